@@ -204,7 +204,10 @@ def term(
 
 
 class ClassCommand(Command):
-    """A command with a word that may be MODULE:CLASS, which adds the options of that class."""
+    """A command with a word that may be MODULE:CLASS, which adds the options of that class.
+
+    They replace other options of the engine. The tilt of a live rotation is for the stage and the class.
+    """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Load the class, and parse the arguments with its options."""

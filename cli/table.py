@@ -115,6 +115,8 @@ def read_column(
 def unit_of(heading: str, kind: Kind, where: str) -> str:
     """Return the unit in the heading of a column; "" if there is none.
 
+    Units are in brackets, after a slash, or the last word: ``travel [um]``, ``position/µm``, ``z_um``.
+
     Raises
     ------
     InputError
@@ -190,7 +192,11 @@ def _value(cell: str, where: str, kind: Kind, factor: float | None) -> float:
 
 
 def _refuse_decimal_commas(path: Path, contents: Sequence[tuple[int, str]]) -> None:
-    """Raise InputError if commas separate the digits of numbers instead of the numbers."""
+    """Raise InputError if commas separate the digits of numbers instead of the numbers.
+
+    They do if each line, or each word of the only line, is two whole numbers with a comma between them; or if
+    a unit follows.
+    """
     words = contents
     if len(contents) == 1:
         words = [(number, word) for number, text in contents for word in text.split()]

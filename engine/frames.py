@@ -124,9 +124,9 @@ def estimate_noise_of_all(samples: NDArray[Any]) -> float:
     """Estimate the standard deviation of a sample, counts, from the same pixels of all frames, (T, n).
 
     It is the median over pairs of consecutive frames, at most 16, so that a repeated frame, or a lamp that
-    settles, has little effect. Pixels that turn light, or dark, all change in one direction, and noise changes
-    as many in the other: the noise is estimated from the direction with the smaller changes. Samples at an
-    end of the scale, where noise is cut off, are omitted.
+    settles, has little effect. Pixels that turn light, or dark, all change in one direction, and noise
+    changes as many in the other: the noise is estimated from the direction with the smaller changes. Samples
+    at an end of the scale, where noise is cut off, are omitted.
     """
     integer = samples.dtype.kind == "u"
     pairs = np.unique(np.linspace(0, len(samples) - 2, _PAIRS).round().astype(int))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Context:
-    """What a step may use besides maps.
+    """Information for steps in addition to maps.
 
     Attributes
     ----------
@@ -52,13 +52,13 @@ class Step(Configured):
     """
 
     def apply(self, result: Result, context: Context) -> Result:
-        """Return the result with the maps of this step, and in ``process`` what was done."""
+        """Return the result with the maps of this step, and with its description in ``process``."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a method does with one source.
+    """Processing of one source by a method.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class Plan:
 
 
 class Method(OnDevice):
-    """Base of methods. Their options are those of their operations and steps, listed by name.
+    """Base of methods, which have the options of their operations and steps, listed by name.
 
     ``threshold: float = Onset.threshold`` gives a method the option of an operation.
     """
@@ -108,11 +108,11 @@ class Method(OnDevice):
     """Motions of recordings that the method applies to; none for all."""
 
     def plan(self, source: Source) -> Plan:
-        """Return what is done with a source: its operation, steps and frames."""
+        """Return the plan for a source: its operation, steps and frames."""
         raise NotImplementedError
 
     def live_plan(self, source: Source) -> Plan:
-        """Return what is done with a source whose frames come while the body moves."""
+        """Return the plan for a source whose frames arrive while the body moves."""
         return self.plan(source)
 
     def run(self, source: Source, progress: Progress | None = None, *, undistort: bool = True) -> Result:

@@ -1,4 +1,4 @@
-"""Operations: frames in, maps out. The base class of everything that is computed from frames."""
+"""Operations convert frames to maps: their base class."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ ABOUT_WEIGHTS = "Weight of each frame, such as its inverse variance; 0 for a mis
 
 
 class _DeviceOption(Option):
-    """The device, or several: names or open devices are given, and they are opened on first use.
+    """The option for one or several devices: names or open devices, opened on first use.
 
-    The attribute is the first of them, which computes what is not divided among them.
+    The attribute is the first of them, which does all work that is not divided.
     """
 
     def store(self, holder: object, value: Any) -> None:
@@ -73,7 +73,7 @@ _device: Option = option(
 
 
 class OnDevice(Configured):
-    """What has a device, or several: they are opened on first use."""
+    """Base of objects with one or several devices, which are opened on first use."""
 
     device: _DeviceOption = _DeviceOption(**{**vars(_device), "name": "device"})
 
@@ -137,19 +137,19 @@ class Operation(ThreadSafe, OnDevice):
     dtypes: ClassVar[tuple[np.dtype[Any], ...] | None] = None
     """Types of samples that it takes; None for all numbers."""
     least_frames: ClassVar[int] = 1
-    """Frames that a result needs."""
+    """Number of frames that a result needs."""
     maps: ClassVar[Mapping[str, Map]] = {}
     """The declared maps by name: the class attributes that are maps."""
     positions: ClassVar[Mapping[str, bool]] = {}
-    """What ``push`` takes of each frame, and whether it needs it; an object's may depend on its options."""
+    """Positions that ``push`` takes for each frame, and whether it needs them; may depend on options."""
     on_device: ClassVar[bool] = False
     """Whether frames are read for the device: ahead, or where kernels can read them without a copy."""
     takes_device_arrays: ClassVar[bool] = False
-    """Whether ``push`` takes a `mirrorskin.kernels.array.Array`, which it gets as a NumPy array otherwise."""
+    """Whether ``push`` accepts a `mirrorskin.kernels.array.Array`; otherwise it gets a NumPy array."""
     long_blocks: ClassVar[bool] = False
     """Whether as many frames as possible should be pushed at once."""
     updates_per_second: ClassVar[float] = 15.0
-    """Live, as many updates are of use."""
+    """Number of useful updates per second of a live run."""
     _takes_lent: ClassVar[bool] = False
     on_objects: ClassVar[tuple[str, ...]] = ("shape", "dtype", "count")
     """Attributes of objects: rows and columns of a frame, type of a sample, number of frames so far."""
@@ -252,10 +252,10 @@ class Operation(ThreadSafe, OnDevice):
         return cast(Result, self.result())
 
     def reconsider(self, samples: FrameSamples) -> bool:
-        """Return whether all frames must be pushed again, as an assumption about them was wrong.
+        """Return whether all frames must be pushed again, because an assumption about them was wrong.
 
-        It is called after the last frame, with samples of all of them; the operation has forgotten the frames
-        if it returns True. They are then pushed as `corrected` returns them.
+        It is called after the last frame, with samples of all of them. If it returns True, the operation has
+        forgotten the frames, and they are pushed again as returned by `corrected`.
         """
         return False
 
@@ -265,7 +265,7 @@ class Operation(ThreadSafe, OnDevice):
         return ()
 
     def corrected(self, frames: NDArray[Any], first: int) -> NDArray[Any]:
-        """Return frames, the first of which has a number, in the operation's type and as it needs them."""
+        """Return frames in the operation's type, with its corrections; the first of them has a number."""
         return frames
 
     def preview(self, seconds: float) -> Mapping[str, Any]:
@@ -273,7 +273,7 @@ class Operation(ThreadSafe, OnDevice):
         return self.result()  # type: ignore[no-any-return]
 
     def spare(self, seconds: float) -> None:
-        """Do what can wait, for some seconds at most: no frame is expected meanwhile."""
+        """Do postponed work, for some seconds at most, while no frame is expected."""
 
     def warm(self) -> None:
         """Push a frame of zeros and forget it, so that what is compiled on first use is ready."""
@@ -422,7 +422,7 @@ def _checked_result(method: Callable[..., Any]) -> Callable[..., Result]:
 
 
 def _check_class(cls: type[Operation]) -> None:
-    """Raise InputError if the attributes of a class cannot be those of an operation."""
+    """Raise InputError if a class has attributes that an operation must not have."""
     own, name = vars(cls), cls.__name__
     try:
         check_maps(cls.maps)

@@ -70,7 +70,7 @@ class Option:
         )
 
     def store(self, holder: object, value: Any) -> None:
-        """Keep a checked value in an object."""
+        """Store a checked value in an object."""
         vars(holder)[self.name] = value
 
     def stored(self, holder: object) -> Any:
@@ -78,7 +78,7 @@ class Option:
         return vars(holder)[self.name]
 
     def settled(self, annotation: Any) -> Option:
-        """Return the declaration as it is in its class; an annotation ``float`` makes a number of an integer.
+        """Return the declaration as completed by its class; for ``float``, an integer becomes a number.
 
         Raises
         ------
@@ -169,7 +169,7 @@ class Option:
 
     @property
     def needed(self) -> str:
-        """What a number must be, such as ``a share from 0 to 1``."""
+        """Requirement for a number, such as ``a share from 0 to 1``."""
         noun = _NOUNS.get(self.unit, "a number" + (f" in {self.unit}" if self.unit else ""))
         low, high = self.within
         if low is not None and high is not None and high < _ANY:
@@ -330,7 +330,7 @@ class Configured:
         return {name: one.stored(self) for name, one in self.options.items()}
 
     def part(self, kind: type[Configured]) -> dict[str, Any]:
-        """Return the values of the options that another class has as well."""
+        """Return the values of the options that another class also has."""
         return {name: one.stored(self) for name, one in self.options.items() if name in kind.options}
 
 
@@ -364,9 +364,9 @@ def signature_of(
 
 
 def documented(text: str | None, options: Mapping[str, Option], before: str = "") -> str | None:
-    """Return a docstring with its section "Parameters" made of the declarations.
+    """Return a docstring whose section "Parameters" is generated from the declarations.
 
-    ``before`` are lines about positional parameters. Sections that the docstring has follow the parameters.
+    ``before``: lines about positional parameters. Existing sections of the docstring follow the parameters.
     """
     if text is None or (not options and not before) or "\n    Parameters\n" in f"\n{text}":
         return text

@@ -1,4 +1,4 @@
-"""The one loop: frames of a source into an operation."""
+"""The common loop: it pushes frames of a source into an operation."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ Reader = Callable[[Source, Operation, int], Iterator[Block]]
 
 
 class Receiver(Protocol):
-    """What frames are pushed into: an operation, offline or live."""
+    """A receiver of frames: an operation, offline or live."""
 
     @property
     def positions(self) -> Mapping[str, bool]:
-        """What ``push`` takes of each frame, and whether it needs it."""
+        """Positions that ``push`` takes for each frame, and whether it needs them."""
 
     def push(self, *args: Any, **kwargs: Any) -> None:
         """Process the next frames."""
@@ -92,7 +92,7 @@ def _as_corrected(finding: Finding, corrects: Collection[str]) -> Finding:
 
 
 class _Corrected(DerivedSource):
-    """Frames of a source as an operation corrects them; they are numbered from ``start`` on."""
+    """Frames of a source, corrected by an operation; they are numbered from ``start`` on."""
 
     def __init__(self, source: Source, operation: Operation, start: int) -> None:
         super().__init__(source)
@@ -140,7 +140,7 @@ def _feed_once(
 
 
 def push_block(operation: Receiver, block: Block, part: slice = slice(None)) -> None:
-    """Push what a source yields, or a part of it: frames and what the operation needs of each."""
+    """Push a block of a source, or a part of it: frames and their required positions."""
     given = {}
     for name in operation.positions:
         values = getattr(block, name, None)
@@ -169,7 +169,7 @@ def _read_in_place(source: Source, operation: Operation, count: int) -> Iterator
 
 
 def _lent_or_read(source: Source, operation: Operation, count: int, *, read: Reader) -> Iterator[Block]:
-    """Use frames in the memory of the source, as many at once as possible, as long as it allows this."""
+    """Use frames in the memory of the source, as many at once as it allows."""
     lend: Callable[[int], Block | None] = getattr(source, "lend", lambda most: None)
     frame_size = math.prod(source.shape[1:]) * source.dtype.itemsize
     most = max(1, operation.device.max_allocation // frame_size)

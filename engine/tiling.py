@@ -309,7 +309,7 @@ def for_each_band(bands: Sequence[Band], work: Callable[[Band], T]) -> list[T]:
 
 
 class _StoppedError(Exception):
-    """Work on a device ended early, since that on another one failed."""
+    """Work on a device ended early, because another device failed."""
 
 
 def _run_on_device(bands: Sequence[Band], work: Callable[[Band], T], stop: Event) -> list[T]:
