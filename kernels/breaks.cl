@@ -80,7 +80,7 @@ __kernel void breaks_trust(
     const float unsure_##slope = 0.5f * noise * (1 / sure + 1 / sure_##slope);                       \
     const float all_##slope = unsure_##slope + bent_##slope * bent_##slope + torn_##slope * torn_##slope; \
     weight[p] = link[p] * GREATER(noise / all_##slope, least);                                                     \
-    rise[p] = (facing[p] * slope[p] + facing[to] * slope[to]) / (facing[p] + facing[to]);
+    rise[p] = 0.5f * (slope[p] + slope[to]);
 #define ONE_TRUST(p, before, after, above, below)                                                    \
     const float sure = facing[p] * facing[p] * facing[p] * facing[p];                                \
     LINK(after, above, slope_x, right, weight_x, rise_x)                                             \

@@ -77,7 +77,7 @@ def breaks_trust(right: Floats, down: Floats, slope_x: Floats, slope_y: Floats, 
     """Return weights of the links to the right and down, and their slopes.
 
     ``facing`` are the cosines a, ``right`` and ``down`` the weights w, ``noise`` is n^2, and n^2 / v is at
-    least ``least``. The slope of a link is computed from the sum of both normals, which is exact on a sphere.
+    least ``least``. A link's slope is the mean of both: a crease may be anywhere between the pixels.
     """
     one = _trust(right, slope_x, facing, tears, noise, bend, tear, least)
     other = _trust(down.T, slope_y.T, facing.T, tears.T, noise, bend, tear, least)
@@ -98,7 +98,7 @@ def _trust(
     s_next, a_next = np.roll(s, -1, 1), np.roll(a, -1, 1)
     torn = np.maximum(t, np.roll(t, 1, 0))
     v = noise * (a**-4 + a_next**-4) / 2 + (bend * (s - s_next)) ** 2 + (tear * torn) ** 2
-    return w * np.maximum(noise / v, least), (a * s + a_next * s_next) / (a + a_next)
+    return w * np.maximum(noise / v, least), (s + s_next) / 2
 
 
 def breaks_links(weight_x: Floats, weight_y: Floats, rise_x: Floats, rise_y: Floats, slope_x: Floats,

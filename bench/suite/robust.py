@@ -2,7 +2,8 @@
 
 Targets on every scene: an error no larger than with the published method, and half of it on average; at most
 10 % more than with plain least squares; twenty times as fast as the published method; 3 s for a megapixel.
-For held-out heaps, the median and the maximum are tested.
+For held-out heaps, the median and the maximum are tested. Figures, which include pinhole cameras and errors of
+normals, are compared with plain least squares only, and their errors with the standard deviations.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from mirrorskin.cli.bench.timing import OURS, Work, take_turns
 from mirrorskin.kernels.device import Device
 from suite.bilateral import integrate_bilaterally
 from suite.depth_scenes import HELD_OUT, SCENES, Scene
+from suite.figure_scenes import CHOSEN_ON, Figure
+from suite.figure_scenes import HELD_OUT as HELD_OUT_FIGURES
 from suite.harness import Cases, at_most, ratio_target
 
 _SHAPE, _QUICK, _LARGE = (256, 256), (24, 24), (1024, 1024)
@@ -56,6 +59,16 @@ def run_robust(device: Device, quick: bool) -> Case:
         at_most(f"held-out heaps: median of errors, of those of {_PEER}", float(np.median(to_peer)), _MEAN)
     )
     targets.append(at_most(f"held-out heaps: worst of errors, of {_PLAIN}", float(to_plain.max()), _WORSE))
+    for which, figures in (("chosen on", CHOSEN_ON), ("held out", HELD_OUT_FIGURES)):
+        chosen = list(figures.values())[: 1 if quick else None]
+        found = np.array([_compare_figure(make(), device) for make in chosen])
+        (middle, chi2), (most, worst) = np.median(found, axis=0), found.max(axis=0)
+        notes.append(
+            f"figures {which}, errors over those of {_PLAIN}: median {middle:.2f}, worst {most:.2f}; "
+            f"chi^2: median {chi2:.2f}, worst {worst:.1f}"
+        )
+        targets.append(at_most(f"figures {which}: worst of errors, of {_PLAIN}", float(most), _WORSE))
+        targets.append(at_most(f"figures {which}: median chi^2", float(chi2), 2.0))
     if not quick:
         scene = SCENES[_HARDEST](_LARGE)
         start = time.perf_counter()
@@ -88,6 +101,15 @@ def _compare(
     found, steps = integrate_bilaterally(scene)
     peer = _once(f"{_PEER}, {name}", time.perf_counter() - start, scene)
     return [*rows.values(), peer], (errors[0], errors[1], scene.error(found)), steps
+
+
+def _compare_figure(figure: Figure, device: Device) -> tuple[float, float]:
+    """Return the error over that of plain least squares, and chi^2."""
+    plain, ours = (
+        engine.integrate(**figure.arguments(), robust=robust, device=device) for robust in (False, True)
+    )
+    chi2 = float(np.nanmean(figure.scores(ours) ** 2))
+    return figure.error(ours.height) / figure.error(plain.height), chi2
 
 
 CASES: Cases = {"integrate-robust": run_robust}

@@ -124,11 +124,14 @@ def integrate(
         undefined. Other maps are (H, W), and shared by all surfaces.
 
         ``height_sigma``: expected standard deviation, about the mean of the component if it has no known
-        height; NaN where the noise of the slopes cannot be estimated.
+        height; NaN where the noise of the slopes cannot be estimated. With ``robust`` it contains the
+        difference from the surface without breaks.
 
         ``component``: connected component of each pixel, numbered in reading order of the first pixels; -1
         without an answer. ``offset_unknown``, (components,): 1 for a component without a known height, whose
-        mean is 0, or whose depth has the geometric mean 1.
+        mean is 0, or whose depth has the geometric mean 1. With ``robust``, parts that breaks separate are
+        components; their heights relative to each other are the best estimate, and the mean is that of all
+        parts that were connected without breaks.
 
         ``filled``: all 0. ``edges``: 1 on both sides of a discontinuity, if ``robust``.
 

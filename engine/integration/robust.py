@@ -10,9 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.integration.graph import Links, Plane
+from mirrorskin.engine.integration.graph import Components, Links, Plane
 from mirrorskin.engine.integration.multigrid import Multigrid, Solution
-from mirrorskin.engine.integration.validation import Flags, Inputs
+from mirrorskin.engine.integration.parts import (
+    find_doubt,
+    find_parts,
+    find_ties,
+    join_fragments,
+    largest_within,
+    place_parts,
+)
+from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.breaks import DOWN, RIGHT
 from mirrorskin.kernels.least_squares import mad_sigma
@@ -20,10 +28,11 @@ from mirrorskin.kernels.least_squares import mad_sigma
 _BROKEN = 6.0
 """k r^2 (see ``mirrorskin.kernels.breaks``) above which a link crosses a discontinuity."""
 
-_SCALES = 32.0, 16.0, 8.0, 4.0, 2.0, 1.0  # times 1 / sqrt(2 k): misfit of a link that is tolerated
+_SCALES = 16.0, 8.0, 4.0, 2.0, 1.0  # times 1 / sqrt(2 k): misfit of a link that is tolerated
 _MOST, _REST = 4, 0.02  # largest number of steps at a scale; relative decrease of broken links to go on
 _LOOSE = 0.001  # residual of a step's solution
 _CYCLES = 10  # largest number of cycles of a step
+
 _GONE = 1e4  # k r^2 above which a link is cut for a step, because tiny weights cannot be solved
 _AGAIN = 3  # largest number of additional solutions at the end
 _NOISE = 0.03  # smallest standard deviation of slopes
@@ -39,9 +48,10 @@ class Robust:
     """Heights of a surface, and its discontinuities."""
 
     relief: Array  # (H, W), float32: heights above the plane, mm; arbitrary without an answer
-    links: Links  # the graph with the final weights
-    flags: Flags  # (H, W), uint8: the flags without broken links
+    links: Links  # the graph with the final weights, within parts
+    flags: Flags  # (H, W), uint8: the flags without broken links, and without links between parts
     edges: Flags  # (H, W), uint8: 1 on both sides of a discontinuity
+    doubt: Floats  # (H, W): variance of heights about the mean of their component because of breaks, mm^2
     iterations: int  # number of solutions
     residual: float  # of the last solution
     converged: bool  # whether all steps were done, and the last residual is within the tolerance
@@ -54,6 +64,9 @@ def solve_robust(
     plane: Plane,
     sharpness: float,
     *,
+    plain: Floats,
+    components: Components,
+    solver: Multigrid,
     start: NDArray[np.floating[Any]] | None = None,
     tolerance: float = 1e-5,
     deadline: float | None = None,
@@ -66,21 +79,23 @@ def solve_robust(
     misfit above 2.4 / sqrt(2 k) are cut, and the rest is solved to the tolerance. There are two searches,
     with contradictions counted locally and over 11 x 11 corners; the heights that break fewer links win.
 
-    - A region that is cut off on all sides keeps its shape, and is a component with an unknown offset unless
-      it has a known height. Without contradictions it is not cut off: a ball on a plane stays connected.
+    - A part of the surface that few confident links hold is a component of its own, with an unknown offset
+      unless it has a known height. It is as high as these links and ``plain``, the heights of least squares
+      without a search, say together (``mirrorskin.engine.integration.parts``).
     - The position of a discontinuity is determined where its height changes along it; elsewhere it follows
       the largest differences between normals.
     - A step lower than about one pixel (at k = 2) counts as a bend.
 
-    Only ``links``, of heights above the plane, can be cut. ``sharpness`` is k, 1/pixel^2. With a ``start``,
-    heights above the plane, only the last scales are used. After the ``deadline``, a ``time.perf_counter``,
-    only the first cycle of the last solution is started.
+    Only ``links``, of heights above the plane, can be cut. They connect the ``components``. ``sharpness`` is
+    k, 1/pixel^2. With a ``start``, heights above the plane, only the last scales are used. After the
+    ``deadline``, a ``time.perf_counter``, only the first cycle of the last solution is started. The memory of
+    the ``solver`` is used.
     """
-    search = _Search(inputs, links, flags, plane, sharpness, deadline)
+    search = _Search(inputs, links, flags, plane, sharpness, solver, deadline)
     search.trust(*_LOCAL)
     if start is not None:
         first = links.device.from_host("start", np.where(np.isfinite(start), start, 0.0))
-        return search.conclude(search.descend(first), flags, tolerance)
+        return search.conclude(search.descend(first), flags, tolerance, plain, components)
     best = search.descend()
     if search.contradicted and not search.late():
         local, broken = best.read(), search.link(best)
@@ -90,7 +105,7 @@ def solve_robust(
         best = search.descend(best)
         if search.link(best) >= broken:
             best = links.device.from_host("first", local)
-    return search.conclude(best, flags, tolerance)
+    return search.conclude(best, flags, tolerance, plain, components)
 
 
 class _Search:
@@ -103,6 +118,7 @@ class _Search:
         flags: Flags,
         plane: Plane,
         sharpness: float,
+        solver: Multigrid,
         deadline: float | None,
     ) -> None:
         self._links, self._shape, self._given = links, links.shape, links.device.from_host
@@ -118,7 +134,7 @@ class _Search:
         self._slopes, self._facing = self._find_slopes(inputs, plane)
         self._held = self._find_held(inputs, plane)
         self._curl, self._noise = self._find_curl(flags)
-        self._solver: Multigrid | None = None
+        self._solver = solver
 
     def late(self) -> bool:
         """Return whether the deadline has passed."""
@@ -143,7 +159,7 @@ class _Search:
 
         From given heights, only the last scales are used.
         """
-        scales: tuple[float, ...] = _SCALES[3:]
+        scales: tuple[float, ...] = _SCALES[2:]
         if heights is None:
             self.link(self._held, math.inf)
             heights, scales = self._solve(None, _LOOSE).height, _SCALES
@@ -171,39 +187,68 @@ class _Search:
         """Solve for the weights of the last `link`."""
         right, down, source = (self._maps[name] for name in ("right", "down", "source"))
         links = Links(self._links.device, self._shape, right, down, self._links.anchor, source)
-        if self._solver is None:
-            self._solver = Multigrid(links)
-        else:
-            self._solver.rebuild(links)
+        self._solver.rebuild(links)
         self._steps += 1
         self.last = links
         limit = _CYCLES if tolerance == _LOOSE else 100
         return self._solver.solve(start, tolerance=tolerance, limit=limit, deadline=self._deadline)
 
-    def conclude(self, heights: Array, flags: Flags, tolerance: float) -> Robust:
-        """Cut broken links, solve the rest to the tolerance, and return the surface."""
+    def conclude(
+        self, heights: Array, flags: Flags, tolerance: float, plain: Floats, components: Components
+    ) -> Robust:
+        """Cut broken links, solve the rest to the tolerance, place the parts, and return the surface."""
         done = not self.late()
+        self.link(heights)
+        right, down = self._confidence()
         self.link(heights, most=_BROKEN)
         last = self._solve(heights, tolerance)
         for _ in range(_AGAIN):  # a restart recomputes the residual, whose rounding errors stop the iteration
             if last.converged or self.late():
                 break
-            assert self._solver is not None
             last = self._solver.solve(last.height, tolerance=tolerance, deadline=self._deadline)
+        answered = components.labels >= 0
+        parts, relief = find_parts(right, down, answered), last.height.read()
+        known = np.zeros_like(relief) if self._links.anchor is None else self._links.anchor.read()
+        ties = find_ties(parts, right, down)
+        lifts = place_parts(parts, ties, plain - relief, components, known)
+        joined = join_fragments(parts, ties)
+        largest = largest_within(parts, joined)
+        relief += np.where(answered, lifts[largest], 0)
+        doubt = find_doubt(plain - relief, joined)
         flags, edges = flags.copy(), np.zeros_like(flags)
         for bit, axis, link in ((RIGHT, 1, self.last.right), (DOWN, 0, self.last.down)):
-            broken = (flags & bit != 0) & (link.read() == 0)
-            flags[broken] &= np.uint8(~bit & 255)
+            weight = link.read()
+            broken = (flags & bit != 0) & (weight == 0)
             edges |= broken | np.roll(broken, 1, axis)
+            broken |= (flags & bit != 0) & (joined != np.roll(joined, -1, axis))
+            flags[broken] &= np.uint8(~bit & 255)
+            link.write(np.where(broken, np.float32(0), weight))
         return Robust(
-            relief=last.height,
+            relief=self._given("relief", relief),
             links=self.last,
             flags=flags,
             edges=edges,
+            doubt=doubt,
             iterations=self._steps,
             residual=last.residual,
             converged=done and last.converged,
         )
+
+    def _confidence(self) -> tuple[Floats, Floats]:
+        """Return the confidences of the links to the right and down after the last `link`.
+
+        With the weight w of a link, its trusted weight t, and the weight u of its misfit as well, it is
+        u / w (t / w)^1/2: the misfit has to be small, and the slope well known in addition.
+        """
+        confidences = []
+        maps = ("right", "weight_x", self._links.right), ("down", "weight_y", self._links.down)
+        for link, trusted, full in maps:
+            weight = full.read()
+            with np.errstate(invalid="ignore", divide="ignore"):
+                share = np.sqrt(self._maps[trusted].read() / weight)
+                confidence = self._maps[link].read() / weight * share
+            confidences.append(np.where(weight > 0, confidence, np.float32(0)))
+        return confidences[0], confidences[1]
 
     def _find_slopes(self, inputs: Inputs, plane: Plane) -> tuple[dict[str, Array], Array]:
         """Return slopes relative to the plane, to the right and down, and the normals' cosines."""

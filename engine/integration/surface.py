@@ -19,7 +19,7 @@ from mirrorskin.engine.integration.graph import (
     Plane,
     find_components,
 )
-from mirrorskin.engine.integration.height_variance import expected_misfit
+from mirrorskin.engine.integration.height_variance import JOINED, expected_misfit
 from mirrorskin.engine.integration.multigrid import Multigrid, Solution
 from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
@@ -35,6 +35,7 @@ from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
 Method = Literal["direct", "multigrid", "robust"]
 
 _UNEVEN = 2.0  # ratio of the weights of horizontal and vertical links above which they count as uneven
+_PLAIN = 3e-3  # residual of the surface without breaks, with which one with breaks is compared
 _GOAL = 1e-4  # residual to stop at if there is a deadline, but no tolerance
 
 
@@ -97,6 +98,7 @@ class _Relief:
     links: Links | None = None
     flags: Flags | None = None
     edges: Flags | None = None
+    doubt: Floats | None = None  # variance because of breaks, mm^2
 
 
 @dataclass(slots=True)
@@ -188,17 +190,49 @@ class SurfaceSolver:
         plane, links = self._plane, self._graph.links(self._plane)
         first = None if start is None else self._above_plane(start, inputs, plane)
         if options.robust:
-            problem = inputs, links, self._cache.flags, plane, options.bilateral_sharpness
-            goal = options.tolerance or _GOAL
-            robust = solve_robust(*problem, start=first, tolerance=goal, deadline=options.deadline)
-            numbers = robust.iterations, robust.residual, robust.converged or options.tolerance is None
-            return _Relief(
-                robust.relief, [plane], "robust", *numbers, robust.links, robust.flags, robust.edges
-            )
+            return self._find_robust(inputs, options, links, first)
         first_heights = self._last if first is None else self._graph.put("start", first)
         solution = self._build(links).solve(first_heights, **self._goal(options))
         self._last = solution.height
         return _relief(solution, [plane])
+
+    def _find_robust(
+        self, inputs: Inputs, options: IntegrationOptions, links: Links, start: Floats | None
+    ) -> _Relief:
+        """Find a surface and its breaks, after the surface without breaks."""
+        assert self._plane is not None
+        weighted = inputs.weighted()
+        if weighted is not inputs:
+            self._graph.upload(weighted)
+            links = self._graph.links(self._plane)
+        first = None if start is None else self._graph.put("start", start)
+        solver = self._build(links)
+        plain = solver.solve(first, tolerance=_PLAIN, deadline=options.deadline).height.read()
+        if weighted is not inputs:
+            self._graph.upload(inputs)
+            links = self._graph.links(self._plane)
+        self._cache.built = False
+        robust = solve_robust(
+            *(inputs, links, self._cache.flags, self._plane, options.bilateral_sharpness),
+            plain=plain,
+            components=self._whole_components(inputs),
+            solver=solver,
+            start=start,
+            tolerance=options.tolerance or _GOAL,
+            deadline=options.deadline,
+        )
+        return _Relief(
+            robust.relief,
+            [self._plane],
+            "robust",
+            robust.iterations,
+            robust.residual,
+            robust.converged or options.tolerance is None,
+            robust.links,
+            robust.flags,
+            robust.edges,
+            robust.doubt,
+        )
 
     def _find_several(self, inputs: Inputs, options: IntegrationOptions) -> _Relief:
         """Solve for several surfaces with one graph."""
@@ -239,9 +273,11 @@ class SurfaceSolver:
 
     def _finish(self, inputs: Inputs, options: IntegrationOptions, relief: _Relief) -> Result:
         """Add plane and offsets to the relief, and estimate the standard deviation."""
-        components = self._find_components(inputs, relief)
+        whole = components = self._whole_components(inputs)
+        if relief.flags is not None:
+            components = find_components(relief.flags, True)
         on_device = isinstance(inputs.dz_dx, Array)
-        height = self._levelling.level(components, relief.height, relief.planes, inputs.datum, on_device)
+        height = self._levelling.level(whole, relief.height, relief.planes, inputs.datum, on_device)
         return _as_result(
             height,
             self._find_sigma(inputs, relief, components) if options.sigma else None,
@@ -255,9 +291,8 @@ class SurfaceSolver:
             invalid=int(np.count_nonzero(self._cache.flags & LOST)),
         )
 
-    def _find_components(self, inputs: Inputs, relief: _Relief) -> Components:
-        if relief.flags is not None:
-            return find_components(relief.flags, True)
+    def _whole_components(self, inputs: Inputs) -> Components:
+        """Return the components of the graph, without breaks that a search finds."""
         if self._cache.components is None:
             flags = self._cache.flags
             alone = (flags & (SLOPE | KNOWN)) == KNOWN
@@ -267,17 +302,21 @@ class SurfaceSolver:
 
     def _find_sigma(self, inputs: Inputs, relief: _Relief, components: Components) -> Floats:
         factor = self._graph.scale
-        if not inputs.weights_given:
-            factor *= self._excess(inputs, relief, components)
-        if relief.flags is not None:  # a link is cut, or has the weight of its pixels
+        excess = 1.0 if inputs.weights_given else self._excess(inputs, relief, components)
+        factor *= excess
+        if relief.flags is not None:
+            assert self._multigrid is not None
+            assert relief.links is not None
             self._graph.put("flags", relief.flags)
-            sigma = self._unit_sigma(Multigrid(self._graph.links()), inputs, components)
+            self._multigrid.rebuild(relief.links, strength=JOINED)
+            sigma = self._multigrid.deviation(self._graph.flags, uneven=False)
         else:
             assert self._multigrid is not None
             if self._cache.sigma is None:
                 self._cache.sigma = self._unit_sigma(self._multigrid, inputs, components)
             sigma = self._cache.sigma
-        return sigma * np.float32(factor**0.5)
+        sigma = sigma * np.float32(factor**0.5)
+        return sigma if relief.doubt is None else np.sqrt(np.square(sigma) + relief.doubt)
 
     def _unit_sigma(self, solver: Multigrid, inputs: Inputs, components: Components) -> Floats:
         ends = self._link_weights(inputs)

@@ -75,6 +75,17 @@ class Inputs:
         x, y = (np.where(missing, np.float32(np.nan), slope) for slope in (self.dz_dx, self.dz_dy))
         return replace(self, dz_dx=x, dz_dy=y)
 
+    def weighted(self) -> Inputs:
+        """Return inputs whose slopes have the weights of equally noisy normals."""
+        if self.steep is None:
+            return self
+        given = [plane for plane in (self.weight_x, self.weight_y) if plane is not None]
+        planes = [self.steep * plane for plane in given] or [np.float32(self.typical_weight) * self.steep]
+        typical = _median(planes)
+        planes = [_clipped(plane, typical * LEAST, typical * MOST) for plane in planes]
+        second = planes[1] if len(planes) > 1 else None
+        return replace(self, weight_x=planes[0], weight_y=second, typical_weight=typical)
+
     @property
     def weight(self) -> float:
         """Factor of the maps of weights; without maps, the weight of all pixels."""

@@ -133,7 +133,8 @@ def integrate_normals(
     """Integrate the normals of pixels in contact, of one picture or of each turn, or raise NotConverged.
 
     ``independent_sigma``, (H, W) or (turns, H, W), is that of `find_slopes`. The mean height of each
-    component is 0; components are numbered over all turns. With ``robust``, edges are breaks of the surface.
+    component is 0; components are numbered over all turns. With ``robust``, edges are breaks of the surface,
+    and the mean of components that breaks separate is 0 together.
     """
     per_turn = result.contact.ndim == 3
     each, sigmas = [result], [independent_sigma]
