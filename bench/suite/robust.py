@@ -2,8 +2,8 @@
 
 Targets on every scene: an error no larger than with the published method, and half of it on average; at most
 10 % more than with plain least squares; twenty times as fast as the published method; 3 s for a megapixel.
-For held-out heaps, the median and the maximum are tested. Figures, which include pinhole cameras and errors of
-normals, are compared with plain least squares only, and their errors with the standard deviations.
+For held-out heaps, the median and the maximum are tested. Figures, which include pinhole cameras and errors
+of normals, are compared with plain least squares only, and their errors with the standard deviations.
 """
 
 from __future__ import annotations
