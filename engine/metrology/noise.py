@@ -17,7 +17,7 @@ from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
 
-_MARGIN = 4.0  # correlation lengths by which the periodic picture is larger than the map
+_MARGIN = 4.0  # correlation lengths between the map and its periodic continuation
 _LARGEST = 2  # times the size of the map: the periodic picture where the correlation is longer
 _SEED = 20  # realisations are the same in each call
 

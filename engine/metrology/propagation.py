@@ -21,10 +21,12 @@ HOPELESS = 0.6
 """Share of noise in Sq^2 above which skewness, kurtosis and material ratios cannot be separated from it."""
 
 ANY_DIRECTION = 180 / math.sqrt(12)
-"""Standard deviation of a direction of which nothing is known, degrees."""
+"""Standard deviation of a uniformly distributed direction, degrees."""
 
-_EXTREME = 1.8  # by which the change of extremes is larger than extrapolated, since it begins steeply
-_RATIO = 2.0  # power of the rest of Sq^2 by which the change of material ratios is larger than extrapolated
+# Factor on the extrapolated change of extremes and material ratios, which is steep where noise is small;
+# chosen for a chi-square of about 1 (tests/engine/metrology/test_uncertainty.py).
+_EXTREME = 1.8
+_RATIO = 2.0  # power of the surface's share of Sq^2 in a further factor for material ratios
 _SHAPES = {"sk": (0.0, 1.5), "ku": (3.0, 2.0)}  # value of a normal distribution, and power of Sq^2
 
 
