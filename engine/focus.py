@@ -155,8 +155,7 @@ def _off_centre(
     variance of the window away.
     """
     reach = math.ceil(math.sqrt(variance))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        texture = 2 * np.log(sharpness)
+    texture = 2 * np.log(np.where(sharpness > 0, sharpness, np.float32(np.nan)))
     noise = sigma**2 * np.float32(_BETWEEN / reach**2)
     slope = np.maximum(_slopes(height, reach) - noise, 0)
     product = np.float32(variance**2) * _slopes(texture, reach) * slope

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, ndtr
 
+from mirrorskin.engine.amplitude_blur import with_blur
 from mirrorskin.engine.frames import noise_of_residual
 from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.operation import Operation, phase_function
@@ -129,6 +130,9 @@ class Fringes(Operation):
         np.divide(noise.astype(np.float32) * np.sqrt(variance), square, out=spread, where=square != 0)
         # No cosine fits these samples: one of them is of a hot pixel, or of a reflection that moved.
         misfit = fit.residual > _MISFIT * np.fmax(noise, seen)
+        length = np.where(misfit | (modulation == 0), np.float32(np.nan), modulation)
+        with np.errstate(invalid="ignore"):
+            spread = with_blur(spread, np.stack([fit.cosine, fit.sine]) / length, length)
         maps = {
             "phase": np.where(misfit, np.float32(np.nan), phase),
             "phase_sigma": np.where(misfit, np.float32(np.inf), spread),

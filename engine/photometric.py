@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.amplitude_blur import with_blur
 from mirrorskin.engine.frames import noise_of_residual
 from mirrorskin.engine.operation import Operation, optional_phase_function
 from mirrorskin.engine.options import option
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import as_array
+from mirrorskin.io.findings import Finding, in_process
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
+from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array import fetch
 from mirrorskin.kernels.array_types import Doubles
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     from mirrorskin.io import Source
 
 
+_FEWEST, _CLEAR, _POWER = 64, 6.0, 0.03  # pixels, standard errors, and change of the power that decide
 _BEYOND = 4.0  # standard deviations of a residual that noise does not explain
 
 
@@ -44,6 +48,7 @@ class PhotometricStereo(Operation):
     """
 
     takes_device_arrays = True
+    _response: Finding | None = None  # that brightness is not proportional to light
     dtypes = FRAME_DTYPES
     on_device = True
 
@@ -122,7 +127,8 @@ class PhotometricStereo(Operation):
         self._triangle = self.device.array("triangle", (11, *shape), np.float32, zeroed=False)
 
     def clear(self) -> None:
-        """Do nothing: the first frame overwrites the sums."""
+        """Forget what the frames so far showed; the next one overwrites their sums."""
+        self._response = None
 
     def push(self, frames: NDArray[Any], *, phase: ArrayLike | None = None) -> None:
         """Process the next frames, (n, H, W), and the azimuth of each lamp, (n,) radians."""
@@ -138,19 +144,45 @@ class PhotometricStereo(Operation):
 
     def _lights_of(self, count: int, phase: ArrayLike | None) -> Doubles:
         """Return the vectors towards the lamps of the next frames, (n, 3)."""
-        if self._lights is not None:
-            stop = self.count + count
-            if stop > len(self._lights):
-                raise InputError(
-                    f"light has {len(self._lights)} vectors: one is needed for each of {stop} frames"
-                )
-            return self._lights[self.count : stop]
-        if self.zenith is None:
+        stop = self.count + count
+        if self._lights is not None and stop > len(self._lights):
+            raise InputError(
+                f"light has {len(self._lights)} vectors: one is needed for each of {stop} frames"
+            )
+        if self._lights is None and self.zenith is None:
             raise InputError("phases are azimuths only: specify the zenith of the lamps, radians, or light")
-        azimuth, out = check_phase(phase, count, "phase"), np.sin(self.zenith)
-        return np.stack(
-            [out * np.cos(azimuth), out * np.sin(azimuth), np.full(count, np.cos(self.zenith))], axis=1
+        return self._lights_at(
+            np.arange(self.count, stop), None if phase is None else check_phase(phase, count, "phase")
         )
+
+    def _lights_at(self, frames: NDArray[np.integer], phase: Doubles | None) -> Doubles:
+        """Return the vectors towards the lamps of frames with numbers and azimuths, (n, 3)."""
+        if self._lights is not None:
+            return np.asarray(self._lights[frames])
+        assert phase is not None
+        assert self.zenith is not None
+        up = np.full(len(frames), np.cos(self.zenith))
+        return np.stack(
+            [np.sin(self.zenith) * np.cos(phase), np.sin(self.zenith) * np.sin(phase), up], axis=1
+        )
+
+    def reconsider(self, samples: FrameSamples) -> bool:
+        """Look whether brightness is proportional to light, which only shows after the last frame."""
+        values, dark = samples.values, np.asarray(0.0 if self.dark is None else self.dark)
+        level = dark if dark.ndim == 0 else samples.of_map(dark).ravel()
+        light = values.reshape(len(values), -1).astype(np.float64) - level
+        phase = self.pushed("phase") if self._lights is None else None
+        lamps = self._lights_at(np.arange(len(light)), phase)
+        lit = np.all((light > max(self.shadow, 0.0)) & (light < self._saturation - level), axis=0)
+        power = find_power(light[:, lit], lamps)
+        if power != 1:
+            text = (
+                f"the brightness is not proportional to the light, but to its power {power:.2g}, as with"
+                " gamma (or gloss), so normals are wrong by more than their sigma: use a camera with a linear"
+                " response"
+            )
+            self._response = Finding("response", text)
+        return False
 
     def result(self) -> dict[str, Any]:
         """Return normals and albedo of the frames so far."""
@@ -172,7 +204,10 @@ class PhotometricStereo(Operation):
         scale = np.asarray(noise, np.float32) * _misfit(residual, samples - 3, noise)
         for name in ("normals", "albedo"):
             maps[f"{name}_sigma"] = maps.pop(f"{name}_spread") * scale
-        return maps if np.ndim(noise) or np.isnan(noise) else maps | {"noise": float(noise)}
+        sigma = with_blur(maps["normals_sigma"], np.moveaxis(maps["normals"], -1, 0), maps["albedo"])
+        maps["normals_sigma"] = sigma
+        said = in_process([] if self._response is None else [self._response], {})
+        return maps | said if np.ndim(noise) or np.isnan(noise) else maps | said | {"noise": float(noise)}
 
     def finish(self) -> Result:
         """Return normals and albedo of all frames; their number must be that of the lamps."""
@@ -229,6 +264,28 @@ def _misfit(residual: NDArray[Any], freedom: NDArray[Any], noise: Any) -> NDArra
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = residual / np.asarray(noise, np.float32)
         return np.where(ratio > limit[freedom], ratio, np.float32(1))
+
+
+def find_power(light: Doubles, lamps: Doubles) -> float:
+    """Return the power of the light to which brightness is proportional; 1 if that is not contradicted.
+
+    With the light x = albedo (normal . lamp), x^g is x + (g - 1) x log x to first order. ``light``, (T, n),
+    is brightness less dark, ``lamps`` are vectors, (T, 3).
+    """
+    if light.shape[1] < _FEWEST or len(lamps) < 5:
+        return 1.0
+    axes = np.linalg.qr(lamps)[0]
+    fitted = axes @ (axes.T @ light)
+    light, fitted = (one[:, np.all(fitted > 0, axis=0)] for one in (light, fitted))
+    if light.shape[1] < _FEWEST:
+        return 1.0
+    bent = fitted * np.log(fitted / np.mean(fitted, axis=0))
+    bent -= axes @ (axes.T @ bent)
+    left = light - axes @ (axes.T @ light)
+    size, pull = np.sum(bent**2, axis=0), np.sum(bent * left, axis=0)
+    excess = float(np.sum(pull) / np.sum(size))
+    error = float(np.sqrt(np.sum((pull - excess * size) ** 2)) / np.sum(size))
+    return 1 + excess if abs(excess) > max(_CLEAR * error, _POWER) else 1.0
 
 
 def _vectors(light: ArrayLike) -> Doubles:

@@ -4,17 +4,19 @@ import re
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from stacks import MadeUp
 
 from mirrorskin import engine, io
 from mirrorskin.engine.photometric import PhotometricStereo, photometric_stereo
+from mirrorskin.io.arrays import ArrayRecording
 
 AZIMUTH = np.arange(12) * 2 * np.pi / 12
 ROW, COLUMN = np.mgrid[1:-1:60j, -1:1:60j]
 BALL = np.dstack([COLUMN, ROW, np.sqrt(np.maximum(1 - ROW**2 - COLUMN**2, 0))])
 INSIDE = BALL[..., 2] > 0.1
 LAMPS = np.random.default_rng(3).normal(size=(8, 3)) * 0.4 + [0, 0, 1]
-ALBEDO = 100 + 40 * COLUMN
+ALBEDO = np.where(INSIDE, 100 + 40 * COLUMN, 0)
 
 
 def round_lamps(zenith, azimuth=AZIMUTH):
@@ -142,3 +144,40 @@ def test_lamps_in_a_plane_determine_no_normal(azimuth):
     found = photometric_stereo(lit(round_lamps(0.6, np.array(azimuth))), azimuth, zenith=0.6, noise=1)
     assert np.isnan(found.normals).all()
     assert np.isnan(found.normals_sigma).all()
+
+
+def bumps():
+    """Return the normals of a wavy surface, (H, W, 3)."""
+    u, v = np.meshgrid(np.arange(60) * 2 * np.pi / 24, np.arange(60) * 2 * np.pi / 28)
+    normal = np.dstack([-0.6 * np.cos(u) * np.cos(v), 0.5 * np.sin(u) * np.sin(v), np.ones((60, 60))])
+    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def shone_on(normals, blur=0.0, power=1.0):
+    """Return a recording of a surface under lamps at a zenith of 0.5, seen by a camera."""
+    light = 0.8 * np.einsum("hwk,tk->thw", normals, round_lamps(0.5))
+    light = np.stack([gaussian_filter(one, blur, mode="nearest") if blur else one for one in light])
+    counts = 200 * light**power + np.random.default_rng(2).normal(size=light.shape)
+    frames = np.rint(counts).clip(0, 255).astype(np.uint8)
+    return ArrayRecording(frames, {"phase": AZIMUTH}, {})
+
+
+def chi2(found, normals):
+    error = np.linalg.norm(np.cross(found.normals.astype(float), normals), axis=-1)
+    return np.mean((error / found.normals_sigma)[5:-5, 5:-5] ** 2)
+
+
+def test_a_lens_that_blurs_is_part_of_the_error():
+    found = engine.run(shone_on(bumps(), blur=1.5), PhotometricStereo(zenith=0.5))
+    assert 0.5 < chi2(found, bumps()) < 2  # 33 without
+
+
+def test_brightness_that_is_not_proportional_to_light_is_found():
+    with pytest.warns(io.MirrorskinWarning, match="to its power 0.88"):
+        engine.run(shone_on(bumps(), power=0.9), PhotometricStereo(zenith=0.5))
+
+
+def test_brightness_that_is_proportional_to_light_has_no_finding():
+    found = engine.run(shone_on(bumps()), PhotometricStereo(zenith=0.5))
+    assert "warnings" not in found.process
+    assert 0.9 < chi2(found, bumps()) < 1.1

@@ -1,0 +1,101 @@
+"""The blur of a lens, by what it takes away from the strength of a signal whose direction changes.
+
+A lens with a Gaussian point spread of variance b^2, pixels^2, averages a signal s u of strength s and unit
+direction u: fringes of a phase, or light in proportion to normals. To second order it shows s u + (b^2 / 2)
+laplace(s u), whose strength is s (1 - (b^2 / 2) |grad u|^2), and whose direction is wrong by (b^2 / 2) times
+the part of laplace(u) across it. The one determines b, the other is its error.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.least_squares import mad_sigma
+
+_LINES, _FEWEST = 64, 400  # lines of pixels along a side that are used; least number of pixels
+_ROUNDS, _OUTLYING = 4, 4.0  # iterations, and standard deviations beyond which a pixel is left out
+_CLEAR, _CLEAR_SIDE, _SMALLEST = 6.0, 2.0, 0.4  # standard errors, and pixels, from which on a blur is one
+
+
+def with_blur(
+    sigma: NDArray[np.float32], direction: NDArray[np.floating], strength: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """Return standard deviations of directions, (H, W) radians, with that because of blur.
+
+    ``direction``, (n, H, W), are unit vectors, NaN where unknown; ``strength`` is (H, W).
+    """
+    variance = find_blur(direction, strength)
+    if variance == 0:
+        return sigma
+    reach = max(1, round(2 * math.sqrt(variance)))
+    vectors = [np.ascontiguousarray(part, np.float32) for part in direction]
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
+    kernel[[0, reach, reach, -1], [reach, 0, -1, reach]] = 1 / reach**2
+    kernel[reach, reach] = -4 / reach**2
+    bent = [cv2.filter2D(part, -1, kernel, borderType=cv2.BORDER_REPLICATE) for part in vectors]
+    along = np.sum([one * other for one, other in zip(bent, vectors, strict=True)], axis=0)
+    square = np.sum([part**2 for part in bent], axis=0) - along**2
+    square = np.maximum(square, 0)
+    known = np.isfinite(square)
+    size = 2 * reach + 1, 2 * reach + 1
+    total, share = (cv2.blur(part.astype(np.float32), size) for part in (np.where(known, square, 0), known))
+    mean = np.divide(total, share, out=np.zeros_like(total), where=share > 0)
+    return np.asarray(np.hypot(sigma, np.float32(variance / 2) * np.sqrt(mean)), np.float32)
+
+
+def find_blur(direction: NDArray[np.floating], strength: NDArray[np.floating]) -> float:
+    """Return the variance of the point spread, pixels^2; 0 if it is not significant.
+
+    The logarithm of the strength is fitted by a quadratic of the place, as of uneven light, and the square
+    of the gradient of the direction.
+    """
+    rows, columns = strength.shape
+    if min(rows, columns) < 3:
+        return 0.0
+    thin = max(1, math.isqrt(rows * columns) // _LINES)
+    down, right = np.arange(1, rows - 1, thin), np.arange(1, columns - 1, thin)
+
+    def look(by_rows: int, by_columns: int) -> Doubles:
+        return np.stack([part[np.ix_(down + by_rows, right + by_columns)] for part in direction]).astype(
+            float
+        )
+
+    across, upright = (look(*one) - look(*other) for one, other in (((0, 1), (0, -1)), ((1, 0), (-1, 0))))
+    turning = np.sum(across**2 + upright**2, axis=0) / 4
+    level = strength[np.ix_(down, right)].astype(np.float64)
+    known = np.isfinite(turning) & (level > 0) & np.isfinite(level)
+    if np.count_nonzero(known) < _FEWEST:
+        return 0.0
+    y, x = (
+        np.broadcast_to(one, known.shape)[known]
+        for one in np.ix_(2 * down / (rows - 1) - 1, 2 * right / (columns - 1) - 1)
+    )
+    turning, values = turning[known], np.log(level[known])
+    terms = np.stack([turning, np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    variance, error = _fit(terms, values)
+    if not variance > max(_CLEAR * error, _SMALLEST**2):
+        return 0.0
+    # Reflectance that changes with the place may look like blur somewhere, but not on all sides.
+    sides = (_fit(terms[half], values[half]) for half in (x < 0, x >= 0, y < 0, y >= 0))
+    return (
+        variance if all(one > max(variance / 2, _CLEAR_SIDE * its_error) for one, its_error in sides) else 0.0
+    )
+
+
+def _fit(terms: Doubles, values: Doubles) -> tuple[float, float]:
+    """Return the variance of the point spread by the first of some terms, and its standard error."""
+    kept = np.full(len(values), True)
+    for _ in range(_ROUNDS):
+        matrix = np.einsum("ni,nj->ij", terms[kept], terms[kept])
+        if np.linalg.cond(matrix) > 1e12:
+            return 0.0, math.inf
+        inverse = np.linalg.inv(matrix)
+        fit = inverse @ np.einsum("ni,n->i", terms[kept], values[kept])
+        left = values - np.einsum("ni,i->n", terms, fit)
+        kept = np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+    return -2 * float(fit[0]), 2 * math.sqrt(inverse[0, 0] * float(np.mean(left[kept] ** 2)))
