@@ -80,7 +80,7 @@ def compared(printed):
 
 
 def fused(printed):
-    ((error,),) = numbers(printed, r"RMS error (\S+) um")
+    ((error,),) = numbers(printed, r"RMS error (\S+) µm")
     assert error < 5
 
 
