@@ -85,9 +85,13 @@ def refused(said: str, *words: object, run: Callable[..., Ended] = run, code: in
 
 
 def _files() -> dict[Path, tuple[int, int]]:
-    """Return size and time of each file below the working directory, which must not be the repository."""
+    """Return size and time of each file below the working directory, which must not be the repository.
+
+    Compiled modules, which Python writes when a command imports the user's, are left out.
+    """
     assert not Path("pyproject.toml").exists(), "work in a temporary folder"
-    found = {path: path.lstat() for path in Path().rglob("*") if not path.is_dir()}
+    paths = (path for path in Path().rglob("*") if "__pycache__" not in path.parts)
+    found = {path: path.lstat() for path in paths if not path.is_dir()}
     return {path: (stat.st_size, stat.st_mtime_ns) for path, stat in found.items()}
 
 
