@@ -20,7 +20,8 @@ from mirrorskin.kernels.least_squares import mad_sigma
 _BEND = np.array([-1.0, 3.0, -3.0, 1.0])  # third difference of four pixels in a row
 _RISE = np.array([-1.0, -1.0, 1.0, 1.0]) / 4  # mean difference of neighbours
 _LEAST_RISE = 0.2  # steps from pixel to pixel of a slope that shows positions
-_LONGEST = 3  # pixels: greatest distance of the pixels in a row
+_FARTHER = (1.5, 2.2)  # steps over the rise to the next pixel: above each, rows of pixels are longer
+_LONGEST = 3  # pixels: their greatest distance, with which jitter is not estimated
 _FEW, _MOST = 2000, 4000  # rows of four pixels along each axis, to begin with and in all
 _SUSPICIOUS = 2.5  # standard errors: least difference of a frame from its neighbours
 _CLOSEST = 0.3  # steps: least distance of two frames whose errors are estimated
@@ -182,7 +183,7 @@ def _find_errors(height: NDArray[Any], pushed: Doubles) -> _Errors | None:
     rise = rise[rise > _LEAST_RISE / 2 * step]
     if np.count_nonzero(clear) < _FEWEST - 2 or rise.size < _SEEN:
         return None
-    reach = int(np.clip(round(step / float(np.median(rise))), 1, _LONGEST))
+    reach = 1 + int(np.searchsorted(_FARTHER, step / float(np.median(rise))))
     if reach > 1:
         pixels = _pixels_of(height, reach, _FEW)
     if not _rows_of(pixels, travel, step).suspicious(clear):
