@@ -22,7 +22,7 @@ QUANTUM = 1 / math.sqrt(12)
 """Standard deviation of the rounding of integer counts."""
 
 _AT_ONCE = 65536  # pixels processed at once
-_PAIRS, _FEWEST = 16, 64  # pairs of frames from which noise is estimated, and samples that are enough of each
+_PAIRS, _FEWEST = 16, 64  # maximum number of pairs of frames for the noise, and minimum of samples of each
 _MEDIAN = 0.6745  # magnitude of half of the values of a normal distribution, standard deviations
 _ROUNDS = 3  # of clipping, after which the noise changes by less than a percent
 _CLIP = 4.0  # standard deviations beyond which differences are clipped
@@ -123,10 +123,10 @@ def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], inte
 def estimate_noise_of_all(samples: NDArray[Any]) -> float:
     """Estimate the standard deviation of a sample, counts, from the same pixels of all frames, (T, n).
 
-    It is the median over pairs of consecutive frames, at most 16, so that a repeated frame, or a lamp that
-    settles, has little effect. Pixels that turn light, or dark, all change in one direction, and noise
-    changes as many in the other: the noise is estimated from the direction with the smaller changes. Samples
-    at an end of the scale, where noise is cut off, are omitted.
+    It is the median over at most 16 pairs of consecutive frames, so a repeated frame or a lamp that settles
+    has little influence. Pixels that turn light (or dark) all change in one direction, while noise changes as
+    many in each direction: the noise is estimated from the direction with the smaller changes. Samples at the
+    ends of the scale, where noise is clipped, are excluded.
     """
     integer = samples.dtype.kind == "u"
     pairs = np.unique(np.linspace(0, len(samples) - 2, _PAIRS).round().astype(int))
@@ -150,7 +150,7 @@ def _side(change: NDArray[np.float32], integer: bool) -> NDArray[np.float64]:
     count = np.count_nonzero(below, axis=1)
     square = np.where(below, change * change, 0)
     ordered = np.sort(np.where(below, square, np.inf), axis=1)
-    place = np.clip(((count + same) / 2 - same).astype(int), 0, None)  # of the median, after the zeros
+    place = np.clip(((count + same) / 2 - same).astype(int), 0, None)  # index of the median, after the zeros
     middle = np.sqrt(ordered[np.arange(len(ordered)), np.minimum(place, np.maximum(count - 1, 0))])
     spread = np.maximum(np.where(count > 0, middle, 0) / _MEDIAN, 1.0 if integer else 0.0)
     for _ in range(_ROUNDS):
@@ -162,8 +162,8 @@ def _side(change: NDArray[np.float32], integer: bool) -> NDArray[np.float64]:
 def noise_of_residual(residual: NDArray[Any], freedom: ArrayLike) -> float:
     """Return the standard deviation of a sample from residuals of fits; NaN without any.
 
-    The residuals have n degrees of freedom each, scalar or a map. Their median is that of sqrt(chi^2 / n), in
-    the approximation of Wilson and Hilferty (PNAS 17, 1931).
+    The residuals have n degrees of freedom each, scalar or a map. Their median is the median of
+    sqrt(chi^2 / n), in the approximation of Wilson and Hilferty (PNAS 17, 1931).
     """
     degrees = np.asarray(freedom)
     known = (degrees > 0) & np.isfinite(residual)
@@ -180,9 +180,9 @@ def reference_maps(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Check the references; missing ones are replaced by the range of the frames' type.
 
-    Dark and bright are counts without and with full light, scalar or (H, W). InputError if a shape differs
-    from that of frames, float frames have no references, no pixel has both, or bright is not above dark at
-    half or more of the pixels that have both.
+    Dark and bright are counts without light and with full light, scalar or (H, W). InputError if a shape
+    differs from the frames', float frames have no references, no pixel has both, or bright is not above dark
+    at half or more of the pixels that have both.
     """
     if dtype.kind == "f" and (dark is None or bright is None):
         raise InputError("float frames have no natural range: give dark and bright, as counts or as maps")

@@ -38,7 +38,7 @@ _STRIPES = {
     "border": Map("number of the stripe that begins at the pixel", dtype="int32", undefined=-1),
     "border_risk": Map("probability that the number is wrong by 1 where there is no border, or the reverse"),
 }
-_MISFIT = 4.0  # noise: residual above which samples do not follow a cosine of the shift
+_MISFIT = 4.0  # standard deviations of noise: maximum residual of samples that follow a cosine of the shift
 _UNCLEAR = 0.5  # distance of a bit from the threshold, RMS distances, below which the pixel is on a border
 
 
@@ -46,8 +46,8 @@ class Fringes(Operation):
     """Phase of fringes, projected or reflected, that are shifted by known steps.
 
     E_k = mean + modulation cos(phase - shift_k) is fitted to each pixel by least squares, for three or more
-    different shifts (Bruning et al. 1974, Greivenkamp 1984). What ``push`` takes as the ``phase`` of a frame
-    is the shift of its pattern towards larger phases.
+    different shifts (Bruning et al. 1974, Greivenkamp 1984). The ``phase`` of a frame in ``push`` is the
+    shift of its pattern towards larger phases.
 
     Examples
     --------
@@ -114,7 +114,7 @@ class Fringes(Operation):
         used = weights > 0
         freedom = np.count_nonzero(used) - 3
         modulation, phase = fit.modulation, fit.azimuth
-        seen = np.asarray(math.nan)  # noise that the residuals of the half with more modulation show
+        seen = np.asarray(math.nan)  # noise estimated from the residuals of the half with more modulation
         if freedom > 0:
             strong = modulation >= np.median(modulation[np.isfinite(modulation)])
             seen = np.asarray(noise_of_residual(fit.residual[strong], freedom))
@@ -128,7 +128,7 @@ class Fringes(Operation):
         square = modulation * modulation
         spread = np.full(square.shape, np.inf, np.float32)
         np.divide(noise.astype(np.float32) * np.sqrt(variance), square, out=spread, where=square != 0)
-        # No cosine fits these samples: one of them is of a hot pixel, or of a reflection that moved.
+        # These samples do not follow a cosine, as at a hot pixel or a moving reflection.
         misfit = fit.residual > _MISFIT * np.fmax(noise, seen)
         length = np.where(misfit | (modulation == 0), np.float32(np.nan), modulation)
         with np.errstate(invalid="ignore"):
@@ -184,17 +184,17 @@ def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: 
     """Unwrap fringes of several frequencies, each from the next coarser one.
 
     The coarser phase, times the ratio of the frequencies, predicts the next one, which determines the order.
-    With d the remaining difference and s its standard error, the adjacent order is the right one with
-    probability 1 / (1 + exp(2 pi (pi - abs(d)) / s^2)); such risks of all steps are added.
+    With d the remaining difference and s its standard error, the adjacent order is the correct one with
+    probability 1 / (1 + exp(2 pi (pi - abs(d)) / s^2)). These risks are added over all steps.
 
     Parameters
     ----------
     fringes : sequence of Result, mapping, xarray.Dataset or path
-        Maps ``phase`` and ``phase_sigma``, (H, W), radians, from coarse to fine fringes, such as those of
-        `fit_fringes`. The phase may be wrapped in any way.
+        Maps ``phase`` and ``phase_sigma``, (H, W), radians, from coarse to fine fringes, as returned by
+        `fit_fringes`. The phase may be wrapped to any interval.
     frequency : array_like, (F,)
-        Fringes over the field, ascending; all phases are 0 at the same place. The coarsest has one turn at
-        most.
+        Numbers of fringes over the field, ascending; all phases are 0 at the same position. The coarsest
+        pattern has at most one fringe.
     start : float
         Radians: the smallest phase of the coarsest fringe; -pi if phases are 0 in the middle of the field.
 
@@ -250,7 +250,7 @@ def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: 
 def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike) -> Result:
     """Read the number of a pixel's stripe from pictures of a reflected binary (Gray) code.
 
-    With c the RMS distance from the threshold over the pictures, less the noise, a bit at the distance d is
+    With c the RMS distance from the threshold over the pictures, minus the noise, a bit at the distance d is
     wrong with probability 1 / (1 + exp(2 c d / noise^2)).
 
     Parameters
@@ -258,17 +258,17 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
     frames : ndarray, (B, H, W), integers or floats
         Counts; the first picture has the broadest stripes. A stripe's number n is shown as n ^ (n >> 1).
     threshold : float or array_like, (H, W)
-        Counts above which a bit is 1: half of white and black, or the mean of `fit_fringes`.
+        Counts above which a bit is 1: the mean of white and black, or ``mean`` of `fit_fringes`.
     noise : float or array_like, (H, W)
-        Counts: standard deviation of a sample, such as that of `fit_fringes`.
+        Standard deviation of a sample, counts, such as ``noise`` of `fit_fringes`.
 
     Returns
     -------
     Result
         ``stripe``, int32, from 0. ``risk`` is an upper bound of the probability that the number is wrong by
         more than 1, and 1 where a sample is not a number. On the border of two stripes one bit is uncertain,
-        and the number may be that of the other stripe: ``border`` is then the larger of the two numbers, and
-        -1 elsewhere. ``border_risk`` is the probability that noise makes or hides a border.
+        so either number may be returned: ``border`` is then the larger of the two, and -1 elsewhere.
+        ``border_risk`` is the probability that noise creates or hides a border.
 
     Raises
     ------
@@ -317,27 +317,27 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
 def unwrap_gray(fringes: Maps, stripes: Maps, *, width: float = np.pi, start: float = 0.0) -> Result:
     """Unwrap fringes by the numbers of stripes that are as wide as a fringe, or narrower.
 
-    The order brings the phase nearest to the middle of the stripe. With stripes of half a fringe, a number
-    that is wrong by one at the border of two stripes does not matter. With wider ones, the order of a pixel
-    on a border brings the phase nearest to that of the border.
+    The order is chosen such that the phase is nearest to the middle of the stripe. With stripes of half a
+    fringe, an error of one in the number at the border of two stripes does not matter. With wider stripes,
+    the order of a pixel on a border is chosen such that the phase is nearest to the border.
 
     Parameters
     ----------
     fringes : Result, mapping, xarray.Dataset or path
-        Maps ``phase`` and ``phase_sigma``, (H, W), radians, such as those of `fit_fringes`.
+        Maps ``phase`` and ``phase_sigma``, (H, W), radians, as returned by `fit_fringes`.
     stripes : Result, mapping, xarray.Dataset or path
-        Maps ``stripe`` and ``risk``, (H, W), such as those of `decode_gray`; for stripes wider than half a
+        Maps ``stripe`` and ``risk``, (H, W), as returned by `decode_gray`; for stripes wider than half a
         fringe also its ``border`` and ``border_risk``.
     width : float
-        Radians of phase that a stripe is wide, above 0 and at most 2 pi.
+        Width of a stripe, radians of phase, above 0 and at most 2 pi.
     start : float
-        Radians: the phase where stripe 0 begins.
+        Phase at the start of stripe 0, radians.
 
     Returns
     -------
     Result
-        The maps of `unwrap_frequencies`. The risk is the sum of that of the stripe and of the probability
-        that the error of the phase leads to the adjacent order.
+        The maps of `unwrap_frequencies`. The risk is the risk of the stripe plus the probability that the
+        error of the phase leads to the adjacent order.
 
     Raises
     ------

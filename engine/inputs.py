@@ -33,14 +33,14 @@ def as_result(
     Parameters
     ----------
     maps : Result, mapping, xarray.Dataset, path or array_like
-        A mapping has arrays by name; it may have the fields of a result, such as ``x`` and ``y``, and numbers
-        such as ``travel``. A dataset has maps with the dimensions y and x; other units than the declared ones
-        are converted. A path is that of a result file. An array is the map of ``quantity``.
+        A mapping contains arrays by name, and optionally fields of a result, such as ``x`` and ``y``, and
+        numbers, such as ``travel``. A dataset contains maps with the dimensions y and x, which are converted
+        to the declared units. A path leads to a result file. An array is the map of ``quantity``.
     name : str
         The argument, for messages.
     quantity : str
     pixel_size : float or (float, float), optional
-        Millimetres along x and y; by default ``x`` and ``y`` of the maps, if they have them.
+        Millimetres along x and y; by default from ``x`` and ``y`` of the maps, if available.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def pixel_size_of(result: Result, name: str, pixel_size: ArrayLike | None = None
 
 
 def spacing(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the distances of pixel centres along x and y, mm; of a single row or column, square pixels."""
+    """Return the distances of pixel centres along x and y, mm; a single row or column has square pixels."""
     steps = [abs(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None for axis in (x, y)]
     known = [float(step) for step in steps if step is not None]
     if not known:

@@ -51,13 +51,13 @@ class Correlation(Method):
     window_frames: int | None = Correlate.window_frames
 
     def check_options(self) -> None:
-        """Raise InputError if the phase of a dither is given in another way, too."""
+        """Raise InputError if a dither is combined with another source of the phase."""
         if self.dither and (self.harmonic != 1 or self.frequency is not None):
             other = "harmonic" if self.harmonic != 1 else "frequency"
             raise InputError(f"dither takes the phase from the travel: leave {other} out")
 
     def plan(self, source: Source) -> Plan:
-        """Return the correlation with the phase that the options name."""
+        """Return the correlation with the phase selected by the options."""
         limit = max(1, min(self.memory_limit, 2 * math.prod(source.shape) * source.dtype.itemsize))
         process: dict[str, ProcessValue] = {
             "method": "correlation",
@@ -84,7 +84,7 @@ class Correlation(Method):
         return Plan(self.make(Correlate, memory_limit=limit), process=process, stream=stream)
 
     def _times(self, source: Source) -> Doubles:
-        """Return when each frame was taken, s, by the frame rate or else as the source says."""
+        """Return the times of the frames, s, from the frame rate, otherwise from the source."""
         if self.frame_rate is not None:
             return np.arange(source.shape[0]) / self.frame_rate
         time: Doubles | None = getattr(source, "time", None)

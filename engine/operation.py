@@ -66,7 +66,7 @@ class _DeviceOption(Option):
 
 _device: Option = option(
     default=None,
-    help='device to compute on, or several of which each gets a band of rows: "all" or a list; see'
+    help='device to compute on, or several devices, each for a band of rows: "all" or a list; see'
     " `mirrorskin.kernels.device.open_devices`",
     python_only=True,
 )

@@ -33,8 +33,8 @@ _BEYOND = 4.0  # standard deviations of a residual that noise does not explain
 class PhotometricStereo(Operation):
     """Normals and albedo of a matt surface under one distant lamp after the other (Woodham 1980).
 
-    E = dark + albedo (normal . light) is fitted to the brightness of each pixel. The phase of each frame is
-    the azimuth of a lamp of brightness 1 that goes round at one zenith; lamps at any other places are
+    E = dark + albedo (normal . light) is fitted to the brightness of each pixel. The phase of a frame is the
+    azimuth of a lamp of brightness 1 that revolves at a constant zenith; other positions of lamps are
     specified by the option ``light``.
 
     Examples
@@ -224,16 +224,17 @@ photometric_stereo = optional_phase_function(
     """Fit normals and albedo of a matt surface to frames under distant lamps of known directions.
 
     Least squares of E_k = dark + albedo (normal . light_k) over the frames in which the pixel is lit
-    (Woodham 1980). With C = (L'L)^-1 noise^2, rows light_k in L, and P = I - n n' the projection along the
-    normal, the normal's squared error is trace(P C) / albedo^2 and the albedo's n'C n: the Cramer-Rao bound.
+    (Woodham 1980). With C = (L'L)^-1 noise^2, where the rows of L are light_k, and P = I - n n' the
+    projection along the normal, the variance of the normal is trace(P C) / albedo^2 and the variance of the
+    albedo n'C n: the Cramer-Rao bounds.
 
     Returns
     -------
     Result
-        ``normals``, ``albedo`` and their standard deviations are undefined where fewer than three lamps lit
-        the pixel, or those that did are coplanar; ``residual`` where it was not more than three. Standard
-        deviations are larger where noise does not explain the residual. ``process`` contains the ``noise``,
-        counts, if it is one number.
+        ``normals``, ``albedo`` and their standard deviations are undefined where fewer than three lamps light
+        the pixel, or these are coplanar; ``residual`` is undefined for three or fewer. Standard deviations
+        are increased where noise does not explain the residual. ``process`` contains the ``noise``, counts,
+        if it is one number.
 
     Raises
     ------
@@ -255,7 +256,7 @@ photometric_stereo = optional_phase_function(
 
 
 def _misfit(residual: NDArray[Any], freedom: NDArray[Any], noise: Any) -> NDArray[Any]:
-    """Return the residual over the noise where no noise explains it, as of gloss or a hot sample; else 1."""
+    """Return the residual over the noise where noise does not explain it, such as gloss; 1 elsewhere."""
     freedom = np.maximum(freedom, 0)
     # The cube root of chi^2 / n is nearly normal (Wilson and Hilferty, PNAS 17, 1931).
     spread = 2 / (9 * np.maximum(np.arange(freedom.max() + 1), 1))

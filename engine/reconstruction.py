@@ -48,29 +48,27 @@ def reconstruct(
     progress: Progress | None = None,
     **options: Any,
 ) -> Result:
-    """Reconstruct what was touched, by the method that fits the source's motion.
+    """Reconstruct the touched object, by the method for the motion of the source.
 
     Parameters
     ----------
     source : Source or array_like, (T, H, W), uint8, uint16 or float32
-        An open recording, or anything else that frames come from, which is rewound first, if it can be; or
-        the frames themselves.
+        An open recording or another source of frames, which is rewound first if possible; or an array of
+        frames.
     calibration : Calibration or path, optional
-        What is known of the sensor, or a file that holds it; by default what the recording carries, if
-        anything.
+        Calibration of the sensor, or its file; by default the calibration in the recording, if any.
     travel, phase, twist : array_like, (T,), optional
-        Of frames in an array: mm of a press, radians of a rotation or a twist. One position of each frame,
-        which also determines the motion.
+        For an array: the position in each frame, which also determines the motion. Travel of a press, mm;
+        phase of a rotation, or angle of a twist, radians.
     displacement : array_like, (T, 2), optional
-        Of frames in an array: mm along x and y of a slide.
+        For an array: displacement of a slide along x and y, mm.
     pixel_size : float or (float, float), optional
-        Of frames in an array: mm along x and y at the sheet.
+        For an array: size of a pixel along x and y at the sheet, mm.
     progress : callable, optional
         Called with the number of frames so far.
     **options
-        Those of `mirrorskin.engine.Press` for a vertical motion, of `mirrorskin.engine.Rotation` for an axial
-        one, of `mirrorskin.engine.Sliding` for a horizontal one or a twist; ``help(engine.Press)`` shows
-        them.
+        Options of `mirrorskin.engine.Press` for a vertical motion, of `mirrorskin.engine.Rotation` for an
+        axial motion, and of `mirrorskin.engine.Sliding` for a slide or a twist; see ``help(engine.Press)``.
 
     Returns
     -------
@@ -80,7 +78,7 @@ def reconstruct(
     Raises
     ------
     mirrorskin.io.InputError
-        The calibration is of another camera, or the input cannot be used.
+        The calibration belongs to another camera, or the input cannot be used.
 
     Examples
     --------
@@ -125,19 +123,19 @@ def _as_source(
 
 
 def calibrated(source: Source, calibration: Calibration | str | Path | None = None) -> Source:
-    """Return a source as it is with a calibration.
+    """Return a source with a calibration applied.
 
     Parameters
     ----------
     source : Source
-        One that has a calibration already stays as it is.
+        A source that is already calibrated is returned unchanged.
     calibration : Calibration or path, optional
-        By default what a recording carries; without that, the source is returned as it is.
+        By default the calibration in the recording; without one, the source is returned unchanged.
 
     Raises
     ------
     mirrorskin.io.InputError
-        The calibration is of another camera, or the file is none.
+        The calibration belongs to another camera, or the file is not a calibration.
     """
     if isinstance(source, io.Calibrated):
         return source

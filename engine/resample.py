@@ -1,4 +1,4 @@
-"""Interpolation between the pixels of a map, some of which are undefined or have another label."""
+"""Interpolation between the pixels of a map with undefined pixels and labels."""
 
 from __future__ import annotations
 
@@ -45,24 +45,24 @@ class SamplePoints:
         return np.asarray(self.shares.max(axis=0) == 1)
 
     def same_label(self, labels: NDArray[Any]) -> Mask:
-        """Return which of the four pixels have the nearest one's label, (4, n), in a map (H, W)."""
+        """Return which of the four pixels have the label of the nearest one, (4, n), in a map (H, W)."""
         flat = labels.ravel()
         return np.asarray(flat[self.pixels] == flat[self.nearest])
 
     def nearest_values(self, values: NDArray[Any], outside: int | float) -> NDArray[Any]:
-        """Return the nearest pixels' values, (n,), of a map (H, W), and another outside."""
+        """Return the values of the nearest pixels, (n,), of a map (H, W), or ``outside``."""
         return np.where(self.inside, values.ravel()[self.nearest], np.asarray(outside, values.dtype))
 
     def interpolate(self, values: Floats, count: Mask | None = None) -> Floats:
         """Interpolate a map, (H, W), to values, (n,); NaN where the nearest pixel has no answer.
 
-        ``count``, (4, n), are the pixels that count, the nearest always among them; by default all do.
+        ``count``, (4, n), are the pixels to use, always including the nearest; by default all.
         """
         mean = self._mean([values.ravel()[self.pixels]], count)[0].astype(np.float32)
         return np.where(self.on_pixel, self.nearest_values(values, np.nan), mean)
 
     def interpolate_vectors(self, values: Floats, count: Mask | None = None) -> Floats:
-        """Interpolate unit vectors, (H, W, 3), to such vectors, (n, 3); see `interpolate`."""
+        """Interpolate unit vectors, (H, W, 3), to unit vectors, (n, 3); see `interpolate`."""
         flat = values.reshape(-1, 3)
         mean = np.stack(self._mean(list(np.moveaxis(flat[self.pixels], -1, 0)), count))
         unit = (mean / np.sqrt(np.sum(mean * mean, axis=0))).astype(np.float32)
@@ -70,14 +70,14 @@ class SamplePoints:
         return np.where(own[:, np.newaxis], flat[self.nearest], unit.T)
 
     def interpolate_angles(self, values: Floats, count: Mask | None = None) -> Floats:
-        """Interpolate angles, (H, W), radians, the short way round the circle; see `interpolate`."""
+        """Interpolate angles, (H, W), radians, along the shorter arc; see `interpolate`."""
         around = values.ravel()[self.pixels]
         cosine, sine = self._mean([np.cos(around), np.sin(around)], count)
         mean = np.arctan2(sine, cosine).astype(np.float32)
         return np.where(self.on_pixel, self.nearest_values(values, np.nan), mean)
 
     def _mean(self, around: list[Floats], count: Mask | None) -> list[Doubles]:
-        """Return weighted means, (n,) each, of values, (4, n), which are all undefined at the same pixels."""
+        """Return weighted means, (n,) each, of values, (4, n), that are undefined at the same pixels."""
         means = [np.einsum("kn,kn->n", self.shares, values) for values in around]
         nearest = np.take_along_axis(around[0], self.closest[np.newaxis], axis=0)[0]
         nearest = np.where(self.inside, nearest, np.nan)

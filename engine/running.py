@@ -1,4 +1,4 @@
-"""An operation, run over a recording, an array, or frames that come one by one."""
+"""Running an operation over a recording, an array, or an iterable of frames."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ def run(
     Parameters
     ----------
     source : Source, array_like or device array (T, H, W), or iterable of array_like (H, W)
-        An open recording, or anything else that frames come from, which is rewound first, if it can be; or
-        the frames themselves: an array is pushed as a whole, frames of an iterable one by one.
+        An open recording or another source of frames, which is rewound first if possible; or frames: an array
+        is pushed as a whole, frames of an iterable one by one.
     operation : Operation, or a class of operations
-        It forgets all earlier frames. Options that are not given are taken from a source, where it has them.
+        It forgets all earlier frames. Missing options are taken from the source, if available.
     pixel_size : float or (float, float), optional
         Millimetres along x and y, for an array or an iterable; a recording has its own.
     progress : callable, optional
         Called with the number of frames so far.
     **positions : array_like, (T, ...)
-        For an array or an iterable: what the operation needs of each frame, such as ``travel=``, mm.
+        For an array or an iterable: the positions that the operation needs, such as ``travel=``, mm.
 
     Returns
     -------
@@ -57,8 +57,8 @@ def run(
     Raises
     ------
     mirrorskin.io.InputError
-        The operation does not apply to the recording's motion, needs something that is unknown, or returns
-        maps that do not fit to its declarations.
+        The operation does not apply to the motion, needs missing information, or returns maps that contradict
+        its declarations.
 
     Examples
     --------

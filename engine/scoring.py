@@ -20,7 +20,7 @@ from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
 
-_JUMP = np.radians(10.0)  # smallest angle between normals of neighbours that is an edge
+_JUMP = np.radians(10.0)  # minimum angle between normals of neighbours at an edge
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,15 +30,15 @@ class AngleScore:
     Attributes
     ----------
     answered : int
-        Pixels with an answer and a known truth; for angles, those in contact in the truth and in the result.
-        Level pixels have no azimuth.
+        Number of pixels with an answer and a known truth; for angles, only those in contact in the truth and
+        in the result. Level pixels have no azimuth.
     touched : int
         Pixels in contact.
     coverage : float
         Share of the touched pixels that are answered.
     rms, median, p99, largest : float
-        Statistics of the angle between answer and truth, degrees, or of the size of the height error, mm;
-        NaN without answers.
+        Statistics of the angle between answer and truth, degrees, or of the absolute height error, mm; NaN
+        without answers.
     chi_square : float
         Mean of (error / sigma)^2: 1 if the standard deviations are correct; NaN without them.
     """
@@ -106,7 +106,7 @@ class ContactScore:
     lost : int
         Pixels with an answer that lost contact in some frame.
     lost_flagged, wrongly_flagged : float
-        Shares of these, and of the other pixels with an answer, that are out of contact in the result.
+        Share of these, and share of the other pixels with an answer, that the result marks as out of contact.
     """
 
     recall: float
@@ -171,7 +171,7 @@ class SlipScore:
     onset_rms, onset_chi_square : float
         Root mean square error of the onset, and mean of (error / sigma)^2, where result and truth slipped.
     displacement_rms, displacement_chi_square : float
-        The same of the displacement in the last frame, mm, with a chi square along each axis.
+        The same for the displacement in the last frame, mm; chi square is along each axis.
     """
 
     answered: int
@@ -222,7 +222,7 @@ class Score:
         Azimuths of a result without normals.
     contact : ContactScore or None
     edges : EdgeScore or None
-        None for registered frames, whose contact is that of the object's points, not of the picture's pixels.
+        None for registered frames, whose contact refers to points of the object, not to pixels.
     slip : SlipScore or None
         Slip of a slide or a twist that starts with the first frame.
     slip_left_out : str or None

@@ -18,14 +18,14 @@ _STICKS = status_of(SlipStatus).codes[SlipStatus.STICKS]
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Number of pixels of a result with an answer, and their range; ``str()`` is one line.
+    """Numbers of pixels of a result with an answer, and their range; ``str()`` is one line.
 
     Attributes
     ----------
     what : str
         Name of the summarised maps, such as ``"height"`` or ``"normals"``.
     pixels, answered : int
-        Number of pixels, and of those with an answer; of all turns, if there are maps for each.
+        Number of pixels, and number with an answer; of all turns, if there are maps for each.
     quantity, unit : str
         Map whose range is ``lowest`` to ``highest``, and its unit.
     lowest, highest : float
@@ -39,10 +39,10 @@ class Summary:
     relief : (float, float) or None
         Range of relative heights of a result with normals, mm.
     counts : dict of str to int
-        Pixels of each code of the status, where the status matters most, as for slip.
+        Number of pixels of each code of the status, if the status is the main result, as for slip.
     numbers : dict of str to (float, float or None, str)
-        Value, standard deviation and unit of each single number, such as a force, and the last known value of
-        each series that is summarised.
+        Value, standard deviation and unit of each single number, such as a force, and last known value of
+        each summarised series.
     """
 
     what: str
@@ -156,7 +156,7 @@ def summarise(result: Result) -> Summary:
 
 
 def _leading(result: Result, relative: bool) -> tuple[str | None, str]:
-    """Return the name of the map that the summary is about, and what it calls the pixels with a value."""
+    """Return the name of the summarised map, and the name of its pixels with a value."""
     maps = {name: result.declaration(name) for name in result.maps()}
     heights = result.name_of("height") if relative else None
     called = {name: one.summary or (name if one.quantity else "") for name, one in maps.items()}
@@ -169,7 +169,7 @@ def _leading(result: Result, relative: bool) -> tuple[str | None, str]:
 
 
 def _counts(result: Result) -> Iterator[tuple[str, int]]:
-    """Yield the number of pixels of each code of the maps whose declaration asks for it."""
+    """Yield the number of pixels of each code, for maps whose codes are counted."""
     for name, values in result.maps().items():
         declared = result.declaration(name)
         for code, text in declared.codes.items() if declared.counted else ():

@@ -13,10 +13,10 @@ from typing import Any, Self
 class ThreadSafe:
     """Base of classes whose objects may be used by several threads at once.
 
-    One thread at a time runs an object's public methods and properties; others wait. So a display may call
-    ``result()`` while another thread pushes: it gets the maps of all completed pushes. A method may call
-    others of the same object. Public methods of subclasses are wrapped when the class is created. Plain
-    attributes are not locked.
+    One thread at a time runs the public methods and properties of an object; others wait. A display may
+    therefore call ``result()`` while another thread pushes, and gets the maps of all completed pushes.
+    Methods may call other methods of the same object. Public methods of subclasses are wrapped when the class
+    is created. Plain attributes are not locked.
 
     Examples
     --------

@@ -168,8 +168,8 @@ class Band:
     def fetch(self, parts: Mapping[str, int | slice], keep: Collection[str] = ()) -> list[NDArray[Any]]:
         """Wait once, and return planes or rows of maps, (count, stride) or (rows, W).
 
-        They are copies of the maps to ``keep``. The other maps are blank afterwards, and memory that they
-        share with the device is returned as it is.
+        Maps to ``keep`` are copied. The other maps are uninitialised afterwards, and their memory is returned
+        without a copy if it is shared with the device.
         """
         with self.resident():
             maps = [(self.maps[name] if name in keep else self.maps.pop(name), parts[name]) for name in parts]
@@ -186,15 +186,15 @@ class Band:
     def stage(self, frames: AnyArray, lent: bool = False, whole: bool = False) -> Iterator[Staged]:
         """Yield frames, (n, H, W), on the device in pieces; launch the kernels for each before the next.
 
-        Frames that are on the device already are yielded in one piece; DeviceMemoryError if there is no room
-        for the maps of the whole picture in addition.
+        Frames that are already on the device are yielded in one piece; DeviceMemoryError if there is no
+        memory for the maps of the whole picture in addition.
 
         If the device shares the host's memory, frames are used in place if their layout allows it. On a
         device with its own memory, they are copied while kernels process the previous piece. Afterwards the
         memory of the frames may be overwritten, except if it is ``lent`` (never overwritten while
         referenced): then kernels may still read it. ``whole``: yield at most ``length`` frames in one piece.
 
-        It ends before the next piece if ``stop`` is set; see `for_each_band`.
+        The iteration ends before the next piece if ``stop`` is set; see `for_each_band`.
         """
         if isinstance(frames, Array):
             if not self._only:
@@ -282,7 +282,7 @@ def cut_into_bands(
 
 
 def for_each_band(bands: Sequence[Band], work: Callable[[Band], T]) -> list[T]:
-    """Return what a function returns for each band.
+    """Return the results of a function for each band.
 
     Several devices work at the same time, in a thread each. If one fails, or the program is interrupted, the
     others stop before their next frames, and the first error is raised, with the device in its message.
@@ -313,7 +313,7 @@ class _StoppedError(Exception):
 
 
 def _run_on_device(bands: Sequence[Band], work: Callable[[Band], T], stop: Event) -> list[T]:
-    """Return what a function returns for the bands of one device; let the others stop if it fails."""
+    """Return the results of a function for the bands of one device; stop the others if it fails."""
     values = []
     try:
         for band in bands:
@@ -330,7 +330,7 @@ def _run_on_device(bands: Sequence[Band], work: Callable[[Band], T], stop: Event
 
 
 def room_of(bands: Sequence[Band], length: int) -> NDArray[Any]:
-    """Return a staging buffer for frames: that of a single band, or host memory for ``length`` frames."""
+    """Return a staging buffer for frames: of the only band, or host memory for ``length`` frames."""
     room = bands[0].room
     if len(bands) == 1:
         return room
@@ -338,7 +338,7 @@ def room_of(bands: Sequence[Band], length: int) -> NDArray[Any]:
 
 
 def join_rows(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return a map from those of the bands, without a copy for a single band."""
+    """Return a map joined from the maps of the bands, without a copy for a single band."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 

@@ -69,23 +69,23 @@ _BAND = 1 << 14  # pixels that are resampled at once
 def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None) -> Result:
     """Resample the maps of a result from the camera's pixels to equal pixels on the sheet.
 
-    Each map is sampled as its declaration says; see `mirrorskin.io.Map`. Numbers are interpolated between
-    four pixels. A pixel has no answer where the nearest one has none. Of the other three, those are left out
-    that have no answer or another label: heights are not interpolated between components, nor other maps
-    across the border of contact. Integers, such as codes and components, are taken from the nearest pixel.
-    Pixels that the camera did not see are undefined. Where a position is that of a pixel to a millionth, its
-    value is copied.
+    Each map is sampled according to its declaration; see `mirrorskin.io.Map`. Numbers are interpolated
+    between four pixels. The result is undefined where the nearest pixel is undefined. Of the other three,
+    pixels that are undefined or have another label are excluded: heights are not interpolated between
+    components, nor other maps across the border of contact. Integers, such as codes and components, are taken
+    from the nearest pixel. Positions that the camera did not see are undefined. If a position coincides with
+    a pixel within a millionth of a pixel, its value is copied.
 
     Directions are normalised after interpolation. They are not rotated: a normal is estimated from
     brightness, in the directions of the sensor's light, and does not depend on its position in the picture.
     The axes of the map are parallel to those of the picture at its centre. Zenith and azimuth are computed
-    from the normals; without normals, azimuths are interpolated the short way round.
+    from the normals; without normals, azimuths are interpolated along the shorter arc.
 
-    Standard deviations are interpolated as numbers are: this is correct if neighbours have a common error,
-    and too large, never too small, if their errors are independent.
+    Standard deviations are interpolated like numbers: this is correct if neighbours have a common error, and
+    too large, never too small, if their errors are independent.
 
-    Heights that were integrated from normals in the camera's pixels assumed pixels of equal size. If that is
-    too inaccurate, undistort the normals alone, and integrate them on the sheet.
+    The integration of normals in the camera's pixels assumes pixels of equal size. If this is too inaccurate,
+    undistort only the normals, and integrate them on the sheet.
 
     Parameters
     ----------
@@ -93,13 +93,13 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
         Maps in the camera's pixels, also for each turn.
     lens : Lens
     origin : (int, int), optional
-        Row and column of the maps' first pixel in the full picture; by default those of the region in the
-        result's process. The same region of the undistorted maps is returned.
+        Row and column of the maps' first pixel in the full picture; by default from the region in the process
+        of the result. The same region of the undistorted maps is returned.
 
     Raises
     ------
     mirrorskin.io.InputError
-        The maps do not fit the lens, or were undistorted before.
+        The maps do not fit the lens, or have already been undistorted.
     """
     if result.process.get(UNDISTORTED):
         raise InputError("these maps were undistorted before, which is done once: take them as they are")
@@ -144,7 +144,7 @@ def _resampled(maps: Maps, declared: Mapping[str, Map], points: SamplePoints) ->
 def _sample(
     values: NDArray[Any], declared: Map, same: Mapping[str, NDArray[np.bool_]], points: SamplePoints
 ) -> NDArray[Any]:
-    """Return one map at points, by its declaration; ``same`` are the neighbours with equal labels."""
+    """Return one map at points, according to its declaration; ``same`` are neighbours with equal labels."""
     count = same.get(declared.within)
     if values.dtype.kind != "f" or declared.sampling == "nearest":
         outside = declared.undefined_value if values.dtype.kind == "f" else int(declared.undefined or 0)

@@ -69,7 +69,7 @@ def make_jobs(paths: Iterable[Path], folder: Path) -> list[Job]:
 
 
 def _distinct_names(sources: Sequence[Path]) -> list[str]:
-    """Return the names of the results of recordings with the same name, relative to the results' folder."""
+    """Return names of results for recordings with the same name, relative to the folder of results."""
     if len(sources) == 1:
         return [f"{sources[0].stem}-result.h5"]
     folders = [_absolute(source).parent for source in sources]
@@ -101,9 +101,9 @@ class Plan:
 
     opening: Mapping[str, Any] = field(default_factory=dict)  # keywords of `io.open_recording`
     press: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Press`
-    rotation: Mapping[str, Any] = field(default_factory=dict)  # of `engine.Rotation`
+    rotation: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Rotation`
     memory_limit: int = MEMORY_LIMIT  # bytes of host memory for frames that are read ahead, per device
-    slip: Mapping[str, Any] = field(default_factory=dict)  # of `engine.Sliding`
+    slip: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Sliding`
     operation: str = ""  # MODULE:CLASS of an operation that is run instead of all methods
     operation_options: Mapping[str, Any] = field(default_factory=dict)
     strict: bool = False  # whether warnings are errors

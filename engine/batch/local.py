@@ -14,8 +14,8 @@ from mirrorskin.kernels.device import ALL, Device, open_device, open_devices
 
 Watch = Callable[[Job, int], None]
 
-_INTERRUPTS = 3  # number of Ctrl-C that end the process at once, while a thread waits for a network disk
-_INTERRUPTED = 130  # exit status of programs that Ctrl-C ended
+_INTERRUPTS = 3  # number of Ctrl-C that end the process immediately, if a thread waits for a network disk
+_INTERRUPTED = 130  # exit status of programs ended by Ctrl-C
 
 
 class _Stopped(BaseException):  # not an Exception, which would be reported as a failure of the recording

@@ -72,19 +72,19 @@ def see_ball(
 
 # --- the outline of the light -------------------------------------------------------------------------------
 
-_COARSE, _LONGEST = 128, 256  # pixels of the longer side of a downscaled picture: for the search, for the fit
+_COARSE, _LONGEST = 128, 256  # longer side of a downscaled picture for the search, and for the fit, pixels
 _BLUR = 1.5  # pixels, standard deviation: blur of the search for edges
-_FINE = 0.7  # pixels: blur of the last fit. A wider one shifts the edge of a disc that brightens outwards
-_CLEAR = 6.0  # times the picture's median slope: least slope of an edge
-_FAINT = 0.1  # of the picture's steepest slope: least slope of an edge
-_LEAST = 2.5  # pixels: radius of the smallest outline
-_SHARE = 0.25  # of an outline: least part that must be visible
+_FINE = 0.7  # pixels: blur of the last fit; more would shift the edge of a disc that brightens outwards
+_CLEAR = 6.0  # minimum slope of an edge, times the median slope of the picture
+_FAINT = 0.1  # minimum slope of an edge, as a share of the maximum slope of the picture
+_LEAST = 2.5  # pixels: minimum radius of an outline
+_SHARE = 0.25  # minimum share of an outline that is visible
 _NEAR = 4  # pixels: distance from the outline within which its edge is searched for
-_OUTSIDE = 0.5  # radii of the ball: distance of its centre from the picture, at most
-_RAYS = 90  # directions from the centre in which the edge is located
-_SHARP = 0.5  # pixels: least scatter of the edge's distances, for weights
+_OUTSIDE = 0.5  # maximum distance of a ball's centre from the picture, in radii of the ball
+_RAYS = 90  # number of rays from the centre along which the edge is located
+_SHARP = 0.5  # pixels: minimum scatter of the edge's distances, for weights
 _CONVERGED = 3e-3  # pixels: size of the last step of a fit
-_ROUND = 1.5  # pixels: greatest distance of the edge from the fitted circle
+_ROUND = 1.5  # pixels: maximum distance of the edge from the fitted circle
 _STRAY, _OFF = 3.0, 2.0  # times the median residual: scale of the robust weights of frames, and of an edge
 _ROUNDS = 8  # iterations of a fit
 
@@ -110,10 +110,10 @@ def find_ball(
 def follow_ball(frames: NDArray[Any], pixel_size: tuple[float, float], radius: float) -> BallCentres:
     """Find a ball's centre in each frame, in the body's frame of that pose.
 
-    Light ends on a circle about the ball's centre: where the sheet leaves the ball, or where the ball becomes
-    too steep to reflect the wall. Edges vote for centres on their bright side, for each radius of the circle
-    (a Hough transform that uses the edges' directions). The best circle is then fitted to the edge, which is
-    located on rays from the centre.
+    Light ends on a circle about the ball's centre, where the sheet leaves the ball, or where the ball becomes
+    too steep to reflect the wall. A Hough transform that uses the directions of edges finds the circle: edges
+    vote for centres on their bright side, for each radius. The circle is then fitted to the edge, which is
+    located along rays from the centre.
 
     A circle of radius a implies a centre at sqrt(radius^2 - a^2) below the rest plane. If the light ends
     before the contact does, the true centre is lower. InputError if a ball is visible in less than half of

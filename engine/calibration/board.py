@@ -1,4 +1,4 @@
-"""Boards that show a camera's scale: their marks, their picture for printing, and the mean of a recording."""
+"""Calibration boards for the scale of a camera: marks, picture for printing, and mean of a recording."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ FEWEST = 12
 _FAMILIES = (
     *(f"{kind}X{kind}_{count}" for kind in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
     "APRILTAG_36h11",
-)  # of markers in OpenCV, each with its numbers of markers in ascending order
+)  # families of markers in OpenCV, each with its numbers of markers in ascending order
 _INCH = 25.4  # mm
 _DOT = 0.5  # diameter of a printed dot as a share of the pitch
-_MOVED = 1.5  # change from first to last frame, relative to that of neighbours, of a moving scene
+_MOVED = 1.5  # minimum change from first to last frame of a moving scene, in changes between neighbours
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ _END = 0.06  # share of the range, at both ends, where scatter makes the linear 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearBrightness:
-    """Brightness that is linear in the zenith, and in units of it: radians."""
+    """Brightness that is linear in the zenith, converted to radians of zenith."""
 
     offset: Doubles  # (H * W,): counts at zenith 0
     gain: Doubles  # (H * W,): counts per radian
@@ -31,7 +31,7 @@ class LinearBrightness:
 
     @classmethod
     def of_header(cls, header: Header, shape: tuple[int, int]) -> LinearBrightness:
-        """Use the zenith gain and offset of a recording; without references they are valid everywhere."""
+        """Return the brightness from the zenith gain and offset of a recording, within its references."""
         if header.zenith_gain is None or header.zenith_offset is None:
             raise InputError(
                 "the recording has no zenith gain and offset: calibrate the zenith first, or give both"
@@ -44,7 +44,7 @@ class LinearBrightness:
         return cls(offset, gain, np.fmin(*ends), np.fmax(*ends))
 
     depth_sigma: ClassVar[float] = 0.0
-    """Common standard deviation of all depths determined from light, mm: none are."""
+    """Common standard deviation of all depths, mm: 0, because this light does not determine depths."""
 
     def sight(self, pixels: Pixels) -> Doubles:
         """Return zeros: pixels look straight down."""

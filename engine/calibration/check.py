@@ -19,10 +19,10 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.response import sight_slopes
 
-_FEWEST = 20  # pixels with errors in a cell, at least
-_LEAST = 100  # pixels of the ball, at least
-_MARGIN = 2  # pixels: width of the margin of the contact that is left out
-_ROUNDS = 3  # iterations of the ball's centre, which its depth influences slightly
+_FEWEST = 20  # minimum number of pixels with errors in a cell
+_LEAST = 100  # minimum number of pixels of the ball
+_MARGIN = 2  # pixels: width of the excluded margin of the contact
+_ROUNDS = 3  # iterations of the ball's centre, which depends slightly on its depth
 
 
 class Summary(NamedTuple):
@@ -38,8 +38,8 @@ class Errors:
     """Errors of one map."""
 
     error: Doubles  # (H, W): result minus truth, in ``unit``; NaN where there is no error
-    whole: Summary  # of all pixels
-    cells: Summary  # of equal parts of the picture, (n, n); row 0 is its upper edge
+    whole: Summary  # all pixels
+    cells: Summary  # equal parts of the picture, (n, n); row 0 is at the top
     unit: str  # "deg" or "mm"
     expected: float = math.nan  # RMS of the result's standard deviations, in ``unit``; NaN without any
 
@@ -68,7 +68,7 @@ class Check:
     """The errors that remain on a ball.
 
     For a rotation these are zenith, azimuth, normal (the angle between normals) and height; for a press
-    height. ``before`` are those with the references and the precession alone, and empty if unknown.
+    height. ``before`` contains the errors with references and precession only; it is empty if unknown.
     """
 
     ball: float  # diameter, mm
@@ -122,10 +122,10 @@ def check_ball(
 ) -> Check:
     """Compare the reconstruction of a ball by a calibrated sensor with the ball.
 
-    The ball's position is estimated from the maps that are judged: its centre from the normals of a rotation
-    (by the median), centre and top from the heights of a press. So a common shift is not detected, but
-    deviations from a ball of that size are. Heights of a rotation are relative, so their mean error is
-    subtracted. Those of a press contain the error of the travel's zero.
+    The position of the ball is estimated from the maps to be checked: its centre from the normals of a
+    rotation (by the median), centre and top from the heights of a press. Therefore a common shift is not
+    detected, but deviations from a ball of that size are. Heights of a rotation are relative, so their mean
+    error is subtracted. Heights of a press include the error of the travel's zero.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def _check_rotation(
     truth = _true_ball(sight, centre, ball / 2, result)
     before: dict[str, Errors] = {}
     if references is not None:
-        # The nominal response of a central pixel: counts per radian, and counts at zenith 0.
+        # Nominal response of a central pixel: counts per radian, and counts at zenith 0.
         rim = math.atan2(response.radius, response.rim) / 2
         offset, bright = (np.asarray(level, np.float64) for level in (references.dark, references.bright))
         gain = (bright - offset) / (math.pi / 4 - rim)
@@ -275,13 +275,13 @@ def _check_enough(pixels: Any, what: str = "could be judged") -> None:
 
 
 def _measured(result: Result) -> NDArray[np.bool_]:
-    """Return where a height was measured, not filled in."""
+    """Return where heights were measured, not filled."""
     measured: NDArray[np.bool_] = np.isfinite(result["height"])
     return measured if result.filled is None else measured & (result.filled == 0)
 
 
 def _top_by_heights(result: Result, radius: float) -> tuple[float, float]:
-    """Return the position of the top of a ball, mm, that fits best to measured heights."""
+    """Return the position of the top of the ball that fits measured heights best, mm."""
     measured = _measured(result)
     _check_enough(np.count_nonzero(measured), "turn light")
     x, y = (values[measured] for values in np.meshgrid(*_axes(result)))

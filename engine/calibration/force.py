@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 
 _PRIOR = 6.0  # prior standard deviation of the gel's parameters, in their standard errors
-_MODEL_ERROR = 0.003  # relative error of a load by splines and cells: measured on the twin, balls and cones
-_EXACT = 1e-12  # least relative standard deviation of a force
+_MODEL_ERROR = 0.003  # relative error of a load due to splines and cells, for balls and cones of the twin
+_EXACT = 1e-12  # minimum relative standard deviation of a force
 
 
 class KnownPress(NamedTuple):
@@ -45,9 +45,9 @@ class StiffnessFit:
     ----------
     stiffness : Stiffness
     residual : ndarray, (presses,), float64
-        Forces by the modulus minus those of the scale, N.
+        Forces computed with the modulus minus readings of the scale, N.
     held_out : ndarray, (presses,), float64
-        The same, each by the modulus of the other presses; NaN for a single press.
+        The same with the modulus fitted to the other presses; NaN for a single press.
     sigma : ndarray, (presses,), float64
         Expected standard deviations of the residuals, N.
     """
@@ -67,7 +67,7 @@ def known_press(
     device: str | Device | None = None,
     progress: Progress | None = None,
 ) -> KnownPress:
-    """Return the load of a press by a calibration with a gel, together with the force that a scale measured.
+    """Return the load of a press, computed with a calibrated gel, and the force measured by a scale.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def known_press(
     ------
     mirrorskin.io.InputError
         The source is not a press or has no pixel size, the force is not above 0, or the contact is not found
-        or not completely in the picture.
+        or extends beyond the picture.
     """
     if source.motion != "vertical":
         raise InputError(f"{source.name} is of {source.motion} motion: give presses of known force")
@@ -111,10 +111,11 @@ def fit_stiffness(presses: Sequence[KnownPress], gel: Gel) -> StiffnessFit:
     """Fit Young's modulus of the elastomer to presses of measured force.
 
     A force is the modulus times the load. Errors of the gel's parameters change each load differently, so
-    three shifts of these parameters are fitted as well, with a prior standard deviation of six of their
-    standard errors (which come from one or two balls, and are themselves uncertain). The linear least squares
-    are weighted by the errors of load and scale and by a relative scatter of the force: at least 0.3 %, and
-    large enough that chi^2 equals its degrees of freedom (Paule and Mandel, J. Res. NBS 87, 1982, 377-385).
+    three shifts of these parameters are fitted as well. Their prior standard deviation is six of their
+    standard errors, which are estimated from one or two balls and are uncertain themselves. The linear least
+    squares are weighted by the errors of load and scale, and by a relative scatter of the force: at least
+    0.3 %, and large enough that chi^2 equals its degrees of freedom (Paule and Mandel, J. Res. NBS 87, 1982,
+    377-385).
 
     Raises
     ------

@@ -18,25 +18,25 @@ from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma, soft_l1
 
-_NODES = 24  # of the Gauss-Legendre quadrature over punches
-_THINNEST = 1e-3  # radii of the ball: least depth of the mirror below the surface
+_NODES = 24  # number of nodes of the Gauss-Legendre quadrature over punches
+_THINNEST = 1e-3  # minimum depth of the mirror below the surface, in radii of the ball
 
 _RIM = 0.1  # variance of the dark top's radius in pixels, times its radius in pixels
-_MOST = 600  # pixels of a press that are used, at most
-_FEWEST = 50  # pixels of a press that turned bright, at least
+_MOST = 600  # maximum number of pixels used of a press
+_FEWEST = 50  # minimum number of pixels of a press that turned bright
 
-_SHARED = ("threshold", "compliance", "curvature")  # parameters that all presses have in common:
+_SHARED = ("threshold", "compliance", "curvature")  # parameters common to all presses, with the numbers below
 _START = (0.2, 0.005, 0.03)
 _BOUNDS = ((0.02, 0.0, 0.0), (0.78, 2.0, 0.2))
 _WORST = (0.01, 0.02, 0.02)  # standard errors above which they are not determined
-_LATER = np.linspace(-0.1, 0.2, 13)  # radii of the ball: delays of the contact that are tried for the start
+_LATER = np.linspace(-0.1, 0.2, 13)  # delays of the contact tried for the start, in radii of the ball
 _INDEPENDENT = 200  # number of pixels of a press with independent errors
 _AROUND = 24  # points on a dark top's rim
 _LOSS = soft_l1(1.0)  # standard deviations
 _TABLE = 400  # entries of the table from travel to contact radius
 _WIDEST = 0.999  # radii of the ball: largest contact radius
-_SLOPE_ERROR = 0.003  # standard deviation of the sheet's slope by the theory
-_TRAVEL_ERROR = 0.004  # mm: least standard deviation of onsets, which are between two frames
+_SLOPE_ERROR = 0.003  # standard deviation of the sheet's slope computed by the theory
+_TRAVEL_ERROR = 0.004  # mm: minimum standard deviation of onsets, which are between two frames
 _DELAY = 1e-3  # mm of travel: step of numerical derivatives
 _LEAST_RATE = 0.05  # 1/mm: below this rate the sheet is already in contact, and the onset is random
 _DIGITS = 8  # decimals of compliance and curvature, so that a value next to the bound 0 becomes 0
@@ -100,7 +100,7 @@ class BallOnset:
     sigma: Doubles  # (n,): its standard deviation
     x: Doubles  # (n,)
     y: Doubles  # (n,)
-    radius: float  # of the ball
+    radius: float  # radius of the ball
     inner: float = math.nan  # radius of the ball's dark top; NaN if it was not completely visible
     inner_sigma: float = math.nan
 
@@ -177,12 +177,12 @@ def fit_gel(
 ) -> GelFit:
     """Fit a gel to the onsets of light in presses of balls of known radius.
 
-    At a pixel's onset the slope of the sheet there equals the threshold (see `threshold_at` of
-    `mirrorskin.engine.press.elastic`); the slope next to a ball has a closed form (`sphere_slope`). Fitted by
-    robust least squares over all pixels are the threshold on the wall's axis, the wall's curvature, the
+    At the onset of a pixel, the slope of the sheet there equals the threshold (see `threshold_at` of
+    `mirrorskin.engine.press.elastic`); the slope next to a ball has a closed form (`sphere_slope`). Robust
+    least squares over all pixels determine the threshold on the wall's axis, the wall's curvature, the
     stage's compliance, and for each press the ball's position and the travel of first contact. Compliance and
     curvature are 0 if they are not determined. The ball's height above the stage's zero and this zero cannot
-    be separated. More presses, of different balls or at other positions, determine more.
+    be separated. More presses, of different balls or at other positions, determine more parameters.
 
     Parameters
     ----------

@@ -18,19 +18,19 @@ from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma, soft_l1
 
-_ROUNDS = 8  # fits, at most; each predicts further marks
+_ROUNDS = 8  # maximum number of fits; each predicts further marks
 _ADJACENT = 1.5  # pitches: distance from located marks within which others are predicted
-_FEWEST_YET = 6  # marks that are needed before all are predicted
-_LEAST_REACH, _MOST_REACH = 2.5, 12.0  # pixels: radius around a corner in which it is centred
-_FAR = 0.2  # pitches: greatest distance of a mark from its predicted place
-_OFF, _OFF_SHARE = 0.6, 3e-4  # greatest RMS residual of a picture: pixels, or share of its diagonal
+_FEWEST_YET = 6  # minimum number of marks before all are predicted
+_LEAST_REACH, _MOST_REACH = 2.5, 12.0  # pixels: limits of the radius around a corner in which it is centred
+_FAR = 0.2  # pitches: maximum distance of a mark from its predicted position
+_OFF, _OFF_SHARE = 0.6, 3e-4  # maximum RMS residual of a picture: pixels, or share of its diagonal
 _MARKER = 0.15  # greatest relative difference of the markers' size from the specified one; blur shrinks them
 
-_PLANE = 8  # parameters of the homography; then those of the distortion, then the pose of each other board
+_PLANE = 8  # number of parameters of the homography; distortion and poses of the other boards follow
 _LENS = _PLANE + 5
 _LIKELY = np.array([0.3, 0.03, 0.003, 0.003, 0.008])  # prior standard deviations of k1, k2, p1, p2, k3
 _LOSS = soft_l1(3.0)  # standard deviations
-_NOISE, _LEAST_NOISE = 0.1, 0.003  # pixels: first guess, and lower limit
+_NOISE, _LEAST_NOISE = 0.1, 0.003  # pixels: initial value and lower limit of the noise
 _DIFFERENCE = 1e-6  # step of numerical derivatives; all parameters are of the order of 1
 _OUT = 0.9  # relative distance from the map's centre to its corners at which standard errors are computed
 _RIM = 8  # points on a dot's rim
@@ -75,10 +75,10 @@ def calibrate_lens(pictures: Sequence[tuple[str, NDArray[Any]]], board: Board) -
 def fit_lens(pictures: Sequence[Marks]) -> LensFit:
     """Fit one camera to the marks of several pictures, whose boards are in one plane.
 
-    The ray of a point (x, y) is H (x, y, 1) with a homography H, distorted about the picture's centre in
-    units of half its diagonal. A plane determines neither the focal length nor the optical axis: H and the
-    tangential terms absorb both. The loss is linear beyond three standard deviations (`soft_l1` of SciPy);
-    the prior of the distortion is that of common lenses.
+    The ray of a point (x, y) is H (x, y, 1) with a homography H, distorted about the centre of the picture,
+    in units of half its diagonal. A plane determines neither the focal length nor the optical axis; both are
+    absorbed by H and the tangential terms. The loss is linear beyond three standard deviations (`soft_l1` of
+    SciPy), and the prior of the distortion represents common lenses.
 
     The axes on the sheet are rotated so that the map at the picture's centre has no rotation. Its pixels have
     the mean size of the picture's pixels at the centre.
@@ -97,7 +97,7 @@ def fit_lens(pictures: Sequence[Marks]) -> LensFit:
 def locate_marks(picture: NDArray[Any], board: Board, name: str) -> Marks:
     """Locate the marks of a board to a few hundredths of a pixel.
 
-    The marks that OpenCV finds determine a first lens. It predicts all marks, which are then centred.
+    A first lens is fitted to the marks found by OpenCV. It predicts all marks, which are then centred.
     """
     from scipy.spatial import KDTree
 
@@ -123,7 +123,7 @@ def _centre_predicted(picture: Doubles, board: Board, fit: CameraFit, points: Do
     starts, pitch = fit.places(0, points), _pitch(fit.places(0, board.marks()))
     reach = 0.45 * pitch
     if isinstance(board, Charuco):
-        # Up to the first cell inside the markers' black border, at least a ninth of a marker.
+        # The radius ends at the first cell inside a marker's black border, at least a ninth of a marker.
         clear = math.sqrt(2) * ((board.square - board.marker) / 2 + board.marker / 9) / board.square
         reach = min(0.9 * clear * pitch, _MOST_REACH)
     places, found = centre_marks(picture, starts, max(_LEAST_REACH, reach))
@@ -201,7 +201,7 @@ class CameraFit:
         """Fit twice; the second fit is weighted by the noise estimated from the first."""
         self.pictures = pictures
         self._shape = pictures[0].shape
-        self._unit = float(max(np.abs(picture.board).max() for picture in pictures))  # of lengths, mm
+        self._unit = float(max(np.abs(picture.board).max() for picture in pictures))  # unit of lengths, mm
         self._middle = (np.array(self._shape[::-1]) - 1) / 2  # column and row of the picture's centre
         self._focal = math.hypot(*self._shape) / 2  # half the picture's diagonal, pixels
         start = self._start()

@@ -15,16 +15,16 @@ from mirrorskin.io.types import Floats
 Mask = NDArray[np.bool_]
 
 ROUNDING = 1 / 12
-"""Variance of rounding to integers, counts^2: that of a uniform distribution of width 1."""
+"""Variance of rounding to integers, counts^2, of a uniform distribution of width 1."""
 
 FEWEST = 5
-"""Samples in full light that a level under a rolled ball needs."""
+"""Minimum number of samples in full light for a level under a rolled ball."""
 
-_BIN, _BINS = 2048, 32  # pixels in a bin of equal levels, at least; number of bins, at most
+_BIN, _BINS = 2048, 32  # minimum number of pixels in a bin of equal levels; maximum number of bins
 _RARE = 6.0  # standard deviations beyond which a variance is an outlier
-_UNCLIPPED = 0.05  # least share of unclipped samples for a level to be estimated
+_UNCLIPPED = 0.05  # minimum share of unclipped samples for the estimate of a level
 _FAR = 6.0  # standard deviations from the end of the scale beyond which clipping is negligible
-_STEPS = 4  # iterations, which converge in fewer
+_STEPS = 4  # number of iterations; fewer are needed
 _TINY = 1e-30  # counts^2: avoids division by 0
 
 
@@ -87,9 +87,9 @@ class Level(NamedTuple):
 def level_above(moments: Moments, floor: float | None) -> Level:
     """Estimate the level of samples that may be clipped at a floor, counts.
 
-    The standard error is that of the mean, with a variance between the pixel's own and the mean one of pixels
-    of this level (Buehlmann's credibility), plus the error of rounding. Clipping raises the mean of samples:
-    the level is that of the normal distribution which has this mean when clipped. If 95 % of the samples or
+    The standard error is computed from a variance between the pixel's own and the mean over pixels of this
+    level (Buehlmann's credibility), plus the error of rounding. Clipping increases the mean of samples: the
+    level is the mean of the normal distribution that has this mean when clipped. If 95 % of the samples or
     more are at the floor, the level is an upper bound, and its error is the noise of one sample.
     """
     return _level(moments, moments.mean, moments.lowest, moments.at_lowest, floor)
@@ -105,7 +105,7 @@ def level_below(moments: Moments, top: float | None) -> Level:
 def _level(
     moments: Moments, mean: Floats, least: Floats, at_least: NDArray[np.int32], floor: float | None
 ) -> Level:
-    """Estimate the level of samples, or of their negatives, from their mean and least value."""
+    """Estimate the level of samples, or of their negatives, from their mean and minimum."""
     variance = moments.variance
     clipped = np.zeros(mean.shape)
     if floor is not None:
@@ -127,7 +127,7 @@ def _level(
 def rounding_error(variance: Floats) -> Floats:
     """Return the variance due to rounding of a mean of samples with a variance, counts^2.
 
-    It does not average out: without noise, the level can be anywhere within half a count of the mean.
+    It is not reduced by averaging: without noise, the level may be anywhere within half a count of the mean.
     """
     sigma, bias, observed = _rounding_tables()
     return np.asarray(np.interp(np.interp(variance, observed, sigma), sigma, bias))
@@ -136,9 +136,9 @@ def rounding_error(variance: Floats) -> Floats:
 def pool_variance(level: Floats, variance: Floats, freedom: NDArray[np.int32]) -> tuple[Floats, Floats]:
     """Estimate the noise of pixels from all pixels of about the same level.
 
-    Returned are the mean variance at that level without outliers, and the best linear estimate of the pixel's
-    own variance (Buehlmann): between both, depending on how much pixels differ beyond chance; outliers keep
-    their variance. ``freedom`` are the degrees of freedom of the variances.
+    Return the mean variance at that level without outliers, and the best linear estimate of the pixel's own
+    variance (Buehlmann): a value between both, which depends on how much pixels differ beyond chance.
+    Outliers keep their variance. ``freedom`` are the degrees of freedom of the variances.
     """
     valid = np.isfinite(level) & np.isfinite(variance)
     if not valid.any():
@@ -260,11 +260,11 @@ def _lost_by_rounding(u: Floats, noise: Floats) -> Floats:
 
 # --- full light under a rolled ball -------------------------------------------------------------------------
 
-_BRIGHTEST = 3  # rank, by brightness, of the sample that is the first level: ignores glints
+_BRIGHTEST = 3  # rank by brightness of the sample used as the initial level, which ignores glints
 _LIT = 0.75  # share of that light above which samples may be in full light
 _WIDTH = 3.0  # standard deviations to either side that count as full light
-_BELOW = 6.0  # standard deviations below full light from which the number in half light is estimated
-_ROUNDS = 30  # iterations, at most
+_BELOW = 6.0  # standard deviations below full light within which the number in half light is estimated
+_ROUNDS = 30  # maximum number of iterations
 _CONVERGED = 1e-3  # standard deviations: change of the level in the last iteration
 _PLATEAU_BIN, _PLATEAU_BINS = 256, 16  # as _BIN and _BINS
 
@@ -280,13 +280,13 @@ class Plateau:
 
 
 def find_plateau(samples: Floats, dark: Floats, integer: bool) -> Plateau:
-    """Find the mean of the samples in full light, (T, P), when others are in half light or dark.
+    """Find the mean of the samples in full light; others, of (T, P), may be in half light or dark.
 
-    The plateau is the mean that is in the middle of its own window, three standard deviations to either side.
-    The window cuts off as much above as below, so this mean has no bias, unlike that of the brightest
-    samples. The standard deviation is estimated from the samples above the mean, of all pixels of about that
+    The plateau is the mean that is at the centre of its own window of three standard deviations to either
+    side. The window excludes as much above as below, so unlike the mean of the brightest samples this mean is
+    unbiased. The standard deviation is estimated from the samples above the mean, of all pixels of similar
     level, because none of these is in half light. The number of samples in half light within the window is
-    estimated from those just below it, and their contribution to the mean is subtracted.
+    estimated from the samples just below it, and their contribution to the mean is subtracted.
     """
     rank = max(len(samples) - _BRIGHTEST, 0)
     rough = np.partition(np.where(np.isfinite(samples), samples, -np.inf), rank, axis=0)[rank]

@@ -17,21 +17,21 @@ from mirrorskin.kernels.array_types import Doubles
 Singles = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
-_SATURATED = 0.3  # share of saturated pixels above which a message names them as the reason
-_LEAST_DOT = 9.0  # pixels: least area of a dot
+_SATURATED = 0.3  # share of saturated pixels above which a message states them as the reason
+_LEAST_DOT = 9.0  # pixels: minimum area of a dot
 _RANGE = 0.5, 99.5  # percentiles between which a picture's contrast is measured
-_LEAST_MARKER = 12.0  # pixels: least side of a marker
-_FEWEST_MARKERS = 3  # of a picture
-_ENOUGH = 0.5  # share of a board's markers with which sharpened pictures are not searched
-_SAME_BOARD = 0.7  # share of the markers of a clear picture that lie on one plane
-_OFF_PLANE = 0.35  # greatest distance of a marker's corner from the plane of others, as a share of its side
-_OFF_GRID = 0.25  # the same of a dot, as a share of the pitch
-_MOST_BLOBS = 2  # blobs among which dots are searched, per dot
-_DARK = 25.0  # brightness, at a contrast of 255, below which details are not divided by it
+_LEAST_MARKER = 12.0  # pixels: minimum side of a marker
+_FEWEST_MARKERS = 3  # minimum number of markers in a picture
+_ENOUGH = 0.5  # share of a board's markers from which on sharpened pictures are not searched
+_SAME_BOARD = 0.7  # minimum share of the markers of a clear picture that are on one plane
+_OFF_PLANE = 0.35  # maximum distance of a marker's corner from the plane of others, as a share of its side
+_OFF_GRID = 0.25  # maximum distance of a dot from the grid, as a share of the pitch
+_MOST_BLOBS = 2  # maximum number of blobs per dot that are searched
+_DARK = 25.0  # brightness, at a contrast of 255, below which details are not normalised by brightness
 _LIGHT = 16  # parts of a picture's longer side within which the light is assumed to be even
 
 _BLUR = 1.0  # pixels, standard deviation
-_STEPS = 20  # Gauss-Newton steps, at most
+_STEPS = 20  # maximum number of Gauss-Newton steps
 _CONVERGED = 1e-4  # pixels: size of the last step
 _STEP, _SHIFT = 0.25, 0.6  # longest step, and longest distance from the start, as shares of the radius
 _SPACING, _FEWEST_SAMPLES, _MOST_SAMPLES = 1.5, 6, 24  # pixels between samples along a radius; their number
@@ -44,7 +44,7 @@ _FAINT = 3.0  # counts, at a contrast of 255: least standard deviation around a 
 class Marks:
     """Marks of a board that were found in a picture."""
 
-    name: str  # of the picture, for messages
+    name: str  # name of the picture, for messages
     shape: tuple[int, int]  # rows and columns of the picture
     board: Doubles  # (n, 2): positions on the board, mm from its middle, y up
     places: Doubles  # (n, 2): column and row in the picture, 0 for the first
@@ -63,7 +63,7 @@ def scale_contrast(picture: NDArray[Any], name: str) -> Doubles:
 
 
 def find_marks(picture: NDArray[Any], board: Board, name: str) -> Marks:
-    """Find the corners of a ChArUco board's markers (four each, marker by marker), or dots, approximately."""
+    """Find approximate positions of the markers' corners of a ChArUco board (four each), or of dots."""
     scaled = np.asarray(scale_contrast(picture, name), np.float32)
     if isinstance(board, Dots):
         positions = _find_dots(scaled, board)
@@ -99,7 +99,7 @@ def _band(scaled: Singles, fine: float, coarse: float) -> Singles:
 
 
 def _find_markers(pictures: Iterable[tuple[int, Bytes]], board: Charuco) -> tuple[Doubles, Doubles] | None:
-    """Return the corners of the markers in (scale, picture)s that lie on one plane.
+    """Return the corners of the markers in pairs (scale, picture) that are on one plane.
 
     If the first picture shows many markers, most of them in another arrangement, all of these are returned.
     """
@@ -236,16 +236,16 @@ def _dot_pictures(scaled: Singles, pitch: float) -> Iterator[Bytes]:
 def centre_marks(picture: NDArray[Any], starts: Doubles, radius: float) -> tuple[Doubles, NDArray[np.bool_]]:
     """Move places to the centres of point symmetry: I(q + d) = I(q - d) for the offsets d in a circle.
 
-    A corner of a chessboard and a dot are such centres under any symmetric blur, so q has no bias. It is
+    A corner of a chessboard and a dot are such centres under any symmetric blur, so q is unbiased. It is
     found by Gauss-Newton steps with the weights (1 - d^2 / radius^2)^2. The picture is interpolated by cubic
     splines after a slight blur, because splines oscillate next to a sharp edge.
 
-    Light that increases to one side moves such a centre. The light is estimated from the asymmetries around
-    all marks, as the exponential of a quadratic polynomial, and the picture is divided by it.
+    A gradient of the light shifts such a centre. The light is estimated from the asymmetries around all
+    marks, as the exponential of a quadratic polynomial, and the picture is divided by it.
 
     ``picture`` has a contrast of about 255, ``starts`` are columns and rows, (n, 2), and ``radius`` is the
-    circle's, pixels. Returned are the places, and whether there is such a centre near the start, with the
-    whole circle in the picture.
+    radius of the circle, pixels. Return the positions, and whether there is such a centre near the start with
+    the whole circle in the picture.
     """
     from scipy import ndimage
 
@@ -280,7 +280,7 @@ def _centre(
 
 
 def _light(smooth: Doubles, places: Doubles, offsets: Doubles, weights: Doubles) -> Doubles:
-    """Return the light of all pixels, as far as it makes marks asymmetric; 1 if that is insignificant."""
+    """Return the light of all pixels, estimated from the asymmetry of marks; 1 if insignificant."""
     slopes = -_gauss_newton_step(smooth, places, offsets, weights, light=True)[:, 2:] / 2
     rows, columns = smooth.shape
     (x, y), one, zero = (places - [columns / 2, rows / 2]).T, np.ones(len(places)), np.zeros(len(places))

@@ -29,18 +29,18 @@ from mirrorskin.kernels.least_squares import mad_sigma
 
 _CHUNK = 8_000_000  # bytes of float64 samples that are processed at a time
 _MEMORY = 256_000_000  # bytes of frames of a rolled ball that are kept in memory
-_BITS = 8  # bits of a camera, at least
-_UNSTEADY = 0.1  # of full light: noise above which the light is unsteady
-_MOST_HOT = 0.05  # greatest share of hot pixels
+_BITS = 8  # minimum number of bits of a camera
+_UNSTEADY = 0.1  # noise above which the light is unsteady, as a share of full light
+_MOST_HOT = 0.05  # maximum share of hot pixels
 
 # Limits of `find_defects`; "full light" is bright minus dark of the picture's brighter pixels.
-_WINDOW = 5  # pixels of a side of the neighbourhood
-_FAR = 7.0  # standard deviations of a hot pixel's dark level, and of a live one's light
-_GLOW = 0.05  # of full light: least excess of a hot pixel over its neighbours
-_GLARE = 0.5  # of full light: dark level above which a pixel is hot in any case
-_UNREST = 16.0  # ratio of variances, i.e. four times the noise, above which a pixel is hot
-_WEAK = 0.5  # of the neighbours' light: least light of a live pixel
-_BLIND = 0.1  # of full light: least light of a live pixel
+_WINDOW = 5  # side of the neighbourhood, pixels
+_FAR = 7.0  # standard deviations: minimum excess of a hot pixel's dark level, and of a live pixel's light
+_GLOW = 0.05  # minimum excess of a hot pixel over its neighbours, as a share of full light
+_GLARE = 0.5  # dark level above which a pixel is hot in any case, as a share of full light
+_UNREST = 16.0  # ratio of variances (four times the noise) above which a pixel is hot
+_WEAK = 0.5  # minimum light of a live pixel, as a share of its neighbours' light
+_BLIND = 0.1  # minimum light of a live pixel, as a share of full light
 _BRIGHTER = 90.0  # percentile of light that represents the picture's brighter pixels
 _FULL = 0.1  # share of clipped samples of a saturated pixel
 
@@ -49,7 +49,7 @@ _FULL = 0.1  # share of clipped samples of a saturated pixel
 class LevelReport:
     """Quality of a measured level, counts; noise and sigma are medians over pixels."""
 
-    frames: int  # of all recordings together
+    frames: int  # number of frames of all recordings
     noise: float  # standard deviation of a sample
     sigma: float  # standard error of the reference
     rounding: float  # part of the standard error that more frames do not reduce
@@ -87,19 +87,20 @@ def measure_references(
     Parameters
     ----------
     dark : sequence of Source
-        Recordings of a sheet that touches nothing.
+        Recordings of the sheet without contact.
     bright : sequence of Source
         Recordings of full light.
     rolled : bool
-        Whether the bright recordings are of a ball that is rolled about, so that each pixel is in full light
-        in some frames only. They are then read once per 256 MB.
+        Whether the bright recordings show a ball that is rolled over the sheet, so that each pixel is in full
+        light in some frames only. They are then read once per 256 MB.
     progress : callable, optional
         Called with the number of frames so far.
 
     Raises
     ------
     mirrorskin.io.InputError
-        The frames are of different cameras, too few, of unsteady light, or not brighter than the dark ones.
+        The frames are from different cameras or too few, the light is unsteady, or bright frames are not
+        brighter than dark ones.
     """
     check_one_camera([*dark, *bright])
     reader = _Reader(progress)
@@ -131,12 +132,13 @@ def find_defects(dark: Level, bright: Level, freedom: int, integer: bool) -> NDA
     A pixel is compared with the median of the 5 x 5 pixels around it, so vignetting, uneven gains and a
     gradient of the dark level are not defects.
 
-    - *hot*: the dark level exceeds that of the neighbours by more than seven standard deviations of such
-      differences (from their median) and by more than 5 % of full light, or exceeds half of full light; or
-      the noise of dark samples is four times the usual one (``freedom``: degrees of freedom of the variance).
-    - *dead*: the response to light is less than half of the neighbours', or less than a tenth of that of the
-      picture's brighter pixels, or less than the noise; or there are no samples.
-    - *saturated*: a tenth of the samples in full light are at the top of the camera's scale.
+    - *hot*: the dark level exceeds the neighbours' by more than seven standard deviations of such differences
+      (estimated from their median) and by more than 5 % of full light; or it exceeds half of full light; or
+      the noise of dark samples is four times the usual noise (``freedom``: degrees of freedom of the
+      variance).
+    - *dead*: the response to light is less than half of the neighbours', less than a tenth of the response of
+      the picture's brighter pixels, or less than the noise; or there are no samples.
+    - *saturated*: at least a tenth of the samples in full light are at the top of the camera's scale.
     """
     span = bright.value - dark.value
     light = _full_span(span)
@@ -161,7 +163,7 @@ def _full_span(span: Floats) -> float:
 
 
 def _neighbourhood(values: Floats) -> Floats:
-    """Return the median around each pixel; pixels without a value count as the median of all."""
+    """Return the median around each pixel; pixels without a value are replaced by the median of all."""
     from scipy.ndimage import median_filter
 
     finite = np.isfinite(values)
@@ -193,7 +195,7 @@ class _Reader:
                     early, count = moments.sum.copy(), moments.count.copy()
                 moments.push(frame[np.newaxis])
         if not moments.frames:
-            raise InputError(f"{sources[0].name} holds no frames: take some")
+            raise InputError(f"{sources[0].name} contains no frames: record some")
         with np.errstate(invalid="ignore"):
             change = (moments.sum - early) / (moments.count - count) - early / count
         # The interquartile mean is as robust as the median, and has a finer resolution.
@@ -212,10 +214,10 @@ def _scale_top_of(highest: Floats, integer: bool) -> float | None:
 
 
 def scale_top(highest: float, integer: bool) -> float | None:
-    """Return the greatest sample if it is the top of a camera's scale, else None.
+    """Return the largest sample if it is the top of a camera's scale, else None.
 
-    That is 1 for floats. For integers it is eight or more binary ones followed by any number of zeros, as of
-    a 12-bit camera in 16-bit frames.
+    The top is 1 for floats. For integers it is eight or more binary ones followed by any number of zeros, as
+    for a 12-bit camera in 16-bit frames.
     """
     if highest == 1 and not integer:
         return highest
@@ -241,7 +243,7 @@ def _rolled_level(sources: Sequence[Source], dark: Level, reader: _Reader) -> Le
             count += len(part)
         if count < FEWEST:
             raise InputError(
-                f"{sources[0].name} holds {count} frames: roll the ball over the field in many more"
+                f"{sources[0].name} contains {count} frames: roll the ball over the field in many more"
             )
         levels = _plateaus(samples[:count].reshape(count, -1), dark.value[band].ravel())
         maps[:, band] = levels.reshape(5, -1, columns)
@@ -267,9 +269,9 @@ def _plateaus(samples: NDArray[Any], dark: Floats) -> Floats:
 
 def _check_level(level: Level, moments: Moments, name: str) -> None:
     if moments.frames < 2:
-        raise InputError(f"{name} holds 1 frame, which does not show its noise: take 2 or more")
+        raise InputError(f"{name} contains 1 frame, which does not show its noise: take 2 or more")
     if not np.isfinite(level.sigma).any():
-        raise InputError(f"{name} holds no pixel with two finite samples: take it again")
+        raise InputError(f"{name} contains no pixel with two finite samples: take it again")
 
 
 def _check_light(dark: Level, bright: Level, rolled: bool, dark_name: str, name: str) -> None:

@@ -20,19 +20,19 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 
 NAMES = ("tilt", "phase_offset", "oval_x", "oval_y", "centre_x", "centre_y", "pivot_x", "pivot_y", "pivot_z")
-"""The body's parameters; in a fit, three of each ball and two of each wedge follow."""
+"""The parameters of the body; in a fit, three for each ball and two for each wedge follow."""
 
 _ACROSS, _DEPTH, _ZENITH = 0, 1, 2  # kinds of residuals: a ball's x and y, its z, a plate's zenith
-_NOMINAL = math.radians(2.5)  # first guess of the tilt
+_NOMINAL = math.radians(2.5)  # initial value of the tilt
 _PRIOR = np.array([0.0, 10.0, 1.0, 1.0, 0.2, 0.2, 1e3, 1e3, 1e3])  # weak prior standard deviations
 _HALF = 0.5  # prior standard deviation of the tilt relative to its start
 _FIXED = 1e-9  # prior standard deviation of a fixed parameter
-_ROUNDS = 5  # fits, each weighted by the residuals of the one before
+_ROUNDS = 5  # number of fits, each weighted by the residuals of the preceding one
 _LOSS = least_squares.soft_l1(3.0)  # standard deviations
-_BEYOND = 5.0  # standard deviations beyond which a residual does not count for the scale of its kind
-_ALIKE = 0.03  # relative change of the scales at which fits end
+_BEYOND = 5.0  # standard deviations beyond which a residual is excluded from the scale of its kind
+_ALIKE = 0.03  # relative change of the scales that ends the fits
 _CLEAR = 16.0  # difference of chi^2 that decides between two solutions
-_DIRECTION = 5.0  # standard errors: least significance of the sense of rotation
+_DIRECTION = 5.0  # standard errors: minimum significance of the sense of rotation
 _VAGUE_TILT = 0.1  # relative standard error above which the tilt is not determined
 _VAGUE_PHASE = math.radians(5.0)  # the same for the phase offset
 _VAGUE_PIVOT = 3.0  # mm: the same for the pivot
@@ -57,28 +57,28 @@ def fit_precession(
 ) -> PrecessionFit:
     """Fit the lean of the body as a function of the phase, and its pivot, to balls and plates.
 
-    A ball looks the same in any orientation, so pictures show only its centre in each frame: it moves on a
-    circle of radius tilt times its distance from the pivot's height, and up and down by tilt times its
-    distance from the pivot across the axis. One ball at one position does not separate tilt and distances.
-    They are separated by a level plate, whose zenith is the lean; by a wedge, whose zenith varies by the
-    tilt; and by balls at several positions or of several sizes. One ball and plates leave two solutions, with
-    the pivot above or below the ball and opposite leans: the phase offset is then assumed to be within 90
-    degrees of 0. Only a level plate determines the mean lean; otherwise the mean pose is assumed to be
-    upright.
+    A ball looks the same in any orientation, so pictures only show its centre in each frame. The centre moves
+    on a circle, whose radius is the tilt times its vertical distance from the pivot, and up and down by the
+    tilt times its horizontal distance from the pivot. One ball at one position does not separate tilt and
+    distances. They are separated by a level plate, whose zenith equals the lean; by a wedge, whose zenith
+    varies by the tilt; and by balls at several positions or of several sizes. With one ball and plates there
+    are two solutions, with the pivot above or below the ball and opposite leans: the phase offset is then
+    assumed to be within 90 degrees of 0. Only a level plate determines the mean lean; otherwise the mean pose
+    is assumed to be upright.
 
-    The least squares are weighted by the residuals' scatter, but not less than the tracks' errors.
+    The least squares are weighted by the scatter of the residuals, or by the errors of the tracks if larger.
 
     Parameters
     ----------
     balls : sequence of BallTrack
     plates : sequence of PlateTrack
     depth_sigma : float
-        Common standard deviation of all depths, mm; it adds to that of the pivot's height.
+        Common standard deviation of all depths, mm; it is added to the uncertainty of the pivot's height.
 
     Returns
     -------
     PrecessionFit
-        Coordinates of the pivot that are not determined are NaN.
+        Undetermined coordinates of the pivot are NaN.
 
     Raises
     ------
@@ -187,13 +187,13 @@ def _circular_parts(track: BallTrack) -> tuple[complex, complex]:
 
 
 def _swing(track: PlateTrack) -> float:
-    """Return the tilt that a plate shows, in a first approximation, radians."""
+    """Return a first approximation of the tilt from a plate, radians."""
     mean, cosine, sine = smooth_turn(track.zenith[:, np.newaxis], track.phase)[:, 0]
     return float(mean if track.level else math.hypot(cosine, sine))
 
 
 def _start(model: _Model) -> Doubles:
-    """Return start parameters in the approximation of small angles.
+    """Return initial parameters in the approximation of small angles.
 
     A lean by the complex number l = tilt exp(i a) moves a ball's centre C by (C.z - pivot.z) l, and lifts it
     by the real part of -conj(C - pivot) l.
@@ -273,7 +273,7 @@ def _fit(model: _Model, start: Doubles, scale: Doubles, rounds: int) -> _Fit:
         )
         covariance, parameters = found.covariance(), found.parameters.copy()
         spread = np.einsum("nk,kl,nl->n", found.jacobian, covariance, found.jacobian)
-        if parameters[0] < 0:  # the same lean with a positive tilt
+        if parameters[0] < 0:  # convert to the same lean with a positive tilt
             parameters[:2] = -parameters[0], parameters[1] + math.pi
         freedom = (1 - found.information * spread)[: len(kinds)]
         residuals = model.residuals(parameters, start)[: len(kinds)]

@@ -18,22 +18,22 @@ from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 
-_MOST_BYTES = 2_000_000_000  # of frames in memory
-_PHASES = 4  # phases that an ellipse and its mean need
+_MOST_BYTES = 2_000_000_000  # maximum size of frames in memory
+_PHASES = 4  # minimum number of phases for an ellipse and its mean
 _SAME_PHASE = 1e-6  # radians
 _MARGIN = 2.0  # pixels from the outline within which a sample may show the free sheet
-_MOST = 20_000  # samples of a frame that are fitted, at most
-_FEWEST = 30  # samples of a frame, at least
+_MOST = 20_000  # maximum number of fitted samples of a frame
+_FEWEST = 30  # minimum number of samples of a frame
 _STEP = 1e-3  # mm: step of numerical derivatives
 _OUTLIER = 4.0  # standard deviations: scale of the robust weights
 _OUT = 1e3  # residual of a sample that does not show the ball, or is out of range
-_FAR = 0.25  # radii: greatest distance of the fitted centre from that of the outline
-_DEEP = 0.5  # mm: standard deviation of the depth if the outline is not that of the contact
-_RIM = 0.85  # share of the outline's radius at which the rim begins
-_MOSTLY = 0.8  # least share of the rim that shows the ball
-_SHALLOWER = 0.1  # greatest relative difference of the depth from the recorded press
-_RIM_ERROR = 0.01  # radians: greatest mean residual of a valid rim
-_FAINT = 0.01  # share of the range that a plate must not show, at both ends
+_FAR = 0.25  # radii: maximum distance of the fitted centre from the outline's centre
+_DEEP = 0.5  # mm: standard deviation of the depth if the outline is not the outline of the contact
+_RIM = 0.85  # inner radius of the rim, as a share of the outline's radius
+_MOSTLY = 0.8  # minimum share of the rim that shows the ball
+_SHALLOWER = 0.1  # maximum relative difference of the depth from the recorded press
+_RIM_ERROR = 0.01  # radians: maximum mean residual of a valid rim
+_FAINT = 0.01  # share of the range, at both ends, that is excluded for a plate
 
 
 class BallTrack(NamedTuple):
@@ -63,11 +63,11 @@ class _BallTurn(NamedTuple):
 def track_ball(source: Source, radius: float, light: Brightness) -> BallTrack:
     """Find a ball's centre in each frame of an axial recording.
 
-    The outline gives an approximate centre (see `follow_ball`); the light inside it is then fitted by
-    Gauss-Newton steps. Light that is linear in the zenith does not depend on the ball's depth, which then
-    follows from the outline alone, provided that it is the outline of the contact. Otherwise the depth is
-    nearly unknown: if the rim does not show the ball (the wall ends before the contact does), or if the depth
-    differs from the recorded press (the elastomer gives way, or the stage's zero is wrong).
+    The outline determines an approximate centre (see `follow_ball`); the light inside it is then fitted by
+    Gauss-Newton steps. Light that is linear in the zenith does not depend on the ball's depth, so the depth
+    is computed from the outline only, provided that it is the outline of the contact. The depth is nearly
+    unknown if the rim does not show the ball (the wall ends before the contact does), or if the depth differs
+    from the recorded press (the elastomer deflects, or the stage's zero is wrong).
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Do
     sight = np.stack([x, y, *turn.light.sight(pixels)])
     linear = isinstance(turn.light, LinearBrightness)
     prior, outline_sigma = float(sigma[2]) if linear else _DEEP, sigma[2]
-    sigma[2] = _DEEP  # unless the outline proves to be that of the contact
+    sigma[2] = _DEEP  # unless the outline is found to be the outline of the contact
 
     def residuals(place: Doubles) -> Doubles:
         expected, within = _expected(turn, sight, pixels, place)

@@ -26,9 +26,9 @@ BODY_RADIUS, BODY_HEIGHT = 17.5, 40.0
 """Radius and height of the paper's body, mm."""
 
 FEWEST = 5
-"""Number of presses that are needed."""
+"""Minimum number of presses."""
 
-_SAMPLES = 60_000  # of all presses
+_SAMPLES = 60_000  # number of samples of all presses
 _LIKELY = {
     **dict.fromkeys(("axis_x", "axis_y"), (0.0, 1.0)),
     "sight_0": (0.004, 0.004),  # a camera at 100 to 200 mm; 0 for a telecentric one
@@ -39,22 +39,22 @@ _LIKELY = {
 }
 """wall_fit.Prior means and standard deviations of a sensor's parameters."""
 
-_FEW, _MANY = 4_000, 30_000  # samples of the first fits, and of the last
+_FEW, _MANY = 4_000, 30_000  # number of samples of the first fits, and of the last
 _TOLERANCES = {_FEW: 1e-4, _MANY: 3e-6}  # relative change of the sum of squares at which these fits end
-_COARSE = 0.1  # of full light: noise assumed in the first fit, large for convergence
-_QUIET = 1e-3  # of full light: least error of the model
-_INNER = 0.7  # of the light's outline: radius within which the sheet certainly touches the ball
-_RING = 0.05  # of the light's outline: width of the rings that are added
-_AT_ONCE = 2  # rings that are added at a time
-_USUAL = 1.2  # greatest standard deviation of a ring relative to the usual one
-_BIASED = 0.3  # greatest median of a ring relative to the usual standard deviation
-_CHANCE = 4.0  # allowance for chance in both: this, divided by the root of the ring's number of samples
-_BAD = 2.0  # greatest noise of a press relative to that of the other presses
-_UNLIKELY = 1.5  # greatest RMS deviation of the sensor from its prior, standard deviations
-_TOUCHED = 0.02  # mm above the rest plane: least height of a sample
-_MODEST = 0.01  # of full light: least noise assumed in a fit without one of the presses
-_FEWEST_IN_RING = 30  # samples with which a ring is judged
-_BINS = 6  # of brightness, in which noise is estimated
+_COARSE = 0.1  # share of full light: noise assumed in the first fit, large for convergence
+_QUIET = 1e-3  # share of full light: minimum error of the model
+_INNER = 0.7  # share of the outline's radius within which the sheet certainly touches the ball
+_RING = 0.05  # share of the outline's radius: width of the rings that are added
+_AT_ONCE = 2  # number of rings that are added at once
+_USUAL = 1.2  # maximum standard deviation of a ring, in usual standard deviations
+_BIASED = 0.3  # maximum median of a ring, in usual standard deviations
+_CHANCE = 4.0  # allowance for chance in both, divided by the root of the number of samples of the ring
+_BAD = 2.0  # maximum ratio of the noise of a press to the noise of the other presses
+_UNLIKELY = 1.5  # maximum RMS deviation of the sensor from its prior, standard deviations
+_TOUCHED = 0.02  # mm: minimum height of a sample above the rest plane
+_MODEST = 0.01  # share of full light: minimum noise assumed in a fit without one of the presses
+_FEWEST_IN_RING = 30  # minimum number of samples to test a ring
+_BINS = 6  # number of bins of brightness in which noise is estimated
 
 
 def fit_zenith(
@@ -69,22 +69,23 @@ def fit_zenith(
 ) -> WallResponse:
     """Fit the brightness of mirrors to axial recordings of one ball pressed at several positions.
 
-    The wall (its radius, rim and axis, the camera's lines of sight, the lamps, the scatter, the shading, and
-    the printed pattern as a monotone curve) and the balls' positions are fitted jointly to the light of some
-    ten thousand samples. A sphere looks the same in any orientation, so the tilt of the rotation has little
-    influence, except through the ball's movement; the pivot is fitted, too.
+    The wall and the balls' positions are fitted jointly to the light of tens of thousands of samples. The
+    parameters of the wall are its radius, rim and axis, the camera's lines of sight, the lamps, the scatter,
+    the shading, and the printed pattern as a monotone curve. A sphere looks the same in any orientation, so
+    the tilt of the rotation has little influence except through the movement of the ball; the pivot is fitted
+    as well.
 
-    The area in which the sheet takes the ball's shape is found from the data: rings of samples are added from
+    The area in which the sheet touches the ball is estimated from the data: rings of samples are added from
     the centre outwards until one does not fit.
 
     Parameters
     ----------
     presses : sequence of Source
-        At least five, better nine, spread over the field; read one after the other, once.
+        At least five, preferably nine, spread over the field; each is read once, one after the other.
     ball : float
         Radius of the ball, mm.
     references, precession : optional
-        Calibrated ones; by default the levels, tilt and pivot of each recording.
+        Calibrated parts; by default the levels, tilt and pivot of each recording.
     pattern : {"graded", "uniform"}
         Whether the wall's brightness changes with its height.
     body : (float, float)
@@ -159,9 +160,9 @@ def fit_touch(
 ) -> Touch:
     """Fit the wall to samples where the sheet touches the ball.
 
-    From well within the light's outline, rings are added to each press as long as they fit as well as the
-    inner ones: an elastomer leaves the ball earlier than a perfectly flexible sheet. If a ring does not fit,
-    the ring inside it is left out as well.
+    Starting well within the outline of the light, rings are added to each press as long as they fit as well
+    as the inner ones, because an elastomer leaves the ball earlier than a perfectly flexible sheet. If a ring
+    does not fit, the next inner ring is excluded as well.
     """
     rings = _Rings(samples, presses)
     taken = np.full(len(presses), round(_INNER / _RING))
@@ -226,7 +227,7 @@ def _refit(
 
 
 def _grow(off: Doubles, ring: Numbers, taken: int) -> tuple[int, bool]:
-    """Return how many rings of a press fit, and whether there may be more.
+    """Return the number of rings of a press that fit, and whether more may fit.
 
     ``off`` are the residuals of its samples in standard deviations, and ``ring`` their rings.
     """
@@ -274,7 +275,7 @@ def _check_presses(
 ) -> None:
     """Raise InputError if a press does not fit the others.
 
-    Either its residuals are larger; or the sensor is unlikely with it, and likely without it.
+    Either its residuals are larger, or the fitted sensor is unlikely with it and likely without it.
     """
     finite = np.isfinite(off)
     scales = np.array([_scale(off[finite & (rings.press == number)]) for number in range(len(presses))])

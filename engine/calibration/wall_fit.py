@@ -27,30 +27,30 @@ from mirrorskin.io import InputError, Precession, References, Source, pixel_axes
 from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
 
-_STEEPEST = math.radians(50.0)  # greatest zenith on the ball of a sample
-_BEYOND = 1.35  # greatest distance of a sample from the ball's centre, relative to the outline of the light
-_PLACE = 1.0  # mm: standard deviation of a ball's centre that is found in the picture
+_STEEPEST = math.radians(50.0)  # maximum zenith of the ball at a sample
+_BEYOND = 1.35  # maximum distance of a sample from the ball's centre, relative to the outline of the light
+_PLACE = 1.0  # mm: standard deviation of a ball's centre located in the picture
 _DEPTH = 0.2  # mm: standard deviation of the recorded press
-_LEAST = 20  # mean number of samples of a frame, at least
-_FRAMES = 16  # frames of a recording that are used, at most
-_CLIPPED = 64  # samples at a value 2^n - 1 above which it is assumed to be the camera's full scale
+_LEAST = 20  # minimum of the mean number of samples per frame
+_FRAMES = 16  # maximum number of frames used of a recording
+_CLIPPED = 64  # number of samples at a value 2^n - 1 above which it is assumed to be the camera's full scale
 _UNKNOWN_PIVOT = 30.0  # mm: standard deviation of a pivot without information
 _RECORDED_PIVOT = 3.0  # mm: standard deviation of a recorded pivot
 _CALIBRATED_PHASE = math.radians(2.0)  # standard deviation of a calibrated phase without a standard error
 _RECORDED_PHASE = math.radians(45.0)  # standard deviation of a recorded phase
-_FLOOR = 0.02  # least standard error of a calibrated value, relative to the standard deviation without one
+_FLOOR = 0.02  # minimum standard error of a calibrated value, relative to the standard deviation without one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BallPress:
     """M samples of an axial recording of a ball, with prior information; lengths in mm."""
 
-    name: str  # of its source
+    name: str  # name of its source
     light: Doubles  # (M,)
-    place: Doubles  # (2, M): of each sample's pixel on the rest plane
+    place: Doubles  # (2, M): position of each sample's pixel on the rest plane
     frame: NDArray[np.intp]  # (M,)
-    lean: Doubles  # (T, 2): radians, of each frame
-    centre: Doubles  # (3,): of the ball in the mean pose, at the recorded depth if that is plausible
+    lean: Doubles  # (T, 2): lean in each frame, radians
+    centre: Doubles  # (3,): centre of the ball in the mean pose, at the recorded depth if that is plausible
     centre_sigma: Doubles  # (3,): its standard deviation
     outline: float  # radius of the circle in which light is visible
     pivot: tuple[float, float, float]
@@ -58,7 +58,7 @@ class BallPress:
 
 @dataclass(frozen=True, slots=True)
 class Pivot:
-    """Centre of the body's rotation, mm, with its standard errors and that of the phases' zero."""
+    """Centre of the body's rotation, mm, with its standard errors and the standard error of phase zero."""
 
     place: tuple[float, float, float]
     sigma: tuple[float, ...]
@@ -188,7 +188,7 @@ def _clipped_counts(frames: NDArray[Any]) -> NDArray[Any]:
 # --- the fit ------------------------------------------------------------------------------------------------
 
 _LOSS = least_squares.cauchy(3.0)  # standard deviations
-_ROUGH = 0.05  # of full light: prior standard deviation of third differences of the curve's coefficients
+_ROUGH = 0.05  # prior standard deviation of third differences of the coefficients, share of full light
 _SCATTER = (1e-3, 0.3)  # radians: bounds of the scatter
 _CHUNK = 8192  # samples whose derivatives are computed at a time
 
@@ -266,9 +266,9 @@ def fit_wall(
 
 
 def _excess(residuals: Doubles) -> float:
-    """Return the factor of the covariance for the size of the residuals, in standard deviations.
+    """Return the factor of the covariance due to the size of the residuals, in standard deviations.
 
-    Huber's proposal: the variance of the weighted residuals divided by the square of their mean slope.
+    It is Huber's proposal: the variance of the weighted residuals divided by the square of their mean slope.
     """
     weights = _LOSS.weights(residuals)
     slope = weights**2 * (1 - (residuals / _LOSS.limit) ** 2)

@@ -1,9 +1,9 @@
 """The light of balls under the lit wall, and its derivatives by the parameters of a fit.
 
 A printed pattern is a monotone curve of light, blurred by scatter: a ray is spread evenly over the angles by
-which the sheet's flakes turn it, and rays over the rim or below the rest plane are dark. Otherwise the
-formula is that of `mirrorskin.kernels.response`. The position on the wall is a share u: 0 at the rim and 1 at
-the rest plane, linear in the elevation seen from the sheet's centre.
+which the sheet's flakes deflect it, and rays above the rim or below the rest plane are dark. Otherwise the
+formula is the same as in `mirrorskin.kernels.response`. The position on the wall is a share u: 0 at the rim
+and 1 at the rest plane, linear in the elevation seen from the centre of the sheet.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mirrorskin.engine.calibration.ball import rotations
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.response import Ray, follow, lamp_light, shade_terms, sight_of, sight_slopes
 
-_PIECES = 8  # of the curve: enough for a gamma of 2.2 within 2e-4 of full light
+_PIECES = 8  # pieces of the curve, which represent a gamma of 2.2 within 2e-4 of full light
 _CUBIC = 3  # degree of the curve
 CURVE_COEFFICIENTS = _PIECES + _CUBIC
 """Number of coefficients of the curve, a cubic spline with evenly spaced knots on 0 to 1, and 0 outside."""
@@ -89,8 +89,8 @@ STEPS = slice(len(SENSOR), len(SENSOR) + CURVE_COEFFICIENTS)
 
 _GEOMETRIC = len(SENSOR) - 7  # number of parameters that change the path of rays; others change their light
 _OF_THE_WALL = ("radius", "rim", "scatter")  # parameters without influence on where rays are reflected
-_STEEPEST = np.radians(89.0)  # greatest elevation of a ray that is followed to the wall
-_CLOSEST = 1e-6  # mm^2: to the wall; see `follow`
+_STEEPEST = np.radians(89.0)  # maximum elevation of a ray that is followed to the wall
+_CLOSEST = 1e-6  # mm^2: minimum difference to the wall; see `follow`
 _SMALL = 1e-5  # step of numerical derivatives, relative to a parameter's scale
 SCALES = dict(zip(SENSOR, (1, 1, 1, 1, 1e-3, 1e-6, 1e-2, 1, 1, 1, 1e-2, *[0.1] * 7), strict=True))
 """Order of magnitude of the error of each parameter of the sensor."""
@@ -104,7 +104,7 @@ class LightSamples:
     place: Doubles  # (2, N): x and y of the pixel on the rest plane, mm
     pose: NDArray[np.intp]  # (N,): number of the frame, counted through all presses
     press: NDArray[np.intp]  # (poses,): press that each frame belongs to
-    lean: Doubles  # (poses, 2): of the body in each frame, radians; see `rotations`
+    lean: Doubles  # (poses, 2): lean of the body in each frame, radians; see `rotations`
     ball: float  # radius of the ball, mm
 
     def __getitem__(self, some: NDArray[np.bool_] | NDArray[np.intp] | slice) -> LightSamples:
@@ -183,7 +183,7 @@ def reach_wall(met: SheetPoints, named: Mapping[str, float]) -> WallHit:
 
 
 def _shade_terms(met: SheetPoints, radius: float) -> Doubles:
-    """Return the functions of the position on the rest plane that shading is composed of, (5, N)."""
+    """Return the basis functions of the shading at positions on the rest plane, (5, N)."""
     back = met.z / met.sight[2]
     return shade_terms((met.x - back * met.sight[0]) / radius, (met.y - back * met.sight[1]) / radius)
 

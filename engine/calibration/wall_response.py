@@ -18,23 +18,23 @@ from mirrorskin.io import InputError, Source, WallResponse, pixel_axes
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.response import follow, half_tangent, lamp_light, level, sight_of, sight_slopes
 
-_ZENITHS = 16  # at which the first light is searched for
-_HALVINGS = 16  # of the interval of the first light
-_STEEPEST = math.radians(89.0)  # greatest elevation of a ray that is followed to the wall
+_ZENITHS = 16  # number of zeniths at which the first light is searched for
+_HALVINGS = 16  # number of bisections of the interval of the first light
+_STEEPEST = math.radians(89.0)  # maximum elevation of a ray that is followed to the wall
 
 _MARGIN = 1.05  # factor of the scatter, whose edges are not sharp; off the centre it is slightly wider
-_EXACT = 1e-4  # of full light: greatest error of the polynomial
-_TERMS = 12  # of the polynomial, at most
-_PLACES = 400  # points of the curve to which the polynomial is fitted
-_HALF = 0.5  # of full light: threshold of a uniform wall
-_GRADED = 0.2  # of its greatest light: least variation of a graded wall
-_FLAT = 0.02  # least slope of the curve relative to that in its middle
+_EXACT = 1e-4  # share of full light: maximum error of the polynomial
+_TERMS = 12  # maximum number of terms of the polynomial
+_PLACES = 400  # number of points of the curve to which the polynomial is fitted
+_HALF = 0.5  # share of full light: threshold of a uniform wall
+_GRADED = 0.2  # minimum variation of a graded wall, as a share of its maximum light
+_FLAT = 0.02  # minimum slope of the curve, relative to the slope in its middle
 _FEW = 2e-3  # share of the samples outside the reach, at either end
 
-_SIDE = 5  # places along a side at which errors are computed
-_TURN = 8  # azimuths at each place
-_LEAN = math.radians(2.5)  # of a typical rotation; errors of the normals hardly depend on it
-_FRAMES = 8  # of that rotation
+_SIDE = 5  # number of positions along a side at which errors are computed
+_TURN = 8  # number of azimuths at each position
+_LEAN = math.radians(2.5)  # tilt of a typical rotation; errors of the normals hardly depend on it
+_FRAMES = 8  # number of frames of that rotation
 _STEP = 1e-4  # radians: step of numerical derivatives by angles
 _SMALL = 1e-3  # step of numerical derivatives by a parameter, relative to its scale
 _OUTLIER = 3.0  # times the noise at which residuals are clipped
@@ -80,7 +80,7 @@ def threshold_zenith(
 
 
 def full_light(response: WallResponse, places: Doubles, zenith: Doubles, azimuth: Doubles) -> Doubles:
-    """Return shares of the pixels' full light, (n,), also where part of a scattered ray misses the wall.
+    """Return shares of the pixels' full light, (n,), including scattered rays that partly miss the wall.
 
     ``places`` are x and y on the rest plane and the mirror's height, (3, n), mm; zenith and azimuth are its
     normal's. Outside its reach the wall is as bright as at the end of the reach.
@@ -221,8 +221,8 @@ def _error_maps(
 def error_left(samples: model.LightSamples, fit: WallFit, noise: Doubles) -> tuple[float, float]:
     """Return the RMS error of the zenith that remains on the balls, and its upper bound, radians.
 
-    The error is estimated from the mean residuals of cells, octants of rings of each ball, in which noise is
-    averaged. It is what exceeds the noise, or 0. The bound adds one standard error of its square, and so is
+    The error is estimated from mean residuals over cells (octants of rings of each ball), in which noise is
+    averaged: it is the excess over the noise, or 0. The bound adds one standard error of its square, so it is
     never 0.
     """
     named, steps, centres = model.split(fit.parameters)

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from mirrorskin.engine.press.elastic import PressFit
     from mirrorskin.io import Stiffness
 
-_UNCERTAIN = 0.4  # standard deviation of a correction for errors of heights, as a share of it
-_BEYOND = 0.01  # largest share of the load outside of the picture
+_UNCERTAIN = 0.4  # relative standard deviation of the correction for errors of heights
+_BEYOND = 0.01  # maximum share of the load outside the picture
 
 
 @checked(
@@ -55,16 +55,16 @@ def find_force(
         Height of the object, mm, and its standard deviation, if available; an array is the height. It is 0
         where the object meets the sheet at travel 0, and NaN where there is no object.
     travel : float, optional
-        Distance by which the body is lowered, mm; by default ``travel`` of the result's process.
+        Downward displacement of the body, mm; by default ``travel`` of the result's process.
     pixel_size : float or (float, float), optional
         Millimetres along x and y; by default that of the result.
     modulus : float, optional
         Young's modulus, MPa; by default that of the result's calibration.
     sigma : array_like, scalar or (H, W), optional
-        Standard deviation of each height, mm, independent of the others'; where it is NaN, that of the
-        nearest pixel. By default ``height_sigma`` of the result, or 0.
+        Independent standard deviations of the heights, mm; NaN is replaced by the value of the nearest pixel.
+        By default ``height_sigma`` of the result, or 0.
     travel_sigma : float
-        Standard deviation of the travel, or of an error that all heights have in common, mm.
+        Standard deviation of the travel, or of an error common to all heights, mm.
     modulus_sigma : float
         Standard deviation of the modulus, MPa; by default that of the calibration if the modulus is.
     compliance : float
@@ -79,7 +79,7 @@ def find_force(
     Raises
     ------
     mirrorskin.io.InputError
-        A shape or a number that is not possible.
+        A shape or a number is not possible.
     mirrorskin.engine.NotConverged
         The search for the contact did not converge.
 
@@ -136,11 +136,11 @@ def _excess_load(
     compliance: float,
     pressed: Pressed,
 ) -> float:
-    """Return by how much independent errors of heights raise the load, mm^2.
+    """Return the increase of the load due to independent errors of heights, mm^2.
 
-    Peaks press more than dents relieve. Errors of the same size are added with both signs, which cancels what
-    is linear; the mean change of the load is about the one that the heights already contain (SIMEX, Cook and
-    Stefanski 1994).
+    Peaks increase the load more than dents decrease it. Errors of the same size are added with both signs,
+    which cancels linear terms; the mean change of the load approximates the change that the heights already
+    contain (SIMEX, Cook and Stefanski 1994).
     """
     if not np.any(errors * pressed.contact > 0):
         return 0.0

@@ -24,9 +24,9 @@ Mask = NDArray[np.bool_]
 _SOFTNESS = 3 / (4 * math.pi)  # 1 / (4 pi G) at E = 1: G = E / 3
 _UP = np.array([1.0, -1.0]).reshape(2, 1, 1)  # y points up, rows increase downwards
 _TOLERANCE, _ROUGH = 1e-5, 1e-3  # residual relative to the largest displacement; with damping, the second
-_STEPS = 400  # largest number of conjugate gradient steps
-_FARTHEST = 1e6  # largest displacement, mm
-_LEAST_KNOWN = 0.8  # smallest share of the contact with a displacement
+_STEPS = 400  # maximum number of conjugate gradient steps
+_FARTHEST = 1e6  # maximum displacement, mm
+_LEAST_KNOWN = 0.8  # minimum share of the contact with a displacement
 _DAMPING = 1e-4, 1e4  # range of the damping, relative to the compliance of the contact as a whole
 
 
@@ -54,13 +54,13 @@ def find_tangential_force(
 
     The elastomer is an incompressible half-space, in which pressure displaces nothing along the surface. A
     force Q along x displaces it by 3 / (4 pi E) times Q (1 / r + x^2 / r^3) along x and Q x y / r^3 along y
-    (Cerruti; Johnson, Contact Mechanics, 1985, 3.6). This is inverted within the contact, outside of which
-    there is no traction. No law of friction is needed: the skin may stick or slip.
+    (Cerruti; Johnson, Contact Mechanics, 1985, 3.6). This is inverted within the contact; outside, the
+    traction is 0. No law of friction is needed: the skin may stick or slip.
 
     The operator is symmetric, so the force is a sum of the displacements, weighted by the traction that
-    displaces the whole contact by 1; its error follows from their errors. Tractions amplify noise of short
-    wavelengths, so they are damped such that the misfit of the displacements equals their standard deviation
-    (Morozov's discrepancy principle).
+    displaces the whole contact by 1; the error of the force is propagated from their errors. Tractions
+    amplify noise of short wavelengths, so they are damped such that the misfit of the displacements equals
+    their standard deviation (Morozov's discrepancy principle).
 
     Parameters
     ----------
@@ -72,15 +72,15 @@ def find_tangential_force(
     modulus : float, optional
         Young's modulus, MPa; by default that of the result's calibration.
     contact : array_like, (H, W), optional
-        Where the object touches; by default where the pressure is above 0, or the contact or pressure of the
-        result. A contact that is too large adds noise, one that is too small loses force.
+        Nonzero where the object touches; by default where the pressure is above 0, or the contact or pressure
+        of the result. If it is too large, noise increases; if it is too small, force is lost.
     normal_pressure : array_like, (H, W), optional
-        As a result's ``pressure``; needed without a contact.
+        Pressure, as in the ``pressure`` of a result; required without a contact.
     sigma : array_like, scalar, (H, W) or (H, W, 2), optional
-        Standard deviation of each component of the displacement, mm; where it is NaN, that of the nearest
-        pixel. By default ``displacement_sigma`` of the result, or 0.
+        Standard deviation of each component of the displacement, mm; NaN is replaced by the value of the
+        nearest pixel. By default ``displacement_sigma`` of the result, or 0.
     window_size : int
-        Side of the windows in which displacements were found, pixels: their errors are correlated.
+        Side of the windows in which displacements were estimated, pixels; errors are correlated within it.
     modulus_sigma : float
         Standard deviation of the modulus, MPa; by default that of the calibration if the modulus is.
 
@@ -93,7 +93,7 @@ def find_tangential_force(
     Raises
     ------
     mirrorskin.io.InputError
-        No contact, a shape or number that is not possible, or less than 80 % of the contact with a
+        There is no contact, a shape or number is not possible, or less than 80 % of the contact has a
         displacement.
     mirrorskin.engine.NotConverged
         The traction was not found in the allowed number of steps.

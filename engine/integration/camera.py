@@ -1,4 +1,4 @@
-"""A pinhole camera, and the slopes of the logarithmic depth from the normals that it sees."""
+"""A pinhole camera, and the slopes of the logarithmic depth from normals seen by it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Camera:
 
     Examples
     --------
-    A plane turned by 45 degrees, whose right end is 1.25 / 0.75 times as far away as its left end.
+    A plane inclined by 45 degrees, whose right end is 1.25 / 0.75 times as far away as its left end.
 
     >>> import numpy as np
     >>> from mirrorskin import engine

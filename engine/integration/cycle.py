@@ -19,7 +19,7 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Kernel
 
 _FIRST_W_LEVEL = 2  # finest level that is visited twice where launches are cheap
-_WEAKEST_ANCHORS = 1e-12  # relative to a component's links, up to which its offset counts as free
+_WEAKEST_ANCHORS = 1e-12  # weight relative to a component's links up to which its offset is free
 
 
 def add_parts(parts: Array) -> Doubles:
@@ -34,9 +34,10 @@ class Cycle:
 
     With several right sides (``lanes``), the values of a node are adjacent in memory.
 
-    The smoother is three or four Jacobi steps while descending, and the same while ascending. Each is one
-    kernel, whose work-groups keep a tile of the level in local memory. One kernel does all small levels. On a
-    GPU, where launches dominate, the larger levels are visited once (V-cycle), with one more step.
+    The smoother does three or four Jacobi steps while descending, and as many while ascending. Each half is
+    one kernel, whose work-groups keep a tile of the level in local memory. One kernel processes all small
+    levels. On a GPU, where launches dominate, the larger levels are visited once (V-cycle), with one
+    additional step.
     """
 
     b: Array
@@ -76,7 +77,7 @@ class Cycle:
         return {"live": self._live, "first_tile": int(self._first_tile[number])}
 
     def factorise(self) -> bool:
-        """Solve the second level directly on the host from now on; return whether that is a change.
+        """Use a direct solver on the host for the second level; return whether this is a change.
 
         Coarser levels join corridors that are narrower than their aggregates, which slows convergence.
         """
@@ -140,7 +141,7 @@ class Cycle:
             residual=self._rest,
             coarse_b=self.b,
         )
-        if number + 1 != self._tail or self._factors is not None:  # the tail does it itself
+        if number + 1 != self._tail or self._factors is not None:  # the tail's kernel includes this
             h.gather(number, self._rest, self.b, self._lanes)
         twice = self._first_w_level <= number + 1 < self._tail
         for second in (False, True)[: 1 + twice]:

@@ -20,11 +20,11 @@ Plane = tuple[float, float, float]
 """Slopes along x and y, and the height of the top left pixel, mm."""
 
 LEVEL: Plane = (0.0, 0.0, 0.0)
-_CHUNK, _STRIP = 256, 16  # columns and rows of a work-item that is a core's loop; see links.cl, components.cl
+_CHUNK, _STRIP = 256, 16  # columns and rows of a work-item on a CPU; see links.cl, components.cl
 _SAMPLES = 64  # samples along each side of the picture for the mean slope
-_PARTIAL_SUMS = 64  # largest number of partial sums of a component, four times as many of work-groups
-_FEW = 64  # components up to which a work-group adds up each, so that a picture is read once for each
-_MOST_SUMS = 1 << 22  # largest number of partial sums of all components
+_PARTIAL_SUMS = 64  # maximum number of partial sums of a component; four times as many for work-groups
+_FEW = 64  # number of components up to which a work-group sums one component, reading the picture for each
+_MOST_SUMS = 1 << 22  # maximum number of partial sums of all components
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +48,9 @@ class Links:
 class PixelGraph:
     """A picture's maps and links on a device; memory is reused for the next picture.
 
-    ``flags`` contain the state of each pixel (see ``mirrorskin.kernels.links``), ``known_heights`` the maps
-    of heights above the inputs' datum and of their weights, if any. Weights are multiplied by ``scale``, so
-    that they are about 1.
+    ``flags`` is the state of each pixel (see ``mirrorskin.kernels.links``). ``known_heights`` are the maps of
+    heights above the inputs' datum and of their weights, if any. Weights are multiplied by ``scale``, so that
+    they are about 1.
     """
 
     device: Device
@@ -225,8 +225,9 @@ def find_components(flags: Flags, cut: bool) -> Components:
 class Levelling:
     """Adds the plane to heights above it, and to each component its offset.
 
-    The mean of a component without a known height becomes 0. For other components, the weighted mean
-    difference from the known heights becomes 0: a solver converges slowly in it if these weights are small.
+    The mean of a component without a known height becomes 0. In other components, the weighted mean
+    difference from the known heights becomes 0, because a solver converges slowly to it if the weights are
+    small.
     """
 
     def __init__(self, graph: PixelGraph) -> None:

@@ -61,8 +61,8 @@ JOINED = 3e-3
 # Coefficients c of the local part on the finest level, and on coarser ones; see `local_part` for c0.
 _FINEST = 0.0, 4.7682, -2.5894, -0.9665, -2.4153, 0.255
 _COARSER = 0.0, -0.2621, -0.1186, -0.6233, 0.0, 0.0
-_MODES = 64  # along each axis, for integrals over all modes of a plane
-_ROWS = 64  # of modes that are transformed at once, and stay in a core's cache
+_MODES = 64  # number of modes along each axis in integrals over a plane
+_ROWS = 64  # rows of modes that are transformed at once, so that they stay in the cache of a core
 _BORDER = 0.12  # reduction of the misfit per loop, for each loop that a pixel lacks at the border
 
 
@@ -71,7 +71,7 @@ def find_graph_variance(
 ) -> None:
     """Write the heights' variance to the finest level of the first array; the others are scratch memory.
 
-    ``flags``, (H, W), are those of the pixels; see ``mirrorskin.kernels.links``.
+    ``flags``, (H, W), are the flags of the pixels; see ``mirrorskin.kernels.links``.
     """
     h = hierarchy
     number = next(

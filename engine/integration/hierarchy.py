@@ -23,12 +23,12 @@ LANES = 16, 8, 4
 """Numbers of right sides that can be solved at once."""
 
 _VECTOR = 16  # the length of a row is a multiple of it: two of a kernel's vectors
-_BEFORE = _VECTOR  # nodes before the first level, which vectors left of its margin read
+_BEFORE = _VECTOR  # nodes before the first level, which vectors at its left margin may read
 _WIDE_TILE_MEMORY = 45056  # bytes of local memory needed; OpenCL guarantees only 32768
-_TAIL_GROUP = 512  # work-items of one group that does several levels
-_TAIL_MEMORY = 49152  # bytes of local memory of that group, at most
-_TAIL_NODES = 20480  # nodes times lanes of the finest level of these, where heights stay in global memory
-_SUM_GROUP = 128  # work-items of one that adds up a part; any device of lanes allows this number
+_TAIL_GROUP = 512  # work-items of the group that processes several levels
+_TAIL_MEMORY = 49152  # maximum local memory of that group, bytes
+_TAIL_NODES = 20480  # maximum nodes times lanes of the finest of these, with heights in global memory
+_SUM_GROUP = 128  # work-items of a group that sums a part, which all GPUs support
 _BEYOND = 64  # nodes after the last level, which vectors may read
 
 
@@ -79,11 +79,11 @@ def cut_levels(shape: tuple[int, int]) -> list[Level]:
 class Hierarchy:
     """All levels of a graph.
 
-    ``graph`` has the nodes' links, and the weights of known heights as ``anchor`` (see
-    ``kernels/multigrid.cl``); ``inverse`` is the inverse of the diagonal, which cycles compute for large
+    ``graph`` contains the links of the nodes, and the weights of known heights as ``anchor`` (see
+    ``kernels/multigrid.cl``). ``inverse`` is the inverse of the diagonal, which cycles compute for large
     levels when they are prepared. ``to`` marks nodes that belong to the aggregate of another block.
-    ``moves`` counts, for each level, the aggregates that differ from blocks for this reason, and ``changed``
-    lists them; ``changes`` are the same numbers on the device.
+    ``moves`` is the number of aggregates of each level that differ from blocks for this reason, and
+    ``changed`` lists them; ``changes`` are the same numbers on the device.
     """
 
     device: Device
@@ -179,7 +179,7 @@ class Hierarchy:
     def kernel(self, name: str, links: int, lanes: int = 1, *, once: bool = True) -> Kernel:
         """Return a kernel for a number of links of a node, and of right sides.
 
-        ``once``: for levels that are visited once, on which a GPU does one more step in half a cycle.
+        ``once``: for levels that are visited once, where a GPU does one more step per half cycle.
         """
         width = 8 if self.device.layout.tile > 1 and lanes == 1 else 1
         macros = {"ANCHORED": int(self.anchored), "LINKS": links, "PART": part_of(self.device)}
@@ -298,7 +298,7 @@ def tile_rows(device: Device, lanes: int) -> int:
 
 
 def tail_group(device: Device) -> int:
-    """Return the number of work-items of the group that does all small levels."""
+    """Return the number of work-items of the group that processes all small levels."""
     lanes = min(_TAIL_GROUP, device.context.devices[0].max_work_group_size)
     return lanes if device.layout.tile == 1 else 1
 

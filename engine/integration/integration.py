@@ -27,8 +27,8 @@ from mirrorskin.io.arguments import as_array_or_number, checked
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device, open_device
 
-# Pixels up to which the device keeps the memory of the last call, about 100 bytes per pixel: allocation takes
-# as long as a solution (512 x 512 within a mask: 12 ms instead of 26).
+# Maximum number of pixels for which the memory of the last call is cached on the device, about 100 bytes per
+# pixel: allocation takes as long as a solution (512 x 512 within a mask: 12 ms with the cache, 26 without).
 _LARGEST_CACHED = 2**23
 _OUTSIDE = {"height": np.nan, "height_sigma": np.nan, "component": -1, "filled": 0, "edges": 0}
 
@@ -60,7 +60,7 @@ def integrate(
     initial_heights: ArrayLike | None = None,
     **options: Any,
 ) -> Result:
-    """Integrate slopes to the heights that fit them, and known heights, best.
+    """Integrate slopes to heights that fit slopes and known heights best.
 
     Neighbouring pixels i and j with slopes are linked. The heights u minimise ::
 
@@ -98,19 +98,19 @@ def integrate(
     mask : array_like, (H, W), optional
         0 where no height is wanted.
     slope_weights : array_like, scalar, (H, W) or (2, H, W), optional
-        Inverse variances of the slopes, or of dz_dx and of dz_dy; 0 where undefined. With ``normals``, those
-        of unit normals, 1/rad^2, from which a slope gets the weight times (n . v)^2, with v = (0, 0, 1)
-        without a camera. By default all slopes have the same noise, which is estimated from the misfit for
-        ``height_sigma``. Weights are clipped to 1e-4 to 1e3 times the median; values that are 0 in float32
-        count as 0.
+        Inverse variances of the slopes, or of dz_dx and of dz_dy; 0 where undefined. With ``normals``,
+        inverse variances of unit normals, 1/rad^2; the weight of a slope is that times (n . v)^2, with
+        v = (0, 0, 1) without a camera. By default all slopes have the same noise, which is estimated from the
+        misfit for ``height_sigma``. Weights are clipped to 1e-4 to 1e3 times the median; values that are 0 in
+        float32 count as 0.
     edges : array_like, (H, W), optional
-        Not 0 at pixels where the surface is discontinuous. Such a pixel keeps only one link: to the neighbour
-        off the edge with the most similar slopes. So it never connects two sides.
+        Nonzero at pixels where the surface is discontinuous. Such a pixel keeps only one link, to the
+        neighbour off the edge with the most similar slopes, so that it does not connect both sides.
     known_heights : array_like, (H, W), optional
         Known heights, mm, or depths in any unit; NaN elsewhere. These pixels need no slope.
     known_height_weights : array_like, scalar or (H, W), optional
-        Their inverse variances, 1/mm^2 (1 over the square of the depths' unit), 0 where unknown; default 1.
-        Weights are clipped at 1e4 times a link's weight w.
+        Inverse variances of known heights, 1/mm^2 (or the inverse square of the unit of depths), 0 where
+        unknown; default 1. Weights are clipped at 1e4 times the weight w of a link.
     initial_heights : array_like, (H, W), optional
         Heights to start from, NaN where undefined.
     **options
@@ -267,9 +267,10 @@ class Integrator(ThreadSafe):
         Parameters
         ----------
         budget : float, optional
-            Time limit, seconds: after the first, cycles are done while they end in time and reduce the error.
+            Time limit, seconds: after the first cycle, further ones are done while they are expected to end
+            in time and reduce the error.
         tolerance : float, optional
-            Residual to stop at; with a budget it may be missed.
+            Residual to stop at; it may not be reached within a budget.
 
         Raises
         ------

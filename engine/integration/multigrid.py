@@ -17,19 +17,19 @@ from mirrorskin.kernels.array import Array, fetch
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.links import KNOWN, SLOPE
 
-_USUAL = 40  # cycles after which coarse levels are replaced by a direct solver
-_CYCLES = 2  # cycles without a tolerance
-_DEEP = 3e-4  # tolerance that one cycle from 0 does not reach: two are done before the first test
-_DEEPEST = 1e-5  # tolerance that two hardly ever reach: three are done first where a wait takes long
-_LONGEST = 100  # cycles of a solution, at most
-_PATIENCE, _PROGRESS = 8, 0.7  # iterations in which the residual must decrease to this share of the best one
-_SOONER = 0.75  # share of the expected cycles, as later ones reduce more
-_UNTESTED = 6  # cycles between tests of convergence, at most
-_WORSE = 10  # times the smallest residual so far, above which rounding errors dominate
+_USUAL = 40  # number of cycles after which coarse levels are replaced by a direct solver
+_CYCLES = 2  # number of cycles without a tolerance
+_DEEP = 3e-4  # tolerance below which two cycles are done before the first test: one from 0 does not reach it
+_DEEPEST = 1e-5  # tolerance below which three cycles are done first if a wait takes long
+_LONGEST = 100  # maximum number of cycles
+_PATIENCE, _PROGRESS = 8, 0.7  # iterations in which the residual must decrease to this share of the minimum
+_SOONER = 0.75  # share of the expected cycles after which to test, because later cycles reduce more
+_UNTESTED = 6  # maximum number of cycles between tests of convergence
+_WORSE = 10  # residual above which rounding errors dominate, in minima so far
 _FAILED = 0.3  # residual above which two cycles count as failed
-_FACTORS = 8e-6  # seconds per node of the second level for a factorisation, at most
+_FACTORS = 8e-6  # maximum duration of a factorisation, seconds per node of the second level
 _ROUNDING = 1e-6  # residual of an exact solution, relative to the right side
-_FIRM = 1e-3  # smallest share of the energy that remains when that of known heights is subtracted
+_FIRM = 1e-3  # minimum share of the energy that remains after subtracting that of known heights
 _NEAR = 0.03  # residual below which the energy of the heights is not computed again
 
 
@@ -130,9 +130,9 @@ class Multigrid:
     def follow(self, links: Links, *, deep: bool) -> Array:
         """Do one step from the last heights towards those of a similar graph.
 
-        The step minimises the energy in the plane of the preconditioned residual and the last step. So it is
-        a conjugate gradient step if the graph is the same, and never increases the error. It is enqueued when
-        this returns; heights are valid until the next solution or step. ``deep``: rebuild all levels of the
+        The step minimises the energy in the plane of the preconditioned residual and the last step. It is a
+        conjugate gradient step if the graph is unchanged, and never increases the error. The step is only
+        enqueued; heights are valid until the next solution or step. ``deep``: rebuild all levels of the
         graph, not only the finest.
         """
         h, solver = self._hierarchy, self._alone
@@ -158,8 +158,8 @@ class Multigrid:
     def deviation(self, flags: Array, uneven: bool) -> NDArray[np.float32]:
         """Return the heights' standard deviation, (H, W), if the weights are inverse variances.
 
-        ``flags`` are those of the pixels. If links are ``uneven``, the graph must be rebuilt before the next
-        solution.
+        ``flags`` are the flags of the pixels. If links are ``uneven``, the graph must be rebuilt before the
+        next solution.
         """
         if uneven:
             self.rebuild(self._links, strength=JOINED)
@@ -209,7 +209,7 @@ class _Gradients:
         self._taken: int | None = None  # the cycle whose step is not yet added to the heights
         self._given: Doubles | None = None  # squared right sides
         self.cycle = Cycle(h, lanes)
-        # Whether a wait takes longer than a cycle that is too many.
+        # Whether a wait takes longer than an unnecessary cycle.
         self._waits_long = h.device.layout.tile == 1
 
     def copy(self, name: str, level: Array, map_: Array, batch: slice = slice(0, 1)) -> None:
@@ -278,7 +278,7 @@ class _Gradients:
         self._h.over_parts("weigh", self.parts, **weigh, lanes=self.lanes)
         return np.maximum(energy - add_parts(self.parts), _FIRM * energy)
 
-    @np.errstate(all="ignore")  # a right side that overflows stops
+    @np.errstate(all="ignore")  # the iteration stops on overflow
     def _iterate(self, goal: float, limit: int, deadline: float | None) -> tuple[int, Doubles]:
         """Do conjugate gradient steps; return their number, and the residuals."""
         done, residual, energy = 0, np.full(self.lanes, np.inf), np.zeros(self.lanes)

@@ -18,10 +18,10 @@ Whole = NDArray[np.intp]
 
 _RADICES = 13, 11, 7, 5, 3  # odd radices; see ``rectangle.cl``
 _RARE = 7  # smallest radix that needs a kernel with more registers
-_PIECE = 16, 256  # rows and columns of a work-item that is a core's loop over pixels
+_PIECE = 16, 256  # rows and columns of a work-item on a CPU
 _SAMPLED = 64  # step of the rows that are checked for missing slopes
-_STIFF = 100.0  # weight of known heights relative to links, above which float32 has too few digits
-_LANES = 8  # adjacent lines in a vector, if a work-item is a core's loop
+_STIFF = 100.0  # weight of known heights relative to links above which float32 is not accurate enough
+_LANES = 8  # adjacent lines in a vector on a CPU
 _LEAST_ROOM, _MOST_ROOM = 256, 4096  # complex numbers in local memory; longer lines use global memory
 
 Table = NDArray[np.float64] | NDArray[np.intp]
@@ -178,7 +178,7 @@ class Rectangle:
         on_device = isinstance(inputs.dz_dx, Array)
         heights: Any = relief if on_device else relief.release()
         first = relief.read(0) if on_device else heights[..., 0, 0]
-        if not np.isfinite(first).all():  # one undefined pixel makes all undefined
+        if not np.isfinite(first).all():  # one undefined slope makes all heights undefined
             return None
         deviation = None
         if sigma:

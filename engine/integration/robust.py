@@ -28,10 +28,10 @@ from mirrorskin.kernels.least_squares import mad_sigma
 _BROKEN = 6.0
 """k r^2 (see ``mirrorskin.kernels.breaks``) above which a link crosses a discontinuity."""
 
-_SCALES = 16.0, 8.0, 4.0, 2.0, 1.0  # times 1 / sqrt(2 k): misfit of a link that is tolerated
-_MOST, _REST = 4, 0.02  # largest number of steps at a scale; relative decrease of broken links to go on
+_SCALES = 16.0, 8.0, 4.0, 2.0, 1.0  # tolerated misfits of a link, in 1 / sqrt(2 k)
+_MOST, _REST = 4, 0.02  # maximum number of steps at a scale; relative decrease of broken links to continue
 _LOOSE = 0.001  # residual of a step's solution
-_CYCLES = 10  # largest number of cycles of a step
+_CYCLES = 10  # maximum number of cycles of a step
 
 _GONE = 1e4  # k r^2 above which a link is cut for a step, because tiny weights cannot be solved
 _AGAIN = 3  # largest number of additional solutions at the end

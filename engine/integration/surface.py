@@ -109,7 +109,7 @@ class _GraphCache:
     flags: Flags
     built: bool = False  # whether the multigrid has the levels of this graph
     components: Components | None = None
-    sigma: Floats | None = None  # of heights, for slopes of variance 1
+    sigma: Floats | None = None  # standard deviation of heights for slopes of variance 1
 
 
 class SurfaceSolver:
@@ -127,13 +127,13 @@ class SurfaceSolver:
         self._finishing = 0.0  # seconds from the last solution to the result
 
     def reset(self) -> None:
-        """Forget the last picture's heights; a next picture with the same graph still uses its levels."""
+        """Forget the heights of the last picture; its levels are still used for the same graph."""
         self._last = self._plane = None
 
     def solve(
         self, inputs: Inputs, options: IntegrationOptions, start: NDArray[np.floating] | None = None
     ) -> Result:
-        """Return the surface of a picture. The solver starts from ``start``, (H, W) mm, or the last ones."""
+        """Return the surface of a picture, starting from ``start``, (H, W) mm, or the last heights."""
         if (
             not options.robust
             and seems_full(inputs)

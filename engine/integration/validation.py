@@ -23,7 +23,7 @@ LEAST, MOST = 1e-4, 1e3
 
 _LARGEST_HEIGHT_WEIGHT = 1e4  # relative to the weight of a link; larger weights are clipped
 SAMPLES = 65536
-"""Pixels from which the median weight is taken."""
+"""Number of pixels from which the median weight is computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Inputs:
     # (H, W), float32: squared cosine between normal and line of sight; None: it follows from the slopes.
     steep: Floats | None = None
     picture: tuple[int, int] = (0, 0)  # rows and columns of the whole picture
-    box: Box = (slice(None), slice(None))  # part of the picture that the maps show
+    box: Box = (slice(None), slice(None))  # part of the picture covered by the maps
     lost: int = 0  # wanted pixels outside the box
 
     @property

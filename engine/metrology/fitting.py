@@ -28,14 +28,14 @@ from mirrorskin.kernels.least_squares import mad_sigma
 Mask = NDArray[np.bool_]
 _Frame = tuple[Doubles, Doubles]
 
-_DAMPING = 1e-9  # of the first step: forms are nearly linear in their parameters
-_CONVERGED = 1e-12  # largest relative decrease of the sum of squares by the last step
-_SINGULAR = 1e-14  # smallest eigenvalue of normal equations with columns of length 1
+_DAMPING = 1e-9  # damping of the first step; forms are nearly linear in their parameters
+_CONVERGED = 1e-12  # maximum relative decrease of the sum of squares by the last step
+_SINGULAR = 1e-14  # minimum eigenvalue of normal equations with columns of length 1
 _FAR = 5.0  # standard deviations, estimated from the median distance, beyond which points are outliers
-_FEW = 0.15  # largest share of outliers or uncertain points; if there are more, they belong to the surface
-_PASSES = 5  # largest number of updates of the outliers
-_ENOUGH = 65536  # points for the first fit
-_CHUNK = 16384  # points at a time: their derivatives stay in the processor's cache
+_FEW = 0.15  # maximum share of outliers or uncertain points; if there are more, they belong to the surface
+_PASSES = 5  # maximum number of updates of the outliers
+_ENOUGH = 65536  # number of points for the first fit
+_CHUNK = 16384  # points per block, whose derivatives fit into the processor's cache
 _NOTHING = 1e-300  # avoids a division by 0
 _ROUNDING = 1e-9  # relative to the points' extent: smaller distances count as 0; also for squared lengths
 _UNCERTAIN = 5.0  # times the median standard deviation, above which a height counts as uncertain
@@ -136,7 +136,7 @@ class PointCloud:
 def find_uncertain(sigma: Doubles, known: Mask) -> Mask:
     """Return the known pixels, (H, W), with more than five times the median sigma, if at most 15 % are.
 
-    The errors of these would determine the highest and the lowest point. If there are more, all pixels count.
+    Their errors would determine the highest and the lowest point. If there are more, none is excluded.
     """
     uncertain = known & (sigma > _UNCERTAIN * np.median(sigma[known]))
     return np.asarray(uncertain & (np.count_nonzero(uncertain) <= _FEW * np.count_nonzero(known)))

@@ -24,17 +24,17 @@ from mirrorskin.kernels.pose import BLOCK, PARTS
 FEWEST_SHARED = 20
 """Smallest number of pixels that two maps must share."""
 
-_UPPER = np.zeros((6, 6), np.intp)  # of a symmetric matrix, the place of each element in the upper triangle
+_UPPER = np.zeros((6, 6), np.intp)  # index of each element of a symmetric matrix in the upper triangle
 _UPPER[np.triu_indices(6)] = _UPPER.T[np.triu_indices(6)] = np.arange(21)
 _FLOOR = 1e-5  # share of the mean information that is added to all directions, for rounding errors
-_LIKELY = 0.5, 0.02  # noise that `Equations.free` assumes during steps, near the solution and far from it
+_LIKELY = 0.5, 0.02  # noise assumed by `Equations.free` during steps, near the solution and far from it
 _AWAY = 3.0  # chi square above which a motion is far from the solution
 _COARSEST = 24  # pixels along the shorter side of the coarsest maps
-_STEPS, _STILL = 40, 1e-2  # largest number of steps; step, in standard deviations, that ends them
+_STEPS, _STILL = 40, 1e-2  # maximum number of steps; step, in standard deviations, that ends them
 _BLOCKS = 100  # weight, in blocks, of the covariance of independent errors
 _POOR = 2.0  # typical chi square above which other starts are tried
-_ANGLES, _SHIFTS, _TRIED = 24, 13, 6  # starts of the search: turns, shifts per axis, and those refined
-_REACH, _SHARED = 0.8, 0.2  # largest shift relative to the map's extent; smallest share of common pixels
+_ANGLES, _SHIFTS, _TRIED = 24, 13, 6  # starts of the search: rotations, shifts per axis, and number refined
+_REACH, _SHARED = 0.8, 0.2  # maximum shift relative to the map's extent; minimum share of common pixels
 _NONE = np.zeros((6, 0))
 _LONGEST = 0.35  # longest step, relative to the object's size
 
@@ -46,11 +46,11 @@ class Equations:
     ----------
     pixels : float
     normal_matrix, unbiased : ndarray, (6, 6)
-        J'WJ, and J'WK, in which the noise of the Jacobians averages out; J'WJ if K was not computed.
+        J'WJ, and J'WK, in which the noise of the Jacobians is averaged out; J'WJ if K was not computed.
     right : ndarray, (6,)
         J'Wr.
     chi_square : float
-        For each degree of freedom, `compared` in all.
+        Chi square per degree of freedom; `compared` is their number.
     """
 
     def __init__(self, sums: NDArray[np.float32], size: float, unbiased: bool) -> None:
@@ -67,7 +67,7 @@ class Equations:
 
     @cached_property
     def typical(self) -> float:
-        """Median chi square of the blocks, which a dent in the object does not change."""
+        """Median chi square of the blocks, which is insensitive to a dent in the object."""
         _, _, chi, expected, *_ = _split(self._sums.astype(np.float64))
         used = expected > 0
         return float(np.median(chi[used] / expected[used])) if used.any() else math.inf
@@ -75,9 +75,10 @@ class Equations:
     def free(self, noise: float | None = None) -> Doubles:
         """Return orthonormal directions, (6, k), that the maps do not determine.
 
-        The noise of the Jacobian adds spurious information on every direction, which the product of two
-        Jacobians of independent noise does not have. A direction is undetermined if more than half of its
-        information is spurious; the limit is lower if the fit is worse than the standard deviations predict.
+        The noise of the Jacobian adds spurious information on every direction, which is absent in the product
+        of two Jacobians with independent noise. A direction is undetermined if more than half of its
+        information is spurious; the limit is lower if the fit is worse than predicted by the standard
+        deviations.
         """
         full = self.normal_matrix + _FLOOR * np.trace(self.normal_matrix) / 6 * np.eye(6)
         share, directions = eigh((self.unbiased + self.unbiased.T) / 2, full)
@@ -85,11 +86,11 @@ class Equations:
         return np.linalg.qr(directions[:, share < noise / (1 + noise)])[0]
 
     def covariance(self, free: Doubles) -> Doubles:
-        """Return the covariance of the motion outside of some directions.
+        """Return the covariance of the motion, except in some directions.
 
-        It is estimated from the scatter of the blocks' scores, so that errors of adjacent pixels may be
-        correlated. A few blocks determine its size but hardly its form, which is then closer to that of
-        independent errors.
+        It is estimated from the scatter of the blocks' scores, so errors of adjacent pixels may be
+        correlated. A few blocks determine its size but hardly its shape, which is then closer to the
+        covariance of independent errors.
         """
         directions = complement(free)
         _, scores, _, _, heights, normals, *_ = _split(self._sums.astype(np.float64))
@@ -104,7 +105,7 @@ class Equations:
 
 
 def _split(sums: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return the parts that `PARTS` names of sums, (..., numbers)."""
+    """Divide sums, (..., numbers), into the parts listed in `PARTS`."""
     ends = PARTS[1 : PARTS.index(sums.shape[-1]) + 1]
     return [sums[..., start:end] for start, end in itertools.pairwise((0, *ends))]
 

@@ -31,7 +31,7 @@ class Extent:
     Attributes
     ----------
     pixels, compared : int
-        Numbers of usable points, and of those with a standard deviation.
+        Number of usable points, and number with a standard deviation.
     middle : ndarray, (3,)
         Mean of the points, mm.
     size : float
@@ -64,7 +64,7 @@ class PoseMap:
         On the device.
     grid : tuple of float
     least : float
-        Squared sine of the tilt that the normals were measured with, or 1.
+        Squared sine of the tilt with which the normals were measured, or 1.
     extent : Extent
     """
 
@@ -102,9 +102,9 @@ class PoseMap:
 
 
 def coarser(maps: Sequence[PoseMap], least: int) -> list[list[PoseMap]]:
-    """Return maps at a half of their resolution, at a quarter and so on, the first with ``least`` pixels.
+    """Return maps at half of their resolution, a quarter and so on, while the first has ``least`` pixels.
 
-    They are means of 2 x 2 pixels, if all four are known.
+    They are means of 2 x 2 pixels, if all four are valid.
     """
     levels = [[(one.records, one.grid) for one in maps]]
     while min(levels[-1][0][0].shape[:2]) >= 2 * least and min(levels[-1][-1][0].shape[:2]) >= 2:

@@ -33,8 +33,8 @@ class Motion:
         """Return this motion followed by a small rotation about a point and a translation, (6,)."""
         turn = np.asarray(cv2.Rodrigues(step[:3])[0], np.float64)
         moved = self.then(Motion(turn, centre - turn @ centre + step[3:]))
-        # Rounding errors would grow from motion to motion, because the transpose is used as the inverse.
-        # A Newton step towards the nearest rotation squares them.
+        # Rounding errors would accumulate, because the transpose is used as the inverse. A Newton step
+        # towards the nearest rotation squares them.
         return Motion(moved.turn @ (1.5 * np.eye(3) - 0.5 * moved.turn.T @ moved.turn), moved.shift)
 
     def adjoint(self) -> Doubles:

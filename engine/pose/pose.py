@@ -35,7 +35,7 @@ class Pose:
         Covariance of the small rotation d (radians) and translation e (mm) from the motion to the true one:
         x' + d x x' + e. It is 0 along `undetermined`, where it has no meaning.
     chi_square : float
-        Of the fit, for each degree of freedom; 1 if the maps differ by their standard deviations.
+        Chi square of the fit per degree of freedom; 1 if the maps differ by their standard deviations.
     pixels : int
         Pixels of the first map that have a counterpart in the second.
     undetermined : ndarray, (k, 6), float64
@@ -73,8 +73,8 @@ class Pose:
     def then(self, other: Pose) -> Pose:
         """Return this motion followed by another of independent errors.
 
-        A direction that one of them leaves undetermined is undetermined; chi square and pixels are the
-        other's.
+        A direction is undetermined if one of them leaves it undetermined; chi square and pixels are taken
+        from ``other``.
         """
         change = other.motion.adjoint()
         covariance = change @ self.covariance @ change.T + other.covariance
@@ -111,18 +111,19 @@ def estimate_pose(
 ) -> Pose:
     """Find the rigid motion of an object from one result to the next, with its covariance.
 
-    Each usable pixel of the first result is moved, and compared with the second result at its new position:
-    its normal with the normal there, and its height with the height there, along the second surface's normal
-    (Chen and Medioni, Image and Vision Computing 10, 1992). Gauss-Newton steps minimise the squares over the
-    variances of both maps, from coarse to fine maps. If there is no good fit from the identity, a grid of
-    rotations about z and shifts is tried.
+    Each usable pixel of the first result is moved and compared with the second result at its new position:
+    normals with normals, and heights with heights, along the second surface's normal (Chen and Medioni, Image
+    and Vision Computing 10, 1992). Gauss-Newton steps from coarse to fine maps minimise the squared
+    differences over the variances of both maps. If the fit from the identity is not good, a grid of rotations
+    about z and shifts is tried.
 
-    Filled pixels are ignored, and those within two pixels of `edges` and of the border of `contact`. Heights
-    of unknown offset were integrated from the normals and contain no more information: they only determine
-    the positions of points. The pose is then between the coordinates of both results, with an undetermined z.
+    Filled pixels, and pixels within two pixels of `edges` or of the border of `contact`, are ignored. Heights
+    of unknown offset were integrated from the normals and contain no further information: they only determine
+    the positions of points. The pose is then relative to the coordinates of both results, and z is
+    undetermined.
 
     The covariance is estimated from the scatter of the equations over blocks of 8 x 8 pixels, so errors of
-    adjacent pixels may be correlated, and larger than their standard deviations.
+    adjacent pixels may be correlated, and may exceed their standard deviations.
 
     Parameters
     ----------
@@ -130,9 +131,9 @@ def estimate_pose(
         ``height``, (H, W), mm, with ``height_sigma``, or ``normals``, (H, W, 3), with ``normals_sigma``, or
         both. The sizes may differ. Maps that are on a device are used there.
     pixel_size : float or (float, float), optional
-        Millimetres along x and y; by default that of the results.
+        Millimetres along x and y; by default from the results.
     start : Pose, optional
-        A motion to start from.
+        Initial motion.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
 
@@ -143,7 +144,7 @@ def estimate_pose(
     Raises
     ------
     mirrorskin.io.InputError
-        No height, no sigma, no overlap, or maps that determine no direction at all.
+        Heights, standard deviations or an overlap are missing, or no direction is determined.
 
     Examples
     --------

@@ -27,7 +27,7 @@ from mirrorskin.kernels.device import Device, open_device
 _SHARED = 0.2  # smallest share of the smaller map's pixels that two touches must have in common
 _ALIKE = 4.0  # largest chi square of a link between two touches
 _ROUNDS, _NEWTON = 5, 8  # steps for the poses, and for a height along z
-_LEVELLINGS = 3  # iterations for a touch of unknown offset, whose height determines where its pixels are
+_LEVELLINGS = 3  # iterations for a touch of unknown offset, because positions of pixels depend on the height
 _APART = 4.0  # sigmas between a touch and the mean above which they disagree
 _LARGEST = 1 << 28  # largest number of pixels of the stitched surface
 _UNFIT = 1e-9  # smallest information of a direction, relative to the largest
@@ -42,11 +42,11 @@ class Stitch:
     result : Result
         Height, its standard deviation, status (0 no height, 1 one touch or touches that agree, 2 touches that
         differ by more than 4 standard deviations), contact and, if all touches have them, normals; x and y as
-        in the first touch. The standard deviation includes that of the poses.
+        in the first touch. The standard deviation includes the errors of the poses.
     poses : tuple of Pose
-        The motion of the object from the first touch to each, the first being none.
+        The motion of the object from the first touch to each; the first one is the identity.
     links : int
-        Pairs of touches that were compared.
+        Number of pairs of touches that were compared.
     """
 
     result: Result
@@ -63,11 +63,10 @@ def stitch(
 ) -> Stitch:
     """Merge the maps of several touches of one object into one larger surface.
 
-    The motion from each touch to the next is estimated by `mirrorskin.engine.pose.estimate_pose`, then
-    those
-    between all others that share a fifth of their pixels. The poses are a least-squares fit of all motions,
-    weighted by their covariances (a pose graph: Lu and Milios, Autonomous Robots 4, 1997). Heights of all
-    touches are then resampled to the pixels of the first, and merged by inverse-variance weighting.
+    The motion from each touch to the next is estimated by `mirrorskin.engine.pose.estimate_pose`, then the
+    motions between all others that share a fifth of their pixels. The poses are a least-squares fit to all
+    motions, weighted by their covariances (a pose graph: Lu and Milios, Autonomous Robots 4, 1997). Heights
+    of all touches are then resampled to the pixels of the first, and merged by inverse-variance weighting.
 
     Parameters
     ----------
@@ -260,7 +259,7 @@ class _Moved:
 
     height: Doubles
     variance: Doubles  # including that of the pose and of a determined offset
-    common: Doubles  # variance of errors that all pixels share: those of the pose and the offset
+    common: Doubles  # variance of errors common to all pixels: of the pose and the offset
     contact: NDArray[np.bool_]
     normals: Doubles | None
     normal_variance: Doubles | None
@@ -365,8 +364,9 @@ class _Sums:
     def level(self, height: Doubles, variance: Doubles, lever: Doubles) -> tuple[float, Doubles, float]:
         """Return the offset of heights, (n,), to earlier ones, its mean lever, and its variance.
 
-        Errors of pixels are independent. Errors that pixels share by their poses do not average out; with
-        several touches, their weighted mean is an upper bound. All values are NaN without common pixels.
+        Errors of pixels are independent. Errors of the poses, which are common to pixels, are not averaged
+        out; with several touches, their weighted mean is an upper bound. All values are NaN without common
+        pixels.
         """
         off = self.mean().ravel() - height
         shared = np.isfinite(off) & np.isfinite(variance)

@@ -16,17 +16,17 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 
 _SHARED = 0.6  # share of the key's pixels below which the next result becomes the key
-_COARSE, _STEPS, _STILL = 4, 8, 0.3  # pixel step of the coarse fit; number of steps, and sigmas that end them
+_COARSE, _STEPS, _STILL = 4, 8, 0.3  # pixel step of the coarse fit; maximum steps, and the last one (sigmas)
 _LOST = 3.0  # times the key's first chi square, above which the motion is searched again
 
 
 class PoseTracker(ThreadSafe):
-    """Estimates the motion of an object from the first of a stream of results to each of them.
+    """Estimates the motion of an object from the first result of a stream to each later one.
 
-    Each result is compared with a key: the first result, or a later one when too few pixels were shared with
-    the previous key. So errors increase with the number of keys, not of results. The start is extrapolated
-    from the last two results. It is refined on every fourth row and column, then on all pixels. Directions
-    that the key does not determine are found with the first result after it, and are kept fixed.
+    Each result is compared with a key: the first result, or a later one if too few pixels overlap with the
+    previous key. Errors therefore increase with the number of keys, not of results. The start is extrapolated
+    from the last two results, and refined on every fourth row and column, then on all pixels. Directions that
+    the key does not determine are identified with the first result after it, and are kept fixed.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 _CELLS = 32  # along each side of the lit area, if it were square
 _AROUND = 2  # cells around the lit area
 _MARGIN = 6  # cells outside the picture, where the object reaches its border
-_SHARE = 0.5  # least share of a cell's pixels that have a height
+_SHARE = 0.5  # minimum share of a cell's pixels with a height
 _SMALL = 4  # cells: gaps up to this size belong to the surface
 
 
@@ -109,9 +109,9 @@ def cut_into_cells(lit: Mask, pixel_size: tuple[float, float]) -> Cells:
 def touched(height: Doubles, dark: Mask, hidden: Mask) -> Mask:
     """Return which cells belong to the object's surface.
 
-    Lit cells do, and hidden ones, which were light before the first frame. A group of dark cells does if the
-    heights around it rise towards it, as around a flat top; if they fall, it is untouched sheet. Small gaps
-    belong to the surface.
+    These are lit cells, and hidden cells, which were light before the first frame. A group of dark cells
+    belongs to the surface if the heights around it increase towards it, as around a flat top; otherwise it is
+    untouched sheet. Small gaps belong to the surface.
     """
     lit = np.isfinite(height)
     surface = lit | hidden

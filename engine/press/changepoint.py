@@ -19,7 +19,7 @@ from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
 from mirrorskin.kernels.device import C_TYPES, Device, Kernel
 
-_EVIDENCE = 12.0  # least logarithm of the likelihood ratio of a change
+_EVIDENCE = 12.0  # minimum logarithm of the likelihood ratio of a change
 _RELEASED = np.array([0, 1, 3, 2], np.uint8)  # status of a release, from that of a press
 
 
@@ -238,7 +238,7 @@ class ChangePoint(PressOperation):
         return -1 if self._release else 1
 
     def _quiet(self) -> float:
-        """Return the squared counts that noise alone may add up to; 0 before the second frame."""
+        """Return the sum of squared counts that noise alone may reach; 0 before the second frame."""
         return _EVIDENCE * (self._noise.value or 0.0) ** 2
 
     def _kernel(self, band: Band, name: str) -> Kernel:

@@ -1,4 +1,4 @@
-"""Correction of a press for the elastomer: deeper contact than by eq. 3, and light before contact."""
+"""Correction of a press for the elastomer: contact is deeper than in eq. 3, and light precedes contact."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ Mask = NDArray[np.bool_]
 LEARNED_AT = 0.5
 """Threshold at which gels are calibrated, as a share of the range from dark to bright."""
 
-_FEWEST = 12  # cells that must have turned light
+_FEWEST = 12  # minimum number of cells that turned light
 _SAMPLED = 250  # cells whose onsets are fitted; the splines have too few coefficients to need more
 _TRAVELS = 16  # travels at which the press is simulated
 _BENDING = 1.0  # expected third derivatives of the surface, 1/mm^2
-# Stages of its fit, which is stiff at first: bending, number of steps, relative decrease of the cost.
+# Stages of the fit, which is stiff at first: bending, number of steps, relative decrease of the cost.
 _STAGES = (0.1, 1, 0.0), (0.1, 1, 0.0), (0.3, 1, 0.0), (_BENDING, 1, 0.0), (_BENDING, 10, 0.1)
 _RELAXED, _STUCK = 3.0, 1e3  # divisor of the damping from step to step, and its limit; see `_STEP`
 _STEP = 0.3  # mm: largest change of the surface in a step
@@ -126,13 +126,14 @@ def fit_press(
 ) -> PressFit:
     """Fit the surface whose press into the elastomer explains the onsets, and correct heights with it.
 
-    Eq. 3 takes a pixel's travel at its onset for the object's depth there. An elastomer is indented around
-    the contact: a paraboloid touches a point at twice its depth, and the sheet around a contact is steep
-    enough to turn light before it touches. Therefore a smooth surface is fitted (cubic splines, no finer than
-    an eighth of the lit area). Its press into an elastic half-space brings the sheet to the threshold's slope
-    at each pixel's onset. The fit uses Levenberg-Marquardt steps with penalised third derivatives; the
-    penalty is larger in the first steps. The correction is the difference between this surface and an equally
-    smooth one through the uncorrected heights, so finer details are preserved.
+    Eq. 3 assumes that the travel at a pixel's onset equals the depth of the object there. An elastomer,
+    however, is indented around the contact: a paraboloid touches a point at twice its depth, and the sheet
+    around a contact is steep enough to turn light before it touches. Therefore a smooth surface is fitted
+    (cubic splines, no finer than an eighth of the lit area), such that its press into an elastic half-space
+    brings the sheet to the threshold's slope at the onset of each pixel. The fit uses Levenberg-Marquardt
+    steps with penalised third derivatives; the penalty is larger in the first steps. The correction is the
+    difference between this surface and an equally smooth one through the uncorrected heights, so finer
+    details are preserved.
 
     Parameters
     ----------
@@ -149,9 +150,9 @@ def fit_press(
     Returns
     -------
     PressFit
-        Its ``height`` and ``sigma``, (H, W) mm, include the correction and its uncertainty. They are NaN
-        where a pixel turned light without contact, except near the contact: farther away, only the penalty
-        determines the surface.
+        ``height`` and ``sigma``, (H, W) mm, include the correction and its uncertainty. They are NaN where a
+        pixel turned light without contact, except near the contact: farther away, the surface is determined
+        by the penalty only.
 
     Raises
     ------
@@ -209,7 +210,7 @@ class PressFit(NamedTuple):
     def load_errors(self, pressed: Pressed) -> tuple[float, Doubles]:
         """Return the load's standard error from the fit, and its changes with the gel's parameters, mm^2.
 
-        The changes, (3,), are those by one standard error of threshold, compliance and curvature.
+        The changes, (3,), are for one standard error of threshold, compliance and curvature.
         """
         gel = self.scene.gel
         gradient = load_gradient(self.scene.space, pressed.contact, gel.compliance)
@@ -354,7 +355,7 @@ class _Surface:
 def _simulate(scene: _Scene, factors: Doubles) -> SlopeFit:
     """Press a surface, and compare the sheet's slope with the threshold's when cells turned light.
 
-    Dark cells of the surface are flat tops: those steeper than the threshold add residuals, too.
+    Dark cells of the surface are flat tops; they add residuals where they are steeper than the threshold.
     """
     height = scene.splines.surface(factors)
     down, across = (part @ factors for part in scene.splines.slopes)

@@ -34,7 +34,7 @@ def estimate_levels(
 
     Pixels turned light if their brightness differs between these frames by more than half of the 16th largest
     difference. The levels are the medians of these pixels; their standard deviations exclude the noise.
-    A given level is kept and has a standard deviation of 0.
+    Given levels are unchanged, with a standard deviation of 0.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def estimate_levels_of(
     dark: ArrayLike | None = None,
     bright: ArrayLike | None = None,
 ) -> EstimatedLevels | None:
-    """Do what `estimate_levels` does for frames in memory, (T, H, W), and their travel, (T,), mm."""
+    """Return the result of `estimate_levels` for frames in memory, (T, H, W), and their travel, (T,), mm."""
     return _estimate(stack.__getitem__, travel, range(len(stack)), dark, bright)
 
 

@@ -26,8 +26,8 @@ from mirrorskin.kernels.array_types import Doubles
 if TYPE_CHECKING:
     from mirrorskin.io import Source
 
-_SINUSOID = 0.9  # least share of the travel's variance in its first harmonic
-_PERIODS = 2  # least number of periods of the dither
+_SINUSOID = 0.9  # minimum share of the travel's variance in its first harmonic
+_PERIODS = 2  # minimum number of periods of the dither
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,9 +44,9 @@ class Growth(CorrelationOperation):
 
     At the mean travel s0, the share of full light of a pixel, (E - dark) / (bright - dark), has the
     derivative G with respect to travel. To first order in the dither's amplitude d, its component in phase
-    with the travel is G d, which is fitted. A pixel that turns light abruptly within the dither has a
-    component that is not a derivative; but the sum over the border of the contact is (dA/ds) d for any shape
-    of the border, with A the area of full light.
+    with the travel is G d, which is fitted. If a pixel turns light abruptly within the dither, this component
+    is not a derivative, but the sum over the border of the contact is (dA/ds) d for any shape of the border,
+    with A the area of full light.
 
     ``azimuth`` is the phase lag of the light behind the travel. ``process`` contains the mean ``travel`` and
     the ``travel_amplitude``, mm, and with a pixel size ``area_growth``, the sum over all pixels, mm^2 of full

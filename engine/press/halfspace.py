@@ -21,15 +21,15 @@ Real = TypeVar("Real", np.float32, np.float64)
 Mask = NDArray[np.bool_]
 
 TOLERANCE = 1e-4
-"""Largest gap in contact, as a share of the surface's greatest height above the rest plane."""
+"""Maximum gap in contact, as a share of the surface's maximum height above the rest plane."""
 
 _SOFTNESS = 3 / (4 * math.pi)  # 1 / (pi E*) at E = 1, with E* = E / (1 - nu^2) and nu = 1/2
-_ROUNDS = 40  # largest number of changes of the contact
-_STEPS = 300  # largest number of conjugate-gradient steps
-_GRADIENT_ERROR = 1e-3  # largest gap of a flat punch that is pressed in by 1
+_ROUNDS = 40  # maximum number of changes of the contact
+_STEPS = 300  # maximum number of conjugate-gradient steps
+_GRADIENT_ERROR = 1e-3  # maximum gap of a flat punch that is pressed in by 1
 _NO_SLOPE = 1e-9  # slope below which its direction is undefined
-_FIRM = 0.05  # share of the greatest pressure below which a cell's contact is neglected in derivatives
-_ROUGH, _ROUGH_STEPS = 2e-2, 60  # relative residual, and largest number of steps, of derivatives
+_FIRM = 0.05  # share of the maximum pressure below which the contact of a cell is neglected in derivatives
+_ROUGH, _ROUGH_STEPS = 2e-2, 60  # relative residual, and maximum number of steps, for derivatives
 _SIZES = 4  # cells: granularity of the size of windows
 
 
@@ -315,8 +315,8 @@ def _weights(
 def _pressed_by(space: HalfSpace, contact: Mask, heights: Singles, compliance: float) -> Doubles:
     """Return the strains in contact for given heights in contact, (n, H, W): (n, touching).
 
-    All are solved at once by conjugate gradients: the maps are too small for a factorisation, whose threads
-    would cost more than they save. Two digits are enough, since the derivatives only steer the search.
+    All are solved at once by conjugate gradients: for maps of this size, the threads of a factorisation would
+    cost more than they save. Two digits are sufficient, because the derivatives only guide the search.
     """
     window, space = _window(space, contact)
     contact, heights = contact[window], heights[(slice(None), *window)]
@@ -337,7 +337,7 @@ def _window(space: HalfSpace, contact: Mask) -> tuple[tuple[slice, slice], HalfS
     window = []
     for axis, size in zip((1, 0), space.shape, strict=True):
         places = np.flatnonzero(contact.any(axis=axis))
-        # Few different sizes, so that few spectra are computed.
+        # Sizes are rounded, so that few spectra are computed.
         length = min(size, -(-(places[-1] + 1 - places[0]) // _SIZES) * _SIZES)
         start = min(int(places[0]), size - length)
         window.append(slice(start, start + int(length)))

@@ -25,8 +25,8 @@ Box = tuple[slice, slice]
 _SQUARE = np.ones((3, 3), np.uint8)
 _LINES: tuple[Any, ...] = np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]  # a map's four sides
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
-_LEAST_AREA, _LEAST_SIDE = 9, 3  # pixels: smaller or narrower holes get a membrane
-_SMALL = 2.0  # pixels: so do holes whose largest circle has a smaller radius
+_LEAST_AREA, _LEAST_SIDE = 9, 3  # pixels: smaller or narrower holes are filled with a membrane
+_SMALL = 2.0  # pixels: minimum radius of the largest circle in a hole that is not filled with a membrane
 _RING = 1.1  # width of the ring that determines the fill, in radii of the hole
 _NARROW = 0.6  # width of the second ring to try, in radii
 _LEAST_RING = 3.0  # pixels
@@ -34,15 +34,15 @@ _TERRACES = 1.9  # steps of height that a ring must span to show curvature: 2, l
 _WIDEST, _WIDER = 3.0, 1.3  # radii up to which a ring is widened, and the factor
 _SAMPLES = 12  # samples of the ring per radius of the hole
 _MOST_SAMPLES = 120  # approximate number of samples along a side of the hole's box
-_MOST_CELLS = 20  # largest number of spline cells, of the length of a radius, along an axis
-_STIFFNESS = 2e-4  # see `fit_within`; of a hole of radius 1 and intervals of half-width _DEPTH
+_MOST_CELLS = 20  # maximum number of spline cells, of the length of a radius, along an axis
+_STIFFNESS = 2e-4  # see `fit_within`; for a hole of radius 1 and intervals of half-width _DEPTH
 _MISFIT = 0.5  # half-widths: RMS excess above which the ring is not one smooth surface
-_STEEP_SHARE = 0.05  # largest share of a hole's pixels that may be steeper than `steepest`
+_STEEP_SHARE = 0.05  # maximum share of a hole's pixels that are steeper than `steepest`
 _DEPTH = 0.1  # depth of a spherical cap that is dark up to 11.8 degrees, in radii of its hole
-_CUT = 0.2  # largest share of a hole's outline that may be on the picture's border
+_CUT = 0.2  # maximum share of a hole's outline on the picture's border
 _HEAVY = 250  # splines of a surface that takes twice as long as a small one
-_WORK = 40.0  # limit of the work, in small surfaces; further holes get membranes
-_EXACT = 0.01  # pixel sizes: least half-width of an interval
+_WORK = 40.0  # limit of the work, in small surfaces; further holes are filled with membranes
+_EXACT = 0.01  # pixel sizes: minimum half-width of an interval
 
 
 @checked(
@@ -74,9 +74,9 @@ def fill_holes(
     fix the surface at their borders and leave it free within the intervals elsewhere.
 
     *Membrane.* If that surface would be light in the hole (steeper than `steepest`), there is a crease at the
-    rim; if no surface stays within the intervals, there is one in the ring. These holes, and small or
-    long thin ones, get the solution of Laplace's equation with the heights at their rim: flat tops become
-    flat. Of these, holes that are cut off by the picture's border, except for a corner, are not filled.
+    rim; if no surface stays within the intervals, there is a crease in the ring. These holes, and small or
+    long thin ones, are filled with the solution of Laplace's equation for the heights at their rim, so flat
+    tops are filled flat. Such holes are not filled if the picture's border cuts off more than a corner.
 
     Parameters
     ----------
@@ -87,11 +87,11 @@ def fill_holes(
     pixel_size : float or (float, float)
         Millimetres, along x and y.
     above : array_like, scalar or (H, W), optional
-        Lower bounds of the heights, mm; NaN without. Where a pixel was light at the start, it is minus the
-        first travel.
+        Lower bounds of the heights, mm; NaN without a bound. For a pixel that was light at the start, it is
+        minus the first travel.
     steepest : float
-        Slope above which a pressed sheet is light. The default fits the paper's sensor up to 10 mm off its
-        centre, with a margin; a sensor with a gap of air needs 0.45.
+        Slope above which a pressed sheet is light. The default is for the paper's sensor up to 10 mm off its
+        centre, with a margin; a sensor with an air gap needs 0.45.
     deepest : float, optional
         Height of the untouched sheet in the last frame, mm: minus the last travel. Pixels whose fill is less
         than a step above it may be untouched, and are not filled.
@@ -276,7 +276,7 @@ def _smooth_surfaces(
             shape = None if ring is None else _size(ring.box)
             spans = zip(shape or (), field.spacing, strict=False)
             cells = tuple(math.ceil((count - 1) * step / hole.radius) for count, step in spans)
-            # No ring, a box of a single row or column, or a hole that is too long and thin.
+            # There is no ring, the box is a single row or column, or the hole is too long and thin.
             if ring is None or min(cells) < 1 or max(cells) > _MOST_CELLS:
                 break
             work += 1 + ((cells[0] + 3) * (cells[1] + 3) / _HEAVY) ** 3

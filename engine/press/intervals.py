@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
 
-_USUAL = 0.9, 1.5  # range of the sigma of a height between two frames, in that of the interval
+_USUAL = 0.9, 1.5  # range of the sigma of a height between two frames, in sigmas of the interval
 _ROUNDED = 1e-3  # error of a height by its rounding, as a share of an interval
-_LEAST = 0.02  # least blur of an interval's ends, as a share of its half-width
+_LEAST = 0.02  # minimum blur of an interval's ends, as a share of its half-width
 _FAR = 6.0  # blurs outside an interval beyond which an onset is an outlier
-_SPAN = 20.0  # half-widths: least range over which outliers are distributed
+_SPAN = 20.0  # half-widths: minimum range over which outliers are distributed
 _FEWEST, _MOST = 1e-4, 0.5  # limits of the share of outliers
-_SAMPLES = 8192  # largest number of errors from which their distribution is estimated
+_SAMPLES = 8192  # maximum number of errors from which their distribution is estimated
 _ROUNDS = 12  # iterations of the share of outliers
 _FAINT = 1e-4  # least curvature of the log-likelihood, relative to that of a single sharp end
 _NEAR = 0.02  # tolerance of the logarithm of the blur
@@ -56,12 +56,12 @@ class Intervals(NamedTuple):
 
 
 def heights_as_intervals(height: Doubles, sigma: Doubles, travel: Doubles) -> Intervals:
-    """Return heights of a press that are at the middles of their intervals between two frames.
+    """Return heights of a press, moved to the middles of their intervals between two frames.
 
-    Where light from neighbours reaches a pixel, a sample near the threshold moves the height off the middle,
-    by up to a quarter of the interval, although its error is still that of the interval. These errors differ
-    at both ends of an interval, so an interval around such a height would shift the surface. Heights whose
-    sigma is not about that of the interval are returned as they are.
+    Where light from neighbours reaches a pixel, a sample near the threshold moves the height off the middle
+    by up to a quarter of the interval, although its error is still the error of the interval. These shifts
+    differ at both ends of an interval, so an interval around such a height would shift the surface. Heights
+    whose sigma differs from the sigma of the interval are unchanged.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def _chance(error: Doubles, half: Doubles, blur: float) -> Doubles:
 def normal_distribution(x: Doubles) -> Doubles:
     """Return the distribution function of a standard normal variable, with an error of 1e-15.
 
-    SciPy's is in a module that a fusion does not load, in a fifth of a second.
+    Loading SciPy's function, which a fusion does not need otherwise, would take a fifth of a second.
     """
     distance = np.abs(x)
     tail: Doubles = np.exp(-(distance**2) / 2) * np.polyval(_ABOVE, distance) / np.polyval(_BELOW, distance)
@@ -177,7 +177,7 @@ def normal_distribution(x: Doubles) -> Doubles:
 def _lowest(function: Callable[[float], float], low: float, high: float) -> float:
     """Return the minimum of a function with one minimum, by golden-section search.
 
-    SciPy's minimiser is in a module that a fusion does not load, in a quarter of a second.
+    Loading SciPy's minimiser, which a fusion does not need otherwise, would take a quarter of a second.
     """
     golden = (math.sqrt(5) - 1) / 2
     left, right = high - golden * (high - low), low + golden * (high - low)

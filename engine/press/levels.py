@@ -18,8 +18,8 @@ from mirrorskin.io.maps import TABLE, PressStatus
 class Levels(ThresholdOperation):
     """Height from the lowest of several thresholds, and bounds of the sheet's inclination from all of them.
 
-    The wall has steps of light, so that a pixel passes one threshold after the other while the sheet tilts.
-    A pixel that has passed a threshold is inclined by at least the angle of this threshold.
+    The wall has steps of brightness, so a pixel passes one threshold after the other while the sheet tilts. A
+    pixel that has passed a threshold is inclined by at least the angle of this threshold.
 
     Examples
     --------
@@ -37,7 +37,7 @@ class Levels(ThresholdOperation):
         within=(0, 1),
         several=True,
         help="shares of the range from dark to bright, from the lowest to the highest, for a wall with"
-        " levels; heights are those of the lowest",
+        " levels; heights are computed from the lowest",
         shown_default="one threshold",
     )
     inclinations: Sequence[float] = option(
@@ -45,7 +45,7 @@ class Levels(ThresholdOperation):
         unit="rad",
         within=(0, None),
         several=True,
-        help="inclination of the sheet at which each of the thresholds is passed",
+        help="inclination of the sheet at which each threshold is passed",
         shown_default="none",
     )
     slope_min = TABLE["slope_min"]

@@ -16,7 +16,7 @@ _STEPS = tuple(1 / (1.25 + sign * 0.75 * math.sqrt(0.5)) for sign in (-1, 1))  #
 _LONGER = 1.5  # aspect ratio of pixels from which only the shorter side is doubled
 _SMALLEST = 4  # pixels along the sides of the coarsest level
 _SETTLED = 3e-4  # RMS change that ends the cycles, as a share of the range of heights at the rim
-_CYCLES = 8  # largest number
+_CYCLES = 8  # maximum number of cycles
 
 
 def stretch(height: NDArray[np.floating], fixed: Mask, free: Mask, spacing: tuple[float, float]) -> Floats:
@@ -104,7 +104,7 @@ class _Level:
         return residual
 
     def _reduce(self, values: Floats) -> Floats:
-        """Return the means over large pixels; what is beyond the border counts as 0."""
+        """Return the means over large pixels; values beyond the border are 0."""
         (rows, columns), (down, across) = values.shape, self._factors
         if rows % down or columns % across:
             values = np.pad(values, ((0, rows % down), (0, columns % across)))

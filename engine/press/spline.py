@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 _PIECES = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6
 _ORDER = 3  # order of the penalised derivatives; those of a paraboloid are 0
 _PULL = 1e-3  # weight of the middle of an interval, relative to that of its ends
-_ITERATIONS = 20  # largest number
+_ITERATIONS = 20  # maximum number of iterations
 _HEAVIEST = 1e4  # largest weight of a pixel, relative to a typical one
 _SETTLED = 0.01  # half-widths: changes of the surface below this end the iterations
-_LARGEST = 2.0  # half-widths: limit of one pixel's excess in the misfit
+_LARGEST = 2.0  # half-widths: limit of a pixel's excess in the misfit
 _FAR, _PATIENCE = (
     1.0,
     3,
-)  # misfit at which the iterations are given up, and number of the first such iteration
+)  # misfit above which the iterations are stopped, and number of the first iteration to be tested
 _SPLINES = 8  # along each side of the grid, if it were square
 _FEWEST_PIECES = 3
 _RIDGE = 1e-13  # share of the diagonal that is added to keep matrices regular
@@ -257,6 +257,6 @@ def _solve_banded(matrix: Doubles, right: Doubles, size: int) -> Doubles:
 
 
 def _product(first: NDArray[Any], second: NDArray[Any]) -> Doubles:
-    """Return a matrix product, computed by one thread: at this size, several cost more than they save."""
+    """Return a matrix product, computed by one thread: at this size, threads cost more than they save."""
     nothing: Any = None
     return np.asarray(cv2.gemm(first, second, 1.0, nothing, 0.0))

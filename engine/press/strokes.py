@@ -25,10 +25,10 @@ _UNLIKELY = 1e-3  # significance level of scatter beyond the predicted one
 class Strokes(CrossingOperation):
     """Height and hysteresis from a press that oscillates: the onsets and releases of all strokes.
 
-    A stroke is a run of frames in which travel does not change its direction; its turning points belong to
-    both strokes. The documentation, "Vibration", describes how strokes are joined. An unknown noise is
-    estimated in the first stroke. A press of one stroke has no hysteresis. ``frame`` is that of the last
-    stroke in which there was the event.
+    A stroke is a sequence of frames with the same direction of travel; turning points belong to both strokes.
+    The documentation, "Vibration", describes how strokes are joined. An unknown noise is estimated in the
+    first stroke. A press of one stroke has no hysteresis. ``frame`` is the frame of the last stroke with an
+    event.
 
     Examples
     --------
@@ -141,7 +141,7 @@ class Strokes(CrossingOperation):
 class _JoinedOnsets:
     """The onsets, or releases, of several strokes: sums and bounds of each pixel, (H W,).
 
-    Heights are relative to the pixel's first one, mm. A single stroke is kept as it is.
+    Heights are relative to the first height of the pixel, mm. A single stroke is stored unchanged.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:

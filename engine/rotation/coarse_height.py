@@ -13,10 +13,9 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 
 Mask = NDArray[np.bool_]
-_CELLS = 512  # along the longer side, at most
+_CELLS = 512  # maximum number of cells along the longer side
 _GAP = 0.3  # mm: gaps between normals that are filled
-_FILLED = 0.03  # weight of a slope that was filled in, relative to others
-_FILLED = 0.03  # weight of a slope that was filled in
+_FILLED = 0.03  # weight of a filled slope relative to others
 _TOLERANCE = 1e-3
 
 
@@ -32,8 +31,8 @@ def coarse_heights(
 
     Slopes are integrated; the highest point of each component is assumed to be at the depth of the press.
     Pixels without a normal get the nearest slope, as at a crease. Where the surface is too level to be
-    visible, this slope decreases towards the middle, as on a ball. Outside, the nearest height is used.
-    Without any contact, all heights are equal to the press.
+    visible, this slope decreases towards the middle, as on a ball. Outside the contact, the nearest height is
+    used. Without any contact, all heights equal the press.
     """
     import cv2
     from scipy import ndimage

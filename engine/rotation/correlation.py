@@ -1,6 +1,6 @@
 """Mean, cosine and sine of the brightness over an axial rotation (paper, section 4: equations 17 to 22).
 
-A device holds four sums per pixel, of E, E cos alpha, E sin alpha and E^2, and solves the fit from them.
+A device stores four sums per pixel, of E, E cos alpha, E sin alpha and E^2, and solves the fit from them.
 Integer samples of frames with weights 0 and 1 are summed as integers, with cosines rounded to multiples of
 2^-17 or 2^-23: these sums are exact and do not depend on how frames are divided into blocks. Other samples
 are summed as pairs of floats, in the order of the frames. See `mirrorskin.kernels.correlation`.
@@ -107,9 +107,9 @@ class Correlate(CorrelationOperation):
     """Least-squares fit of mean, cosine and sine of the phase to each pixel's brightness.
 
     It minimises SS = sum_k w_k (E_k - mean - cosine cos alpha_k - sine sin alpha_k)^2. For N evenly spaced
-    phases, sine and cosine are 2/N times the sums that stand for the paper's integrals S and C (equations 17
-    and 20), and so gain times tilt times sine and cosine of the azimuth, as in equations 19 and 22. Uneven
-    or measured phases mix the three, and least squares separates them.
+    phases, sine and cosine are 2/N times the sums that correspond to the paper's integrals S and C (equations
+    17 and 20), that is, gain times tilt times sine and cosine of the azimuth (equations 19 and 22). Uneven
+    phases mix the three coefficients, which least squares separates.
 
     The residual is sqrt(SS / (N - 3)), the standard deviation of a sample of weight 1; it is undefined if N
     is 3. The modulation is the amplitude sqrt(cosine^2 + sine^2), and the azimuth is the phase of the
@@ -236,7 +236,7 @@ class _Sums:
         return self._phase, self._weight
 
     def result(self, on_device: bool = False) -> Result:
-        """Return the fit, perhaps with maps on the device; InputError if the phases do not determine it."""
+        """Return the fit, optionally with maps on the device; InputError if phases do not determine it."""
         used = self._weight > 0
         check_phases(self._phase[used], self._weight[used])
         self._solve()
@@ -352,7 +352,7 @@ class TurnSums(_Sums):
     def push(self, frames: AnyArray, phase: Doubles, weight: Doubles, lent: bool = False) -> None:
         """Add some frames."""
         if len(self._phase) + len(frames) > _MAX_FRAMES:
-            raise InputError(f"sums hold {_MAX_FRAMES} frames: take the result of those so far, and reset")
+            raise InputError(f"at most {_MAX_FRAMES} frames can be summed: take the result so far, and reset")
         if self._counts is None:
             fractions = np.flatnonzero((weight != 0) & (weight != 1))
             whole = slice(fractions[0] if len(fractions) else len(frames))
@@ -426,8 +426,8 @@ class TurnSums(_Sums):
 class WindowSums(_Sums):
     """The last frames of an endless rotation, which are summed when the fit is computed.
 
-    The map ``ring`` of each band is a ring buffer of frames; ``oldest`` is the number of the plane with the
-    oldest frame of a full window, which the next frame replaces.
+    The map ``ring`` of each band is a ring buffer of frames; ``oldest`` is the index of the oldest frame of a
+    full window, which the next frame replaces.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ LIMITS = Limits(
 )
 """Limits of edges, for the kernels and their reference."""
 
-_SHORTER = 4  # run time of the longest kernel over that of the others, about
+_SHORTER = 4  # approximate ratio of the run times of the longest kernel and the others
 
 
 @checked(normals=as_any_array, normals_sigma=as_any_array, contact=as_any_array)
@@ -39,9 +39,9 @@ def find_edges(
 ) -> Any:
     """Draw thin lines where the normal jumps by more than 10 degrees, and where contact ends.
 
-    A steady bend is not a jump, and a jump must exceed 3.5 of its standard errors. Flags of contact that
-    nearly all neighbours contradict are ignored. Where contact ends, the last pixels in contact are drawn:
-    those with one of four neighbours without contact. The picture's border is not an edge.
+    A continuous bend is not a jump, and a jump must exceed 3.5 standard errors. Flags of contact that nearly
+    all neighbours contradict are ignored. Where contact ends, the pixels in contact with one of four
+    neighbours out of contact are drawn. The border of the picture is not an edge.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def find_edges(
     contact : ndarray or device array, (H, W), uint8
         1 where there is contact in every frame.
     device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``. It holds all maps at once, 74 bytes per pixel.
+        See ``mirrorskin.kernels.device.open_device``. All maps are in its memory at once, 74 bytes per pixel.
 
     Returns
     -------
@@ -101,7 +101,7 @@ class EdgeDrawing:
             **dict.fromkeys(("contact", "clean", "doubt", "lines", "more", "ways"), (shape, np.uint8)),
             **dict.fromkeys(("cells", "joined"), (cells, np.float32)),
         }
-        # Every kernel writes all of its maps, so that none need be filled before.
+        # Every kernel writes its maps completely, so they need no initialisation.
         self._maps = {name: device.array(name, *kind, zeroed=False) for name, kind in kinds.items()}
 
     def take(

@@ -39,7 +39,7 @@ class FollowingHeights:
         if self._step is not None:
             wait_for([self._step])
         self._step, self.height = None, None
-        self._in_step = self._estimates = self._in_height = 0  # numbers of estimates: current, total, shown
+        self._in_step = self._estimates = self._in_height = 0  # numbers of estimates: current, all, shown
         self._slopes.typical = math.nan
         self._integrator.reset()
 

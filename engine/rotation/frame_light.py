@@ -1,8 +1,8 @@
 """Flicker of the light and drift of the dark level in a rotation: a gain and an offset of each frame.
 
-The zenith determines the mean of a pixel's brightness over a turn and, with the tilt, how much it swings.
-A change of the light that is common to all pixels contradicts this at pixels that face different directions,
-so gains and offsets of the frames are fitted together with the normals of a grid of pixels.
+The zenith determines the mean of a pixel's brightness over a turn and, with the tilt, its amplitude. A change
+of the light that is common to all pixels contradicts this at pixels that face different directions, so gains
+and offsets of the frames are fitted together with the normals of a grid of pixels.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 
 _FEWEST_PIXELS, _FEWEST_FRAMES, _MOST_FRAMES = 64, 7, 128
-_STEEP, _UPRIGHT = 1.5, math.radians(80)  # range of zeniths: from this multiple of the tilt
-_SUSPECT = 4.0  # standard deviations by which the common variance must exceed that of noise for a fit
-_CLEAR = 5.0  # standard errors by which flicker or drift must exceed 0
-_FLICKER, _DRIFT = 0.005, 1.0  # least flicker, share of the light, and drift, counts of 8 bits
+_STEEP, _UPRIGHT = 1.5, math.radians(80)  # range of zeniths: minimum in tilts, and maximum
+_SUSPECT = 4.0  # minimum excess of the common variance over that of noise for a fit, standard deviations
+_CLEAR = 5.0  # minimum of flicker or drift, standard errors
+_FLICKER, _DRIFT = 0.005, 1.0  # minimum flicker, share of the light, and drift, counts of 8 bits
 _PRIOR = 0.05, 0.02  # initial standard deviations of gains, and of offsets as a share of the light
 _ROUNDS = 6  # iterations
-_STEADY = 1e-6  # standard deviation of gains and offsets that are left out
-_SWING = 2.0  # ratio of the swing of the brightness to that of the tilt, up to which a pixel is used
-_MOST = 0.2  # largest standard deviation of gains
+_STEADY = 1e-6  # standard deviation of gains and offsets that are not fitted
+_SWING = 2.0  # maximum amplitude of the zenith of a usable pixel, in tilts
+_MOST = 0.2  # maximum standard deviation of gains
 _AS_ONE = 0.5  # mean direction above which pixels face the same way, so that the light is not determined
-_ALIKE = 0.5  # largest difference of the light at steep and at other pixels, as a share of its change
-_OUTLIER = 3.0  # times the usual misfit, beyond which a pixel is left out
+_ALIKE = 0.5  # maximum difference of the light at steep and at other pixels, as a share of its change
+_OUTLIER = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
 _LEAST_NOISE = 1e-3  # counts
 
 
@@ -42,12 +42,12 @@ class FrameLight:
     Attributes
     ----------
     gain : ndarray, (T,), float64
-        Light of each frame over that of the mean.
+        Light of each frame divided by the mean.
     offset : ndarray, (T,), float64
-        Counts by which each frame is brighter than with its light alone.
+        Offset of each frame, counts.
     variance : (float, float)
-        Variance of normals because of the errors of both, radians^2, is the first plus the second times the
-        square of the sine of the zenith.
+        Coefficients a and b of the variance of normals due to errors of gains and offsets,
+        a + b sin(zenith)^2, radians^2.
     flicker, drift : float
         Standard deviation of the light, and range of the smoothed offset, counts; 0 if not significant.
     """
@@ -151,7 +151,7 @@ def _fitted(
 
 
 def _is_suspect(samples: NDArray[Any], phase: Doubles) -> bool:
-    """Return whether pixels change together by more than noise, after a fit of two harmonics each."""
+    """Return whether pixels have a common change beyond noise, after a fit of two harmonics each."""
     columns = np.concatenate([basis(phase), basis(2 * phase)[:, 1:]], axis=1)
     if len(phase) <= columns.shape[1] + 1:
         return False
@@ -198,7 +198,7 @@ class _Fit:
         return np.asarray(np.sqrt(np.mean(self._left**2, axis=0)))
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Leave the other pixels out."""
+        """Exclude the other pixels."""
         if chosen.all():
             return
         for name in ("_gain", "_base", "_dark", "_zenith", "_azimuth"):
@@ -240,7 +240,7 @@ class _Fit:
         return own, through, matrix, noise
 
     def improve(self) -> None:
-        """Do one step, and estimate the standard deviations of gains and offsets anew."""
+        """Do one step, and update the standard deviations of gains and offsets."""
         own, through, matrix, noise = self._normal_equations()
         frames = self._light.shape[1]
         push = np.einsum("ati,ti->ia", self._by_normal, self._left)
@@ -288,7 +288,7 @@ class _Fit:
         covariance = np.linalg.inv(matrix) * noise
         excess, offset = self._light * known[:, np.newaxis]
         error = np.einsum("iak,kl,ial->i", through, covariance, through)
-        # The mean of gains and offsets is assumed to be that of the calibration.
+        # The means of gains and offsets are assumed to be as in the calibration.
         light = self._by_light[0].mean(axis=0)
         mean = light**2 * np.var(excess) / len(excess) + (_range(offset) / 2) ** 2
         error += mean / self._gain**2

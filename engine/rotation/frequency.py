@@ -14,12 +14,12 @@ from mirrorskin.io import InputError, Source
 from mirrorskin.io.arguments import as_array, as_array_or_number, checked
 from mirrorskin.kernels.array_types import Doubles
 
-_FEWEST = 8  # least number of frames
-_PIXELS, _SAMPLES = 4096, 2**22  # largest numbers of pixels and of samples that are used
-_GREATEST = 1e12  # counts: largest sample
+_FEWEST = 8  # minimum number of frames
+_PIXELS, _SAMPLES = 4096, 2**22  # maximum numbers of pixels and of samples that are used
+_GREATEST = 1e12  # counts: maximum sample
 _FINER = 4  # lines of the periodogram per independent line
-_SPARSE = 64  # largest duration over the number of frames, in median steps between frames
-_SIGNIFICANT = 8.0  # standard deviations of the power of noise: least power of an oscillation
+_SPARSE = 64  # maximum mean interval between frames, in median intervals
+_SIGNIFICANT = 8.0  # minimum power of an oscillation, in standard deviations of the power of noise
 _STEPS = 3  # Gauss-Newton steps
 
 

@@ -25,22 +25,22 @@ if TYPE_CHECKING:
     from mirrorskin.io import Source
 
 _UPDATES_BETWEEN_PLACINGS = 8  # updates between estimates of the object's height in the body
-_FEWEST = 3  # least number of frames of a fit
-_WARMING = 10  # updates until all kernels have been run
-_PARTS = 24  # parts of the longest kernel of the edges
+_FEWEST = 3  # minimum number of frames of a fit
+_WARMING = 10  # number of updates that run all kernels
+_PARTS = 24  # number of parts of the longest kernel of the edges
 _OVERDUE = 0.1  # seconds without a part after which one is run without spare time
 _FIRST_COST = 0.005  # seconds: assumed duration of the first part
 _DECAY = 0.7  # decay of the expected duration of a part, per part
 
 
 def choose_window(frames_per_turn: float, window_frames: int | None = None) -> tuple[int, int]:
-    """Return the number of frames of a window of one turn, and n if every n-th frame is used.
+    """Return the number of frames of a window of one turn, and n, if every n-th frame is used.
 
     Parameters
     ----------
     frames_per_turn : float
     window_frames : int, optional
-        Frames of the window; by default those of a turn, up to 64.
+        Number of frames of the window; by default all of a turn, up to 64.
 
     Raises
     ------
@@ -61,9 +61,9 @@ def choose_window(frames_per_turn: float, window_frames: int | None = None) -> t
 class LastTurn(Normals):
     """Normals of the last turn of an endless rotation; while the body moves, also its edges and heights.
 
-    Heights follow the normals in a separate thread, by at most one solver step per update: their error is
-    similar to the changes between updates, and normals do not wait for them. Edges are drawn in spare time.
-    With a calibrated response, the height of the object in the body is estimated at intervals, from the
+    Heights follow the normals in a separate thread, by at most one solver step per update: normals do not
+    wait for them, and their error is similar to the changes between updates. Edges are drawn in idle time.
+    With a calibrated response, the height of the object in the body is estimated at intervals from the
     heights so far.
     """
 

@@ -21,16 +21,16 @@ from mirrorskin.kernels.array_types import Doubles
 
 P = ParamSpec("P")
 
-_FEWEST = 4  # frames of a preview: one more than a slope needs, to estimate the noise
-_WARMING = 8  # frames that run all kernels
+_FEWEST = 4  # minimum number of frames of a preview: one more than for a slope, to estimate the noise
+_WARMING = 8  # number of frames that run all kernels
 
 
 class MovingNormals(NormalsOperation):
     """Normals from frames at any given poses, or the slope along one direction if the body only rocks.
 
-    The frames are fitted in windows of `longest` frames; a later window that determines less than the first
-    is omitted. If the travel varies, only frames in which a pixel is in contact are used, and ``contact`` is
-    1 where the pixel is in contact in the frames of at least one window.
+    The frames are fitted in windows of `longest` frames; later windows that determine less than the first are
+    omitted. If the travel varies, only frames in which a pixel is in contact are used, and ``contact`` is 1
+    where the pixel is in contact in all frames of at least one window.
 
     If all axes lie in one plane, ``slope`` is the rise per millimetre along ``slope_direction`` in
     ``process``, radians from x towards y, and there are no normals.

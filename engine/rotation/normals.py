@@ -118,16 +118,16 @@ class NormalsOperation(SensorOptions, Operation):
 
     @cached_property
     def _buffer(self) -> NDArray[Any]:
-        """The frames of the open turn, and space for more."""
+        """Buffer with the frames of the current turn, and space for more."""
         return room_of(self._bands, min(band.length for band in self._bands))
 
     def clear(self) -> None:
         """Forget the frames so far, and all estimates from them."""
         self._model = self._kernel.model
         self._lent: AnyArray | None = None  # a whole stack, which is used without a copy
-        self._phase = np.empty((0, self._width) if self._width else 0)  # of the frames in the buffer
+        self._phase = np.empty((0, self._width) if self._width else 0)  # phases of the frames in the buffer
         self._weights = np.empty(0)
-        self._turns = self._frames = 0  # numbers of those in the maps
+        self._turns = self._frames = 0  # numbers of turns and frames in the maps
         self._each: list[list[NDArray[Any]]] = []
 
     @property
@@ -371,7 +371,7 @@ class Normals(NormalsOperation):
     """
 
     takes_device_arrays = True
-    _light: FrameLight | None = None  # of the frames that are pushed again
+    _light: FrameLight | None = None  # light of the frames that are pushed again
     _weighted: bool = False  # whether frames had weights
 
     tilt: ArrayLike | None = option(  # of `estimate_normals`, an array is one of each frame
@@ -401,7 +401,7 @@ class Normals(NormalsOperation):
     )
 
     def check_options(self) -> None:
-        """Raise InputError if the zenith's gain is 0, or no body tilts so."""
+        """Raise InputError if the zenith's gain is 0, or the tilt is impossible."""
         super().check_options()
         if not isinstance(self.tilt, str | None):
             check_tilt(cast(float, self.tilt))
@@ -449,7 +449,7 @@ class Normals(NormalsOperation):
         return super().room if self.window_frames is None else self._window.room
 
     def reconsider(self, samples: FrameSamples) -> bool:
-        """Return whether the light of the frames differs, so that they are pushed again in steady light."""
+        """Return whether the light varies, so that the frames must be pushed again in steady light."""
         alone = self.per_turn or self.window_frames is not None or self.response is not None
         if alone or self._weighted or self.zenith_gain is None or self._tilt_so_far is None:
             return False

@@ -31,9 +31,9 @@ MAPS = "vectors", "sigma", "contact", "mean", "cosine", "sine", "residual"
 SLOPE_MAPS = "slopes", "slope_errors", "zeniths"
 """Names of the additional maps of a body that rocks."""
 
-_TABLES = 64  # largest number of turns whose tables are on the device
+_TABLES = 64  # maximum number of turns whose tables are on the device
 _TURN_PLANES, _POSE_PLANES = 6, 13  # rows of a table
-_ENOUGH = 500  # least number of clear pixels for an estimate of the noise
+_ENOUGH = 500  # minimum number of clear pixels for an estimate of the noise
 _MOST_NOISE = 1e12  # counts
 _MAP_BYTES = 33  # bytes per pixel of all output maps
 
@@ -191,7 +191,7 @@ class NormalKernel:
                 band.write("scale", values[band.rows], plane=plane)
 
     def write_tables(self, fits: Sequence[TurnFit | PoseFit]) -> None:
-        """Copy the tables of turns to the devices, after earlier turns, unless they are there already."""
+        """Copy the tables of turns to the devices, after earlier turns, unless they are already there."""
         if all(fit in self._places for fit in fits):
             return
         self._places = {fit: place for place, fit in enumerate(dict.fromkeys(fits))}
@@ -225,7 +225,7 @@ class NormalKernel:
             file, name = "normals_pose", "normals_pose" if fit.direction is None else "normals_rock"
         kernel = device.kernel(file, name, FRAME=C_TYPES[self._dtype.name], LANES=lanes)
         limits = contact_limits(count - 3, tilt)
-        fitted = tilt if self._method == "exact" else 0.0  # the exact method fits a pixel's excess over this
+        fitted = tilt if self._method == "exact" else 0.0  # the exact method fits the excess over this tilt
         further: dict[str, Any] = {}
         if isinstance(fit, PoseFit):
             further = {"presses": int(fit.presses)}

@@ -24,8 +24,8 @@ class NormalWindow:
     """Normals of a window of the last frames on the device, for `mirrorskin.engine.Normals`.
 
     Noise and tilt are estimated from the first full window, unless they are given. The frames are in a ring
-    buffer on the device that the correlation uses as well. Normals and correlation are equal, bit by bit, to
-    those that ``estimate_normals`` and ``correlate`` compute from the same frames.
+    buffer on the device that the correlation uses as well. Normals and correlation are bitwise equal to the
+    results of ``estimate_normals`` and ``correlate`` for the same frames.
     """
 
     device: Device

@@ -16,12 +16,12 @@ from mirrorskin.io.types import body_axes
 from mirrorskin.kernels.array_types import Doubles
 
 PRESSES = 0.02
-"""Least range of travel of a body that also presses, as a share of the greatest travel."""
+"""Minimum range of travel of a body that also presses, as a share of the maximum travel."""
 
 _SAME = 1e-4  # ratio of singular values of the axes below which all axes are the same
 _PLANE = 1e-2  # ratio of singular values of the axes below which they are in a plane
-_UPRIGHT = 0.05  # sine of the largest angle between this plane and the vertical
-_FRAMES_OF_SECOND = 9  # least number of frames for a fit of second order
+_UPRIGHT = 0.05  # sine of the maximum angle between this plane and the vertical
+_FRAMES_OF_SECOND = 9  # minimum number of frames for a fit of second order
 _UNIT = 1e-6  # tolerance of the length of a unit vector
 
 
@@ -29,14 +29,14 @@ _UNIT = 1e-6  # tolerance of the length of a unit vector
 class PoseFit:
     """The fit to a window of N frames. Fits are compared by identity.
 
-    ``direction`` is that of rocking, radians from x towards y; None if the axes determine a normal.
+    ``direction`` is the direction of rocking, radians from x towards y; None if the axes determine a normal.
     """
 
     weights: Doubles  # (N,), above 0
     matrix: Doubles  # (3, N): from samples to mean, cosine and sine
     waves: Doubles  # (N, n): orthonormal basis of the samples of all normals, approximately
     table: NDArray[np.float32]  # (13, N): see mirrorskin.kernels.normals_pose
-    tilt: float  # root mean square of the frames', radians
+    tilt: float  # root mean square tilt of the frames, radians
     presses: bool  # whether travel differs between frames
     deep: NDArray[np.bool_]  # (N,): frames with at least the median travel
     direction: float | None
@@ -51,7 +51,7 @@ def check_poses(
 ) -> Doubles:
     """Return the axis and the travel of each frame, (count, 4), from its phase and tilt, or its axis.
 
-    InputError: both an axis and a phase, neither, or numbers that cannot be a pose.
+    InputError if both an axis and a phase are given, or neither, or if the numbers are not poses.
     """
     if (axis is None) == (phase is None or tilt is None):
         raise InputError("poses are a phase and a tilt of each frame, or an axis: give one of both")
@@ -95,7 +95,7 @@ def even_windows(frames: int) -> int:
 def pose_fit(pose: Doubles, weights: Doubles) -> PoseFit:
     """Return the fit to frames with poses (N, 4) and weights above 0.
 
-    InputError: fewer than 3 frames, axes that are all the same, or axes in a plane that is not upright.
+    InputError for fewer than 3 frames, for identical axes, and for axes in a plane that is not upright.
     """
     axes, travel = pose[:, :3], pose[:, 3]
     if len(axes) < 3:

@@ -56,8 +56,8 @@ class Registered(DerivedSource):
     height is NaN. If ``zenith_gain`` and ``zenith_offset`` are maps, counts are converted to the scale of the
     output pixel; a pixel without a scale, such as a defect, gets the mean of two opposite neighbours.
 
-    It is assumed that the sheet touches all points in every pose and that none is hidden: a mirror skin
-    takes the object's shape, and a camera along the body's axis sees all of it that does not overhang.
+    The sheet is assumed to touch all points in every pose, and no point to be hidden: a mirror skin conforms
+    to the object, and a camera along the body's axis sees all parts that do not overhang.
 
     Attributes
     ----------
@@ -185,7 +185,7 @@ class _Geometry:
         return cls((float(x[0]), float(y[0])), pixel_size, tilt, press, pivot, sight)
 
     def shift(self, phase: float) -> NDArray[np.float32]:
-        """Return the shifts of the points at a phase, as ``registration_resample`` needs them."""
+        """Return the shifts of the points at a phase, as required by ``registration_resample``."""
         cosine, sine = math.cos(phase), math.sin(phase)
         along_x, along_y = self.pixel_size
         rise, drop = math.sin(self.tilt), 2 * math.sin(self.tilt / 2) ** 2

@@ -16,11 +16,11 @@ from mirrorskin.io import InputError
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import huber
 
-_FLOAT_NOISE = 1e-6  # least noise of float frames, as a share of the greatest count
-_FRAMES_OF_TWO = 7  # least number of frames for a fit with the second harmonic
-_MAX_CONDITION = 100.0  # largest condition of this fit
-_BINS, _BIN_PIXELS = 16, 200  # largest number of bins of brightness, and least number of pixels of a bin
-_AT_ONCE = 4096  # pixels per block, which stays in the cache
+_FLOAT_NOISE = 1e-6  # minimum noise of float frames, as a share of the maximum count
+_FRAMES_OF_TWO = 7  # minimum number of frames for a fit with the second harmonic
+_MAX_CONDITION = 100.0  # maximum condition of this fit
+_BINS, _BIN_PIXELS = 16, 200  # maximum number of bins of brightness, and minimum number of pixels per bin
+_AT_ONCE = 4096  # pixels per block, which fits into the cache
 _ROUNDS, _OUTLYING = 10, 0.2  # iterations of the line's robust fit, and its limit of relative residuals
 _BEYOND = 1e-3  # significance level of outliers
 
@@ -120,7 +120,7 @@ def _variance(squares: Doubles, freedom: int) -> float:
 def _share_beyond(freedom: int, square: float) -> float:
     """Return the probability that chi^2 exceeds a value, for integer degrees of freedom.
 
-    SciPy's function is in a module that a rotation does not load; it would add a tenth to the command's time.
+    Loading SciPy's function would increase the time of a rotation's command by a tenth.
     """
     half = square / 2
     powers = np.arange(1 if freedom % 2 == 0 else 1.5, freedom / 2, dtype=np.float64)

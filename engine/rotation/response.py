@@ -29,7 +29,7 @@ class Response:
     """Brightness of each pixel as a function of the normal; replaces a ``Scale``.
 
     The planes, (5, H, W), are counts without light; light per count; x and y from the wall's axis, and the
-    height z of the object in the mean pose above the rest plane, mm. They are NaN without a response.
+    height z of the object above the rest plane in the mean pose, mm. They are NaN where there is no response.
     """
 
     planes: NDArray[np.float32]
@@ -91,7 +91,7 @@ class Response:
 
 
 def wall_response_of(source: Source) -> WallResponse | None:
-    """Return the response of a source's calibration, if it has a graded one.
+    """Return the response in the calibration of a source, or None unless it is graded.
 
     Normals are computed with one half-angle d of the precession. If it is elliptic with ellipticity e and its
     greatest half-angle at azimuth m, the half-angle at azimuth a is d (1 + e cos 2(a - m)). Apart from the
@@ -113,7 +113,7 @@ def wall_response_of(source: Source) -> WallResponse | None:
 def initial_response(wall: WallResponse, source: Source, header: Header) -> Response:
     """Return the response for a source's pixels, with the object at half the press.
 
-    ``header`` replaces that of the source.
+    ``header`` replaces the header of the source.
     """
     if header.pixel_size is None or header.press is None:
         missing = "pixel size" if header.pixel_size is None else "press"

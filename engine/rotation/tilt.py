@@ -16,8 +16,8 @@ from mirrorskin.kernels.array_types import Doubles
 STEEP = 4.0
 """Ratio of zenith and tilt above which one wave per turn is a good approximation."""
 
-_STEEPEST = math.radians(30.0)  # largest tilt that the sheet can follow
-_FEWEST = 30  # least number of pixels of an estimate
+_STEEPEST = math.radians(30.0)  # maximum tilt that the sheet can follow
+_FEWEST = 30  # minimum number of pixels of an estimate
 _ROUNDS = 5  # iterations
 
 

@@ -31,10 +31,10 @@ MAPS = {
 """Declarations of the maps of `find_displacement`: each component has its own standard deviation."""
 
 _RANK = np.array([1, 0, 2, 3], np.uint8)  # rank of a status: a pixel has the highest of its nodes
-_MOST_STEP = 64  # largest distance of nodes, pixels
+_MOST_STEP = 64  # maximum distance of nodes, pixels
 _ALIKE = 4  # samples over which residuals are correlated
-_LAPLACIAN_NOISE = 4 * 20 / 24**2  # noise of the squared bias, two standard deviations, per variance
-_LEAST_TEXTURED = 0.1  # smallest share of windows with texture; edges of light give as many on a clear sheet
+_LAPLACIAN_NOISE = 4 * 20 / 24**2  # noise of the squared bias (two standard deviations) per variance
+_LEAST_TEXTURED = 0.1  # minimum share of windows with texture; edges of light on a clear sheet may reach it
 
 
 @checked(
@@ -55,13 +55,13 @@ def find_displacement(
     noise: float | None = None,
     device: str | Device | None = None,
 ) -> Result:
-    """Find how far the texture of a reference has moved in frames.
+    """Estimate the displacement of the texture of a reference in frames.
 
-    Least squares in square windows. Each may move, strain and turn (an affine field), and its brightness may
-    change by a gain and a plane; see the documentation, "Slip". The texture at the pixel x of the reference
-    is at x + displacement in the frame. The start of each frame is extrapolated from earlier ones, so that
-    steps may be as long as half of the texture's grain; after a longer one, coarser resolutions and the
-    correlation of the whole picture are tried.
+    The method is least squares in square windows. In each window, the displacement is an affine field, and
+    the brightness may change by a gain and a plane; see the documentation, "Slip". The texture at the pixel x
+    of the reference is at x + displacement in the frame. The initial displacement of each frame is
+    extrapolated from earlier ones, so steps may be as long as half of the texture's grain; after a longer
+    step, coarser resolutions and the correlation of the whole picture are tried.
 
     Parameters
     ----------
@@ -71,8 +71,7 @@ def find_displacement(
     pixel_size : float or (float, float)
         Millimetres, along x and y.
     window_size : int
-        Side of a window, pixels. A window twice as large halves the standard deviation, and smooths twice as
-        far.
+        Side of a window, pixels. Doubling it halves the standard deviation and the resolution.
     window_step : int
         Distance between the centres of adjacent windows, pixels.
     noise : float, optional
@@ -84,16 +83,16 @@ def find_displacement(
     -------
     Result
         ``displacement`` and ``displacement_sigma``, (T, H, W, 2), mm along x and y (up), are undefined unless
-        ``status``, (T, H, W), is 1: 0 the window leaves the picture or has no usable sample, 2 the texture
-        was not found again, 3 no texture beyond the noise. ``process`` contains the ``noise``, counts. Of
-        frames on a device, displacement and sigma stay there.
+        ``status``, (T, H, W), is 1. Other values are 0 if the window leaves the picture or has no usable
+        sample, 2 if the texture was not found, and 3 if it does not exceed the noise. ``process`` contains
+        the ``noise``, counts. If frames are on a device, displacement and sigma are returned there.
 
     Raises
     ------
     mirrorskin.io.InputError
-        Frames or parameters that cannot be used; hardly any window has texture beyond the noise.
+        Frames or parameters cannot be used, or hardly any window has texture beyond the noise.
     mirrorskin.kernels.errors.DeviceError
-        No device, or one without room.
+        There is no device, or its memory is too small.
 
     Examples
     --------
@@ -145,9 +144,9 @@ class Texture:
     usable : ndarray, (rows, columns), bool
         Whether the window has enough samples.
     variance : ndarray, (rows, columns), float64
-        Of a sample, counts^2.
+        Variance of a sample, counts^2.
     noise : float
-        The median's root.
+        Square root of the median variance, counts.
     """
 
     covariance: Doubles
@@ -206,7 +205,7 @@ def _at_nodes(
 def misfit(field: NodeField, texture: Texture, window: int) -> Doubles:
     """Return the factor, (rows, columns, 1), of sigma for a frame's misfit beyond noise.
 
-    Residuals from changes of brightness are correlated over some samples, by whose number they count.
+    Residuals due to changes of brightness are correlated over some samples; the factor allows for that.
     """
     chance = 1 + 2 * math.sqrt(2) / window  # two standard deviations of a window's variance
     more = np.fmax(field.variance / texture.variance - chance, 0)

@@ -14,14 +14,14 @@ from scipy.sparse.linalg import splu
 
 from mirrorskin.kernels.array_types import Doubles
 
-_CANDIDATES = 48  # onsets that are tried for the first map
-_EVIDENCE = 8.0  # smallest log-likelihood ratio of a departure, for a node's first onset
-_ROUNDS = 20  # largest number of Gauss-Newton steps
-_WIDE = 5  # of them, in the first of which departures begin gradually
-_MANY = 1000  # nodes above which a fit of a quarter of them saves time
-_SETTLED = 1e-6  # change of an onset on the path, relative to its length, that ends them
-_NEAR = 0.01  # change below which steps reuse the equations of an earlier one
-_FARTHEST = 0.08  # largest change of an onset in a step, relative to the path
+_CANDIDATES = 48  # number of onsets tried for the initial map
+_EVIDENCE = 8.0  # minimum log-likelihood ratio of a departure for the initial onset of a node
+_ROUNDS = 20  # maximum number of Gauss-Newton steps
+_WIDE = 5  # number of initial steps in which departures begin gradually
+_MANY = 1000  # number of nodes above which a quarter of them is fitted first, to save time
+_SETTLED = 1e-6  # change of an onset, relative to the path, that ends the steps
+_NEAR = 0.01  # change of an onset, relative to the path, below which steps reuse earlier equations
+_FARTHEST = 0.08  # maximum change of an onset in a step, relative to the path
 _LOCKING = 0.05  # prior sigma of the bias of displacements towards halves of a pixel, pixels
 _POWER_SIGMA = 0.1  # standard deviation of the power; those of slides and twists differ by twice that
 _APART = 9  # distance of nodes above which errors of onsets are independent
@@ -71,21 +71,22 @@ def fit_onsets(
 ) -> OnsetMap:
     """Fit ``growth (distance - onset)^power``, zero before the onset, to departures blurred by windows.
 
-    A window's departure is the mean over it. Where the onset changes by ``slope`` from node to node, it is
-    the mean over onsets within ± slope window / 2. The map of growth has small second differences, and that
-    of onsets small third ones: under a ball it is a paraboloid. Both are estimated together by Gauss-Newton
-    steps, with the amplitude by which displacements are biased towards halves of a pixel. The standard
-    deviation combines the noise and the change of the onset for another power.
+    The departure of a window is the mean over it. Where the onset changes by ``slope`` from node to node, it
+    is the mean over onsets within ± slope window / 2. The prior penalises second differences of the growth,
+    and third differences of the onsets, which are 0 for the paraboloid under a ball. Both maps are estimated
+    jointly by Gauss-Newton steps, together with the amplitude of the bias of displacements towards halves of
+    a pixel. The standard deviation combines the noise and the change of the onset for another power.
 
     Parameters
     ----------
-    departure : (T, rows, columns), mm, of the frames after the reference; NaN where there is none
-    sigma : (rows, columns), mm, of a departure; half of its variance is the reference's, common to all frames
-    distance : (T,), of the body since the reference, along its path
-    window : nodes, over which a departure is a mean
-    radius : nodes, of a disc as large as the contact
-    expected : of the motion
-    locking : (2, T, rows, columns), mm, what an amplitude of a pixel along x, or y, would add to departures
+    departure : (T, rows, columns), mm, in the frames after the reference; NaN where unknown
+    sigma : (rows, columns), standard deviation of a departure, mm; half of the variance is the reference's,
+        which is common to all frames
+    distance : (T,), distance travelled by the body since the reference
+    window : side of the window over which a departure is averaged, nodes
+    radius : radius of a disc as large as the contact, nodes
+    expected : prior knowledge of the motion
+    locking : (2, T, rows, columns), mm, change of departures for an amplitude of one pixel along x, or y
     """
     fit = _fit(departure, sigma, distance, window, radius, expected, locking)
     length = float(distance[-1])
@@ -116,7 +117,7 @@ def _fit(
     expected: Expected,
     locking: Doubles,
 ) -> _Fit | None:
-    """Return what fits best; None without departure. Many nodes start from the fit of every second one."""
+    """Return the best fit; None without a departure. For many nodes, every second one is fitted first."""
     power = expected.power
     known = np.isfinite(departure).all(axis=0) & np.isfinite(sigma)
     scale = np.divide(1.0, sigma, out=np.zeros(sigma.shape), where=known)

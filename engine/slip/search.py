@@ -42,14 +42,14 @@ _EXPECTED = {  # see docs/method/slip.md
     "horizontal": Expected(power=1.6, onset_bend=12.0, growth_bend=32.0),
     "twist": Expected(power=1.4, onset_bend=24.0, growth_bend=4.0),
 }
-# An estimated contact is too wide: at its rim in a slide, windows contain free skin.
+# An estimated contact is too wide: at its rim, windows of a slide contain free skin.
 _BEND_ESTIMATED = {"horizontal": 64.0, "twist": 24.0}
 _RIM, _ENOUGH = (
     1.5,
     0.25,
 )  # windows from its rim that are left out, and least share of the nodes that are left
-_FOLLOWS = 0.5  # of the object's movement, above which skin is assumed to have been in contact with it
-_LEAST_STUCK = 4  # smallest number of nodes for the centre and the angle of a twist
+_FOLLOWS = 0.5  # minimum displacement of skin in contact, as a share of the object's
+_LEAST_STUCK = 4  # minimum number of nodes for the centre and the angle of a twist
 _STILL = 1e-9  # motion, relative to the body's path, up to which it is at rest
 _BLOCK = 16  # frames read at once
 
@@ -57,13 +57,13 @@ _BLOCK = 16  # frames read at once
 class Slip(Operation):
     """Displacement of the skin, and where and when it slips while the body slides or twists.
 
-    The first frame is the reference. In the body's frame, skin that sticks to an object at rest moves as the
-    object does, against the body; skin that lags behind it has slipped. The onset of slip is fitted to all
-    frames (`mirrorskin.engine.slip.onset_map.fit_onsets`); see the documentation, "Slip".
+    The first frame is the reference. In the body's frame, skin that sticks to an object at rest moves with
+    the object; skin that lags behind it has slipped. The onset of slip is fitted to all frames
+    (`mirrorskin.engine.slip.onset_map.fit_onsets`); see the documentation, "Slip".
 
-    ``process`` contains the ``noise``, counts, and where the ``contact`` is from. For a twist it contains the
-    ``angle``, radians counter-clockwise, by which the skin that sticks turned, and ``centre_x`` and
-    ``centre_y``, mm from the body's axis, of that rotation; they are NaN if too little skin sticks.
+    ``process`` contains the ``noise``, counts, and the origin of the ``contact``. For a twist it also
+    contains the rotation of the sticking skin: its ``angle``, radians counter-clockwise, and its centre,
+    ``centre_x`` and ``centre_y``, mm from the body's axis; they are NaN if too little skin sticks.
 
     Examples
     --------
@@ -88,8 +88,8 @@ class Slip(Operation):
         default=None,
         file="RES.h5",
         help="where the skin touches the object in the first frame: the result of a press, or a map that is"
-        " not 0 there. A pressure determines contact; heights alone are those of light, which runs ahead of"
-        " an elastic contact",
+        " not 0 there. With a pressure, this is the contact; with heights only, the area of light, which is"
+        " ahead of an elastic contact",
         shown_default="where the skin followed the object by half of its movement, 2 to 9 % too wide",
     )
     per_frame: bool = option(
@@ -114,17 +114,17 @@ class Slip(Operation):
     motion: Literal["horizontal", "twist"] = option(
         default="horizontal",
         choices=("horizontal", "twist"),
-        help="motion of the body: a slide along the sheet, or a rotation about its axis; that of a source",
+        help="motion of the body: a slide along the sheet, or a rotation about its axis; from the source",
         python_only=True,
     )
     pixel_size: ArrayLike | None = option(
         default=None,
-        help="millimetres along x and y, one number or both; that of a source",
+        help="millimetres along x and y, one number or both; from the source",
         python_only=True,
     )
     centre: tuple[float, float] = option(
         default=(0.0, 0.0),
-        help="where the body's axis is, mm from the centre of the frames along x and y; that of a source",
+        help="position of the body's axis, mm from the centre of the frames along x and y; from the source",
         python_only=True,
     )
 
@@ -355,7 +355,7 @@ class Slip(Operation):
     def _inside(self, touched: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return the nodes of a contact whose windows contain no free skin: all, if the contact is given.
 
-        An estimated contact is too wide by about a window. All nodes are returned if this leaves few.
+        An estimated contact is too wide by about a window. All nodes are returned if few would be left.
         """
         if self._contact is not None:
             return touched
@@ -408,9 +408,9 @@ class Slip(Operation):
 class _Course:
     """Trajectory of the body, and of the object in the body's frame.
 
-    ``distance``, (T - 1,), mm or radians, is the length of the path since the first frame, and ``end`` that
-    before the body turns back, after ``forward`` frames. ``reach`` is the distance in millimetres that a node
-    moves for each unit of it.
+    ``distance``, (T - 1,), mm or radians, is the length of the path since the first frame. ``end`` is its
+    length before the body turns back, after ``forward`` frames. ``reach`` is the displacement of a node, mm,
+    per unit of the path.
     """
 
     def __init__(self, places: Doubles, x: Doubles, y: Doubles, centre: tuple[float, float]) -> None:

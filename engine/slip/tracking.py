@@ -22,15 +22,15 @@ ITERATIONS = 8
 GRADIENT_NOISE = 1.3923
 """Variance of a cubic spline's derivative at a sample, for samples with noise of variance 1."""
 
-_LEVELS = 4  # largest number of resolutions
-_ENOUGH = 0.5  # share of the windows that must be found
-_LIKE = 0.5  # smallest contrast of the same texture, relative to the reference
-_MOST = 0.98  # share of the nodes that must settle; windows with little texture never do
+_LEVELS = 4  # maximum number of resolutions
+_ENOUGH = 0.5  # minimum share of windows that are found
+_LIKE = 0.5  # minimum contrast of the same texture, relative to the reference
+_MOST = 0.98  # share of the nodes that must converge; windows with little texture never do
 _SETTLED = 0.03  # change, pixels, that ends iterations: the linearisation error is then below 0.001 pixels
-_FARTHEST = 1.5  # largest change in one iteration, pixels
+_FARTHEST = 1.5  # maximum change in one iteration, pixels
 _KERNEL = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16  # smoothing of the field over nodes
 _HOLD = 0.01  # weight of the previous field, relative to that of the median node
-_TILE = 4096  # pixels of a core's work-item
+_TILE = 4096  # pixels per work-item on a CPU
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class NodeField:
     Attributes
     ----------
     moved : ndarray, (2, rows, columns), float64
-        Pixels to the right and down; NaN where a window leaves the picture or has no texture at all.
+        Pixels to the right and down; NaN where a window leaves the picture or has no texture.
     variance : ndarray, (rows, columns), float64
         Variance of a sample, counts^2, from the residual in the window.
     found : ndarray, (rows, columns), bool
@@ -70,9 +70,9 @@ class Tracker:
     Parameters
     ----------
     reference : ndarray or Array, (H, W), uint8, uint16 or float32
-        Frames that are followed are in either memory as well.
+        Frames may be in host or device memory as well.
     window, step : int
-        Pixels of a window's side, and from node to node.
+        Side of a window, and distance between nodes, pixels.
     device : Device
     """
 
@@ -85,7 +85,7 @@ class Tracker:
 
     @cached_property
     def _levels(self) -> list[_Level]:
-        """The reference at all resolutions, each half of the one before."""
+        """The reference at all resolutions, each half of the preceding one."""
         levels, counts = [self.finest], on_host(self._reference)
         for _ in range(1, _LEVELS):
             counts = cv2.pyrDown(counts.astype(np.float32))

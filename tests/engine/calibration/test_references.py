@@ -128,9 +128,9 @@ def test_frames_that_are_all_equal_are_exact_but_for_their_rounding(dtype):
 @pytest.mark.parametrize(
     ("dark", "bright", "said"),
     [
-        ((1, 16), (8, 200), "dark holds 1 frame"),
-        ((8, 16), (1, 200), "bright holds 1 frame"),
-        ((0, 16), (8, 200), "dark holds no frames"),
+        ((1, 16), (8, 200), "dark contains 1 frame"),
+        ((8, 16), (1, 200), "bright contains 1 frame"),
+        ((0, 16), (8, 200), "dark contains no frames"),
         ((8, 200), (8, 16), "no brighter"),
         ((8, 16), (8, 16), "no brighter"),
     ],

@@ -284,7 +284,7 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing(window, monkey
         (frames, MEASURED, -np.ones(8), "weight -1.0 at frame 0"),
     ]
     if window is None:
-        wrong.append((frames, MEASURED, None, "sums hold 12 frames"))
+        wrong.append((frames, MEASURED, None, "at most 12 frames can be summed"))
     for block, phase, weights, message in wrong:
         with pytest.raises(InputError, match=message):
             operation.push(block, phase=phase, frame_weights=weights)
