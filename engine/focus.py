@@ -9,12 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.focus_travel import find_travel_jump
 from mirrorskin.engine.footprint import with_curvature
 from mirrorskin.engine.operation import Operation, travel_function
 from mirrorskin.engine.options import option
 from mirrorskin.io import InputError, Map
+from mirrorskin.io.findings import Finding, in_process
 from mirrorskin.io.maps import TABLE, FocusStatus, status_of
 from mirrorskin.io.positions import check_strokes
+from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array import fetch
 from mirrorskin.kernels.device import C_TYPES
@@ -44,6 +47,7 @@ class Focus(Operation):
 
     motions = ("vertical",)
     takes_device_arrays = True
+    _jump: Finding | None = None  # of the travel
     dtypes = FRAME_DTYPES
     on_device = True
 
@@ -82,7 +86,17 @@ class Focus(Operation):
         self._recent = self.device.array("recent", (self.reach, *shape), np.float32, zeroed=False)
 
     def clear(self) -> None:
-        """Do nothing: the first frame overwrites the maps."""
+        """Forget what the frames so far showed; the next one overwrites their maps."""
+        self._jump = None
+
+    def reconsider(self, samples: FrameSamples) -> bool:
+        """Look whether the peaks fit to the travel, which only shows after the last frame."""
+        assert self.noise is not None
+        if 0 < self.noise < _LARGEST and self.reach > 1:
+            peak, best = fetch([(array, slice(None)) for array in (self._peak, self._best)])
+            freedom = (2 * self.radius + 1) ** 2 - 1
+            self._jump = find_travel_jump(peak, best, self.pushed("travel"), freedom, self.noise**2)
+        return False
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike) -> None:
         """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
@@ -125,7 +139,8 @@ class Focus(Operation):
         # Where few pixels around have a peak, noise and their surroundings decided which ones.
         peaks = cv2.blur(np.isfinite(height).astype(np.float32), (2 * self.radius + 1,) * 2)
         sigma = sigma / np.maximum(peaks, _LEAST_SHARE) ** 2
-        return {"height": height, "height_sigma": sigma, "status": status, "sharpness": sharpness}
+        maps = {"height": height, "height_sigma": sigma, "status": status, "sharpness": sharpness}
+        return maps | in_process([] if self._jump is None else [self._jump], {})
 
     def _excess(self, misfit: NDArray[Any]) -> NDArray[np.float32]:
         """Return the variance of log S in excess of noise: the median, or more where curves fit less well."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine, io
+from mirrorskin.io.arrays import ArrayRecording
 
 SHAPE = (48, 48)
 TRAVEL = np.arange(0, 9, 0.5)
@@ -155,3 +156,32 @@ def test_errors_grow_where_few_pixels_around_have_a_peak():
     found = engine.focus.find_focus(noisy(frames, 0.5, 0), TRAVEL, noise=0.5)
     inside, border = np.nanmedian(found.height_sigma[:, 10]), np.nanmedian(found.height_sigma[:, 24])
     assert border > 2 * inside
+
+
+def jumped(steps):
+    """Return the travel of frames from which some are missing, or one is there twice, before frame 9."""
+    return np.where(np.arange(len(TRAVEL)) >= 9, TRAVEL + 0.5 * steps, TRAVEL)
+
+
+def seen(travel, stated):
+    """Return the maps of an inclined surface at some travel, from a recording that states another one."""
+    slope = 4.2 + 0.04 * (np.arange(SHAPE[1]) - 23.5)
+    frames = noisy(textured(travel, sharpest=slope), 0.5, 0)
+    return engine.run(ArrayRecording(frames, {"travel": stated}, {}), engine.focus.Focus(noise=0.5))
+
+
+@pytest.mark.parametrize(
+    ("steps", "words"),
+    [
+        (1, "0.5 mm further, as if a frame before it was missing"),
+        (-1, "0.5 mm back, as if a frame before it was there twice"),
+    ],
+)
+def test_a_lost_frame_is_found_by_the_peaks(steps, words):
+    with pytest.warns(io.MirrorskinWarning, match=f"from frame 9 on, .* fit a travel {words}"):
+        seen(jumped(steps), TRAVEL)
+
+
+@pytest.mark.filterwarnings("ignore:.*is this a rotation")
+def test_travel_that_is_measured_may_jump():
+    assert "peaks" not in seen(jumped(1), jumped(1)).process.get("warnings", "")
