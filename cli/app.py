@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack, closing
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import click
@@ -16,6 +19,7 @@ from mirrorskin.cli.stack import RECORDING, stack_options, stack_words
 if TYPE_CHECKING:
     from mirrorskin.view.app import Opening
 
+_ENDING = "SIGINT", "SIGTERM", "SIGHUP"
 _LIFETIME = 1000
 """Milliseconds after which a rig is stopped if its page was closed or lost its connection."""
 
@@ -74,9 +78,35 @@ def command(
         server = AppServer(pages(files or (), openings, control), port or 0, **lifetime)
         click.echo(server.address)
         try:
-            server.run(browser=not no_browser)
+            with _ended_by_signals(server.stop):
+                server.run(browser=not no_browser)
         except KeyboardInterrupt:
             click.echo("ended", err=True)
+
+
+@contextmanager
+def _ended_by_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """Let signals stop the server, and handle them as usual when it has ended.
+
+    An exception in the middle of what the server does could be lost there.
+    """
+    numbers = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
+    usual = {number: handler for number in numbers if callable(handler := signal.getsignal(number))}
+    received: list[int] = []
+
+    def handle(number: int, _: FrameType | None) -> None:
+        received.append(number)
+        stop()
+
+    for number in usual:
+        signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+    if received:
+        usual[received[0]](received[0], None)
 
 
 def _opening(

@@ -14,7 +14,7 @@ import pytest
 from tornado.ioloop import IOLoop
 
 from mirrorskin.io import InputError
-from mirrorskin.view.app.server import AppServer, StopServer
+from mirrorskin.view.app.server import AppServer, StopServer, open_browser
 
 PATIENCE = 60.0  # seconds
 
@@ -117,6 +117,14 @@ def test_a_web_socket_without_the_token_is_refused(served):
 def test_a_port_that_is_in_use_is_refused_in_one_line(served):
     with pytest.raises(InputError, match=f"port {served.port} cannot be used .*choose another with --port"):
         AppServer(_page, served.port)
+
+
+def test_the_token_is_no_argument_of_the_browser(tmp_path, monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    open_browser("http://127.0.0.1:1/secret/", tmp_path)
+    assert "secret" not in opened[0]
+    assert "http://127.0.0.1:1/secret/" in (tmp_path / "open.html").read_text()
 
 
 @pytest.fixture

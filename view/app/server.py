@@ -14,8 +14,11 @@ import threading
 import webbrowser
 from collections.abc import Callable
 from contextlib import closing
+from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from mirrorskin.io import InputError
@@ -82,17 +85,32 @@ class AppServer:
         self.address = f"http://{HERE}:{port}/{token}/"
 
     def run(self, browser: bool) -> None:
-        """Serve until the program is interrupted."""
+        """Serve until `stop` is called."""
         self._server.io_loop.asyncio_loop.set_exception_handler(_handle)
         self._server.start()
-        if browser:
-            self._server.io_loop.add_callback(webbrowser.open, self.address)
-        with closing(self):
+        with closing(self), TemporaryDirectory(prefix="mirrorskin-") as folder:
+            if browser:
+                self._server.io_loop.add_callback(open_browser, self.address, Path(folder))
             self._server.io_loop.start()
+
+    def stop(self) -> None:
+        """End `run`; a signal handler may call it."""
+        loop = self._server.io_loop.asyncio_loop
+        loop.call_soon_threadsafe(loop.stop)
 
     def close(self) -> None:
         """Stop serving, and close all pages."""
         self._server.stop(wait=False)
+
+
+def open_browser(address: str, folder: Path) -> None:
+    """Open an address in the browser, through a file in a private folder that leads there.
+
+    The arguments of programs can be read by all users of a computer, and the address is secret.
+    """
+    page = folder / "open.html"
+    page.write_text(f'<meta http-equiv="refresh" content="0; url={escape(address)}">', encoding="utf-8")
+    webbrowser.open(page.as_uri())
 
 
 class StopServer:
