@@ -129,7 +129,7 @@ class FusionSolver:
 
     @property
     def process(self) -> dict[str, ProcessValue]:
-        """What is known of the last surface: contradictions, and the correlation of the errors of heights."""
+        """Facts about the last surface: contradictions, and the correlation of the errors of heights."""
         said = describe_disagreement(self._disagreement, self._slope_error, self._scatter)
         return {**said, "height_correlation": self._correlation}
 

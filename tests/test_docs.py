@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+import yaml
 from commands import run
 from right_scores import check_score
 
@@ -126,3 +127,18 @@ def test_every_kind_of_finding_is_explained():
     page = (DOCS / "troubleshooting.md").read_text()
     assert len(kinds) > 20
     assert {kind for kind in kinds if f"`{kind}`" not in page} == set()
+
+
+def test_phrases_that_contributing_asks_to_avoid_are_not_used():
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))["repos"][-1][
+        "hooks"
+    ]
+    phrase, files, without = (re.compile(hooks[0][key]) for key in ("entry", "files", "exclude"))
+    phrase = re.compile(phrase.pattern, re.IGNORECASE)
+    folders = ("cli", "docs", "engine", "hw", "io", "kernels", "view")
+    paths = [ROOT / "README.md", *(path for name in folders for path in (ROOT / name).rglob("*.*"))]
+    names = [path.relative_to(ROOT).as_posix() for path in paths]
+    checked = [name for name in names if files.search(name) and not without.search(name)]
+    found = [name for name in checked if phrase.search((ROOT / name).read_text(encoding="utf-8"))]
+    assert len(checked) > 100
+    assert found == []

@@ -43,7 +43,7 @@ class Stream(Closing):
     motion : {"vertical", "axial", "horizontal", "twist"}, optional
         How the body moves; by default the motion that the operation applies to.
     header : Header, optional
-        What is known of all frames, such as the pixel size; its motion is used.
+        Properties of all frames, such as the pixel size; its motion is used.
     latency : float
         Seconds; infinite to use all frames: then `push` waits while 64 frames wait.
 
