@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from mirrorskin.engine.device_arrays import as_any_array_or_number, device_of, on_host
 from mirrorskin.engine.integration.camera import Camera
 from mirrorskin.engine.integration.device_inputs import check_device_inputs
+from mirrorskin.engine.integration.slope_errors import add_gain
 from mirrorskin.engine.integration.surface import IntegrationOptions, SurfaceSolver
 from mirrorskin.engine.integration.validation import (
     Inputs,
@@ -114,7 +115,8 @@ def integrate(
     initial_heights : array_like, (H, W), optional
         Heights to start from, NaN where undefined.
     **options
-        ``robust``, ``bilateral_sharpness``, ``sigma``, ``tolerance``, ``budget`` and ``device``; see
+        ``robust``, ``bilateral_sharpness``, ``sigma``, ``slope_correlation``, ``slope_gain_sigma``,
+        ``tolerance``, ``budget`` and ``device``; see
         `mirrorskin.engine.integration.surface.IntegrationOptions`.
 
     Returns
@@ -182,7 +184,7 @@ def integrate(
         start = check_map("initial_heights", initial_heights, inputs.picture)[inputs.box]
         start = start.astype(np.float64) if camera is None else logarithm("initial_heights", start)
     with _cached_solver(chosen.device, inputs) as solver:
-        result = solver.solve(inputs, chosen, start)
+        result = add_gain(solver.solve(inputs, chosen, start), chosen.slope_gain_sigma)
     if camera is not None:
         depth = np.exp(result.height)
         sigma = None if result.height_sigma is None else depth * result.height_sigma

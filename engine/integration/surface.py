@@ -23,6 +23,7 @@ from mirrorskin.engine.integration.height_variance import JOINED, expected_misfi
 from mirrorskin.engine.integration.multigrid import Multigrid, Solution
 from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
+from mirrorskin.engine.integration.slope_errors import correlation_of
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.engine.operation import OnDevice
 from mirrorskin.engine.options import Option, option
@@ -34,6 +35,7 @@ from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
 
 Method = Literal["direct", "multigrid", "robust"]
 
+_NO_NOTE: dict[str, ProcessValue] = {}
 _UNEVEN = 2.0  # ratio of the weights of horizontal and vertical links above which they count as uneven
 _PLAIN = 3e-3  # residual of the surface without breaks, with which one with breaks is compared
 _GOAL = 1e-4  # residual to stop at if there is a deadline, but no tolerance
@@ -70,6 +72,20 @@ class IntegrationOptions(OnDevice):
     sigma: bool = option(
         default=True,
         help="whether to estimate the heights' standard deviation, which takes about as long as the heights",
+    )
+    slope_correlation: float | None = option(
+        default=None,
+        within=(0, None),
+        help="distance in pixels at which the correlation of the slopes' errors is 1/e; 0 if they are "
+        "independent. It increases ``height_sigma``",
+        shown_default="0 with weights and for slopes on a device, otherwise estimated from their curl",
+    )
+    slope_gain_sigma: float = option(
+        default=0.0,
+        unit="share",
+        within=(0, 1),
+        help="standard deviation of an error that all slopes have in common, as a share of them: it adds "
+        "this share of the height above the mean of the component to ``height_sigma``",
     )
     tolerance: float | None = cast(Any, _Tolerance(**vars(_tolerance)))
     budget: float | None = option(
@@ -170,8 +186,13 @@ class SurfaceSolver:
         maps = self._rectangle.integrate(inputs, options.sigma)
         if maps is None:
             return None
+        (height, sigma), note = maps, _NO_NOTE
+        if sigma is not None:
+            factor, note = correlation_of(inputs, options.slope_correlation)
+            sigma = sigma * np.float32(factor**0.5)
         return _as_result(
-            *maps,
+            height,
+            sigma,
             np.zeros(self._graph.shape, np.int32),
             np.array([inputs.known_heights is None]),
             method="direct",
@@ -179,6 +200,7 @@ class SurfaceSolver:
             residual=0.0,
             converged=True,
             invalid=0,
+            note=note,
         )
 
     def _find(
@@ -278,9 +300,13 @@ class SurfaceSolver:
             components = find_components(relief.flags, True)
         on_device = isinstance(inputs.dz_dx, Array)
         height = self._levelling.level(whole, relief.height, relief.planes, inputs.datum, on_device)
+        sigma, note = None, _NO_NOTE
+        if options.sigma:
+            factor, note = correlation_of(inputs, options.slope_correlation)
+            sigma = self._find_sigma(inputs, relief, components, factor)
         return _as_result(
             height,
-            self._find_sigma(inputs, relief, components) if options.sigma else None,
+            sigma,
             components.labels,
             components.offset_unknown,
             relief.edges,
@@ -289,6 +315,7 @@ class SurfaceSolver:
             residual=relief.residual,
             converged=relief.converged,
             invalid=int(np.count_nonzero(self._cache.flags & LOST)),
+            note=note,
         )
 
     def _whole_components(self, inputs: Inputs) -> Components:
@@ -300,10 +327,11 @@ class SurfaceSolver:
             self._cache.components = find_components(flags, cut)
         return self._cache.components
 
-    def _find_sigma(self, inputs: Inputs, relief: _Relief, components: Components) -> Floats:
-        factor = self._graph.scale
-        excess = 1.0 if inputs.weights_given else self._excess(inputs, relief, components)
-        factor *= excess
+    def _find_sigma(self, inputs: Inputs, relief: _Relief, components: Components, factor: float) -> Floats:
+        """Return the standard deviation of heights; the factor is of the variance of noise."""
+        factor *= self._graph.scale
+        if not inputs.weights_given:
+            factor *= self._excess(inputs, relief, components)
         if relief.flags is not None:
             assert self._multigrid is not None
             assert relief.links is not None
@@ -366,9 +394,10 @@ def _as_result(
     edges: Flags | None = None,
     *,
     method: Method,
+    note: dict[str, ProcessValue],
     **numbers: ProcessValue,
 ) -> Result:
-    process: dict[str, ProcessValue] = {"integration": method}
+    process: dict[str, ProcessValue] = {"integration": method, **note}
     process |= {f"integration_{name}": value for name, value in numbers.items()}
     return Result(
         height=height,

@@ -1,0 +1,78 @@
+"""Standard deviations of heights when errors of slopes are correlated, or have a gain in common."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from mirrorskin import engine
+
+SHAPE, NOISE = (96, 110), 0.02
+Y, X = (places - (size - 1) / 2 for places, size in zip(np.indices(SHAPE), SHAPE, strict=True))
+HEIGHT = 10 * np.exp(-(X * X + Y * Y) / 800)
+SLOPES = np.stack([-X, Y]) * HEIGHT / 400
+HEIGHT -= HEIGHT.mean()
+DISC = X * X + Y * Y < 46**2
+
+
+def noise(reach, seed=0):
+    """Return noise of slopes whose correlation is 1/e at twice the reach, pixels."""
+    values = np.random.default_rng([seed, 3]).standard_normal((2, *SHAPE))
+    values = gaussian_filter(values, (0, reach, reach)) if reach else values
+    return NOISE * values / values.std()
+
+
+def scores(slopes, **options):
+    """Return errors of heights over their standard deviations."""
+    surface = engine.integrate(*slopes, 1.0, **options)
+    error = surface.height - HEIGHT
+    return (error - np.nanmean(error)) / surface.height_sigma
+
+
+def is_honest(values):
+    values = values[np.isfinite(values)]
+    return np.mean(values**2) <= 2 and np.mean(np.abs(values) > 3) <= 0.02
+
+
+@pytest.mark.parametrize("mask", [None, DISC], ids=["full", "disc"])
+@pytest.mark.parametrize("reach", [1, 2, 4])
+def test_correlated_noise_is_recognised(reach, mask):
+    surface = engine.integrate(*(SLOPES + noise(reach)), 1.0, mask=mask)
+    assert surface.process["slope_correlation"] == pytest.approx(2 * reach, rel=0.3)
+    assert is_honest(scores(SLOPES + noise(reach), mask=mask))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_independent_noise_is_not_correlated(seed):
+    surface = engine.integrate(*(SLOPES + noise(0, seed)), 1.0)
+    assert "slope_correlation" not in surface.process
+
+
+@pytest.mark.parametrize("options", [{}, {"slope_weights": 1 / NOISE**2}], ids=["no weights", "weights"])
+def test_a_stated_correlation_is_used(options):
+    slopes = SLOPES + noise(2)
+    assert not is_honest(scores(slopes, slope_correlation=0, **options))
+    assert is_honest(scores(slopes, slope_correlation=4, **options))
+
+
+@pytest.mark.parametrize("mask", [None, DISC], ids=["full", "disc"])
+def test_a_gain_of_slopes_is_used(mask):
+    slopes = 1.01 * SLOPES + 0.05 * noise(0)
+    assert not is_honest(scores(slopes, mask=mask))
+    assert is_honest(scores(slopes, mask=mask, slope_gain_sigma=0.01))
+
+
+def test_a_gain_with_a_camera_scales_the_relief_of_the_depth():
+    camera = engine.integration.Camera(200.0)
+    normals = np.stack([0.3 * np.sin(X / 9), 0 * X, np.ones(SHAPE)], axis=-1)
+    surface, other = (
+        engine.integrate(normals=normals, camera=camera, slope_gain_sigma=gain) for gain in (0.0, 0.02)
+    )
+    added = np.sqrt(other.height_sigma**2 - surface.height_sigma**2) / surface.height
+    relief = np.log(surface.height) - np.log(surface.height).mean()
+    np.testing.assert_allclose(added, 0.02 * np.abs(relief), atol=1e-4)
+
+
+def test_several_surfaces_have_the_largest_of_their_errors():
+    slopes = np.stack([SLOPES, 3 * SLOPES], axis=1)
+    surfaces = engine.integrate(*slopes, 1.0, slope_gain_sigma=0.1)
+    np.testing.assert_allclose(surfaces.height_sigma, 0.3 * np.abs(HEIGHT), atol=0.02)
