@@ -33,7 +33,7 @@ def test_works_take_turns_after_a_warm_up():
     assert {name: one.wall.rounds for name, one in measured.items()} == {"a": 3, "b": 3}
 
 
-def test_the_spread_is_the_quartiles_and_the_first_call_is_told_apart(clock):
+def test_the_spread_is_the_quartiles_and_the_first_call_is_separate(clock):
     seconds = iter([100, *np.random.default_rng(0).permutation(9)])
     one = take_turns({"a": Work(lambda: clock.move(next(seconds)))}, 9, Profile())["a"]
     # Nine turns, of 0 to 8 seconds, are not all taken: ten seconds of patience end them.
@@ -64,7 +64,7 @@ def test_nothing_is_timed_before_the_check():
     assert calls == ["a", "b"]
 
 
-def test_the_devices_account_is_told_by_kind_and_by_kernel(clock):
+def test_device_times_are_reported_by_kind_and_by_kernel(clock):
     profile = Profile()
     profile.add("kernel", "before", 99.0)
     turns = iter([1, 2, 3, 4])

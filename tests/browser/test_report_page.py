@@ -128,7 +128,7 @@ def test_a_page_fits_every_screen(opening, path, scheme):
         opened.keep(f"{scheme}-{width}")
 
 
-def test_letters_stand_out_in_the_light_and_in_the_dark(opening, path):
+def test_letters_have_contrast_in_light_and_dark_themes(opening, path):
     for scheme, dark in (("light", False), ("dark", True)):
         page = opening(path, color_scheme=scheme).page
         ink, paper = page.evaluate(

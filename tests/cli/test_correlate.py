@@ -60,7 +60,7 @@ def test_any_stack_is_fitted_by_least_squares(dtype, words, phase):
     assert np.max(np.hypot(cosine, sine) * np.abs(np.sin(turned / 2))) < 2e-6 * scale
 
 
-def test_what_was_written_is_told_in_a_line_and_plotted():
+def test_the_output_is_printed_in_a_line_and_plotted():
     ended = run("correlate", theirs(), "--phases", "phases.txt", "-o", "out.h5")
     reach = io.open_result("out.h5").modulation
     assert ended.out == (
@@ -70,7 +70,7 @@ def test_what_was_written_is_told_in_a_line_and_plotted():
     assert plot_of("out.h5")[1].name == "/entry/result/azimuth"
 
 
-def test_it_is_told_how_it_came_about():
+def test_the_process_is_stored():
     ended = run("correlate", theirs(), "--phases", "phases.txt", "--pixel-size", "0.5mm", "--json")
     told = json.loads(ended.out)
     assert told["output"] == "theirs-correlation.h5"
@@ -83,7 +83,7 @@ def test_it_is_told_how_it_came_about():
     assert io.open_result("theirs-correlation.h5").x[1] == -1.0
 
 
-def test_a_recording_of_a_rotation_knows_its_phases_and_one_of_a_press_is_told_them():
+def test_a_rotation_has_its_own_phases_and_a_press_needs_them():
     record(MadeUp(random_stack(), io.Header("axial"), phase=np.array(UNEVEN)), Path("turn.h5"))
     assert run("correlate turn.h5").code == 0
     assert run("correlate", theirs(), "--phases", "phases.txt").code == 0

@@ -67,7 +67,7 @@ def test_each_file_is_written_and_printed_in_a_line():
         np.testing.assert_array_equal(file["height"], io.open_result("ball-result.h5").height)
 
 
-def test_the_ball_stands_where_it_stood():
+def test_the_ball_stays_at_its_place():
     assert run("export ball-result.h5 -o ball.ply -o ball.png").code == 0
     np.testing.assert_allclose(place_of_top("ball.ply"), [0.3, -0.2], atol=1e-6)
     counts = cv2.imread("ball.png", cv2.IMREAD_UNCHANGED)
@@ -112,7 +112,7 @@ def test_a_cross_section_runs_between_two_points_and_a_hole_is_empty():
     assert len(missing) == 1
 
 
-def test_a_filled_height_is_told_apart_in_a_cross_section():
+def test_a_filled_height_is_marked_in_a_cross_section():
     filled = np.zeros((31, 41), np.uint8)
     filled[:, 20] = 1
     io.save_result(io.Result(height=cap(), filled=filled, x=X, y=Y), "filled-result.h5")

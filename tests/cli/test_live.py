@@ -309,7 +309,7 @@ class Slow:
         self.closed = True
 
 
-def test_a_slow_viewer_misses_updates_but_not_the_last_and_holds_up_nobody():
+def test_a_slow_viewer_misses_updates_but_not_the_last_and_delays_nothing():
     viewer = Slow()
     newest = Newest(viewer)
     begun = time.monotonic()

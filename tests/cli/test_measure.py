@@ -94,7 +94,7 @@ def test_what_cannot_be_measured_is_printed_in_a_line(ball, tmp_path):
     refused("no such file", "measure", tmp_path / "none.h5")
 
 
-def test_quantities_stand_under_headings_with_what_they_mean(ball):
+def test_quantities_are_listed_under_headings_with_their_meaning(ball):
     lines = run("measure", ball).out.splitlines()
     headings = [line for line in lines if line and not line.startswith(" ")]
     assert headings[:4] == ["heights", "areas and volumes", "form", "texture: height"]

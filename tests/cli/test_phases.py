@@ -24,7 +24,7 @@ MEASURED = [178.1, 220.8, 280.5, 316.5, 7.6, 48.0, 96.3, 136.4]
         ("0rad 3.141592653589793rad 1turn -90\u00b0", [0, 180, 360, -90]),
     ],
 )
-def test_angles_stand_between_blanks_in_any_unit(tmp_path, text, degrees):
+def test_angles_are_separated_by_blanks_in_any_unit(tmp_path, text, degrees):
     path = tmp_path / "phases.txt"
     path.write_bytes(text.encode())
     found = read_phases(path)

@@ -87,7 +87,7 @@ def test_a_rig_that_homes_and_moves_is_printed_in_json_and_ends_where_it_homed(c
     assert not machine.moving()
 
 
-def test_what_failed_is_told_in_a_line_and_nothing_is_moved(controller):
+def test_a_failure_is_printed_in_a_line_and_nothing_is_moved(controller):
     port = controller(home=True, s22=0.0)
     before = port.machine.position()
     ended = run("rig check rig.toml --move")
@@ -140,7 +140,7 @@ def test_an_alarm_is_ended_only_by_unlocking(controller):
     assert port.machine.state == "Idle"
 
 
-def test_a_hold_of_someone_else_is_left_alone(controller, clock):
+def test_a_hold_by_another_user_is_left_alone(controller, clock):
     port = controller()
     port.machine.receive(b"G53G1Z-8F10\n")
     clock.sleep(0.05)
@@ -159,7 +159,7 @@ def test_a_stage_with_switches_is_homed_by_hand(controller):
     assert machine.position() == pytest.approx({"X": -0.3, "Y": -0.3, "Z": -0.3})
 
 
-def test_a_missing_camera_is_bad_input_and_the_stage_is_told_of_all_the_same(controller):
+def test_a_missing_camera_is_bad_input_and_the_stage_is_still_reported(controller):
     controller()
     Path("film.y4m").rename("other.y4m")
     ended = run("rig", "check", "rig.toml")

@@ -57,7 +57,7 @@ program()
 """
 
 
-def test_who_insists_ends_a_program_that_hangs_at_once_and_without_an_abort(press):
+def test_a_repeated_signal_ends_a_hanging_program_at_once_and_without_an_abort(press):
     command = [sys.executable, "-c", INSISTING]
     done = subprocess.run(command, cwd=press.parent, capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stdout) == (130, "")

@@ -67,7 +67,7 @@ def test_strokes_go_up_and_down_as_far_as_the_steps_would():
     refused("leave --release out", "simulate vertical --strokes 3 --release -o a.h5")
 
 
-def test_a_body_rocks_or_spirals_as_it_is_told():
+def test_a_body_rocks_or_spirals_as_requested():
     phases = np.arange(5) * np.pi / 4
     _, rocked = simulate("axial", "--tilt", "4deg", "--rock", "30deg", "--frames", "5")
     np.testing.assert_allclose(rocked.tilt, np.radians(4) * np.sin(phases), atol=1e-12)
@@ -128,7 +128,7 @@ def test_each_motion_is_recorded_as_it_is_given(motion, contact):
 
 
 @pytest.mark.parametrize("motion", ["horizontal", "twist"])
-def test_elastic_contact_knows_where_the_sheet_slips(motion):
+def test_elastic_contact_includes_where_the_sheet_slips(motion):
     words = [*GIVEN[motion], "--frames", "4", "--contact", "elastic", *EXACT]
     slips = [simulate(motion, *words, "--friction", friction)[1].truth for friction in ("0", "0.05", "100")]
     frictionless, some, rough = ((truth.slip, truth.contact) for truth in slips)
@@ -479,7 +479,7 @@ def test_bits_set_the_camera_s_levels(bits, scale):
     assert recording.header.bright[0, 0] == 224 * scale
 
 
-def test_a_picture_can_stand_round_the_body():
+def test_a_picture_can_surround_the_body():
     shown = np.zeros((2, 8), np.uint8)
     shown[:, 4:] = 255
     cv2.imwrite("half.png", shown)

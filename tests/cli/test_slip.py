@@ -46,7 +46,7 @@ def found(slide, contact):
     return io.open_result(slide.with_name("found.h5"))
 
 
-def test_a_slide_is_told_as_the_search_finds_it_in_its_frames(slide, contact, found):
+def test_a_slide_is_reported_as_found_in_its_frames(slide, contact, found):
     touched = io.open_result(contact).contact
     with io.open_recording(slide) as recording:
         block = recording.read(np.empty(recording.shape, recording.dtype))
@@ -72,7 +72,7 @@ def test_a_slide_agrees_with_the_truth(slide, found):
 
 
 @pytest.mark.parametrize(("motion", "words"), [("horizontal", "--friction 0.5"), ("twist", "--friction 0.8")])
-def test_skin_at_coarse_pixels_is_not_told_to_slip_before_it_does(motion, words, tmp_path):
+def test_skin_at_coarse_pixels_is_not_reported_to_slip_too_early(motion, words, tmp_path):
     path = tmp_path / "coarse.h5"
     scene = SCENE.replace("64x64", "96x96").replace("--friction 0.6", words).split()
     assert run("simulate", motion, *scene, "-o", path).code == 0
@@ -247,7 +247,7 @@ def test_frames_that_show_no_slip_are_refused_by_the_name_of_their_file(tmp_path
     assert told in said
 
 
-def test_a_press_that_knows_its_pressure_determines_contact_from_it(slide):
+def test_contact_is_determined_from_the_pressure_of_a_press(slide):
     touched = np.zeros((64, 64), bool)
     touched[20:40, 20:40] = True
     press = io.Result(height=np.zeros((64, 64), np.float32), pressure=touched.astype(np.float32))

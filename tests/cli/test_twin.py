@@ -52,7 +52,7 @@ def serving(folder: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], 
 
 
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 0), ("SIGTERM", 128 + signal.SIGTERM)])
-def test_a_rig_is_served_until_it_is_told_to_end(name: str, code: int, tmp_path: Path) -> None:
+def test_a_rig_is_served_until_it_is_stopped(name: str, code: int, tmp_path: Path) -> None:
     folder = tmp_path / "rig"
     with serving(folder, "--pattern", "linear", "--rate", "60") as (child, said):
         path = folder / "rig.toml"

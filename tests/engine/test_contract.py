@@ -76,7 +76,7 @@ def test_the_result_does_not_depend_on_how_frames_are_divided_nor_on_memory(devi
 
 
 @ONCE
-def test_a_result_on_the_way_is_that_of_the_frames_so_far_and_stays(device, name):
+def test_an_intermediate_result_is_that_of_the_frames_so_far_and_stays(device, name):
     case, seen = CASES[name], []
     operation = case.make(device=device)
     for part in CUTS["unevenly"](len(case.frames)):

@@ -53,7 +53,7 @@ def test_texture_of_all_lengths_is_right_to_a_twentieth_of_a_step():
     assert abs(np.median(found.height) + 4.2) < 0.5 / 20
 
 
-def test_the_standard_error_knows_a_curve_that_is_not_a_gaussian():
+def test_the_standard_error_includes_a_curve_that_is_not_a_gaussian():
     frames = textured(waves=lambda generator: np.sqrt(generator.uniform(0.02**2, 0.3**2, 200)))
     found = engine.focus.find_focus(noisy(frames, 0.1, 0), TRAVEL, noise=0.1)
     ratio = (found.height + 4.2) / found.height_sigma

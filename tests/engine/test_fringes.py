@@ -106,7 +106,7 @@ def test_the_standard_error_is_the_scatter_at_every_phase(shift):
 
 
 @pytest.mark.parametrize("count", [4, 5, 16])
-def test_noise_is_told_from_the_residual(count):
+def test_noise_is_estimated_from_the_residual(count):
     shift = np.arange(count) * TURN / count
     frames = shown(FIELD, shift, 1.5)
     frames[:, :, :100] = 10  # no fringes there, and no noise

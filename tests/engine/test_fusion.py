@@ -672,7 +672,7 @@ def test_what_a_press_and_a_rotation_disagree_about_is_part_of_the_standard_devi
     assert 0.7 * rms(error) < result.process["disagreement"] < 2 * rms(error)
 
 
-def test_maps_that_contradict_each_other_are_told_of():
+def test_maps_that_contradict_each_other_are_reported():
     height, *slope = waves()
     normals = np.stack([-slope[0] * 1.1, -slope[1], np.ones_like(height)], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)

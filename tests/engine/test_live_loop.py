@@ -99,7 +99,7 @@ def test_of_frames_that_are_all_too_old_the_newest_is_used():
     assert status.skipped == COUNT - status.used
 
 
-def test_what_the_ring_lost_is_told_as_dropped():
+def test_frames_lost_by_the_ring_are_reported_as_dropped():
     source, slow = make(slots=4, update_time=0.1)
     status = Loop(source, slow).run()
     assert status.dropped > 0
@@ -148,7 +148,7 @@ def test_each_update_has_the_newest_frame_and_the_status_so_far():
 
 
 @pytest.mark.parametrize("wrong", [{"latency": 0.0}, {"updates": -1.0}, {"latency": math.nan}])
-def test_a_latency_or_rate_that_cannot_be_is_refused(wrong):
+def test_an_impossible_latency_or_rate_is_refused(wrong):
     source, slow = make()
     with pytest.raises(InputError, match="above 0"):
         Loop(source, slow, **wrong).run()

@@ -97,7 +97,7 @@ def test_the_error_of_a_normal_is_the_angle_to_the_true_one():
 
 
 @pytest.mark.parametrize("error", [2e-5, 179.999])
-def test_small_angles_and_large_ones_are_told_alike(error):
+def test_small_and_large_angles_are_printed_alike(error):
     across = np.linspace(0, 360, 24, endpoint=False, dtype=np.float32)[np.newaxis]
     truth = truth_of_normals(np.full_like(across, 0.0), across)
     found = normals(np.full(across.shape, error), across)
@@ -106,7 +106,7 @@ def test_small_angles_and_large_ones_are_told_alike(error):
     assert part.rms == pytest.approx(error, rel=1e-5)
 
 
-def test_azimuths_alone_are_scored_the_shorter_way_round():
+def test_differences_of_azimuths_are_at_most_half_a_turn():
     truth = truth_of_normals([[30, 30, 0, 30]], [[179, -90, np.nan, 0]], [[1, 1, 1, 0]])
     azimuth = np.radians(np.array([[-179, 90, 5, 77]], np.float32))
     score = engine.score(io.Result(azimuth=azimuth), truth)

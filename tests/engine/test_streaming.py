@@ -86,7 +86,7 @@ def test_a_source_that_ends_early_is_not_an_error(device):
 
 
 @pytest.mark.parametrize("fails", [0, 5, 9])
-def test_what_fails_in_reading_is_told_and_what_came_before_was_pushed(device, fails):
+def test_a_failure_of_reading_is_reported_and_earlier_frames_were_pushed(device, fails):
     keeper = Keeper(device, 2)
     with pytest.raises(InputError, match=f"frame {fails} is damaged"):
         feed(Source(10, fails), keeper, range(10))

@@ -169,7 +169,7 @@ def test_normals_stay_unit_and_their_angles_fit():
     np.testing.assert_allclose(found.azimuth, np.arctan2(y, x), atol=1e-5)
 
 
-def test_azimuths_go_the_short_way_round():
+def test_azimuths_are_interpolated_the_short_way_round():
     shape = (9, 11)
     azimuth = np.where(np.arange(11) % 2, 3.1, -3.1).astype(np.float32)
     found = undistort(Result(azimuth=np.broadcast_to(azimuth, shape).copy()), bent(shape)).azimuth

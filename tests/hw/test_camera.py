@@ -195,7 +195,7 @@ def test_counts_stop_at_both_ends_and_do_not_wrap(dtype: str, bits: int) -> None
         assert (counts == end).mean() == pytest.approx(share, abs=4 * np.sqrt(share / counts.size))
 
 
-def test_pixels_deviate_as_much_as_told() -> None:
+def test_pixels_deviate_as_much_as_stated() -> None:
     shape = (300, 400)
     sensor = Sensor(make_camera("uint16", gain_deviation=0.02, offset_deviation=5, seed=1), shape)
     gain = (sensor.full - sensor.offset) / 3328

@@ -205,7 +205,7 @@ def test_an_interrupt_comes_where_the_first_thread_waits(clock):
         clock.interrupt()
 
 
-def test_a_thread_of_someone_else_cannot_wait(clock):
+def test_a_foreign_thread_cannot_wait(clock):
     said = []
 
     def work():

@@ -45,7 +45,7 @@ BODIES: dict[str, tuple[Callable[[float], contact_theory.Pressed], Callable[[Map
 
 @pytest.mark.parametrize("radius", [1.8, 2.0, 2.2])
 @pytest.mark.parametrize("body", BODIES)
-def test_bodies_of_revolution_are_those_of_the_books(body: str, radius: float) -> None:
+def test_bodies_of_revolution_follow_closed_forms(body: str, radius: float) -> None:
     theory, fall = BODIES[body][0](radius), BODIES[body][1]
     r = np.hypot(*centres((SIDE, SIDE), (PIXEL, PIXEL)))
     found = press(space((SIDE, SIDE), (PIXEL, PIXEL)), theory.depth - fall(r))
@@ -77,7 +77,7 @@ def test_a_smooth_load_pushes_in_as_its_spectrum_says(pixel_size: tuple[float, f
 
 
 @pytest.mark.parametrize("depth", [0.05, 0.3, 2.0])
-def test_below_an_even_disc_the_mirror_is_where_the_books_say(depth: float) -> None:
+def test_below_a_uniform_disc_the_mirror_follows_the_closed_form(depth: float) -> None:
     r = np.hypot(*centres((129, 129), (0.02, 0.02)))
     load = np.where(r < 1.0, 2.0, 0.0)
     radius = np.sqrt((load > 0).sum() * 0.02**2 / np.pi)

@@ -82,7 +82,7 @@ def homed(changes: dict[int, float] | None = None, **options) -> Bench:
 # Lines and answers
 
 
-def test_it_greets_and_with_homing_is_locked_until_it_is_told_otherwise() -> None:
+def test_it_greets_and_with_homing_is_locked_until_unlocked() -> None:
     assert Bench().greeting == BANNER
     bench = Bench({22: 1})
     assert bench.greeting == [*BANNER, LOCKED]

@@ -125,7 +125,7 @@ def test_an_arc_goes_round_at_the_tilt(running, clock) -> None:
     assert [place.tilt for place in round_it] == pytest.approx([math.radians(2.0)] * len(round_it), rel=2e-3)
 
 
-def test_a_rig_that_homes_is_locked_until_it_has_and_knows_its_place_then(running, clock) -> None:
+def test_a_rig_that_homes_is_locked_before_and_has_a_position_afterwards(running, clock) -> None:
     rig = running(home=True)
     assert rig.machine.state == "Alarm"
     assert rig.where(clock.now()) == Position(-4.0, 0.0, 0.0)
@@ -189,7 +189,7 @@ def test_its_files_are_removed_when_it_ends(tmp_path: Path) -> None:
     assert list((tmp_path / "rig").iterdir()) == []
 
 
-def test_a_picture_of_someone_else_is_kept(tmp_path: Path) -> None:
+def test_another_users_picture_is_kept(tmp_path: Path) -> None:
     (tmp_path / "bright.npy").write_bytes(b"mine")
     with EmulatedRig(**SMALL) as rig, pytest.raises(InputError, match=r"bright\.npy exists"):
         rig.write(tmp_path, "tcp://127.0.0.1:1")
@@ -202,7 +202,7 @@ def test_a_rig_that_cannot_be_leaves_nothing_running(running) -> None:
 
 
 @pytest.mark.parametrize(("every", "late"), [(2, math.inf), (7, 0.05)])
-def test_a_sweep_with_nth_frames_lost_or_late_knows_where_the_body_was(running, clock, every, late) -> None:
+def test_a_sweep_with_lost_or_late_frames_has_the_right_positions(running, clock, every, late) -> None:
     rig = running(delay=0.02)
     rig.camera.lateness = lambda number: late if number % every == 0 else 0.0
     camera = structs.replace(rig.settings.camera, delay=0.02, dark=16.0)

@@ -198,7 +198,7 @@ def test_lost_frames_are_what_its_numbers_leave_out(before, number, lost) -> Non
 
 
 @pytest.mark.parametrize("drift", [50e-6, -50e-6])
-def test_a_cameras_clock_takes_out_the_jitter_of_the_way_and_follows_the_drift(drift) -> None:
+def test_a_cameras_clock_removes_the_jitter_of_arrival_and_follows_the_drift(drift) -> None:
     random = np.random.default_rng(1)
     exposed = 1000 + np.arange(0, 120, 0.02)
     stamps = (exposed - 400) * (1 + drift)  # a clock of its own

@@ -84,7 +84,7 @@ def test_places_are_gone_to_one_after_the_other_without_anyone_waiting(bench):
     assert min(travel[int(np.argmax(travel)) :]) == pytest.approx(0.2, abs=0.05)
 
 
-def test_a_stage_that_was_homed_knows_its_place_at_once_and_goes_on(clock):
+def test_a_homed_stage_has_its_position_at_once_and_continues(clock):
     with (
         EmulatedRig(shape=(4, 6), rate=5, home=True, clock=clock) as rig,
         rig.open_stage(rig.settings.stage) as stage,

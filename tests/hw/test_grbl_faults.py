@@ -56,7 +56,7 @@ def test_silence_at_rest_is_borne_for_the_timeout(opened, clock):
 
 
 @pytest.mark.parametrize("noise", [random.Random(3).randbytes(100_000), b"a\n" * 500_000])
-def test_noise_stops_it_and_keeps_nobody_waiting(moving, noise):
+def test_noise_stops_it_and_delays_no_caller(moving, noise):
     stage, port = moving
     port.inject(noise)
     assert "garbled" in failure(stage)
@@ -215,7 +215,7 @@ def test_a_stop_goes_out_at_once_and_ends_others_waits(moving, clock):
     assert port.state == "Idle"
 
 
-def test_a_stop_needs_nobody_elses_lock(moving, clock):
+def test_a_stop_needs_no_lock_of_other_threads(moving, clock):
     stage, port = moving
     done = clock.event()
 
@@ -257,7 +257,7 @@ def test_a_machine_that_never_holds_is_reset_all_the_same(moving, clock):
 
 
 @pytest.mark.parametrize("what", ["lost", "undone"])
-def test_a_hold_that_is_lost_or_undone_is_told_again(moving, what):
+def test_a_hold_that_is_lost_or_undone_is_repeated(moving, what):
     stage, port = moving
     hold, told = port.hold, []
 

@@ -132,7 +132,7 @@ def test_an_impossible_speed_is_refused(place, speed, told):
     ("letters", "plane"),
     [("XY", "G17"), ("YX", "G17"), ("ZX", "G18"), ("XZ", "G18"), ("YZ", "G19"), ("ZY", "G19")],
 )
-def test_arcs_go_round_the_circle_as_often_and_the_way_they_should(letters, plane, directions, start, turns):
+def test_arcs_have_the_right_number_and_sense_of_turns(letters, plane, directions, start, turns):
     third = (set("XYZ") - set(letters)).pop()
     rig = axes(
         travel=axis(third, 1, 5.0, "mm"),

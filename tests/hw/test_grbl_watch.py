@@ -46,7 +46,7 @@ def test_an_answer_to_one_of_two_questions_has_no_time_until_all_is_quiet():
     assert answered(watch, 1.17, 0.001).sure
 
 
-def test_silence_is_what_somebody_listened_to_while_a_question_was_open():
+def test_silence_counts_only_while_a_question_is_open():
     watch = ReportTimes(0.05)
     watch.listened(0.99, 1.01)
     assert watch.silence(1.01) == 0

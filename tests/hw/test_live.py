@@ -72,7 +72,7 @@ def test_an_impossible_rate_is_refused(rate: float) -> None:
         make_live(rate)
 
 
-def test_frames_of_other_movements_are_passed_over_too_and_told_apart() -> None:
+def test_frames_of_other_movements_are_skipped_too() -> None:
     def make() -> Twin:
         movement = Axial(np.arange(COUNT) * 2 * np.pi / 10, 0.1, 1.0)
         return Twin(object="sphere", shape=(13, 17), pixel_size=0.4, movement=movement)

@@ -113,7 +113,7 @@ def test_a_rotation_raises_the_rim_of_a_disc_as_far_as_it_says(pivot: tuple[floa
 
 
 @pytest.mark.parametrize("thing", [Sphere(), Cylinder(), Plane()])
-def test_nothing_stands_higher_than_its_rise(thing: Object) -> None:
+def test_no_object_is_higher_than_its_rise(thing: Object) -> None:
     rng = np.random.default_rng(6)
     view = View((60, 60), (0.6, 0.6), Body())
     for _ in range(5):

@@ -178,7 +178,7 @@ def test_homing_that_the_controller_cannot_do_fails():
 
 
 @pytest.mark.parametrize(("at", "verdict"), [((3.0, 0.0, 0.0), "warning"), ((2.0, 0.0, 0.0), "ok")])
-def test_a_stage_without_homing_is_told_if_it_stands_beyond_its_limits(at, verdict):
+def test_a_stage_without_homing_beyond_its_limits_is_reported(at, verdict):
     settings = structs.replace(STAGE, home=False)
     assert look(Stage(settings, at=at), settings)["position"].verdict == verdict
 
@@ -358,7 +358,7 @@ def test_the_stage_is_closed_when_the_camera_is_not_there_or_is_lost():
     assert camera.closed
 
 
-def test_the_stage_is_closed_when_nobody_wants_to_know_more():
+def test_the_stage_is_closed_when_no_caller_needs_it():
     stage = Stage()
     findings = opened(stage, Camera())
     next(findings)
@@ -378,7 +378,7 @@ def test_a_stage_that_is_lost_while_the_camera_is_looked_at_is_reported():
     assert stage.did == ["close"]
 
 
-def test_what_hardware_warns_of_is_found_and_not_printed_besides(caplog):
+def test_warnings_of_hardware_are_findings_and_not_also_printed(caplog):
     log = logging.getLogger("mirrorskin.hw")
 
     class Talking(Camera):

@@ -28,7 +28,7 @@ ways = pytest.mark.parametrize(
 
 
 @ways
-def test_a_way_is_what_its_speed_adds_up_to(length, speed, acceleration):
+def test_the_distance_is_the_integral_of_the_speed(length, speed, acceleration):
     path = Trapezoid(length, speed, acceleration)
     time = np.linspace(0, path.duration, 200_001)
     pace = np.minimum(np.minimum(acceleration * time, acceleration * (time[-1] - time)), speed)
@@ -45,7 +45,7 @@ def test_a_press_in_steps_takes_every_place_to_its_end():
 
 
 @ways
-def test_legs_are_one_way_after_the_other(length, speed, acceleration):
+def test_legs_follow_one_another(length, speed, acceleration):
     one, three = Trapezoid(length, speed, acceleration), Trapezoid(3 * length, speed, acceleration, 3)
     assert three.duration == pytest.approx(3 * one.duration)
     time = np.linspace(0, one.duration, 101)
@@ -115,7 +115,7 @@ def test_a_rocking_body_leans_from_one_side_to_the_other_about_one_axis():
 
 
 @pytest.mark.parametrize("sense", [1, -1])
-def test_a_twist_turns_the_way_of_its_sign(sense):
+def test_a_twist_turns_by_its_sign(sense):
     plan = TwistPlan(1.0, sense * 0.4, step=0.1)
     np.testing.assert_allclose(plan.values, sense * np.array([0, 0.1, 0.2, 0.3, 0.4]))
     assert [place.twist for place in plan.places] == list(plan.values)
@@ -209,7 +209,7 @@ def test_an_impossible_rotation_is_refused(values):
         (TwistPlan, {"angle": 1, "step": -0.1}),
     ],
 )
-def test_a_slide_or_a_twist_that_cannot_be_is_refused(make, wrong):
+def test_an_impossible_slide_or_twist_is_refused(make, wrong):
     with pytest.raises(InputError):
         make(**{"press": 1.0, "step": 0.5, **wrong})
 

@@ -60,7 +60,7 @@ def _exposed(scan):
     return (places,)
 
 
-def test_each_frame_of_steps_shows_the_place_that_it_tells():
+def test_each_frame_of_steps_shows_its_stated_position():
     with make_rig() as rig, StepScan(rig, VerticalPlan(0.0, 1.0, step=0.25), settle=0.02, frames=2) as scan:
         assert scan.shape == (10, *SHAPE)
         blocks = drain(scan, ROOM[:2])
@@ -101,7 +101,7 @@ def slid(place):
         (TwistPlan(0.5, -0.4, step=0.2), [3]),
     ],
 )
-def test_each_frame_of_a_stepwise_slide_or_twist_shows_where_it_tells(plan, columns):
+def test_each_frame_of_a_stepwise_slide_or_twist_shows_its_stated_position(plan, columns):
     with make_rig(slid) as rig:
         with StepScan(rig, plan, settle=0.0, frames=2) as scan:
             blocks = drain(scan, np.empty((8, 2, 4), np.uint8))
@@ -132,7 +132,7 @@ def test_a_rocking_body_reports_its_tilts_and_goes_back_upright():
     assert (scan.header.press, scan.header.pivot) == (0.5, (0, 0, 0))
 
 
-def test_a_slide_without_a_halt_waits_pressed_and_then_knows_where_it_is():
+def test_a_continuous_slide_waits_pressed_and_has_its_positions():
     plan = HorizontalPlan(0.5, 0.8, math.radians(30), speed=1.5, wait=0.2)
     with make_rig(slid, rate=100.0) as rig:
         scan = SweepScan(rig, plan)
@@ -154,7 +154,7 @@ def test_a_body_that_was_left_displaced_is_lifted_before_it_goes_back():
         assert rig.stage.moves[-2:] == [Position(-5.0, x=0.4, twist=0.1), Position(-5.0)]
 
 
-def test_a_press_without_a_halt_only_goes_down_and_knows_where(pressed):
+def test_a_continuous_press_only_moves_down_and_has_its_positions(pressed):
     scan, blocks, places = pressed
     true = np.array([place.travel for place in places])
     live, corrected = joined(blocks, "travel"), scan.positions()["travel"]
@@ -167,7 +167,7 @@ def test_a_press_without_a_halt_only_goes_down_and_knows_where(pressed):
     assert true[-1] == pytest.approx(1)
 
 
-def test_strokes_without_a_halt_are_told_as_they_are():
+def test_continuous_strokes_have_the_right_positions():
     plan = VerticalPlan(0.2, 0.7, speed=1.5, strokes=3)
     with make_rig(rate=100.0, late=0.002) as rig, SweepScan(rig, plan) as scan:
         blocks = drain(scan)
@@ -205,7 +205,7 @@ def test_of_many_frames_a_turn_only_some_are_given():
 
 
 @pytest.mark.parametrize("camera", [{}, {"source": "http://camera/video", "delay": 0.03}])
-def test_a_delay_that_nobody_told_and_that_of_a_stream_are_measured(camera):
+def test_an_unstated_delay_and_that_of_a_stream_are_measured(camera):
     with make_rig(spreading((24, 24)), 100.0, delay=0.05, jitter=0.003, late=0.002) as rig:
         rig.settings = settings((24, 24), dark=5.0, **camera)
         scan = SweepScan(rig, VerticalPlan(0.0, 1.0, speed=1.0))

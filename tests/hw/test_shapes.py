@@ -113,7 +113,7 @@ def test_an_object_larger_than_the_sensor_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["teapot", "Sphere", "sphere.step", "", "."])
-def test_an_unknown_name_is_told_the_known_ones(name: str) -> None:
+def test_an_unknown_name_is_refused_with_the_known_ones(name: str) -> None:
     with pytest.raises(InputError) as caught:
         named(name)
     message = str(caught.value)

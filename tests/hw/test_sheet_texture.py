@@ -114,7 +114,7 @@ def test_references_know_the_texture_of_a_sheet_at_rest() -> None:
     np.testing.assert_allclose(light, (read_all(plain) - DARK) / SPAN, atol=1e-5)
 
 
-def test_the_zenith_s_scale_knows_the_texture() -> None:
+def test_the_zenith_s_scale_includes_the_texture() -> None:
     turn = Axial([0.0, 2.0, 4.0], 0.04, 1.0)
     plain, coated = (
         make_twin(turn, texture, pattern="linear", object="sphere", contact="elastic")

@@ -71,7 +71,7 @@ def test_a_small_field_shows_what_a_field_as_large_as_the_body_shows(reach: str)
         np.testing.assert_allclose(here, inner(there, small), atol=2e-5)
 
 
-def test_an_object_that_needs_too_many_points_is_told_what_to_do() -> None:
+def test_an_object_that_needs_too_many_points_is_refused_with_a_remedy() -> None:
     with pytest.raises(
         InputError, match=r"coin needs 17500 x 17500 points.*larger pixels or.*conform"
     ) as caught:

@@ -185,6 +185,6 @@ def test_a_body_that_does_not_press_moves_no_skin() -> None:
     np.testing.assert_allclose(displacement(free, 1), 0, atol=1e-12)
 
 
-def test_too_long_a_way_is_refused() -> None:
+def test_too_long_a_displacement_is_refused() -> None:
     with pytest.raises(InputError, match=r"a displacement of 50 mm .* points, .*: use larger pixels"):
         history(Horizontal([[0.0, 0.0], [50.0, 0.0]], 0.1), 0.5, 0.005)

@@ -23,7 +23,7 @@ def reports(seed, jitter=0.004, lag=0.07):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_track_finds_the_way_better_than_single_reports(seed):
+def test_a_track_is_more_accurate_than_single_reports(seed):
     time, way = reports(seed)
     track = Track(time, way, PLAN)
     frames = np.linspace(BEGAN - 0.5, BEGAN + 3, 500)
@@ -41,7 +41,7 @@ def test_exact_reports_give_the_exact_way():
     assert track.path.acceleration == pytest.approx(8.0, rel=1e-2)
 
 
-def test_a_stage_that_waits_on_its_way_is_followed():
+def test_a_stage_that_pauses_is_followed():
     time = np.arange(0.0, 5.0, 0.05)
     way = np.interp(time, [1, 2, 3, 4], [0, 1, 1, 2])
     frames = np.linspace(0, 5, 300)
@@ -50,7 +50,7 @@ def test_a_stage_that_waits_on_its_way_is_followed():
     assert np.sqrt(np.mean(error**2)) < 0.04
 
 
-def test_a_move_too_short_for_any_report_is_made_when_it_was_told():
+def test_a_move_too_short_for_any_report_is_assumed_at_its_command():
     track = Track([BEGAN, BEGAN + 5], [0.0, LENGTH], PLAN)
     assert track.began == BEGAN
     np.testing.assert_array_equal(track.at([BEGAN - 1, BEGAN + 5]), [0, LENGTH])
@@ -69,7 +69,7 @@ def live(time, way, frames, began=BEGAN):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_live_way_is_near_and_never_runs_back(seed):
+def test_the_live_distance_is_accurate_and_never_decreases(seed):
     time, way = reports(seed)
     frames = np.linspace(BEGAN, BEGAN + 3, 600)
     found = live(time, way, frames)
@@ -81,7 +81,7 @@ def test_the_live_way_is_near_and_never_runs_back(seed):
     assert np.sqrt(np.mean(error[frames > BEGAN + 0.5] ** 2)) < 0.006
 
 
-def test_the_live_way_goes_on_between_reports():
+def test_the_live_distance_increases_between_reports():
     track = LiveTrack(PLAN, BEGAN)
     for time in np.arange(BEGAN + 0.3, BEGAN + 1.0, 0.1):
         track.add(time, float(PLAN.place(time - BEGAN)))

@@ -91,7 +91,7 @@ def hal(opened, clock):
     return open_hal
 
 
-def test_the_driver_knows_grblhal(hal):
+def test_the_driver_supports_grblhal(hal):
     stage = hal()
     assert stage.firmware == "grblHAL 1.1f.20260817"
     assert stage.parameters[110] == 1200

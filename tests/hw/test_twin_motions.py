@@ -235,7 +235,7 @@ def test_counts_are_linear_in_the_zenith_of_each_frame() -> None:
         assert (frame[~seen.contact] == 16).all()
 
 
-def test_whoever_rolls_a_ball_knows_the_nominal_zenith_scale() -> None:
+def test_a_rolled_ball_determines_the_nominal_zenith_scale() -> None:
     exact = make_twin("axial", pattern="linear").header
     header = make_twin("axial", pattern="linear", references="ball", gain_deviation=0.1).header
     for scale, expected in zip(
@@ -372,7 +372,7 @@ def test_a_small_field_shows_the_slip_of_the_whole_contact() -> None:
 # A stage that gives way.
 
 
-def test_a_stage_that_gives_way_shows_the_frames_of_a_smaller_depth() -> None:
+def test_a_compliant_stage_shows_the_frames_of_a_smaller_depth() -> None:
     compliance = 0.3
     # Travel that leaves Sneddon's contact of each radius: its depth and what its force lifts the body.
     books = [contact_theory.sphere(10.0, radius, 1.0) for radius in (0.6, 1.1, 1.6)]

@@ -81,7 +81,7 @@ def wait_until(clock: Clock, holds: Callable[[], bool]) -> None:
         clock.sleep(0.01)
 
 
-def test_where_nobody_sends_there_is_no_camera() -> None:
+def test_without_a_sender_there_is_no_camera() -> None:
     with pytest.raises(InputError, match=r"^camera tcp://127\.0\.0\.1:\d+ cannot be opened"):
         VideoCamera(settings(f"tcp://127.0.0.1:{free_port()}"))
 

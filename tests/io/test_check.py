@@ -140,7 +140,7 @@ def jumped(steps, count=24):
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.01, ["outliers"]), (0.001, [])])
-def test_samples_that_stand_out_of_a_press_are_found(share, expected):
+def test_outlying_samples_of_a_press_are_found(share, expected):
     generator, frames = np.random.default_rng(2), noisy(pressed())
     wrong = generator.random(frames.shape) < share
     frames[wrong] = generator.integers(0, 256, np.count_nonzero(wrong))

@@ -130,7 +130,7 @@ def test_a_result_that_came_meanwhile_is_not_replaced(tmp_path):
     assert list(io.open_result(path).maps()) == ["height"]
 
 
-def test_no_result_replaces_a_recording_even_if_told_to_overwrite(tmp_path):
+def test_no_result_replaces_a_recording_even_with_overwrite(tmp_path):
     path = record(sphere(), tmp_path / "a.h5")
     with pytest.raises(io.InputError, match="is a recording, which this command never replaces"):
         io.save_result(io.Result(height=MAP), path, overwrite=True)

@@ -52,7 +52,7 @@ def test_a_file_without_heights_is_one_line(tmp_path, make, line):
     assert "\n" not in str(caught.value)
 
 
-def test_heights_whose_offset_nobody_knows_are_left_out(tmp_path):
+def test_heights_of_unknown_offset_are_left_out(tmp_path):
     piece = np.zeros((5, 7), np.int32)
     piece[:, 4:] = 1
     result = io.Result(height=heights(), component=piece, offset_unknown=np.array([1, 0], np.uint8))

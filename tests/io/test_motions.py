@@ -92,7 +92,7 @@ BAD: list[tuple[str, str, Any, str | None, str]] = [
 
 
 @pytest.mark.parametrize(("motion", "name", "value", "units", "line"), BAD)
-def test_what_a_recording_says_wrongly_is_told_in_one_line(tmp_path, motion, name, value, units, line):
+def test_a_wrong_statement_in_a_recording_is_reported_in_one_line(tmp_path, motion, name, value, units, line):
     path = make(tmp_path, motion)
     put(path, f"{STAGE}/{name}", value, units)
     with pytest.raises(io.InputError, match=line) as caught:

@@ -133,7 +133,7 @@ with silx.io.open(sys.argv[1]) as file:
 """
 
 
-def test_a_recording_under_way_is_shown_as_far_as_it_has_come(tmp_path):
+def test_an_unfinished_recording_is_shown_as_far_as_it_is_written(tmp_path):
     path, frames = tmp_path / "rec.h5", random_stack("uint8", (T, H, W))
     known = header("vertical"), frames.shape, frames.dtype, "raw", None, ()
     with path.open("wb") as place, GrowingRecording(path, place.fileno(), *known) as recording:

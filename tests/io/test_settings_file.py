@@ -105,7 +105,7 @@ def test_a_decimal_comma_is_named(tmp_path):
         load(tmp_path, "[stage]\npress-depth = 0,5  # mm\n")
 
 
-def test_a_pipe_that_nobody_writes_to_is_refused(tmp_path):
+def test_a_pipe_without_a_writer_is_refused(tmp_path):
     os.mkfifo(tmp_path / "rig.toml")
     with pytest.raises(io.InputError, match="is not a regular file: save its contents in one first"):
         load_toml(tmp_path / "rig.toml", Rig, "write it anew")

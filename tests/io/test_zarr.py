@@ -192,7 +192,7 @@ def test_a_fingerprint_distinguishes_recordings(pair, tmp_path):
         ({"node_type": "sheep"}, ""),
     ],
 )
-def test_metadata_that_cannot_be_is_refused(pair, changes, said):
+def test_impossible_metadata_is_refused(pair, changes, said):
     assert said in line(edit(pair[1], STACK, **changes))
 
 

@@ -308,14 +308,14 @@ def test_parts_of_several_arrays_are_waited_for_once(device):
             assert sum(record.runs for record in device.profile.records() if record.kind == "wait") == 1
 
 
-def test_a_lack_of_memory_is_told_apart(small_device):
+def test_a_lack_of_memory_has_its_own_error(small_device):
     small_device.max_allocation = 100
     with pytest.raises(DeviceMemoryError, match="no memory for too much"):
         small_device.array("too much", (101,), np.uint8)
     small_device.array("just enough", (100,), np.uint8)
 
 
-def test_a_drivers_own_lack_of_memory_is_told_apart(small_device, monkeypatch):
+def test_a_drivers_own_lack_of_memory_has_its_own_error(small_device, monkeypatch):
     small_device.max_allocation = 2**60
     monkeypatch.setattr(small_device, "info", replace(small_device.info, shares_memory=False))
     with pytest.raises(DeviceMemoryError, match="no memory for maps"):

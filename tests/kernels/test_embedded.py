@@ -359,7 +359,7 @@ def asked(monkeypatch):
 @pytest.mark.parametrize(
     ("names", "given"), [("znver3", ["called"]), ("generic", ["called", "skylake-avx512"])]
 )
-def test_the_known_function_is_patched_where_it_knows_no_processor(asked, names, given):
+def test_the_known_function_is_patched_for_unknown_processors(asked, names, given):
     assert asked(names) == given
     assert ("patched" in embedded.note("3.0")) == (names == "generic")
 

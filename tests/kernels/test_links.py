@@ -153,7 +153,7 @@ def test_a_cubic_surface_leaves_no_misfit_where_four_are_in_line():
         assert np.abs((step + level - real)[flags & ~inner & bit != 0]).min() > 1e-7  # of two pixels only
 
 
-def test_a_pixel_is_told_by_its_maps():
+def test_a_pixel_is_described_by_its_maps():
     nan, one = np.nan, 1.0
     dz = np.array([[one, nan, one, one, nan]], np.float32)
     inputs = check_inputs(

@@ -46,7 +46,7 @@ def test_kernels_do_what_the_reference_does(device, shape):
         np.testing.assert_allclose(found[name], exact, rtol=2e-5, atol=1e-6, err_msg=name)
 
 
-def test_the_typical_weight_is_told_once_and_bounds_the_others(device):
+def test_the_typical_weight_is_determined_once_and_bounds_the_others(device):
     given = normals((30, 40))
     given[1][3, 4] = 1e-9
     maps, found = on_device(device, *given)

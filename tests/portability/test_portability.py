@@ -65,7 +65,7 @@ def no_other_root(monkeypatch, tmp_path):
     monkeypatch.setattr(portability, "TESTING", tmp_path / "none")
 
 
-def test_what_is_missing_is_told_in_one_line_after_the_others_ran(monkeypatch, capsys, other):
+def test_missing_ones_are_reported_in_one_line_after_the_others_ran(monkeypatch, capsys, other):
     absent = [Check("absent", f"install {name}", "/no/such/file") for name in ("two", "one", "two")]
     monkeypatch.setattr(portability, "CHECKS", (*absent, other))
     monkeypatch.setattr(portability, "examine", lambda *_: Finding("1.0", "5 of 5", "0"))

@@ -67,7 +67,7 @@ def test_a_file_keeps_all_that_was_shown(tmp_path):
         assert name in told
 
 
-def test_what_is_shown_is_told_in_words(tmp_path):
+def test_the_display_is_described_in_words(tmp_path):
     view = live.LiveView(tmp_path / "run.rrd", SHAPE)
     view.show(known(), STATUS)
     told = view._status_text(known(), STATUS)

@@ -179,7 +179,7 @@ def test_names_are_shown_and_never_run(page):
     assert HOSTILE in "".join(page.texts["q"])
 
 
-def test_a_page_tells_numbers_parameters_and_where_they_come_from(page):
+def test_a_page_contains_numbers_parameters_and_their_origin(page):
     told = engine.measure(cap())
     for name in told.quantities:
         assert name in page.texts["th"]
@@ -204,7 +204,7 @@ def decoded(data):
     return np.where(marks > 0, height, np.nan), marks & 0x7FFF, marks >> 15
 
 
-def test_the_script_is_told_the_heights_holes_and_what_was_filled(tmp_path, quick):
+def test_the_script_gets_heights_holes_and_filled_pixels(tmp_path, quick):
     result = cap()
     height, piece, filled = decoded(written(tmp_path, result).surface)
     rows, columns = (np.flatnonzero(np.isfinite(result.height).any(axis=axis)) for axis in (1, 0))
@@ -289,13 +289,13 @@ def test_one_turn_of_several_is_shown(tmp_path, quick):
         written(tmp_path, turns)
 
 
-def test_what_a_calibration_says_is_told_where_there_is_one(tmp_path, quick, page):
+def test_a_calibration_is_described_if_there_is_one(tmp_path, quick, page):
     assert "half-angle" in page.texts["th"]
     assert "calibration" in [one.get("id") for one in page.all("section")]
     assert "calibration" not in [one.get("id") for one in written(tmp_path, cap()).all("section")]
 
 
-def test_a_fused_process_is_told_by_movement():
+def test_a_fused_process_is_listed_by_movement():
     process = {
         "program": "mirrorskin",
         "method": "fusion",
@@ -317,7 +317,7 @@ def test_a_fused_process_is_told_by_movement():
     }
 
 
-def test_points_stand_below_each_other():
+def test_points_are_listed_below_each_other():
     figure, point = "\N{FIGURE SPACE}", "\N{PUNCTUATION SPACE}"
     assert align(["1.25", "10", "", "0.5"]) == ["1.25", f"10{point}{figure * 2}", "", f"0.5{figure}"]
     assert align(["1", "20"]) == ["1", "20"]

@@ -79,7 +79,7 @@ def test_the_scale_bar_is_as_long_as_it_says():
     assert told == "0.5 mm"  # the longest round length below 0.3 of 3.2 mm
 
 
-def test_a_single_pixel_has_no_scale_bar_as_nobody_knows_its_size():
+def test_a_single_pixel_of_unknown_size_has_no_scale_bar():
     assert not panel_of(draw_height, ball((1, 1))).lines
 
 
@@ -96,7 +96,7 @@ def test_without_pixel_size_heights_are_along_pixels_and_have_no_scale_bar():
     assert not axes.lines
 
 
-def test_notes_tell_what_colours_mean_and_what_a_level_is_worth():
+def test_notes_explain_colours_and_the_size_of_a_level():
     assert note(panel_of(draw_height, ball())) == "orange: filled (1.6 %); blue: no answer (10.9 %)"
     whole = ball(filled=None, height=np.zeros((24, 32), np.float32))
     assert note(panel_of(draw_height, whole)) == ""
@@ -129,7 +129,7 @@ def test_the_line_of_a_section_runs_from_a_to_b():
     ],
     ids=["short", "backwards", "upright", "across", "across backwards"],
 )
-def test_a_and_b_stand_beyond_the_ends_but_within_the_picture(ends, sides):
+def test_a_and_b_are_beyond_the_ends_but_within_the_picture(ends, sides):
     axes = panel_of(draw_height, ball(), section(ball(), *ends))
     letters = {text.get_text(): text.get_ha() for text in axes.texts}
     assert (letters["A"], letters["B"]) == sides  # the side of a letter that is at the end
@@ -191,7 +191,7 @@ def test_a_section_is_stretched_as_it_says(span, told):
     assert low < -span < 0 < high
 
 
-def test_a_section_without_errors_or_holes_tells_of_neither():
+def test_a_section_without_errors_or_holes_mentions_neither():
     level = io.Result(height=np.zeros((3, 9), np.float32), x=np.arange(9.0), y=np.arange(3.0)[::-1])
     sheet, cut = cut_of(level)
     axes = panel_of(draw_section, sheet.result, cut)

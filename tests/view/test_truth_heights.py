@@ -143,7 +143,7 @@ def test_higher_is_lighter_and_what_is_not_known_has_a_colour_of_its_own():
     assert picture.cmap.get_bad()[3] == 0  # and shows through where there is no answer
 
 
-def test_a_surface_stands_in_space_over_the_field(surfaces):
+def test_a_surface_is_drawn_over_the_field(surfaces):
     height = slope()
     height[4:9, 10:15] = np.nan
     axes, _ = draw({"a": result_of(height)}, truth_of(height), surface=True)

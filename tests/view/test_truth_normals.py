@@ -69,7 +69,7 @@ def test_needles_point_where_the_surface_faces_and_only_in_contact(tmp_path, mon
     assert needles.X.min() > 0
 
 
-def test_errors_are_angles_where_contact_is_told_and_true(tmp_path, monkeypatch):
+def test_errors_are_angles_where_contact_is_found_and_true(tmp_path, monkeypatch):
     touched, told = np.ones((2, *SHAPE), np.uint8)
     touched[0], told[1] = 0, 0
     results = {"right": result_of(contact=told), "turned": result_of(0.5, ZENITH + np.radians(2))}

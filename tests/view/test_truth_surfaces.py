@@ -54,7 +54,7 @@ def test_the_last_is_drawn_as_a_whole_and_all_are_cut():
     assert low < 2 < high
 
 
-def test_red_is_too_high_and_the_title_tells_the_rms():
+def test_red_is_too_high_and_the_title_contains_the_rms():
     error = np.where(np.arange(SHAPE[1]) < 15, 3.0, -3.0) * np.ones(SHAPE)
     _, _, errors, _, _ = drawn({"a": result_of(error)})
     picture = errors.get_images()[0]
@@ -80,7 +80,7 @@ def test_errors_of_what_was_filled_are_framed_and_open():
         np.testing.assert_array_equal(np.isfinite(inside), filled[10] == 1)
 
 
-def test_errors_are_told_after_the_level_is_the_truth_s():
+def test_errors_are_relative_to_the_level_of_the_truth():
     maps = {"component": np.zeros(SHAPE, np.int32), "offset_unknown": np.ones(1, np.uint8)}
     error = 4 * np.sin(np.arange(SHAPE[1])) * np.ones(SHAPE)
     _, _, errors, _, _ = drawn({"a": result_of(700 + error, **maps)})

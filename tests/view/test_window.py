@@ -25,7 +25,7 @@ def test_without_windows_there_is_no_screen():
 
 @pytest.mark.usefixtures("backend")
 @pytest.mark.parametrize("name", ["tkagg", "QtAgg"])
-def test_a_way_to_open_windows_is_a_screen(monkeypatch, name):
+def test_a_means_to_open_windows_is_a_screen(monkeypatch, name):
     asked = []
     monkeypatch.setattr(matplotlib, "get_backend", lambda: name)
     monkeypatch.setattr(pyplot, "switch_backend", asked.append)
@@ -34,7 +34,7 @@ def test_a_way_to_open_windows_is_a_screen(monkeypatch, name):
 
 
 @pytest.mark.usefixtures("backend")
-def test_a_way_that_does_not_go_here_is_not_a_screen(monkeypatch):
+def test_a_means_that_fails_here_is_not_a_screen(monkeypatch):
     def refuse(name):
         raise ImportError(f"cannot load {name}: headless")
 

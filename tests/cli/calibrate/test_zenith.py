@@ -77,7 +77,7 @@ def test_a_response_is_added_to_a_calibration(folder, fitted):
     assert any("place-3.h5" in str(value) for value in known.process.values())
 
 
-def test_without_a_calibration_one_is_made_and_told_as_json(folder, fitted):
+def test_without_a_calibration_one_is_made_and_printed_as_json(folder, fitted):
     ended = calibrate("--pattern", "uniform", "--tilt", "3deg", "--json")
     assert ended.code == 0, ended.said
     told = json.loads(ended.out)

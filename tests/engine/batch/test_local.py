@@ -94,7 +94,7 @@ local._wait(threading.Semaphore(0))
 
 
 @pytest.mark.slow
-def test_a_thread_that_hangs_does_not_keep_one_who_insists():
+def test_a_thread_that_hangs_does_not_delay_a_repeated_signal():
     start = time.monotonic()
     ended = subprocess.run([sys.executable, "-c", HANGS], check=False)
     assert ended.returncode == 130

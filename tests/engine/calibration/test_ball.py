@@ -22,7 +22,7 @@ SLANTED = np.stack([X, Y, -X / 80, -Y / 80])  # of a pinhole 80 mm above the res
 PIXEL, SHAPE = (0.15, 0.15), (80, 80)
 
 
-def test_an_upright_ball_is_a_sphere_where_it_stands_above_the_rest_plane():
+def test_an_upright_ball_is_a_sphere_above_the_rest_plane():
     seen = see_ball(STRAIGHT, CENTRE, RADIUS, UPRIGHT, (0, 0, 0))
     away = (X - CENTRE[0]) ** 2 + (Y - CENTRE[1]) ** 2
     touched = seen.contact[0]

@@ -68,7 +68,7 @@ def test_the_print_is_found_as_it_was_made(calibration):
     assert report.row_of_the_print(LAB, calibration).good
 
 
-def test_the_movement_is_found_though_another_was_told(calibration):
+def test_the_movement_is_found_though_another_was_stated(calibration):
     found = calibration.precession
     turned = math.degrees(math.remainder(found.phase_offset - LAB.phase_error, math.tau))
     assert found.direction == 1

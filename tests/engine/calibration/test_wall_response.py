@@ -58,7 +58,7 @@ def test_scatter_does_not_move_half_the_light_but_other_shares():
     assert math.degrees(late - early) == pytest.approx(1.5, abs=1e-3)
 
 
-def test_a_higher_mirror_sees_the_rim_sooner_and_a_place_is_told_from_the_axis():
+def test_a_higher_mirror_sees_the_rim_sooner_and_places_are_relative_to_the_axis():
     assert threshold_zenith(response(), 0, 0, 0, z=2.0) == pytest.approx(math.atan2(17.5, 38.0) / 2, abs=1e-5)
     moved = response(axis=(1.0, -2.0))
     there, here = threshold_zenith(moved, 4.0, 0.5, 0.7), threshold_zenith(response(), 3.0, 2.5, 0.7)

@@ -140,7 +140,7 @@ def test_a_uniform_wall_shows_where_light_begins():
     assert math.degrees(found) == pytest.approx(math.degrees(math.atan2(17.1, 38.5) / 2), abs=0.1)
 
 
-def test_a_wall_without_a_print_is_told_from_one_with():
+def test_walls_with_and_without_a_print_are_distinguished():
     with pytest.raises(io.InputError, match="give --pattern uniform"):
         respond(some_presses(np.full(CURVE_COEFFICIENTS, 0.95), each=400))
 

@@ -81,7 +81,7 @@ def test_a_section_has_no_height_between_two_components():
     assert np.isnan(cut.height).sum() == 1
 
 
-def test_without_a_pixel_size_it_is_told_in_pixels():
+def test_without_a_pixel_size_it_is_in_pixels():
     result = result_of(cap(SHAPE, (1, 1), 50.0, 9.0), x=None, y=None)
     cut = section(result)
     assert cut.unit == "px"
@@ -184,7 +184,7 @@ def test_lengths_and_slope_are_those_between_the_ends():
     assert "step height" not in told
 
 
-def test_a_step_is_told_where_there_is_one_and_else_that_there_is_none():
+def test_a_step_is_reported_or_that_there_is_none():
     ends = (-2.5, 0.0), (2.5, 0.0)
     assert measured(stair(), ends).quantities["step height"].value == pytest.approx(0.2)
     flat = 0.001 * np.random.default_rng(9).standard_normal(LONG)

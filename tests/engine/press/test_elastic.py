@@ -130,7 +130,7 @@ def test_a_ball_is_corrected_with_pixels_of_two_sizes_and_defects():
     assert np.sqrt(np.mean((after / spread[known]) ** 2)) < 2.5
 
 
-def test_a_ball_at_the_edge_of_the_picture_is_put_right():
+def test_a_ball_at_the_edge_of_the_picture_is_corrected():
     height, sigma, status, truth = ball_press(5.0, (60, 60), (0.1, 0.1), 1.0, 0.05)
     cut = np.s_[:, 12:]
     gel = replace(GEL, axis=(-0.6, 0.0))

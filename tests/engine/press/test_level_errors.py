@@ -32,7 +32,7 @@ def reconstruct(frames, **options):
 
 
 @pytest.mark.parametrize("method", ["threshold", "change-point"])
-def test_heights_have_honest_errors_while_the_dark_level_drifts(method):
+def test_heights_have_true_errors_while_the_dark_level_drifts(method):
     frames, height = pressed(dark=6.0, light=6.0)
     result = reconstruct(frames, method=method)
     assert np.nanmean(((result.height - height) / result.height_sigma) ** 2) < 1.5

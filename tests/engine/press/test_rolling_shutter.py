@@ -47,7 +47,7 @@ def test_heights_are_those_of_the_travel_of_their_row(error_of, line_time, event
     assert np.nanmax(np.abs(error)) < 0.002
 
 
-def test_without_the_line_time_heights_are_off_by_the_way_that_the_body_moved(error_of):
+def test_without_the_line_time_heights_are_wrong_by_the_movement_of_the_body(error_of):
     error = error_of(press(4e-4, known=False))
     assert np.ptp(np.nanmean(error, axis=1)) == pytest.approx(SPEED * 4e-4 * (SHAPE[0] - 1), rel=0.05)
 

@@ -40,7 +40,7 @@ def test_without_it_the_travel_is_exact():
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
-def test_a_recording_knows_it(tmp_path):
+def test_a_recording_stores_it(tmp_path):
     frames, travel, _ = jittered(0)
 
     levels = {name: np.full((40, 50), value, np.float32) for name, value in LEVELS.items()}

@@ -131,7 +131,7 @@ def test_heights_that_are_given_do_as_well():
     assert result.process["heights"] == "given"
 
 
-def test_a_source_that_cannot_be_read_twice_is_taken_to_stand_at_half_the_press():
+def test_a_source_that_cannot_be_read_twice_is_assumed_at_half_the_press():
     result = engine.reconstruct(scene().source(rewindable=False))
     zenith, _ = scene().errors(result)
     assert 0.1 < rms(zenith) < 0.5

@@ -81,7 +81,7 @@ def test_mirrors_that_face_one_way_are_found_to_do_so_all_over_the_picture(devic
     assert found.contact.mean() > 0.98
 
 
-def test_dark_pixels_are_told_to_be_too_level():
+def test_dark_pixels_are_marked_too_level():
     response = made()
     light = np.full(SHAPE, 0.5)
     light[2, 3:9] = 0.01

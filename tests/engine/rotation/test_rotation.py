@@ -303,7 +303,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(case):
     assert "\n" not in str(caught.value)
 
 
-def test_operations_run_over_a_source_with_what_it_knows():
+def test_operations_run_over_a_source_with_its_properties():
     result = engine.run(source(), engine.Normals)
     known = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
     alike(result, engine.estimate_normals(frames(), PHASE, **known))

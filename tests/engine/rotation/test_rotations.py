@@ -39,7 +39,7 @@ def test_the_bound_is_that_of_differences():
 
 
 @pytest.mark.parametrize("z", [-1.0, 0.5, 5.0])
-def test_what_clipping_leaves_is_what_the_likelihood_tells(z):
+def test_clipped_samples_have_the_estimate_of_the_likelihood(z):
     inside, _ = integrate.quad(lambda x: x**2 * stats.norm.pdf(x), -20, z)
     beyond = stats.norm.sf(z)
     expected = inside + stats.norm.pdf(z) ** 2 / beyond

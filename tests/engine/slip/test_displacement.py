@@ -99,7 +99,7 @@ def test_sigma_counts_that_the_movement_bends_inside_windows():
 
 
 @pytest.mark.parametrize("far", [6.0, 40.0])
-def test_a_long_way_in_one_step_is_found(far):
+def test_a_long_displacement_in_one_step_is_found(far):
     frame = SPECKLE.frame(SHAPE, far, 0, NOISE, 1)[None]
     found = find_displacement(REFERENCE, frame, PIXEL, window_size=16)
     there = found.displacement[0, 16:-16, 16 : -16 - int(far), 0]

@@ -82,7 +82,7 @@ def slid():
     return operation.result(), float(places[-1, 0])
 
 
-def test_slip_is_told_from_stick_within_a_pixel(slid):
+def test_slip_and_stick_are_distinguished_within_a_pixel(slid):
     found, way = slid
     true = onset(COLUMN, ROW) * PIXEL < way
     border = binary_dilation(true & INSIDE) & ~binary_erosion(true & INSIDE)

@@ -50,7 +50,7 @@ def differing(header, own=OWN):
         (None, {"dark", "bright", "pixel_size", "tilt", "pivot"}),
     ],
 )
-def test_each_part_tells_what_it_knows_and_the_rest_is_the_source_s(only, changed):
+def test_each_part_replaces_its_values_and_the_rest_is_the_source_s(only, changed):
     with_calibration = calibrated(only)
     header, calibration = with_calibration.header, with_calibration.calibration
     assert differing(header) == changed
@@ -153,7 +153,7 @@ def test_a_part_of_the_picture_has_its_part_of_every_map(tmp_path):
 
 
 @pytest.mark.parametrize(("lens", "pixel"), [(None, (0.1, 0.2)), (a_lens(), (0.5, 0.6))])
-def test_places_are_told_from_the_centre_of_a_part(tmp_path, lens, pixel):
+def test_places_are_relative_to_the_centre_of_a_part(tmp_path, lens, pixel):
     """The same point of the sheet is the same pixel, of the whole picture and of a part."""
     path = record(a_source(), tmp_path / "turn.h5")
     region = io.Region((1, 4), (2, 7))
@@ -261,7 +261,7 @@ def test_a_result_carries_a_copy_also_where_its_form_was_written_before(tmp_path
             assert io.describe(path)["carried calibration"].startswith("references, scale")
 
 
-def test_a_copy_that_is_damaged_is_told_when_it_is_asked_for_and_only_then(tmp_path):
+def test_a_damaged_copy_is_reported_only_when_it_is_read(tmp_path):
     path = tmp_path / "turn.h5"
     with io.Recorder(a_source(), path, calibration=a_calibration()) as recorder:
         recorder.drain(lambda count: None)

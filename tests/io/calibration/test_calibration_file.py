@@ -106,7 +106,7 @@ def test_parts_are_added_one_by_one(path):
     assert found.process == {"references.program": "mirrorskin", "references.frames": 8, "tilt.frames": 9}
 
 
-def test_a_part_is_replaced_with_what_is_told_of_it_and_others_stay(saved):
+def test_a_part_is_replaced_with_its_notes_and_others_stay(saved):
     before = io.open_calibration(saved)
     io.update_calibration(saved, a_precession(tilt=0.05), CAMERA, {"turns": 2})
     after = io.open_calibration(saved)

@@ -62,7 +62,7 @@ def test_the_scale_counts_rather_than_what_the_recording_says(motion):
     assert io.Calibrated(source(motion), calibration).header.pixel_size == (0.5, 0.6)
 
 
-def test_a_thousandth_is_the_same_size_and_what_nobody_told_is_believed():
+def test_a_thousandth_is_the_same_size_and_an_unknown_one_is_accepted():
     parts = ["zenith", "precession", "gel"]
     assert not list(outdated(made_with((0.1, 0.2), parts), (0.10005, 0.19995)))
     assert [part for part, _ in outdated(made_with((0.1, 0.2), parts), (0.1, 0.2003))] == parts
