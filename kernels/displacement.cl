@@ -268,15 +268,15 @@ __kernel void displacement_solve(
         }
         const int count = WINDOW - chunk < LANES ? WINDOW - chunk : LANES;
         for (int i = 0; i < count; ++i) {
-            const float beside = PLACE(chunk + i);
+            const float across = PLACE(chunk + i);
             sums[0] += x[i];
             sums[1] += y[i];
-            sums[2] += x[i] * beside;
+            sums[2] += x[i] * across;
             sums[3] += x_down[i];
-            sums[4] += y[i] * beside;
+            sums[4] += y[i] * across;
             sums[5] += y_down[i];
             sums[6] += level[i];
-            sums[7] += level[i] * beside;
+            sums[7] += level[i] * across;
             sums[8] += level_down[i];
             sums[9] += gain[i];
             squares += square[i];
@@ -350,8 +350,8 @@ __kernel void displacement_normals(
     for (int j = 0; j < WINDOW; ++j) {
         for (int i = 0; i < WINDOW; ++i) {
             MAP at = corner + j * width + i;
-            const float x = at[plane], y = at[2 * plane], known = at[0] - at[0] == 0, beside = PLACE(i), below = PLACE(j);
-            const float column[PARAMETERS] = {x, y, x * beside, x * below, y * beside, y * below, known, known * beside,
+            const float x = at[plane], y = at[2 * plane], known = at[0] - at[0] == 0, across = PLACE(i), below = PLACE(j);
+            const float column[PARAMETERS] = {x, y, x * across, x * below, y * across, y * below, known, known * across,
                 known * below, at[3 * plane]};
             #pragma unroll
             for (int k = 0; k < PARAMETERS; ++k) {

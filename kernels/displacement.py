@@ -50,10 +50,10 @@ def displacement_filter(step: int, source: Array, filtered: Array) -> None:
     flat, out, reach = source.reshape(-1).astype(np.float64), filtered.reshape(-1), TAPS * step
     middle = flat[reach:-reach].copy()
     for k in range(1, TAPS + 1):
-        beside = (
+        neighbours = (
             flat[reach - k * step : flat.size - reach - k * step] + flat[reach + k * step :][: middle.size]
         )
-        middle += POLE**k * beside
+        middle += POLE**k * neighbours
     out[reach:-reach] = np.sqrt(3.0) * middle
 
 

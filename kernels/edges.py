@@ -272,8 +272,8 @@ def _guarded(edges: Array, row: int, column: int, cosine: float, sine: float, gu
         for right in range(-guard, guard + 1):
             along = abs(right * cosine + down * sine)
             across = abs(down * cosine - right * sine)
-            beside = along <= guard + 0.2 and across <= along + 0.1
-            if beside and _value(edges, row + down, column + right) > 0:
+            adjacent = along <= guard + 0.2 and across <= along + 0.1
+            if adjacent and _value(edges, row + down, column + right) > 0:
                 return True
     return False
 

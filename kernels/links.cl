@@ -229,7 +229,7 @@ __kernel void links_join(GRAPH, KEPT_MAPS OUT source, const int place)
     PIECE(ROWS)
     if (top >= rows) return;
     const int width = end - begin;
-    float beside[CHUNK + 1], above[CHUNK];
+    float from_left[CHUNK + 1], above[CHUNK];
     for (int i = 0; i < width; ++i) above[i] = 0.0f;
     if (top > 0) {
         NEIGHBOURS(top - 1)
@@ -239,13 +239,13 @@ __kernel void links_join(GRAPH, KEPT_MAPS OUT source, const int place)
     for (int row = top; row < bottom; ++row) {
         const int first = row * columns + begin;
         NEIGHBOURS(row)
-        beside[0] = begin > 0 ? X_RISE(first - 1, GREATER(first - 2, 0), begin > 1 ? RIGHT : 0) : 0.0f;
-        beside[1] = X_RISE(first, GREATER(first - 1, 0), begin > 0 ? RIGHT : 0);
-        for (int i = 1; i < width; ++i) beside[i + 1] = X_RISE(first + i, first + i - 1, RIGHT);
+        from_left[0] = begin > 0 ? X_RISE(first - 1, GREATER(first - 2, 0), begin > 1 ? RIGHT : 0) : 0.0f;
+        from_left[1] = X_RISE(first, GREATER(first - 1, 0), begin > 0 ? RIGHT : 0);
+        for (int i = 1; i < width; ++i) from_left[i + 1] = X_RISE(first + i, first + i - 1, RIGHT);
         for (int i = 0; i < width; ++i) {
             const int p = first + i;
             const float below = Y_RISE(p);
-            float sum = beside[i] - beside[i + 1] + above[i] - below;
+            float sum = from_left[i] - from_left[i + 1] + above[i] - below;
             above[i] = below;
 #if HEIGHTS
             const float weight = ANCHOR(p), rise = heights[p] - LEVEL(row, begin + i);

@@ -255,15 +255,15 @@ INLINE void move_parts(MOVE_ARGS)
                     if (w == 0) continue;
                     const int j = NODE(m) + y * stride + x, J_there = J + (v >> 1) * coarse_stride + (u >> 1);
                     const int went = first_round ? 0 : to[j];
-                    const int below = (v >> 1) + (went ? (went - 1) / 3 - 1 : 0), beside = (u >> 1) + (went ? (went - 1) % 3 - 1 : 0);
+                    const int below = (v >> 1) + (went ? (went - 1) / 3 - 1 : 0), across = (u >> 1) + (went ? (went - 1) % 3 - 1 : 0);
                     top = GREATER(top, below - 1);
                     bottom = LESSER(bottom, below + 1);
-                    left = GREATER(left, beside - 1);
-                    right_most = LESSER(right_most, beside + 1);
+                    left = GREATER(left, across - 1);
+                    right_most = LESSER(right_most, across + 1);
                     const int has_place = went || parts[J_there] >> (2 * (v & 1) + (u & 1)) & 1;
-                    if (!has_place || inside || below < -1 || below > 1 || beside < -1 || beside > 1) continue;
+                    if (!has_place || inside || below < -1 || below > 1 || across < -1 || across > 1) continue;
                     // in registers
-                    for (int way = 0; way < 9; ++way) sums[way] += way == 3 * below + beside + 4 ? w : 0;
+                    for (int way = 0; way < 9; ++way) sums[way] += way == 3 * below + across + 4 ? w : 0;
                 }
                 for (int way = 0; way < 9; ++way) {
                     const int y = way / 3 - 1, x = way % 3 - 1, is_old = way + 1 == old;
@@ -344,11 +344,11 @@ INLINE void coarsen(COARSEN_ARGS)
                         : link_of(i, stride, way / 3 - 1, way % 3 - 1, right, down, falling, rising, anchor);
                     if (w == 0) continue;
                     const int v = y + way / 3 - 1, u = x + way % 3 - 1, j = i + (way / 3 - 1) * stride + way % 3 - 1;
-                    const int below = (v >> 1) + WENT_DOWN(j) - row, beside = (u >> 1) + WENT_RIGHT(j) - C;
-                    if (below == 0 && beside == 1) to_right += w;
-                    if (below == 1 && beside == -1) rises += w;
-                    if (below == 1 && beside == 0) to_below += w;
-                    if (below == 1 && beside == 1) falls += w;
+                    const int below = (v >> 1) + WENT_DOWN(j) - row, across = (u >> 1) + WENT_RIGHT(j) - C;
+                    if (below == 0 && across == 1) to_right += w;
+                    if (below == 1 && across == -1) rises += w;
+                    if (below == 1 && across == 0) to_below += w;
+                    if (below == 1 && across == 1) falls += w;
                 }
             }
             coarse_right[J] = 0.5f * to_right;
@@ -393,8 +393,8 @@ INLINE void invert_coarsest(
     EACH_LATER(n, -1) {
         for (int k = 0; k < nodes; ++k) {
             const int y = k / stride - n / stride, x = k % stride - n % stride;
-            const int beside = (y || x) && y * y <= 1 && x * x <= 1;
-            m[n * nodes + k] = beside ? link_of(first + n, stride, y, x, right, down, falling, rising, anchor) : 0;
+            const int adjacent = (y || x) && y * y <= 1 && x * x <= 1;
+            m[n * nodes + k] = adjacent ? link_of(first + n, stride, y, x, right, down, falling, rising, anchor) : 0;
         }
         held[n] = 0 WITH_ANCHOR(anchor[first + n]);
     }

@@ -344,9 +344,9 @@ def walk(level: Level) -> tuple[Doubles, Doubles]:
 def local_part(level: Level, c: Sequence[float]) -> Doubles:
     """Return the local part of each node's variance."""
     (links, uneven), (d, r) = evened_sides(level), walk(level)
-    beside = sum(w * shifted(d * (c[3] + c[4] * r), *way) for way, w in links)
+    neighbours = sum(w * shifted(d * (c[3] + c[4] * r), *way) for way, w in links)
     back = sum(w * shifted(r, *way) for way, w in links)
-    return np.asarray(d * (c[0] + c[1] * r + c[2] * d * back + c[5] * uneven + beside))
+    return np.asarray(d * (c[0] + c[1] * r + c[2] * d * back + c[5] * uneven + neighbours))
 
 
 def spread(level: Level, coarse: Doubles, local: Doubles) -> Doubles:

@@ -160,7 +160,7 @@ float2 answer(
     const int waits = (rise <= light_tolerance) | ((waited - 2) * rise > 2.5f * light_tolerance);
     const int hovered = waits & !jumped, sudden = (from_dark & to_light) | jumped, look = !(sudden | hovered);
     const float near = 0.125f * rise;
-    const int beside = (low <= dark + near) | (high >= after - near), guess = from_dark | to_light | beside | hovered | jumped;
+    const int at_plateau = (low <= dark + near) | (high >= after - near), guess = from_dark | to_light | at_plateau | hovered | jumped;
     const float least = level > low ? level : low, most = least < high ? least : high;
     const float crossed = (most - low) * steepness, rest = 1 - crossed;
     const float share = sudden ? 0.5f : crossed;

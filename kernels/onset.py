@@ -180,8 +180,8 @@ def onset_heights(onset: Array, below: Array, foot: Array, risen: Array, before:
     step = high - low
     way = level[found] - dark[found]
     jumped = (foot[found] + 1 < start) & (risen[found] >= settled - way / 8) & (way >= _SURE_WAY * noise)
-    beside = (low <= dark[found] + step / 8) | (high >= settled - step / 8)
-    sudden, under_way = from_dark & to_light | jumped, ~(from_dark | to_light | beside)
+    at_plateau = (low <= dark[found] + step / 8) | (high >= settled - step / 8)
+    sudden, under_way = from_dark & to_light | jumped, ~(from_dark | to_light | at_plateau)
     end = np.where(jumped, foot[found] + 1, start)
     width = travel[end] - travel[end - 1]
 

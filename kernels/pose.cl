@@ -227,10 +227,10 @@ __kernel void pose_equations(
 #if BESIDE
             const F over_turned = 1.0f / turned.z;
             const Symmetric curved = turn_curvature(before.z, (Symmetric){mine.xx, mine.xy, mine.yy}, over_turned, turn, turned);
-            Jacobian beside;
-            jacobian(turned, curved, over_turned, arm, lower, sure, &beside);
+            Jacobian other_jacobian;
+            jacobian(turned, curved, over_turned, arm, lower, sure, &other_jacobian);
             UNROLL for (int i = 0; i < 6; ++i)
-                UNROLL for (int k = 0; k < 6; ++k) total[31 + 6 * i + k] += PRODUCT(j, i, beside, k);
+                UNROLL for (int k = 0; k < 6; ++k) total[31 + 6 * i + k] += PRODUCT(j, i, other_jacobian, k);
 #endif
         }
     OUT out = sums + item * SUMS;

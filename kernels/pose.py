@@ -93,7 +93,7 @@ def _equations_at(step: int, first: Array, second: Array, pose: Array, sums: Arr
     compared = (mine[:, 4] < NEAR) & (theirs[4] < NEAR)
     sure = np.where(compared, sure, 0)
     residual = np.stack([*_whiten(turned[0] - n[0], turned[1] - n[1], lower), sure * (place[2] - theirs[3])])
-    jacobian, beside = (_jacobian(one, arm, lower, sure) for one in (shape, own))
+    jacobian, other_jacobian = (_jacobian(one, arm, lower, sure) for one in (shape, own))
     expected = told * (2 - part) + sure**2 * (own_height + share * theirs[4])
 
     upper = np.triu_indices(6)
@@ -102,7 +102,7 @@ def _equations_at(step: int, first: Array, second: Array, pose: Array, sums: Arr
             np.einsum("kin,kjn->ijn", jacobian, jacobian)[upper],
             np.einsum("kin,kn->in", jacobian, residual),
             [np.sum(residual**2, axis=0), expected, compared, told],
-            np.einsum("kin,kjn->ijn", jacobian, beside).reshape(36, -1),
+            np.einsum("kin,kjn->ijn", jacobian, other_jacobian).reshape(36, -1),
         ]
     )
     sums[...] = np.stack([np.bincount(block, one, len(sums)) for one in whole[: sums.shape[1]]], axis=-1)
@@ -126,10 +126,10 @@ def _interpolate(second: Doubles, place: Doubles, grid: Array) -> tuple[Doubles,
     west, north = right.astype(np.intp), down.astype(np.intp)
     found, share, bent = np.zeros((8, len(west))), np.zeros(len(west)), np.zeros(len(west))
     for below in (0, 1):
-        for beside in (0, 1):
-            from_x, from_y = right - west - beside, down - north - below
+        for right_of in (0, 1):
+            from_x, from_y = right - west - right_of, down - north - below
             weight = (1 - np.abs(from_x)) * (1 - np.abs(from_y))
-            record = second[north + below, west + beside].T
+            record = second[north + below, west + right_of].T
             found += weight * record
             bent += weight / 2 * (record[0] * from_x * step_x - record[1] * from_y * step_y)
             share += weight**2

@@ -33,18 +33,18 @@ INLINE float2 gradient_at(
     const float here = values[p];
     float count = 0, x = 0, y = 0, xx = 0, xy = 0, yy = 0, z = 0, xz = 0, yz = 0;
     for (int below = -LESSER(AROUND, row); below <= LESSER(AROUND, rows - 1 - row); ++below)
-        for (int beside = -left; beside <= right; ++beside) {
-            const float value = values[p + below * columns + beside] - here;
+        for (int right_of = -left; right_of <= right; ++right_of) {
+            const float value = values[p + below * columns + right_of] - here;
             const int known = value == value;
-            const float one = known ? 1.0f : 0.0f, rise = known ? value : 0.0f, i = beside * one, j = below * one;
+            const float one = known ? 1.0f : 0.0f, rise = known ? value : 0.0f, i = right_of * one, j = below * one;
             count += one;
             x += i;
             y += j;
-            xx += i * beside;
+            xx += i * right_of;
             xy += i * below;
             yy += j * below;
             z += rise;
-            xz += rise * beside;
+            xz += rise * right_of;
             yz += rise * below;
         }
     const float mean_x = x / count, mean_y = y / count;

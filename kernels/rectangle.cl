@@ -305,14 +305,14 @@ __kernel void rectangle_divide(
 {
     const int strip = get_group_id(0) / pictures, picture = get_group_id(0) % pictures;
     __global C *column = (__global C *)spectrum + (long)strip * padded + picture * length;
-    const C beside = ((__global const C *)along)[strip];
+    const C eigenvalue = ((__global const C *)along)[strip];
     TAKE_WORK
     ALL(n, length) work[SPOT(n)] = column[n];
     TRANSFORM(0)
     ALL(k, length / 2 + 1) {
         GET_MODES(k)
-        low /= beside + across[k];
-        high /= beside + across[length - k];
+        low /= eigenvalue + across[k];
+        high /= eigenvalue + across[length - k];
         if (k == 0 && strip == 0) low.s0 = 0.0f * high.s0;
         PUT_MODES(k)
     }

@@ -61,8 +61,8 @@ __kernel void registration_mend(const int count, __global const int *restrict pl
     const int first = get_global_id(0) * TILE, end = min(first + TILE, count);
     for (int i = first; i < end; ++i) {
         __global const int *place = places + 5 * i;
-        const float beside = padded[place[1]] + padded[place[2]], above = padded[place[3]] + padded[place[4]];
-        padded[place[0]] = 0.25f * (beside + above);
+        const float horizontal = padded[place[1]] + padded[place[2]], above = padded[place[3]] + padded[place[4]];
+        padded[place[0]] = 0.25f * (horizontal + above);
     }
 }
 

@@ -120,12 +120,12 @@ __kernel void slopes_weigh(
             const F upright = 1.0f - flat, steep = 1.0f / GREATER(upright, (F)(STEEPEST * STEEPEST));
             UNSURE(flat, variance)
             const F here = share * variance * steep * steep + 0.5f * flat * steep * turned * turned;
-            const F beside = (1.0f - share) * variance * steep, twice = 2.0f * turned;
+            const F orthogonal = (1.0f - share) * variance * steep, twice = 2.0f * turned;
             const F east_of = (sum_x + LEAST) / (sum_x + sum_y + 2.0f * LEAST) - 0.5f;
             const F share_x = 0.5f + east_of * EXPONENTIAL(twice);
             const F high = LESSER(share_x, (F)1.0f), east = GREATER(high, (F)0.0f), north = 1.0f - east;
-            const F one = GREATER(1.0f / (east * here + north * beside), (F)lowest);
-            const F two = GREATER(1.0f / (north * here + east * beside), (F)lowest);
+            const F one = GREATER(1.0f / (east * here + north * orthogonal), (F)lowest);
+            const F two = GREATER(1.0f / (north * here + east * orthogonal), (F)lowest);
             const F in_x = known ? LESSER(one, (F)highest) : (F)0.0f, in_y = known ? LESSER(two, (F)highest) : (F)0.0f;
             if (i + WIDTH <= width) {
                 WRITE(weight_x, p, in_x);
