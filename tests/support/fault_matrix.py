@@ -12,7 +12,7 @@ import functools
 import json
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from independent_camera import (
 )
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from slope_faults import SLOPE_FAULTS, integrated
 
 from mirrorskin import engine
 from mirrorskin.engine.fusion import fuse_recordings
@@ -332,7 +333,11 @@ def _watched(compute: Callable[[], Result]) -> tuple[Result, bool]:
     return result, warned or "warnings" in result.process
 
 
-ESTIMATORS: Mapping[str, Callable[[Fault, int], Answer]] = {
+def _of_slopes(*, weights: bool = False, robust: bool = False) -> Callable[[Any, int], Answer]:
+    return lambda fault, seed: Answer(*integrated(fault, seed, weights=weights, robust=robust), warned=False)
+
+
+ESTIMATORS: Mapping[str, Callable[[Any, int], Answer]] = {
     "threshold, steps of 20 µm": _onset(_waves, 0.02),
     "threshold, steps of 100 µm": _onset(_waves, 0.1),
     "threshold, rim of a crater": _onset(_crater, 0.02),
@@ -345,10 +350,15 @@ ESTIMATORS: Mapping[str, Callable[[Fault, int], Answer]] = {
     "photometric stereo": _photometric,
     "displacement": _moved,
     "focus": _by_focus,
+    "integrate": _of_slopes(),
+    "integrate with weights": _of_slopes(weights=True),
+    "integrate robustly": _of_slopes(robust=True),
 }
 
 
 PRESS = [name for name in ESTIMATORS if name.startswith(("threshold", "change-point"))]
+SLOPES = [name for name in ESTIMATORS if name.startswith("integrate")]
+OTHERS = [name for name in ESTIMATORS if name not in PRESS + SLOPES]
 
 
 # --- Cells ---------------------------------------------------------------------------------------------
@@ -363,13 +373,21 @@ def applies(estimator: str, fault: Fault) -> bool:
     return not (fault.shutter and estimator in ("fringes", "photometric stereo"))
 
 
-def row(estimator: str, faults: Iterable[Fault] = FAULTS, seed: int = 1) -> dict[str, Cell]:
+def faults_of(estimator: str) -> tuple[Any, ...]:
+    """Return the faults of the frames, or of the slopes, that an estimator gets."""
+    if estimator in SLOPES:
+        return SLOPE_FAULTS
+    return tuple(fault for fault in FAULTS if applies(estimator, fault))
+
+
+def row(estimator: str, part_of_name: str = "", seed: int = 1) -> dict[str, Cell]:
     """Return the cells of an estimator by the name of the fault."""
-    usual = _rms(_inside(ESTIMATORS[estimator](FAULTS[0], seed).error))
+    faults = faults_of(estimator)
+    usual = _rms(_inside(ESTIMATORS[estimator](faults[0], seed).error))
     return {
         fault.name: _cell(ESTIMATORS[estimator](fault, seed), usual)
         for fault in faults
-        if applies(estimator, fault)
+        if part_of_name in fault.name
     }
 
 
@@ -454,12 +472,12 @@ def _number(value: float) -> float | None:
 def with_tables(page: str) -> str:
     """Return the text of the page with the stored cells in its tables."""
     cells, opened = _stored()["cells"], open_cells()
-    for number, names in enumerate((PRESS, [name for name in ESTIMATORS if name not in PRESS])):
+    for number, (names, faults) in enumerate(((PRESS, FAULTS), (OTHERS, FAULTS), (SLOPES, SLOPE_FAULTS))):
         start, end = f"<!-- cells {number} -->\n", f"<!-- end {number} -->"
         head, rest = page.split(start)
         table = [["fault", *names], ["---"] * (len(names) + 1)]
         table += [
-            [fault.name, *(_shown(cells, opened, name, fault.name) for name in names)] for fault in FAULTS
+            [fault.name, *(_shown(cells, opened, name, fault.name) for name in names)] for fault in faults
         ]
         lines = "".join(f"| {' | '.join(line)} |\n" for line in table)
         page = head + start + "\n" + lines + "\n" + end + rest.split(end, 1)[1]
@@ -493,10 +511,9 @@ def main() -> None:
     parser.add_argument("--freeze", action="store_true", help="store all cells of these, and write the page")
     asked = parser.parse_args()
     names = [one for one in ESTIMATORS if not asked.estimator or any(part in one for part in asked.estimator)]
-    faults = [fault for fault in FAULTS if asked.freeze or asked.fault in fault.name]
     table = {}
     for name in names:
-        table[name] = row(name, faults)
+        table[name] = row(name, "" if asked.freeze else asked.fault)
         print(name)
         for fault, cell in table[name].items():
             print(f"  {fault:18} {cell}")
