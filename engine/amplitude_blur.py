@@ -9,6 +9,7 @@ the part of laplace(u) across it. The one determines b, the other is its error.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -17,28 +18,31 @@ from numpy.typing import NDArray
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 
-_LINES, _FEWEST = 64, 400  # lines of pixels along a side that are used; least number of pixels
+_LINES, _FEWEST = 48, 400  # lines of pixels along a side that are used; least number of pixels
 _ROUNDS, _OUTLYING = 4, 4.0  # iterations, and standard deviations beyond which a pixel is left out
 _CLEAR, _CLEAR_SIDE, _SMALLEST = 6.0, 2.0, 0.4  # standard errors, and pixels, from which on a blur is one
 
 
 def with_blur(
-    sigma: NDArray[np.float32], direction: NDArray[np.floating], strength: NDArray[np.floating]
+    sigma: NDArray[np.float32], vectors: Sequence[NDArray[np.floating]], strength: NDArray[np.floating]
 ) -> NDArray[np.float32]:
     """Return standard deviations of directions, (H, W) radians, with that because of blur.
 
-    ``direction``, (n, H, W), are unit vectors, NaN where unknown; ``strength`` is (H, W).
+    ``vectors`` are the components of a signal, (H, W) each and of any length, NaN where unknown; ``strength``
+    is that of the signal, (H, W).
     """
-    variance = find_blur(direction, strength)
+    variance = find_blur(vectors, strength)
     if variance == 0:
         return sigma
     reach = max(1, round(2 * math.sqrt(variance)))
-    vectors = [np.ascontiguousarray(part, np.float32) for part in direction]
+    length = np.sqrt(np.sum([part * part for part in vectors], axis=0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        direction = [np.asarray(part / length, np.float32) for part in vectors]
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
     kernel[[0, reach, reach, -1], [reach, 0, -1, reach]] = 1 / reach**2
     kernel[reach, reach] = -4 / reach**2
-    bent = [cv2.filter2D(part, -1, kernel, borderType=cv2.BORDER_REPLICATE) for part in vectors]
-    along = np.sum([one * other for one, other in zip(bent, vectors, strict=True)], axis=0)
+    bent = [cv2.filter2D(part, -1, kernel, borderType=cv2.BORDER_REPLICATE) for part in direction]
+    along = np.sum([one * other for one, other in zip(bent, direction, strict=True)], axis=0)
     square = np.sum([part**2 for part in bent], axis=0) - along**2
     square = np.maximum(square, 0)
     known = np.isfinite(square)
@@ -48,7 +52,7 @@ def with_blur(
     return np.asarray(np.hypot(sigma, np.float32(variance / 2) * np.sqrt(mean)), np.float32)
 
 
-def find_blur(direction: NDArray[np.floating], strength: NDArray[np.floating]) -> float:
+def find_blur(vectors: Sequence[NDArray[np.floating]], strength: NDArray[np.floating]) -> float:
     """Return the variance of the point spread, pixels^2; 0 if it is not significant.
 
     The logarithm of the strength is fitted by a quadratic of the place, as of uneven light, and the square
@@ -61,9 +65,10 @@ def find_blur(direction: NDArray[np.floating], strength: NDArray[np.floating]) -
     down, right = np.arange(1, rows - 1, thin), np.arange(1, columns - 1, thin)
 
     def look(by_rows: int, by_columns: int) -> Doubles:
-        return np.stack([part[np.ix_(down + by_rows, right + by_columns)] for part in direction]).astype(
-            float
-        )
+        at = np.ix_(down + by_rows, right + by_columns)
+        found = np.stack([part[at] for part in vectors]).astype(np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(found / np.sqrt(np.sum(found**2, axis=0)))
 
     across, upright = (look(*one) - look(*other) for one, other in (((0, 1), (0, -1)), ((1, 0), (-1, 0))))
     turning = np.sum(across**2 + upright**2, axis=0) / 4

@@ -130,9 +130,7 @@ class Fringes(Operation):
         np.divide(noise.astype(np.float32) * np.sqrt(variance), square, out=spread, where=square != 0)
         # These samples do not follow a cosine, as at a hot pixel or a moving reflection.
         misfit = fit.residual > _MISFIT * np.fmax(noise, seen)
-        length = np.where(misfit | (modulation == 0), np.float32(np.nan), modulation)
-        with np.errstate(invalid="ignore"):
-            spread = with_blur(spread, np.stack([fit.cosine, fit.sine]) / length, length)
+        spread = with_blur(spread, (fit.cosine, fit.sine), modulation)
         maps = {
             "phase": np.where(misfit, np.float32(np.nan), phase),
             "phase_sigma": np.where(misfit, np.float32(np.inf), spread),

@@ -204,7 +204,7 @@ class PhotometricStereo(Operation):
         scale = np.asarray(noise, np.float32) * _misfit(residual, samples - 3, noise)
         for name in ("normals", "albedo"):
             maps[f"{name}_sigma"] = maps.pop(f"{name}_spread") * scale
-        sigma = with_blur(maps["normals_sigma"], np.moveaxis(maps["normals"], -1, 0), maps["albedo"])
+        sigma = with_blur(maps["normals_sigma"], [*np.moveaxis(maps["normals"], -1, 0)], maps["albedo"])
         maps["normals_sigma"] = sigma
         said = in_process([] if self._response is None else [self._response], {})
         return maps | said if np.ndim(noise) or np.isnan(noise) else maps | said | {"noise": float(noise)}
