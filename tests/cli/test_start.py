@@ -42,7 +42,7 @@ def folder(tmp_path_factory):
         ("reconstruct turn.h5 -o turn-result.h5", set()),
         ("fuse press.h5 turn.h5 -o surface.h5", set()),
         ("view fused.h5 -o fused.png", {"matplotlib"}),
-        ("report fused.h5 -o fused.html", {"matplotlib"}),
+        ("report fused.h5 -o fused.html", {"matplotlib", "numpy.polynomial", "numpy.testing", "scipy"}),
     ],
 )
 def test_a_command_imports_only_what_it_needs(words, needed, folder, monkeypatch):
