@@ -105,7 +105,7 @@ def _step(side: int) -> int:
 
 
 def _curls(sums: tuple[Doubles, Doubles], gaps: tuple[Doubles, Doubles] | None, side: int) -> Doubles:
-    """Return the sums around squares of so many links where all slopes exist, (loops,)."""
+    """Return the sums around squares of side x side links where all slopes exist, (loops,)."""
     if min(sums[0].shape) <= side:
         return np.zeros(0)
     sides = [_around(one, side) for one in (sums, gaps) if one is not None]
