@@ -93,7 +93,8 @@ class Focus(Operation):
         """Look whether the peaks fit to the travel, which only shows after the last frame."""
         assert self.noise is not None
         if 0 < self.noise < _LARGEST and self.reach > 1:
-            peak, best = fetch([(array, slice(None)) for array in (self._peak, self._best)])
+            kept = (self._peak, self._best)
+            peak, best = fetch([(array, slice(None)) for array in kept], keep=[True, True])
             freedom = (2 * self.radius + 1) ** 2 - 1
             self._jump = find_travel_jump(peak, best, self.pushed("travel"), freedom, self.noise**2)
         return False
