@@ -161,8 +161,8 @@ class PhaseErrors(Step):
 class ResponseErrors(Step):
     """Compare the swing of the brightness with what tilt and gain predict.
 
-    Gains of pixels are added to the errors; a response that is not as stated, uneven light and blur are
-    warnings: see `mirrorskin.engine.rotation.swing`. A calibrated response is not judged.
+    Gains of pixels and uneven light are added to the errors, and noted; a response that is not as stated and
+    blur are warnings: see `mirrorskin.engine.rotation.swing`. A calibrated response is not judged.
     """
 
     def apply(self, result: Result, context: Context) -> Result:
@@ -206,7 +206,14 @@ def _uneven(swing: Swing) -> Iterator[Finding]:
     if swing.response > 0:
         causes.append(f"differs by {100 * swing.response:.2g} % from zenith to zenith, as with gamma")
     if swing.light > 0:
-        causes.append(f"differs by {100 * swing.light:.2g} % from place to place, as in uneven light")
+        light = f"differs by {100 * swing.light:.2g} % from place to place, as in uneven light"
+        if swing.response > 0 or swing.blur > 0:
+            causes.append(light)
+        else:
+            text = (
+                f"the swing of the brightness {light} (or points move in the picture); the errors include it"
+            )
+            yield Finding("swing", text, False)
     if swing.blur > 0:
         causes.append(f"is weak at tops and edges, as if a lens blurs by {swing.blur:.2g} pixels")
     if causes:
