@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.focus_travel import find_travel_jump
+from mirrorskin.engine import focus_travel
 from mirrorskin.engine.footprint import with_curvature
 from mirrorskin.engine.operation import Operation, travel_function
 from mirrorskin.engine.options import option
@@ -96,7 +96,9 @@ class Focus(Operation):
             kept = (self._peak, self._best)
             peak, best = fetch([(array, slice(None)) for array in kept], keep=[True, True])
             freedom = (2 * self.radius + 1) ** 2 - 1
-            self._jump = find_travel_jump(peak, best, self.pushed("travel"), freedom, self.noise**2)
+            self._jump = focus_travel.find_travel_jump(
+                peak, best, self.pushed("travel"), freedom, self.noise**2
+            )
         return False
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike) -> None:

@@ -174,7 +174,7 @@ class PhotometricStereo(Operation):
         phase = self.pushed("phase") if self._lights is None else None
         lamps = self._lights_at(np.arange(len(light)), phase)
         lit = np.all((light > max(self.shadow, 0.0)) & (light < self._saturation - level), axis=0)
-        power = find_power(light[:, lit], lamps)
+        power = _power(light[:, lit], lamps)
         if power != 1:
             text = (
                 f"the brightness is not proportional to the light, but to its power {power:.2g}, as with"
@@ -267,7 +267,7 @@ def _misfit(residual: NDArray[Any], freedom: NDArray[Any], noise: Any) -> NDArra
         return np.where(ratio > limit[freedom], ratio, np.float32(1))
 
 
-def find_power(light: Doubles, lamps: Doubles) -> float:
+def _power(light: Doubles, lamps: Doubles) -> float:
     """Return the power of the light to which brightness is proportional; 1 if that is not contradicted.
 
     With the light x = albedo (normal . lamp), x^g is x + (g - 1) x log x to first order. ``light``, (T, n),
