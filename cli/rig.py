@@ -16,7 +16,7 @@ from mirrorskin.cli.groups import Argument, Group, Option
 from mirrorskin.cli.output import print_json, print_table, printable
 
 if TYPE_CHECKING:
-    from mirrorskin.hw.rig.check import Finding
+    from mirrorskin.hw.rig.check import CheckResult
     from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.hw.stage import Stage
 
@@ -71,7 +71,7 @@ def check(
     from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig)
-    findings: list[Finding] = []
+    findings: list[CheckResult] = []
     complete = False
     try:
         with closing(check_rig(settings, move=move)) as found:
@@ -180,7 +180,7 @@ def _opened(rig: Path, unlock: bool = False) -> Iterator[Stage]:
         click.echo(printable(f"{settings.name}: {where}{locked}"))
 
 
-def _print(settings: RigSettings, findings: Sequence[Finding], complete: bool, as_json: bool) -> None:
+def _print(settings: RigSettings, findings: Sequence[CheckResult], complete: bool, as_json: bool) -> None:
     if as_json:
         sound = complete and all(finding.verdict != "failed" for finding in findings)
         print_json({"rig": settings.name, "sound": sound, "findings": findings})

@@ -45,7 +45,7 @@ _POSITION_TOLERANCE = {"mm": 0.02, "deg": math.radians(0.02)}  # tolerance of a 
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckResult:
     """The result of one check."""
 
     part: str  # stage, camera or move
@@ -62,7 +62,7 @@ def check_rig(
     open_stage: Callable[[StageSettings], Stage] = open_stage,
     open_camera: Callable[[CameraSettings], Camera] = open_camera,
     clock: Clock = SYSTEM,
-) -> Generator[Finding, None, None]:
+) -> Generator[CheckResult, None, None]:
     """Open the stage and the camera, and yield the result of each check.
 
     With `move` the stage is homed if the file requires it, and each axis moves back and forth a little,
@@ -79,7 +79,7 @@ def check_rig(
             looked = check_camera if settings.camera.trigger is None else partial(check_trigger, stage)
             yield from looked(camera, settings.camera, clock)
         yield from (
-            Finding(
+            CheckResult(
                 "camera",
                 "message",
                 line,
@@ -91,7 +91,7 @@ def check_rig(
         if move and sound:
             yield from check_moves(stage, settings.stage)
         elif move:
-            yield Finding("move", "moves", "not tried", "failed", "correct the failures above first")
+            yield CheckResult("move", "moves", "not tried", "failed", "correct the failures above first")
         stage.report()  # raises if the stage was lost meanwhile
 
 
@@ -113,9 +113,9 @@ def _logged_warnings() -> Iterator[list[str]]:
 # Checks of the stage at rest
 
 
-def check_stage(stage: Stage, settings: StageSettings, clock: Clock = SYSTEM) -> Iterator[Finding]:
+def check_stage(stage: Stage, settings: StageSettings, clock: Clock = SYSTEM) -> Iterator[CheckResult]:
     """Check an open stage for about a second, without moving it."""
-    yield Finding("stage", "firmware", getattr(stage, "firmware", settings.firmware))
+    yield CheckResult("stage", "firmware", getattr(stage, "firmware", settings.firmware))
     report = stage.report()
     yield _state(report, settings)
     yield _position(report, stage, settings)
@@ -124,10 +124,10 @@ def check_stage(stage: Stage, settings: StageSettings, clock: Clock = SYSTEM) ->
         yield from _controller(stage, settings)
     if not getattr(stage, "homing_stops", True):
         remedy = "build the firmware with EMERGENCY_PARSER, or be ready to switch off the power"
-        yield Finding("stage", "stop of homing", "not certain", "warning", remedy)
+        yield CheckResult("stage", "stop of homing", "not certain", "warning", remedy)
 
 
-def _controller(stage: Any, settings: StageSettings) -> Iterator[Finding]:
+def _controller(stage: Any, settings: StageSettings) -> Iterator[CheckResult]:
     """Compare the settings of a GRBL controller with the rig file."""
     yield _homing(stage.parameters, settings)
     for name, axis in settings.axes.items():
@@ -142,9 +142,9 @@ def _controller(stage: Any, settings: StageSettings) -> Iterator[Finding]:
     yield _wait("stage", "longest round trip", stage.longest_trip, stage.longest_silence, "stage.silence")
 
 
-def _rated(part: str, what: str, found: str, remedy: str = "", verdict: Verdict = "warning") -> Finding:
+def _rated(part: str, what: str, found: str, remedy: str = "", verdict: Verdict = "warning") -> CheckResult:
     """Return a finding that is ok unless there is a remedy."""
-    return Finding(part, what, found, verdict if remedy else "ok", remedy)
+    return CheckResult(part, what, found, verdict if remedy else "ok", remedy)
 
 
 def in_words(position: Position, settings: StageSettings) -> str:
@@ -155,28 +155,30 @@ def in_words(position: Position, settings: StageSettings) -> str:
     )
 
 
-def _state(report: Report, settings: StageSettings) -> Finding:
+def _state(report: Report, settings: StageSettings) -> CheckResult:
     if report.state == "idle":
-        return Finding("stage", "state", "idle")
+        return CheckResult("stage", "state", "idle")
     if report.state == "alarm" and settings.home:
-        return Finding("stage", "state", "alarm: locked until it is homed")
+        return CheckResult("stage", "state", "alarm: locked until it is homed")
     remedy = "check the machine, and unlock it" if report.state == "alarm" else "wait until it is at rest"
-    return Finding("stage", "state", report.state, "failed", f"no moves are possible in this state; {remedy}")
+    return CheckResult(
+        "stage", "state", report.state, "failed", f"no moves are possible in this state; {remedy}"
+    )
 
 
-def _position(report: Report, stage: Stage, settings: StageSettings) -> Finding:
+def _position(report: Report, stage: Stage, settings: StageSettings) -> CheckResult:
     found = in_words(report.position, settings)
     if settings.home:
-        return Finding("stage", "position", f"{found} (before homing)")
+        return CheckResult("stage", "position", f"{found} (before homing)")
     try:
         stage.limits.check(report.position, "it")
     except InputError:
         remedy = "outside the file's limits; move it inside by hand, or correct zero"
-        return Finding("stage", "position", found, "warning", remedy)
-    return Finding("stage", "position", found)
+        return CheckResult("stage", "position", found, "warning", remedy)
+    return CheckResult("stage", "position", found)
 
 
-def _homing(parameters: Mapping[int, float], settings: StageSettings) -> Finding:
+def _homing(parameters: Mapping[int, float], settings: StageSettings) -> CheckResult:
     on = bool(int(parameters.get(_HOMING, 0)) & 1)
     found = ("on" if on else "off") if _HOMING in parameters else "not told"
     wrong = settings.home and not on
@@ -184,7 +186,7 @@ def _homing(parameters: Mapping[int, float], settings: StageSettings) -> Finding
     return _rated("stage", "homing ($22)", found, remedy, "failed")
 
 
-def _length(name: str, axis: Axis, parameters: Mapping[int, float]) -> Finding:
+def _length(name: str, axis: Axis, parameters: Mapping[int, float]) -> CheckResult:
     """Compare the length of an axis; after homing GRBL counts down from 0, or up if built so."""
     unit, (low, high) = axis.unit, axis.limits
     number = _LENGTHS + _LETTERS.index(axis.letter)
@@ -192,7 +194,7 @@ def _length(name: str, axis: Axis, parameters: Mapping[int, float]) -> Finding:
     what = f"{name}: limits against ${number}"
     found = f"{low:g} to {high:g} {unit}, {_of_controller(length, unit)}"
     if length is None:
-        return Finding("stage", what, found)
+        return CheckResult("stage", what, found)
     ends = sorted(axis.zero + axis.direction * value for value in (low, high))
     most, remedy = length * (1 + _ROUNDING), ""
     within = -most <= ends[0] <= ends[1] <= 0 or 0 <= ends[0] <= ends[1] <= most
@@ -209,7 +211,7 @@ def _length(name: str, axis: Axis, parameters: Mapping[int, float]) -> Finding:
     return _rated("stage", what, found, remedy)
 
 
-def _speed(name: str, axis: Axis, parameters: Mapping[int, float]) -> Finding:
+def _speed(name: str, axis: Axis, parameters: Mapping[int, float]) -> CheckResult:
     """Compare the speed of an axis; GRBL's settings are per minute."""
     unit, number = axis.unit, _RATES + _LETTERS.index(axis.letter)
     theirs = parameters[number] / 60 if number in parameters else None
@@ -224,7 +226,7 @@ def _of_controller(value: float | None, unit: str) -> str:
     return "unknown in the controller" if value is None else f"{value:g} {unit} in the controller"
 
 
-def _arcs(pitch: Axis, roll: Axis) -> Finding:
+def _arcs(pitch: Axis, roll: Axis) -> CheckResult:
     """Return whether GRBL supports arcs in the plane of the axes."""
     remedy = ""
     if not {pitch.letter, roll.letter} <= set("XYZ"):
@@ -235,11 +237,11 @@ def _arcs(pitch: Axis, roll: Axis) -> Finding:
     return _rated("stage", "arcs", f"in {pitch.letter} and {roll.letter}", remedy)
 
 
-def _reports(stage: Stage, settings: StageSettings, clock: Clock) -> Iterator[Finding]:
+def _reports(stage: Stage, settings: StageSettings, clock: Clock) -> Iterator[CheckResult]:
     """Measure the rate of reports, and their duration."""
     times, asked = _listen(stage, settings, clock), settings.report_rate
     if len(times) < 2:
-        yield Finding(
+        yield CheckResult(
             "stage", "reports", "none", "failed", "none arrived; check the connection and stage.baud"
         )
         return
@@ -252,7 +254,7 @@ def _reports(stage: Stage, settings: StageSettings, clock: Clock) -> Iterator[Fi
     yield _rated("stage", "reports", f"{rate:.1f} Hz, requested {asked:g} Hz", remedy)
 
 
-def _wait(part: str, what: str, longest: float, limit: float, key: str) -> Finding:
+def _wait(part: str, what: str, longest: float, limit: float, key: str) -> CheckResult:
     """Compare the longest wait for something with its limit during a move."""
     remedy = ""
     if longest > 2 / _SPARE * limit:
@@ -275,10 +277,10 @@ def _listen(stage: Stage, settings: StageSettings, clock: Clock) -> list[float]:
 # Checks of the camera: frames, their rate, and brightness
 
 
-def check_camera(camera: Camera, settings: CameraSettings, clock: Clock = SYSTEM) -> Iterator[Finding]:
+def check_camera(camera: Camera, settings: CameraSettings, clock: Clock = SYSTEM) -> Iterator[CheckResult]:
     """Check an open camera for about a second."""
     rows, columns = camera.shape
-    yield Finding("camera", "pictures", f"{columns} x {rows} {camera.dtype.name}")
+    yield CheckResult("camera", "pictures", f"{columns} x {rows} {camera.dtype.name}")
     camera.take(1, _FRAME_TIMEOUT)
     camera.flush()
     before, dropped, end = camera.counts, 0, clock.now() + _PERIOD
@@ -300,10 +302,10 @@ def check_camera(camera: Camera, settings: CameraSettings, clock: Clock = SYSTEM
 
 def check_trigger(
     stage: Stage, camera: Camera, settings: CameraSettings, clock: Clock = SYSTEM
-) -> Iterator[Finding]:
+) -> Iterator[CheckResult]:
     """Trigger an open camera, at rest."""
     rows, columns = camera.shape
-    yield Finding("camera", "pictures", f"{columns} x {rows} {camera.dtype.name}")
+    yield CheckResult("camera", "pictures", f"{columns} x {rows} {camera.dtype.name}")
     trigger = Trigger(stage, camera, settings, lambda: None, clock)
     frames = [trigger.expose() for _ in range(_TRIGGERED)]
     trigger.check(wait=True)
@@ -311,11 +313,11 @@ def check_trigger(
         f"{_TRIGGERED} frames, at most {1e3 * trigger.longest:.0f} ms after '{settings.trigger}' was "
         "switched on"
     )
-    yield Finding("camera", "trigger", found)
+    yield CheckResult("camera", "trigger", found)
     yield _brightness(frames[-1].pixels[-1].copy())
 
 
-def _rate(counts: Counts, settings: CameraSettings) -> Finding:
+def _rate(counts: Counts, settings: CameraSettings) -> CheckResult:
     found, remedy = f"{counts.rate:.2f} Hz", ""
     if settings.rate is not None:
         found += f", requested {settings.rate:g} Hz"
@@ -326,7 +328,7 @@ def _rate(counts: Counts, settings: CameraSettings) -> Finding:
     return _rated("camera", "rate", found, remedy)
 
 
-def _losses(dropped: int, after: Counts, before: Counts) -> Finding:
+def _losses(dropped: int, after: Counts, before: Counts) -> CheckResult:
     total, late = after.frames - before.frames, after.late - before.late
     found = f"{total} frames, {dropped} lost, {late} late, {after.reconnects} reconnections"
     lost = dropped or after.reconnects
@@ -334,10 +336,12 @@ def _losses(dropped: int, after: Counts, before: Counts) -> Finding:
     return _rated("camera", "frames", found, remedy)
 
 
-def _brightness(picture: NDArray[Any]) -> Finding:
+def _brightness(picture: NDArray[Any]) -> CheckResult:
     known = picture[~np.isnan(picture)]
     if not known.size:
-        return Finding("camera", "brightness", "NaN", "warning", "no pixel has a value; check camera.dtype")
+        return CheckResult(
+            "camera", "brightness", "NaN", "warning", "no pixel has a value; check camera.dtype"
+        )
     low, middle, high = (float(value) for value in np.percentile(known, (0, 50, 100)))
     top = np.iinfo(picture.dtype).max if picture.dtype.kind == "u" else np.inf
     saturated, dark = float(np.mean(picture >= top)), float(np.mean(picture <= 0))
@@ -353,14 +357,14 @@ def _brightness(picture: NDArray[Any]) -> Finding:
 # Checks of the axes: each moves back and forth a little
 
 
-def check_moves(stage: Stage, settings: StageSettings) -> Iterator[Finding]:
+def check_moves(stage: Stage, settings: StageSettings) -> Iterator[CheckResult]:
     """Home the stage if the file requires it, set it upright, and move each axis a little.
 
     For x, y and twist the body is lifted first, so that it is not dragged over anything.
     """
     if settings.home:
         stage.home()
-        yield Finding("move", "homing", f"done; now {in_words(stage.report().position, settings)}")
+        yield CheckResult("move", "homing", f"done; now {in_words(stage.report().position, settings)}")
     home = stage.limits.nearest(stage.report().position)
     stage.move(home)
     stage.wait()
@@ -381,7 +385,7 @@ def _step(limits: Limits, name: str, unit: str, value: float) -> float:
     return step if value - step < low else -step
 
 
-def _there_and_back(stage: Stage, settings: StageSettings, name: str, home: Position) -> Finding:
+def _there_and_back(stage: Stage, settings: StageSettings, name: str, home: Position) -> CheckResult:
     axis, value = settings.axes[name], getattr(home, name)
     step, off = _step(stage.limits, name, axis.unit, value), 0.0
     for place in (value + step, value):

@@ -14,7 +14,7 @@ from simulated import write_film_rig
 from mirrorskin.cli import rig as command
 from mirrorskin.hw import load_rig
 from mirrorskin.hw.emulator.port import GrblLine, GrblMachine
-from mirrorskin.hw.rig.check import Finding
+from mirrorskin.hw.rig.check import CheckResult
 
 RIG = """
 [stage]
@@ -186,7 +186,10 @@ def test_on_a_terminal_the_table_has_colours(folder, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.delenv("NO_COLOR", raising=False)
     write_film_rig(folder, RIG.format(port="nowhere", home="true"))
-    findings = [Finding("stage", "state", "[b]idle"), Finding("camera", "rate", "1 Hz", "failed", "mend it")]
+    findings = [
+        CheckResult("stage", "state", "[b]idle"),
+        CheckResult("camera", "rate", "1 Hz", "failed", "mend it"),
+    ]
     command._print(load_rig("rig.toml"), findings, True, False)
     said = sys.stdout.getvalue()
     assert "[b]idle" in said
