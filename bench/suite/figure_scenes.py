@@ -177,7 +177,8 @@ def wavy(body: Body, depth: float, length: float) -> Body:
 def see(body: Body, shape: tuple[int, int], pinhole: bool) -> Figure:
     """Follow the rays of the pixels to a body that is about 100 mm large, in the middle."""
     rows, columns = shape
-    pixel, start, end = SPAN / min(shape), *((FAR - 120, FAR + 120) if pinhole else (0, 240))
+    pixel = SPAN / min(shape)
+    start, end = (FAR - 120, FAR + 120) if pinhole else (0.0, 240.0)
     x = (np.arange(columns) - (columns - 1) / 2) * pixel
     y = ((rows - 1) / 2 - np.arange(rows)) * pixel
     origin = np.stack([*np.meshgrid(x, y), np.full(shape, 120.0)], axis=-1)
@@ -185,7 +186,7 @@ def see(body: Body, shape: tuple[int, int], pinhole: bool) -> Figure:
     if pinhole:
         origin, ray = np.broadcast_to([0.0, 0.0, FAR], origin.shape), origin - [0, 0, FAR + 120]
         ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-    reach, distance, moving = np.full(shape, float(start)), np.full(shape, np.inf), np.ones(shape, bool)
+    reach, distance, moving = np.full(shape, start), np.full(shape, np.inf), np.ones(shape, bool)
     for _ in range(_STEPS):
         distance[moving] = body(origin[moving] + reach[moving, np.newaxis] * ray[moving])
         reach[moving] += distance[moving]
