@@ -258,6 +258,17 @@ def tilt_bound(normals: Map, setup: Setup) -> float:
     return float(setup.spread / np.sqrt(np.sum((tilting - explained) ** 2)))
 
 
+def waves(shape: tuple[int, int], pixel: tuple[float, float]) -> Map:
+    """Return the normals of a wavy surface, (H, W, 3), seen by pixels of a width and a height, mm."""
+    rows, columns = shape
+    x = (np.arange(columns) - (columns - 1) / 2) * pixel[0]
+    y = ((rows - 1) / 2 - np.arange(rows)) * pixel[1]
+    u, v = np.meshgrid(2 * np.pi * x / 1.6, 2 * np.pi * y / 1.9)
+    slope = 0.8 * np.cos(u) * np.cos(v) + 0.1, -0.7 * np.sin(u) * np.sin(v)
+    normal = np.stack([-slope[0], -slope[1], np.ones_like(u)], axis=-1)
+    return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+
+
 def _from_axis(normals: Map, axis: Map) -> Map:
     """Return the angle between unit vectors, by the sides of a rhombus: exact for small and large ones."""
     apart, together = (np.sqrt(np.sum((normals + sign * axis) ** 2, axis=-1)) for sign in (-1, 1))

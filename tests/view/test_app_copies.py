@@ -60,6 +60,22 @@ def by_python(text):
     return io.open_result("result.h5")
 
 
+def changed(source, changes):
+    """Return a session with chosen options, none of which is refused."""
+    session = Session(source)
+    for name, value in changes.items():
+        session.choose(name, value)
+    assert session.problem == ""
+    return session
+
+
+@pytest.fixture(params=[(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
+def again(request):
+    """Compute the result of a session again, from the text that it copies."""
+    write, run = request.param
+    return lambda session: run(write(session))
+
+
 CHANGES = [
     {},
     {"threshold": 1 / 3},
@@ -72,53 +88,37 @@ CHANGES = [
 ]
 
 
-@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
 @pytest.mark.parametrize("changes", CHANGES, ids=str)
-def test_a_press_is_computed_again_with_the_same_numbers(press, changes, way):
+def test_a_press_is_computed_again_with_the_same_numbers(press, changes, again):
     np.save("dark.npy", np.full(SHAPE, 17.25))
-    session = Session(press)
-    for name, value in changes.items():
-        session.choose(name, value)
-    assert session.problem == ""
-    write, run = way
-    same(session.now.result, run(write(session)))
+    session = changed(press, changes)
+    same(session.now.result, again(session))
 
 
-@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
-def test_a_part_of_a_press_is_computed_again(press, way):
+def test_a_part_of_a_press_is_computed_again(press, again):
     session = Session(press)
     session.choose_part(REGION, (1, None))
-    write, run = way
-    same(session.now.result, run(write(session)))
+    same(session.now.result, again(session))
 
 
-@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
-def test_what_the_command_line_said_of_a_stack_is_repeated(press, way):
+def test_what_the_command_line_said_of_a_stack_is_repeated(press, again):
     given = {"travel_step": 0.2, "travel_start": 0.1, "pixel_size": (0.1, 0.2)}
     keywords = {"travel": io.Steps(0.2, 0.1), "pixel_size": (0.1, 0.2)}
     session = Session(press, Opening(keywords, stack_words(given), device="0"))
-    write, run = way
-    same(session.now.result, run(write(session)))
+    same(session.now.result, again(session))
 
 
-@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
 @pytest.mark.parametrize("changes", [{"tilt": 0.0371}, {"tilt": "estimate"}, {"zenith_gain": 77.7}], ids=str)
-def test_a_rotation_is_computed_again_with_the_same_numbers(turn, changes, way):
-    session = Session(turn)
-    for name, value in changes.items():
-        session.choose(name, value)
-    assert session.problem == ""
-    write, run = way
-    same(session.now.result, run(write(session)))
+def test_a_rotation_is_computed_again_with_the_same_numbers(turn, changes, again):
+    session = changed(turn, changes)
+    same(session.now.result, again(session))
 
 
-@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
-def test_another_operation_is_computed_again(press, way):
+def test_another_operation_is_computed_again(press, again):
     session = Session(press)
     session.choose_operation("mirrorskin.engine:Onset")
     session.choose("threshold", 0.35)
-    write, run = way
-    same(session.now.result, run(write(session)))
+    same(session.now.result, again(session))
 
 
 OWN = """
@@ -137,13 +137,11 @@ class Brightest(engine.Operation):
 """
 
 
-@pytest.mark.parametrize("way", [(as_command, by_command), (as_python, by_python)], ids=["command", "Python"])
-def test_an_operation_of_ones_own_is_computed_again(press, way):
+def test_an_operation_of_ones_own_is_computed_again(press, again):
     Path("own.py").write_text(OWN)
     session = Session(press, Opening(operation="own.py:Brightest"))
     session.choose("least", 100.5)
-    write, run = way
-    same(session.now.result, run(write(session)))
+    same(session.now.result, again(session))
 
 
 def test_a_result_is_saved_as_the_command_line_saves_it(press):

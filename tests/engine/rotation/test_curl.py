@@ -16,20 +16,13 @@ PHASE = np.arange(16) * np.pi / 8
 SETUP = Setup(noise=1.2, offset=20.0, phase=tuple(PHASE))
 
 
-@cache
-def waves():
-    """Return the normals of a wavy surface, (H, W, 3)."""
-    x, y = np.meshgrid(*io.pixel_axes(SHAPE, PIXEL))
-    u, v = 2 * np.pi * x / 1.6, 2 * np.pi * y / 1.9
-    slope = 0.8 * np.cos(u) * np.cos(v) + 0.1, -0.7 * np.sin(u) * np.sin(v)
-    normal = np.stack([-slope[0], -slope[1], np.ones_like(x)], axis=-1)
-    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+WAVES = rotations.waves(SHAPE, PIXEL)
 
 
 def rotated(degrees):
     """Return the normals, rotated by angles, one or one of each row."""
     angle = np.broadcast_to(np.radians(degrees), SHAPE[0])[:, np.newaxis]
-    x, y, z = np.moveaxis(waves(), -1, 0)
+    x, y, z = np.moveaxis(WAVES, -1, 0)
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=-1)
 
@@ -66,7 +59,7 @@ def test_a_rotation_that_grows_from_row_to_row_is_found():
 
 
 def test_slopes_of_a_surface_are_not_rotated():
-    assert error_of(noisy(waves())) is None
+    assert error_of(noisy(WAVES)) is None
 
 
 def test_slopes_without_curvature_show_no_rotation():
@@ -80,7 +73,7 @@ def test_few_slopes_show_no_rotation():
 
 def test_normals_seen_by_a_rolling_shutter_have_the_errors_that_they_state():
     result = rolled()
-    error = np.linalg.norm(np.cross(result.normals.astype(float), waves()), axis=-1)
+    error = np.linalg.norm(np.cross(result.normals.astype(float), WAVES), axis=-1)
     assert 0.8 < np.mean((error / result.normals_sigma) ** 2) < 1.3  # 17 without
 
 

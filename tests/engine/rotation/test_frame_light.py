@@ -1,13 +1,11 @@
 """Flicker and drift of a rotation are found and removed, in renderings independent of the twin."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 import rotations
 from rotations import Setup
 
-from mirrorskin import engine, io
+from mirrorskin import engine
 from mirrorskin.io.arrays import ArrayRecording
 
 SIZE, PIXEL, COUNT = 72, 0.05, 16
@@ -17,14 +15,7 @@ DRIFT = np.linspace(0, 4, COUNT)
 STEADY = np.ones(COUNT), np.zeros(COUNT)
 
 
-@cache
-def waves():
-    """Return the normals of a wavy surface, (H, W, 3)."""
-    x, y = np.meshgrid(*io.pixel_axes((SIZE, SIZE), (PIXEL, PIXEL)))
-    u, v = 2 * np.pi * x / 1.6, 2 * np.pi * y / 1.9
-    slope = 0.8 * np.cos(u) * np.cos(v) + 0.1, -0.7 * np.sin(u) * np.sin(v)
-    normal = np.stack([-slope[0], -slope[1], np.ones_like(x)], axis=-1)
-    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+WAVES = rotations.waves((SIZE, SIZE), (PIXEL, PIXEL))
 
 
 def plate():
@@ -54,35 +45,35 @@ def reconstruct(normals, gain, offset, seed=1):
 
 
 def test_flicker_is_removed_as_if_it_were_not_there():
-    steady, _ = errors(reconstruct(waves(), *STEADY), waves())
-    error, _ = errors(reconstruct(waves(), FLICKER, STEADY[1]), waves())
+    steady, _ = errors(reconstruct(WAVES, *STEADY), WAVES)
+    error, _ = errors(reconstruct(WAVES, FLICKER, STEADY[1]), WAVES)
     assert np.sqrt(np.mean(error**2)) < 1.03 * np.sqrt(np.mean(steady**2))  # 1.3 times without
 
 
 def test_normals_in_flickering_light_have_the_errors_that_they_state():
-    error, sigma = errors(reconstruct(waves(), FLICKER, STEADY[1]), waves())
+    error, sigma = errors(reconstruct(WAVES, FLICKER, STEADY[1]), WAVES)
     assert 0.8 < np.mean((error / sigma) ** 2) < 1.2
 
 
 def test_drift_is_removed():
-    error, sigma = errors(reconstruct(waves(), STEADY[0], DRIFT), waves())
+    error, sigma = errors(reconstruct(WAVES, STEADY[0], DRIFT), WAVES)
     assert 0.8 < np.mean((error / sigma) ** 2) < 1.3  # 4 without
 
 
 def test_what_was_removed_is_stated():
-    process = reconstruct(waves(), FLICKER, STEADY[1]).process
+    process = reconstruct(WAVES, FLICKER, STEADY[1]).process
     assert process["flicker"] == f"{100 * np.std(FLICKER):.2g} %, corrected"
     assert "drift" not in process
 
 
 def test_flicker_that_was_removed_is_a_note():
-    result = reconstruct(waves(), FLICKER, STEADY[1])
+    result = reconstruct(WAVES, FLICKER, STEADY[1])
     assert "warnings" not in result.process
     assert "flickers" in result.process["notes"]
     assert "corrected" in result.process["notes"]
 
 
-@pytest.mark.parametrize("normals", [waves(), plate()], ids=["waves", "plate"])
+@pytest.mark.parametrize("normals", [WAVES, plate()], ids=["waves", "plate"])
 def test_steady_light_is_left_alone(normals):
     assert {"flicker", "drift"} & set(reconstruct(normals, *STEADY).process) == set()
 
@@ -93,7 +84,7 @@ def test_a_plate_does_not_show_the_light():
 
 
 def test_arrays_are_corrected_as_recordings_are():
-    source = turn(waves(), FLICKER, STEADY[1], 1)
+    source = turn(WAVES, FLICKER, STEADY[1], 1)
     options = {"tilt": SETUP.tilt, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "dark": 20.0}
     frames = source.read(np.empty(source.shape, source.dtype)).frames
     found = engine.estimate_normals(frames, SETUP.phase, **options)
@@ -103,13 +94,13 @@ def test_arrays_are_corrected_as_recordings_are():
 def test_an_operation_forgets_the_light_with_the_frames():
     operation = engine.Normals(tilt=SETUP.tilt, zenith_gain=SETUP.slope, zenith_offset=SETUP.offset)
     results = [
-        engine.run(turn(waves(), gain, STEADY[1], 1), operation) for gain in (STEADY[0], FLICKER, STEADY[0])
+        engine.run(turn(WAVES, gain, STEADY[1], 1), operation) for gain in (STEADY[0], FLICKER, STEADY[0])
     ]
     assert np.array_equal(results[0].normals, results[2].normals, equal_nan=True)
 
 
 def test_a_response_that_is_not_as_stated_is_no_flicker():
-    light = rotations.levels(waves(), SETUP)
+    light = rotations.levels(WAVES, SETUP)
     floor = np.maximum(light, 20 + SETUP.slope * np.radians(12))  # level surfaces do not get darker
     counts = np.rint(floor + np.random.default_rng(1).normal(0, SETUP.noise, light.shape))
     header = {"tilt": SETUP.tilt, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}

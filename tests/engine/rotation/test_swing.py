@@ -1,7 +1,5 @@
 """What the swing of the brightness of a rotation shows: gamma, vignetting, gains of pixels, and blur."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 import rotations
@@ -16,14 +14,7 @@ SETUP = Setup(noise=1.2, offset=20.0, phase=tuple(np.arange(COUNT) * 2 * np.pi /
 FULL = 200.0  # counts above dark
 
 
-@cache
-def waves():
-    """Return the normals of a wavy surface, (H, W, 3)."""
-    x, y = np.meshgrid(*io.pixel_axes((SIZE, SIZE), (PIXEL, PIXEL)))
-    u, v = 2 * np.pi * x / 1.6, 2 * np.pi * y / 1.9
-    slope = 0.8 * np.cos(u) * np.cos(v) + 0.1, -0.7 * np.sin(u) * np.sin(v)
-    normal = np.stack([-slope[0], -slope[1], np.ones_like(x)], axis=-1)
-    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+WAVES = rotations.waves((SIZE, SIZE), (PIXEL, PIXEL))
 
 
 def shares(normals):
@@ -45,7 +36,7 @@ def warned(light, words):
 
 
 def chi2(result):
-    error = np.linalg.norm(np.cross(result.normals.astype(float), waves()), axis=-1)
+    error = np.linalg.norm(np.cross(result.normals.astype(float), WAVES), axis=-1)
     return np.nanmean((error / result.normals_sigma) ** 2)
 
 
@@ -60,39 +51,39 @@ def gains():
 
 
 def test_light_as_stated_has_no_finding():
-    process = result_of(shares(waves())).process
+    process = result_of(shares(WAVES)).process
     assert not {"warnings", "notes", "pixel_gain_sigma", "swing_range"} & set(process)
 
 
 def test_a_response_that_is_not_linear_is_found():
-    warned(shares(waves()) ** 0.85, "from zenith to zenith, as with gamma")
+    warned(shares(WAVES) ** 0.85, "from zenith to zenith, as with gamma")
 
 
 def test_uneven_light_is_found():
-    process = result_of(shares(waves()) * uneven()).process
+    process = result_of(shares(WAVES) * uneven()).process
     assert "from place to place, as in uneven light" in process["notes"]
     assert "warnings" not in process
 
 
 def test_errors_of_normals_in_uneven_light_include_it():
-    assert chi2(result_of(shares(waves()) * uneven())) < 1.2
+    assert chi2(result_of(shares(WAVES) * uneven())) < 1.2
 
 
 def test_a_lens_that_blurs_is_found():
-    blurred = np.stack([gaussian_filter(frame, 1.5, mode="nearest") for frame in shares(waves())])
+    blurred = np.stack([gaussian_filter(frame, 1.5, mode="nearest") for frame in shares(WAVES)])
     warned(blurred, r"as if a lens blurs by 1\.6 pixels")
 
 
 def test_gains_of_pixels_are_estimated():
-    assert result_of(shares(waves()) * gains()).process["pixel_gain_sigma"] == pytest.approx(0.03, abs=0.006)
+    assert result_of(shares(WAVES) * gains()).process["pixel_gain_sigma"] == pytest.approx(0.03, abs=0.006)
 
 
 def test_gains_of_pixels_are_part_of_the_errors_of_normals():
-    assert 0.8 < chi2(result_of(shares(waves()) * gains())) < 1.25
+    assert 0.8 < chi2(result_of(shares(WAVES) * gains())) < 1.25
 
 
 def test_gains_of_pixels_are_part_of_the_errors_of_heights():
-    even, differing = result_of(shares(waves())), result_of(shares(waves()) * gains())
+    even, differing = result_of(shares(WAVES)), result_of(shares(WAVES) * gains())
     assert np.median(differing.height_sigma) > 1.5 * np.median(even.height_sigma)
 
 
