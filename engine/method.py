@@ -15,6 +15,7 @@ from mirrorskin.engine.provenance import attach_provenance, naming
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import Calibrated, InputError, Result
 from mirrorskin.io.findings import warn, with_findings
+from mirrorskin.io.types import alone
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
@@ -138,10 +139,11 @@ class Method(OnDevice):
             The source has another motion, or it and the options cannot be used.
         """
         check_motion(source, self)
-        with naming(source):
+        with alone(source), naming(source):
             plan = self.plan(source)
-            found = feed(plan.stream or source, plan.operation, plan.frames, progress)
-            result = plan.finish(plan.operation.finish(), source)
+            with alone(plan.operation):
+                found = feed(plan.stream or source, plan.operation, plan.frames, progress)
+                result = plan.finish(plan.operation.finish(), source)
         result = with_findings(result, *found)
         warn(source.name, result.process)
         return undistorted(result, source) if undistort else result

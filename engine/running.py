@@ -19,6 +19,7 @@ from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.findings import in_process, warn
 from mirrorskin.io.own_class import load_class
+from mirrorskin.io.types import alone
 from mirrorskin.kernels.array import Array
 
 if TYPE_CHECKING:
@@ -91,7 +92,8 @@ def run(
         remedy = "open a path with io.open_recording, or give an array"
         raise InputError(f"frames are a {type(source).__name__}: {remedy}")
     warn_of_degrees(type(operation).__name__, positions.get("phase"))
-    result = _run_frames(source, operation, positions, progress)
+    with alone(operation):
+        result = _run_frames(source, operation, positions, progress)
     result = as_result(result, pixel_size=pixel_size)
     return result.assign(process={**signature(), **describe(operation), **result.process})
 
@@ -136,12 +138,13 @@ def _run_source(
     if positions:
         raise InputError(f"{source.name} has the positions of its frames. Remove {', '.join(positions)}")
     check_motion(source, operation)
-    with naming(source):
-        configured = operation.configured_for(source)
-        found = feed(source, configured, progress=progress)
-        result = configured.finish()
-    process = {**describe(configured, source), **result.process, **in_process(found, result.process)}
-    result = attach_provenance(result, source, configured.opened_devices, process)
+    with alone(source), alone(operation):
+        with naming(source):
+            configured = operation.configured_for(source)
+            found = feed(source, configured, progress=progress)
+            result = configured.finish()
+        process = {**describe(configured, source), **result.process, **in_process(found, result.process)}
+        result = attach_provenance(result, source, configured.opened_devices, process)
     warn(source.name, result.process)
     return result
 

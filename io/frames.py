@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +69,15 @@ class FrameReader(Closing, ABC):
 
 
 class WholeFrames(FrameReader):
-    """Frames that can only be decoded whole."""
+    """Frames that can only be decoded whole, by one thread at a time."""
+
+    _decoding: AbstractContextManager[Any]
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Create an object with a lock, independently of ``__init__``."""
+        reader = super().__new__(cls)
+        reader._decoding = threading.Lock()
+        return reader
 
     @abstractmethod
     def frames(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -77,14 +87,15 @@ class WholeFrames(FrameReader):
         """Decode frames, and copy some rows and columns of each into ``out``."""
         (start, stop), *part = spans
         region = tuple(slice(*span) for span in part)
-        for target, (name, frame) in zip(out, self.frames(start, stop), strict=True):
-            if frame.shape != self.shape[1:] or frame.dtype != self.dtype:
-                first = kind_of(self.shape[1:], self.dtype)
-                raise InputError(
-                    f"{name} is {kind_of(frame.shape, frame.dtype)}, but the first frame is {first}: "
-                    "all frames must have the same size and depth"
-                )
-            target[...] = frame[region]
+        with self._decoding:
+            for target, (name, frame) in zip(out, self.frames(start, stop), strict=True):
+                if frame.shape != self.shape[1:] or frame.dtype != self.dtype:
+                    first = kind_of(self.shape[1:], self.dtype)
+                    raise InputError(
+                        f"{name} is {kind_of(frame.shape, frame.dtype)}, but the first frame is {first}: "
+                        "all frames must have the same size and depth"
+                    )
+                target[...] = frame[region]
 
 
 def kind_of(shape: Sequence[int], dtype: np.dtype[Any]) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mirrorskin.io.recording import open_recording
-from mirrorskin.io.types import InputError, Source
+from mirrorskin.io.types import InputError, Source, alone
 from mirrorskin.io.watch import FIELD, TRAVEL, Check, Limits, Watch
 
 _BLOCK = 32_000_000  # bytes of frames read at a time
@@ -60,6 +60,12 @@ def check(
             return check(opened, field_limits=field_limits, travel_limits=travel_limits, progress=progress)
     if opening:
         raise InputError(f"{source.name} is open: give {', '.join(opening)} to io.open_recording")
+    with alone(source):
+        return _watched(source, progress).check(field_limits, travel_limits)
+
+
+def _watched(source: Source, progress: Callable[[int], None] | None) -> Watch:
+    """Return what all frames of a source show, and rewind it before and after, if possible."""
     seen = Watch(source)
     if source.rewindable:
         source.rewind()
@@ -73,4 +79,4 @@ def check(
             progress(done)
     if source.rewindable:
         source.rewind()
-    return seen.check(field_limits, travel_limits)
+    return seen

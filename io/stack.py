@@ -11,6 +11,7 @@ import math
 import mmap
 import os
 import tempfile
+import threading
 import weakref
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -144,6 +145,7 @@ class Stack:
             self._file = None if frames else dataset.file
             self._size = 0 if frames else os.fstat(dataset.file.id.get_vfd_handle()).st_size
         self._kept: Span = (0, 0)
+        self._reading = threading.Lock()  # a single frame may be wanted while another thread reads
         self._unpacked: NDArray[Any] | None = None
         self._how = ""
 
@@ -154,6 +156,10 @@ class Stack:
 
     def read(self, start: int, out: NDArray[Any]) -> NDArray[Any]:
         """Read frames into ``out``, at most as many as it holds, and return them."""
+        with self._reading:
+            return self._read(start, out)
+
+    def _read(self, start: int, out: NDArray[Any]) -> NDArray[Any]:
         first, stop = self._run(start, len(out))
         if not self._kept[0] <= first < self._kept[1]:
             span = self._chunk_span(first)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Literal, Protocol, Self, get_args
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -190,6 +193,36 @@ class Source(Protocol):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
     ) -> None: ...
+
+
+_locks: WeakValueDictionary[int, Any] = WeakValueDictionary()  # of objects in use, by their id
+_choosing = threading.Lock()
+
+
+@contextmanager
+def alone(used: object) -> Iterator[None]:
+    """Let no other thread into such a context with the same object, or with a source that both read.
+
+    A source has one position of reading, and an operation the state of one run. So that no two threads wait
+    for each other, enter with one source at a time, and with an operation after the source.
+    """
+    parts = _sources_in(used, {})
+    with _choosing:
+        locks = [_locks.setdefault(number, threading.RLock()) for number in sorted(parts)]
+    with ExitStack() as held:
+        for lock in locks:
+            held.enter_context(lock)
+        yield
+
+
+def _sources_in(used: object, parts: dict[int, object]) -> dict[int, object]:
+    """Add an object, and the sources that it reads, such as the recording behind a calibrated source."""
+    parts[id(used)] = used
+    for part in list(getattr(used, "__dict__", {}).values()):
+        is_source = all(callable(getattr(part, name, None)) for name in ("read", "rewind"))
+        if is_source and id(part) not in parts:
+            _sources_in(part, parts)
+    return parts
 
 
 class LiveSource(Source, Protocol):

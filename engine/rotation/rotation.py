@@ -44,6 +44,7 @@ from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Sour
 from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.result import absolute_heights
+from mirrorskin.io.types import alone
 from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
@@ -317,9 +318,10 @@ def at_poses(source: Source, tilt: ArrayLike | None = None) -> bool:
         return each is not None if source.header.tilt is None else rocks(phase)
     if source.header.tilt is not None or not source.rewindable:
         return False
-    source.rewind()
-    first = source.read()
-    source.rewind()
+    with alone(source):
+        source.rewind()
+        first = source.read()
+        source.rewind()
     return first is not None and first.tilt is not None
 
 
