@@ -99,7 +99,7 @@ class MovingNormals(NormalsOperation):
 
     def _fit_of(self, where: Doubles, weights: Doubles, first: bool) -> PoseFit | None:
         try:
-            fit = pose_fit(where, weights)
+            fit = pose_fit(where, weights, None if first else self._direction)
         except InputError:
             return None
         self._direction = fit.direction if first else self._direction

@@ -92,8 +92,11 @@ def even_windows(frames: int) -> int:
     return -(-frames // -(-frames // LONGEST))
 
 
-def pose_fit(pose: Doubles, weights: Doubles) -> PoseFit:
+def pose_fit(pose: Doubles, weights: Doubles, rocked: float | None = None) -> PoseFit:
     """Return the fit to frames with poses (N, 4) and weights above 0.
+
+    ``rocked`` is the direction of rocking of earlier frames, radians, which these have as well if theirs
+    differs by rounding only, or by little.
 
     InputError for fewer than 3 frames, for identical axes, and for axes in a plane that is not upright.
     """
@@ -110,6 +113,8 @@ def pose_fit(pose: Doubles, weights: Doubles) -> PoseFit:
                 "the body's axes lie in a plane that is not upright: rock it through the vertical, or turn it"
             )
         direction = float(np.arctan2(planes[2, 0], -planes[2, 1]) % math.pi)
+        if rocked is not None and abs((direction - rocked + math.pi / 2) % math.pi - math.pi / 2) < _PLANE:
+            direction = rocked
         along = axes @ [math.cos(direction), math.sin(direction), 0.0]
         axes = np.column_stack([along, np.zeros(len(axes)), axes[:, 2]])
     across = np.hypot(axes[:, 0], axes[:, 1])

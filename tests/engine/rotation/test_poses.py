@@ -90,6 +90,15 @@ def test_rocking_determines_the_slope_along_it_at_the_bound_and_nothing_across(d
     assert found.normals is found.normals_sigma is found.azimuth is None
 
 
+@pytest.mark.parametrize("direction", [0.0, 0.3, 1.0, 3.0, np.pi - 1e-9, -1e-12])
+def test_rocking_of_several_windows_uses_all_frames(direction):
+    """The direction of a window differs from that of the first by rounding."""
+    axes = body_axes(np.full(COUNT, direction), ROCKING)
+    operation = engine.rotation.MovingNormals(**SCALE, longest=16)
+    operation.push(shown(axes), pose=axes)
+    assert operation.result().process["frames"] == COUNT
+
+
 def test_two_phases_half_a_turn_apart_rock():
     phase = np.pi * (FRAME % 2) + 0.3
     frames = shown(body_axes(phase, np.radians(2.5)))
