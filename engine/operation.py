@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import cached_property, wraps
+from functools import cached_property, partial, wraps
 from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Protocol, Self, cast, get_args, overload
 
 import numpy as np
@@ -18,12 +19,12 @@ from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import as_array, unknown_argument
 from mirrorskin.io.findings import warn
-from mirrorskin.io.maps import declaration_of
+from mirrorskin.io.maps import SIGMA, UNDECLARED, declaration_of
 from mirrorskin.io.positions import step_in_degrees
 from mirrorskin.io.result import check_maps, result_of
 from mirrorskin.io.samples import convert_samples, frame_dtype
 from mirrorskin.io.traces import FrameSamples
-from mirrorskin.io.types import Motion, ProcessValue
+from mirrorskin.io.types import Motion
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Choice, Device, open_devices
 
@@ -34,6 +35,8 @@ P = ParamSpec("P")
 
 _COMPONENTS = {"displacement": (2,), "pose": (4,)}  # positions that are not single numbers
 _NOT_POSITIONS = ("lent", "frame_weights")  # keywords of push that are not positions of the body
+_SCALARS = str | int | float | np.generic
+_ALIKE = 0.75  # similarity, from 0 to 1, from which on a name seems to be misspelt
 _SIMPLE_TYPES = ("bool", "float", "int", "str")  # annotations of options, not of maps
 ABOUT_WEIGHTS = "Weight of each frame, such as its inverse variance; 0 for a missing frame. By default 1."
 """Description of ``frame_weights`` of array functions."""
@@ -140,6 +143,8 @@ class Operation(ThreadSafe, OnDevice):
     """Number of frames that a result needs."""
     maps: ClassVar[Mapping[str, Map]] = {}
     """The declared maps by name: the class attributes that are maps."""
+    optional_maps: ClassVar[tuple[str, ...]] = ()
+    """Names of declared maps that ``result`` does not always return."""
     positions: ClassVar[Mapping[str, bool]] = {}
     """Positions that ``push`` takes for each frame, and whether it needs them; may depend on options."""
     on_device: ClassVar[bool] = False
@@ -182,7 +187,7 @@ class Operation(ThreadSafe, OnDevice):
         super().__init__(**options)
         self.shape: Any = None
         self.dtype: Any = None
-        self._pushing = False
+        self._pushing = self._answering = False
         self._forget()
 
     def _forget(self) -> None:
@@ -382,8 +387,8 @@ def _checked_push(method: Callable[..., None]) -> Callable[..., None]:
     return push
 
 
-def _checked_result(method: Callable[..., Any]) -> Callable[..., Result]:
-    """Return a method ``result`` whose maps are checked against their declarations."""
+def _checked_result(method_name: str, method: Callable[..., Any]) -> Callable[..., Result]:
+    """Return a method ``result`` or ``finish`` whose maps are checked against their declarations."""
 
     @wraps(method)
     def result(self: Operation) -> Result:
@@ -391,34 +396,77 @@ def _checked_result(method: Callable[..., Any]) -> Callable[..., Result]:
         self.check_count()
         if self.passes == 2 and (self._pass == 1 or self.count != self._expected):
             raise InputError(f"{name} needs all frames twice, with next_pass() in between")
-        found = method(self)
-        if isinstance(found, Result):
-            return found
+        outermost, self._answering = not self._answering, True
+        try:
+            found = method(self)
+        finally:
+            self._answering = not outermost
         if not isinstance(found, Mapping):
             raise InputError(f"{name}.result() returns a {type(found).__name__}. Return maps by name")
-        declared = self.declarations
-        for one, value in found.items():
-            option_value = self.options[one].stored(self) if one in self.options else None
-            if one in RESERVED or (option_value is not None and np.any(value != option_value)):
-                raise InputError(f"{name}.result() returns {one}, which has a meaning already. Rename it")
-        scalars = {
-            one: value
-            for one, value in found.items()
-            if isinstance(value, str | int | float | np.generic)
-            and declaration_of(one, declared).axes != "none"
-        }
-        maps = {one: value for one, value in found.items() if one not in scalars}
-        if not maps:
-            raise InputError(f"{name}.result() returns no map: return at least one, (H, W)")
-        process: dict[str, ProcessValue] = {
-            one: value.item() if isinstance(value, np.generic) else value for one, value in scalars.items()
-        }
-        try:
-            return result_of(maps, self.shape, process, declared)
-        except InputError as error:
-            raise InputError(f"{name}.result(): {error}") from error
+        if outermost:  # of a base that a subclass calls, the subclass may add maps
+            _check_names(self, found, method_name)
+        return found if isinstance(found, Result) else _as_result(self, found)
 
     return result
+
+
+def _as_result(operation: Operation, found: Mapping[str, Any]) -> Result:
+    """Return what a method ``result`` returned by name: maps, and numbers and texts for the process."""
+    name, declared = type(operation).__name__, operation.declarations
+    scalars, maps = dict[str, Any](), dict[str, Any]()
+    for one, value in found.items():
+        given = operation.options[one].stored(operation) if one in operation.options else None
+        if one in RESERVED or (given is not None and not _is_rounded(value, given)):
+            raise InputError(f"{name}.result() returns {one}, which has a meaning already. Rename it")
+        if not isinstance(value, _SCALARS) or declaration_of(one, declared).axes == "none":
+            maps[one] = value
+        elif given is not None:
+            scalars[one] = given
+        else:
+            scalars[one] = value.item() if isinstance(value, np.generic) else value
+    if not maps:
+        raise InputError(f"{name}.result() returns no map: return at least one, (H, W)")
+    try:
+        return result_of(maps, operation.shape, scalars, declared)
+    except InputError as error:
+        raise InputError(f"{name}.result(): {error}") from error
+
+
+def _is_rounded(value: Any, option_value: Any) -> bool:
+    """Return whether a returned value is that of an option, which float32 may have rounded."""
+    values, wanted = np.asarray(value), np.asarray(option_value)
+    if values.dtype.kind in "uif" and wanted.dtype.kind in "uif":
+        values, wanted = values.astype(np.float32), wanted.astype(np.float32)
+    return (wanted.ndim == 0 or wanted.shape == values.shape) and bool(np.all(values == wanted))
+
+
+def _check_names(operation: Operation, found: Mapping[str, Any], method: str) -> None:
+    """Raise InputError if a declared map is missing, or a name looks like that of a missing one.
+
+    A method that overrides another one may return fewer maps than those declared for the other.
+    """
+    kind, declared = type(operation), operation.declarations
+    where = f"{kind.__name__}.result()"
+    owner, overridden = [base for base in kind.__mro__ if method in vars(base)][:2]
+    last = overridden if overridden is Operation else owner
+    classes = kind.__mro__[: kind.__mro__.index(last) + 1]
+    own = {one for base in classes for one, value in vars(base).items() if isinstance(value, Map)}
+    missing = [one for one in declared if one not in found]
+    required = [one for one in missing if one in own and one not in kind.optional_maps]
+    for one in found:
+        base = one.removesuffix(SIGMA)
+        if declaration_of(one, declared) is not UNDECLARED or (base != one and base in found):
+            continue
+        possible = missing if base == one else [f"{name}{SIGMA}" for name in declared]
+        if not isinstance(found, Result) and isinstance(found[one], _SCALARS):
+            possible = required
+        if close := difflib.get_close_matches(one, possible, n=1, cutoff=_ALIKE):
+            raise InputError(f"{where} returns {one}, which is not declared: did you mean {close[0]}?")
+    if required:
+        raise InputError(
+            f"{where} does not return {' and '.join(required)}, which its class declares. Return each"
+            " declared map, or list those that may be missing in optional_maps"
+        )
 
 
 def _check_class(cls: type[Operation]) -> None:
@@ -429,10 +477,14 @@ def _check_class(cls: type[Operation]) -> None:
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
     for one in cls.maps:
+        if one in cls.options:
+            raise InputError(f"{name}: {one} is an option and a map. Rename one of them")
         if hasattr(Operation, one):
             raise InputError(
                 f"{name}: a map cannot be called {one!r}, which operations use. Choose another name"
             )
+    if unknown := [one for one in cls.optional_maps if one not in cls.maps]:
+        raise InputError(f"{name}: optional_maps has {unknown[0]}, which is not declared as a map")
     for one, kind in inspect.get_annotations(cls).items():
         if isinstance(own.get(one), Map) and getattr(kind, "__name__", kind) in _SIMPLE_TYPES:
             raise InputError(f"{name}: {one} is an option and a map. Rename one of them")
@@ -462,8 +514,8 @@ def _checked_room(member: property | cached_property[Any]) -> property:
 
 _WRAPPERS: Mapping[str, Callable[[Any], Any]] = {
     "push": _checked_push,
-    "result": _checked_result,
-    "finish": _checked_result,
+    "result": partial(_checked_result, "result"),
+    "finish": partial(_checked_result, "finish"),
 }
 
 

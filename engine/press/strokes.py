@@ -46,6 +46,7 @@ class Strokes(CrossingOperation):
 
     hysteresis = TABLE["hysteresis"]
     strokes = TABLE["strokes"]
+    optional_maps = ("hysteresis", "strokes")  # of several strokes
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare a search for each direction."""

@@ -51,6 +51,7 @@ class MovingNormals(NormalsOperation):
     status = status_of(PoseStatus)
     slope = TABLE["slope"]
     slope_sigma = TABLE["slope"].deviation("slope")
+    optional_maps = ("normals", "azimuth", "normals_sigma", "slope", "slope_sigma")  # depending on the poses
 
     _kernel_maps = (*MAPS, *SLOPE_MAPS)
     _width = 4

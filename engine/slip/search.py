@@ -134,6 +134,7 @@ class Slip(Operation):
     slide_distance = TABLE["slide_distance"]
     twist_angle = TABLE["twist_angle"]
     stick_ratio = TABLE["stick_ratio"]
+    optional_maps = ("slide_distance", "twist_angle")  # depending on the motion
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

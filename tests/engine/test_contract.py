@@ -205,6 +205,51 @@ def test_the_function_on_arrays_gives_the_same(name):
     assert_same(case.function(case.frames, **case.given, **case.options), whole(name))
 
 
+# For values that float32 cannot hold, by unit: what is added to that of a case, and the value if it has none.
+UNEVEN = {
+    "share": (-1 / 6, 1 / 3),
+    "counts": (1 / 3, 1.04),
+    "mm": (0.1, 0.1),
+    "rad": (0.01, 0.1),
+    "counts/rad": (0.1, 180.1),
+}
+LEVEL = {"dark": 16.1, "bright": 240.1}
+
+
+def uneven(option, value):
+    """Return a value of an option that float32 cannot hold."""
+    added, alone = UNEVEN[option.unit]
+    if isinstance(value, list):
+        return [one + added / 10 for one in value]
+    number = (
+        LEVEL.get(option.name, alone) if value is None or isinstance(value, str) else float(value) + added
+    )
+    assert option.check(number) == number != float(np.float32(number))
+    return number
+
+
+def uneven_options():
+    """Yield each case with each option of a number."""
+    for name, case in CASES.items():
+        operation = case.make()
+        for option in operation.options.values():
+            value = option.stored(operation)
+            if option.kind in ("number", "numbers", "map") and not (option.name == "noise" and case.weights):
+                yield pytest.param(name, option.name, uneven(option, value), id=f"{name}, {option.name}")
+
+
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
+@pytest.mark.parametrize(("name", "option", "value"), list(uneven_options()))
+def test_a_value_that_float32_cannot_hold_is_kept(name, option, value):
+    case = CASES[name]
+    options = {**case.options, option: value}
+    answers = [engine.run(replace(case, weights={}).source(), case.kind(**options))]
+    if case.function:
+        answers.append(case.function(case.frames, **case.given, **options))
+    kept = str(value) if isinstance(value, list) else value
+    assert [found.process.get(option, kept) for found in answers] == [kept] * len(answers)
+
+
 @EACH
 def test_live_gives_the_same_or_refuses_before_anything_moves(name):
     case = replace(CASES[name], weights={})

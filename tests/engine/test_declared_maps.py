@@ -100,3 +100,80 @@ def test_codes_of_the_legend_are_accepted(codes):
     values = np.resize([*codes], SHAPE)
     found = engine.run(FRAMES, operation({"kind": io.Map(codes=codes)}, kind=values))
     np.testing.assert_array_equal(found["kind"], values)
+
+
+WEAR = {"wear": io.Map("depth of the wear", "mm"), "force": io.Map("force", "N", axes="none")}
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        ({"waer": FLAT, "force": 1.0}, "returns waer, which is not declared: did you mean wear?"),
+        ({"Wear": FLAT, "force": 1.0}, "returns Wear, which is not declared: did you mean wear?"),
+        ({"wear": FLAT, "forec": 1.0}, "returns forec, which is not declared: did you mean force?"),
+        (
+            {"wear": FLAT, "force": 1.0, "waer_sigma": FLAT},
+            "returns waer_sigma, which is not declared: did you mean wear_sigma?",
+        ),
+        (
+            {"depth": FLAT, "force": 1.0},
+            "does not return wear, which its class declares. Return each declared map, or list those that may"
+            " be missing in optional_maps",
+        ),
+        ({}, "does not return wear and force, which its class declares. Return each"),
+    ],
+)
+def test_a_declared_map_that_is_not_returned_is_refused_with_its_name(returned, message):
+    with pytest.raises(io.InputError, match=rf"^Own\.result\(\) {re.escape(message)}") as caught:
+        engine.run(FRAMES, operation(WEAR, **returned))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_misspelt_map_in_what_a_subclass_adds_to_its_base_is_refused():
+    class Own(engine.Onset):
+        wear = WEAR["wear"]
+
+        def result(self):
+            return super().result().assign(waer=np.zeros(self.shape))
+
+    with pytest.raises(io.InputError, match=r"^Own\.result\(\) returns waer.*: did you mean wear\?$"):
+        engine.run(FRAMES, Own, travel=[0.0, 1.0])
+
+
+def test_a_map_that_a_subclass_declares_and_nothing_returns_is_refused():
+    own = type("Own", (engine.Onset,), {"wear": WEAR["wear"]})
+    with pytest.raises(io.InputError, match=r"^Own\.result\(\) does not return wear"):
+        engine.run(FRAMES, own, travel=[0.0, 1.0])
+
+
+def test_a_map_of_a_base_that_looks_like_another_one_is_refused():
+    class Own(engine.Onset):
+        def result(self):
+            return {"heigth": np.zeros(self.shape)}
+
+    with pytest.raises(io.InputError, match="returns heigth, which is not declared: did you mean height"):
+        engine.run(FRAMES, Own, travel=[0.0, 1.0])
+
+
+def test_a_result_that_replaces_that_of_a_base_may_have_other_maps():
+    class Own(engine.Onset):
+        def result(self):
+            return {"height": np.ones(self.shape), "certainty": np.ones(self.shape)}
+
+    assert list(engine.run(FRAMES, Own, travel=[0.0, 1.0])) == ["height", "certainty"]
+
+
+def test_a_map_that_may_be_missing_can_be_left_out():
+    own = type("Own", (operation(WEAR, wear=FLAT),), {"optional_maps": ("force",)})
+    assert list(engine.run(FRAMES, own)) == ["wear"]
+
+
+def test_maps_that_are_not_declared_may_be_returned_in_addition():
+    found = engine.run(FRAMES, operation(WEAR, wear=FLAT, force=1.0, area=FLAT, area_sigma=FLAT))
+    assert set(found) == {"wear", "force", "area", "area_sigma"}
+
+
+def test_an_optional_map_that_is_not_declared_is_refused_where_the_class_is_defined():
+    with pytest.raises(io.InputError, match="Own: optional_maps has forec, which is not declared") as caught:
+        operation({**WEAR, "optional_maps": ("forec",)})
+    assert "\n" not in str(caught.value)
