@@ -56,6 +56,7 @@ class Option:
     shown_default: str
     python_only: bool
     name: str = ""
+    optional: bool = False  # whether None is a value: the default of the first declaration
 
     def __set_name__(self, owner: type, name: str) -> None:
         object.__setattr__(self, "name", name)
@@ -101,7 +102,13 @@ class Option:
             raise InputError(f"option {self.name}: no value is within {low:g} and {high:g}")
         if self.default is not None:
             made.check(self.default)
-        return made
+        return replace(made, optional=made.optional or self.default is None)
+
+    def with_default(self, value: Any) -> Option:
+        """Return the declaration with another default, which is checked as a value is."""
+        if hasattr(value, "__get__"):  # a method or a property
+            raise InputError(f"{self.name} is an option. Assign a value, or choose another name")
+        return replace(self, default=self.check(value), shown_default="")
 
     def described(self) -> str:
         """Return type and unit for a docstring, such as ``float, share, default 0.5``."""
@@ -110,7 +117,8 @@ class Option:
         kind = "{" + ", ".join(f'"{one}"' for one in self.choices) + "}" if self.choices else kinds[self.kind]
         kind = " or ".join([kind, *(f'"{word}"' for word in self.words)])
         unit = f", {self.unit}" if self.unit else ""
-        end = ", optional" if self.default is None else f", default {self.default!r}"
+        default = "a map" if isinstance(self.default, np.ndarray) else repr(self.default)
+        end = ", optional" if self.default is None else f", default {default}"
         return f"{kind}{unit}{end}"
 
     def check(self, value: Any) -> Any:
@@ -121,7 +129,7 @@ class Option:
         InputError
             The value has another type, or is outside of the limits.
         """
-        if value is None and self.default is None:
+        if value is None and (self.optional or self.default is None):
             return None
         if isinstance(value, str) and value in self.words:
             return value
@@ -277,7 +285,7 @@ class Configured:
     """Base of classes whose keyword arguments are declared options.
 
     A class has the options that it declares, and those of its bases. ``threshold: float = Onset.threshold``
-    declares the option of another class once more.
+    declares the option of another class once more, and ``threshold = 0.3`` changes the default of a base's.
 
     Raises
     ------
@@ -288,18 +296,24 @@ class Configured:
     options: ClassVar[Mapping[str, Option]] = {}
     """All options by name."""
 
+    _text: ClassVar[str | None] = None
+    """Docstring without options."""
+
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        found = {name: one.settled(annotation) for name, one, annotation in _declared(cls)}
-        for name, one in found.items():
-            setattr(cls, name, one)
-        for base in cls.__mro__[1:]:
-            if issubclass(base, Configured):
-                found |= {name: one for name, one in base.options.items() if name not in found}
-        common = {name: found.pop(name) for name in _LAST if name in found}
-        cls.options = found | common
+        for name, one, annotation in _declared(cls):
+            setattr(cls, name, one.settled(annotation))
+        bases = (base.options for base in cls.__mro__[1:] if issubclass(base, Configured))
+        own = [name for name, one in vars(cls).items() if isinstance(one, Option)]
+        names = dict.fromkeys([*own, *(name for options in bases for name in options)])
+        changed = [name for name in names if _take_default(cls, name)]
+        first = [name for name in names if name not in _LAST]
+        last = [name for name in _LAST if name in names]
+        cls.options = {name: getattr(cls, name) for name in [*first, *last]}
         cls.__signature__ = signature_of(cls.options)  # type: ignore[attr-defined]  # for help() and editors
-        cls.__doc__ = documented(cls.__doc__, cls.options)
+        if cls.__doc__ is not None or changed:
+            cls._text = cls.__doc__ or cls._text
+            cls.__doc__ = documented(cls._text, cls.options)
 
     def __init__(self, **options: Any) -> None:
         unknown = options.keys() - self.options
@@ -347,6 +361,19 @@ def _declared(cls: type) -> Iterator[tuple[str, Option, Any]]:
                 f"{cls.__name__}: an option cannot have the name {name}, which has a meaning already"
             )
         yield name, one, annotations.get(name)
+
+
+def _take_default(cls: type, name: str) -> bool:
+    """Make a plain value that a class, or a base without options, assigns to an option its default."""
+    values = [vars(base)[name] for base in cls.__mro__ if name in vars(base)]
+    if isinstance(values[0], Option):
+        return False
+    declared = next(one for one in values if isinstance(one, Option))
+    try:
+        setattr(cls, name, declared.with_default(values[0]))
+    except InputError as error:
+        raise InputError(f"{cls.__name__}: {error}") from error
+    return True
 
 
 def signature_of(

@@ -121,6 +121,8 @@ def run_class(
     kind: type[Operation | Method], source: Source, progress: Progress | None = None, /, **options: Any
 ) -> Result:
     """Run an operation or a method with these options over a source; see `run`."""
+    if options.get("device") is None:
+        options.pop("device", None)  # the class may have a default
     configured = kind(**options)
     if isinstance(configured, Method):
         return configured.run(calibrated(source), progress)
