@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.operation import OnDevice, Operation
+from mirrorskin.engine.operation import OnDevice, Operation, place_of
 from mirrorskin.engine.options import Configured
 from mirrorskin.engine.provenance import attach_provenance, naming
 from mirrorskin.engine.streaming import Progress, feed
@@ -107,6 +107,11 @@ class Method(OnDevice):
 
     motions: ClassVar[tuple[str, ...]] = ()
     """Motions of recordings that the method applies to; none for all."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if place_of(cls, "plan") < place_of(cls, "live_plan"):  # live, too, the plan of a subclass is used
+            cls.live_plan = Method.live_plan  # type: ignore[method-assign]
 
     def plan(self, source: Source) -> Plan:
         """Return the plan for a source: its operation, steps and frames."""

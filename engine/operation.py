@@ -156,6 +156,7 @@ class Operation(ThreadSafe, OnDevice):
     updates_per_second: ClassVar[float] = 15.0
     """Number of useful updates per second of a live run."""
     _takes_lent: ClassVar[bool] = False
+    _starts_again: ClassVar[bool] = False  # whether a subclass prepares more than its base clears
     on_objects: ClassVar[tuple[str, ...]] = ("shape", "dtype", "count")
     """Attributes of objects: rows and columns of a frame, type of a sample, number of frames so far."""
 
@@ -170,18 +171,30 @@ class Operation(ThreadSafe, OnDevice):
             found |= {name: one for name, one in vars(base).items() if isinstance(one, Map)}
         cls.maps = found
         _check_class(cls)
-        if "push" in vars(cls):
-            parameters = [*inspect.signature(cls.push).parameters.values()][2:]
-            cls.positions = {
-                one.name: one.default is one.empty for one in parameters if one.name not in _NOT_POSITIONS
-            }
-            cls._takes_lent = any(one.name == "lent" for one in parameters)
         for name, wrap in _WRAPPERS.items():
-            if name in vars(cls):
-                setattr(cls, name, wrap(vars(cls)[name]))
+            owner = cls.__mro__[place_of(cls, name)]
+            if owner is not cls and issubclass(owner, Operation):
+                continue
+            if name == "push":
+                cls._take_positions(vars(owner)[name])
+            setattr(cls, name, wrap(vars(owner)[name]))
+        for name in ("finish", "preview"):  # faster ways to the maps that a base's result returns
+            if place_of(cls, "result") < place_of(cls, name):
+                setattr(cls, name, vars(Operation)[name])
+        cls._starts_again = place_of(cls, "start") < place_of(cls, "clear")
         if "room" in vars(cls):
             cls.room = _checked_room(vars(cls)["room"])  # type: ignore[assignment]
         super().__init_subclass__(**kwargs)
+
+    @classmethod
+    def _take_positions(cls, push: Callable[..., None]) -> None:
+        """Set the positions to the keywords of ``push``; others that it accepts are those of the base."""
+        parameters = [*inspect.signature(push).parameters.values()][2:]
+        named = {one.name: one.default is one.empty for one in parameters if one.kind is not one.VAR_KEYWORD}
+        passes_on = len(named) < len(parameters)
+        cls._takes_lent = "lent" in named or (passes_on and cls._takes_lent)
+        own = {name: needed for name, needed in named.items() if name not in _NOT_POSITIONS}
+        cls.positions = {**(cls.positions if passes_on else {}), **own}
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -241,7 +254,9 @@ class Operation(ThreadSafe, OnDevice):
     def reset(self) -> None:
         """Forget the frames so far, and all estimates from them."""
         self._forget()
-        if self.dtype is not None:
+        if self.dtype is not None and self._starts_again:
+            self.start(self.shape, self.dtype)
+        elif self.dtype is not None:
             self.clear()
 
     def push(self, *args: Any, **kwargs: Any) -> None:
@@ -493,6 +508,11 @@ def _check_class(cls: type[Operation]) -> None:
     if isinstance(cls.motions, str) or not set(cls.motions) <= {*get_args(Motion)}:
         motions = ", ".join(get_args(Motion))
         raise InputError(f'{name}: motions is {cls.motions!r}. Use a tuple of {motions}, such as ("axial",)')
+
+
+def place_of(cls: type, name: str) -> int:
+    """Return how far up in the order of its bases a class has a method from."""
+    return next(number for number, base in enumerate(cls.__mro__) if name in vars(base))
 
 
 def _check_started(operation: Operation) -> None:

@@ -238,7 +238,6 @@ class Press(Method):
         """Return the search for strokes, which does not need the travel in advance."""
         operation: PressOperation = self.make(Strokes).configured_for(source)
         process = self._process(source, range(0), operation)
-        del process["frames"]  # the operation counts them
         return Plan(operation, self._steps(operation, live=True), process, omit=_OMIT)
 
     def _kind(self, source: Source, oscillates: bool) -> type[PressOperation]:
@@ -256,7 +255,6 @@ class Press(Method):
     def _process(self, source: Source, frames: range, operation: PressOperation) -> dict[str, ProcessValue]:
         process: dict[str, ProcessValue] = {
             "first_frame": frames.start,
-            "frames": len(frames),
             "event": self.event,
             "method": self.method,
             "threshold": self._lowest(operation),
