@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 
 P = ParamSpec("P")
 
-_COMPONENTS = {"displacement": (2,), "pose": (4,)}  # positions that are not single numbers
+COMPONENTS = {"displacement": (2,), "pose": (4,)}
+"""Shapes of positions of a frame that are not single numbers."""
 _NOT_POSITIONS = ("lent", "frame_weights")  # keywords of push that are not positions of the body
 _SCALARS = str | int | float | np.generic
 _ALIKE = 0.75  # similarity, from 0 to 1, from which on a name seems to be misspelt
@@ -297,7 +298,7 @@ class Operation(ThreadSafe, OnDevice):
 
     def warm(self) -> None:
         """Push a frame of zeros and forget it, so that what is compiled on first use is ready."""
-        where = {name: np.zeros((1, *_COMPONENTS.get(name, ()))) for name in self.positions}
+        where = {name: np.zeros((1, *COMPONENTS.get(name, ()))) for name in self.positions}
         self.push(np.zeros((1, *self.shape), self.dtype), **where)
         with suppress(InputError):
             self.preview(0.0)

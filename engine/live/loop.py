@@ -15,6 +15,7 @@ from mirrorskin.engine.live.operation import LiveOperation
 from mirrorskin.engine.live.status import PUSHED, RAISED, SHOWN, UPDATED, WAITED, Monitor, Status, Update
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import Block, InputError, LiveSource
+from mirrorskin.io.layout import POSITIONS
 
 LATENCY = 0.1
 """Seconds after which a frame is too old, by default."""
@@ -122,7 +123,8 @@ class Loop:
         if used.any():
             last = int(np.flatnonzero(used)[-1])
             at = math.nan if block.time is None else float(block.time[last])
-            place = getattr(block, self._operation.position)[last]
+            places = getattr(block, self._operation.position)  # a tilt, if the source has those of frames
+            place = (getattr(block, POSITIONS[self._source.motion]) if places is None else places)[last]
             self._newest = at, float(np.hypot(*place) if np.ndim(place) else place), block.frames[last]
             self._taken, self._pending = float(time[last]), True
             self._monitor.time(PUSHED, self._source.now() - now)

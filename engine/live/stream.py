@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
 import math
 import threading
 import time
+import weakref
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from types import TracebackType
 from typing import Any, cast
 
 import numpy as np
@@ -17,20 +20,24 @@ from mirrorskin.engine.live.loop import LATENCY, Loop
 from mirrorskin.engine.live.operation import LiveOperation
 from mirrorskin.engine.live.status import Status, Update
 from mirrorskin.engine.method import Method
-from mirrorskin.engine.operation import Operation
+from mirrorskin.engine.operation import COMPONENTS, Operation
 from mirrorskin.io import Block, Header, InputError, Motion, Result
-from mirrorskin.io.layout import POSITIONS
+from mirrorskin.io.arguments import as_array, check_number, unknown_argument
+from mirrorskin.io.layout import LIVE, POSITIONS
+from mirrorskin.io.positions import check_finite
 from mirrorskin.io.types import Closing, Floats
 
 _WAITING = 64  # frames at most that wait to be processed
 _ENDLESS = 1 << 40  # frames that a stream may have
+_readers: weakref.WeakKeyDictionary[threading.Thread, _Pushed] = weakref.WeakKeyDictionary()
 
 
 class Stream(Closing):
     """Push frames of your own camera and stage into an operation, and read its maps at any time.
 
     A separate thread runs the operation by the policy of `Loop`: frames that waited longer than ``latency``
-    are skipped, except for the newest one.
+    are skipped, except for the newest one. An error there is raised by the next call, or by `close` if no
+    other call raised it. A stream to which nothing refers any more ends its thread.
 
     Parameters
     ----------
@@ -77,10 +84,15 @@ class Stream(Closing):
         self._source = _Pushed(_header(operation, motion, header), shape, check_dtype(dtype), latency)
         self._operation = LiveOperation(self._source, operation)
         self._operation.warm()
-        self._latest: Update | None = None
-        self._loop = Loop(self._source, self._operation, latency=latency, on_update=self._keep)
-        self._thread = threading.Thread(target=self._run, name="mirrorskin-stream", daemon=True)
+        if {"pose", "tilt"} & {name for name, needed in self._operation.positions.items() if needed}:
+            self._source.needed += ("tilt",)
+        self._loop = Loop(self._source, self._operation, latency=latency, on_update=self._source.keep)
+        self._thread = threading.Thread(
+            target=_run, args=(self._loop, self._source), name="mirrorskin-stream", daemon=True
+        )
+        _readers[self._thread] = self._source
         self._thread.start()
+        weakref.finalize(self, self._source.abandon).atexit = False  # `_end_all` does, and waits
 
     def push(self, frames: ArrayLike, *, time: float | None = None, **positions: ArrayLike) -> None:
         """Process the next frame, (H, W), or frames, (n, H, W): they are copied, and processed later.
@@ -89,15 +101,17 @@ class Stream(Closing):
         ----------
         frames : array_like
         time : float, optional
-            Seconds, of the newest of them, on the scale of `now`; by default the time of this call.
+            Seconds, of the newest of them, on the scale of `now`, not before that of earlier frames; by
+            default the time of this call.
         **positions : float or array_like, (n,)
-            Of the body, one of each frame: ``travel``, mm, ``phase`` or ``twist``, radians, or
-            ``displacement``, mm, two numbers.
+            Of the body, one of each frame: ``travel``, mm, ``phase``, ``twist`` or ``tilt``, radians, or
+            ``displacement``, mm, two numbers. The same ones with each frame.
 
         Raises
         ------
         mirrorskin.io.InputError
-            Frames of another size or type, a position that is missing, or whatever the operation refused.
+            Frames of another size or type, or a time or a position that is missing or impossible: then
+            nothing is pushed. Or whatever the operation refused: then the stream can only be closed.
         """
         self._source.put(frames, time, positions)
 
@@ -108,7 +122,7 @@ class Stream(Closing):
     def latest(self) -> Update | None:
         """Return the newest maps, for a display, without waiting; None before the first ones."""
         self._source.check()
-        return self._latest
+        return self._source.latest
 
     @property
     def status(self) -> Status:
@@ -127,18 +141,41 @@ class Stream(Closing):
         return self._operation.result()
 
     def close(self) -> None:
-        """End the thread; frames that still wait are processed before."""
+        """End the thread; frames that still wait are processed before.
+
+        Raises
+        ------
+        mirrorskin.io.InputError
+            Whatever the operation refused, unless it was raised before.
+        """
         self._source.close()
         self._thread.join()
+        self._source.check(again=False)
 
-    def _keep(self, update: Update, status: Status) -> None:
-        self._latest = update
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self._source.close()
+        self._thread.join()
+        if error is None:
+            self._source.check(again=False)
 
-    def _run(self) -> None:
-        try:
-            self._loop.run()
-        except BaseException as error:  # it is raised by the next call of another thread
-            self._source.fail(error)
+
+def _run(loop: Loop, source: _Pushed) -> None:
+    """Process frames, without a reference to the stream, which is deleted when it is forgotten."""
+    try:
+        loop.run()
+    except BaseException as error:  # it is raised by the next call of another thread
+        source.fail(error)
+
+
+@atexit.register
+def _end_all() -> None:
+    """Wait for what the threads compute, so that the program does not end under them."""
+    for thread, source in list(_readers.items()):
+        if thread.is_alive():
+            source.abandon()
+            thread.join()
 
 
 def _header(operation: Operation | Method, motion: Motion | None, header: Header | None) -> Header:
@@ -163,12 +200,15 @@ class _Pushed(Closing):
     def __init__(self, header: Header, shape: tuple[int, int], dtype: np.dtype[Any], latency: float) -> None:
         self.header, self.motion = header, header.motion
         self.shape, self.dtype = (_ENDLESS, *shape), dtype
+        self.needed: tuple[str, ...] = (POSITIONS[self.motion],)
+        self.latest: Update | None = None
         self._start = time.monotonic()
         self._keeps_all = latency == math.inf
         self._changed = threading.Condition()
         self._waiting: deque[tuple[NDArray[Any], float, dict[str, Floats]]] = deque()
         self._count = self._lost = 0
-        self._idle = self._ended = False
+        self._newest, self._names = -math.inf, frozenset[str]()
+        self._idle = self._ended = self._raised = False
         self._error: BaseException | None = None
 
     def now(self) -> float:
@@ -180,22 +220,25 @@ class _Pushed(Closing):
     def rewind(self) -> None:
         raise RuntimeError("a stream cannot be rewound")
 
+    def keep(self, update: Update, status: Status) -> None:
+        """Keep the newest maps."""
+        self.latest = update
+
     def put(self, frames: ArrayLike, at: float | None, positions: Mapping[str, ArrayLike]) -> None:
-        array = np.asarray(frames)
+        """Add frames, after everything about them has been checked."""
+        array = as_array("frames", frames)
         single = array.ndim == 2
         array = array[np.newaxis] if single else array
         if array.ndim != 3 or array.shape[1:] != self.shape[1:] or array.dtype != self.dtype:
             raise InputError(
                 f"frames are {array.dtype} {np.shape(frames)}: {self.dtype} {self.shape[1:]} are expected"
             )
-        known = {name: np.asarray(value, np.float64) for name, value in positions.items()}
-        known = {name: value[np.newaxis] if single else value for name, value in known.items()}
-        needed = POSITIONS[self.motion]
-        wrong = [name for name, value in known.items() if value.shape[:1] != (len(array),)]
-        if needed not in known or wrong:
-            raise InputError(f"{(wrong or [needed])[0]} is needed of each frame: push(frame, {needed}=...)")
-        when = self.now() if at is None else at
+        places = self._checked(positions, len(array), single)
+        if at is not None and not math.isfinite(check_number("time", at)):
+            raise InputError(f"time is {at}: a finite number of seconds is needed")
         with self._changed:
+            self._check()
+            when = self._in_order(at, places)
             for number, frame in enumerate(array):
                 if self._keeps_all:
                     self._changed.wait_for(lambda: len(self._waiting) < _WAITING or self._stopped)
@@ -203,9 +246,40 @@ class _Pushed(Closing):
                 if len(self._waiting) == _WAITING:
                     self._waiting.popleft()
                     self._lost += 1
-                here = {name: value[number] for name, value in known.items()}
+                here = {name: value[number] for name, value in places.items()}
                 self._waiting.append((frame.copy(), when, here))
                 self._changed.notify_all()
+
+    def _checked(self, positions: Mapping[str, ArrayLike], count: int, single: bool) -> dict[str, Floats]:
+        """Return the positions of frames, (count,) or (count, components)."""
+        if unknown := positions.keys() - LIVE:
+            raise InputError(unknown_argument("push()", min(unknown), [*LIVE], "position"))
+        known = {name: as_array(name, value) for name, value in positions.items() if value is not None}
+        if missing := [name for name in self.needed if name not in known]:
+            raise InputError(f"{missing[0]} is needed of each frame: push(frame, {missing[0]}=...)")
+        for name, value in known.items():
+            width = COMPONENTS.get(name, ())
+            if value.shape != (width if single else (count, *width)):
+                numbers = "two numbers are" if width else "one number is"
+                raise InputError(f"{name} has shape {value.shape}: {numbers} needed of each frame")
+            known[name] = check_finite(value.reshape(count, *width), count, name, width=width)
+        return known
+
+    def _in_order(self, at: float | None, names: Collection[str]) -> float:
+        """Return the time of frames that follow the earlier ones, and have positions of the same names."""
+        if self._names and self._names != set(names):
+            given, before = (" and ".join(sorted(each)) for each in (names, self._names))
+            raise InputError(
+                f"frames have {given}, but earlier ones had {before}. Push the same with each frame"
+            )
+        when = self.now() if at is None else float(at)
+        if when < self._newest:
+            raise InputError(
+                f"time {when:.6g} s is before that of an earlier frame, {self._newest:.6g} s. Push frames in"
+                " the order of their times, on the scale of now()"
+            )
+        self._newest, self._names = when, frozenset(names)
+        return when
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         assert out is not None
@@ -238,16 +312,23 @@ class _Pushed(Closing):
             self._ended = True
             self._changed.notify_all()
 
+    def abandon(self) -> None:
+        """Let the reader end without the waiting frames."""
+        with self._changed:
+            self._waiting.clear()
+            self.close()
+
     def fail(self, error: BaseException) -> None:
         """Raise an error at the next call of another thread."""
         with self._changed:
             self._error = error
             self._changed.notify_all()
 
-    def check(self) -> None:
-        """Raise the error that ended the reader, if any."""
+    def check(self, again: bool = True) -> None:
+        """Raise the error that ended the reader, if any; if it was raised before, only if ``again``."""
         with self._changed:
-            if self._error is not None:
+            if self._error is not None and (again or not self._raised):
+                self._raised = True
                 raise self._error
 
     @property
@@ -255,7 +336,6 @@ class _Pushed(Closing):
         return self._ended or self._error is not None
 
     def _check(self) -> None:
-        if self._error is not None:
-            raise self._error
+        self.check()
         if self._ended:
             raise InputError("the stream is closed: push frames, and ask for its result, before")

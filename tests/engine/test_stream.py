@@ -1,6 +1,9 @@
 """Frames of the user's own camera: maps equal those of a recording, and faults reach the pushing thread."""
 
+import gc
 import math
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -94,7 +97,7 @@ def test_a_result_before_there_are_enough_frames_says_how_many_are_missing(frame
         ({"frames": np.zeros((3, 4), np.uint8)}, r"frames are uint8 \(3, 4\): uint8 \(24, 32\) are expected"),
         ({"frames": np.zeros(SHAPE, np.uint16)}, "frames are uint16"),
         ({"travel": None}, r"travel is needed of each frame: push\(frame, travel=\.\.\.\)"),
-        ({"travel": [0.1, 0.2]}, "travel is needed of each frame"),
+        ({"travel": [0.1, 0.2]}, r"travel has shape \(2,\): one number is needed of each frame"),
     ],
 )
 def test_what_does_not_fit_is_refused_at_once(frames, change, line):
@@ -102,6 +105,160 @@ def test_what_does_not_fit_is_refused_at_once(frames, change, line):
     given = {name: value for name, value in given.items() if value is not None}
     with stream() as pushed, pytest.raises(io.InputError, match=line):
         pushed.push(**given)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"travel": [0.1]}, r"travel has shape \(1,\): one number is needed of each frame"),
+        ({"travel": [[0.1], [0.2]]}, r"travel has shape \(2, 1\): one number is needed of each frame"),
+        ({"travel": np.nan}, "travel is nan at frame 0: every frame needs a finite number"),
+        ({"travel": np.inf}, "travel is inf at frame 0"),
+        ({"travel": "far"}, "travel is 'far': numbers are needed"),
+        ({"travel": 1j}, "travel is 1j: numbers are needed"),
+        ({"travel": None}, "travel is needed of each frame"),
+        ({"travel": True}, "travel is of type bool: numbers are needed"),
+        ({"travl": 0.1}, r"push\(\) has no position travl: did you mean travel\?"),
+        (
+            {"twist": 0.1},
+            "frames have travel and twist, but earlier ones had travel. Push the same with each",
+        ),
+        ({"time": "noon"}, "time is 'noon': a number is needed"),
+        ({"time": [0.1, 0.2]}, "time is a list: a number is needed"),
+        ({"time": np.nan}, "time is nan: a finite number of seconds is needed"),
+        ({"time": -1.0}, "time -1 s is before that of an earlier frame, .* s. Push frames in the order"),
+        ({"frames": "none"}, "frames is 'none': numbers are needed"),
+        ({"frames": np.zeros((1, 2, *SHAPE), np.uint8)}, "frames are uint8"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_where_it_is_pushed_and_changes_nothing(frames, change, line):
+    with stream() as pushed:
+        pushed.push(frames[0], travel=TRAVEL[0])
+        with pytest.raises(io.InputError, match=line) as caught:
+            pushed.push(**{"frames": frames[1], "travel": TRAVEL[1], **change})
+        assert "\n" not in str(caught.value)
+        pushed.push(frames[1:], travel=TRAVEL[1:])
+        found = pushed.result()
+    np.testing.assert_array_equal(found.height, engine.find_onset(frames, TRAVEL, **LEVELS).height)
+
+
+@pytest.mark.parametrize("place", [0.1, [0.1], [0.1, 0.2, 0.3], [[0.1, 0.2]], [0.1, np.nan]])
+def test_a_displacement_that_is_not_two_numbers_is_refused_where_it_is_pushed(place):
+    operation = engine.slip.Slip(pixel_size=0.1)
+    with stream(operation, motion="horizontal") as pushed, pytest.raises(io.InputError, match="displacement"):
+        pushed.push(np.zeros(SHAPE, np.uint8), displacement=place)
+
+
+def test_a_tilt_that_the_operation_needs_is_asked_for_where_frames_are_pushed():
+    operation = engine.rotation.MovingNormals(zenith_gain=300.0)
+    with stream(operation) as pushed, pytest.raises(io.InputError, match="tilt is needed of each frame"):
+        pushed.push(np.zeros(SHAPE, np.uint8), phase=0.1)
+
+
+def test_a_rotation_without_tilts_is_processed():
+    counts = np.random.default_rng(0).integers(0, 255, (8, *SHAPE)).astype(np.uint8)
+    phase = np.arange(8) * np.pi / 4
+    with stream(engine.Correlate(), motion="axial") as pushed:
+        pushed.push(counts, phase=phase)
+        found = pushed.result()
+    np.testing.assert_array_equal(found.mean, engine.correlate(counts, phase).mean)
+
+
+def test_times_that_run_backwards_are_refused_and_no_frame_is_lost(frames):
+    with Stream(engine.Onset(**LEVELS), SHAPE) as pushed:
+        pushed.push(frames[0], travel=TRAVEL[0], time=1e6)
+        for number in range(1, len(frames)):
+            with pytest.raises(io.InputError, match="is before that of an earlier frame, 1e\\+06 s"):
+                pushed.push(frames[number], travel=TRAVEL[number], time=1e6 - number)
+        pushed.push(frames[-1], travel=TRAVEL[-1], time=2e6)
+        pushed.result()
+        assert (pushed.status.used, pushed.status.skipped) == (2, 0)
+
+
+class Failing(engine.Operation):
+    """It fails at a frame with a count above 200."""
+
+    motions = ("vertical",)
+
+    def push(self, frames, *, travel):
+        if frames.max() > 200:
+            raise io.InputError("the lamp is too bright")
+
+    def result(self):
+        return {"height": np.zeros(self.shape)}
+
+
+def failed(latency=math.inf):
+    """Return a stream whose last frame cannot be processed."""
+    pushed = Stream(Failing(), SHAPE, latency=latency)
+    pushed.push(np.full(SHAPE, 255, np.uint8), travel=0.0)
+    return pushed
+
+
+@pytest.mark.parametrize("latency", [0.1, math.inf])
+def test_an_error_in_the_last_frames_is_raised_by_close(latency):
+    with pytest.raises(io.InputError, match="the lamp is too bright"):
+        failed(latency).close()
+
+
+def test_an_error_in_the_last_frames_is_raised_at_the_end_of_with():
+    with pytest.raises(io.InputError, match="the lamp is too bright"), failed():
+        pass
+
+
+def test_close_raises_an_error_once():
+    pushed = failed()
+    with pytest.raises(io.InputError, match="the lamp is too bright"):
+        pushed.close()
+    pushed.close()
+
+
+def test_close_does_not_raise_an_error_that_was_raised_before():
+    pushed = failed()
+    with pytest.raises(io.InputError, match="the lamp is too bright"):
+        pushed.result()
+    pushed.close()
+
+
+def test_an_error_inside_with_is_not_hidden_by_that_of_a_frame():
+    with pytest.raises(KeyError, match="first"), failed():
+        raise KeyError("first")
+
+
+def reader_of(pushed):
+    """Return the thread of a stream."""
+    before = set(threading.enumerate())
+    made = pushed()
+    (thread,) = set(threading.enumerate()) - before
+    return made, thread
+
+
+@pytest.mark.parametrize("latency", [0.1, math.inf])
+def test_a_forgotten_stream_ends_its_thread(frames, latency):
+    pushed, thread = reader_of(lambda: Stream(engine.Onset(**LEVELS), SHAPE, latency=latency))
+    pushed.push(frames, travel=TRAVEL)
+    del pushed
+    gc.collect()
+    thread.join(20)
+    assert not thread.is_alive()
+
+
+LEFT_OPEN = """
+import math
+import numpy as np
+from mirrorskin import engine
+
+streams = [engine.live.Stream(engine.Onset(), (300, 400), latency=math.inf) for _ in range(2)]
+for number in range(60):
+    for stream in streams:
+        stream.push(np.full((300, 400), 4 * number, np.uint8), travel=float(number))
+del stream, streams[0]
+"""
+
+
+def test_a_program_that_leaves_streams_open_ends_cleanly():
+    ended = subprocess.run([sys.executable, "-c", LEFT_OPEN], capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
 
 
 def test_what_the_operation_refuses_is_raised_where_frames_are_pushed(frames):
