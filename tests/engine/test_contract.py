@@ -234,7 +234,7 @@ def uneven_options():
         operation = case.make()
         for option in operation.options.values():
             value = option.stored(operation)
-            if option.kind in ("number", "numbers", "map") and not (option.name == "noise" and case.weights):
+            if option.kind in ("number", "numbers", "map"):
                 yield pytest.param(name, option.name, uneven(option, value), id=f"{name}, {option.name}")
 
 
