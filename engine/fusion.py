@@ -28,7 +28,7 @@ from mirrorskin.io import InputError, Motion, Result, Source, pixel_axes
 from mirrorskin.io.arguments import as_array_or_number, check_count, check_flag, checked
 from mirrorskin.io.findings import in_process, warn
 from mirrorskin.io.result import absolute_heights
-from mirrorskin.io.types import ProcessValue, alone
+from mirrorskin.io.types import ProcessValue, exclusive_use
 from mirrorskin.kernels.device import Choice, Device, open_devices
 
 Mask = NDArray[np.bool_]
@@ -284,7 +284,7 @@ def _press(
     Slopes determine how far a lens that blurs has moved each height, but they are blurred as well.
     """
     lens, method = LensBlur(blur=options.get("blur")), Press(**{**options, "blur": 0.0})
-    with alone(vertical), naming(vertical):
+    with exclusive_use(vertical), naming(vertical):
         plan = method.plan(vertical)
         found = feed(vertical, plan.operation, plan.frames, progress)
         onsets = plan.operation.finish()
@@ -302,7 +302,7 @@ def _press(
 
 def _rotate(method: Rotation, axial: Source, progress: Progress | None) -> tuple[Result, Slopes]:
     """Return the normals of a rotation, and the slopes that are integrated."""
-    with alone(axial), naming(axial):
+    with exclusive_use(axial), naming(axial):
         plan = method.plan(axial)
         stream = plan.stream or axial
         found = feed(stream, plan.operation, plan.frames, progress)

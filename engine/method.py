@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.operation import OnDevice, Operation, place_of
+from mirrorskin.engine.operation import OnDevice, Operation, mro_index
 from mirrorskin.engine.options import Configured
 from mirrorskin.engine.provenance import attach_provenance, naming
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import Calibrated, InputError, Result
 from mirrorskin.io.findings import warn, with_findings
-from mirrorskin.io.types import alone
+from mirrorskin.io.types import exclusive_use
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
@@ -110,7 +110,7 @@ class Method(OnDevice):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if place_of(cls, "plan") < place_of(cls, "live_plan"):  # live, too, the plan of a subclass is used
+        if mro_index(cls, "plan") < mro_index(cls, "live_plan"):  # live, too, the plan of a subclass is used
             cls.live_plan = Method.live_plan  # type: ignore[method-assign]
 
     def plan(self, source: Source) -> Plan:
@@ -144,9 +144,9 @@ class Method(OnDevice):
             The source has another motion, or it and the options cannot be used.
         """
         check_motion(source, self)
-        with alone(source), naming(source):
+        with exclusive_use(source), naming(source):
             plan = self.plan(source)
-            with alone(plan.operation):
+            with exclusive_use(plan.operation):
                 found = feed(plan.stream or source, plan.operation, plan.frames, progress)
                 result = plan.finish(plan.operation.finish(), source)
         result = with_findings(result, *found)

@@ -173,16 +173,16 @@ class Operation(ThreadSafe, OnDevice):
         cls.maps = found
         _check_class(cls)
         for name, wrap in _WRAPPERS.items():
-            owner = cls.__mro__[place_of(cls, name)]
+            owner = cls.__mro__[mro_index(cls, name)]
             if owner is not cls and issubclass(owner, Operation):
                 continue
             if name == "push":
                 cls._take_positions(vars(owner)[name])
             setattr(cls, name, wrap(vars(owner)[name]))
-        for name in ("finish", "preview"):  # faster ways to the maps that a base's result returns
-            if place_of(cls, "result") < place_of(cls, name):
+        for name in ("finish", "preview"):  # a base's shortcuts to what its own result returns
+            if mro_index(cls, "result") < mro_index(cls, name):
                 setattr(cls, name, vars(Operation)[name])
-        cls._starts_again = place_of(cls, "start") < place_of(cls, "clear")
+        cls._starts_again = mro_index(cls, "start") < mro_index(cls, "clear")
         if "room" in vars(cls):
             cls.room = _checked_room(vars(cls)["room"])  # type: ignore[assignment]
         super().__init_subclass__(**kwargs)
@@ -191,11 +191,13 @@ class Operation(ThreadSafe, OnDevice):
     def _take_positions(cls, push: Callable[..., None]) -> None:
         """Set the positions to the keywords of ``push``; others that it accepts are those of the base."""
         parameters = [*inspect.signature(push).parameters.values()][2:]
-        named = {one.name: one.default is one.empty for one in parameters if one.kind is not one.VAR_KEYWORD}
+        named = {
+            part.name: part.default is part.empty for part in parameters if part.kind != part.VAR_KEYWORD
+        }
         passes_on = len(named) < len(parameters)
         cls._takes_lent = "lent" in named or (passes_on and cls._takes_lent)
-        own = {name: needed for name, needed in named.items() if name not in _NOT_POSITIONS}
-        cls.positions = {**(cls.positions if passes_on else {}), **own}
+        positions = {name: needed for name, needed in named.items() if name not in _NOT_POSITIONS}
+        cls.positions = {**(cls.positions if passes_on else {}), **positions}
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -414,49 +416,49 @@ def _checked_result(method_name: str, method: Callable[..., Any]) -> Callable[..
             raise InputError(f"{name} needs all frames twice, with next_pass() in between")
         outermost, self._answering = not self._answering, True
         try:
-            found = method(self)
+            returned = method(self)
         finally:
             self._answering = not outermost
-        if not isinstance(found, Mapping):
-            raise InputError(f"{name}.result() returns a {type(found).__name__}. Return maps by name")
-        if outermost:  # of a base that a subclass calls, the subclass may add maps
-            _check_names(self, found, method_name)
-        return found if isinstance(found, Result) else _as_result(self, found)
+        if not isinstance(returned, Mapping):
+            raise InputError(f"{name}.result() returns a {type(returned).__name__}. Return maps by name")
+        if outermost:  # to what a base returns, a subclass may add maps
+            _check_names(self, returned, method_name)
+        return returned if isinstance(returned, Result) else _as_result(self, returned)
 
     return result
 
 
-def _as_result(operation: Operation, found: Mapping[str, Any]) -> Result:
+def _as_result(operation: Operation, returned: Mapping[str, Any]) -> Result:
     """Return what a method ``result`` returned by name: maps, and numbers and texts for the process."""
-    name, declared = type(operation).__name__, operation.declarations
-    scalars, maps = dict[str, Any](), dict[str, Any]()
-    for one, value in found.items():
-        given = operation.options[one].stored(operation) if one in operation.options else None
-        if one in RESERVED or (given is not None and not _is_rounded(value, given)):
-            raise InputError(f"{name}.result() returns {one}, which has a meaning already. Rename it")
-        if not isinstance(value, _SCALARS) or declaration_of(one, declared).axes == "none":
-            maps[one] = value
-        elif given is not None:
-            scalars[one] = given
+    kind, declared = type(operation).__name__, operation.declarations
+    process, maps = dict[str, Any](), dict[str, Any]()
+    for name, value in returned.items():
+        option_value = operation.options[name].stored(operation) if name in operation.options else None
+        if name in RESERVED or (option_value is not None and not _is_rounded(value, option_value)):
+            raise InputError(f"{kind}.result() returns {name}, which has a meaning already. Rename it")
+        if not isinstance(value, _SCALARS) or declaration_of(name, declared).axes == "none":
+            maps[name] = value
+        elif option_value is not None:
+            process[name] = option_value
         else:
-            scalars[one] = value.item() if isinstance(value, np.generic) else value
+            process[name] = value.item() if isinstance(value, np.generic) else value
     if not maps:
-        raise InputError(f"{name}.result() returns no map: return at least one, (H, W)")
+        raise InputError(f"{kind}.result() returns no map: return at least one, (H, W)")
     try:
-        return result_of(maps, operation.shape, scalars, declared)
+        return result_of(maps, operation.shape, process, declared)
     except InputError as error:
-        raise InputError(f"{name}.result(): {error}") from error
+        raise InputError(f"{kind}.result(): {error}") from error
 
 
 def _is_rounded(value: Any, option_value: Any) -> bool:
-    """Return whether a returned value is that of an option, which float32 may have rounded."""
-    values, wanted = np.asarray(value), np.asarray(option_value)
-    if values.dtype.kind in "uif" and wanted.dtype.kind in "uif":
-        values, wanted = values.astype(np.float32), wanted.astype(np.float32)
-    return (wanted.ndim == 0 or wanted.shape == values.shape) and bool(np.all(values == wanted))
+    """Return whether a value equals that of an option, or its rounding to float32."""
+    left, right = np.asarray(value), np.asarray(option_value)
+    if left.dtype.kind in "uif" and right.dtype.kind in "uif":
+        left, right = left.astype(np.float32), right.astype(np.float32)
+    return (right.ndim == 0 or right.shape == left.shape) and bool(np.all(left == right))
 
 
-def _check_names(operation: Operation, found: Mapping[str, Any], method: str) -> None:
+def _check_names(operation: Operation, returned: Mapping[str, Any], method: str) -> None:
     """Raise InputError if a declared map is missing, or a name looks like that of a missing one.
 
     A method that overrides another one may return fewer maps than those declared for the other.
@@ -466,18 +468,19 @@ def _check_names(operation: Operation, found: Mapping[str, Any], method: str) ->
     owner, overridden = [base for base in kind.__mro__ if method in vars(base)][:2]
     last = overridden if overridden is Operation else owner
     classes = kind.__mro__[: kind.__mro__.index(last) + 1]
-    own = {one for base in classes for one, value in vars(base).items() if isinstance(value, Map)}
-    missing = [one for one in declared if one not in found]
-    required = [one for one in missing if one in own and one not in kind.optional_maps]
-    for one in found:
-        base = one.removesuffix(SIGMA)
-        if declaration_of(one, declared) is not UNDECLARED or (base != one and base in found):
+    promised = {name for base in classes for name, value in vars(base).items() if isinstance(value, Map)}
+    missing = [name for name in declared if name not in returned]
+    required = [name for name in missing if name in promised and name not in kind.optional_maps]
+    for name in returned:
+        quantity = name.removesuffix(SIGMA)
+        deviates = quantity != name
+        if declaration_of(name, declared) is not UNDECLARED or (deviates and quantity in returned):
             continue
-        possible = missing if base == one else [f"{name}{SIGMA}" for name in declared]
-        if not isinstance(found, Result) and isinstance(found[one], _SCALARS):
+        possible = [f"{other}{SIGMA}" for other in declared] if deviates else missing
+        if not isinstance(returned, Result) and isinstance(returned[name], _SCALARS):
             possible = required
-        if close := difflib.get_close_matches(one, possible, n=1, cutoff=_ALIKE):
-            raise InputError(f"{where} returns {one}, which is not declared: did you mean {close[0]}?")
+        if close := difflib.get_close_matches(name, possible, n=1, cutoff=_ALIKE):
+            raise InputError(f"{where} returns {name}, which is not declared: did you mean {close[0]}?")
     if required:
         raise InputError(
             f"{where} does not return {' and '.join(required)}, which its class declares. Return each"
@@ -511,9 +514,9 @@ def _check_class(cls: type[Operation]) -> None:
         raise InputError(f'{name}: motions is {cls.motions!r}. Use a tuple of {motions}, such as ("axial",)')
 
 
-def place_of(cls: type, name: str) -> int:
-    """Return how far up in the order of its bases a class has a method from."""
-    return next(number for number, base in enumerate(cls.__mro__) if name in vars(base))
+def mro_index(cls: type, name: str) -> int:
+    """Return the index in the method resolution order of the first class that defines a name."""
+    return next(index for index, base in enumerate(cls.__mro__) if name in vars(base))
 
 
 def _check_started(operation: Operation) -> None:

@@ -301,11 +301,11 @@ class Configured:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for name, one, annotation in _declared(cls):
-            setattr(cls, name, one.settled(annotation))
-        bases = (base.options for base in cls.__mro__[1:] if issubclass(base, Configured))
-        own = [name for name, one in vars(cls).items() if isinstance(one, Option)]
-        names = dict.fromkeys([*own, *(name for options in bases for name in options)])
+        for name, declared, annotation in _declared(cls):
+            setattr(cls, name, declared.settled(annotation))
+        names = dict.fromkeys(name for name, value in vars(cls).items() if isinstance(value, Option))
+        for base in cls.__mro__[1:]:
+            names |= dict.fromkeys(base.options if issubclass(base, Configured) else ())
         changed = [name for name in names if _take_default(cls, name)]
         first = [name for name in names if name not in _LAST]
         last = [name for name in _LAST if name in names]
@@ -368,7 +368,7 @@ def _take_default(cls: type, name: str) -> bool:
     values = [vars(base)[name] for base in cls.__mro__ if name in vars(base)]
     if isinstance(values[0], Option):
         return False
-    declared = next(one for one in values if isinstance(one, Option))
+    declared = next(value for value in values if isinstance(value, Option))
     try:
         setattr(cls, name, declared.with_default(values[0]))
     except InputError as error:

@@ -19,7 +19,7 @@ from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.findings import in_process, warn
 from mirrorskin.io.own_class import load_class
-from mirrorskin.io.types import alone
+from mirrorskin.io.types import exclusive_use
 from mirrorskin.kernels.array import Array
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def run(
         remedy = "open a path with io.open_recording, or give an array"
         raise InputError(f"frames are a {type(source).__name__}: {remedy}")
     warn_of_degrees(type(operation).__name__, positions.get("phase"))
-    with alone(operation):
+    with exclusive_use(operation):
         result = _run_frames(source, operation, positions, progress)
     result = as_result(result, pixel_size=pixel_size)
     return result.assign(process={**signature(), **describe(operation), **result.process})
@@ -140,7 +140,7 @@ def _run_source(
     if positions:
         raise InputError(f"{source.name} has the positions of its frames. Remove {', '.join(positions)}")
     check_motion(source, operation)
-    with alone(source), alone(operation):
+    with exclusive_use(source), exclusive_use(operation):
         with naming(source):
             configured = operation.configured_for(source)
             found = feed(source, configured, progress=progress)

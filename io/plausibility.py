@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mirrorskin.io.recording import open_recording
-from mirrorskin.io.types import InputError, Source, alone
+from mirrorskin.io.types import InputError, Source, exclusive_use
 from mirrorskin.io.watch import FIELD, TRAVEL, Check, Limits, Watch
 
 _BLOCK = 32_000_000  # bytes of frames read at a time
@@ -60,7 +60,7 @@ def check(
             return check(opened, field_limits=field_limits, travel_limits=travel_limits, progress=progress)
     if opening:
         raise InputError(f"{source.name} is open: give {', '.join(opening)} to io.open_recording")
-    with alone(source):
+    with exclusive_use(source):
         return _watched(source, progress).check(field_limits, travel_limits)
 
 

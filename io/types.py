@@ -200,7 +200,7 @@ _choosing = threading.Lock()
 
 
 @contextmanager
-def alone(used: object) -> Iterator[None]:
+def exclusive_use(used: object) -> Iterator[None]:
     """Let no other thread into such a context with the same object, or with a source that both read.
 
     A source has one position of reading, and an operation the state of one run. So that no two threads wait

@@ -254,23 +254,23 @@ class _Pushed(Closing):
         """Return the positions of frames, (count,) or (count, components)."""
         if unknown := positions.keys() - LIVE:
             raise InputError(unknown_argument("push()", min(unknown), [*LIVE], "position"))
-        known = {name: as_array(name, value) for name, value in positions.items() if value is not None}
-        if missing := [name for name in self.needed if name not in known]:
+        places = {name: as_array(name, value) for name, value in positions.items() if value is not None}
+        if missing := [name for name in self.needed if name not in places]:
             raise InputError(f"{missing[0]} is needed of each frame: push(frame, {missing[0]}=...)")
-        for name, value in known.items():
+        for name, value in places.items():
             width = COMPONENTS.get(name, ())
             if value.shape != (width if single else (count, *width)):
                 numbers = "two numbers are" if width else "one number is"
                 raise InputError(f"{name} has shape {value.shape}: {numbers} needed of each frame")
-            known[name] = check_finite(value.reshape(count, *width), count, name, width=width)
-        return known
+            places[name] = check_finite(value.reshape(count, *width), count, name, width=width)
+        return places
 
     def _in_order(self, at: float | None, names: Collection[str]) -> float:
         """Return the time of frames that follow the earlier ones, and have positions of the same names."""
         if self._names and self._names != set(names):
-            given, before = (" and ".join(sorted(each)) for each in (names, self._names))
+            now, before = (" and ".join(sorted(each)) for each in (names, self._names))
             raise InputError(
-                f"frames have {given}, but earlier ones had {before}. Push the same with each frame"
+                f"frames have {now}, but earlier ones had {before}. Push the same with each frame"
             )
         when = self.now() if at is None else float(at)
         if when < self._newest:

@@ -44,7 +44,7 @@ from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Sour
 from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.result import absolute_heights
-from mirrorskin.io.types import alone
+from mirrorskin.io.types import exclusive_use
 from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
@@ -318,7 +318,7 @@ def at_poses(source: Source, tilt: ArrayLike | None = None) -> bool:
         return each is not None if source.header.tilt is None else rocks(phase)
     if source.header.tilt is not None or not source.rewindable:
         return False
-    with alone(source):
+    with exclusive_use(source):
         source.rewind()
         first = source.read()
         source.rewind()
