@@ -6,21 +6,26 @@ import difflib
 import functools
 import inspect
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from numbers import Real
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.samples import order_of
+from mirrorskin.io.samples import order_of, order_of_map, packing_of
 from mirrorskin.io.types import InputError
+from mirrorskin.io.units import PLAIN, ratio
 
 P = ParamSpec("P")
 R = TypeVar("R")
 Check = Callable[[str, Any], Any]
 """Function that takes the name and value of an argument, and returns the value, or a converted one."""
 
+_NUMBERS = "buif"  # kinds of NumPy's types that are numbers
+_PROTOCOLS = ("__array__", "__array_interface__", "__array_struct__")
+# Of `mirrorskin.io.samples.ATTRIBUTES`, those that xarray removes from an array when it applies them.
+_PACKING = ("_Unsigned", "_FillValue", "missing_value", "scale_factor", "add_offset")
 _COUNTS = ("frames", "reference", "dark", "bright", "zenith_offset")  # arguments whose numbers are counts
 
 _PRESSES = "an option of presses: engine.reconstruct, engine.Press, engine.find_onset"
@@ -100,47 +105,154 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
     return decorate
 
 
-def as_array(name: str, value: Any) -> NDArray[Any]:
-    """Return an argument as an array of numbers; an array of numbers is returned unchanged.
+def as_array(name: str, value: Any, unit: str = "", components: bool = False) -> NDArray[Any]:
+    """Return an argument as an array of numbers in this machine's byte order, in the argument's unit.
 
-    Masked values become NaN (frames and references of integers then become float32), or 0 in other maps of
-    integers. Arrays on a device are copied to the host. Frames of xarray are transposed to (T, H, W) if their
-    dimensions are in another order.
+    Every public function converts its arguments here; `docs/operations.md`, "Arrays and units", lists what
+    they may be. An array of numbers is returned unchanged. ``components``: whether the last axis of a map is
+    that of a vector's components.
     """
-    if type(value) is np.ndarray and value.dtype.kind in "buif":
+    if type(value) is np.ndarray and value.dtype.kind in _NUMBERS and value.dtype.isnative:
         return value
     if type(value).__module__ == "pyopencl.array":  # np.asarray would treat it as a sequence of arrays
         value = value.get()
-    if name == "frames" and type(value).__module__.startswith("xarray.") and value.ndim == 3:
-        value = value.to_numpy().transpose(order_of([str(one) for one in value.dims], name))
-    masked = isinstance(value, np.ma.MaskedArray)
+    numbers, own_unit = _numbers_and_unit(value.data if _is_labelled(value) else value)
+    array = _as_numpy(name, numbers, unit, components)
+    if array.dtype.kind not in _NUMBERS:
+        remedy = ", as in time - time[0]" if array.dtype.kind == "M" and unit == "s" else ""
+        raise InputError(f"{name} is {shown(value)}: numbers are needed{remedy}")
+    if isinstance(numbers, np.ma.MaskedArray) and np.any(numbers.mask):
+        array = _without_masked(array, np.ma.getmaskarray(numbers), as_nan=name in _COUNTS or bool(unit))
+    attributes = _attributes(value)
+    stored = {one: attributes[one] for one in _PACKING if one in attributes}
+    if stored and (packing := packing_of(stored, array.dtype, name)) is not None:
+        array = packing.unpack(array, np.float32 if name in _COUNTS else np.float64)
+    if _is_labelled(value):
+        array = array.transpose(_order(name, value, components))
+    stated = own_unit or (attributes.get("units") if unit not in PLAIN else "")
+    factor = _factor(name, stated, unit) if stated else 1.0
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)
+    return array if factor == 1 else array.astype(np.float64) * factor
+
+
+def _as_numpy(name: str, value: Any, unit: str, components: bool) -> NDArray[Any]:
+    """Return an array of any library, or a list of arrays, as an array of NumPy."""
     try:
-        array = np.asarray(value)
-    except (ValueError, TypeError) as error:  # rows of different lengths
+        if not _is_simple(value):
+            value = np.stack([as_array(name, part, unit, components) for part in value])
+        array: NDArray[Any] = np.from_dlpack(value) if _has_dlpack_only(value) else np.asarray(value)
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # rows of different lengths, or whatever another library raises
         raise InputError(f"{name} is not an array: {_line(error)}") from error
-    if array.dtype.kind not in "buif":
-        raise InputError(f"{name} is {shown(value)}: numbers are needed")
-    mask = np.ma.getmaskarray(value) if masked else None
-    if mask is None or not mask.any():
-        return array
-    if array.dtype.kind == "f":
-        return np.where(mask, array.dtype.type(np.nan), array)
-    if name in _COUNTS:
-        return np.where(mask, np.float32(np.nan), array.astype(np.float32))
-    return np.where(mask, array.dtype.type(0), array)
+    if array.dtype.kind == "m" and unit == "s":
+        array = array.astype("m8[ns]") / np.timedelta64(1, "s")
+    return array
 
 
-def as_array_or_number(name: str, value: Any) -> Any:
+def _attributes(value: Any) -> Mapping[Any, Any]:
+    """Return the attributes of an array of xarray, pandas, h5py or Zarr."""
+    attributes = getattr(value, "attrs", None)
+    return attributes if isinstance(attributes, Mapping) else {}
+
+
+def _is_labelled(value: Any) -> bool:
+    """Return whether an argument is an array of xarray, whose dimensions have names."""
+    return type(value).__module__.startswith("xarray.") and isinstance(value.dims, tuple)
+
+
+def _order(name: str, value: Any, components: bool) -> tuple[int, ...]:
+    """Return the order of the dimensions of an array of xarray that the argument needs."""
+    names = [str(one) for one in value.dims]
+    if name in ("frames", "samples") and len(names) == 3:
+        return order_of(names, name)
+    return order_of_map(names, name, components)
+
+
+def _numbers_and_unit(value: Any) -> tuple[Any, str]:
+    """Return the numbers and the unit of a quantity of pint, astropy or unyt; no unit for anything else."""
+    if isinstance(value, Real | str | list | tuple) or not callable(getattr(value, "to", None)):
+        return value, ""
+    unit, numbers = (
+        next((part for one in names if (part := getattr(value, one, None)) is not None), None)
+        for names in (("units", "unit"), ("magnitude", "value"))
+    )
+    if unit is None or numbers is None:
+        return value, ""
+    # The short form of pint is found in a table; its long one needs pint's own table.
+    return numbers, (f"{unit:~}" if hasattr(unit, "dimensionality") else str(unit)) or "dimensionless"
+
+
+def _factor(name: str, stated: Any, unit: str) -> float:
+    """Return the factor that converts an argument from the unit that it states."""
+    try:
+        return ratio(stated.decode(errors="replace") if isinstance(stated, bytes) else str(stated), unit)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+
+
+def _is_simple(value: Any) -> bool:
+    """Return whether NumPy converts an argument as it is: it contains no other arrays or quantities."""
+    if isinstance(value, np.ndarray) and value.dtype == object and value.ndim:
+        value = value.tolist()
+    if not isinstance(value, list | tuple):
+        return True
+    kinds = {*map(type, value)}
+    if all(issubclass(kind, Real | np.generic | np.ndarray | str | bytes) for kind in kinds):
+        return not any(issubclass(kind, np.ndarray) and kind is not np.ndarray for kind in kinds)
+    return kinds <= {list, tuple} and all(_is_simple(part) for part in value)
+
+
+def _has_dlpack_only(value: Any) -> bool:
+    return hasattr(value, "__dlpack__") and not any(hasattr(value, one) for one in _PROTOCOLS)
+
+
+def _without_masked(array: NDArray[Any], mask: NDArray[np.bool_], as_nan: bool) -> NDArray[Any]:
+    """Return an array whose masked values are NaN, or 0 in integers unless these become NaN as well."""
+    if array.dtype.kind != "f" and not as_nan:
+        return np.where(mask, array.dtype.type(0), array)
+    dtype = array.dtype if array.dtype.kind == "f" else np.result_type(array.dtype, np.float32)
+    return np.where(mask, dtype.type(np.nan), array.astype(dtype))
+
+
+def is_array(value: Any) -> bool:
+    """Return whether an argument is a whole array, or a list of its parts, and not an iterator over them."""
+    whole = isinstance(value, list | tuple | memoryview | bytes | bytearray)
+    return whole or any(hasattr(value, one) for one in (*_PROTOCOLS, "__dlpack__"))
+
+
+def as_array_or_number(name: str, value: Any, unit: str = "") -> Any:
     """Return an argument as an array of numbers, or unchanged if it is a number."""
-    return value if isinstance(value, Real) else as_array(name, value)
+    return value if isinstance(value, Real) else as_array(name, value, unit)
 
 
-def check_number(name: str, value: Any) -> Any:
-    """Return a number; InputError for anything else."""
-    scalar = isinstance(value, np.ndarray | np.generic) and not value.ndim and value.dtype.kind in "buif"
-    if not (scalar or isinstance(value, Real)):
+def as_pixel_size(name: str, value: Any) -> tuple[float, float]:
+    """Return width and height of a pixel, mm, from one number or both.
+
+    Examples
+    --------
+    >>> as_pixel_size("pixel_size", 0.1)
+    (0.1, 0.1)
+    """
+    size = as_array(name, value, "mm")
+    if size.shape not in ((), (2,)):
+        raise InputError(f"pixel size {size.tolist()}: one length in mm, or (x, y), is needed")
+    width, height = np.broadcast_to(size, 2).tolist()
+    return width, height
+
+
+def check_number(name: str, value: Any, unit: str = "") -> Any:
+    """Return a number, in the argument's unit; InputError for anything else."""
+    if not isinstance(value, Real) and getattr(value, "ndim", None) == 0:
+        value = as_array(name, value, unit)[()]
+    if not isinstance(value, Real | np.bool_):
         raise InputError(f"{name} is {shown(value)}: a number is needed")
     return value
+
+
+def in_unit(unit: str, check: Callable[..., Any] = as_array_or_number) -> Check:
+    """Return a check of an argument that has a unit; plain numbers are in this unit."""
+    return functools.partial(check, unit=unit)
 
 
 def or_none(check: Check) -> Check:

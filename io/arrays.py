@@ -16,11 +16,12 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.arguments import as_array, as_pixel_size
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.fingerprint import State, check_unchanged, fingerprint_of_files, modified, state_of
 from mirrorskin.io.foreign import kind_of_frames, open_reader
 from mirrorskin.io.frames import FrameReader, WholeFrames
-from mirrorskin.io.layout import COMPLETE, POSITIONS, REMEDIES
+from mirrorskin.io.layout import COMPLETE, POSITIONS, REMEDIES, as_series
 from mirrorskin.io.os_errors import (
     MAX_UNPACKED_BYTES,
     as_input_error,
@@ -47,7 +48,7 @@ class ArrayRecording(Recording):
 
     Parameters
     ----------
-    frames : ndarray or FrameReader, (T, H, W)
+    frames : array_like or FrameReader, (T, H, W)
         An array, or frames in a file, which are read when they are used; see
         `mirrorskin.io.samples.frame_dtype` for their types.
     positions : mapping
@@ -81,6 +82,7 @@ class ArrayRecording(Recording):
         origins: Mapping[Path, State] | None = None,
     ) -> None:
         reader = frames if isinstance(frames, FrameReader) else None
+        frames = frames if reader is not None else as_array("frames", frames)
         if reader is not None and reader.shape[0] < 2:
             hints = "".join(f". {found.text}" for found in reader.findings if found.warning)
             raise InputError(f"{name} contains {reader.shape[0]} frame: a stack has at least 2{hints}")
@@ -103,7 +105,7 @@ class ArrayRecording(Recording):
         self.dtype: np.dtype[Any] = decoding.dtype
         self.time = self.travel = self.phase = self.displacement = self.twist = self.tilt = None
         lost = None if reader is None else reader.lost
-        given = along(positions[series], self.full_shape[0], lost)
+        given = along(as_series(series, positions[series]), self.full_shape[0], lost)
         assert given is not None
         width = (2,) if series == "displacement" else ()
         where = f"{name}: the {series} given"
@@ -115,9 +117,12 @@ class ArrayRecording(Recording):
         maps = {one: _map(name, one, header.get(one), self.full_shape[1:]) for one in ("dark", "bright")}
         known = {one: value[cut.region.slices] for one, value in maps.items() if value is not None}
         size = header.get("pixel_size")
+        size = None if size is None else as_pixel_size("pixel_size", size)
         if size is not None and not all(1e-9 < one < 1e6 for one in size):
             raise InputError(f"{name}: pixel size {size} mm: give one above zero: 1e-9 to 1e6")
-        self.header: Header = Header(self.motion, **{"title": self.path.stem, **header, **known})
+        self.header: Header = Header(
+            self.motion, **{"title": self.path.stem, **header, **known, "pixel_size": size}
+        )
         self.used, self.dropped, self.state = None, None, COMPLETE
         if reader is not None:
             self.time = None if reader.time is None else reader.time[slice(*cut.frames)]
@@ -458,7 +463,7 @@ def _map(name: str, what: str, value: Any, shape: tuple[int, int]) -> NDArray[np
     """Return a reference as a map of the whole picture."""
     if value is None:
         return None
-    array = np.asarray(value)
-    if array.dtype.kind not in "buif" or array.shape not in ((), shape):
+    array = as_array(what, value)
+    if array.shape not in ((), shape):
         raise InputError(f"{name}: {what} has shape {array.shape}: a number, or a map {shape}, is needed")
     return np.broadcast_to(array.astype(np.float32), shape)

@@ -11,13 +11,14 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.arguments import as_array
 from mirrorskin.io.atomic import is_locked
 from mirrorskin.io.coordinates import Coordinates
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.maps import TWIST, declaration_of
 from mirrorskin.io.os_errors import as_input_error
-from mirrorskin.io.positions import check_finite
+from mirrorskin.io.positions import Positions, check_finite
 from mirrorskin.io.selection import Selection
 from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Truth
 
@@ -55,6 +56,11 @@ POSITIONS: dict[Motion, str] = {
 """The series that contains the positions, for each motion."""
 
 REMEDIES = {"travel": "give --travel-step or --travel", "phase": "give --phase-step or --phases"}
+
+
+def as_series(name: str, values: Any) -> Any:
+    """Return times, positions or weights of frames as an array in their unit; `Positions` unchanged."""
+    return values if isinstance(values, Positions) else as_array(name, values, SERIES.get(name, ("", ""))[1])
 
 
 @dataclass(frozen=True, slots=True)

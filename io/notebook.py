@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.arguments import as_array
 from mirrorskin.io.findings import warnings_in
 from mirrorskin.io.maps import FILLED_SHADES, Map, declaration_of
 from mirrorskin.io.opencv import encode
 from mirrorskin.io.result import Result, Shown, map_shape, may_name_a_map
 from mirrorskin.io.types import InputError
-from mirrorskin.io.units import ratio
 
 if TYPE_CHECKING:
     import xarray
@@ -149,16 +149,17 @@ def from_xarray(dataset: xarray.Dataset) -> Result:
         if _DECLARATION in variable.attrs:
             text = str(variable.attrs[_DECLARATION])
             declarations[str(name)] = Map.decode(text, f"variable {name} of the dataset")
-        values = variable.to_numpy()
+        declared = declaration_of(str(name), declarations)
+        where = f"variable {name} of the dataset"
+        values = as_array(where, variable, declared.unit, bool(declared.components))
         maps[str(name)] = values if values.ndim else values.item()
-    for name, values in maps.items():
-        maps[name] = _in_unit(values, dataset[name], declaration_of(name, declarations).unit)
-    x, y = (
-        _in_unit(dataset[name].to_numpy(), dataset[name], "mm") if name in dataset.variables else None
-        for name in "xy"
-    )
+    axes = {
+        name: as_array(f"variable {name} of the dataset", dataset[name], "mm")
+        for name in ("x", "y")
+        if name in dataset.variables
+    }
     process = {str(name): one for name, one in dataset.attrs.items()}
-    return Result(maps, x=x, y=y, process=process, declarations=declarations)
+    return Result(maps, x=axes.get("x"), y=axes.get("y"), process=process, declarations=declarations)
 
 
 def _as_picture(dataset: xarray.Dataset) -> xarray.Dataset:
@@ -173,18 +174,6 @@ def _as_picture(dataset: xarray.Dataset) -> xarray.Dataset:
         if {"x", "y"} <= {*names} and names.index("x") < names.index("y"):
             dataset = dataset.assign({label: variable.transpose(*(swapped.get(one, one) for one in names))})
     return dataset
-
-
-def _in_unit(values: Any, variable: xarray.DataArray, unit: str) -> Any:
-    """Return values in a declared unit, converted if the attribute of the variable names another."""
-    own = str(variable.attrs.get("units", unit))
-    if not unit or own == unit:
-        return values
-    try:
-        factor = ratio(own, unit)
-    except InputError as error:
-        raise InputError(f"variable {variable.name} of the dataset: {error}") from error
-    return np.asarray(values, np.float64) * factor if np.ndim(values) else values * factor
 
 
 def _first(result: Shown) -> str | None:

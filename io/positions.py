@@ -157,9 +157,10 @@ def check_finite(
         needed = "two numbers a frame are" if width else "one number a frame is"
         raise InputError(f"{name} has shape {array.shape} for {count} frames: {needed} needed")
     start, stop = within or (0, count)
-    known = (np.abs(array[start:stop]) <= _GREATEST).all(axis=tuple(range(1, array.ndim)))
+    checked = array[start:stop].astype(np.float64)
+    known = (np.abs(checked) <= _GREATEST).all(axis=tuple(range(1, array.ndim)))
     if not np.all(known):
         frame = start + int(np.argmin(known))
         needed = f"every frame needs a finite number, at most {_GREATEST:g}"
         raise InputError(f"{name} is {array[frame]} at frame {frame}: {needed}")
-    return array[start:stop].astype(np.float64)
+    return checked

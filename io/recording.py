@@ -12,7 +12,15 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.arguments import check_count, check_flag, check_number, check_path, checked
+from mirrorskin.io.arguments import (
+    as_pixel_size,
+    check_count,
+    check_flag,
+    check_number,
+    check_path,
+    checked,
+    in_unit,
+)
 from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
 from mirrorskin.io.coordinates import Coordinates, read_coordinates
@@ -20,7 +28,16 @@ from mirrorskin.io.findings import Finding
 from mirrorskin.io.fingerprint import check_unchanged, fingerprint, modified, origins
 from mirrorskin.io.foreign import kind_of_frames
 from mirrorskin.io.hdf5 import Hdf5File
-from mirrorskin.io.layout import CHECKSUM, MARK, SERIES, STACK, Layout, RecordingState, read_state
+from mirrorskin.io.layout import (
+    CHECKSUM,
+    MARK,
+    SERIES,
+    STACK,
+    Layout,
+    RecordingState,
+    as_series,
+    read_state,
+)
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions, along
 from mirrorskin.io.recorder import checksums
@@ -243,7 +260,10 @@ class Recording(Closing):
 
 @checked(
     path=check_path,
-    tilt=check_number,
+    travel=as_series,
+    phase=as_series,
+    tilt=in_unit("rad", check_number),
+    pixel_size=as_pixel_size,
     threads=check_count,
     memory_limit=check_count,
     live=check_flag,

@@ -360,6 +360,35 @@ def order_of(names: Sequence[str], where: str) -> tuple[int, int, int]:
     return kinds.index("frames"), kinds.index("rows"), kinds.index("columns")
 
 
+def order_of_map(names: Sequence[str], where: str, components: bool = False) -> tuple[int, ...]:
+    """Return the order of axes in which frames come first, and rows before columns.
+
+    Other axes come before rows; of a map with components, the last one is that of the components.
+
+    Raises
+    ------
+    InputError
+        The names leave open which axes are rows and columns.
+
+    Examples
+    --------
+    >>> order_of_map(("x", "y", "turn"), "height"), order_of_map(("vector", "y", "x"), "normals", True)
+    ((2, 1, 0), (1, 2, 0))
+    """
+    kinds = [_kind_of(name) for name in names]
+    frames, rows, columns, others = (
+        [axis for axis, kind in enumerate(kinds) if kind in wanted]
+        for wanted in (("frames",), ("rows",), ("columns",), ("", "colours"))
+    )
+    if len(rows) == len(columns) == 1:
+        last = others[-1:] if components else []
+        return *frames, *others[: len(others) - len(last)], *rows, *columns, *last
+    end = len(names) - components
+    if len(names) > 1 and (rows not in ([], [end - 2]) or columns not in ([], [end - 1])):
+        raise InputError(f"{where} has the dimensions ({', '.join(names)}): name rows y and columns x")
+    return *frames, *(axis for axis in range(len(names)) if axis not in frames)
+
+
 def _kind_of(name: str) -> str:
     """Return the kind of an axis from its name; "" if it is unknown."""
     word = name.lower().strip()

@@ -49,6 +49,9 @@ _NOUN: dict[Kind, str] = {
     "pressure": "a pressure",
 }
 _ANGLES = ("radian", "degree", "arcminute", "arcsecond", "grade", "turn")
+PLAIN = {"", "1", "dimensionless", "share", "count", "counts", "frame", "frames", "pixel", "pixels", "px"}
+"""Names of the unit of plain numbers."""
+_PER_SECOND = {"Hz": "1/s", "hertz": "1/s"}
 _MOST_DECIMALS = 9
 _LONGEST = 40  # maximum number of quoted characters of a unit
 _SYMBOL = re.compile(r"[^\W\d]+|°")  # pint evaluates arithmetic, so only single names are passed to it
@@ -102,11 +105,15 @@ def ratio(unit: str, other: str) -> float:
 
     Examples
     --------
-    >>> ratio("mm", "um")
-    1000.0
+    >>> ratio("mm", "um"), ratio("count / ms", "1/s")
+    (1000.0, 1000.0)
     """
-    if unit == other:
+    if unit == other or (unit in PLAIN and other in PLAIN):
         return 1.0
+    parts, others = (_PER_SECOND.get(one, one).split("/") for one in (unit, other))
+    if len(parts) == len(others) == 2:
+        over, under = (ratio(one.strip(), base.strip()) for one, base in zip(parts, others, strict=True))
+        return over / under
     for common in _COMMON.values():  # before any unit that needs pint
         if unit in common and other in common:
             return common[unit] / common[other]
@@ -116,9 +123,8 @@ def ratio(unit: str, other: str) -> float:
                 return in_base(unit, kind) / in_base(other, kind)
         except ValueError:
             continue
-    raise InputError(
-        f"{unit[:_LONGEST]!r} cannot be converted to {other[:_LONGEST]!r}. Use units of one quantity"
-    )
+    wanted = repr(other[:_LONGEST]) if other else "a number without a unit"
+    raise InputError(f"{unit[:_LONGEST]!r} cannot be converted to {wanted}. Use units of one quantity")
 
 
 def numbers_with_unit(values: Sequence[float], unit: str) -> tuple[list[str], str]:
