@@ -19,7 +19,7 @@ AnyArray = Any
 """An array on the host, or a `mirrorskin.kernels.array.Array` on a device."""
 
 
-def as_any_array(name: str, value: Any) -> Any:
+def as_any_array(name: str, value: Any, unit: str = "", components: bool = False) -> Any:
     """Return an argument as an array on a device if it is one, otherwise as an array of numbers on the host.
 
     An array of pyopencl is copied on its device.
@@ -27,7 +27,7 @@ def as_any_array(name: str, value: Any) -> Any:
     if isinstance(value, Array):
         return value
     if not is_on_device(value):
-        return as_array(name, value)
+        return as_array(name, value, unit, components)
     if not value.flags.c_contiguous or 0 in value.shape or value.dtype.kind not in "uif":
         raise InputError(f"{name} is {value.dtype} {value.shape} on a device: numbers in C order are needed")
     owner = next((device for device in opened_devices() if device.context == value.context), None)
@@ -39,9 +39,9 @@ def as_any_array(name: str, value: Any) -> Any:
     return adopt(owner, name, value)
 
 
-def as_any_array_or_number(name: str, value: Any) -> Any:
+def as_any_array_or_number(name: str, value: Any, unit: str = "") -> Any:
     """Return an argument as `as_any_array` does, or unchanged if it is a number."""
-    return value if isinstance(value, Real) else as_any_array(name, value)
+    return value if isinstance(value, Real) else as_any_array(name, value, unit)
 
 
 def device_of(choice: Choice, *arrays: Any) -> Device:

@@ -21,7 +21,7 @@ from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.correlation import Correlate
 from mirrorskin.engine.rotation.design_matrix import check_weights, fit_matrix
 from mirrorskin.io import InputError, Map, Result
-from mirrorskin.io.arguments import as_array, as_array_or_number, check_number, checked
+from mirrorskin.io.arguments import as_array, as_array_or_number, check_number, checked, in_unit
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array_types import Doubles
@@ -177,7 +177,7 @@ fit_fringes = phase_function(
 )
 
 
-@checked(frequency=as_array_or_number, start=check_number)
+@checked(frequency=as_array_or_number, start=in_unit("rad", check_number))
 def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: float = 0.0) -> Result:
     """Unwrap fringes of several frequencies, each from the next coarser one.
 
@@ -311,7 +311,7 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
     )
 
 
-@checked(width=check_number, start=check_number)
+@checked(width=in_unit("rad", check_number), start=in_unit("rad", check_number))
 def unwrap_gray(fringes: Maps, stripes: Maps, *, width: float = np.pi, start: float = 0.0) -> Result:
     """Unwrap fringes by the numbers of stripes that are as wide as a fringe, or narrower.
 

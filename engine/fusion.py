@@ -25,7 +25,7 @@ from mirrorskin.engine.rotation.steps import Integration
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion, Result, Source, pixel_axes
-from mirrorskin.io.arguments import as_array_or_number, check_count, check_flag, checked
+from mirrorskin.io.arguments import as_array_or_number, check_count, check_flag, checked, in_unit
 from mirrorskin.io.findings import in_process, warn
 from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.types import ProcessValue, exclusive_use
@@ -38,7 +38,7 @@ _PASSES = 3  # over the axial frames, at most
 _STILL = 0.02  # pixels that points may move between the last two passes
 
 
-@checked(pixel_size=as_array_or_number, mask=as_array_or_number, robust=check_flag)
+@checked(pixel_size=in_unit("mm"), mask=as_array_or_number, robust=check_flag)
 def fuse(
     heights: Maps,
     normals: Maps,

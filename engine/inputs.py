@@ -101,7 +101,8 @@ def _converted(maps: Any, name: str, quantity: str) -> Result:
         raise InputError(
             f"{name} is {maps!r:.40}: a Result, a mapping, a dataset, a path or an array is needed"
         )
-    array = as_array(name, maps)
+    declared = declaration_of(quantity)
+    array = as_array(name, maps, declared.unit, bool(declared.components))
     if array.ndim < 2:
         raise InputError(f"{name} has shape {array.shape}: a map (H, W) is needed")
     return Result({quantity: array})
@@ -111,16 +112,17 @@ def _of_mapping(maps: Mapping[Any, Any], name: str) -> Result:
     """Return arrays by name as a result; numbers and texts that are not declared go to its process."""
     fields = {one: value for one, value in maps.items() if one in FIELDS and value is not None}
     for axis in fields.keys() & {"x", "y"}:
-        fields[axis] = np.asarray(as_array(f"{name}[{axis!r}]", fields[axis]), np.float64)
+        fields[axis] = np.asarray(as_array(f"{name}[{axis!r}]", fields[axis], "mm"), np.float64)
     arrays: dict[str, Any] = {}
     process: dict[str, Any] = {}
     for one, value in maps.items():
         if one in fields or value is None:
             continue
-        values = value if isinstance(value, str) else as_any_array(f"{name}[{one!r}]", value)
-        if isinstance(values, str) or (
-            not values.ndim and declaration_of(one, fields.get("declarations")).axes != "none"
-        ):
+        declared = declaration_of(one, fields.get("declarations"))
+        values = value
+        if not isinstance(value, str):
+            values = as_any_array(f"{name}[{one!r}]", value, declared.unit, bool(declared.components))
+        if isinstance(values, str) or (not values.ndim and declared.axes != "none"):
             process[one] = values if isinstance(values, str) else values.item()
         else:
             arrays[one] = values if values.ndim else float(values)

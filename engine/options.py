@@ -142,18 +142,21 @@ class Option:
         if self.kind == "flag":
             return check_flag(self.name, value)
         if self.kind == "numbers":
-            values = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+            several = isinstance(value, Sequence) and not isinstance(value, str)
+            values = value if several else np.atleast_1d(as_array(self.name, value, self.unit))
             return [self._number(one) for one in values]
         if self.kind == "map" and isinstance(value, str | Path):
             from mirrorskin.io.arrays import read_map
 
             return read_map(Path(value))
         if self.kind == "map" and not isinstance(value, Real):
-            return as_array(self.name, value)
+            return as_array(self.name, value, self.unit)
         return self._number(value)
 
     def _number(self, value: Any) -> Any:
         whole = self.kind == "integer"
+        if not isinstance(value, Real) and getattr(value, "ndim", None) == 0:
+            value = as_array(self.name, value, self.unit)[()]
         scalar = isinstance(value, np.ndarray | np.generic) and value.ndim == 0 and value.dtype.kind in "buif"
         if not scalar and (not isinstance(value, Real) or (whole and not hasattr(value, "__index__"))):
             what = "a whole number" if whole else "a number"

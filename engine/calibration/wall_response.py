@@ -15,6 +15,7 @@ from mirrorskin.engine.calibration.sources import pixel_size_of
 from mirrorskin.engine.calibration.wall_fit import WallFit
 from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import InputError, Source, WallResponse, pixel_axes
+from mirrorskin.io.arguments import check_number, checked, in_unit
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.response import follow, half_tangent, lamp_light, level, sight_of, sight_slopes
 
@@ -41,6 +42,7 @@ _OUTLIER = 3.0  # times the noise at which residuals are clipped
 _RINGS, _OCTANTS = 6, 8  # cells of a press, in which residuals are averaged
 
 
+@checked(x=in_unit("mm"), y=in_unit("mm"), azimuth=in_unit("rad"), threshold=check_number, z=in_unit("mm"))
 def threshold_zenith(
     response: WallResponse,
     x: ArrayLike,

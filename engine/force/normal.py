@@ -13,7 +13,7 @@ from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.halfspace import HalfSpace, Pressed, load_gradient, press
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import as_array_or_number, check_number, checked
+from mirrorskin.io.arguments import check_number, checked, in_unit
 
 if TYPE_CHECKING:
     from mirrorskin.engine.press.elastic import PressFit
@@ -24,12 +24,12 @@ _BEYOND = 0.01  # maximum share of the load outside the picture
 
 
 @checked(
-    travel=check_number,
-    pixel_size=as_array_or_number,
-    modulus=check_number,
-    sigma=as_array_or_number,
-    travel_sigma=check_number,
-    modulus_sigma=check_number,
+    travel=in_unit("mm", check_number),
+    pixel_size=in_unit("mm"),
+    modulus=in_unit("MPa", check_number),
+    sigma=in_unit("mm"),
+    travel_sigma=in_unit("mm", check_number),
+    modulus_sigma=in_unit("MPa", check_number),
     compliance=check_number,
 )
 def find_force(

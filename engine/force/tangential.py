@@ -15,7 +15,7 @@ from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.halfspace import spectrum_of
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import as_array_or_number, check_count, check_number, checked
+from mirrorskin.io.arguments import as_array_or_number, check_count, check_number, checked, in_unit
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 
@@ -31,13 +31,13 @@ _DAMPING = 1e-4, 1e4  # range of the damping, relative to the compliance of the 
 
 
 @checked(
-    pixel_size=as_array_or_number,
-    modulus=check_number,
+    pixel_size=in_unit("mm"),
+    modulus=in_unit("MPa", check_number),
     contact=as_array_or_number,
-    normal_pressure=as_array_or_number,
-    sigma=as_array_or_number,
+    normal_pressure=in_unit("MPa"),
+    sigma=in_unit("mm"),
     window_size=check_count,
-    modulus_sigma=check_number,
+    modulus_sigma=in_unit("MPa", check_number),
 )
 def find_tangential_force(
     displacement: Maps,

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.engine.device_arrays import as_any_array_or_number, device_of, on_host
+from mirrorskin.engine.device_arrays import as_any_array, as_any_array_or_number, device_of, on_host
 from mirrorskin.engine.integration.camera import Camera
 from mirrorskin.engine.integration.device_inputs import check_device_inputs
 from mirrorskin.engine.integration.slope_errors import add_gain
@@ -24,7 +25,7 @@ from mirrorskin.engine.integration.validation import (
 )
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import as_array_or_number, checked
+from mirrorskin.io.arguments import Check, as_array_or_number, checked, in_unit
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device, open_device
 
@@ -34,17 +35,18 @@ _LARGEST_CACHED = 2**23
 _OUTSIDE = {"height": np.nan, "height_sigma": np.nan, "component": -1, "filled": 0, "edges": 0}
 
 
+_MAPS: Mapping[str, Check] = {
+    **dict.fromkeys(("dz_dx", "dz_dy"), as_any_array_or_number),
+    **dict.fromkeys(("mask", "slope_weights", "edges", "known_height_weights"), as_array_or_number),
+    "known_heights": in_unit("mm"),
+}
+
+
 @checked(
-    dz_dx=as_any_array_or_number,
-    dz_dy=as_any_array_or_number,
-    pixel_size=as_array_or_number,
-    normals=as_any_array_or_number,
-    mask=as_array_or_number,
-    slope_weights=as_array_or_number,
-    edges=as_array_or_number,
-    known_heights=as_array_or_number,
-    known_height_weights=as_array_or_number,
-    initial_heights=as_array_or_number,
+    **_MAPS,
+    pixel_size=in_unit("mm"),
+    normals=partial(as_any_array, components=True),
+    initial_heights=in_unit("mm"),
 )
 def integrate(
     dz_dx: ArrayLike | None = None,
@@ -248,6 +250,7 @@ class Integrator(ThreadSafe):
         self._solver = SurfaceSolver(open_device(device), shape)
         self._result: Result | None = None
 
+    @checked(**_MAPS)
     def push(
         self,
         dz_dx: ArrayLike,

@@ -15,15 +15,16 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.frames import check_dtype
+from mirrorskin.engine.device_arrays import on_host
+from mirrorskin.engine.frames import as_frames, check_dtype
 from mirrorskin.engine.live.loop import LATENCY, Loop
 from mirrorskin.engine.live.operation import LiveOperation
 from mirrorskin.engine.live.status import Status, Update
 from mirrorskin.engine.method import Method
 from mirrorskin.engine.operation import COMPONENTS, Operation
 from mirrorskin.io import Block, Header, InputError, Motion, Result
-from mirrorskin.io.arguments import as_array, check_number, unknown_argument
-from mirrorskin.io.layout import LIVE, POSITIONS
+from mirrorskin.io.arguments import check_number, unknown_argument
+from mirrorskin.io.layout import LIVE, POSITIONS, as_series
 from mirrorskin.io.positions import check_finite
 from mirrorskin.io.types import Closing, Floats
 
@@ -226,7 +227,7 @@ class _Pushed(Closing):
 
     def put(self, frames: ArrayLike, at: float | None, positions: Mapping[str, ArrayLike]) -> None:
         """Add frames, after everything about them has been checked."""
-        array = as_array("frames", frames)
+        array = on_host(as_frames("frames", frames))
         single = array.ndim == 2
         array = array[np.newaxis] if single else array
         if array.ndim != 3 or array.shape[1:] != self.shape[1:] or array.dtype != self.dtype:
@@ -234,7 +235,8 @@ class _Pushed(Closing):
                 f"frames are {array.dtype} {np.shape(frames)}: {self.dtype} {self.shape[1:]} are expected"
             )
         places = self._checked(positions, len(array), single)
-        if at is not None and not math.isfinite(check_number("time", at)):
+        at = None if at is None else float(check_number("time", at, "s"))
+        if at is not None and not math.isfinite(at):
             raise InputError(f"time is {at}: a finite number of seconds is needed")
         with self._changed:
             self._check()
@@ -254,7 +256,7 @@ class _Pushed(Closing):
         """Return the positions of frames, (count,) or (count, components)."""
         if unknown := positions.keys() - LIVE:
             raise InputError(unknown_argument("push()", min(unknown), [*LIVE], "position"))
-        places = {name: as_array(name, value) for name, value in positions.items() if value is not None}
+        places = {name: as_series(name, value) for name, value in positions.items() if value is not None}
         if missing := [name for name in self.needed if name not in places]:
             raise InputError(f"{missing[0]} is needed of each frame: push(frame, {missing[0]}=...)")
         for name, value in places.items():
@@ -272,7 +274,7 @@ class _Pushed(Closing):
             raise InputError(
                 f"frames have {now}, but earlier ones had {before}. Push the same with each frame"
             )
-        when = self.now() if at is None else float(at)
+        when = self.now() if at is None else at
         if when < self._newest:
             raise InputError(
                 f"time {when:.6g} s is before that of an earlier frame, {self._newest:.6g} s. Push frames in"

@@ -19,11 +19,11 @@ from mirrorskin.engine.metrology.parameters import PARAMETERS
 from mirrorskin.engine.metrology.patch import Patch, patch_of
 from mirrorskin.engine.metrology.profile import profile_parameters
 from mirrorskin.engine.metrology.quantity import Quantity
-from mirrorskin.engine.metrology.sections import Point, along, step_height
+from mirrorskin.engine.metrology.sections import Point, along, as_point, step_height
 from mirrorskin.engine.metrology.sections import section as cut
 from mirrorskin.engine.metrology.texture import DRAWS, FormRemoval, roughness
 from mirrorskin.io import InputError, Region, Result
-from mirrorskin.io.arguments import as_array_or_number, check_number, checked
+from mirrorskin.io.arguments import check_number, checked, in_unit
 from mirrorskin.kernels.array_types import Doubles
 
 FormName = Literal["plane", "sphere", "none"]
@@ -83,7 +83,11 @@ class Measures:
 
 
 @checked(
-    pixel_size=as_array_or_number, s_filter=check_number, l_filter=check_number, noise_length=check_number
+    pixel_size=in_unit("mm"),
+    s_filter=in_unit("mm", check_number),
+    l_filter=in_unit("mm", check_number),
+    section=lambda name, ends: tuple(as_point(name, end) for end in ends),
+    noise_length=in_unit("mm", check_number),
 )
 def measure(
     result: Maps,

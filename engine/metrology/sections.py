@@ -15,6 +15,7 @@ from mirrorskin.engine.metrology.patch import heights_of
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Result, pixel_axes
+from mirrorskin.io.arguments import as_array, checked
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
@@ -55,6 +56,16 @@ class Section:
     unit: str = "mm"
 
 
+def as_point(name: str, value: Any) -> Point:
+    """Return an argument as a point, x and y in mm."""
+    place = as_array(name, value, "mm")
+    if place.shape != (2,):
+        raise InputError(f"{name} has shape {place.shape}: x and y, mm, are needed")
+    x, y = place.tolist()
+    return x, y
+
+
+@checked(start=as_point, end=as_point)
 def section(
     result: Maps,
     start: Point | None = None,

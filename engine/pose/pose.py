@@ -13,7 +13,7 @@ from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import Equations, PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import Motion
-from mirrorskin.io.arguments import as_array_or_number, checked
+from mirrorskin.io.arguments import as_array, checked, in_unit
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 
@@ -62,7 +62,7 @@ class Pose:
 
     def apply(self, points: ArrayLike) -> Doubles:
         """Move points, (..., 3), mm."""
-        return self.motion.apply(np.asarray(points, np.float64))
+        return self.motion.apply(np.asarray(as_array("points", points, "mm"), np.float64))
 
     def inverse(self) -> Pose:
         """Return the inverse motion and its covariance."""
@@ -100,7 +100,7 @@ IDENTITY = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0,
 """No motion, without errors."""
 
 
-@checked(pixel_size=as_array_or_number)
+@checked(pixel_size=in_unit("mm"))
 def estimate_pose(
     first: Maps,
     second: Maps,

@@ -14,7 +14,7 @@ from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.membrane import stretch
 from mirrorskin.engine.press.spline import Spline, fit_within
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import as_array_or_number, check_number, checked
+from mirrorskin.io.arguments import check_number, checked, in_unit
 from mirrorskin.kernels.array_types import Doubles
 
 Floats = NDArray[np.float32]
@@ -46,12 +46,12 @@ _EXACT = 0.01  # pixel sizes: minimum half-width of an interval
 
 
 @checked(
-    height=as_array_or_number,
-    sigma=as_array_or_number,
-    pixel_size=as_array_or_number,
-    above=as_array_or_number,
+    height=in_unit("mm"),
+    sigma=in_unit("mm"),
+    pixel_size=in_unit("mm"),
+    above=in_unit("mm"),
     steepest=check_number,
-    deepest=check_number,
+    deepest=in_unit("mm", check_number),
 )
 def fill_holes(
     height: ArrayLike,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.device_arrays import AnyArray, as_any_array, device_of
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import checked
+from mirrorskin.io.arguments import checked, in_unit
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.edges import COARSE, FINE, MARGIN, NEAR, Limits, Pass, pairs
@@ -29,7 +30,11 @@ LIMITS = Limits(
 _SHORTER = 4  # approximate ratio of the run times of the longest kernel and the others
 
 
-@checked(normals=as_any_array, normals_sigma=as_any_array, contact=as_any_array)
+@checked(
+    normals=partial(as_any_array, components=True),
+    normals_sigma=in_unit("rad", as_any_array),
+    contact=as_any_array,
+)
 def find_edges(
     normals: AnyArray,
     normals_sigma: AnyArray,

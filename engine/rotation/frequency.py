@@ -11,7 +11,7 @@ from scipy import optimize
 
 from mirrorskin.engine.rotation.design_matrix import basis
 from mirrorskin.io import InputError, Source
-from mirrorskin.io.arguments import as_array, as_array_or_number, checked
+from mirrorskin.io.arguments import as_array, checked, in_unit
 from mirrorskin.kernels.array_types import Doubles
 
 _FEWEST = 8  # minimum number of frames
@@ -30,7 +30,7 @@ class Frequency(NamedTuple):
     sigma: float
 
 
-@checked(samples=as_array, time=as_array_or_number)
+@checked(samples=as_array, time=in_unit("s"))
 def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     """Estimate the common frequency of all pixels, whose amplitudes and phases differ.
 

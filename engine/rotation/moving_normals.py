@@ -14,7 +14,7 @@ from mirrorskin.engine.rotation.normals_kernel import MAPS, SLOPE_MAPS, NormalKe
 from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows, pose_fit, rocks
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.arguments import as_array
+from mirrorskin.io.layout import as_series
 from mirrorskin.io.maps import TABLE, PoseStatus, status_of
 from mirrorskin.io.types import body_axes
 from mirrorskin.kernels.array_types import Doubles
@@ -151,7 +151,7 @@ def _estimate(frames: NDArray[Any], where: dict[str, Any], options: dict[str, An
     phase, axis, travel = (where[name] for name in ("phase", "axis", "travel"))
     tilt, weights = options.pop("tilt", None), where["frame_weights"]
     options["memory_limit"] = max(1, min(MEMORY_LIMIT, 2 * frames.nbytes))
-    angle = None if tilt is None or isinstance(tilt, str) else as_array("tilt", tilt).astype(np.float64)
+    angle = None if tilt is None or isinstance(tilt, str) else as_series("tilt", tilt).astype(np.float64)
     varies = angle is not None and (angle.ndim > 0 or rocks(phase))
     if axis is None and travel is None and not varies:
         return apply(Normals(tilt=tilt, **options), frames, phase=phase, frame_weights=weights)

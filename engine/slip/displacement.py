@@ -15,7 +15,7 @@ from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker, invert_symmetric
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import as_array_or_number, check_count, check_number, checked
+from mirrorskin.io.arguments import check_count, check_number, checked, in_unit
 from mirrorskin.io.maps import TABLE, DisplacementStatus, status_of
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
@@ -40,7 +40,7 @@ _LEAST_TEXTURED = 0.1  # minimum share of windows with texture; edges of light o
 @checked(
     reference=as_frames,
     frames=as_frames,
-    pixel_size=as_array_or_number,
+    pixel_size=in_unit("mm"),
     window_size=check_count,
     window_step=check_count,
     noise=check_number,
