@@ -17,8 +17,9 @@ from mirrorskin.engine.options import RESERVED, Configured, Option, documented, 
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Map, Result
-from mirrorskin.io.arguments import as_array, unknown_argument
+from mirrorskin.io.arguments import unknown_argument
 from mirrorskin.io.findings import warn
+from mirrorskin.io.layout import as_series
 from mirrorskin.io.maps import SIGMA, UNDECLARED, declaration_of
 from mirrorskin.io.positions import step_in_degrees
 from mirrorskin.io.result import check_maps, result_of
@@ -332,23 +333,30 @@ class Operation(ThreadSafe, OnDevice):
             pushed = f"{self.count} has been" if self.count == 1 else f"{self.count or 'none'} have been"
             raise InputError(f"{type(self).__name__} needs at least {frames}; {pushed} pushed so far")
 
-    def _check_frames(self, frames: Any) -> AnyArray:
-        """Return frames as an array that fits to earlier ones."""
+    def _as_frames(self, frames: Any, first: int) -> AnyArray:
+        """Return frames as an array in a type that the operation takes; ``first``: number of the first."""
         array = as_any_array("frames", frames)
         if not self.takes_device_arrays:
             array = on_host(array)
         elif isinstance(array, Array):
             self.use_device_of(array)
         if self.dtypes is not None and array.dtype not in self.dtypes and isinstance(array, np.ndarray):
-            array = convert_samples(array, frame_dtype(array.dtype, "frames"), "frames", self.count)
-        if self.dtype is None:
-            if array.ndim == 2 and 0 not in array.shape:
-                raise InputError(
-                    f"frames are {array.dtype} {array.shape}: for a single frame, pass frame[None]"
-                )
-            if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
-                raise InputError(f"frames are {array.dtype} {array.shape}: numbers (n, H, W) are needed")
-            self.begin(array.shape[1:], array.dtype)
+            array = convert_samples(array, frame_dtype(array.dtype, "frames"), "frames", first)
+        return array
+
+    def _begin_with(self, frames: Any) -> AnyArray:
+        """Forget earlier frames, prepare for these, (n, H, W), and return them in the operation's type."""
+        array = self._as_frames(frames, 0)
+        if array.ndim == 2 and 0 not in array.shape:
+            raise InputError(f"frames are {array.dtype} {array.shape}: for a single frame, pass frame[None]")
+        if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
+            raise InputError(f"frames are {array.dtype} {array.shape}: numbers (n, H, W) are needed")
+        self.begin(array.shape[1:], array.dtype)
+        return array
+
+    def _check_frames(self, frames: Any) -> AnyArray:
+        """Return frames as an array that fits to earlier ones."""
+        array = self._begin_with(frames) if self.dtype is None else self._as_frames(frames, self.count)
         self._on_device = isinstance(array, Array)
         if array.dtype != self.dtype or array.shape[1:] != self.shape or len(array) == 0:
             expected = f"{self.dtype} (n, {self.shape[0]}, {self.shape[1]})"
@@ -388,7 +396,7 @@ def _checked_push(method: Callable[..., None]) -> Callable[..., None]:
             return
         array = self._check_frames(frames)
         for name in given.keys() & {*self.positions, "frame_weights"}:
-            given[name] = None if given[name] is None else as_array(name, given[name])
+            given[name] = None if given[name] is None else as_series(name, given[name])
         self._check_positions(len(array), given)
         if not self._takes_lent:
             given.pop("lent", None)
@@ -560,15 +568,20 @@ def limit_of(frames: AnyArray) -> int:
     return max(1, min(MEMORY_LIMIT, 2 * int(frames.nbytes)))
 
 
-def apply(operation: Operation, frames: NDArray[Any], **given: Any) -> Result:
-    """Return the maps of a stack that fits in memory."""
+def apply(
+    operation: Operation, frames: Any, progress: Callable[[int], None] | None = None, **given: Any
+) -> Result:
+    """Return the maps of a stack that fits in memory; the operation forgets all earlier frames."""
 
     def push_all() -> None:
         for number in range(operation.passes):
             if number:
                 operation.next_pass()
             operation.push(frames, lent=True, **given)
+            if progress:
+                progress(len(frames))
 
+    frames = operation._begin_with(frames)
     push_all()
     if isinstance(frames, np.ndarray) and operation.reconsider(FrameSamples.of(frames)):
         frames = operation.corrected(frames, 0)
@@ -668,7 +681,7 @@ def array_function(
         given = signature.bind(*args, **kwargs).arguments
         frames = as_any_array("frames", given.pop("frames"))
         where = {one: given.pop(one, None) for one in (*positions, *optional)}
-        where = {one: None if values is None else as_array(one, values) for one, values in where.items()}
+        where = {one: None if values is None else as_series(one, values) for one, values in where.items()}
         warn_of_degrees(name, where.get("phase"))
         return (compute or run)(frames, where, given)
 

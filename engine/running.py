@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.engine.device_arrays import AnyArray, as_any_array, is_on_device
 from mirrorskin.engine.inputs import as_result
 from mirrorskin.engine.method import Method, check_motion
-from mirrorskin.engine.operation import Operation, warn_of_degrees
+from mirrorskin.engine.operation import Operation, apply, warn_of_degrees
 from mirrorskin.engine.provenance import attach_provenance, describe, naming, signature
 from mirrorskin.engine.reconstruction import calibrated
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.arguments import as_array, is_array
 from mirrorskin.io.findings import in_process, warn
+from mirrorskin.io.layout import as_series
 from mirrorskin.io.own_class import load_class
 from mirrorskin.io.types import exclusive_use
-from mirrorskin.kernels.array import Array
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
@@ -40,7 +40,7 @@ def run(
     ----------
     source : Source, array_like or device array (T, H, W), or iterable of array_like (H, W)
         An open recording or another source of frames, which is rewound first if possible; or frames: an array
-        is pushed as a whole, frames of an iterable one by one.
+        or a list is pushed as a whole, frames of an iterator one by one.
     operation : Operation, or a class of operations
         It forgets all earlier frames. Missing options are taken from the source, if available.
     pixel_size : float or (float, float), optional
@@ -87,13 +87,16 @@ def run(
                 f"{cast('Source', source).name} is a recording: give pixel_size to io.open_recording"
             )
         return _run_source(cast("Source", source), operation, positions, progress)
-    source = as_any_array("frames", source) if is_on_device(source) else source
-    if isinstance(source, str | os.PathLike) or not isinstance(source, Iterable):
+    if isinstance(source, str | os.PathLike) or not (is_array(source) or isinstance(source, Iterable)):
         remedy = "open a path with io.open_recording, or give an array"
         raise InputError(f"frames are a {type(source).__name__}: {remedy}")
+    positions = {name: as_series(name, values) for name, values in positions.items() if values is not None}
     warn_of_degrees(type(operation).__name__, positions.get("phase"))
+    if operation.passes == 2 and not is_array(source):
+        source = list(source)
+    compute = apply if is_array(source) else _run_each
     with exclusive_use(operation):
-        result = _run_frames(source, operation, positions, progress)
+        result = compute(operation, source, progress, **positions)
     result = as_result(result, pixel_size=pixel_size)
     return result.assign(process={**signature(), **describe(operation), **result.process})
 
@@ -151,50 +154,28 @@ def _run_source(
     return result
 
 
-def _run_frames(
-    frames: Iterable[ArrayLike],
-    operation: Operation,
-    positions: dict[str, ArrayLike],
-    progress: Progress | None,
+def _run_each(
+    operation: Operation, frames: Iterable[ArrayLike], progress: Progress | None, **positions: Any
 ) -> Result:
-    """Push an array as a whole, or frames one by one."""
-    if not isinstance(frames, np.ndarray | Array) and operation.passes == 2:
-        frames = np.stack([np.asarray(frame) for frame in frames])
-    started = False
-    for number in range(operation.passes):
-        if number:
-            operation.next_pass()
-        done = 0
-        for piece, where in _cut(frames, positions):
-            if not started:
-                if isinstance(piece, Array):
-                    operation.use_device_of(piece)
-                operation.begin(piece.shape[1:], piece.dtype)
-                started = True
-            operation.push(piece, **where)
-            done += len(piece)
-            if progress:
-                progress(done)
-    return operation.finish()
-
-
-def _cut(
-    frames: Iterable[ArrayLike], positions: dict[str, ArrayLike]
-) -> Iterator[tuple[AnyArray, dict[str, Any]]]:
-    """Yield an array as a whole, or frames one by one, with their positions."""
-    given = {name: np.asarray(values) for name, values in positions.items()}
-    whole = isinstance(frames, np.ndarray | Array)
-    done = 0
-    pieces: Iterable[AnyArray] = [frames] if whole else (np.asarray(one)[np.newaxis] for one in frames)
-    for array in pieces:
-        if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
-            shape, needed = (array.shape, "(T, H, W)") if whole else (array.shape[1:], "(H, W) of one size")
-            raise InputError(f"frames are {array.dtype} {shape}: numbers {needed} are needed")
-        stop = done + len(array)
-        for name, values in given.items():
-            if values.ndim == 0 or len(values) < stop or (whole and len(values) != stop):
-                raise InputError(f"{name} has shape {values.shape}: one is needed for each of {stop} frames")
-        yield array, {name: values[done:stop] for name, values in given.items()}
-        done = stop
-    if done == 0:
+    """Push frames, (H, W), one by one."""
+    count = 0
+    for frame in frames:
+        array = as_array("frames", frame)[np.newaxis]
+        if array.ndim != 3:
+            shape = array.shape[1:]
+            raise InputError(f"frames are {array.dtype} {shape}: numbers (H, W) of one size are needed")
+        array = array if count else operation._begin_with(array)
+        for name, values in positions.items():
+            if values.ndim == 0 or len(values) <= count:
+                text = f"{name} has shape {values.shape} for {count + 1} frames or more"
+                raise InputError(f"{text}: give one of each frame")
+        operation.push(array, **{name: values[count : count + 1] for name, values in positions.items()})
+        count += 1
+        if progress:
+            progress(count)
+    if not count:
         raise InputError("there are no frames: give at least one")
+    for name, values in positions.items():
+        if len(values) > count:
+            raise InputError(f"{name} has shape {values.shape} for {count} frames: give one of each frame")
+    return operation.finish()

@@ -237,16 +237,18 @@ def test_impossible_options_are_refused_in_a_line(options, line):
 @pytest.mark.parametrize(
     ("frames", "positions", "line"),
     [
-        ([], {}, "there are no frames"),
+        (iter([]), {}, "there are no frames"),
         ("press.h5", {}, "frames are a str: open a path with io.open_recording"),
         (None, {}, "frames are a NoneType"),
         (FRAMES, {}, "travel is missing: Moments needs it of each frame"),
-        (FRAMES, {"travel": TRAVEL[:7]}, r"travel has shape \(7,\): one is needed for each of 8"),
-        (iter(FRAMES), {"travel": TRAVEL[:7]}, r"travel has shape \(7,\): one is needed for each of 8"),
+        (FRAMES, {"travel": TRAVEL[:7]}, r"travel has shape \(7,\) for 8 frames: give one of each frame"),
+        (iter(FRAMES), {"travel": TRAVEL[:7]}, r"travel has shape \(7,\) for 8 frames or more: give one"),
+        (iter(FRAMES), {"travel": [*TRAVEL, 1.0]}, r"travel has shape \(9,\) for 8 frames: give one"),
         (FRAMES, {"travel": TRAVEL, "phase": TRAVEL}, "Moments does not take phase. It takes travel"),
         (FRAMES[0], {"travel": TRAVEL}, r"frames are uint16 \(5, 7\)"),
-        (["text"], {"travel": TRAVEL}, "frames are <U4"),
-        ([FRAMES[0], FRAMES[0, 1:]], {"travel": TRAVEL}, r"frames are uint16 \(1, 4, 7\)"),
+        (["text"], {"travel": TRAVEL}, "frames is a list: numbers are needed"),
+        (iter([FRAMES[0], FRAMES[0, 1:]]), {"travel": TRAVEL}, r"frames are uint16 \(1, 4, 7\)"),
+        ([FRAMES[0], FRAMES[0, 1:]], {"travel": TRAVEL}, "frames is not an array"),
     ],
 )
 def test_frames_that_cannot_be_pushed_are_refused_in_a_line(frames, positions, line):
