@@ -157,8 +157,7 @@ class Option:
         whole = self.kind == "integer"
         if not isinstance(value, Real) and getattr(value, "ndim", None) == 0:
             value = as_array(self.name, value, self.unit)[()]
-        scalar = isinstance(value, np.ndarray | np.generic) and value.ndim == 0 and value.dtype.kind in "buif"
-        if not scalar and (not isinstance(value, Real) or (whole and not hasattr(value, "__index__"))):
+        if not isinstance(value, Real | np.bool_) or (whole and not hasattr(value, "__index__")):
             what = "a whole number" if whole else "a number"
             raise InputError(f"{self.name} is {shown(value)}: {what} is needed")
         number = int(value) if whole else float(value)

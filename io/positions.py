@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.arguments import check_number
 from mirrorskin.io.types import Floats, InputError
 
 _ROUNDING = 1e-6  # radians
@@ -47,6 +48,10 @@ class Steps:
 
     step: float
     start: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_number("step", self.step)
+        check_number("start", self.start)
 
     def positions(self, count: int) -> Floats:
         """Return the positions of ``count`` frames."""

@@ -335,6 +335,17 @@ def test_counts_in_units_of_a_camera_are_counts():
     assert content(found) == content(engine.find_onset(FRAMES, TRAVEL, **LEVELS))
 
 
+@pytest.mark.parametrize("hold", [2.7, np.float64(2.7), np.array(2.7), xarray.DataArray(2.7)])
+def test_a_number_of_frames_is_whole(hold):
+    with pytest.raises(io.InputError, match=r"hold is .*: a whole number is needed"):
+        engine.Onset(hold=hold)
+
+
+def test_even_steps_have_no_units():
+    with pytest.raises(io.InputError, match="step: 'µm' cannot be converted to a number without a unit"):
+        io.Steps(UNITS.Quantity(10, "um"))
+
+
 def test_displacements_have_frames_first():
     slide = np.arange(2.0 * COUNT).reshape(COUNT, 2)
     labels = xarray.DataArray(1e3 * slide.T, dims=("axis", "time"), attrs={"units": "um"})
