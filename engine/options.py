@@ -157,7 +157,8 @@ class Option:
         whole = self.kind == "integer"
         if not isinstance(value, Real) and getattr(value, "ndim", None) == 0:
             value = as_array(self.name, value, self.unit)[()]
-        if not isinstance(value, Real | np.bool_) or (whole and not hasattr(value, "__index__")):
+        is_number = isinstance(value, Real | np.bool_)
+        if not is_number or (whole and not hasattr(value, "__index__")):
             what = "a whole number" if whole else "a number"
             raise InputError(f"{self.name} is {shown(value)}: {what} is needed")
         number = int(value) if whole else float(value)

@@ -49,11 +49,11 @@ def counting(kind):
     class Counting(kind):
         def start(self, shape, dtype):
             super().start(shape, dtype)
-            self.seen = 0
+            self.total = 0
 
         def push(self, frames, **given):
             super().push(frames, **given)
-            self.seen += len(frames)
+            self.total += len(frames)
 
     return Counting
 
@@ -137,7 +137,7 @@ def test_each_run_starts_a_subclass_anew(name):
     own = counting(case.kind)(**case.options)
     for _ in range(2):
         engine.run(case.frames, own, **case.positions)
-        assert own.seen == own.passes * len(case.frames)
+        assert own.total == own.passes * len(case.frames)
 
 
 @ONCE
@@ -146,7 +146,7 @@ def test_the_frames_of_warming_are_forgotten_by_a_subclass(name):
     live = LiveOperation(case.source(), counting(case.kind)(**case.options))
     live.warm()
     case.push(live, slice(0, 4))
-    assert live.operation.seen == 4
+    assert live.operation.total == 4
 
 
 class Halved(engine.Press):
