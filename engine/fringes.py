@@ -6,7 +6,7 @@ The least-squares fit is that of a rotation: `mirrorskin.engine.rotation.correla
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from mirrorskin.engine.rotation.correlation import Correlate
 from mirrorskin.engine.rotation.design_matrix import check_weights, fit_matrix
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import as_array, as_array_or_number, check_number, checked, in_unit
+from mirrorskin.io.findings import carried
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array_types import Doubles
@@ -38,6 +39,8 @@ _STRIPES = {
     "border": Map("number of the stripe that begins at the pixel", dtype="int32", undefined=-1),
     "border_risk": Map("probability that the number is wrong by 1 where there is no border, or the reverse"),
 }
+_WHOLE_FIELD = 1 + 1e-6  # fringes over the field, up to which a phase is absolute; rounded
+_LEAST_SIGMA = 1e-12  # radians
 _MISFIT = 4.0  # standard deviations of noise: maximum residual of samples that follow a cosine of the shift
 _UNCLEAR = 0.5  # distance of a bit from the threshold, RMS distances, below which the pixel is on a border
 
@@ -182,8 +185,9 @@ def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: 
     """Unwrap fringes of several frequencies, each from the next coarser one.
 
     The coarser phase, times the ratio of the frequencies, predicts the next one, which determines the order.
-    With d the remaining difference and s its standard error, the adjacent order is the correct one with
-    probability 1 / (1 + exp(2 pi (pi - abs(d)) / s^2)). These risks are added over all steps.
+    With d the remaining difference and s its standard error, the order is right with the probability
+    exp(-d^2 / (2 s^2)) over the sum of exp(-(d + 2 pi k)^2 / (2 s^2)) for all orders k. The probabilities
+    that it is wrong are added over all steps.
 
     Parameters
     ----------
@@ -192,7 +196,7 @@ def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: 
         `fit_fringes`. The phase may be wrapped to any interval.
     frequency : array_like, (F,)
         Numbers of fringes over the field, ascending; all phases are 0 at the same position. The coarsest
-        pattern has at most one fringe.
+        pattern has at most one fringe: otherwise the absolute phase is not determined.
     start : float
         Radians: the smallest phase of the coarsest fringe; -pi if phases are 0 in the middle of the field.
 
@@ -207,7 +211,8 @@ def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: 
     Raises
     ------
     mirrorskin.io.InputError
-        Arrays of other shapes, or frequencies that are not positive and ascending.
+        Arrays of other shapes; frequencies that are not positive and ascending; or a coarsest pattern of more
+        than one fringe.
 
     Examples
     --------
@@ -227,21 +232,27 @@ def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: 
         raise InputError(
             f"frequency has shape {rate.shape}: one is needed for each of {len(fringes)} fringes"
         )
-    pairs = [_phase_of(one, f"fringes[{number}]") for number, one in enumerate(fringes)]
+    results = _results({f"fringes[{number}]": one for number, one in enumerate(fringes)}, "phase")
+    pairs = [_phase_of(result, name) for name, result in results.items()]
     phases, sigmas = zip(*pairs, strict=True)
     if len({phase.shape for phase in phases}) > 1:
         shapes = " and ".join(str(phase.shape) for phase in phases)
         raise InputError(f"fringes have phases of shapes {shapes}: give maps of one size")
     if not (np.all(np.isfinite(rate)) and rate[0] > 0 and np.all(np.diff(rate) > 0)):
         raise InputError(f"frequencies {rate.tolist()}: positive ones from coarse to fine are needed")
+    if rate[0] > _WHOLE_FIELD:
+        raise InputError(
+            f"frequencies {rate.tolist()}: the coarsest pattern has {rate[0]:g} fringes over the field, so"
+            " the absolute phase is not determined. Add a pattern of one fringe, or use unwrap_gray"
+        )
     whole = start + np.mod(phases[0] - start, _TURN)
     border = np.minimum(whole - start, start + _TURN - whole)  # distance to the field's ends
-    risk = ndtr(-border / np.maximum(sigmas[0], 1e-12))
+    spread = np.maximum(sigmas[0], _LEAST_SIGMA)
+    risk = ndtr(-border / spread) + ndtr(-(_TURN - border) / spread)
     for finer, ratio in enumerate(rate[1:] / rate[:-1], 1):
         guess, whole = ratio * whole, _nearest(phases[finer], ratio * whole)
-        variance = np.maximum(sigmas[finer] ** 2 + (ratio * sigmas[finer - 1]) ** 2, 1e-24)
-        risk += expit(-_TURN * (np.pi - np.abs(guess - whole)) / variance)
-    return _unwrapped(phases[-1], whole, sigmas[-1], risk)
+        risk += _wrong_order(guess - whole, np.hypot(sigmas[finer], ratio * sigmas[finer - 1]))
+    return _unwrapped(phases[-1], whole, sigmas[-1], risk, results)
 
 
 @checked(frames=as_array, threshold=as_array_or_number, noise=as_array_or_number)
@@ -360,30 +371,35 @@ def unwrap_gray(fringes: Maps, stripes: Maps, *, width: float = np.pi, start: fl
     >>> engine.fringes.unwrap_gray(fringes, stripes, width=2 * np.pi).phase.round(2).tolist()
     [[0.1, 6.3, 12.0]]
     """
-    wrapped, errors = _phase_of(fringes, "fringes")
-    number, wrong = _maps_of(stripes, "stripes", "stripe", "risk")
+    results = _results({"fringes": fringes}, "phase") | _results({"stripes": stripes}, "stripe")
+    wrapped, errors = _phase_of(results["fringes"], "fringes")
+    number, wrong = _maps_of(results["stripes"], "stripes", "stripe", "risk")
     if number.shape != wrapped.shape:
         raise InputError(f"stripes have shape {number.shape}, fringes {wrapped.shape}: give maps of one size")
     if not 0 < width <= _TURN * (1 + 1e-9):
         raise InputError(f"width {width}: stripes of at most a fringe, 2 pi, are needed")
     guess = start + (number + 0.5) * width
     if width > np.pi:
-        border, border_risk = _maps_of(stripes, "stripes", "border", "border_risk")
+        border, border_risk = _maps_of(results["stripes"], "stripes", "border", "border_risk")
         guess = np.where(border < 0, guess, start + border * width)
         wrong = wrong + border_risk
     whole = _nearest(wrapped, guess)
     error = (np.pi - np.abs(whole - guess)) / np.maximum(errors, 1e-12)
-    return _unwrapped(wrapped, whole, errors, wrong + ndtr(-error))
+    return _unwrapped(wrapped, whole, errors, wrong + ndtr(-error), results)
 
 
-def _phase_of(fringes: Maps, name: str) -> tuple[Doubles, Doubles]:
+def _results(inputs: Mapping[str, Maps], quantity: str) -> dict[str, Result]:
+    """Return inputs as results, by their names."""
+    return {name: as_result(maps, name, quantity=quantity) for name, maps in inputs.items()}
+
+
+def _phase_of(fringes: Result, name: str) -> tuple[Doubles, Doubles]:
     """Return a phase and its standard deviation, (H, W)."""
     return _maps_of(fringes, name, "phase", "phase_sigma")
 
 
-def _maps_of(maps: Maps, name: str, *quantities: str) -> tuple[Doubles, Doubles]:
+def _maps_of(result: Result, name: str, *quantities: str) -> tuple[Doubles, Doubles]:
     """Return two maps of one size, (H, W), float64."""
-    result = as_result(maps, name, quantity=quantities[0])
     missing = [one for one in quantities if one not in result]
     if missing:
         raise InputError(
@@ -401,15 +417,35 @@ def _nearest(phase: Doubles, guess: Doubles) -> Doubles:
     return np.asarray(phase + _TURN * np.rint((guess - phase) / _TURN))
 
 
-def _unwrapped(wrapped: Doubles, whole: Doubles, sigma: Doubles, risk: Doubles) -> Result:
-    """Return an unwrapped phase with its order and risk."""
+def _wrong_order(difference: Doubles, sigma: Doubles) -> Doubles:
+    """Return the probability that another order than the nearest is right, for differences within +- pi.
+
+    The sum over all orders is that of five if sigma is less than 3, otherwise that of its Fourier series.
+    """
+    sigma = np.maximum(sigma, _LEAST_SIGMA)
+    with np.errstate(over="ignore", invalid="ignore"):
+        others = np.sum(
+            [np.exp(-_TURN * k * (_TURN * k + 2 * difference) / 2 / sigma / sigma) for k in (-2, -1, 1, 2)],
+            axis=0,
+        )
+        waves = sum(2 * np.exp(-((m * sigma) ** 2) / 2) * np.cos(m * difference) for m in (1, 2))
+        nearest = np.exp(-((difference / sigma) ** 2) / 2) * np.sqrt(_TURN) / (sigma * (1 + waves))
+        wrong: Doubles = np.where(sigma < 3, others / (1 + others), 1 - nearest)
+    return np.where(np.isinf(sigma), 1.0, wrong)
+
+
+def _unwrapped(
+    wrapped: Doubles, whole: Doubles, sigma: Doubles, risk: Doubles, inputs: Mapping[str, Result]
+) -> Result:
+    """Return an unwrapped phase with its order and risk, and the findings of the inputs."""
+    process = carried({}, **{name: result.process for name, result in inputs.items()})
     order = np.nan_to_num(np.rint((whole - wrapped) / _TURN)).astype(np.int32)
     with np.errstate(over="ignore"):
         error = sigma.astype(np.float32)
     known = np.isfinite(whole) & np.isfinite(error)
     phase, error, wrong = (np.where(known, one, np.nan) for one in (whole, error, risk))
     maps = {"phase": phase, "phase_sigma": error.astype(np.float32), "order": order}
-    return Result(maps, risk=_probability(wrong), declarations=_UNWRAPPED)
+    return Result(maps, risk=_probability(wrong), process=process, declarations=_UNWRAPPED)
 
 
 def _probability(sum_of_risks: Doubles) -> NDArray[np.float32]:

@@ -209,6 +209,17 @@ def test_fringes_of_a_dataset_and_of_a_file_unwrap_as_the_results_do(tmp_path):
     assert found.declaration("phase").unit == found.declaration("phase_sigma").unit == "rad"
 
 
+@pytest.mark.parametrize("sigma", [0.01, 0.05, 0.3, 3.0])
+@pytest.mark.parametrize("rates", [[1], [0.5], [1, 7.3, 50.1], [1, 30], [1, 1000]], ids=str)
+def test_risk_is_not_below_the_share_of_wrong_orders(rates, sigma):
+    place, random = np.linspace(0.02, 0.98, 20_000)[np.newaxis], np.random.default_rng(1)
+    true = TURN * np.multiply.outer(np.array(rates), place)
+    found = unwrap_frequencies(given(np.mod(true + random.normal(0, sigma, true.shape), TURN), sigma), rates)
+    wrong, safe = np.abs(found.phase - true[-1]) > np.pi, found.risk < 0.01
+    assert wrong.mean() < 1.05 * found.risk.mean() + 0.002
+    assert np.count_nonzero(wrong & safe) <= 0.01 * np.count_nonzero(safe)
+
+
 ONE = {"phase": np.ones((1, 1)), "phase_sigma": np.ones((1, 1))}
 STRIPES = {"stripe": np.ones((1, 1)), "risk": np.ones((1, 1))}
 
@@ -229,6 +240,14 @@ STRIPES = {"stripe": np.ones((1, 1)), "risk": np.ones((1, 1))}
         (lambda: fit_fringes(shown(FIELD, EVEN), EVEN, noise=[1, 2]), "noise has shape (2,)"),
         (lambda: unwrap_frequencies([ONE], [1, 2]), "frequency has shape (2,)"),
         (lambda: unwrap_frequencies([ONE, ONE], [2, 1]), "coarse to fine"),
+        (lambda: unwrap_frequencies([ONE, ONE], [1, 1]), "coarse to fine"),
+        (lambda: unwrap_frequencies([ONE, ONE], [0, 1]), "coarse to fine"),
+        (lambda: unwrap_frequencies([ONE, ONE], [np.nan, 1]), "coarse to fine"),
+        (
+            lambda: unwrap_frequencies([ONE, ONE], [16, 64]),
+            "16 fringes over the field, so the absolute phase is not determined. Add a pattern of one fringe",
+        ),
+        (lambda: unwrap_frequencies([ONE], [2]), "the coarsest pattern has 2 fringes over the field"),
         (lambda: unwrap_frequencies(ONE, [1]), "fringes are a dict: a list of results"),
         (lambda: unwrap_frequencies([ONE["phase"]], [1]), "fringes[0] has no phase_sigma"),
         (lambda: unwrap_frequencies([ONE | {"phase": FIELD}], [1]), "give maps of one size"),
