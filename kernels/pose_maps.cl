@@ -15,6 +15,7 @@
 #define FAR 1e30f
 #define NEAR 1e20f
 #define NOT_COMPARED 1e6f
+#define SHARPEST 1e-10f
 #define VAGUE 100.0f
 #define STEEPEST 0.17f
 #define NUMBERS 8
@@ -99,8 +100,8 @@ __kernel void pose_records(
             x = -a * upright;
             y = -b * upright;
         }
-        if (normals_sigma) square = normals_sigma[p] > 0 ? normals_sigma[p] * normals_sigma[p] : NAN;
-        if (height_sigma && height_sigma[p] * height_sigma[p] > 0) variance = height_sigma[p] * height_sigma[p];
+        if (normals_sigma) square = normals_sigma[p] > 0 ? GREATER(normals_sigma[p] * normals_sigma[p], SHARPEST) : NAN;
+        if (height_sigma && height_sigma[p] > 0) variance = GREATER(height_sigma[p] * height_sigma[p], SHARPEST);
         if (component && (component[p] < 0 || offset_unknown[component[p]])) variance = FAR;
         int used = FINITE(height[p]) && upright > STEEPEST && FINITE(square);
         if (filled) used = used && !filled[p];

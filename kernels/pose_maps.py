@@ -18,6 +18,8 @@ STEEPEST = 0.17
 """Cosine of the largest zenith at which slopes are used."""
 NOT_COMPARED = 1e6
 """Mean square error of normals that are not compared, radians^2."""
+SHARPEST = 1e-10
+"""Smallest variance of a normal or height, radians^2 or mm^2; interpolation between pixels errs by more."""
 SUMMARY, STRIP = 6, 16
 """Length of the record of a strip in `pose_summary`, and number of its pixels."""
 AROUND = 2  # pixels around edges and the border of contact that are excluded; reach of a gradient
@@ -81,9 +83,9 @@ def pose_records(
     square, variance = np.full(height.shape, NOT_COMPARED), np.full(height.shape, FAR)
     with np.errstate(invalid="ignore", divide="ignore"):
         if normals_sigma is not None:
-            square = np.where(normals_sigma > 0, normals_sigma, np.nan) ** 2
+            square = np.where(normals_sigma > 0, np.maximum(normals_sigma**2, SHARPEST), np.nan)
         if height_sigma is not None:
-            variance = np.where(height_sigma**2 > 0, height_sigma**2, FAR)
+            variance = np.where(height_sigma > 0, np.maximum(height_sigma**2, SHARPEST), FAR)
         if component is not None and offset_unknown is not None:
             variance = np.where(np.append(offset_unknown, 1).astype(bool)[component], FAR, variance)
         used = np.isfinite(height) & (normals[..., 2] > STEEPEST) & np.isfinite(square)

@@ -19,6 +19,7 @@ from mirrorskin.kernels.least_squares import mad_sigma
 _SIDES = 8, 16  # of the loops whose curl is compared with that of single corners, pixels
 _CROP = 128  # largest side of the part of a picture that is examined, pixels
 _FEWEST = 6  # loops that do not overlap, below which a correlation is not estimated
+_CHANCE = 4.0  # ratio of an estimated variance to the true one, up to which chance explains it
 _CLEAR = 5.0  # standard errors of the ratio of curls above which slopes count as correlated
 
 
@@ -66,6 +67,10 @@ def find_correlation(inputs: Inputs) -> float:
     (4 b - 2) s^2 for independent errors of variance s^2. For errors that are correlated over a distance l it
     is about 4 b l pi^(1/2) s^2 for a large loop, and 4 s^2 / l^2 for a single corner. Medians are used, so
     that breaks and outliers do not count. Slopes on a device are not examined.
+
+    The sum around a loop is that of its b^2 corners, so correlated errors increase its variance by at most
+    b^4. A larger increase has another cause: slopes with little noise, or none, are contradictory only at
+    creases, which most corners do not touch but most loops do.
     """
     if isinstance(inputs.dz_dx, Array):
         return 0.0
@@ -84,8 +89,9 @@ def find_correlation(inputs: Inputs) -> float:
         loops = curls.size * (_step(side) / side) ** 2
         if loops < _FEWEST or not corner:
             break
-        ratio = (mad_sigma(curls) / corner) ** 2 * 2 / (4 * side - 2)
-        if ratio > 1 + _CLEAR * math.sqrt(3 / loops):
+        increase = (mad_sigma(curls) / corner) ** 2
+        ratio = increase * 2 / (4 * side - 2)
+        if increase <= _CHANCE * side**4 and ratio > 1 + _CLEAR * math.sqrt(3 / loops):
             longest = max(longest, (2 * ratio / math.sqrt(math.pi)) ** (1 / 3))
     return longest
 

@@ -76,3 +76,34 @@ def test_several_surfaces_have_the_largest_of_their_errors():
     slopes = np.stack([SLOPES, 3 * SLOPES], axis=1)
     surfaces = engine.integrate(*slopes, 1.0, slope_gain_sigma=0.1)
     np.testing.assert_allclose(surfaces.height_sigma, 0.3 * np.abs(HEIGHT), atol=0.02)
+
+
+def grooved(angle, period, pixel=0.05):
+    """Return heights and slopes of V grooves, mm, without noise, from the first pixel's corner."""
+    rows, columns = np.indices(SHAPE)
+    along = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+    place = (along[0] * columns - along[1] * rows) * pixel + 0.37
+    place = np.mod(place, period) - period / 2
+    return 0.8 * np.abs(place), 0.8 * np.sign(place) * along[:, np.newaxis, np.newaxis]
+
+
+GROOVES = [(angle, period) for angle in (0, 19, 45, 69, 90) for period in (0.5, 1.0)]
+
+
+@pytest.mark.parametrize("noise_of_slopes", [0.0, 1e-6])
+@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.parametrize("groove", GROOVES, ids=str)
+def test_sigma_of_grooves_is_not_beyond_their_depth(groove, robust, noise_of_slopes):
+    height, slopes = grooved(*groove)
+    slopes = slopes + noise(0) / NOISE * noise_of_slopes
+    surface = engine.integrate(*slopes, 0.05, robust=robust)
+    assert np.isfinite(surface.height_sigma).all()
+    assert surface.height_sigma.max() < np.ptp(height)
+
+
+@pytest.mark.parametrize("angle", [19, 37, 69])
+def test_sigma_of_oblique_grooves_is_about_the_error_at_their_creases(angle):
+    height, slopes = grooved(angle, 1.0)
+    surface = engine.integrate(*slopes, 0.05)
+    error = np.std(surface.height - height)
+    assert error / 3 < np.median(surface.height_sigma) < 3 * error

@@ -103,6 +103,19 @@ def test_heights_alone_are_enough() -> None:
     assert np.abs(error_of(pose, vector, shift)).max() < 0.005
 
 
+@pytest.mark.parametrize("sigma", [1e-6, 1e-12, 1e-30])
+def test_maps_without_noise_have_a_pose_and_a_covariance(sigma: float) -> None:
+    rng = np.random.default_rng(5)
+    vector, shift = draw(rng)
+    none = {"height_sigma": 0.0, "normals_sigma": 0.0}
+    pair = [sampled(bumpy, *way, rng=rng, **none) for way in ((), (vector, shift))]
+    same = {"height_sigma": np.full_like(pair[0].height, sigma)}
+    same |= {"normals_sigma": same["height_sigma"]}
+    pose = engine.pose.estimate_pose(*(one.assign(same) for one in pair))
+    assert np.abs(error_of(pose, vector, shift)).max() < 1e-3
+    assert 0 < pose.sigma.max() < 1e-3
+
+
 def test_integrated_heights_leave_z_open() -> None:
     rng = np.random.default_rng(4)
     pair = []
