@@ -226,15 +226,15 @@ def _surfaces(
 
 def _fuse(folder: Path, device: str | None, overwrite: bool) -> io.Result:
     """Fuse the recordings of the press and of the rotation, and save the result."""
-    from mirrorskin import io
-    from mirrorskin.engine.fusion import frames_to_read, fuse_recordings
+    from mirrorskin import engine, io
+    from mirrorskin.engine.fusion import frames_to_read
 
     with (
         io.open_recording(folder / f"{_FUSED_PRESS}.h5") as vertical,
         io.open_recording(folder / f"{_TURN}.h5") as axial,
         progress("fusing", frames_to_read(vertical, axial, register=True)) as show,
     ):
-        result = fuse_recordings(vertical, axial, device=device, progress=show)
+        result = engine.fuse(vertical, axial, device=device, progress=show)
     io.save_result(result, folder / "fused-result.h5", overwrite=overwrite)
     return result
 

@@ -33,10 +33,10 @@ def command(
     **chosen: Annotated[Any, STACK.without("motion", "frames", "tilt"), declared("fuse")],
 ) -> None:
     """Fuse a press and a rotation to one surface."""
-    from mirrorskin import io
+    from mirrorskin import engine, io
     from mirrorskin.cli.output import make_strict, progress, report_levels, report_notes, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.engine.fusion import frames_to_read, fuse_recordings
+    from mirrorskin.engine.fusion import frames_to_read
     from mirrorskin.engine.reconstruction import calibrated
 
     make_strict(strict)
@@ -53,7 +53,7 @@ def command(
         calibration = calibration_of(pressed, calibration)
         shared = None if calibration is None else io.open_calibration(calibration)
         with progress("fusing", frames_to_read(pressed, turned, register)) as show:
-            result = fuse_recordings(
+            result = engine.fuse(
                 calibrated(pressed, shared),
                 calibrated(turned, shared),
                 rotation=chosen,

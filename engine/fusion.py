@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Mapping
+from contextlib import ExitStack
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -14,7 +18,7 @@ from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.method import Context, Method, undistorted
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.blur import PIXEL, LensBlur
-from mirrorskin.engine.press.intervals import heights_as_intervals
+from mirrorskin.engine.press.intervals import heights_as_intervals, repeated_heights_as_intervals
 from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.provenance import attach_provenance, naming
 from mirrorskin.engine.reconstruction import calibrated
@@ -24,37 +28,64 @@ from mirrorskin.engine.rotation.rotation import Rotation, at_poses
 from mirrorskin.engine.rotation.steps import Integration
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io import InputError, Motion, Result, Source, pixel_axes
+from mirrorskin.io import InputError, Motion, Result, Source, open_recording, open_result, pixel_axes
 from mirrorskin.io.arguments import as_array_or_number, check_count, check_flag, checked, in_unit
-from mirrorskin.io.findings import in_process, warn
+from mirrorskin.io.findings import Finding, carried, in_process, merged, warn
+from mirrorskin.io.foreign import kind_of_frames
+from mirrorskin.io.recording import is_result
 from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.types import ProcessValue, exclusive_use
-from mirrorskin.kernels.device import Choice, Device, open_devices
+from mirrorskin.io.url import path_of
+from mirrorskin.kernels.device import Choice, open_devices
+from mirrorskin.kernels.registration import MEAN_NOISE_GAIN
 
 Mask = NDArray[np.bool_]
 
 _SAME = 1e-6  # largest relative difference of pixel sizes
 _PASSES = 3  # over the axial frames, at most
 _STILL = 0.02  # pixels that points may move between the last two passes
+_SHARPEST = 1e-4  # radians: smallest standard deviation of normals; neighbours at a curve contradict by more
+_FROM_RESULTS = Finding(
+    "fused results",
+    "the surface is that of two results: engine.fuse of both recordings, or 'mirrorskin fuse', registers the"
+    " frames of the rotation with the fused heights, which is more accurate",
+    False,
+)
 
 
-@checked(pixel_size=in_unit("mm"), mask=as_array_or_number, robust=check_flag)
+@checked(
+    pixel_size=in_unit("mm"),
+    mask=as_array_or_number,
+    robust=check_flag,
+    register=check_flag,
+    memory_limit=check_count,
+)
 def fuse(
-    heights: Maps,
-    normals: Maps,
+    heights: Source | Maps,
+    normals: Source | Maps,
     pixel_size: ArrayLike | None = None,
     *,
     mask: ArrayLike | None = None,
     robust: bool = False,
-    device: str | Device | None = None,
+    register: bool = True,
+    press: Press | Mapping[str, Any] | None = None,
+    rotation: Rotation | Mapping[str, Any] | None = None,
+    memory_limit: int = MEMORY_LIMIT,
+    device: Choice = None,
+    progress: Progress | None = None,
 ) -> Result:
     """Join heights and normals of the same pixels to one surface in absolute millimetres.
 
-    Heights are those of a press, a focus stack, or of any operation; normals are those of a rotation, of
-    photometric stereo, or of any operation. The surface is the one that fits the slopes of the normals and
-    the heights best, weighted by inverse variance; see `mirrorskin.engine.integrate`. After a first solution,
-    each height is treated as an interval, such as that between two frames of a press: only heights near the
-    ends of their intervals have a weight in the final solution; see `mirrorskin.engine.press.intervals`.
+    Give the recordings of a press and of a rotation, or two results. Recordings are more accurate: the frames
+    of the rotation are registered for the shift of the pivot with the heights of the press, then with those
+    of the joined surface, until points move by less than a fiftieth of a pixel, at most three times. A source
+    that cannot be read twice is registered once. The heights of results are those of a press, a focus stack,
+    or of any operation; their normals are those of a rotation, of photometric stereo, or of any operation.
+
+    The surface is the one that fits the slopes of the normals and the heights best, weighted by inverse
+    variance; see `mirrorskin.engine.integrate`. After a first solution, each height is treated as an
+    interval, such as that between two frames of a press: only heights near the ends of their intervals have a
+    weight in the final solution; see `mirrorskin.engine.press.intervals`.
 
     Where there is a height but no normal, the surface has that height; near normals it has the slope of a
     smooth surface fitted to the surrounding heights, if one fits. Where there is a normal but no height,
@@ -64,33 +95,47 @@ def fuse(
 
     Parameters
     ----------
-    heights : Result, mapping, xarray.Dataset or path
-        With ``height`` and ``height_sigma``, (H, W), mm; NaN where unknown. Maps that are on a device are
-        copied to the host once, and the surface is computed on that device. A map that is declared with the
-        quantity "height" serves as well. Heights of components whose offset is unknown are not used.
-    normals : Result, mapping, xarray.Dataset or path
-        With ``normals``, (H, W, 3), and ``normals_sigma``, (H, W), radians; NaN where unknown. If there is
-        ``contact``, (H, W), normals where it is 0 are not used. If its process has a ``tilt``, radians, the
-        normals are those of a precession, whose errors depend on the direction.
+    heights : Source, Result, mapping, xarray.Dataset or path
+        A press, as an open recording, its path or another source, such as `mirrorskin.io.ArrayRecording` for
+        frames in an array. Or a result, with ``height`` and ``height_sigma``, (H, W), mm; NaN where unknown.
+        Maps that are on a device are copied to the host once, and the surface is computed on that device. A
+        map that is declared with the quantity "height" serves as well. Heights of components whose offset is
+        unknown are not used.
+    normals : Source, Result, mapping, xarray.Dataset or path
+        A rotation, likewise, if ``heights`` is a press. Or a result, with ``normals``, (H, W, 3), and
+        ``normals_sigma``, (H, W), radians; NaN where unknown. If there is ``contact``, (H, W), normals where
+        it is 0 are not used. If its process has a ``tilt``, radians, the normals are those of a precession,
+        whose errors depend on the direction.
     pixel_size : float or (float, float), optional
-        Millimetres along x and y; by default that of the heights.
+        For results: millimetres along x and y; by default that of the heights.
     mask : array_like, (H, W), optional
-        Nonzero where heights are wanted; by default everywhere.
+        For results: nonzero where heights are wanted; by default everywhere.
     robust : bool
         Whether the surface may break, at discontinuities that are found in it.
-    device : str or Device, optional
-        See ``mirrorskin.kernels.device.open_device``.
+    register : bool
+        For recordings: whether the frames of the rotation follow the object; they must not where the pivot is
+        unknown.
+    press, rotation : Press and Rotation, or mappings of their options, optional
+        For recordings: how to reconstruct them. Holes of the press are not filled.
+    memory_limit : int
+        For recordings: bytes of host memory for frames that are read ahead.
+    device : str, Device or sequence of them, optional
+        See ``mirrorskin.kernels.device.open_devices``.
+    progress : callable, optional
+        For recordings: called with the number of frames so far. A rotation is read up to three times.
 
     Returns
     -------
     Result
         ``height``, ``height_sigma``, ``component``, ``offset_unknown`` and ``filled``; ``edges`` if robust.
+        Of recordings, also ``status`` of the press and the maps of the rotation. Their process values begin
+        with ``vertical_`` or ``axial_``.
 
     Raises
     ------
     mirrorskin.io.InputError
-        A map is missing, maps have different sizes, there is no height and no normal at all, or the pixel
-        size is not possible.
+        A recording and a result; other motions; pixels or maps of different sizes; a missing map; no height
+        and no normal at all; a pixel size that is not possible; or what `Press` and `Rotation` refuse.
     mirrorskin.engine.NotConverged
         The surface was not found.
 
@@ -98,7 +143,11 @@ def fuse(
     -----
     Errors of normals are assumed to be independent and normally distributed. Each height is assumed to be
     within sqrt(3) ``height_sigma`` of the surface, with equal probability everywhere in this interval. A
-    height that is rounded to multiples of a step fits this with step / sqrt(12) as its sigma.
+    height that is rounded to multiples of a step fits this with step / sqrt(12) as its sigma. Of results,
+    heights that many pixels share are taken as the middles of the intervals between frames.
+
+    If normals are those of a rotation whose frames were not registered, the differences between heights and
+    surface are part of ``height_sigma``.
 
     If the surface of a component rises by less than one step, all of its heights have nearly the same error,
     which normals cannot reduce. The returned ``height_sigma`` contains only a part of it: add
@@ -106,29 +155,129 @@ def fuse(
 
     Examples
     --------
+    >>> from mirrorskin import engine, hw
+    >>> from mirrorskin.hw.twin import Axial, Vertical
+    >>> ball = {"object": "sphere", "shape": (50, 50), "pixel_size": 0.1}
+    >>> press = hw.Twin(movement=Vertical(0.1 * np.arange(1, 31)), **ball)
+    >>> eighths = np.pi / 4 * np.arange(8)
+    >>> turn = hw.Twin(movement=Axial(eighths, tilt=0.05, press=1.5), pattern="linear", **ball)
+    >>> surface = engine.fuse(press, turn)
+    >>> error = engine.score(surface, turn.truth).height
+    >>> error.rms < 0.005  # mm
+    True
+
+    Of results, or other maps:
+
     >>> heights = {"height": np.array([[1.0, np.nan]]), "height_sigma": np.array([[0.01, np.nan]])}
     >>> upright = np.array([[[0.0, 0.0, 1.0]] * 2])
     >>> normals = {"normals": upright, "normals_sigma": np.full((1, 2), 0.01)}
-    >>> fuse(heights, normals, 0.1).height.tolist()
+    >>> engine.fuse(heights, normals, 0.1).height.tolist()
     [[1.0, 1.0]]
     """
+    with ExitStack() as opening:
+        first, second = (
+            _opened(name, value, memory_limit, opening)
+            for name, value in (("heights", heights), ("normals", normals))
+        )
+        if _is_source(first) != _is_source(second):
+            (recording, result) = ("heights", "normals") if _is_source(first) else ("normals", "heights")
+            raise InputError(
+                f"{recording} is a recording, but {result} is a result: give two recordings, or two results"
+                " (engine.reconstruct)"
+            )
+        if _is_source(first):
+            for name, value in (("pixel_size", pixel_size), ("mask", mask)):
+                if value is not None:
+                    raise InputError(f"{name} is for results, but recordings are fused. Remove it")
+            options: dict[str, Any] = {"press": press, "rotation": rotation, "memory_limit": memory_limit}
+            options |= {"robust": robust, "register": register, "device": device, "progress": progress}
+            return _fuse_sources(first, second, **options)
+        for name, value in (("press", press), ("rotation", rotation)):
+            if value is not None:
+                raise InputError(f"{name} has options for a recording, but results are fused. Remove it")
+        return _fuse_maps(first, second, pixel_size, mask, robust, device)
+
+
+def _is_source(value: Any) -> bool:
+    return hasattr(value, "header") and hasattr(value, "motion")
+
+
+def _opened(name: str, value: Any, memory_limit: int, opening: ExitStack) -> Any:
+    """Return a source, or maps; a file is opened as what it is."""
+    if isinstance(value, str | os.PathLike):
+        path = path_of(os.fspath(value))
+        if not kind_of_frames(path) and is_result(path):
+            return open_result(path)
+        return opening.enter_context(open_recording(path, memory_limit=memory_limit))
+    if getattr(value, "ndim", None) == 3 and (name == "heights" or value.shape[-1] != 3):
+        raise InputError(
+            f"{name} is an array of shape {tuple(value.shape)}: give frames as io.ArrayRecording(frames,"
+            " {'travel': travel}, {'pixel_size': (0.03, 0.03)}), a rotation with 'phase' and its tilt, press"
+            " and pivot"
+        )
+    return value
+
+
+def _fuse_maps(
+    heights: Maps,
+    normals: Maps,
+    pixel_size: ArrayLike | None,
+    mask: ArrayLike | None,
+    robust: bool,
+    device: Choice,
+) -> Result:
+    """Return the surface of heights and normals."""
     height_maps = _maps_of("heights", heights, "height", "height_sigma")
     normal_maps = _maps_of("normals", normals, "normals", "normals_sigma")
     wanted = _check_shapes(height_maps, normal_maps, mask)
-    contact = 1 if normal_maps.contact is None else normal_maps.contact
-    slopes = slopes_of(normal_maps, contact=np.where(wanted, contact, 0).astype(np.uint8))
+    size = pixel_size_of(height_maps, "heights", pixel_size)
     height = absolute_heights(height_maps)
     assert height is not None
-    known = AbsoluteHeights.of(height, height_maps.height_sigma, wanted)
-    size = pixel_size_of(height_maps, "heights", pixel_size)
-    solver = FusionSolver(known, size, robust, device_of_maps(device, height_maps, normal_maps))
+    known = AbsoluteHeights.of(*repeated_heights_as_intervals(height, height_maps.height_sigma), wanted)
+    tilt = normal_maps.process.get("tilt")
+    moved = 0.0  # pixels that points move in frames that were not registered
+    if isinstance(tilt, float) and not _registered(normal_maps):
+        moved = math.sin(tilt) * float(np.max(np.abs(known.height), initial=0, where=known.known)) / min(size)
+    slopes = _slopes_of_maps(normal_maps, wanted, moved)
+    opened = device_of_maps(device, height_maps, normal_maps)
+    solver = FusionSolver(known, size, robust, opened, doubtful=moved > 0)
     surface = solver.filled(solver.surface(slopes))
     x, y = pixel_axes(wanted.shape, size)
     if height_maps.x is not None and height_maps.y is not None:
         x, y = height_maps.x, height_maps.y
     process = describe_integration([surface]) | solver.process
     warn("fuse", process)
+    if tilt is not None:
+        process |= in_process([_FROM_RESULTS], process)
+    process |= carried(process, heights=height_maps.process, normals=normal_maps.process)
     return surface.assign(x=x, y=y, process=process)
+
+
+def _slopes_of_maps(normals: Result, wanted: Mask, moved: float) -> Slopes:
+    """Return the slopes of a result's normals, in frames whose points moved by some pixels.
+
+    Where the contact ends, but not at single pixels without it, a pixel shows points outside of the contact
+    in some frames: such normals are not used. If frames were registered, which interpolates them, the errors
+    of neighbours are correlated.
+    """
+    contact = np.ones(wanted.shape, np.uint8)
+    if normals.contact is not None:
+        contact = (np.asarray(normals.contact) != 0).astype(np.uint8)
+    if moved > 0:
+        border = math.ceil(moved) + 1
+        whole = cv2.morphologyEx(contact, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        contact &= cv2.erode(whole, np.ones((2 * border + 1, 2 * border + 1), np.uint8), borderValue=1)
+    contact[~wanted] = 0
+    sigma = np.asarray(normals.normals_sigma, np.float32)
+    sigma = np.where(sigma < _SHARPEST, np.float32(_SHARPEST), sigma)
+    gain = np.float32(MEAN_NOISE_GAIN if _registered(normals) else 1)
+    return slopes_of(normals.assign(normals_sigma=sigma), sigma / gain, contact)
+
+
+def _registered(normals: Result) -> bool:
+    """Return whether the normals are those of registered frames."""
+    process = normals.process
+    return bool(process.get("registered", process.get("heights", "none") != "none"))
 
 
 def _maps_of(name: str, maps: Maps, *needed: str) -> Result:
@@ -160,56 +309,19 @@ def _check_shapes(heights: Result, normals: Result, mask: ArrayLike | None) -> M
     return np.ones((rows, columns), bool) if mask is None else np.asarray(mask) != 0
 
 
-@checked(register=check_flag, robust=check_flag, memory_limit=check_count)
-def fuse_recordings(
+def _fuse_sources(
     vertical: Source,
     axial: Source,
     *,
-    press: Press | Mapping[str, Any] | None = None,
-    rotation: Rotation | Mapping[str, Any] | None = None,
-    register: bool = True,
-    robust: bool = False,
-    memory_limit: int = MEMORY_LIMIT,
-    device: Choice = None,
-    progress: Progress | None = None,
+    press: Press | Mapping[str, Any] | None,
+    rotation: Rotation | Mapping[str, Any] | None,
+    register: bool,
+    robust: bool,
+    memory_limit: int,
+    device: Choice,
+    progress: Progress | None,
 ) -> Result:
-    """Reconstruct a press and a rotation on the same object, and join them to one surface.
-
-    The axial frames are registered for the pivot's shift with the heights of the press, then with those of
-    the joined surface, until points move by less than a fiftieth of a pixel; at most three times. A source
-    that cannot be read twice is registered once.
-
-    Parameters
-    ----------
-    vertical, axial : Source
-        On the same pixels. They are rewound first, if they can be, and are read with the calibrations that
-        they carry.
-    press, rotation : Press and Rotation, or mappings of their options, optional
-        How to reconstruct the one and the other. Holes of the press are not filled.
-    register : bool
-        Whether frames follow the object; they must not where the pivot is unknown.
-    robust : bool
-        As for `fuse`.
-    memory_limit : int
-        Bytes of host memory for frames that are read ahead.
-    device : str, Device or sequence of them, optional
-        See ``mirrorskin.kernels.device.open_devices``.
-    progress : callable, optional
-        Called with the number of frames so far, of ``frames_to_read(vertical, axial, register)``.
-
-    Returns
-    -------
-    Result
-        Heights and normals. Process values of one source alone begin with ``vertical_`` or ``axial_``.
-
-    Raises
-    ------
-    mirrorskin.io.InputError
-        Other motions, pixels that differ, no height at all, or what `Press`, `Rotation` and `Registered`
-        refuse.
-    mirrorskin.engine.NotConverged
-        The surface was not found.
-    """
+    """Reconstruct a press and a rotation, and return the surface of both."""
     vertical, axial = calibrated(vertical), calibrated(axial)
     pixel_size = _check_sources(vertical, axial)
     opened = open_devices(device)
@@ -263,7 +375,7 @@ def fuse_recordings(
 
 
 def frames_to_read(vertical: Source, axial: Source, register: bool = True) -> int:
-    """Return the largest number of frames that `fuse_recordings` reads."""
+    """Return the largest number of frames that `fuse` reads from recordings of a press and a rotation."""
     return vertical.shape[0] + _passes(axial, register) * axial.shape[0]
 
 
@@ -308,9 +420,8 @@ def _rotate(method: Rotation, axial: Source, progress: Progress | None) -> tuple
         found = feed(stream, plan.operation, plan.frames, progress)
         result = plan.operation.finish()
     context = Context(axial, plan.operation, stream)
-    result = result.assign(
-        dict.fromkeys(plan.omit), process={**plan.process, **result.process, **in_process(found, {})}
-    )
+    process = merged(plan.process, result.process)
+    result = result.assign(dict.fromkeys(plan.omit), process={**process, **in_process(found, process)})
     slopes = None
     for step in plan.steps:
         if isinstance(step, Integration):

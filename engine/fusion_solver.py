@@ -84,7 +84,8 @@ class FusionSolver:
 
     Later slopes, of the same frames after another registration, are integrated in one pass: the last surface
     replaces the first two. `surface` raises InputError without any height or slope, and NotConverged if the
-    integration does not converge.
+    integration does not converge. If slopes are ``doubtful``, as those of frames that were not registered,
+    their difference from the heights is part of ``height_sigma`` even if chance explains it.
     """
 
     def __init__(
@@ -94,9 +95,11 @@ class FusionSolver:
         robust: bool,
         device: Device,
         footprint: float = PIXEL,
+        doubtful: bool = False,
     ) -> None:
         self._press, self._pixel_size = press, check_pixel_size(pixel_size)
         self._robust, self._device, self._footprint = robust, device, footprint
+        self._doubtful = doubtful
         self._near: Result | None = None
         self._slope_error, self._disagreement = SlopeError(), Disagreement()
         self._correlation, self._scatter = 0.0, 1.0
@@ -112,7 +115,8 @@ class FusionSolver:
         surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
         if self._disagreement.clear:  # perhaps only because the first surface was too far from the last
             surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
-        contradict = self._disagreement.clear or self._slope_error != SlopeError()
+        doubtful = self._doubtful and math.isfinite(self._disagreement.rms)
+        contradict = doubtful or self._disagreement.clear or self._slope_error != SlopeError()
         for _ in range(_CORRECTIONS):
             if not self._disagreement.clear or self._disagreement.slope_error is None:
                 break

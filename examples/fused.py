@@ -8,7 +8,6 @@ crater of the press is closed, and the ball's radius is correct.
 import numpy as np
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.fusion import fuse_recordings
 from mirrorskin.hw.twin import Axial, Camera, Vertical
 from mirrorskin.view.result import figures_of
 
@@ -19,7 +18,7 @@ turn = hw.Twin(
     pattern="linear",
     **ball,
 )
-result = fuse_recordings(press, turn)
+result = engine.fuse(press, turn)
 
 error = engine.score(result, press.truth).height
 print(f"RMS error {1000 * error.rms:.1f} µm at {error.answered} pixels")

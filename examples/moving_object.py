@@ -11,7 +11,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.fusion import fuse_recordings
 from mirrorskin.hw.twin import Axial, Camera, HeightMap, Vertical
 
 TOUCHES, SIZE, FIELD = 10, 80, 5.0  # touches, pixels of a side, mm
@@ -58,7 +57,7 @@ def touch(thing, depth, seed):
         )
         for number, (pattern, movement) in enumerate(movements.items())
     )
-    return fuse_recordings(press, rotation)
+    return engine.fuse(press, rotation)
 
 
 share = np.linspace(0, 1, TOUCHES)

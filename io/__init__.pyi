@@ -1,3 +1,4 @@
+from .arrays import ArrayRecording
 from .atomic import check_output, check_result_output
 from .calibration.file import open_calibration, save_calibration, update_calibration
 from .calibration.source import Calibrated
@@ -39,6 +40,7 @@ from .watch import Check
 from .zarr_export import save_zarr
 
 __all__ = [
+    "ArrayRecording",
     "Block",
     "Calibrated",
     "Calibration",

@@ -8,7 +8,7 @@ import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -16,7 +16,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.arguments import as_array, as_pixel_size
+from mirrorskin.io.arguments import as_array, as_pixel_size, unknown_argument
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.fingerprint import State, check_unchanged, fingerprint_of_files, modified, state_of
 from mirrorskin.io.foreign import kind_of_frames, open_reader
@@ -54,7 +54,7 @@ class ArrayRecording(Recording):
     positions : mapping
         ``travel``, mm, (T,), ``phase`` or ``twist``, radians, (T,), or ``displacement``, mm, (T, 2).
     header : mapping
-        Other properties: ``tilt``, ``pixel_size``, ``dark``, ``bright``; see ``Header``.
+        Properties, such as ``pixel_size``, ``tilt``, ``press``, ``pivot`` and ``dark``: those of ``Header``.
     motion : str, optional
         By default the motion of the given position.
     region, wanted
@@ -68,11 +68,18 @@ class ArrayRecording(Recording):
     ------
     InputError
         Frames, positions or header cannot be used.
+
+    Examples
+    --------
+    >>> frames = np.zeros((5, 3, 4), np.uint8)
+    >>> press = ArrayRecording(frames, {"travel": [0.0, 0.1, 0.2, 0.3, 0.4]}, {"pixel_size": 0.03})
+    >>> press.motion, press.header.pixel_size
+    ('vertical', (0.03, 0.03))
     """
 
     def __init__(
         self,
-        frames: NDArray[Any] | FrameReader,
+        frames: ArrayLike | FrameReader,
         positions: Mapping[str, ArrayLike | Positions | None],
         header: Mapping[str, Any],
         motion: Motion | None = None,
@@ -81,6 +88,7 @@ class ArrayRecording(Recording):
         name: str = "the array of frames",
         origins: Mapping[Path, State] | None = None,
     ) -> None:
+        _check_names(name, positions, header)
         reader = frames if isinstance(frames, FrameReader) else None
         frames = frames if reader is not None else as_array("frames", frames)
         if reader is not None and reader.shape[0] < 2:
@@ -114,15 +122,12 @@ class ArrayRecording(Recording):
             problem = f"{where} has shape {np.shape(given)} for {count} frames of {columns} columns"
             raise InputError(f"{problem}: if the frames are the last axis, use numpy.moveaxis(frames, -1, 0)")
         setattr(self, series, check_finite(given, self.full_shape[0], where, cut.frames, width))
-        maps = {one: _map(name, one, header.get(one), self.full_shape[1:]) for one in ("dark", "bright")}
-        known = {one: value[cut.region.slices] for one, value in maps.items() if value is not None}
-        size = header.get("pixel_size")
-        size = None if size is None else as_pixel_size("pixel_size", size)
-        if size is not None and not all(1e-9 < one < 1e6 for one in size):
-            raise InputError(f"{name}: pixel size {size} mm: give one above zero: 1e-9 to 1e6")
-        self.header: Header = Header(
-            self.motion, **{"title": self.path.stem, **header, **known, "pixel_size": size}
-        )
+        levels = {one: _map(name, one, header.get(one), self.full_shape[1:]) for one in ("dark", "bright")}
+        known: dict[str, Any] = {
+            one: level[cut.region.slices] for one, level in levels.items() if level is not None
+        }
+        known["pixel_size"] = _pixel_size(name, header.get("pixel_size"))
+        self.header: Header = Header(self.motion, **{"title": self.path.stem, **header, **known})
         self.used, self.dropped, self.state = None, None, COMPLETE
         if reader is not None:
             self.time = None if reader.time is None else reader.time[slice(*cut.frames)]
@@ -438,6 +443,24 @@ def _stack_of(path: Path, names: Iterable[str]) -> str:
     if "frames" in others or len(others) == 1:
         return "frames" if "frames" in others else others[0]
     raise InputError(f"{path} contains the arrays {', '.join(names)}: choose the frames with --dataset")
+
+
+def _check_names(name: str, positions: Iterable[str], header: Iterable[str]) -> None:
+    """Raise InputError if a position or a property does not exist."""
+    properties = [field.name for field in fields(Header) if field.name != "motion"]
+    for given, known in ((positions, [*POSITIONS.values()]), (header, properties)):
+        if unknown := next((one for one in given if one not in known), ""):
+            raise InputError(unknown_argument(name, unknown, known, "property"))
+
+
+def _pixel_size(name: str, size: Any) -> tuple[float, float] | None:
+    """Return millimetres along x and y; None if they are unknown."""
+    if size is None:
+        return None
+    lengths = as_pixel_size("pixel_size", size)
+    if not all(1e-9 < length < 1e6 for length in lengths):
+        raise InputError(f"{name}: pixel size {lengths} mm: give one above zero: 1e-9 to 1e6")
+    return lengths
 
 
 def _motion(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from mirrorskin.io.result import Result
 
 _BETWEEN = "; "
+_CARRIED = "of an input"
+_KINDS = "warnings", "notes"
 
 
 class MirrorskinWarning(UserWarning):
@@ -39,7 +41,7 @@ class Finding:
     warning: bool = True
 
 
-def in_process(findings: Iterable[Finding], process: Mapping[str, Any]) -> dict[str, str]:
+def in_process(findings: Sequence[Finding], process: Mapping[str, Any]) -> dict[str, str]:
     """Return the ``warnings`` and ``notes`` of a process, with those of findings added.
 
     Examples
@@ -48,12 +50,66 @@ def in_process(findings: Iterable[Finding], process: Mapping[str, Any]) -> dict[
     {'warnings': 'the light flickers by 3 %'}
     """
     known = {}
-    for name, wanted in (("warnings", True), ("notes", False)):
-        texts = [str(process[name])] if name in process else []
-        texts += [one.text for one in findings if one.warning is wanted]
-        if texts:
-            known[name] = _BETWEEN.join(dict.fromkeys(texts))
+    for name, wanted in zip(_KINDS, (True, False), strict=True):
+        text = str(process.get(name, ""))
+        for one in findings:
+            repeated = f"{_BETWEEN}{one.text}{_BETWEEN}" in f"{_BETWEEN}{text}{_BETWEEN}"
+            if one.warning is wanted and not repeated:
+                text = f"{text}{_BETWEEN}{one.text}" if text else one.text
+        if text:
+            known[name] = text
     return known
+
+
+def carried(process: Mapping[str, Any], **inputs: Mapping[str, Any]) -> dict[str, str]:
+    """Return the ``warnings`` and ``notes`` of a process, with those of the results that it is computed from.
+
+    Each is preceded by the name of its input. A finding that the process contains already is not repeated.
+
+    Parameters
+    ----------
+    process : mapping
+        Of the new result.
+    **inputs : mapping
+        The processes of its inputs, by their names.
+
+    Examples
+    --------
+    >>> carried({"noise": 1.2}, heights={"warnings": "frame 3: lost"}, normals={"tilt": 0.04})
+    {'warnings': 'heights: frame 3: lost'}
+    """
+    findings = [one for name, own in inputs.items() for one in findings_of(name, own)]
+    return in_process(findings, process)
+
+
+def merged(*processes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of processes, later ones replacing earlier ones, with the findings of all of them.
+
+    Examples
+    --------
+    >>> merged({"noise": 1.2, "warnings": "frame 3: lost"}, {"noise": 1.5, "warnings": "flicker"})
+    {'noise': 1.5, 'warnings': 'frame 3: lost; flicker'}
+    """
+    values: dict[str, Any] = {}
+    for process in processes:
+        own = [Finding(_CARRIED, str(process[kind]), kind == _KINDS[0]) for kind in _KINDS if kind in process]
+        values = {**values, **process, **in_process(own, values)}
+    return values
+
+
+def findings_of(name: str, process: Mapping[str, Any]) -> list[Finding]:
+    """Return the findings in the process of an input, with its name.
+
+    Examples
+    --------
+    >>> [finding.text for finding in findings_of("result", {"warnings": "frame 3: lost"})]
+    ['result: frame 3: lost']
+    """
+    return [
+        Finding(_CARRIED, named(name, text), kind == _KINDS[0])
+        for kind in _KINDS
+        for text in _texts(process, kind)
+    ]
 
 
 def warnings_in(process: Mapping[str, Any]) -> list[str]:
@@ -64,7 +120,12 @@ def warnings_in(process: Mapping[str, Any]) -> list[str]:
     >>> warnings_in({"vertical_warnings": "frame 3: lost", "noise": 1.2})
     ['frame 3: lost']
     """
-    return [str(text) for name, text in process.items() if f"_{name}".endswith("_warnings")]
+    return _texts(process, "warnings")
+
+
+def _texts(process: Mapping[str, Any], kind: str) -> list[str]:
+    """Return the warnings or notes of a process, with those of fused recordings."""
+    return [str(text) for name, text in process.items() if f"_{name}".endswith(f"_{kind}")]
 
 
 def with_findings(result: Result, *findings: Finding) -> Result:

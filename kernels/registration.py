@@ -31,6 +31,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
+MEAN_NOISE_GAIN = 0.776
+"""Factor of the noise of a sample by interpolation, RMS over all positions between the pixels."""
 BORDER = 2
 """Width of the border of NaN around a padded frame: results that need one of them are NaN."""
 

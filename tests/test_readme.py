@@ -19,7 +19,7 @@ from mishaps import starved
 from right_scores import check_score
 from rotations import Setup, direction, expose
 
-from mirrorskin import io
+from mirrorskin import engine, io
 
 ROOT = Path(__file__).parent.parent
 TEXT = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in ("README.md", "docs/twin.md"))
@@ -102,14 +102,16 @@ def test_the_block_of_the_emulated_rig_runs_as_it_is_pasted(tmp_path):
 
 def test_the_python_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["--size", "48x40", "--pixel-size", "0.25mm", "--frames", "12"]
-    assert run("simulate", "vertical", *words, "-o", "press.h5").code == 0
+    for name in ("press", "turn"):
+        assert run("sample", name, "-o", f"{name}.h5").code == 0
     assert len(PYTHON) == 2
     known = arrays()
     for block in PYTHON:
         exec(block, known)
     assert np.isfinite(known["onset"].height).any()
     assert np.isfinite(known["surface"].height).all()
+    with io.open_recording("press.h5") as recording:
+        assert engine.score(known["both"], recording.truth).height.rms < 0.001  # mm
     assert known["twin"].shape == (4, 480, 640)
 
 

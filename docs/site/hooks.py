@@ -40,7 +40,6 @@ _PACKAGES = {
         "engine.rotation": "normals, contact and edges from a rotation",
         "engine.slip": "displacement and slip of the skin",
         "engine.integration": "heights from slopes or normals",
-        "engine.fusion": "one surface from heights and normals",
         "engine.pose": "motion of an object between results; stitching of results",
         "engine.force": "pressure, traction and forces from heights or displacements",
         "engine.metrology": "planes, spheres, sections, steps, texture and profiles, with uncertainties",

@@ -21,6 +21,8 @@ from mirrorskin.kernels.array_types import Doubles
 
 _USUAL = 0.9, 1.5  # range of the sigma of a height between two frames, in sigmas of the interval
 _ROUNDED = 1e-3  # error of a height by its rounding, as a share of an interval
+_SHARED_BY, _LEAST_SHARED = 4, 0.25  # samples that have the middle of an interval; least share of all samples
+_ADJOIN = 0.6  # least distance of the middles of intervals, in their widths by sigma
 _LEAST = 0.02  # minimum blur of an interval's ends, as a share of its half-width
 _FAR = 6.0  # blurs outside an interval beyond which an onset is an outlier
 _SPAN = 20.0  # half-widths: minimum range over which outliers are distributed
@@ -82,6 +84,40 @@ def heights_as_intervals(height: Doubles, sigma: Doubles, travel: Doubles) -> In
     between &= (-height >= ends[0]) & (-height <= ends[-1])
     middle = -(ends[place] + ends[place - 1]) / 2
     return Intervals(np.where(between, middle, height), np.where(between, usual, sigma))
+
+
+def repeated_heights_as_intervals(height: NDArray[np.floating], sigma: NDArray[np.floating]) -> Intervals:
+    """Return heights of a result, moved to the middles of their intervals between two frames.
+
+    As `heights_as_intervals`, without the travel: most heights between two frames are their exact middle, so
+    it is a value that many pixels share. If less than a quarter of the pixels share one, such as after a
+    correction for the elastomer, or if shared values are much nearer than intervals, all are unchanged.
+
+    Parameters
+    ----------
+    height, sigma : ndarray, (H, W)
+        Heights and their standard deviations, mm; NaN where unknown.
+    """
+    height, sigma = np.asarray(height, np.float64), np.asarray(sigma, np.float64)
+    known = np.isfinite(height) & np.isfinite(sigma)
+    thin = slice(None, None, max(1, -(-np.count_nonzero(known) // _SAMPLES)))
+    samples, sigmas = height[known][thin], sigma[known][thin]
+    values, place, count = np.unique(samples, return_inverse=True, return_counts=True)
+    shared = count >= _SHARED_BY
+    if np.sum(count[shared]) <= _LEAST_SHARED * samples.size:
+        return Intervals(height, sigma)
+    middles, of_middle = values[shared], shared[place]
+    between = (middles[1:] + middles[:-1]) / 2
+    number = np.searchsorted(between, samples[of_middle])
+    usual = np.bincount(number, sigmas[of_middle]) / np.bincount(number)
+    wide = math.sqrt(3) * (usual[1:] + usual[:-1])
+    if np.any(np.diff(middles) < _ADJOIN * wide):
+        return Intervals(height, sigma)
+    nearest = np.searchsorted(between, np.where(known, height, 0.0))
+    middle, width = middles[nearest], usual[nearest]
+    inside = known & (sigma > _USUAL[0] * width) & (sigma < _USUAL[1] * width)
+    inside &= np.abs(height - middle) <= math.sqrt(3) * width
+    return Intervals(np.where(inside, middle, height), np.where(inside, width, sigma))
 
 
 class IntervalErrors(NamedTuple):

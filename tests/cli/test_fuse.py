@@ -12,7 +12,6 @@ from commands import done, refused, run
 from stacks import record
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.fusion import fuse_recordings
 from mirrorskin.hw.twin import Axial, Camera, Vertical
 
 SHAPE, PIXEL = (44, 48), 0.25
@@ -114,7 +113,7 @@ def test_json_contains_the_engine_s_surface_and_where_it_came_from():
     assert told["process"]["vertical_source"].endswith("press.h5")
     assert told["process"]["axial_source"].endswith("turn.h5")
     with io.open_recording("press.h5") as vertical, io.open_recording("turn.h5") as axial:
-        expected = fuse_recordings(vertical, axial)
+        expected = engine.fuse(vertical, axial)
     np.testing.assert_array_equal(result.height, expected.height)
     np.testing.assert_array_equal(result.filled, expected.filled)
 
@@ -225,6 +224,6 @@ def test_a_surface_that_was_not_found_is_one_line_and_no_file(monkeypatch):
     def fails(*sources, **options):
         raise engine.NotConverged("the residual is 0.3 after 100 iterations: allow more")
 
-    monkeypatch.setattr("mirrorskin.engine.fusion.fuse_recordings", fails)
+    monkeypatch.setattr("mirrorskin.engine.fuse", fails)
     line = "the residual is 0.3 after 100 iterations: allow more"
     assert refused(line, "fuse press.h5 turn.h5", code=1) == line

@@ -25,7 +25,6 @@ from scenes import (
 )
 
 from mirrorskin import engine, io
-from mirrorskin.engine.fusion import fuse_recordings as engine_fuse_recordings
 from mirrorskin.engine.lock_in import Correlation
 from mirrorskin.engine.metrology import Quantity
 from mirrorskin.engine.metrology import fit_plane as engine_fit_plane
@@ -648,7 +647,7 @@ def fuse_sources() -> Answer:
     turned = turn_source(pivot=(0.4, -0.3, 5.0))
     with warnings.catch_warnings():  # the press and the rotation are not of one surface
         warnings.simplefilter("ignore", io.MirrorskinWarning)
-        return result_maps(engine_fuse_recordings(down, turned, press={"noise": 1.0}))
+        return result_maps(engine.fuse(down, turned, press={"noise": 1.0}))
 
 
 # Measures.

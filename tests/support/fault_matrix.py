@@ -36,7 +36,6 @@ from scipy.ndimage import gaussian_filter
 from slope_faults import SLOPE_FAULTS, integrated
 
 from mirrorskin import engine
-from mirrorskin.engine.fusion import fuse_recordings
 from mirrorskin.io import MirrorskinWarning, Result
 from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.io.frames import lossy
@@ -284,7 +283,7 @@ def _integrated(fault: Fault, seed: int) -> Answer:
 def _fused(fault: Fault, seed: int) -> Answer:
     truth = _waves(*centres(SHAPE, PIXEL))[0]
     press, turn = _press(_waves, 0.05, fault, seed), _turn(_waves, fault, seed + 2)
-    result, warned = _watched(lambda: fuse_recordings(press, turn, rotation=_scale(fault), register=False))
+    result, warned = _watched(lambda: engine.fuse(press, turn, rotation=_scale(fault), register=False))
     return Answer(result.height - truth, result.height_sigma, warned)
 
 
