@@ -31,6 +31,8 @@ def command(
         if recording.truth is None:
             raise io.InputError(f"{truth} holds no truth: only 'mirrorskin simulate' writes one")
         score = engine.score(found, recording.truth)
+    for note in score.notes:
+        click.echo(printable(f"{result}: {note.removeprefix('result: ')}"), err=True)
     if score.slip_left_out is not None:
         click.echo(printable(f"{result}: slip is left out: {score.slip_left_out}"), err=True)
     if as_json:

@@ -14,7 +14,7 @@ from mirrorskin.engine.options import Configured
 from mirrorskin.engine.provenance import attach_provenance, naming
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import Calibrated, InputError, Result
-from mirrorskin.io.findings import warn, with_findings
+from mirrorskin.io.findings import merged, warn, with_findings
 from mirrorskin.io.types import exclusive_use
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class Plan:
         """Return the operation's maps after all steps, with provenance, in the camera's pixels."""
         context = Context(source, self.operation, self.stream or source)
         result = result.assign(dict.fromkeys(self.omit))
-        process = {"frames": self.operation.count, **self.process, **result.process, **(more or {})}
+        process = merged({"frames": self.operation.count}, self.process, result.process, more or {})
         result = result.assign(process=process)
         for step in self.steps:
             result = step.apply(result, context)

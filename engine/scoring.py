@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.inputs import Maps, as_result
 from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.arguments import check_kind, checked
+from mirrorskin.io.findings import findings_of
 from mirrorskin.io.maps import SlipStatus
 from mirrorskin.io.result import map_shape
 from mirrorskin.io.types import UNDISTORTED
@@ -227,6 +228,8 @@ class Score:
         Slip of a slide or a twist that starts with the first frame.
     slip_left_out : str or None
         Reason why the result's slip is not scored.
+    notes : tuple of str
+        Warnings and notes of the result.
     """
 
     height: HeightScore | None = None
@@ -237,11 +240,12 @@ class Score:
     edges: EdgeScore | None = None
     slip: SlipScore | None = None
     slip_left_out: str | None = None
+    notes: tuple[str, ...] = ()
 
     def parts(self) -> dict[str, Any]:
         """Return the available scores, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        del values["slip_left_out"]
+        del values["slip_left_out"], values["notes"]
         return {name: value for name, value in values.items() if value is not None}
 
     def table(self) -> dict[str, str]:
@@ -306,6 +310,7 @@ def score(result: Maps, truth: Truth) -> Score:
         edges=None if edges is None else _score_edges(edges, _edges_of(truth)),
         slip=None if left_out or result.slip_onset is None else _score_slip(result, truth, touched),
         slip_left_out=left_out,
+        notes=tuple(one.text for one in findings_of("result", result.process)),
     )
     if not found.parts() and left_out is not None:
         raise InputError(f"slip, all that the result has, cannot be scored: {left_out}")

@@ -19,6 +19,7 @@ from mirrorskin.io import pictures
 from mirrorskin.io.arguments import check_flag, check_kind, check_path, checked
 from mirrorskin.io.atomic import write_new
 from mirrorskin.io.export_formats import FORMATS
+from mirrorskin.io.findings import warnings_in
 from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
 from mirrorskin.io.result import Result
 from mirrorskin.io.text import one_line
@@ -339,6 +340,8 @@ def notes_of(result: Result) -> dict[str, str]:
     notes = {name: one_line(process[key]) for name, key in _FROM_PROCESS.items() if key in process}
     if maker:
         notes[_SOFTWARE] = one_line(maker)
+    if warnings := warnings_in(process):
+        notes["warnings"] = one_line("; ".join(warnings))
     notes["heights"] = _height_datum(result)
     if result.height is not None and result.filled is not None and result.filled.any():
         known = np.isfinite(result.height)

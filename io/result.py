@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.findings import merged
 from mirrorskin.io.maps import (
     SIGMA,
     UNDECLARED,
@@ -237,6 +238,7 @@ class Result(Shown, Mapping[str, Any]):
         Parameters
         ----------
         maps : mapping of str to ndarray or float, optional
+            The warnings and notes of a result are added to those of this one.
         **changes
             Maps by name or quantity; ``x``, ``y``, ``process``, ``calibration`` and ``declarations``.
             Declarations are added to those of the result.
@@ -247,6 +249,9 @@ class Result(Shown, Mapping[str, Any]):
         >>> list(flat.assign(height=None, slope=np.zeros((2, 3))))
         ['slope']
         """
+        if isinstance(maps, Result) and "process" not in changes:
+            own = {name: maps.process[name] for name in ("warnings", "notes") if name in maps.process}
+            changes["process"] = merged(self.process, own)
         values = {**(maps or {}), **changes}
         fields = {name: values.pop(name, getattr(self, name)) for name in FIELDS}
         fields["declarations"] = {**self.declarations, **(fields["declarations"] or {})}

@@ -14,6 +14,7 @@ from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.halfspace import HalfSpace, Pressed, load_gradient, press
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import check_number, checked, in_unit
+from mirrorskin.io.findings import carried
 
 if TYPE_CHECKING:
     from mirrorskin.engine.press.elastic import PressFit
@@ -126,7 +127,7 @@ def find_force(
     force = _force(pressure, pressed.contact, young * load, spread)
     x, y = pixel_axes((surface.shape[0], surface.shape[1]), size)
     process = {"travel": float(travel), "modulus": float(young)}
-    return force.assign(x=x, y=y, process=process)
+    return force.assign(x=x, y=y, process={**process, **carried({}, height=result.process)})
 
 
 def _excess_load(

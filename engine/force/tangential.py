@@ -16,6 +16,7 @@ from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.halfspace import spectrum_of
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import as_array_or_number, check_count, check_number, checked, in_unit
+from mirrorskin.io.findings import carried
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 
@@ -136,7 +137,7 @@ def find_tangential_force(
         force_y_sigma=float(force_sigma[1]),
         x=x,
         y=y,
-        process={"modulus": float(young)},
+        process={"modulus": float(young), **carried({}, displacement=result.process)},
     )
 
 

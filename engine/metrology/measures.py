@@ -24,6 +24,7 @@ from mirrorskin.engine.metrology.sections import section as cut
 from mirrorskin.engine.metrology.texture import DRAWS, FormRemoval, roughness
 from mirrorskin.io import InputError, Region, Result
 from mirrorskin.io.arguments import check_number, checked, in_unit
+from mirrorskin.io.findings import findings_of
 from mirrorskin.kernels.array_types import Doubles
 
 FormName = Literal["plane", "sphere", "none"]
@@ -71,7 +72,7 @@ class Measures:
     quantities : dict of str to Quantity
         By name, in reading order.
     notes : list of str
-        What is omitted, and what is assumed.
+        Warnings and notes of the result; what is omitted, and what is assumed.
     budget : dict of str to dict of str to float
         The contributions to the standard uncertainty of each quantity, in its unit; their root sum of squares
         is the standard uncertainty.
@@ -158,7 +159,8 @@ def measure(
     lens = None if maps.calibration is None else maps.calibration.lens
     scale = 0.0 if lens is None else lens.scale_sigma
     quantities, budget = _scaled(quantities, budget, scale)
-    return Measures(quantities, [*notes, *_assumed(patch, scale)], budget)
+    inherited = [one.text for one in findings_of("result", maps.process)]
+    return Measures(quantities, [*inherited, *notes, *_assumed(patch, scale)], budget)
 
 
 def _volumes(patch: Patch, base: Quantity | None) -> dict[str, Quantity]:

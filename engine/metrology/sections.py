@@ -16,6 +16,7 @@ from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import as_array, checked
+from mirrorskin.io.findings import findings_of
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
@@ -45,6 +46,8 @@ class Section:
         Whether the height was filled, not measured.
     unit : {"mm", "px"}
         Millimetres, or pixels if their size is unknown.
+    notes : tuple of str
+        Warnings and notes of the result.
     """
 
     distance: Doubles
@@ -54,6 +57,7 @@ class Section:
     sigma: Doubles
     filled: Mask
     unit: str = "mm"
+    notes: tuple[str, ...] = ()
 
 
 def as_point(name: str, value: Any) -> Point:
@@ -126,7 +130,8 @@ def section(
     along, distance = _samples(start, end, size)
     column, row_of = (along[0] - x[0]) / size[0], (y[0] - along[1]) / size[1]
     values = _between(maps, height, SamplePoints.at(column, row_of, (height.shape[0], height.shape[1])))
-    return Section(distance, along[0], along[1], *values, unit)
+    notes = tuple(one.text for one in findings_of("result", maps.process))
+    return Section(distance, along[0], along[1], *values, unit, notes)
 
 
 def section_columns(result: Result, ends: tuple[Point, Point] | None = None) -> dict[str, NDArray[Any]]:

@@ -14,6 +14,7 @@ from mirrorskin.engine.pose.fit import Equations, PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import Motion
 from mirrorskin.io.arguments import as_array, checked, in_unit
+from mirrorskin.io.findings import findings_of
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 
@@ -40,6 +41,8 @@ class Pose:
         Pixels of the first map that have a counterpart in the second.
     undetermined : ndarray, (k, 6), float64
         Orthonormal directions (d, e) that the maps do not determine, such as a ball's spin.
+    notes : tuple of str
+        Warnings and notes of the results.
     """
 
     rotation: Doubles
@@ -48,6 +51,7 @@ class Pose:
     chi_square: float
     pixels: int
     undetermined: Doubles
+    notes: tuple[str, ...] = ()
 
     @property
     def motion(self) -> Motion:
@@ -79,7 +83,8 @@ class Pose:
         change = other.motion.adjoint()
         covariance = change @ self.covariance @ change.T + other.covariance
         free = np.concatenate([self.undetermined @ change.T, other.undetermined])
-        return other._changed(self.motion.then(other.motion), covariance, free)
+        moved = other._changed(self.motion.then(other.motion), covariance, free)
+        return replace(moved, notes=tuple(dict.fromkeys((*self.notes, *other.notes))))
 
     def _changed(self, motion: Motion, covariance: Doubles, free: Doubles) -> Pose:
         """Return another motion with its errors, and orthonormal undetermined directions."""
@@ -162,11 +167,13 @@ def estimate_pose(
     >>> len(pose.undetermined)
     3
     """
-    results = as_result(first, "first"), as_result(second, "second")
-    opened = device_of_maps(device, *results)
-    before, after = (PoseMap.of(result, pixel_size, opened) for result in results)
+    results = {"first": as_result(first, "first"), "second": as_result(second, "second")}
+    opened = device_of_maps(device, *results.values())
+    before, after = (PoseMap.of(result, pixel_size, opened) for result in results.values())
     fit = PairFit(before, after, opened)
-    return pose_of(fit, *fit.solve(None if start is None else start.motion))
+    pose = pose_of(fit, *fit.solve(None if start is None else start.motion))
+    findings = [one for name, result in results.items() for one in findings_of(name, result.process)]
+    return replace(pose, notes=tuple(one.text for one in findings))
 
 
 def pose_of(fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose:

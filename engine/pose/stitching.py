@@ -19,10 +19,12 @@ from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
 from mirrorskin.engine.provenance import signature
 from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Result, select_turn
+from mirrorskin.io.findings import carried
 from mirrorskin.io.maps import StitchStatus, status_of
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.pose_maps import SHARPEST
 
 _SHARED = 0.2  # smallest share of the smaller map's pixels that two touches must have in common
 _ALIKE = 4.0  # largest chi square of a link between two touches
@@ -124,7 +126,10 @@ def stitch(
             raise InputError(f"{name}: {error}") from error
     graph = _Graph(maps, names, opened)
     poses = graph.solve()
-    return Stitch(_merged(touches, maps, poses, names), tuple(poses), len(graph.links))
+    merged = _merged(touches, maps, poses, names)
+    inherited = carried({}, **{str(name): one.process for name, one in zip(names, touches, strict=True)})
+    merged = merged.assign(process={**merged.process, **inherited})
+    return Stitch(merged, tuple(poses), len(graph.links))
 
 
 class _Graph:
@@ -333,7 +338,7 @@ class _Moved:
 def _variance_of(touch: Result) -> Doubles:
     """Return the variance of a touch's heights, (H, W); NaN if unknown."""
     sigma = np.asarray(touch.height_sigma, np.float64)
-    return np.where(sigma > 0, sigma, np.nan) ** 2
+    return np.where(sigma > 0, np.maximum(sigma**2, SHARPEST), np.nan)
 
 
 class _Sums:

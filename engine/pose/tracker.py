@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -12,6 +14,7 @@ from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import Result
+from mirrorskin.io.findings import findings_of
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 
@@ -63,6 +66,8 @@ class PoseTracker(ThreadSafe):
         self._key_pose = IDENTITY
         self._free: Doubles | None = None
         self._fewest, self._worst = 0.0, np.inf  # pixels, and chi square
+        self._results = 0
+        self._notes: tuple[str, ...] = ()  # of the last result
         self._back, self._last = STILL, STILL  # from the last result to the key, and to the one before
 
     def push(self, maps: Maps) -> Pose:
@@ -75,6 +80,13 @@ class PoseTracker(ThreadSafe):
             ignored.
         """
         result = as_result(maps, "result")
+        self._notes = tuple(one.text for one in findings_of(f"result {self._results}", result.process))
+        pose = self._find(result)
+        self._results += 1
+        return self._noted(pose)
+
+    def _find(self, result: Result) -> Pose:
+        """Return the motion from the first result; its notes are those of the keys."""
         if self._key is None:
             self._take_key(result, self._key_pose)
             return self._key_pose
@@ -119,9 +131,13 @@ class PoseTracker(ThreadSafe):
         return self._key_pose.then(to_key.inverse())
 
     def _take_key(self, result: Result, pose: Pose) -> None:
-        self._key, self._key_pose, self._free = self._map(result), pose, None
+        self._key, self._key_pose, self._free = self._map(result), self._noted(pose), None
         self._back = STILL
         self.keys += 1
+
+    def _noted(self, pose: Pose) -> Pose:
+        """Return a pose with the notes of the last result."""
+        return replace(pose, notes=tuple(dict.fromkeys((*pose.notes, *self._notes))))
 
     def _map(self, result: Result, curved: bool = True) -> PoseMap:
         return PoseMap.of(result, self._pixel_size, self._device, curved)

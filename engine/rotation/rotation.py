@@ -42,8 +42,11 @@ from mirrorskin.engine.rotation.steps import (
 from mirrorskin.engine.streaming import feed
 from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Source, WallResponse, open_heights
 from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.findings import carried
 from mirrorskin.io.positions import check_phase
+from mirrorskin.io.recording import is_result
 from mirrorskin.io.result import absolute_heights
+from mirrorskin.io.result_file import open_process
 from mirrorskin.io.types import exclusive_use
 from mirrorskin.kernels.array_types import Doubles
 
@@ -122,9 +125,12 @@ class Rotation(Method):
             return self._poses(source)
         header = self._header(source)
         heights = _heights_of(self.heights, source)
-        if wall is None:
-            return self._linear(source, header, heights)
-        return self._calibrated(source, header, wall, heights)
+        plan = (
+            self._linear(source, header, heights)
+            if wall is None
+            else self._calibrated(source, header, wall, heights)
+        )
+        return replace(plan, process=plan.process | carried({}, heights=_process_of(self.heights)))
 
     def live_plan(self, source: Source) -> Plan:
         """Return the normals of the last turn, without registration, or what the source determines."""
@@ -293,6 +299,13 @@ def _heights_of(heights: Any, source: Source) -> ArrayLike | None:
     if isinstance(heights, Mapping):
         return absolute_heights(as_result(heights, "heights"))
     return cast("ArrayLike | None", heights)
+
+
+def _process_of(heights: Any) -> Mapping[str, ProcessValue]:
+    """Return the process of a result with heights, or of its file; empty for others."""
+    if isinstance(heights, str | Path):
+        return open_process(heights) if is_result(heights) else {}
+    return as_result(heights, "heights").process if isinstance(heights, Mapping) else {}
 
 
 def _half_way(source: Source, press: float) -> Doubles:

@@ -28,6 +28,7 @@ from mirrorskin.engine.slip.displacement import (
 from mirrorskin.engine.slip.onset_map import Expected, OnsetMap, fit_onsets
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
 from mirrorskin.io import Calibrated, InputError, Map, Recording, Result, pixel_axes
+from mirrorskin.io.findings import carried
 from mirrorskin.io.maps import TABLE, TWIST, DisplacementStatus, SlipStatus, status_of
 from mirrorskin.io.positions import check_finite
 from mirrorskin.io.types import FRAME_DTYPES, UNDISTORTED
@@ -164,7 +165,7 @@ class Slip(Operation):
             raise InputError("the pixel size is missing, which slip needs: give --pixel-size (pixel_size=)")
         self._size = check_pixel_size(self.pixel_size)
         check_windows(shape, self.window_size, self.window_step)
-        self._contact, self._contact_origin = _read_contact(self.contact, shape)
+        self._contact, self._contact_origin, self._findings = _read_contact(self.contact, shape)
         self.clear()
 
     def clear(self) -> None:
@@ -262,6 +263,7 @@ class Slip(Operation):
             "frames": self.count,
             "noise": texture.noise,
             "contact": self._contact_origin,
+            **self._findings,
         }
         if self.motion == "twist":
             found = codes == DisplacementStatus.FOUND
@@ -466,17 +468,18 @@ class _Course:
         return ratio
 
 
-def _read_contact(contact: Maps | None, shape: tuple[int, int]) -> tuple[NDArray[np.bool_] | None, str]:
-    """Return the contact, if it is specified, and its origin for ``process``."""
+def _read_contact(
+    contact: Maps | None, shape: tuple[int, int]
+) -> tuple[NDArray[np.bool_] | None, str, dict[str, str]]:
+    """Return the contact, if it is specified, its origin for ``process``, and the findings of its result."""
     if contact is None:
-        return None, "estimated"
-    if isinstance(contact, str | os.PathLike):
-        try:
-            return _contact_of(as_result(contact), shape)
-        except InputError as error:
-            path = os.fspath(contact)
-            raise (error if path in str(error) else InputError(f"{path}: {error}")) from error
-    return _contact_of(as_result(contact, "contact", quantity="contact"), shape)
+        return None, "estimated", {}
+    result = as_result(contact, "contact", quantity="contact")
+    try:
+        return *_contact_of(result, shape), carried({}, contact=result.process)
+    except InputError as error:
+        path = os.fspath(contact) if isinstance(contact, str | os.PathLike) else ""
+        raise (error if path in str(error) else InputError(f"{path}: {error}")) from error
 
 
 def _contact_of(result: Result, shape: tuple[int, int]) -> tuple[NDArray[np.bool_], str]:
