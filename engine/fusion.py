@@ -47,8 +47,8 @@ _STILL = 0.02  # pixels that points may move between the last two passes
 _SHARPEST = 1e-4  # radians: smallest standard deviation of normals; neighbours at a curve contradict by more
 _FROM_RESULTS = Finding(
     "fused results",
-    "the surface is that of two results: engine.fuse of both recordings, or 'mirrorskin fuse', registers the"
-    " frames of the rotation with the fused heights, which is more accurate",
+    "the surface is that of two results. If these are of a press and a rotation, engine.fuse of both"
+    " recordings, or 'mirrorskin fuse', registers the rotation with the fused heights and is more accurate",
     False,
 )
 
@@ -269,7 +269,7 @@ def _slopes_of_maps(normals: Result, wanted: Mask, moved: float) -> Slopes:
         contact &= cv2.erode(whole, np.ones((2 * border + 1, 2 * border + 1), np.uint8), borderValue=1)
     contact[~wanted] = 0
     sigma = np.asarray(normals.normals_sigma, np.float32)
-    sigma = np.where(sigma < _SHARPEST, np.float32(_SHARPEST), sigma)
+    sigma = np.where((sigma >= 0) & (sigma < _SHARPEST), np.float32(_SHARPEST), sigma)
     gain = np.float32(MEAN_NOISE_GAIN if _registered(normals) else 1)
     return slopes_of(normals.assign(normals_sigma=sigma), sigma / gain, contact)
 

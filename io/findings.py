@@ -61,7 +61,7 @@ def in_process(findings: Sequence[Finding], process: Mapping[str, Any]) -> dict[
     return known
 
 
-def carried(process: Mapping[str, Any], **inputs: Mapping[str, Any]) -> dict[str, str]:
+def carried(process: Mapping[str, Any], /, **inputs: Mapping[str, Any]) -> dict[str, str]:
     """Return the ``warnings`` and ``notes`` of a process, with those of the results that it is computed from.
 
     Each is preceded by the name of its input. A finding that the process contains already is not repeated.
