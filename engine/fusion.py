@@ -179,23 +179,23 @@ def fuse(
             _opened(name, value, memory_limit, opening)
             for name, value in (("heights", heights), ("normals", normals))
         )
-        if _is_source(first) != _is_source(second):
-            (recording, result) = ("heights", "normals") if _is_source(first) else ("normals", "heights")
+        sources = _is_source(first)
+        if sources != _is_source(second):
+            recording, result = ("heights", "normals") if sources else ("normals", "heights")
             raise InputError(
                 f"{recording} is a recording, but {result} is a result: give two recordings, or two results"
                 " (engine.reconstruct)"
             )
-        if _is_source(first):
-            for name, value in (("pixel_size", pixel_size), ("mask", mask)):
-                if value is not None:
-                    raise InputError(f"{name} is for results, but recordings are fused. Remove it")
-            options: dict[str, Any] = {"press": press, "rotation": rotation, "memory_limit": memory_limit}
-            options |= {"robust": robust, "register": register, "device": device, "progress": progress}
-            return _fuse_sources(first, second, **options)
-        for name, value in (("press", press), ("rotation", rotation)):
+        for_results: dict[str, Any] = {"pixel_size": pixel_size, "mask": mask}
+        for_recordings: dict[str, Any] = {"press": press, "rotation": rotation}
+        for name, value in (for_results if sources else for_recordings).items():
             if value is not None:
-                raise InputError(f"{name} has options for a recording, but results are fused. Remove it")
-        return _fuse_maps(first, second, pixel_size, mask, robust, device)
+                kind, others = ("results", "recordings") if sources else ("recordings", "results")
+                raise InputError(f"{name} is for {kind}, but {others} are fused. Remove it")
+        if not sources:
+            return _fuse_maps(first, second, pixel_size, mask, robust, device)
+        options: dict[str, Any] = {"memory_limit": memory_limit, "device": device, "progress": progress}
+        return _fuse_sources(first, second, **for_recordings, register=register, robust=robust, **options)
 
 
 def _is_source(value: Any) -> bool:
@@ -233,7 +233,8 @@ def _fuse_maps(
     size = pixel_size_of(height_maps, "heights", pixel_size)
     height = absolute_heights(height_maps)
     assert height is not None
-    known = AbsoluteHeights.of(*repeated_heights_as_intervals(height, height_maps.height_sigma), wanted)
+    values, sigma = (np.asarray(map_, np.float64) for map_ in (height, height_maps.height_sigma))
+    known = AbsoluteHeights.of(*repeated_heights_as_intervals(values, sigma), wanted)
     tilt = normal_maps.process.get("tilt")
     moved = 0.0  # pixels that points move in frames that were not registered
     if isinstance(tilt, float) and not _registered(normal_maps):
@@ -266,7 +267,8 @@ def _slopes_of_maps(normals: Result, wanted: Mask, moved: float) -> Slopes:
     if moved > 0:
         border = math.ceil(moved) + 1
         whole = cv2.morphologyEx(contact, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-        contact &= cv2.erode(whole, np.ones((2 * border + 1, 2 * border + 1), np.uint8), borderValue=1)
+        inner = cv2.erode(whole, np.ones((2 * border + 1, 2 * border + 1), np.uint8), borderValue=1)
+        contact[inner == 0] = 0
     contact[~wanted] = 0
     sigma = np.asarray(normals.normals_sigma, np.float32)
     sigma = np.where((sigma >= 0) & (sigma < _SHARPEST), np.float32(_SHARPEST), sigma)

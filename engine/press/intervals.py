@@ -86,7 +86,7 @@ def heights_as_intervals(height: Doubles, sigma: Doubles, travel: Doubles) -> In
     return Intervals(np.where(between, middle, height), np.where(between, usual, sigma))
 
 
-def repeated_heights_as_intervals(height: NDArray[np.floating], sigma: NDArray[np.floating]) -> Intervals:
+def repeated_heights_as_intervals(height: Doubles, sigma: Doubles) -> Intervals:
     """Return heights of a result, moved to the middles of their intervals between two frames.
 
     As `heights_as_intervals`, without the travel: most heights between two frames are their exact middle, so
@@ -95,10 +95,9 @@ def repeated_heights_as_intervals(height: NDArray[np.floating], sigma: NDArray[n
 
     Parameters
     ----------
-    height, sigma : ndarray, (H, W)
+    height, sigma : ndarray, (H, W), float64
         Heights and their standard deviations, mm; NaN where unknown.
     """
-    height, sigma = np.asarray(height, np.float64), np.asarray(sigma, np.float64)
     known = np.isfinite(height) & np.isfinite(sigma)
     thin = slice(None, None, max(1, -(-np.count_nonzero(known) // _SAMPLES)))
     samples, sigmas = height[known][thin], sigma[known][thin]

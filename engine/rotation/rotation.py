@@ -130,7 +130,8 @@ class Rotation(Method):
             if wall is None
             else self._calibrated(source, header, wall, heights)
         )
-        return replace(plan, process=plan.process | carried({}, heights=_process_of(self.heights)))
+        inherited = carried({}, heights=_process_of(self.heights))
+        return replace(plan, process={**plan.process, **inherited})
 
     def live_plan(self, source: Source) -> Plan:
         """Return the normals of the last turn, without registration, or what the source determines."""

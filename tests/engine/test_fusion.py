@@ -580,7 +580,7 @@ UNFIT = {
         ((DOWN, ROUND, 0.1), "pixel_size is for results, but recordings are fused. Remove it"),
         (
             (nothing(), directions(plane()[1]), 0.1),
-            "press has options for a recording, but results are fused",
+            "press is for recordings, but results are fused. Remove it",
         ),
     ],
     ids=["pixel size", "press"],
