@@ -640,14 +640,14 @@ def test_other_regions_of_one_size_are_refused(tmp_path):
 SEEDS = 11, 12, 13
 
 
-@pytest.mark.parametrize("way", sample_fusion.WAYS)
-def test_sigma_of_the_fused_sample_is_the_scatter_of_its_errors(way):
+@pytest.mark.parametrize("inputs", sample_fusion.INPUTS)
+def test_sigma_of_the_fused_sample_is_the_scatter_of_its_errors(inputs):
     scores = [
-        sample_fusion.error_of(sample_fusion.WAYS[way](seed), sample_fusion.sources_of(seed)[0].truth)
+        sample_fusion.error_of(sample_fusion.INPUTS[inputs](seed), sample_fusion.sources_of(seed)[0].truth)
         for seed in SEEDS
     ]
     rms, _, chi_square, _ = np.mean(scores, axis=0)
-    assert rms < (1.0 if way == "results" else 0.7)  # µm
+    assert rms < (1.0 if inputs == "results" else 0.7)  # µm
     assert 0.8 < chi_square < 1.3
 
 

@@ -40,7 +40,7 @@ def of_registered_results(seed: int) -> io.Result:
     return engine.fuse(pressed, engine.reconstruct(turn, heights=pressed))
 
 
-WAYS = {"recordings": of_recordings, "results": of_results, "registered results": of_registered_results}
+INPUTS = {"recordings": of_recordings, "results": of_results, "registered results": of_registered_results}
 
 
 def error_of(surface: io.Result, truth: io.Truth) -> tuple[float, float, float, float]:
@@ -60,7 +60,7 @@ def main() -> None:
     """Print the errors for each seed, and their mean."""
     warnings.simplefilter("ignore", io.MirrorskinWarning)
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 20
-    for name, fused in WAYS.items():
+    for name, fused in INPUTS.items():
         rows = np.array([error_of(fused(seed), sources_of(seed)[0].truth) for seed in range(11, 11 + count)])
         print(f"{name}, {count} seeds and their mean:")
         for rms, bias, chi2, beyond in (*rows, rows.mean(axis=0)):
