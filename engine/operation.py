@@ -472,17 +472,18 @@ def _check_names(operation: Operation, returned: Mapping[str, Any], method: str)
     A method that overrides another one may return fewer maps than those declared for the other.
     """
     kind, declared = type(operation), operation.declarations
+    names = set(returned)  # to look for a name in the result would copy the map from its device
     where = f"{kind.__name__}.result()"
     owner, overridden = [base for base in kind.__mro__ if method in vars(base)][:2]
     last = overridden if overridden is Operation else owner
     classes = kind.__mro__[: kind.__mro__.index(last) + 1]
     promised = {name for base in classes for name, value in vars(base).items() if isinstance(value, Map)}
-    missing = [name for name in declared if name not in returned]
+    missing = [name for name in declared if name not in names]
     required = [name for name in missing if name in promised and name not in kind.optional_maps]
     for name in returned:
         quantity = name.removesuffix(SIGMA)
         deviates = quantity != name
-        if declaration_of(name, declared) is not UNDECLARED or (deviates and quantity in returned):
+        if declaration_of(name, declared) is not UNDECLARED or (deviates and quantity in names):
             continue
         possible = [f"{other}{SIGMA}" for other in declared] if deviates else missing
         if not isinstance(returned, Result) and isinstance(returned[name], _SCALARS):
