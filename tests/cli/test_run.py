@@ -252,7 +252,7 @@ def test_what_a_module_itself_lacks_is_not_hidden():
 def test_what_the_page_says_runs():
     page = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
-    own, code, configured, declared, on_a_device, with_kernel = blocks
+    own, code, configured, declared, with_units, on_a_device, with_kernel = blocks
     Path("light.py").write_text(own)
     Path("first_light.py").write_text(with_kernel)
     for line in "".join(re.findall(r"^```sh\n(.*?)^```", page, re.DOTALL | re.MULTILINE)).splitlines():
@@ -260,8 +260,9 @@ def test_what_the_page_says_runs():
         if not {"live", "--live"} & {*words}:  # tests/cli/test_live.py
             done(*words)
     known = {}
-    exec(own + code + configured + declared + on_a_device, known)
+    exec(own + code + configured + declared + with_units + on_a_device, known)
     assert known["result"]["light"].any()
+    np.testing.assert_array_equal(known["again"].height, known["onset"].height)
     assert known["edges"].shape == known["surface"].height.shape
     assert known["Wear"].maps["wear"].quantity == "height"
     header = io.Header("vertical", dark=np.full((2, 3), 60, np.float32))

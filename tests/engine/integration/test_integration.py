@@ -373,7 +373,7 @@ BAD = {
     "shapes (0, 5) and": {"dz_dx": MAP[:0, :5], "dz_dy": MAP[:0, :5]},
     "pixel size 0": {"pixel_size": 0},
     "pixel size [1, 2, 3]": {"pixel_size": [1, 2, 3]},
-    "pixel size [0.1, -1.0]": {"pixel_size": (0.1, -1)},
+    "pixel size (0.1, -1.0)": {"pixel_size": (0.1, -1)},
     "mask: shape (48, 62)": {"mask": MAP[1:]},
     "known_heights: shape (48, 62)": {"known_heights": MAP[1:]},
     "initial_heights: shape (48, 62)": {"initial_heights": MAP[1:]},
