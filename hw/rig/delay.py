@@ -177,7 +177,7 @@ def frame_times(number: NDArray[np.int64], arrival: Floats) -> tuple[Floats, flo
     """
     line = even_times(number, arrival, len(arrival))
     late = arrival - line
-    blocks = max(2, round((arrival[-1] - arrival[0]) / _WANDER))
+    blocks = min(max(2, round((arrival[-1] - arrival[0]) / _WANDER)), len(arrival))
     wander = math.sqrt(np.mean([np.mean(block) ** 2 for block in np.array_split(late, blocks)]))
     keeps_time = np.std(late) <= _EVEN_RATIO * np.std(arrival - even_times(number, arrival))
     return (line if keeps_time else arrival), wander
@@ -188,7 +188,8 @@ def block_means(frames: NDArray[Any], blocks: int = _BLOCKS) -> Floats:
     rows, columns = (np.linspace(0, size, min(blocks, size) + 1).astype(np.intp) for size in frames.shape[1:])
     sums = np.add.reduceat(frames, columns[:-1], axis=2, dtype=np.float64)
     sums = np.add.reduceat(sums, rows[:-1], axis=1)
-    return np.asarray((sums / np.outer(np.diff(rows), np.diff(columns))).reshape(len(frames), -1))
+    sizes = np.outer(np.diff(rows), np.diff(columns))
+    return np.asarray((sums / sizes).reshape(len(frames), sizes.size))  # there may be no frames
 
 
 def estimate_delay(

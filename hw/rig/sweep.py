@@ -77,6 +77,8 @@ class SweepScan(Scan):
     @property
     def rate(self) -> float:
         """Measured frames per second of the camera during the scan."""
+        if not self._frames:
+            return super().rate
         number, time = (np.concatenate(one) for one in zip(*self._frames, strict=True))
         return float(np.ptp(number) / np.ptp(time)) if len(time) > 1 else super().rate
 
@@ -98,7 +100,7 @@ class SweepScan(Scan):
 
     def positions(self) -> Mapping[str, Floats]:
         """Return the positions of all frames, computed from all reports once the motion has ended."""
-        if not self._complete:
+        if not (self._complete and self._frames):  # all frames may have been before or after the motion
             return super().positions()
         number, arrival = (np.concatenate(one) for one in zip(*self._frames, strict=True))
         times, reported = zip(*self._reports, strict=True)
@@ -114,27 +116,30 @@ class SweepScan(Scan):
         if self._move is None:
             taken, rest = self._begin(most)
             if not isinstance(self.plan, AxialPlan):
-                return self._give(taken, rest, np.zeros(rest.stop - rest.start), origin)
+                return self._give(taken, rest, np.zeros(rest.stop - rest.start), taken.dropped, origin)
         move = self._move
         assert move is not None  # set by _begin
+        dropped = 0  # frames lost since the last block
         while True:
             taken = self.rig.take(most)
             self._add_reports()
             exposed = taken.time - self.delay.seconds
             distance = self._live_track.at(exposed)
-            part = self._thinned(taken, self._part(move, exposed, distance))
+            moving = self._part(move, exposed, distance)
+            dropped += taken.dropped if moving.start < moving.stop else 0
+            part = self._thinned(taken, moving)
             if part.start < part.stop:
-                return self._give(taken, part, distance[part], origin)
+                return self._give(taken, part, distance[part], dropped, origin)
             if part.stop < len(distance):
                 self.rig.end(move)
                 self._add_reports()
                 return None
 
-    def _give(self, taken: Frames, part: slice, distance: Floats, origin: float) -> Block:
+    def _give(self, taken: Frames, part: slice, distance: Floats, dropped: int, origin: float) -> Block:
         """Return a block with a part of the frames, and record their times."""
         time = taken.time[part]
         self._frames.append((taken.number[part], time))
-        return self._block(taken.pixels[part], time, self.plan.recorded(distance), taken.dropped, origin)
+        return self._block(taken.pixels[part], time, self.plan.recorded(distance), dropped, origin)
 
     def _begin(self, most: int) -> tuple[Frames, slice]:
         """Wait until frames show the body at rest, and start the motion; return these frames."""

@@ -204,6 +204,31 @@ def test_of_many_frames_a_turn_only_some_are_given():
     np.testing.assert_allclose(joined(blocks, "frames")[:, 2, 0], 100 + 1000 * TILT * np.sin(phase), atol=16)
 
 
+def test_losses_between_frames_that_are_skipped_are_counted(monkeypatch):
+    with make_rig(rate=200.0) as rig, SweepScan(rig, AxialPlan(0.5, TILT, rate=2.0), 60) as scan:
+        take = rig.camera.take
+        monkeypatch.setattr(rig.camera, "take", lambda *given: replace(take(*given), dropped=1))
+        blocks = drain(scan)
+    assert scan.dropped == sum(block.dropped for block in blocks)
+    assert scan.dropped > 2 * scan.count
+
+
+def test_a_rotation_between_two_frames_has_none():
+    with make_rig(rate=1.0) as rig, SweepScan(rig, AxialPlan(0.5, TILT, rate=5.0)) as scan:
+        assert drain(scan) == []
+        assert scan.positions()["phase"].shape == (0,)
+        assert scan.rate == pytest.approx(1)
+
+
+@pytest.mark.parametrize("rate", [1.0, 300.0, 1000.0])
+def test_the_delay_of_a_slow_and_a_fast_camera_is_measured(rate):
+    with make_rig(spreading((24, 24)), rate, delay=0.05) as rig:
+        rig.settings = settings((24, 24), dark=5.0)
+        delay = SweepScan(rig, VerticalPlan(0.0, 1.0, speed=1.0)).delay
+    assert delay.seconds == pytest.approx(0.05, abs=1e-3 + 3 * delay.error)
+    assert delay.error < 0.01
+
+
 @pytest.mark.parametrize("camera", [{}, {"source": "http://camera/video", "delay": 0.03}])
 def test_an_unstated_delay_and_that_of_a_stream_are_measured(camera):
     with make_rig(spreading((24, 24)), 100.0, delay=0.05, jitter=0.003, late=0.002) as rig:
