@@ -100,9 +100,10 @@ class StreamRecorder(TeeSource[LiveSource]):
     older file exists and ``overwrite`` is set, the recording has another name next to it
     (``press-partial.h5``), and replaces the older file at the end, if it is complete. From the first frame on
     other programs can read it (HDF5's SWMR). Every ``period`` all data is passed to the operating system, and
-    survives if this process is killed. After an exception the frames so far are kept, and ``/entry/state``
-    contains "cut short" and the reason. At the end the source is closed first, so that hardware stops. Then
-    its corrected positions are stored as the positions, in addition to those that arrived with the frames.
+    survives if this process is killed. ``/entry/state`` is "complete" only if the source was read to its end;
+    otherwise, and after an exception, the frames so far are kept, and it contains "cut short" and the reason.
+    At the end the source is closed first, so that hardware stops. Then its corrected positions are stored as
+    the positions, in addition to those that arrived with the frames.
 
     Parameters
     ----------
@@ -163,6 +164,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         self._queue: queue.SimpleQueue[Block | _Mark | _Maps | _End] = queue.SimpleQueue()
         self._backlog, self._lock = 0, threading.Lock()
         self._error: BaseException | None = None
+        self._reached_end = False  # the source has no more frames
         self._writer = threading.Thread(target=self._write, name="recorder")
 
     @property
@@ -195,7 +197,9 @@ class StreamRecorder(TeeSource[LiveSource]):
         self._check()
         block = self.source.read(out)
         self._check()
-        if block is not None:
+        if block is None:
+            self._reached_end = True
+        else:
             self._hand_over(block)
         return block
 
@@ -255,7 +259,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         except BaseException as failed:  # Ctrl-C, too: the frames are kept in any case
             failure = failure or failed
         finally:
-            self._queue.put(_End(positions, COMPLETE if failure is None else _cut_short(failure)))
+            self._queue.put(_End(positions, self._final_state(failure)))
         if self._writer.ident is not None:  # the thread was started
             self._writer.join()
         if error is None:
@@ -264,6 +268,11 @@ class StreamRecorder(TeeSource[LiveSource]):
                 raise failure
             if not self.count:
                 raise InputError(f"{self.name} gave no frames: nothing was written")
+
+    def _final_state(self, failure: BaseException | None) -> str:
+        if failure is not None:
+            return _cut_short(failure)
+        return COMPLETE if self._reached_end else f"{CUT_SHORT}stopped before the last frame"
 
     def _write(self) -> None:
         """Write the contents of the queue; the body of the thread."""

@@ -260,7 +260,7 @@ class StepScan(Scan):
         self._step += 1
         place = self._places[self._step]
         rest = self.rig.go(place)
-        _check_there(rest, place, self.rig.stage.name)
+        check_there(rest, place, self.rig.stage.name)
         self._left = self.frames
         if self.rig.trigger is not None:
             self._since = -math.inf
@@ -284,7 +284,7 @@ class StepScan(Scan):
                 return taken.pixels[new:], taken.time[new:], 0 if first else taken.dropped
 
 
-def _check_there(rest: Report, place: Position, name: str) -> None:
+def check_there(rest: Report, place: Position, name: str) -> None:
     """Refuse a stage that does not rest at its target."""
     off, turned = (
         max(abs(getattr(rest.position, motion) - getattr(place, motion)) for motion in motions)

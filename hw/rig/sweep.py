@@ -13,7 +13,7 @@ from mirrorskin.hw.camera import Frames
 from mirrorskin.hw.rig.delay import Delay, measure_delay
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
 from mirrorskin.hw.rig.rig import Move, Rig, untriggered
-from mirrorskin.hw.rig.scan import SETTLE, Scan, StepScan
+from mirrorskin.hw.rig.scan import SETTLE, Scan, StepScan, check_there
 from mirrorskin.hw.rig.track import LiveTrack, Progress, Track, even_times
 from mirrorskin.io.types import Block, Floats
 
@@ -131,7 +131,8 @@ class SweepScan(Scan):
             if part.start < part.stop:
                 return self._give(taken, part, distance[part], dropped, origin)
             if part.stop < len(distance):
-                self.rig.end(move)
+                end = self.plan.place(self.plan.length)
+                check_there(self.rig.end(move), end, self.rig.stage.name)
                 self._add_reports()
                 return None
 

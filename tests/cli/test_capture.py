@@ -1,6 +1,7 @@
 """``mirrorskin capture`` from the command line to the file, on an emulated rig, on simulated time."""
 
 import re
+import signal
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from simulated import simulated_rig
 from stacks import record, sphere
 
 from mirrorskin import io
+from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.hw.twin import Axial
 
@@ -153,6 +155,34 @@ def test_a_capture_that_is_cut_short_reports_what_it_kept(emulated, tmp_path, mo
         assert recording.shape[0] == int(kept[1])
         assert recording.state.startswith("cut short")
     assert not rig.machine.moving()
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("command", ["capture", "live"])
+@pytest.mark.parametrize("seconds", [0, 0.15])
+def test_a_signal_cuts_a_recording_short(emulated, tmp_path, monkeypatch, name, command, seconds):
+    read, halt = io.StreamRecorder.read, GrblStage.stop
+    signalled = []
+
+    def stop(stage):
+        emulated[0].clock.sleep(seconds)
+        halt(stage)
+        emulated[0].clock.sleep(seconds)
+
+    def read_and_signal(recorder, out=None, /):
+        if recorder.count > 10 and not signalled:
+            signalled.append(name)
+            signal.raise_signal(getattr(signal, name))
+        return read(recorder, out)
+
+    monkeypatch.setattr(GrblStage, "stop", stop)
+    monkeypatch.setattr(io.StreamRecorder, "read", read_and_signal)
+    path = tmp_path / "short.h5"
+    words = "vertical", "--stop", "2mm", "--speed", "0.5mm/s", "--rig", emulated[1]
+    ended = run(command, *words, "--record" if command == "live" else "-o", path)
+    assert ended.code == 128 + getattr(signal, name)
+    assert re.match("cut short: (stopped by the user|the program was ended)$", state_of(path))
+    assert not emulated[0].machine.moving()
 
 
 STEPS = ("--stop", "1mm", "--step", "500um", "--settle", "0s")

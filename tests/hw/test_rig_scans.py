@@ -1,6 +1,7 @@
 """Scans with a fake stage and camera, whose frames record where they were exposed."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPl
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
 from mirrorskin.hw.stage import Position, Report
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, StreamRecorder
 
 TILT = 0.04
 SHAPE = (3, 4)
@@ -337,3 +338,14 @@ def test_a_stage_that_rests_elsewhere_is_not_believed(monkeypatch):
         monkeypatch.setattr(rig, "go", lambda place, speed=None: astray)
         with pytest.raises(HardwareError, match="from its target"):
             drain(scan)
+
+
+def test_a_recording_of_a_sweep_that_rests_elsewhere_is_cut_short(monkeypatch, tmp_path):
+    with make_rig() as rig, monkeypatch.context() as patch:
+        scan = SweepScan(rig, VerticalPlan(0.0, 1.0, speed=1.0))
+        _ = scan.header
+        patch.setattr(rig, "end", lambda move: Report(0.0, Position(0.4), "idle"))
+        recorder = StreamRecorder(scan, tmp_path / "press.h5")
+        with pytest.raises(HardwareError, match="from its target"), recorder:
+            drain(recorder)
+    assert re.fullmatch("cut short: .* from its target: .*", recorder.state)

@@ -179,6 +179,15 @@ def test_what_a_run_that_was_cut_short_recorded_has_a_name_of_its_own(older):
     assert names(older.parent) == sorted(path.name for path in (older, partial(older), partial(older, 2)))
 
 
+def test_a_source_that_is_not_read_to_its_end_is_cut_short(older):
+    before = older.read_bytes()
+    with io.StreamRecorder(Feed(8), older, overwrite=True) as recorder:
+        for _ in range(8):  # all frames, but the source has not said that there are no more
+            recorder.read()
+    assert (recorder.state, recorder.file) == ("cut short: stopped before the last frame", partial(older))
+    assert older.read_bytes() == before
+
+
 def test_a_recording_of_its_own_name_says_that_it_was_cut_short(tmp_path):
     stream(Feed(3), tmp_path / "a.h5")
     with pytest.raises(KeyboardInterrupt):

@@ -9,6 +9,7 @@ from simulated import simulate
 
 from mirrorskin import io
 from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.view.app import App
 from mirrorskin.view.app.page import pages
 from mirrorskin.view.app.rig import RigPane
@@ -127,6 +128,60 @@ def test_stop_ends_a_run(ready):
     ready.control.stop()
     ready.until(lambda: ended(ready) and not ready.rig.machine.moving())
     assert "The stage was stopped." in ready.control.problem
+
+
+@pytest.fixture
+def slow_stop(emulated, monkeypatch):
+    """Let each step of stopping take some time before and after it, seconds."""
+
+    def delay(before, after):
+        def stop(stage):
+            emulated.clock.sleep(before)
+            halt(stage)
+            emulated.clock.sleep(after)
+
+        halt = GrblStage.stop
+        monkeypatch.setattr(GrblStage, "stop", stop)
+
+    return delay
+
+
+def press_to(ready, path, end):
+    """Start a recorded press to a travel of 1.5 mm, and wait until another travel is reached, mm."""
+    ready.control.run(vertical_plan(0.0, 1.5, 0.5), path)
+    ready.until(lambda: ready.control.seen.update is not None and travel(ready) >= end)
+
+
+@pytest.mark.parametrize("end", [0.3, 1.2, 1.499])
+@pytest.mark.parametrize(("before", "after"), [(0, 0), (0.15, 0), (0, 0.15), (0.15, 0.15), (1, 1)])
+def test_a_stopped_recording_is_complete_only_at_its_last_travel(
+    ready, slow_stop, tmp_path, before, after, end
+):
+    path = tmp_path / "run.h5"
+    slow_stop(before, after)
+    press_to(ready, path, end)
+    ready.control.stop()
+    ready.until(lambda: ended(ready))
+    with io.open_recording(path) as recording:
+        reached = recording.travel[-1] == pytest.approx(1.5, abs=0.01)
+        assert reached or recording.state.startswith("cut short: "), recording.state
+
+
+@pytest.mark.parametrize("seconds", [0, 0.15, 1])
+def test_a_body_that_is_stopped_at_the_end_of_a_press_is_not_lifted(ready, slow_stop, tmp_path, seconds):
+    slow_stop(seconds, seconds)
+    press_to(ready, tmp_path / "run.h5", 1.4999)
+    ready.control.stop()
+    ready.until(lambda: ended(ready) and not ready.rig.machine.moving())
+    assert travel(ready) == pytest.approx(1.5, abs=1e-3)
+
+
+def test_a_run_that_was_asked_for_but_not_begun_does_not_move_after_closing(ready):
+    before = travel(ready)
+    ready.control.run(vertical_plan(0.0, 1.5, 0.5))
+    ready.control.close()
+    assert ended(ready)
+    assert travel(ready) == before
 
 
 def test_after_a_stop_it_can_be_connected_again(ready):

@@ -113,9 +113,9 @@ class RigControl:
 
     def close(self) -> None:
         """Stop what moves, and let the rig go."""
+        self._closing.set()  # before the look at the state, so that no request can start in between
         if self.state in ("connecting", "moving"):
             self.stop()
-        self._closing.set()
         self._join()
 
     def jog(self, axis: str, by: float) -> None:
@@ -183,6 +183,7 @@ class RigControl:
     def _do(self, rig: Rig, task: Callable[[Rig], None]) -> None:
         self.state = "moving"
         try:
+            self._check_ending()
             task(rig)
         except io.InputError as error:  # refused before anything moved, or the run has no result
             self.problem = str(error)
@@ -229,12 +230,19 @@ class RigControl:
             operation = _live(source, plan, rig.rate)
             operation.warm()
             mark = None if recorder is None else recorder.mark
+            self._check_ending()
             Loop(source, operation, on_update=on_update, stop=self._ending, mark=mark).run()
+            self._check_ending()  # the scan then stops the stage, and does not lift the body
         self.recorded = None if recorder is None else recorder.path
         self.result = operation.result()
 
     def _ending(self) -> bool:
         return self._stopping.is_set() or self._closing.is_set()
+
+    def _check_ending(self) -> None:
+        """Raise after a stop, which the stage may not have obeyed yet, and while the rig is closed."""
+        if self._ending():
+            raise HardwareError(_STOPPED)
 
 
 def _live(source: io.LiveSource, plan: Plan, rate: float) -> LiveOperation:
