@@ -29,14 +29,16 @@ def command(
     """Move the stage, and record what the camera sees; what was taken is kept whatever happens."""
     from mirrorskin import io
     from mirrorskin.hw.rig.rig import open_rig
+    from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.hw.rig.sweep import make_scan
     from mirrorskin.hw.rig_file import load_rig
     from mirrorskin.kernels.correlation import WINDOW
 
     settings = load_rig(rig_file)
     plan = scans.make_plan(context, given, settings)
-    io.check_output(output, rig_file, calibration, replaces="anything" if overwrite else "nothing")
     known = scans.open_calibration(calibration, settings)
+    planned = PlannedScan(settings, plan)
+    scans.check_recording(planned, output, rig_file, calibration, known=known, overwrite=overwrite)
     with open_rig(settings, plan.in_steps) as rig:
         # Normals are computed from this number of frames of a turn; more would be of no use.
         scan = make_scan(rig, plan, given.get("settle"), given.get("frames"), turn_frames=WINDOW)

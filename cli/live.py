@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import signal
 import threading
 from collections.abc import Iterator, Mapping
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from mirrorskin.engine.method import Method
     from mirrorskin.engine.operation import Operation
     from mirrorskin.hw.rig.plans import Plan
+    from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, LiveSource
 
@@ -79,6 +81,7 @@ def command(
     from mirrorskin.cli.quantity import duration
     from mirrorskin.engine.reconstruction import method_for
     from mirrorskin.engine.running import load_operation
+    from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.hw.rig_file import load_rig
 
     rig = load_rig(rig_file)
@@ -91,15 +94,18 @@ def command(
     if overwrite and record is None and output is None:
         raise io.InputError("--overwrite is for --record and -o: leave it out")
     inputs = rig_file, calibration, *(one for one in chosen.values() if isinstance(one, Path))
-    if record is not None:
-        io.check_output(record, *inputs, replaces="anything" if overwrite else "nothing")
     if output is not None:
         io.check_result_output(output, *inputs, record, overwrite=overwrite)
-    if "contact" in chosen:
-        io.open_result(chosen["contact"])  # refused before anything moves
+        if record is not None and record.resolve() == output.resolve():
+            raise io.InputError(f"--record and -o are both {output}: name two files")
     known = scans.open_calibration(calibration, rig)
+    scan = PlannedScan(rig, plan)
+    if record is not None:
+        scans.check_recording(scan, record, *inputs, known=known, overwrite=overwrite)
     values = {**context.params, **given, "latency": duration(latency, "--latency")}
-    _Live(rig, plan, computed, values, known).run()
+    live = _Live(rig, plan, computed, values, known)
+    live.check(scan)
+    live.run()
 
 
 class _Live:
@@ -117,6 +123,19 @@ class _Live:
         self._calibration = calibration
         self._loop: Loop | None = None
         self._operation: LiveOperation | None = None
+
+    def check(self, planned: PlannedScan) -> None:
+        """Refuse what cannot be done with a scan, before the rig is opened."""
+        from mirrorskin.engine.live import Loop
+
+        source = self._calibrated(planned)
+        operation = self._prepare(source, self._settings.camera.rate)
+        operation.warm()
+        Loop(source, operation, latency=self._given["latency"])
+        if self._given["view"]:
+            from mirrorskin.view.viewer import check_place
+
+            check_place(self._given["view"], "--view")
 
     def run(self) -> None:
         """Reconstruct while the stage moves, and save the result."""
@@ -145,7 +164,7 @@ class _Live:
         from mirrorskin.engine.live import Loop
         from mirrorskin.hw.rig.rig import open_rig
         from mirrorskin.hw.rig.sweep import make_scan
-        from mirrorskin.io import Calibrated, StreamRecorder
+        from mirrorskin.io import StreamRecorder
 
         given, settings, known = self._given, self._settings, self._calibration
         with ExitStack() as stack:
@@ -158,9 +177,7 @@ class _Live:
             recorder = None
             if record is not None:
                 recorder = StreamRecorder(scan, record, calibration=known, overwrite=given["overwrite"])
-            source: LiveSource = scan if recorder is None else recorder
-            if known is not None:
-                source = Calibrated(source, known)
+            source = self._calibrated(scan if recorder is None else recorder)
             stack.enter_context(scans.kept(recorder))
             stack.enter_context(source)
             self._operation = operation = self._prepare(source, rig.rate)
@@ -185,8 +202,16 @@ class _Live:
             finally:
                 gc.unfreeze()
 
-    def _prepare(self, source: LiveSource, rate: float) -> LiveOperation:
-        """Connect the operation with the source, its references and its calibration."""
+    def _calibrated(self, source: LiveSource) -> LiveSource:
+        from mirrorskin.io import Calibrated
+
+        return source if self._calibration is None else Calibrated(source, self._calibration)
+
+    def _prepare(self, source: LiveSource, rate: float | None) -> LiveOperation:
+        """Connect the operation with the source, its references and its calibration.
+
+        Without a frame rate, the window of a continuous rotation is not determined yet.
+        """
         from mirrorskin.engine import Rotation
         from mirrorskin.engine.live import LiveOperation
         from mirrorskin.engine.rotation.last_turn import choose_window
@@ -195,7 +220,9 @@ class _Live:
         computed, plan = self._computed, self._plan
         if not (isinstance(plan, AxialPlan) and isinstance(computed, Rotation)):
             return LiveOperation(source, computed)
-        per_turn = plan.frames_a_turn(rate, self._given.get("frames") or 1)
+        if rate is None and not plan.in_steps:
+            return LiveOperation(source, computed)
+        per_turn = plan.frames_a_turn(rate or math.nan, self._given.get("frames") or 1)
         window, every = choose_window(per_turn, computed.window_frames)
         return LiveOperation(source, computed.with_options(window_frames=window), every=every)
 

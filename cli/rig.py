@@ -138,13 +138,15 @@ def probe(
 ) -> None:
     """Lower the body until the picture shows contact, lift it, and print the zero of the travel."""
     from mirrorskin.cli.quantity import length
-    from mirrorskin.hw.rig.probe import find_contact
+    from mirrorskin.hw.rig.plans import check_plan
+    from mirrorskin.hw.rig.probe import contact_plan, find_contact
     from mirrorskin.hw.rig.rig import open_rig
     from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig)
     travel, each = settings.stage.travel, length(step, "--step")
     first = travel.low if start is None else length(start, "--from")
+    check_plan(contact_plan(settings.stage.limits, first, each), settings.stage, settings.name)
     with open_rig(settings) as opened:
         contact = find_contact(opened, first, each)
     zero = travel.coordinate(contact)

@@ -15,6 +15,7 @@ from mirrorskin.cli.options import MotionName
 
 if TYPE_CHECKING:
     from mirrorskin.hw.rig.plans import Plan
+    from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, StreamRecorder
 
@@ -110,6 +111,20 @@ def open_calibration(path: Path | None, settings: RigSettings) -> Calibration | 
     known = io.CameraId(camera.name, camera.shape, np.dtype(camera.dtype))
     check_camera(calibration, known, settings.name)
     return calibration
+
+
+def check_recording(
+    planned: PlannedScan,
+    path: Path,
+    *inputs: Path | None,
+    known: Calibration | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Raise InputError for a recording of a scan that could not be written, before the rig is opened."""
+    from mirrorskin import io
+
+    io.check_output(path, *inputs, replaces="anything" if overwrite else "nothing")
+    io.StreamRecorder(planned, path, calibration=known)
 
 
 @contextmanager

@@ -42,6 +42,8 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.quantity import length
     from mirrorskin.engine.calibration.gel import fit_gel
+    from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of
+    from mirrorskin.kernels.device import open_devices
 
     radius, thickness = length(ball, "--ball") / 2, length(sheet, "--sheet")
     if thickness < 0:
@@ -55,11 +57,16 @@ def command(
         prompt = "put the ball at place {} of {}, near the middle of the field"
         return inputs.at_each("elastic", prompt, places, plan)
 
+    def check(planned: Source, calibration: Calibration | None) -> None:
+        check_ball_radius(radius)
+        pixel_size_of(planned)
+        open_devices(device)
+
     def fit(sources: list[Source], calibration: Calibration | None, paths: list[Path]) -> inputs.Learned:
         onsets = [_onset(source, calibration, radius, device) for source in sources]
         return _learned(fit_gel(onsets, sheet=thickness), {"sources": paths, "ball": ball, "sheet": sheet})
 
-    capture = inputs.Capture(rig, balls, settle, overwrite)
+    capture = inputs.Capture(rig, balls, settle, overwrite, check)
     inputs.learn(output, presses or [], fit, stack, as_json, capture, press=press)
 
 

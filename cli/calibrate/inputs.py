@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -17,6 +18,7 @@ from mirrorskin.cli.stack import stack_options
 if TYPE_CHECKING:
     from mirrorskin.cli.stack import StackOptions
     from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
+    from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.io import Calibration, CameraId, Recording, Source
     from mirrorskin.io.calibration.parameters import Part
     from mirrorskin.io.types import ProcessValue
@@ -75,20 +77,28 @@ def open_all(
 ) -> Iterator[tuple[list[Source], CameraId]]:
     """Open recordings with the pixel size of the calibration's scale, and return them and their camera."""
     from mirrorskin import io
-    from mirrorskin.io.calibration.source import differ
 
-    if calibration is not None and calibration.lens is not None:
-        size = calibration.lens.pixel_size
-        option = options.get("pixel_size", size)
-        if differ(option, size):
-            raise io.InputError(
-                f"--pixel-size {option[0]:.5g} mm: the scale of {calibration.name} is {size[0]:.5g} mm;"
-                " remove the option"
-            )
-        options = options | {"pixel_size": size}
+    options = _scaled(options, calibration)
     with ExitStack() as opening:
         sources = [opening.enter_context(io.open_recording(path, **options)) for path in paths]
         yield [*sources], _one_camera(sources, calibration, output)
+
+
+def _scaled(options: StackOptions, calibration: Calibration | None) -> StackOptions:
+    """Return the options with the pixel size of the calibration's scale; another one is refused."""
+    from mirrorskin.io import InputError
+    from mirrorskin.io.calibration.source import differ
+
+    if calibration is None or calibration.lens is None:
+        return options
+    size = calibration.lens.pixel_size
+    option = options.get("pixel_size", size)
+    if differ(option, size):
+        raise InputError(
+            f"--pixel-size {option[0]:.5g} mm: the scale of {calibration.name} is {size[0]:.5g} mm;"
+            " remove the option"
+        )
+    return options | {"pixel_size": size}
 
 
 def open_still(path: Path) -> Recording:
@@ -150,6 +160,8 @@ class Capture(NamedTuple):
     places: Callable[[], list[Place]] = list  # called with a rig only; may remove options of the stack
     settle: str | None = None
     overwrite: bool = False
+    # raises what rules out the fit, for a recording that is still to be captured
+    check: Callable[[Source, Calibration | None], None] = lambda planned, calibration: None
 
 
 class Learned(NamedTuple):
@@ -181,9 +193,22 @@ def learn(
     needs_rig = options | {"settle": capture.settle, "overwrite": capture.overwrite}
     calibration = check_call(output, presses, capture.rig, plates, **needs_rig)
     paths = list(presses)
+    places = [] if capture.rig is None else capture.places()
+    opening = stack_options(stack)
     if capture.rig is not None:
-        paths = take(capture.rig, output, capture.places(), capture.settle, capture.overwrite)
-    with open_all([*paths, *plates], stack_options(stack), calibration, output) as (sources, camera):
+        size = _scaled(opening, calibration).get("pixel_size")
+
+        def check(planned: PlannedScan) -> None:
+            if size is not None:
+                planned.header = replace(planned.header, pixel_size=size)
+            capture.check(planned, calibration)
+
+        places = [place._replace(check=check) for place in places]
+        if plates:
+            with open_all(plates, opening, calibration, output):
+                pass  # refused before anything moves
+        paths = take(capture.rig, output, places, capture.settle, capture.overwrite)
+    with open_all([*paths, *plates], opening, calibration, output) as (sources, camera):
         learned = fit(sources, calibration, paths)
         process = process_of(sources[0], **learned.facts)
     save(output, camera, learned, process, as_json)
@@ -216,6 +241,7 @@ class Place(NamedTuple):
     prompt: str  # instruction for the user: "put the ball at place 1 of 9"
     plan: Plan  # movement of the body
     frames: int = 1  # at each step of a plan in steps
+    check: Callable[[PlannedScan], None] = lambda planned: None  # raises what rules out its use
 
 
 def take(
@@ -227,8 +253,8 @@ def take(
 ) -> list[Path]:
     """Capture recordings into files next to the calibration: CAL-dark.h5 for CAL.h5 and a place "dark".
 
-    For each place the body is lifted, and the user is asked to follow the prompt and to press Enter. Plans
-    and files are checked before any movement.
+    For each place the body is lifted, and the user is asked to follow the prompt and to press Enter. Plans,
+    files and the calibration's camera are checked before any movement.
     """
     import numpy as np
 
@@ -237,6 +263,7 @@ def take(
     from mirrorskin.cli.quantity import duration
     from mirrorskin.hw.rig.plans import check_plan
     from mirrorskin.hw.rig.rig import open_rig
+    from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.hw.rig.sweep import make_scan
     from mirrorskin.hw.rig_file import load_rig
 
@@ -245,9 +272,13 @@ def take(
     if seconds is not None and seconds < 0:
         raise io.InputError(f"--settle {settle}: a time must not be negative")
     paths = [calibration.with_name(f"{calibration.stem}-{place.name}.h5") for place in places]
+    if calibration.exists():
+        scans.open_calibration(calibration, settings)
     for place, path in zip(places, paths, strict=True):
         check_plan(place.plan, settings.stage, settings.name)
-        io.check_output(path, rig_file, replaces="anything" if overwrite else "nothing")
+        planned = PlannedScan(settings, place.plan)
+        scans.check_recording(planned, path, rig_file, overwrite=overwrite)
+        place.check(planned)
     with open_rig(settings) as rig:
         for place, path in zip(places, paths, strict=True):
             scan = make_scan(rig, place.plan, seconds, place.frames)

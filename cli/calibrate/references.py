@@ -61,6 +61,8 @@ def command(
     _check_call(darks, brights, noise, rig, rolled, press, overwrite)
     io.check_output(output, *darks, *brights, rig, replaces="calibration")
     if rig is not None:
+        for path in (*darks, *brights):
+            inputs.open_still(path).close()  # refused before anything moves
         darks = darks or inputs.take(rig, output, [_still("dark", rig, frames)], overwrite=overwrite)
         balls = _balls(rig, places, frames, press) if rolled else [_still("bright", rig, frames)]
         brights = brights or inputs.take(rig, output, balls, overwrite=overwrite)

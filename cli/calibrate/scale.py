@@ -106,6 +106,8 @@ def command(
     io.check_output(output, *paths, rig, replaces="calibration")
     if rig is not None:
         prompt = "lay the board flat on the sheet, place {} of {}, turned and moved, also to the corners"
+        if paths:
+            _read(paths, output)  # refused before anything moves
         boards = inputs.at_each("board", prompt, places, inputs.still_plan(rig), _SHOTS)
         paths += inputs.take(rig, output, boards, overwrite=overwrite)
     read, camera = _read(paths, output)

@@ -52,6 +52,7 @@ def command(
     """Determine half-angle, phase offset, direction, ellipticity and pivot, with their standard errors."""
     from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import angle, length
+    from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of
     from mirrorskin.engine.calibration.tilt import fit_precession
     from mirrorskin.engine.calibration.tilt_tracks import track_ball, track_plate
 
@@ -61,8 +62,14 @@ def command(
     def turns() -> list[inputs.Place]:
         half_angle = None if tilt is None else angle(tilt, "--tilt")
         plan = inputs.turn_plan(press, half_angle, stack.get("phase_step"), "0.5mm")
-        stack.clear()
+        stack.pop("phase_step", None)
+        stack.pop("phases", None)
         return inputs.at_each("tilt", inputs.BALL, places, plan)
+
+    def check(planned: Source, calibration: Calibration | None) -> None:
+        check_ball_radius(radius)
+        pixel_size_of(planned)
+        _brightness(planned, calibration, *response)
 
     def fit(sources: list[Source], calibration: Calibration | None, paths: list[Path]) -> inputs.Learned:
         light = _brightness(sources[0], calibration, *response)
@@ -78,7 +85,7 @@ def command(
         named = {"sources": paths, "flats": flats, "wedges": wedges}
         return _learned(found, {"ball": ball, **{name: files for name, files in named.items() if files}})
 
-    capture = inputs.Capture(rig, turns, settle, overwrite)
+    capture = inputs.Capture(rig, turns, settle, overwrite, check)
     plates = [*flats, *wedges]
     inputs.learn(output, balls or [], fit, stack, as_json, capture, plates, press=press, tilt=tilt)
 

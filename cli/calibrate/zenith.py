@@ -57,7 +57,7 @@ def command(
     """Learn brightness as a function of position and normal, from a ball pressed all over the field."""
     from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import length
-    from mirrorskin.engine.calibration.wall import fit_zenith
+    from mirrorskin.engine.calibration.wall import check_zenith, fit_zenith
 
     radius = length(ball, "--ball") / 2
     body = length(body_radius, "--body-radius"), length(body_height, "--body-height")
@@ -66,6 +66,10 @@ def command(
         turn = stack.pop("tilt", None), stack.pop("phase_step", None)
         plan = inputs.turn_plan(press, *turn, "0.4mm for 4 mm")
         return inputs.at_each("zenith", inputs.BALL, places, plan)
+
+    def check(planned: Source, calibration: Calibration | None) -> None:
+        references = None if calibration is None else calibration.references
+        check_zenith([planned] * places, radius, references, pattern.value, body)
 
     def fit(sources: list[Source], calibration: Calibration | None, paths: list[Path]) -> inputs.Learned:
         with progress("fitting", len(sources)) as show:
@@ -81,7 +85,7 @@ def command(
         facts = {"sources": paths, "ball": ball, "body_radius": body[0], "body_height": body[1]}
         return _learned(response, facts)
 
-    capture = inputs.Capture(rig, balls, settle, overwrite)
+    capture = inputs.Capture(rig, balls, settle, overwrite, check)
     inputs.learn(output, presses or [], fit, stack, as_json, capture, press=press)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.calibration import wall_fit
 from mirrorskin.engine.calibration import wall_model as model
 from mirrorskin.engine.calibration.ball import moved
-from mirrorskin.engine.calibration.sources import check_ball_radius
+from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of
 from mirrorskin.engine.calibration.wall_response import make_response
 from mirrorskin.io import InputError, Precession, References, Source, WallResponse
 from mirrorskin.io.calibration.types import PATTERNS
@@ -98,7 +98,7 @@ def fit_zenith(
     mirrorskin.io.InputError
         There are too few presses, or the named one shows no ball or does not fit the others.
     """
-    _check(presses, ball, pattern, body)
+    check_zenith(presses, ball, references, pattern, body)
     samples = []
     for number, source in enumerate(presses, 1):
         samples.append(wall_fit.read_press(source, ball, references, precession, _SAMPLES // len(presses)))
@@ -128,7 +128,14 @@ def _prior(
     )
 
 
-def _check(presses: Sequence[Source], ball: float, pattern: str, body: tuple[float, float]) -> None:
+def check_zenith(
+    presses: Sequence[Source],
+    ball: float,
+    references: References | None,
+    pattern: str,
+    body: tuple[float, float],
+) -> None:
+    """Raise what `fit_zenith` would refuse without looking at frames."""
     if len(presses) < FEWEST:
         raise InputError(f"{len(presses)} presses do not determine the wall: take {FEWEST} or more")
     check_ball_radius(ball)
@@ -141,6 +148,9 @@ def _check(presses: Sequence[Source], ball: float, pattern: str, body: tuple[flo
         pixels = source.shape[1:], source.header.pixel_size
         if pixels != (first.shape[1:], first.header.pixel_size):
             raise InputError(f"{source.name} and {first.name} differ in pixels or their size: take all alike")
+    for source in presses:
+        wall_fit.levels_of(source, references)
+        pixel_size_of(source)
 
 
 # --- the area in which the sheet takes the ball's shape -----------------------------------------------------

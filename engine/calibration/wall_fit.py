@@ -69,7 +69,7 @@ def read_press(
     source: Source, ball: float, references: References | None, precession: Precession | None, count: int
 ) -> BallPress:
     """Read a recording once, find the ball, and select about ``count`` samples around it."""
-    levels, pixel_size = _levels(source, references), pixel_size_of(source)
+    levels, pixel_size = levels_of(source, references), pixel_size_of(source)
     pivot = pivot_of(source, precession).place
     frames, phase = read_turn(source, _FRAMES)
     if precession is not None:
@@ -158,7 +158,8 @@ def join(presses: Sequence[BallPress], ball: float) -> LightSamples:
     )
 
 
-def _levels(source: Source, references: References | None) -> tuple[Doubles, Doubles]:
+def levels_of(source: Source, references: References | None) -> tuple[Doubles, Doubles]:
+    """Return the dark and the bright level of each pixel, (H, W), counts; InputError without them."""
     levels = source.header if references is None else references
     dark, bright = levels.dark, levels.bright
     if dark is None or bright is None:

@@ -11,7 +11,8 @@ from mirrorskin.hw.rig.delay import block_means
 from mirrorskin.hw.rig.plans import VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
-from mirrorskin.io.types import Floats
+from mirrorskin.hw.stage import Limits
+from mirrorskin.io.types import Floats, InputError
 
 _FRAMES, _PLACES = 4, 4  # frames at a position, and number of preceding positions to compare with
 _SIGMAS = 8.0  # change of a block's mean on contact, in standard deviations
@@ -36,6 +37,8 @@ def find_contact(rig: Rig, start: float, step: float) -> float:
 
     Raises
     ------
+    InputError
+        There are fewer than five positions.
     HardwareError
         There was no contact, or it occurred before the fifth position.
 
@@ -45,10 +48,9 @@ def find_contact(rig: Rig, start: float, step: float) -> float:
     ...     find_contact(rig, start=-1.0, step=0.05)
     0.025
     """
-    limits = rig.stage.limits
-    deepest = min(limits.press, limits.travel[1])
+    plan = contact_plan(rig.stage.limits, start, step)
     before: list[Floats] = []
-    with StepScan(rig, VerticalPlan(start, deepest, step=step), frames=_FRAMES) as scan:
+    with StepScan(rig, plan, frames=_FRAMES) as scan:
         room = np.empty((_FRAMES, *scan.shape[1:]), scan.dtype)
         while (block := scan.read(room)) is not None and block.travel is not None:
             seen = [block_means(block.frames)]
@@ -59,9 +61,20 @@ def find_contact(rig: Rig, start: float, step: float) -> float:
                 return float(block.travel[0]) - step / 2
             before = [*before[1 - _PLACES :], here]
     raise HardwareError(
-        f"{rig.name}: the picture showed no contact between travels of {start:g} and {deepest:g} "
+        f"{rig.name}: the picture showed no contact between travels of {start:g} and {plan.stop:g} "
         "mm: check the position of the object and the light, and start higher"
     )
+
+
+def contact_plan(limits: Limits, start: float, step: float) -> VerticalPlan:
+    """Return the plan of `find_contact`, down to the limits; InputError if it has too few positions."""
+    plan = VerticalPlan(start, min(limits.press, limits.travel[1]), step=step)
+    if len(plan.distances) <= _PLACES:
+        raise InputError(
+            f"{len(plan.distances)} positions between travels of {start:g} and {plan.stop:g} mm are too few"
+            f" to detect contact: give a smaller step, or start higher, for at least {_PLACES + 1}"
+        )
+    return plan
 
 
 def _differ(before: Floats, here: Floats) -> bool:

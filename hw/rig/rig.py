@@ -12,7 +12,7 @@ from typing import cast
 from mirrorskin.hw.camera import Camera, Frames
 from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig.trigger import Trigger
+from mirrorskin.hw.rig.trigger import Trigger, no_trigger
 from mirrorskin.hw.rig_file import CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.stage import Position, Report, Stage
 from mirrorskin.io import InputError
@@ -327,6 +327,8 @@ def open_rig(
     """
     if settings.camera.trigger is not None and not steps:
         raise untriggered(settings)
+    if settings.camera.trigger is not None and settings.stage.firmware == "marlin":
+        raise no_trigger(f"stage {settings.stage.port}")
     with ExitStack() as opening:
         camera = open_camera(settings.camera)
         opening.callback(camera.close)
@@ -334,6 +336,8 @@ def open_rig(
             camera.take(1, _PATIENCE)
         stage = open_stage(settings.stage)
         opening.callback(stage.close)
+        if settings.camera.trigger is not None and not hasattr(stage, "switch"):
+            raise no_trigger(stage.name)
         if settings.stage.home:
             stage.home()
         rig = Rig(stage, camera, settings, clock)

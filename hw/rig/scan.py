@@ -17,15 +17,62 @@ from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, RockPlan, TwistPlan, check_plan
 from mirrorskin.hw.rig.references import read_reference
 from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.rig_file import RigSettings
 from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
 SETTLE = 0.1
 """Seconds from rest to the first exposure, of a motion with stops, by default."""
 
+MARGIN = 0.3
+"""Seconds of frames before and after a motion without stops."""
+
+_RATE = 30.0  # assumed frames per second, before the rate of the camera is known
 _DARK_FRAMES = 16
 
 _UNKNOWN_DELAY = 0.2  # assumed maximum delay of frames, seconds, if it is unknown
+
+
+class PlannedScan(Closing):
+    """A scan before its rig is opened: a `mirrorskin.io.types.LiveSource` without frames.
+
+    What cannot be done with the scan is refused with it before anything moves. Its header is that of the
+    scan, with 0 in place of a dark reference that is still to be taken.
+
+    Parameters
+    ----------
+    settings : RigSettings
+    plan : Plan
+    """
+
+    rewindable = False
+
+    def __init__(self, settings: RigSettings, plan: Plan) -> None:
+        camera = settings.camera
+        self.name, self.motion = settings.name, plan.motion
+        if plan.in_steps:
+            count = len(plan.distances)
+        else:
+            count = math.ceil((plan.path.duration + MARGIN) * (camera.rate or _RATE))
+        self.shape, self.dtype = (count, *camera.shape), np.dtype(camera.dtype)
+        header = _header(settings, plan)
+        dark = np.zeros(camera.shape, np.float32) if header.dark is None else header.dark
+        self.header: Header = replace(header, dark=dark)
+
+    def now(self) -> float:
+        """Return 0."""
+        return 0.0
+
+    def positions(self) -> Mapping[str, Floats]:
+        """Return an empty mapping."""
+        return {}
+
+    def rewind(self) -> None:
+        """Raise: a live source cannot be rewound."""
+        raise RuntimeError("a live source cannot be rewound")
+
+    def read(self, out: NDArray[Any] | None = None, /) -> None:
+        """Return None."""
 
 
 class Scan(Closing):
@@ -77,16 +124,13 @@ class Scan(Closing):
     @functools.cached_property
     def header(self) -> Header:
         """Metadata of all frames; the first access prepares the scan."""
-        header = self._known()
-        settings = self.rig.settings
-        dark = read_reference(settings.camera, "dark", settings.path)
-        bright = read_reference(settings.camera, "bright", settings.path)
+        header = _header(self.rig.settings, self.plan)
         lifted = self.lift()
-        if dark is None:
-            late = max(_UNKNOWN_DELAY, settings.camera.delay or 0.0) + self.rig.period
-            dark = take_dark(self.rig, lifted.time + late)
+        if header.dark is None:
+            late = max(_UNKNOWN_DELAY, self.rig.settings.camera.delay or 0.0) + self.rig.period
+            header = replace(header, dark=take_dark(self.rig, lifted.time + late))
         self._prepare()
-        return replace(header, dark=dark, bright=bright)
+        return header
 
     def now(self) -> float:
         """Return the seconds since the first frame was requested, the scale of ``Block.time``."""
@@ -168,27 +212,30 @@ class Scan(Closing):
     def _sleep_until(self, due: float) -> None:
         self.rig.clock.sleep(max(0.0, due - self.rig.clock.now()))
 
-    def _known(self) -> Header:
-        """Return the metadata that are available before anything moves."""
-        stage, camera = self.rig.settings.stage, self.rig.settings.camera
-        header = Header(
-            self.motion,
-            title=f"{self.name}, {self.motion} motion",
-            start_time=datetime.now(UTC).isoformat(timespec="milliseconds"),
-            pixel_size=camera.pixel_sides,
-            zenith_gain=_scalar(camera.counts_per_radian),
-            zenith_offset=_scalar(camera.zenith_offset),
-            camera=camera.name,
-            travel_sigma=stage.travel_sigma,
-            line_time=None if isinstance(self, StepScan) else camera.line_time,
-        )
-        if isinstance(self.plan, AxialPlan):
-            return replace(header, press=self.plan.press, tilt=self.plan.tilt, pivot=stage.pivot)
-        if isinstance(self.plan, HorizontalPlan | TwistPlan):
-            return replace(header, press=self.plan.press)
-        if isinstance(self.plan, RockPlan):
-            return replace(header, press=self.plan.press, pivot=stage.pivot)
-        return header
+
+def _header(settings: RigSettings, plan: Plan) -> Header:
+    """Return the metadata that are available before anything moves."""
+    stage, camera = settings.stage, settings.camera
+    header = Header(
+        plan.motion,
+        title=f"{settings.name}, {plan.motion} motion",
+        start_time=datetime.now(UTC).isoformat(timespec="milliseconds"),
+        pixel_size=camera.pixel_sides,
+        dark=read_reference(camera, "dark", settings.path),
+        bright=read_reference(camera, "bright", settings.path),
+        zenith_gain=_scalar(camera.counts_per_radian),
+        zenith_offset=_scalar(camera.zenith_offset),
+        camera=camera.name,
+        travel_sigma=stage.travel_sigma,
+        line_time=None if plan.in_steps else camera.line_time,
+    )
+    if isinstance(plan, AxialPlan):
+        return replace(header, press=plan.press, tilt=plan.tilt, pivot=stage.pivot)
+    if isinstance(plan, HorizontalPlan | TwistPlan):
+        return replace(header, press=plan.press)
+    if isinstance(plan, RockPlan):
+        return replace(header, press=plan.press, pivot=stage.pivot)
+    return header
 
 
 def _scalar(value: float | None) -> Floats | None:

@@ -13,12 +13,11 @@ from mirrorskin.hw.camera import Frames
 from mirrorskin.hw.rig.delay import Delay, measure_delay
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
 from mirrorskin.hw.rig.rig import Move, Rig, untriggered
-from mirrorskin.hw.rig.scan import SETTLE, Scan, StepScan, check_there
+from mirrorskin.hw.rig.scan import MARGIN, SETTLE, Scan, StepScan, check_there
 from mirrorskin.hw.rig.track import LiveTrack, Progress, Track, even_times
 from mirrorskin.io.types import Block, Floats
 
 _SLOWER = 1.01  # factor by which a turn may be slower than planned without having too many frames
-_MARGIN = 0.3  # seconds of frames before and after the move
 
 
 class SweepScan(Scan):
@@ -62,7 +61,7 @@ class SweepScan(Scan):
     def expected(self) -> int:
         """Expected number of frames."""
         rate = self.rig.rate
-        all_frames = (self._path.duration + _MARGIN) * rate
+        all_frames = (self._path.duration + MARGIN) * rate
         return math.ceil(all_frames / self.every) if math.isfinite(rate) else 1
 
     @property

@@ -40,9 +40,7 @@ class Trigger:
     ) -> None:
         switch = getattr(stage, "switch", None)
         if switch is None:
-            raise InputError(
-                f"{stage.name}: camera.trigger needs a GRBL controller; remove it from the rig file"
-            )
+            raise no_trigger(stage.name)
         self._switch, self._line = switch, settings.trigger
         self._camera, self._check, self._clock = camera, check, clock
         self._patience = _PATIENCE + (settings.exposure or 0.0) + (settings.delay or 0.0)
@@ -97,3 +95,8 @@ class Trigger:
                         f"its trigger: check the controller's output '{self._line}', its wiring, "
                         "and the camera's triggered mode"
                     ) from None
+
+
+def no_trigger(stage: str) -> InputError:
+    """Return the error of a stage, by name, that has no outputs."""
+    return InputError(f"{stage}: camera.trigger needs a GRBL controller; remove it from the rig file")

@@ -172,6 +172,18 @@ def test_a_stage_that_has_no_line_is_refused():
         fake_rig(lambda place: np.zeros((8, 8), np.uint8), told={"trigger": "coolant"})
 
 
+def test_a_stage_that_has_no_line_is_not_homed(monkeypatch):
+    with fake_rig(lambda place: np.zeros((3, 4), np.uint8)) as rig:
+        homed = []
+        monkeypatch.setattr(rig.stage, "home", lambda: homed.append(True), raising=False)
+        stage = msgspec.structs.replace(rig.settings.stage, firmware="own:Stage", home=True)
+        camera = msgspec.structs.replace(rig.settings.camera, trigger="coolant")
+        opened = {"open_stage": lambda _: rig.stage, "open_camera": lambda _: rig.camera}
+        with pytest.raises(InputError, match="needs a GRBL controller"):
+            rigs.open_rig(replace(rig.settings, stage=stage, camera=camera), True, clock=rig.clock, **opened)
+        assert homed == []
+
+
 def test_rig_check_triggers_a_few_frames(emulated):
     rig, told = emulated()
     found = {one.what: one for one in check.check_rig(told)}

@@ -13,7 +13,7 @@ from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.view.app import App
 from mirrorskin.view.app.page import pages
 from mirrorskin.view.app.rig import RigPane
-from mirrorskin.view.app.rig_control import RigControl, judge, vertical_plan
+from mirrorskin.view.app.rig_control import RigControl, axial_plan, judge, vertical_plan
 
 SHAPE, PIXEL, RATE = (24, 32), 0.3, 50.0
 LONG = 120.0  # simulated seconds, after which what should have happened never will
@@ -271,6 +271,15 @@ def test_an_impossible_plan_is_refused(ready):
     pane.press["stop"].value = -1.0
     pane.start.param.trigger("clicks")
     assert "does not go down" in ready.control.problem
+
+
+def test_a_run_without_a_possible_result_moves_nothing(ready):
+    before = travel(ready)
+    ready.control.run(axial_plan(0.5, 0.002, 1.0, 20.0))
+    ready.until(lambda: ready.control.problem != "")
+    assert "2.5 frames a turn: at least 3 are needed" in ready.control.problem
+    assert ready.control.state == "ready"
+    assert travel(ready) == before
 
 
 def test_the_recording_of_a_run_is_opened(ready, tmp_path):

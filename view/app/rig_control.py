@@ -21,6 +21,7 @@ from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.rig.scan import PlannedScan
 from mirrorskin.hw.rig.sweep import make_scan
 from mirrorskin.hw.rig_file import RigSettings, StageSettings
 from mirrorskin.hw.stage import Position, Stage
@@ -219,6 +220,7 @@ class RigControl:
         self.result = self.recorded = None
         self.seen = replace(self.seen, update=None, status=None)
         scan = make_scan(rig, plan)
+        _live(PlannedScan(self.settings, plan), plan, rig.rate)  # refused before anything moves
         recorder = None if record is None else io.StreamRecorder(scan, record)
         source: io.LiveSource = scan if recorder is None else recorder
 
