@@ -89,8 +89,8 @@ class ArrayRecording(Recording):
         origins: Mapping[Path, State] | None = None,
     ) -> None:
         _check_names(name, positions, header)
+        frames = frames if isinstance(frames, FrameReader) else as_array("frames", frames)
         reader = frames if isinstance(frames, FrameReader) else None
-        frames = frames if reader is not None else as_array("frames", frames)
         if reader is not None and reader.shape[0] < 2:
             hints = "".join(f". {found.text}" for found in reader.findings if found.warning)
             raise InputError(f"{name} contains {reader.shape[0]} frame: a stack has at least 2{hints}")
