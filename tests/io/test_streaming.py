@@ -363,7 +363,7 @@ except io.InputError as error:
     print(error)
 """
     told = subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-B", "-c", code],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": os.fspath(SUPPORT)},
         capture_output=True,

@@ -116,7 +116,7 @@ class Child:
             program = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit},) * 2); {program}"
         self.process = subprocess.Popen(
             [
-                *(sys.executable, "-P", "-c", program, "capture", *words),
+                *(sys.executable, "-B", "-P", "-c", program, "capture", *words),
                 *("--rig", str(rig_file), "-o", str(self.recording)),
             ],
             stdin=subprocess.DEVNULL,
