@@ -19,6 +19,7 @@ from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import unknown_argument
 from mirrorskin.io.findings import warn
+from mirrorskin.io.interpreter_end import computation
 from mirrorskin.io.layout import as_series
 from mirrorskin.io.maps import SIGMA, UNDECLARED, declaration_of
 from mirrorskin.io.positions import step_in_degrees
@@ -390,6 +391,7 @@ def _checked_push(method: Callable[..., None]) -> Callable[..., None]:
     """Return a method ``push`` that checks its arguments, and counts frames."""
 
     @wraps(method)
+    @computation()
     def push(self: Operation, frames: Any, **given: Any) -> None:
         if self._pushing:  # by the push of a subclass
             method(self, frames, **given)
@@ -417,6 +419,7 @@ def _checked_result(method_name: str, method: Callable[..., Any]) -> Callable[..
     """Return a method ``result`` or ``finish`` whose maps are checked against their declarations."""
 
     @wraps(method)
+    @computation()
     def result(self: Operation) -> Result:
         name = type(self).__name__
         self.check_count()
@@ -676,6 +679,7 @@ def array_function(
         given_positions = {one: values for one, values in where.items() if values is not None}
         return apply(operation(memory_limit=limit_of(frames), **given), frames, **given_positions)
 
+    @computation()
     def function(*args: Any, **kwargs: Any) -> Result:
         if unknown := next((one for one in kwargs if one not in signature.parameters), ""):
             raise TypeError(unknown_argument(f"{name}()", unknown, [*signature.parameters]))

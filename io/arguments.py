@@ -13,6 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.interpreter_end import computation
 from mirrorskin.io.samples import order_of, order_of_map, packing_of
 from mirrorskin.io.types import InputError
 from mirrorskin.io.units import PLAIN, ratio
@@ -84,6 +85,7 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
         takes_any = any(one.kind is one.VAR_KEYWORD for one in parameters)
 
         @functools.wraps(function)
+        @computation()
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
             given: list[Any] = list(args)
             for index, name, check in known:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import math
 import threading
 import time
@@ -30,7 +29,6 @@ from mirrorskin.io.types import Closing, Floats
 
 _WAITING = 64  # frames at most that wait to be processed
 _ENDLESS = 1 << 40  # frames that a stream may have
-_readers: weakref.WeakKeyDictionary[threading.Thread, _Pushed] = weakref.WeakKeyDictionary()
 
 
 class Stream(Closing):
@@ -91,9 +89,8 @@ class Stream(Closing):
         self._thread = threading.Thread(
             target=_run, args=(self._loop, self._source), name="mirrorskin-stream", daemon=True
         )
-        _readers[self._thread] = self._source
         self._thread.start()
-        weakref.finalize(self, self._source.abandon).atexit = False  # `_end_all` does, and waits
+        weakref.finalize(self, self._source.abandon).atexit = False
 
     def push(self, frames: ArrayLike, *, time: float | None = None, **positions: ArrayLike) -> None:
         """Process the next frame, (H, W), or frames, (n, H, W): they are copied, and processed later.
@@ -168,15 +165,6 @@ def _run(loop: Loop, source: _Pushed) -> None:
         loop.run()
     except BaseException as error:  # it is raised by the next call of another thread
         source.fail(error)
-
-
-@atexit.register
-def _end_all() -> None:
-    """Wait for what the threads compute, so that the program does not end under them."""
-    for thread, source in list(_readers.items()):
-        if thread.is_alive():
-            source.abandon()
-            thread.join()
 
 
 def _header(operation: Operation | Method, motion: Motion | None, header: Header | None) -> Header:

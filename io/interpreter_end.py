@@ -1,0 +1,80 @@
+"""Computations of daemon threads, and the end of the interpreter.
+
+Before version 3.14, Python ends a daemon thread where it returns from native code while the interpreter ends.
+In C++, as in OpenCV and pyopencl, this aborts the process ("terminate called without an active exception").
+"""
+
+from __future__ import annotations
+
+import concurrent.futures.thread  # noqa: F401  # its pools end after what is registered later
+import functools
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_LONGEST_WAIT = 10.0  # seconds that the end is delayed at most
+_PAUSE = 5.0  # seconds in which the interpreter ends
+
+_changed = threading.Condition()
+_computations = 0  # of daemon threads
+_ending = _waited = False
+_ended = set[threading.Thread]()  # threads in which SystemExit was raised
+
+
+@contextmanager
+def computation() -> Iterator[None]:
+    """Delay the end of the interpreter while a daemon thread is in the context.
+
+    At the end, `SystemExit` is raised in daemon threads that enter or leave a context, such as between two
+    blocks of frames.
+    """
+    if not threading.current_thread().daemon:
+        yield
+        return
+    _register()
+    _count(1)
+    try:
+        yield
+    finally:
+        _count(-1)
+
+
+def _count(change: int) -> None:
+    """Count a computation of this thread that begins or has ended, and end the thread if the program ends."""
+    global _computations
+    with _changed:
+        if change < 0 or not _ending:
+            _computations += change
+            _changed.notify_all()
+        if not _ending:
+            return
+        if not _waited:
+            _ended.add(threading.current_thread())
+    if _waited:  # nobody waits while this thread deletes what it computed, so the interpreter ends first
+        time.sleep(_PAUSE)
+    raise SystemExit
+
+
+@functools.cache
+def _register() -> None:
+    # Functions given to `atexit` are called after pools refuse work, which computations need until they end.
+    try:
+        threading._register_atexit(_wait)  # type: ignore[attr-defined]
+    except RuntimeError:  # the interpreter ends already
+        raise SystemExit from None
+
+
+def _wait() -> None:
+    """Wait for computations, and for the threads that ended with them."""
+    global _ending, _waited
+    end = time.monotonic() + _LONGEST_WAIT
+    with _changed:
+        _ending = True
+        _changed.wait_for(lambda: not _computations, _LONGEST_WAIT)
+    while not _waited:
+        with _changed:
+            thread = _ended.pop() if _ended else None
+            _waited = thread is None
+        if thread is not None:
+            thread.join(max(0.0, end - time.monotonic()))
