@@ -8,7 +8,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from io import FileIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -177,9 +177,9 @@ class NewHdf5(Closing):
 def new_file(path: Path, replaces: Replaces = "derived") -> Iterator[int]:
     """Create a file under a temporary name next to ``path``, and rename it after success.
 
-    It is synchronised to the disk before it is renamed. Incomplete files of killed programs in that folder
-    are removed, once per process. If ``path`` is a link, its target is replaced. Whether an existing file may
-    be replaced is checked at the start, and again before renaming.
+    The file is synchronised to the disk before it is renamed, and the folder afterwards. Incomplete files of
+    killed programs in that folder are removed, once per process. If ``path`` is a link, its target is
+    replaced. Whether an existing file may be replaced is checked at the start, and again before renaming.
     """
     check_output(path, replaces=replaces)
     with new_part(path) as (part, descriptor):
@@ -201,7 +201,8 @@ def new_part(path: Path) -> Iterator[tuple[Path, int]]:
             descriptor = _make(part)
         yield part, descriptor
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):  # the next file in this folder removes it
+            part.unlink(missing_ok=True)
         with suppress(OSError):
             os.close(descriptor)  # releases the lock, after the renaming
 
@@ -210,6 +211,16 @@ def synchronise(descriptor: int) -> None:
     """Synchronise a file to the disk."""
     os.fsync(descriptor)
     os.close(os.dup(descriptor))  # some file systems report a full disk only on closing
+
+
+def _synchronise_path(path: Path) -> None:
+    """Synchronise a file to the disk, or the names in a folder if the file system can do that."""
+    with suppress(OSError) if path.is_dir() else nullcontext():
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def link_new(part: Path, target: Path) -> None:
@@ -224,6 +235,13 @@ def link_new(part: Path, target: Path) -> None:
         if os.path.lexists(target):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target)) from None
         part.rename(target)
+    _synchronise_path(target.parent)
+
+
+def replace_file(part: Path, target: Path) -> None:
+    """Rename a file, which replaces another."""
+    part.replace(target)
+    _synchronise_path(target.parent)
 
 
 def _rename(part: Path, path: Path, replaces: Replaces) -> None:
@@ -238,7 +256,7 @@ def _rename(part: Path, path: Path, replaces: Replaces) -> None:
         return
     if target.exists():
         _check_existing(path, replaces)
-    part.replace(target)
+    replace_file(part, target)
 
 
 @contextmanager
@@ -255,6 +273,8 @@ def new_folder(path: Path) -> Iterator[Path]:
             descriptor = _make_folder(part)
         yield part
         with as_input_error(f"{path} could not be written", "choose another place with -o"):
+            for written in (*part.rglob("*"), part):
+                _synchronise_path(written)
             if path.exists() or not _renamed(part, path):
                 raise InputError(f"{path} was made by another program meanwhile: name another output with -o")
     finally:
@@ -316,6 +336,7 @@ def _renamed(part: Path, path: Path) -> bool:
         if error.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
             return False
         raise
+    _synchronise_path(path.parent)
     return True
 
 

@@ -312,8 +312,10 @@ class GrowingMessages(Closing):
         self.flush()
 
     def close(self) -> None:
-        """Close the file."""
-        self._stream.close()
+        """Close the file, after synchronising it to the disk."""
+        with self._stream:
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
 
 
 def _picture(values: NDArray[Any]) -> dict[str, Any]:

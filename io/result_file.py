@@ -74,7 +74,7 @@ def save_result(result: Result, path: str | Path, *, overwrite: bool = False) ->
         return
     from mirrorskin.io.zarr_export import save_zarr
 
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         write_file(Path(folder, "result.h5"), _items(result))
         save_zarr(Path(folder, "result.h5"), target)
 

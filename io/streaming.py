@@ -26,6 +26,7 @@ from mirrorskin.io.atomic import (
     check_output,
     link_new,
     new_part,
+    replace_file,
     synchronise,
 )
 from mirrorskin.io.calibration.file import size_of
@@ -325,14 +326,13 @@ class StreamRecorder(TeeSource[LiveSource]):
         if self.file == self.path:
             return
         target = Path(os.path.realpath(self.path))
-        with self.file.open("rb") as file:
-            os.fsync(file.fileno())
         with suppress(FileExistsError):
             if self._older is not None and _identity(target) == self._older:
-                self.file.replace(target)
+                replace_file(self.file, target)
             else:
                 link_new(self.file, target)
-                self.file.unlink(missing_ok=True)
+                with suppress(OSError):  # the recording has its name
+                    self.file.unlink(missing_ok=True)
             self.file = self.path
             return
         raise InputError(
@@ -495,6 +495,7 @@ class GrowingRecording(Closing):
         with ExitStack() as opening:
             self._descriptor = os.dup(descriptor)
             opening.callback(os.close, self._descriptor)
+            opening.callback(synchronise, self._descriptor)
             room = self._spare + 32 * math.prod(shape[1:])  # includes the maps of the header
             room += 0 if calibration is None else size_of(calibration)
             self._reserve(room)

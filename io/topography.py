@@ -81,7 +81,7 @@ def encode_gsf(result: Result) -> Encoded:
         "Title": "height",
         "Comment": _comment(result).replace("=", ":"),
     }
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         path = Path(folder, "height.gsf")
         gsffile.write_gsf(path, (height * np.float64(_METRE)).astype(np.float32), fields)
         return Encoded([path.read_bytes()], _holds(result))

@@ -1,11 +1,19 @@
 """Files appear complete or not at all; temporary files of killed writers."""
 
+import errno
 import fcntl
+import itertools
+import os
 import re
+import stat
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
+from growing import Feed, stream
+from stacks import record, sphere
 
 from mirrorskin import io
 from mirrorskin.io.atomic import new_hdf5, remove_leftovers, write_new
@@ -104,6 +112,127 @@ def test_what_a_link_leads_to_is_replaced_and_the_link_stays(tmp_path):
     write_new(link, [b"new"])
     assert link.is_symlink()
     assert target.read_bytes() == b"new"
+
+
+@pytest.fixture
+def steps(monkeypatch, tmp_path):
+    """What is synchronised to the disk, and renamed or linked, in order."""
+    done = []
+
+    def watch(name, describe):
+        call = getattr(os, name)
+
+        def watched(*given, **options):
+            what = describe(*given)
+            call(*given, **options)
+            done.append(what)
+
+        monkeypatch.setattr(os, name, watched)
+
+    def kind(descriptor):
+        return "folder" if stat.S_ISDIR(os.fstat(descriptor).st_mode) else "file"
+
+    watch("fsync", lambda descriptor: f"synchronise {kind(descriptor)}")
+    for name in ("rename", "replace", "link"):
+        watch(name, lambda *_: "name")
+    return done
+
+
+def write_result(path):
+    io.save_result(io.Result(height=np.zeros((3, 4), "f4")), path, overwrite=True)
+
+
+def write_table(path):
+    write_new(path, [b"new"])
+
+
+def write_calibration(path):
+    levels = [np.full((5, 7), level, np.float32) for level in (10, 200, 1, 1)]
+    references = io.References(*levels, np.zeros((5, 7), np.uint8))
+    io.update_calibration(path, references, io.CameraId("a", (5, 7), np.dtype("u1")), {})
+
+
+def write_recording(path):
+    record(sphere(), path)
+
+
+def write_live(path):
+    stream(Feed(4), path)
+
+
+def write_messages(path):
+    stream(Feed(4), path.with_suffix(".mcap"))
+
+
+ORDER = ["synchronise file", "name", "synchronise folder"]
+
+
+@pytest.mark.parametrize("write", [write_result, write_table, write_calibration, write_recording])
+def test_a_file_is_on_the_disk_before_its_name_and_then_the_name(tmp_path, steps, write):
+    write(tmp_path / "a.h5")
+    assert steps == ORDER
+
+
+@pytest.mark.parametrize("write", [write_live, write_messages])
+def test_a_live_recording_is_on_the_disk_when_it_is_complete(tmp_path, steps, write):
+    write(tmp_path / "a.h5")
+    assert steps == [*ORDER, "synchronise file"]
+
+
+def test_a_live_recording_that_replaces_another_is_on_the_disk_first(tmp_path, steps):
+    write_live(tmp_path / "a.h5")
+    steps.clear()
+    with io.StreamRecorder(Feed(4), tmp_path / "a.h5", overwrite=True) as recorder:
+        while recorder.read() is not None:
+            pass
+    assert steps == [*ORDER, "synchronise file", "name", "synchronise folder"]
+
+
+def test_a_folder_of_zarr_is_on_the_disk_before_its_name(tmp_path, steps):
+    write_result(tmp_path / "a.zarr")
+    files = sum(one.is_file() for one in (tmp_path / "a.zarr").rglob("*"))
+    assert steps[-2:] == ["name", "synchronise folder"]
+    last = itertools.takewhile(lambda step: step != "name", reversed(steps[:-2]))
+    assert [*last].count("synchronise file") == files
+
+
+def test_a_folder_that_cannot_be_synchronised_is_no_failure(tmp_path, monkeypatch):
+    synchronise = os.fsync
+
+    def refuse(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "not here")
+        synchronise(descriptor)
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    write_result(tmp_path / "a.h5")
+    assert io.open_result(tmp_path / "a.h5").height.shape == (3, 4)
+
+
+def refuse_to_remove(*_, **__):
+    raise OSError(errno.EIO, "stays")
+
+
+def test_a_temporary_file_that_stays_is_no_failure(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "unlink", refuse_to_remove)
+    write_result(tmp_path / "a.h5")
+    assert io.open_result(tmp_path / "a.h5").height.shape == (3, 4)
+
+
+def test_a_live_recording_is_complete_although_its_temporary_files_stay(tmp_path, monkeypatch):
+    write_live(tmp_path / "a.h5")
+    monkeypatch.setattr(Path, "unlink", refuse_to_remove)
+    with io.StreamRecorder(Feed(6), tmp_path / "a.h5", overwrite=True) as recorder:
+        while recorder.read() is not None:
+            pass
+    with io.open_recording(tmp_path / "a.h5") as recording:
+        assert (recording.shape[0], recording.state) == (6, "complete")
+
+
+def test_an_error_is_reported_although_the_temporary_file_stays(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "unlink", refuse_to_remove)
+    with pytest.raises(ZeroDivisionError), new_hdf5(tmp_path / "a.h5"):
+        raise ZeroDivisionError
 
 
 @pytest.mark.parametrize(

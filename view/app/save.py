@@ -95,7 +95,7 @@ class SavePane:
         if session.now is None or session.failed:
             raise InputError(f"no result has been computed with these options: {session.problem}")
         result = session.now.result
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             path = Path(folder, str(self.download.filename))
             if suffix == _RESULT:
                 io.save_result(result, path)

@@ -88,7 +88,7 @@ class AppServer:
         """Serve until `stop` is called."""
         self._server.io_loop.asyncio_loop.set_exception_handler(_handle)
         self._server.start()
-        with closing(self), TemporaryDirectory(prefix="mirrorskin-") as folder:
+        with closing(self), TemporaryDirectory(prefix="mirrorskin-", ignore_cleanup_errors=True) as folder:
             if browser:
                 self._server.io_loop.add_callback(open_browser, self.address, Path(folder))
             self._server.io_loop.start()
