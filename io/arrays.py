@@ -34,7 +34,7 @@ from mirrorskin.io.recording import Recording, cut_out
 from mirrorskin.io.samples import DecodedFrames, Decoding
 from mirrorskin.io.selection import Region
 from mirrorskin.io.stack import RawFrames
-from mirrorskin.io.types import MOTIONS, Block, Header, InputError, Motion, block_memory
+from mirrorskin.io.types import FRAME_DTYPES, MOTIONS, Block, Header, InputError, Motion, block_memory
 
 _KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are not frames
 _NEEDED = "travel (--travel-step or --travel), phase (--phase-step or --phases)"
@@ -308,6 +308,7 @@ def read_map(path: Path) -> NDArray[Any]:
     values = read_array(path) if path.suffix.lower() == ".npy" else read_picture(path)
     if values.ndim != 2:
         raise InputError(f"{path} has shape {values.shape}: a map (H, W) is needed, one value a pixel")
+    check_unpacked(values.nbytes + 4 * values.size, f"{path}, as float32,", "give a smaller one")
     return values
 
 
@@ -355,10 +356,15 @@ def _read_members(
         if head.size + head.nbytes != members[name].file_size:
             raise ValueError(f"{name} states {head.nbytes} bytes of values and has another number")
     packed = [name for name, member in members.items() if member.compress_type != zipfile.ZIP_STORED]
-    unpacked = sum(heads[name].nbytes for name in packed)
+    unpacked = sum(_memory(heads[name]) for name in packed)
     remedy = "raise --memory, or write it with numpy.savez"
     check_unpacked(unpacked, f"{path}: {', '.join(packed)}", remedy, limit)
     return {name: _read_member(archive, members[name], head) for name, head in heads.items()}
+
+
+def _memory(head: _Head) -> int:
+    """Return the bytes that an array takes; samples are converted to a type of frames after all are read."""
+    return head.nbytes if head.dtype in FRAME_DTYPES else 2 * head.nbytes
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, head: _Head) -> NDArray[Any]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.findings import Finding
+from mirrorskin.io.opencv import look_up
 from mirrorskin.io.types import InputError
 
 _LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
@@ -41,4 +42,4 @@ class ColourTable:
             raise InputError(
                 f"{self._name} is damaged: its table has {len(self._samples)} colours. Copy it again"
             )
-        return np.asarray(self._samples[indices])
+        return look_up(self._samples, indices)

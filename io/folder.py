@@ -45,12 +45,18 @@ class FolderFrames(WholeFrames):
         self._channel = channel
         self.lost, numbering = _lost(numbers)
         first_of_each = {file.suffix.lower(): file for file in reversed(self.files)}
-        pictures = {file: decode_picture(file) for file in sorted(first_of_each.values())}
-        frame = to_grey(pictures[self.files[0]].samples, str(self.files[0]), channel)
-        self.shape, self.dtype = (len(self.files), *frame.shape), frame.dtype
-        seen = dict.fromkeys(found for picture in pictures.values() for found in picture.findings)
+        files = sorted(first_of_each.values())
+        seen = dict.fromkeys(found for file in files for found in self._look(file))
         kept = [found for found in seen if channel is None or found.kind != "colour"]
         self.findings = (*numbering, *lost_frames(self.lost), *kept)
+
+    def _look(self, file: Path) -> tuple[Finding, ...]:
+        """Return the findings about a picture; that of the first frame determines size and type."""
+        picture = decode_picture(file)
+        if file == self.files[0]:
+            frame = to_grey(picture.samples, str(file), self._channel)
+            self.shape, self.dtype = (len(self.files), *frame.shape), frame.dtype
+        return picture.findings
 
     def frames(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
         """Decode pictures."""

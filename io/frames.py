@@ -88,7 +88,9 @@ class WholeFrames(FrameReader):
         (start, stop), *part = spans
         region = tuple(slice(*span) for span in part)
         with self._decoding:
-            for target, (name, frame) in zip(out, self.frames(start, stop), strict=True):
+            decoded = self.frames(start, stop)
+            for target in out:
+                name, frame = next(decoded)
                 if frame.shape != self.shape[1:] or frame.dtype != self.dtype:
                     first = kind_of(self.shape[1:], self.dtype)
                     raise InputError(
@@ -96,6 +98,7 @@ class WholeFrames(FrameReader):
                         "all frames must have the same size and depth"
                     )
                 target[...] = frame[region]
+                del frame  # before the next frame is decoded
 
 
 def kind_of(shape: Sequence[int], dtype: np.dtype[Any]) -> str:

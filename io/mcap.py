@@ -57,6 +57,7 @@ _NOTES, _MOST_NOTES = "mirrorskin", 8  # name of the metadata; maximum number of
 _NUMERAL = re.compile(r"[-+]?[0-9]+\.?[0-9]*(?:[eE][-+]?[0-9]+)?")
 _LONGEST = 100  # characters quoted of an error message of a package
 _MOST_PACKED = 255  # largest compression ratio accepted for all chunks of a file, the limit of LZ4
+_COPIES = 6  # of a chunk with one image that exist at the same time: packed, unpacked, message, image, frame
 
 # From the file format (https://mcap.dev/spec): opcode and length, then the fields.
 _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
@@ -493,7 +494,8 @@ class MessageFrames(WholeFrames):
                 if isinstance(record, Message) and record.channel_id in wanted:
                     yield record
                 if isinstance(record, Chunk):
-                    data = _unpack(record)
+                    data, crc = _unpack(record), record.uncompressed_crc
+                    del record  # before messages are copied
                     total += len(data)
                     check_unpacked(total, f"{self._path}, unpacked,", "repack it with 'mcap compress'", most)
                     yield from _messages_in(data, wanted)
@@ -503,7 +505,7 @@ class MessageFrames(WholeFrames):
         from mcap.stream_reader import StreamReader
 
         if not self._summary.chunks:
-            yield from StreamReader(file, emit_chunks=True).records
+            yield from StreamReader(file, emit_chunks=True, record_size_limit=most).records
         for chunk in sorted(self._summary.chunks, key=lambda one: one.chunk_start_offset):
             if not chunk.message_index_offsets or wanted & chunk.message_index_offsets.keys():
                 file.seek(chunk.chunk_start_offset)
@@ -513,6 +515,7 @@ class MessageFrames(WholeFrames):
         """Read the channels and chunks from the file's index."""
         try:
             from mcap.records import Channel, ChunkIndex, Metadata, MetadataIndex, Schema
+        most = MAX_UNPACKED_BYTES // _COPIES
             from mcap.stream_reader import StreamReader
         except ImportError as error:
             raise InputError(_INSTALL) from error
@@ -575,7 +578,7 @@ class _Summary(NamedTuple):
 def _unpack(chunk: Chunk) -> bytes:
     """Return the records of a chunk, which must have the stated length; see ``MAX_UNPACKED_BYTES``."""
     size = chunk.uncompressed_size
-    check_unpacked(size, "a chunk", "repack the file with 'mcap compress'")
+    check_unpacked(_COPIES * size, "a chunk", "repack the file in smaller chunks with 'mcap compress'")
     if chunk.compression == "zstd":
         import zstandard
 
@@ -661,11 +664,10 @@ def _decode(message: Any, name: str) -> Picture:
             f"{name}: {len(data)} bytes in steps of {message.step} are not {message.width} x {message.height}"
             f" pixels of {encoding}: correct its step, width and height"
         )
-    shape, strides = (
-        (message.height, message.width, len(order)),
-        (step, len(order) * kind.itemsize, kind.itemsize),
-    )
-    samples = np.ndarray(shape, kind, data, strides=strides)[..., order].astype(kind.newbyteorder("="))
+    shape = message.height, message.width, len(order)
+    stored = np.ndarray(shape, kind, data, strides=(step, len(order) * kind.itemsize, kind.itemsize))
+    samples = stored[..., 0] if len(order) == 1 else stored[..., order]
+    samples = samples.astype(kind.newbyteorder("="), copy=False)
     if len(order) == 1:
-        return Picture(samples[..., 0])
+        return Picture(samples)
     return Picture(samples, (CONVERTED_COLOUR,) if is_coloured(samples) else ())

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.os_errors import check_unpacked
 from mirrorskin.io.types import InputError
 
+_AT_ONCE = 1 << 20  # samples that are compared or converted at once
 _COLOURS = ("red", "green", "blue", "opacity")
 
 
@@ -53,12 +55,43 @@ def encode(suffix: str, picture: NDArray[Any], parameters: Sequence[int] = ()) -
     return bytes(data)
 
 
+def check_picture(
+    name: str, columns: int, rows: int, itemsize: int, channels: int = 1, packed: int = 0, copies: int = 0
+) -> None:
+    """Raise InputError if a picture takes more memory than a file may, before it is decoded.
+
+    All that exists at the same time is counted: its packed bytes twice (as read, and as decoded), its samples
+    with ``copies`` of them, and grey samples twice (converted from colours, and where the caller needs them).
+    """
+    grey = 2 if channels > 1 else 1
+    size = 2 * packed + columns * rows * itemsize * (channels * (1 + copies) + grey)
+    check_unpacked(size, f"{name}: a picture of {columns} x {rows}", "save it as smaller pictures")
+
+
+def rows_of(picture: NDArray[Any]) -> Iterator[slice]:
+    """Yield parts of a picture, which are processed one after the other to take little memory."""
+    step = max(1, _AT_ONCE // max(1, picture[:1].size))
+    for start in range(0, len(picture), step):
+        yield slice(start, start + step)
+
+
+def look_up(table: NDArray[Any], indices: NDArray[Any]) -> NDArray[Any]:
+    """Return ``table[indices]``, for which NumPy would convert all indices to 8 bytes each."""
+    values = np.empty(indices.shape, table.dtype)
+    for rows in rows_of(indices):
+        values[rows] = table[indices[rows]]
+    return values
+
+
 def is_coloured(picture: NDArray[Any]) -> bool:
     """Return whether the colours of a picture, (H, W) or (H, W, channels), differ anywhere."""
     if picture.ndim == 2:
         return False
-    first = picture[..., 0]
-    return not all(np.array_equal(first, picture[..., one], equal_nan=True) for one in (1, 2))
+    return not all(
+        np.array_equal(picture[rows, :, 0], picture[rows, :, one], equal_nan=True)
+        for rows in rows_of(picture)
+        for one in (1, 2)
+    )
 
 
 def to_grey(picture: NDArray[Any], name: str, channel: int | None = None) -> NDArray[Any]:
@@ -76,5 +109,8 @@ def to_grey(picture: NDArray[Any], name: str, channel: int | None = None) -> NDA
         return picture[..., order[channel]]
     if not is_coloured(picture):
         return picture if picture.ndim == 2 else picture[..., 0]
+    grey = np.empty(picture.shape[:2], picture.dtype)
     with quiet_opencv() as cv2:
-        return np.asarray(cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_BGR2GRAY))
+        for rows in rows_of(picture):
+            grey[rows] = cv2.cvtColor(np.ascontiguousarray(picture[rows, :, :3]), cv2.COLOR_BGR2GRAY)
+    return grey

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 import zlib
@@ -17,9 +16,9 @@ from mirrorskin.io.atomic import write_new
 from mirrorskin.io.colour_table import ColourTable
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.frames import CONVERTED_COLOUR, lossy
-from mirrorskin.io.opencv import decode, encode, is_coloured, to_grey
-from mirrorskin.io.os_errors import check_unpacked, read_regular
-from mirrorskin.io.tiff import SMALLER, TIFF_SUFFIXES, TiffFrames
+from mirrorskin.io.opencv import check_picture, decode, encode, is_coloured, to_grey
+from mirrorskin.io.os_errors import read_regular
+from mirrorskin.io.tiff import TIFF_SUFFIXES, TiffFrames
 from mirrorskin.io.types import FRAME_DTYPES, InputError
 
 PICTURE_SUFFIXES = (".png", ".bmp", ".pgm", ".jpg", ".jpeg", *TIFF_SUFFIXES)
@@ -34,7 +33,7 @@ _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), 
 _PIECE = 1 << 20  # bytes unpacked at a time
 _INCH = 0.0254  # m
 _JPEG_MARK, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_JPEG_BYTES = 8  # bytes per pixel in a decoder; a progressive JPEG needs three coefficients of 2 bytes
+_SEQUENTIAL = (0xC0, 0xC1)  # markers of JPEGs that are decoded block by block
 _BMP_HEAD = struct.Struct("<2x4s4xIIiiHHI12xI")  # file size, offset, then the header of Windows 3 or later
 _BLANK = rb"\s+(?:#[^\n]*\n\s*)*"
 _PGM_HEAD = re.compile(rb"P5%b(\d{1,9})%b(\d{1,9})%b(\d{1,5})\s" % (_BLANK, _BLANK, _BLANK))
@@ -83,7 +82,9 @@ def decode_bytes(data: bytes, name: str) -> Picture:
 
 
 def _decode_jpeg(data: bytes, name: str) -> NDArray[Any]:
-    check_unpacked(_JPEG_BYTES * math.prod(_jpeg_size(data, name)), name, SMALLER)
+    marker, rows, columns, channels = _jpeg_frame(data, name)
+    copies = 1 if marker in _SEQUENTIAL else 3  # the turned picture, and 2 bytes for a coefficient
+    check_picture(name, columns, rows, 1, 1 if channels == 1 else 3, len(data), copies)
     if _JPEG_END not in data[-64:]:  # some cameras add padding; OpenCV fills missing parts with grey
         raise InputError(f"{name} is cut off: copy it again")
     return decode(data, name, upright=True)
@@ -95,8 +96,7 @@ def _decode_bmp(data: bytes, name: str) -> Picture:
     _, start, head, width, height, _, bits, packing, colours = _BMP_HEAD.unpack_from(data)
     if head < 40:
         raise InputError(f"{name} is a BMP of OS/2: save it as PNG")
-    size = abs(width * height) * max(bits // 8, 1)
-    check_unpacked(size, f"{name}: a picture of {width} x {abs(height)}", SMALLER)
+    check_picture(name, abs(width), abs(height), 1, 4 if bits > 24 else 3, len(data))
     if packing == 0 and len(data) < start + -(-width * bits // 32) * 4 * abs(height):
         raise InputError(f"{name} is cut off: copy it again")
     if bits > 8:
@@ -105,7 +105,8 @@ def _decode_bmp(data: bytes, name: str) -> Picture:
     table = np.frombuffer(data[place : place + 4 * min(count, 256)], np.uint8).reshape(-1, 4)[:, 2::-1]
     # With a table of equal colours OpenCV returns the indices.
     equal = np.repeat(np.arange(len(table), dtype=np.uint8), 4).tobytes()
-    indices = decode(data[:place] + equal + data[place + len(equal) :], name)
+    view = memoryview(data)
+    indices = decode(b"".join([view[:place], equal, view[place + len(equal) :]]), name)
     indices = indices if indices.ndim == 2 else indices[..., 0]
     colour_table = ColourTable(name, table)
     return Picture(colour_table.look_up(indices), colour_table.findings)
@@ -117,16 +118,18 @@ def _decode_pgm(data: bytes, name: str) -> NDArray[Any]:
     kind = np.dtype(">u2" if most > 255 else "u1")
     if found is None or not 0 < most < 65536 or len(data) - found.end() < rows * columns * kind.itemsize:
         raise InputError(f"{name} is damaged or cut off: copy it again")
+    check_picture(name, columns, rows, kind.itemsize, packed=len(data))
     samples = np.frombuffer(data, kind, rows * columns, found.end()).reshape(rows, columns)
     return samples.astype(kind.newbyteorder("="))
 
 
 def _decode_png(data: bytes, name: str) -> Picture:
     chunks = _essential_chunks(data, name)
-    head = struct.unpack_from(">IIBB2xB", b"".join([_PNG_MARK, *chunks]).ljust(_PNG_HEAD, b"\0"), 16)
-    width, height, depth, colour, interlaced = head
-    size = width * height * (2 if depth == 16 else 1) * (1 if colour == 0 else 4)
-    check_unpacked(size, f"{name}: a picture of {width} x {height}", SMALLER)
+    head = bytes(chunks[0][8:21]).ljust(13, b"\0")
+    width, height, depth, colour, interlaced = struct.unpack_from(">IIBB2xB", head)
+    channels = {0: 1, 2: 3}.get(colour, 4)
+    # OpenCV holds a second picture, because a PNG may be animated.
+    check_picture(name, width, height, 2 if depth == 16 else 1, channels, len(data), copies=1)
     needed = _png_bytes(width, height, depth * _PNG_CHANNELS.get(colour, 1), bool(interlaced))
     packed = (chunk[8:-4] for chunk in chunks if chunk[4:8] == b"IDAT")
     if [chunk[4:8] for chunk in chunks].count(b"IHDR") != 1 or not _unpack_to(packed, needed):
@@ -135,10 +138,11 @@ def _decode_png(data: bytes, name: str) -> Picture:
     if colour != _PNG_PALETTE or len(tables) != 1 or len(tables[0]) % 3:
         return Picture(decode(b"".join([_PNG_MARK, *chunks]), name))
     # As a grey picture of the same bits, OpenCV returns the indices, scaled to 8 bits.
-    grey = _png_chunk(b"IHDR", chunks[0][8:17] + b"\0" + chunks[0][18:-4])
+    grey = _png_chunk(b"IHDR", head[:9] + b"\0" + head[10:])
     indices = decode(b"".join([_PNG_MARK, grey, *(one for one in chunks[1:] if one[4:8] != b"PLTE")]), name)
     table = ColourTable(name, np.frombuffer(tables[0], np.uint8).reshape(-1, 3))
-    return Picture(table.look_up(indices // (255 // ((1 << depth) - 1))), table.findings)
+    indices //= 255 // ((1 << depth) - 1)
+    return Picture(table.look_up(indices), table.findings)
 
 
 def _png_bytes(width: int, height: int, bits: int, interlaced: bool) -> int:
@@ -161,14 +165,13 @@ def _unpack_to(pieces: Iterable[bytes], size: int) -> bool:
     return size <= 0
 
 
-def _jpeg_size(data: bytes, name: str) -> tuple[int, int]:
-    """Return the rows and columns stated by a JPEG (ITU-T T.81, B.2.2)."""
+def _jpeg_frame(data: bytes, name: str) -> tuple[int, int, int, int]:
+    """Return marker, rows, columns and channels of the frame of a JPEG (ITU-T T.81, B.2.2)."""
     at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
+    while at + 10 <= len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            rows, columns = struct.unpack_from(">HH", data, at + 5)
-            return rows, columns
+            return marker, *struct.unpack_from(">HHB", data, at + 5)
         at += 1 if marker == 0xFF else 2 + length
     raise InputError(f"{name} is damaged or cut off: copy it again")
 
@@ -200,13 +203,13 @@ def _png_chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def _essential_chunks(data: bytes, name: str) -> list[bytes]:
+def _essential_chunks(data: bytes, name: str) -> list[memoryview]:
     """Check each chunk of a PNG, and keep those needed for the picture: others may make libpng print."""
-    kept, at, kind = list[bytes](), len(_PNG_MARK), b""
+    kept, at, kind, view = list[memoryview](), len(_PNG_MARK), b"", memoryview(data)
     while kind != b"IEND":
         size = int.from_bytes(data[at : at + 4], "big")
-        chunk, at = data[at : at + 12 + size], at + 12 + size
-        kind = chunk[4:8]
+        chunk, at = view[at : at + 12 + size], at + 12 + size
+        kind = bytes(chunk[4:8])
         if at > len(data) or zlib.crc32(chunk[4:-4]) != int.from_bytes(chunk[-4:], "big"):
             raise InputError(f"{name} is damaged or cut off: copy it again")
         if kind[:1].isupper():

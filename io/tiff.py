@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from mirrorskin.io.colour_table import ColourTable
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.frames import CONVERTED_COLOUR, WholeFrames, lossy
-from mirrorskin.io.opencv import decode, is_coloured, to_grey
-from mirrorskin.io.os_errors import check_regular, check_unpacked, open_regular
+from mirrorskin.io.opencv import check_picture, decode, is_coloured, to_grey
+from mirrorskin.io.os_errors import check_regular, open_regular
 from mirrorskin.io.types import FRAME_DTYPES, InputError
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 
-SMALLER = "save it as smaller pictures"
 _REMEDY = "copy it again, or save it again"
 _DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
 _MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -154,7 +153,9 @@ class TiffFrames(WholeFrames):
             raise InputError(f"{name} is compressed by {kind}: save it with LZW or deflate, or uncompressed")
         self.dtype, rows, columns = np.dtype(dtype), page.imagelength, page.imagewidth
         size = rows * columns * page.samplesperpixel * self.dtype.itemsize
-        check_unpacked(size, f"{name} (page {page.index + 1}): a picture of {columns} x {rows}", SMALLER)
+        packed = 0 if page.compression == _NONE else min(sum(page.databytecounts), self._file.filehandle.size)
+        where, samples = f"{name} (page {page.index + 1})", page.samplesperpixel
+        check_picture(where, columns, rows, self.dtype.itemsize, samples, packed, copies=1)
         self._numbers, self._colour = _numbers(name, series, self._channel)
         self._orientation = _orientation(page)
         turned = self._orientation > _LAST_UPRIGHT

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.colour_table import ColourTable
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.frames import CONVERTED_COLOUR, WholeFrames, lossy, lost_frames
-from mirrorskin.io.opencv import is_coloured, to_grey
+from mirrorskin.io.opencv import is_coloured, look_up, rows_of, to_grey
 from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, check_regular, check_unpacked
 from mirrorskin.io.selection import Span
 from mirrorskin.io.text import one_line
@@ -37,7 +37,10 @@ _OPTIONS = {
     "protocol_whitelist": "file",
     "format_whitelist": "avi,mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,mpeg,mpegts,asf,flv,ogg,nut",
 }
-_LIMIT = {"max_pixels": str(MAX_UNPACKED_BYTES // 3)}  # applies from the opening of the file
+_DECODER_FRAMES = 10  # frames that a decoder and its packets take at the same time, measured with H.264
+_CONVERTED_BYTES = 6  # bytes per pixel of the colours, luma and frame made of one
+# It applies from the opening of the file, to frames of at least one byte per pixel.
+_LIMIT = {"max_pixels": str(MAX_UNPACKED_BYTES // (_DECODER_FRAMES + _CONVERTED_BYTES))}
 _ALL_FRAMES = {"ignore_editlist": "1"}
 _INSTALL = "videos need mirrorskin[video]: pip install 'mirrorskin[video]'"
 _KEPT = 256_000_000  # bytes of decoded frames that are kept in memory, by default
@@ -149,9 +152,9 @@ class VideoFrames(WholeFrames):
             context = stream.codec_context
             if context is None:
                 raise self._not_a_video()
-            check_unpacked(
-                3 * context.width * context.height, f"{self._path}: a frame", "encode it in a smaller size"
-            )
+            pixel = _DECODER_FRAMES * (context.format.padded_bits_per_pixel / 8 if context.format else 4)
+            size = int(context.width * context.height * (pixel + _CONVERTED_BYTES))
+            check_unpacked(size, f"{self._path}: a frame", "encode it in a smaller size")
             context.options = _LIMIT
         except BaseException:
             container.close()
@@ -316,7 +319,7 @@ def _shows_colour(frame: VideoFrame, name: str) -> bool:
     if frame.format.is_rgb or len(frame.format.components) < 3:
         return is_coloured(_stored(frame, name, None))
     colours = frame.reformat(format="bgr24").to_ndarray()
-    return bool(np.ptp(colours, axis=2).max() > _GREY_COUNTS)
+    return any(np.ptp(colours[rows], axis=2).max() > _GREY_COUNTS for rows in rows_of(colours))
 
 
 def _stored(frame: VideoFrame, name: str, channel: int | None) -> NDArray[Any]:
@@ -356,7 +359,7 @@ def _luma(frame: VideoFrame, bits: int) -> NDArray[Any]:
     full = kind.name.startswith("yuvj") or frame.color_range == _FULL_RANGE or kind.name[:2] == "ya"
     plane = frame if kind.is_planar else frame.reformat(format="gray" if kind.name[:2] == "ya" else "yuv444p")
     luma = _plane(plane, 0, np.dtype("u1"))
-    return luma if full else _FULL[luma]
+    return luma if full else look_up(_FULL, luma)
 
 
 def _plane(frame: VideoFrame, number: int, dtype: np.dtype[Any]) -> NDArray[Any]:

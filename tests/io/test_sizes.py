@@ -2,11 +2,16 @@
 
 import io as memory
 import resource
+import shutil
 import struct
+import subprocess
+import sys
 import tracemalloc
 import zipfile
 import zlib
 
+import av
+import cv2
 import h5py
 import hdf5plugin
 import numpy as np
@@ -17,7 +22,7 @@ from PIL import Image as pil  # noqa: N813
 
 from mirrorskin import io
 from mirrorskin.io import os_errors
-from mirrorskin.io.arrays import read_array
+from mirrorskin.io.arrays import ArrayRecording, read_array, read_map
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.pictures import decode_bytes, read_picture
 
@@ -169,6 +174,124 @@ def test_a_compressed_image_of_another_kind_is_refused(data):
     with pytest.raises(io.InputError, match=r"^an image is ") as refusal:
         decode_bytes(data, "an image")
     assert "\n" not in str(refusal.value)
+
+
+def test_a_folder_of_pictures_that_decoders_cannot_hold_is_refused(tmp_path):
+    for number in range(3):
+        (tmp_path / f"frame{number}.png").write_bytes(png(30_000, 30_000, 8, 0))
+    with pytest.raises(io.InputError, match=r"frame0\.png: a picture of .* takes \d+ bytes of memory"):
+        io.open_recording(tmp_path, **POSITIONS)
+
+
+def test_a_map_is_refused_if_its_float32_copy_is_too_large(tmp_path, monkeypatch):
+    cv2.imwrite(str(tmp_path / "dark.png"), np.zeros((300, 300), np.uint8))
+    monkeypatch.setattr("mirrorskin.io.os_errors.check_unpacked.__defaults__", (4 * 90_000,))
+    with pytest.raises(io.InputError, match=r"dark\.png, as float32, takes 450000 bytes of memory"):
+        read_map(tmp_path / "dark.png")
+
+
+# Reads the pictures, arrays, messages or videos named, and prints the largest size that was compared with the
+# limit, and how much memory was taken at the same time.
+MEASURE = """
+import gc, sys
+from pathlib import Path
+import cv2, av, mcap.stream_reader, mcap_ros2.decoder, tifffile
+import numpy as np
+from mirrorskin import io
+from mirrorskin.io import arrays, mcap, opencv, os_errors, video
+
+def status(name):
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * int(next(line for line in lines if line.startswith(name)).split()[1])
+
+def read(path):
+    with io.open_recording(path, memory_limit=1, motion="vertical", travel=io.Steps(0.1)) as recording:
+        out = np.empty((1, *recording.shape[1:]), recording.dtype)
+        while recording.read(out) is not None:
+            pass
+
+read(sys.argv[1])  # imports, and what libraries keep
+counted = []
+for module in (arrays, mcap, opencv, video):
+    module.check_unpacked = lambda size, *_: counted.append(size)
+for path in sys.argv[2:]:
+    gc.collect()
+    Path("/proc/self/clear_refs").write_text("5")  # the peak is counted from here
+    before = status("VmRSS")
+    counted.clear()
+    read(path)
+    print(Path(path).name, max(counted), status("VmHWM") - before)
+"""
+
+SIDE = 3000  # pixels along each side of a picture: 9 MB, more than Python itself takes meanwhile
+
+
+def bands(count):
+    """Return frames of bands, which are packed in no time."""
+    return np.broadcast_to(np.arange(SIDE, dtype=np.uint8), (count, SIDE, SIDE)).copy()
+
+
+def large_pictures(folder):
+    """Write folders of two pictures each: of every kind, and one with pictures of several kinds."""
+    grey = bands(1)[0]
+    colours = np.stack([grey, grey[::-1], grey[:, ::-1]], axis=-1)
+    deep, packed = grey.astype(np.uint16) * 300, {"compression": "deflate"}
+    writers = {
+        "grey.png": lambda path: cv2.imwrite(path, grey),
+        "deep.png": lambda path: cv2.imwrite(path, deep),
+        "colours.png": lambda path: cv2.imwrite(path, colours),
+        "opacity.png": lambda path: cv2.imwrite(path, np.dstack([colours, grey])),
+        "table.png": lambda path: pil.fromarray(grey).convert("P").save(path),
+        "grey.bmp": lambda path: cv2.imwrite(path, grey),
+        "colours.bmp": lambda path: cv2.imwrite(path, colours),
+        "deep.pgm": lambda path: cv2.imwrite(path, deep),
+        "colours.jpg": lambda path: pil.fromarray(colours).save(path),
+        "progressive.jpg": lambda path: pil.fromarray(colours).save(path, progressive=True),
+        "plain.tif": lambda path: tifffile.imwrite(path, grey),
+        "swapped.tif": lambda path: tifffile.imwrite(path, deep, byteorder=">"),
+        "piece.tif": lambda path: tifffile.imwrite(path, deep, rowsperstrip=SIDE, **packed),
+        "tiles.tif": lambda path: tifffile.imwrite(path, deep, tile=(256, 256), **packed),
+        "colours.tif": lambda path: tifffile.imwrite(path, colours, photometric="rgb", **packed),
+    }
+    for name, write in writers.items():
+        (folder / name).mkdir()
+        for number in range(2):
+            write(str(folder / name / f"frame{number}{name[-4:]}"))
+    several = folder / "several"
+    several.mkdir()
+    for number, name in enumerate(("grey.png", "grey.bmp", "plain.tif")):
+        shutil.copy(folder / name / f"frame0{name[-4:]}", several / f"frame{number}{name[-4:]}")
+    return [*(folder / name for name in writers), several]
+
+
+def large_files(folder):
+    """Write archives, messages and videos with pictures of the same size."""
+    frames = bands(2)
+    np.savez_compressed(folder / "a.npz", frames=frames)
+    np.savez_compressed(folder / "converted.npz", frames=frames.astype(np.float64))
+    with ArrayRecording(frames, {"travel": np.arange(2.0)}, {}) as source:
+        io.save_messages(source, folder / "a.mcap")
+    for name, codec, kind in (("a.mp4", "libx264", "yuv420p"), ("a.mkv", "ffv1", "gray")):
+        with av.open(str(folder / name), "w") as film:
+            stream = film.add_stream(codec, rate=25)
+            stream.width = stream.height = SIDE
+            stream.pix_fmt = kind
+            for frame in frames:
+                film.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "gray").reformat(format=kind)))
+            film.mux(stream.encode())
+    return [folder / name for name in ("a.npz", "converted.npz", "a.mcap", "a.mp4", "a.mkv")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("write", [large_pictures, large_files])
+def test_the_size_that_is_checked_covers_all_memory_that_is_taken(tmp_path, write):
+    paths = write(tmp_path)
+    command = [sys.executable, "-c", MEASURE, *map(str, [paths[0], *paths])]
+    measured = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    slack = 6 << 20  # of libraries and Python itself
+    rows = [line.split() for line in measured.splitlines()]
+    assert [name for name, counted, taken in rows if int(taken) > int(counted) + slack] == [], measured
+    assert len(rows) == len(paths)
 
 
 def test_the_limit_is_what_the_documentation_states():
