@@ -267,6 +267,7 @@ def _show_batch(total: int, as_json: bool) -> Iterator[_Show]:
 def _problem(outcome: Outcome) -> str:
     """Return a line that names the file and what is wrong with it."""
     name, message = str(outcome.job.source), " ".join(outcome.message.split())
+    message = message.replace("--no-verify", "verify = false in [stack] of --settings")
     message = _OPTIONS.sub(r"\1 in [stack] of --settings", message)
     return printable(message if name in message else f"{name}: {message}")
 

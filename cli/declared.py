@@ -193,9 +193,9 @@ def term(
 ) -> Term:
     """Return an option of a command that the engine does not declare.
 
-    ``kind`` is "number", "integer", "switch", "text", "file" or "name" (a file if it has an ending); of the
-    last three, ``unit`` is the placeholder in help. ``default`` is a text as on the command line; ``shown``
-    is what help says instead.
+    ``kind`` is "number", "integer", "switch", "flag" (a switch that can also be off, with "no-"), "text",
+    "file" or "name" (a file if it has an ending); of the last three, ``unit`` is the placeholder in help.
+    ``default`` is a text as on the command line; ``shown`` is what help says instead.
     """
     kind = "choice" if choices else kind
     return Term(

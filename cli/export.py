@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.stack import STACK
 from mirrorskin.io.export_formats import contents, suffixes_with
 
 _APEX = "apex"
@@ -40,6 +41,7 @@ def command(
     float32: Annotated[
         bool, Option("--float32", help="A .tif of float32 in mm, NaN for holes, instead of 16 bits.")
     ] = False,
+    **stack: Annotated[Any, STACK.only("verify")],
 ) -> None:
     """Write a result as meshes, points, surface files, pictures, tables or arrays."""
     from mirrorskin import io
@@ -58,7 +60,7 @@ def command(
     ends = None if section in (None, _APEX) else segment(section, "--section")
     stores, output = _part(output, result, turn)
     if all(path.suffix.lower() == MCAP_SUFFIX for path in output) and is_recording(result):
-        with io.open_recording(result) as recording:
+        with io.open_recording(result, **stack) as recording:
             for path in output:
                 click.echo(printable(f"{path}: {io.save_messages(recording, path)}"))
     elif output:
@@ -71,7 +73,7 @@ def command(
             click.echo(printable(f"{path}: {holds}"))
     for path in stores:
         with progress("exporting", None) as show:
-            click.echo(printable(f"{path}: {io.save_zarr(result, path, show)}"))
+            click.echo(printable(f"{path}: {io.save_zarr(result, path, show, **stack)}"))
 
 
 def _part(output: list[Path], result: Path, turn: int | None) -> tuple[list[Path], list[Path]]:

@@ -81,6 +81,8 @@ def _table(name: str, kind: type[Any]) -> type[Struct]:
 
 def _stack_type(one: Term) -> Any:
     """Return the type in TOML of an option of a stack."""
+    if one.kind == "flag":
+        return bool
     return Literal[one.choices] if one.choices else Annotated[str, _text(one.example or one.unit)]
 
 
@@ -139,8 +141,10 @@ def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
     read = {}
     for one in STACK.terms:
         if one.name in values:
-            text, place = values[one.name], f"{where}{one.flag[2:]}"
-            read[one.name] = Path(text) if one.kind == "file" else one.read(text, place)
+            value, place = values[one.name], f"{where}{one.flag[2:]}"
+            if one.kind == "file":
+                value = Path(value)
+            read[one.name] = one.read(value, place) if isinstance(value, str) else value
     options = stack_options(read, where)
     if "tilt" in options:
         try:

@@ -28,6 +28,7 @@ class StackOptions(TypedDict, total=False):
     pixel_size: tuple[float, float]
     region: Region
     frames: tuple[int, int | None]
+    verify: bool
 
 
 _PRESS, _TURN = ("vertical",), ("axial",)
@@ -63,6 +64,7 @@ STACK = Terms(
         term("pixel_size", "size of a pixel at the sheet: 0.03mm", "mm,mm"),
         term("region", "only W x H pixels, from column X and row Y on: 100,50,640x480", "region"),
         term("frames", "only frames A to B - 1; the first frame is 0", "range"),
+        term("verify", "compare whole frames with the checksums in the file", kind="flag", shown="verify"),
     ]
 )
 """Properties that a recording may lack, and the part of it that is used."""
@@ -84,7 +86,7 @@ def stack_options(given: dict[str, Any], where: str = "--") -> StackOptions:
     names = [one.name for one in STACK.terms if one.name != "tilt"]
     values = {name: given.pop(name) for name in names if name in given}
     options = StackOptions()
-    for name in ("dataset", "channel", "motion", "pixel_size", "region", "frames"):
+    for name in ("dataset", "channel", "motion", "pixel_size", "region", "frames", "verify"):
         if name in values:
             options[name] = values[name]
     if isinstance(given.get("tilt"), float):
@@ -99,12 +101,17 @@ def stack_words(given: Mapping[str, Any]) -> list[str]:
     --------
     >>> stack_words({"travel_step": 0.1, "pixel_size": (0.03, 0.04), "threshold": 0.4})
     ['--travel-step=0.1mm', '--pixel-size=0.03mm,0.04mm']
+    >>> stack_words({"verify": False})
+    ['--no-verify']
     """
     words = []
     for one in STACK.terms:
         if one.name not in given or one.name in ("region", "frames"):
             continue
         value = given[one.name]
+        if one.kind == "flag":
+            words.append(one.flag if value else f"--no-{one.flag[2:]}")
+            continue
         values = value if isinstance(value, tuple) else (value,)
         unit = one.unit.partition(",")[0] if one.unit in ("mm", "rad", "mm,mm") else ""
         words.append(f"{one.flag}={','.join(f'{part}{unit}' for part in values)}")

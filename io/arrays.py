@@ -386,6 +386,7 @@ def open_stack(
     wanted: tuple[int, int | None] | None,
     memory_limit: int | None = None,
     override_motion: bool = False,
+    verify: bool = True,
 ) -> ArrayRecording:
     """Open a stack that is neither HDF5 nor Zarr; see ``open_recording``.
 
@@ -403,7 +404,7 @@ def open_stack(
         else:
             if kind == "video":  # fail before decoding if there are no positions
                 _motion(str(path), positions, motion)
-            frames = opening.enter_context(open_reader(path, dataset, channel, memory_limit))
+            frames = opening.enter_context(open_reader(path, dataset, channel, memory_limit, verify))
             with as_input_error(str(path)):
                 files = {file: state_of(file.stat()) for file in frames.files}
             held = {**frames.positions, **frames.header}

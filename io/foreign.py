@@ -41,11 +41,16 @@ _KINDS: dict[str, Kind] = {
 
 
 def open_reader(
-    path: Path, dataset: str | None = None, channel: int | None = None, memory_limit: int | None = None
+    path: Path,
+    dataset: str | None = None,
+    channel: int | None = None,
+    memory_limit: int | None = None,
+    verify: bool = True,
 ) -> FrameReader:
     """Open the frames of a folder of pictures, a TIFF, a video or an MCAP file.
 
     ``dataset`` is a TIFF's series, a video's stream, or a topic; ``channel`` a colour, or a TIFF's channel.
+    ``verify``: compare the chunks of an MCAP file with their checksums.
     """
     match kind_of_frames(path):
         case "TIFF":
@@ -55,7 +60,7 @@ def open_reader(
         case "MCAP":
             from mirrorskin.io.mcap import MessageFrames
 
-            return MessageFrames(path, dataset, channel)
+            return MessageFrames(path, dataset, channel, verify)
         case "folder" if dataset is not None:
             raise InputError(f"{path}: a folder of pictures is one stack: leave --dataset out")
         case "folder":

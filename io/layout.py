@@ -102,6 +102,18 @@ def read_state(file: Hdf5File, ours: bool, stack: h5py.Dataset, count: int) -> R
     return RecordingState(count, state, None if used is None else used != 0, dropped)
 
 
+def read_checksums(file: Hdf5File, node: Node, state: RecordingState) -> NDArray[np.uint32]:
+    """Read the checksums of a recording's frames; while it is written, those of the last may be missing."""
+    remedy = "copy the file again, or read the frames without them with --no-verify"
+    rows = state.count
+    if state.state != COMPLETE and _grows(node):
+        rows = min(rows, int(node.shape[0]))
+    values = file.read(node, (rows,), rows=rows if _grows(node) else None, remedy=remedy)
+    if values.dtype != np.uint32:
+        raise InputError(f"{file.where(node)} is of type {values.dtype} where uint32 is needed: {remedy}")
+    return values
+
+
 def _grows(node: Node | None) -> TypeGuard[h5py.Dataset]:
     return isinstance(node, h5py.Dataset) and node.ndim > 0 and node.maxshape[0] is None
 

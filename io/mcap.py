@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.arguments import check_path, checked
 from mirrorskin.io.atomic import MAKE_ROOM, new_file
+from mirrorskin.io.checksums import REMEDY, crc32
 from mirrorskin.io.export import check_heights, points_of
 from mirrorskin.io.frames import CONVERTED_COLOUR, WholeFrames, lost_frames
 from mirrorskin.io.opencv import is_coloured, to_grey
@@ -56,8 +57,8 @@ _PROPERTIES = ("tilt", "press", "line_time", "travel_sigma")  # numbers of a rec
 _NOTES, _MOST_NOTES = "mirrorskin", 8  # name of the metadata; maximum number of its records to read
 _NUMERAL = re.compile(r"[-+]?[0-9]+\.?[0-9]*(?:[eE][-+]?[0-9]+)?")
 _LONGEST = 100  # characters quoted of an error message of a package
-_MOST_PACKED = 255  # largest compression ratio accepted for all chunks of a file, the limit of LZ4
 _COPIES = 6  # of a chunk with one image that exist at the same time: packed, unpacked, message, image, frame
+_MOST_PACKED = 255  # largest compression ratio accepted for all chunks of a file, the limit of LZ4
 
 # From the file format (https://mcap.dev/spec): opcode and length, then the fields.
 _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
@@ -360,12 +361,16 @@ class MessageFrames(WholeFrames):
         Topic of the images, if the file has more than one.
     channel : int, optional
         Colour to read: 0 red, 1 green, 2 blue; by default luma.
+    verify : bool, optional
+        Whether chunks are compared with the checksums in the file.
     """
 
     how = "message by message"
 
-    def __init__(self, path: Path, topic: str | None = None, channel: int | None = None) -> None:
-        self._path, self.files, self._channel = path, (path,), channel
+    def __init__(
+        self, path: Path, topic: str | None = None, channel: int | None = None, verify: bool = True
+    ) -> None:
+        self._path, self.files, self._channel, self._verify = path, (path,), channel, verify
         self._summary = self._read_summary()
         self._known: dict[str, _Stamps] = {}
         self._topic = self._choose(topic)
@@ -487,23 +492,30 @@ class MessageFrames(WholeFrames):
         from mcap.records import Chunk, Message
 
         wanted = {number for number, one in self._summary.channels.items() if one.topic == topic and one.kind}
-        total = 0
+        total = count = 0
         with open_regular(self._path) as file:
             most = max(MAX_UNPACKED_BYTES, _MOST_PACKED * os.fstat(file.fileno()).st_size)
             for record in self._records(file, wanted):
                 if isinstance(record, Message) and record.channel_id in wanted:
                     yield record
+                    count += 1
                 if isinstance(record, Chunk):
                     data, crc = _unpack(record), record.uncompressed_crc
                     del record  # before messages are copied
                     total += len(data)
                     check_unpacked(total, f"{self._path}, unpacked,", "repack it with 'mcap compress'", most)
-                    yield from _messages_in(data, wanted)
+                    if self._verify and crc not in (0, crc32(data)):  # 0: unknown
+                        what = f"the chunk that begins with message {count} of {topic}"
+                        raise InputError(f"{self._path}: {what} differs from what was recorded: {REMEDY}")
+                    for message in _messages_in(data, wanted):
+                        yield message
+                        count += 1
 
     def _records(self, file: BufferedReader, wanted: set[int]) -> Iterator[Any]:
         """Yield the chunks that contain messages of some channels; without an index, all records."""
         from mcap.stream_reader import StreamReader
 
+        most = MAX_UNPACKED_BYTES // _COPIES
         if not self._summary.chunks:
             yield from StreamReader(file, emit_chunks=True, record_size_limit=most).records
         for chunk in sorted(self._summary.chunks, key=lambda one: one.chunk_start_offset):
@@ -515,7 +527,6 @@ class MessageFrames(WholeFrames):
         """Read the channels and chunks from the file's index."""
         try:
             from mcap.records import Channel, ChunkIndex, Metadata, MetadataIndex, Schema
-        most = MAX_UNPACKED_BYTES // _COPIES
             from mcap.stream_reader import StreamReader
         except ImportError as error:
             raise InputError(_INSTALL) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import UTC, datetime
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.atomic import fixed_text, new_hdf5
 from mirrorskin.io.calibration.file import CARRIED, write_calibration
 from mirrorskin.io.calibration.types import Calibration
+from mirrorskin.io.checksums import checksums
 from mirrorskin.io.existing import Replaces
 from mirrorskin.io.layout import (
     CHECKSUM,
@@ -93,11 +93,6 @@ def new_stack(file: h5py.File, shape: tuple[int, int, int], dtype: Any, **storag
     stack = file.create_dataset(STACK, shape, dtype, **storage)
     stack.attrs.update(interpretation="image", units="counts")
     return stack
-
-
-def checksums(frames: NDArray[Any]) -> NDArray[np.uint32]:
-    """Return the CRC-32 of each frame's bytes."""
-    return np.array([zlib.crc32(np.ascontiguousarray(frame).data) for frame in frames], np.uint32)
 
 
 def write_plot(file: h5py.File, motion: Motion, known: set[str]) -> None:

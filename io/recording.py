@@ -23,6 +23,7 @@ from mirrorskin.io.arguments import (
 )
 from mirrorskin.io.calibration.file import carried_by
 from mirrorskin.io.calibration.types import Calibration
+from mirrorskin.io.checksums import UNVERIFIED, UNVERIFIED_PARTS, checksums
 from mirrorskin.io.coordinates import Coordinates, read_coordinates
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.fingerprint import check_unchanged, fingerprint, modified, origins
@@ -36,11 +37,11 @@ from mirrorskin.io.layout import (
     Layout,
     RecordingState,
     as_series,
+    read_checksums,
     read_state,
 )
 from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions, along
-from mirrorskin.io.recorder import checksums
 from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.result_file import MARK as RESULT_MARK
 from mirrorskin.io.result_file import open_result
@@ -209,7 +210,7 @@ class Recording(Closing):
     def find_damage(self) -> NDArray[np.intp] | None:
         """Return the frames whose checksums do not match; None if the recording has no checksums.
 
-        The recording must have been opened as a whole, and is rewound.
+        The recording must have been opened as a whole, and is rewound. Its frames are not verified again.
         """
         if self.shape != self.full_shape:
             raise InputError(
@@ -218,7 +219,8 @@ class Recording(Closing):
         node = self._file.find(CHECKSUM)
         if node is None:
             return None
-        expected = self._file.read(node, (self.full_shape[0],), rows=self.full_shape[0])
+        expected = read_checksums(self._file, node, RecordingState(self.full_shape[0]))
+        self._stack.verifier = None
         room = np.empty((1, *self.shape[1:]), self.dtype)
         self.rewind()
         found = [checksums(block.frames) for block in iter(lambda: self.read(room), None)]
@@ -268,6 +270,7 @@ class Recording(Closing):
     memory_limit=check_count,
     live=check_flag,
     override_motion=check_flag,
+    verify=check_flag,
 )
 def open_recording(
     path: str | Path,
@@ -285,6 +288,7 @@ def open_recording(
     memory_limit: int | None = None,
     live: bool = False,
     override_motion: bool = False,
+    verify: bool = True,
 ) -> Recording:
     """Open a stack of frames: HDF5, Zarr, NPY, NPZ, TIFF, MCAP, a video, or a folder of numbered pictures.
 
@@ -316,6 +320,8 @@ def open_recording(
         Only the frames used by a live run, with the positions it used.
     override_motion : bool, optional
         Whether ``motion`` replaces the motion in the file, to correlate any stack with phases.
+    verify : bool, optional
+        Whether whole frames are compared with the checksums that were stored when they were recorded.
 
     Returns
     -------
@@ -325,7 +331,8 @@ def open_recording(
     Raises
     ------
     InputError
-        The file, the stack, or one of its parameters cannot be used.
+        The file, the stack, or one of its parameters cannot be used. Reading raises it for frames that differ
+        from what was recorded.
 
     Examples
     --------
@@ -345,7 +352,9 @@ def open_recording(
         known = {"tilt": tilt, "pixel_size": pixel_size}
         where = {"travel": travel, "phase": phase}
         part = region, frames
-        return open_stack(path, dataset, channel, where, known, motion, *part, memory_limit, override_motion)
+        return open_stack(
+            path, dataset, channel, where, known, motion, *part, memory_limit, override_motion, verify
+        )
     with ExitStack() as opening:
         file = opening.enter_context(open_file(path, memory_limit))
         ours = file.marked(MARK)
@@ -365,11 +374,12 @@ def open_recording(
             given = {"vertical": travel, "axial": phase}.get(header.motion)
             positions = layout.positions(header.motion, along(given, shape[0]))
         opened = file.frames(stack) if isinstance(file, ZarrFile) else None
+        expected, notes = _expected(file, stack, state, cut.region, verify)
         frames_of = Stack(
-            stack, str(path), shape[0], numbers, cut.region, memory_limit, threads, decoding, opened
+            stack, str(path), shape[0], numbers, cut.region, memory_limit, threads, decoding, opened, expected
         )
         recording = Recording(file, stack, frames_of, cut, header, positions, layout, state, shape, live)
-        recording.findings += (*decoding.findings, *coordinates.findings)
+        recording.findings += (*decoding.findings, *coordinates.findings, *notes)
         opening.pop_all()  # the recording closes the file from now on
     return recording
 
@@ -409,6 +419,20 @@ def _used(
     return used
 
 
+def _expected(
+    file: Hdf5File, stack: h5py.Dataset, state: RecordingState, region: Region, verify: bool
+) -> tuple[NDArray[np.uint32] | None, tuple[Finding, ...]]:
+    """Return the checksums of the frames if they can be compared, and a note if not."""
+    node = file.find(CHECKSUM) if file.marked(MARK) and stack == file.find(STACK) else None
+    if node is None:
+        return None, ()
+    if not verify:
+        return None, (UNVERIFIED,)
+    if region != Region.whole(stack.shape[1:]):
+        return None, (UNVERIFIED_PARTS,)
+    return read_checksums(file, node, state), ()
+
+
 def _find_stack(
     file: Hdf5File, dataset: str | None, ours: bool
 ) -> tuple[h5py.Dataset, RecordingState, Decoding]:
@@ -423,7 +447,7 @@ def _find_stack(
         shape = stack.shape
     if shape is None or len(shape) != 3:
         raise InputError(f"{where} has shape {shape}: a stack of frames, (T, H, W), is needed")
-    ours = ours and dataset == STACK
+    ours = ours and stack == file.find(STACK)
     decoding = _decoding(file, stack, ours, where)
     count, *picture = decoding.shape(shape)
     if 0 in picture:

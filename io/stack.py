@@ -22,6 +22,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.checksums import Verifier
 from mirrorskin.io.chunks import Chunks, find_codecs
 from mirrorskin.io.frames import FrameReader
 from mirrorskin.io.os_errors import as_input_error
@@ -113,7 +114,7 @@ class Hdf5Frames(Closing):
 class Stack:
     """Some frames (``numbers``, in order) of the first ``count`` of a dataset, and the ``region`` of each.
 
-    ``decoding`` converts stored values to frames.
+    ``decoding`` converts stored values to frames. Whole frames are compared with ``checksums``, if given.
 
     Each chunk is unpacked once: chunks that contain more frames than one read are kept in memory, up to
     ``limit`` bytes, or on disk.
@@ -133,6 +134,7 @@ class Stack:
         threads: int | None,
         decoding: Decoding,
         frames: ZarrFrames | None = None,
+        checksums: NDArray[np.uint32] | None = None,
     ) -> None:
         self.shape, self.dtype = (len(numbers), *region.shape), decoding.dtype
         self._place, self._limit = Place(path, str(dataset.name)), memory_limit or _LIMIT
@@ -144,6 +146,7 @@ class Stack:
             self._frames = reader if decoding.plain else DecodedFrames(reader, decoding, dataset.shape)
             self._file = None if frames else dataset.file
             self._size = 0 if frames else os.fstat(dataset.file.id.get_vfd_handle()).st_size
+        self.verifier = None if checksums is None else Verifier(checksums, numbers, path)
         self._kept: Span = (0, 0)
         self._reading = threading.Lock()  # a single frame may be wanted while another thread reads
         self._unpacked: NDArray[Any] | None = None
@@ -183,7 +186,11 @@ class Stack:
             # HDF5 returns zeros beyond the end of a truncated file.
             if self._file is not None and os.fstat(self._file.id.get_vfd_handle()).st_size < self._size:
                 raise OSError("truncated: the file became shorter")
-            self._frames.fetch((frames, self._region.rows, self._region.columns), out)
+            spans = frames, self._region.rows, self._region.columns
+            if self.verifier is None:
+                self._frames.fetch(spans, out)
+            else:
+                self.verifier.fetch(self._frames, spans, out)
 
     def _run(self, start: int, most: int) -> Span:
         """Return the consecutive frames of the dataset that begin with a selected one: first and end."""

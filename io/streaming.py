@@ -31,6 +31,7 @@ from mirrorskin.io.atomic import (
 )
 from mirrorskin.io.calibration.file import size_of
 from mirrorskin.io.calibration.types import Calibration
+from mirrorskin.io.checksums import checksums
 from mirrorskin.io.foreign import MCAP_SUFFIX
 from mirrorskin.io.layout import (
     CHECKSUM,
@@ -49,7 +50,6 @@ from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.recorder import (
     Compression,
     TeeSource,
-    checksums,
     new_stack,
     packing,
     write_header,

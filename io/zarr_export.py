@@ -29,7 +29,13 @@ _CLAIM = ".mirrorskin-writer-"  # prefix of the object with which a writer claim
 _CHUNK, _BLOCK = 4 << 20, 64 << 20  # unpacked bytes of frames in a chunk, and written at a time
 
 
-def save_zarr(source: str | Path, path: str | Path, progress: Callable[[int], None] | None = None) -> str:
+def save_zarr(
+    source: str | Path,
+    path: str | Path,
+    progress: Callable[[int], None] | None = None,
+    *,
+    verify: bool = True,
+) -> str:
     """Copy a recording or a result in HDF5 to Zarr, version 3; a folder appears complete or not at all.
 
     Parameters
@@ -40,6 +46,8 @@ def save_zarr(source: str | Path, path: str | Path, progress: Callable[[int], No
         Output: ``NAME.zarr``, or an address such as ``s3://bucket/NAME.zarr``.
     progress : callable, optional
         Called with the number of frames written so far.
+    verify : bool, optional
+        Whether frames are compared with their checksums; see `open_recording`.
 
     Returns
     -------
@@ -67,7 +75,7 @@ def save_zarr(source: str | Path, path: str | Path, progress: Callable[[int], No
         with _new_store(target) as store:
             _write_nodes(file, store)
             if is_recording(source):
-                with open_recording(source, memory_limit=_BLOCK) as recording:
+                with open_recording(source, memory_limit=_BLOCK, verify=verify) as recording:
                     _write_frames(recording, store, progress or (lambda count: None))
             _finish(file, store)
     with ZarrFile(target) as written:

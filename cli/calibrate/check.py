@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import click
 
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.stack import STACK
 
 
 def command(
@@ -23,6 +24,7 @@ def command(
     ] = None,
     device: options.Device = None,
     as_json: options.Json = False,
+    **stack: Annotated[Any, STACK.only("verify")],
 ) -> None:
     """Show the remaining errors over the field, in mm and degrees, before and after the calibration."""
     from mirrorskin import io
@@ -35,7 +37,7 @@ def command(
     if picture is not None:
         check_drawing()
         io.check_output(picture, recording, calibration)
-    with io.open_recording(recording) as source:
+    with io.open_recording(recording, **stack) as source:
         parts = io.open_calibration(calibration), length(ball, "--ball")
         errors = check_ball(source, *parts, cells=cells, device=device)
     if picture is not None:

@@ -36,7 +36,7 @@ def command(
     overwrite: inputs.Overwrite = False,
     device: options.Device = None,
     as_json: options.Json = False,
-    **stack: Annotated[Any, STACK.only("travel_step", "travel_start", "pixel_size")],
+    **stack: Annotated[Any, STACK.only("travel_step", "travel_start", "pixel_size", "verify")],
 ) -> None:
     """Learn the slope at which the sheet turns bright, and the stage's compliance, from presses of a ball."""
     from mirrorskin import io

@@ -34,7 +34,7 @@ def command(
     ] = None,
     device: options.Device = None,
     as_json: options.Json = False,
-    **stack: Annotated[Any, STACK.only("travel_step", "travel_start", "pixel_size")],
+    **stack: Annotated[Any, STACK.only("travel_step", "travel_start", "pixel_size", "verify")],
 ) -> None:
     """Learn the modulus, for forces in newtons, from a scale or known weights; after elastic."""
     from mirrorskin import io

@@ -101,14 +101,14 @@ def _scaled(options: StackOptions, calibration: Calibration | None) -> StackOpti
     return options | {"pixel_size": size}
 
 
-def open_still(path: Path) -> Recording:
+def open_still(path: Path, **stack: Any) -> Recording:
     """Open frames at rest; those of other programs have no positions, and need none here."""
     from mirrorskin import io
     from mirrorskin.io.foreign import kind_of_frames
 
     if kind_of_frames(path):
-        return io.open_recording(path, motion="vertical", travel=io.Steps(1.0))
-    return io.open_recording(path)
+        return io.open_recording(path, motion="vertical", travel=io.Steps(1.0), **stack)
+    return io.open_recording(path, **stack)
 
 
 def camera_name(names: Sequence[str]) -> str:

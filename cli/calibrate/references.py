@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.groups import Option
+from mirrorskin.cli.stack import STACK
 
 if TYPE_CHECKING:
     from mirrorskin.engine.calibration.references import Measured
@@ -53,6 +54,7 @@ def command(
     ] = None,
     overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
+    **stack: Annotated[Any, STACK.only("verify")],
 ) -> None:
     """Measure dark and bright references, and find hot, dead and saturated pixels."""
     from mirrorskin import io
@@ -62,11 +64,11 @@ def command(
     io.check_output(output, *darks, *brights, rig, replaces="calibration")
     if rig is not None:
         for path in (*darks, *brights):
-            inputs.open_still(path).close()  # refused before anything moves
+            inputs.open_still(path, **stack).close()  # refused before anything moves
         darks = darks or inputs.take(rig, output, [_still("dark", rig, frames)], overwrite=overwrite)
         balls = _balls(rig, places, frames, press) if rolled else [_still("bright", rig, frames)]
         brights = brights or inputs.take(rig, output, balls, overwrite=overwrite)
-    measured, camera = _measure(darks, brights, rolled)
+    measured, camera = _measure(darks, brights, rolled, stack)
     for number in range(2, _ROUNDS + 1):
         missing = _missing(measured, noise, rig is None or rolled)
         if rig is None or not missing:
@@ -75,7 +77,7 @@ def command(
             place = _still(name, rig, count, number)
             paths = inputs.take(rig, output, [place], overwrite=overwrite)
             (darks if name == "dark" else brights).extend(paths)
-        measured, camera = _measure(darks, brights, rolled)
+        measured, camera = _measure(darks, brights, rolled, stack)
     _missing(measured, noise, True)
     process = inputs.process_of(
         bright_light="of a ball rolled about" if rolled else "of a flat field",
@@ -126,7 +128,9 @@ def _balls(rig: Path, places: int, frames: int, press: str | None) -> list[input
     return inputs.at_each("bright", inputs.BALL, places, plan, max(1, -(-frames // 2)))
 
 
-def _measure(darks: Sequence[Path], brights: Sequence[Path], rolled: bool) -> tuple[Measured, CameraId]:
+def _measure(
+    darks: Sequence[Path], brights: Sequence[Path], rolled: bool, stack: dict[str, Any]
+) -> tuple[Measured, CameraId]:
     """Return the references and their camera."""
     from mirrorskin import io
     from mirrorskin.cli.output import progress
@@ -134,7 +138,8 @@ def _measure(darks: Sequence[Path], brights: Sequence[Path], rolled: bool) -> tu
 
     with ExitStack() as opening:
         low, high = (
-            [opening.enter_context(inputs.open_still(path)) for path in paths] for paths in (darks, brights)
+            [opening.enter_context(inputs.open_still(path, **stack)) for path in paths]
+            for paths in (darks, brights)
         )
         name = inputs.camera_name([source.header.camera for source in (*low, *high)])
         camera = io.CameraId(name, low[0].shape[1:], low[0].dtype)

@@ -12,6 +12,7 @@ import click
 from mirrorskin.cli import options
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.stack import STACK
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -88,6 +89,7 @@ def command(
     places: Annotated[int, Option(min=1, help="With --rig: places of the board.")] = 5,
     overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
+    **stack: Annotated[Any, STACK.only("verify")],
 ) -> None:
     """Determine millimetres per pixel, perspective and distortion from a board on the sheet.
 
@@ -107,10 +109,10 @@ def command(
     if rig is not None:
         prompt = "lay the board flat on the sheet, place {} of {}, turned and moved, also to the corners"
         if paths:
-            _read(paths, output)  # refused before anything moves
+            _read(paths, output, stack)  # refused before anything moves
         boards = inputs.at_each("board", prompt, places, inputs.still_plan(rig), _SHOTS)
         paths += inputs.take(rig, output, boards, overwrite=overwrite)
-    read, camera = _read(paths, output)
+    read, camera = _read(paths, output, stack)
     fit = calibrate_lens(read, kind)
     process = inputs.process_of(
         board=str(kind),
@@ -125,7 +127,9 @@ def command(
         click.echo(f"learn {', '.join(old)} again: made with another pixel size", err=True)
 
 
-def _read(paths: Sequence[Path], output: Path) -> tuple[list[tuple[str, NDArray[Any]]], CameraId]:
+def _read(
+    paths: Sequence[Path], output: Path, stack: dict[str, Any]
+) -> tuple[list[tuple[str, NDArray[Any]]], CameraId]:
     """Return pictures and the means of recordings with their names, and the camera."""
     from mirrorskin import io
     from mirrorskin.engine.calibration.board import mean_of_still
@@ -141,7 +145,7 @@ def _read(paths: Sequence[Path], output: Path) -> tuple[list[tuple[str, NDArray[
         if kind_of_frames(path) in ("picture", "TIFF"):
             pictures.append(read_picture(path))
             continue
-        with inputs.open_still(path) as recording:
+        with inputs.open_still(path, **stack) as recording:
             pictures.append(mean_of_still(recording))
             names.append(recording.header.camera)
             dtypes.append(recording.dtype)

@@ -47,7 +47,7 @@ def command(
     settle: inputs.Settle = None,
     overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
-    **stack: Annotated[Any, STACK.only("phase_step", "phases", "pixel_size"), _RESPONSE],
+    **stack: Annotated[Any, STACK.only("phase_step", "phases", "pixel_size", "verify"), _RESPONSE],
 ) -> None:
     """Determine half-angle, phase offset, direction, ellipticity and pivot, with their standard errors."""
     from mirrorskin.cli.output import progress
@@ -62,8 +62,8 @@ def command(
     def turns() -> list[inputs.Place]:
         half_angle = None if tilt is None else angle(tilt, "--tilt")
         plan = inputs.turn_plan(press, half_angle, stack.get("phase_step"), "0.5mm")
-        stack.pop("phase_step", None)
-        stack.pop("phases", None)
+        for name in ("phase_step", "phases"):
+            stack.pop(name, None)
         return inputs.at_each("tilt", inputs.BALL, places, plan)
 
     def check(planned: Source, calibration: Calibration | None) -> None:

@@ -52,7 +52,7 @@ def command(
     settle: inputs.Settle = None,
     overwrite: inputs.Overwrite = False,
     as_json: options.Json = False,
-    **stack: Annotated[Any, STACK.only("tilt", "phase_step", "pixel_size")],
+    **stack: Annotated[Any, STACK.only("tilt", "phase_step", "pixel_size", "verify")],
 ) -> None:
     """Learn brightness as a function of position and normal, from a ball pressed all over the field."""
     from mirrorskin.cli.output import progress

@@ -401,6 +401,29 @@ def test_messages_are_decoded_as_ros_defines_them_and_not_as_the_file_does(tmp_p
     assert frames_of(path).frames[:, 0, 0].tolist() == [0, 1, 2]
 
 
+def damaged_messages(path):
+    """Write images of 1000 in one chunk, and change one sample of the second."""
+    values = [(stamp * 10**7, grey(100 + stamp)) for stamp in range(3)]
+    write_messages(path, "/a", IMAGE, values, compression=CompressionType.NONE)
+    data = bytearray(path.read_bytes())
+    data[data.index(bytes([101, 101, 101]))] = 7
+    path.write_bytes(data)
+    return path
+
+
+def test_images_that_differ_from_what_was_recorded_are_refused(tmp_path):
+    path = damaged_messages(tmp_path / "a.mcap")
+    said = "the chunk that begins with message 0 of /a differs from what was recorded: .*--no-verify"
+    with pytest.raises(io.InputError, match=said):
+        frames_of(path)
+
+
+def test_images_that_differ_are_used_without_verification(tmp_path):
+    path = damaged_messages(tmp_path / "a.mcap")
+    with opened(path, verify=False) as recording:
+        assert [recording.frame(number)[0, 0] for number in range(3)] == [100, 7, 102]
+
+
 def chunk_bomb(path, compression):
     """Write a chunk of 8 MB of zeros, which states a size of 100 bytes."""
     data = bytes(8 << 20)

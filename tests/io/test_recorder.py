@@ -182,6 +182,7 @@ from mirrorskin import io
 from mirrorskin.io.recorder import COMPRESSIONS
 from stacks import MadeUp, random_stack, record
 
+sys.dont_write_bytecode = True  # compiled modules would be cut off, too
 resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
 folder = Path(sys.argv[1])
 (folder / "old.h5").write_bytes(b"as it was")

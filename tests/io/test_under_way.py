@@ -171,6 +171,34 @@ def test_live_is_refused_where_there_was_no_live_run(tmp_path, prepare, given, l
         io.open_recording(tmp_path / "a.h5", live=True, **given)
 
 
+def cut_short(path, damaged):
+    """Leave the checksums of the first five frames of a run that was killed, and damage a frame."""
+    stream(Feed(9), path)
+    with h5py.File(path, "r+") as file:
+        file["/entry/state"][()] = "under way"
+        file[f"{DETECTOR}/frame_checksum"].resize(5, axis=0)
+        file[f"{DETECTOR}/data"][damaged, 2, 3] ^= 1
+    return io.open_recording(path)
+
+
+def test_frames_whose_checksums_were_not_written_any_more_are_read(tmp_path):
+    with cut_short(tmp_path / "a.h5", 7) as recording:
+        assert len(read_all(recording, 4).frames) == 9
+
+
+def test_a_damaged_frame_of_a_run_that_was_killed_is_refused(tmp_path):
+    with cut_short(tmp_path / "a.h5", 4) as recording, pytest.raises(io.InputError, match="frame 4 differs"):
+        read_all(recording, 4)
+
+
+def test_only_the_frames_that_a_live_run_used_are_verified(tmp_path):
+    path = run_live(tmp_path / "a.h5")
+    with h5py.File(path, "r+") as file:
+        file[f"{DETECTOR}/data"][np.flatnonzero(~USED)[1], 2, 3] ^= 1
+    with io.open_recording(path, live=True) as recording:
+        assert len(read_all(recording, 40).frames) == np.count_nonzero(USED)
+
+
 def test_a_live_run_is_reconstructed_again_from_its_recording(tmp_path):
     travel = np.linspace(0.0, 1.0, 24)
     twin = ball((9, 11), (0.3, 0.3), travel)
