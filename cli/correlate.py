@@ -24,7 +24,7 @@ def command(
 ) -> None:
     """Fit mean, cosine and sine of the phase to each pixel's brightness."""
     from mirrorskin import io
-    from mirrorskin.cli.output import progress, save_and_report
+    from mirrorskin.cli.output import progress, report_unverified, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.engine.lock_in import Correlation
 
@@ -48,3 +48,4 @@ def command(
         with progress("correlating", source.shape[0]) as show:
             result = method.run(source, show)
     save_and_report(result, target, device, as_json, overwrite=overwrite)
+    report_unverified(source)

@@ -34,7 +34,14 @@ def command(
 ) -> None:
     """Fuse a press and a rotation to one surface."""
     from mirrorskin import engine, io
-    from mirrorskin.cli.output import make_strict, progress, report_levels, report_notes, save_and_report
+    from mirrorskin.cli.output import (
+        make_strict,
+        progress,
+        report_levels,
+        report_notes,
+        report_unverified,
+        save_and_report,
+    )
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.engine.fusion import frames_to_read
     from mirrorskin.engine.reconstruction import calibrated
@@ -64,7 +71,8 @@ def command(
                 progress=show,
             )
     save_and_report(result, target, device, as_json, overwrite=overwrite)
-    for path, prefix in ((vertical, "vertical_"), (axial, "axial_")):
+    for path, opened, prefix in ((vertical, pressed, "vertical_"), (axial, turned, "axial_")):
+        report_unverified(opened)
         process = {name.removeprefix(prefix): said for name, said in result.process.items()}
         report_notes(str(path), process)
         if path == vertical:

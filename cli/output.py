@@ -17,7 +17,7 @@ import click
 from mirrorskin.io import text
 
 if TYPE_CHECKING:
-    from mirrorskin.io import Result
+    from mirrorskin.io import Recording, Result
 
 _NO_GEL = "none: the calibration has no gel"
 _ASCII = {"±": "+-", "µ": "u", "°": " deg", "²": "^2", "³": "^3", "\u2212": "-"}
@@ -160,6 +160,14 @@ def report_notes(name: str, process: Mapping[str, object]) -> None:
         from mirrorskin.io.findings import named
 
         click.echo(printable(named(name, str(process["notes"]))), err=True)
+
+
+def report_unverified(recording: Recording) -> None:
+    """Print that parts of frames cannot be compared with the checksums of whole frames."""
+    from mirrorskin.io.checksums import UNVERIFIED_PARTS
+
+    if UNVERIFIED_PARTS in recording.findings:
+        click.echo(printable(f"{recording.name}: {UNVERIFIED_PARTS.text}"), err=True)
 
 
 def report_levels(name: str, process: Mapping[str, object]) -> None:

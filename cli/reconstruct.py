@@ -53,6 +53,7 @@ def command(
         with outputs.progress("reconstructing", source.shape[0]) as show:
             result = engine.reconstruct(source, memory_limit=limit, device=device, progress=show, **chosen)
     io.save_result(result, target, overwrite=overwrite)  # a failure is the only message
+    outputs.report_unverified(opened)
     outputs.report_notes(str(recording), result.process)
     outputs.report_missing_maps(str(recording), result.process, _REMEDIES)
     outputs.report_contact(str(recording), result.process)

@@ -32,7 +32,7 @@ def command(
     mirrorskin.engine.Operation. 'mirrorskin run MODULE:CLASS --help' shows its options.
     """
     from mirrorskin import io
-    from mirrorskin.cli.output import make_strict, progress, report_notes, save_and_report
+    from mirrorskin.cli.output import make_strict, progress, report_notes, report_unverified, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.engine.running import load_operation, run_class
     from mirrorskin.kernels.device import open_devices
@@ -51,6 +51,7 @@ def command(
         with progress("running", frames.shape[0]) as show:
             result = run_class(kind, frames, show, memory_limit=limit, device=device, **chosen)
     save_and_report(result, target, device, as_json, overwrite=overwrite)
+    report_unverified(source)
     report_notes(str(recording), result.process)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mirrorskin.io.checksums import UNVERIFIED_PARTS
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.traces import FrameSamples, Traces, named_frames
 from mirrorskin.io.types import Block, Floats, Source
@@ -83,8 +84,9 @@ class Watch:
         return Check(source.name, facts, self._findings(series, traces, field_limits, travel_limits))
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the findings about the frames so far."""
-        return self._findings(*self._look(), FIELD, TRAVEL)
+        """Return the findings about the frames so far, for a result, which states their region itself."""
+        found = self._findings(*self._look(), FIELD, TRAVEL)
+        return tuple(one for one in found if one != UNVERIFIED_PARTS)
 
     def _look(self) -> tuple[dict[str, Floats], Traces]:
         """Return the positions and times of the frames so far, and their brightness."""

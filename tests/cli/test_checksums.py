@@ -60,7 +60,17 @@ def test_a_batch_uses_damaged_frames_with_a_setting():
     done("batch press.h5 -o out --settings a.toml")
 
 
-def test_a_crop_notes_once_that_it_is_not_verified():
+@pytest.mark.parametrize(
+    "line",
+    [
+        "reconstruct press.h5",
+        "run mirrorskin.engine:Onset press.h5",
+        "correlate turn.h5",
+        "fuse press.h5 turn.h5 --no-register",
+    ],
+)
+def test_a_crop_reports_that_it_is_not_verified(line):
     press(Path("press.h5"))
-    said = done("reconstruct press.h5 --region 1,1,4x3").said
-    assert said.count("the frames were not verified") == 1
+    rotation(Path("turn.h5"))
+    said = run(line, "--region", "1,1,4x3").said
+    assert said.count("the frames were not verified") == line.count(".h5")
