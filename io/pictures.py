@@ -125,21 +125,22 @@ def _decode_pgm(data: bytes, name: str) -> NDArray[Any]:
 
 def _decode_png(data: bytes, name: str) -> Picture:
     chunks = _essential_chunks(data, name)
-    head = bytes(chunks[0][8:21]).ljust(13, b"\0")
+    head = bytes(chunks[0].whole[8:21]).ljust(13, b"\0")
     width, height, depth, colour, interlaced = struct.unpack_from(">IIBB2xB", head)
     channels = {0: 1, 2: 3}.get(colour, 4)
     # OpenCV holds a second picture, because a PNG may be animated.
     check_picture(name, width, height, 2 if depth == 16 else 1, channels, len(data), copies=1)
     needed = _png_bytes(width, height, depth * _PNG_CHANNELS.get(colour, 1), bool(interlaced))
-    packed = (chunk[8:-4] for chunk in chunks if chunk[4:8] == b"IDAT")
-    if [chunk[4:8] for chunk in chunks].count(b"IHDR") != 1 or not _unpack_to(packed, needed):
+    packed = (chunk.whole[8:-4] for chunk in chunks if chunk.kind == b"IDAT")
+    if [chunk.kind for chunk in chunks].count(b"IHDR") != 1 or not _unpack_to(packed, needed):
         raise InputError(f"{name} is damaged: it is not one picture of {width} x {height}. Copy it again")
-    tables = [chunk[8:-4] for chunk in chunks if chunk[4:8] == b"PLTE"]
+    tables = [chunk.whole[8:-4] for chunk in chunks if chunk.kind == b"PLTE"]
     if colour != _PNG_PALETTE or len(tables) != 1 or len(tables[0]) % 3:
-        return Picture(decode(b"".join([_PNG_MARK, *chunks]), name))
+        return Picture(decode(b"".join([_PNG_MARK, *(chunk.whole for chunk in chunks)]), name))
     # As a grey picture of the same bits, OpenCV returns the indices, scaled to 8 bits.
     grey = _png_chunk(b"IHDR", head[:9] + b"\0" + head[10:])
-    indices = decode(b"".join([_PNG_MARK, grey, *(one for one in chunks[1:] if one[4:8] != b"PLTE")]), name)
+    others = (chunk.whole for chunk in chunks[1:] if chunk.kind != b"PLTE")
+    indices = decode(b"".join([_PNG_MARK, grey, *others]), name)
     table = ColourTable(name, np.frombuffer(tables[0], np.uint8).reshape(-1, 3))
     indices //= 255 // ((1 << depth) - 1)
     return Picture(table.look_up(indices), table.findings)
@@ -152,7 +153,7 @@ def _png_bytes(width: int, height: int, bits: int, interlaced: bool) -> int:
     return sum(rows * (1 + -(-columns * bits // 8)) for columns, rows in sizes if columns > 0)
 
 
-def _unpack_to(pieces: Iterable[bytes], size: int) -> bool:
+def _unpack_to(pieces: Iterable[bytes | memoryview], size: int) -> bool:
     """Return whether the pixels of a PNG have at least ``size`` bytes; otherwise libpng prints messages."""
     unpacker = zlib.decompressobj()
     try:
@@ -203,9 +204,14 @@ def _png_chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def _essential_chunks(data: bytes, name: str) -> list[memoryview]:
+class _Chunk(NamedTuple):
+    kind: bytes
+    whole: memoryview  # size, kind, contents and checksum
+
+
+def _essential_chunks(data: bytes, name: str) -> list[_Chunk]:
     """Check each chunk of a PNG, and keep those needed for the picture: others may make libpng print."""
-    kept, at, kind, view = list[memoryview](), len(_PNG_MARK), b"", memoryview(data)
+    kept, at, kind, view = list[_Chunk](), len(_PNG_MARK), b"", memoryview(data)
     while kind != b"IEND":
         size = int.from_bytes(data[at : at + 4], "big")
         chunk, at = view[at : at + 12 + size], at + 12 + size
@@ -213,5 +219,5 @@ def _essential_chunks(data: bytes, name: str) -> list[memoryview]:
         if at > len(data) or zlib.crc32(chunk[4:-4]) != int.from_bytes(chunk[-4:], "big"):
             raise InputError(f"{name} is damaged or cut off: copy it again")
         if kind[:1].isupper():
-            kept.append(chunk)
+            kept.append(_Chunk(kind, chunk))
     return kept
