@@ -24,6 +24,10 @@ _FEW = 0.05  # share of pixels below which their common behaviour is ignored
 _MOST_OF = 0.8  # share of pixels that must agree
 _CLIPPED = 0.1  # tolerated share of responding pixels that reach the end of the scale
 _FLICKER, _DRIFT = 0.01, 2.0  # tolerated flicker, share of the light; tolerated drift, counts of 8 bits
+_PARTS = 10  # of a press, in which its dark level is compared
+_DARK, _DARK_PIXELS = 0.25, 0.25  # brightest dark pixel, share of the span; fewest dark pixels, share
+_COMMON = 2.0  # minimum change in common, standard deviations of the pixels' own changes
+_OF_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
 _OUTLYING = 0.1  # minimum difference of an outlier from the samples before and after it, share of the span
 _OUTLIERS, _FLASH = 0.003, 0.2  # tolerated share of outliers; share in a frame from which it is a flash
 _NOISY = 0.3  # share of the pixels that differ between frames because of noise
@@ -355,8 +359,9 @@ class Traces:
             return None
         counts, used, counted = counts[enough], used[enough], counted[enough]
         levels = np.sum(counts, axis=0, where=used) / np.maximum(np.count_nonzero(used, axis=0), 1)
-        offset = np.sum(counts - levels, axis=1, where=used) / counted
-        return offset, self.noise / np.sqrt(counted), float(np.sum(levels * used) / np.sum(counted))
+        offset = np.nanmedian(np.where(used, counts - levels, np.nan), axis=1)
+        errors = _OF_MEDIAN * self.noise / np.sqrt(counted)
+        return offset, errors, float(np.sum(levels * used) / np.sum(counted))
 
     @functools.cached_property
     def _flicker(self) -> tuple[float, float] | None:
@@ -386,16 +391,38 @@ class Traces:
 
     @functools.cached_property
     def _drift(self) -> tuple[float, float] | None:
-        """Return the range of the smoothed level of pixels that do not respond, and its error, counts."""
-        if not self._goes_down():
+        """Return the range of the dark level over the parts of a press, and its error, counts.
+
+        Each part is compared with the first, in the pixels that are still dark in the part after it: a pixel
+        that is about to turn light, perhaps after the last frame, becomes brighter without a drift. So does
+        a dark pixel next to light ones, because lenses blur. It is brighter than others then, whereas a drift
+        is common to many pixels: the differences between them that noise does not explain are small.
+        """
+        if not self._goes_down() or len(self._counts) < 5:
             return None
-        counts = self._counts[:, ~self._responding]
-        found = self._common(counts, np.ones(counts.shape, bool))
-        if found is None:
+        travel = self._series["travel"]
+        counts = self._counts if travel[-1] > travel[0] else self._counts[::-1]
+        parts = np.array_split(counts, min(_PARTS, len(counts)))
+        means = np.stack([part.mean(axis=0) for part in parts])
+        change = np.maximum.accumulate([np.abs(part - means[0]).max(axis=0) for part in parts])
+        dark = (change < self._response) & (means[0] < self._lowest.min() + _DARK * self.span)
+        start = counts[: len(parts[0]) + len(parts[1]), dark[2]]
+        if start.shape[1] < _FEWEST:
             return None
-        offset, errors, _ = found
-        parts = [float(np.mean(part)) for part in np.array_split(offset, 5)]
-        return max(parts) - min(parts), float(np.mean(errors)) / math.sqrt(len(offset) / 5)
+        noise = _MAD / math.sqrt(2) * float(np.median(np.abs(np.diff(start, axis=0))))
+        noise = max(noise, _QUANTUM if self._integer else 0.0)
+        levels, error = [0.0], 0.0
+        for part, mean, used in zip(parts[1:-1], means[1:-1], dark[2:], strict=True):
+            pixels = np.count_nonzero(used)
+            if pixels < max(_FEWEST, _DARK_PIXELS * used.size):
+                break
+            rise = (mean - means[0])[used]
+            common = float(np.median(rise))
+            spread = _MAD * float(np.median(np.abs(rise - common)))
+            by_noise = noise * math.sqrt(1 / len(parts[0]) + 1 / len(part))
+            levels.append(common if common**2 > _COMMON**2 * (spread**2 - by_noise**2) else 0.0)
+            error = max(error, _OF_MEDIAN * by_noise / math.sqrt(pixels))
+        return (max(levels) - min(levels), error) if len(levels) > 1 else None
 
     def _goes_down(self) -> bool:
         """Return whether the travel of a press only rises, or only falls."""
