@@ -1,15 +1,13 @@
-"""Commands in the documentation are valid: the first steps run, all others are parsed."""
+"""Commands in the documentation are valid: all are parsed; test_blocks.py runs many of them."""
 
+import pkgutil
 import re
 import shlex
 from pathlib import Path
 
 import click
-import numpy as np
 import pytest
 import yaml
-from commands import run
-from right_scores import check_score
 
 from mirrorskin.cli import groups
 from mirrorskin.cli.main import app
@@ -32,33 +30,26 @@ def commands_of(page):
 
 
 WRITTEN = [(page.name, words) for page in PAGES for words in commands_of(page)]
-STEPS = commands_of(DOCS / "start.md")
 # Where a message is put together, or a value is filled in, it cannot be found as a whole.
 FILLED_IN = re.compile(
     r"\.\.\.|[:;,] |[()'\"]| of mean|horizontal|PoCL|pyopencl|NAME.cl|/dev/videoN|[A-Z]+_[A-Z_]+|\b[NM]\b|\d+"
 )
 COMMAND = app
+NAMING = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
+FOLDERS = "bench", "cli", "docs", "engine", "examples", "hw", "io", "kernels", "tests", "view"
+SOURCES = [
+    "/setup.py",
+    *(f"/{path.relative_to(ROOT)}" for name in FOLDERS for path in (ROOT / name).rglob("*.*")),
+]
+OTHER_OPTIONS = {  # of developers' scripts, of other programs, and of a user's operation
+    *("--freeze", "--only", "--gpus", "--group-add", "--list-formats-ext", "--memory-limit"),
+    *("--no-deps", "--now", "--lean", "--travel-offset"),
+}
 CLASSES = ("light.py", "first_light.py")  # of the page about operations, the first block and the last
 
 
-def test_there_are_steps_and_commands():
-    assert len(STEPS) >= 10
-    assert sum(words[0] == "score" for words in STEPS) == 4
+def test_there_are_commands():
     assert len(WRITTEN) >= 40
-
-
-def test_the_steps_of_the_start_run_one_after_the_other(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for words in STEPS:
-        ended = run(*words)
-        assert ended.code == 0, f"{' '.join(words)}: {ended.said}"
-        if words[0] == "score":
-            check_score(words)
-    for page in ("start.md", "index.md"):
-        (code,) = blocks_of(DOCS / page, "python")
-        known = {}
-        exec(code, known)
-        assert np.isfinite(known["result"].height).any()
 
 
 @pytest.mark.parametrize(("page", "words"), WRITTEN, ids=[f"{page}: {' '.join(w)}" for page, w in WRITTEN])
@@ -118,6 +109,40 @@ def understood(words):
             return
         _, command, words = command.resolve_command(context, rest)
         above = context
+
+
+def named_in(page):
+    """Return what a page names as code outside of blocks."""
+    text = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return set(re.findall(r"`([^`\n]+)`", text))
+
+
+def options_of(command, above=None):
+    """Return the options of a command and of all commands in it."""
+    context = click.Context(command, parent=above)
+    names = {name for one in command.get_params(context) for name in (*one.opts, *one.secondary_opts)}
+    inner = command.list_commands(context) if hasattr(command, "list_commands") else ()
+    return names.union(*(options_of(command.get_command(context, name), context) for name in inner))
+
+
+@pytest.mark.parametrize("page", NAMING, ids=lambda page: page.name)
+def test_options_that_a_page_names_exist(page):
+    named = {word for text in named_in(page) for word in re.findall(r"(?<![\w-])--[a-z][a-z\d-]+", text)}
+    assert named <= options_of(COMMAND) | OTHER_OPTIONS
+
+
+@pytest.mark.parametrize("page", NAMING, ids=lambda page: page.name)
+def test_source_files_that_a_page_names_exist(page):
+    named = {text for text in named_in(page) if re.fullmatch(r"[\w/.-]+\.(py|cl|clh)", text)}
+    named = {name for name in named if Path(name).stem not in ("NAME", "mine", "lab")}  # the user's
+    assert {name for name in named if not any(path.endswith(f"/{name}") for path in SOURCES)} == set()
+
+
+@pytest.mark.parametrize("page", NAMING, ids=lambda page: page.name)
+def test_python_names_of_a_page_exist(page):
+    pattern = r"((?:mirrorskin\.)?(?:engine|hw|io|kernels|view)\.[\w.]+)(?:\(.*\))?"
+    for name in (match[1] for text in named_in(page) if (match := re.fullmatch(pattern, text))):
+        pkgutil.resolve_name("mirrorskin." + name.removeprefix("mirrorskin."))
 
 
 def test_every_kind_of_finding_is_explained():

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from commands import done
 
+from mirrorskin import io
+
 PAGE = (Path(__file__).parents[1] / "docs" / "tutorial.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```(sh|python)\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+BLOCKS = BLOCK.findall(PAGE)
 AZIMUTHS = [178.1, 220.8, 280.5, 316.5, 7.6, 48.0, 96.3, 136.4]  # degrees
 
 
@@ -54,6 +57,10 @@ def test_the_tutorial_leads_to_a_surface(photographs, capsys):
             for line in text.splitlines():
                 shell(line)
     printed = capsys.readouterr().out
+    (section,) = re.findall(r"^## 2\..*?(?=^## )", PAGE, re.DOTALL | re.MULTILINE)
+    maps = re.findall(r"`([a-z_]+)`", BLOCK.sub("", section))
+    assert maps
+    assert set(maps) <= set(io.open_result("facing.h5"))
     found = re.findall(r"they differ by (\S+) degrees, expected (\S+)", printed)
     (before, expected_before), (after, expected_after) = (map(float, pair) for pair in found)
     assert before > 1.5 * expected_before

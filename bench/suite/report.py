@@ -25,7 +25,8 @@ _ABOUT = (
     "are listed at its end, so do not edit it. `mirrorskin bench` measures the core operations on your "
     "device."
 )
-_COMMANDS = """```sh
+_COMMANDS = """<!-- not run: it takes hours -->
+```sh
 pip install '.[bench]'                            # peers: Numba, PyTorch, pyamg, NumPy, SciPy, OpenCV
 python bench/run.py run --list                    # the cases
 python bench/run.py run 'call-*' -o mine.json     # some of them; all tables are written to mine.md

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from commands import refused, run, small_presses, small_turn
+from commands import done, refused, run, small_presses, small_turn
 
 from mirrorskin import io, view
 from mirrorskin.cli import demo
@@ -132,3 +134,18 @@ def test_without_matplotlib_nothing_is_computed(tmp_path, monkeypatch):
     monkeypatch.setattr("mirrorskin.view.canvas.find_spec", lambda name: None)
     refused("pip install 'mirrorskin", "demo -o", tmp_path / "demo")
     assert not (tmp_path / "demo").exists()
+
+
+@pytest.mark.slow
+def test_the_page_of_the_twin_shows_what_the_demo_prints(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "twin.md").read_text(encoding="utf-8")
+    tables = re.findall(r"^```\n(figure .*?)^```", page, re.DOTALL | re.MULTILINE)
+    printed = done("demo -o", tmp_path / "demo").out
+    shown = "".join(tables).split()
+    for word, expected in zip(printed.replace("\n\n", "\n").split()[: len(shown)], shown, strict=True):
+        number = re.fullmatch(r"[+-]?\d+(\.\d+)?", expected)
+        if number is None:
+            assert word == expected
+        else:  # other processors round differently
+            last_digit = 10.0 ** -len((number[1] or ".")[1:])
+            assert float(word) == pytest.approx(float(expected), rel=0.01, abs=1.01 * last_digit)

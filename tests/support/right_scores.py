@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
+import pytest
 from commands import run
 
 from mirrorskin import io
@@ -13,10 +15,16 @@ STEP = 0.1  # mm from frame to frame
 FUSED = 0.0012  # mm, as the README has it
 
 
-def check_score(words: list[str]) -> None:
-    """Run ``score RES.h5 --truth REC.h5`` as JSON, and hold its numbers against what they must be."""
+def check_score(words: list[str], comment: str = "") -> None:
+    """Run ``score RES.h5 --truth REC.h5`` as JSON, and compare its numbers with what they must be.
+
+    A comment such as ``RMS error 0.025 mm, mean error -0.001 mm`` must state them to its last digit.
+    """
     name = words[1]
     heights = json.loads(run(*words, "--json").out)["height"]
+    for kind, stated, digits in re.findall(r"(RMS|mean) error (-?\d+\.(\d+)) mm", comment):
+        measured = heights[kind.lower()]
+        assert measured == pytest.approx(float(stated), abs=0.6 * 10.0 ** -len(digits)), (name, kind)
     result = io.open_result(name)
     assert np.nanmax(result.height) < 0.001, f"{name}: heights above the rest plane"
     assert heights["coverage"] > 0.5
