@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+import threading
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from mirrorskin.io.types import InputError
 
+_path_lock = threading.Lock()  # of changes to sys.path
+
 
 def load_class(name: str) -> Callable[..., Any]:
     """Return a class given as MODULE:CLASS or FILE.py:CLASS; modules may be in the current folder.
+
+    While MODULE is imported, modules of the current folder can be imported too, and while FILE.py is run,
+    those of its folder; installed modules of the same name come first. For mirrorskin, nothing is added.
 
     Missing modules and classes raise `InputError`. Errors of the module itself are not caught.
 
@@ -30,10 +37,12 @@ def load_class(name: str) -> Callable[..., Any]:
     folder, module = (Path(), place) if file is None else (file.parent, file.stem)
     if file is not None and not file.is_file():
         raise InputError(f"{name}: there is no {file.name} in {folder.resolve()}")
-    if str(folder.resolve()) not in sys.path:
-        sys.path.insert(0, str(folder.resolve()))
     try:
-        found = importlib.import_module(module) if file is None else _run(file)
+        if place.partition(".")[0] == "mirrorskin":
+            found = importlib.import_module(module)
+        else:
+            with _importable(str(folder.resolve())):
+                found = importlib.import_module(module) if file is None else _run(file)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # an import of the module itself failed
@@ -45,6 +54,18 @@ def load_class(name: str) -> Callable[..., Any]:
         own = [one for one, it in classes.items() if exported or it.__module__ == found.__name__]
         raise InputError(f"{name}: there is no class {kind} in {place}; it has {', '.join(own) or 'none'}")
     return made  # type: ignore[no-any-return]
+
+
+@contextmanager
+def _importable(folder: str) -> Iterator[None]:
+    """Let modules of a folder be imported, after all others."""
+    with _path_lock:
+        sys.path.append(folder)
+    try:
+        yield
+    finally:
+        with _path_lock, suppress(ValueError):  # the module may have removed it
+            del sys.path[len(sys.path) - 1 - sys.path[::-1].index(folder)]  # the last, if it was there before
 
 
 def _run(file: Path) -> ModuleType:

@@ -53,8 +53,11 @@ def check_drawing() -> None:
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure with a size in inches."""
     check_drawing()
+    import matplotlib
     from matplotlib.figure import Figure
 
+    if Path(matplotlib.matplotlib_fname()).parent == Path.cwd():  # perhaps of a stranger
+        matplotlib.rcParams["text.usetex"] = False  # which runs LaTeX
     return Figure(figsize=(width, height), layout="constrained")
 
 

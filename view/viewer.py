@@ -67,7 +67,7 @@ def _start(where: str, option: str) -> int:
     """Start a viewer, wait until it listens, and return its port."""
     port = _free_port()
     # Not through the command "rerun", which takes most of a second to import.
-    words = [sys.executable, "-m", "rerun_cli", "--bind", _HERE, "--port", str(port)]
+    words = [sys.executable, "-P", "-m", "rerun_cli", "--bind", _HERE, "--port", str(port)]
     words += ["--server-memory-limit", _MEMORY, "--memory-limit", _MEMORY]
     if where == BROWSER:
         words += ["--web-viewer", "--web-viewer-port", str(_free_port())]

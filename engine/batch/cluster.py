@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
+import os
 import queue
 import tempfile
 import time
@@ -216,6 +217,7 @@ def _local_cluster(workers: int) -> Iterator[Any]:
     patient = dask.config.set({"distributed.deploy.lost-worker-timeout": "1 hour"})
     with (
         patient,
+        _without_current_folder(),
         start(
             n_workers=workers,
             threads_per_worker=1,
@@ -227,6 +229,20 @@ def _local_cluster(workers: int) -> Iterator[Any]:
         ) as cluster,
     ):
         yield cluster
+
+
+@contextmanager
+def _without_current_folder() -> Iterator[None]:
+    """Let new processes of Python, which start as "python -c", import nothing from the current folder."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 @contextmanager
