@@ -2,18 +2,29 @@
 
 import asyncio
 import http.client
+import logging
 import re
 import socket
+import sys
 import threading
 import urllib.error
 import urllib.request
-from contextlib import closing
+from contextlib import closing, contextmanager
+from functools import partial
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
+from stacks import record
+from tornado.httpclient import HTTPRequest
 from tornado.ioloop import IOLoop
+from tornado.websocket import websocket_connect
 
+from mirrorskin import hw
+from mirrorskin.engine.running import load_operation
+from mirrorskin.hw.twin import Vertical
 from mirrorskin.io import InputError
+from mirrorskin.view.app import App, Opening
 from mirrorskin.view.app.server import AppServer, StopServer, open_browser
 
 PATIENCE = 60.0  # seconds
@@ -25,26 +36,35 @@ def _page():
     return pn.pane.HTML("<p>here</p>")
 
 
-@pytest.fixture(scope="module")
-def served():
-    """The parts of the address of a server, which runs in a thread."""
-    ready, ended, found = threading.Event(), threading.Event(), {}
+@contextmanager
+def serving(page, **settings):
+    """Serve pages from a thread; yield the parts of the address."""
+    ready, ended, server = threading.Event(), threading.Event(), {}
 
     def serve():
         asyncio.set_event_loop(asyncio.new_event_loop())
-        server = AppServer(_page)
-        found["address"], found["loop"] = urlsplit(server.address), IOLoop.current()
+        app = AppServer(page, **settings)
+        server["address"], server["loop"] = urlsplit(app.address), IOLoop.current()
         IOLoop.current().add_callback(ready.set)
-        server.run(browser=False)
+        app.run(browser=False)
         ended.set()
 
     thread = threading.Thread(target=serve)
     thread.start()
     assert ready.wait(PATIENCE)
-    yield found["address"]
-    found["loop"].add_callback(found["loop"].stop)
-    thread.join(PATIENCE)
+    try:
+        yield server["address"]
+    finally:
+        server["loop"].add_callback(server["loop"].stop)
+        thread.join(PATIENCE)
     assert ended.is_set()
+
+
+@pytest.fixture(scope="module")
+def served():
+    """The parts of the address of a server, which runs in a thread."""
+    with serving(_page, most=1000) as address:
+        yield address
 
 
 def status(url, **headers):
@@ -78,7 +98,7 @@ def test_it_listens_on_this_machine_only(served):
         socket.create_connection(("127.0.0.2", served.port), timeout=PATIENCE)
 
 
-def _connect(served, path, origin):
+def _connect(served, path, origin, **headers):
     """Return the HTTP status of the answer to a WebSocket: 101 if it is accepted."""
     headers = {
         "Connection": "Upgrade",
@@ -87,6 +107,7 @@ def _connect(served, path, origin):
         "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
         "Sec-WebSocket-Protocol": f"bokeh, {_token(served)}",
         "Origin": origin,
+        **headers,
     }
     with closing(http.client.HTTPConnection(served.netloc, timeout=PATIENCE)) as connection:
         connection.request("GET", path, headers=headers)
@@ -105,9 +126,49 @@ def test_a_web_socket_of_the_page_is_accepted(served):
     assert _connect(served, f"{served.path}ws", f"http://{served.netloc}") == 101
 
 
-@pytest.mark.parametrize("origin", ["http://example.org", "http://localhost:1", "null"])
+FOREIGN = ["http://example.org", "http://localhost:1", "null", "", "http://[", "[::1]", "http://a:b:c", "//"]
+
+
+@pytest.mark.parametrize("origin", FOREIGN)
 def test_a_web_socket_of_another_page_is_refused(served, origin):
     assert _connect(served, f"{served.path}ws", origin) == 403
+
+
+@pytest.mark.parametrize("origin", FOREIGN)
+def test_a_request_of_another_page_is_refused(served, origin):
+    assert status(served.geturl(), Origin=origin) == 403
+
+
+@pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "[::1]", "LocalHost"])
+def test_names_of_this_machine_are_answered(served, name):
+    host = f"{name}:{served.port}"
+    assert status(served.geturl(), Host=host) == 200
+    assert _connect(served, f"{served.path}ws", f"http://{host}", Host=host) == 101
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "example.org",
+        "localhost",
+        "127.0.0.1:1",
+        "[::1]",
+        "[::1",
+        "]",
+        "a:b:c",
+        ":",
+        "127.0.0.1.example.org:{}",
+    ],
+)
+def test_other_names_are_refused(served, host):
+    host = host.format(served.port)
+    assert status(served.geturl(), Host=host) == 421
+    assert _connect(served, f"{served.path}ws", f"http://{served.netloc}", Host=host) == 421
+
+
+@pytest.mark.parametrize("query", ["bokeh-session-id=", "bokeh-token=x", "a?b"])
+def test_a_query_is_refused(served, query):
+    assert status(f"{served.geturl()}?{query}") == 404
 
 
 def test_a_web_socket_without_the_token_is_refused(served):
@@ -127,6 +188,120 @@ def test_the_token_is_no_argument_of_the_browser(tmp_path, monkeypatch):
     assert "http://127.0.0.1:1/secret/" in (tmp_path / "open.html").read_text()
 
 
+def test_no_log_contains_the_token(caplog, capfd):
+    caplog.set_level(logging.DEBUG)
+    with serving(_page) as address:
+        here = f"http://{address.netloc}"
+        answers = [
+            status(address.geturl(), Host="example.org"),
+            status(f"{address.geturl()}static/../../none"),
+            status(f"{address.geturl()}none"),
+            post(address.geturl()),
+            _connect(address, f"{address.path}ws", here, **{"Sec-WebSocket-Protocol": "bokeh, none"}),
+        ]
+    assert answers == [421, 403, 404, 405, 101]
+    token = address.path.strip("/")
+    written = capfd.readouterr()
+    assert caplog.text.count("GET /.../") >= 3
+    assert token not in caplog.text + "".join(str(record.exc_text) for record in caplog.records)
+    assert token not in written.out + written.err
+
+
+async def _open_socket(address, token):
+    """Open the WebSocket of a page, and wait for its greeting."""
+    headers = {"Origin": f"http://{address.netloc}"}
+    request = HTTPRequest(f"ws://{address.netloc}{address.path}ws", headers=headers)
+    socket = await websocket_connect(request, subprotocols=["bokeh", token])
+    assert "ACK" in await socket.read_message()
+    return socket
+
+
+async def _close_socket(socket):
+    socket.close()
+    while await socket.read_message() is not None:
+        pass
+
+
+def test_more_pages_than_the_limit_are_refused_until_one_is_closed():
+    closed = threading.Event()
+
+    def page():
+        import panel as pn
+
+        pn.state.on_session_destroyed(lambda _: closed.set())
+        return _page()
+
+    async def open_and_close(address):
+        get = partial(asyncio.to_thread, status, address.geturl())
+        tokens = [await asyncio.to_thread(_token, address) for _ in range(2)]
+        sockets = [await _open_socket(address, token) for token in tokens]
+        assert await get() == 503
+        closed.clear()
+        await _close_socket(sockets[0])
+        assert await asyncio.to_thread(closed.wait, PATIENCE)
+        answer = await get()
+        await _close_socket(sockets[1])
+        return answer
+
+    with serving(page, most=2, lifetime=10) as address:
+        assert asyncio.run(open_and_close(address)) == 200
+
+
+BLOCKED = """
+import threading
+from mirrorskin import engine
+
+started, go = threading.Event(), threading.Event()
+
+class Blocked(engine.Operation):
+    motions = ("vertical",)
+
+    def start(self, shape, dtype):
+        self.brightest = 0
+
+    def push(self, frames):
+        started.set()
+        assert go.wait(20)
+        self.brightest = frames.max(axis=0)
+
+    def result(self):
+        return {"brightest": self.brightest}
+"""
+
+
+@pytest.fixture
+def blocked(tmp_path, monkeypatch):
+    """The class of an operation that waits, and its events."""
+    (tmp_path / "blocked.py").write_text(BLOCKED)
+    return load_operation(f"{tmp_path / 'blocked.py'}:Blocked"), f"{tmp_path / 'blocked.py'}:Blocked"
+
+
+def test_pages_are_served_while_one_computes(blocked, tmp_path):
+    kind, name = blocked
+    events = sys.modules[kind.__module__]
+    twin = hw.Twin(object="sphere", shape=(20, 20), pixel_size=0.5, movement=Vertical(0.1 * np.arange(4)))
+    record(twin, tmp_path / "press.h5")
+    computed = threading.Event()
+
+    def page():
+        app = App(tmp_path / "press.h5", opening=Opening(operation=name))
+        app.session.watch("result", callback=computed.set)
+        return app.view
+
+    async def look(address):
+        socket = await _open_socket(address, await asyncio.to_thread(_token, address))
+        assert await asyncio.to_thread(events.started.wait, PATIENCE)
+        answer = await asyncio.to_thread(status, address.geturl())
+        early = computed.is_set()
+        events.go.set()
+        assert await asyncio.to_thread(computed.wait, PATIENCE)
+        await _close_socket(socket)
+        return answer, early
+
+    with serving(page) as address:
+        assert asyncio.run(look(address)) == (200, False)
+
+
 @pytest.fixture
 def stopper():
     """A server that stops something, and what was asked of it so far."""
@@ -135,9 +310,10 @@ def stopper():
         yield server.address, asked
 
 
-def post(url):
+def post(url, **headers):
+    request = urllib.request.Request(url, method="POST", headers=headers)
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, method="POST"), timeout=PATIENCE) as reply:
+        with urllib.request.urlopen(request, timeout=PATIENCE) as reply:
             return reply.status
     except urllib.error.HTTPError as error:
         return error.code
@@ -147,6 +323,12 @@ def test_a_post_to_the_secret_address_stops(stopper):
     address, asked = stopper
     assert post(address) == 204
     assert asked == ["stop"]
+
+
+def test_a_post_to_another_host_stops_nothing(stopper):
+    address, asked = stopper
+    assert post(address, Host="example.org") == 421
+    assert asked == []
 
 
 def test_a_post_to_another_address_stops_nothing(stopper):

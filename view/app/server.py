@@ -1,18 +1,20 @@
 """The server of the application: on this machine only, and only for those who have its address.
 
-The address contains a token, which is the first part of every path; other paths do not exist. WebSockets are
-accepted from pages of this server only.
+The address contains a token, which is the first part of every path; other paths do not exist, and logs do not
+contain it. Requests are answered if they are sent to a name of this machine, and WebSockets if they come from
+pages of this server.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import secrets
 import signal
 import socket
 import threading
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -25,7 +27,10 @@ from mirrorskin.io import InputError
 
 HERE = "127.0.0.1"
 
+_NAMES = HERE, "localhost", "[::1]"
 _TOKEN_BYTES = 24
+_PAGES = 16  # each has its own result, and memory of the device
+_HTTP_PORT = 80  # which browsers leave out
 
 
 def check_app() -> None:
@@ -46,6 +51,8 @@ class AppServer:
         0 for any free one.
     lifetime : int
         Milliseconds after which a page that was closed, or lost its connection, is forgotten.
+    most : int
+        Number of open pages; further ones are refused.
 
     Attributes
     ----------
@@ -58,7 +65,9 @@ class AppServer:
         The port cannot be used.
     """
 
-    def __init__(self, page: Callable[[], Any], port: int = 0, lifetime: int = 15_000) -> None:
+    def __init__(
+        self, page: Callable[[], Any], port: int = 0, lifetime: int = 15_000, most: int = _PAGES
+    ) -> None:
         from panel.io.resources import DIST_DIR
         from panel.io.server import get_server
         from tornado.web import StaticFileHandler
@@ -66,11 +75,13 @@ class AppServer:
         port = _free_port(port)
         token = secrets.token_urlsafe(_TOKEN_BYTES)
         interrupt = signal.getsignal(signal.SIGINT)
-        self._server = get_server(
+        hosts = _hosts(port)
+        self._make_record = _hide_in_logs(token)
+        self._server: Any = get_server(
             page,
             port=port,
             address=HERE,
-            websocket_origin=f"{HERE}:{port}",
+            location=False,  # Panel cannot parse all of these hosts
             prefix=token,
             title="mirrorskin",
             ico_path="none",  # Bokeh's is at an address without the token
@@ -82,6 +93,7 @@ class AppServer:
             check_unused_sessions_milliseconds=min(lifetime, 17_000),
         )
         _restore(interrupt)
+        _refuse_others(self._server, hosts, f"/{token}", most)
         self.address = f"http://{HERE}:{port}/{token}/"
 
     def run(self, browser: bool) -> None:
@@ -101,6 +113,7 @@ class AppServer:
     def close(self) -> None:
         """Stop serving, and close all pages."""
         self._server.stop(wait=False)
+        logging.setLogRecordFactory(self._make_record)
 
 
 def open_browser(address: str, folder: Path) -> None:
@@ -131,15 +144,17 @@ class StopServer:
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
                 known = secrets.compare_digest(self.path.encode(), path.encode())
-                if known:
+                here = self.headers.get("Host", "").lower() in hosts
+                if known and here:
                     stop()
-                self.send_response(204 if known else 404)
+                self.send_response(204 if known and here else 404 if here else 421)
                 self.end_headers()
 
             def log_message(self, format: str, *args: Any) -> None:  # noqa: A002  # overrides
                 pass
 
         self._server = ThreadingHTTPServer((HERE, 0), Handler)
+        hosts = _hosts(self._server.server_port)
         self.address = f"http://{HERE}:{self._server.server_port}{path}"
         self._thread = threading.Thread(target=self._server.serve_forever, name="stop", daemon=True)
         self._thread.start()
@@ -149,6 +164,89 @@ class StopServer:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+
+
+def _hosts(port: int) -> list[str]:
+    """Return the names of this machine with a port, as browsers send them."""
+    return [f"{name}:{port}" for name in _NAMES] + ([*_NAMES] if port == _HTTP_PORT else [])
+
+
+def _refuse_others(server: Any, hosts: Sequence[str], prefix: str, most: int) -> None:
+    """Refuse requests for other hosts, from other pages, and for more pages than are allowed."""
+    from tornado.httputil import HTTPServerRequest
+    from tornado.routing import Matcher, Rule
+    from tornado.web import RequestHandler
+
+    class Refused(RequestHandler):
+        def initialize(self, status: int, text: str) -> None:
+            self._status, self._text = status, text
+
+        def prepare(self) -> None:
+            self.set_status(self._status)
+            self.set_header("Content-Type", "text/plain; charset=utf-8")
+            self.finish(f"{self._text}\n")
+
+    class Unwanted(Matcher):
+        def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
+            refusal = _why_foreign(request, hosts) or _why_no_page(
+                request, prefix, server.get_sessions(), most
+            )
+            return refusal and {"target_kwargs": {"status": refusal[0], "text": refusal[1]}}
+
+    server._tornado.default_router.rules.insert(0, Rule(Unwanted(), Refused))
+    server._tornado.websocket_origins.update(hosts)
+
+
+def _why_foreign(request: Any, hosts: Sequence[str]) -> tuple[int, str] | None:
+    """Return status and text of the answer to a request to another host or of another page."""
+    if request.host.lower() not in hosts:
+        return 421, "This server answers requests to localhost only."
+    origin = request.headers.get("Origin")
+    if origin is not None and origin.lower() not in [f"http://{host}" for host in hosts]:
+        return 403, "This server answers its own pages only."
+    return None
+
+
+def _why_no_page(request: Any, prefix: str, sessions: Sequence[Any], most: int) -> tuple[int, str] | None:
+    """Return status and text of the answer to a request for a page that cannot be opened."""
+    place = request.path.removeprefix(prefix)
+    if place == request.path or place not in ("", "/", "/ws", "/autoload.js"):
+        return None
+    if request.query or place == "/autoload.js":  # which Bokeh answers, and the application does not use
+        return 404, "There is no such page."
+    if len(sessions) < most or _is_open(request, sessions):
+        return None
+    remedy = "Close one, and load this page again after half a minute"
+    return 503, f"{most} pages are open, which is the limit. {remedy}."
+
+
+def _is_open(request: Any, sessions: Sequence[Any]) -> bool:
+    """Return whether a WebSocket belongs to an open page."""
+    from bokeh.util.token import get_session_id
+
+    try:
+        number = get_session_id(request.headers.get("Sec-WebSocket-Protocol", "").split(", ")[-1])
+    except ValueError:
+        return False
+    return any(number == session.id for session in sessions)
+
+
+def _hide_in_logs(secret: str) -> Callable[..., logging.LogRecord]:
+    """Let no record that is logged contain a secret; return what made records before."""
+    make = logging.getLogRecordFactory()
+    traceback = logging.Formatter().formatException
+
+    def make_without(*args: Any, **kwargs: Any) -> logging.LogRecord:
+        record = make(*args, **kwargs)
+        message = record.getMessage()
+        if secret in message:
+            record.msg, record.args = message.replace(secret, "..."), ()
+        if record.exc_info and record.exc_info[0] is not None:
+            record.exc_text = traceback(record.exc_info).replace(secret, "...")
+        return record
+
+    logging.setLogRecordFactory(make_without)
+    return make
 
 
 def _handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
