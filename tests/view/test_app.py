@@ -15,6 +15,7 @@ from mirrorskin.io.maps import TABLE
 from mirrorskin.view.app import App, Opening
 from mirrorskin.view.app.options import read, widget_of
 from mirrorskin.view.app.picture import show_map
+from mirrorskin.view.app.save import SavePane
 from mirrorskin.view.app.session import Session
 from mirrorskin.view.app.trace import trace_of
 from mirrorskin.view.result.sheet import sheet_of
@@ -269,6 +270,53 @@ def test_a_recording_is_opened_as_the_command_line_says(press):
     session = Session(press, Opening(keywords={"pixel_size": (0.4, 0.4)}))
     assert session.now.result.x[1] - session.now.result.x[0] == pytest.approx(0.4)
     session.close()
+
+
+@pytest.fixture
+def postponed(press):
+    """A session whose computations wait, and these computations."""
+    waiting = []
+    session = Session(press, run=lambda work, then: waiting.append((work, then)))
+    yield session, waiting
+    session.close()
+    _compute(waiting)
+
+
+def _compute(waiting):
+    while waiting:
+        work, then = waiting.pop(0)
+        then(work())
+
+
+def test_only_the_last_of_several_changes_is_computed(postponed):
+    session, waiting = postponed
+    session.choose("threshold", 0.3)
+    session.choose("threshold", 0.4)
+    assert session.computing
+    _compute(waiting)
+    assert (session.now.label, session.before, session.computing) == ("threshold 0.4", None, False)
+
+
+def test_a_session_that_is_closed_keeps_no_result(postponed):
+    session, waiting = postponed
+    session.close()
+    _compute(waiting)
+    assert session.now is None
+
+
+def test_a_part_is_chosen_while_another_is_computed(postponed):
+    session, waiting = postponed
+    session.choose_part(io.Region((0, 10), (0, 10)), (0, 9))
+    _compute(waiting)
+    assert session.now.result.height.shape == (10, 10)
+
+
+def test_nothing_is_saved_while_a_result_is_computed(postponed):
+    session, waiting = postponed
+    _compute(waiting)
+    session.choose("threshold", 0.3)
+    with pytest.raises(io.InputError, match="is being computed"):
+        SavePane(session).write()
 
 
 def test_nothing_to_show_is_refused():

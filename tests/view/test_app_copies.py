@@ -1,5 +1,6 @@
 """Files saved by the application, and copied commands that compute the same numbers."""
 
+import asyncio
 import shlex
 from pathlib import Path
 
@@ -172,7 +173,7 @@ def test_nothing_is_saved_for_options_without_a_result(press):
     session = Session(press)
     session.choose("event", "release")
     pane = SavePane(session)
-    assert pane._file() is None
+    assert asyncio.run(pane._file()) is None
     assert "no result has been computed with these options" in pane.problem.object
 
 
@@ -181,5 +182,5 @@ def test_a_file_that_cannot_be_written_says_why(press):
     session.now = type(session.now)(session.now.result.assign(height=None), "no heights")
     pane = SavePane(session)
     pane.format.value = (".ply", False)
-    assert pane._file() is None
+    assert asyncio.run(pane._file()) is None
     assert "no heights" in pane.problem.object

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +19,7 @@ from mirrorskin.view.app.options import OptionsPane
 from mirrorskin.view.app.recording import RecordingPane
 from mirrorskin.view.app.result import ResultPane
 from mirrorskin.view.app.save import SavePane
-from mirrorskin.view.app.session import Opening, Session
+from mirrorskin.view.app.session import Opening, Run, Session, T, run_now
 from mirrorskin.view.app.surface import SurfacePane
 
 if TYPE_CHECKING:
@@ -72,6 +74,8 @@ class App:
         pn.extension(inline=True)  # in a notebook, no other machine is asked for scripts
         one = opening or Opening()
         openings = [one] * len(sources) if isinstance(one, Opening) else [*one]
+        self._worker = ThreadPoolExecutor(1, "mirrorskin-page") if _is_served() else None
+        self._run = run_now if self._worker is None else _in_thread(self._worker, pn.state.curdoc)
         self._sources = [*zip(sources, openings, strict=True)]
         self.session: Session | None = None
         self.rig: RigPane | None = None
@@ -85,7 +89,7 @@ class App:
             self.rig = RigPane(rig, self.add)
             names = {f"rig {rig.settings.name}": _RIG, **names}
             stop = [self.rig.stop]
-            if pn.state.curdoc is not None and pn.state.curdoc.session_context is not None:
+            if self._worker is not None:
                 pn.state.add_periodic_callback(self.rig.refresh, REFRESH)
         self.choice = pn.widgets.Select(
             options=names, width=280, label="", value=next(iter(names.values())), visible=len(names) > 1
@@ -123,7 +127,7 @@ class App:
             self._body[:] = [self.rig.view]
             self._describe()
             return
-        session = Session(*self._sources[number])
+        session = Session(*self._sources[number], run=self._run)
         self.session = session
         session.watch("result", "problem", callback=self._describe)
         tabs: list[tuple[str, Any]] = []
@@ -154,6 +158,8 @@ class App:
         if session.whole is not None:
             count, rows, columns = session.whole.shape
             parts.append(f"{session.whole.motion} motion, {count} frames of {columns} x {rows}")
+        if session.computing:
+            parts.append("the result is being computed")
         told: Sequence[str] = ()
         if session.now is not None:
             told = warnings_in(session.now.result.process)
@@ -172,6 +178,26 @@ class App:
         """Close the files."""
         if self.session is not None:
             self.session.close()
+        if self._worker is not None:
+            self._worker.shutdown(wait=False)
+
+
+def _is_served() -> bool:
+    """Return whether a page is being made for a browser window, not for a notebook."""
+    return pn.state.curdoc is not None and pn.state.curdoc.session_context is not None
+
+
+def _in_thread(worker: Executor, document: Any) -> Run:
+    """Return a way to compute in a thread, so that the server answers meanwhile, and to show the result."""
+
+    def run(work: Callable[[], T], then: Callable[[T], object], /) -> None:
+        def compute() -> None:
+            result = work()
+            document.add_next_tick_callback(lambda: then(result))
+
+        worker.submit(compute).add_done_callback(Future.result)  # an error is logged
+
+    return run
 
 
 def _name_of(source: Shown, number: int) -> str:
@@ -185,6 +211,8 @@ def pages(
 ) -> Callable[[], Any]:
     """Return a function that makes a page; when the last page is closed, the rig is stopped."""
     opened: list[App] = []
+    # Pages show them; threads cannot change filters for themselves.
+    warnings.simplefilter("ignore", io.MirrorskinWarning)
 
     def page() -> Any:
         app = App(*sources, opening=openings, rig=rig)

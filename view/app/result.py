@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from html import escape
 from typing import Any
 
@@ -100,7 +99,7 @@ class ResultPane:
         self.section.figure.visible = height is not None
         self._show_maps()
         self._show_section()
-        _later(self._show_measures)
+        self._show_measures()
 
     def _show_maps(self) -> None:
         name = self.map.value
@@ -203,23 +202,25 @@ class ResultPane:
             if region is not None:
                 shape = len(sheet.y), len(sheet.x)
                 self._dragging.box.update(**edges_of(sheet.place, shape, region))
-        try:
-            measures = engine.measure(sheet.result, region=region)
-        except InputError as error:
-            self.measures.object = problem(str(error))
-            return
-        rows = {name: str(value) for name, value in measures.quantities.items()}
-        where = "the whole map" if region is None else f"the region {region.text}"
-        self.measures.object = f"<h3>Measures of {where}</h3>{table(rows, _SECTION[1] - 60)}"
+        now = self._session.now
 
+        def measure() -> engine.Measures | InputError:
+            try:
+                return engine.measure(sheet.result, region=region)
+            except InputError as error:
+                return error
 
-def _later(callback: Callable[[], None]) -> None:
-    """Call back after the browser has been sent what was drawn so far; at once without a browser."""
-    document = pn.state.curdoc
-    if document is not None and document.session_context is not None:
-        document.add_next_tick_callback(callback)
-    else:
-        callback()
+        def show(measures: engine.Measures | InputError) -> None:
+            if (now, region) != (self._session.now, self._session.measured):
+                return
+            if isinstance(measures, InputError):
+                self.measures.object = problem(str(measures))
+                return
+            rows = {name: str(value) for name, value in measures.quantities.items()}
+            where = "the whole map" if region is None else f"the region {region.text}"
+            self.measures.object = f"<h3>Measures of {where}</h3>{table(rows, _SECTION[1] - 60)}"
+
+        self._session.run(measure, show)
 
 
 def _legend(sheet: Sheet, shown: Shown, marked: bool) -> str:

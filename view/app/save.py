@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import tempfile
 from io import BytesIO
 from pathlib import Path
@@ -81,10 +82,10 @@ class SavePane:
             self.command.value = as_command(self._session)
             self.python.value = as_python(self._session)
 
-    def _file(self) -> BytesIO | None:
+    async def _file(self) -> BytesIO | None:
         """Return the file, written by the exporter that the command line uses."""
         try:
-            return BytesIO(self.write())
+            return BytesIO(await asyncio.to_thread(self.write))
         except InputError as error:
             self.problem.object = problem(str(error))
             return None
@@ -92,6 +93,8 @@ class SavePane:
     def write(self) -> bytes:
         """Return the bytes of the file."""
         session, (suffix, with_section) = self._session, self.format.value
+        if session.computing:
+            raise InputError("the result is being computed. Save it when it is shown")
         if session.now is None or session.failed:
             raise InputError(f"no result has been computed with these options: {session.problem}")
         result = session.now.result

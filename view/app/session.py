@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ from mirrorskin.io.foreign import kind_of_frames
 from mirrorskin.io.recording import is_result
 from mirrorskin.io.result import map_shape
 from mirrorskin.view.result.sheet import Sheet, sheet_of
+
+T = TypeVar("T")
 
 Ends = tuple[tuple[float, float], tuple[float, float]]
 """Ends of a section, x and y, mm."""
@@ -63,6 +65,25 @@ class Computed:
     seconds: float = 0.0
 
 
+class Run(Protocol):
+    """Calls a function, perhaps in another thread, and then another one with what it returned."""
+
+    def __call__(self, work: Callable[[], T], then: Callable[[T], object], /) -> None:
+        """Call ``work``, and ``then`` with its result."""
+
+
+def run_now(work: Callable[[], T], then: Callable[[T], object], /) -> None:
+    """Call both functions at once; the page shows the warnings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", io.MirrorskinWarning)
+        result = work()
+    then(result)
+
+
+class _OutdatedError(Exception):
+    """A result is being computed with options that have changed since, or that nobody needs."""
+
+
 class Session:
     """A recording with an operation, its options and results, or a stored result.
 
@@ -73,6 +94,8 @@ class Session:
     source : path, Recording or Result
         What is shown.
     opening : Opening
+    run : Run
+        How results are computed, one after the other.
 
     Raises
     ------
@@ -80,7 +103,15 @@ class Session:
         The file cannot be read.
     """
 
-    def __init__(self, source: str | Path | io.Recording | io.Result, opening: Opening | None = None) -> None:
+    def __init__(
+        self,
+        source: str | Path | io.Recording | io.Result,
+        opening: Opening | None = None,
+        run: Run = run_now,
+    ) -> None:
+        self.run = run
+        self.computing = False
+        self._version = 0  # of what is to be computed
         self._watchers: dict[str, list[Callable[[], None]]] = {}
         self.opening = opening = opening or Opening()
         self.path: Path | None = Path(source) if isinstance(source, str | Path) else None
@@ -194,7 +225,7 @@ class Session:
             return
         self.region, self.frames = region, frames
         if self._part is not None:
-            self._part.close()
+            self.run(self._part.close, _ignore)  # it may be in use
             self._part = self._samples = None
         self.measured = self.ends = None
         self._tell("part")
@@ -248,9 +279,14 @@ class Session:
 
     def brightness(self, row: int, column: int) -> NDArray[Any]:
         """Return the samples of a pixel of the part, (T,)."""
-        part = self.part()
+        part, whole = self.part(), self.whole
+        assert whole is not None
         if self._samples is None or self._samples[:2] != (row, column):
-            samples = [part.frame(number)[row, column] for number in range(part.shape[0])]
+            # Of the whole recording: the part may be in use.
+            down, right = (at - start for at, start in zip(part.origin, whole.origin, strict=True))
+            first = 0 if part is whole or self.frames is None else self.frames[0]
+            numbers = range(first, first + part.shape[0])
+            samples = [whole.frame(number)[row + down, column + right] for number in numbers]
             self._samples = row, column, np.array(samples, part.dtype)
         return self._samples[2]
 
@@ -260,22 +296,45 @@ class Session:
 
     def compute(self) -> None:
         """Compute the result with the current options; the last one is kept next to it."""
-        started = time.perf_counter()
-        self.problem = ""
+        self._version += 1
+        version, kind, changed, label = self._version, self.kind, dict(self.changed), self.label()
+        self.problem, self.computing = "", True
+        self._tell("problem")
         try:
             source = self.source()
-            source.rewind()
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", io.MirrorskinWarning)  # the page shows them
-                result = run_class(self.kind, source, device=self.opening.device, **self.changed)
         except Exception as error:
-            if not hasattr(error, "exit_code"):  # not one of the project's own
-                raise
-            self.problem, self.failed = str(error), True
-            self._tell("problem")
+            self._end(version, error)
             return
-        self.failed = False
-        self._keep(Computed(result, self.label(), time.perf_counter() - started))
+
+        def check(_: int) -> None:
+            if version != self._version:
+                raise _OutdatedError
+
+        def work() -> Computed | Exception:
+            started = time.perf_counter()
+            try:
+                check(0)
+                source.rewind()
+                result = run_class(kind, source, check, device=self.opening.device, **changed)
+            except Exception as error:
+                return error
+            return Computed(result, label, time.perf_counter() - started)
+
+        self.run(work, lambda computed: self._end(version, computed))
+
+    def _end(self, version: int, computed: Computed | Exception) -> None:
+        """Keep a result, or report why there is none, unless it is outdated."""
+        if version != self._version:
+            return
+        self.computing = False
+        self.failed = isinstance(computed, Exception)
+        if isinstance(computed, Computed):
+            self._keep(computed)
+            return
+        self.problem = str(computed)
+        self._tell("problem")
+        if not hasattr(computed, "exit_code"):  # not one of the project's own
+            raise computed
 
     def label(self) -> str:
         """Return the options that were changed, in words."""
@@ -291,10 +350,11 @@ class Session:
         self._tell("result", "problem")
 
     def close(self) -> None:
-        """Close the recording."""
-        for one in (self.whole, self._part):
-            if one is not None and self.path is not None:
-                one.close()
+        """Close the recording; what is being computed is given up."""
+        self._version += 1
+        for recording in (self.whole, self._part):
+            if recording is not None and self.path is not None:
+                self.run(recording.close, _ignore)
 
 
 def holds_result(path: Path) -> bool:
@@ -309,6 +369,10 @@ def shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     return ", ".join(map(shown, value)) if isinstance(value, list) else str(value)
+
+
+def _ignore(_: object) -> None:
+    """Do nothing with what a function returned."""
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -43,6 +43,15 @@ class SurfacePane:
         if sheet is None:
             self.page.object = ""
             return
-        page = escape(surface_page(sheet.result, self._session.name), quote=True)
+        self._session.run(
+            lambda: surface_page(sheet.result, self._session.name),
+            lambda page: self._show(page, now),
+        )
+
+    def _show(self, page: str, of: Computed | None) -> None:
+        """Show a page with the surface of a result, unless another one is drawn."""
+        if of is not self._drawn:
+            return
         style = f"border:0;width:100%;height:{_SIZE[1]}px"
-        self.page.object = f'<iframe title="Surface" srcdoc="{page}" style="{style}"></iframe>'
+        srcdoc = escape(page, quote=True)
+        self.page.object = f'<iframe title="Surface" srcdoc="{srcdoc}" style="{style}"></iframe>'

@@ -105,8 +105,8 @@ def _press(
 
 
 def _at(session: Session, name: str, row: int, column: int) -> float | None:
-    """Return the value of a map of the result at a pixel."""
-    if session.now is None or (values := session.now.result.maps().get(name)) is None:
+    """Return the value of a map of the result at a pixel; None while another result is computed."""
+    if session.computing or session.now is None or (values := session.now.result.maps().get(name)) is None:
         return None
     if session.now.result.process.get(UNDISTORTED):  # its pixels are not those of the camera
         return None
