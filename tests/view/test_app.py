@@ -304,6 +304,7 @@ def test_a_session_that_is_closed_keeps_no_result(postponed):
     assert session.now is None
 
 
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")  # the part is small
 def test_a_part_is_chosen_while_another_is_computed(postponed):
     session, waiting = postponed
     session.choose_part(io.Region((0, 10), (0, 10)), (0, 9))
