@@ -28,7 +28,7 @@ import pyopencl as cl
 
 from mirrorskin.kernels.disk_cache import keep, recall
 from mirrorskin.kernels.errors import DeviceError
-from mirrorskin.kernels.processor_name import NAME_FUNCTION, PATCHABLE, ensure_name, look_up
+from mirrorskin.kernels.processor_name import NAME_FUNCTION, PATCHABLE, VARIABLE, ensure_name, look_up
 
 _log = logging.getLogger("mirrorskin.kernels")
 
@@ -71,6 +71,13 @@ def compiler() -> object:
     """Return the processor and settings on which PoCL's programs depend, once prepared."""
     settings = [item for item in os.environ.items() if item[0].startswith("POCL_")]
     return _processor, sorted(item for item in settings if item[0] != "POCL_CACHE_DIR")
+
+
+def vector_width(device: cl.Device) -> int:
+    """Return the floats in a register of the processor for which a device compiles."""
+    width: int = device.native_vector_width_float  # of this processor, whatever PoCL compiles for
+    target = os.environ.get(VARIABLE)
+    return min(width, 8) if target and "avx512" not in target else width
 
 
 def note(driver: str) -> str:
@@ -128,9 +135,9 @@ def why_no_device() -> str | None:
 def why_no_kernel(is_pocl: bool) -> str | None:
     """Return the environment variable that may prevent a kernel from compiling, in one line."""
     problem = _why_no_cache() if is_pocl else None
-    names = ("PYOPENCL_BUILD_OPTIONS", *(("POCL_EXTRA_BUILD_FLAGS",) if is_pocl else ()))
-    added = [f"{name} adds {os.environ[name]!r}" for name in names if os.environ.get(name)]
-    return problem or ("; ".join(added) or None)
+    names = ("PYOPENCL_BUILD_OPTIONS", *(("POCL_EXTRA_BUILD_FLAGS", VARIABLE) if is_pocl else ()))
+    given = [f"{name} is {os.environ[name]!r}" for name in names if os.environ.get(name)]
+    return problem or ("; ".join(given) or None)
 
 
 def _shows_pocl() -> bool:

@@ -27,6 +27,9 @@ PATCHABLE = "3.0"
 NAME_FUNCTION = "pocl_get_llvm_cpu_name"
 """The function that is patched."""
 
+VARIABLE = "MIRRORSKIN_PROCESSOR"
+"""Environment variable with another name, for tests of code for an older processor."""
+
 _NAME_FUNCTION_SIZE = 83  # bytes, in that wheel
 _NAME_FUNCTION_SHA256 = "fd587da3800019b6c70376351f2227b8fea5f15daff803329977ee54951655b6"  # of its code
 
@@ -55,12 +58,12 @@ def ensure_name(library: Path) -> tuple[str, bool]:
     if look_up(start)[1] != _NAME_FUNCTION_SIZE or _digest(start) != _NAME_FUNCTION_SHA256:
         raise OSError(f"{NAME_FUNCTION} in {library} is not that of PoCL {PATCHABLE}")
     ask.restype = ctypes.c_void_p
-    known = _take_string(ask())
-    if known != "generic":
-        return known, False
-    name = choose_name(_read_flags())
+    recognised, target = _take_string(ask()), os.environ.get(VARIABLE)
+    if recognised != "generic" and not target:
+        return recognised, False
+    name = target or choose_name(_read_flags())
     _answer_with(start, name)
-    _log.info("PoCL does not recognise this processor; it compiles for %s", name)
+    _log.info("PoCL calls this processor %s; it compiles for %s", recognised, name)
     return name, True
 
 

@@ -22,6 +22,7 @@ from mirrorskin.engine.tiling import Band, Planes
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Operand
 from mirrorskin.kernels.device import C_TYPES, Device
+from mirrorskin.kernels.embedded import vector_width
 from mirrorskin.kernels.normals import contact_limits
 
 NormalMethod = Literal["exact", "paper"]
@@ -277,4 +278,4 @@ def vector_lanes(device: Device) -> int:
     """Return the number of pixels per vector in `normals.cl`: 1 on a GPU, the width of registers on a CPU."""
     if device.layout.tile == 1:
         return 1
-    return 16 if device.queue.device.native_vector_width_float >= 16 else 8
+    return 16 if vector_width(device.queue.device) >= 16 else 8

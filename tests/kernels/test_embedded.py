@@ -40,7 +40,7 @@ def script(file: Path, body: str) -> Path:
 @pytest.fixture(autouse=True)
 def start(tmp_path, monkeypatch):
     """Give the test caches of its own, and a way to begin as a new process does."""
-    for name in ("POCL_CACHE_DIR", "OCL_ICD_VENDORS", "PYOPENCL_NO_CACHE"):
+    for name in ("POCL_CACHE_DIR", "OCL_ICD_VENDORS", "PYOPENCL_NO_CACHE", "MIRRORSKIN_PROCESSOR"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     path = os.environ["PATH"]
@@ -266,7 +266,8 @@ def test_hidden_drivers_and_broken_libraries_are_named(tmp_path, monkeypatch):
         ),
         ("POCL_DEVICES", "", "no OpenCL device found: POCL_DEVICES is '', which makes PoCL show"),
         ("POCL_MAX_PTHREAD_COUNT", "-3", "POCL_MAX_PTHREAD_COUNT is '-3': a whole number above 0 is needed"),
-        ("PYOPENCL_BUILD_OPTIONS", "-bogus", "kernels here: PYOPENCL_BUILD_OPTIONS adds '-bogus'; unset it"),
+        ("MIRRORSKIN_PROCESSOR", "i999", "kernels here: MIRRORSKIN_PROCESSOR is 'i999'; unset it"),
+        ("PYOPENCL_BUILD_OPTIONS", "-bogus", "kernels here: PYOPENCL_BUILD_OPTIONS is '-bogus'; unset it"),
     ],
 )
 def test_the_variable_that_hides_the_device_or_breaks_it_is_named(tmp_path, name, value, said):
@@ -362,6 +363,17 @@ def asked(monkeypatch):
 def test_the_known_function_is_patched_for_unknown_processors(asked, names, given):
     assert asked(names) == given
     assert ("patched" in embedded.note("3.0")) == (names == "generic")
+
+
+def test_the_processor_of_the_variable_replaces_the_recognised_one(asked, monkeypatch):
+    monkeypatch.setenv("MIRRORSKIN_PROCESSOR", "haswell")
+    assert asked("znver3") == ["called", "haswell"]
+
+
+@pytest.mark.parametrize(("processor", "width"), [("", 16), ("haswell", 8), ("skylake-avx512", 16)])
+def test_vectors_are_as_wide_as_registers_of_the_processor(monkeypatch, processor, width):
+    monkeypatch.setenv("MIRRORSKIN_PROCESSOR", processor)
+    assert embedded.vector_width(SimpleNamespace(native_vector_width_float=16)) == width
 
 
 @pytest.mark.parametrize("other", [{"size": 84}, {"changed": True}], ids=["another size", "other bytes"])

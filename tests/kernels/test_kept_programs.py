@@ -45,17 +45,17 @@ def start(tmp_path):
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     environment.pop("POCL_CACHE_DIR", None)
 
-    def begin(change):
-        command = [sys.executable, "-c", CHANGE, change]
-        return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+    def begin(change, **variables):
+        command, given = [sys.executable, "-c", CHANGE, change], {**environment, **variables}
+        return subprocess.Popen(command, env=given, stdout=subprocess.PIPE, text=True)
 
     return begin
 
 
 @pytest.fixture
 def change(start):
-    def run(change):
-        with start(change) as process:
+    def run(change, **variables):
+        with start(change, **variables) as process:
             return json.load(process.stdout)
 
     return run
@@ -77,6 +77,13 @@ def test_kernels_of_one_name_in_several_programs_stay_apart(change, tmp_path):
     for _ in range(2):
         assert change("2*values[item]")[0] == [0, 2, 4]
         assert change("7-values[item]")[0] == [7, 6, 5]
+    assert len(records(tmp_path)) == 2
+
+
+def test_programs_of_one_processor_are_not_used_for_another(change, tmp_path):
+    for compiled in (1, 0):
+        for processor in ("x86-64", "core2"):
+            assert change("exp(values[item])", MIRRORSKIN_PROCESSOR=processor) == [EXP, compiled]
     assert len(records(tmp_path)) == 2
 
 

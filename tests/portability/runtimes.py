@@ -11,7 +11,6 @@ runs.
 from __future__ import annotations
 
 import argparse
-import ctypes
 import json
 import platform
 import subprocess
@@ -23,6 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from portability import CHECKS, ROOT, environment_for
+
+from mirrorskin.kernels.processor_name import VARIABLE
 
 ROUNDS, SECONDS = 15, 1.5  # of a call, at most
 THIS = "this processor"
@@ -47,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     words = parser.parse_args(arguments)
     if words.inside:
-        print(json.dumps(time_calls(words.calls, words.layouts[0], *words.targets)))
+        print(json.dumps(time_calls(words.calls, words.layouts[0])))
         return 0
     columns = list(measure(words.names or [""], words.layouts, words.targets, words.calls))
     print(page(columns))
@@ -68,19 +69,17 @@ def measure(
             for layout in layouts:
                 print(f"{check.name}, {target}, {layout}", file=sys.stderr)
                 told = ["--inside", "--layouts", layout, "--calls", *calls]
-                told += [] if target == THIS else ["--targets", target]
                 with tempfile.TemporaryDirectory() as folder:
                     environment = environment_for(check, Path(folder))
+                    environment |= {} if target == THIS else {VARIABLE: target}
                     command = [sys.executable, "-W", "ignore", __file__, *told]
                     child = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True)
                 yield {"runtime": check.name, "target": target, **json.loads(child.stdout)}
 
 
-def time_calls(calls: Sequence[str], layout: str, target: str | None = None) -> Column:
+def time_calls(calls: Sequence[str], layout: str) -> Column:
     """Return the processor time of each public call on the first device."""
     sys.path.insert(0, str(ROOT / "bench"))
-    if target is not None:
-        compile_for(target)
     import gpu_calls
     import numpy as np
 
@@ -104,22 +103,6 @@ def time_calls(calls: Sequence[str], layout: str, target: str | None = None) -> 
     run = describe_run(device, (), quick=False)
     machine = {"processor": run.processor, "threads": run.threads, "system": platform.system()}
     return {"driver": device.info.driver, "layout": layout, "commit": run.commit, **machine, "ms": times}
-
-
-def compile_for(target: str) -> None:
-    """Make the wheel's PoCL compile for a processor, from its first look at devices on."""
-    from mirrorskin.engine.rotation import normals_kernel
-    from mirrorskin.kernels import embedded, processor_name
-
-    def name_target(library: Path) -> tuple[str, bool]:
-        function = getattr(ctypes.CDLL(str(library)), processor_name.NAME_FUNCTION)
-        processor_name._answer_with(processor_name._address(function), target)
-        return target, True
-
-    assert embedded.ensure_name is processor_name.ensure_name
-    embedded.ensure_name = name_target
-    if "avx512" not in target:  # the device goes on to report the registers of this processor
-        normals_kernel.vector_lanes = lambda device: 1 if device.layout.tile == 1 else 8
 
 
 def page(columns: Sequence[Column]) -> str:

@@ -1,15 +1,9 @@
 """Parts of ``runtimes.py`` that need no other runtime."""
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import runtimes
-
-from mirrorskin.kernels import embedded
 
 
 @pytest.fixture
@@ -34,24 +28,3 @@ def test_numbers_and_page_are_written(monkeypatch, tmp_path, capsys, columns):
     assert json.loads((tmp_path / "table.json").read_text()) == columns
     assert (tmp_path / "table.md").read_text() == runtimes.page(columns)
     assert capsys.readouterr().out.startswith(runtimes.page(columns))
-
-
-COMPILED = """
-import runtimes
-runtimes.compile_for("nehalem")
-from mirrorskin.kernels.device import open_device
-print(open_device("Portable").info.note)
-"""
-
-
-def test_the_wheels_pocl_compiles_for_the_processor_that_is_named():
-    if embedded.find_library() is None:
-        pytest.skip("there is no wheel of PoCL")
-    paths = os.pathsep.join([str(Path(runtimes.__file__).parent), *sys.path])
-    ran = subprocess.run(
-        [sys.executable, "-c", COMPILED],
-        env=os.environ | {"PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-    )
-    assert "compiles for nehalem" in ran.stdout, ran.stderr
