@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from engine_cases import (
-    FITTED,
     PIXEL,
     RECONSTRUCTED,
     Source,
@@ -17,7 +16,7 @@ from engine_cases import (
     result_maps,
     turn_source,
 )
-from golden import Answer, case
+from golden import FITTED, Answer, Tolerance, case
 from scenes import EIGHTHS, TILT, dome, places, turn
 
 from mirrorskin import engine, hw, io
@@ -66,7 +65,7 @@ def measure_references_of_flat_fields() -> Answer:
     return named(**told)
 
 
-@case(FITTED, numbers=(1e-4, 1e-6))
+@case(FITTED, numbers=Tolerance(1e-4, 1e-6))
 def calibrate_a_lens() -> Answer:
     column, row = np.meshgrid(np.arange(160.0), np.arange(130.0))
     u, v = (column - 79.5) / 150, (row - 64.5) / 150
@@ -87,7 +86,7 @@ def calibrate_a_lens() -> Answer:
     }
 
 
-@case(FITTED, numbers=(1e-5, 1e-6), sigma=(1e-3, 1e-9))
+@case(FITTED, numbers=Tolerance(1e-5, 1e-6), sigma=Tolerance(1e-3, 1e-9))
 def fit_a_precession() -> Answer:
     tilt, turned, pivot = 0.0441, 0.05, np.array([0.3, -0.2, 12.0])
     alpha = EIGHTHS + turned
@@ -136,7 +135,7 @@ class Ball:
         return -(x - self.x) / rise, -(y - self.y) / rise
 
 
-@case(FITTED, frames=(0.0, 0.0), numbers=(1e-4, 1e-6), curve=(1e-3, 1e-4), map=(1e-2, 1e-6))
+@case(FITTED, numbers=Tolerance(1e-4, 1e-6), curve=Tolerance(1e-3, 1e-4), map=Tolerance(1e-2, 1e-6))
 def fit_a_wall() -> Answer:
     presses = []
     for number, place in enumerate(((0.2, 0.1), (-3.6, -3.4), (3.5, -3.6), (-3.4, 3.6), (3.6, 3.3)), 1):

@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 import tifffile
 from commands import run
-from engine_cases import FITTED, RECONSTRUCTED, named, result_maps
-from golden import Answer, case
+from engine_cases import PROCESS, RECONSTRUCTED, named, result_maps
+from golden import FITTED, KERNEL, Answer, Tolerance, case
 from scenes import press
 
 from mirrorskin import io
@@ -106,7 +106,7 @@ def result(*words: object) -> Answer:
     return result_maps(io.open_result("some-result.h5"))
 
 
-TWIN = {"travel": (0.0, 1e-9), "truth_height": (1e-6, 1e-6), "truth_zenith": (1e-6, 1e-6)}
+TWIN = {"travel": Tolerance(0.0, 1e-9), "truth_height": KERNEL, "truth_zenith": KERNEL}
 RESULT = {"tolerance": FITTED, **RECONSTRUCTED}
 
 
@@ -120,7 +120,7 @@ def simulate_a_rotation() -> Answer:
     return named(turn=recording("turn.h5"), turns=recording("turns.h5"))
 
 
-@case(FITTED, frames=(1e-5, 1e-3), **TWIN)
+@case(FITTED, frames=Tolerance(1e-5), **TWIN)
 def simulate_other_motions() -> Answer:
     return named(moved=recording("moved.h5"), twisted=recording("twisted.h5"))
 
@@ -226,7 +226,7 @@ def fuse_recordings() -> Answer:
     )
 
 
-@case((1e-3, 1e-6), fragile=True)
+@case(PROCESS, fragile=True)
 def score_results() -> Answer:
     return {
         "press": told("score", "press-result.h5", "--truth", "press.h5"),
@@ -236,13 +236,13 @@ def score_results() -> Answer:
     }
 
 
-@case((1e-3, 1e-6), fragile=True)
+@case(PROCESS, fragile=True)
 def info_of_files() -> Answer:
     names = ("press.h5", "turn.h5", "press-result.h5", "turn-result.h5", "fused.h5", "gel-cal.h5")
     return {name: told("info", name) for name in names}
 
 
-@case((1e-3, 1e-6), fragile=True)
+@case(PROCESS, fragile=True)
 def measure_results() -> Answer:
     return {
         "fused": told("measure", "fused.h5"),
@@ -252,7 +252,7 @@ def measure_results() -> Answer:
     }
 
 
-@case((1e-5, 1e-4), picture=(0.0, 0.0), fragile=True)
+@case(FITTED, fragile=True)
 def export_results() -> Answer:
     names = [f"fused.{kind}" for kind in ("ply", "stl", "xyz", "png", "tif", "npz")]
     command("export", "fused.h5", *(word for name in names for word in ("-o", f"./{name}")))
@@ -307,7 +307,7 @@ def batch_of_recordings() -> Answer:
     }
 
 
-@case((1e-3, 1e-5))
+@case(Tolerance(1e-3, 1e-5))
 def calibrate_a_gel() -> Answer:
     make("gel-cal.h5")
     learned = told("calibrate", "elastic", "gel.h5", "--ball", "10mm", "-o", "again-cal.h5")

@@ -49,7 +49,7 @@ def report(name: str, frozen: dict[str, dict[str, golden.NDArray]], freeze: bool
     print(f"{name}: {'DIFFERS' if wrong else 'same'} ({time.perf_counter() - begin:.2f} s)")
     for key in sorted(found.keys() | known.keys()):
         if key in found and key in known:
-            same, said = golden.compare(found[key], known[key], CASES[name].within(key))
+            same, said = golden.compare(found[key], known[key], CASES[name].within(key, known))
         else:
             same, said = False, "is new" if key in found else "is missing"
         print(f"    {'  ' if same else '! '}{key}: {said}")

@@ -7,7 +7,20 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from golden import Answer, Tolerance, case
+from golden import (
+    AZIMUTH,
+    FITTED,
+    HEIGHT,
+    KERNEL,
+    NORMAL,
+    RESIDUAL_SIGMA,
+    SIGMA,
+    SOLVED,
+    WAVE,
+    Answer,
+    Tolerance,
+    case,
+)
 from scenes import (
     EIGHTHS,
     LEVELS,
@@ -37,11 +50,7 @@ from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.engine.streaming import push_block
 from mirrorskin.engine.summary import summarise as engine_summarise
 
-HEIGHT: Tolerance = (1e-4, 1e-5)  # mm: single precision, and what solvers leave
-SOLVED: Tolerance = (0.0, 1e-4)  # mm: the integration's own tolerance
-SIGMA: Tolerance = (1e-2, 1e-7)
-FITTED: Tolerance = (1e-5, 1e-7)  # what least squares in double precision settle at
-NORMAL: Tolerance = (1e-5, 2e-6)  # of unit vectors in single precision
+PROCESS = Tolerance(1e-3, 1e-6)  # numbers of solved heights
 ONSET = {"height": HEIGHT, "height_sigma": HEIGHT, "process": FITTED}
 SMALL = (19, 26)
 
@@ -263,17 +272,17 @@ def reconstruct_a_press_with_a_gel() -> Answer:
 # A rotation.
 
 
-@case(azimuth=(1e-5, 1e-4))
+@case(azimuth=AZIMUTH)
 def correlate_even_phases() -> Answer:
     return named(**{d: result_maps(engine.correlate(turn(d)[0], EIGHTHS)) for d in LEVELS})
 
 
-@case(azimuth=(1e-5, 1e-4))
+@case(azimuth=AZIMUTH)
 def correlate_uneven_phases() -> Answer:
     return named(**{d: result_maps(engine.correlate(turn(d, phase=UNEVEN)[0], UNEVEN)) for d in LEVELS})
 
 
-@case(azimuth=(1e-5, 1e-4))
+@case(azimuth=AZIMUTH)
 def correlate_weights_and_missing_samples() -> Answer:
     frames = turn("float32", phase=UNEVEN)[0]
     frames[pick(frames.shape, 0.002, 3)] = np.nan
@@ -286,7 +295,7 @@ def long_turn(dtype: str) -> tuple[Any, Any]:
     return turn(dtype, (33, 47), phase)[0], phase
 
 
-@case(azimuth=(1e-5, 1e-4))
+@case(azimuth=AZIMUTH)
 def correlate_block_by_block() -> Answer:
     answers = {}
     for dtype in LEVELS:
@@ -298,7 +307,7 @@ def correlate_block_by_block() -> Answer:
     return named(**answers)
 
 
-@case(azimuth=(1e-5, 1e-4))
+@case(azimuth=AZIMUTH)
 def correlate_a_sliding_window() -> Answer:
     answers = {}
     for dtype in LEVELS:
@@ -310,7 +319,7 @@ def correlate_a_sliding_window() -> Answer:
     return named(**answers)
 
 
-@case(phase=NORMAL, phase_sigma=(1e-4, 1e-7), process=FITTED)
+@case(phase=FITTED, phase_sigma=RESIDUAL_SIGMA, process=FITTED)
 def fit_fringes() -> Answer:
     return named(
         **{d: result_maps(engine.fringes.fit_fringes(turn(d, SMALL, UNEVEN)[0], UNEVEN)) for d in LEVELS}
@@ -333,7 +342,7 @@ def find_focus() -> Answer:
     normals_sigma=SIGMA,
     albedo=FITTED,
     albedo_sigma=SIGMA,
-    residual=(1e-3, 1e-6),
+    residual=Tolerance(1e-3),
     process=FITTED,
 )
 def photometric_stereo() -> Answer:
@@ -358,7 +367,14 @@ def normals_of(dtype: str = "uint16", phase: Any = EIGHTHS, **options: Any) -> A
     return result_maps(engine.estimate_normals(frames, phase, **known, **options))
 
 
-ROTATION = {"normals": NORMAL, "normals_sigma": (1e-4, 1e-7), "zenith": NORMAL, "azimuth": (1e-5, 1e-4)}
+ROTATION = {
+    "normals": NORMAL,
+    "normals_sigma": RESIDUAL_SIGMA,
+    "zenith": NORMAL,
+    "azimuth": AZIMUTH,
+    "mean": KERNEL,
+    **dict.fromkeys(("cosine", "sine", "modulation", "residual"), WAVE),
+}
 
 
 @case(FITTED, **ROTATION)
@@ -393,7 +409,7 @@ def estimate_normals_where_contact_is_lost() -> Answer:
     return normals_of("uint8", lost=True, shape=(48, 64))
 
 
-@case(FITTED, **ROTATION, process=(1e-4, 1e-7))
+@case(FITTED, **ROTATION, process=Tolerance(1e-4, 1e-7))
 def estimate_normals_and_the_tilt() -> Answer:
     frames, gain, offset = turn("uint16")
     known = {"tilt": "estimate", "zenith_gain": gain, "zenith_offset": offset}
@@ -439,15 +455,8 @@ def turn_source(turns: int = 1, dtype: str = "uint16", **known: Any) -> Source:
     return Source(frames, header, phase=phase)
 
 
-RECONSTRUCTED = {
-    "height": SOLVED,
-    "height_sigma": SIGMA,
-    "normals": NORMAL,
-    "zenith": NORMAL,
-    "azimuth": (1e-5, 1e-4),
-    "normals_sigma": (1e-4, 1e-7),
-    "process": (1e-3, 1e-6),
-}
+SURFACE = {"height": SOLVED, "height_sigma": SIGMA, "process": PROCESS}
+RECONSTRUCTED = {**ROTATION, **SURFACE}
 
 
 @case(FITTED, **RECONSTRUCTED)
@@ -479,7 +488,7 @@ def reconstruct_a_registered_rotation() -> Answer:
     return result_maps(engine.reconstruct(turn_source(pivot=(0.4, -0.3, 5.0)), heights=heights))
 
 
-@case((1e-5, 1e-5))
+@case(Tolerance(10 * 3e-7))  # pixels have numbers up to 50, in single precision: 3 units
 def registered_frames() -> Answer:
     heights = dome((40, 52))[0].astype(np.float32)
     source = Registered(turn_source(dtype="float32", pivot=(0.4, -0.3, 5.0)), heights)
@@ -504,9 +513,6 @@ def integrated(shape: tuple[int, int], **options: Any) -> Answer:
     random = np.random.default_rng(3)
     along_x, along_y = (slope + random.normal(0, 0.01, shape) for slope in (along_x, along_y))
     return result_maps(engine.integrate(along_x, along_y, PIXEL, **options))
-
-
-SURFACE = {"height": SOLVED, "height_sigma": SIGMA, "process": (1e-3, 1e-6)}
 
 
 def disc(shape: tuple[int, int]) -> Any:
@@ -636,7 +642,7 @@ def fuse() -> Answer:
     )
 
 
-@case(FITTED, **{**RECONSTRUCTED, "normals": (1e-3, 1e-5)})
+@case(FITTED, **{**RECONSTRUCTED, "normals": SOLVED})  # registered by solved heights
 def fuse_sources() -> Answer:
     shape, travel = (40, 52), np.arange(0.0, 1.0, 0.05)
     starts = -dome(shape)[0]

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,37 @@ from numpy.typing import NDArray
 ANSWERS = Path(__file__).with_name("answers.npz")
 
 Answer = Mapping[str, Any]
-Tolerance = tuple[float, float]  # relative, absolute
+Arrays = Mapping[str, NDArray[Any]]
+Limits = tuple[float, float]  # of a difference: relative to the value, and absolute
+UNIT = float(np.finfo(np.float32).eps)  # 1.2e-7, the distance between float32 numbers at 1
 
-KERNEL: Tolerance = (1e-6, 1e-7)  # one pass over the frames: the last bits of a float32
+
+class Tolerance(NamedTuple):
+    """The largest difference between floats: a part relative to their size, and one in the unit of the array.
+
+    The size is the value plus, in a map (an array of two or more dimensions), the root mean square of the
+    map, because values near 0 are differences of larger ones. ``of`` names the map if it is another one.
+    """
+
+    relative: float
+    absolute: float = 0.0
+    of: str = ""
+
+
+# Processors round differently: sums have another order, functions other last bits. How much a map differs
+# follows from its conditioning, or from where its solver stops. Each tolerance is at least 5 times the
+# largest difference between code for AVX-512, AVX2 and AVX, which the comment ends with.
+KERNEL = Tolerance(10 * UNIT)  # sums over frames in float32: 1 unit
+WAVE = Tolerance(20 * UNIT, of="mean")  # parts of a wave are sums of samples as large as the mean: 3 units
+# The error of the azimuth is that of the wave over its amplitude, a tenth of the mean (tilt over zenith);
+# registered samples have four times the error of others.
+NORMAL = Tolerance(4 * 10 * 10 * UNIT)  # 60 units
+AZIMUTH = Tolerance(0.0, 2e-4)  # radians, NORMAL over the sine of zeniths from 0.2: 2e-5
+RESIDUAL_SIGMA = Tolerance(80 * 10 * UNIT)  # from residuals, which are an eightieth of the mean: 24 units
+FITTED = Tolerance(100 * UNIT, 1e-7)  # double precision, of maps in single precision: 5 units
+HEIGHT = Tolerance(100 * UNIT)  # between frames, from differences of samples: 1 unit
+SOLVED = Tolerance(10 * 1e-5)  # heights: solvers stop where the relative residual is 1e-5: 2e-6
+SIGMA = Tolerance(5e-3)  # of solved heights, from the misfit that the solver leaves: 4e-4
 VOLATILE = (
     *("date", "path", "hash", "sha256", "fingerprint", "modified", "batch_parameters", "start", "seconds"),
     *("version", "device", "driver", "program", "bytes", "integration_residual", "integration_iterations"),
@@ -35,50 +63,56 @@ class Case:
 
     make: Callable[[], Answer]
     tolerance: Tolerance
-    of: Mapping[str, Tolerance]
+    maps: Mapping[str, Tolerance]
     fragile: bool = False
 
-    def within(self, array: str) -> Tolerance:
-        """Return the tolerance of one of its arrays, by the last word of its name."""
-        return self.of.get(array.split(".")[-1], self.tolerance)
+    def within(self, array: str, frozen: Arrays) -> Limits:
+        """Return the limits of one of its arrays, by the last word of its name."""
+        part, dot, name = array.rpartition(".")
+        relative, absolute, of = Tolerance(*self.maps.get(name, self.tolerance))
+        values = frozen[f"{part}{dot}{of}" if of else array]
+        if values.dtype.kind == "f" and values.ndim > 1:
+            finite = values[np.isfinite(values)].astype(float)
+            absolute += relative * float(np.linalg.norm(finite)) / max(finite.size, 1) ** 0.5
+        return relative, absolute
 
 
 CASES: dict[str, Case] = {}
 
 
 def case(
-    tolerance: Tolerance = KERNEL, fragile: bool = False, **of: Tolerance
+    tolerance: Tolerance = KERNEL, fragile: bool = False, **maps: Tolerance
 ) -> Callable[[Callable[[], Answer]], Callable[[], Answer]]:
     """Keep a function as the case of its name; it works in an empty folder that all cases share."""
 
     def keep(make: Callable[[], Answer]) -> Callable[[], Answer]:
         assert make.__name__ not in CASES
-        CASES[make.__name__] = Case(make, tolerance, of, fragile)
+        CASES[make.__name__] = Case(make, tolerance, maps, fragile)
         return make
 
     return keep
 
 
-def tell(found: Any) -> NDArray[Any]:
+def as_array(found: Any) -> NDArray[Any]:
     """Return an answer as an array; what is neither array nor number becomes JSON."""
     if isinstance(found, dict | list | str):
-        return np.array(json.dumps(steady(found), sort_keys=True))
+        return np.array(json.dumps(without_volatile(found), sort_keys=True))
     return np.asarray(found)
 
 
-def steady(found: Any) -> Any:
+def without_volatile(found: Any) -> Any:
     """Return JSON without what differs from run to run."""
     if isinstance(found, dict):
         kept = {k: v for k, v in found.items() if not any(word in k.lower() for word in VOLATILE)}
-        return {name: steady(value) for name, value in kept.items()}
+        return {name: without_volatile(value) for name, value in kept.items()}
     if isinstance(found, str):
         return found.replace("-0.0000 ", "+0.0000 ")  # the sign of nothing
-    return [steady(one) for one in found] if isinstance(found, list) else found
+    return [without_volatile(one) for one in found] if isinstance(found, list) else found
 
 
 def answers(name: str) -> dict[str, NDArray[Any]]:
     """Run a case, and return its arrays."""
-    return {key: tell(value) for key, value in CASES[name].make().items() if value is not None}
+    return {key: as_array(value) for key, value in CASES[name].make().items() if value is not None}
 
 
 def load() -> dict[str, dict[str, NDArray[Any]]]:
@@ -98,14 +132,12 @@ def save(kept: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
     np.savez_compressed(ANSWERS, **arrays)
 
 
-def differences(
-    name: str, found: Mapping[str, NDArray[Any]], frozen: Mapping[str, NDArray[Any]]
-) -> dict[str, str]:
+def differences(name: str, found: Arrays, frozen: Arrays) -> dict[str, str]:
     """Return what differs beyond the tolerance, in words, by array."""
     wrong = dict.fromkeys(frozen.keys() - found.keys(), "is missing")
     wrong |= dict.fromkeys(found.keys() - frozen.keys(), "is new")
     for key in sorted(found.keys() & frozen.keys()):
-        one, other, within = found[key], frozen[key], CASES[name].within(key)
+        one, other, within = found[key], frozen[key], CASES[name].within(key, frozen)
         if CASES[name].fragile:
             same, words = _compare_usual(one, other)
         else:
@@ -138,7 +170,7 @@ def _compare_usual(found: NDArray[Any], frozen: NDArray[Any]) -> tuple[bool, str
     return bool(error <= 0.05 * size), f"differ by {error:.2g} in the median, of {size:.2g}"
 
 
-def compare(found: NDArray[Any], frozen: NDArray[Any], within: Tolerance) -> tuple[bool, str]:
+def compare(found: NDArray[Any], frozen: NDArray[Any], within: Limits) -> tuple[bool, str]:
     """Tell whether two arrays are the same within a tolerance, and how they differ."""
     if (found.dtype.kind, found.shape) != (frozen.dtype.kind, frozen.shape):
         return False, f"{frozen.dtype} {frozen.shape} became {found.dtype} {found.shape}"
@@ -152,7 +184,7 @@ def compare(found: NDArray[Any], frozen: NDArray[Any], within: Tolerance) -> tup
     return _compare_floats(found.astype(float), frozen.astype(float), within)
 
 
-def _compare_floats(found: NDArray[Any], frozen: NDArray[Any], within: Tolerance) -> tuple[bool, str]:
+def _compare_floats(found: NDArray[Any], frozen: NDArray[Any], within: Limits) -> tuple[bool, str]:
     there = np.isfinite(frozen)
     elsewhere = np.where(there, 0.0, frozen)
     odd = int(
@@ -174,7 +206,7 @@ def _differ(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
     return ~((one == other) | (np.isnan(one) & np.isnan(other)))
 
 
-def _compare_texts(found: str, frozen: str, within: Tolerance) -> tuple[bool, str]:
+def _compare_texts(found: str, frozen: str, within: Limits) -> tuple[bool, str]:
     if found == frozen:
         return True, "equal"
     one = dict(_leaves(json.loads(found)))
@@ -184,7 +216,7 @@ def _compare_texts(found: str, frozen: str, within: Tolerance) -> tuple[bool, st
     return not wrong, told or "equal but for rounding"
 
 
-def _alike(place: str, one: dict[str, Any], other: dict[str, Any], within: Tolerance) -> bool:
+def _alike(place: str, one: dict[str, Any], other: dict[str, Any], within: Limits) -> bool:
     if place not in one or place not in other:
         return False
     left, right = _number(one[place]), _number(other[place])

@@ -6,17 +6,16 @@ import math
 from typing import Any
 
 import numpy as np
-from golden import Answer, Tolerance, case
+from golden import HEIGHT, NORMAL, Answer, Tolerance, case
 from moved_surfaces import bumpy, rod, sampled
 from scenes import LEVELS, PIXEL, counted, dome, places
 from speckle import Speckle
 
 from mirrorskin.engine import force, pose, press, rotation, slip
 
-MOVED: Tolerance = (1e-3, 1e-5)  # mm: a thousandth of a pixel, where Gauss-Newton steps end
-POSE: Tolerance = (1e-3, 2e-6)  # radians and mm
-FORCE: Tolerance = (1e-3, 1e-7)  # N and MPa: where conjugate gradients end
-HEIGHT: Tolerance = (1e-4, 1e-5)  # mm
+MOVED = Tolerance(1e-3, 1e-5)  # mm: a thousandth of a pixel, where Gauss-Newton steps end
+POSE = Tolerance(1e-3, 2e-6)  # radians and mm
+FORCE = Tolerance(1e-3, 1e-7)  # N and MPa: where conjugate gradients end
 
 TEXTURE = Speckle(4)
 SHAPE = (64, 72)
@@ -100,7 +99,7 @@ def leaning(direction: Any, tilt: Any, dtype: str = "uint16") -> tuple[Any, Any,
     return np.clip(np.rint(offset + gain * zenith + noise), 0, None).astype(dtype), axis, gain, offset
 
 
-@case((1e-4, 1e-5), azimuth=(1e-3, 1e-4))
+@case(NORMAL, slope_sigma=Tolerance(1e-3))
 def normals_of_poses() -> Answer:
     answers: dict[str, Any] = {}
     turn = 0.7 * np.arange(20)
@@ -160,7 +159,12 @@ def find_displacement() -> Answer:
     return answers
 
 
-@case(MOVED, stick_ratio=(0, 5e-3), slip_onset=(1e-2, 1e-4), slip_onset_sigma=(3e-2, 1e-4))
+@case(
+    MOVED,
+    stick_ratio=Tolerance(0, 5e-3),
+    slip_onset=Tolerance(1e-2, 1e-4),
+    slip_onset_sigma=Tolerance(3e-2, 1e-4),
+)
 def slip_search() -> Answer:
     answers: dict[str, Any] = {}
     x, y = np.meshgrid(np.arange(72) - 36, np.arange(64) - 32)

@@ -226,7 +226,7 @@ def compare_answers(trial: Trial, end: float) -> dict[str, dict[str, str]]:
             except Exception as error:  # the next ones are tried all the same
                 found[name] = {"fails with": f"{type(error).__name__}: {error}"}
                 continue
-            within = {key: golden.CASES[name].within(key) for key in answers}
+            within = {key: golden.CASES[name].within(key, frozen) for key in answers}
             said = {key: differs(answers, frozen, key, within[key]) for key in answers}
             found[name] = {key: words for key, words in said.items() if words}
     return found
