@@ -1,10 +1,10 @@
-# make [demo|test|test-all|test-lowest|test-browser|test-cameras|test-hardware|docs|package|lint|types|fuzz|bench|portability|gpu-check|gpu|gpu-wheels|clean]; each installs what it needs in .venv first.
+# make [demo|test|test-all|test-older|test-lowest|test-browser|test-cameras|test-hardware|docs|package|lint|types|fuzz|bench|portability|gpu-check|gpu|gpu-wheels|clean]; each installs what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test test-all test-lowest test-browser test-cameras test-hardware docs package lint types fuzz bench portability gpu-check gpu gpu-wheels clean
+.PHONY: demo test test-all test-older test-lowest test-browser test-cameras test-hardware docs package lint types fuzz bench portability gpu-check gpu gpu-wheels clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -12,7 +12,8 @@ PACKAGES := $(patsubst %/__init__.py,%,$(wildcard */__init__.py))
 BIN := .venv/bin
 DEMO := .venv/.demo
 READY := .venv/.ready
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
+TESTS := -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
+PYTEST := $(BIN)/python $(TESTS)
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Modules are compiled when they are imported, which few are; setuptools warns of every editable installation.
 INSTALL := PYTHONWARNINGS=ignore $(PIP) install --no-compile --editable
@@ -28,12 +29,21 @@ test: lint
 	wait $$types
 
 # What 'make test' leaves out: a few captures in real time, with nothing beside them; the second work shape of
-# every device, statistics over many draws, recordings of full size, batches that are killed, the documentation,
-# and reports in a real browser.
+# every device, statistics over many draws, recordings of full size, batches that are killed, older processors, the
+# documentation, and reports in a real browser.
 test-all: $(READY)
 	@$(BIN)/python -m pytest --ignore tests/browser -m 'slow and real_time'
 	$(PYTEST) -m 'slow and not real_time'
-	$(MAKE) --no-print-directory docs package test-browser
+	$(MAKE) --no-print-directory test-older docs package test-browser
+
+# Golden results, the contract of operations, and kernels against their references, with the instructions of an older
+# PROCESSOR only, whose floats have other last bits.
+PROCESSOR ?= haswell sandybridge
+test-older: $(READY)
+	@for processor in $(PROCESSOR); do
+		$(BIN)/python tests/portability/older_processor.py $$processor $(TESTS) -m 'not slow' \
+		    tests/golden tests/engine/test_contract.py tests/kernels/test_references.py
+	done
 
 # Each command with the lowest versions of all dependencies that pyproject.toml allows, from the package index, in
 # an environment of their own; it needs Python 3.11.

@@ -11,6 +11,7 @@ from gpu_check import taken_for_gpu
 
 from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.kernels import device as device_layer
+from mirrorskin.kernels import embedded
 from mirrorskin.kernels.device import Device, list_devices
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 
@@ -44,6 +45,12 @@ def _default_interrupt():
 def pytest_xdist_auto_num_workers():
     """One more than there are cores, as some tests wait for processes that they start."""
     return (os.cpu_count() or 1) + 1
+
+
+def pytest_report_header():
+    """Which processor gave the results, since the last bits of floats depend on it."""
+    processor, _ = embedded.compiler()
+    return f"OpenCL: {', '.join(info.title for info in FOUND)}; PoCL compiles for {processor}"
 
 
 def pytest_configure(config):
