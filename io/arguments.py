@@ -110,9 +110,8 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
 def as_array(name: str, value: Any, unit: str = "", components: bool = False) -> NDArray[Any]:
     """Return an argument as an array of numbers in this machine's byte order, in the argument's unit.
 
-    Every public function converts its arguments here; `docs/operations.md`, "Arrays and units", lists what
-    they may be. An array of numbers is returned unchanged. ``components``: whether the last axis of a map is
-    that of a vector's components.
+    Every public function converts its arguments here. An array of numbers is returned unchanged.
+    ``components``: whether the last axis of a map is that of a vector's components.
     """
     if type(value) is np.ndarray and value.dtype.kind in _NUMBERS and value.dtype.isnative:
         return value

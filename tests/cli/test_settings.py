@@ -75,7 +75,7 @@ def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
         "dataset": "/entry/frames",
         "motion": "vertical",
         "travel": io.Steps(0.1, 10.0),
-        "phase": io.Steps(pytest.approx(math.pi / 4)),
+        "phase": io.Steps(math.radians(45)),
         "tilt": pytest.approx(math.radians(2.5)),
         "pixel_size": (0.03, pytest.approx(0.04)),
         "region": Region(rows=(50, 98), columns=(100, 164)),

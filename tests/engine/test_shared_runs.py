@@ -15,7 +15,6 @@ from operations import CASES, Readable
 from stacks import record
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.fusion import fuse_recordings
 from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.io.calibration.types import CameraId
 from mirrorskin.io.zarr_export import save_zarr
@@ -272,8 +271,8 @@ def test_fusions_that_share_recordings_give_each_thread_what_one_thread_gets():
         hw.Twin(**common, movement=hw.twin.Vertical(step * np.arange(1, 12))) for step in (0.1, 0.11)
     )
     assert_as_alone(
-        lambda: fuse_recordings(press, rotation),
-        lambda: fuse_recordings(other, rotation),
+        lambda: engine.fuse(press, rotation),
+        lambda: engine.fuse(other, rotation),
         lambda: engine.reconstruct(rotation),
         lambda: engine.reconstruct(press),
     )

@@ -127,7 +127,8 @@ class App:
             self._body[:] = [self.rig.view]
             self._describe()
             return
-        session = Session(*self._sources[number], run=self._run)
+        source, opening = self._sources[number]
+        session = Session(source, opening, self._run)
         self.session = session
         session.watch("result", "problem", callback=self._describe)
         tabs: list[tuple[str, Any]] = []

@@ -12,7 +12,7 @@ from bokeh.models import ColumnDataSource, HoverTool
 from bokeh.plotting import figure
 
 from mirrorskin import engine
-from mirrorskin.engine.metrology import Section, section
+from mirrorskin.engine.metrology import Measures, Section, section
 from mirrorskin.io import InputError
 from mirrorskin.view.app.look import hint, plain_axes, problem, table, text
 from mirrorskin.view.app.picture import (
@@ -204,13 +204,13 @@ class ResultPane:
                 self._dragging.box.update(**edges_of(sheet.place, shape, region))
         now = self._session.now
 
-        def measure() -> engine.Measures | InputError:
+        def measure() -> Measures | InputError:
             try:
                 return engine.measure(sheet.result, region=region)
             except InputError as error:
                 return error
 
-        def show(measures: engine.Measures | InputError) -> None:
+        def show(measures: Measures | InputError) -> None:
             if (now, region) != (self._session.now, self._session.measured):
                 return
             if isinstance(measures, InputError):
