@@ -23,6 +23,7 @@ tilt = "2.5deg"
 pixel-size = "0.03mm,40um"
 region = "100,50,64x48"
 frames = "10:200"
+verify = false
 
 [press]
 event = "release"
@@ -80,6 +81,7 @@ def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
         "pixel_size": (0.03, pytest.approx(0.04)),
         "region": Region(rows=(50, 98), columns=(100, 164)),
         "frames": (10, 200),
+        "verify": False,
     }
     assert plan.press == {
         "event": "release",
