@@ -391,7 +391,6 @@ def _checked_push(method: Callable[..., None]) -> Callable[..., None]:
     """Return a method ``push`` that checks its arguments, and counts frames."""
 
     @wraps(method)
-    @computation()
     def push(self: Operation, frames: Any, **given: Any) -> None:
         if self._pushing:  # by the push of a subclass
             method(self, frames, **given)
@@ -419,7 +418,6 @@ def _checked_result(method_name: str, method: Callable[..., Any]) -> Callable[..
     """Return a method ``result`` or ``finish`` whose maps are checked against their declarations."""
 
     @wraps(method)
-    @computation()
     def result(self: Operation) -> Result:
         name = type(self).__name__
         self.check_count()

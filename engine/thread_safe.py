@@ -9,6 +9,8 @@ from functools import cached_property, wraps
 from types import FunctionType
 from typing import Any, Self
 
+from mirrorskin.io.interpreter_end import computation
+
 
 class ThreadSafe:
     """Base of classes whose objects may be used by several threads at once.
@@ -16,7 +18,7 @@ class ThreadSafe:
     One thread at a time runs the public methods and properties of an object; others wait. A display may
     therefore call ``result()`` while another thread pushes, and gets the maps of all completed pushes.
     Methods may call other methods of the same object. Public methods of subclasses are wrapped when the class
-    is created. Plain attributes are not locked.
+    is created. Plain attributes are not locked. Methods are computations of `mirrorskin.io.interpreter_end`.
 
     Examples
     --------
@@ -66,7 +68,7 @@ def _guarded(member: Any) -> Any:
 def _locked(function: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(function)
     def locked(self: ThreadSafe, /, *args: Any, **kwargs: Any) -> Any:
-        with self._thread_lock:
+        with computation(), self._thread_lock:
             return function(self, *args, **kwargs)
 
     return locked

@@ -16,7 +16,6 @@ from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.provenance import describe, naming
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, LiveSource, Result
-from mirrorskin.io.interpreter_end import computation
 from mirrorskin.io.layout import POSITIONS
 
 _FRAMES = 64  # largest number of frames of a push
@@ -89,7 +88,6 @@ class LiveOperation(ThreadSafe):
         with naming(self._source):
             self.operation.push(frames, **positions)
 
-    @computation()
     def maps(self, seconds: float = math.inf, /) -> Maps:
         """Return the maps of the frames so far for a display; none before they are determined."""
         try:
@@ -108,7 +106,6 @@ class LiveOperation(ThreadSafe):
         available = {**maps, "contact_area": area}.items()
         return cast(Maps, {name: value for name, value in available if value is not None})
 
-    @computation()
     def spare(self, seconds: float) -> None:
         """Do low-priority work, for some seconds at most."""
         self.operation.spare(seconds)
