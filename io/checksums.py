@@ -76,15 +76,16 @@ class Verifier:
         if not left.any():
             reader.fetch(spans, out)
             return
-        length, size = reader.length, out[:1].nbytes
-        step = max(1, _PIECE // (length * size)) * length
+        cores, length, size = usable_cores(), reader.length, out[:1].nbytes
+        # Chunks of a piece are decoded in parallel, so there are several for each core.
+        step = max(2 * cores, _PIECE // (length * size)) * length
         found: list[Future[NDArray[np.uint32]]] = []
-        with ThreadPoolExecutor(usable_cores(), "mirrorskin-checksums") as pool:
+        with ThreadPoolExecutor(cores, "mirrorskin-checksums") as pool:
             for place in range(first // step * step, stop, step):
                 start, end = max(place, first), min(place + step, stop)
                 piece = out[start - first : end - first]
                 reader.fetch([(start, end), *part], piece)
-                found += [pool.submit(checksums, one) for one in np.array_split(piece, usable_cores())]
+                found += [pool.submit(checksums, one) for one in np.array_split(piece, cores)]
         values = np.concatenate([one.result() for one in found])
         damaged = first + np.flatnonzero(left & (values[: len(left)] != self._expected[first:stop]))
         if damaged.size:
