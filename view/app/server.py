@@ -225,8 +225,8 @@ def _is_open(request: Any, sessions: Sequence[Any]) -> bool:
     from bokeh.util.token import get_session_id
 
     try:
-        number = get_session_id(request.headers.get("Sec-WebSocket-Protocol", "").split(", ")[-1])
-    except ValueError:
+        number = get_session_id(request.headers.get("Sec-WebSocket-Protocol", "").split(",")[-1].strip())
+    except (ValueError, KeyError, TypeError):
         return False
     return any(number == session.id for session in sessions)
 
