@@ -15,7 +15,7 @@ from mirrorskin.engine.provenance import attach_provenance, naming
 from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import Calibrated, InputError, Result
 from mirrorskin.io.findings import merged, warn, with_findings
-from mirrorskin.io.interpreter_end import computation
+from mirrorskin.io.interpreter_end import computes
 from mirrorskin.io.types import exclusive_use
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ class Method(OnDevice):
         """Return the plan for a source whose frames arrive while the body moves."""
         return self.plan(source)
 
-    @computation()
+    @computes
     def run(self, source: Source, progress: Progress | None = None, *, undistort: bool = True) -> Result:
         """Reconstruct a source.
 

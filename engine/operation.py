@@ -19,7 +19,7 @@ from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import unknown_argument
 from mirrorskin.io.findings import warn
-from mirrorskin.io.interpreter_end import computation
+from mirrorskin.io.interpreter_end import computes
 from mirrorskin.io.layout import as_series
 from mirrorskin.io.maps import SIGMA, UNDECLARED, declaration_of
 from mirrorskin.io.positions import step_in_degrees
@@ -677,7 +677,7 @@ def array_function(
         given_positions = {one: values for one, values in where.items() if values is not None}
         return apply(operation(memory_limit=limit_of(frames), **given), frames, **given_positions)
 
-    @computation()
+    @computes
     def function(*args: Any, **kwargs: Any) -> Result:
         if unknown := next((one for one in kwargs if one not in signature.parameters), ""):
             raise TypeError(unknown_argument(f"{name}()", unknown, [*signature.parameters]))

@@ -18,7 +18,7 @@ from mirrorskin.engine.streaming import Progress, feed
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.arguments import as_array, is_array
 from mirrorskin.io.findings import in_process, warn
-from mirrorskin.io.interpreter_end import computation
+from mirrorskin.io.interpreter_end import computes
 from mirrorskin.io.layout import as_series
 from mirrorskin.io.own_class import load_class
 from mirrorskin.io.types import exclusive_use
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mirrorskin.io import Source
 
 
-@computation()
+@computes
 def run(
     source: Source | Iterable[ArrayLike],
     operation: Operation | type[Operation],

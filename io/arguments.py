@@ -85,7 +85,6 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
         takes_any = any(one.kind is one.VAR_KEYWORD for one in parameters)
 
         @functools.wraps(function)
-        @computation()
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
             given: list[Any] = list(args)
             for index, name, check in known:
@@ -100,7 +99,8 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
                 and (unknown := next((one for one in kwargs if one not in places), ""))
             ):
                 raise TypeError(unknown_argument(f"{function.__name__}()", unknown, [*places]))
-            return function(*given, **kwargs)
+            with computation():
+                return function(*given, **kwargs)
 
         return call
 

@@ -10,8 +10,12 @@ import concurrent.futures.thread  # noqa: F401  # its pools end after what is re
 import functools
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _LONGEST_WAIT = 10.0  # seconds that the end is delayed at most
 _PAUSE = 5.0  # seconds in which the interpreter ends
@@ -38,6 +42,17 @@ def computation() -> Iterator[None]:
         yield
     finally:
         _count(-1)
+
+
+def computes(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate a function that is a computation."""
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        with computation():
+            return function(*args, **kwargs)
+
+    return call
 
 
 def _count(change: int) -> None:

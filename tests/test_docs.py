@@ -134,7 +134,7 @@ def test_options_that_a_page_names_exist(page):
 @pytest.mark.parametrize("page", NAMING, ids=lambda page: page.name)
 def test_source_files_that_a_page_names_exist(page):
     named = {text for text in named_in(page) if re.fullmatch(r"[\w/.-]+\.(py|cl|clh)", text)}
-    named = {name for name in named if Path(name).stem not in ("NAME", "mine", "lab")}  # the user's
+    named = {name for name in named if Path(name).stem not in ("FILE", "NAME", "mine", "lab")}  # the user's
     assert {name for name in named if not any(path.endswith(f"/{name}") for path in SOURCES)} == set()
 
 
