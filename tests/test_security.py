@@ -89,6 +89,7 @@ def strange_folder(tmp_path, monkeypatch):
     for name in {*packages_distributions(), *sys.stdlib_module_names, "cupy", "torch", "sitecustomize"}:
         Path(f"{name}.py").write_text("open(f'{__file__}.run', 'w').close()")
     Path("mine.py").write_text(OWN)
+    Path("matplotlibrc").write_text("text.usetex: True")  # runs LaTeX
     return tmp_path
 
 
@@ -108,7 +109,7 @@ def test_no_module_of_the_current_folder_runs(strange_folder, tmp_path_factory, 
     if "--workers" in lines:
         assert list(strange_folder.glob("out/*.h5"))
     else:
-        assert {"points.h5", "press-Mine.h5", "surface.ply"} <= {
+        assert {"points.h5", "press-Mine.h5", "maps.png", "surface.ply"} <= {
             path.name for path in strange_folder.iterdir()
         }
 

@@ -56,7 +56,7 @@ def new_figure(width: float, height: float) -> Figure:
     import matplotlib
     from matplotlib.figure import Figure
 
-    if Path(matplotlib.matplotlib_fname()).parent == Path.cwd():  # perhaps of a stranger
+    if Path(matplotlib.matplotlib_fname()).absolute().parent == Path.cwd():  # perhaps of a stranger
         matplotlib.rcParams["text.usetex"] = False  # which runs LaTeX
     return Figure(figsize=(width, height), layout="constrained")
 

@@ -15,7 +15,7 @@ import socket
 import threading
 import webbrowser
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.util import find_spec
@@ -238,9 +238,10 @@ def _hide_in_logs(secret: str) -> Callable[..., logging.LogRecord]:
 
     def make_without(*args: Any, **kwargs: Any) -> logging.LogRecord:
         record = make(*args, **kwargs)
-        message = record.getMessage()
-        if secret in message:
-            record.msg, record.args = message.replace(secret, "..."), ()
+        with suppress(Exception):  # handlers report messages that do not fit their values
+            message = record.getMessage()
+            if secret in message:
+                record.msg, record.args = message.replace(secret, "..."), ()
         if record.exc_info and record.exc_info[0] is not None:
             record.exc_text = traceback(record.exc_info).replace(secret, "...")
         return record
