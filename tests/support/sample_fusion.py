@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import warnings
 from functools import cache
+from unittest import mock
 
 import numpy as np
 
@@ -19,8 +20,8 @@ from mirrorskin.cli import sample
 @cache
 def sources_of(seed: int) -> tuple[hw.Twin, hw.Twin]:
     """Return the press and the turn of the sample, with another seed."""
-    sample._SEED = seed
-    return sample._pressed(), sample._twin(10.0, sample._turn(1.5), pattern="linear")
+    with mock.patch.object(sample, "_SEED", seed):
+        return sample._pressed(), sample._twin(10.0, sample._turn(1.5), pattern="linear")
 
 
 def of_recordings(seed: int) -> io.Result:
