@@ -294,13 +294,13 @@ def _write_long(press: Frames, path: Path) -> None:
     import h5py
     import hdf5plugin
 
-    from mirrorskin.io.layout import SERIES, STACK
+    from mirrorskin.io.layout import CHECKSUM, SERIES, STACK
 
     record(press.first(2), path)
     block, travel = press.block, SERIES["travel"][0]
     chunk = tuple(max(1, length // 8) for length in press.shape)
     with h5py.File(path, "r+") as file:
-        del file[STACK], file[travel]
+        del file[STACK], file[travel], file[CHECKSUM]
         file[travel] = block.travel
         file[travel].attrs["units"] = "mm"
         packing = hdf5plugin.Bitshuffle(cname="lz4")
