@@ -65,8 +65,7 @@ def press(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("repetition", range(3))
-def test_a_program_ends_while_daemon_threads_compute(press, repetition):
+def test_a_program_ends_while_daemon_threads_compute(press):
     ended = subprocess.run(
         [sys.executable, "-P", "-c", EXITING, press], capture_output=True, text=True, timeout=120
     )
