@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import pictures
-from mirrorskin.io.arguments import check_flag, check_kind, check_path, checked
+from mirrorskin.io.arguments import check_flag, check_kind, check_path, checked, unknown_argument
 from mirrorskin.io.atomic import write_new
-from mirrorskin.io.export_formats import FORMATS
+from mirrorskin.io.export_formats import FORMATS, ExportFormat, suffixes_with
 from mirrorskin.io.findings import warnings_in
 from mirrorskin.io.mesh import Mesh, face_vectors, normals_around, surface_mesh
 from mirrorskin.io.result import Result
@@ -37,14 +37,22 @@ _STL_HEAD = 80  # bytes of free text, which must not begin with "solid", the mar
 _PNG_KEYWORDS = {_SOURCE: "Title", _DATE: "Creation Time", _SOFTWARE: "Software"}
 _CENTIMETRE = 10.0  # mm
 _METRE = 1e-3  # m per mm
+_REMEDY = "or export its maps as .npz"
 _NO_DATA = 42113  # GDAL's tag for the value of holes
 
 
-@checked(result=check_kind(Result), path=check_path, points=check_flag, float32=check_flag)
+@checked(
+    result=check_kind(Result),
+    path=check_path,
+    map_name=check_kind(str),
+    points=check_flag,
+    float32=check_flag,
+)
 def export_result(
     result: Result,
     path: str | Path,
     *,
+    map_name: str = "",
     section: Mapping[str, NDArray[Any]] | None = None,
     points: bool = False,
     float32: bool = False,
@@ -62,6 +70,9 @@ def export_result(
         scale, 0 for undefined; ``.csv``, heights as a matrix in mm, or a cross-section; ``.npz``, all maps as
         plain arrays; ``.mcap``, ROS 2 messages, as written by ``save_messages``; ``.zarr``, everything in a
         result file, as written by ``save_zarr``.
+    map_name : str, optional
+        Name of a map, built-in or declared, which a ``.csv``, a ``.tif`` (float32) or an ``.npz`` contains
+        instead, in its unit.
     section : mapping of ndarray, (n,), optional
         Columns of a cross-section, for a ``.csv``; lengths in mm, and ``filled`` is 1 where a height was not
         measured.
@@ -88,9 +99,11 @@ def export_result(
     '1860 triangles between 961 points, 3 x 3 x 0.5 mm'
     """
     path = path_of(path)
-    check_export(result, path)
+    check_export(result, path, map_name)
+    if map_name and section is not None:
+        raise InputError(f"{path}: a cross-section is of the heights. Leave out the section or the map")
     form = FORMATS[path.suffix.lower()]
-    given = {"section": section, "points": points, "float32": float32}
+    given = {"map_name": map_name, "section": section, "points": points, "float32": float32}
     options = {name: value for name, value in given.items() if value and name in form.options}
     module, _, function = form.encoder.partition(":")
     encode = getattr(import_module(f"mirrorskin.io.{module}"), function)
@@ -103,12 +116,13 @@ def export_result(
             raise InputError(f"{path}: {error}") from error
         write_new(path, parts)
     unknown = result.offset_unknown
-    relative = form.needs_heights and unknown is not None and unknown.any()
+    heights = form.needs_heights and map_name in ("", result.name_of("height"))
+    relative = heights and unknown is not None and unknown.any()
     return f"{holds}, heights {_height_datum(result)}" if relative else holds
 
 
-def check_export(result: Result, path: str | Path) -> None:
-    """Raise InputError for a result that cannot be exported to a path, before any work is done."""
+def check_export(result: Result, path: str | Path, map_name: str = "") -> None:
+    """Raise InputError for a result, or a map, that cannot be exported to a path, before any work is done."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         wrong = f"{suffix} is not a supported format" if suffix else "its name has no suffix"
@@ -116,20 +130,37 @@ def check_export(result: Result, path: str | Path) -> None:
     form = FORMATS[suffix]
     if form.package and find_spec(form.package) is None:
         raise InputError(f"{path} needs the package {form.package}: pip install 'mirrorskin[{form.extra}]'")
-    if form.needs_heights:
+    if map_name:
+        _check_map(result, path, map_name, form)
+    elif form.needs_heights:
         check_heights(result, path)
+
+
+def _check_map(result: Result, path: str | Path, map_name: str, form: ExportFormat) -> None:
+    """Raise InputError for a map that the result lacks, or that a format cannot hold."""
+    if "map_name" not in form.options:
+        raise InputError(f"{path} takes no map: choose {', '.join(suffixes_with('map_name'))}")
+    if map_name not in result.maps():
+        raise InputError(f"{path}: {unknown_argument('the result', map_name, [*result.maps()], 'map')}")
+    if form.needs_heights:
+        if result.declaration(map_name).components:
+            raise InputError(f"{path}: {map_name} has vectors: export it as .npz")
+        _check_millimetres(result, path)
 
 
 def check_heights(result: Result, path: str | Path) -> None:
     """Raise InputError for a result without heights in millimetres."""
-    remedy = "or export its maps as .npz"
     if result.height is None:
-        raise InputError(f"{path}: the result has no heights: reconstruct it again with them, {remedy}")
+        raise InputError(f"{path}: the result has no heights: reconstruct it again with them, {_REMEDY}")
     if not np.isfinite(result.height).any():
-        raise InputError(f"{path}: no pixel of the result has a height: look at its status, {remedy}")
+        raise InputError(f"{path}: no pixel of the result has a height: look at its status, {_REMEDY}")
+    _check_millimetres(result, path)
+
+
+def _check_millimetres(result: Result, path: str | Path) -> None:
     if result.x is None or result.y is None:
         again = "reconstruct it again with --pixel-size"
-        raise InputError(f"{path} needs millimetres, and the result has no pixel size: {again}, {remedy}")
+        raise InputError(f"{path} needs millimetres, and the result has no pixel size: {again}, {_REMEDY}")
 
 
 def save_table(
@@ -242,23 +273,26 @@ def encode_obj(result: Result) -> Encoded:
     return Encoded([file.getvalue()], _size(mesh))
 
 
-def encode_csv(result: Result, section: Mapping[str, NDArray[Any]] | None = None) -> Encoded:
-    """Encode the heights as a matrix in mm, NaN where undefined; or the columns of a cross-section."""
+def encode_csv(
+    result: Result, section: Mapping[str, NDArray[Any]] | None = None, map_name: str = ""
+) -> Encoded:
+    """Encode the heights or a map as a matrix, NaN where undefined; or the columns of a cross-section."""
     if section is not None:
         units = {name: "mm" for name in section if name != "filled"}
         text = _table(section, units, notes_of(result))
         return Encoded([text], f"{len(section['height'])} points of a cross-section")
-    height, x, y = grid_of(result)
+    values, x, y = grid_of(result, map_name)
     width, step = pixel_size_of(x, y)
+    what = what_is(result, map_name)
     notes = {
-        "content": "heights in mm, a row of the picture per line, from the top",
+        "content": f"{what}, a row of the picture per line, from the top",
         "pixel size": f"{width!r} x {step!r} mm (x, y)",
         "first value": f"x = {float(x[0])!r} mm, y = {float(y[0])!r} mm; y decreases from line to line",
     }
     text_file = _commented(notes | notes_of(result))
-    np.savetxt(text_file, height, "%.9g", delimiter=",")
-    rows, columns = height.shape
-    return Encoded([text_file.getvalue().encode()], f"{rows} x {columns} heights in mm")
+    np.savetxt(text_file, values, "%.9g", delimiter=",")
+    rows, columns = values.shape
+    return Encoded([text_file.getvalue().encode()], f"{rows} x {columns} {what}")
 
 
 def encode_xyz(result: Result) -> Encoded:
@@ -285,18 +319,18 @@ def encode_png(result: Result) -> Encoded:
     return Encoded(pictures.encode_png(counts.values, size, _texts(counts, notes)), str(counts))
 
 
-def encode_tiff(result: Result, float32: bool = False) -> Encoded:
-    """Encode heights as a grey picture of 16 bits, or of float32 in mm.
+def encode_tiff(result: Result, float32: bool = False, map_name: str = "") -> Encoded:
+    """Encode heights as a grey picture of 16 bits, or of float32 in mm; a map in float32 in its unit.
 
     Its resolution is in pixels per centimetre, GDAL's tag marks holes, and the scale of heights is in a
     description that ImageJ reads to display millimetres.
     """
     import tifffile
 
-    if float32:
+    if float32 or map_name:
         from mirrorskin.io.topography import encode_float_tiff
 
-        return encode_float_tiff(result)
+        return encode_float_tiff(result, map_name)
     counts, notes = _counts(result), notes_of(result)
     width, height = counts.pixel_size
     file = BytesIO()
@@ -314,23 +348,24 @@ def encode_tiff(result: Result, float32: bool = False) -> Encoded:
     return Encoded([file.getvalue()], str(counts))
 
 
-def encode_npz(result: Result) -> Encoded:
-    """Encode the maps, the positions of the pixels, and JSON texts of units, legends and process.
+def encode_npz(result: Result, map_name: str = "") -> Encoded:
+    """Encode all maps or one, positions of the pixels, and JSON texts of units, legends, process and fitted.
 
     It can be loaded without ``allow_pickle``.
     """
     axes = {name: values for name, values in (("x", result.x), ("y", result.y)) if values is not None}
-    arrays: dict[str, Any] = {**result, **axes}
-    declared = {name: result.declaration(name) for name in result}
+    kept: dict[str, Any] = {map_name: result[map_name]} if map_name else {**result}
+    arrays, declared = {**kept, **axes}, {name: result.declaration(name) for name in kept}
     texts = {
         "units": {name: one.unit for name, one in declared.items() if one.unit} | dict.fromkeys(axes, "mm"),
         "legends": {name: one.codes for name, one in declared.items() if one.codes},
         "process": dict(result.process),
+        "fitted": result.fitted.values(),
     }
     arrays |= {name: json.dumps(text) for name, text in texts.items()}
     file = BytesIO()
     np.savez(file, **arrays)
-    return Encoded([file.getvalue()], ", ".join(result.maps()))
+    return Encoded([file.getvalue()], map_name or ", ".join(result.maps()))
 
 
 def notes_of(result: Result) -> dict[str, str]:
@@ -342,7 +377,8 @@ def notes_of(result: Result) -> dict[str, str]:
         notes[_SOFTWARE] = one_line(maker)
     if warnings := warnings_in(process):
         notes["warnings"] = one_line("; ".join(warnings))
-    notes["heights"] = _height_datum(result)
+    if result.height is not None:
+        notes["heights"] = _height_datum(result)
     if result.height is not None and result.filled is not None and result.filled.any():
         known = np.isfinite(result.height)
         filled, of = np.count_nonzero(known & (result.filled > 0)), np.count_nonzero(known)
@@ -363,12 +399,22 @@ def _ascii(text: str) -> str:
     return text.encode("ascii", "backslashreplace").decode()
 
 
-def grid_of(result: Result) -> tuple[NDArray[np.float32], Floats, Floats]:
-    """Return the heights, (H, W), and the positions of columns and rows, mm."""
-    assert result.height is not None
+def grid_of(result: Result, map_name: str = "") -> tuple[NDArray[np.float32], Floats, Floats]:
+    """Return the heights or a map, (H, W), NaN where undefined, and the positions of columns and rows, mm."""
+    name = map_name or result.name_of("height")
+    assert name is not None
     assert result.x is not None
     assert result.y is not None
-    return result.height, result.x, result.y
+    values, declared = result[name], result.declaration(name)
+    if declared.undefined is not None:
+        values = np.where(declared.has_answer(values), values, np.float32(np.nan))
+    return values, result.x, result.y
+
+
+def what_is(result: Result, map_name: str = "") -> str:
+    """Return the name and the unit of the values of an export: those of the heights, or of a map."""
+    unit = result.declaration(map_name).unit if map_name else "mm"
+    return " in ".join(filter(None, [map_name or "heights", unit]))
 
 
 def points_of(result: Result, pixels: NDArray[np.int64] | None = None) -> dict[str, NDArray[Any]]:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.arguments import as_array
+from mirrorskin.io.arguments import as_array, unknown_argument
 from mirrorskin.io.findings import warnings_in
+from mirrorskin.io.fitted import Fitted, taken_from
 from mirrorskin.io.maps import FILLED_SHADES, Map, declaration_of
 from mirrorskin.io.opencv import encode
 from mirrorskin.io.result import Result, Shown, map_shape, may_name_a_map
@@ -71,8 +72,8 @@ def plot(result: Shown, name: str | None, axes: Axes | None) -> Axes:
     maps = result.maps()
     chosen = _first(result) if name is None else name
     if chosen not in maps or maps[chosen].ndim != 2:
-        pictures = ", ".join(one for one, values in maps.items() if values.ndim == 2)
-        raise InputError(f"there is no map {chosen!r} to draw: choose from {pictures or 'none'}")
+        pictures = [one for one, values in maps.items() if values.ndim == 2]
+        raise InputError(unknown_argument("the result", str(chosen), pictures, "picture"))
     x, y = (getattr(result, one, None) for one in "xy")
     extent = None
     if x is not None and y is not None:
@@ -96,6 +97,7 @@ def plot(result: Shown, name: str | None, axes: Axes | None) -> Axes:
 
 
 _DECLARATION = "declaration"  # attribute of a variable that is not declared in the table
+_FITTED = "fitted"  # attribute of a dataset of ours
 
 
 def as_xarray(result: Result) -> xarray.Dataset:
@@ -117,7 +119,8 @@ def as_xarray(result: Result) -> xarray.Dataset:
             attributes[_DECLARATION] = declared.encode()
         data[name] = (dimensions, values, attributes)
         coordinates |= components
-    return xarray.Dataset(data, coordinates, attrs=dict(result.process))
+    known = {_FITTED: result.fitted.encode()} if result.fitted.values() else {}
+    return xarray.Dataset(data, coordinates, attrs={**result.process, **known})
 
 
 def _dimensions(
@@ -159,7 +162,13 @@ def from_xarray(dataset: xarray.Dataset) -> Result:
         if name in dataset.variables
     }
     process = {str(name): one for name, one in dataset.attrs.items()}
-    return Result(maps, x=axes.get("x"), y=axes.get("y"), process=process, declarations=declarations)
+    stored = process.pop(_FITTED, None)
+    try:
+        fitted = taken_from(process) if stored is None else Fitted.decode(str(stored))
+    except ValueError as error:
+        raise InputError(f"the dataset's attribute {_FITTED} is no JSON text. Remove it") from error
+    places: dict[str, Any] = {name: axes.get(name) for name in "xy"}
+    return Result(maps, **places, process=process, fitted=fitted, declarations=declarations)
 
 
 def _as_picture(dataset: xarray.Dataset) -> xarray.Dataset:

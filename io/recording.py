@@ -40,16 +40,15 @@ from mirrorskin.io.layout import (
     read_checksums,
     read_state,
 )
-from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions, along
 from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.result_file import MARK as RESULT_MARK
 from mirrorskin.io.result_file import open_result
 from mirrorskin.io.samples import Decoding, frame_dtype, order_of
-from mirrorskin.io.selection import Region, Selection, source_region
+from mirrorskin.io.selection import Region, Selection
 from mirrorskin.io.stack import Stack
+from mirrorskin.io.system import as_input_error
 from mirrorskin.io.types import (
-    UNDISTORTED,
     Block,
     Closing,
     Floats,
@@ -124,7 +123,7 @@ class Recording(Closing):
     storage: str
 
     rewindable = True
-    read_ahead = False
+    read_ahead = used_live = False
     left_out: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 
@@ -536,11 +535,11 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
             height, part = None if recording.truth is None else recording.truth.height, None
     else:
         result = open_result(path)
-        if result.process.get(UNDISTORTED):
+        if result.fitted.undistorted:
             remedy = "give one that was computed without a scale in its calibration"
             raise InputError(f"{path} contains undistorted heights, but frames are not undistorted: {remedy}")
         height = absolute_heights(result)
-        part = source_region(result.process)
+        part = result.fitted.region
     if height is None:
         raise InputError(f"{path} contains no heights: give a result of a press, or a simulation with truth")
     if source is not None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.io.arguments import unknown_argument
 from mirrorskin.io.findings import merged
+from mirrorskin.io.fitted import Fitted, taken_from
 from mirrorskin.io.maps import (
     SIGMA,
     UNDECLARED,
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 
     from mirrorskin.io.calibration.types import Calibration
 
-FIELDS = ("x", "y", "process", "calibration", "declarations")
+FIELDS = ("x", "y", "process", "fitted", "calibration", "declarations")
 """Contents of a result other than maps."""
 
 RESERVED = frozenset(
@@ -37,6 +39,7 @@ RESERVED = frozenset(
 )
 """Names that maps cannot have, because files use them for other purposes."""
 
+_UNKNOWN = Fitted()
 _FEW_GAPS = 16  # maximum number of gaps between codes that are searched one by one
 
 
@@ -115,7 +118,9 @@ class Result(Shown, Mapping[str, Any]):
     x, y : ndarray, (W,) and (H,), float64, optional
         Millimetres of the pixel centres from the picture's centre; y points up the picture.
     process : mapping, optional
-        Program, version, date, all parameters, device, source and its hash.
+        Program, version, date, all parameters, device, source and its hash, for display.
+    fitted : Fitted, optional
+        What later stages need to know of the maps, such as the tilt of a rotation.
     calibration : Calibration, optional
         The calibration used, for the camera's whole picture.
     declarations : mapping of str to Map, optional
@@ -140,11 +145,12 @@ class Result(Shown, Mapping[str, Any]):
     (True, 'mm')
     """
 
-    __slots__ = ("_maps", "_on_device", "calibration", "declarations", "process", "x", "y")
+    __slots__ = ("_maps", "_on_device", "calibration", "declarations", "fitted", "process", "x", "y")
 
     x: Floats | None
     y: Floats | None
     process: Mapping[str, ProcessValue]
+    fitted: Fitted
     calibration: Calibration | None
     declarations: Mapping[str, Map]
 
@@ -156,6 +162,7 @@ class Result(Shown, Mapping[str, Any]):
         x: Floats | None = None,
         y: Floats | None = None,
         process: Mapping[str, ProcessValue] | None = None,
+        fitted: Fitted = _UNKNOWN,
         calibration: Calibration | None = None,
         declarations: Mapping[str, Map] | None = None,
         **named: Any,
@@ -170,6 +177,7 @@ class Result(Shown, Mapping[str, Any]):
             "x": x,
             "y": y,
             "process": process or {},
+            "fitted": fitted,
             "calibration": calibration,
             "declarations": known,
         }.items():
@@ -195,8 +203,7 @@ class Result(Shown, Mapping[str, Any]):
             return self[own]
         if is_builtin(name):
             return None
-        has = ", ".join(self._maps) or "no maps"
-        raise AttributeError(f"the result has no map {name!r}: it has {has}")
+        raise AttributeError(unknown_argument("the result", name, [*self._maps], "map"))
 
     def __setattr__(self, name: str, value: object) -> NoReturn:
         raise AttributeError(f"results are read-only: use result.assign({name}=...)")
@@ -240,7 +247,8 @@ class Result(Shown, Mapping[str, Any]):
         maps : mapping of str to ndarray or float, optional
             The warnings and notes of a result are added to those of this one.
         **changes
-            Maps by name or quantity; ``x``, ``y``, ``process``, ``calibration`` and ``declarations``.
+            Maps by name or quantity; ``x``, ``y``, ``process``, ``fitted``, ``calibration`` and
+            ``declarations``.
             Declarations are added to those of the result.
 
         Examples
@@ -261,6 +269,21 @@ class Result(Shown, Mapping[str, Any]):
         changed._on_device.update(kept)
         return changed
 
+    def with_fitted(self, **values: Any) -> Result:
+        """Return a copy in which values of ``fitted`` are replaced, which ``process`` shows, too.
+
+        Examples
+        --------
+        >>> turn = Result(zenith=np.zeros((2, 3), np.float32)).with_fitted(tilt=0.05)
+        >>> turn.fitted.tilt, turn.process
+        (0.05, {'tilt': 0.05})
+        """
+        return self.assign(fitted=replace(self.fitted, **values), process={**self.process, **values})
+
+    def with_process(self, process: Mapping[str, ProcessValue]) -> Result:
+        """Return a copy with another process; what `Fitted` declares of it is in ``fitted``, if unknown."""
+        return self.assign(fitted=taken_from(process) | self.fitted, process=process)
+
     def on_device(self, name: str) -> Any:
         """Return a map as a `mirrorskin.kernels.array.Array`, or None if it is not on a device.
 
@@ -276,7 +299,10 @@ class Result(Shown, Mapping[str, Any]):
         >>> fit.on_device("mean").shape, fit.mean[0, 0]
         ((2, 3), np.float32(1.0))
         """
-        return self._on_device.get(self._own_name(name))
+        own = self._own_name(name)
+        if own not in self._maps and not is_builtin(name):
+            raise InputError(unknown_argument("the result", name, [*self._maps], "map"))
+        return self._on_device.get(own)
 
     def maps(self) -> dict[str, NDArray[Any]]:
         """Return the maps, by name: built-in ones in the order of the table, then others."""
@@ -310,7 +336,7 @@ class Result(Shown, Mapping[str, Any]):
     def to_xarray(self) -> xarray.Dataset:
         """Return the result as an `xarray.Dataset`: coordinates ``x`` and ``y`` in mm, units as attributes.
 
-        The process becomes the dataset's attributes. It needs the package xarray:
+        The process and ``fitted`` become the dataset's attributes. It needs the package xarray:
         ``pip install 'mirrorskin[xarray]'``.
 
         Examples
@@ -348,12 +374,13 @@ def result_of(
     process: Mapping[str, ProcessValue],
     declarations: Mapping[str, Map] | None = None,
 ) -> Result:
-    """Return a result with copies of maps, checked against their declarations.
+    """Return a result with maps that are checked against their declarations.
 
     Parameters
     ----------
     maps : mapping of array_like, (H, W), or of vectors, (H, W, components)
-        Built-in and declared maps are converted to the declared type.
+        Built-in and declared maps are converted to the declared type; an array on a device that has this type
+        stays there.
     shape : (int, int)
     process : mapping
     declarations : mapping of str to Map, optional
@@ -373,11 +400,11 @@ def result_of(
     if not isinstance(declarations, Mapping):
         raise InputError(f"maps are declared as {declarations!r:.40}. Use a dictionary of names and Map(...)")
     check_maps(declarations, *maps)
-    copies = {
-        name: _checked_map(name, np.array(values), declaration_of(name, declarations), shape)
+    checked = {
+        name: _checked_map(name, values, declaration_of(name, declarations), shape)
         for name, values in maps.items()
     }
-    return Result(copies, process=process, declarations=declarations)
+    return Result(checked, process=process, declarations=declarations)
 
 
 def check_maps(declarations: Mapping[str, Map], *others: str) -> None:
@@ -389,11 +416,14 @@ def check_maps(declarations: Mapping[str, Map], *others: str) -> None:
             raise InputError(f"a map cannot be called {name!r}: use letters, digits and _, but not {taken}")
 
 
-def _checked_map(name: str, values: NDArray[Any], declared: Map, shape: tuple[int, int]) -> Any:
+def _checked_map(name: str, values: Any, declared: Map, shape: tuple[int, int]) -> Any:
     """Return a map in its declared type; raise InputError if its shape or values do not fit."""
     size = (*shape, len(declared.components)) if declared.components else shape
+    if hasattr(values, "read") and (values.shape, values.dtype) == (size, np.dtype(declared.dtype)):
+        return values
+    values = np.asarray(values)
     if declared.axes != "pixels":
-        size = () if declared.axes == "none" else values.shape[:1] or (1,)
+        size = () if declared.axes == "none" else (*values.shape[:1],) or (1,)
     own = values.shape[1:] if declared.per_frame and values.ndim > len(size) else values.shape
     if values.dtype.kind not in "buif" or own != size:
         raise InputError(f"map {name} is {values.dtype} {values.shape}: numbers {size} are needed")
@@ -437,6 +467,29 @@ def absolute_heights(result: Result) -> NDArray[np.float32] | None:
     if height is None or piece is None or unknown is None or not unknown.any():
         return height
     return np.where((piece >= 0) & (unknown[piece] == 0), height, np.float32(np.nan))
+
+
+def display_order(result: Result) -> list[str]:
+    """Return the names of the maps in the order in which a display offers them; it shows the first one.
+
+    Heights come first, then the other built-in maps in the order of the table, then others as declared. Maps
+    of codes, standard deviations, and maps that an overview omits come last.
+
+    Examples
+    --------
+    >>> declared = {"kind": Map(codes={0: "none", 1: "steel"}), "wear": Map(), "gloss": Map()}
+    >>> maps = {name: np.zeros((2, 3)) for name in ("gloss", "kind", "wear")}
+    >>> display_order(Result(maps, declarations=declared))
+    ['wear', 'gloss', 'kind']
+    """
+    height, own = result.name_of("height"), [*result.declarations]
+
+    def place(name: str) -> tuple[bool, bool, bool, int]:
+        one, builtin = result.declaration(name), is_builtin(name)
+        aside = bool(one.codes) or is_deviation(name) or not one.overview
+        return name != height, aside, not builtin, own.index(name) if name in own and not builtin else 0
+
+    return sorted(result.maps(), key=place)
 
 
 def may_name_a_map(name: str) -> bool:

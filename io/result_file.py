@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.arguments import check_flag, check_kind, check_path, checked
 from mirrorskin.io.atomic import Item, fixed_text, process_items, replaced_by_result, write_file
-from mirrorskin.io.calibration.file import CARRIED, calibration_items, carried_by
+from mirrorskin.io.calibration.file import (
+    CARRIED,
+    calibration_items,
+    carried_by,
+    read_record,
+    record_items,
+)
+from mirrorskin.io.fitted import Fitted
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape, read_process
 from mirrorskin.io.maps import (
     SIGMA,
@@ -37,7 +44,7 @@ from mirrorskin.io.url import is_zarr, path_of
 from mirrorskin.io.zarr import open_file
 
 MARK = "mirrorskin_result"
-_RESULT, _PROCESS, _OWN = "/entry/result", "/entry/process", "own_maps"
+_RESULT, _PROCESS, _FITTED, _OWN = "/entry/result", "/entry/process", "/entry/fitted", "own_maps"
 _DECLARATION = "declaration"  # attribute of a map that is not declared in the table
 _AGAIN = "reconstruct it again"
 _AXES = dict.fromkeys("xy", Map(unit="mm", dtype="float64"))
@@ -86,6 +93,7 @@ def _items(result: Result) -> Iterator[Item]:
     yield Item(_PROCESS, None, {"NX_class": "NXprocess"})
     yield from _map_items(result)
     yield from process_items(_PROCESS, result.process)
+    yield from record_items(result.fitted, _FITTED)
     if result.calibration is not None:
         yield from calibration_items(result.calibration, CARRIED)
     if result.height_sigma is not None:  # viewers use a dataset of this name for error bars
@@ -162,8 +170,9 @@ def open_result(path: str | Path) -> Result:
         process = read_process(file, _PROCESS)
         if _layout(file) < _LAYOUT and "status" in maps:
             declarations |= _status_of_layout_1(maps, process)
-        axes = {name: maps.pop(name, None) for name in _AXES}
-        return Result(maps, **axes, process=process, calibration=carried_by(file), declarations=declarations)
+        others: dict[str, Any] = {name: maps.pop(name, None) for name in _AXES}
+        others |= {"process": process, "fitted": read_record(file, _FITTED, Fitted, _AGAIN)}
+        return Result(maps, **others, calibration=carried_by(file), declarations=declarations)
 
 
 def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:

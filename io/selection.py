@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -99,20 +98,6 @@ class Region:
                     f"{name}: a region of {axis} {start} to {stop}, where the picture has {count}: "
                     f"give a start from 0 and a larger end up to {count}"
                 )
-
-
-def source_region(process: Mapping[str, object]) -> Region | None:
-    """Return the region of the picture from which a result was computed; None if it is unknown.
-
-    For a result of 'fuse', it is the common region of both recordings.
-
-    Examples
-    --------
-    >>> source_region({"source_region": "2,1,4x3"}).rows
-    (1, 4)
-    """
-    texts = (str(process.get(name, "")) for name in ("source_region", "vertical_source_region"))
-    return next((region for region in map(Region.read, texts) if region is not None), None)
 
 
 class Selection(NamedTuple):

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
@@ -33,6 +33,7 @@ ENTRY, CARRIED = "/entry", "/entry/calibration"
 """Group of the calibration in a calibration file, and of the copy in recordings and results."""
 
 _AGAIN = "calibrate again"
+T = TypeVar("T")
 
 
 def open_calibration(path: str | Path) -> Calibration:
@@ -189,9 +190,30 @@ def _part_items(part: Part, place: str, camera: CameraId) -> Iterator[Item]:
         yield Item(f"{place}/{name}", values, image | _units(one.unit))
 
 
+def record_items(record: Any, place: str) -> Iterator[Item]:
+    """Yield the known values of a record that `parameter` declares, in a group if there are any."""
+    known = {name: one for name, one in parameters(record).items() if getattr(record, name) is not None}
+    if known:
+        yield Item(place, None, {"NX_class": "NXcollection"})
+    for name, one in known.items():
+        yield Item(f"{place}/{name}", _values_of(getattr(record, name), one), _units(one.unit))
+
+
+def read_record(file: Hdf5File, place: str, kind: type[T], remedy: str) -> T:
+    """Read what `record_items` writes; InputError with a remedy if a value is damaged."""
+    values: dict[str, Any] = {}
+    for name, one in parameters(kind).items():
+        node = file.find(f"{place}/{name}")
+        if node is not None:
+            values[name] = _read_field(file, node, one, {}, remedy)
+    return kind(**values)
+
+
 def _values_of(value: Any, how: Parameter) -> NDArray[Any]:
     if how.kind in ("text", "names"):
         return fixed_text(value)
+    if how.kind == "flag":
+        return np.asarray(value)
     integer = how.kind in ("integer", "integers")
     return np.ascontiguousarray(value, np.int64 if integer else how.dtype).reshape(np.shape(value))
 
@@ -257,32 +279,36 @@ def _read_part(file: Hdf5File, group: Node, kind: type[Part], camera: CameraId) 
     return kind(**values)
 
 
-def _read_field(file: Hdf5File, node: Node, how: Parameter, sizes: dict[str, int]) -> Any:
+def _read_field(
+    file: Hdf5File, node: Node, how: Parameter, sizes: dict[str, int], remedy: str = _AGAIN
+) -> Any:
     value: Any
     if how.kind == "text":
         value = str(file.value(node))
     elif how.kind == "names":
-        value = file.texts(node, _AGAIN)
+        value = file.texts(node, remedy)
         if (len(value),) != _shape_of(how, (len(value),), sizes):
             raise InputError(
-                f"{file.where(node)} has {len(value)} names, others in its group more or less: {_AGAIN}"
+                f"{file.where(node)} has {len(value)} names, others in its group more or less: {remedy}"
             )
     elif how.kind == "mapping":
         value = {
-            key: float(file.read(file.follow(f"{node.name}/{key}", _AGAIN), (), remedy=_AGAIN))
+            key: float(file.read(file.follow(f"{node.name}/{key}", remedy), (), remedy=remedy))
             for key in file.names(str(node.name))
         }
     else:
         shape = _shape_of(how, getattr(node, "shape", None) or (), sizes)
-        value = file.read(node, shape, unit=how.unit or None, remedy=_AGAIN).astype(how.dtype, copy=False)
+        value = file.read(node, shape, unit=how.unit or None, remedy=remedy).astype(how.dtype, copy=False)
         if how.kind == "array" and not np.isfinite(value).all():
-            raise InputError(f"{file.where(node)} has numbers that are not finite: {_AGAIN}")
+            raise InputError(f"{file.where(node)} has numbers that are not finite: {remedy}")
         if how.kind in ("integer", "integers") and not np.isfinite(value).all():
             found = tuple(np.ravel(value).tolist())
-            raise InputError(f"{file.where(node)} is {found}, where whole numbers are needed: {_AGAIN}")
-        if how.kind in ("number", "numbers", "integer", "integers"):
+            raise InputError(f"{file.where(node)} is {found}, where whole numbers are needed: {remedy}")
+        if how.kind == "flag":
+            value = bool(value)
+        elif how.kind in ("number", "numbers", "integer", "integers"):
             number = int if how.kind.startswith("integer") else float
             value = tuple(map(number, value)) if how.kind.endswith("s") else number(value)
     if how.valid is not None and not how.valid(value):
-        raise InputError(f"{file.where(node)} is {value}, which is invalid: {_AGAIN}")
+        raise InputError(f"{file.where(node)} is {value}, which is invalid: {remedy}")
     return value

@@ -18,12 +18,13 @@ import numpy as np
 
 from mirrorskin.io.units import ratio
 
-Kind = Literal["map", "array", "number", "integer", "numbers", "integers", "text", "names", "mapping"]
+Kind = Literal["map", "array", "number", "integer", "flag", "numbers", "integers", "text", "names", "mapping"]
 
 _SHOWN = {"rad": "deg", "pixel": "px", "MPa": "kPa"}  # default units of tables and figures
 _KINDS: dict[str, Kind] = {
     "float": "number",
     "int": "integer",
+    "bool": "flag",
     "str": "text",
     "Floats": "array",
     "tuple[str, ...]": "names",
@@ -33,6 +34,7 @@ _FACTORS = {"%": 100.0, "px": 1.0, "deg": math.degrees(1)}  # for units that `ra
 _TYPES = {
     "number": "float",
     "integer": "int",
+    "flag": "bool",
     "text": "str",
     "names": "tuple of str",
     "mapping": "mapping of str to float",
@@ -93,6 +95,7 @@ class Parameter:
 
     def settled(self, annotation: str) -> Parameter:
         """Return the declaration of an attribute with this annotation."""
+        annotation = annotation.removesuffix(" | None")
         kind, shape, dtype = _KINDS.get(annotation), self.shape or (len(self.components),), self.dtype
         if annotation.startswith("tuple") and kind is None:
             kind, shape = "integers" if "int" in annotation else "numbers", (annotation.count(",") + 1,)
@@ -222,6 +225,7 @@ class Part:
                 yield Row(self.command, what, float(number) * factor, sigma, one.shown_unit, key)
 
 
+K = TypeVar("K")
 T = TypeVar("T", bound=Part)
 
 
@@ -234,13 +238,17 @@ def median(values: Any) -> float:
 @dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(parameter,))
 def part(cls: type[T]) -> type[T]:
     """Convert a class whose attributes are declared by `parameter` to a dataclass."""
-    made = dataclass(frozen=True, slots=True, eq=False)(cls)
+    return documented(dataclass(frozen=True, slots=True, eq=False)(cls))
+
+
+def documented(cls: type[K]) -> type[K]:
+    """Add the attributes declared by `parameter` to the docstring of a dataclass."""
     lines = ["Attributes", "----------"]
-    for name, one in parameters(made).items():
+    for name, one in parameters(cls).items():
         text = f"{one.text[:1].upper()}{one.text[1:]}."
         lines += [f"{name} : {one.described()}", textwrap.indent(textwrap.fill(text, _COLUMNS), "    ")]
-    made.__doc__ = "\n\n".join([inspect.cleandoc(made.__doc__ or ""), "\n".join(lines)])
-    return made
+    cls.__doc__ = "\n\n".join([inspect.cleandoc(cls.__doc__ or ""), "\n".join(lines)])
+    return cls
 
 
 def parameters(of: Any) -> dict[str, Parameter]:
