@@ -15,6 +15,7 @@ from .calibration.types import (
 from .description import describe
 from .export import export_result, save_table
 from .findings import Finding, MirrorskinWarning
+from .fitted import Fitted
 from .maps import Map
 from .mcap import save_messages
 from .mesh import Mesh, surface_mesh
@@ -47,6 +48,7 @@ __all__ = [
     "CameraId",
     "Check",
     "Finding",
+    "Fitted",
     "Gel",
     "Header",
     "InputError",

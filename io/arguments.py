@@ -6,7 +6,7 @@ import difflib
 import functools
 import inspect
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from numbers import Real
 from typing import Any, ParamSpec, TypeVar
 
@@ -52,13 +52,17 @@ def unknown_argument(owner: str, name: str, known: Collection[str], what: str = 
     >>> unknown_argument("find_onset()", "treshold", ["threshold", "hold"])
     'find_onset() has no argument treshold: did you mean threshold?'
     """
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
     remedy = f"it has {', '.join(known) or 'none'}"
-    if close:
-        remedy = f"did you mean {close[0]}?"
-    elif name in _ELSEWHERE:
+    if close := nearest(name, known):
+        remedy = f"did you mean {close}?"
+    elif what in ("argument", "option") and name in _ELSEWHERE:
         remedy = f"it is {_ELSEWHERE[name]}"
     return f"{owner} has no {what} {name}: {remedy}"
+
+
+def nearest(name: str, known: Iterable[str], similarity: float = 0.75) -> str:
+    """Return the name that a misspelt one is likely to mean; empty if none is as similar, from 0 to 1."""
+    return next(iter(difflib.get_close_matches(name, list(known), n=1, cutoff=similarity)), "")
 
 
 def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -240,6 +244,21 @@ def as_pixel_size(name: str, value: Any) -> tuple[float, float]:
         raise InputError(f"pixel size {size.tolist()}: one length in mm, or (x, y), is needed")
     width, height = np.broadcast_to(size, 2).tolist()
     return width, height
+
+
+def check_pixel_size(value: Any) -> tuple[float, float]:
+    """Return width and height of a pixel, mm; InputError unless they can be those of a pixel.
+
+    Examples
+    --------
+    >>> check_pixel_size((0.1, 0.2))
+    (0.1, 0.2)
+    """
+    size = as_pixel_size("pixel_size", value)
+    if not all(1e-9 < length < 1e6 for length in size):
+        text = value if isinstance(value, Real | tuple | list) else size
+        raise InputError(f"pixel size {text}: a length from 1e-9 to 1e6 mm is needed")
+    return size
 
 
 def check_number(name: str, value: Any, unit: str = "") -> Any:

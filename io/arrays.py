@@ -21,19 +21,19 @@ from mirrorskin.io.findings import Finding
 from mirrorskin.io.fingerprint import State, check_unchanged, fingerprint_of_files, modified, state_of
 from mirrorskin.io.foreign import kind_of_frames, open_reader
 from mirrorskin.io.frames import FrameReader, WholeFrames
-from mirrorskin.io.layout import COMPLETE, POSITIONS, REMEDIES, as_series
-from mirrorskin.io.os_errors import (
+from mirrorskin.io.layout import COMPLETE, POSITIONS, REMEDIES, ROW_SHAPES, as_series
+from mirrorskin.io.positions import Positions, along, check_finite
+from mirrorskin.io.recording import Recording, cut_out
+from mirrorskin.io.samples import DecodedFrames, Decoding
+from mirrorskin.io.selection import Region
+from mirrorskin.io.stack import RawFrames
+from mirrorskin.io.system import (
     MAX_UNPACKED_BYTES,
     as_input_error,
     check_regular,
     check_unpacked,
     open_regular,
 )
-from mirrorskin.io.positions import Positions, along, check_finite
-from mirrorskin.io.recording import Recording, cut_out
-from mirrorskin.io.samples import DecodedFrames, Decoding
-from mirrorskin.io.selection import Region
-from mirrorskin.io.stack import RawFrames
 from mirrorskin.io.types import FRAME_DTYPES, MOTIONS, Block, Header, InputError, Motion, block_memory
 
 _KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are not frames
@@ -115,7 +115,7 @@ class ArrayRecording(Recording):
         lost = None if reader is None else reader.lost
         given = along(as_series(series, positions[series]), self.full_shape[0], lost)
         assert given is not None
-        width = (2,) if series == "displacement" else ()
+        width = ROW_SHAPES.get(series, ())
         where = f"{name}: the {series} given"
         if np.shape(given)[:1] == (self.full_shape[2],) != (self.full_shape[0],):
             count, _, columns = self.full_shape

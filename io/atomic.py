@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.existing import Replaces, check_replaced
 from mirrorskin.io.export_formats import FORMATS
-from mirrorskin.io.os_errors import as_input_error, legible
-from mirrorskin.io.system import check_writable_system, lock
+from mirrorskin.io.system import as_input_error, check_writable_system, lock
+from mirrorskin.io.text import legible
 from mirrorskin.io.types import Closing, InputError, ProcessValue
 from mirrorskin.io.url import ZARR_SUFFIX, is_zarr
 

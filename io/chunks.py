@@ -24,8 +24,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.selection import Span
+from mirrorskin.io.system import as_input_error
 
 Bytes = NDArray[np.uint8]
 Codec = Callable[[Bytes, Bytes], None]

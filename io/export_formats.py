@@ -39,7 +39,7 @@ class ExportFormat:
     writes_itself: bool = False
 
 
-_TIFF = ExportFormat("heights in 16 bits", "export:encode_tiff", ("float32",))
+_TIFF = ExportFormat("heights in 16 bits", "export:encode_tiff", ("float32", "map_name"))
 
 FORMATS: dict[str, ExportFormat] = {
     ".ply": ExportFormat("a mesh", "export:encode_ply", ("points",)),
@@ -52,8 +52,8 @@ FORMATS: dict[str, ExportFormat] = {
     ".png": ExportFormat("heights in 16 bits", "export:encode_png"),
     ".tif": _TIFF,
     ".tiff": _TIFF,
-    ".csv": ExportFormat("a matrix or a cross-section", "export:encode_csv", ("section",)),
-    ".npz": ExportFormat("arrays", "export:encode_npz", needs_heights=False),
+    ".csv": ExportFormat("a matrix or a cross-section", "export:encode_csv", ("section", "map_name")),
+    ".npz": ExportFormat("arrays", "export:encode_npz", ("map_name",), needs_heights=False),
     ".mcap": ExportFormat("ROS 2 messages", "mcap:save_messages", writes_itself=True),
     ".zarr": ExportFormat(
         "everything in the file", "result_file:save_result", needs_heights=False, writes_itself=True

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.hdf5 import Hdf5File, chunks_of, virtual_source
-from mirrorskin.io.os_errors import as_input_error
+from mirrorskin.io.system import as_input_error
 from mirrorskin.io.types import InputError
 
 Spans = NDArray[np.int64]

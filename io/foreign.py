@@ -8,8 +8,8 @@ from typing import Literal
 
 from mirrorskin.io.folder import FolderFrames
 from mirrorskin.io.frames import FrameReader
-from mirrorskin.io.os_errors import check_regular
 from mirrorskin.io.pictures import PICTURE_SUFFIXES
+from mirrorskin.io.system import check_regular
 from mirrorskin.io.tiff import TIFF_SUFFIXES, TiffFrames
 from mirrorskin.io.types import InputError
 from mirrorskin.io.url import is_zarr

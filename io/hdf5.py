@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.chunks import Chunks, find_codecs
-from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, as_input_error, is_flagged, open_regular
 from mirrorskin.io.samples import ATTRIBUTES, Packing, packing_of
+from mirrorskin.io.system import MAX_UNPACKED_BYTES, as_input_error, is_flagged, open_regular
 from mirrorskin.io.types import Closing, InputError, ProcessValue
 from mirrorskin.io.units import conversion_factor
 
@@ -148,7 +148,12 @@ class Hdf5File(Closing):
 
     def storage(self, stack: h5py.Dataset) -> str:
         """Return a description of how a stack is stored."""
-        return describe_storage(stack)
+        if stack.is_virtual:
+            return "virtual"
+        if stack.chunks is None:
+            return "in raw files" if stack.external else "in one piece"
+        names = [name.split(";")[0].strip() or str(code) for code, name in _filters(stack)]
+        return f"chunks {stack.chunks}, {', '.join(names) or 'raw'}"
 
     def read(
         self,
@@ -582,16 +587,6 @@ def check_storage(
             f"{file.where(dataset)} claims {claimed} {unit} and its file contains {held}: it was cut short; "
             "copy it again"
         )
-
-
-def describe_storage(dataset: h5py.Dataset) -> str:
-    """Return a description of how a dataset is stored."""
-    if dataset.is_virtual:
-        return "virtual"
-    if dataset.chunks is None:
-        return "in raw files" if dataset.external else "in one piece"
-    names = [name.split(";")[0].strip() or str(code) for code, name in _filters(dataset)]
-    return f"chunks {dataset.chunks}, {', '.join(names) or 'raw'}"
 
 
 def chunks_of(dataset: h5py.Dataset) -> list[h5py.h5d.StoreInfo]:

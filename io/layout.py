@@ -17,9 +17,9 @@ from mirrorskin.io.coordinates import Coordinates
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.hdf5 import Hdf5File, Node, Shape
 from mirrorskin.io.maps import TWIST, declaration_of
-from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.positions import Positions, check_finite
 from mirrorskin.io.selection import Selection
+from mirrorskin.io.system import as_input_error
 from mirrorskin.io.types import MOTIONS, Floats, Header, InputError, Motion, Truth
 
 MARK = "mirrorskin_recording"
@@ -37,6 +37,8 @@ SERIES = {
     "twist": (f"{STAGE}/twist", "rad"),
     "tilt": (f"{STAGE}/tilt", "rad"),
 }
+ROW_SHAPES: Mapping[str, Shape] = {"displacement": (2,)}
+"""Shapes of the values of one frame in series that have several."""
 # Datasets of recordings that are written live: the positions estimated when the frames arrived, whether a
 # frame was used, the number of frames lost before it, and the state of the recording.
 LIVE = {name: (f"{place}_live", unit) for name, (place, unit) in SERIES.items() if name != "time"}
@@ -116,11 +118,6 @@ def read_checksums(file: Hdf5File, node: Node, state: RecordingState) -> NDArray
 
 def _grows(node: Node | None) -> TypeGuard[h5py.Dataset]:
     return isinstance(node, h5py.Dataset) and node.ndim > 0 and node.maxshape[0] is None
-
-
-def _width(name: str) -> Shape:
-    """Return the shape of one row of a series: () or (2,)."""
-    return (2,) if name == "displacement" else ()
 
 
 class Layout:
@@ -206,7 +203,7 @@ class Layout:
             if values is None:
                 raise InputError(f"{self._file.path} contains no positions of a live run: leave --live out")
             where = f"{self._file.path}: {LIVE[one][0]} of the frames that were used"
-            found[one] = check_finite(values[chosen], len(chosen), where, width=_width(one))
+            found[one] = check_finite(values[chosen], len(chosen), where, width=ROW_SHAPES.get(one, ()))
         return found
 
     def findings(self) -> tuple[Finding, ...]:
@@ -257,7 +254,8 @@ class Layout:
             return self._coordinates.series.get(name)
         place, unit = places[name]
         rows = self._count if self._find(STATE) is not None else None
-        return self._read(place, (self._count, *_width(name)), unit=unit, remedy=remedy, rows=rows)
+        shape = self._count, *ROW_SHAPES.get(name, ())
+        return self._read(place, shape, unit=unit, remedy=remedy, rows=rows)
 
     def _pixel_size(self) -> tuple[float, float] | None:
         x, y = (self._scalar(f"{DETECTOR}/{axis}_pixel_size", "mm", "give --pixel-size") for axis in "xy")
@@ -278,9 +276,11 @@ class Layout:
         return pixel_size
 
     def _reference(self, name: str) -> NDArray[np.float32] | None:
-        remedy = f"give --{name}, or take the reference again"
-        values = self._numbers(f"{DETECTOR}/{name}", self._frame, remedy=remedy)
-        return None if values is None else np.ascontiguousarray(values[self._part.region.slices], np.float32)
+        node = self._find(f"{DETECTOR}/{name}")
+        if node is None:
+            return None
+        values = self._file.read(node, self._frame, remedy=f"give --{name}, or take the reference again")
+        return np.ascontiguousarray(values[self._part.region.slices], np.float32)
 
     def _map(self, name: str, unit: str | None = None) -> Floats | None:
         """Read a map of the picture, or one number for all of it."""
@@ -325,12 +325,8 @@ class Layout:
 
     def _read(self, name: str, *shapes: Shape, **how: Any) -> Floats | None:
         """Read numbers as float64 if they exist; see `Hdf5File.read`."""
-        values = self._numbers(name, *shapes, **how)
-        return None if values is None else values.astype(np.float64, copy=False)
-
-    def _numbers(self, name: str, *shapes: Shape, **how: Any) -> NDArray[Any] | None:
         node = self._find(name)
-        return None if node is None else self._file.read(node, *shapes, **how)
+        return None if node is None else self._file.read(node, *shapes, **how).astype(np.float64, copy=False)
 
     def _text(self, name: str) -> str:
         node = self._find(name)

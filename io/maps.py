@@ -526,6 +526,7 @@ TABLE: Mapping[str, Map] = {
 """The maps, series and numbers that built-in operations return, in the order of files and figures."""
 
 _PLACES = {name: place for place, name in enumerate(TABLE)}
+_DEVIATIONS = {f"{name}{SIGMA}": one.deviation(name) for name, one in TABLE.items()}
 
 TWIST: Mapping[str, Map] = {
     "slip_onset": Map(
@@ -570,9 +571,11 @@ def declaration_of(name: str, declared: Mapping[str, Map] | None = None) -> Map:
         if name in table:
             return table[name]
     base = name.removesuffix(SIGMA)
-    if is_deviation(name) and (base in TABLE or base in (declared or {})):
-        return declaration_of(base, declared).deviation(base)
-    return UNDECLARED
+    builtin = TABLE.get(base)
+    own = (declared or {}).get(base, builtin)
+    if own is None:
+        return UNDECLARED
+    return _DEVIATIONS[name] if own is builtin else own.deviation(base)
 
 
 UNDECLARED = Map()

@@ -22,10 +22,10 @@ from mirrorskin.io.checksums import REMEDY, crc32
 from mirrorskin.io.export import check_heights, points_of
 from mirrorskin.io.frames import CONVERTED_COLOUR, WholeFrames, lost_frames
 from mirrorskin.io.opencv import is_coloured, to_grey
-from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, as_input_error, check_unpacked, open_regular
 from mirrorskin.io.pictures import Picture, decode_bytes
 from mirrorskin.io.recording import Recording
 from mirrorskin.io.result import Result
+from mirrorskin.io.system import MAX_UNPACKED_BYTES, as_input_error, check_unpacked, open_regular
 from mirrorskin.io.text import one_line
 from mirrorskin.io.types import MOTIONS, Block, Closing, Floats, Header, InputError
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.os_errors import check_unpacked
+from mirrorskin.io.system import check_unpacked
 from mirrorskin.io.types import InputError
 
 _AT_ONCE = 1 << 20  # samples that are compared or converted at once

@@ -29,7 +29,7 @@ class PhaseCheck:
         if not self.possible:
             return
         waves = np.linalg.qr(_waves(phase))[0].astype(np.float32)
-        swing = (np.exp(1j * phase) @ counts)[:, np.newaxis]
+        swing = swing_of(counts, phase)[:, np.newaxis]
         size = np.abs(swing)
         swings = size > max(_SWINGS * float(np.median(size)), 1e-6)
         self.possible = bool(swings.any()) and abs(np.mean(swing[swings] / size[swings])) < _AS_ONE
@@ -72,6 +72,13 @@ class PhaseCheck:
         if rise**2 * size < _STEADY * float(np.sum(common**2)):
             return None
         return rise, float(np.std(each)) / len(each) ** 0.5
+
+
+def swing_of(counts: NDArray[np.float32], phase: Floats) -> NDArray[np.complex64]:
+    """Return the sum of the brightness of each pixel, (T, n), times exp(i phase)."""
+    # Not as one complex product: the threads that NumPy starts for it wait for those of OpenCL.
+    cosine, sine = (wave.astype(np.float32) @ counts for wave in (np.cos(phase), np.sin(phase)))
+    return np.asarray(cosine + 1j * sine, np.complex64)
 
 
 def _waves(phase: Floats) -> Floats:

@@ -17,7 +17,7 @@ from mirrorskin.io.colour_table import ColourTable
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.frames import CONVERTED_COLOUR, lossy
 from mirrorskin.io.opencv import check_picture, decode, encode, is_coloured, to_grey
-from mirrorskin.io.os_errors import read_regular
+from mirrorskin.io.system import read_regular
 from mirrorskin.io.tiff import TIFF_SUFFIXES, TiffFrames
 from mirrorskin.io.types import FRAME_DTYPES, InputError
 

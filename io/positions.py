@@ -60,7 +60,7 @@ class Steps:
 
 
 def check_travel(
-    travel: ArrayLike | None, count: int, name: str, after: Sequence[float] = (), falls: bool = False
+    travel: ArrayLike | None, count: int, name: str, after: Sequence[float] | Floats = (), falls: bool = False
 ) -> NDArray[np.float64]:
     """Return the travel of a press, mm, or of a release if it ``falls``, as float64 (T,).
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
-from mirrorskin.io.os_errors import read_text
+from mirrorskin.io.system import read_text
 from mirrorskin.io.text import printable, shortened
 from mirrorskin.io.types import InputError
 

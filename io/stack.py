@@ -25,10 +25,9 @@ from numpy.typing import NDArray
 from mirrorskin.io.checksums import Verifier
 from mirrorskin.io.chunks import Chunks, find_codecs
 from mirrorskin.io.frames import FrameReader
-from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.samples import DecodedFrames, Decoding, Reader
 from mirrorskin.io.selection import Place, Region, Span
-from mirrorskin.io.system import reserve_space, usable_cores
+from mirrorskin.io.system import as_input_error, reserve_space, usable_cores
 from mirrorskin.io.types import Closing, InputError
 from mirrorskin.io.zarr import ZarrFrames
 
@@ -159,21 +158,18 @@ class Stack:
 
     def read(self, start: int, out: NDArray[Any]) -> NDArray[Any]:
         """Read frames into ``out``, at most as many as it holds, and return them."""
-        with self._reading:
-            return self._read(start, out)
-
-    def _read(self, start: int, out: NDArray[Any]) -> NDArray[Any]:
         first, stop = self._run(start, len(out))
-        if not self._kept[0] <= first < self._kept[1]:
-            span = self._chunk_span(first)
-            if span[0] == first and span[1] <= stop:
-                stop = stop if stop == self._end else stop // self._frames.length * self._frames.length
-                self._fetch((first, stop), out[: stop - first])
-                return out[: stop - first]
-            self._unpack(*span)
-        assert self._unpacked is not None
-        stop = min(stop, self._kept[1])
-        out[: stop - first] = self._unpacked[first - self._kept[0] : stop - self._kept[0]]
+        with self._reading:
+            if not self._kept[0] <= first < self._kept[1]:
+                span = self._chunk_span(first)
+                if span[0] == first and span[1] <= stop:
+                    stop = stop if stop == self._end else stop // self._frames.length * self._frames.length
+                    self._fetch((first, stop), out[: stop - first])
+                    return out[: stop - first]
+                self._unpack(*span)
+            assert self._unpacked is not None
+            stop = min(stop, self._kept[1])
+            out[: stop - first] = self._unpacked[first - self._kept[0] : stop - self._kept[0]]
         return out[: stop - first]
 
     def close(self) -> None:
@@ -243,10 +239,12 @@ def _open(
     dataset: h5py.Dataset, place: Place, count: int, limit: int, threads: int | None
 ) -> RawFrames | Chunks | Hdf5Frames:
     """Open the frames: directly if they are contiguous, otherwise by chunks, otherwise through HDF5."""
-    why, codecs = _why_only_hdf5(dataset), find_codecs(dataset.id)
-    if why or isinstance(codecs, str):
-        return Hdf5Frames(dataset, why or str(codecs))
+    if why := _why_only_hdf5(dataset):
+        return Hdf5Frames(dataset, why)
     if dataset.chunks:
+        codecs = find_codecs(dataset.id)
+        if isinstance(codecs, str):
+            return Hdf5Frames(dataset, codecs)
         # The number of threads is limited so that a quarter of the memory suffices for them.
         most = max(1, limit // (4 * math.prod(dataset.chunks) * dataset.dtype.itemsize))
         return Chunks(dataset.id, codecs, place.name, min(threads or usable_cores(), most))

@@ -40,13 +40,13 @@ from mirrorskin.io.layout import (
     DROPPED,
     LIVE,
     POSITIONS,
+    ROW_SHAPES,
     SERIES,
     STATE,
     UNDER_WAY,
     USED,
 )
 from mirrorskin.io.mcap import GrowingMessages, load_writer
-from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.recorder import (
     Compression,
     TeeSource,
@@ -55,7 +55,7 @@ from mirrorskin.io.recorder import (
     write_header,
     write_plot,
 )
-from mirrorskin.io.system import lock, reserve_space
+from mirrorskin.io.system import as_input_error, lock, reserve_space
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, LiveSource
 
 _POLL = 0.5  # seconds between checks whether the main program is still running
@@ -109,7 +109,7 @@ class StreamRecorder(TeeSource[LiveSource]):
     Parameters
     ----------
     source : LiveSource
-        Frames that are not lent are copied.
+        Frames that do not stay valid are copied.
     path : str or Path
         HDF5, or for ROS 2 a file ``.mcap`` (`GrowingMessages`), which also stores maps.
     compression : {"raw", "bitshuffle", "blosc", "gzip", "lzf"}
@@ -233,7 +233,7 @@ class StreamRecorder(TeeSource[LiveSource]):
         if frames.dtype != self.dtype or frames.shape[1:] != self.shape[1:]:
             raise ValueError(f"{self.name} gave {frames.shape} {frames.dtype} and announced {self.shape}")
         self._reserve(size)
-        if not block.lent:
+        if not block.stays_valid:
             block = dataclasses.replace(block, frames=frames.copy())
         self._queue.put(block)
         self.count += len(frames)
@@ -371,7 +371,7 @@ class StreamRecorder(TeeSource[LiveSource]):
                 self._release(item.size)
             elif item is not None:
                 self._append(file, item)
-            del item  # releases lent frames at once
+            del item  # releases frames at once
             if time.monotonic() >= due:
                 file.flush()
                 due = time.monotonic() + self._period
@@ -585,7 +585,7 @@ class GrowingRecording(Closing):
         self._write_state(UNDER_WAY)
         self._series = {
             name: [
-                Column(file, *place, np.nan, expected, (2,) if name == "displacement" else ())
+                Column(file, *place, np.nan, expected, ROW_SHAPES.get(name, ()))
                 for place in (SERIES[name], LIVE.get(name))
                 if place is not None
             ]

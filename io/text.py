@@ -14,6 +14,11 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
+def legible(text: str) -> str:
+    """Return a text without invalid characters: the name of a file may contain any bytes."""
+    return text.encode(errors="surrogateescape").decode(errors="replace")
+
+
 def one_line(value: object) -> str:
     r"""Return a value as one line of printable text.
 

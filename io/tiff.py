@@ -17,7 +17,7 @@ from mirrorskin.io.colour_table import ColourTable
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.frames import CONVERTED_COLOUR, WholeFrames, lossy
 from mirrorskin.io.opencv import check_picture, decode, is_coloured, to_grey
-from mirrorskin.io.os_errors import check_regular, open_regular
+from mirrorskin.io.system import check_regular, open_regular
 from mirrorskin.io.types import FRAME_DTYPES, InputError
 
 TIFF_SUFFIXES = (".tif", ".tiff")

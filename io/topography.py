@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mirrorskin.io.export import Encoded, grid_of, notes_of, pixel_size_of
+from mirrorskin.io.export import Encoded, grid_of, notes_of, pixel_size_of, what_is
 from mirrorskin.io.result import Result
 from mirrorskin.io.text import one_line
 from mirrorskin.io.types import InputError
@@ -87,14 +87,14 @@ def encode_gsf(result: Result) -> Encoded:
         return Encoded([path.read_bytes()], _holds(result))
 
 
-def encode_float_tiff(result: Result) -> Encoded:
-    """Encode heights as a TIFF of float32 in mm, NaN where undefined."""
+def encode_float_tiff(result: Result, map_name: str = "") -> Encoded:
+    """Encode heights in mm, or a map in its unit, as a TIFF of float32, NaN where undefined."""
     import tifffile
 
-    height, x, y = grid_of(result)
+    values, x, y = grid_of(result, map_name)
     width, step = pixel_size_of(x, y)
     lines = {
-        "unit": "mm",
+        "unit": result.declaration(map_name).unit if map_name else "mm",
         "pixel size": f"{width!r} x {step!r} mm",
         "first pixel": f"x {float(x[0])!r} mm, y {float(y[0])!r} mm",
     } | notes_of(result)
@@ -102,14 +102,17 @@ def encode_float_tiff(result: Result) -> Encoded:
     file = BytesIO()
     tifffile.imwrite(
         file,
-        height,
+        values.astype(np.float32),
         photometric="minisblack",
         resolution=(_CENTIMETRE / width, _CENTIMETRE / step),
         resolutionunit="CENTIMETER",
         description=description.encode("ascii", "backslashreplace"),
         metadata=None,
     )
-    return Encoded([file.getvalue()], _holds(result))
+    rows, columns = values.shape
+    return Encoded(
+        [file.getvalue()], f"{rows} x {columns} {what_is(result, map_name) if map_name else 'heights'}"
+    )
 
 
 def _holds(result: Result) -> str:

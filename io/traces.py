@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.findings import Finding
-from mirrorskin.io.phase_check import PhaseCheck
+from mirrorskin.io.phase_check import PhaseCheck, swing_of
 from mirrorskin.io.types import Floats, Motion
 
 _SIDE = 24  # pixels of the grid along each side
-_MOST = 1 << 22  # maximum number of samples kept
+_MOST = 1 << 22  # number of samples above which the grid becomes coarser
 _FEWEST = 64  # minimum number of pixels for findings
 _QUANTUM = 1 / math.sqrt(12)  # standard deviation of rounding, counts
 _MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
@@ -51,6 +51,8 @@ class FrameSamples:
     ----------
     rows, columns : ndarray of int
         Rows and columns of the grid in a frame.
+    count : int
+        Number of frames so far.
 
     Examples
     --------
@@ -61,12 +63,12 @@ class FrameSamples:
     """
 
     def __init__(self, shape: tuple[int, int, int]) -> None:
-        side = max(2, min(_SIDE, math.isqrt(_MOST // max(1, shape[0]))))
-        steps = [-(-length // side) for length in shape[1:]]
+        steps = [-(-length // _SIDE) for length in shape[1:]]
         cuts = [slice((n - 1) % step // 2, None, step) for n, step in zip(shape[1:], steps, strict=True)]
-        self._cut = (slice(None), *cuts)
-        self.rows, self.columns = (np.arange(n)[cut] for n, cut in zip(shape[1:], self._cut[1:], strict=True))
+        self._grid = (slice(None), *cuts)
+        self.rows, self.columns = (np.arange(n)[cut] for n, cut in zip(shape[1:], cuts, strict=True))
         self._parts: list[NDArray[Any]] = []
+        self.count = 0
 
     @classmethod
     def of(cls, frames: NDArray[Any]) -> Self:
@@ -77,21 +79,39 @@ class FrameSamples:
 
     def push(self, frames: NDArray[Any]) -> None:
         """Add the next frames, (n, H, W)."""
-        self._parts.append(frames[self._cut].copy())
+        self.push_samples(self.of_frames(frames))
+
+    def of_frames(self, frames: NDArray[Any]) -> NDArray[Any]:
+        """Return a copy of the samples of frames, (n, H, W), at the pixels of the grid."""
+        return frames[self._grid].copy()
+
+    def push_samples(self, values: NDArray[Any]) -> None:
+        """Add the samples of the next frames, (n, rows, columns)."""
+        self._parts.append(values)
+        self.count += len(values)
+        # The grid depends on the number of frames only, which live runs do not know in advance.
+        while (
+            self.count * len(self.rows) * len(self.columns) > _MOST and len(self.rows) + len(self.columns) > 4
+        ):
+            down, across = (2, 1) if len(self.rows) >= len(self.columns) else (1, 2)
+            self._parts = [part[:, ::down, ::across].copy() for part in self._parts]
+            self.rows, self.columns = self.rows[::down], self.columns[::across]
+            cuts = (
+                slice(int(one[0]), None, int(one[1] - one[0]) if len(one) > 1 else None)
+                for one in (self.rows, self.columns)
+            )
+            self._grid = (slice(None), *cuts)
 
     def of_map(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return a map, (H, W), at the pixels of the grid."""
-        return values[self._cut[1:]]
+        return values[self._grid[1:]]
 
     @property
     def values(self) -> NDArray[Any]:
         """Samples, (T, rows, columns), in the type of the frames."""
-        return np.concatenate(self._parts)
-
-    @property
-    def count(self) -> int:
-        """Number of frames so far."""
-        return sum(map(len, self._parts))
+        if len(self._parts) > 1:
+            self._parts = [np.concatenate(self._parts)]
+        return self._parts[0]
 
 
 def named_frames(numbers: Sequence[int] | NDArray[np.intp]) -> str:
@@ -340,7 +360,8 @@ class Traces:
             return
         turned = np.abs(phase - phase[0])
         last = int(np.argmin(np.abs(turned - 2 * math.pi)))
-        if abs(turned[last] - 2 * math.pi) > 1.5 * float(np.median(np.abs(np.diff(phase)))):
+        step = float(np.median(np.abs(np.diff(phase))))
+        if step > math.pi / 2 or abs(turned[last] - 2 * math.pi) > 1.5 * step:  # a body may also rock
             return
         counts, extent = self._counts[:, self._responding], self._range[self._responding]
         jump = float(np.median(np.abs(counts[last] - counts[0]) / extent))
@@ -370,7 +391,7 @@ class Traces:
             left = self._counts - self._fit
             if float(np.mean(left**2)) > 0.02 * float(np.var(self._counts)):
                 return None  # harmonics do not describe the brightness
-            wave = np.exp(1j * self._series["phase"]) @ self._counts[:, self._responding]
+            wave = swing_of(self._counts[:, self._responding], self._series["phase"])
             if wave.size and abs(np.mean(wave / np.abs(wave))) > _AS_ONE:
                 return None  # on a flat object, light that is not a cosine would look the same
             gain = np.median(left / np.maximum(self._fit, 1e-3 * self._highest.max()), axis=1)

@@ -49,11 +49,16 @@ class Block:
         Rotation of the body about its axis, radians, counter-clockwise (twist).
     tilt : ndarray, (n,), float64, or None
         Half-angle of the lean, radians, if it varies between frames (axial motion).
+    axes : ndarray, (n, 3) or (n, 4), float64, or None
+        The body's axis in each frame, unit vectors towards the camera, and its travel, mm, if these are given
+        instead of phases and tilts.
+    frame_weights : ndarray, (n,), float64, or None
+        Weight of each frame, such as its inverse variance; 0 for a missing frame.
     origin : (int, int)
         Row and column of the first pixel in the full picture.
     dropped : int
         Frames lost between the preceding block and this one.
-    lent : bool
+    stays_valid : bool
         Whether the memory of the frames belongs to the source, is not overwritten while it is referenced, and
         is readable for 64 bytes beyond the frames, so that a device can use it without a copy.
     """
@@ -66,16 +71,20 @@ class Block:
     displacement: Floats | None = None
     twist: Floats | None = None
     tilt: Floats | None = None
+    axes: Floats | None = None
+    frame_weights: Floats | None = None
     origin: tuple[int, int] = (0, 0)
     dropped: int = 0
-    lent: bool = False
+    stays_valid: bool = False
 
     @property
     def pose(self) -> Floats | None:
         """The axis and travel of the body in each frame, (n, 4): unit vectors, and mm, 0 if unknown.
 
-        It is None without phases and tilts.
+        It is None without axes, or phases and tilts.
         """
+        if self.axes is not None:
+            return self.axes
         if self.phase is None or self.tilt is None:
             return None
         travel = np.zeros(len(self.phase)) if self.travel is None else self.travel
@@ -203,8 +212,8 @@ _choosing = threading.Lock()
 def exclusive_use(used: object) -> Iterator[None]:
     """Let no other thread into such a context with the same object, or with a source that both read.
 
-    A source has one position of reading, and an operation the state of one run. So that no two threads wait
-    for each other, enter with one source at a time, and with an operation after the source.
+    A source has one position of reading. So that no two threads wait for each other, enter with one source
+    at a time.
     """
     parts = _sources_in(used, {})
     with _choosing:
@@ -282,10 +291,6 @@ class Truth:
     force: Floats | None = None
     displacement: NDArray[np.float32] | None = None
     slip_onset: NDArray[np.float32] | None = None
-
-
-UNDISTORTED = "undistorted"
-"""Value in the process of a result whose maps have been undistorted to positions on the sheet."""
 
 
 def body_axes(phase: ArrayLike, tilt: ArrayLike) -> Floats:

@@ -16,8 +16,8 @@ from mirrorskin.io.colour_table import ColourTable
 from mirrorskin.io.findings import Finding
 from mirrorskin.io.frames import CONVERTED_COLOUR, WholeFrames, lossy, lost_frames
 from mirrorskin.io.opencv import is_coloured, look_up, rows_of, to_grey
-from mirrorskin.io.os_errors import MAX_UNPACKED_BYTES, check_regular, check_unpacked
 from mirrorskin.io.selection import Span
+from mirrorskin.io.system import MAX_UNPACKED_BYTES, check_regular, check_unpacked
 from mirrorskin.io.text import one_line
 from mirrorskin.io.types import Floats, InputError
 

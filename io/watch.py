@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mirrorskin.io.checksums import UNVERIFIED_PARTS
 from mirrorskin.io.findings import Finding
@@ -63,12 +65,15 @@ class Watch:
     def __init__(self, source: Source, moved: bool = True, phased: bool = True) -> None:
         self._source, self._moved, self._phased = source, moved, phased
         self.samples = FrameSamples(source.shape)
-        self._series: dict[str, list[Floats]] = {"time": [], "travel": [], "phase": []}
+        self._series: dict[str, list[Floats]] = {"time": [], "travel": [], "phase": [], "axes": []}
         self._lost = 0
 
-    def push(self, block: Block) -> None:
-        """Add the next frames."""
-        self.samples.push(block.frames)
+    def push(self, block: Block, samples: NDArray[Any] | None = None) -> None:
+        """Add the next frames; their ``samples`` on the grid are given if they are on a device."""
+        if samples is None:
+            self.samples.push(block.frames)
+        else:
+            self.samples.push_samples(samples)
         self._lost += block.dropped
         for name, parts in self._series.items():
             values = getattr(block, name)
@@ -90,14 +95,21 @@ class Watch:
 
     def _look(self) -> tuple[dict[str, Floats], Traces]:
         """Return the positions and times of the frames so far, and their brightness."""
-        source, count = self._source, self.samples.count
-        samples = self.samples.values if count else np.empty((0, 0, 0), source.dtype)
-        series = {
+        source, series = self._source, self.series
+        samples = self.samples.values if self.samples.count else np.empty((0, 0, 0), source.dtype)
+        if "axes" in series and "phase" not in series:  # brightness follows the direction of the axis
+            x, y = series["axes"][:, :2].T
+            return series, Traces(samples, source.motion, {**series, "phase": np.unwrap(np.arctan2(y, x))})
+        return series, Traces(samples, source.motion, series)
+
+    @property
+    def series(self) -> dict[str, Floats]:
+        """Times and positions that all frames so far have, (T,), by name."""
+        return {
             name: np.concatenate(parts)
             for name, parts in self._series.items()
-            if parts and sum(map(len, parts)) == count
+            if parts and sum(map(len, parts)) == self.samples.count
         }
-        return series, Traces(samples, source.motion, series)
 
     def _findings(
         self, series: Mapping[str, Floats], traces: Traces, field_limits: Limits, travel_limits: Limits

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from mirrorskin.io.atomic import MAKE_ROOM
-from mirrorskin.io.os_errors import reason
+from mirrorskin.io.system import reason
 from mirrorskin.io.text import one_line
 from mirrorskin.io.types import InputError
 

@@ -17,8 +17,8 @@ import numpy as np
 from mirrorskin.io.atomic import new_folder
 from mirrorskin.io.hdf5 import VALUES_LIMIT, Hdf5File, Node, first_value
 from mirrorskin.io.layout import STACK
-from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.recording import is_recording, open_recording
+from mirrorskin.io.system import as_input_error
 from mirrorskin.io.types import InputError, Source
 from mirrorskin.io.url import ZARR_SUFFIX, Url, path_of
 from mirrorskin.io.zarr import AT_ONCE, ZarrFile, open_file
