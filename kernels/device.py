@@ -5,7 +5,6 @@ It contains no algorithms. Nothing here uses OpenCL before the first call.
 
 from __future__ import annotations
 
-import copy
 import functools
 import itertools
 import json
@@ -17,6 +16,7 @@ import threading
 import time
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, SupportsIndex, TypeAlias, cast
@@ -273,6 +273,12 @@ class Device:
         """Its number in `list_devices`, which distinguishes it from others of the same title."""
         return _find().index(self.context.devices[0])
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how another process opens it: by its title, or by its number if that is ambiguous."""
+        titles = [info.title for info in list_devices()]
+        title = self.info.title
+        return open_device, (title if titles.count(title) == 1 else str(self.number),)
+
     def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zeroed: bool = True) -> Array:
         """Return a new array on the device.
 
@@ -404,7 +410,8 @@ class Device:
 
         Arrays can be used on both; a kernel waits for their ``arrived``.
         """
-        other = copy.copy(self)
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
         other.queue, other.copies = _queues(self.context)
         other._launching, other._kernels = threading.Lock(), {}
         return other
@@ -687,22 +694,21 @@ def _queues(context: cl.Context) -> list[cl.CommandQueue]:
     return [cl.CommandQueue(context, properties=profiling) for _ in range(2)]
 
 
+@functools.cache  # OpenCL loads its drivers once in a process
 def _find() -> list[cl.Device]:
     embedded.prepare()
     try:
         platforms = cl.get_platforms()
     except cl.LogicError:  # raised by the loader if there is no platform
         return []
-    return [device for platform in platforms for device in _devices_of(platform)]
+    devices: list[cl.Device] = []
+    for platform in platforms:
+        with suppress(cl.RuntimeError):  # a driver without its hardware
+            devices += platform.get_devices()
+    return devices
 
 
-def _devices_of(platform: cl.Platform) -> list[cl.Device]:
-    try:
-        return platform.get_devices()
-    except cl.RuntimeError:  # a driver without its hardware
-        return []
-
-
+@functools.cache
 def _describe(device: cl.Device) -> DeviceInfo:
     kind: DeviceKind = "other"
     if device.type & cl.device_type.GPU:

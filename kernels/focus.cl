@@ -7,8 +7,8 @@
 #include "common.clh"
 
 __kernel void focus_scan(
-    __global const FRAME *restrict frames, const int count, const int rows, const int columns, const int first,
-    const int radius, const int reach, __global int *restrict best, OUT peak, OUT recent)
+    __global const FRAME *restrict frames, const int count, const int rows, const int columns, const int stride,
+    const int first, const int radius, const int reach, __global int *restrict best, OUT peak, OUT recent)
 {
     const int pixels = rows * columns, low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
     for (int t = first; t < first + count; ++t) {
@@ -29,7 +29,7 @@ __kernel void focus_scan(
 
             OUT at = peak + p;
             OUT before = recent + p;
-            const size_t plane = pixels;
+            const size_t plane = stride;
             const int since = t - best[p];
             if (t == 0 || sharp > at[reach * plane] || at[reach * plane] != at[reach * plane]) {
                 for (int k = 1; k <= reach; ++k) {
@@ -61,13 +61,13 @@ __kernel void focus_scan(
     if (!(weight > 0)) continue;
 
 __kernel void focus_fit(
-    const int rows, const int columns, const int count, const int radius, const int reach, const float variance,
+    const int rows, const int columns, const int stride, const int count, const int radius, const int reach, const float variance,
     const float least_contrast, const float least_curvature, MAP places, MAP travel, const float unit,
     __global const int *restrict best, MAP peak, OUT height, OUT spread, OUT gain, OUT misfit, OUT sharpness,
     __global uchar *restrict status)
 {
     const int pixels = rows * columns, low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
-    const size_t plane = pixels;
+    const size_t plane = stride;
     for (int p = low; p < end; ++p) {
         const int row = p / columns, column = p % columns, sharpest = best[p];
         const int high = min(row + radius, rows - 1) - max(row - radius, 0) + 1;

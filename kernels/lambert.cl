@@ -24,17 +24,14 @@
 #define R(k) triangle[(k) * plane + p]
 
 __kernel void lambert_add(
-    __global const FRAME *restrict frames, const int count, const int pixels, MAP lights, const int fresh,
-    MAP darks, const int dark_step, const float shadow, const float bright, OUT triangle)
+    __global const FRAME *restrict frames, const int count, const int pixels, const int stride, MAP lights, MAP darks,
+    const float shadow, const float bright, OUT triangle)
 {
     const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
-    const size_t plane = pixels;
-    if (fresh)
-        for (int p = low; p < end; ++p)
-            for (int k = 0; k < 11; ++k) R(k) = 0;
+    const size_t plane = stride;
     for (int t = 0; t < count; ++t)
         for (int p = low; p < end; ++p) {
-            const float sample = frames[t * plane + p], light = sample - darks[p * dark_step];
+            const float sample = frames[(size_t)t * pixels + p], light = sample - darks[p];
             const int seen = (light > shadow) & (sample < bright);
             float x = seen ? lights[3 * t] : 0, y = seen ? lights[3 * t + 1] : 0, z = seen ? lights[3 * t + 2] : 0;
             float e = seen ? light : 0, along, across;
@@ -55,11 +52,11 @@ __kernel void lambert_add(
 #define LEAST_PIVOT 1e-3f
 
 __kernel void lambert_normals(
-    const int pixels, MAP triangle, OUT normals, OUT normals_spread, OUT albedo, OUT albedo_spread, OUT residual,
+    const int pixels, const int stride, MAP triangle, OUT normals, OUT normals_spread, OUT albedo, OUT albedo_spread, OUT residual,
     __global int *restrict samples)
 {
     const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
-    const size_t plane = pixels;
+    const size_t plane = stride;
     for (int p = low; p < end; ++p) {
         const float r00 = R(0), r01 = R(1), r02 = R(2), r11 = R(4), r12 = R(5), r22 = R(7), freedom = R(10) - 3;
         const float size = sqrt(r00 * r00 + r01 * r01 + r02 * r02 + r11 * r11 + r12 * r12 + r22 * r22);

@@ -21,22 +21,21 @@ LEAST_PIVOT = 1e-3
 _PLACES = np.triu_indices(4)
 
 
-def lambert_add(frames: Array, lights: Array, fresh: bool, darks: Array, shadow: float, bright: float,
-                triangle: Array) -> None:  # fmt: skip
-    """Add frames, or start anew if ``fresh``; the triangle is updated in place.
+def lambert_add(
+    frames: Array, lights: Array, darks: Array, shadow: float, bright: float, triangle: Array
+) -> None:
+    """Add frames; the triangle is updated in place.
 
     Parameters
     ----------
     frames : (n, P), uint8, uint16 or float32
     lights : (n, 3)
-    darks : (P,) or (1,), counts without light, which are subtracted
+    darks : (P,), counts without light, which are subtracted
     shadow : lower limit of usable samples (exclusive), counts above dark
     bright : upper limit of usable samples (exclusive), counts
-    triangle : (11, P). First R by rows, with a diagonal that is not negative; its last element is squared,
-        and is then the residual sum of squares. Then the number of usable samples
+    triangle : (11, P), at first 0. First R by rows, with a diagonal that is not negative; its last element is
+        squared, and is then the residual sum of squares. Then the number of usable samples
     """
-    if fresh:
-        triangle[:] = 0
     light = frames.astype(np.float32) - darks
     seen = (light > shadow) & (frames < bright)
     rows = np.concatenate([np.broadcast_to(lights[:, None], (*seen.shape, 3)), light[..., None]], axis=2)

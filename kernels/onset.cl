@@ -16,7 +16,7 @@
 //          one that was not near the level
 // answers  height; sigma: as if no frame followed
 // status   0 invalid input, 1 onset, 2 never light, 3 light at start (`release`: 2 dark at start, 3 light to the end)
-// travel   has planes of `room` frames: travel; the step to it; travel since the first frame
+// travel   has planes of `row_length` frames: travel; the step to it; travel since the first frame
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
@@ -227,7 +227,7 @@ float2 answer(
 __kernel void onset_scan(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride, const int first,
     const int hold, const int release, const int subframe, const float threshold, __global const FRAME *restrict marks,
-    __global Count *restrict left, __global int *restrict times, MAP levels, MAP travel, const int room,
+    __global Count *restrict left, __global int *restrict times, MAP levels, MAP travel, const int row_length,
     const float noise, const float dark_tolerance, const float light_tolerance, __global FRAME *restrict samples,
     OUT answers, __global uchar *restrict status)
 {
@@ -319,7 +319,7 @@ __kernel void onset_scan(
             if (!subframe) {
                 for (int p = low; p < high; ++p) {
                     const int begin = times[p], frame = begin < 1 ? 1 : begin;
-                    const float height = -travel[frame], step = travel[room + frame], size = step < 0 ? -step : step;
+                    const float height = -travel[frame], step = travel[row_length + frame], size = step < 0 ? -step : step;
                     answers[p] = begin > 0 ? height : NAN;
                     answers[stride + p] = begin > 0 ? size * 0.577350269f : NAN;  // over sqrt(3)
                     status[p] = begin > 0 ? 1 : begin == 0 ? 3 - release : begin == DARK ? never : 0;
@@ -387,7 +387,7 @@ __kernel void onset_scan(
                 for (int p = low, i = 0; p < high; ++p, ++i) {
                     const int begin = times[p], kept = waits[i], from = kept ? begin - 1 : 0, dark = kept ? darks[p] : 0;
                     waited[i] = kept ? begin - dark : 1;
-                    doubt[i] = travel[2 * room + from] - travel[2 * room + dark];
+                    doubt[i] = travel[2 * row_length + from] - travel[2 * row_length + dark];
                     const float way = levels[p] - levels[stride + p], light = later[i], risen = risens[p];
                     const int rises = risen >= light - way * 0.125f;
                     jumped[i] = kept & rises & (feet[p] + 1 < begin) & (way >= SURE_WAY * noise);
@@ -400,7 +400,7 @@ __kernel void onset_scan(
             for (int p = low, i = 0; p < high; ++p, ++i) {
                 const int begin = times[p];
                 const float2 found = answer(dim[i], bright[i], later[i], waited[i], doubt[i], travel[frame[i] - 1],
-                                            travel[room + frame[i]], levels[p], levels[stride + p], threshold,
+                                            travel[row_length + frame[i]], levels[p], levels[stride + p], threshold,
                                             noise, dark_tolerance, light_tolerance, jumped[i]);
                 const float height = answers[p], spread = rough_inverse_root(found.y);
                 const uchar was = status[p], is = begin > 0 ? 1 : begin == 0 ? 3 - release : begin == DARK ? never : 0;

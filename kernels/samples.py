@@ -14,20 +14,26 @@ if TYPE_CHECKING:
 
 
 def samples_take(
-    lines: int, count: int, values: NDArray[Any], first: int, apart: int, step: int
+    lines: int, rows: int, count: int, values: NDArray[Any], first: int, apart: int, down: int, step: int
 ) -> NDArray[Any]:
-    """Return values of an array, (lines, count): value j of line i has index first + i apart + j step."""
+    """Return values of an array, (lines, rows, count).
+
+    Value k of row j of line i has index first + i apart + j down + k step.
+    """
     flat = values.reshape(-1)[first:]
-    strides = apart * flat.itemsize, step * flat.itemsize
-    return as_strided(flat, (lines, count), strides, writeable=False).copy()
+    strides = [one * flat.itemsize for one in (apart, down, step)]
+    return as_strided(flat, (lines, rows, count), strides, writeable=False).copy()
 
 
-def take_samples(array: Array, first: int, apart: int, step: int, shape: tuple[int, int]) -> NDArray[Any]:
+def take_samples(
+    array: Array, first: int, steps: tuple[int, int, int], shape: tuple[int, int, int]
+) -> NDArray[Any]:
     """Return the result of `samples_take` for an array on a device; nothing else is copied to the host."""
     samples = array.device.array("samples", shape, array.dtype, zeroed=False)
     kernel = array.device.kernel("samples", "samples_take", VALUE=C_TYPES[array.dtype.name])
+    (lines, rows, count), (apart, down, step) = shape, steps
     kernel(
-        shape[0] * shape[1], lines=shape[0], count=shape[1], values=array, first=first, apart=apart,
-        step=step, samples=samples, moved=2 * samples.nbytes,
+        lines * rows * count, lines=lines, rows=rows, count=count, values=array, first=first, apart=apart,
+        down=down, step=step, samples=samples, moved=2 * samples.nbytes,
     )  # fmt: skip
     return samples.read()
