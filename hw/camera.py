@@ -17,7 +17,7 @@ class Frames:
     """Consecutive frames of a camera.
 
     The pixels are raw counts in C order. Their memory is shared: it is not written to while this array or a
-    view of it is referenced, and the 64 bytes after it may be read (``mirrorskin.io.Block.lent``).
+    view of it is referenced, and the 64 bytes after it may be read (``mirrorskin.io.Block.stays_valid``).
     """
 
     pixels: NDArray[Any]  # (n, H, W), uint8, uint16 or float32

@@ -176,7 +176,10 @@ class TiltAxis(AngleAxis, frozen=True, kw_only=True):
 
 
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """The connection and the limits of the stage: the table ``[stage]``."""
+    """The connection and the limits of the stage: the table ``[stage]``.
+
+    In Python, ``firmware`` may also be a stage class itself.
+    """
 
     port: Annotated[Text, Meta(description="a serial port or a URL, in quotes,", examples=["/dev/ttyUSB0"])]
     firmware: Annotated[

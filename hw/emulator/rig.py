@@ -39,7 +39,7 @@ from mirrorskin.hw.stage import Position
 from mirrorskin.hw.twin import Axial, Camera, Object, Twin, Vertical
 from mirrorskin.hw.twin.movement import Movement, Pose
 from mirrorskin.io.atomic import write_new
-from mirrorskin.io.os_errors import as_input_error
+from mirrorskin.io.system import as_input_error
 from mirrorskin.io.types import Floats, InputError
 
 PRESS = 3.0

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
 from mirrorskin.io.arrays import read_array
-from mirrorskin.io.os_errors import check_regular
 from mirrorskin.io.pictures import PICTURE_SUFFIXES, read_picture
+from mirrorskin.io.system import check_regular
 
 if TYPE_CHECKING:
     from mirrorskin.hw.rig_file import CameraSettings

@@ -276,8 +276,8 @@ def open_stage(settings: StageSettings, unlock: bool = False, clock: Clock = SYS
 
 def _open_own(settings: StageSettings) -> Stage:
     """Open a stage with a class of the user."""
-    name = settings.firmware
-    made = load_class(name)
+    made = load_class(settings.firmware)
+    name = getattr(settings.firmware, "__name__", settings.firmware)
     try:
         inspect.signature(made).bind(settings)
     except (TypeError, ValueError) as error:

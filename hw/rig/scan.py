@@ -197,8 +197,8 @@ class Scan(Closing):
     ) -> Block:
         known: dict[str, Any] = {self.plan.series: place}
         known |= {name: np.full(len(frames), value) for name, value in self.plan.constants.items()}
-        lent = frames.flags.c_contiguous
-        return Block(frames, self.count, arrival - origin, dropped=dropped, lent=lent, **known)
+        stays_valid = frames.flags.c_contiguous
+        return Block(frames, self.count, arrival - origin, dropped=dropped, stays_valid=stays_valid, **known)
 
     def _prepare(self) -> None:
         """Move to the start of the scan, and wait there; the body leans only when it is pressed."""

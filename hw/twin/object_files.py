@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.hw.twin.objects import difference_slope
 from mirrorskin.io.arrays import read_array
-from mirrorskin.io.os_errors import read_regular
 from mirrorskin.io.pictures import decode_picture
+from mirrorskin.io.system import read_regular
 from mirrorskin.io.types import Floats, InputError, pixel_axes
 
 if TYPE_CHECKING:
