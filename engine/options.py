@@ -6,31 +6,56 @@ of the documentation are derived from the declaration.
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import hashlib
 import inspect
 import math
+import os
+import pickle
+import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from numbers import Real
 from pathlib import Path
-from typing import Any, ClassVar, Literal, dataclass_transform
+from types import NoneType, UnionType
+from typing import Any, ClassVar, Literal, Self, Union, cast, dataclass_transform, get_args, get_origin
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import as_array, check_flag, shown, unknown_argument
+from mirrorskin.io.arguments import as_array, check_flag, nearest, shown, unknown_argument
+from mirrorskin.io.own_class import importable_name, load_class
 
-Kind = Literal["number", "integer", "flag", "choice", "numbers", "map", "file", "object"]
+Kind = Literal[
+    "number", "integer", "numbers", "integers", "flag", "choice", "text", "path", "map", "file", "object"
+]
 
 _LAST = ("device", "memory_limit")  # options that come last in signatures and help
 _ANY = 2**31 - 1  # an upper limit that messages do not mention
 _COLUMNS = 100  # of the lines of a docstring
-_INTEGERS = ("frames", "pixels", "turns")  # units of counts
+_MISSPELT = 0.85  # similarity, from 0 to 1, of an attribute to an option for which it is taken
+_SHOWN = 8  # values of an array that are shown
 _EXAMPLES = {"share": "0.5", "mm": "0.1", "rad": "0.05", "counts": "1.5", "frames": "2", "pixels": "8"}
 _UNITS = (
-    *("", "share", "counts", *_INTEGERS, "mm", "rad", "s", "MPa", "N"),
+    *("", "share", "counts", "frames", "pixels", "turns", "mm", "rad", "s", "MPa", "N"),
     *("counts/rad", "mm/N", "Hz", "frames/s"),
 )
+_TYPES = {  # in docstrings
+    "number": "float",
+    "integer": "int",
+    "numbers": "sequence of float",
+    "integers": "sequence of int",
+    "flag": "bool",
+    "text": "str",
+    "path": "path",
+    "map": "float, ndarray (H, W) or path",
+    "file": "path, Result or array",
+    "object": "object",
+}
 RESERVED = ("operation", "program", "version", "date", "source", "driver", "calibration", "live")
 """Names of the process that mirrorskin writes: no option has one of them."""
 
@@ -46,20 +71,19 @@ class Option:
 
     default: Any
     unit: str
-    kind: Kind
     help: str
     within: tuple[float | None, float | None]
     above: float | None
-    choices: tuple[str, ...]
-    words: tuple[str, ...]
     file: str
     shown_default: str
     python_only: bool
+    kind: Kind | None = None  # this and what follows are determined by the annotation
+    choices: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()  # that are allowed in place of a number
+    instance_of: type | None = None  # class of an enumeration or an object
+    count: int | None = None  # of the numbers of a sequence, if that is fixed
+    optional: bool = False  # whether None is a value
     name: str = ""
-    optional: bool = False  # whether None is a value: the default of the first declaration
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        object.__setattr__(self, "name", name)
 
     def __get__(self, holder: object | None, owner: type) -> Any:
         return self if holder is None else self.stored(holder)
@@ -78,31 +102,27 @@ class Option:
         """Return the value in an object."""
         return vars(holder)[self.name]
 
-    def settled(self, annotation: Any) -> Option:
-        """Return the declaration as completed by its class; for ``float``, an integer becomes a number.
+    def settled(self, name: str, annotation: Any) -> Option:
+        """Return the declaration as completed by its name and annotation in a class.
 
         Raises
         ------
         InputError
             The declaration contradicts itself.
         """
-        made = self
-        if self.kind == "integer" and self.unit not in _INTEGERS and annotation in (float, "float"):
-            made = replace(self, kind="number")
-        if made.kind == "number" and isinstance(made.default, int):
-            made = replace(made, default=float(made.default))
+        made = replace(self, name=name)
+        if self.kind is None:
+            made = replace(made, **_meaning(name, annotation, self.file))
+            made = replace(made, optional=made.optional or self.default is None)
         low, high = self.within
         if not self.help.strip():
-            raise InputError(f"option {self.name} has no help: say in a sentence what it means")
+            raise InputError(f"option {name} has no help: say in a sentence what it means")
         if self.unit not in _UNITS:
-            raise InputError(
-                f"option {self.name} has the unit {self.unit!r}. Use one of {', '.join(_UNITS[1:])}"
-            )
+            raise InputError(f"option {name} has the unit {self.unit!r}. Use one of {', '.join(_UNITS[1:])}")
         if low is not None and high is not None and low > high:
-            raise InputError(f"option {self.name}: no value is within {low:g} and {high:g}")
-        if self.default is not None:
-            made.check(self.default)
-        return replace(made, optional=made.optional or self.default is None)
+            raise InputError(f"option {name}: no value is within {low:g} and {high:g}")
+        only = made.python_only or made.kind == "object"
+        return replace(made, default=made.check(self.default), python_only=only)
 
     def with_default(self, value: Any) -> Option:
         """Return the declaration with another default, which is checked as a value is."""
@@ -112,12 +132,11 @@ class Option:
 
     def described(self) -> str:
         """Return type and unit for a docstring, such as ``float, share, default 0.5``."""
-        kinds = {"number": "float", "integer": "int", "flag": "bool", "numbers": "sequence of float"}
-        kinds |= {"map": "float, ndarray (H, W) or path", "file": "path, Result or array", "object": "object"}
-        kind = "{" + ", ".join(f'"{one}"' for one in self.choices) + "}" if self.choices else kinds[self.kind]
+        quoted = [f'"{one}"' for one in self.choices]
+        kind = "{" + ", ".join(quoted) + "}" if quoted else _TYPES[self.kind or "object"]
         kind = " or ".join([kind, *(f'"{word}"' for word in self.words)])
         unit = f", {self.unit}" if self.unit else ""
-        default = "a map" if isinstance(self.default, np.ndarray) else repr(self.default)
+        default = "a map" if isinstance(self.default, np.ndarray) else repr(plain(self.default))
         end = ", optional" if self.default is None else f", default {default}"
         return f"{kind}{unit}{end}"
 
@@ -129,32 +148,56 @@ class Option:
         InputError
             The value has another type, or is outside of the limits.
         """
-        if value is None and (self.optional or self.default is None):
+        if value is None and self.optional:
             return None
         if isinstance(value, str) and value in self.words:
             return value
-        if self.kind in ("object", "file"):
-            return value
-        if self.kind == "choice":
-            if not isinstance(value, str) or value not in self.choices:
-                raise InputError(f"unknown {self.name} {shown(value)}. Use {' or '.join(self.choices)}")
-            return str(value)
+        if self.kind in ("numbers", "integers"):
+            return self._several(value)
+        if self.kind in ("number", "integer"):
+            return self._number(value)
+        if self.kind == "map":
+            return self._map(value)
         if self.kind == "flag":
             return check_flag(self.name, value)
-        if self.kind == "numbers":
-            several = isinstance(value, Sequence) and not isinstance(value, str)
-            values = value if several else np.atleast_1d(as_array(self.name, value, self.unit))
-            return [self._number(one) for one in values]
-        if self.kind == "map" and isinstance(value, str | Path):
+        return self._chosen(value) if self.kind == "choice" else self._object(value)
+
+    def _map(self, value: Any) -> Any:
+        if isinstance(value, str | Path):
             from mirrorskin.io.arrays import read_map
 
             return read_map(Path(value))
-        if self.kind == "map" and not isinstance(value, Real):
-            return as_array(self.name, value, self.unit)
-        return self._number(value)
+        return self._number(value) if isinstance(value, Real) else as_array(self.name, value, self.unit)
+
+    def _chosen(self, value: Any) -> Any:
+        if self.instance_of is not None and isinstance(value, self.instance_of):
+            return value
+        if not isinstance(value, str) or value not in self.choices:
+            raise InputError(f"unknown {self.name} {shown(value)}. Use {' or '.join(self.choices)}")
+        if self.instance_of is None:
+            return str(value)
+        return next(one for one in cast(type[Enum], self.instance_of) if plain(one) == value)
+
+    def _object(self, value: Any) -> Any:
+        """Return a text, a path or an object."""
+        if self.kind == "path" and isinstance(value, str | os.PathLike):
+            return value if isinstance(value, Path) else Path(value)
+        needed = {"text": str, "path": Path}.get(str(self.kind), self.instance_of)
+        if needed is not None and not isinstance(value, needed):
+            noun = {"text": "a text", "path": "a path"}.get(str(self.kind), f"a {needed.__name__}")
+            raise InputError(f"{self.name} is {shown(value)}: {noun} is needed")
+        return value
+
+    def _several(self, value: Any) -> Any:
+        """Return numbers as a tuple."""
+        several = isinstance(value, Sequence) and not isinstance(value, str)
+        values = value if several else np.atleast_1d(as_array(self.name, value, self.unit))
+        if self.count is not None and len(values) != self.count:
+            raise InputError(f"{self.name} is {shown(value)}: {self.count} numbers are needed")
+        return tuple(self._number(one) for one in values)
 
     def _number(self, value: Any) -> Any:
-        whole = self.kind == "integer"
+        whole = self.kind in ("integer", "integers")
         if not isinstance(value, Real) and getattr(value, "ndim", None) == 0:
             value = as_array(self.name, value, self.unit)[()]
         is_number = isinstance(value, Real | np.bool_)
@@ -194,6 +237,54 @@ class Option:
         return f"{noun}{limits}"
 
 
+def _meaning(name: str, annotation: Any, file: str) -> dict[str, Any]:
+    """Return what the annotation of an option says of its values, as fields of the declaration."""
+    if annotation is None:
+        raise InputError(f"option {name} has no type: annotate it, as in {name}: float = option(...)")
+    union = get_origin(annotation) in (Union, UnionType)
+    parts = [*get_args(annotation)] if union else [annotation]
+    words = tuple(word for part in parts if get_origin(part) is Literal for word in get_args(part))
+    types = [part for part in parts if part is not NoneType and get_origin(part) is not Literal]
+    if not all(isinstance(word, str) for word in words):
+        raise InputError(f"option {name}: the values of Literal must be texts")
+    if file:
+        meaning: dict[str, Any] = {"kind": "file"}
+    elif not types:
+        meaning, words = {"kind": "choice", "choices": words}, ()
+    elif {*get_args(ArrayLike)} <= {*types} or any(np.ndarray in (one, get_origin(one)) for one in types):
+        meaning = {"kind": "map"}
+    else:
+        is_number = len(types) == 2 and {*types} == {int, float}
+        meaning = _meaning_of_type(float if is_number else types[0] if len(types) == 1 else object)
+    return {"optional": NoneType in parts, "words": words, **meaning}
+
+
+def _meaning_of_type(one: Any) -> dict[str, Any]:
+    """Return what a single type says of an option's values; see `_meaning`."""
+    kinds: dict[Any, Kind] = {bool: "flag", int: "integer", float: "number", str: "text", Path: "path"}
+    if one in kinds:
+        return {"kind": kinds[one]}
+    items, origin = [part for part in get_args(one) if part is not ...], get_origin(one)
+    if origin in (list, tuple, Sequence) and {*items} <= {int, float}:
+        count = len(items) if origin is tuple and ... not in get_args(one) else None
+        return {"kind": "integers" if {*items} == {int} else "numbers", "count": count}
+    if not isinstance(one, type) or getattr(one, "_is_protocol", False) or one is object:
+        return {"kind": "object"}
+    if issubclass(one, Enum):
+        return {"kind": "choice", "choices": tuple(map(plain, one)), "instance_of": one}
+    return {"kind": "object", "instance_of": one}
+
+
+def plain(value: Any) -> Any:
+    """Return a value as files and the command line have it: a path or a member of an enumeration as text.
+
+    The text of a member is its value if that is a text, otherwise its name.
+    """
+    if isinstance(value, Enum):
+        return str(value.value) if isinstance(value.value, str) else value.name
+    return str(value) if isinstance(value, Path) else value
+
+
 def option(
     *,
     default: Any,
@@ -201,15 +292,16 @@ def option(
     help: str,  # noqa: A002  # the name that argparse and click use
     within: tuple[float | None, float | None] = (None, None),
     above: float | None = None,
-    choices: Sequence[str] = (),
-    words: Sequence[str] = (),
-    several: bool = False,
-    map: bool = False,  # noqa: A002
     file: str = "",
     shown_default: str = "",
     python_only: bool = False,
 ) -> Any:
     """Declare an option in the body of a class derived from `Configured`.
+
+    The annotation determines its kind: ``float``, ``int``, ``bool``, ``str`` (any text), ``Path``,
+    ``Literal["a", "b"]`` or an enumeration (one of several texts), ``Sequence[float]``, ``Sequence[int]``,
+    ``ArrayLike`` (a number or a map of the frames' size), and ``float | Literal["estimate"]`` (a number or a
+    word); with ``| None`` also None. Values of any other class are for Python only.
 
     Parameters
     ----------
@@ -226,14 +318,6 @@ def option(
         Least and greatest allowed value.
     above : float, optional
         The value must be greater than this.
-    choices : sequence of str
-        The allowed texts.
-    words : sequence of str
-        Texts that are allowed in place of a number, such as ``"estimate"``.
-    several : bool
-        Whether the value is a list of numbers.
-    map : bool
-        Whether an array of the frames' size may be given in place of a number.
     file : str
         What file the value is read from on the command line, such as ``"RES.h5"``; in Python anything that
         the operation accepts.
@@ -253,34 +337,7 @@ def option(
     ...
     mirrorskin.io.types.InputError: threshold 2: a share from 0 to 1 is needed, such as 0.5
     """
-    kind: Kind = "number"
-    if choices:
-        kind = "choice"
-    elif isinstance(default, bool):
-        kind = "flag"
-    elif file:
-        kind = "file"
-    elif several:
-        kind = "numbers"
-    elif map:
-        kind = "map"
-    elif unit in _INTEGERS or (isinstance(default, int) and not unit):
-        kind = "integer"
-    elif python_only and not unit and not isinstance(default, float):
-        kind = "object"
-    return Option(
-        default=default,
-        unit=unit,
-        kind=kind,
-        help=help,
-        within=within,
-        above=above,
-        choices=tuple(choices),
-        words=tuple(words),
-        file=file,
-        shown_default=shown_default,
-        python_only=python_only,
-    )
+    return Option(default, unit, help, within, above, file, shown_default, python_only)
 
 
 @dataclass_transform(kw_only_default=True, field_specifiers=(option,))
@@ -304,8 +361,8 @@ class Configured:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for name, declared, annotation in _declared(cls):
-            setattr(cls, name, declared.settled(annotation))
+        for name, declared in _declared(cls):
+            setattr(cls, name, declared)
         names = dict.fromkeys(name for name, value in vars(cls).items() if isinstance(value, Option))
         for base in cls.__mro__[1:]:
             names |= dict.fromkeys(base.options if issubclass(base, Configured) else ())
@@ -313,6 +370,7 @@ class Configured:
         first = [name for name in names if name not in _LAST]
         last = [name for name in _LAST if name in names]
         cls.options = {name: getattr(cls, name) for name in [*first, *last]}
+        _refuse_misspelt(cls, cls.options)
         cls.__signature__ = signature_of(cls.options)  # type: ignore[attr-defined]  # for help() and editors
         if cls.__doc__ is not None or changed:
             cls._text = cls.__doc__ or cls._text
@@ -324,17 +382,32 @@ class Configured:
             raise InputError(unknown_argument(type(self).__name__, min(unknown), [*self.options], "option"))
         for name, one in self.options.items():
             value = options.get(name, one.default)
-            one.store(self, one.check(list(value) if isinstance(value, list) else value))
+            one.store(self, one.check(value))
         self.check_options()
 
     def __repr__(self) -> str:
-        chosen = {name: value for name, value in self.chosen().items() if name not in _LAST}
-        given = (f"{name}={value!r}" for name, value in chosen.items() if not self._is_default(name, value))
+        values = ((name, value, self.options[name].default) for name, value in self.chosen().items())
+        given = (f"{name}={_text(value)}" for name, value, default in values if not _equal(value, default))
         return f"{type(self).__name__}({', '.join(given)})"
 
-    def _is_default(self, name: str, value: Any) -> bool:
-        default = self.options[name].default
-        return value is default or (not isinstance(value, np.ndarray) and bool(value == default))
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and _equal(self.chosen(), other.chosen())
+
+    def __hash__(self) -> int:
+        return hash((type(self), content_of(self.chosen())))
+
+    def __copy__(self) -> Self:
+        return type(self)(**self.chosen())
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return type(self)(**copy.deepcopy(self.chosen(), memo))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _construct, (importable_name(type(self)), self.written())
+
+    def __dask_tokenize__(self) -> tuple[str, str]:
+        kind, content = type(self), repr(content_of(self.chosen()))
+        return f"{kind.__module__}:{kind.__qualname__}", hashlib.sha256(content.encode()).hexdigest()
 
     def check_options(self) -> None:
         """Raise InputError if the options do not fit together; called at the end of construction.
@@ -346,13 +419,66 @@ class Configured:
         """Return the value of each option by name."""
         return {name: one.stored(self) for name, one in self.options.items()}
 
+    def written(self) -> dict[str, Any]:
+        """Return the value of each option by name, members of enumerations as text."""
+        return {
+            name: plain(value) if isinstance(value, Enum) else value for name, value in self.chosen().items()
+        }
+
+    def with_options(self, **options: Any) -> Self:
+        """Return an object of the same class in which some options differ."""
+        return type(self)(**{**self.chosen(), **options})
+
     def part(self, kind: type[Configured]) -> dict[str, Any]:
         """Return the values of the options that another class also has."""
         return {name: one.stored(self) for name, one in self.options.items() if name in kind.options}
 
 
-def _declared(cls: type) -> Iterator[tuple[str, Option, Any]]:
-    """Yield the options in the body of a class with their annotations, if their names can be used."""
+def _construct(name: str, options: dict[str, Any]) -> Any:
+    """Return an unpickled object."""
+    return load_class(name)(**options)
+
+
+def content_of(value: Any) -> Hashable:
+    """Return what is equal for equal values, in any process: the content of arrays, where NaN equals NaN."""
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "buif":
+        numbers = np.asarray(value, np.float64) + 0.0  # for which -0 is 0
+        content = np.where(np.isnan(numbers), np.nan, numbers).tobytes()
+        return value.shape, hashlib.sha256(content).hexdigest()
+    if isinstance(value, Configured):
+        return f"{type(value).__module__}:{type(value).__qualname__}", content_of(value.chosen())
+    if isinstance(value, Mapping):
+        return tuple((str(name), content_of(value[name])) for name in value)
+    if isinstance(value, list | tuple):
+        return tuple(map(content_of, value))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return type(value).__qualname__, tuple(
+            content_of(getattr(value, one.name)) for one in dataclasses.fields(value)
+        )
+    value = plain(value)
+    if value is None or isinstance(value, str | int | float):
+        return value
+    try:
+        return hashlib.sha256(pickle.dumps(value)).hexdigest()
+    except (pickle.PicklingError, TypeError, AttributeError):  # such as a function without a name
+        return id(value)
+
+
+def _equal(one: Any, other: Any) -> bool:
+    return one is other or content_of(one) == content_of(other)
+
+
+def _text(value: Any) -> str:
+    """Return a value as an expression; a long array is shortened."""
+    if isinstance(value, np.ndarray):
+        return repr(value.tolist()) if value.size <= _SHOWN else f"<{value.dtype} {value.shape}>"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_text, value))}]"
+    return repr(plain(value.item() if isinstance(value, np.generic) else value))
+
+
+def _declared(cls: type) -> Iterator[tuple[str, Option]]:
+    """Yield the options in the body of a class, completed, if their names can be used."""
     annotations = inspect.get_annotations(cls)
     taken = {name for base in cls.__mro__[1:] for name in (*vars(base), *getattr(base, "on_objects", ()))}
     for name, one in list(vars(cls).items()):
@@ -363,7 +489,33 @@ def _declared(cls: type) -> Iterator[tuple[str, Option, Any]]:
             raise InputError(
                 f"{cls.__name__}: an option cannot have the name {name}, which has a meaning already"
             )
-        yield name, one, annotations.get(name)
+        try:
+            annotation = None if one.kind else _evaluated(cls, annotations.get(name))
+            yield name, one.settled(name, annotation)
+        except InputError as error:
+            raise InputError(f"{cls.__name__}: {error}") from error
+
+
+def _evaluated(cls: type, annotation: Any) -> Any:
+    """Return an annotation of a class that is being defined; texts are evaluated where that is."""
+    if not isinstance(annotation, str):
+        return annotation
+    frame = sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__") != cls.__module__:
+        frame = frame.f_back
+    try:
+        return eval(annotation, frame.f_globals, dict(frame.f_locals))
+    except Exception as error:
+        raise InputError(f"the annotation {annotation} cannot be evaluated: {error}") from error
+
+
+def _refuse_misspelt(cls: type, options: Mapping[str, Option]) -> None:
+    """Raise InputError if a class assigns a value to what looks like an option of its bases."""
+    inherited = {name for base in cls.__mro__[1:] for name in vars(base)}
+    for name, value in vars(cls).items():
+        is_plain = value is None or isinstance(value, str | Real | list | tuple | Enum | Path)
+        if is_plain and name[0] != "_" and name not in inherited and nearest(name, options, _MISSPELT):
+            raise InputError(unknown_argument(cls.__name__, name, [*options], "option"))
 
 
 def _take_default(cls: type, name: str) -> bool:
