@@ -9,18 +9,17 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine import focus_travel
+from mirrorskin.engine.focus_travel import TravelJump
 from mirrorskin.engine.footprint import with_curvature
-from mirrorskin.engine.operation import Operation, travel_function
+from mirrorskin.engine.functions import travel_function
+from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
+from mirrorskin.engine.picture import Picture
+from mirrorskin.engine.tiling import Planes
 from mirrorskin.io import InputError, Map
-from mirrorskin.io.findings import Finding, in_process
 from mirrorskin.io.maps import TABLE, FocusStatus, status_of
 from mirrorskin.io.positions import check_strokes
-from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES
-from mirrorskin.kernels.array import fetch
-from mirrorskin.kernels.device import C_TYPES
 from mirrorskin.kernels.least_squares import mad_sigma
 
 _LARGEST = 1e18  # noise whose square a float32 holds
@@ -29,6 +28,7 @@ _BETWEEN = 2 / 3  # variance of noise between pixels two reaches apart, whose wi
 _UNUSUAL = 3.0  # standard deviations from the median misfit, beyond which a pixel has its own
 _LEAST_SHARE = 0.1  # of the pixels of a window with a peak, below which errors do not grow any more
 _LEAST_CURVATURE = 3.0  # smallest curvature of a peak, in standard errors
+_FLOATS = "height", "sharpness", "spread", "gain", "misfit"  # maps of focus.cl
 
 
 class Focus(Operation):
@@ -37,19 +37,18 @@ class Focus(Operation):
     Examples
     --------
     >>> from mirrorskin import engine
-    >>> focus = engine.focus.Focus(noise=0.1)
-    >>> texture = np.random.default_rng(0).normal(size=(20, 20)).astype(np.float32)
-    >>> for travel in range(9):
-    ...     focus.push((np.exp(-((travel - 3.7) ** 2) / 9) * texture[None]).astype("f4"), travel=[travel])
-    >>> round(float(focus.result().height[10, 10]), 2)
+    >>> texture = np.random.default_rng(0).normal(size=(20, 20))
+    >>> sharp = [np.exp(-((travel - 3.7) ** 2) / 9) * texture for travel in range(9)]
+    >>> found = engine.run(sharp, engine.focus.Focus(noise=0.1), travel=range(9))
+    >>> round(float(found.height[10, 10]), 2)
     -3.7
     """
 
     motions = ("vertical",)
-    takes_device_arrays = True
-    _jump: Finding | None = None  # of the travel
     dtypes = FRAME_DTYPES
-    on_device = True
+    checks = (TravelJump,)
+    usual_findings = "not a press", "reversed"  # each pixel is sharp in between
+    for_device = True
 
     noise: float | None = option(
         default=None,
@@ -79,61 +78,35 @@ class Focus(Operation):
         """Prepare the kernel and its maps."""
         if self.noise is None:
             raise InputError("noise is missing: give the standard deviation of a sample in counts, such as 2")
-        self._scan = self.device.kernel("focus", "focus_scan", FRAME=C_TYPES[dtype.name])
-        self._fit = self.device.kernel("focus", "focus_fit", FRAME=C_TYPES[dtype.name])
-        self._best = self.device.array("best", shape, np.int32, zeroed=False)
-        self._peak = self.device.array("peak", (2 * self.reach + 1, *shape), np.float32, zeroed=False)
-        self._recent = self.device.array("recent", (self.reach, *shape), np.float32, zeroed=False)
+        maps: dict[str, Any] = {"best": np.int32, "status": np.uint8, **dict.fromkeys(_FLOATS, np.float32)}
+        maps |= {"peak": Planes(2 * self.reach + 1, np.float32), "recent": Planes(self.reach, np.float32)}
+        self._maps = Picture(self, "focus", maps, around=self.radius)
 
-    def clear(self) -> None:
-        """Forget what the frames so far showed; the next one overwrites their maps."""
-        self._jump = None
-
-    def reconsider(self, samples: FrameSamples) -> bool:
-        """Look whether the peaks fit to the travel, which only shows after the last frame."""
-        assert self.noise is not None
-        if 0 < self.noise < _LARGEST and self.reach > 1:
-            kept = (self._peak, self._best)
-            peak, best = fetch([(array, slice(None)) for array in kept], keep=[True, True])
-            freedom = (2 * self.radius + 1) ** 2 - 1
-            self._jump = focus_travel.find_travel_jump(
-                peak, best, self.pushed("travel"), freedom, self.noise**2
-            )
-        return False
+    def peaks(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the contrast in the frames around the sharpest one of each pixel, and its number."""
+        best, *peak = self._maps.read("best", *(("peak", place) for place in range(2 * self.reach + 1)))
+        return np.stack(peak), best
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike) -> None:
         """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
         check_strokes(travel, len(frames), "travel")
-        rows, columns = self.shape
-        self._scan(
-            -(-rows * columns // self.device.layout.tile), frames=self.device.share("frames", frames),
-            count=len(frames), rows=rows, columns=columns, first=self.count, radius=self.radius,
-            reach=self.reach, best=self._best, peak=self._peak, recent=self._recent, moved=frames.nbytes,
-        )  # fmt: skip
-        self.device.finish()
+        self._maps.scan("focus_scan", frames, radius=self.radius, reach=self.reach)
 
     def result(self) -> dict[str, Any]:
         """Return height, status and sharpness of the frames so far."""
         assert self.noise is not None
-        (rows, columns), travel = self.shape, self.pushed("travel")
+        travel = self.positions_so_far("travel")
         unit = float(np.ptp(travel)) / max(len(travel) - 1, 1) or 1.0
         around = np.arange(len(travel))[:, np.newaxis] + np.arange(-self.reach, self.reach + 1)
         places = (travel[np.clip(around, 0, len(travel) - 1)] - travel[:, np.newaxis]) / unit
-        names = ("height", "spread", "gain", "misfit", "sharpness")
-        maps: dict[str, Any] = {
-            name: self.device.array(name, self.shape, np.float32, zeroed=False) for name in names
-        }
-        maps["status"] = self.device.array("status", self.shape, np.uint8, zeroed=False)
         variance = min(self.noise, _LARGEST) ** 2
-        self._fit(
-            -(-rows * columns // self.device.layout.tile), rows=rows, columns=columns, count=len(travel),
-            radius=self.radius, reach=self.reach, variance=variance, least_contrast=_LEAST_CONTRAST,
-            least_curvature=_LEAST_CURVATURE, places=self.device.from_host("places", places),
-            travel=self.device.from_host("travel", travel), unit=unit, best=self._best, peak=self._peak,
-            **maps, moved=self._peak.nbytes + sum(array.nbytes for array in maps.values()),
+        self._maps.run(
+            "focus_fit", count=len(travel), radius=self.radius, reach=self.reach, variance=variance,
+            least_contrast=_LEAST_CONTRAST, least_curvature=_LEAST_CURVATURE, places=places, travel=travel,
+            unit=unit,
         )  # fmt: skip
-        found = fetch([(array, slice(None)) for array in maps.values()])
-        height, spread, gain, misfit, sharpness, status = found
+        status, *floats = self._maps.take("status", *_FLOATS)
+        height, sharpness, spread, gain, misfit = map(np.asarray, floats)
         sigma = np.sqrt(np.float32(variance) * spread + self._excess(misfit) * gain)
         # The window shows the mean of its heights, which is not that of its middle on a curved surface.
         footprint = ((2 * self.radius + 1) ** 2 - 1) / 12
@@ -142,8 +115,7 @@ class Focus(Operation):
         # Where few pixels around have a peak, noise and their surroundings decided which ones.
         peaks = cv2.blur(np.isfinite(height).astype(np.float32), (2 * self.radius + 1,) * 2)
         sigma = sigma / np.maximum(peaks, _LEAST_SHARE) ** 2
-        maps = {"height": height, "height_sigma": sigma, "status": status, "sharpness": sharpness}
-        return maps | in_process([] if self._jump is None else [self._jump], {})
+        return {"height": floats[0], "height_sigma": sigma, "status": status, "sharpness": floats[1]}
 
     def _excess(self, misfit: NDArray[Any]) -> NDArray[np.float32]:
         """Return the variance of log S in excess of noise: the median, or more where curves fit less well."""

@@ -6,18 +6,37 @@ there, it is one if later frames have travelled a step further.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.findings import Finding
+from mirrorskin.engine.steps import Context, Step
+from mirrorskin.io import Result
+from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles
+
+if TYPE_CHECKING:
+    from mirrorskin.engine.focus import Focus
 
 _LINES, _FEWEST = 64, 64  # lines of pixels along a side that are used; least number of pixels around a frame
 _SHIFTS = 1, -1, 2  # steps of the travel by which later frames may be wrong
 _BETTER = 0.25  # largest ratio of the squares of residuals with and without a jump
 _CONTRAST = 5.0  # least contrast of a peak above that of noise, in standard errors
+_LARGEST = 1e18  # noise whose square a float32 holds
+
+
+class TravelJump(Step):
+    """Warn if from one frame on the travel is wrong."""
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result; its process has the warning, if the peaks do not fit to the travel."""
+        operation = cast("Focus", context.operation)
+        noise, freedom = operation.noise or 0.0, (2 * operation.radius + 1) ** 2 - 1
+        if not 0 < noise < _LARGEST or operation.reach < 2:
+            return result
+        jump = find_travel_jump(*operation.peaks(), context.positions("travel"), freedom, noise**2)
+        return result if jump is None else with_findings(result, jump)
 
 
 def find_travel_jump(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.device_arrays import AnyArray, as_any_array
 from mirrorskin.io import InputError
 from mirrorskin.io.samples import convert_samples, frame_dtype
+from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.least_squares import mad_sigma
@@ -95,10 +96,23 @@ def thinned(frames: AnyArray) -> NDArray[Any]:
     *count, rows, columns = frames.shape
     step, pixels = thinning((rows, columns)), rows * columns
     if isinstance(frames, Array):
-        samples = take_samples(frames, 0, pixels, step, (math.prod(count), -(-pixels // step)))
+        samples = take_samples(frames, 0, (pixels, 0, step), (math.prod(count), 1, -(-pixels // step)))
         return samples.reshape(*count, -1)
     samples = frames.reshape(*count, -1)[..., ::step]
     return samples
+
+
+def take_grid(frames: AnyArray, grid: FrameSamples) -> NDArray[Any]:
+    """Return a copy of the samples of frames, (n, H, W), on the host or a device, at the pixels of a grid."""
+    if not isinstance(frames, Array):
+        return grid.of_frames(frames)
+    if frames.device.info.shares_memory:
+        return grid.of_frames(np.from_dlpack(cast(Any, frames)))
+    rows, columns = grid.rows, grid.columns
+    count, height, width = frames.shape
+    down, step = (int(one[1] - one[0]) if len(one) > 1 else 0 for one in (rows, columns))
+    steps, shape = (height * width, down * width, step), (count, len(rows), len(columns))
+    return take_samples(frames, int(rows[0] * width + columns[0]), steps, shape)
 
 
 def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], integer: bool) -> float:

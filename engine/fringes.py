@@ -15,16 +15,16 @@ from scipy.special import expit, ndtr
 
 from mirrorskin.engine.amplitude_blur import with_blur
 from mirrorskin.engine.frames import noise_of_residual
+from mirrorskin.engine.functions import phase_function
 from mirrorskin.engine.inputs import Maps, as_result
-from mirrorskin.engine.operation import Operation, phase_function
 from mirrorskin.engine.options import option
-from mirrorskin.engine.rotation.correlation import Correlate
+from mirrorskin.engine.rotation.correlation import CorrelationOperation
 from mirrorskin.engine.rotation.design_matrix import check_weights, fit_matrix
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import as_array, as_array_or_number, check_number, checked, in_unit
 from mirrorskin.io.findings import carried
 from mirrorskin.io.maps import TABLE
-from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.io.positions import check_phase
 from mirrorskin.kernels.array_types import Doubles
 
 _TURN = 2 * np.pi
@@ -45,7 +45,7 @@ _MISFIT = 4.0  # standard deviations of noise: maximum residual of samples that 
 _UNCLEAR = 0.5  # distance of a bit from the threshold, RMS distances, below which the pixel is on a border
 
 
-class Fringes(Operation):
+class Fringes(CorrelationOperation):
     """Phase of fringes, projected or reflected, that are shifted by known steps.
 
     E_k = mean + modulation cos(phase - shift_k) is fitted to each pixel by least squares, for three or more
@@ -55,21 +55,18 @@ class Fringes(Operation):
     Examples
     --------
     >>> from mirrorskin import engine
-    >>> fringes = engine.fringes.Fringes()
+    >>> run = engine.Run(engine.fringes.Fringes())
     >>> for shift in np.arange(4) * np.pi / 2:
-    ...     fringes.push(np.full((1, 1, 2), 9 + np.cos(0.5 - shift), np.float32), phase=[shift])
-    >>> fringes.result().phase.round(4).tolist()
+    ...     run.push(np.full((1, 1, 2), 9 + np.cos(0.5 - shift), np.float32), phase=[shift])
+    >>> run.result().phase.round(4).tolist()
     [[0.5, 0.5]]
     """
 
-    dtypes = FRAME_DTYPES
     least_frames = 3
-    on_device = long_blocks = True
 
     noise: ArrayLike | None = option(
         default=None,
         unit="counts",
-        map=True,
         within=(0, None),
         help="standard deviation of a sample, a number or a map (H, W)",
         shown_default="estimated from the median residual of the half of the pixels that has more modulation,"
@@ -83,37 +80,19 @@ class Fringes(Operation):
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare the fit."""
+        super().start(shape, dtype)
         self._noise = None if self.noise is None else _map(self.noise, shape, "noise")
-        self._fit = Correlate(device=self.devices, memory_limit=self.memory_limit)
-        self._fit.begin(shape, dtype)
         self._weights: list[Doubles] = []
 
-    @property
-    def room(self) -> NDArray[Any]:
-        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        return np.asarray(self._fit.room)
-
-    def clear(self) -> None:
-        """Forget the frames so far."""
-        self._fit.reset()
-        self._weights.clear()
-
-    def push(
-        self,
-        frames: NDArray[Any],
-        *,
-        phase: ArrayLike,
-        frame_weights: ArrayLike | None = None,
-        lent: bool = False,
-    ) -> None:
+    def push(self, frames: NDArray[Any], *, phase: ArrayLike, frame_weights: ArrayLike | None = None) -> None:
         """Process the next frames, (n, H, W), the shift of the pattern in each, (n,) radians, and weights."""
-        weights = check_weights(frame_weights, len(frames))
-        self._fit.push(frames, phase=phase, frame_weights=weights, lent=lent)
+        shift, weights = check_phase(phase, len(frames), "phase"), check_weights(frame_weights, len(frames))
+        self._push(frames, shift, weights)
         self._weights.append(weights)
 
     def result(self) -> dict[str, Any]:
         """Return phase, mean and modulation of the frames so far."""
-        fit, weights = self._fit.result(), np.concatenate(self._weights)
+        fit, weights = self._fit(), np.concatenate(self._weights)
         used = weights > 0
         freedom = np.count_nonzero(used) - 3
         modulation, phase = fit.modulation, fit.azimuth
@@ -124,7 +103,7 @@ class Fringes(Operation):
         elif self._noise is None:
             raise InputError("3 frames leave no residual to estimate the noise from: specify noise, counts")
         noise = seen if self._noise is None else self._noise
-        matrix = fit_matrix(self.pushed("phase")[used], weights[used])
+        matrix = fit_matrix(self.positions_so_far("phase")[used], weights[used])
         (cc, cs), (_, ss) = ((matrix @ (matrix / weights[used]).T)[1:, 1:]).tolist()
         # sin p = sine / modulation, likewise the cosine; without modulation there is no error bound.
         variance = (cc * fit.sine - 2 * cs * fit.cosine) * fit.sine + ss * fit.cosine * fit.cosine

@@ -15,22 +15,24 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.device_arrays import device_of_maps
 from mirrorskin.engine.fusion_solver import AbsoluteHeights, FusionSolver
 from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
-from mirrorskin.engine.method import Context, Method, undistorted
+from mirrorskin.engine.method import Method
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.blur import PIXEL, LensBlur
 from mirrorskin.engine.press.intervals import heights_as_intervals, repeated_heights_as_intervals
 from mirrorskin.engine.press.press import Press
-from mirrorskin.engine.provenance import attach_provenance, naming
+from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.reconstruction import calibrated
 from mirrorskin.engine.rotation.normals_to_height import Slopes, describe_integration, slopes_of
 from mirrorskin.engine.rotation.response import wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, at_poses
-from mirrorskin.engine.rotation.steps import Integration
-from mirrorskin.engine.streaming import Progress, feed
+from mirrorskin.engine.rotation.steps import take_slopes
+from mirrorskin.engine.running import Progress, Run, run_over
+from mirrorskin.engine.steps import Context, Step, undistorted
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion, Result, Source, open_recording, open_result, pixel_axes
 from mirrorskin.io.arguments import as_array_or_number, check_count, check_flag, checked, in_unit
-from mirrorskin.io.findings import Finding, carried, in_process, merged, warn
+from mirrorskin.io.findings import Finding, carried, in_process, warn
+from mirrorskin.io.fitted import taken_from
 from mirrorskin.io.foreign import kind_of_frames
 from mirrorskin.io.recording import is_result
 from mirrorskin.io.result import absolute_heights
@@ -104,7 +106,7 @@ def fuse(
     normals : Source, Result, mapping, xarray.Dataset or path
         A rotation, likewise, if ``heights`` is a press. Or a result, with ``normals``, (H, W, 3), and
         ``normals_sigma``, (H, W), radians; NaN where unknown. If there is ``contact``, (H, W), normals where
-        it is 0 are not used. If its process has a ``tilt``, radians, the normals are those of a precession,
+        it is 0 are not used. With a ``tilt``, radians, the normals are those of a precession,
         whose errors depend on the direction.
     pixel_size : float or (float, float), optional
         For results: millimetres along x and y; by default that of the heights.
@@ -235,9 +237,9 @@ def _fuse_maps(
     assert height is not None
     values, sigma = (np.asarray(map_, np.float64) for map_ in (height, height_maps.height_sigma))
     known = AbsoluteHeights.of(*repeated_heights_as_intervals(values, sigma), wanted)
-    tilt = normal_maps.process.get("tilt")
+    tilt = normal_maps.fitted.tilt
     moved = 0.0  # pixels that points move in frames that were not registered
-    if isinstance(tilt, float) and not _registered(normal_maps):
+    if tilt is not None and not normal_maps.fitted.registered:
         moved = math.sin(tilt) * float(np.max(np.abs(known.height), initial=0, where=known.known)) / min(size)
     slopes = _slopes_of_maps(normal_maps, wanted, moved)
     opened = device_of_maps(device, height_maps, normal_maps)
@@ -251,7 +253,8 @@ def _fuse_maps(
     if tilt is not None:
         process |= in_process([_FROM_RESULTS], process)
     process |= carried(process, heights=height_maps.process, normals=normal_maps.process)
-    return surface.assign(x=x, y=y, process=process)
+    fitted = normal_maps.fitted.place | height_maps.fitted.place | taken_from(process)
+    return surface.assign(x=x, y=y, process=process, fitted=fitted)
 
 
 def _slopes_of_maps(normals: Result, wanted: Mask, moved: float) -> Slopes:
@@ -272,14 +275,8 @@ def _slopes_of_maps(normals: Result, wanted: Mask, moved: float) -> Slopes:
     contact[~wanted] = 0
     sigma = np.asarray(normals.normals_sigma, np.float32)
     sigma = np.where((sigma >= 0) & (sigma < _SHARPEST), np.float32(_SHARPEST), sigma)
-    gain = np.float32(MEAN_NOISE_GAIN if _registered(normals) else 1)
+    gain = np.float32(MEAN_NOISE_GAIN if normals.fitted.registered else 1)
     return slopes_of(normals.assign(normals_sigma=sigma), sigma / gain, contact)
-
-
-def _registered(normals: Result) -> bool:
-    """Return whether the normals are those of registered frames."""
-    process = normals.process
-    return bool(process.get("registered", process.get("heights", "none") != "none"))
 
 
 def _maps_of(name: str, maps: Maps, *needed: str) -> Result:
@@ -330,19 +327,23 @@ def _fuse_sources(
     common: dict[str, Any] = {"memory_limit": memory_limit, "device": opened}
     turn = Rotation(**{**_options_of(rotation), **common})
     _check_rotation(axial, turn)
-    pressed, known, footprint = _press({**_options_of(press), **common, "fill": False}, vertical, progress)
+    own = _options_of(press)
+    taken = _Evidence(blur=own.get("blur"))
+    method = Press(**{**own, **common, "fill": False, "blur": 0.0})
+    pressed = run_over(vertical, method, progress, [taken])
     if not np.isfinite(pressed.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
     before = fill_with_nearest(pressed.height)
-    solver = FusionSolver(known, pixel_size, robust, opened[0], footprint)
+    solver = FusionSolver(taken.known, pixel_size, robust, opened[0], taken.footprint)
     passes = _passes(axial, register)
     for number in range(passes):
-        method = turn.with_options(heights=before) if register else turn
+        registered = turn.with_options(heights=before) if register else turn
         done = vertical.shape[0] + number * axial.shape[0]
-        turned, slopes = _rotate(method, axial, _after(progress, done))
+        turned, slopes = _rotate(registered, axial, _after(progress, done))
         # The first of several surfaces is rarely the last one, so its sigma is not needed.
         surface = solver.surface(slopes, sigma=number > 0 or passes == 1)
-        moved = _moved(before, surface.height, float(turned.process["tilt"]), pixel_size)
+        assert turned.fitted.tilt is not None
+        moved = _moved(before, surface.height, turned.fitted.tilt, pixel_size)
         if moved <= _STILL:
             break
         before = fill_with_nearest(surface.height)
@@ -353,13 +354,8 @@ def _fuse_sources(
     warn(f"{vertical.name} and {axial.name}", solver.process)
     if progress:
         progress(frames_to_read(vertical, axial, register))
-    signed = attach_provenance(Result(), axial, opened, dict(turned.process))
-    process = (
-        _both(pressed.process, signed.process)
-        | describe_integration([surface])
-        | solver.process
-        | {"heights": "none"}
-    )
+    joined = describe_integration([surface]) | solver.process
+    process = _both(pressed.process, turned.process) | joined | {"heights": "none"}
     if register:
         process |= {"heights": "fused", "registrations": number + 1, "last_move_in_pixels": moved}
     if surface.edges is not None:
@@ -370,7 +366,7 @@ def _fuse_sources(
         x=pressed.x,
         y=pressed.y,
         process=process,
-        calibration=signed.calibration,
+        fitted=turned.fitted | taken_from(joined),
         declarations={"status": pressed.declaration("status")},
     )
     return undistorted(result, axial)
@@ -390,48 +386,32 @@ def _options_of(method: Method | Mapping[str, Any] | None) -> Mapping[str, Any]:
     return method.chosen() if isinstance(method, Method) else method or {}
 
 
-def _press(
-    options: Mapping[str, Any], vertical: Source, progress: Progress | None
-) -> tuple[Result, AbsoluteHeights, float]:
-    """Return the maps of a press, its heights as intervals between frames, and the area that a pixel sees.
+class _Evidence(Step):
+    """Take what the solver needs from a press: heights as intervals, and the area that a pixel sees.
 
     Slopes determine how far a lens that blurs has moved each height, but they are blurred as well.
     """
-    lens, method = LensBlur(blur=options.get("blur")), Press(**{**options, "blur": 0.0})
-    with exclusive_use(vertical), naming(vertical):
-        plan = method.plan(vertical)
-        found = feed(vertical, plan.operation, plan.frames, progress)
-        onsets = plan.operation.finish()
-        result = plan.finish(onsets, vertical)
-    result = result.assign(process={**result.process, **in_process(found, result.process)})
-    warn(vertical.name, result.process)
-    height, sigma = (np.asarray(onsets[name], np.float64) for name in ("height", "height_sigma"))
-    middle, between = heights_as_intervals(height, sigma, plan.operation.pushed("travel"))
-    # Steps, such as the correction for the elastomer, move heights and change their sigma.
-    sigma = result.height_sigma * (between / sigma)
-    footprint = lens.footprint(result, Context(vertical, plan.operation, plan.stream or vertical))
-    variance = footprint.variance if footprint is not None and footprint.clear else PIXEL
-    return result, AbsoluteHeights.of(result.height + (middle - height), sigma), variance
+
+    blur: float | None = LensBlur.blur
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result unchanged."""
+        height, sigma = (
+            np.asarray(context.computed[name], np.float64) for name in ("height", "height_sigma")
+        )
+        middle, between = heights_as_intervals(height, sigma, context.positions("travel"))
+        # Checks and steps, such as the correction for the elastomer, move heights and change their sigma.
+        larger = result.height_sigma * (between / sigma)
+        self.known = AbsoluteHeights.of(result.height + (middle - height), larger)
+        footprint = LensBlur(blur=self.blur).footprint(result, context)
+        self.footprint = footprint.variance if footprint is not None and footprint.clear else PIXEL
+        return result
 
 
 def _rotate(method: Rotation, axial: Source, progress: Progress | None) -> tuple[Result, Slopes]:
     """Return the normals of a rotation, and the slopes that are integrated."""
     with exclusive_use(axial), naming(axial):
-        plan = method.plan(axial)
-        stream = plan.stream or axial
-        found = feed(stream, plan.operation, plan.frames, progress)
-        result = plan.operation.finish()
-    context = Context(axial, plan.operation, stream)
-    process = merged(plan.process, result.process)
-    result = result.assign(dict.fromkeys(plan.omit), process={**process, **in_process(found, process)})
-    slopes = None
-    for step in plan.steps:
-        if isinstance(step, Integration):
-            slopes = step.slopes(result, context)
-        else:
-            result = step.apply(result, context)
-    assert slopes is not None
-    return result, slopes
+        return take_slopes(Run(method.slope_plan(axial), axial).complete(progress))
 
 
 def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:

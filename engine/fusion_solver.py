@@ -17,12 +17,12 @@ from mirrorskin.engine.fusion_agreement import (
     find_disagreement,
 )
 from mirrorskin.engine.integration.integration import integrate
-from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.blur import PIXEL
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.intervals import estimate_interval_errors, fit_paraboloids, interval_evidence
 from mirrorskin.engine.rotation.normals_to_height import Slopes
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device

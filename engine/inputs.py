@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.device_arrays import as_any_array
-from mirrorskin.engine.integration.validation import check_pixel_size
-from mirrorskin.io import InputError, Result, open_result, pixel_axes
-from mirrorskin.io.arguments import as_array
+from mirrorskin.io import Fitted, InputError, Result, open_result, pixel_axes
+from mirrorskin.io.arguments import as_array, check_pixel_size
+from mirrorskin.io.fitted import taken_from
 from mirrorskin.io.maps import declaration_of
 from mirrorskin.io.result import FIELDS, map_shape, shape_of, size_of_maps
 
@@ -109,7 +109,10 @@ def _converted(maps: Any, name: str, quantity: str) -> Result:
 
 
 def _of_mapping(maps: Mapping[Any, Any], name: str) -> Result:
-    """Return arrays by name as a result; numbers and texts that are not declared go to its process."""
+    """Return arrays by name as a result; numbers and texts that are not declared go to its process.
+
+    Those that `mirrorskin.io.Fitted` declares, such as ``tilt``, are in its ``fitted``, too.
+    """
     fields = {one: value for one, value in maps.items() if one in FIELDS and value is not None}
     for axis in fields.keys() & {"x", "y"}:
         fields[axis] = np.asarray(as_array(f"{name}[{axis!r}]", fields[axis], "mm"), np.float64)
@@ -126,7 +129,9 @@ def _of_mapping(maps: Mapping[Any, Any], name: str) -> Result:
             process[one] = values if isinstance(values, str) else values.item()
         else:
             arrays[one] = values if values.ndim else float(values)
-    return Result(arrays, **{**fields, "process": {**process, **fields.get("process", {})}})
+    fitted = taken_from(process) | fields.get("fitted", Fitted())
+    process |= fields.get("process", {})
+    return Result(arrays, **{**fields, "process": process, "fitted": fitted})
 
 
 def _of_one_size(result: Result, name: str) -> Result:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from mirrorskin.engine.method import Method, Plan
+from mirrorskin.engine.method import Method
+from mirrorskin.engine.operation import Plan
 from mirrorskin.engine.options import option
 from mirrorskin.engine.press.growth import Growth
 from mirrorskin.engine.rotation.correlation import Correlate
@@ -30,7 +31,6 @@ class Correlation(Method):
         default=None,
         unit="Hz",
         above=0,
-        words=("estimate",),
         help="frequency, or estimate it: the phase is 2 pi times frequency times the time since the first"
         " frame. To estimate it, the source is read twice; see `engine.rotation.estimate_frequency`",
         shown_default="the phase of the source",
@@ -58,14 +58,12 @@ class Correlation(Method):
 
     def plan(self, source: Source) -> Plan:
         """Return the correlation with the phase selected by the options."""
-        limit = max(1, min(self.memory_limit, 2 * math.prod(source.shape) * source.dtype.itemsize))
         process: dict[str, ProcessValue] = {
             "method": "correlation",
             "zenith": "none: the recording has no zenith gain",
         }
         if self.dither:
-            growth: Growth = self.make(Growth, memory_limit=limit)
-            return Plan(growth.configured_for(source), process=process)
+            return Plan(self.make(Growth).configured_for(source), process=process)
         if self.harmonic != 1:
             process["harmonic"] = self.harmonic
         stream = None
@@ -81,7 +79,7 @@ class Correlation(Method):
                 process["frequency_sigma"] = frequency.sigma
             phase = 2 * math.pi * frequency.hertz * (time - time[0])
             stream = EditedSource(source, partial(_with_phase, phase))
-        return Plan(self.make(Correlate, memory_limit=limit), process=process, stream=stream)
+        return Plan(self.make(Correlate), process=process, stream=stream)
 
     def _times(self, source: Source) -> Doubles:
         """Return the times of the frames, s, from the frame rate, otherwise from the source."""

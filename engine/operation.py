@@ -2,47 +2,37 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import cached_property, partial, wraps
-from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, Protocol, Self, cast, get_args, overload
+from copy import copy
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast, get_args, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from mirrorskin.engine.device_arrays import AnyArray, as_any_array, device_of, on_host
-from mirrorskin.engine.options import RESERVED, Configured, Option, documented, option, signature_of
-from mirrorskin.engine.thread_safe import ThreadSafe
+from mirrorskin.engine.options import Configured, Option, option
+from mirrorskin.engine.provenance import describe
 from mirrorskin.engine.tiling import MEMORY_LIMIT
-from mirrorskin.io import InputError, Map, Result
+from mirrorskin.io import InputError, Map
 from mirrorskin.io.arguments import unknown_argument
-from mirrorskin.io.findings import warn
-from mirrorskin.io.interpreter_end import computes
-from mirrorskin.io.layout import as_series
-from mirrorskin.io.maps import SIGMA, UNDECLARED, declaration_of
-from mirrorskin.io.positions import step_in_degrees
-from mirrorskin.io.result import check_maps, result_of
-from mirrorskin.io.samples import convert_samples, frame_dtype
+from mirrorskin.io.result import check_maps
 from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import Motion
-from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Choice, Device, open_devices
 
 if TYPE_CHECKING:
+    from mirrorskin.engine.picture import Picture
+    from mirrorskin.engine.steps import Step
     from mirrorskin.io import Source
-
-P = ParamSpec("P")
+    from mirrorskin.io.types import ProcessValue
 
 COMPONENTS = {"displacement": (2,), "pose": (4,)}
 """Shapes of positions of a frame that are not single numbers."""
-_NOT_POSITIONS = ("lent", "frame_weights")  # keywords of push that are not positions of the body
-_SCALARS = str | int | float | np.generic
-_ALIKE = 0.75  # similarity, from 0 to 1, from which on a name seems to be misspelt
+_WEIGHTS = "frame_weights"  # the keyword of push that is not a position of the body
+_ANSWERS = "result", "preview"
 _SIMPLE_TYPES = ("bool", "float", "int", "str")  # annotations of options, not of maps
-ABOUT_WEIGHTS = "Weight of each frame, such as its inverse variance; 0 for a missing frame. By default 1."
-"""Description of ``frame_weights`` of array functions."""
 
 
 class _DeviceOption(Option):
@@ -81,7 +71,7 @@ _device: Option = option(
 class OnDevice(Configured):
     """Base of objects with one or several devices, which are opened on first use."""
 
-    device: _DeviceOption = _DeviceOption(**{**vars(_device), "name": "device"})
+    device: _DeviceOption = _DeviceOption(**{**vars(_device), "kind": "object", "optional": True})
 
     @property
     def devices(self) -> Sequence[Device]:
@@ -97,8 +87,43 @@ class OnDevice(Configured):
         return opened
 
 
-class Operation(ThreadSafe, OnDevice):
+@dataclass(frozen=True)
+class Plan:
+    """What a run computes: an operation, and the steps that follow it.
+
+    Attributes
+    ----------
+    operation : Operation
+        It is configured for the source.
+    steps : sequence of Step
+        Applied to the operation's maps after its checks, one after the other.
+    process : mapping
+        The options, and where their values come from.
+    frames : range, optional
+        Frames that are used, in steps of 1, by default all; earlier ones are read and dropped.
+    omit : sequence of str
+        Maps of the operation that the result leaves out.
+    stream : Source, optional
+        Where the frames are read, if not from the source itself.
+    checked : bool
+        Whether frames are watched, and the checks of the operation are applied.
+    """
+
+    operation: Operation
+    steps: Sequence[Step] = ()
+    process: Mapping[str, ProcessValue] = field(default_factory=dict)
+    frames: range | None = None
+    omit: Sequence[str] = ()
+    stream: Source | None = None
+    checked: bool = True
+
+
+class Operation(OnDevice):
     """Base of operations, which receive frames one block after the other and return maps.
+
+    An operation is a value: its class and its options. `mirrorskin.engine.Run` and all that is built on it
+    (`mirrorskin.engine.run`, commands, live runs) compute with a copy of it, so that an operation can be used
+    again, and by several threads at once.
 
     A subclass declares its options (`mirrorskin.engine.option`) and maps (`mirrorskin.io.Map`) as class
     attributes, and defines ``push`` and ``result``:
@@ -108,14 +133,13 @@ class Operation(ThreadSafe, OnDevice):
       frame: ``time``, ``travel``, ``phase``, ``displacement``, ``twist``, ``tilt`` or ``pose``; see
       `mirrorskin.io.Block`. The result must not depend on how the frames are divided, and the memory of the
       frames is reused.
-    - ``result()`` returns the maps of the frames so far by name, and numbers and texts for ``process``. It
-      has no side effects.
+    - ``result()`` returns the maps of the frames so far by name, and numbers and texts for ``process``. They
+      are copied if frames may follow, which ``ended`` tells.
     - ``passes = 2`` means that the frames are pushed twice; ``start_second_pass()`` is called in between.
-
-    One thread at a time runs the methods of an object; see `mirrorskin.engine.thread_safe.ThreadSafe`.
 
     Examples
     --------
+    >>> from mirrorskin import engine
     >>> class Brightest(Operation):
     ...     least: float = option(default=0.0, unit="counts", help="counts below which a pixel is 0")
     ...     brightest = Map("largest brightness", "counts")
@@ -125,9 +149,9 @@ class Operation(ThreadSafe, OnDevice):
     ...         np.maximum(self.most, frames.max(axis=0), out=self.most)
     ...     def result(self):
     ...         return {"brightest": np.where(self.most < self.least, 0, self.most)}
-    >>> operation = Brightest(least=4)
-    >>> operation.push(np.arange(12.0).reshape(3, 2, 2))
-    >>> operation.result().brightest.tolist()
+    >>> run = engine.Run(Brightest(least=4))
+    >>> run.push(np.arange(12.0).reshape(3, 2, 2))
+    >>> run.result().brightest.tolist()
     [[8.0, 9.0], [10.0, 11.0]]
     """
 
@@ -150,18 +174,19 @@ class Operation(ThreadSafe, OnDevice):
     """Names of declared maps that ``result`` does not always return."""
     positions: ClassVar[Mapping[str, bool]] = {}
     """Positions that ``push`` takes for each frame, and whether it needs them; may depend on options."""
-    on_device: ClassVar[bool] = False
-    """Whether frames are read for the device: ahead, or where kernels can read them without a copy."""
-    takes_device_arrays: ClassVar[bool] = False
-    """Whether ``push`` accepts a `mirrorskin.kernels.array.Array`; otherwise it gets a NumPy array."""
-    long_blocks: ClassVar[bool] = False
-    """Whether as many frames as possible should be pushed at once."""
+    checks: ClassVar[tuple[type[Step], ...]] = ()
+    """Steps that every run applies to the maps: they compare them with the frames, and correct them."""
+    usual_findings: ClassVar[tuple[str, ...]] = ()
+    """Kinds of findings about frames that are not reported, because its frames are usually so."""
+    for_device: ClassVar[bool] = False
+    """Whether ``push`` takes frames that are on a device, for `mirrorskin.engine.picture.Picture`."""
     updates_per_second: ClassVar[float] = 15.0
     """Number of useful updates per second of a live run."""
-    _takes_lent: ClassVar[bool] = False
-    _starts_again: ClassVar[bool] = False  # whether a subclass prepares more than its base clears
-    on_objects: ClassVar[tuple[str, ...]] = ("shape", "dtype", "count")
-    """Attributes of objects: rows and columns of a frame, type of a sample, number of frames so far."""
+    on_objects: ClassVar[tuple[str, ...]] = ("shape", "dtype", "count", "ended")
+    """Attributes of objects: rows and columns of a frame, type of a sample, number of frames so far, and
+    whether no more frames follow."""
+
+    _weighted: ClassVar[bool] = False  # whether ``push`` takes weights of frames
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         if "maps" in vars(cls):
@@ -174,19 +199,11 @@ class Operation(ThreadSafe, OnDevice):
             found |= {name: one for name, one in vars(base).items() if isinstance(one, Map)}
         cls.maps = found
         _check_class(cls)
-        for name, wrap in _WRAPPERS.items():
-            owner = cls.__mro__[mro_index(cls, name)]
-            if owner is not cls and issubclass(owner, Operation):
-                continue
-            if name == "push":
-                cls._take_positions(vars(owner)[name])
-            setattr(cls, name, wrap(vars(owner)[name]))
-        for name in ("finish", "preview"):  # a base's shortcuts to what its own result returns
-            if mro_index(cls, "result") < mro_index(cls, name):
-                setattr(cls, name, vars(Operation)[name])
-        cls._starts_again = mro_index(cls, "start") < mro_index(cls, "clear")
-        if "room" in vars(cls):
-            cls.room = _checked_room(vars(cls)["room"])  # type: ignore[assignment]
+        if "push" in vars(cls):
+            cls._take_positions(vars(cls)["push"])
+        definer = {name: next(base for base in cls.__mro__ if name in vars(base)) for name in _ANSWERS}
+        if not issubclass(definer["preview"], definer["result"]):  # a shortcut to what another result returns
+            cls.preview = Operation.preview  # type: ignore[method-assign]
         super().__init_subclass__(**kwargs)
 
     @classmethod
@@ -197,33 +214,40 @@ class Operation(ThreadSafe, OnDevice):
             part.name: part.default is part.empty for part in parameters if part.kind != part.VAR_KEYWORD
         }
         passes_on = len(named) < len(parameters)
-        cls._takes_lent = "lent" in named or (passes_on and cls._takes_lent)
-        positions = {name: needed for name, needed in named.items() if name not in _NOT_POSITIONS}
-        cls.positions = {**(cls.positions if passes_on else {}), **positions}
+        cls._weighted = _WEIGHTS in named or (passes_on and cls._weighted)
+        named.pop(_WEIGHTS, None)
+        cls.positions = {**(cls.positions if passes_on else {}), **named}
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
+        self._forget_frames()
+
+    def _forget_frames(self) -> None:
         self.shape: Any = None
         self.dtype: Any = None
-        self._pushing = self._answering = False
-        self._forget()
-
-    def _forget(self) -> None:
-        self.count, self._pass = 0, 1
-        self._on_device = False  # whether frames were on a device, where the maps then stay
-        self._pushed: dict[str, list[NDArray[np.float64]]] = {}
+        self.count = 0
+        self.ended = False
+        self._second_pass = False
+        self._stay_valid = False  # whether the pushed frames stay as they are while they are referenced
+        self._on_device = False  # whether frames are on a device, where the maps then stay
+        self._picture: Picture | None = None
+        self._positions_so_far: dict[str, list[NDArray[np.float64]]] = {}
 
     def configured_for(self, source: Source) -> Self:
         """Return the operation with options that are not given set from what a source says of its frames."""
         return self
 
-    def with_options(self, **options: Any) -> Self:
-        """Return an operation of the same class in which some options differ."""
-        return type(self)(**{**self.chosen(), **options})
+    def plan(self, source: Source) -> Plan:
+        """Return the plan for a source: this operation alone."""
+        operation = self.configured_for(source)
+        return Plan(operation, process=describe(operation, source))
 
-    def pushed(self, name: str) -> NDArray[np.float64]:
+    def positions_so_far(self, name: str) -> NDArray[np.float64]:
         """Return the positions of the frames so far, (T,) or (T, components), such as those of ``travel``."""
-        return np.concatenate(self._pushed[name]) if name in self._pushed else np.empty(0)
+        parts = self._positions_so_far.get(name, [])
+        if len(parts) > 1:  # joined once, as this may be called with each push
+            parts[:] = [np.concatenate(parts)]
+        return parts[0].copy() if parts else np.empty(0)
 
     @property
     def passes(self) -> int:
@@ -235,267 +259,91 @@ class Operation(ThreadSafe, OnDevice):
         """Declarations of the maps of this object, where they depend on options."""
         return self.maps
 
-    def begin(self, shape: tuple[int, ...], dtype: DTypeLike) -> None:
-        """Prepare for frames of a shape, (H, W), and type, and forget all earlier frames."""
-        wanted = np.dtype(dtype)
-        if self.dtypes is not None and wanted not in self.dtypes:
-            *others, last = map(str, self.dtypes)
-            raise InputError(f"frames of type {wanted}: {', '.join(others)} or {last} are needed")
-        if (self.shape, self.dtype) == (shape, wanted):
-            self.reset()
-            return
-        vars(self).pop("room", None)
-        self.shape, self.dtype = (shape[0], shape[1]), wanted
-        self._forget()
-        self.start(self.shape, wanted)
-
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare for frames of a shape and type; called before the first."""
-
-    def clear(self) -> None:
-        """Forget the frames so far, but keep what `start` prepared; by default, start again."""
-        self.start(self.shape, self.dtype)
-
-    def reset(self) -> None:
-        """Forget the frames so far, and all estimates from them."""
-        self._forget()
-        if self.dtype is not None and self._starts_again:
-            self.start(self.shape, self.dtype)
-        elif self.dtype is not None:
-            self.clear()
 
     def push(self, *args: Any, **kwargs: Any) -> None:
         """Process the next frames."""
         raise NotImplementedError(f"{type(self).__name__} has no push(frames)")
 
+    def start_second_pass(self) -> None:
+        """Prepare for the same frames once more."""
+
+    def after_last_frame(self, samples: FrameSamples) -> Self | None:
+        """Return the operation that all frames are to be pushed into again, if an assumption was wrong.
+
+        It is called after the last frame, with samples of all of them.
+        """
+        return None
+
+    @property
+    def corrected_kinds(self) -> tuple[str, ...]:
+        """Kinds of findings about frames, such as "flicker", that `apply_correction` removes."""
+        return ()
+
+    def apply_correction(self, frames: NDArray[Any], first: int) -> NDArray[Any]:
+        """Return corrected frames, float32; the first of them has a number."""
+        return frames
+
     def result(self) -> Any:
         """Return the maps of the frames so far."""
         raise NotImplementedError(f"{type(self).__name__} has no result()")
-
-    def finish(self) -> Result:
-        """Return the maps of all frames; only `reset` may follow, so that buffers need not be copied."""
-        return cast(Result, self.result())
-
-    def reconsider(self, samples: FrameSamples) -> bool:
-        """Return whether all frames must be pushed again, because an assumption about them was wrong.
-
-        It is called after the last frame, with samples of all of them. If it returns True, the operation has
-        forgotten the frames, and they are pushed again as returned by `corrected`.
-        """
-        return False
-
-    @property
-    def corrects(self) -> tuple[str, ...]:
-        """Kinds of findings about frames, such as "flicker", that `corrected` removes."""
-        return ()
-
-    def corrected(self, frames: NDArray[Any], first: int) -> NDArray[Any]:
-        """Return frames in the operation's type, with its corrections; the first of them has a number."""
-        return frames
 
     def preview(self, seconds: float) -> Mapping[str, Any]:
         """Return the maps that a display shows while the body moves, if possible within some seconds."""
         return self.result()  # type: ignore[no-any-return]
 
-    def spare(self, seconds: float) -> None:
+    def idle_work(self, seconds: float) -> None:
         """Do postponed work, for some seconds at most, while no frame is expected."""
 
-    def warm(self) -> None:
-        """Push a frame of zeros and forget it, so that what is compiled on first use is ready."""
-        where = {name: np.zeros((1, *COMPONENTS.get(name, ()))) for name in self.positions}
-        self.push(np.zeros((1, *self.shape), self.dtype), **where)
-        with suppress(InputError):
+    def precompile(self) -> None:
+        """Push frames of zeros, so that what is compiled on first use is ready; called on a copy."""
+        count = max(1, self.least_frames)
+        where = {name: np.zeros((count, *COMPONENTS.get(name, ()))) for name in self.positions}
+        self.push(np.zeros((count, *self.shape), self.dtype), **where)
+        self.count, self._positions_so_far = count, {name: [values] for name, values in where.items()}
+        with suppress(InputError):  # such frames may determine nothing
             self.preview(0.0)
-        self.reset()
 
-    def start_second_pass(self) -> None:
-        """Prepare for the same frames once more."""
+    def _copy_for_run(self) -> Self:
+        """Return a copy with a state of its own."""
+        copied = object.__new__(type(self))
+        state = {name: value for name, value in vars(self).items() if name != "_opened_devices"}
+        for name, value in state.items():
+            own = isinstance(value, list | dict | set | np.ndarray) and name not in self.options
+            vars(copied)[name] = copy(value) if own else value
+        copied._forget_frames()
+        return copied
 
-    def next_pass(self) -> None:
-        """Begin the second pass, after all frames have been pushed once."""
-        self.check_count()
+    def _begin(self, shape: tuple[int, ...], dtype: DTypeLike) -> None:
+        """Prepare a copy for a run over frames of a shape, (H, W), and type."""
+        wanted = np.dtype(dtype)
+        if self.dtypes is not None and wanted not in self.dtypes:
+            *others, last = map(str, self.dtypes)
+            raise InputError(f"frames of type {wanted}: {', '.join(others)} or {last} are needed")
+        self.shape, self.dtype = (shape[0], shape[1]), wanted
+        self.start(self.shape, wanted)
+
+    def _begin_second_pass(self) -> None:
         self.start_second_pass()
-        expected = self.count
-        self._forget()
-        self._pass, self._expected = 2, expected
+        self.count, self._second_pass = 0, True
+        self._positions_so_far.clear()
 
-    @cached_property
-    def room(self) -> NDArray[Any]:
-        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        _check_started(self)
+    @property
+    def frames_at_once(self) -> int:
+        """Number of frames that are read at once: half of the memory limit."""
         rows, columns = self.shape
-        at_once = max(1, self.memory_limit // (2 * rows * columns * self.dtype.itemsize))
-        return np.empty((at_once, rows, columns), self.dtype)
+        return max(1, self.memory_limit // (2 * int(rows * columns * self.dtype.itemsize)))
 
-    def check_count(self) -> None:
-        """Raise InputError if fewer frames have been pushed than a result needs."""
-        if self.count < self.least_frames:
-            frames = "1 frame" if self.least_frames == 1 else f"{self.least_frames} frames"
-            pushed = f"{self.count} has been" if self.count == 1 else f"{self.count or 'none'} have been"
-            raise InputError(f"{type(self).__name__} needs at least {frames}; {pushed} pushed so far")
-
-    def _as_frames(self, frames: Any, first: int) -> AnyArray:
-        """Return frames as an array in a type that the operation takes; ``first``: number of the first."""
-        array = as_any_array("frames", frames)
-        if not self.takes_device_arrays:
-            array = on_host(array)
-        elif isinstance(array, Array):
-            self.use_device_of(array)
-        if self.dtypes is not None and array.dtype not in self.dtypes and isinstance(array, np.ndarray):
-            array = convert_samples(array, frame_dtype(array.dtype, "frames"), "frames", first)
-        return array
-
-    def _begin_with(self, frames: Any) -> AnyArray:
-        """Forget earlier frames, prepare for these, (n, H, W), and return them in the operation's type."""
-        array = self._as_frames(frames, 0)
-        if array.ndim == 2 and 0 not in array.shape:
-            raise InputError(f"frames are {array.dtype} {array.shape}: for a single frame, pass frame[None]")
-        if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
-            raise InputError(f"frames are {array.dtype} {array.shape}: numbers (n, H, W) are needed")
-        self.begin(array.shape[1:], array.dtype)
-        return array
-
-    def _check_frames(self, frames: Any) -> AnyArray:
-        """Return frames as an array that fits to earlier ones."""
-        array = self._begin_with(frames) if self.dtype is None else self._as_frames(frames, self.count)
-        self._on_device = isinstance(array, Array)
-        if array.dtype != self.dtype or array.shape[1:] != self.shape or len(array) == 0:
-            expected = f"{self.dtype} (n, {self.shape[0]}, {self.shape[1]})"
-            raise InputError(f"frames are {array.dtype} {array.shape}: {expected} is needed")
-        return array
-
-    def use_device_of(self, frames: Array) -> None:
-        """Compute on the device of frames, if none was chosen; InputError if they are on another one."""
-        vars(self)["_device"] = device_of(self.opened_devices or vars(self)["_device"], frames)
-
-    def _check_positions(self, count: int, given: Mapping[str, Any]) -> None:
-        """Raise InputError unless there is a position of each frame."""
-        for name, needed in self.positions.items():
-            values = given.get(name)
-            if values is None and needed:
-                raise InputError(f"{name} is missing: {type(self).__name__} needs it of each frame")
-            if values is not None and np.shape(values)[:1] != (count,):
-                frames = "1 frame" if count == 1 else f"{count} frames"
-                last = np.shape(values)[:1] == (self.shape[1],)
-                axes = "; if the frames are the last axis, use numpy.moveaxis(frames, -1, 0)" if last else ""
-                raise InputError(
-                    f"{name} has shape {np.shape(values)} for {frames}: give one of each frame{axes}"
-                )
-        if foreign := given.keys() - {*self.positions, *_NOT_POSITIONS}:
-            names = ", ".join(sorted(foreign))
-            taken = ", ".join(self.positions) or "frames only"
-            raise InputError(f"{type(self).__name__} does not take {names}. It takes {taken}")
-
-
-def _checked_push(method: Callable[..., None]) -> Callable[..., None]:
-    """Return a method ``push`` that checks its arguments, and counts frames."""
-
-    @wraps(method)
-    def push(self: Operation, frames: Any, **given: Any) -> None:
-        if self._pushing:  # by the push of a subclass
-            method(self, frames, **given)
-            return
-        array = self._check_frames(frames)
-        for name in given.keys() & {*self.positions, "frame_weights"}:
-            given[name] = None if given[name] is None else as_series(name, given[name])
-        self._check_positions(len(array), given)
-        if not self._takes_lent:
-            given.pop("lent", None)
-        self._pushing = True
-        try:
-            method(self, array, **given)
-        finally:
-            self._pushing = False
-        self.count += len(array)
-        for name, values in given.items():
-            if name in self.positions and values is not None:
-                self._pushed.setdefault(name, []).append(np.array(values, np.float64))
-
-    return push
-
-
-def _checked_result(method_name: str, method: Callable[..., Any]) -> Callable[..., Result]:
-    """Return a method ``result`` or ``finish`` whose maps are checked against their declarations."""
-
-    @wraps(method)
-    def result(self: Operation) -> Result:
-        name = type(self).__name__
-        self.check_count()
-        if self.passes == 2 and (self._pass == 1 or self.count != self._expected):
-            raise InputError(f"{name} needs all frames twice, with next_pass() in between")
-        outermost, self._answering = not self._answering, True
-        try:
-            returned = method(self)
-        finally:
-            self._answering = not outermost
-        if not isinstance(returned, Mapping):
-            raise InputError(f"{name}.result() returns a {type(returned).__name__}. Return maps by name")
-        if outermost:  # to what a base returns, a subclass may add maps
-            _check_names(self, returned, method_name)
-        return returned if isinstance(returned, Result) else _as_result(self, returned)
-
-    return result
-
-
-def _as_result(operation: Operation, returned: Mapping[str, Any]) -> Result:
-    """Return what a method ``result`` returned by name: maps, and numbers and texts for the process."""
-    kind, declared = type(operation).__name__, operation.declarations
-    process, maps = dict[str, Any](), dict[str, Any]()
-    for name, value in returned.items():
-        option_value = operation.options[name].stored(operation) if name in operation.options else None
-        if name in RESERVED or (option_value is not None and not _is_rounded(value, option_value)):
-            raise InputError(f"{kind}.result() returns {name}, which has a meaning already. Rename it")
-        if not isinstance(value, _SCALARS) or declaration_of(name, declared).axes == "none":
-            maps[name] = value
-        elif option_value is not None:
-            process[name] = option_value
-        else:
-            process[name] = value.item() if isinstance(value, np.generic) else value
-    if not maps:
-        raise InputError(f"{kind}.result() returns no map: return at least one, (H, W)")
-    try:
-        return result_of(maps, operation.shape, process, declared)
-    except InputError as error:
-        raise InputError(f"{kind}.result(): {error}") from error
-
-
-def _is_rounded(value: Any, option_value: Any) -> bool:
-    """Return whether a value equals that of an option, or its rounding to float32."""
-    left, right = np.asarray(value), np.asarray(option_value)
-    if left.dtype.kind in "uif" and right.dtype.kind in "uif":
-        left, right = left.astype(np.float32), right.astype(np.float32)
-    return (right.ndim == 0 or right.shape == left.shape) and bool(np.all(left == right))
-
-
-def _check_names(operation: Operation, returned: Mapping[str, Any], method: str) -> None:
-    """Raise InputError if a declared map is missing, or a name looks like that of a missing one.
-
-    A method that overrides another one may return fewer maps than those declared for the other.
-    """
-    kind, declared = type(operation), operation.declarations
-    names = set(returned)  # to look for a name in the result would copy the map from its device
-    where = f"{kind.__name__}.result()"
-    owner, overridden = [base for base in kind.__mro__ if method in vars(base)][:2]
-    last = overridden if overridden is Operation else owner
-    classes = kind.__mro__[: kind.__mro__.index(last) + 1]
-    promised = {name for base in classes for name, value in vars(base).items() if isinstance(value, Map)}
-    missing = [name for name in declared if name not in names]
-    required = [name for name in missing if name in promised and name not in kind.optional_maps]
-    for name in returned:
-        quantity = name.removesuffix(SIGMA)
-        deviates = quantity != name
-        if declaration_of(name, declared) is not UNDECLARED or (deviates and quantity in names):
-            continue
-        possible = [f"{other}{SIGMA}" for other in declared] if deviates else missing
-        if not isinstance(returned, Result) and isinstance(returned[name], _SCALARS):
-            possible = required
-        if close := difflib.get_close_matches(name, possible, n=1, cutoff=_ALIKE):
-            raise InputError(f"{where} returns {name}, which is not declared: did you mean {close[0]}?")
-    if required:
-        raise InputError(
-            f"{where} does not return {' and '.join(required)}, which its class declares. Return each"
-            " declared map, or list those that may be missing in optional_maps"
-        )
+    @property
+    def staging_buffer(self) -> NDArray[Any]:
+        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
+        if self._picture is not None:
+            return self._picture.staging_buffer
+        buffer = vars(self).get("_staging_buffer")
+        if buffer is None:
+            buffer = vars(self)["_staging_buffer"] = np.empty((self.frames_at_once, *self.shape), self.dtype)
+        return cast("NDArray[Any]", buffer)
 
 
 def _check_class(cls: type[Operation]) -> None:
@@ -513,7 +361,7 @@ def _check_class(cls: type[Operation]) -> None:
                 f"{name}: a map cannot be called {one!r}, which operations use. Choose another name"
             )
     if unknown := [one for one in cls.optional_maps if one not in cls.maps]:
-        raise InputError(f"{name}: optional_maps has {unknown[0]}, which is not declared as a map")
+        raise InputError(f"optional_maps: {unknown_argument(name, unknown[0], [*cls.maps], 'map')}")
     for one, kind in inspect.get_annotations(cls).items():
         if isinstance(own.get(one), Map) and getattr(kind, "__name__", kind) in _SIMPLE_TYPES:
             raise InputError(f"{name}: {one} is an option and a map. Rename one of them")
@@ -522,177 +370,3 @@ def _check_class(cls: type[Operation]) -> None:
     if isinstance(cls.motions, str) or not set(cls.motions) <= {*get_args(Motion)}:
         motions = ", ".join(get_args(Motion))
         raise InputError(f'{name}: motions is {cls.motions!r}. Use a tuple of {motions}, such as ("axial",)')
-
-
-def mro_index(cls: type, name: str) -> int:
-    """Return the index in the method resolution order of the first class that defines a name."""
-    return next(index for index, base in enumerate(cls.__mro__) if name in vars(base))
-
-
-def _check_started(operation: Operation) -> None:
-    """Raise InputError if the shape of the frames is unknown."""
-    if operation.shape is None:
-        name = type(operation).__name__
-        raise InputError(f"{name} does not know the shape of the frames yet. Call begin(shape, dtype) first")
-
-
-def _checked_room(member: property | cached_property[Any]) -> property:
-    """Return the property ``room`` of an operation, which needs the shape of the frames."""
-
-    def room(self: Operation) -> NDArray[Any]:
-        _check_started(self)
-        return cast("NDArray[Any]", member.__get__(self, type(self)))
-
-    return property(room, doc=member.__doc__)
-
-
-_WRAPPERS: Mapping[str, Callable[[Any], Any]] = {
-    "push": _checked_push,
-    "result": partial(_checked_result, "result"),
-    "finish": partial(_checked_result, "finish"),
-}
-
-
-def warn_of_degrees(name: str, phase: ArrayLike | None) -> None:
-    """Issue a warning if phases of frames, (T,), radians, seem to be degrees; ``name`` begins it."""
-    step = 0.0 if phase is None else step_in_degrees(np.asarray(phase))
-    if step:
-        text = f"phase is in radians; yours steps by {step:.4g} rad: are they degrees?"
-        warn(name, {"warnings": text})
-
-
-Compute = Callable[[Any, dict[str, Any], dict[str, Any]], Result]
-"""Function of frames, positions by name and options by name that returns the maps."""
-
-
-def limit_of(frames: AnyArray) -> int:
-    """Return the memory limit of an operation on a stack in memory, bytes."""
-    return max(1, min(MEMORY_LIMIT, 2 * int(frames.nbytes)))
-
-
-def apply(
-    operation: Operation, frames: Any, progress: Callable[[int], None] | None = None, **given: Any
-) -> Result:
-    """Return the maps of a stack that fits in memory; the operation forgets all earlier frames."""
-
-    def push_all() -> None:
-        for number in range(operation.passes):
-            if number:
-                operation.next_pass()
-            operation.push(frames, lent=True, **given)
-            if progress:
-                progress(len(frames))
-
-    frames = operation._begin_with(frames)
-    push_all()
-    if isinstance(frames, np.ndarray) and operation.reconsider(FrameSamples.of(frames)):
-        frames = operation.corrected(frames, 0)
-        push_all()
-    return operation.finish()
-
-
-class TravelFunction(Protocol[P]):
-    """A function of frames, (T, H, W), their travel, (T,) mm, and options."""
-
-    def __call__(self, frames: ArrayLike, travel: ArrayLike, *args: P.args, **options: P.kwargs) -> Result:
-        """Return the maps."""
-
-
-class PhaseFunction(Protocol[P]):
-    """A function of frames, (T, H, W), their phase, (T,) radians, their weights, (T,), and options."""
-
-    def __call__(
-        self,
-        frames: ArrayLike,
-        phase: ArrayLike,
-        frame_weights: ArrayLike | None = None,
-        *args: P.args,
-        **options: P.kwargs,
-    ) -> Result:
-        """Return the maps."""
-
-
-def travel_function(
-    operation: Callable[P, Operation], name: str, text: str, about_travel: str, compute: Compute | None = None
-) -> TravelFunction[P]:
-    """Return the function on arrays of an operation whose ``push`` takes ``travel``; see `array_function`."""
-    function = array_function(cast(Any, operation), name, text, {"travel": about_travel}, compute=compute)
-    return cast(TravelFunction[P], function)
-
-
-class OptionalPhaseFunction(Protocol[P]):
-    """A function of frames, (T, H, W), their phase, (T,) radians, if it is needed, and options."""
-
-    def __call__(
-        self, frames: ArrayLike, phase: ArrayLike | None = None, *args: P.args, **options: P.kwargs
-    ) -> Result:
-        """Return the maps."""
-
-
-def phase_function(
-    operation: Callable[P, Operation], name: str, text: str, about_phase: str
-) -> PhaseFunction[P]:
-    """Return the function on arrays of an operation whose ``push`` takes ``phase`` and ``frame_weights``."""
-    function = array_function(
-        cast(Any, operation), name, text, {"phase": about_phase}, {"frame_weights": ABOUT_WEIGHTS}
-    )
-    return cast(PhaseFunction[P], function)
-
-
-def optional_phase_function(
-    operation: Callable[P, Operation], name: str, text: str, about_phase: str
-) -> OptionalPhaseFunction[P]:
-    """Return the function on arrays of an operation whose ``push`` takes ``phase`` if options ask for it."""
-    function = array_function(cast(Any, operation), name, text, {}, {"phase": about_phase})
-    return cast(OptionalPhaseFunction[P], function)
-
-
-def array_function(
-    operation: type[Operation],
-    name: str,
-    text: str,
-    positions: Mapping[str, str],
-    optional: Mapping[str, str] | None = None,
-    compute: Compute | None = None,
-) -> Callable[..., Result]:
-    """Return a function of frames, positions and options, with signature and docstring.
-
-    Parameters
-    ----------
-    operation : type
-        Operation that has the options.
-    name : str
-    text : str
-        Docstring without the section "Parameters".
-    positions, optional : mapping of str
-        Names of what is needed of each frame, or may be given, with descriptions.
-    compute : callable, optional
-        Receives frames, positions and options, and returns the result; by default that of the operation.
-    """
-    optional = optional or {}
-    options = {one: declared for one, declared in operation.options.items() if one != "memory_limit"}
-    signature = signature_of(options, ("frames", *positions), tuple(optional))
-
-    def run(frames: NDArray[Any], where: dict[str, Any], given: dict[str, Any]) -> Result:
-        given_positions = {one: values for one, values in where.items() if values is not None}
-        return apply(operation(memory_limit=limit_of(frames), **given), frames, **given_positions)
-
-    @computes
-    def function(*args: Any, **kwargs: Any) -> Result:
-        if unknown := next((one for one in kwargs if one not in signature.parameters), ""):
-            raise TypeError(unknown_argument(f"{name}()", unknown, [*signature.parameters]))
-        given = signature.bind(*args, **kwargs).arguments
-        frames = as_any_array("frames", given.pop("frames"))
-        where = {one: given.pop(one, None) for one in (*positions, *optional)}
-        where = {one: None if values is None else as_series(one, values) for one, values in where.items()}
-        warn_of_degrees(name, where.get("phase"))
-        return (compute or run)(frames, where, given)
-
-    before = "frames : array_like or device array, (T, H, W)\n    Raw counts.\n"
-    for names, end in ((positions, ""), (optional, ", optional")):
-        before += "".join(f"{one} : array_like, (T,){end}\n    {about}\n" for one, about in names.items())
-    function.__name__ = function.__qualname__ = name
-    function.__module__ = operation.__module__
-    function.__doc__ = documented(text, options, before)
-    function.__signature__ = signature  # type: ignore[attr-defined]
-    return function

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.amplitude_blur import with_blur
 from mirrorskin.engine.frames import noise_of_residual
-from mirrorskin.engine.operation import Operation, optional_phase_function
+from mirrorskin.engine.functions import optional_phase_function
+from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
+from mirrorskin.engine.picture import PerFrame, Picture
+from mirrorskin.engine.steps import Context, Step
+from mirrorskin.engine.tiling import Planes
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.arguments import as_array
-from mirrorskin.io.findings import Finding, in_process
+from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
-from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES
-from mirrorskin.kernels.array import fetch
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.device import C_TYPES
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
@@ -28,6 +30,37 @@ if TYPE_CHECKING:
 
 _FEWEST, _CLEAR, _POWER = 64, 6.0, 0.03  # pixels, standard errors, and change of the power that decide
 _BEYOND = 4.0  # standard deviations of a residual that noise does not explain
+_PLANES: Mapping[str, Any] = {
+    "darks": np.float32,
+    "triangle": Planes(11, np.float32),  # least squares of the frames so far, see lambert.cl
+    "normals": np.dtype((np.float32, 3)),
+    **dict.fromkeys(("albedo", "residual", "normals_spread", "albedo_spread"), np.float32),
+    "samples": np.int32,
+}
+_ANSWERS = "normals", "albedo", "residual", "samples", "normals_spread", "albedo_spread"
+
+
+class ResponseLinearity(Step):
+    """Warn if the brightness is not proportional to the light."""
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result; its process has the warning, if another power of the light fits better."""
+        operation, samples = cast("PhotometricStereo", context.operation), context.samples
+        if samples is None:
+            return result
+        values, dark = samples.values, np.asarray(0.0 if operation.dark is None else operation.dark)
+        level = dark if dark.ndim == 0 else samples.of_map(dark).ravel()
+        light = values.reshape(len(values), -1).astype(np.float64) - level
+        lamps = operation.lights(0, len(light), context.positions("phase"))
+        lit = np.all((light > max(operation.shadow, 0.0)) & (light < operation.saturation - level), axis=0)
+        power = _power(light[:, lit], lamps)
+        if power == 1:
+            return result
+        text = (
+            f"the brightness is not proportional to the light, but to its power {power:.2g}, as with gamma"
+            " (or gloss), so normals are wrong by more than their sigma: use a camera with a linear response"
+        )
+        return with_findings(result, Finding("response", text))
 
 
 class PhotometricStereo(Operation):
@@ -40,17 +73,16 @@ class PhotometricStereo(Operation):
     Examples
     --------
     >>> from mirrorskin import engine
+    >>> azimuth = np.arange(4) * np.pi / 2
+    >>> frames = np.full((4, 1, 2), 50 + 30 * np.cos(azimuth)[:, None, None])
     >>> stereo = engine.photometric.PhotometricStereo(zenith=np.pi / 4)
-    >>> for azimuth in np.arange(4) * np.pi / 2:
-    ...     stereo.push(np.full((1, 1, 2), 50 + 30 * np.cos(azimuth), np.float32), phase=[azimuth])
-    >>> round(float(stereo.result().normals[0, 0, 0]), 4)
+    >>> round(float(engine.run(frames, stereo, phase=azimuth).normals[0, 0, 0]), 4)
     0.5145
     """
 
-    takes_device_arrays = True
-    _response: Finding | None = None  # that brightness is not proportional to light
     dtypes = FRAME_DTYPES
-    on_device = True
+    checks = (ResponseLinearity,)
+    for_device = True
 
     light: ArrayLike | None = option(
         default=None,
@@ -68,7 +100,6 @@ class PhotometricStereo(Operation):
     dark: ArrayLike | None = option(
         default=None,
         unit="counts",
-        map=True,
         help="brightness without a lamp, a number or a map (H, W)",
         shown_default="that of the recording or calibration; of arrays, 0",
     )
@@ -88,7 +119,6 @@ class PhotometricStereo(Operation):
     noise: ArrayLike | None = option(
         default=None,
         unit="counts",
-        map=True,
         within=(0, None),
         help="standard deviation of a sample, a number or a map (H, W)",
         shown_default="estimated from the median residual, which needs four frames or more",
@@ -113,109 +143,52 @@ class PhotometricStereo(Operation):
         return self if self.dark is not None else self.with_options(dark=source.header.dark)
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
-        """Prepare the kernel and its maps."""
+        """Prepare the maps."""
         self._noise = None if self.noise is None else _map("noise", self.noise, shape)
         if self._noise is not None and not np.all(self._noise >= 0):
             raise InputError("noise: standard deviations of a sample are needed, counts from 0 on")
         self._lights = None if self.light is None else _vectors(self.light)
         top = np.inf if dtype.kind == "f" else float(np.iinfo(dtype).max)
-        self._saturation = top if self.bright is None else self.bright
-        darks = _map("dark", 0.0 if self.dark is None else self.dark, shape)
-        self._darks, self._dark_step = self.device.from_host("darks", darks.ravel()), int(darks.ndim > 0)
-        self._add = self.device.kernel("lambert", "lambert_add", FRAME=C_TYPES[dtype.name])
-        self._solve = self.device.kernel("lambert", "lambert_normals", FRAME=C_TYPES[dtype.name])
-        self._triangle = self.device.array("triangle", (11, *shape), np.float32, zeroed=False)
-
-    def clear(self) -> None:
-        """Forget what the frames so far showed; the next one overwrites their sums."""
-        self._response = None
+        self.saturation = top if self.bright is None else self.bright
+        self._maps = Picture(self, "lambert", _PLANES)
+        self._maps.fill("darks", _map("dark", 0.0 if self.dark is None else self.dark, shape))
+        self._maps.fill("triangle", 0)
 
     def push(self, frames: NDArray[Any], *, phase: ArrayLike | None = None) -> None:
         """Process the next frames, (n, H, W), and the azimuth of each lamp, (n,) radians."""
-        lights = self._lights_of(len(frames), phase)
-        pixels = self.shape[0] * self.shape[1]
-        self._add(
-            -(-pixels // self.device.layout.tile), frames=self.device.share("frames", frames),
-            count=len(frames), pixels=pixels, lights=self.device.from_host("lights", lights),
-            fresh=self.count == 0, darks=self._darks, dark_step=self._dark_step, shadow=self.shadow,
-            bright=self._saturation, triangle=self._triangle, moved=frames.nbytes,
-        )  # fmt: skip
-        self.device.finish()
+        lights = PerFrame(self.lights(self.count, len(frames), phase))
+        self._maps.scan("lambert_add", frames, lights=lights, shadow=self.shadow, bright=self.saturation)
 
-    def _lights_of(self, count: int, phase: ArrayLike | None) -> Doubles:
-        """Return the vectors towards the lamps of the next frames, (n, 3)."""
-        stop = self.count + count
-        if self._lights is not None and stop > len(self._lights):
-            raise InputError(
-                f"light has {len(self._lights)} vectors: one is needed for each of {stop} frames"
-            )
-        if self._lights is None and self.zenith is None:
-            raise InputError("phases are azimuths only: specify the zenith of the lamps, radians, or light")
-        return self._lights_at(
-            np.arange(self.count, stop), None if phase is None else check_phase(phase, count, "phase")
-        )
-
-    def _lights_at(self, frames: NDArray[np.integer], phase: Doubles | None) -> Doubles:
-        """Return the vectors towards the lamps of frames with numbers and azimuths, (n, 3)."""
+    def lights(self, first: int, count: int, phase: ArrayLike | None) -> Doubles:
+        """Return the vectors towards the lamps of some frames, (n, 3), by their azimuths if needed."""
         if self._lights is not None:
-            return np.asarray(self._lights[frames])
+            self._check_lights(first + count, len(self._lights) >= first + count)
+            return np.asarray(self._lights[first : first + count])
+        if self.zenith is None:
+            raise InputError("phases are azimuths only: specify the zenith of the lamps, radians, or light")
         assert phase is not None
-        assert self.zenith is not None
-        up = np.full(len(frames), np.cos(self.zenith))
-        return np.stack(
-            [np.sin(self.zenith) * np.cos(phase), np.sin(self.zenith) * np.sin(phase), up], axis=1
-        )
+        azimuth = check_phase(phase, count, "phase")
+        up, out = np.full(count, np.cos(self.zenith)), np.sin(self.zenith)
+        return np.stack([out * np.cos(azimuth), out * np.sin(azimuth), up], axis=1)
 
-    def reconsider(self, samples: FrameSamples) -> bool:
-        """Look whether brightness is proportional to light, which only shows after the last frame."""
-        values, dark = samples.values, np.asarray(0.0 if self.dark is None else self.dark)
-        level = dark if dark.ndim == 0 else samples.of_map(dark).ravel()
-        light = values.reshape(len(values), -1).astype(np.float64) - level
-        phase = self.pushed("phase") if self._lights is None else None
-        lamps = self._lights_at(np.arange(len(light)), phase)
-        lit = np.all((light > max(self.shadow, 0.0)) & (light < self._saturation - level), axis=0)
-        power = _power(light[:, lit], lamps)
-        if power != 1:
-            text = (
-                f"the brightness is not proportional to the light, but to its power {power:.2g}, as with"
-                " gamma (or gloss), so normals are wrong by more than their sigma: use a camera with a linear"
-                " response"
-            )
-            self._response = Finding("response", text)
-        return False
+    def _check_lights(self, frames: int, right: bool) -> None:
+        if not right:
+            given = 0 if self._lights is None else len(self._lights)
+            raise InputError(f"light has {given} vectors: one is needed for each of {frames} frames")
 
     def result(self) -> dict[str, Any]:
-        """Return normals and albedo of the frames so far."""
-        names = ("normals_spread", "albedo", "albedo_spread", "residual")
-        arrays: dict[str, Any] = {
-            name: self.device.array(name, self.shape, np.float32, zeroed=False) for name in names
-        }
-        arrays["normals"] = self.device.array("normals", (*self.shape, 3), np.float32, zeroed=False)
-        arrays["samples"] = self.device.array("samples", self.shape, np.int32, zeroed=False)
-        pixels, moved = self.shape[0] * self.shape[1], sum(array.nbytes for array in arrays.values())
-        self._solve(
-            -(-pixels // self.device.layout.tile), pixels=pixels, triangle=self._triangle, **arrays,
-            moved=moved + self._triangle.nbytes,
-        )  # fmt: skip
-        found = fetch([(array, slice(None)) for array in arrays.values()])
-        maps = dict(zip(arrays, found, strict=True))
-        residual, samples = maps["residual"], maps["samples"]
+        """Return normals and albedo of the frames so far; in the end there must be one for each lamp."""
+        if self.ended and self._lights is not None:
+            self._check_lights(self.count, len(self._lights) == self.count)
+        self._maps.run("lambert_normals")
+        maps = dict(zip(_ANSWERS, self._maps.take(*_ANSWERS), strict=True))
+        normals, albedo, residual, samples = (np.asarray(maps[name]) for name in _ANSWERS[:4])
         noise = noise_of_residual(residual, samples - 3) if self._noise is None else self._noise
         scale = np.asarray(noise, np.float32) * _misfit(residual, samples - 3, noise)
         for name in ("normals", "albedo"):
-            maps[f"{name}_sigma"] = maps.pop(f"{name}_spread") * scale
-        sigma = with_blur(maps["normals_sigma"], [*np.moveaxis(maps["normals"], -1, 0)], maps["albedo"])
-        maps["normals_sigma"] = sigma
-        said = in_process([] if self._response is None else [self._response], {})
-        return maps | said if np.ndim(noise) or np.isnan(noise) else maps | said | {"noise": float(noise)}
-
-    def finish(self) -> Result:
-        """Return normals and albedo of all frames; their number must be that of the lamps."""
-        if self._lights is not None and len(self._lights) != self.count:
-            raise InputError(
-                f"light has {len(self._lights)} vectors: one is needed for each of {self.count} frames"
-            )
-        return super().finish()
+            maps[f"{name}_sigma"] = np.asarray(maps.pop(f"{name}_spread")) * scale
+        maps["normals_sigma"] = with_blur(maps["normals_sigma"], [*np.moveaxis(normals, -1, 0)], albedo)
+        return maps if np.ndim(noise) or np.isnan(noise) else maps | {"noise": float(noise)}
 
 
 photometric_stereo = optional_phase_function(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Literal
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from mirrorskin import io
 from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.options import plain
 
 if TYPE_CHECKING:
     from mirrorskin.engine.options import Configured
@@ -62,10 +64,13 @@ def attach_provenance(
             "source_region": own.region.text,
             "source_frames": own.which,
         }
+        frames = None if own.used_live else (own.first_frame, own.first_frame + own.shape[0])
+        region = (*own.region.rows, *own.region.columns)
+        result = result.assign(fitted=replace(result.fitted, source_frames=frames, source_region=region))
     if isinstance(source, io.Calibrated):
         known |= {"calibration": source.whole.name, "calibration_parts": source.whole.contents}
         result = result.assign(calibration=source.whole)
-    return result.assign(x=x, y=y, process=known | process)
+    return result.assign(x=x, y=y).with_process(known | process)
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -78,14 +83,14 @@ def describe(configured: Configured, source: Source | None = None) -> dict[str, 
     """Return the name of an operation, step or method, and its options, for ``process``."""
     found: dict[str, ProcessValue] = {"operation": type(configured).__name__}
     for name, value in configured.chosen().items():
-        if name in ("device", "memory_limit") or value is None:
+        if name in ("device", "memory_limit") or value is None or (isinstance(value, Sequence) and not value):
             continue
-        if isinstance(value, str | bool | int | float):
-            found[name] = value
+        if isinstance(text := plain(value), str | bool | int | float):
+            found[name] = text
         elif isinstance(value, Sequence):
             found[name] = str(list(value))
-        elif isinstance(value, np.ndarray) and value.ndim == 0:
-            found[name] = float(value)
+        elif isinstance(value, np.ndarray) and value.ndim < 2:
+            found[name] = str(value.tolist()) if value.ndim else float(value)
         elif isinstance(value, np.ndarray):
             own = source is not None and getattr(source.header, name, None) is value
             found[name] = "map of the recording" if own else "map given"
@@ -108,27 +113,6 @@ def estimated_level(counts: float) -> str:
     return f"{counts:.4g}, {_ESTIMATED}"
 
 
-def missing_levels(process: Mapping[str, object]) -> str:
-    """Return which levels in a process were not given, and their replacements; empty if all were given.
-
-    Examples
-    --------
-    >>> missing_levels({"dark": 12.0, "bright": estimated_level(182.0)})
-    'no bright given: estimated as 182 counts'
-    """
-    if "tilt_from" in process:  # of a rotation: dark and bright are only limits
-        return ""
-    origins = {name: str(process.get(name, "")) for name in ("dark", "bright")}
-    missing = [name for name, text in origins.items() if text == _ASSUMED or text.endswith(_ESTIMATED)]
-    if not missing:
-        return ""
-    counts = [origins[name].partition(",")[0] for name in missing]
-    what = f"estimated as {' and '.join(counts)} counts"
-    if _ASSUMED in counts:
-        what = "the range of the frames' type is taken, and heights may be wrong by more than height_sigma"
-    return f"no {' and '.join(missing)} given: {what}"
-
-
 def parameter_origin(
     given: ArrayLike | None, own: ArrayLike | None, otherwise: str, whose: str = "recording"
 ) -> ProcessValue:
@@ -142,11 +126,10 @@ def parameter_origin(
 
 @contextmanager
 def naming(source: Source) -> Iterator[None]:
-    """Prefix the messages of errors with the source's name."""
+    """Prefix the messages of errors with the source's name, unless it is an argument."""
     try:
         yield
-    except io.InputError as error:
-        message = str(error)
-        raise (error if source.name in message else io.InputError(f"{source.name}: {message}")) from error
-    except NotConverged as error:
-        raise NotConverged(f"{source.name}: {error}") from error
+    except (io.InputError, NotConverged) as error:
+        if source.name in str(error) or not getattr(source, "names_errors", True):
+            raise
+        raise type(error)(f"{source.name}: {error}") from error

@@ -1,8 +1,9 @@
-"""From a source to a result: the method that fits the motion, and what a calibration adds."""
+"""From frames to a result: doors to a run, by an operation or by the method that fits the motion."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -10,10 +11,16 @@ from typing import TYPE_CHECKING, Any, cast
 from numpy.typing import ArrayLike
 
 from mirrorskin import io
+from mirrorskin.engine.array_source import ArraySource, IteratorSource
+from mirrorskin.engine.method import Method
+from mirrorskin.engine.operation import Operation
+from mirrorskin.engine.running import Progress, check_taken, run_over
+from mirrorskin.io import InputError
+from mirrorskin.io.arguments import is_array
+from mirrorskin.io.interpreter_end import computes
+from mirrorskin.io.own_class import OPERATIONS, load_class
 
 if TYPE_CHECKING:
-    from mirrorskin.engine.method import Method
-    from mirrorskin.engine.streaming import Progress
     from mirrorskin.io import Calibration, Motion, Result, Source
 
 _METHODS: Mapping[str, str] = {
@@ -34,6 +41,129 @@ def method_for(motion: Motion) -> type[Method]:
     """
     module, _, name = _METHODS[motion].rpartition(".")
     return cast("type[Method]", getattr(import_module(f"mirrorskin.engine.{module}"), name))
+
+
+@computes
+def run(
+    source: Source | Iterable[ArrayLike],
+    operation: Operation | type[Operation],
+    *,
+    pixel_size: ArrayLike | None = None,
+    progress: Progress | None = None,
+    **positions: ArrayLike,
+) -> Result:
+    """Return the maps of an operation over all frames.
+
+    Parameters
+    ----------
+    source : Source, array_like or device array (T, H, W), or iterable of array_like (H, W)
+        An open recording or another source of frames, which is rewound first if possible, with the
+        calibration that it carries; or frames: an array or a list is pushed as a whole, frames of an iterator
+        one by one.
+    operation : Operation, or a class of operations
+        It is not changed. Missing options are taken from the source, if available.
+    pixel_size : float or (float, float), optional
+        Millimetres along x and y, for an array or an iterable; a recording has its own.
+    progress : callable, optional
+        Called with the number of frames so far.
+    **positions : array_like, (T, ...)
+        For an array or an iterable: the positions that the operation needs, such as ``travel=``, mm.
+
+    Returns
+    -------
+    Result
+        ``process`` contains the operation's name, options and numbers.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        The operation does not apply to the motion, needs missing information, or returns maps that contradict
+        its declarations.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import engine
+    >>> class Brightest(engine.Operation):
+    ...     def start(self, shape, dtype):
+    ...         self.most = np.zeros(shape, dtype)
+    ...     def push(self, frames):
+    ...         np.maximum(self.most, frames.max(axis=0), out=self.most)
+    ...     def result(self):
+    ...         return {"brightest": self.most}
+    >>> run(np.arange(12).reshape(3, 2, 2), Brightest).brightest.tolist()
+    [[8, 9], [10, 11]]
+    """
+    if isinstance(operation, type) and issubclass(operation, Operation):
+        operation = operation()
+    if not isinstance(operation, Operation):
+        raise _no_operation(operation)
+    if wrong := [one for one in positions if one in operation.options]:
+        kind = type(operation).__name__
+        raise InputError(f"{wrong[0]} is an option: give it to the class, {kind}({wrong[0]}=...)")
+    return run_over(_frames_of(source, operation, positions, pixel_size), operation, progress)
+
+
+def _frames_of(source: Any, operation: Operation, positions: Mapping[str, Any], pixel_size: Any) -> Source:
+    """Return what frames are taken from as a source."""
+    if hasattr(source, "read") and hasattr(source, "header"):
+        opened = cast("Source", source)
+        if pixel_size is not None:
+            raise InputError(f"{opened.name} is a recording: give pixel_size to io.open_recording")
+        if positions:
+            raise InputError(f"{opened.name} has the positions of its frames. Remove {', '.join(positions)}")
+        return calibrated(opened)
+    if isinstance(source, str | os.PathLike) or not (is_array(source) or isinstance(source, Iterable)):
+        remedy = "open a path with io.open_recording, or give an array"
+        raise InputError(f"frames are a {type(source).__name__}: {remedy}")
+    check_taken(operation, positions)
+    if is_array(source) or operation.passes == 2:
+        frames = source if is_array(source) else [*source]
+        return ArraySource(frames, operation, positions, pixel_size=pixel_size)
+    return IteratorSource(source, operation, positions, pixel_size)
+
+
+def load_operation(name: str | type) -> type[Operation | Method]:
+    """Return a class of operations or methods, which may be named.
+
+    The name is MODULE:CLASS, FILE.py:CLASS, or that of an entry point in the group ``mirrorskin.operations``.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        There is no such class, or it is not derived from `mirrorskin.engine.Operation`.
+
+    Examples
+    --------
+    >>> load_operation("mirrorskin.engine:Onset").__name__
+    'Onset'
+    """
+    kind = load_class(name, OPERATIONS)
+    if not isinstance(kind, type) or not issubclass(kind, Operation | Method):
+        raise _no_operation(kind)
+    return kind
+
+
+def run_class(
+    kind: type[Operation | Method],
+    source: Source,
+    progress: Progress | None = None,
+    calibration: Calibration | str | Path | None = None,
+    /,
+    **options: Any,
+) -> Result:
+    """Run an operation or a method with these options over a source; see `run` and `calibrated`."""
+    if options.get("device") is None:
+        options.pop("device", None)  # the class may have a default
+    configured, source = kind(**options), calibrated(source, calibration)
+    if isinstance(configured, Method):
+        return configured.run(source, progress)
+    return run(source, configured, progress=progress)
+
+
+def _no_operation(kind: object) -> InputError:
+    name = getattr(kind, "__name__", type(kind).__name__)
+    return InputError(f"{name} is not an operation: derive the class from mirrorskin.engine.Operation")
 
 
 def reconstruct(
@@ -114,8 +244,7 @@ def _as_source(
         return opened
     if isinstance(source, str | Path):
         raise io.InputError(f"{source} is a path: open it with io.open_recording")
-    from mirrorskin.engine.integration.validation import check_pixel_size
-    from mirrorskin.io.arguments import as_array
+    from mirrorskin.io.arguments import as_array, check_pixel_size
     from mirrorskin.io.arrays import ArrayRecording
 
     size = None if pixel_size is None else check_pixel_size(pixel_size)

@@ -16,7 +16,6 @@ from mirrorskin.io.arguments import check_kind, checked
 from mirrorskin.io.findings import findings_of
 from mirrorskin.io.maps import SlipStatus
 from mirrorskin.io.result import map_shape
-from mirrorskin.io.types import UNDISTORTED
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
@@ -288,7 +287,7 @@ def score(result: Maps, truth: Truth) -> Score:
     0.25
     """
     result = as_result(result, "result")
-    if result.process.get(UNDISTORTED):
+    if result.fitted.undistorted:
         remedy = "score one that was made without a scale in its calibration"
         raise InputError(f"the result is undistorted, the truth is that of the camera's pixels: {remedy}")
     size = map_shape(result)[-2:]
@@ -297,8 +296,7 @@ def score(result: Maps, truth: Truth) -> Score:
     touched = truth.contact.astype(bool)
     azimuth = result.azimuth if result.normals is None else None
     # Maps of registered frames belong to the object's points, but the truth to the picture's pixels.
-    follows = bool(result.process.get("registered", result.process.get("heights", "none") != "none"))
-    contact, edges = (None, None) if follows else (result.contact, result.edges)
+    contact, edges = (None, None) if result.fitted.registered else (result.contact, result.edges)
     height, filled = _score_heights(result, truth.height, touched)
     left_out = _why_slip_is_left_out(result, truth)
     found = Score(
@@ -335,10 +333,10 @@ def _why_slip_is_left_out(result: Result, truth: Truth) -> str | None:
         return "the truth has none; simulate a slide or a twist with --contact elastic"
     assert distance is not None
     count, whole = len(distance), len(truth.displacement)
-    frames = str(result.process.get("source_frames", f"0:{whole}"))
-    if frames.partition(",")[0] != f"0:{count}" or count > whole:
+    first, end = result.fitted.source_frames or (0, whole)
+    if (first, end) != (0, count) or count > whole:
         return (
-            f"the result is of {count} frames ({frames}), the truth of {whole} from frame 0 on;"
+            f"the result is of {count} frames ({first}:{end}), the truth of {whole} from frame 0 on;"
             " reconstruct all from frame 0 to any other"
         )
     return None

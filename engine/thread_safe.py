@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from functools import cached_property, wraps
+from functools import wraps
 from types import FunctionType
 from typing import Any, Self
 
@@ -57,11 +57,8 @@ def _guarded(member: Any) -> Any:
     """Return a method or property that runs under the object's lock; anything else unchanged."""
     if isinstance(member, FunctionType):
         return _locked(member)
-    if isinstance(member, property):
-        read, write = (end and _locked(end) for end in (member.fget, member.fset))
-        return property(read, write, doc=member.__doc__)
-    if isinstance(member, cached_property):
-        return property(_locked(member.__get__), doc=member.__doc__)
+    if isinstance(member, property) and member.fget is not None:
+        return property(_locked(member.fget), doc=member.__doc__)
     return member
 
 

@@ -74,10 +74,10 @@ class _Maps(dict[str, Array]):
     def __missing__(self, name: str) -> Array:
         kind = self._kinds[name]
         if isinstance(kind, Planes):
-            array = self._device.array(name, (kind.count, self._stride), kind.dtype, zeroed=False)
+            shape, dtype = (kind.count, self._stride), np.dtype(kind.dtype)
         else:
-            array = self._device.array(name, self._shape, kind, zeroed=False)
-        self[name] = array
+            shape, dtype = (*self._shape, *np.dtype(kind).shape), np.dtype(kind).base
+        array = self[name] = self._device.array(name, shape, dtype, zeroed=False)
         return array
 
 
@@ -89,6 +89,8 @@ class Band:
     device : Device
     rows : slice
         Rows of the picture.
+    own : slice
+        Those of its rows that belong to no other band.
     pixels : int
     stride : int
         Pixels from plane to plane.
@@ -102,6 +104,7 @@ class Band:
 
     device: Device
     rows: slice
+    own: slice
     pixels: int
     stop: Event
 
@@ -118,7 +121,7 @@ class Band:
     ) -> None:
         self._shape = shape = (rows.stop - rows.start, columns)
         self.device, self._dtype, self.stop = device, dtype, stop
-        self.rows, self.pixels = rows, shape[0] * shape[1]
+        self.rows, self.own, self.pixels = rows, slice(0, shape[0]), shape[0] * shape[1]
         word = _LINE // dtype.itemsize
         self.stride: int = -(-self.pixels // word) * word
         if self.stride > _MOST_PIXELS:
@@ -136,7 +139,7 @@ class Band:
         self._blank = set(maps)  # maps that are uninitialised
 
     @cached_property
-    def room(self) -> NDArray[Any]:
+    def staging_buffer(self) -> NDArray[Any]:
         """Staging buffer for frames, (length, rows, W)."""
         nbytes = self.length * self.pixels * self._dtype.itemsize
         buffer = memory.take(nbytes + SLACK, zeroed=False)[:nbytes]
@@ -160,10 +163,16 @@ class Band:
         """Return a plane, (stride,), without its padding, (rows, W)."""
         return plane[: self.pixels].reshape(self._shape)
 
+    def own_rows(self, values: NDArray[Any], plane: int) -> NDArray[Any]:
+        """Return a map, or one of its planes, of the rows that belong to no other band."""
+        padded = values.ndim == 2 and values.shape[1] == self.stride
+        return (self.picture(values[plane]) if padded else values)[self.own]
+
     def cut(self, name: str, plane: int = 0, components: int = 0) -> Array:
         """Return a copy on the device of a map, (rows, W), of one of several planes, or of vectors."""
-        shape = (*self._shape, components) if components else self._shape
-        return self.maps[name].cut(plane * self.stride, shape)
+        array = self.maps[name]
+        shape = (*self._shape, components) if components else (*self._shape, *array.shape[2:])
+        return array.cut(plane * self.stride, shape)
 
     def fetch(self, parts: Mapping[str, int | slice], keep: Collection[str] = ()) -> list[NDArray[Any]]:
         """Wait once, and return planes or rows of maps, (count, stride) or (rows, W).
@@ -183,7 +192,7 @@ class Band:
         if not self._only:
             self._park()
 
-    def stage(self, frames: AnyArray, lent: bool = False, whole: bool = False) -> Iterator[Staged]:
+    def stage(self, frames: AnyArray, stay_valid: bool = False, whole: bool = False) -> Iterator[Staged]:
         """Yield frames, (n, H, W), on the device in pieces; launch the kernels for each before the next.
 
         Frames that are already on the device are yielded in one piece; DeviceMemoryError if there is no
@@ -191,7 +200,7 @@ class Band:
 
         If the device shares the host's memory, frames are used in place if their layout allows it. On a
         device with its own memory, they are copied while kernels process the previous piece. Afterwards the
-        memory of the frames may be overwritten, except if it is ``lent`` (never overwritten while
+        memory of the frames may be overwritten, except if they ``stay_valid`` (it is never overwritten while
         referenced): then kernels may still read it. ``whole``: yield at most ``length`` frames in one piece.
 
         The iteration ends before the next piece if ``stop`` is set; see `for_each_band`.
@@ -215,7 +224,7 @@ class Band:
             else:
                 yield (staged := self._share(rest[: self._most], start, whole))
                 assert self._borrowed is not None
-                if not (lent and np.may_share_memory(self._borrowed.host, rest)):
+                if not (stay_valid and np.may_share_memory(self._borrowed.host, rest)):
                     self._borrowed.wait()
             start = staged.frames.stop
 
@@ -225,9 +234,9 @@ class Band:
         if borrowed is None and not whole and frames.flags.c_contiguous and len(frames) > 1:
             borrowed = self.device.borrow("frames", frames[:-1])  # the memory may end after the last frame
         if borrowed is None:
-            room = self.room[: len(frames)]
-            room[...] = frames[: len(room)]
-            borrowed = BorrowedBuffer(self.device, "frames", room)
+            copied = self.staging_buffer[: len(frames)]
+            copied[...] = frames[: len(copied)]
+            borrowed = BorrowedBuffer(self.device, "frames", copied)
         # Releasing the previous buffer waits for its kernels, so at most one piece is being processed.
         self._borrowed = borrowed
         return Staged(borrowed, slice(start, start + borrowed.shape[0]))
@@ -253,18 +262,23 @@ def cut_into_bands(
     maps: Mapping[str, DTypeLike | Planes],
     length: int,
     least: int = 1,
+    around: int = 0,
 ) -> list[Band]:
     """Allocate the bands of a picture: one on each device if its memory is enough, else as few as possible.
 
     Devices get equal numbers of rows. ``shape`` is rows and columns of the picture, ``dtype`` that of
     samples, ``maps`` the arrays of pixels. A band has memory for ``length`` frames, or fewer if they do not
-    fit, but at least ``least``. DeviceError if a single row does not fit.
+    fit, but at least ``least``. It overlaps with others by ``around`` rows on each side. DeviceError if a
+    single row does not fit.
     """
     stop = Event()
 
     def cut(device: Device, start: int, end: int) -> list[Band]:
         try:
-            return [Band(device, slice(start, end), shape[1], dtype, maps, length, least, stop)]
+            rows = slice(max(0, start - around), min(shape[0], end + around))
+            band = Band(device, rows, shape[1], dtype, maps, length, least, stop)
+            band.own = slice(start - rows.start, end - rows.start)
+            return [band]
         except DeviceMemoryError as error:
             if end - start == 1:
                 message = f"one row of {shape[1]} pixels does not fit: {error}"
@@ -286,7 +300,7 @@ def for_each_band(bands: Sequence[Band], work: Callable[[Band], T]) -> list[T]:
 
     Several devices work at the same time, in a thread each. If one fails, or the program is interrupted, the
     others stop before their next frames, and the first error is raised, with the device in its message.
-    Therefore ``work`` must not use locks that the caller holds, such as the public methods of an `Operation`.
+    Therefore ``work`` must not use locks that the caller holds, such as the public methods of a `Run`.
     """
     by_device: dict[Device, list[Band]] = {}
     for band in bands:
@@ -329,12 +343,12 @@ def _run_on_device(bands: Sequence[Band], work: Callable[[Band], T], stop: Event
     return values
 
 
-def room_of(bands: Sequence[Band], length: int) -> NDArray[Any]:
+def staging_buffer_of(bands: Sequence[Band], length: int) -> NDArray[Any]:
     """Return a staging buffer for frames: of the only band, or host memory for ``length`` frames."""
-    room = bands[0].room
+    buffer = bands[0].staging_buffer
     if len(bands) == 1:
-        return room
-    return np.empty((length, bands[-1].rows.stop, room.shape[2]), room.dtype)
+        return buffer
+    return np.empty((length, bands[-1].rows.stop, buffer.shape[2]), buffer.dtype)
 
 
 def join_rows(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:

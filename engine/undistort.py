@@ -14,8 +14,6 @@ from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Lens, Result, pixel_axes
 from mirrorskin.io.maps import Map
 from mirrorskin.io.result import map_shape
-from mirrorskin.io.selection import source_region
-from mirrorskin.io.types import UNDISTORTED
 from mirrorskin.kernels.array_types import Doubles
 
 
@@ -93,7 +91,7 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
         Maps in the camera's pixels, also for each turn.
     lens : Lens
     origin : (int, int), optional
-        Row and column of the maps' first pixel in the full picture; by default from the region in the process
+        Row and column of the maps' first pixel in the full picture; by default from the region in ``fitted``
         of the result. The same region of the undistorted maps is returned.
 
     Raises
@@ -101,7 +99,7 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     mirrorskin.io.InputError
         The maps do not fit the lens, or have already been undistorted.
     """
-    if result.process.get(UNDISTORTED):
+    if result.fitted.undistorted:
         raise InputError("these maps were undistorted before, which is done once: take them as they are")
     maps = result.maps()
     if not maps:
@@ -110,7 +108,7 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     declared = {name: result.declaration(name) for name in maps}
     if any(maps[name].ndim > len(turns) + 2 + bool(one.components) for name, one in declared.items()):
         raise InputError("displacements of each frame cannot be undistorted: leave per_frame out")
-    region = source_region(result.process)
+    region = result.fitted.region
     row, column = (region.origin if region else (0, 0)) if origin is None else origin
     if min(row, column) < 0 or row + rows > lens.shape[0] or column + columns > lens.shape[1]:
         raise InputError(
@@ -130,7 +128,7 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
             for name, values in resampled.items():
                 target = undistorted[name][turn][band]
                 target[...] = values.reshape(target.shape)
-    return result.assign(undistorted, x=x, y=y, process={**result.process, UNDISTORTED: True})
+    return result.assign(undistorted, x=x, y=y).with_fitted(undistorted=True)
 
 
 def _resampled(maps: Maps, declared: Mapping[str, Map], points: SamplePoints) -> Maps:
