@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.footprint import with_curvature
-from mirrorskin.engine.method import Context, Step
 from mirrorskin.engine.options import option
-from mirrorskin.engine.press.changepoint import ChangePoint
 from mirrorskin.engine.press.crossing import PressOperation
-from mirrorskin.engine.press.strokes import Strokes
+from mirrorskin.engine.steps import Context, Step
 from mirrorskin.io import Result
 from mirrorskin.io.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
@@ -37,17 +35,15 @@ _CLEAR = 3.0  # standard errors: least difference of a blur from none
 _RESOLVED = 0.35  # steps of the travel within a standard deviation of the footprint on a slope
 
 
-class LensBlur(Step):
+class StatedBlur(Step):
     """Add to the standard deviation of heights what a lens that blurs may have moved.
 
     A pixel sees the surface through a footprint, of variance v in square pixels, and shows the median of its
-    heights. On a slope g it turns light over a travel with the standard deviation g sqrt(v), so that steep
-    and flat parts of the surface show v.
-    Where the surface is curved, by H in each direction, the median differs from the height in the middle by
-    up to v H / 2. If the footprint is hardly larger than the pixel, or if the steps of the travel do not
-    resolve it, nothing is added to thresholds, and what the pixel's own area moves to change-points, which
-    resolve more.
+    heights. Where the surface is curved, by H in each direction, the median differs from the height in the
+    middle by up to v H / 2.
     """
+
+    needs = ("height", "height_sigma")
 
     blur: float | None = option(
         default=None,
@@ -70,16 +66,35 @@ class LensBlur(Step):
 
     def footprint(self, result: Result, context: Context) -> Footprint | None:
         """Return a pixel's footprint; None if nothing is to be added."""
+        return Footprint(self.blur**2 + PIXEL, True) if self.blur else None
+
+
+class LensBlur(StatedBlur):
+    """The same with a blur that is estimated, unless it is stated.
+
+    On a slope g, a pixel turns light over a travel with the standard deviation g sqrt(v), so that steep and
+    flat parts of the surface show v. If the footprint is hardly larger than the pixel, or if the steps of the
+    travel do not resolve it, nothing is added.
+    """
+
+    def footprint(self, result: Result, context: Context) -> Footprint | None:
+        """Return a pixel's footprint; None if nothing is to be added."""
+        samples, travel = context.samples, context.positions("travel")
         if self.blur is not None:
-            return Footprint(self.blur**2 + PIXEL, True) if self.blur else None
-        operation = context.operation
-        if not isinstance(operation, PressOperation) or isinstance(operation, Strokes):
+            return super().footprint(result, context)
+        if samples is None or len(travel) < _LEAST_FRAMES:
             return None
-        samples, travel = operation.seen, context.pushed("travel")
-        if samples is None or samples.count != len(travel) or len(travel) < _LEAST_FRAMES:
-            return None
-        found = _footprint(samples, travel, operation, result.height)
-        return Footprint(PIXEL) if found is None and isinstance(operation, ChangePoint) else found
+        return _footprint(samples, travel, cast("PressOperation", context.operation), result.height)
+
+
+class PixelBlur(LensBlur):
+    """The same for change-points, which resolve more: at least what the pixel's own area moves is added."""
+
+    def footprint(self, result: Result, context: Context) -> Footprint | None:
+        """Return a pixel's footprint."""
+        found = super().footprint(result, context)
+        few = context.samples is None or context.samples.count < _LEAST_FRAMES
+        return Footprint(PIXEL) if found is None and self.blur is None and not few else found
 
 
 @dataclass(frozen=True)
@@ -142,7 +157,7 @@ def _footprint(
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = (values - dark) / (bright - dark)
-    spread = (_first(shares, travel, _SHARES[1]) - _first(shares, travel, _SHARES[0])) / 2
+    spread = (first_travel(shares, travel, _SHARES[1]) - first_travel(shares, travel, _SHARES[0])) / 2
     flat, steep = (_Quarter.of(slope[part], spread[part]) for part in (slope <= least, slope >= most))
     if min(flat.count, steep.count) < _FEWEST // 4 or steep.slope < _STEEPER * flat.slope:
         return None
@@ -163,7 +178,7 @@ def _footprint(
     return Footprint(math.hypot(variance, usual), variance - PIXEL > _CLEAR * greatest)
 
 
-def _first(shares: NDArray[Any], travel: Doubles, level: float) -> Doubles:
+def first_travel(shares: NDArray[Any], travel: Doubles, level: float) -> Doubles:
     """Return the travel at which each share first reaches a level, NaN where it does not."""
     reached = shares >= level
     after = np.argmax(reached, axis=0)

@@ -12,7 +12,6 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.press.cells import Cells, cut_into_cells, touched
 from mirrorskin.engine.press.halfspace import (
     HalfSpace,
@@ -25,6 +24,7 @@ from mirrorskin.engine.press.halfspace import (
 )
 from mirrorskin.engine.press.spline import CellSplines
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
+from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.io.maps import PressStatus
 from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles

@@ -3,18 +3,98 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import estimate_noise, thin_out
-from mirrorskin.io import Source
+from mirrorskin.engine.press.crossing import Event, PressOperation
+from mirrorskin.engine.steps import Context, Step
+from mirrorskin.io import Block, Result, Source
+from mirrorskin.io.findings import Finding, with_findings
 
 _FEWEST = 16  # pixels that must have turned light
 _RISE = 8.0  # standard deviations of the noise: least rise of brightness between dark and light
+
+
+T = TypeVar("T", bound=PressOperation)
+
+
+def with_estimated_levels(operation: T, source: Source, oscillates: bool = False) -> T:
+    """Return an operation with levels that neither its options nor the source specify, from the frames."""
+    missing = [name for name in ("dark", "bright") if getattr(operation, name) is None]
+    travel = _travel_of(source) if missing else None
+    if travel is None:
+        return operation
+    frames = range(len(travel)) if oscillates else frames_of(travel, operation.event)
+    levels = estimate_levels(source, travel, frames, operation.dark, operation.bright)
+    if levels is None:
+        return operation
+    changes: dict[str, Any] = {name: getattr(levels, name) for name in missing}
+    for name in ("dark_sigma", "bright_sigma"):
+        if operation.chosen().get(name) == 0:
+            changes[name] = getattr(levels, name)
+    return operation.with_options(**changes, estimated_levels=missing)
+
+
+def _travel_of(source: Source) -> NDArray[np.float64] | None:
+    """Return the travel of all frames, if known; None of frames that come, or came, while the body moves."""
+    if hasattr(source, "now") or getattr(source, "used_live", False) or source.motion != "vertical":
+        return None
+    travel: NDArray[np.float64] | None = getattr(source, "travel", None)
+    if travel is None and source.rewindable:
+        parts = [block.travel for block in _blocks(source) if block.travel is not None]
+        travel = np.concatenate(parts) if parts else None
+    return travel if travel is not None and np.isfinite(travel).all() else None  # the run refuses others
+
+
+def _pictures(source: Source, *numbers: int) -> list[NDArray[Any]]:
+    """Return some frames of a source."""
+    read: Callable[[int], NDArray[Any]] | None = getattr(source, "frame", None)
+    if read is not None:
+        return [read(number) for number in numbers]
+    found: dict[int, NDArray[Any]] = {}
+    for block in _blocks(source):
+        here = range(block.index, block.index + len(block.frames))
+        found |= {number: block.frames[number - block.index].copy() for number in numbers if number in here}
+    return [found[number] for number in numbers]
+
+
+def _blocks(source: Source) -> Iterator[Block]:
+    source.rewind()
+    while (block := source.read()) is not None:
+        yield block
+
+
+def frames_of(travel: NDArray[np.float64], event: Event) -> range:
+    """Return the frames of a press up to the greatest travel, or of a release from there."""
+    deepest = np.flatnonzero(travel == travel.max())
+    return range(int(deepest[0]), len(travel)) if event == "release" else range(int(deepest[-1]) + 1)
+
+
+class EstimatedLevelNote(Step):
+    """Note which levels were not given."""
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result with a note, if levels were estimated or assumed."""
+        operation = cast("PressOperation", context.operation)
+        missing = [name for name in ("dark", "bright") if getattr(operation, name) is None]
+        if estimated := operation.estimated_levels:
+            counts = " and ".join(f"{getattr(operation, name):.4g}" for name in estimated)
+            names = " and ".join(estimated)
+            text = f"no {names} given: estimated as {counts} counts (give {names}, or take references)"
+            result = with_findings(result, Finding("estimated levels", text, False))
+        if missing:
+            names = " and ".join(missing)
+            text = (
+                f"no {names} given: the range of the frames' type is taken, and heights may be wrong by more"
+                f" than height_sigma (give {names}, or take references)"
+            )
+            result = with_findings(result, Finding("assumed levels", text, False))
+        return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +108,11 @@ class EstimatedLevels:
 
 
 def estimate_levels(
-    source: Source, frames: range, dark: ArrayLike | None = None, bright: ArrayLike | None = None
+    source: Source,
+    travel: NDArray[np.float64],
+    frames: range,
+    dark: ArrayLike | None = None,
+    bright: ArrayLike | None = None,
 ) -> EstimatedLevels | None:
     """Estimate the dark and bright levels from the frames of least and greatest travel.
 
@@ -39,7 +123,9 @@ def estimate_levels(
     Parameters
     ----------
     source : Source
-        A recording whose frames can be read in any order.
+        It can be read again.
+    travel : ndarray, (T,)
+        Of all frames, mm.
     frames : range
         The press, or the release.
     dark, bright : array_like, scalar or (H, W), optional
@@ -48,38 +134,14 @@ def estimate_levels(
     Returns
     -------
     EstimatedLevels or None
-        None if nothing turns light, or the source can only be read in order.
+        None if nothing turns light.
     """
-    travel: NDArray[np.float64] | None = getattr(source, "travel", None)
-    read = getattr(source, "frame", None)
-    if travel is None or read is None:
-        return None
-    return _estimate(read, travel, frames, dark, bright)
-
-
-def estimate_levels_of(
-    stack: NDArray[Any],
-    travel: NDArray[np.float64],
-    dark: ArrayLike | None = None,
-    bright: ArrayLike | None = None,
-) -> EstimatedLevels | None:
-    """Return the result of `estimate_levels` for frames in memory, (T, H, W), and their travel, (T,), mm."""
-    return _estimate(stack.__getitem__, travel, range(len(stack)), dark, bright)
-
-
-def _estimate(
-    read: Callable[[int], NDArray[Any]],
-    travel: NDArray[np.float64],
-    frames: range,
-    dark: ArrayLike | None,
-    bright: ArrayLike | None,
-) -> EstimatedLevels | None:
     if len(frames) < 2:
         return None
     part = travel[frames.start : frames.stop]
     least, most = (frames.start + int(number) for number in (np.argmin(part), np.argmax(part)))
     neighbour = least + (1 if least + 1 < frames.stop else -1)
-    pictures = [read(number) for number in (least, neighbour, most)]
+    pictures = _pictures(source, least, neighbour, most)
     samples = np.stack([thin_out(picture) for picture in pictures])
     first, second, last = samples[:, np.isfinite(samples).all(axis=0)]
     integer = pictures[0].dtype.kind == "u"

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.frames import reference_pair
-from mirrorskin.engine.integration.validation import check_pixel_size
-from mirrorskin.engine.operation import travel_function
+from mirrorskin.engine.functions import travel_function
 from mirrorskin.engine.options import option
 from mirrorskin.engine.press.crossing import PressOperation
-from mirrorskin.engine.rotation.correlation import CorrelationOperation
+from mirrorskin.engine.rotation.correlation import Correlate, CorrelationOperation
 from mirrorskin.engine.rotation.design_matrix import basis
 from mirrorskin.engine.rotation.frequency import estimate_frequency
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_strokes
 from mirrorskin.io.types import ProcessValue
@@ -66,11 +66,13 @@ class Growth(CorrelationOperation):
     """
 
     motions = ("vertical",)
+    usual_findings = ("no response",)  # it may be smaller than the noise of a frame
 
     dark: ArrayLike | None = PressOperation.dark
     bright: ArrayLike | None = PressOperation.bright
     pixel_size: tuple[float, float] | None = option(
         default=None,
+        unit="mm",
         help="size of a pixel along x and y, mm, for the growth of the area",
         shown_default="that of the recording",
         python_only=True,
@@ -82,6 +84,8 @@ class Growth(CorrelationOperation):
         python_only=True,
     )
 
+    mean, cosine, sine = Correlate.mean, Correlate.cosine, Correlate.sine
+    modulation, azimuth, residual = Correlate.modulation, Correlate.azimuth, Correlate.residual
     growth = TABLE["growth"]
     growth_sigma = TABLE["growth"].deviation("growth")
 
@@ -111,16 +115,11 @@ class Growth(CorrelationOperation):
         self._levels = reference_pair(self.dark, self.bright, shape, dtype)
         self._wave = self.travel_wave
 
-    def clear(self) -> None:
-        """Forget the frames so far."""
-        super().clear()
-        self._wave = self.travel_wave
-
     def start_second_pass(self) -> None:
         """Estimate the first harmonic of the travel of all frames."""
-        self._wave = first_harmonic(self.pushed("travel"), self.count)
+        self._wave = first_harmonic(self.positions_so_far("travel"), self.count)
 
-    def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
+    def push(self, frames: NDArray[Any], *, travel: ArrayLike) -> None:
         """Process the next frames, (n, H, W), and the travel of each, (n,) mm."""
         check_strokes(travel, len(frames), "travel")
         if self._wave is None:  # in the first pass
@@ -128,7 +127,7 @@ class Growth(CorrelationOperation):
         phase = self._wave.phase[self.count : self.count + len(frames)]
         if len(phase) < len(frames):
             raise InputError(f"there are more than the {len(self._wave.phase)} frames whose travel was known")
-        self._push(frames, phase, np.ones(len(frames)), lent)
+        self._push(frames, phase, np.ones(len(frames)))
 
     def result(self) -> Result:
         """Return the growth and the correlation with the travel's first harmonic."""

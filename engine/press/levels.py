@@ -25,9 +25,9 @@ class Levels(ThresholdOperation):
     --------
     >>> frames = np.zeros((4, 1, 3), np.uint8)
     >>> frames[2:, 0] = [0, 120, 250]
+    >>> from mirrorskin import engine
     >>> levels = Levels(thresholds=[0.25, 0.75], inclinations=[0.2, 0.5], noise=1.0)
-    >>> levels.push(frames, travel=[0.0, 0.1, 0.2, 0.3])
-    >>> levels.result().slope_min
+    >>> engine.run(frames, levels, travel=[0.0, 0.1, 0.2, 0.3]).slope_min
     array([[0. , 0.2, 0.5]], dtype=float32)
     """
 
@@ -35,7 +35,6 @@ class Levels(ThresholdOperation):
         default=None,
         unit="share",
         within=(0, 1),
-        several=True,
         help="shares of the range from dark to bright, from the lowest to the highest, for a wall with"
         " levels; heights are computed from the lowest",
         shown_default="one threshold",
@@ -44,7 +43,6 @@ class Levels(ThresholdOperation):
         default=None,
         unit="rad",
         within=(0, None),
-        several=True,
         help="inclination of the sheet at which each threshold is passed",
         shown_default="none",
     )
@@ -69,9 +67,15 @@ class Levels(ThresholdOperation):
                 f"inclinations {degrees} deg: they must rise with the thresholds, between 0 and 90"
             )
 
+    @property
     def shares(self) -> Sequence[float]:
-        """Return the thresholds."""
+        """The thresholds."""
         return self.thresholds
+
+    @property
+    def lowest_threshold(self) -> float:
+        """Share of the range from dark to bright at which heights are computed."""
+        return self.thresholds[0]
 
     def result(self) -> Result:
         """Return heights by the lowest threshold, and the bounds of the inclination."""

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.method import Context, Method, Plan, Step
+from mirrorskin.engine.method import Method
+from mirrorskin.engine.operation import Plan
 from mirrorskin.engine.options import option
-from mirrorskin.engine.press.blur import LensBlur
 from mirrorskin.engine.press.changepoint import ChangePoint
 from mirrorskin.engine.press.crossing import Event, PressOperation
-from mirrorskin.engine.press.estimated_levels import estimate_levels
-from mirrorskin.engine.press.level_errors import LevelErrors
+from mirrorskin.engine.press.estimated_levels import frames_of
 from mirrorskin.engine.press.levels import Levels
-from mirrorskin.engine.press.no_answer import with_reason
 from mirrorskin.engine.press.onset import Onset
-from mirrorskin.engine.press.position_errors import PositionErrors
-from mirrorskin.engine.press.rolling_shutter import RollingShutter
 from mirrorskin.engine.press.strokes import Strokes
 from mirrorskin.engine.provenance import estimated_level, level_origin
+from mirrorskin.engine.steps import Context, Step
 from mirrorskin.io import Calibrated, InputError, Result
 from mirrorskin.io.maps import PressStatus
 from mirrorskin.io.positions import stroke_starts
@@ -61,7 +57,7 @@ class Elastomer(Step):
             return result
         from mirrorskin.engine.press.elastic import correct_press  # splines, a tenth of a second to load
 
-        deepest, gel = float(np.max(context.pushed("travel"))), source.calibration.gel
+        deepest, gel = float(np.max(context.positions("travel"))), source.calibration.gel
         result, summary, fit = correct_press(result, source, deepest, self.threshold, gel)
         result = result.assign(process={**result.process, "gel": summary})
         return self._with_force(result, fit, source.calibration)
@@ -116,7 +112,7 @@ class HoleFilling(Step):
             return result.assign(process={**result.process, "fill": f"none: {reason}"})
         from mirrorskin.engine.press.holes import fill_holes
 
-        travel = context.pushed("travel")
+        travel = context.positions("travel")
         above = None
         if self.event == "onset":  # pixels that are light at the start were touched before
             above = np.where(result.status == PressStatus.LIGHT_AT_START, -travel[0], np.nan)
@@ -124,20 +120,6 @@ class HoleFilling(Step):
             result.height, result.height_sigma, pixel_size, above=above, deepest=-float(np.max(travel))
         )
         return result.assign(height=height, filled=filled, process={**result.process, "fill": "holes"})
-
-
-class NoAnswer(Step):
-    """Add the reason to the warnings of a result without any height."""
-
-    threshold: float = Onset.threshold
-
-    def apply(self, result: Result, context: Context) -> Result:
-        """Return the result; its process says why there is no height at any pixel."""
-        read, count = getattr(context.stream, "frame", None), context.stream.shape[0]
-        numbers = (0, count // 2, count - 1) if count else ()
-        frames = () if read is None else (read(number) for number in numbers)
-        assert isinstance(context.operation, PressOperation)
-        return with_reason(result, context.operation, self.threshold, frames)
 
 
 class Press(Method):
@@ -170,7 +152,6 @@ class Press(Method):
 
     method: PressMethod = option(
         default="threshold",
-        choices=("threshold", "change-point"),
         help="first crossing of the threshold, or most likely change",
     )
     threshold: float = Onset.threshold
@@ -185,8 +166,8 @@ class Press(Method):
     travel_sigma: float | None = Onset.travel_sigma
     thresholds: Sequence[float] | None = Levels.thresholds
     inclinations: Sequence[float] | None = Levels.inclinations
-    line_time: float | None = RollingShutter.line_time
-    blur: float | None = LensBlur.blur
+    line_time: float | None = Onset.line_time
+    blur: float | None = Onset.blur
     modulus: float | None = Elastomer.modulus
     fill: bool = HoleFilling.fill
 
@@ -218,14 +199,9 @@ class Press(Method):
             frames = range(source.shape[0])
         else:
             frames = _frames_of(source.name, travel, self.event)
-        size = len(frames) * math.prod(source.shape[1:]) * source.dtype.itemsize
-        limits = {"memory_limit": max(1, min(self.memory_limit, 2 * size))}
-        kind = self._kind(source, oscillates)
-        operation: PressOperation = self.make(kind, **limits).configured_for(source)
-        process = self._process(source, frames, operation)
-        if self.method == "threshold":
-            operation = _with_estimated_levels(operation, source, frames, process)
-        elif operation.passes == 2:
+        operation: PressOperation = self.make(self._kind(source, oscillates)).configured_for(source)
+        process = self._process(source, operation)
+        if self.method == "change-point" and operation.passes == 2:
             if not source.rewindable:
                 raise InputError(
                     f"{source.name} cannot be read twice, as a change between unknown levels needs: "
@@ -237,8 +213,8 @@ class Press(Method):
     def live_plan(self, source: Source) -> Plan:
         """Return the search for strokes, which does not need the travel in advance."""
         operation: PressOperation = self.make(Strokes).configured_for(source)
-        process = self._process(source, range(0), operation)
-        return Plan(operation, self._steps(operation, live=True), process, omit=_OMIT)
+        process, frames = self._process(source, operation), range(source.shape[0])
+        return Plan(operation, self._steps(operation), process, frames, _OMIT)
 
     def _kind(self, source: Source, oscillates: bool) -> type[PressOperation]:
         """Return the class of the operation."""
@@ -252,68 +228,33 @@ class Press(Method):
             return Strokes
         return Onset if self.method == "threshold" else ChangePoint
 
-    def _process(self, source: Source, frames: range, operation: PressOperation) -> dict[str, ProcessValue]:
+    def _process(self, source: Source, operation: PressOperation) -> dict[str, ProcessValue]:
         process: dict[str, ProcessValue] = {
-            "first_frame": frames.start,
             "event": self.event,
             "method": self.method,
-            "threshold": self._lowest(operation),
+            "threshold": operation.lowest_threshold,
             "hold": self.hold,
             "subframe": self.subframe,
             "dark": level_origin(source, "dark", self.dark),
             "bright": level_origin(source, "bright", self.bright),
         }
+        process |= {name: estimated_level(getattr(operation, name)) for name in operation.estimated_levels}
         if operation.travel_sigma is not None:
             process["travel_sigma"] = operation.travel_sigma
-        if isinstance(operation, Levels):
+        if self._has_levels:
             process |= {name: str(list(getattr(self, name))) for name in ("thresholds", "inclinations")}
         return process
 
-    def _steps(self, operation: PressOperation, live: bool = False) -> list[Step]:
-        lowest = self._lowest(operation)
-        shutter = [] if live else [self.make(RollingShutter)]  # live, times come with the frames
-        return [
-            self.make(NoAnswer, threshold=lowest),
-            self.make(PositionErrors),
-            *shutter,
-            self.make(LensBlur),
-            self.make(LevelErrors),
-            self.make(Elastomer, threshold=lowest),
-            self.make(HoleFilling),
-        ]
-
-    def _lowest(self, operation: PressOperation) -> float:
-        """Return the threshold of the heights."""
-        return operation.thresholds[0] if isinstance(operation, Levels) else self.threshold
-
-
-def _with_estimated_levels(
-    operation: PressOperation, source: Source, frames: range, process: dict[str, ProcessValue]
-) -> PressOperation:
-    """Return an operation with levels that neither the options nor the source specify, and record them."""
-    if operation.dark is not None and operation.bright is not None:
-        return operation
-    levels = estimate_levels(source, frames, operation.dark, operation.bright)
-    if levels is None:
-        return operation
-    changes: dict[str, Any] = {}
-    for name in ("dark", "bright"):
-        if getattr(operation, name) is None:
-            changes[name] = getattr(levels, name)
-            process[name] = estimated_level(changes[name])
-    if isinstance(operation, Onset):
-        changes |= {"dark_sigma": levels.dark_sigma, "bright_sigma": levels.bright_sigma}
-    return operation.with_options(**changes)
+    def _steps(self, operation: PressOperation) -> list[Step]:
+        return [self.make(Elastomer, threshold=operation.lowest_threshold), self.make(HoleFilling)]
 
 
 def _frames_of(name: str, travel: NDArray[np.float64], event: Event) -> range:
-    """Return the frames of a press up to the greatest travel, or of a release from there."""
-    deepest = np.flatnonzero(travel == travel.max())
-    rises, falls = travel[0] < travel[deepest[0]], travel[-1] < travel[deepest[0]]
-    if event == "release":
-        if rises and not falls:
-            raise InputError(f"{name}: travel only rises: that is a press; give event onset")
-        return range(int(deepest[0]), len(travel))
-    if falls and not rises:
+    """Return the frames of the event; InputError if the body does not move as it takes."""
+    deepest = travel.max()
+    rises, falls = travel[0] < deepest, travel[-1] < deepest
+    if event == "release" and rises and not falls:
+        raise InputError(f"{name}: travel only rises: that is a press; give event onset")
+    if event == "onset" and falls and not rises:
         raise InputError(f"{name}: travel only falls: that is a release; give event release")
-    return range(int(deepest[-1]) + 1)
+    return frames_of(travel, event)

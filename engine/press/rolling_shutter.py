@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mirrorskin.engine.method import Context, Step
 from mirrorskin.engine.options import option
+from mirrorskin.engine.steps import Context, Step
 from mirrorskin.io import InputError, Recording, Result
 from mirrorskin.kernels.array_types import Doubles
 
@@ -16,6 +16,8 @@ class RollingShutter(Step):
     The time and the travel of a frame belong to its middle row. With ``line_time`` l, row r of R is exposed
     (r - (R - 1) / 2) l later; in between, the body moves as from frame to frame.
     """
+
+    needs = ("height",)
 
     line_time: float | None = option(
         default=None,
@@ -31,15 +33,12 @@ class RollingShutter(Step):
         line_time = source.header.line_time if self.line_time is None else self.line_time
         if not line_time:
             return result
-        times = getattr(source, "time", None)
-        if times is None:
-            raise InputError(f"{source.name}: a rolling shutter needs the time of each frame: record it")
-        travel = context.pushed("travel")
-        first = int(result.process.get("first_frame", 0))
-        travel, kept = np.unique(travel, return_index=True)
+        if context.time is None:
+            raise InputError("a rolling shutter needs the time of each frame: record it, or give time")
+        travel, kept = np.unique(context.positions("travel"), return_index=True)
         if len(travel) < 2:  # the body rests
             return result
-        time = times[first + kept]
+        time = context.time[kept]
         rows, columns = result.height.shape
         top, whole = 0, rows
         own = getattr(source, "source", source)

@@ -4,17 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import copy
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.device_arrays import on_host
+from mirrorskin.engine.press.blur import StatedBlur
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, CrossingOperation, Event, EventMaps
+from mirrorskin.engine.press.estimated_levels import EstimatedLevelNote, with_estimated_levels
+from mirrorskin.engine.press.no_answer import NoAnswer
 from mirrorskin.engine.press.onset import Onset
+from mirrorskin.engine.press.rolling_shutter import RollingShutter
 from mirrorskin.io import Result
 from mirrorskin.io.maps import TABLE, PressStatus
 from mirrorskin.io.positions import check_strokes, stroke_starts
 from mirrorskin.io.types import ProcessValue
+
+if TYPE_CHECKING:
+    from mirrorskin.io import Source
 
 _ALIKE = 1e-3  # relative tolerance of equal numbers, for rounding
 _CONTRADICT = 0.001  # share of pixels with contradictory intervals above which travel is not exact
@@ -41,12 +49,20 @@ class Strokes(CrossingOperation):
     (8, True)
     """
 
+    checks = NoAnswer, RollingShutter, StatedBlur, EstimatedLevelNote
+
     threshold: float = Onset.threshold
     event: Event = Onset.event
+    line_time: float | None = Onset.line_time
+    blur: float | None = Onset.blur
 
     hysteresis = TABLE["hysteresis"]
     strokes = TABLE["strokes"]
     optional_maps = ("hysteresis", "strokes")  # of several strokes
+
+    def configured_for(self, source: Source) -> Self:
+        """Return the operation with levels and travel error of the source, or estimated from its frames."""
+        return with_estimated_levels(super().configured_for(source), source, oscillates=True)
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare a search for each direction."""
@@ -55,33 +71,22 @@ class Strokes(CrossingOperation):
             sign: Crossing(self, shape, dtype, threshold=self.threshold, event=event)
             for sign, event in events.items()
         }
-        self.clear()
-
-    @property
-    def room(self) -> NDArray[Any]:
-        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        return self._searches[1].room
-
-    def clear(self) -> None:
-        """Forget the frames so far."""
-        for search in self._searches.values():
-            search.reset()
         self._direction = 1  # frames at rest at the start belong to a press
         self._joined = {sign: _JoinedOnsets(self.shape) for sign in self._searches}
         self._travel: list[float] = []
         self._last: NDArray[Any] | None = None
         self._noise: float | None = None
 
-    def push(self, frames: NDArray[Any], *, travel: ArrayLike, lent: bool = False) -> None:
+    def push(self, frames: NDArray[Any], *, travel: ArrayLike) -> None:
         """Process the next frames, (n, H, W), and the travel of each, (n,) mm."""
-        values = check_strokes(travel, len(frames), "travel")
+        values, frames = check_strokes(travel, len(frames), "travel"), on_host(frames)
         before = self._travel[-1:]
         turns = (stroke_starts(np.concatenate([before, values]), self._direction) - len(before)).tolist()
         for start, stop in zip([0, *turns], [*turns, len(frames)], strict=True):
             if start in turns and stop > start:
                 self._turn(frames[start - 1] if start > 0 else self._last)
             if stop > start:
-                self._searches[self._direction].push(frames[start:stop], values[start:stop], lent)
+                self._searches[self._direction].push(frames[start:stop], values[start:stop])
                 self._travel += values[start:stop].tolist()
         self._last = frames[-1].copy()
 
@@ -100,22 +105,22 @@ class Strokes(CrossingOperation):
             maps["strokes"] = strokes.count
             process["strokes"] = count
         result = Result(maps, process=process, declarations=self.declarations)
-        return self.with_travel_errors(result)
+        return self.with_event(result)
 
-    def preview(self, seconds: float) -> Mapping[str, Any]:
+    def preview(self, seconds: float) -> Result:
         """Return height and contact, without the other maps."""
         if self.count < self.least_frames:
-            return {}
+            return Result()
         onset = self._with_open(1).event_maps()
         contact = np.isin(onset.status, (PressStatus.ONSET, PressStatus.LIGHT_AT_START))
-        return {"height": onset.height, "contact": contact.astype(np.uint8)}
+        return Result(height=onset.height, contact=contact.astype(np.uint8))
 
-    def warm(self) -> None:
+    def precompile(self) -> None:
         """Push two presses without an object, so that all kernels are compiled."""
         for travel in (0.0, 1.0, 2.0, 1.0, 0.0):
             self.push(np.zeros((1, *self.shape), self.dtype), travel=[travel])
+            self.count += 1
             self.preview(0.0)
-        self.reset()
 
     def _with_open(self, sign: int) -> _JoinedOnsets:
         """Return the events of one direction, including those of the open stroke."""

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.method import Context, Step
 from mirrorskin.engine.press.crossing import PressOperation, with_travel_error
-from mirrorskin.engine.press.strokes import Strokes
+from mirrorskin.engine.steps import Context, Step
 from mirrorskin.io import Result
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles
@@ -39,7 +38,7 @@ _JUMP, _CLEAR_JUMP = (0.6, 1.5), 5.0  # steps, and standard errors, of one lost 
 _ALONE = 0.7  # greatest jump elsewhere, relative to it
 
 
-class PositionErrors(Step):
+class PositionUncertainty(Step):
     """Compare the travel of the frames with the surface, and report contradictions.
 
     If a frame was exposed at another travel than stated, all heights near it are shifted, wherever in the
@@ -50,19 +49,18 @@ class PositionErrors(Step):
     Random errors are added to the standard deviation of heights; one missing step is a lost frame.
     """
 
+    needs = ("height", "height_sigma")
+
     def apply(self, result: Result, context: Context) -> Result:
         """Return a result with larger standard deviations, or a warning, where positions do not fit."""
-        operation = context.operation
-        if not isinstance(operation, PressOperation) or isinstance(operation, Strokes):
-            return result
-        travel = context.pushed("travel")
+        operation = cast("PressOperation", context.operation)
+        travel = context.positions("travel")
         errors = _find_errors(result.height, travel)
         if errors is None:
             return result
         jump = errors.lost_frame()
         if jump is not None:
-            first = int(result.process.get("first_frame", 0))
-            later = first + int(np.argmin(np.abs(travel - errors.travel[jump + 1])))
+            later = context.first_frame + int(np.argmin(np.abs(travel - errors.travel[jump + 1])))
             text = (
                 f"the surface bends everywhere at the height of frame {later}, as if the body had moved by"
                 " two steps before it: was a frame lost? Give the travel of each frame"

@@ -1,0 +1,151 @@
+"""Uncertainty of heights because of the levels of dark and light."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, cast
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.options import option
+from mirrorskin.engine.press.blur import first_travel
+from mirrorskin.engine.press.crossing import PressOperation
+from mirrorskin.engine.steps import Context, Step
+from mirrorskin.io import Result
+from mirrorskin.io.findings import Finding, with_findings
+from mirrorskin.io.traces import FrameSamples
+from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.least_squares import mad_sigma
+
+_PART = 0.1  # of the frames, at each end, in which levels are compared with the references
+_AWAY = 0.3  # of the travel, least distance of these frames from the onset of a pixel
+_FEWEST = 64  # pixels
+_FLAT = 0.25  # share of the pixels: the flattest ones
+_OF_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
+_CLEAR, _LEAST = 5.0, 0.01  # standard errors, and share of the rise to light, from which on a level differs
+_COMMON = 2.0  # standard deviations of the pixels' own differences: a smaller one is not common to them
+
+
+class LevelUncertainty(Step):
+    """Add to the standard deviation of heights what uncertain levels of dark and light do.
+
+    A level that is wrong by the share u of the rise to light moves the crossing by u times the travel in
+    which the pixel turns light. This is the slope g, and more if the lens blurs or the skin touches slowly,
+    which a grid of pixels shows. Levels of pixels scatter by `dark_sigma` and `bright_sigma`. They may also
+    have changed: the darkness of the first frames and the light of the last ones are compared with the
+    references, at pixels that turn light much later or earlier.
+    """
+
+    needs = ("height", "height_sigma")
+
+    dark_sigma: float = option(
+        default=0.0,
+        unit="counts",
+        within=(0, None),
+        help="standard deviation of the pixels' own dark levels about `dark`",
+        python_only=True,
+    )
+    bright_sigma: float = option(
+        default=0.0,
+        unit="counts",
+        within=(0, None),
+        help="standard deviation of the pixels' own bright levels about `bright`",
+        python_only=True,
+    )
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return heights with larger standard deviations, and a note if levels changed."""
+        operation = cast("PressOperation", context.operation)
+        dark, bright, samples = operation.dark, operation.bright, context.samples
+        if dark is None or bright is None:
+            return result
+        share, threshold = 0.0, operation.lowest_threshold
+        if self.dark_sigma or self.bright_sigma:
+            scatter = math.hypot((1 - threshold) * self.dark_sigma, threshold * self.bright_sigma)
+            rise = np.asarray(bright, np.float64) - np.asarray(dark, np.float64)
+            share = scatter / float(np.nanmedian(rise))
+        if samples is not None:
+            errors = _find_errors(samples, context.positions("travel"), result.height, dark, bright)
+            share = math.hypot(share, *(error / math.sqrt(2) for error in errors))
+            if any(errors):
+                said = " and ".join(
+                    f"{name} by {100 * error:+.2g} %"
+                    for name, error in zip(("dark", "light"), errors, strict=True)
+                    if error
+                )
+                text = f"levels differ from their references, {said} of the rise; height_sigma includes this"
+                result = with_findings(result, Finding("levels", text, False))
+        if not share:
+            return result
+        travel = context.positions("travel")
+        width = 0.0 if samples is None else _width(samples, travel, result, dark, bright)
+        slope = _rise(result.height)
+        known = np.isfinite(slope)  # not at the border of the contact
+        usual = np.median(slope[known]) if known.any() else np.float32(0)
+        moved = np.float32(share) * np.hypot(np.where(known, slope, usual), np.float32(width))
+        return result.assign(height_sigma=np.hypot(result.height_sigma, moved))
+
+
+def _find_errors(
+    samples: FrameSamples, travel: Doubles, height: NDArray[Any], dark: ArrayLike, bright: ArrayLike
+) -> tuple[float, float]:
+    """Return by how much dark and light differ from the references, in shares of the rise; 0 if hardly."""
+    onset = -samples.of_map(height).astype(np.float64)
+    low, high = (
+        samples.of_map(np.broadcast_to(np.asarray(level, np.float32), height.shape))
+        for level in (dark, bright)
+    )
+    values = samples.values
+    if travel[-1] < travel[0]:  # of a release
+        values = values[::-1]
+    few, least, most = max(1, round(_PART * len(travel))), float(travel.min()), float(travel.max())
+    away = _AWAY * (most - least)
+    found = []
+    for frames, level, usable in (
+        (values[:few], low, onset > least + away),
+        (values[-few:], high, onset < most - away),
+    ):
+        error = ((frames.mean(axis=0) - level) / (high - low))[usable]
+        error = error[np.isfinite(error)]
+        if error.size < _FEWEST:
+            found.append(0.0)
+            continue
+        middle = float(np.median(error))
+        spread = mad_sigma(error - middle)
+        clear = max(_LEAST, _COMMON * spread, _CLEAR * _OF_MEDIAN * spread / math.sqrt(error.size))
+        found.append(middle if abs(middle) > clear else 0.0)
+    return found[0], found[1]
+
+
+def _width(
+    samples: FrameSamples, travel: Doubles, result: Result, dark: ArrayLike, bright: ArrayLike
+) -> float:
+    """Return the travel in which the flattest pixels turn light in addition to their slopes, mm."""
+    low, high = (
+        samples.of_map(np.broadcast_to(np.asarray(level, np.float32), result.height.shape))
+        for level in (dark, bright)
+    )
+    values, rise = samples.values, samples.of_map(_rise(result.height))
+    if travel[-1] < travel[0]:  # of a release
+        values, travel = values[::-1], travel[::-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = ((values - low) / (high - low)).reshape(len(travel), -1)
+    width = 2 * (first_travel(shares, travel, 0.75) - first_travel(shares, travel, 0.25))
+    known = np.isfinite(width) & np.isfinite(rise.ravel())
+    if np.count_nonzero(known) < _FEWEST:
+        return 0.0
+    width, slope = width[known], rise.ravel()[known]
+    flat = slope <= np.quantile(slope, _FLAT)
+    return math.sqrt(max(0.0, float(np.median(width[flat] ** 2 - slope[flat] ** 2))))
+
+
+def _rise(height: NDArray[Any]) -> NDArray[np.float32]:
+    """Return by how much heights change over a pixel."""
+    kernel = np.array([[-0.5, 0, 0.5]], np.float32)
+    source = height.astype(np.float32)
+    across, along = (
+        cv2.filter2D(source, -1, one, borderType=cv2.BORDER_REPLICATE) for one in (kernel, kernel.T.copy())
+    )
+    return np.asarray(np.abs(across) + np.abs(along))
