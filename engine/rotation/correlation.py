@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.device_arrays import AnyArray, on_host
-from mirrorskin.engine.operation import Operation, phase_function
+from mirrorskin.engine.functions import phase_function
+from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
 from mirrorskin.engine.rotation.design_matrix import basis, check_phases, check_weights
-from mirrorskin.engine.tiling import Band, Planes, cut_into_bands, for_each_band, join_rows, room_of
+from mirrorskin.engine.tiling import Band, Planes, cut_into_bands, for_each_band, join_rows, staging_buffer_of
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
@@ -41,16 +42,8 @@ _FIT = {name: f"wave {name}" for name in ("mean", "cosine_part", "sine_part", "r
 class CorrelationOperation(Operation):
     """Base of operations that fit mean, cosine and sine of a phase to each pixel's brightness."""
 
-    takes_device_arrays = True
     dtypes = FRAME_DTYPES
-    on_device = long_blocks = True
-
-    mean = TABLE["mean"]
-    cosine = TABLE["cosine"]
-    sine = TABLE["sine"]
-    modulation = TABLE["modulation"]
-    azimuth = TABLE["azimuth"]
-    residual = TABLE["residual"]
+    for_device = True
 
     def _window(self) -> int | None:
         """Return the number of the last frames that are fitted; None for all."""
@@ -58,39 +51,30 @@ class CorrelationOperation(Operation):
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare for frames of a shape and type."""
-        self._length = max(1, self.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
         self._stack: tuple[AnyArray, Doubles, Doubles] | None = None
-        vars(self).pop("_sums", None)
 
     @cached_property
     def _sums(self) -> TurnSums | WindowSums:
-        window = self._window()
+        window, length = self._window(), self.frames_at_once
         if window is None:
-            return TurnSums(self.devices, self.shape, self.dtype, self._length)
-        return WindowSums([self.device], self.shape, self.dtype, self._length, window)
-
-    def clear(self) -> None:
-        """Forget the frames so far."""
-        self._stack = None
-        if "_sums" in vars(self):
-            self._sums.reset()
+            return TurnSums(self.devices, self.shape, self.dtype, length)
+        return WindowSums([self.device], self.shape, self.dtype, length, window)
 
     @property
-    def room(self) -> NDArray[Any]:
+    def staging_buffer(self) -> NDArray[Any]:
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        return self._sums.room
+        return self._sums.staging_buffer
 
-    def _push(self, frames: AnyArray, alpha: Doubles, weights: Doubles, lent: bool) -> None:
+    def _push(self, frames: AnyArray, alpha: Doubles, weights: Doubles) -> None:
         """Process frames with the phase and the weight of each."""
-        if lent and self.count == 0 and self._window() is None and StackSums.take(frames, weights):
+        windowed, whole = self._window() is not None, self._stay_valid and self.count == 0
+        if whole and not windowed and StackSums.take(frames, weights):
             self._stack = frames, alpha, weights  # summed and solved by one kernel, unless more frames follow
             return
-        if self._window() is not None:
-            frames = on_host(frames)
         if self._stack is not None:
-            self._sums.push(*self._stack, lent=True)
+            self._sums.push(*self._stack, stay_valid=True)
             self._stack = None
-        self._sums.push(frames, alpha, weights, lent)
+        self._sums.push(on_host(frames) if windowed else frames, alpha, weights, self._stay_valid)
 
     def _fit(self) -> Result:
         """Return the fit of the frames so far, or of those in the window."""
@@ -119,12 +103,19 @@ class Correlate(CorrelationOperation):
     --------
     >>> import numpy as np
     >>> from mirrorskin import engine
-    >>> operation = engine.Correlate()
+    >>> run = engine.Run(engine.Correlate())
     >>> for phase in np.arange(8) * np.pi / 4:
-    ...     operation.push(np.full((1, 2, 3), 100 + 20 * np.sin(phase), np.uint8), phase=[phase])
-    >>> float(operation.result().sine[0, 0].round())
+    ...     run.push(np.full((1, 2, 3), 100 + 20 * np.sin(phase), np.uint8), phase=[phase])
+    >>> float(run.result().sine[0, 0].round())
     20.0
     """
+
+    mean = TABLE["mean"]
+    cosine = TABLE["cosine"]
+    sine = TABLE["sine"]
+    modulation = TABLE["modulation"]
+    azimuth = TABLE["azimuth"]
+    residual = TABLE["residual"]
 
     harmonic: int = option(
         default=1,
@@ -143,18 +134,11 @@ class Correlate(CorrelationOperation):
     def _window(self) -> int | None:
         return self.window_frames
 
-    def push(
-        self,
-        frames: NDArray[Any],
-        *,
-        phase: ArrayLike,
-        frame_weights: ArrayLike | None = None,
-        lent: bool = False,
-    ) -> None:
+    def push(self, frames: NDArray[Any], *, phase: ArrayLike, frame_weights: ArrayLike | None = None) -> None:
         """Process the next frames, (n, H, W), the phase of each, (n,) radians, and their weights, (n,)."""
         alpha = self.harmonic * check_phase(phase, len(frames), "phase")
         weights = check_weights(frame_weights, len(frames))
-        self._push(frames, alpha, weights, lent)
+        self._push(frames, alpha, weights)
 
     def result(self) -> Result:
         """Return the fit of the frames so far, or of those in the window."""
@@ -226,9 +210,9 @@ class _Sums:
         self._tables = {device: _Tables(device) for device in devices}
 
     @cached_property
-    def room(self) -> NDArray[Any]:
+    def staging_buffer(self) -> NDArray[Any]:
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        return room_of(self.bands, self._length)
+        return staging_buffer_of(self.bands, self._length)
 
     @property
     def frames(self) -> tuple[Doubles, Doubles]:
@@ -322,7 +306,7 @@ class StackSums(_Sums):
 
         def run(band: Band) -> None:
             with band.resident():
-                for staged in band.stage(frames, lent=True, whole=True):
+                for staged in band.stage(frames, stay_valid=True, whole=True):
                     self._run_at_once(band, staged.array, band.pixels, np.arange(len(frames)), phase, weight)
 
         for_each_band(self.bands, run)
@@ -340,27 +324,25 @@ class TurnSums(_Sums):
         # Eight bytes are one integer or two floats.
         maps = {"reference": np.float32, **dict.fromkeys(_SUMS.values(), np.int64)}
         super().__init__(devices, shape, dtype, maps, length)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the frames so far."""
         self._phase, self._weight = np.empty((2, 0))
         self._counts: int | None = (
             None if self._integer else 0
         )  # frames that were summed as integers; None: all
 
-    def push(self, frames: AnyArray, phase: Doubles, weight: Doubles, lent: bool = False) -> None:
+    def push(self, frames: AnyArray, phase: Doubles, weight: Doubles, stay_valid: bool = False) -> None:
         """Add some frames."""
         if len(self._phase) + len(frames) > _MAX_FRAMES:
-            raise InputError(f"at most {_MAX_FRAMES} frames can be summed: take the result so far, and reset")
+            raise InputError(
+                f"at most {_MAX_FRAMES} frames can be summed: take the result so far, and start a new run"
+            )
         if self._counts is None:
             fractions = np.flatnonzero((weight != 0) & (weight != 1))
             whole = slice(fractions[0] if len(fractions) else len(frames))
-            self._add(frames[whole], phase[whole], weight[whole], lent)
+            self._add(frames[whole], phase[whole], weight[whole], stay_valid)
             frames, phase, weight = (part[whole.stop :] for part in (frames, phase, weight))
         if len(frames) > 0:
             self._convert_to_pairs()
-            self._add(frames, phase, weight, lent)
+            self._add(frames, phase, weight, stay_valid)
 
     def _solve(self) -> None:
         rows = self._rows_in_steps(self._phase, self._weight)
@@ -380,7 +362,7 @@ class TurnSums(_Sums):
 
         for_each_band(self.bands, solve)
 
-    def _add(self, frames: AnyArray, phase: Doubles, weight: Doubles, lent: bool) -> None:
+    def _add(self, frames: AnyArray, phase: Doubles, weight: Doubles, stay_valid: bool) -> None:
         """Add frames to integer sums, or to pairs."""
         counts = self._counts is None
         rows = self._rows_in_steps(phase, weight) if counts else _float_rows(phase, weight)
@@ -390,7 +372,7 @@ class TurnSums(_Sums):
             tables = self._tables[band.device]
             basis, name = (tables.steps, "add") if counts else (tables.floats, "sum")
             with band.resident():
-                for staged in band.stage(frames, lent):
+                for staged in band.stage(frames, stay_valid):
                     used = staged.frames.start + np.flatnonzero(weight[staged.frames])
                     for start in range(0, len(used), _BATCH):
                         places = used[start : start + _BATCH]
@@ -442,14 +424,10 @@ class WindowSums(_Sums):
         self._window = window
         maps = {"ring": Planes(window, dtype), **(other_maps or {})}
         super().__init__(devices, shape, dtype, maps, length)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the frames so far."""
         self._phase, self._weight = np.zeros((2, self._window))  # oldest frame first; weight 0: no frame
         self.oldest: int = 0
 
-    def push(self, frames: AnyArray, phase: Doubles, weight: Doubles, lent: bool = False) -> None:
+    def push(self, frames: AnyArray, phase: Doubles, weight: Doubles, stay_valid: bool = False) -> None:
         """Add frames to the window, and remove as many of the oldest."""
         frames, phase, weight = (part[-self._window :] for part in (frames, phase, weight))
         for band in self.bands:

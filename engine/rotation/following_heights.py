@@ -32,16 +32,7 @@ class FollowingHeights:
         self._thread = ThreadPoolExecutor(1, "heights")
         self._step: Future[NDArray[np.float32]] | None = None
         self.height: NDArray[np.float32] | None = None
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the heights so far."""
-        if self._step is not None:
-            wait_for([self._step])
-        self._step, self.height = None, None
         self._in_step = self._estimates = self._in_height = 0  # numbers of estimates: current, all, shown
-        self._slopes.typical = math.nan
-        self._integrator.reset()
 
     @property
     def lag(self) -> int:

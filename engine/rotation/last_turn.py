@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -18,7 +17,7 @@ from mirrorskin.engine.rotation.edges import EdgeDrawing
 from mirrorskin.engine.rotation.following_heights import FollowingHeights
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.normals_window import NormalWindow
-from mirrorskin.io import InputError, Result
+from mirrorskin.io import InputError, Map, Result
 from mirrorskin.kernels.device import Device
 
 if TYPE_CHECKING:
@@ -28,8 +27,9 @@ _UPDATES_BETWEEN_PLACINGS = 8  # updates between estimates of the object's heigh
 _FEWEST = 3  # minimum number of frames of a fit
 _WARMING = 10  # number of updates that run all kernels
 _PARTS = 24  # number of parts of the longest kernel of the edges
-_OVERDUE = 0.1  # seconds without a part after which one is run without spare time
+_OVERDUE = 0.1  # seconds without a part after which one is run without idle time
 _FIRST_COST = 0.005  # seconds: assumed duration of the first part
+_LAG = {"height_lag": Map("number of updates since the frames of the heights", dtype="int64", axes="none")}
 _DECAY = 0.7  # decay of the expected duration of a part, per part
 
 
@@ -70,7 +70,7 @@ class LastTurn(Normals):
     updates_per_second = math.inf
 
     pixel_size: tuple[float, float] | None = option(
-        default=None, help="pixel size along x and y, mm, for heights", python_only=True
+        default=None, unit="mm", help="pixel size along x and y, mm, for heights", python_only=True
     )
     press: float | None = option(
         default=None,
@@ -90,27 +90,17 @@ class LastTurn(Normals):
         if self.window_frames is None:
             raise InputError("window_frames is missing: give the number of frames of a turn")
         super().start(shape, dtype)
-        self._edges = SpareEdges(self.device, shape)
+        self._edges = IdleEdges(self.device, shape)
         self._heights = None
         if self.pixel_size is not None:
             self._heights = FollowingHeights(self.device, shape, self.pixel_size)
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget the frames so far, and all estimates from them."""
-        super().clear()
         self._has_estimate, self._updates = False, 0
-        if self.response is not None:
-            self.window.place(self.response.planes[4])
-        self._edges.reset()
-        if self._heights is not None:
-            self._heights.reset()
 
-    def preview(self, seconds: float) -> Mapping[str, Any]:
+    def preview(self, seconds: float) -> Result:
         """Return the maps of the last turn; none before the first is complete. Waits for heights."""
         window, heights = self.window, self._heights
         if not window.is_full:
-            return {}
+            return Result()
         window.estimate()
         started = time.perf_counter()
         if heights is not None:
@@ -123,30 +113,24 @@ class LastTurn(Normals):
         self._updates += 1
         if height is not None and self._updates % _UPDATES_BETWEEN_PLACINGS == 1:
             self._place(height)
-        return {
-            "height": height,
-            "height_lag": 0 if heights is None else heights.lag,
-            "normals": normals,
-            "contact": contact,
-            "edges": self._edges.lines,
-            "offset_unknown": height is not None,
-        }
+        raised: dict[str, Any] = {} if heights is None else {"height_lag": heights.lag}
+        if height is not None:
+            raised |= {"height": height, "offset_unknown": np.ones(1, np.uint8)}
+        return Result(raised, normals=normals, contact=contact, edges=self._edges.lines, declarations=_LAG)
 
-    def spare(self, seconds: float) -> None:
+    def idle_work(self, seconds: float) -> None:
         """Continue to draw the edges, for some seconds at most."""
         if self._has_estimate:
             self._edges.work(self.window, seconds)
 
-    def warm(self) -> None:
-        """Push frames of a slanted plane, and forget them."""
-        with suppress(InputError):  # a plane may not determine the noise or the tilt
-            for number in range(self.window.length + _WARMING):
-                phase = 2 * np.pi * number / self.window.length
-                self.push(self._plane(phase), phase=[phase])
-                if number >= self.window.length:
-                    self.preview(math.inf)
-            self._edges.finish(self.window)
-        self.reset()
+    def precompile(self) -> None:
+        """Push frames of a slanted plane."""
+        for number in range(self.window.length + _WARMING):
+            phase = 2 * np.pi * number / self.window.length
+            self.push(self._plane(phase), phase=[phase])
+            if number >= self.window.length:
+                self.preview(math.inf)
+        self._edges.finish(self.window)
 
     def result(self) -> Result:
         """Return the maps of the last turn; with a response, after an estimate of the object's height."""
@@ -160,10 +144,6 @@ class LastTurn(Normals):
         wave = self.window.correlation()
         names = ("mean", "cosine", "sine", "modulation", "residual")
         return result.assign({name: wave[name] for name in names})
-
-    def finish(self) -> Result:
-        """Return the maps of the last turn; only `reset` may follow."""
-        return self.result()
 
     def _place(self, height: NDArray[np.float32]) -> None:
         """Set the height of the object for a response: the top of each piece is at the depth of the press."""
@@ -193,16 +173,12 @@ class LastTurn(Normals):
         return np.broadcast_to(np.nan_to_num(frame), (1, *self.shape)).astype(self.dtype)
 
 
-class SpareEdges:
-    """Edges that are drawn in spare time: ``lines``, (H, W), None until the first drawing is complete."""
+class IdleEdges:
+    """Edges that are drawn in idle time: ``lines``, (H, W), None until the first drawing is complete."""
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         self._device = device
         self._drawing = EdgeDrawing(device, shape)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget what was drawn."""
         self.lines: NDArray[np.uint8] | None = None
         self._steps: Iterator[None] | None = None
         self._cost, self._last = _FIRST_COST, -math.inf

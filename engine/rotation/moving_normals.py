@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ParamSpec, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.operation import ABOUT_WEIGHTS, apply, array_function
+from mirrorskin.engine.functions import ABOUT_WEIGHTS, function_of
+from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.rotation.normals import Normals, NormalsOperation, normals_result
 from mirrorskin.engine.rotation.normals_kernel import MAPS, SLOPE_MAPS, NormalKernel, TurnModel
+from mirrorskin.engine.rotation.normals_uncertainty import PhaseUncertainty
 from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows, pose_fit, rocks
-from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.layout import as_series
 from mirrorskin.io.maps import TABLE, PoseStatus, status_of
@@ -39,14 +40,16 @@ class MovingNormals(NormalsOperation):
     --------
     >>> import numpy as np
     >>> from mirrorskin import engine
-    >>> operation = engine.rotation.MovingNormals(zenith_gain=300, noise=1.0)
+    >>> run = engine.Run(engine.rotation.MovingNormals(zenith_gain=300, noise=1.0))
     >>> for lean in 0.05 * np.sin(0.8 * np.arange(16)):
     ...     axis = [[np.sin(lean), 0.0, np.cos(lean)]]
-    ...     operation.push(np.full((1, 2, 3), 150 - 300 * lean, np.float32), pose=axis)
-    >>> rocked = operation.result()
+    ...     run.push(np.full((1, 2, 3), 150 - 300 * lean, np.float32), pose=axis)
+    >>> rocked = run.result()
     >>> int(rocked.status[0, 0]), round(float(rocked.slope[0, 0]), 2)
     (4, -0.55)
     """
+
+    checks = (PhaseUncertainty,)
 
     status = status_of(PoseStatus)
     slope = TABLE["slope"]
@@ -59,19 +62,12 @@ class MovingNormals(NormalsOperation):
     def _make_kernel(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> NormalKernel:
         return NormalKernel(self, self.devices, shape, dtype, poses=True)
 
-    def clear(self) -> None:
-        """Forget the frames so far, and all estimates from them."""
-        super().clear()
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Prepare for frames of a shape and type."""
+        super().start(shape, dtype)
         self._direction: float | None = None
 
-    def push(
-        self,
-        frames: NDArray[Any],
-        *,
-        pose: ArrayLike,
-        frame_weights: ArrayLike | None = None,
-        lent: bool = False,
-    ) -> None:
+    def push(self, frames: NDArray[Any], *, pose: ArrayLike, frame_weights: ArrayLike | None = None) -> None:
         """Process the next frames, (n, H, W), the axis in each, (n, 3), with travel (n, 4), and weights.
 
         Axes are unit vectors towards the camera; travel is in mm.
@@ -79,20 +75,20 @@ class MovingNormals(NormalsOperation):
         where = np.asarray(pose, np.float64)
         travel = where[:, 3] if where.shape[1:] == (4,) else None
         poses = check_poses(len(frames), axis=where[..., :3], travel=travel)
-        self._push(frames, poses, frame_weights, lent)
+        self._push(frames, poses, frame_weights)
 
-    def preview(self, seconds: float) -> Mapping[str, Any]:
+    def preview(self, seconds: float) -> Result:
         """Return the maps of the frames so far; none before they determine a slope and its noise."""
-        return {} if self.count < _FEWEST else self.result()
+        return Result() if self.count < _FEWEST else self.result()
 
-    def warm(self) -> None:
-        """Push frames of a rocking plane, and forget them."""
+    def precompile(self) -> None:
+        """Push frames of a rocking plane."""
         tilts = np.linspace(-0.05, 0.05, _WARMING)
         level = np.random.default_rng(0).normal(100, 1, (_WARMING, *self.shape))
         frames = (level + 500 * tilts[:, np.newaxis, np.newaxis]).astype(self.dtype)
         self.push(frames, pose=body_axes(np.zeros(_WARMING), tilts))
+        self.count = _WARMING
         self.preview(0.0)
-        self.reset()
 
     def _turns_in(self, where: Doubles) -> list[slice]:
         starts = range(0, len(where), self._longest)
@@ -125,9 +121,8 @@ class MovingNormals(NormalsOperation):
             status=codes.astype(np.uint8),
             slope=slope,
             slope_sigma=sigma,
-            process={**result.process, "slope_direction": self._direction},
             declarations=status,
-        )
+        ).with_fitted(slope_direction=self._direction)
 
 
 class NormalsFunction(Protocol[P]):
@@ -146,27 +141,35 @@ class NormalsFunction(Protocol[P]):
         """Return the maps."""
 
 
-def _estimate(frames: NDArray[Any], where: dict[str, Any], options: dict[str, Any]) -> Result:
-    """Estimate normals with the operation for the given positions: turns of one tilt, or poses."""
-    phase, axis, travel = (where[name] for name in ("phase", "axis", "travel"))
-    tilt, weights = options.pop("tilt", None), where["frame_weights"]
-    options["memory_limit"] = max(1, min(MEMORY_LIMIT, 2 * frames.nbytes))
+def _choose(positions: dict[str, Any], options: dict[str, Any]) -> tuple[Operation, dict[str, Any]]:
+    """Return the operation for the given positions, turns of one tilt, or poses; and its positions."""
+    given = {name: None if one is None else as_series(name, one) for name, one in positions.items()}
+    phase, axis, travel, weights = (given[name] for name in ("phase", "axis", "travel", "frame_weights"))
+    tilt = options.pop("tilt", None)
     angle = None if tilt is None or isinstance(tilt, str) else as_series("tilt", tilt).astype(np.float64)
     varies = angle is not None and (angle.ndim > 0 or rocks(phase))
     if axis is None and travel is None and not varies:
-        return apply(Normals(tilt=tilt, **options), frames, phase=phase, frame_weights=weights)
-    pose = check_poses(len(frames) if frames.ndim else 0, phase, angle, axis, travel)
+        return Normals(tilt=tilt, **options), {"phase": phase, "frame_weights": weights}
+    count = next((len(one) for one in (phase, axis) if one is not None and np.ndim(one)), 0)
+    pose = check_poses(count, phase, angle, axis, travel)
     for name in (Normals.options.keys() - MovingNormals.options) & options.keys():
         if options.pop(name) != Normals.options[name].default:
             raise InputError(f"{name} needs whole turns of one tilt, but frames have poses. Remove {name}")
-    options.setdefault("longest", even_windows(len(frames)) if frames.ndim and len(frames) else None)
-    return apply(MovingNormals(**options), frames, pose=pose, frame_weights=weights)
+    options.setdefault("longest", even_windows(count) if count else None)
+    if axis is not None:
+        return MovingNormals(**options), {"pose": pose, "frame_weights": weights}
+    return MovingNormals(**options), {
+        "phase": phase,
+        "tilt": np.broadcast_to(cast(Any, angle), count),
+        "travel": pose[:, 3],
+        "frame_weights": weights,
+    }
 
 
-_FUNCTION = array_function(
+_FUNCTION = function_of(
     Normals,
-    "estimate_normals",
-    """Estimate the normals from a stack that fits in memory; see `Normals` and `MovingNormals`.
+    name="estimate_normals",
+    text="""Estimate the normals from a stack that fits in memory; see `Normals` and `MovingNormals`.
 
     With a phase and one tilt, the frames are turns of a precession. With a tilt of each frame, two phases
     half a turn apart, an axis or a travel, they are at given poses.
@@ -199,15 +202,14 @@ _FUNCTION = array_function(
     >>> round(float(result.zenith[0, 0]), 4)
     0.3
     """,
-    {},
-    {
+    optional={
         "phase": "Radians, at least three different phases in each turn. `tilt` may then be an array (T,).",
         "frame_weights": ABOUT_WEIGHTS,
         "axis": "The body's axis in each frame, (T, 3), instead of phase and tilt: unit vectors towards the"
         " camera.",
         "travel": "Millimetres, if the body presses as well.",
     },
-    _estimate,
+    choose=_choose,
 )
 
 

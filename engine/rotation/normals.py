@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Literal, Self, cast
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,19 +25,26 @@ from mirrorskin.engine.rotation.design_matrix import (
 from mirrorskin.engine.rotation.frame_light import FrameLight, find_frame_light
 from mirrorskin.engine.rotation.normals_kernel import (
     MAPS,
-    NORMAL_METHODS,
     NormalKernel,
     NormalMethod,
     Samples,
     SensorOptions,
     TurnModel,
+    azimuth_of,
+    zenith_of,
+)
+from mirrorskin.engine.rotation.normals_uncertainty import (
+    PhaseUncertainty,
+    RegistrationUncertainty,
+    ResponseUncertainty,
+    SystematicUncertainty,
 )
 from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.engine.rotation.poses import PoseFit
 from mirrorskin.engine.rotation.response import Response, initial_response, wall_response_of
 from mirrorskin.engine.rotation.scale import check_gain
 from mirrorskin.engine.rotation.tilt import check_tilt
-from mirrorskin.engine.tiling import Band, cut_into_bands, for_each_band, join_rows, room_of
+from mirrorskin.engine.tiling import Band, cut_into_bands, for_each_band, join_rows, staging_buffer_of
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
@@ -59,7 +66,7 @@ class NormalsOperation(SensorOptions, Operation):
 
     motions = ("axial",)
     dtypes = FRAME_DTYPES
-    on_device = True
+    for_device = True
 
     longest: int | None = option(
         default=None,
@@ -107,65 +114,64 @@ class NormalsOperation(SensorOptions, Operation):
         """Prepare for frames of a shape and type."""
         self._longest = LONGEST if self.longest is None else self.longest
         self._kernel = self._make_kernel(shape, dtype)
-        length = max(self._longest + 1, self.memory_limit // (2 * shape[0] * shape[1] * dtype.itemsize))
-        self._bands = cut_into_bands(
-            self.devices, shape, dtype, self._kernel.planes, length, self._longest + 1
-        )
-        vars(self).pop("_buffer", None)
+        least = self._longest + 1
+        length = max(least, self.frames_at_once)
+        self._bands = cut_into_bands(self.devices, shape, dtype, self._kernel.planes, length, least)
         for band in self._bands:
             self._kernel.write_scale(band)
-        self.clear()
-
-    @cached_property
-    def _buffer(self) -> NDArray[Any]:
-        """Buffer with the frames of the current turn, and space for more."""
-        return room_of(self._bands, min(band.length for band in self._bands))
-
-    def clear(self) -> None:
-        """Forget the frames so far, and all estimates from them."""
         self._model = self._kernel.model
-        self._lent: AnyArray | None = None  # a whole stack, which is used without a copy
+        self._stack: AnyArray | None = None  # all frames, if they stay valid: they are used without a copy
         self._phase = np.empty((0, self._width) if self._width else 0)  # phases of the frames in the buffer
         self._weights = np.empty(0)
         self._turns = self._frames = 0  # numbers of turns and frames in the maps
         self._each: list[list[NDArray[Any]]] = []
 
+    @cached_property
+    def _buffer(self) -> NDArray[Any]:
+        """Buffer with the frames of the current turn, and space for more."""
+        return staging_buffer_of(self._bands, min(band.length for band in self._bands))
+
     @property
-    def room(self) -> NDArray[Any]:
+    def staging_buffer(self) -> NDArray[Any]:
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        self._copy_lent()
+        self._copy_stack()
         return self._buffer[len(self._phase) :]
 
-    def _push(self, frames: AnyArray, where: Doubles, frame_weights: ArrayLike | None, lent: bool) -> None:
-        """Process frames and the position of each, part by part as the buffer has space for them."""
+    def _push(self, frames: AnyArray, where: Doubles, frame_weights: ArrayLike | None) -> None:
+        """Process frames and the position of each."""
         weights = check_weights(frame_weights, len(frames))
-        first = self.count == 0 and len(self._phase) == 0
-        if lent and first and np.all(weights > 0):  # otherwise frames would be moved in the caller's memory
+        # Missing frames would be moved in the memory of the caller.
+        if self._stay_valid and self.count == 0 and np.all(weights > 0):
             self._cut(where)
-            self._lent, self._phase, self._weights = frames, where, weights
+            self._stack, self._phase, self._weights = frames, where, weights
             return
-        frames = on_host(frames)
-        self._copy_lent()
+        self._copy_stack()
+        self._take_parts(on_host(frames), where, weights)
+
+    def _copy_stack(self) -> None:
+        """Copy a whole stack, if there is one, to the buffer, since other frames follow."""
+        if self._stack is not None:
+            frames, where, weights = self._stack, self._phase, self._weights
+            self._stack, self._phase, self._weights = None, where[:0], weights[:0]
+            self._take_parts(on_host(frames), where, weights)
+
+    def _take_parts(self, frames: NDArray[Any], where: Doubles, weights: Doubles) -> None:
+        """Process frames part by part as the buffer has space for them."""
         start = 0
         while start < len(frames):
             part = slice(start, start + len(self._buffer) - len(self._phase))
             self._take(frames[part], where[part], weights[part])
             start = part.stop
 
-    def _copy_lent(self) -> None:
-        """Copy a whole stack, if there is one, to the buffer, since other frames follow."""
-        if self._lent is not None:
-            frames, where, weights = self._lent, self._phase, self._weights
-            self._lent, self._phase, self._weights = None, where[:0], weights[:0]
-            self._push(frames, where, weights, lent=False)
-
     @property
     def _open(self) -> AnyArray:
         """Memory that starts with the frames of the open turn."""
-        return self._buffer if self._lent is None else self._lent
+        return self._buffer if self._stack is None else self._stack
 
     def result(self) -> Result:
         """Return the maps of all turns; the last turn ends with the last frame."""
+        if self.ended:
+            return self._complete()
         state = self._model, self._turns, self._frames, self._phase.copy(), self._weights.copy()
         frames = self._open[: len(self._phase)].copy() if np.any(self._weights == 0) else None
         closed = for_each_band(self._bands, self._copy_maps) if self._turns and not self.per_turn else []
@@ -180,16 +186,12 @@ class NormalsOperation(SensorOptions, Operation):
             if frames is not None:
                 self._buffer[: len(frames)] = frames
 
-    def finish(self) -> Result:
-        """Return the maps of all turns; only `reset` may follow."""
-        return self._complete()
-
     def _complete(self) -> Result:
         """Close the open turn, and return the maps."""
         where, weights = self._phase.copy(), self._weights.copy()
         self._estimate(self._turns_in(self._phase))
         if self._turns == 0:
-            check_turning(self.pushed("phase"))
+            check_turning(self.positions_so_far("phase"))
             self._explain(where, weights)
         if self._model is None:
             raise InputError("no turn of these phases has three frames or more: turn more slowly")
@@ -292,7 +294,7 @@ class NormalsOperation(SensorOptions, Operation):
 
     def _take_maps(self) -> list[Any]:
         """Return the maps of all rows in the order of `_kernel_maps`, on the device if the frames are."""
-        if self._lent is not None and self._on_device and not self.per_turn:
+        if self._stack is not None and self._on_device and not self.per_turn:
             (band,) = self._bands
             return [band.cut(name, components=3 * (name == "vectors")) for name in self._kernel_maps]
         parts = for_each_band(self._bands, self._take_band_maps)
@@ -335,18 +337,6 @@ def normals_result(maps: list[Any], model: TurnModel, turns: int, frames: int) -
     )
 
 
-def zenith_of(normals: ArrayLike) -> NDArray[np.float32]:
-    """Return the angle to the body's axis in the mean pose, (H, W), radians."""
-    x, y, z = np.moveaxis(np.asarray(normals), -1, 0)
-    return np.asarray(np.arctan2(np.hypot(x, y), z))
-
-
-def azimuth_of(normals: ArrayLike) -> NDArray[np.float32]:
-    """Return the direction in which the surface faces, (H, W), radians from x towards y; NaN where level."""
-    x, y, _ = np.moveaxis(np.asarray(normals), -1, 0)
-    return np.where((x == 0) & (y == 0), np.float32(np.nan), np.arctan2(y, x))
-
-
 class Normals(NormalsOperation):
     """Normals from turns of an axial rotation at a constant tilt.
 
@@ -363,27 +353,24 @@ class Normals(NormalsOperation):
     --------
     >>> import numpy as np
     >>> from mirrorskin import engine
-    >>> operation = engine.Normals(tilt=0.05, zenith_gain=300, noise=1.0)
+    >>> run = engine.Run(engine.Normals(tilt=0.05, zenith_gain=300, noise=1.0))
     >>> for phase in np.arange(8) * np.pi / 4:
-    ...     operation.push(np.full((1, 2, 3), 100 + 15 * np.cos(phase), np.uint8), phase=[phase])
-    >>> operation.result().process["turns"]
+    ...     run.push(np.full((1, 2, 3), 100 + 15 * np.cos(phase), np.uint8), phase=[phase])
+    >>> run.result().process["turns"]
     1
     """
 
-    takes_device_arrays = True
-    _light: FrameLight | None = None  # light of the frames that are pushed again
-    _weighted: bool = False  # whether frames had weights
+    checks = RegistrationUncertainty, PhaseUncertainty, ResponseUncertainty, SystematicUncertainty
 
-    tilt: ArrayLike | None = option(  # of `estimate_normals`, an array is one of each frame
+    tilt: float | Literal["estimate"] | None = option(
         default=None,
         unit="rad",
-        words=("estimate",),
         help="half-angle of the precession, or estimate it from the first turn; the estimate is wrong if the"
         " pivot is far from the surface",
         shown_default="that of the recording",
     )
     method: NormalMethod = option(
-        default="exact", choices=NORMAL_METHODS, help="most likely normals, or the paper's equations 14 to 22"
+        default="exact", help="most likely normals, or the paper's equations 14 to 22"
     )
     response: Response | None = option(
         default=None,
@@ -399,12 +386,18 @@ class Normals(NormalsOperation):
         " and tilt are estimated from the first of these turns",
         shown_default="all turns",
     )
+    frame_light: FrameLight | None = option(
+        default=None,
+        help="light of each frame, which is not steady: frames are corrected for it",
+        shown_default="found in all frames, which are then pushed again",
+        python_only=True,
+    )
 
     def check_options(self) -> None:
         """Raise InputError if the zenith's gain is 0, or the tilt is impossible."""
         super().check_options()
         if not isinstance(self.tilt, str | None):
-            check_tilt(cast(float, self.tilt))
+            check_tilt(self.tilt)
 
     def configured_for(self, source: Source) -> Self:
         """Return the operation with the source's values of options that are not given."""
@@ -421,6 +414,7 @@ class Normals(NormalsOperation):
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare for frames of a shape and type."""
+        self._has_weights = False
         if self.window_frames is None:
             super().start(shape, dtype)
         else:
@@ -430,12 +424,9 @@ class Normals(NormalsOperation):
     def _make_kernel(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> NormalKernel:
         if self.tilt is None:
             raise InputError("tilt is missing: give the half-angle of the precession, such as 2.5deg")
-        if not isinstance(self.response, Response | None):
-            raise InputError(f"response is a {type(self.response).__name__}: a Response is needed")
-        tilt = cast('float | Literal["estimate"]', self.tilt)
         devices = self.devices if self.window_frames is None else [self.device]
         return NormalKernel(
-            self, devices, shape, dtype, tilt=tilt, method=self.method, response=self.response
+            self, devices, shape, dtype, tilt=self.tilt, method=self.method, response=self.response
         )
 
     @property
@@ -444,80 +435,67 @@ class Normals(NormalsOperation):
         return self._window
 
     @property
-    def room(self) -> NDArray[Any]:
+    def staging_buffer(self) -> NDArray[Any]:
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        return super().room if self.window_frames is None else self._window.room
+        return super().staging_buffer if self.window_frames is None else self._window.staging_buffer
 
-    def reconsider(self, samples: FrameSamples) -> bool:
-        """Return whether the light varies, so that the frames must be pushed again in steady light."""
+    def after_last_frame(self, samples: FrameSamples) -> Self | None:
+        """Return the operation that corrects the light of each frame, if it is not steady."""
         alone = self.per_turn or self.window_frames is not None or self.response is not None
-        if alone or self._weighted or self.zenith_gain is None or self._tilt_so_far is None:
-            return False
+        if alone or self._has_weights or self.zenith_gain is None or self.frame_light is not None:
+            return None
+        tilt = self._tilt_of_frames()
+        if tilt is None:
+            return None
         maps = self.zenith_gain, self.zenith_offset, self.dark
         scale = [np.asarray(0.0 if one is None else one, np.float64) for one in maps]
         at_grid = [one if one.ndim == 0 else samples.of_map(one).ravel() for one in scale]
         values = samples.values
         light = find_frame_light(
-            values.reshape(len(values), -1), self.pushed("phase"), self._tilt_so_far, *at_grid
+            values.reshape(len(values), -1), self.positions_so_far("phase"), tilt, *at_grid
         )
-        if light is None:
-            return False
-        self.begin(self.shape, np.float32)
-        self._light = light
-        return True
+        return None if light is None else self.with_options(frame_light=light)
+
+    def _tilt_of_frames(self) -> float | None:
+        """Return the tilt, if it is given, or can be estimated from a turn that another one follows."""
+        if not isinstance(self.tilt, str):
+            return None if self.tilt is None else float(np.asarray(self.tilt))
+        if self._model is None and self._stack is not None:
+            turn, *others = self._turns_in(self._phase)
+            fit = self._fit_of(self._phase[turn], self._weights[turn], first=True)
+            if fit is not None and others:
+                self._model = self._kernel.estimate_model(thinned(self._stack[turn]), fit)
+        return None if self._model is None else self._model.tilt
 
     @property
-    def _tilt_so_far(self) -> float | None:
-        """The tilt, if it is given, or was estimated from a complete turn."""
-        if isinstance(self.tilt, str):
-            return None if self._model is None else self._model.tilt
-        return None if self.tilt is None else float(np.asarray(self.tilt))
-
-    @property
-    def corrects(self) -> tuple[str, ...]:
+    def corrected_kinds(self) -> tuple[str, ...]:
         """Kinds of findings about frames that are corrected."""
-        return () if self._light is None else self._light.kinds
+        return () if self.frame_light is None else self.frame_light.kinds
 
-    def corrected(self, frames: NDArray[Any], first: int) -> NDArray[Any]:
+    def apply_correction(self, frames: NDArray[Any], first: int) -> NDArray[Any]:
         """Return frames in steady light."""
-        if self._light is None:
-            return frames
-        return self._light.remove(frames, first, 0.0 if self.dark is None else self.dark)
+        assert self.frame_light is not None
+        return self.frame_light.remove(frames, first, 0.0 if self.dark is None else self.dark)
 
-    def common_sigma(self, normals: NDArray[np.floating]) -> NDArray[np.float32]:
+    def systematic_sigma(self, normals: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the part of the standard deviation of normals that is common to all pixels, radians."""
-        if self._light is None:
+        if self.frame_light is None:
             return np.zeros(normals.shape[:-1], np.float32)
-        return self._light.sigma(normals)
+        return self.frame_light.sigma(normals)
 
     def _as_result(self, maps: list[NDArray[Any]], model: TurnModel) -> Result:
         result = super()._as_result(maps, model)
-        if self._light is None:
+        if self.frame_light is None:
             return result
-        sigma = np.hypot(result.normals_sigma, self.common_sigma(result.normals))
-        return result.assign(normals_sigma=sigma, process={**result.process, **self._light.process})
+        sigma = np.hypot(result.normals_sigma, self.systematic_sigma(result.normals))
+        return result.assign(normals_sigma=sigma, process={**result.process, **self.frame_light.process})
 
-    def clear(self) -> None:
-        """Forget the frames so far, and all estimates from them."""
-        self._light, self._weighted = None, False
-        if self.window_frames is None:
-            super().clear()
-        else:
-            self._window.reset()
-
-    def push(
-        self,
-        frames: NDArray[Any],
-        *,
-        phase: ArrayLike,
-        frame_weights: ArrayLike | None = None,
-        lent: bool = False,
-    ) -> None:
+    def push(self, frames: NDArray[Any], *, phase: ArrayLike, frame_weights: ArrayLike | None = None) -> None:
         """Process the next frames, (n, H, W), the phase of each, (n,) radians, and their weights, (n,)."""
         alpha = check_phase(phase, len(frames), "phase")
-        self._weighted |= frame_weights is not None
+        self._has_weights |= frame_weights is not None
         if self.window_frames is None:
-            self._push(frames, alpha, frame_weights, lent)
+            self._push(frames, alpha, frame_weights)
         elif frame_weights is not None:
             raise InputError("frames in a window have no weights: leave frame_weights or window_frames out")
         else:
@@ -525,13 +503,8 @@ class Normals(NormalsOperation):
 
     def result(self) -> Result:
         """Return the maps of the window, or of all turns; the last turn ends with the last frame."""
-        return super().result() if self.window_frames is None else self._window_result()
-
-    def finish(self) -> Result:
-        """Return the maps of all turns, or of the window; only `reset` may follow."""
-        return super().finish() if self.window_frames is None else self._window_result()
-
-    def _window_result(self) -> Result:
+        if self.window_frames is None:
+            return super().result()
         window = self._window
         window.estimate(bare=False)
         maps = [window.fetch(name) for name in MAPS]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,7 +26,6 @@ from mirrorskin.kernels.embedded import vector_width
 from mirrorskin.kernels.normals import contact_limits
 
 NormalMethod = Literal["exact", "paper"]
-NORMAL_METHODS: tuple[NormalMethod, ...] = get_args(NormalMethod)
 MAPS = "vectors", "sigma", "contact", "mean", "cosine", "sine", "residual"
 """Names of the output maps."""
 SLOPE_MAPS = "slopes", "slope_errors", "zeniths"
@@ -45,21 +44,18 @@ class SensorOptions(Configured):
     zenith_gain: ArrayLike | None = option(
         default=None,
         unit="counts/rad",
-        map=True,
         help="brightness per zenith angle, a number or a map (H, W); negative if steeper is darker",
         shown_default="that of the recording or calibration",
     )
     zenith_offset: ArrayLike | None = option(
         default=None,
         unit="counts",
-        map=True,
         help="brightness at zenith 0, a number or a map (H, W)",
         shown_default="that of the recording or calibration, otherwise 0",
     )
     dark: ArrayLike | None = option(
         default=None,
         unit="counts",
-        map=True,
         help="lowest brightness that is linear in the zenith, a number or a map (H, W); samples that are"
         " expected to be darker are left out",
         shown_default="that of the recording or calibration, otherwise none",
@@ -67,7 +63,6 @@ class SensorOptions(Configured):
     bright: ArrayLike | None = option(
         default=None,
         unit="counts",
-        map=True,
         help="highest brightness that is linear in the zenith, a number or a map (H, W); samples that are"
         " expected to be brighter are left out",
         shown_default="that of the recording or calibration, otherwise none",
@@ -279,3 +274,15 @@ def vector_lanes(device: Device) -> int:
     if device.layout.tile == 1:
         return 1
     return 16 if vector_width(device.queue.device) >= 16 else 8
+
+
+def zenith_of(normals: ArrayLike) -> NDArray[np.float32]:
+    """Return the angle to the body's axis in the mean pose, (H, W), radians."""
+    x, y, z = np.moveaxis(np.asarray(normals), -1, 0)
+    return np.asarray(np.arctan2(np.hypot(x, y), z))
+
+
+def azimuth_of(normals: ArrayLike) -> NDArray[np.float32]:
+    """Return the direction in which the surface faces, (H, W), radians from x towards y; NaN where level."""
+    x, y, _ = np.moveaxis(np.asarray(normals), -1, 0)
+    return np.where((x == 0) & (y == 0), np.float32(np.nan), np.arctan2(y, x))

@@ -15,7 +15,7 @@ from mirrorskin.engine.integration.device_inputs import sample_evenly
 from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.integration.surface import explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
-from mirrorskin.io import Result
+from mirrorskin.io import Fitted, Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
@@ -49,14 +49,13 @@ def slopes_of(
     """Return the slopes of a result's normals; see `find_slopes`.
 
     ``contact``, (H, W), replaces that of the result; without either, all normals are used. The half-angle of
-    the precession and the number of turns are ``tilt`` and ``turns`` in the result's process, if available.
+    the precession and the number of turns are ``tilt`` and ``turns`` of the result's ``fitted``, if known.
     """
-    normals, process = result.normals, result.process
+    normals, fitted = result.normals, result.fitted
     if contact is None:
         contact = result.contact
-    tilt, turns = process.get("tilt"), process.get("turns", 1)
-    sigma, gain = result.normals_sigma, process.get("pixel_gain_sigma")
-    along = np.float32(gain) * result.zenith if isinstance(gain, int | float) else None
+    sigma, gain = result.normals_sigma, fitted.pixel_gain_sigma
+    along = None if gain is None else np.float32(gain) * result.zenith
     if along is not None:  # it is part of the standard deviation of normals
         sigma = _without(sigma, along)
         independent_sigma = None if independent_sigma is None else _without(independent_sigma, along)
@@ -64,8 +63,8 @@ def slopes_of(
         normals,
         sigma,
         np.ones(normals.shape[:-1], np.uint8) if contact is None else contact,
-        float(tilt) if isinstance(tilt, int | float) else None,
-        int(turns) if isinstance(turns, int | float) else 1,
+        fitted.tilt,
+        fitted.turns or 1,
         independent_sigma,
     )
     return slopes if along is None else _with_zenith_errors(slopes, along)
@@ -139,10 +138,10 @@ def integrate_normals(
     per_turn = result.contact.ndim == 3
     each, sigmas = [result], [independent_sigma]
     if per_turn:
-        once = {**result.process, "turns": 1}
+        once = replace(result.fitted, turns=1)
         names = "normals", "normals_sigma", "contact"
         maps = zip(*(result[name] for name in names), strict=True)
-        each = [Result(dict(zip(names, turn, strict=True)), process=once) for turn in maps]
+        each = [Result(dict(zip(names, turn, strict=True)), fitted=once) for turn in maps]
         sigmas = list(independent_sigma)
     surfaces = [
         _integrate(slopes_of(turn, sigma), pixel_size, robust, device)
@@ -159,19 +158,18 @@ def integrate_normals(
         stacked,
         component=_stack(components, per_turn),
         offset_unknown=np.ones(before[-1], np.uint8),
-        process=describe_integration(surfaces),
-    )
+    ).with_process(describe_integration(surfaces))
 
 
 def describe_integration(surfaces: Sequence[Result]) -> dict[str, ProcessValue]:
     """Return the method and convergence of surfaces, for a result's process."""
     if not surfaces:
         return {}
-    processes = [surface.process for surface in surfaces]
+    each = [surface.fitted for surface in surfaces]
     return {
-        "integration": processes[0]["integration"],
-        "integration_iterations": max(process["integration_iterations"] for process in processes),
-        "integration_residual": max(process["integration_residual"] for process in processes),
+        "integration": each[0].integration or "",
+        "integration_iterations": max(one.integration_iterations or 0 for one in each),
+        "integration_residual": max(one.integration_residual or 0.0 for one in each),
     }
 
 
@@ -184,7 +182,7 @@ def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, de
             height_sigma=nan.copy(),
             component=np.full(shape, -1, np.int32),
             offset_unknown=np.zeros(0, np.uint8),
-            process={"integration": "multigrid", "integration_iterations": 0, "integration_residual": 0.0},
+            fitted=Fitted(integration="multigrid", integration_iterations=0, integration_residual=0.0),
         )
     surface = integrate(
         slopes.dz_dx,
@@ -196,9 +194,10 @@ def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, de
         budget=_NO_LIMIT,
         device=device,
     )
-    residual = float(surface.process["integration_residual"])
-    if not (surface.process["integration_converged"] or residual <= _TOLERANCE):
-        raise NotConverged(explain(int(surface.process["integration_iterations"]), residual, _TOLERANCE))
+    fitted = surface.fitted
+    residual = fitted.integration_residual or 0.0
+    if not (fitted.integration_converged or residual <= _TOLERANCE):
+        raise NotConverged(explain(fitted.integration_iterations or 0, residual, _TOLERANCE))
     return surface
 
 

@@ -41,9 +41,9 @@ class NormalWindow:
         self._model, self.count = kernel.model, 0
 
     @property
-    def room(self) -> NDArray[Any]:
+    def staging_buffer(self) -> NDArray[Any]:
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        return self._sums.room
+        return self._sums.staging_buffer
 
     @property
     def is_full(self) -> bool:
@@ -60,11 +60,6 @@ class NormalWindow:
     def bands(self) -> list[Band]:
         """The rows on the device, with the maps that `estimate` computes, named as in `MAPS`."""
         return self._sums.bands
-
-    def reset(self) -> None:
-        """Forget the frames so far, and all estimates from them."""
-        self._sums.reset()
-        self._model, self.count = self._kernel.model, 0
 
     def push(self, frames: NDArray[Any], phase: Doubles) -> None:
         """Process the next frames, (n, H, W), and their phases, (n,) radians."""

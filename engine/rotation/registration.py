@@ -136,7 +136,7 @@ class Registered(DerivedSource):
             self._frame.write(frame)
             self._resample()
             registered[:] = self._registered.read()
-        return replace(block, frames=out[:count], lent=False)
+        return replace(block, frames=out[:count], stays_valid=False)
 
     def _resample(self) -> None:
         """Resample the frame on the device."""

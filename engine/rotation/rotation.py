@@ -6,18 +6,18 @@ on the height of the surface: unless given, it is estimated from the first turn.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.inputs import as_result
-from mirrorskin.engine.method import Method, Plan, Step
+from mirrorskin.engine.method import Method
 from mirrorskin.engine.nearest_fill import fill_with_nearest
+from mirrorskin.engine.operation import Plan
 from mirrorskin.engine.options import option
 from mirrorskin.engine.provenance import level_origin, parameter_origin
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
@@ -31,15 +31,9 @@ from mirrorskin.engine.rotation.normals_kernel import NormalMethod
 from mirrorskin.engine.rotation.poses import even_windows, rocks
 from mirrorskin.engine.rotation.registration import Registered, check_heights
 from mirrorskin.engine.rotation.response import HALF_WAY, Response, initial_response, wall_response_of
-from mirrorskin.engine.rotation.steps import (
-    CalibrationErrors,
-    Edges,
-    Integration,
-    PhaseErrors,
-    RegistrationErrors,
-    ResponseErrors,
-)
-from mirrorskin.engine.streaming import feed
+from mirrorskin.engine.rotation.steps import Edges, Integration, SlopeMaps
+from mirrorskin.engine.running import Run
+from mirrorskin.engine.steps import Step
 from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Source, WallResponse, open_heights
 from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.io.findings import carried
@@ -90,7 +84,7 @@ class Rotation(Method):
     motions = ("axial",)
 
     method: NormalMethod = Normals.method
-    tilt: ArrayLike | None = Normals.tilt
+    tilt: float | Literal["estimate"] | None = Normals.tilt
     heights: Any = option(
         default=None,
         file="RES.h5",
@@ -133,6 +127,10 @@ class Rotation(Method):
         inherited = carried({}, heights=_process_of(self.heights))
         return replace(plan, process={**plan.process, **inherited})
 
+    def slope_plan(self, source: Source) -> Plan:
+        """Return the plan with slopes instead of heights; see `mirrorskin.engine.rotation.steps`."""
+        return replace(self.plan(source), steps=[Edges(), SlopeMaps()])
+
     def live_plan(self, source: Source) -> Plan:
         """Return the normals of the last turn, without registration, or what the source determines."""
         wall = self._wall_of(source)
@@ -159,15 +157,14 @@ class Rotation(Method):
             raise InputError(
                 f"{source.name} has no zenith gain, so no normals, and no {what}: give zenith_gain"
             )
-        operation = self.make(Correlate, memory_limit=_at_most(self.memory_limit, source))
-        return Plan(operation, process={"method": "correlation", "zenith": _NO_GAIN})
+        return Plan(self.make(Correlate), process={"method": "correlation", "zenith": _NO_GAIN})
 
     def _poses(self, source: Source) -> Plan:
         if self.heights is not None or self.method != "exact":
             what = f"method {self.method!r}" if self.heights is None else "registering frames with heights"
             raise InputError(f"{source.name}: {what} needs one tilt for all frames: leave it out")
-        limit, longest = _at_most(self.memory_limit, source), even_windows(source.shape[0])
-        operation = self.make(MovingNormals, longest=longest, memory_limit=limit).configured_for(source)
+        longest = even_windows(source.shape[0])
+        operation = self.make(MovingNormals, longest=longest).configured_for(source)
         process = {"method": "exact", "tilt_from": "each frame: this is their root mean square"}
         tilt = source.header.tilt
 
@@ -175,7 +172,7 @@ class Rotation(Method):
             return replace(block, tilt=np.full(len(block.frames), tilt))
 
         stream = None if tilt is None else EditedSource(source, with_tilts)
-        return Plan(operation, [Edges(), self.make(Integration)], process, omit=_OMIT, stream=stream)
+        return Plan(operation, self._steps(), process, omit=_OMIT, stream=stream)
 
     def _linear(self, source: Source, header: Header, heights: ArrayLike | None) -> Plan:
         """Return the plan for brightness that is linear in the zenith."""
@@ -219,8 +216,7 @@ class Rotation(Method):
         for _ in range(_ROUNDS):
             stream, response = self._placed(turn, header, response, heights)
             operation = self._turns(stream, header, response).with_options(per_turn=False)
-            feed(stream, operation)
-            maps = operation.finish()
+            maps = Run(Plan(operation, checked=False), stream).complete()
             top = coarse_heights(
                 maps.normals, maps.contact, response.too_level(maps.mean), pixel_size, press, self.device
             )
@@ -246,7 +242,6 @@ class Rotation(Method):
             Normals,
             tilt="estimate" if header.tilt is None else header.tilt,
             response=response,
-            memory_limit=_at_most(self.memory_limit, stream),
         )
         return operation.configured_for(stream)
 
@@ -262,20 +257,13 @@ class Rotation(Method):
         offset = header.zenith_offset if self.zenith_offset is None else self.zenith_offset
         return replace(
             header,
-            tilt=cast("float | None", tilt),
+            tilt=tilt,
             zenith_gain=gain,
             zenith_offset=np.asarray(0.0 if offset is None else offset, np.float64),
         )
 
     def _steps(self) -> list[Step]:
-        return [
-            Edges(),
-            RegistrationErrors(),
-            PhaseErrors(),
-            ResponseErrors(),
-            self.make(Integration),
-            CalibrationErrors(),
-        ]
+        return [Edges(), self.make(Integration)]
 
     def _process(self) -> dict[str, ProcessValue]:
         origin = "estimate" if self.tilt == "estimate" else "recording" if self.tilt is None else "given"
@@ -312,11 +300,6 @@ def _process_of(heights: Any) -> Mapping[str, ProcessValue]:
 def _half_way(source: Source, press: float) -> Doubles:
     """Return the initial height of the object less the press, (H, W), mm."""
     return np.full(source.shape[1:], -HALF_WAY * press)
-
-
-def _at_most(memory_limit: int, source: Source) -> int:
-    """Return a memory limit, reduced to the size of a source."""
-    return max(1, min(memory_limit, 2 * math.prod(source.shape) * source.dtype.itemsize))
 
 
 def at_poses(source: Source, tilt: ArrayLike | None = None) -> bool:
