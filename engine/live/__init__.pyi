@@ -1,6 +1,6 @@
 from .loop import LATENCY, Loop
-from .operation import LiveOperation
-from .status import PUSHED, RAISED, SHOWN, STAGES, UPDATED, WAITED, Latency, Maps, Status, Update
+from .run import LiveRun
+from .status import PUSHED, RAISED, SHOWN, STAGES, UPDATED, WAITED, Latency, Status, Update
 from .stream import Stream
 
 __all__ = [
@@ -12,9 +12,8 @@ __all__ = [
     "UPDATED",
     "WAITED",
     "Latency",
-    "LiveOperation",
+    "LiveRun",
     "Loop",
-    "Maps",
     "Status",
     "Stream",
     "Update",

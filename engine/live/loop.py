@@ -1,4 +1,4 @@
-"""The live loop, which pushes frames of a camera into an operation with bounded latency."""
+"""The live loop, which pushes frames of a camera into a run with bounded latency."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import math
 from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.live.operation import LiveOperation
+from mirrorskin.engine.live.run import LiveRun
 from mirrorskin.engine.live.status import PUSHED, RAISED, SHOWN, UPDATED, WAITED, Monitor, Status, Update
-from mirrorskin.engine.streaming import push_block
 from mirrorskin.io import Block, InputError, LiveSource
 from mirrorskin.io.layout import POSITIONS
 
@@ -29,7 +29,7 @@ _MARGIN = 0.001  # seconds before the next expected frame in which no work is st
 
 
 class Loop:
-    """Push the frames of a live source into an operation; the status is available after an exception, too.
+    """Push the frames of a live source into a run; the status is available after an exception, too.
 
     *Policy.* All waiting frames are taken at once. Frames that are older than ``latency`` are skipped, except
     for the newest one; frames that the source has lost are counted as dropped. An update follows each push,
@@ -39,8 +39,8 @@ class Loop:
     Parameters
     ----------
     source : LiveSource
-    operation : LiveOperation
-        Call its ``warm()`` first.
+    run : LiveRun
+        Call ``run.precompile()`` first.
     latency : float
         Seconds.
     updates : float, optional
@@ -64,7 +64,7 @@ class Loop:
     def __init__(
         self,
         source: LiveSource,
-        operation: LiveOperation,
+        run: LiveRun,
         *,
         latency: float = LATENCY,
         updates: float | None = None,
@@ -73,11 +73,11 @@ class Loop:
         mark: Mark | None = None,
         guard: Callable[[], AbstractContextManager[Any]] = nullcontext,
     ) -> None:
-        most = operation.updates_per_second if updates is None else updates
+        most = run.operation.updates_per_second if updates is None else updates
         for name, number in (("latency", latency), ("updates", most)):
             if not number > 0:
                 raise InputError(f"{name} {number}: a number above 0 is needed")
-        self._source, self._operation = source, operation
+        self._source, self._run = source, run
         self._latency, self._period = latency, 1 / most
         self._on_update, self._stop, self._mark, self._guard = on_update, stop, mark, guard
         self._monitor = Monitor()
@@ -94,13 +94,13 @@ class Loop:
 
     def run(self) -> Status:
         """Push until the source ends, or ``stop`` returns True."""
-        while (block := self._source.read(self._operation.room)) is not None:
+        while (block := self._source.read(self._run.staging_buffer)) is not None:
             self._take(block)
             if self._stop is not None and self._stop():
                 break
             if self._source.now() - self._updated >= self._period:
                 self._update()
-            self._operation.spare(self._idle())
+            self._run.idle_work(self._idle())
         if self._pending:
             self._update()
         return self.status
@@ -110,20 +110,22 @@ class Loop:
         now, count = self._source.now(), len(block.frames)
         time = np.full(count, now) if block.time is None else block.time
         used = (now - time <= self._latency) | (np.arange(count) == count - 1)
-        used &= (block.index + np.arange(count)) % self._operation.every == 0
+        used &= (block.index + np.arange(count)) % self._run.every == 0
         self._monitor.time(WAITED, *(now - time).tolist())
         self._times.extend(time.tolist())
         with self._guard():
             self._monitor.took(now, count, int(np.count_nonzero(used)), block.dropped)
             edges = np.flatnonzero(np.diff(used, prepend=False, append=False))
+            part = block
             for start, stop in edges.reshape(-1, 2).tolist():  # contiguous frames
-                push_block(self._operation, block, slice(start, stop))
+                self._run.push_block(part, slice(start, stop))
+                part = replace(block, dropped=0)  # lost frames are counted once
             if self._mark is not None:
                 self._mark(block.index, used)
         if used.any():
             last = int(np.flatnonzero(used)[-1])
             at = math.nan if block.time is None else float(block.time[last])
-            places = getattr(block, self._operation.position)  # a tilt, if the source has those of frames
+            places = getattr(block, self._run.position)  # a tilt, if the source has those of frames
             place = (getattr(block, POSITIONS[self._source.motion]) if places is None else places)[last]
             self._newest = at, float(np.hypot(*place) if np.ndim(place) else place), block.frames[last]
             self._taken, self._pending = float(time[last]), True
@@ -134,15 +136,14 @@ class Loop:
             return
         started = self._source.now()
         (at, position, picture), frames = self._newest, self._monitor.used
-        maps = self._operation.maps(max(_PATIENCE, self._idle()))
-        update = Update(frames, at, self._source.motion, position, picture.copy(), **maps)
+        maps = self._run.maps(max(_PATIENCE, self._idle()))
+        update = Update(frames, at, self._source.motion, position, picture.copy(), maps)
         done = self._source.now()
         self._updated, self._pending = started, False
         self._monitor.updated()
         self._monitor.time(UPDATED, done - started)
         self._arrived.append(self._taken)
-        shown = update.height, update.normals, update.displacement, update.slope
-        if any(values is not None for values in shown):
+        if update.first is not None:
             self._monitor.time(SHOWN, done - self._taken)
         if update.height is not None:
             lag = min(update.height_lag, len(self._arrived) - 1)

@@ -6,13 +6,14 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.thread_safe import ThreadSafe
-from mirrorskin.io import Motion
+from mirrorskin.io import Motion, Result
+from mirrorskin.io.result import display_order
 
 WAITED, PUSHED, UPDATED, SHOWN, RAISED = "waited", "push", "update", "frame to map", "frame to height"
 STAGES = (WAITED, PUSHED, UPDATED, SHOWN, RAISED)
@@ -24,23 +25,12 @@ _LATELY = 1.0  # seconds over which the rate is computed
 _FRESH = 0.25  # seconds for which percentiles are reused
 
 
-class Maps(TypedDict, total=False):
-    """Maps of the frames so far; see `Update`. Unavailable maps are missing or None."""
-
-    height: NDArray[np.float32] | None
-    normals: NDArray[np.float32] | None
-    contact: NDArray[np.uint8] | None
-    edges: NDArray[np.uint8] | None
-    contact_area: float | None
-    height_lag: int
-    offset_unknown: bool
-    displacement: NDArray[np.float32] | None
-    slope: NDArray[np.float32] | None
-
-
 @dataclass(frozen=True, slots=True)
 class Update:
-    """Maps of the frames so far. Unavailable maps are None; no other object writes to the maps.
+    """Maps of the frames so far; no other object writes to them.
+
+    Attributes are the maps by name or quantity, as those of a result: ``update.height`` is an array, or None
+    if it is not available.
 
     Attributes
     ----------
@@ -54,24 +44,10 @@ class Update:
         radians; of a slide, the length of the displacement, mm.
     picture : ndarray, (H, W), uint8, uint16 or float32
         The newest frame, raw counts.
-    height : ndarray, (H, W), float32
-        Millimetres; NaN where undefined.
-    height_lag : int
-        Number of updates since the frames of the heights.
-    normals : ndarray, (H, W, 3), float32
-        Unit vectors; NaN where undefined.
-    contact : ndarray, (H, W), uint8
-        1 where sheet and object touch: at any time of a press, or in all frames of a rotation's window.
-    edges : ndarray, (H, W), uint8
-        1 on thin lines where the normal jumps or contact ends; may be of earlier frames.
-    contact_area : float
-        Square millimetres.
-    offset_unknown : bool
-        Whether heights are relative, with a mean of 0 for each connected piece.
-    displacement : ndarray, (H, W, 2), float32
-        Displacement of the skin along x and y since the first frame, mm.
-    slope : ndarray, (H, W), float32
-        Of a body that rocks: slope of the surface along the direction of rocking.
+    maps : Result
+        The maps that the operation shows, and numbers, with their declarations; see `first`.
+        Of built-in operations: ``height``, ``normals``, ``contact``, ``edges`` (which may be of earlier
+        frames), ``displacement`` since the first frame, and of a body that rocks ``slope``.
     """
 
     frames: int
@@ -79,15 +55,27 @@ class Update:
     motion: Motion
     position: float
     picture: NDArray[Any]
-    height: NDArray[np.float32] | None = None
-    normals: NDArray[np.float32] | None = None
-    contact: NDArray[np.uint8] | None = None
-    edges: NDArray[np.uint8] | None = None
-    contact_area: float | None = None
-    height_lag: int = 0
-    offset_unknown: bool = False
-    displacement: NDArray[np.float32] | None = None
-    slope: NDArray[np.float32] | None = None
+    maps: Result = field(default_factory=Result)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in Update.__slots__:  # the constructor failed
+            raise AttributeError(name)
+        return getattr(self.maps, name)
+
+    @property
+    def first(self) -> str | None:
+        """Name of the map that a display shows first; None without one."""
+        return next(iter(display_order(self.maps)), None)
+
+    @property
+    def contact_area(self) -> float | None:
+        """Square millimetres where sheet and object touch; None if that is unknown."""
+        return self.maps.get("contact_area")
+
+    @property
+    def height_lag(self) -> int:
+        """Number of updates since the frames of the heights."""
+        return int(self.maps.get("height_lag", 0))
 
 
 @dataclass(frozen=True, slots=True)

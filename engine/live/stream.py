@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.device_arrays import on_host
 from mirrorskin.engine.frames import as_frames, check_dtype
 from mirrorskin.engine.live.loop import LATENCY, Loop
-from mirrorskin.engine.live.operation import LiveOperation
+from mirrorskin.engine.live.run import LiveRun
 from mirrorskin.engine.live.status import Status, Update
 from mirrorskin.engine.method import Method
 from mirrorskin.engine.operation import COMPONENTS, Operation
@@ -81,11 +81,11 @@ class Stream(Closing):
         latency: float = LATENCY,
     ) -> None:
         self._source = _Pushed(_header(operation, motion, header), shape, check_dtype(dtype), latency)
-        self._operation = LiveOperation(self._source, operation)
-        self._operation.warm()
-        if {"pose", "tilt"} & {name for name, needed in self._operation.positions.items() if needed}:
+        self._run = LiveRun(self._source, operation)
+        self._run.precompile()
+        if {"pose", "tilt"} & {name for name, needed in self._run.operation.positions.items() if needed}:
             self._source.needed += ("tilt",)
-        self._loop = Loop(self._source, self._operation, latency=latency, on_update=self._source.keep)
+        self._loop = Loop(self._source, self._run, latency=latency, on_update=self._source.keep)
         self._thread = threading.Thread(
             target=_run, args=(self._loop, self._source), name="mirrorskin-stream", daemon=True
         )
@@ -136,7 +136,7 @@ class Stream(Closing):
             The frames do not determine them, or whatever the operation refused.
         """
         self._source.wait()
-        return self._operation.result()
+        return self._run.result()
 
     def close(self) -> None:
         """End the thread; frames that still wait are processed before.
