@@ -25,8 +25,7 @@ from mirrorskin.engine.batch.work import Outcome
 from mirrorskin.engine.provenance import program_version
 from mirrorskin.io import InputError
 from mirrorskin.io.atomic import remove_leftovers
-from mirrorskin.io.os_errors import as_input_error
-from mirrorskin.io.system import lock
+from mirrorskin.io.system import as_input_error, lock
 
 PATIENCE = 30.0
 """Timeout, s, of a scheduler after the first contact, and of a cluster without workers."""
@@ -48,7 +47,7 @@ def run_cluster(
     job whose worker is lost is given to another one. Closing the iterator ends the batch: jobs that are
     running on a remote cluster are finished there, all others are cancelled.
     """
-    jobs = list(jobs)
+    jobs, plan = list(jobs), plan.for_other_processes()
     if not jobs:
         return
     with _connect(address, workers) as client:

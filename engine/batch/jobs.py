@@ -17,11 +17,12 @@ import numpy as np
 
 from mirrorskin.engine.method import Method
 from mirrorskin.engine.operation import Operation
+from mirrorskin.engine.options import plain
 from mirrorskin.engine.provenance import program_version
-from mirrorskin.engine.reconstruction import method_for
-from mirrorskin.engine.running import load_operation
+from mirrorskin.engine.reconstruction import load_operation, method_for
 from mirrorskin.engine.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion
+from mirrorskin.io.own_class import importable_name, name_of
 from mirrorskin.io.url import Url
 
 
@@ -104,7 +105,7 @@ class Plan:
     rotation: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Rotation`
     memory_limit: int = MEMORY_LIMIT  # bytes of host memory for frames that are read ahead, per device
     slip: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Sliding`
-    operation: str = ""  # MODULE:CLASS of an operation that is run instead of all methods
+    operation: str | type = ""  # class of an operation that is run instead of all methods, or MODULE:CLASS
     operation_options: Mapping[str, Any] = field(default_factory=dict)
     strict: bool = False  # whether warnings are errors
 
@@ -116,6 +117,12 @@ class Plan:
         """Return the options of that class."""
         chosen = self.operation_options if self.operation else getattr(self, TABLES[motion])
         return {**chosen, "memory_limit": self.memory_limit}
+
+    def for_other_processes(self) -> Plan:
+        """Return the plan with the name of its operation; InputError if others cannot import the class."""
+        operation = self.operation
+        name = importable_name(operation) if isinstance(operation, type) else operation
+        return dataclasses.replace(self, operation=name)
 
     def key(self, motion: Motion) -> str:
         """Return everything in the plan that affects the results of a motion, as text.
@@ -131,7 +138,8 @@ class Plan:
         defaults = {name: declared.default for name, declared in kind.options.items()}
         values = defaults | dict(self.options(motion))
         used = {name: value for name, value in values.items() if name not in _IRRELEVANT}
-        table = {"operation": self.operation, "code": _code(kind)} if self.operation else {}
+        operation = name_of(self.operation) if isinstance(self.operation, type) else self.operation
+        table = {"operation": operation, "code": _code(kind)} if self.operation else {}
         name = "options" if self.operation else TABLES[motion]
         parts = {"version": program_version(), "opening": opening, name: used, **table}
         return json.dumps(_as_json(parts), sort_keys=True)
@@ -158,4 +166,4 @@ def _as_json(value: Any) -> Any:
         return [_as_json(item) for item in value]
     if isinstance(value, np.ndarray | np.generic):
         return _as_json(value.tolist())
-    return str(value) if isinstance(value, Path) else value
+    return plain(value)

@@ -12,13 +12,13 @@ from typing import Literal
 from mirrorskin import io
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.provenance import missing_levels, naming
-from mirrorskin.engine.running import run_class
-from mirrorskin.engine.streaming import Progress
+from mirrorskin.engine.provenance import naming
+from mirrorskin.engine.reconstruction import run_class
+from mirrorskin.engine.running import Progress
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Recording
-from mirrorskin.io.os_errors import as_input_error
 from mirrorskin.io.result_file import open_process
+from mirrorskin.io.system import as_input_error
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.io.url import Url
 from mirrorskin.kernels.device import Device, open_device
@@ -100,7 +100,7 @@ def _compute(
         result = run_class(
             plan.kind(source.motion), source, progress, device=opened, **plan.options(source.motion)
         )
-    said = str(result.process.get("warnings", ""))
+    said, notes = (str(result.process.get(kind, "")) for kind in ("warnings", "notes"))
     if plan.strict and said:
         raise InputError(f"{source.name}: {said}")
     process: dict[str, ProcessValue] = {**result.process, "batch_parameters": digest}
@@ -108,7 +108,7 @@ def _compute(
     return replace(
         outcome,
         state="done",
-        message="; ".join(filter(None, (str(summarise(result)), missing_levels(result.process), said))),
+        message="; ".join(filter(None, (str(summarise(result)), notes, said))),
         bytes=math.prod(source.shape) * source.dtype.itemsize,
         device=opened.info.title,
     )

@@ -14,7 +14,7 @@ from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.force.normal import press_within
 from mirrorskin.engine.press.elastic import LEARNED_AT, fit_press
 from mirrorskin.engine.press.press import Press
-from mirrorskin.engine.streaming import Progress
+from mirrorskin.engine.running import Progress
 from mirrorskin.io import Calibrated, Calibration, Gel, InputError, Source, Stiffness
 from mirrorskin.kernels.array_types import Doubles
 

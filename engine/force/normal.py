@@ -56,7 +56,7 @@ def find_force(
         Height of the object, mm, and its standard deviation, if available; an array is the height. It is 0
         where the object meets the sheet at travel 0, and NaN where there is no object.
     travel : float, optional
-        Downward displacement of the body, mm; by default ``travel`` of the result's process.
+        Downward displacement of the body, mm; by default ``travel`` of the result's ``fitted``.
     pixel_size : float or (float, float), optional
         Millimetres along x and y; by default that of the result.
     modulus : float, optional
@@ -102,10 +102,9 @@ def find_force(
     if surface.ndim != 2 or 0 in surface.shape:
         raise InputError(f"heights have shape {surface.shape}: one map (H, W) is needed")
     if travel is None:
-        stored = result.process.get("travel")
-        if not isinstance(stored, float):
+        travel = result.fitted.travel
+        if travel is None:
             raise InputError("travel is missing: specify by how many millimetres the body is lowered")
-        travel = stored
     young, young_sigma = modulus_of(result, modulus, modulus_sigma)
     _check(travel=(travel, -math.inf), travel_sigma=(travel_sigma, 0.0), modulus_sigma=(modulus_sigma, 0.0))
     _check(compliance=(compliance, 0.0))
@@ -126,8 +125,8 @@ def find_force(
     pressure = (young * pressed.strain * (load / pressed.load if pressed.load else 1)).astype(np.float32)
     force = _force(pressure, pressed.contact, young * load, spread)
     x, y = pixel_axes((surface.shape[0], surface.shape[1]), size)
-    process = {"travel": float(travel), "modulus": float(young)}
-    return force.assign(x=x, y=y, process={**process, **carried({}, height=result.process)})
+    process = {"modulus": float(young), **carried({}, height=result.process)}
+    return force.assign(x=x, y=y, process=process).with_fitted(travel=float(travel))
 
 
 def _excess_load(

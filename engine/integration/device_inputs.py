@@ -16,11 +16,11 @@ from mirrorskin.engine.integration.validation import (
     Inputs,
     as_marks,
     check_one_source,
-    check_pixel_size,
     median_weight,
     split_weights,
 )
 from mirrorskin.io import InputError
+from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.samples import take_samples
 
@@ -93,4 +93,6 @@ def sample_grid(map_: Array, down: int, across: int) -> Floats:
     """Return every n-th pixel of a map, beginning in the middle of the first step."""
     rows, columns = map_.shape
     shape = len(range(down // 2, rows, down)), len(range(across // 2, columns, across))
-    return take_samples(map_, down // 2 * columns + across // 2, down * columns, across, shape)
+    first, steps = down // 2 * columns + across // 2, (0, down * columns, across)
+    samples: Floats = take_samples(map_, first, steps, (1, *shape))[0]
+    return samples

@@ -20,12 +20,11 @@ from mirrorskin.engine.integration.validation import (
     Inputs,
     check_inputs,
     check_map,
-    check_pixel_size,
     logarithm,
 )
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import Check, as_array_or_number, checked, in_unit
+from mirrorskin.io.arguments import Check, as_array_or_number, check_pixel_size, checked, in_unit
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device, open_device
 
@@ -203,8 +202,8 @@ def _uncropped(result: Result, inputs: Inputs) -> Result:
     for name, part in result.maps().items():
         maps[name] = np.full((*part.shape[:-2], *inputs.picture), _OUTSIDE[name], part.dtype)
         maps[name][(..., *inputs.box)] = part
-    invalid = int(result.process["integration_invalid"]) + inputs.lost
-    return result.assign(maps, process={**result.process, "integration_invalid": invalid})
+    invalid = (result.fitted.integration_invalid or 0) + inputs.lost
+    return result.assign(maps).with_fitted(integration_invalid=invalid)
 
 
 @contextmanager

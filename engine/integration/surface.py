@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.slope_errors import correlation_of
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.engine.operation import OnDevice
-from mirrorskin.engine.options import Option, option
+from mirrorskin.engine.options import option
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array
@@ -39,21 +39,6 @@ _NO_NOTE: dict[str, ProcessValue] = {}
 _UNEVEN = 2.0  # ratio of the weights of horizontal and vertical links above which they count as uneven
 _PLAIN = 3e-3  # residual of the surface without breaks, with which one with breaks is compared
 _GOAL = 1e-4  # residual to stop at if there is a deadline, but no tolerance
-
-
-class _Tolerance(Option):
-    """A number above 0, or None."""
-
-    def check(self, value: Any) -> Any:
-        return None if value is None else super().check(value)
-
-
-_tolerance = option(
-    default=1e-5,
-    above=0,
-    help="residual to stop at: norm of the error over that of the heights above the mean plane, both with "
-    "the weights of the sum that is minimised. None: do two cycles",
-)
 
 
 class IntegrationOptions(OnDevice):
@@ -87,7 +72,12 @@ class IntegrationOptions(OnDevice):
         help="standard deviation of an error that all slopes have in common, as a share of them: it adds "
         "this share of the height above the mean of the component to ``height_sigma``",
     )
-    tolerance: float | None = cast(Any, _Tolerance(**vars(_tolerance)))
+    tolerance: float | None = option(
+        default=1e-5,
+        above=0,
+        help="residual to stop at: norm of the error over that of the heights above the mean plane, both "
+        "with the weights of the sum that is minimised. None: do two cycles",
+    )
     budget: float | None = option(
         default=None,
         above=0,
@@ -406,8 +396,7 @@ def _as_result(
         offset_unknown=offset_unknown.astype(np.uint8),
         filled=np.zeros(component.shape, np.uint8),
         edges=edges,
-        process=process,
-    )
+    ).with_process(process)
 
 
 def explain(iterations: int, residual: float, tolerance: float | None) -> str:

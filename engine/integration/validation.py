@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.integration.camera import Camera, Slopes, find_slopes
 from mirrorskin.engine.integration.crop import Box, Mask, find_box
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import as_pixel_size
+from mirrorskin.io.arguments import check_pixel_size
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.uint8]
@@ -242,15 +241,6 @@ def logarithm(name: str, depths: NDArray[Any]) -> NDArray[np.float64]:
     if np.any(exact <= 0):
         raise InputError(f"{name}: some are not above 0; with a camera give depths, NaN where unknown")
     return np.log(exact)
-
-
-def check_pixel_size(pixel_size: ArrayLike | None) -> tuple[float, float]:
-    """Return width and height of a pixel, mm, from one number or both."""
-    size = as_pixel_size("pixel_size", pixel_size)
-    if not all(1e-9 < length < 1e6 for length in size):
-        text = pixel_size if isinstance(pixel_size, Real | tuple | list) else size
-        raise InputError(f"pixel size {text}: a length from 1e-9 to 1e6 mm is needed")
-    return size
 
 
 def check_map(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 
 from mirrorskin.engine.integration.graph import LEVEL, Levelling, PixelGraph, find_components
 from mirrorskin.engine.integration.multigrid import Multigrid
-from mirrorskin.engine.integration.validation import Floats, Inputs, check_pixel_size
+from mirrorskin.engine.integration.validation import Floats, Inputs
 from mirrorskin.engine.thread_safe import ThreadSafe
+from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 
@@ -44,10 +45,6 @@ class WarmStartIntegrator(ThreadSafe):
         self._levelling = Levelling(self._graph)
         self._multigrid: Multigrid | None = None
         self._height: Floats | None = None
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the heights so far."""
         self._steps, self.gap = 0, math.nan
 
     def push(self, typical_weight: float) -> None:

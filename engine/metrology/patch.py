@@ -15,9 +15,6 @@ from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
 
-CORRELATION = "height_correlation"
-"""Name in the process of a result: length over which errors of heights are correlated, mm."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:
@@ -100,7 +97,7 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
         absolute=absolute,
         place=part,
         noise_length=_noise_length(result),
-        of_press="event" in result.process,
+        of_press=result.fitted.event is not None,
         notes=(*left_out, *notes),
     )
     return patch, result.assign(height=np.where(known, height, np.float32(np.nan)))
@@ -108,10 +105,10 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
 
 def _noise_length(result: Result) -> float:
     """Return the length over which errors of heights are correlated, mm; 0 for independent ones."""
-    fused = result.process.get(CORRELATION)
-    if fused is not None:
-        return float(fused)
-    return math.inf if "integration" in result.process else 0.0
+    fitted = result.fitted
+    if fitted.height_correlation is not None:
+        return fitted.height_correlation
+    return 0.0 if fitted.integration is None else math.inf
 
 
 def _known(result: Result, height: NDArray[np.float32], filled: Mask) -> tuple[Mask, list[str]]:

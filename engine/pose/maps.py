@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.device_arrays import operand_of
-from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.io import InputError, Result, pixel_axes
+from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.io.result import shape_of
 from mirrorskin.kernels.array import Array, Operand, fetch
 from mirrorskin.kernels.array_types import Doubles
@@ -205,6 +205,5 @@ def _run(device: Device, name: str, rows: int, columns: int, **arguments: Any) -
 
 
 def _least(result: Result) -> float:
-    tilt = result.process.get("tilt", result.process.get("axial_tilt"))
-    known = isinstance(tilt, float) and 0 < tilt < math.pi / 2
-    return math.sin(float(tilt)) ** 2 if known else 1.0  # type: ignore[arg-type]
+    tilt = result.fitted.tilt
+    return math.sin(tilt) ** 2 if tilt is not None and 0 < tilt < math.pi / 2 else 1.0

@@ -11,11 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.device_arrays import AnyArray, device_of, on_host
 from mirrorskin.engine.frames import as_frames, check_frames
-from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker, invert_symmetric
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import check_count, check_number, checked, in_unit
+from mirrorskin.io.arguments import check_count, check_number, check_pixel_size, checked, in_unit
 from mirrorskin.io.maps import TABLE, DisplacementStatus, status_of
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
@@ -128,7 +127,7 @@ def find_displacement(
         "status": tracker.worst_at_pixels(status, _RANK),
     }
     x, y = pixel_axes(frames.shape[1:], size)
-    return Result(maps, x=x, y=y, process={"noise": texture.noise}, declarations=MAPS)
+    return Result(maps, x=x, y=y, declarations=MAPS).with_fitted(noise=texture.noise)
 
 
 @dataclass(frozen=True, slots=True)

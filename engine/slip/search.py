@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.inputs import Maps, as_result
-from mirrorskin.engine.integration.validation import check_pixel_size
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
@@ -28,10 +27,11 @@ from mirrorskin.engine.slip.displacement import (
 from mirrorskin.engine.slip.onset_map import Expected, OnsetMap, fit_onsets
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
 from mirrorskin.io import Calibrated, InputError, Map, Recording, Result, pixel_axes
+from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.io.findings import carried
 from mirrorskin.io.maps import TABLE, TWIST, DisplacementStatus, SlipStatus, status_of
 from mirrorskin.io.positions import check_finite
-from mirrorskin.io.types import FRAME_DTYPES, UNDISTORTED
+from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
@@ -73,9 +73,8 @@ class Slip(Operation):
     >>> texture = np.random.default_rng(1).normal(100, 20, (60, 80))
     >>> texture = cv2.GaussianBlur(texture, (0, 0), 1.5).astype(np.float32)
     >>> slip = engine.slip.Slip(pixel_size=0.1, contact=np.ones((60, 80)), noise=0.1)
-    >>> for k in range(4):  # the body moves to the right, the skin sticks to the object
-    ...     slip.push(np.roll(texture, -k, axis=1)[None], displacement=[[0.1 * k, 0.0]])
-    >>> found = slip.result()
+    >>> frames = [np.roll(texture, -k, axis=1) for k in range(4)]  # the skin sticks to the object
+    >>> found = engine.run(frames, slip, displacement=np.outer(range(4), [0.1, 0.0]))
     >>> [round(float(part), 3) for part in found.displacement[30, 40]], int(found.status[30, 40])
     ([-0.3, 0.0], 2)
     """
@@ -83,7 +82,6 @@ class Slip(Operation):
     motions = ("horizontal", "twist")
     dtypes = FRAME_DTYPES
     least_frames = 3
-    on_device = True
 
     contact: Maps | None = option(
         default=None,
@@ -114,17 +112,18 @@ class Slip(Operation):
     )
     motion: Literal["horizontal", "twist"] = option(
         default="horizontal",
-        choices=("horizontal", "twist"),
         help="motion of the body: a slide along the sheet, or a rotation about its axis; from the source",
         python_only=True,
     )
     pixel_size: ArrayLike | None = option(
         default=None,
+        unit="mm",
         help="millimetres along x and y, one number or both; from the source",
         python_only=True,
     )
     centre: tuple[float, float] = option(
         default=(0.0, 0.0),
+        unit="mm",
         help="position of the body's axis, mm from the centre of the frames along x and y; from the source",
         python_only=True,
     )
@@ -160,25 +159,20 @@ class Slip(Operation):
         return self.with_options(**changes)
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
-        """Check windows and contact, and forget all frames."""
+        """Check windows and contact."""
         if self.pixel_size is None:
             raise InputError("the pixel size is missing, which slip needs: give --pixel-size (pixel_size=)")
         self._size = check_pixel_size(self.pixel_size)
         check_windows(shape, self.window_size, self.window_step)
         self._contact, self._contact_origin, self._findings = _read_contact(self.contact, shape)
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget the frames so far."""
         self._tracker: Tracker | None = None
         self._places: list[Doubles] = []
         self._fields: list[NodeField] = []
 
-    @cached_property
-    def room(self) -> NDArray[Any]:
-        """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        frame_size = math.prod(self.shape) * self.dtype.itemsize
-        return np.empty((max(1, min(_BLOCK, self.memory_limit // (2 * frame_size))), *self.shape), self.dtype)
+    @property
+    def frames_at_once(self) -> int:
+        """Number of frames that are read at once: few, as each takes long."""
+        return min(_BLOCK, super().frames_at_once)
 
     def push(
         self, frames: NDArray[Any], *, displacement: ArrayLike | None = None, twist: ArrayLike | None = None
@@ -202,22 +196,21 @@ class Slip(Operation):
         square = float(before @ before)
         return float(np.clip((place - self._places[-1]) @ before / square, -4, 4)) if square > 0 else 0.0
 
-    def warm(self) -> None:
-        """Push a few frames of a texture and forget them, so that all kernels are compiled."""
+    def precompile(self) -> None:
+        """Push a few frames of a texture, so that all kernels are compiled."""
         texture = np.random.default_rng(0).uniform(0, 200, self.shape).astype(self.dtype)
         place = np.zeros((1, 2) if self.motion == "horizontal" else 1)
         for _ in range(3):
             self.push(texture[np.newaxis], **{self._position: place})
             self.preview(0.0)
-        self.reset()
 
-    def preview(self, seconds: float) -> Mapping[str, Any]:  # it takes a moment
+    def preview(self, seconds: float) -> Result:  # it takes a moment
         """Return the displacement in the newest frame, (H, W, 2); none before the second."""
         if self._tracker is None or not self._fields:
-            return {}
+            return Result()
         field = self._fields[-1]
         moved = np.where(field.found, field.moved, np.nan)
-        return {"displacement": self._tracker.to_pixels(np.moveaxis(moved, 0, -1) * self._scale)}
+        return Result(displacement=self._tracker.to_pixels(np.moveaxis(moved, 0, -1) * self._scale))
 
     @property
     def _scale(self) -> Doubles:
@@ -483,7 +476,7 @@ def _read_contact(
 
 
 def _contact_of(result: Result, shape: tuple[int, int]) -> tuple[NDArray[np.bool_], str]:
-    if result.process.get(UNDISTORTED):
+    if result.fitted.undistorted:
         raise InputError("the contact is undistorted, and the frames are not: make it without a lens")
     if result.pressure is not None:
         return _check_contact(result.pressure > 0, shape), "given"

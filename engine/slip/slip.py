@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike
 
 from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.inputs import Maps
-from mirrorskin.engine.method import Context, Method, Plan, Step
+from mirrorskin.engine.method import Method
+from mirrorskin.engine.operation import Plan
 from mirrorskin.engine.options import option
 from mirrorskin.engine.slip.search import Slip
+from mirrorskin.engine.steps import Context, Step
 from mirrorskin.engine.summary import status_shares
 from mirrorskin.io import Calibrated, InputError, Result, Source
 from mirrorskin.io.findings import Finding, with_findings
