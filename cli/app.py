@@ -40,7 +40,9 @@ def command(
     device: options.Devices = None,
     operation: Annotated[
         str | None,
-        Option(metavar="MODULE:CLASS", help="Operation to begin with, such as your own."),
+        Option(
+            metavar="MODULE:CLASS", help="Operation to begin with, and of a rig's runs, such as your own."
+        ),
     ] = None,
     port: Annotated[
         int | None,
@@ -65,10 +67,12 @@ def command(
     with ExitStack() as stack:
         control = None
         if rig is not None:
+            from mirrorskin.engine.reconstruction import load_operation
             from mirrorskin.hw.rig_file import load_rig
             from mirrorskin.view.app.rig_control import RigControl
 
-            control = RigControl(load_rig(rig))
+            kind = None if operation is None else load_operation(operation)
+            control = RigControl(load_rig(rig), operation=kind)
             stack.callback(control.close)
             stop = stack.enter_context(closing(StopServer(control.stop)))
             control.stop_address = stop.address

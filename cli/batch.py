@@ -164,7 +164,7 @@ def _prepare(folder: Path, jobs: Sequence[Job]) -> None:
     """Create the folder, check that it can be written to, and remove temporary files of a killed batch."""
     from mirrorskin import io
     from mirrorskin.io.atomic import remove_leftovers
-    from mirrorskin.io.os_errors import as_input_error
+    from mirrorskin.io.system import as_input_error
 
     with as_input_error(f"{folder} cannot be created", "choose another folder with -o"):
         if folder.exists() and not folder.is_dir():

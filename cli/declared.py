@@ -11,18 +11,28 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mirrorskin.cli.groups import MOTIONS, Command, ExistingPath, MotionOption, NameOrFile, for_motions
+from mirrorskin.cli.groups import (
+    MOTIONS,
+    AnyPath,
+    Command,
+    ExistingPath,
+    MotionOption,
+    NameOrFile,
+    for_motions,
+)
 
 if TYPE_CHECKING:
     from mirrorskin.engine.options import Option
 
 _FILE = re.compile(r"\.[A-Za-z]\w*$")
-_CLASS = re.compile(r".+:[A-Za-z_]\w*")
+_NAME = re.compile(r"[A-Za-z_][\w-]*")  # of an operation of an installed package
+_CLASS = re.compile(r"(?:--operation=)?([^-].*:[A-Za-z_]\w*)")
 _LOADED = "mirrorskin.cli.declared"  # key of a context's class and its options
 _SHARED = ("tilt",)  # options of a stage that classes have, too, with the same meaning
 _COPY = Path(__file__).with_suffix(".json")
@@ -67,13 +77,13 @@ class Term:
     def metavar(self) -> str:
         """Placeholder for a value in help."""
         shown = self.unit if self.kind == "text" else self.unit.upper()
-        plain = shown or ("N" if self.kind == "integer" else "NUMBER")
-        several = {"numbers": "[,...]", "map": "|FILE"}.get(self.kind, "")
+        plain = shown or ("N" if self.kind in ("integer", "integers") else "NUMBER")
+        several = {"numbers": "[,...]", "integers": "[,...]", "map": "|FILE"}.get(self.kind, "")
         return "|".join([_UNITS.get(self.unit, (plain,))[0] + several, *self.words])
 
     def read(self, text: str, where: str) -> Any:
         """Return the value of a text on the command line, in the option's unit."""
-        if self.kind == "numbers":
+        if self.kind in ("numbers", "integers"):
             if self.unit in _UNITS:
                 from mirrorskin.cli.quantity import refuse_decimal_comma
 
@@ -86,11 +96,11 @@ class Term:
         from mirrorskin.cli import quantity
         from mirrorskin.io import InputError
 
-        if text in self.words or self.kind in ("choice", "text", "file", "name"):
+        if text in self.words or self.kind in ("choice", "text", "path", "file", "name"):
             return text
         if self.kind == "map" and _FILE.search(text):
             return ExistingPath().convert(text, None, None)
-        plain = "integer" if self.kind == "integer" else "number"
+        plain = "integer" if self.kind in ("integer", "integers") else "number"
         try:
             value = getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
         except InputError as error:
@@ -121,12 +131,14 @@ class DeclaredOption(MotionOption):
             settings = {"type": click.Choice([*one.choices])}
         elif one.kind == "file":
             settings = {"type": ExistingPath(), "metavar": one.file or one.unit}
+        elif one.kind == "path":
+            settings = {"type": AnyPath(), "metavar": one.unit}
         elif one.kind == "name":
             settings = {"type": NameOrFile(), "metavar": one.unit}
         elif one.kind == "switch":
             settings = {"is_flag": True}
         elif one.kind != "flag":
-            settings = {"metavar": one.metavar, "multiple": one.kind == "numbers"}
+            settings = {"metavar": one.metavar, "multiple": one.kind in ("numbers", "integers")}
         super().__init__(
             names,
             help=f"{one.help[:1].upper()}{one.help[1:].rstrip('.')}.",
@@ -211,20 +223,23 @@ class ClassCommand(Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Load the class, and parse the arguments with its options."""
-        name = next((word for word in args if _CLASS.fullmatch(word)), None)
+        name = next((found[1] for word in args if (found := _CLASS.fullmatch(word))), None)
+        name = name or _installed(args, any(one.name == "class_name" for one in self.params))
         if name is None:
             return super().parse_args(ctx, args)
         ctx.meta[_LOADED] = self._load(name)
+        from mirrorskin.io.arguments import unknown_argument
+
         try:
             return super().parse_args(ctx, args)
         except click.NoSuchOption as error:
-            flags = ", ".join(one.opts[0] for one in ctx.meta[_LOADED][1]) or "none"
-            message = f"{name} has no option {error.option_name}. Its options are {flags}"
+            flags = [one.opts[0] for one in ctx.meta[_LOADED][1]]
+            message = unknown_argument(name, error.option_name, flags, "option")
             raise click.UsageError(message, ctx) from None
 
     def _load(self, name: str) -> tuple[type[Any], list[DeclaredOption]]:
         """Return the class with this name, and its options."""
-        from mirrorskin.engine.running import load_operation
+        from mirrorskin.engine.reconstruction import load_operation
         from mirrorskin.io import InputError
 
         kind = load_operation(name)
@@ -265,6 +280,19 @@ class ClassCommand(Command):
                 formatter.write_text(f"{kind.__name__}: {purpose}")
 
 
+def _installed(args: Sequence[str], first: bool) -> str | None:
+    """Return the name of an operation of an installed package: an option, or the ``first`` word."""
+    words = [word for flag, word in pairwise(args) if flag == "--operation"]
+    words += [word.removeprefix("--operation=") for word in args if word.startswith("--operation=")]
+    words += [word for word in args if _NAME.fullmatch(word)][:first]
+    if not words:
+        return None
+    from mirrorskin.io.own_class import OPERATIONS, installed_names
+
+    names = installed_names(OPERATIONS)
+    return next((word for word in words if word in names), None)
+
+
 def terms_of(kinds: Mapping[str, type[Any]]) -> list[Term]:
     """Return the options of classes by motion; options of one name become one.
 
@@ -281,17 +309,20 @@ def terms_of(kinds: Mapping[str, type[Any]]) -> list[Term]:
 
 def term_of(one: Option) -> Term:
     """Return the term of a declaration."""
-    shown = one.shown_default
-    if not shown and one.default is not None:
-        shown = f"{one.default:g}" if isinstance(one.default, float) else str(one.default)
+    from mirrorskin.engine.options import plain
+
+    shown, default = one.shown_default, plain(one.default)
+    if not shown and default is not None:
+        several = default if isinstance(default, tuple) else (default,)
+        shown = ",".join(f"{value:g}" if isinstance(value, float) else str(value) for value in several)
         if one.kind == "flag":
             shown = one.name.replace("_", "-") if one.default else f"no-{one.name.replace('_', '-')}"
         elif one.unit == "rad":
-            shown = f"{math.degrees(one.default):g}deg"
+            shown = ",".join(f"{math.degrees(value):g}deg" for value in several)
         elif one.unit in ("mm", "MPa", "N", "s"):
             shown += one.unit
-    kind = "number" if one.kind == "object" else one.kind
-    return Term(one.name, kind, one.help, one.unit, shown, one.choices, one.words, one.file)
+    unit = one.unit or {"text": "TEXT", "path": "FILE"}.get(str(one.kind), "")
+    return Term(one.name, str(one.kind), one.help, unit, shown, one.choices, one.words, one.file)
 
 
 def _merged(variants: list[Term]) -> Term:

@@ -28,6 +28,15 @@ def command(
         ),
     ],
     turn: options.Turn = None,
+    map_name: Annotated[
+        str,
+        Option(
+            "--map",
+            metavar="NAME",
+            help="Map to write, such as your own, to .csv, .tif (float32) or .npz.",
+            show_default="heights; all maps in .npz",
+        ),
+    ] = "",
     section: Annotated[
         str | None,
         Option(
@@ -53,12 +62,13 @@ def command(
     from mirrorskin.io.recording import is_recording
 
     suffixes = {path.suffix.lower() for path in output}
-    for name, given in (("section", section), ("points", points), ("float32", float32)):
-        taken = suffixes_with(name)
+    chosen = {"map_name": map_name, "section": section, "points": points, "float32": float32}
+    for option, given in chosen.items():
+        taken, name = suffixes_with(option), option.removesuffix("_name")
         if given and not suffixes & {*taken}:
             raise io.InputError(f"--{name} is for a {taken[0]} file: name one with -o, or leave --{name} out")
     ends = None if section in (None, _APEX) else segment(section, "--section")
-    stores, output = _part(output, result, turn)
+    stores, output = _part(output, result, turn, map_name)
     if all(path.suffix.lower() == MCAP_SUFFIX for path in output) and is_recording(result):
         with io.open_recording(result, **stack) as recording:
             for path in output:
@@ -66,17 +76,19 @@ def command(
     elif output:
         found = io.select_turn(io.open_result(result), turn)
         for path in output:
-            check_export(found, path)
+            check_export(found, path, map_name)
         columns = None if section is None else section_columns(found, ends)
         for path in output:
-            holds = io.export_result(found, path, section=columns, points=points, float32=float32)
+            holds = io.export_result(
+                found, path, map_name=map_name, section=columns, points=points, float32=float32
+            )
             click.echo(printable(f"{path}: {holds}"))
     for path in stores:
         with progress("exporting", None) as show:
             click.echo(printable(f"{path}: {io.save_zarr(result, path, show, **stack)}"))
 
 
-def _part(output: list[Path], result: Path, turn: int | None) -> tuple[list[Path], list[Path]]:
+def _part(output: list[Path], result: Path, turn: int | None, map_name: str) -> tuple[list[Path], list[Path]]:
     """Check all outputs, and return those in Zarr and the others."""
     from mirrorskin.io import InputError, check_output
     from mirrorskin.io.url import is_zarr
@@ -88,6 +100,8 @@ def _part(output: list[Path], result: Path, turn: int | None) -> tuple[list[Path
     stores = [path for path in output if is_zarr(path)]
     if stores and turn is not None:
         raise InputError(f"{stores[0]} takes all turns: leave --turn out")
+    if stores and map_name:
+        raise InputError(f"{stores[0]} takes all maps: leave --map out")
     for path in output:
         if path in stores:
             check_store(path)

@@ -37,7 +37,6 @@ def command(
     from mirrorskin.cli.output import (
         make_strict,
         progress,
-        report_levels,
         report_notes,
         report_unverified,
         save_and_report,
@@ -75,8 +74,6 @@ def command(
         report_unverified(opened)
         process = {name.removeprefix(prefix): said for name, said in result.process.items()}
         report_notes(str(path), process)
-        if path == vertical:
-            report_levels(str(path), process)
 
 
 def _open(path: Path, place: Motion, known: StackOptions, limit: int) -> Recording:

@@ -187,16 +187,17 @@ class _Missing(click.ClickException):
     exit_code = 2
 
 
-class _AnyPath(click.Path):
+class AnyPath(click.Path):
     """A path, or an address."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path of a text."""
         from mirrorskin.io.url import path_of
 
         return path_of(os.fsdecode(super().convert(value, param, ctx)))
 
 
-class ExistingPath(_AnyPath):
+class ExistingPath(AnyPath):
     """The path of a file to read; a missing one is reported before anything heavy is imported."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -299,7 +300,7 @@ def _type(kind: Any, bounds: dict[str, Any], written: bool) -> Any:
     if bounds:
         return (click.IntRange if kind is int else click.FloatRange)(**bounds)
     if kind is Path:
-        return (_AnyPath if written else ExistingPath)()
+        return (AnyPath if written else ExistingPath)()
     return _Words(kind) if issubclass(kind, StrEnum) else kind
 
 

@@ -19,7 +19,7 @@ from mirrorskin.cli.groups import Option, make_command
 
 if TYPE_CHECKING:
     from mirrorskin.cli.status import Newest
-    from mirrorskin.engine.live import LiveOperation, Loop
+    from mirrorskin.engine.live import LiveRun, Loop
     from mirrorskin.engine.method import Method
     from mirrorskin.engine.operation import Operation
     from mirrorskin.hw.rig.plans import Plan
@@ -79,8 +79,7 @@ def command(
     """Reconstruct while the stage moves. Ctrl-C stops it, and keeps what was computed and recorded."""
     from mirrorskin import io
     from mirrorskin.cli.quantity import duration
-    from mirrorskin.engine.reconstruction import method_for
-    from mirrorskin.engine.running import load_operation
+    from mirrorskin.engine.reconstruction import load_operation, method_for
     from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.hw.rig_file import load_rig
 
@@ -122,16 +121,16 @@ class _Live:
         self._settings, self._plan, self._computed, self._given = settings, plan, computed, given
         self._calibration = calibration
         self._loop: Loop | None = None
-        self._operation: LiveOperation | None = None
+        self._run: LiveRun | None = None
 
     def check(self, planned: PlannedScan) -> None:
         """Refuse what cannot be done with a scan, before the rig is opened."""
         from mirrorskin.engine.live import Loop
 
         source = self._calibrated(planned)
-        operation = self._prepare(source, self._settings.camera.rate)
-        operation.warm()
-        Loop(source, operation, latency=self._given["latency"])
+        run = self._prepare(source, self._settings.camera.rate)
+        run.precompile()
+        Loop(source, run, latency=self._given["latency"])
         if self._given["view"]:
             from mirrorskin.view.viewer import check_place
 
@@ -180,8 +179,8 @@ class _Live:
             source = self._calibrated(scan if recorder is None else recorder)
             stack.enter_context(scans.kept(recorder))
             stack.enter_context(source)
-            self._operation = operation = self._prepare(source, rig.rate)
-            operation.warm()
+            self._run = run = self._prepare(source, rig.rate)
+            run.precompile()
 
             def on_update(update: Any, status: Any) -> None:
                 tell(status)
@@ -193,7 +192,7 @@ class _Live:
             mark = None if recorder is None else recorder.mark
             guard = _Guard()
             self._loop = Loop(
-                source, operation, latency=given["latency"], on_update=on_update, mark=mark, guard=guard
+                source, run, latency=given["latency"], on_update=on_update, mark=mark, guard=guard
             )
             gc.freeze()  # a collector that looks through all that was there before would hold up frames
             try:
@@ -207,34 +206,34 @@ class _Live:
 
         return source if self._calibration is None else Calibrated(source, self._calibration)
 
-    def _prepare(self, source: LiveSource, rate: float | None) -> LiveOperation:
+    def _prepare(self, source: LiveSource, rate: float | None) -> LiveRun:
         """Connect the operation with the source, its references and its calibration.
 
         Without a frame rate, the window of a continuous rotation is not determined yet.
         """
         from mirrorskin.engine import Rotation
-        from mirrorskin.engine.live import LiveOperation
+        from mirrorskin.engine.live import LiveRun
         from mirrorskin.engine.rotation.last_turn import choose_window
         from mirrorskin.hw.rig.plans import AxialPlan
 
         computed, plan = self._computed, self._plan
         if not (isinstance(plan, AxialPlan) and isinstance(computed, Rotation)):
-            return LiveOperation(source, computed)
+            return LiveRun(source, computed)
         if rate is None and not plan.in_steps:
-            return LiveOperation(source, computed)
+            return LiveRun(source, computed)
         per_turn = plan.frames_a_turn(rate or math.nan, self._given.get("frames") or 1)
         window, every = choose_window(per_turn, computed.window_frames)
-        return LiveOperation(source, computed.with_options(window_frames=window), every=every)
+        return LiveRun(source, computed.with_options(window_frames=window), every=every)
 
     def _save(self) -> None:
         """Write the result, if requested, and print which maps are missing."""
         output = self._given["output"]
         if output is None:
             return
-        from mirrorskin.cli.output import report_contact, report_levels, report_missing_maps, save_and_report
+        from mirrorskin.cli.output import report_contact, report_missing_maps, report_notes, save_and_report
 
-        assert self._operation is not None
-        result = self._operation.result()
+        assert self._run is not None
+        result = self._run.result()
         report_missing_maps(self._settings.name, result.process, _REMEDIES)
         report_contact(self._settings.name, result.process)
         save_and_report(
@@ -245,7 +244,7 @@ class _Live:
             must_answer=False,
             overwrite=self._given["overwrite"],
         )
-        report_levels(self._settings.name, result.process)
+        report_notes(self._settings.name, result.process)
 
 
 class _Guard:

@@ -72,14 +72,9 @@ def _common(
     from mirrorskin.cli.output import printable
 
     _check_address_space()
-
-    class Formatter(logging.Formatter):
-        def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # overrides
-            return printable(super().formatMessage(record))
-
     _OneLine.debug = debug
     handler = logging.StreamHandler()
-    handler.setFormatter(Formatter("%(message)s"))
+    handler.setFormatter(_Formatter("%(message)s"))
     logging.basicConfig(level=logging.INFO if debug else logging.WARNING, handlers=[handler])
     shown = warnings.showwarning
 
@@ -90,6 +85,15 @@ def _common(
             shown(message, category, *where, **more)
 
     warnings.showwarning = show
+
+
+class _Formatter(logging.Formatter):
+    """Log messages without characters that control terminals."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # overrides
+        from mirrorskin.cli.output import printable
+
+        return printable(super().formatMessage(record))
 
 
 def _check_address_space() -> None:

@@ -170,15 +170,6 @@ def report_unverified(recording: Recording) -> None:
         click.echo(printable(f"{recording.name}: {UNVERIFIED_PARTS.text}"), err=True)
 
 
-def report_levels(name: str, process: Mapping[str, object]) -> None:
-    """Print which levels of dark and bright were not given, and what was assumed."""
-    from mirrorskin.engine.provenance import missing_levels
-
-    said = missing_levels(process)
-    if said:
-        click.echo(printable(f"{name}: {said}; give --dark and --bright, or take references"), err=True)
-
-
 def report_contact(name: str, process: Mapping[str, object]) -> None:
     """Print a warning if the contact of a slide or a twist is wider than that of the skin."""
     widened = {

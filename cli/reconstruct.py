@@ -57,5 +57,4 @@ def command(
     outputs.report_notes(str(recording), result.process)
     outputs.report_missing_maps(str(recording), result.process, _REMEDIES)
     outputs.report_contact(str(recording), result.process)
-    outputs.report_levels(str(recording), result.process)
     outputs.report_saved(result, target, device, as_json)

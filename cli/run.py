@@ -7,19 +7,20 @@ from typing import Annotated, Any
 
 from mirrorskin.cli import options
 from mirrorskin.cli.declared import ClassCommand
-from mirrorskin.cli.defaults import with_pixel_size
+from mirrorskin.cli.defaults import calibration_of, with_pixel_size
 from mirrorskin.cli.groups import Argument, make_command
 from mirrorskin.cli.stack import FORMATS, RECORDING, stack_options
 
 
 def command(
     class_name: Annotated[
-        str, Argument(metavar="MODULE:CLASS", help="Class in a module or file: mine:Sum, or mine.py:Sum.")
+        str, Argument(metavar="MODULE:CLASS", help="Class: mine:Sum, mine.py:Sum, or an installed name.")
     ],
     recording: Annotated[Path, Argument(metavar="REC.h5", help=f"Frames: {FORMATS}.")],
     output: Annotated[Path | None, options.result_option("REC-CLASS.h5")] = None,
     overwrite: options.Overwrite = False,
     live: options.LiveFrames = False,
+    calibration: options.Calibration = None,
     memory: options.Memory = "256MB",
     device: options.Devices = None,
     strict: options.Strict = False,
@@ -34,7 +35,7 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.output import make_strict, progress, report_notes, report_unverified, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.engine.running import load_operation, run_class
+    from mirrorskin.engine.reconstruction import load_operation, run_class
     from mirrorskin.kernels.device import open_devices
 
     make_strict(strict)
@@ -46,10 +47,11 @@ def command(
     limit = bytes_of(memory, "--memory")
     with io.open_recording(recording, memory_limit=limit, live=live, **stack) as source:
         target = output or recording.with_name(f"{recording.stem}-{kind.__name__}.h5")
-        io.check_result_output(target, recording, *files, overwrite=overwrite)
+        io.check_result_output(target, recording, calibration, *files, overwrite=overwrite)
+        calibration = calibration_of(source, calibration)
         frames = with_pixel_size(source)
         with progress("running", frames.shape[0]) as show:
-            result = run_class(kind, frames, show, memory_limit=limit, device=device, **chosen)
+            result = run_class(kind, frames, show, calibration, memory_limit=limit, device=device, **chosen)
     save_and_report(result, target, device, as_json, overwrite=overwrite)
     report_unverified(source)
     report_notes(str(recording), result.process)

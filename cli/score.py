@@ -20,10 +20,9 @@ def command(
 
     from mirrorskin import engine, io
     from mirrorskin.cli.output import printable
-    from mirrorskin.io.selection import source_region
 
     found = io.open_result(result)
-    part = source_region(found.process)
+    part = found.fitted.region
     with io.open_recording(truth) as whole:
         if part is not None and not io.Region.whole(whole.shape[1:]).holds(part):
             part = None  # of another stack

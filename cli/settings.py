@@ -13,12 +13,11 @@ from mirrorskin.cli.declared import Term, term_of
 from mirrorskin.cli.stack import STACK, stack_options
 from mirrorskin.engine.batch.jobs import TABLES, Plan
 from mirrorskin.engine.options import Option
-from mirrorskin.engine.reconstruction import method_for
+from mirrorskin.engine.reconstruction import load_operation, method_for
 from mirrorskin.engine.rotation.tilt import check_tilt
-from mirrorskin.engine.running import load_operation
 from mirrorskin.io import InputError
-from mirrorskin.io.os_errors import read_text
 from mirrorskin.io.settings_file import load_toml
+from mirrorskin.io.system import read_text
 
 _REMEDY = "write the tables [stack], [press], [rotation], [slip], or [stack] and [operation] in TOML"
 
@@ -64,11 +63,12 @@ def _operation_of(path: Path) -> str:
         return ""
     if not isinstance(table, dict):
         return ""
-    place, colon, name = str(table.get("class", "")).rpartition(":")
-    if not colon:
+    name = str(table.get("class", ""))
+    if not name:
         needed = 'MODULE:CLASS or FILE.py:CLASS is needed; write e.g. class = "mine.py:Wear"'
         raise InputError(f"{path}: operation.class: {needed}")
-    return f"{Path(place).resolve() if place.endswith('.py') else place}:{name}"
+    place, _, kind = name.rpartition(":")
+    return f"{Path(place).resolve()}:{kind}" if place.endswith(".py") else name
 
 
 def _table(name: str, kind: type[Any]) -> type[Struct]:
@@ -93,14 +93,14 @@ def _type(one: Option) -> Any:
         return bool
     if one.kind == "choice":
         return Literal[one.choices]
-    if one.kind == "file" or one.words or term.example:
-        kind: Any = Annotated[str, _text(one.file or term.example)]
+    if one.kind in ("file", "path", "text") or one.words or term.example:
+        kind: Any = Annotated[str, _text(one.file or term.example or term.unit)]
     else:
-        number = int if one.kind == "integer" else float
+        number = int if one.kind in ("integer", "integers") else float
         bounds = zip(("ge", "le", "gt"), (*one.within, one.above), strict=True)
         limits: dict[str, Any] = {name: bound for name, bound in bounds if bound is not None}
         kind = Annotated[number, Meta(description=one.needed, examples=[number(one.example or 1)], **limits)]
-    return list[kind] if one.kind == "numbers" else kind
+    return list[kind] if one.kind in ("numbers", "integers") else kind
 
 
 def _given(table: Struct) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def _options(values: Mapping[str, Any], kind: type[Any], where: str) -> dict[str
             continue
         one, term = kind.options[name], term_of(kind.options[name])
         place = f"{where}.{name.replace('_', '-')}"
-        if one.kind == "file":
+        if one.kind in ("file", "path"):
             found[name] = Path(value)
             continue
         if isinstance(value, list):
@@ -124,7 +124,7 @@ def _options(values: Mapping[str, Any], kind: type[Any], where: str) -> dict[str
             value = term.read_one(value, place)
         found[name] = value
     try:
-        chosen: dict[str, Any] = kind(**found).chosen()
+        chosen: dict[str, Any] = kind(**found).written()
     except InputError as error:
         raise InputError(f"{where}{_with_key(str(error), kind)}") from error
     return {name: chosen[name] for name in found}

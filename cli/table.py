@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mirrorskin.cli import quantity
 from mirrorskin.io import InputError
-from mirrorskin.io.os_errors import read_text
+from mirrorskin.io.system import read_text
 from mirrorskin.io.text import shortened
 from mirrorskin.io.units import BASE, Kind, in_base, is_common
 

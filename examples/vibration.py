@@ -45,19 +45,19 @@ twin, frames = simulate("sphere", Vertical(np.array(true)), references="exact")
 # At the zenith where the wall begins, pixels hardly turn bright, and noise crosses their threshold.
 truth = np.where(twin.truth.zenith > math.radians(14), twin.truth.height, np.nan)
 reached = truth > -TRAVEL + BACKLASH
-search = engine.press.Strokes(dark=twin.header.dark, bright=twin.header.bright)
+run = engine.Run(engine.press.Strokes(dark=twin.header.dark, bright=twin.header.bright))
 curve = []
 ends = stroke_starts(travel, 1)[::2].tolist()
 for start, stop in zip([0, *ends], ends, strict=False):
-    search.push(frames[start:stop], travel=travel[start:stop])
-    onset = search.result()
+    run.push(frames[start:stop], travel=travel[start:stop])
+    onset = run.result()
     error = np.where(reached, onset.height - truth, np.nan)
     curve.append(
         (len(curve) + 1.0, rms(error), rms(np.where(np.isfinite(error), onset.height_sigma, np.nan)))
     )
-search.push(frames[ends[-1] :], travel=travel[ends[-1] :])
+run.push(frames[ends[-1] :], travel=travel[ends[-1] :])
 x, y = io.pixel_axes(twin.shape[1:], twin.header.pixel_size)
-pressed = search.result().assign(x=x, y=y)
+pressed = run.result().assign(x=x, y=y)
 lag = 1000 * float(np.nanmean(pressed.hysteresis[np.isfinite(truth)]))
 count, found, expected = (round(curve[-1][0]), 1000 * curve[-1][1], 1000 * curve[-1][2])
 print(f"height after {count} strokes: RMS error {found:.1f} µm, expected {expected:.1f} µm")
@@ -73,7 +73,7 @@ tilt = math.radians(2.5) * np.sin(0.385 * np.arange(48))
 movement = Leaning(np.full(48, DIRECTION), tilt, DEPTH, (0.0, 0.0, DEPTH))
 twin, _ = simulate(pyramid, movement, pattern="linear")
 rocked = engine.reconstruct(twin)
-slope = -np.tan(twin.truth.zenith) * np.cos(twin.truth.azimuth - float(rocked.process["slope_direction"]))
+slope = -np.tan(twin.truth.zenith) * np.cos(twin.truth.azimuth - rocked.fitted.slope_direction)
 # Not next to the ridges and the border of the contact.
 one_side = ndimage.maximum_filter(slope, 7) - ndimage.minimum_filter(slope, 7) < 1e-3
 slope = np.where(one_side & ndimage.binary_erosion(twin.truth.contact == 1, iterations=2), slope, np.nan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,24 +10,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.live.status import SHOWN, Status, Update
-from mirrorskin.io import pixel_axes
+from mirrorskin.io import Result, pixel_axes
+from mirrorskin.io.maps import is_deviation
+from mirrorskin.io.result import display_order
 from mirrorskin.io.units import numbers_with_unit
 from mirrorskin.view.colours import Colours, grey, height_colours, normal_colours
+from mirrorskin.view.result.scale import displayed_values, in_figure_unit
+from mirrorskin.view.result.sheet import sheet_of
 from mirrorskin.view.viewer import close_stream, load_rerun, open_stream
 
 _END = 2.0  # seconds to wait until the last pictures have reached the viewer
 
 
 class LiveView:
-    """The camera's picture, heights, normals, a cross-section and the area of contact, updated live.
+    """The camera's picture, the maps of the operation, and a cross-section of its heights, updated live.
 
     Parameters
     ----------
-    "window", "browser", or the name of a file; see ``open_stream``.
+    where : str or Path
         "window", "browser", or a file to write; see ``open_stream``.
     shape : (int, int)
         Rows and columns of the picture.
-    Millimetres along x and y; without it, the cross-section is in pixels.
+    pixel_size : (float, float), optional
         Millimetres along x and y; without it, the cross-section is along pixels.
 
     Raises
@@ -39,10 +44,11 @@ class LiveView:
         self, where: str | Path, shape: tuple[int, int], pixel_size: tuple[float, float] | None = None
     ) -> None:
         self._x, _ = pixel_axes(shape, pixel_size or (1.0, 1.0))
-        self._heights, self._lengths, self._slopes = _Range(), _Range(), _Range()
-        self._greys = _Range()
+        self._ranges: dict[str, _Range] = {}
+        self._titles: dict[str, str] = {}
+        self._greys, self._scaled = _Range(), pixel_size is not None
         self._stream = open_stream(where, "--view")
-        self._stream.send_blueprint(_blueprint(pixel_size is not None))
+        self._stream.send_blueprint(_blueprint({}, self._scaled))
 
     def show(self, update: Update, status: Status) -> None:
         """Show the current state.
@@ -50,27 +56,39 @@ class LiveView:
         Parameters
         ----------
         update : Update
-            Maps that are None remain as they were.
+            Maps that it lacks remain as they were.
         status : Status
         """
         rr, log = load_rerun(), self._stream.log
+        self._arrange(update)
         self._stream.set_time("frame", sequence=update.frames)
         if np.isfinite(update.time):
             self._stream.set_time("time", duration=update.time)
         log("camera", rr.Image(self._greys.grey(update.picture)))
+        for name in shown_maps(update.maps):
+            log(f"maps/{name}", rr.Image(self._colours(update.maps, name)))
         if update.height is not None:
-            log("height", rr.Image(self._heights.colour(update.height)))
             log("section/surface", rr.LineStrips2D(section(update.height, self._x)))
-        if update.normals is not None:
-            log("normals", rr.Image(normal_colours(update.normals, update.edges)))
-        if update.displacement is not None:
-            length = np.sqrt(np.sum(update.displacement**2, axis=-1))
-            log("displacement", rr.Image(self._lengths.colour(length)))
-        if update.slope is not None:
-            log("slope", rr.Image(self._slopes.colour(update.slope)))
-        if update.contact_area is not None:
-            log("contact/area", rr.Scalars(update.contact_area))
+        for name, value in update.maps.numbers().items():
+            log(f"numbers/{name}", rr.Scalars(value))
         log("status", rr.TextDocument(self._status_text(update, status), media_type="text/markdown"))
+
+    def _arrange(self, update: Update) -> None:
+        """Add a view for each map that was not shown before."""
+        titles = {name: update.maps.declaration(name).title_of(name) for name in shown_maps(update.maps)}
+        if titles.keys() - self._titles.keys():
+            self._titles |= titles
+            self._stream.send_blueprint(_blueprint(self._titles, self._scaled))
+
+    def _colours(self, maps: Result, name: str) -> Colours:
+        """Return the colours of a map, as its declaration determines them."""
+        declared = maps.declaration(name)
+        if declared.sampling == "direction":
+            return normal_colours(maps[name], maps.edges)
+        values = displayed_values(sheet_of(maps), name)
+        if declared.components:
+            values = np.sqrt(np.sum(values**2, axis=-1))
+        return self._ranges.setdefault(name, _Range()).colour(values)
 
     def close(self) -> None:
         """Wait for the last pictures to arrive, and disconnect from the viewer, which stays open."""
@@ -86,19 +104,27 @@ class LiveView:
             lines.append(
                 f"from frame to map {1e3 * shown.median:.1f} ms, 99 % below {1e3 * shown.p99:.1f} ms"
             )
-        if update.height is not None:
-            ends, unit = numbers_with_unit(self._heights.ends, "mm")
-            kind = ", each piece about its mean" if update.offset_unknown else ""
-            lines.append(f"heights from {ends[0]} (violet) to {ends[1]} {unit} (yellow){kind}")
-        if update.displacement is not None:
-            low, high = (1e3 * end for end in self._lengths.ends)
-            lines.append(f"displacement from {low:.1f} (violet) to {high:.1f} µm (yellow)")
-        if update.slope is not None:
-            low, high = self._slopes.ends
-            lines.append(f"slope from {low:.3f} (violet) to {high:.3f} (yellow)")
-        if update.contact_area is not None:
-            lines.append(f"contact {update.contact_area:.2f} mm²")
+        unknown, height = update.offset_unknown, update.maps.name_of("height")
+        for name in shown_maps(update.maps):
+            if name in self._ranges:
+                declared = update.maps.declaration(name)
+                ends, unit = numbers_with_unit(self._ranges[name].ends, declared.figure_unit)
+                about = ", each piece about its mean" if name == height and np.any(unknown) else ""
+                low, high = f"{ends[0]} (violet)", f"{ends[1]} {unit}".rstrip()
+                lines.append(f"{declared.title_of(name)} from {low} to {high} (yellow){about}")
+        for name, value in update.maps.numbers().items():
+            declared = update.maps.declaration(name)
+            lines.append(f"{declared.title_of(name)} {in_figure_unit(value, declared)}")
         return "\n\n".join(lines)
+
+
+def shown_maps(maps: Result) -> list[str]:
+    """Return the names of the maps that are shown: without standard deviations and minor ones.
+
+    Edges are drawn over normals.
+    """
+    known = {name: maps.declaration(name) for name in display_order(maps) if not is_deviation(name)}
+    return [name for name, one in known.items() if one.overview and not one.included_in and name != "edges"]
 
 
 def section(height: NDArray[np.float32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -133,20 +159,17 @@ class _Range:
             self.ends = min(self.ends[0], float(known.min())), max(self.ends[1], float(known.max()))
 
 
-def _blueprint(scaled: bool) -> Any:
-    """Return the layout of the viewer."""
+def _blueprint(titles: Mapping[str, str], scaled: bool) -> Any:
+    """Return the layout of the viewer, with a view for each map."""
     import rerun.blueprint as rrb
 
     across = "Middle row, mm, true to scale" if scaled else "Middle row"
     return rrb.Blueprint(
         rrb.Grid(
             rrb.Spatial2DView(origin="camera", name="Camera"),
-            rrb.Spatial2DView(origin="height", name="Height"),
-            rrb.Spatial2DView(origin="normals", name="Normals"),
-            rrb.Spatial2DView(origin="displacement", name="Displacement of the skin"),
-            rrb.Spatial2DView(origin="slope", name="Slope"),
+            *(rrb.Spatial2DView(origin=f"maps/{name}", name=title) for name, title in titles.items()),
             rrb.Spatial2DView(origin="section", name=across),
-            rrb.TimeSeriesView(origin="contact", name="Contact, mm²"),
+            rrb.TimeSeriesView(origin="numbers", name="Numbers"),
             rrb.TextDocumentView(origin="status", name="Status"),
             grid_columns=3,
         ),

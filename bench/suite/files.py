@@ -65,7 +65,7 @@ class Frames(Closing):
     def _part(self, start: int, stop: int) -> io.Block:
         axis = "travel" if self.motion == "vertical" else "phase"
         positions: dict[str, Any] = {axis: self._positions[start:stop]}
-        return io.Block(self._frames[start:stop], start, lent=True, **positions)
+        return io.Block(self._frames[start:stop], start, stays_valid=True, **positions)
 
 
 def shared_memory(shape: tuple[int, ...], dtype: Any = np.uint8) -> NDArray[Any]:

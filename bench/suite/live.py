@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.cli.bench.records import Case, Target
 from mirrorskin.engine import Press, Rotation
-from mirrorskin.engine.live import RAISED, LiveOperation, Loop, Status, Update
+from mirrorskin.engine.live import RAISED, LiveRun, Loop, Status, Update
 from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.io import Block, Header
 from mirrorskin.io.types import Closing, Floats
@@ -98,7 +98,7 @@ class Paced(Closing):
         place = np.asarray(self._places(number), np.float64)
         self._read.append(place)
         where: dict[str, Any] = {self._position: place}
-        return Block(frames, first, time=number / self._rate, dropped=dropped, lent=True, **where)
+        return Block(frames, first, time=number / self._rate, dropped=dropped, stays_valid=True, **where)
 
     def _wait(self) -> int:
         """Wait until the next frame is due, and return the number of frames due by then."""
@@ -155,7 +155,7 @@ def run_press(case: LiveCase, device: Device, quick: bool) -> Case:
         case.rate,
         case.count,
     )
-    ran = _run(source, LiveOperation(source, Press(device=device)))
+    ran = _run(source, LiveRun(source, Press(device=device)))
     targets = () if quick else judge_press(ran, case.least)
     title = f"heights during a press; {case.size}"
     return Case(case.name, title, [], {}, _notes(ran), targets)
@@ -176,7 +176,7 @@ def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
         case.count,
     )
     noise = math.hypot(noise, 1 / math.sqrt(12))
-    operation = LiveOperation(source, Rotation(window_frames=STEPS, noise=noise, device=device))
+    operation = LiveRun(source, Rotation(window_frames=STEPS, noise=noise, device=device))
     ran = _run(source, operation)
     best, height = operation.result().height, ran.last.height
     assert best is not None
@@ -190,13 +190,13 @@ def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
     return Case(case.name, title, [], {}, (*_notes(ran), note), targets)
 
 
-def _run(source: Paced, operation: LiveOperation) -> Ran:
+def _run(source: Paced, operation: LiveRun) -> Ran:
     last: list[Update] = []
 
     def keep(update: Update, status: Status) -> None:
         last[:] = [update]
 
-    operation.warm()
+    operation.precompile()
     load, begun = os.getloadavg()[0], time.monotonic()
     status = Loop(source, operation, on_update=keep).run()
     return Ran(status, time.monotonic() - begun, last[0], load)

@@ -183,7 +183,7 @@ def _fetch(recording: io.Recording, buffer: NDArray[Any]) -> None:
     """Read all frames; if they are mapped, one byte per page."""
     recording.rewind()
     while (block := recording.read(buffer)) is not None:
-        if block.lent:
+        if block.stays_valid:
             block.frames.reshape(-1).view(np.uint8)[::_PAGE].max()
 
 

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2, PointField
 
 from mirrorskin import engine, hw
-from mirrorskin.engine.live import LiveOperation, Loop
+from mirrorskin.engine.live import LiveRun, Loop
 
 FRAME = "sensor"  # x right and y up in the picture, z towards the sensor
 ENCODINGS = {"uint8": "mono8", "uint16": "mono16", "float32": "32FC1"}
@@ -81,8 +81,8 @@ def main(rig_file, depth):
         with hw.open_rig(hw.load_rig(rig_file)) as rig:
             with hw.SweepScan(rig, hw.VerticalPlan(0.0, depth, speed=SPEED)) as scan:
                 node.pixel_size = scan.header.pixel_size
-                operation = LiveOperation(scan, engine.Press())
-                operation.warm()
+                operation = LiveRun(scan, engine.Press())
+                operation.precompile()
                 Loop(scan, operation, on_update=node.show).run()
             node.finish(operation.result())
     finally:

@@ -8,7 +8,7 @@ from typing import Any
 
 import panel as pn
 
-from mirrorskin.engine.options import Option
+from mirrorskin.engine.options import Option, plain
 from mirrorskin.io import InputError
 from mirrorskin.view.app.look import TALL, problem, text
 from mirrorskin.view.app.session import Session
@@ -89,11 +89,14 @@ def widget_of(option: Option, value: Any) -> tuple[Any, Any]:
     titled = f"{label} ({unit})" if unit else label
     about = described(option)
     widgets, given = pn.widgets, {"width": _WIDTH, "description": about}
-    if option.kind == "flag":
+    if option.kind == "flag" and not option.optional:
         box = widgets.Checkbox(label=label, value=value, margin=(8, 0, 8, 10))
         return box, pn.Row(box, widgets.TooltipIcon(value=about, margin=(6, 5)))
-    if option.kind == "choice":
-        field = widgets.Select(label=label, options=[*option.choices], value=value, **given)
+    if option.kind in ("choice", "flag"):
+        chosen: dict[str, Any] = {one: one for one in option.choices} or {"yes": True, "no": False}
+        if option.optional:
+            chosen = {option.shown_default or "none": None, **chosen}
+        field = widgets.Select(label=label, options=chosen, value=plain(value), **given)
         return field, field
     low, high = option.within
     if option.kind == "integer" and option.default is not None:
@@ -126,9 +129,12 @@ def described(option: Option) -> str:
     """Return help, limits and default of an option as a sentence."""
     text = f"{option.help[:1].upper()}{option.help[1:]}."
     low, high = option.within
-    if option.kind in ("number", "integer", "numbers", "map") and (low, high, option.above) != (None,) * 3:
+    if (
+        option.kind in ("number", "integer", "numbers", "integers", "map")
+        and (low, high, option.above) != (None,) * 3
+    ):
         text += f" {option.needed[:1].upper()}{option.needed[1:]}."
-    default = option.shown_default or (option.default if option.kind != "flag" else "")
+    default = option.shown_default or (plain(option.default) if option.kind != "flag" else "")
     return f"{text} Default: {default}." if default not in ("", None) else text
 
 
@@ -136,8 +142,9 @@ def written(option: Option, value: Any) -> str:
     """Return a value as the text of a field; empty if there is none."""
     if value is None:
         return ""
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return ", ".join(written(option, one) for one in value)
+    value = plain(value)
     return str(value) if isinstance(value, str) else f"{value / _factor(option):.10g}"
 
 
@@ -148,14 +155,23 @@ def read(option: Option, value: Any) -> Any:
     text = value.strip()
     if not text:
         return option.default
-    if text in option.words or option.kind == "file" or (option.kind == "map" and _FILE.search(text)):
+    if (
+        text in option.words
+        or option.kind in ("file", "path", "text")
+        or (option.kind == "map" and _FILE.search(text))
+    ):
         return text
     numbers = [_number(option, part) for part in text.split(",")]
-    if option.kind == "numbers":
-        return numbers
+    if option.kind in ("numbers", "integers"):
+        return numbers if option.kind == "numbers" else [_whole(one) for one in numbers]
     if len(numbers) > 1:
         raise InputError(f"{option.name} {text}: write the number with a decimal point")
-    return int(numbers[0]) if option.kind == "integer" and numbers[0].is_integer() else numbers[0]
+    return _whole(numbers[0]) if option.kind == "integer" else numbers[0]
+
+
+def _whole(number: float) -> float:
+    """Return a number without fraction as an integer; any other number is refused by the option."""
+    return int(number) if number.is_integer() else number
 
 
 def _number(option: Option, text: str) -> float:

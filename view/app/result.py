@@ -14,6 +14,7 @@ from bokeh.plotting import figure
 from mirrorskin import engine
 from mirrorskin.engine.metrology import Measures, Section, section
 from mirrorskin.io import InputError
+from mirrorskin.io.result import display_order
 from mirrorskin.view.app.look import hint, plain_axes, problem, table, text
 from mirrorskin.view.app.picture import (
     Dragging,
@@ -93,7 +94,7 @@ class ResultPane:
         if list(self.map.options or {}) != list(names):
             chosen = self.map.value
             self.map.options = names
-            self.map.value = chosen if chosen in names.values() else height or next(iter(names.values()))
+            self.map.value = chosen if chosen in names.values() else display_order(sheet.result)[0]
         turns = self._session.turns
         self.turn.visible, self.turn.end = turns > 0, max(turns - 1, 0)
         self.section.figure.visible = height is not None

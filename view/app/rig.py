@@ -1,4 +1,4 @@
-"""The pane of a rig: its live picture, moves by hand, and a run that shows heights while they grow."""
+"""The pane of a rig: its live picture, moves by hand, and a run that shows its maps while they grow."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ import panel as pn
 from bokeh.models import ColumnDataSource, Range1d
 from bokeh.plotting import figure
 
-from mirrorskin.io import InputError, Result, pixel_axes
+from mirrorskin.io import InputError, pixel_axes
 from mirrorskin.view.app.look import heading, hint, plain_axes, problem, table, text
 from mirrorskin.view.app.picture import Picture, show_frame, show_map
 from mirrorskin.view.app.rig_control import RigControl, axial_plan, judge, vertical_plan
 from mirrorskin.view.canvas import extent
+from mirrorskin.view.result.scale import in_figure_unit
 from mirrorskin.view.result.sheet import sheet_of
 
 REFRESH = 150
@@ -49,7 +50,7 @@ class RigPane:
     def __init__(self, control: RigControl, add: Callable[[str, Any], None]) -> None:
         self.control, self._add = control, add
         self._drawn: Any = None
-        self._range = math.inf, -math.inf  # of the heights of a run
+        self._ranges: dict[str, tuple[float, float]] = {}  # of the maps of a run
         self._shown: Any = None
         self.stop = pn.widgets.Button(label="STOP", color="danger", width=110, height=38)
         self.stop.on_click(lambda _: self._stop())
@@ -66,8 +67,7 @@ class RigPane:
         x, y = pixel_axes((rows, columns), control.settings.camera.pixel_sides or (1.0, 1.0))
         unit = "mm" if control.settings.camera.pixel_sides else "px"
         self.camera = Picture(extent(x, y), unit, _PICTURE)
-        self.heights = Picture(extent(x, y), unit, _PICTURE)
-        self._axes: dict[str, Any] = {"x": x, "y": y} if unit == "mm" else {}
+        self.growing = Picture(extent(x, y), unit, _PICTURE)
         self.histogram = ColumnDataSource(data={"left": [], "right": [], "top": []})
         self._places = {name: text(width=120) for name in control.settings.stage.axes}
         self.steps = {
@@ -79,7 +79,7 @@ class RigPane:
             pn.Column(
                 pn.Row(self.connect), self.state, *self._jogging(), *self._running(), width=440
             ),
-            pn.Column(pn.pane.Bokeh(self.heights.figure), *self._about_run()),
+            pn.Column(pn.pane.Bokeh(self.growing.figure), *self._about_run()),
         )  # fmt: skip
         self.refresh()
 
@@ -148,7 +148,7 @@ class RigPane:
         return [heading("Run and reconstruct"), self.motion, self._fields, pn.Row(self.file, self.start)]
 
     def _about_run(self) -> list[Any]:
-        self.run = text(hint("While it runs, the heights grow here."), width=_PICTURE[0])
+        self.run = text(hint("While it runs, its map grows here."), width=_PICTURE[0])
         self.open = pn.widgets.Button(label="Show the result", width=200, visible=False)
         self.open.on_click(lambda _: self._show_result())
         return [self.run, self.open]
@@ -231,22 +231,23 @@ class RigPane:
     def _show_run(self) -> None:
         update, status = self.control.seen.update, self.control.seen.status
         if update is None or status is None:
-            self._range = math.inf, -math.inf  # a run begins
+            self._ranges.clear()  # a run begins
             return
         facts = {"Frames used": f"{status.used}, {status.skipped} skipped, {status.dropped} dropped"}
         if update.motion == "vertical":
             facts["Travel"] = f"{update.position:.3f} mm"
         else:
             facts["Phase"] = f"{math.degrees(update.position) % 360:.1f} deg"
-        if update.contact_area is not None:
-            facts["Contact"] = f"{update.contact_area:.2f} mm²"
-        if update.height is not None and np.isfinite(update.height).any():
-            result = Result(height=update.height, **self._axes)
-            shown = show_map(sheet_of(result), "height")
+        for name, value in update.maps.numbers().items():
+            declared = update.maps.declaration(name)
+            facts[declared.title_of(name)] = in_figure_unit(value, declared)
+        first = update.first
+        if first is not None and np.isfinite(update.maps[first]).any():
+            shown = show_map(sheet_of(update.maps), first)
             # Colours change as little as possible.
-            self._range = min(self._range[0], shown.low), max(self._range[1], shown.high)
-            low, high = self._range
-            self.heights.show(replace(shown, low=low, high=high), about="while the stage moves")
+            low, high = self._ranges.get(first, (shown.low, shown.high))
+            low, high = self._ranges[first] = min(low, shown.low), max(high, shown.high)
+            self.growing.show(replace(shown, low=low, high=high), about="while the stage moves")
         _set(self.run, table(facts))
 
 

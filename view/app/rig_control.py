@@ -12,10 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import io
-from mirrorskin.engine.live import LiveOperation, Loop
+from mirrorskin.engine.live import LiveRun, Loop
 from mirrorskin.engine.live.status import Status, Update
+from mirrorskin.engine.method import Method
+from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.reconstruction import method_for
 from mirrorskin.engine.rotation.last_turn import choose_window
+from mirrorskin.engine.rotation.rotation import Rotation
 from mirrorskin.hw.clock import SYSTEM, Clock
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig import rig as rigs
@@ -57,6 +60,8 @@ class RigControl:
     ----------
     settings : RigSettings
     clock : Clock
+    operation : type, optional
+        Class of operations or methods for the runs; by default the method of the motion.
 
     Attributes
     ----------
@@ -72,8 +77,13 @@ class RigControl:
         An address at which a POST calls `stop`; empty without one.
     """
 
-    def __init__(self, settings: RigSettings, clock: Clock = SYSTEM) -> None:
-        self.settings, self._clock = settings, clock
+    def __init__(
+        self,
+        settings: RigSettings,
+        clock: Clock = SYSTEM,
+        operation: type[Operation | Method] | None = None,
+    ) -> None:
+        self.settings, self._clock, self._operation = settings, clock, operation
         self.state: State = "disconnected"
         self.problem = ""
         self.seen = Seen()
@@ -220,7 +230,7 @@ class RigControl:
         self.result = self.recorded = None
         self.seen = replace(self.seen, update=None, status=None)
         scan = make_scan(rig, plan)
-        _live(PlannedScan(self.settings, plan), plan, rig.rate)  # refused before anything moves
+        self._live(PlannedScan(self.settings, plan), plan, rig.rate)  # refused before anything moves
         recorder = None if record is None else io.StreamRecorder(scan, record)
         source: io.LiveSource = scan if recorder is None else recorder
 
@@ -229,14 +239,22 @@ class RigControl:
 
         with ExitStack() as stack:
             stack.enter_context(source)
-            operation = _live(source, plan, rig.rate)
-            operation.warm()
+            run = self._live(source, plan, rig.rate)
+            run.precompile()
             mark = None if recorder is None else recorder.mark
             self._check_ending()
-            Loop(source, operation, on_update=on_update, stop=self._ending, mark=mark).run()
+            Loop(source, run, on_update=on_update, stop=self._ending, mark=mark).run()
             self._check_ending()  # the scan then stops the stage, and does not lift the body
         self.recorded = None if recorder is None else recorder.path
-        self.result = operation.result()
+        self.result = run.result()
+
+    def _live(self, source: io.LiveSource, plan: Plan, rate: float) -> LiveRun:
+        """Return the operation of the runs, with a window of one turn for the method of a rotation."""
+        computed = (self._operation or method_for(plan.motion))()
+        if not (isinstance(plan, AxialPlan) and isinstance(computed, Rotation)):
+            return LiveRun(source, computed)
+        window, every = choose_window(plan.frames_a_turn(rate))
+        return LiveRun(source, computed.with_options(window_frames=window), every=every)
 
     def _ending(self) -> bool:
         return self._stopping.is_set() or self._closing.is_set()
@@ -245,15 +263,6 @@ class RigControl:
         """Raise after a stop, which the stage may not have obeyed yet, and while the rig is closed."""
         if self._ending():
             raise HardwareError(_STOPPED)
-
-
-def _live(source: io.LiveSource, plan: Plan, rate: float) -> LiveOperation:
-    """Return the method of the motion, with a window of one turn for a rotation."""
-    computed = method_for(plan.motion)()
-    if not isinstance(plan, AxialPlan):
-        return LiveOperation(source, computed)
-    window, every = choose_window(plan.frames_a_turn(rate))
-    return LiveOperation(source, computed.with_options(window_frames=window), every=every)
 
 
 def vertical_plan(start: float, stop: float, speed: float) -> Plan:

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import engine, io
-from mirrorskin.engine.options import Option
-from mirrorskin.engine.reconstruction import calibrated, method_for
-from mirrorskin.engine.running import load_operation, run_class
+from mirrorskin.engine.options import Option, plain
+from mirrorskin.engine.reconstruction import calibrated, load_operation, method_for, run_class
 from mirrorskin.io.foreign import kind_of_frames
 from mirrorskin.io.recording import is_result
 from mirrorskin.io.result import map_shape
@@ -291,8 +290,8 @@ class Session:
         return self._samples[2]
 
     def source(self) -> io.Source:
-        """Return the part; for the method of the motion, with its calibration."""
-        return calibrated(self.part(), self.opening.calibration) if self.is_method else self.part()
+        """Return the part with its calibration."""
+        return calibrated(self.part(), self.opening.calibration)
 
     def compute(self) -> None:
         """Compute the result with the current options; the last one is kept next to it."""
@@ -376,6 +375,7 @@ def _ignore(_: object) -> None:
 
 
 def _same(one: Any, other: Any) -> bool:
+    one, other = plain(one), plain(other)
     return type(one) is type(other) and bool(one == other)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.metrology import Quantity
-from mirrorskin.io.types import UNDISTORTED, Floats
+from mirrorskin.io import Fitted
+from mirrorskin.io.types import Floats
 from mirrorskin.view.app.session import Session
 
 _CURVE = 181  # points of the fitted cosine
@@ -86,7 +87,7 @@ def _press(
     levels = levels_at(session, row, column)
     facts = {name: f"{value:.1f} counts" for name, value in levels.items()}
     height, sigma, status = (_at(session, name, row, column) for name in ("height", "height_sigma", "status"))
-    event = session.now.result.process.get("event", "onset") if session.now else "onset"
+    event = (session.now.result.fitted.event if session.now else None) or "onset"
     if session.now is not None and status is not None:
         codes = session.now.result.declaration("status").codes
         facts["Status"] = codes.get(int(status), "unknown")
@@ -108,7 +109,7 @@ def _at(session: Session, name: str, row: int, column: int) -> float | None:
     """Return the value of a map of the result at a pixel; None while another result is computed."""
     if session.computing or session.now is None or (values := session.now.result.maps().get(name)) is None:
         return None
-    if session.now.result.process.get(UNDISTORTED):  # its pixels are not those of the camera
+    if session.now.result.fitted.undistorted:  # its pixels are not those of the camera
         return None
     return float(values[row, column]) if values.shape == session.part().shape[1:] else None
 
@@ -116,30 +117,30 @@ def _at(session: Session, name: str, row: int, column: int) -> float | None:
 def levels_at(session: Session, row: int, column: int) -> dict[str, float]:
     """Return the levels of dark, threshold and bright that were used at a pixel, counts."""
     part, source, levels = session.part(), session.source(), {}
-    process = session.now.result.process if session.now is not None else {}
+    fitted = session.now.result.fitted if session.now is not None else Fitted()
+    estimated = {"dark": fitted.dark_level, "bright": fitted.bright_level}
     for name in ("dark", "bright"):
         option = session.options().get(name)
         given = None if option is None else option.check(session.value(name))
         level = given if given is not None else getattr(source.header, name)
         if level is None:
-            level = _number(str(process.get(name, "")), part.dtype, name)
+            level = estimated[name]
+        if level is None:
+            level = _end_of_type(part.dtype, name)
         values = np.asarray(level, np.float64)
         levels[name.capitalize()] = float(values if values.ndim == 0 else values[row, column])
-    share = process.get("threshold")
-    if isinstance(share, float):
+    share = fitted.threshold
+    if share is not None:
         low, high = levels.values()
         levels = {"Dark": low, "Threshold": low + share * (high - low), "Bright": high}
     return levels
 
 
-def _number(text: str, dtype: np.dtype[Any], name: str) -> float:
-    """Return the level in a text such as "12.3, estimated ..."; otherwise the end of the samples' type."""
-    try:
-        return float(text.partition(",")[0])
-    except ValueError:
-        if dtype.kind != "u":
-            return 0.0 if name == "dark" else 1.0
-        return float(getattr(np.iinfo(dtype), "min" if name == "dark" else "max"))
+def _end_of_type(dtype: np.dtype[Any], name: str) -> float:
+    """Return the least or the greatest value of the samples' type."""
+    if dtype.kind != "u":
+        return 0.0 if name == "dark" else 1.0
+    return float(getattr(np.iinfo(dtype), "min" if name == "dark" else "max"))
 
 
 def _turn(

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from mirrorskin import io
-from mirrorskin.engine.options import Option
+from mirrorskin.engine.options import Option, plain
 from mirrorskin.view.app.session import Session
 
 _WITH_UNIT = ("mm", "rad", "MPa", "N", "s")
@@ -36,12 +36,12 @@ def _flag(option: Option, value: Any) -> list[str]:
     name = option.name.replace("_", "-")
     if option.kind == "flag":
         return [f"--{name}" if value else f"--no-{name}"]
-    values = value if isinstance(value, list) else [value]
+    values = [*value] if isinstance(value, list | tuple) else [value]
     return [f"--{name}={','.join(_number(option.unit, one) for one in values)}"]
 
 
 def _number(unit: str, value: Any) -> str:
-    if isinstance(value, str):
+    if isinstance(value := plain(value), str):
         return value
     if unit == "counts/rad":
         return f"{value!r}/rad"
@@ -54,19 +54,21 @@ def as_python(session: Session) -> str:
     options = dict(session.changed)
     if opening.device is not None:
         options["device"] = opening.device
-    given = [f"{name}={value!r}" for name, value in options.items()]
+    given = [f"{name}={plain(value)!r}" for name, value in options.items()]
+    calibration = [] if opening.calibration is None else [repr(str(opening.calibration))]
     lines = ["from mirrorskin import engine, io"]
     if session.is_method:
-        where = [] if opening.calibration is None else [repr(str(opening.calibration))]
-        call = f"engine.reconstruct({', '.join(['recording', *where, *given])})"
-    elif session.kind_name.startswith("mirrorskin.engine:"):
+        call = f"engine.reconstruct({', '.join(['recording', *calibration, *given])})"
+    elif session.kind_name.startswith("mirrorskin.engine:") and not calibration:
         call = f"engine.run(recording, engine.{session.kind.__name__}({', '.join(given)}))"
     else:
         lines = [
             "from mirrorskin import io",
-            "from mirrorskin.engine.running import load_operation, run_class",
+            "from mirrorskin.engine.reconstruction import load_operation, run_class",
         ]
-        call = f"run_class({', '.join([f'load_operation({session.kind_name!r})', 'recording', *given])})"
+        where = f"load_operation({session.kind_name!r})"
+        places = ["None", *calibration] if calibration else []
+        call = f"run_class({', '.join([where, 'recording', *places, *given])})"
     lines += [
         "",
         f"with io.open_recording({', '.join(_opening(session))}) as recording:",

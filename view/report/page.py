@@ -13,7 +13,7 @@ from typing import Any
 
 from mirrorskin.io import InputError, Result, select_turn
 from mirrorskin.io.atomic import MAKE_ROOM, new_file
-from mirrorskin.io.os_errors import as_input_error
+from mirrorskin.io.system import as_input_error
 from mirrorskin.view.canvas import check_drawing
 from mirrorskin.view.report.contents import Ends, contents_of, surface_of
 

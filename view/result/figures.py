@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.arguments import unknown_argument
 from mirrorskin.io.findings import warnings_in
 from mirrorskin.view.canvas import figure_pixels, new_figure
 from mirrorskin.view.result.maps import draw_declared, draw_height
@@ -102,7 +103,7 @@ def _chosen(sheet: Sheet, name: str, section: Ends | None, maps: Sequence[str] |
     if not has:
         raise InputError(f"{name} has no map to draw: 'mirrorskin export' writes all it has into an .npz")
     if lacking:
-        raise InputError(f"{name} has no {' and no '.join(lacking)} to draw: it has {', '.join(has)}")
+        raise InputError(unknown_argument(name, lacking[0], has, "picture"))
     if section is not None and "section" not in has:
         raise InputError(f"{name} has no heights to cut: leave the section out")
     return [panel for panel in panels if (panel.overview if maps is None else panel.name in maps)]

@@ -80,6 +80,11 @@ def labelled(text: str, declared: Map) -> str:
     return f"{text} ({declared.figure_unit})" if declared.figure_unit else text
 
 
+def in_figure_unit(value: float, declared: Map) -> str:
+    """Return a number as text, in the unit of figures."""
+    return f"{declared.figure_scale * value:.4g} {declared.figure_unit}".rstrip()
+
+
 def title_of_height(sheet: Sheet) -> str:
     """Return the title of the heights in lower case: relative ones if the absolute offset is unknown."""
     name, unknown = sheet.result.name_of("height") or "height", sheet.result.offset_unknown
