@@ -31,7 +31,7 @@ def test_frames_come_when_they_are_due_and_those_that_wait_come_together():
     source = paced(frames, turn_header(), phase, 10.0, clock)
     room = np.empty((8, *SHAPE[1:]), np.uint8)
     block = source.read(room)
-    assert (block.index, len(block.frames), block.lent) == (0, 1, True)
+    assert (block.index, len(block.frames), block.stays_valid) == (0, 1, True)
     clock.sleep(0.45)
     block = source.read(room)
     assert (block.index, len(block.frames), block.dropped) == (1, 4, 0)

@@ -191,7 +191,7 @@ def test_levels_that_were_not_given_are_named():
     said = run(*words).said
     assert "ball.npy: no dark and bright given: estimated as " in said
     assert said.count("\n") == 1
-    assert "ball.npy: no bright given: " in run(*words, "--dark", 0).said
+    assert "no bright given: estimated as " in run(*words, "--dark", 0).said
     assert "no dark" not in run(*words, "--dark", 0, "--bright", 255).said
 
 

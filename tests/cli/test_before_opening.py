@@ -97,7 +97,7 @@ def opened(prepared, monkeypatch):
         (f"{PRESS} --operation own.py:Deep", "frames of type uint8"),
         (f"{PRESS} --operation own.py:Large", "larger frames are needed"),
         (f"{PRESS} --operation own.py:Crowded", "more frames are needed"),
-        (f"{PRESS} --operation own.py:Missing", "there is no class Missing"),
+        (f"{PRESS} --operation own.py:Missing", "has no class Missing"),
         (f"{PRESS} --operation mirrorskin.engine:Normals", "Normals needs axial motion"),
         (f"{TURN} --operation mirrorskin.engine:Onset", "Onset needs vertical motion"),
         (f"{TURN} --operation mirrorskin.engine:Normals", "a zenith gain is needed"),

@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from commands import run
@@ -25,16 +26,14 @@ class Onsets(Configured):
     threshold: float = option(default=0.5, unit="share", within=(0, 1), help="level")
     noise: float = option(default=None, unit="counts", help="noise", shown_default="the first frames")
     length: float = option(default=0.1, unit="mm", help="some length")
-    method: str = option(
-        default="threshold", choices=("threshold", "change-point"), help="how onsets are found"
-    )
-    hidden: object = option(default=None, help="only in Python", python_only=True)
+    method: Literal["threshold", "change-point"] = option(default="threshold", help="how onsets are found")
+    hidden: object = option(default=None, help="only in Python")
 
 
 class Turns(Configured):
     noise: float = option(default=None, unit="counts", help="noise", shown_default="the first turn")
-    tilt: float = option(default=math.radians(2.5), unit="rad", words=("estimate",), help="half-angle")
-    method: str = option(default="exact", choices=("exact", "paper"), help="how normals are found")
+    tilt: float | Literal["estimate"] = option(default=math.radians(2.5), unit="rad", help="half-angle")
+    method: Literal["exact", "paper"] = option(default="exact", help="how normals are found")
     robust: bool = option(default=False, help="keep breaks")
 
 

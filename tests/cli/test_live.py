@@ -3,6 +3,8 @@
 import math
 import re
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -21,8 +23,7 @@ from mirrorskin import engine, io
 from mirrorskin.cli import live
 from mirrorskin.cli.status import Board, Newest, summary
 from mirrorskin.engine.live import SHOWN, Latency, Status
-from mirrorskin.engine.running import load_operation
-from mirrorskin.engine.streaming import push_block
+from mirrorskin.engine.reconstruction import load_operation
 from mirrorskin.hw import HardwareError, Position
 from mirrorskin.hw import rig_file as file
 from mirrorskin.hw.rig import rig
@@ -122,20 +123,21 @@ def test_strokes_are_joined_and_their_hysteresis_is_reported(fake, tmp_path):
 
 
 def test_the_recording_replayed_gives_the_same_onset(fake, tmp_path):
-    from mirrorskin.engine import Onset
+    from mirrorskin.engine import Onset, Run
 
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
     fake.run(*PRESS, "--record", str(record), "-o", str(output))
     with io.open_recording(record, live=True) as recording:
         header = recording.header
-        search = Onset(dark=header.dark, bright=header.bright)
+        search = Run(Onset(dark=header.dark, bright=header.bright), recording)
         while (block := recording.read(np.empty((7, *SHAPE), np.uint8))) is not None:
-            push_block(search, block)
+            search.push_block(block)
+        again = search.result()
     result = io.open_result(output)
     measured = result.filled == 0
     assert measured.sum() > 20
-    np.testing.assert_array_equal(search.result().status, result.status)
-    np.testing.assert_array_equal(search.result().height[measured], result.height[measured])
+    np.testing.assert_array_equal(again.status, result.status)
+    np.testing.assert_array_equal(again.height[measured], result.height[measured])
 
 
 def test_a_rotation_is_reported_and_kept(fake, tmp_path):
@@ -393,7 +395,7 @@ OWN = str(Path(__file__).parents[2] / "examples" / "steepest_rise.py") + ":Steep
 @pytest.mark.parametrize(
     ("words", "where", "flags", "options"),
     [
-        (PRESS, "engine:Onset", "", {}),
+        (PRESS, "engine:Onset", "--dark 0 --bright 255", {"dark": 0, "bright": 255}),
         (
             PRESS,
             "engine:ChangePoint",
@@ -403,8 +405,8 @@ OWN = str(Path(__file__).parents[2] / "examples" / "steepest_rise.py") + ":Steep
         (
             PRESS,
             "engine.press:Levels",
-            "--thresholds 0.2,0.7 --inclinations 0.2rad,0.5rad",
-            {"thresholds": [0.2, 0.7], "inclinations": [0.2, 0.5]},
+            "--thresholds 0.2,0.7 --inclinations 0.2rad,0.5rad --dark 0 --bright 255",
+            {"thresholds": [0.2, 0.7], "inclinations": [0.2, 0.5], "dark": 0, "bright": 255},
         ),
         (PRESS, "engine.focus:Focus", "--noise 1", {"noise": 1}),
         (TURN, "engine:Correlate", "", {}),
@@ -447,11 +449,29 @@ def test_an_operation_of_the_user_s_gives_the_same_live_as_over_the_recording(fa
         np.testing.assert_array_equal(result.maps()[name], values)
 
 
+def test_an_operation_of_the_user_s_is_calibrated_and_its_maps_are_pictures(fake, tmp_path):
+    calibration, view, output = (tmp_path / name for name in ("cal.h5", "run.rrd", "res.h5"))
+    dark, sure = np.full(SHAPE, 10, np.float32), np.full(SHAPE, 0.1, np.float32)
+    references = io.References(dark, dark + 200, sure, sure, np.zeros(dark.shape, np.uint8))
+    io.save_calibration(
+        io.Calibration(io.CameraId("", dark.shape, np.dtype("uint8")), references=references), calibration
+    )
+    done = fake.run(
+        *PRESS, "--operation", OWN, "--calibration", calibration, "--view", view, "-o", str(output)
+    )
+    assert done.exit_code == 0, done.output
+    assert io.open_result(output).process["calibration_parts"] == "references"
+    command = [sys.executable, "-m", "rerun_cli", "rrd", "print", str(view)]
+    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert "/maps/rise" in told
+    assert "/maps/height" in told
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ([*PRESS, "--operation", OWN, "--hold", "3"], "has no option --hold. Its options are --least"),
-        ([*PRESS, "--operation", f"{OWN}r"], "there is no class SteepestRiser"),
+        ([*PRESS, "--operation", OWN, "--hold", "3"], "has no option --hold: it has --least"),
+        ([*PRESS, "--operation", f"{OWN}r"], "has no class SteepestRiser: did you mean SteepestRise?"),
         ([*TURN, "--operation", OWN], "but SteepestRise needs vertical motion"),
     ],
 )

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import csv
+import inspect
 import json
+import math
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -15,17 +18,21 @@ from shown import panel
 from stacks import MadeUp, record
 
 from mirrorskin import engine, io
+from mirrorskin.engine.reconstruction import load_operation
+from mirrorskin.view.app.session import Opening, Session
+from mirrorskin.view.app.wording import as_command, as_python
 from mirrorskin.view.result import overview
 
 CODE = '''\
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mirrorskin import engine, io
 from mirrorskin.kernels.device import C_TYPES
 
 KERNEL = """
-__kernel void above_mean(__global const FRAME *frames, const int count, const int pixels,
-                         __global const float *level, __global int *above) {
+__kernel void above_level(__global const FRAME *frames, const int count, const int pixels,
+                          __global const float *level, __global int *above) {
     const int pixel = get_global_id(0);
     for (int k = 0; k < count && pixel < pixels; k++)
         above[pixel] += frames[(long)k * pixels + pixel] > level[pixel];
@@ -33,35 +40,37 @@ __kernel void above_mean(__global const FRAME *frames, const int count, const in
 """
 
 
-class Mean(engine.Operation):
-    """Height from the number of frames that are brighter than the mean of all."""
+class Bright(engine.Operation):
+    """Height from the number of frames that are brighter than a level."""
 
     travel_offset: float = engine.option(default=0.0, unit="mm", within=(-1, 1), help="added to all travels")
-    margin: float = engine.option(default=5.0, unit="counts", within=(0, None), help="least excess")
+    level: ArrayLike | None = engine.option(
+        default=None, unit="counts", within=(0, None), help="bright above"
+    )
     depth = io.Map("depth at which the pixel turns bright", "mm", quantity="height", displayed="µm")
     kind = io.Map("kind of pixel", codes={0: "never bright", 1: "bright at the end"}, undefined=0)
-    motions, passes = ("vertical",), 2
+    motions = ("vertical",)
+
+    def configured_for(self, source):
+        dark, bright = source.header.dark, source.header.bright  # of the calibration, if there is one
+        known = self.level is None and dark is not None and bright is not None
+        return self.with_options(level=(dark + bright) / 2) if known else self
 
     def start(self, shape, dtype):
-        self.total, self.level = np.zeros(shape), None
+        level = np.broadcast_to(100 if self.level is None else self.level, shape)
+        self.threshold = self.device.from_host("level", level, np.float32)
         self.above = self.device.from_host("above", np.zeros(shape), np.int32)
-        self.kernel = self.device.kernel(KERNEL, "above_mean", FRAME=C_TYPES[dtype.name])
-
-    def start_second_pass(self):
-        self.level = self.device.from_host("level", self.total / self.count + self.margin, np.float32)
+        self.kernel = self.device.kernel(KERNEL, "above_level", FRAME=C_TYPES[dtype.name])
 
     def push(self, frames, *, travel):
-        if self.level is None:
-            self.total += frames.sum(axis=0, dtype=np.float64)
-            return
-        pixels, seen = self.total.size, self.device.share("frames", frames)
-        arguments = {"count": len(frames), "pixels": pixels, "level": self.level, "above": self.above}
+        pixels, seen = frames[0].size, self.device.share("frames", frames)
+        arguments = {"count": len(frames), "pixels": pixels, "level": self.threshold, "above": self.above}
         self.kernel(pixels, frames=seen, moved=frames.nbytes, **arguments)
         self.device.finish()
 
     def result(self):
-        above, travel = self.above.read(), self.pushed("travel") + self.travel_offset
-        step = np.diff(travel).mean()
+        above, travel = self.above.read(), self.positions_so_far("travel") + self.travel_offset
+        step = np.diff(travel).mean() if len(travel) > 1 else np.nan
         depth = np.where(above > 0, above * step - travel[-1] - step / 2, np.nan)
         return {"depth": depth, "depth_sigma": np.where(above > 0, step / 12**0.5, np.nan), "kind": above > 0}
 '''
@@ -88,7 +97,7 @@ def folder(tmp_path_factory):
 
 
 def words(folder):
-    return "run", f"{folder / 'mine.py'}:Mean", folder / "one.h5"
+    return "run", f"{folder / 'mine.py'}:Bright", folder / "one.h5"
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +106,7 @@ def result(folder):
 
 
 def test_it_has_at_most_40_lines():
-    code = CODE[CODE.index("class Mean") :]
+    code = CODE[CODE.index("class Bright") :]
     assert len([line for line in code.splitlines() if line.strip()]) <= 40
 
 
@@ -112,21 +121,21 @@ def test_help_shows_its_options_with_units_and_defaults(folder):
     text = " ".join(ended.out.split())
     assert "--travel-offset LENGTH" in text
     assert "Added to all travels" in text
-    assert "Least excess" in text
+    assert "Bright above" in text
     assert "Height from the number of frames" in text
 
 
 def test_options_are_in_the_process(result):
-    chosen = {name: result.process[name] for name in ("operation", "travel_offset", "margin")}
-    assert chosen == {"operation": "Mean", "travel_offset": OFFSET, "margin": 5.0}
+    chosen = {name: result.process[name] for name in ("operation", "travel_offset")}
+    assert chosen == {"operation": "Bright", "travel_offset": OFFSET}
 
 
 @pytest.mark.parametrize(
     ("option", "line"),
     [
-        (["--travel-offst", "1mm"], "--travel-offset, --margin"),
+        (["--travel-offst", "1mm"], "has no option --travel-offst: did you mean --travel-offset?"),
         (["--travel-offset", "100"], "a unit is needed"),
-        (["--margin", "-1"], "margin -1.0: a number in counts of at least 0"),
+        (["--level", "-1"], "level -1.0: a number in counts of at least 0"),
     ],
 )
 def test_an_impossible_option_is_one_line(folder, option, line):
@@ -147,6 +156,94 @@ def test_files_keep_units_titles_and_legends(folder, result, suffix, tmp_path):
     assert read.declaration("depth").unit == read.declaration("depth_sigma").unit == "mm"
     assert read.declaration("kind").codes == {0: "never bright", 1: "bright at the end"}
     np.testing.assert_array_equal(read.height, result.height)
+
+
+def test_one_of_its_maps_is_exported_in_its_unit(folder, result, tmp_path):
+    targets = [tmp_path / f"kind.{suffix}" for suffix in ("csv", "tif", "npz")]
+    done("export", folder / "res.h5", "--map", "kind", *(word for path in targets for word in ("-o", path)))
+    kind = np.where(result["kind"] == 0, np.nan, 1)  # 0 is undefined
+    np.testing.assert_array_equal(np.loadtxt(targets[0], delimiter=","), kind)
+    np.testing.assert_array_equal(tifffile.imread(targets[1]), kind)
+    with np.load(targets[2]) as arrays:
+        assert set(arrays) == {"kind", "x", "y", "units", "legends", "process", "fitted"}
+    done("export", folder / "res.h5", "--map", "depth_sigma", "-o", tmp_path / "sigma.csv")
+    assert "depth_sigma in mm" in (tmp_path / "sigma.csv").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["--map", "kin", "-o", "a.csv"], "the result has no map kin: did you mean kind?"),
+        (["--map", "kind", "-o", "a.ply"], "--map is for a .tif file"),
+        (["--map", "kind", "-o", "a.zarr", "-o", "a.csv"], "a.zarr takes all maps: leave --map out"),
+        (
+            ["--map", "kind", "-o", "a.ply", "-o", "a.csv"],
+            "a.ply takes no map: choose .tif, .tiff",
+        ),
+        (["--map", "kind", "--section", "apex", "-o", "a.csv"], "Leave out the section or the map"),
+    ],
+)
+def test_a_map_that_cannot_be_exported_is_one_line(folder, options, line):
+    refused(line, "export", folder / "res.h5", *options)
+
+
+def test_its_function_on_arrays_gives_the_same(folder, result):
+    own = load_operation(f"{folder / 'mine.py'}:Bright")
+    height_of = engine.function_of(own)
+    assert [*inspect.signature(height_of).parameters][:2] == ["frames", "travel"]
+    assert "Added to all travels" in height_of.__doc__
+    same(height_of(FRAMES, TRAVEL, travel_offset=OFFSET), result)
+
+
+def same(one, other):
+    assert one.maps().keys() == other.maps().keys()
+    for name in other.maps():
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def test_a_calibration_is_used_by_the_command_the_application_and_if_the_recording_carries_it(
+    folder, tmp_path, monkeypatch
+):
+    level = np.full(SHAPE, 20, np.float32)
+    level[:, :3] = 400  # above all samples, so that these columns never turn bright
+    no, sure = np.zeros(SHAPE, np.uint8), np.full(SHAPE, 0.1, np.float32)
+    references = io.References(level, level + 100, sure, sure, no)
+    calibration = io.Calibration(io.CameraId("", SHAPE, FRAMES.dtype), references=references)
+    io.save_calibration(calibration, tmp_path / "cal.h5")
+    done(*words(folder), "--calibration", tmp_path / "cal.h5", "-o", tmp_path / "res.h5")
+    found = io.open_result(tmp_path / "res.h5")
+    assert found.process["calibration_parts"] == "references"
+    np.testing.assert_array_equal(np.isfinite(found.height[:, :3]), False)
+    assert np.isfinite(found.height[:, 3:]).any()
+    opening = Opening(calibration=tmp_path / "cal.h5", operation=f"{folder / 'mine.py'}:Bright")
+    session = Session(folder / "one.h5", opening)
+    same(session.now.result, found)
+    texts = as_command(session), as_python(session)
+    session.close()
+    monkeypatch.chdir(tmp_path)
+    for work in (lambda: done(*shlex.split(texts[0])[1:], "--overwrite"), lambda: exec(texts[1], {})):
+        Path("result.h5").unlink(missing_ok=True)
+        work()
+        same(io.open_result("result.h5"), found)
+    header = io.Header("vertical", pixel_size=(PIXEL, PIXEL))
+    record(io.Calibrated(MadeUp(FRAMES, header, travel=TRAVEL), calibration), tmp_path / "carried.h5")
+    with io.open_recording(tmp_path / "carried.h5") as recording:
+        again = engine.run(recording, load_operation(f"{folder / 'mine.py'}:Bright"))
+    same(again, found)
+
+
+def test_its_maps_are_shown_while_it_runs(folder, result):
+    own = load_operation(f"{folder / 'mine.py'}:Bright")(travel_offset=OFFSET)
+    header = io.Header("vertical", pixel_size=(PIXEL, PIXEL))
+    with engine.live.Stream(own, SHAPE, header=header, latency=math.inf) as stream:
+        stream.push(FRAMES, travel=TRAVEL)
+        stream.result()
+    shown = stream.latest()
+    assert shown.first == "depth"
+    assert shown.height is shown.depth
+    same(shown.maps, result)
+    for name in result.maps():
+        assert shown.maps.declaration(name) == result.declaration(name)
 
 
 def test_exports_take_its_height(folder, tmp_path):
@@ -192,7 +289,7 @@ def test_xarray_has_units_and_legends(result):
 
 def test_a_batch_runs_it_and_resumes(folder, tmp_path):
     (tmp_path / "batch.toml").write_text(
-        f'[operation]\nclass = "{folder / "mine.py"}:Mean"\ntravel-offset = "100um"\n', encoding="utf-8"
+        f'[operation]\nclass = "{folder / "mine.py"}:Bright"\ntravel-offset = "100um"\n', encoding="utf-8"
     )
     command = "batch", folder / "one.h5", folder / "two.h5", "-o", tmp_path / "out", "--settings"
     done(*command, tmp_path / "batch.toml")
@@ -204,5 +301,5 @@ def test_a_batch_runs_it_and_resumes(folder, tmp_path):
 
 def test_the_documentation_names_all_that_it_needs():
     page = (Path(__file__).parents[2] / "docs" / "operations.md").read_text(encoding="utf-8")
-    for name in re.findall(r"(?:engine|io|self|self\.device)\.(\w+)\(", CODE[CODE.index("class Mean") :]):
+    for name in re.findall(r"(?:engine|io|self|self\.device)\.(\w+)\(", CODE[CODE.index("class Bright") :]):
         assert name in page, name

@@ -12,10 +12,12 @@ from commands import done, refused, run
 from stacks import MadeUp, assert_same, record, sphere
 
 from mirrorskin import engine, io
-from mirrorskin.engine.running import load_operation
+from mirrorskin.engine.reconstruction import load_operation
 
 ROOT = Path(__file__).parents[2]
 MINE = """
+from typing import Literal
+
 import numpy as np
 from mirrorskin import engine
 from mirrorskin.io import Map
@@ -35,10 +37,10 @@ class Light(engine.Operation):
 
 class Deep(Light):
     travel_offset: float = engine.option(default=0.0, unit="mm", help="added to each travel")
-    tilt: float | None = engine.option(
-        default=None, unit="rad", words=["estimate"], help="tilt", shown_default="no"
+    tilt: float | Literal["estimate"] | None = engine.option(
+        default=None, unit="rad", help="tilt", shown_default="no"
     )
-    weights: list = engine.option(default=None, unit="share", several=True, within=(0, 1), help="some shares")
+    weights: list[float] = engine.option(default=None, unit="share", within=(0, 1), help="some shares")
     twice: bool = engine.option(default=False, help="count each frame twice")
 
     @property
@@ -118,9 +120,9 @@ def test_region_frames_and_travel_are_those_of_reconstruct():
         ("none_of_a_test.py:Light", "there is no none_of_a_test.py in "),
         (
             "mine_of_a_test:Dark",
-            "there is no class Dark in mine_of_a_test; it has Light, Deep, Frames, Own, Step, Broken",
+            "mine_of_a_test has no class Dark: it has Light, Deep, Frames, Own, Step, Broken",
         ),
-        ("mine_of_a_test:some", "there is no class some in mine_of_a_test"),
+        ("mine_of_a_test:some", "mine_of_a_test has no class some: it has"),
         (
             "mine_of_a_test:Broken",
             "Broken is not an operation: derive the class from mirrorskin.engine.Operation",
@@ -129,7 +131,7 @@ def test_region_frames_and_travel_are_those_of_reconstruct():
         ("mine_of_a_test:Step", "has an option travel_step, and so has 'mirrorskin run' for something else"),
         (
             "mirrorskin.engine:Onst",
-            "there is no class Onst in mirrorskin.engine; it has ChangePoint, Correlate",
+            "mirrorskin.engine:Onst: mirrorskin.engine has no class Onst: did you mean Onset?",
         ),
         (
             "mine_of_a_test:Frames",
@@ -151,9 +153,10 @@ DEEP = ("run", "mine_of_a_test:Deep", "press.h5")
         (["--level"], "Option '--level' requires an argument"),
         (
             ["--depth", "1"],
-            "mine_of_a_test:Deep has no option --depth. Its options are --travel-offset, --tilt, --weights,"
+            "mine_of_a_test:Deep has no option --depth: it has --travel-offset, --tilt, --weights,"
             " --twice, --level",
         ),
+        (["--levl", "1"], "mine_of_a_test:Deep has no option --levl: did you mean --level?"),
         (["--level", "high"], "--level high: a number is needed; write e.g. 0.25"),
         (["--level", "nan"], "level nan: a number in counts is needed"),
         (["--travel-offset", "0.1"], "--travel-offset 0.1: a unit is needed; write e.g. 0.1mm"),
@@ -252,7 +255,7 @@ def test_what_a_module_itself_lacks_is_not_hidden():
 def test_what_the_page_says_runs():
     page = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
-    own, code, configured, declared, with_units, on_a_device, with_kernel = blocks
+    own, code, configured, loop, steps, declared, with_units, on_a_device, with_kernel = blocks
     Path("light.py").write_text(own)
     Path("first_light.py").write_text(with_kernel)
     for line in "".join(re.findall(r"^```sh\n(.*?)^```", page, re.DOTALL | re.MULTILINE)).splitlines():
@@ -260,11 +263,14 @@ def test_what_the_page_says_runs():
         if not {"live", "--live"} & {*words}:  # tests/cli/test_live.py
             done(*words)
     known = {}
-    exec(own + code + configured + declared + with_units + on_a_device, known)
+    exec(own + code + configured + loop + steps + declared + with_units + on_a_device, known)
     assert known["result"]["light"].any()
     np.testing.assert_array_equal(known["again"].height, known["onset"].height)
     assert known["edges"].shape == known["surface"].height.shape
     assert known["Wear"].maps["wear"].quantity == "height"
+    assert known["run"].result()["light"].tolist() == np.full((48, 64), 2).tolist()
+    in_percent = engine.run(np.full((4, 2, 3), 120, np.uint8), known["LightInPercent"])
+    assert in_percent["share"].tolist() == [[100.0] * 3] * 2
     header = io.Header("vertical", dark=np.full((2, 3), 60, np.float32))
     frames = 10 * np.arange(24, dtype=np.uint8).reshape(4, 2, 3)
     for chosen, level in ({}, 60), ({"dark": 10}, 10):

@@ -87,8 +87,8 @@ def test_every_key_arrives_in_the_engine_s_words_and_units(settings):
         "event": "release",
         "method": "threshold",
         "threshold": 0.25,
-        "thresholds": [0.25],
-        "inclinations": [pytest.approx(math.radians(12))],
+        "thresholds": (0.25,),
+        "inclinations": (pytest.approx(math.radians(12)),),
         "hold": 3,
         "subframe": True,
         "dark": 12.0,
@@ -154,7 +154,7 @@ from mirrorskin import engine
 
 class Wear(engine.Operation):
     travel_offset: float = engine.option(default=0.0, unit="mm", help="added to each travel")
-    angles: list = engine.option(default=None, unit="rad", several=True, help="angles")
+    angles: list[float] = engine.option(default=None, unit="rad", help="angles")
 """
 
 

@@ -49,10 +49,7 @@ def found(slide, contact):
 def test_a_slide_is_reported_as_found_in_its_frames(slide, contact, found):
     touched = io.open_result(contact).contact
     with io.open_recording(slide) as recording:
-        block = recording.read(np.empty(recording.shape, recording.dtype))
-        search = engine.slip.Slip(contact=touched, per_frame=True).configured_for(recording)
-        search.push(block.frames, displacement=block.displacement)
-    told = search.result()
+        told = engine.run(recording, engine.slip.Slip(contact=touched, per_frame=True))
     for name in ("displacement", "displacement_sigma", "slip_onset", "slip_onset_sigma", "status", "contact"):
         np.testing.assert_array_equal(getattr(found, name), getattr(told, name), err_msg=name)
     np.testing.assert_allclose(found.slide_distance, np.arange(12) * 0.02, atol=1e-12)

@@ -94,12 +94,15 @@ def test_of_turns_one_is_chosen_and_a_picture_s_ending_may_be_in_capitals(result
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--map", "normal"], "ball.h5 has no normal to draw: it has height, section"),
+        (["--map", "heigt"], "ball.h5 has no picture heigt: did you mean height?"),
         (["-o", "{}"], "name a picture that ends in .png or .pdf or .svg, or a folder"),
         (["-o", "a.jpg"], "name a picture that ends in .png or .pdf or .svg, or a folder"),
         (["-o", "nowhere/a.png"], "no folder"),
         (["-o", "{}/folder"], "ball.h5 is not a folder. Use another -o"),
-        (["-o", "a.png/folder", "--map", "nothing"], "has no nothing to draw"),
+        (
+            ["-o", "a.png/folder", "--map", "nothing"],
+            "has no picture nothing: it has height, section",
+        ),
         (["--section", "1mm,0mm"], "two points are needed"),
         (["--section", "0.9mm,0.9mm:1mm,1mm"], "no height is known along the section"),
         (["--turn", "0"], "leave --turn out"),

@@ -170,9 +170,9 @@ TRAVEL_OF_KIND = {
 
 
 def by_push(frames, travel, dtype):
-    operation = engine.Onset(**LEVELS)
-    operation.push(frames, travel=travel)
-    return operation.result()
+    run = engine.Run(engine.Onset(**LEVELS))
+    run.push(frames, travel=travel)
+    return run.result()
 
 
 def by_stream(frames, travel, dtype):
@@ -307,6 +307,7 @@ OTHERS = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 @pytest.mark.parametrize("name", calls())
 @pytest.mark.filterwarnings("ignore:.*are estimated from the frames:mirrorskin.io.MirrorskinWarning")
 def test_every_function_takes_arrays_of_other_libraries_as_plain_ones(name):

@@ -25,7 +25,7 @@ def operation(maps, **returned):
     [
         ({"x": io.Map(unit="mm")}, "a map cannot be called 'x': use letters, digits and _, but not"),
         ({"process": io.Map()}, "a map cannot be called 'process'"),
-        ({"reset": io.Map()}, "a map cannot be called 'reset', which operations use. Choose another name"),
+        ({"start": io.Map()}, "a map cannot be called 'start', which operations use. Choose another name"),
         (
             {"height": io.Map("h", "µm")},
             "the map height has the unit µm. Declare mm, as the built-in map has",
@@ -174,6 +174,8 @@ def test_maps_that_are_not_declared_may_be_returned_in_addition():
 
 
 def test_an_optional_map_that_is_not_declared_is_refused_where_the_class_is_defined():
-    with pytest.raises(io.InputError, match="Own: optional_maps has forec, which is not declared") as caught:
+    with pytest.raises(
+        io.InputError, match=r"optional_maps: Own has no map forec: did you mean force\?"
+    ) as caught:
         operation({**WEAR, "optional_maps": ("forec",)})
     assert "\n" not in str(caught.value)

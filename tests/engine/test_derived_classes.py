@@ -7,13 +7,15 @@ import math
 
 import numpy as np
 import pytest
+from bare import Parts
 from commands import done
 from live_frames import press_header
 from operations import CASES, PRESS, TRAVEL, Readable
 from stacks import record
 
 from mirrorskin import engine, io
-from mirrorskin.engine.live import LiveOperation, Stream
+from mirrorskin.engine.live import LiveRun, Stream
+from mirrorskin.engine.operation import Plan
 from mirrorskin.engine.press.press import HoleFilling
 
 pytestmark = pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
@@ -28,7 +30,9 @@ def with_own_result(kind):
     class Own(kind):
         def result(self):
             found = super().result()
-            return found.assign(process={**found.process, "own": True})
+            if isinstance(found, io.Result):
+                return found.assign(process={**found.process, "own": True})
+            return {**found, "own": True}
 
     return Own
 
@@ -79,7 +83,7 @@ def test_a_run_over_arrays_returns_the_result_of_a_subclass(name):
 @ONCE
 def test_a_live_run_returns_the_result_of_a_subclass(name):
     case = CASES[name]
-    live = LiveOperation(case.source(), with_own_result(case.kind)(**case.options))
+    live = LiveRun(case.source(), with_own_result(case.kind)(**case.options))
     case.push(live, slice(None))
     assert live.result().process["own"] is True
 
@@ -87,7 +91,7 @@ def test_a_live_run_returns_the_result_of_a_subclass(name):
 @WITH_PREVIEW
 def test_a_display_shows_the_result_of_a_subclass(name):
     case = CASES[name]
-    live = LiveOperation(case.source(), with_own_height(case.kind)(**case.options))
+    live = LiveRun(case.source(), with_own_height(case.kind)(**case.options))
     case.push(live, slice(None))
     assert np.all(live.maps()["height"] == 7)
 
@@ -121,7 +125,7 @@ def test_the_result_of_a_base_that_is_no_operation_counts_if_it_comes_first():
 
 def test_the_result_of_the_last_of_several_subclasses_counts():
     class Own(with_own_height(engine.Onset)):
-        def finish(self):
+        def result(self):
             return {"height": np.full(self.shape, 8.0)}
 
     class Last(Own):
@@ -135,16 +139,18 @@ def test_the_result_of_the_last_of_several_subclasses_counts():
 def test_each_run_starts_a_subclass_anew(name):
     case = CASES[name]
     own = counting(case.kind)(**case.options)
+    source = Parts(case.frames, own, case.positions, ())
     for _ in range(2):
-        engine.run(case.frames, own, **case.positions)
-        assert own.total == own.passes * len(case.frames)
+        run = engine.Run(own.plan(source), source)
+        run.complete()
+        assert run.operation.total == run.operation.passes * len(case.frames)
 
 
 @ONCE
 def test_the_frames_of_warming_are_forgotten_by_a_subclass(name):
     case = CASES[name]
-    live = LiveOperation(case.source(), counting(case.kind)(**case.options))
-    live.warm()
+    live = LiveRun(case.source(), counting(case.kind)(**case.options))
+    live.precompile()
     case.push(live, slice(0, 4))
     assert live.operation.total == 4
 
@@ -154,7 +160,7 @@ class Halved(engine.Press):
 
     def plan(self, source):
         plan = super().plan(source)
-        return engine.method.Plan(plan.operation, [*plan.steps, Half()], plan.process, plan.frames)
+        return Plan(plan.operation, [*plan.steps, Half()], plan.process, plan.frames)
 
 
 class Half(engine.Step):

@@ -32,9 +32,15 @@ MAPS_OF_A_FIT = {"mean", "cosine", "sine", "residual"}
 
 ON_FRAMES = {
     "onset": (engine.find_onset, PRESS, TRAVEL, LEVELS, {"height", "height_sigma", "status"}),
-    "levels of scatter": (engine.find_onset, PRESS, TRAVEL, LEVELS | {"dark_sigma": 1.0}, set()),
-    "change point": (engine.find_change_point, PRESS, TRAVEL, LEVELS, {"height", "height_sigma"}),
-    "change point, no levels": (engine.find_change_point, PRESS, TRAVEL, {}, {"height", "height_sigma"}),
+    "levels of scatter": (
+        engine.find_onset,
+        PRESS,
+        TRAVEL,
+        LEVELS | {"dark_sigma": 1.0},
+        {"height", "status"},
+    ),
+    "change point": (engine.find_change_point, PRESS, TRAVEL, LEVELS, {"height"}),
+    "change point, no levels": (engine.find_change_point, PRESS, TRAVEL, {}, {"height"}),
     "correlation": (engine.correlate, TURNS, PHASE, {}, MAPS_OF_A_FIT),
     "weights": (
         engine.correlate,
@@ -54,8 +60,11 @@ ON_FRAMES = {
         set(),
     ),
     "fringes": (engine.fringes.fit_fringes, TURNS, PHASE, {}, set()),
-    "focus": (engine.focus.find_focus, PRESS, TRAVEL, {"noise": 2.0}, set()),
-    "lamps": (engine.photometric.photometric_stereo, TURNS, PHASE, {"zenith": 0.7}, set()),
+    "focus": (engine.focus.find_focus, PRESS, TRAVEL, {"noise": 2.0}, {"height", "status", "sharpness"}),
+    "lamps": (
+        *(engine.photometric.photometric_stereo, TURNS, PHASE, {"zenith": 0.7}),
+        {"normals", "albedo", "residual", "samples"},
+    ),
 }
 INTEGRATED = {
     "slopes": ({"dz_dx": SLOPES[0], "dz_dy": SLOPES[1]}, {}),
@@ -93,7 +102,7 @@ def test_frames_on_the_device_give_the_same_maps(device, name, put):
     found = function(put(device, frames), positions, **options, device=device)
     assert {key for key in found if found.on_device(key) is not None} == stay
     assert list(found) == list(expected)
-    assert found.process == expected.process
+    assert {**found.process, "date": ""} == {**expected.process, "date": ""}
     for key in stay:
         np.testing.assert_array_equal(found.on_device(key).read(), expected[key], err_msg=key)
     for key in expected:
@@ -137,22 +146,23 @@ def test_edges_of_normals_on_the_device_stay_there(device):
 
 
 @pytest.mark.parametrize("name", ["onset", "change point", "correlation", "normals"])
-def test_frames_on_a_card_are_not_copied_and_maps_only_when_they_are_used(card, name):
+def test_frames_on_a_card_are_not_copied_and_maps_only_when_they_are_used_or_checked(card, name):
     function, frames, positions, options, stay = ON_FRAMES[name]
     options = options | {"noise": 1.0} if name != "correlation" else options
     placed = ours(card, np.tile(frames, (1, *LARGER)))
     up, down, found = copies(card, lambda: function(placed, positions, **options))
-    few = 5 if name == "change point" else 0  # status and frame are completed on the host
+    # What checks look at; status and frame of a change-point are completed on the host.
+    few = {"onset": 8, "change point": 13, "correlation": 0, "normals": 26}[name]
     assert up < TABLES
     assert down < few + SAMPLES
     card.profile.clear()
     used = found[max(stay)]
     down = sum(one.bytes for one in card.profile.records() if one.kind == "download")
-    assert down == used.nbytes
+    assert down in (0, used.nbytes)  # 0: a check has looked at it
     assert used is found[max(stay)]
 
 
-def test_a_chain_from_frames_to_heights_copies_no_map(card):
+def test_a_chain_from_frames_to_heights_copies_only_what_checks_look_at(card):
     frames = ours(card, np.tile(TURNS, (1, *LARGER)))
 
     def chain():
@@ -164,7 +174,7 @@ def test_a_chain_from_frames_to_heights_copies_no_map(card):
     up, down, (height, edges) = copies(card, chain)
     assert height.shape == edges.shape == (480, 600)
     assert up < TABLES
-    assert down < 3 * SAMPLES + STATE
+    assert down < 26 + 3 * SAMPLES + STATE
 
 
 def test_an_operation_that_takes_none_gets_numpy_arrays(device):

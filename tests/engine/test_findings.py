@@ -198,5 +198,7 @@ class Suspicious(engine.Operation):
         return {"total": self.total, "warnings": LOST}
 
 
-def test_warnings_of_an_own_operation_are_in_the_process():
-    assert engine.run(np.ones((4, 3, 3)), Suspicious).process["warnings"] == LOST
+def test_warnings_of_an_own_operation_are_issued_and_in_the_process():
+    with pytest.warns(io.MirrorskinWarning, match=f"^Suspicious: {LOST}$"):
+        found = engine.run(np.ones((4, 3, 3)), Suspicious)
+    assert found.process["warnings"] == LOST

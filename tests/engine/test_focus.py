@@ -4,8 +4,10 @@ import re
 
 import numpy as np
 import pytest
+from bare import bare
 
 from mirrorskin import engine, io
+from mirrorskin.engine.focus import Focus
 from mirrorskin.io.arrays import ArrayRecording
 
 SHAPE = (48, 48)
@@ -29,6 +31,10 @@ def textured(travel=TRAVEL, sharpest=4.2, seed=0, waves=None, contrast=30.0):
     return frames
 
 
+def find_focus(frames, travel, **options):
+    return bare(Focus(**options), frames, travel=travel)
+
+
 def noisy(frames, noise, seed):
     return (frames + noise * np.random.default_rng(seed).normal(size=frames.shape)).astype(np.float32)
 
@@ -37,25 +43,25 @@ def noisy(frames, noise, seed):
 @pytest.mark.parametrize("sharpest", [4.0, 4.1, 4.25])
 def test_waves_of_one_length_are_exact_without_noise(reach, sharpest):
     frames = textured(sharpest=sharpest).astype(np.float32)
-    found = engine.focus.find_focus(frames, TRAVEL, noise=0, reach=reach)
+    found = find_focus(frames, TRAVEL, noise=0, reach=reach)
     np.testing.assert_allclose(found.height, -sharpest, atol=2e-4)
 
 
 def test_steps_may_be_uneven_and_go_up():
     travel = np.cumsum(np.random.default_rng(1).uniform(0.2, 0.8, 18))[::-1]
-    found = engine.focus.find_focus(textured(travel).astype(np.float32), travel, noise=0)
+    found = find_focus(textured(travel).astype(np.float32), travel, noise=0)
     np.testing.assert_allclose(found.height, -4.2, atol=2e-4)
 
 
 def test_texture_of_all_lengths_is_right_to_a_twentieth_of_a_step():
     frames = textured(waves=lambda generator: np.sqrt(generator.uniform(0.02**2, 0.3**2, 200)))
-    found = engine.focus.find_focus(frames.astype(np.float32), TRAVEL, noise=0)
+    found = find_focus(frames.astype(np.float32), TRAVEL, noise=0)
     assert abs(np.median(found.height) + 4.2) < 0.5 / 20
 
 
 def test_the_standard_error_includes_a_curve_that_is_not_a_gaussian():
     frames = textured(waves=lambda generator: np.sqrt(generator.uniform(0.02**2, 0.3**2, 200)))
-    found = engine.focus.find_focus(noisy(frames, 0.1, 0), TRAVEL, noise=0.1)
+    found = find_focus(noisy(frames, 0.1, 0), TRAVEL, noise=0.1)
     ratio = (found.height + 4.2) / found.height_sigma
     assert 0.1 < np.mean(ratio**2) < 2  # 100 by noise alone
 
@@ -63,19 +69,19 @@ def test_the_standard_error_includes_a_curve_that_is_not_a_gaussian():
 def test_contrast_in_two_frames_has_no_vertex():
     strength = np.array([0, 0, 0, 1, 0.9, 0, 0, 0, 0], np.float32)[:, None, None]
     texture = np.random.default_rng(0).normal(100, 10, SHAPE).astype(np.float32)
-    found = engine.focus.find_focus(strength * texture, np.arange(9.0), noise=0.1)
+    found = find_focus(strength * texture, np.arange(9.0), noise=0.1)
     assert (found.status == 2).all()
 
 
 def test_a_slope_is_followed():
     slope = 4 + 0.02 * (np.arange(SHAPE[1]) - 23.5)
-    found = engine.focus.find_focus(textured(sharpest=slope).astype(np.float32), TRAVEL, noise=0)
+    found = find_focus(textured(sharpest=slope).astype(np.float32), TRAVEL, noise=0)
     error = (found.height + slope)[:, 6:-6]
     assert np.sqrt(np.mean(error**2)) < 0.03
 
 
 def test_three_samples_leave_no_standard_error():
-    found = engine.focus.find_focus(noisy(FRAMES, 0.5, 1), TRAVEL, noise=0.5, reach=1)
+    found = find_focus(noisy(FRAMES, 0.5, 1), TRAVEL, noise=0.5, reach=1)
     assert np.isfinite(found.height).any()
     assert np.isnan(found.height_sigma).all()
 
@@ -84,7 +90,7 @@ def test_three_samples_leave_no_standard_error():
 def test_the_standard_error_is_the_scatter(noise, reach):
     frames, square = textured(), []
     for seed in range(40):
-        found = engine.focus.find_focus(noisy(frames, noise, seed), TRAVEL, noise=noise, reach=reach)
+        found = find_focus(noisy(frames, noise, seed), TRAVEL, noise=noise, reach=reach)
         sound = found.status == 1
         assert sound.mean() > 0.9
         square.append(np.mean(((found.height + 4.2) / found.height_sigma)[sound] ** 2))
@@ -93,19 +99,19 @@ def test_the_standard_error_is_the_scatter(noise, reach):
 
 
 def test_sharpness_is_the_contrast_without_the_noise():
-    found = engine.focus.find_focus(noisy(textured(sharpest=4.0), 3.0, 0), TRAVEL, noise=3.0)
-    clean = engine.focus.find_focus(textured(sharpest=4.0).astype(np.float32), TRAVEL, noise=0)
+    found = find_focus(noisy(textured(sharpest=4.0), 3.0, 0), TRAVEL, noise=3.0)
+    clean = find_focus(textured(sharpest=4.0).astype(np.float32), TRAVEL, noise=0)
     assert np.mean(found.sharpness**2) == pytest.approx(np.mean(clean.sharpness**2), rel=0.01)
 
 
 def test_a_picture_without_texture_has_no_peak():
-    found = engine.focus.find_focus(noisy(np.full((18, *SHAPE), 100.0), 2.0, 0), TRAVEL, noise=2.0)
+    found = find_focus(noisy(np.full((18, *SHAPE), 100.0), 2.0, 0), TRAVEL, noise=2.0)
     assert (found.status != 1).mean() > 0.999
     assert np.isnan(found.height[found.status != 1]).all()
 
 
 def test_a_peak_at_the_end_of_the_stack_is_reported():
-    found = engine.focus.find_focus(textured(sharpest=9.5).astype(np.float32), TRAVEL, noise=0)
+    found = find_focus(textured(sharpest=9.5).astype(np.float32), TRAVEL, noise=0)
     assert (found.status == 3).all()
     assert np.isnan(found.height).all()
 
@@ -114,7 +120,7 @@ def test_a_missing_sample_is_left_out_and_a_missing_pixel_invalid():
     frames = textured().astype(np.float32)
     frames[6, 9, 9] = np.nan
     frames[:, 30, 30] = np.nan
-    found = engine.focus.find_focus(frames, TRAVEL, noise=0)
+    found = find_focus(frames, TRAVEL, noise=0)
     assert found.height[9, 9] == pytest.approx(-4.2, abs=1e-3)
     assert found.status[30, 30] == found.status[26, 34] == 0
     assert found.status[25, 30] == 1
@@ -145,7 +151,7 @@ def test_texture_that_is_uneven_on_a_slope_is_part_of_the_error():
     slope = 4.2 + 0.05 * (np.arange(SHAPE[1]) - 23.5)
     fading = np.linspace(1, 0.1, SHAPE[1])
     frames = 120 + (textured(sharpest=slope) - 120) * fading
-    found = engine.focus.find_focus(noisy(frames, 0.05, 0), TRAVEL, noise=0.05)
+    found = find_focus(noisy(frames, 0.05, 0), TRAVEL, noise=0.05)
     ratio = (found.height + slope)[6:-6, 6:-6] / found.height_sigma[6:-6, 6:-6]
     assert 0.1 < np.mean(ratio**2) < 1  # 2.0 without
 
@@ -153,7 +159,7 @@ def test_texture_that_is_uneven_on_a_slope_is_part_of_the_error():
 def test_errors_grow_where_few_pixels_around_have_a_peak():
     frames = textured()
     frames[:, :, 24:] = 120  # no texture there
-    found = engine.focus.find_focus(noisy(frames, 0.5, 0), TRAVEL, noise=0.5)
+    found = find_focus(noisy(frames, 0.5, 0), TRAVEL, noise=0.5)
     inside, border = np.nanmedian(found.height_sigma[:, 10]), np.nanmedian(found.height_sigma[:, 24])
     assert border > 2 * inside
 
@@ -167,7 +173,7 @@ def seen(travel, stated):
     """Return the maps of an inclined surface at some travel, from a recording that states another one."""
     slope = 4.2 + 0.04 * (np.arange(SHAPE[1]) - 23.5)
     frames = noisy(textured(travel, sharpest=slope), 0.5, 0)
-    return engine.run(ArrayRecording(frames, {"travel": stated}, {}), engine.focus.Focus(noise=0.5))
+    return engine.run(ArrayRecording(frames, {"travel": stated}, {}), Focus(noise=0.5))
 
 
 @pytest.mark.parametrize(
@@ -182,6 +188,5 @@ def test_a_lost_frame_is_found_by_the_peaks(steps, words):
         seen(jumped(steps), TRAVEL)
 
 
-@pytest.mark.filterwarnings("ignore:.*is this a rotation")
 def test_travel_that_is_measured_may_jump():
     assert "peaks" not in seen(jumped(1), jumped(1)).process.get("warnings", "")

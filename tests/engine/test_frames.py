@@ -53,10 +53,10 @@ def test_frames_of_other_types_are_converted(dtype):
 
 
 def test_the_frame_that_cannot_be_converted_is_named_across_pushes():
-    onset = engine.Onset(dark=0, bright=100)
-    onset.push(np.zeros((3, 1, 2), np.int16), travel=[0.0, 0.1, 0.2])
+    run = engine.Run(engine.Onset(dark=0, bright=100))
+    run.push(np.zeros((3, 1, 2), np.int16), travel=[0.0, 0.1, 0.2])
     with pytest.raises(InputError, match="frames: frame 4 has a sample of -1; int16 is read as uint16"):
-        onset.push(np.array([[[0, 0]], [[0, -1]]], np.int16), travel=[0.3, 0.4])
+        run.push(np.array([[[0, 0]], [[0, -1]]], np.int16), travel=[0.3, 0.4])
 
 
 def test_one_frame_is_not_a_stack():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from mirrorskin import io
+from mirrorskin import engine, io
 from mirrorskin.engine.fringes import Fringes, decode_gray, fit_fringes, unwrap_frequencies, unwrap_gray
 
 TURN = 2 * np.pi
@@ -79,12 +79,12 @@ def test_mean_and_modulation_are_those_encoded():
 def test_a_frame_of_weight_0_is_left_out_and_weights_are_inverse_variances():
     frames = shown(TURN * FIELD, UNEVEN, 1.5)
     expected = fit_fringes(np.delete(frames, 2, 0), np.delete(UNEVEN, 2))
-    fringes = Fringes()
-    fringes.push(frames, phase=UNEVEN, frame_weights=[1, 1, 0, 1, 1, 1])
-    found = fringes.result()
+    run = engine.Run(Fringes)
+    run.push(frames, phase=UNEVEN, frame_weights=[1, 1, 0, 1, 1, 1])
+    found = run.result()
     np.testing.assert_allclose(found.phase, expected.phase, atol=1e-5)
     np.testing.assert_allclose(found.phase_sigma, expected.phase_sigma, rtol=1e-3)
-    twice = Fringes(noise=2)
+    twice = engine.Run(Fringes(noise=2))
     twice.push(frames, phase=UNEVEN, frame_weights=np.full(6, 4.0))
     once = fit_fringes(frames, UNEVEN, noise=2)
     np.testing.assert_allclose(twice.result().phase_sigma, once.phase_sigma / 2, rtol=1e-4)

@@ -103,11 +103,12 @@ def test_an_array_is_the_height():
     assert masked.quantities["measured area"] == expected.quantities["measured area"]
 
 
-def test_numbers_and_texts_of_a_mapping_go_to_the_process():
+def test_numbers_and_texts_of_a_mapping_go_to_the_process_and_declared_ones_to_fitted():
     found = as_result(
         {"height": [[0.0, 1.0]], "travel": 0.5, "source": "scanner", "force": 2.0, "normals": None}
     )
     assert found.process == {"travel": 0.5, "source": "scanner"}
+    assert found.fitted == io.Fitted(travel=0.5)
     assert (found.force, found.normals, list(found)) == (2.0, None, ["height", "force"])
 
 

@@ -10,7 +10,7 @@ from live_frames import paced, turn_header
 from mirrorskin.engine.live import PUSHED, RAISED, SHOWN, UPDATED, WAITED, Loop
 from mirrorskin.engine.live.status import Monitor
 from mirrorskin.hw.simulated_clock import SimulatedClock
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, Result
 
 COUNT, RATE = 40, 100.0
 FRAMES = np.arange(COUNT, dtype=np.uint8)[:, np.newaxis, np.newaxis] * np.ones((2, 3), np.uint8)
@@ -19,7 +19,7 @@ PLACES = 0.1 * np.arange(COUNT)
 
 @dataclass
 class Slow:
-    """An operation for which each push and update takes a time of its own."""
+    """A live run for which each push and update takes a time of its own."""
 
     clock: SimulatedClock
     push_time: float = 0.0
@@ -31,20 +31,24 @@ class Slow:
     spared: list[float] = field(default_factory=list)
 
     position = "phase"
-    positions = {"phase": True}  # noqa: RUF012
-    room = np.empty((64, 2, 3), np.uint8)
+    staging_buffer = np.empty((64, 2, 3), np.uint8)
 
-    def push(self, frames, *, phase, lent):
-        assert np.array_equal(phase, PLACES[frames[:, 0, 0]])
+    @property
+    def operation(self):
+        return self
+
+    def push_block(self, block, part):
+        frames = block.frames[part]
+        assert np.array_equal(block.phase[part], PLACES[frames[:, 0, 0]])
         self.pushed += frames[:, 0, 0].tolist()
         self.clock.sleep(self.push_time)
 
     def maps(self, seconds):
         self.clock.sleep(self.update_time)
         self.updates.append(len(self.pushed))
-        return {"height": np.zeros((2, 3), np.float32)}
+        return Result(height=np.zeros((2, 3), np.float32))
 
-    def spare(self, seconds):
+    def idle_work(self, seconds):
         self.spared.append(seconds)
 
 

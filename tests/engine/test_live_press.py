@@ -7,7 +7,7 @@ from suite.scenes import references
 
 from mirrorskin import engine
 from mirrorskin.engine import Press, find_onset
-from mirrorskin.engine.live import LiveOperation, Loop
+from mirrorskin.engine.live import LiveRun, Loop
 from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.io import InputError
 
@@ -19,13 +19,13 @@ def make(dtype="uint8", device=None, **options):
     frames = press_frames(SHAPE, dtype)
     dark, bright = references(SHAPE[1:], np.dtype(dtype))
     header = press_header(dark=dark, bright=bright)
-    return frames, LiveOperation(paced(frames, header, TRAVEL), Press(device=device, **options))
+    return frames, LiveRun(paced(frames, header, TRAVEL), Press(device=device, **options))
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
 def test_heights_are_bit_by_bit_those_of_the_same_frames_offline(device, dtype):
     frames, live = make(dtype, device, fill=False)
-    live.warm()
+    live.precompile()
     for part in np.split(np.arange(SHAPE[0]), np.cumsum([1, 1, 3, 2, 11, 1, 1])):
         live.push(frames[part], travel=TRAVEL[part])
         live.maps()
@@ -70,10 +70,11 @@ def test_holes_are_filled_in_the_result_and_it_says_how_it_came_about():
 
 def test_a_whole_run_uses_each_frame():
     frames = press_frames(SHAPE)
-    source = paced(frames, press_header(), TRAVEL, 1000.0, SimulatedClock())
-    live = LiveOperation(source, Press(fill=False))
+    dark, bright = references(SHAPE[1:], np.dtype("uint8"))
+    source = paced(frames, press_header(dark=dark, bright=bright), TRAVEL, 1000.0, SimulatedClock())
+    live = LiveRun(source, Press(fill=False))
     assert Loop(source, live).run().used == SHAPE[0]
-    expected = engine.run(frames, engine.Onset, travel=TRAVEL)
+    expected = engine.run(frames, engine.Onset(dark=dark, bright=bright), travel=TRAVEL)
     np.testing.assert_array_equal(live.result().height, expected.height)
 
 
@@ -86,4 +87,4 @@ def test_a_single_frame_has_no_result():
 
 def test_a_rotation_is_refused():
     with pytest.raises(InputError, match="vertical"):
-        LiveOperation(paced(press_frames(SHAPE), turn_header(), TRAVEL), Press())
+        LiveRun(paced(press_frames(SHAPE), turn_header(), TRAVEL), Press())

@@ -8,9 +8,9 @@ import pytest
 from live_frames import PIXEL, paced, phases, press_header, turn_frames, turn_header
 from suite.scenes import SCALES, TILT
 
-from mirrorskin.engine import Correlate, Rotation, estimate_normals, find_edges, integrate
+from mirrorskin.engine import Correlate, Rotation, Run, estimate_normals, find_edges, integrate
 from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
-from mirrorskin.engine.live import LiveOperation, Loop
+from mirrorskin.engine.live import LiveRun, Loop
 from mirrorskin.engine.rotation.last_turn import choose_window
 from mirrorskin.engine.rotation.normals_to_height import find_slopes
 from mirrorskin.hw.simulated_clock import SimulatedClock
@@ -27,7 +27,7 @@ def make(device=None, frames=None, header=None, **options):
     frames = turn_frames(SHAPE) if frames is None else frames
     source = paced(frames, header or turn_header(), PHASE)
     options = {"window_frames": WINDOW, "noise": NOISE, **options}
-    return frames, LiveOperation(source, Rotation(device=device, **options))
+    return frames, LiveRun(source, Rotation(device=device, **options))
 
 
 def feed(live, frames, cuts):
@@ -35,7 +35,7 @@ def feed(live, frames, cuts):
     for part in np.split(np.arange(SHAPE[0]), np.cumsum(cuts)[:-1]):
         live.push(frames[part], phase=PHASE[part])
         updates.append(live.maps())
-        live.spare(0.0)
+        live.idle_work(0.0)
     return updates
 
 
@@ -51,7 +51,7 @@ def best_heights(normals):
 
 def test_an_update_is_of_the_last_turn(device):
     frames, live = make(device)
-    live.warm()
+    live.precompile()
     updates = feed(live, frames, [1] * SHAPE[0])
     assert not any(updates[: WINDOW - 1])
     last = updates[-1]
@@ -114,7 +114,7 @@ def test_the_result_is_whole_and_says_how_it_came_about(tmp_path):
     feed(live, frames, [SHAPE[0]])
     save_result(live.result(), tmp_path / "live.h5")
     result = open_result(tmp_path / "live.h5")
-    correlate = Correlate(window_frames=WINDOW)
+    correlate = Run(Correlate(window_frames=WINDOW))
     correlate.push(frames, phase=PHASE)
     np.testing.assert_array_equal(result.cosine, correlate.result().cosine)
     normals = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN)
@@ -130,7 +130,7 @@ def test_edges_are_drawn_in_the_time_that_is_left(device):
     feed(live, frames, [SHAPE[0]])
     assert "edges" not in live.maps()
     for _ in range(400):
-        live.spare(0.05)
+        live.idle_work(0.05)
         if "edges" in live.maps():
             break
     normals = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN, device=device)
@@ -163,7 +163,7 @@ def test_without_contact_there_are_no_heights_and_they_come_with_it():
 def test_without_a_gain_there_is_the_wave_alone():
     frames, live = make(header=turn_header(zenith_gain=None))
     update = feed(live, frames, [SHAPE[0]])[-1]
-    assert not update
+    assert set(update) == {"mean", "cosine", "sine", "modulation", "azimuth", "residual"}
     result = live.result()
     assert result.normals is None
     assert np.isfinite(result.azimuth).mean() > 0.9
@@ -178,9 +178,9 @@ def test_without_a_pixel_size_there_are_no_heights():
     assert live.result().height is None
 
 
-def test_what_warming_leaves_behind_is_nothing():
+def test_compiling_in_advance_changes_nothing():
     frames, live = make(noise=None)
-    live.warm()
+    live.precompile()
     with pytest.raises(InputError):
         live.result()
     feed(live, frames, [SHAPE[0]])
@@ -192,11 +192,11 @@ def test_what_warming_leaves_behind_is_nothing():
 def test_a_whole_run_uses_each_frame():
     frames = turn_frames(SHAPE)
     source = paced(frames, turn_header(), PHASE, 100.0, SimulatedClock())
-    live = LiveOperation(source, Rotation(window_frames=WINDOW, noise=NOISE))
+    live = LiveRun(source, Rotation(window_frames=WINDOW, noise=NOISE))
     status = Loop(source, live).run()
     assert (status.used, status.updates) == (SHAPE[0], SHAPE[0])
     exact = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN)
-    np.testing.assert_array_equal(live.operation.result().normals, exact.normals)
+    np.testing.assert_array_equal(live.result().normals, exact.normals)
 
 
 def test_a_window_is_a_turn_of_at_most_64_frames():
@@ -214,7 +214,7 @@ def test_a_window_is_a_turn_of_at_most_64_frames():
 
 def test_a_press_and_a_step_of_none_are_refused():
     with pytest.raises(InputError, match="axial"):
-        LiveOperation(paced(turn_frames(SHAPE), press_header(), PHASE), Rotation(window_frames=8))
+        LiveRun(paced(turn_frames(SHAPE), press_header(), PHASE), Rotation(window_frames=8))
     source = paced(turn_frames(SHAPE), turn_header(), PHASE)
     with pytest.raises(InputError, match="every 0"):
-        LiveOperation(source, Rotation(window_frames=8), every=0)
+        LiveRun(source, Rotation(window_frames=8), every=0)

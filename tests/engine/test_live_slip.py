@@ -6,13 +6,14 @@ from speckle import Speckle
 from stacks import MadeUp
 
 from mirrorskin.engine import Sliding
-from mirrorskin.engine.live import LiveOperation, Loop
-from mirrorskin.io import Header, InputError
+from mirrorskin.engine.live import LiveRun, Loop
+from mirrorskin.io import Block, Header, InputError
 
 SHAPE, PIXEL, COUNT = (64, 72), 0.05, 8
 PLACES = np.arange(COUNT)[:, None] * [0.02, 0.01]  # mm; the skin sticks, and stays behind
 FRAMES = np.stack([Speckle(3).frame(SHAPE, -x / PIXEL, y / PIXEL, 1.0, k) for k, (x, y) in enumerate(PLACES)])
 CONTACT = np.ones(SHAPE)
+BLOCK = Block(FRAMES, 0, displacement=PLACES)
 
 
 def source(motion="horizontal", **changes):
@@ -28,10 +29,10 @@ class Timed(MadeUp):
 
 
 def test_slip_is_bit_by_bit_that_of_the_same_frames_offline():
-    live = LiveOperation(source(), Sliding(contact=CONTACT))
-    live.warm()
+    live = LiveRun(source(), Sliding(contact=CONTACT))
+    live.precompile()
     for part in np.split(np.arange(COUNT), [1, 2, 5]):
-        live.push(FRAMES[part], displacement=PLACES[part])
+        live.push_block(BLOCK, slice(part[0], part[-1] + 1))
         live.maps()
     found, offline = live.result(), Sliding(contact=CONTACT).run(source())
     for name in ("displacement", "slip_onset", "status", "stick_ratio", "slide_distance"):
@@ -41,9 +42,9 @@ def test_slip_is_bit_by_bit_that_of_the_same_frames_offline():
 
 
 def test_the_displacement_of_the_newest_frame_is_shown_from_the_second_on():
-    live = LiveOperation(source(), Sliding(contact=CONTACT))
+    live = LiveRun(source(), Sliding(contact=CONTACT))
     for number in range(COUNT):
-        live.push(FRAMES[number : number + 1], displacement=PLACES[number : number + 1])
+        live.push_block(BLOCK, slice(number, number + 1))
         maps = live.maps()
         assert bool(maps) == (number > 0)
         if maps:
@@ -55,7 +56,7 @@ def test_a_whole_run_shows_how_far_the_body_has_come():
     given = source()
     timed = Timed(FRAMES, given.header, displacement=PLACES, time=0.01 * np.arange(COUNT))
     updates = []
-    live = LiveOperation(timed, Sliding(contact=CONTACT))
+    live = LiveRun(timed, Sliding(contact=CONTACT))
     status = Loop(timed, live, updates=1e6, on_update=lambda update, _: updates.append(update)).run()
     assert status.used == COUNT
     assert updates[-1].position == pytest.approx(np.hypot(0.14, 0.07))
@@ -68,4 +69,4 @@ def test_a_whole_run_shows_how_far_the_body_has_come():
 )
 def test_what_shows_no_slip_is_refused(given, told):
     with pytest.raises(InputError, match=told):
-        LiveOperation(given, Sliding())
+        LiveRun(given, Sliding())

@@ -5,8 +5,7 @@ import pytest
 from live_frames import blocks, phases, turn_frames
 from suite.scenes import SCALES, TILT
 
-from mirrorskin.engine import Correlate, Normals, correlate, estimate_normals
-from mirrorskin.engine.streaming import push_block
+from mirrorskin.engine import Correlate, Normals, Run, correlate, estimate_normals
 from mirrorskin.io import InputError
 
 SHAPE, WINDOW = (21, 13, 29), 8
@@ -17,12 +16,12 @@ MAPS = "normals", "normals_sigma", "contact", "mean", "cosine", "sine", "residua
 def make(dtype="uint8", device=None, **other):
     offset, gain, _ = SCALES[dtype]
     known = {"window_frames": WINDOW, "tilt": TILT, "zenith_gain": gain, "zenith_offset": offset, **other}
-    return Normals(device=device, **known)
+    return Run(Normals(device=device, **known))
 
 
-def push(operation, frames, cuts, phase=PHASE):
+def push(run, frames, cuts, phase=PHASE):
     for block in blocks(frames, cuts, phase=phase):
-        push_block(operation, block)
+        run.push(block.frames, phase=block.phase)
 
 
 def same(one, other, maps=MAPS):
@@ -33,8 +32,8 @@ def same(one, other, maps=MAPS):
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_normals_are_bit_by_bit_those_of_the_windows_frames(device, dtype):
     frames, (offset, gain, noise) = turn_frames(SHAPE, dtype), SCALES[dtype]
-    operation = make(dtype, device, noise=noise)
-    push(operation, frames, [5, 1, 1, 9, 5])
+    run = make(dtype, device, noise=noise)
+    push(run, frames, [5, 1, 1, 9, 5])
     last = slice(-WINDOW, None)
     exact = estimate_normals(
         frames[last],
@@ -46,19 +45,19 @@ def test_normals_are_bit_by_bit_those_of_the_windows_frames(device, dtype):
         device=device,
     )
     assert np.mean(exact.contact) > 0.3
-    same(operation.result(), exact)
+    same(run.result(), exact)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_noise_and_tilt_are_those_of_the_first_full_window(dtype):
     frames, (offset, gain, _) = turn_frames(SHAPE, dtype), SCALES[dtype]
-    operation = make(dtype, tilt="estimate")
-    push(operation, frames, [21])
+    run = make(dtype, tilt="estimate")
+    push(run, frames, [21])
     first = slice(WINDOW)
     exact = estimate_normals(
         frames[first], PHASE[first], tilt="estimate", zenith_gain=gain, zenith_offset=offset
     )
-    normals = operation.result()
+    normals = run.result()
     assert normals.process["tilt"] == exact.process["tilt"]
     assert normals.process["shot_noise"] == exact.process["shot_noise"]
     assert normals.process["noise"] == pytest.approx(
@@ -69,27 +68,28 @@ def test_noise_and_tilt_are_those_of_the_first_full_window(dtype):
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_the_correlation_is_that_of_correlate(device, dtype):
     frames = turn_frames(SHAPE, dtype)
-    operation = make(dtype, device, noise=1.0)
-    correlate_window = Correlate(window_frames=WINDOW, device=device)
-    for block in blocks(frames, [4, 12, 5], phase=PHASE):
-        push_block(operation, block)
-        push_block(correlate_window, block)
-    operation.result()  # which has maps of its own
-    same(operation.window.correlation(), correlate_window.result(), MAPS[3:])
+    run = make(dtype, device, noise=1.0)
+    correlate_window = Run(Correlate(window_frames=WINDOW, device=device))
+    for one in (run, correlate_window):
+        push(one, frames, [4, 12, 5])
+    run.result()  # which has maps of its own
+    same(run.operation.window.correlation(), correlate_window.result(), MAPS[3:])
     if dtype != "float32":
         exact = correlate(frames[-WINDOW:], PHASE[-WINDOW:], device=device)
-        np.testing.assert_allclose(operation.window.correlation().cosine, exact.cosine, rtol=1e-4, atol=1e-2)
+        np.testing.assert_allclose(
+            run.operation.window.correlation().cosine, exact.cosine, rtol=1e-4, atol=1e-2
+        )
 
 
-def test_a_device_without_room_works_in_bands(small_device):
+def test_a_device_with_little_memory_works_in_bands(small_device):
     frames = turn_frames(SHAPE)
     exact = make(noise=1.3)
     push(exact, frames, [21])
     small_device.max_allocation = 3500
-    operation = make(device=small_device, noise=1.3)
-    push(operation, frames, [2, 19])
-    assert len(operation.window.bands) > 1
-    found = operation.result()
+    run = make(device=small_device, noise=1.3)
+    push(run, frames, [2, 19])
+    assert len(run.operation.window.bands) > 1
+    found = run.result()
     assert np.mean(np.isclose(found.normals, exact.result().normals, atol=1e-5, equal_nan=True)) > 0.99
     assert found.normals.shape == (*SHAPE[1:], 3)
 
@@ -98,11 +98,11 @@ def test_normals_with_ends_and_a_scale_of_each_pixel_go_round_the_ring_too():
     frames, (offset, gain, noise) = turn_frames(SHAPE), SCALES["uint8"]
     gains = gain * np.linspace(0.9, 1.1, SHAPE[2]) * np.ones(SHAPE[1:])
     known = {"noise": noise, "dark": offset + 4, "bright": offset + 150}
-    operation = make(zenith_gain=gains, **known)
-    push(operation, frames, [11, 10])
+    run = make(zenith_gain=gains, **known)
+    push(run, frames, [11, 10])
     last = slice(-WINDOW, None)
     same(
-        operation.result(),
+        run.result(),
         estimate_normals(
             frames[last], PHASE[last], tilt=TILT, zenith_gain=gains, zenith_offset=offset, **known
         ),
@@ -110,18 +110,18 @@ def test_normals_with_ends_and_a_scale_of_each_pixel_go_round_the_ring_too():
 
 
 def test_a_window_that_is_not_full_has_no_normals():
-    operation = make(noise=1.0)
-    push(operation, turn_frames(SHAPE)[:5], [5])
-    assert not operation.window.is_full
+    run = make(noise=1.0)
+    push(run, turn_frames(SHAPE)[:5], [5])
+    assert not run.operation.window.is_full
     with pytest.raises(InputError, match="not full"):
-        operation.result()
+        run.result()
 
 
 def test_phases_that_contain_no_information_are_refused():
-    operation = make(noise=1.0)
-    push(operation, turn_frames(SHAPE), [21], np.zeros(21))
+    run = make(noise=1.0)
+    push(run, turn_frames(SHAPE), [21], np.zeros(21))
     with pytest.raises(InputError, match="8 frames at 1 phase do not determine"):
-        operation.result()
+        run.result()
 
 
 @pytest.mark.parametrize("wrong", [2, 65])

@@ -1,7 +1,9 @@
 """Operations of users: NumPy's answer, for any source of frames and any division into blocks."""
 
+import inspect
 import re
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ from live_frames import PIXEL, paced, press_header
 from stacks import TRAVEL, MadeUp, random_stack, record, sphere
 
 from mirrorskin import engine, io
-from mirrorskin.engine.live import LiveOperation, Loop
+from mirrorskin.engine.live import LiveRun, Loop
+from mirrorskin.engine.options import Option
 
 FRAMES = random_stack("uint16", (8, 5, 7))
 HEADER = io.Header("vertical", pixel_size=(0.5, 0.6))
@@ -34,7 +37,7 @@ class Moments(engine.Operation):
         self.pushes.append(len(frames))
 
     def result(self):
-        return {"total": self.total, "moment": self.moment}
+        return {"total": self.total, "moment": self.moment, "longest": max(self.pushes)}
 
 
 def stack():
@@ -67,7 +70,7 @@ def test_a_recording_gives_the_same_bits_however_it_is_cut(tmp_path, whole, comp
     moments = Moments(memory_limit=2 * at_once * FRAME)
     with io.open_recording(tmp_path / "rec.h5") as recording:
         found = engine.run(recording, moments)
-    assert max(moments.pushes) == min(at_once, 8)
+    assert found.process["longest"] == min(at_once, 8)
     same(found, whole)
 
 
@@ -168,8 +171,8 @@ def test_live_updates_hold_the_heights_so_far_and_the_result_all_of_them():
             return {"height": self.moment, "contact": self.total > 0}
 
     source, updates = paced(FRAMES, press_header(), TRAVEL), []
-    live = LiveOperation(source, Heights())
-    live.warm()
+    live = LiveRun(source, Heights())
+    live.precompile()
     Loop(source, live, updates=1e3, on_update=lambda update, status: updates.append(update)).run()
     assert [update.frames for update in updates] == [*range(1, 9)]
     for update in updates:
@@ -177,6 +180,93 @@ def test_live_updates_hold_the_heights_so_far_and_the_result_all_of_them():
         np.testing.assert_array_equal(update.height, so_far.height)
         assert update.contact_area == pytest.approx(np.count_nonzero(so_far.contact) * PIXEL**2)
     np.testing.assert_array_equal(live.result().height, so_far.height)
+
+
+class Shown(Moments):
+    """An operation with a display of its own."""
+
+    optional_maps = ("gloss",)
+    gloss = io.Map("gloss of the surface", "1/mm", title="Gloss")
+    moment = io.Map("sum of frames times travel", "mm")
+    steps = io.Map("number of frames", axes="none", dtype="int64")
+
+    def preview(self, seconds):
+        return {"gloss": self.moment, "moment": self.total, "steps": self.count, "note": "so far"}
+
+    def result(self):
+        return {**super().result(), "steps": self.count}
+
+
+def updates_of(operation):
+    source, updates = paced(FRAMES, press_header(), TRAVEL), []
+    live = LiveRun(source, operation)
+    live.precompile()
+    Loop(source, live, updates=1e3, on_update=lambda update, status: updates.append(update)).run()
+    return updates
+
+
+def test_live_updates_hold_maps_of_any_name_with_their_declarations():
+    for update in updates_of(Shown()):
+        assert list(update.maps) == ["gloss", "moment", "steps"]
+        assert update.first == "gloss"
+        assert update.maps.declaration("gloss").unit == "1/mm"
+        assert update.maps.numbers() == {"steps": update.frames}
+        total = FRAMES[: update.frames].sum(axis=0).astype(np.float32)
+        np.testing.assert_array_equal(update.moment, total)  # later frames have not changed it
+        assert update.height is None
+        assert update.contact_area is None
+        with pytest.raises(AttributeError, match="the result has no map wear: it has gloss, moment, steps"):
+            _ = update.wear
+
+
+def test_without_a_preview_live_updates_hold_the_maps_of_the_result():
+    last = updates_of(Moments())[-1]
+    same(last.maps, engine.run(FRAMES, Moments, travel=TRAVEL))
+
+
+def test_a_preview_that_contradicts_a_declaration_is_refused():
+    class Odd(Shown):
+        def preview(self, seconds):
+            return {"gloss": np.zeros(3)}
+
+    with pytest.raises(
+        io.InputError, match=r"Odd.preview\(\): map gloss is float64 \(3,\): numbers \(5, 7\)"
+    ):
+        updates_of(Odd())
+
+
+def test_the_function_of_an_operation_has_its_name_docstring_positions_and_options():
+    class SumOfAll(Moments):
+        """Sum of all frames.
+
+        See `Moments`.
+        """
+
+        def push(self, frames, *, travel, pose=None):
+            super().push(frames, travel=travel)
+
+    sum_of_all = engine.function_of(SumOfAll)
+    assert sum_of_all.__name__ == "sum_of_all"
+    assert str(inspect.signature(sum_of_all)).startswith("(frames, travel, pose=None, *, factor=1.0, ")
+    assert sum_of_all.__doc__.startswith("Sum of all frames.\n\nSee `Moments`.\n\nParameters\n")
+    assert "pose : array_like, (T, 4), optional\n" in sum_of_all.__doc__
+    same(sum_of_all(FRAMES, TRAVEL), engine.run(FRAMES, Moments, travel=TRAVEL))
+    doubled = sum_of_all(FRAMES, TRAVEL, factor=2.0)
+    np.testing.assert_array_equal(doubled.moment, engine.run(FRAMES, Moments(factor=2), travel=TRAVEL).moment)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "line"),
+    [
+        (lambda: engine.function_of(Moments)(FRAMES), TypeError, "travel"),
+        (lambda: engine.function_of(Moments)(FRAMES, TRAVEL, factr=2), TypeError, "did you mean factor?"),
+        (lambda: engine.function_of(engine.Press), io.InputError, "Press is not a class of operations"),
+        (lambda: engine.function_of(Moments()), io.InputError, "Moments is not a class of operations"),
+    ],
+)
+def test_what_a_function_of_an_operation_cannot_use_is_refused(call, error, line):
+    with pytest.raises(error, match=re.escape(line)):
+        call()
 
 
 class Bare(engine.Operation):
@@ -244,7 +334,8 @@ def test_impossible_options_are_refused_in_a_line(options, line):
         (FRAMES, {"travel": TRAVEL[:7]}, r"travel has shape \(7,\) for 8 frames: give one of each frame"),
         (iter(FRAMES), {"travel": TRAVEL[:7]}, r"travel has shape \(7,\) for 8 frames or more: give one"),
         (iter(FRAMES), {"travel": [*TRAVEL, 1.0]}, r"travel has shape \(9,\) for 8 frames: give one"),
-        (FRAMES, {"travel": TRAVEL, "phase": TRAVEL}, "Moments does not take phase. It takes travel"),
+        (FRAMES, {"travel": TRAVEL, "phase": TRAVEL}, "Moments has no position phase: it has travel"),
+        (FRAMES, {"travl": TRAVEL}, r"Moments has no position travl: did you mean travel\?"),
         (FRAMES[0], {"travel": TRAVEL}, r"frames are uint16 \(5, 7\)"),
         (["text"], {"travel": TRAVEL}, "frames is a list: numbers are needed"),
         (iter([FRAMES[0], FRAMES[0, 1:]]), {"travel": TRAVEL}, r"frames are uint16 \(1, 4, 7\)"),
@@ -295,7 +386,7 @@ def test_two_passes_are_refused_by_what_is_read_once_and_live():
     with pytest.raises(io.InputError, match="can be read only once, but Twice needs all frames twice"):
         engine.run(source, Twice)
     with pytest.raises(io.InputError, match="Twice needs all frames twice, so it cannot run live"):
-        LiveOperation(paced(FRAMES, press_header(), TRAVEL), Twice())
+        LiveRun(paced(FRAMES, press_header(), TRAVEL), Twice())
 
 
 def test_live_what_an_operation_needs_is_checked_before_anything_moves():
@@ -304,7 +395,7 @@ def test_live_what_an_operation_needs_is_checked_before_anything_moves():
             pass
 
     with pytest.raises(io.InputError, match=r"Turned needs phase. While the body moves, .* has time, travel"):
-        LiveOperation(paced(FRAMES, press_header(), TRAVEL), Turned())
+        LiveRun(paced(FRAMES, press_header(), TRAVEL), Turned())
 
 
 def test_a_map_declared_in_the_class_is_written_with_its_unit_and_legend(tmp_path):
@@ -324,7 +415,7 @@ def test_a_map_declared_in_the_class_is_written_with_its_unit_and_legend(tmp_pat
 
 
 def test_what_result_returns_does_not_change_afterwards():
-    moments = Moments()
+    moments = engine.Run(Moments())
     moments.push(FRAMES[:3], travel=TRAVEL[:3])
     first = moments.result()
     kept = {name: values.copy() for name, values in first.items()}
@@ -334,7 +425,9 @@ def test_what_result_returns_does_not_change_afterwards():
 
 def declared(**attributes):
     """Return a class of operations with some attributes; annotations are those of numbers."""
-    body = {"push": lambda self, frames: None, "result": lambda self: {}, "__module__": __name__}
+    kinds = {name: float for name, value in attributes.items() if isinstance(value, Option)}
+    body = {"push": lambda self, frames: None, "result": lambda self: {}, "__annotations__": kinds}
+    body["__module__"] = __name__
     return type("Own", (engine.Operation,), body | attributes)
 
 
@@ -354,7 +447,10 @@ def number(default=1.0, **settings):
         (lambda: {"least": number(within=(5, 1))}, "least: no value is within 5 and 1"),
         (lambda: {"least": number(help=" ")}, "least has no help"),
         (lambda: {"least": number(unit="furlong")}, "least has the unit 'furlong'. Use one of share"),
-        (lambda: {"kind": number("c", choices=("a", "b"))}, "unknown kind 'c'. Use a or b"),
+        (
+            lambda: {"kind": number("c"), "__annotations__": {"kind": Literal["a", "b"]}},
+            "Own: unknown kind 'c'. Use a or b",
+        ),
         (lambda: {"passes": 3}, "passes is 3"),
         (lambda: {"motions": ("up",)}, r"motions is \('up',\). Use a tuple of vertical"),
         (lambda: {"motions": "vertical"}, "motions is 'vertical'. Use a tuple"),
@@ -376,21 +472,11 @@ def test_a_whole_number_as_the_default_of_a_float_is_a_number(annotation):
     assert own(level=2.5).level == 2.5
 
 
-def test_a_length_is_a_number_whatever_its_default():
-    assert declared(zero=number(0, unit="mm"))(zero=0.02).zero == 0.02
-
-
 def test_options_are_read_only():
     moments = Moments(factor=2)
     with pytest.raises(AttributeError, match="factor is an option of Moments, which is read-only"):
         moments.factor = 3
     assert moments.factor == 2
-
-
-def test_a_list_as_default_is_of_one_object_alone():
-    own = declared(shares=number([0.5], several=True))
-    own().shares.append(1.0)
-    assert own().shares == [0.5]
 
 
 def test_it_is_shown_with_the_options_that_are_given():

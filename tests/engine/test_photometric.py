@@ -97,13 +97,13 @@ def test_a_lamp_that_goes_round_is_the_correlation_of_a_rotation():
 
 
 def test_a_lamp_is_needed_for_each_frame_and_no_more():
-    stereo = PhotometricStereo(light=LAMPS)
-    stereo.push(FRAMES[:6])
-    assert np.isfinite(stereo.result().normals[INSIDE]).any()
+    run = engine.Run(PhotometricStereo(light=LAMPS))
+    run.push(FRAMES[:6])
+    assert np.isfinite(run.result().normals[INSIDE]).any()
     with pytest.raises(io.InputError, match="light has 8 vectors: one is needed for each of 6 frames"):
-        stereo.finish()
+        run.result(ended=True)
     with pytest.raises(io.InputError, match="light has 8 vectors: one is needed for each of 9 frames"):
-        stereo.push(FRAMES[:3])
+        run.push(FRAMES[:3])
 
 
 def test_the_dark_level_is_that_of_the_recording():
@@ -125,7 +125,7 @@ FRAMES = lit(LAMPS)
         ({"phase": AZIMUTH[:8]}, "specify the zenith"),
         ({"phase": AZIMUTH[:8], "zenith": 2.0}, "a number in rad from 0 to 1.5708 is needed"),
         ({"phase": AZIMUTH[:3], "zenith": 0.5}, "phase has shape (3,) for 8 frames"),
-        ({"phase": AZIMUTH[:8], "light": LAMPS}, "PhotometricStereo does not take phase"),
+        ({"phase": AZIMUTH[:8], "light": LAMPS}, "PhotometricStereo has no position phase"),
         ({"light": AZIMUTH[:8]}, "light has shape (8,): (T, 3) is needed"),
         ({"light": LAMPS[:3]}, "light has 3 vectors: one is needed for each of 8 frames"),
         ({"light": 0 * LAMPS}, "light has lengths 0 to 0"),

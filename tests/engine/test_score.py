@@ -7,7 +7,6 @@ from rotations import direction
 from mirrorskin import engine, io
 from mirrorskin.engine.summary import summarise
 from mirrorskin.io.maps import SlipStatus, status_of
-from mirrorskin.io.types import UNDISTORTED
 
 NAN = np.float32(np.nan)
 
@@ -298,7 +297,7 @@ def test_the_line_of_slip_has_the_counts_of_the_status_and_the_forces():
 
 
 def test_undistorted_maps_are_not_of_the_truth_s_pixels():
-    result = io.Result(height=np.zeros((2, 3), np.float32), process={UNDISTORTED: True})
+    result = io.Result(height=np.zeros((2, 3), np.float32), fitted=io.Fitted(undistorted=True))
     with pytest.raises(io.InputError, match="the result is undistorted"):
         engine.score(result, truth_of(np.zeros((2, 3), np.float32)))
 

@@ -198,6 +198,7 @@ def test_one_operation_gives_each_thread_what_one_thread_gets(name):
 
 
 @pytest.mark.parametrize("frames", [FRAMES, list(FRAMES)], ids=["an array", "frame by frame"])
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 def test_one_operation_gives_each_thread_what_one_thread_gets_of_arrays(frames):
     shared = engine.Onset(**LEVELS)
     inverse = 240 - FRAMES if isinstance(frames, np.ndarray) else list(240 - FRAMES)

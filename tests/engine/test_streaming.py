@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mirrorskin.engine import Operation
-from mirrorskin.engine.streaming import feed
+from mirrorskin.engine import Operation, Run
+from mirrorskin.engine.operation import Plan
 from mirrorskin.io import Block, Header, InputError
 
 
@@ -34,18 +34,31 @@ class Source:
 class Keeper(Operation):
     """Keeps the numbers of the frames that it receives."""
 
-    on_device = True
+    for_device = True
+    least_frames = 0
 
-    def __init__(self, device, room, fails=None, long=False):
+    def __init__(self, device, room, fails=None):
         super().__init__(device=device, memory_limit=2 * room * 3 * 5 * 2)
-        self.seen, self.fails, self.long_blocks = [], fails, long
+        self.seen, self.fails = [], fails
 
-    def push(self, frames, *, travel, lent=False):
+    def push(self, frames, *, travel):
         numbers = frames[:, 0, 0].tolist()
         if self.fails in numbers:
             raise InputError("no")
         assert np.allclose(travel, 0.1 * np.array(numbers))
         self.seen += numbers
+
+    def result(self):
+        return {"numbers": np.zeros(self.shape)}
+
+
+def feed(source, keeper, wanted, progress=None):
+    """Return the numbers of the frames that an operation receives."""
+    run = Run(Plan(keeper, frames=wanted, checked=False), source)
+    try:
+        run.complete(progress)
+    finally:
+        keeper.seen = run.operation.seen
 
 
 @pytest.mark.parametrize("room", [1, 3, 100])
@@ -69,10 +82,12 @@ def test_frames_that_a_source_lends_are_pushed_where_they_lie(device, longest):
             self.next = stop
             frames = np.broadcast_to(np.arange(start, stop, dtype="u2")[:, None, None], (stop - start, 3, 5))
             return (
-                Block(frames, start, travel=0.1 * np.arange(start, stop), lent=True) if len(frames) else None
+                Block(frames, start, travel=0.1 * np.arange(start, stop), stays_valid=True)
+                if len(frames)
+                else None
             )
 
-    keeper, told = Keeper(device, 1, long=True), []
+    keeper, told = Keeper(device, 1), []
     feed(Lender(10), keeper, range(2, 10), told.append)
     assert keeper.seen == list(range(2, 10))
     if device.info.shares_memory:

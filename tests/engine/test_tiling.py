@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from bare import bare, find_onset, ready
 from presses import LEVELS, SPEC, assert_equal, random_press
 
-from mirrorskin import engine
-from mirrorskin.engine import Onset, find_onset
+from mirrorskin.engine import Onset
+from mirrorskin.io import Block
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.array import BorrowedBuffer
 from mirrorskin.kernels.errors import DeviceError
@@ -16,62 +17,58 @@ LARGEST = 3 * 768 * 4  # three planes of frame numbers, 23 x 31 pixels in whole 
 SMALLEST = 3 * 64 * 4  # those of one row
 
 
-def ready(operation):
-    """Return an operation that is prepared for the frames."""
-    operation.begin(FRAMES.shape[1:], FRAMES.dtype)
-    return operation
-
-
 @pytest.mark.parametrize("limit", [LARGEST, LARGEST - 1, SMALLEST])
 def test_less_room_gives_the_same_answer(small_device, limit):
     whole = find_onset(FRAMES, TRAVEL, **LEVELS["uint8"], device=small_device)
     small_device.max_allocation = limit
-    search = ready(Onset(dark=20, bright=220, device=small_device))
+    search = ready(Onset(dark=20, bright=220, device=small_device), FRAMES, TRAVEL)
     for start in range(0, 30, 4):
         part = slice(start, start + 4)
         search.push(FRAMES[part], travel=TRAVEL[part])
     assert_equal(search.result(), whole)
     assert_equal(search.result(), whole)
-    assert (len(search._searches[0]._bands) > 1) == (limit < LARGEST)
+    assert (len(search.operation._picture.bands) > 1) == (limit < LARGEST)
 
 
 def test_the_room_shrinks_before_the_picture_is_cut_and_one_row_must_fit(small_device):
     small_device.max_allocation = 14 * 23 * 31
-    search = ready(Onset(device=small_device))
-    assert 1 <= len(search.room) <= 14
+    search = ready(Onset(device=small_device), FRAMES, TRAVEL)
+    assert 1 <= len(search.staging_buffer) <= 14
     small_device.max_allocation = SMALLEST - 1
     with pytest.raises(DeviceError, match="one row of 31 pixels does not fit"):
-        ready(Onset(device=small_device))
+        ready(Onset(device=small_device), FRAMES, TRAVEL)
 
 
 def test_bands_leave_the_device_to_each_other(small_device):
     small_device.max_allocation = SMALLEST
-    search = ready(Onset(dark=20, bright=220, device=small_device))
+    search = ready(Onset(dark=20, bright=220, device=small_device), FRAMES, TRAVEL)
     search.push(FRAMES, travel=TRAVEL)
     search.result()
-    arrays = [array for band in search._searches[0]._bands for array in (*band.maps.values(), *band._places)]
+    arrays = [
+        array for band in search.operation._picture.bands for array in (*band.maps.values(), *band._places)
+    ]
     on_device = [array._buffer is not None for array in arrays]
     assert all(on_device) if small_device.info.shares_memory else not any(on_device)
 
 
 def test_frames_in_the_room_are_not_copied(device):
-    search = ready(Onset(device=device))
-    search.room[:30] = FRAMES
-    band = search._searches[0]._bands[0]
-    (staged,) = band.stage(search.room[:30])
+    search = ready(Onset(device=device), FRAMES, TRAVEL)
+    search.staging_buffer[:30] = FRAMES
+    band = search.operation._picture.bands[0]
+    (staged,) = band.stage(search.staging_buffer[:30])
     assert staged.frames == slice(0, 30)
     if device.info.shares_memory:
-        assert np.shares_memory(staged.array.host, search.room)
-    search.push(search.room[:30:2], travel=TRAVEL[:15])
-    expected = engine.run(FRAMES[::2].copy(), engine.Onset(device=device), travel=TRAVEL[:15])
+        assert np.shares_memory(staged.array.host, search.staging_buffer)
+    search.push(search.staging_buffer[:30:2], travel=TRAVEL[:15])
+    expected = find_onset(FRAMES[::2].copy(), TRAVEL[:15], device=device)
     assert_equal(search.result(), expected)
 
 
 def test_the_room_of_a_picture_in_bands_holds_many_frames(small_device):
     small_device.max_allocation = SMALLEST
-    search = ready(Onset(dark=20, bright=220, device=small_device))
-    search.room[:30] = FRAMES
-    search.push(search.room[:30], travel=TRAVEL)
+    search = ready(Onset(dark=20, bright=220, device=small_device), FRAMES, TRAVEL)
+    search.staging_buffer[:30] = FRAMES
+    search.push(search.staging_buffer[:30], travel=TRAVEL)
     small_device.max_allocation = 10**9
     assert_equal(search.result(), find_onset(FRAMES, TRAVEL, dark=20, bright=220, device=small_device))
 
@@ -96,32 +93,29 @@ def test_lent_frames_give_the_same_answer_wherever_they_lie(device, dtype, size,
     placed = lent(frames, offset)
     dark, bright = SPEC[dtype]
     search = Onset(dark=dark, bright=bright, device=device, memory_limit=2 * frames.nbytes)
-    search.begin(size, dtype)
-    room = search.room.copy()
-    for part in (slice(0, 33), slice(33, 34), slice(34, 40)):
-        search.push(placed[part], travel=travel[part], lent=True)
-    assert_equal(search.result(), find_onset(frames, travel, **LEVELS[dtype], device=device))
-    np.testing.assert_array_equal(search.room, room)  # nothing was copied there
+    found = bare(search, placed, [33, 34], travel=travel)
+    assert_equal(found, find_onset(frames, travel, **LEVELS[dtype], device=device))
 
 
 def test_lent_frames_are_worked_on_where_they_lie(device):
     placed = lent(FRAMES, 128)
-    search = ready(Onset(device=device))
-    (staged,) = search._searches[0]._bands[0].stage(placed, lent=True)
+    search = ready(Onset(device=device), FRAMES, TRAVEL)
+    (staged,) = search.operation._picture.bands[0].stage(placed, stay_valid=True)
     in_place = isinstance(staged.array, BorrowedBuffer) and np.shares_memory(staged.array.host, placed)
     assert in_place == device.info.shares_memory
 
 
 def test_lent_frames_stay_until_their_kernels_are_done(device):
-    search = ready(Onset(dark=20, bright=220, device=device))
+    search = ready(Onset(dark=20, bright=220, device=device), FRAMES, TRAVEL)
     for start in range(0, 30, 3):
         part = slice(start, start + 3)
-        search.push(lent(FRAMES[part], 64), travel=TRAVEL[part], lent=True)
+        frames = lent(FRAMES[part], 64)
+        search.push_block(Block(frames, start, travel=TRAVEL[part], stays_valid=True))
     assert_equal(search.result(), find_onset(FRAMES, TRAVEL, dark=20, bright=220, device=device))
 
 
 def test_a_block_may_be_written_anew_after_it_was_pushed(device):
-    search = ready(Onset(dark=20, bright=220, device=device))
+    search = ready(Onset(dark=20, bright=220, device=device), FRAMES, TRAVEL)
     for start in range(0, 30, 3):
         part = slice(start, start + 3)
         block = FRAMES[part].copy()
@@ -138,6 +132,6 @@ def test_a_device_that_refuses_lent_memory_gets_copies(device, monkeypatch):
 
     borrow = device_layer.BorrowedBuffer
     monkeypatch.setattr(device_layer, "BorrowedBuffer", refuse)
-    search = ready(Onset(dark=20, bright=220, device=device))
-    search.push(lent(FRAMES, 64), travel=TRAVEL, lent=True)
+    search = ready(Onset(dark=20, bright=220, device=device), FRAMES, TRAVEL)
+    search.push_block(Block(lent(FRAMES, 64), 0, travel=TRAVEL, stays_valid=True))
     assert_equal(search.result(), find_onset(FRAMES, TRAVEL, dark=20, bright=220, device=device))

@@ -106,12 +106,12 @@ def test_answers_are_those_of_shared_memory(card, name):
 
 
 def test_maps_of_a_press_that_goes_on_are_copies(card):
-    operation = engine.Onset(**LEVELS, device=card)
-    operation.push(PRESS[:10], travel=TRAVEL[:10])
-    first = operation.result()
+    run = engine.Run(engine.Onset(**LEVELS, device=card))
+    run.push(PRESS[:10], travel=TRAVEL[:10])
+    first = run.result()
     before = {key: first[key].copy() for key in ("height", "status", "frame")}
-    operation.push(PRESS[10:], travel=TRAVEL[10:])
+    run.push(PRESS[10:], travel=TRAVEL[10:])
     whole = engine.find_onset(PRESS, TRAVEL, **LEVELS, device=card)
     for key, values in before.items():
         np.testing.assert_array_equal(first[key], values)
-        np.testing.assert_array_equal(operation.result()[key], whole[key])
+        np.testing.assert_array_equal(run.result()[key], whole[key])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine.undistort import picture_places, undistort
-from mirrorskin.io import InputError, Lens, Result, pixel_axes
+from mirrorskin.io import Fitted, InputError, Lens, Result, pixel_axes
 
 SIZES = [(1, 1), (1, 9), (7, 11), (33, 20)]
 BENT = (-0.12, 0.03, 0.002, -0.003, 0.0)
@@ -203,8 +203,8 @@ def test_a_part_of_the_picture_is_that_part_of_the_map(said):
     shape, top, left = (41, 57), 9, 15
     result = maps_of(shape).assign(component=None, contact=None)
     part = slice(top, 30), slice(left, 49)
-    process = {"source_region": f"{left},{top},34x21"} if said else {}
-    cut = result.assign({name: values[part] for name, values in result.maps().items()}, process=process)
+    fitted = Fitted(source_region=(top, top + 21, left, left + 34) if said else None)
+    cut = result.assign({name: values[part] for name, values in result.maps().items()}, fitted=fitted)
     whole = undistort(result, bent(shape))
     found = undistort(cut, bent(shape), None if said else (top, left))
     np.testing.assert_array_equal(found.x, whole.x[part[1]])

@@ -26,7 +26,7 @@ _COUNTS = (
     "modulation",
     "residual",
 )  # of a pixel's samples, which may be infinite themselves
-ELSEWHERE = {"reconstruct", "run", "option"}
+ELSEWHERE = {"reconstruct", "run", "option", "function_of"}
 """Public functions that take no arrays of numbers; other tests call them."""
 
 _ROW, _COLUMN = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)

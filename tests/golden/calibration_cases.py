@@ -29,8 +29,7 @@ from mirrorskin.engine.calibration import (
     fit_zenith,
     measure_references,
 )
-from mirrorskin.engine.live import LiveOperation
-from mirrorskin.engine.streaming import push_block
+from mirrorskin.engine.live import LiveRun
 from mirrorskin.engine.undistort import undistort
 
 
@@ -190,11 +189,11 @@ def undistort_maps() -> Answer:
 @case(FITTED, **RECONSTRUCTED)
 def live_press() -> Answer:
     source = press_source()
-    live = LiveOperation(source, engine.Press())
+    live = LiveRun(source, engine.Press())
     for block in blocks(
         source.frames, [1, 1, 3, 2, 7], time=0.01 * np.arange(24), travel=source.series["travel"]
     ):
-        push_block(live, block)
+        live.push_block(block)
         update = live.maps()
     answers = {"contact": update.get("contact"), "height": update.get("height")}
     return named(update=answers, result=result_maps(live.result()))
@@ -203,18 +202,18 @@ def live_press() -> Answer:
 @case(FITTED, **RECONSTRUCTED)
 def live_rotation() -> Answer:
     source = turn_source(3)
-    live = LiveOperation(source, engine.Rotation(window_frames=8, noise=20.0))
+    live = LiveRun(source, engine.Rotation(window_frames=8, noise=20.0))
     updates = {}
     series = {"time": 0.01 * np.arange(24), "phase": source.series["phase"]}
     for number, block in enumerate(blocks(source.frames, [1, 7, 1, 4, 8], **series)):
-        push_block(live, block)
+        live.push_block(block)
         update = live.maps()
         updates[f"update_{number}"] = {
             "normals": update.get("normals"),
             "height": update.get("height"),
             "contact": update.get("contact"),
         }
-        live.spare(0.0)
+        live.idle_work(0.0)
     known = {"result": result_maps(live.result())}
     return named(**{name: updates[name] for name in ("update_1", "update_5")}, **known)
 

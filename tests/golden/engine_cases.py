@@ -45,9 +45,8 @@ from mirrorskin.engine.metrology import fit_sphere as engine_fit_sphere
 from mirrorskin.engine.metrology import roughness as engine_roughness
 from mirrorskin.engine.metrology import section as engine_section
 from mirrorskin.engine.metrology import step_height as engine_step_height
-from mirrorskin.engine.operation import apply
+from mirrorskin.engine.operation import Plan
 from mirrorskin.engine.rotation.registration import Registered
-from mirrorskin.engine.streaming import push_block
 from mirrorskin.engine.summary import summarise as engine_summarise
 
 PROCESS = Tolerance(1e-3, 1e-6)  # numbers of solved heights
@@ -135,8 +134,9 @@ def find_onset_with_one_level_for_all() -> Answer:
     frames, travel = press("uint8", (48, 64), 24)
     dark, bright = LEVELS["uint8"]
     wide = engine.find_onset(frames, travel, dark=dark, bright=bright)
-    bright_only = apply(engine.Onset(bright=bright), frames, travel=travel)
-    return named(both=result_maps(wide), bright=result_maps(bright_only))
+    run = engine.Run(engine.Onset(bright=bright))
+    run.push(frames, travel=travel)
+    return named(both=result_maps(wide), bright=result_maps(run.result()))
 
 
 @case(**ONSET)
@@ -178,10 +178,10 @@ def find_onset_of_missing_samples() -> Answer:
 def find_onset_block_by_block() -> Answer:
     frames, travel = press("uint8")
     dark, bright = level_maps("uint8", frames.shape[1:])
-    search = engine.Onset(dark=dark, bright=bright)
+    run = engine.Run(engine.Onset(dark=dark, bright=bright))
     for block in blocks(frames, [1, 1, 3, 2, 7], travel=travel):
-        push_block(search, block)
-    return result_maps(search.result())
+        run.push(block.frames, travel=block.travel)
+    return result_maps(run.result())
 
 
 def change_of(dtype: str, **options: Any) -> Answer:
@@ -217,14 +217,10 @@ def find_change_point_of_a_release() -> Answer:
 @case(**ONSET)
 def find_change_point_block_by_block() -> Answer:
     frames, travel = press("uint16", seed=8)
-    search = engine.ChangePoint()
-    cut = blocks(frames, [2, 1, 6, 1], travel=travel)
-    for block in cut:
-        push_block(search, block)
-    search.next_pass()
-    for block in cut:
-        push_block(search, block)
-    return result_maps(search.result())
+    source = Source(frames, io.Header("vertical"), travel=travel)
+    search = engine.ChangePoint(memory_limit=8 * frames[0].nbytes)  # of four frames
+    found = engine.Run(Plan(search, checked=False), source).complete()
+    return result_maps(found.assign(process={"noise": found.process["noise"]}))
 
 
 @case(HEIGHT)
@@ -300,10 +296,10 @@ def correlate_block_by_block() -> Answer:
     answers = {}
     for dtype in LEVELS:
         frames, phase = long_turn(dtype)
-        operation = engine.Correlate()
+        run = engine.Run(engine.Correlate())
         for block in blocks(frames, [3, 1, 8, 5], phase=phase):
-            push_block(operation, block)
-        answers[dtype] = result_maps(operation.result())
+            run.push(block.frames, phase=block.phase)
+        answers[dtype] = result_maps(run.result())
     return named(**answers)
 
 
@@ -312,10 +308,10 @@ def correlate_a_sliding_window() -> Answer:
     answers = {}
     for dtype in LEVELS:
         frames, phase = long_turn(dtype)
-        operation = engine.Correlate(window_frames=10)
+        run = engine.Run(engine.Correlate(window_frames=10))
         for number, block in enumerate(blocks(frames, [4, 9, 1, 3], phase=phase)):
-            push_block(operation, block)
-            answers[f"{dtype}_{number}"] = result_maps(operation.result())
+            run.push(block.frames, phase=block.phase)
+            answers[f"{dtype}_{number}"] = result_maps(run.result())
     return named(**answers)
 
 
@@ -421,10 +417,11 @@ def estimate_normals_block_by_block() -> Answer:
     frames, phase = long_turn("uint16")
     answers = {}
     for per_turn in (False, True):
-        operation = engine.Normals(tilt=TILT, zenith_gain=3400.0, zenith_offset=150.0, per_turn=per_turn)
+        normals = engine.Normals(tilt=TILT, zenith_gain=3400.0, zenith_offset=150.0, per_turn=per_turn)
+        run = engine.Run(normals)
         for block in blocks(frames, [5, 1, 9, 3], phase=phase):
-            push_block(operation, block)
-        answers["each" if per_turn else "mean"] = result_maps(operation.result())
+            run.push(block.frames, phase=block.phase)
+        answers["each" if per_turn else "mean"] = result_maps(run.result())
     return named(**answers)
 
 

@@ -11,6 +11,7 @@ from moved_surfaces import bumpy, rod, sampled
 from scenes import LEVELS, PIXEL, counted, dome, places
 from speckle import Speckle
 
+from mirrorskin import engine
 from mirrorskin.engine import force, pose, press, rotation, slip
 
 MOVED = Tolerance(1e-3, 1e-5)  # mm: a thousandth of a pixel, where Gauss-Newton steps end
@@ -39,10 +40,10 @@ def stroke_search() -> Answer:
         dark, bright = LEVELS[dtype]
         found = {}
         for event in ("onset", "release"):
-            search = press.Strokes(event=event, dark=dark, bright=bright)
+            run = engine.Run(press.Strokes(event=event, dark=dark, bright=bright))
             for part in np.split(np.arange(len(frames)), [1, 17, 30]):
-                search.push(frames[part], travel=travel[part])
-            found[event] = search.result()
+                run.push(frames[part], travel=travel[part])
+            found[event] = run.result()
         onset, release = found["onset"], found["release"]
         answers[dtype] = {
             "onset": onset.height,
@@ -111,10 +112,10 @@ def normals_of_poses() -> Answer:
         for name, (direction, tilt) in ways.items():
             frames, axis, gain, offset = leaning(direction, tilt, dtype)
             options = {"zenith_gain": gain, "zenith_offset": offset, "noise": gain / 200}
-            operation = rotation.MovingNormals(**options)
+            run = engine.Run(rotation.MovingNormals(**options))
             for part in np.split(np.arange(20), [3, 11]):
-                operation.push(frames[part], pose=axis[part])
-            found = operation.result()
+                run.push(frames[part], pose=axis[part])
+            found = run.result()
             whole = {"vectors": found.normals, "sigma": found.normals_sigma} if name == "whole" else {}
             direction = found.process.get("slope_direction")
             rocked = {"slope": found.slope, "slope_sigma": found.slope_sigma, "direction": direction}
@@ -170,10 +171,10 @@ def slip_search() -> Answer:
     x, y = np.meshgrid(np.arange(72) - 36, np.arange(64) - 32)
     contact = np.hypot(x, y) < 26
     for motion, position in (("horizontal", "displacement"), ("twist", "twist")):
-        search = slip.Slip(pixel_size=PIXEL, motion=motion, contact=contact)
+        run = engine.Run(slip.Slip(pixel_size=PIXEL, motion=motion, contact=contact))
         for k in range(12):
-            search.push(slipping(motion, k)[None], **{position: places_of(motion, k)})
-        found = search.result()
+            run.push(slipping(motion, k)[None], **{position: places_of(motion, k)})
+        found = run.result()
         told = {
             "displacement": found.displacement[::3, ::3],
             "sigma": found.displacement_sigma[::3, ::3],

@@ -1,10 +1,12 @@
 """The stage of docs/stages.md moves a rig with a fake controller, and stops on faults."""
 
 import builtins
+import contextlib
 import re
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from commands import run
@@ -14,7 +16,7 @@ from simulated import on_clock, write_film_rig
 from mirrorskin import io
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
-from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.rig.rig import Rig, open_stage
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
 from mirrorskin.hw.rig_file import StageSettings, TravelAxis
@@ -121,6 +123,14 @@ def test_what_it_cannot_do_is_refused_before_it_moves(lab):
     assert line.way[1][1] == -1.0
 
 
+def test_settings_take_the_class_itself(lab):
+    kind = type(lab[0])
+    with contextlib.closing(open_stage(msgspec.structs.replace(STAGE, firmware=kind))) as stage:
+        assert isinstance(stage, kind)
+    with pytest.raises(io.InputError, match=r"^Controller has no name, no limits"):
+        open_stage(msgspec.structs.replace(STAGE, firmware=Controller))
+
+
 def test_silence_stops_it(lab):
     stage, line = lab
     stage.move(Position(1.0), 0.5)
@@ -218,7 +228,7 @@ def test_commands_move_it_from_a_rig_file(folder):
             "my_stage.py:LabStage has no home: mirrorskin.hw.stage.Stage",
         ),
         ("unlock", ("", ""), "only GRBL can be unlocked"),
-        ("lift", (":LabStage", ":NoStage"), "there is no class NoStage"),
+        ("lift", (":LabStage", ":NoStage"), "has no class NoStage"),
         ("lift", ("my_stage:", "no_stage:"), "there is no no_stage in"),
         ("lift", ("my_stage:LabStage", "collections:namedtuple"), "namedtuple(settings) failed"),
         ("lift", ("my_stage:LabStage", "copy:copy"), "copy:copy has no name, no error"),

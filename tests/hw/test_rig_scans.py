@@ -72,7 +72,7 @@ def test_each_frame_of_steps_shows_its_stated_position():
     np.testing.assert_array_equal(scan.positions()["travel"], travel)
     assert max(len(block.frames) for block in blocks) <= 2
     assert [block.index for block in blocks] == list(np.cumsum([0, *(len(b.frames) for b in blocks)])[:-1])
-    assert all(block.lent and block.dropped == 0 for block in blocks)
+    assert all(block.stays_valid and block.dropped == 0 for block in blocks)
     assert scan.count == 10
 
 

@@ -5,10 +5,12 @@ import time
 
 import numpy as np
 import pytest
+from bare import bare, ready
 
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.hw.errors import HardwareError
 from mirrorskin.hw.ring import MEMORY, Ring, usual_slots
+from mirrorskin.io import Block
 
 SHAPE = (5, 7)
 SOON = 20.0  # seconds, that nothing here takes
@@ -193,10 +195,9 @@ def test_a_device_works_in_the_ring_while_the_camera_goes_on(device) -> None:
     frames = np.random.default_rng(5).integers(0, 60, (count, *shape)).astype(np.uint8)
     frames[17:, 2:7, 3:11] += 150
     travel = np.linspace(0.0, 2.0, count)
-    whole = Onset(device=device)
-    whole.push(frames, travel=travel)
+    whole = bare(Onset(device=device), frames, travel=travel)
     ring = Ring(shape, np.uint8, 6)
-    search = Onset(device=device)
+    search = ready(Onset(device=device), frames, travel)
     sent = done = 0
     for stop in range(2, count + 1, 2):
         while sent < stop:
@@ -206,11 +207,11 @@ def test_a_device_works_in_the_ring_while_the_camera_goes_on(device) -> None:
         while done < stop:
             taken = ring.take(2, SOON)
             part = slice(done, done + len(taken.pixels))
-            search.push(taken.pixels, travel=travel[part], lent=True)
+            search.push_block(Block(taken.pixels, done, travel=travel[part], stays_valid=True))
             done = part.stop
             ring.slot()[...] = 255  # a kernel that is still at work must not see it
     for name in ("height", "status", "frame"):
-        np.testing.assert_array_equal(getattr(search.result(), name), getattr(whole.result(), name))
+        np.testing.assert_array_equal(getattr(search.result(), name), getattr(whole, name))
 
 
 def test_the_usual_ring_fills_its_memory_or_holds_half_a_second() -> None:

@@ -95,9 +95,9 @@ def test_attributes_are_maps():
 
 def test_an_attribute_that_is_not_a_map_is_an_error_that_lists_the_maps():
     result = io.Result(height=FLAT, wear=FLAT)
-    with pytest.raises(AttributeError, match=r"^the result has no map 'heigth': it has height, wear$"):
+    with pytest.raises(AttributeError, match=r"^the result has no map heigth: did you mean height\?$"):
         _ = result.heigth
-    with pytest.raises(AttributeError, match="it has no maps"):
+    with pytest.raises(AttributeError, match="it has none"):
         _ = io.Result().heigth
     with pytest.raises(KeyError, match="normals"):
         result["normals"]

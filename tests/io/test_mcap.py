@@ -459,6 +459,6 @@ def test_a_chunk_that_unpacks_to_more_than_it_states_is_refused(tmp_path, compre
 
 
 def test_a_chunk_that_states_gigabytes_is_refused(film, monkeypatch):
-    monkeypatch.setattr("mirrorskin.io.os_errors.check_unpacked.__defaults__", (100,))
+    monkeypatch.setattr("mirrorskin.io.system.check_unpacked.__defaults__", (100,))
     with pytest.raises(io.InputError, match=r"a chunk takes \d+ bytes of memory"):
         frames_of(film(("/a", np.zeros((20, 30), np.uint8))))

@@ -70,6 +70,22 @@ def test_a_dataset_becomes_the_result_again(result):
     assert back.numbers() == result.numbers()
 
 
+def test_what_is_known_of_maps_is_an_attribute_of_the_dataset(result):
+    known = io.Fitted(
+        tilt=0.05, registered=True, event="onset", height_correlation=np.inf, source_region=(1, 4, 2, 6)
+    )
+    dataset = result.assign(fitted=known).to_xarray()
+    assert io.Result.from_xarray(dataset).fitted == known
+    dataset.attrs["fitted"] = '{"tilt": "steep", "source_region": [4, 1, 2, 6], "turns": 3}'
+    assert io.Result.from_xarray(dataset).fitted == io.Fitted(turns=3)
+    dataset.attrs["fitted"] = "tilt=3"
+    with pytest.raises(io.InputError, match="attribute fitted is no JSON text"):
+        io.Result.from_xarray(dataset)
+    del dataset.attrs["fitted"]
+    dataset.attrs["travel"] = 0.5  # of another program
+    assert io.Result.from_xarray(dataset).fitted == io.Fitted(travel=0.5)
+
+
 def test_a_map_is_drawn_where_its_pixels_are(result):
     axes = result.plot("height")
     (image,) = axes.images
@@ -82,15 +98,18 @@ def test_a_map_is_drawn_where_its_pixels_are(result):
 
 
 def test_what_is_not_a_picture_is_not_drawn(result):
-    with pytest.raises(io.InputError, match=r"there is no map 'depth' to draw: choose from height"):
+    with pytest.raises(io.InputError, match=r"the result has no picture depth: it has height"):
         result.plot("depth")
 
 
 def test_what_functions_return_shows_itself_in_a_few_lines():
     frames = np.zeros((5, 30, 40), np.uint8)
-    frames[3:] = 255
-    onset = engine.find_onset(frames, [0.0, 0.1, 0.2, 0.3, 0.4], dark=0, bright=255)
-    assert repr(onset).splitlines()[:2] == ["Result", "  height        30 x 40         -0.25 to -0.25 mm"]
+    frames[3:] = 250
+    onset = engine.find_onset(frames, [0.0, 0.1, 0.2, 0.3, 0.4], dark=0, bright=250)
+    assert repr(onset).splitlines()[:2] == [
+        "Result of find_onset",
+        "  height        30 x 40         -0.25 to -0.25 mm",
+    ]
     assert "<img" in onset._repr_html_()
     assert onset.plot().get_xlabel() == "column"
     surface = engine.integrate(np.zeros((8, 9)), np.zeros((8, 9)), 0.1)

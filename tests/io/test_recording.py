@@ -133,7 +133,7 @@ def test_frames_are_read_into_the_given_array(tmp_path, packing):
     with io.open_recording(path) as recording:
         block = recording.read(room[:3])
         assert np.shares_memory(block.frames, room)
-        assert not block.lent
+        assert not block.stays_valid
         np.testing.assert_array_equal(block.frames, frames[:3])
         assert (room[3:] == 255).all()
 

@@ -13,7 +13,16 @@ from mirrorskin import io
 from mirrorskin.io.maps import declaration_of
 
 PROCESS = {"program": "mirrorskin", "threshold": 0.5, "hold": 2, "subframe": True, "source": "Münze 五円.h5"}
-
+KNOWN = io.Fitted(
+    tilt=0.05,
+    turns=2,
+    registered=False,
+    undistorted=True,
+    event="release",
+    height_correlation=np.inf,
+    source_frames=(0, 8),
+    source_region=(1, 6, 2, 9),
+)
 
 PLACES = dict(zip("xy", io.pixel_axes((5, 7), (0.5, 0.6)), strict=True))
 FLOATS = ("zenith", "azimuth", "normals_sigma", "mean", "cosine", "sine", "modulation", "residual")
@@ -77,7 +86,14 @@ def test_a_result_has_the_layout_of_the_design(path):
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"height_sigma": None, "status": None}, {"x": None, "y": None}, {"process": {}}]
+    "changes",
+    [
+        {},
+        {"height_sigma": None, "status": None},
+        {"x": None, "y": None},
+        {"process": {}},
+        {"fitted": KNOWN, "process": {}},
+    ],
 )
 def test_a_result_comes_back_as_it_was(path, changes):
     result = a_press(**changes)
@@ -225,10 +241,14 @@ def test_what_is_not_a_result_is_refused(tmp_path, path):
         ("result/offset_unknown", np.zeros(3), r"has shape \(3,\) where \(2,\) is needed: reconstruct"),
         ("result/component", np.zeros(2), r"component has shape \(2,\) where \(5, 7\) is needed"),
         ("process/hold", [1, 2], "/entry/process/hold does not hold one value"),
+        ("fitted/tilt", "steep", "/entry/fitted/tilt contains no numbers: reconstruct it again"),
+        ("fitted/turns", np.nan, "/entry/fitted/turns is .nan,., where whole numbers are needed: recons"),
+        ("fitted/event", np.ones(2), "/entry/fitted/event does not hold one value"),
+        ("fitted/source_region", [3, 1, 0, 7], r"source_region is \(3, 1, 0, 7\), which is invalid: reco"),
     ],
 )
 def test_a_damaged_result_is_one_line(path, name, value, line):
-    io.save_result(a_press(**pieces(5, 7)), path)
+    io.save_result(a_press(**pieces(5, 7), fitted=KNOWN), path)
     with h5py.File(path, "r+") as file:
         del file[f"entry/{name}"]
         if value is not None:
@@ -238,6 +258,19 @@ def test_a_damaged_result_is_one_line(path, name, value, line):
             read(path)
         assert str(caught.value).startswith(str(path))
         assert "\n" not in str(caught.value)
+
+
+def test_what_is_known_of_maps_is_stored_with_its_unit(path):
+    io.save_result(a_press(fitted=KNOWN), path)
+    with h5py.File(path) as file:
+        fitted = file["entry/fitted"]
+        assert set(fitted) == set(KNOWN.values())
+        assert dict(fitted["tilt"].attrs) == {"units": "rad"}
+        assert (fitted["event"].asstr()[()], fitted["turns"].dtype, fitted["turns"][()]) == (
+            "release",
+            "i8",
+            2,
+        )
 
 
 def test_a_number_in_place_of_a_series_is_refused(path):

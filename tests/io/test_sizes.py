@@ -21,7 +21,7 @@ from numcodecs import blosc
 from PIL import Image as pil  # noqa: N813
 
 from mirrorskin import io
-from mirrorskin.io import os_errors
+from mirrorskin.io import system
 from mirrorskin.io.arrays import ArrayRecording, read_array, read_map
 from mirrorskin.io.hdf5 import Hdf5File
 from mirrorskin.io.pictures import decode_bytes, read_picture
@@ -185,7 +185,7 @@ def test_a_folder_of_pictures_that_decoders_cannot_hold_is_refused(tmp_path):
 
 def test_a_map_is_refused_if_its_float32_copy_is_too_large(tmp_path, monkeypatch):
     cv2.imwrite(str(tmp_path / "dark.png"), np.zeros((300, 300), np.uint8))
-    monkeypatch.setattr("mirrorskin.io.os_errors.check_unpacked.__defaults__", (4 * 90_000,))
+    monkeypatch.setattr("mirrorskin.io.system.check_unpacked.__defaults__", (4 * 90_000,))
     with pytest.raises(io.InputError, match=r"dark\.png, as float32, takes 450000 bytes of memory"):
         read_map(tmp_path / "dark.png")
 
@@ -198,7 +198,7 @@ from pathlib import Path
 import cv2, av, mcap.stream_reader, mcap_ros2.decoder, tifffile
 import numpy as np
 from mirrorskin import io
-from mirrorskin.io import arrays, mcap, opencv, os_errors, video
+from mirrorskin.io import arrays, mcap, opencv, system, video
 
 def status(name):
     lines = Path("/proc/self/status").read_text().splitlines()
@@ -295,7 +295,7 @@ def test_the_size_that_is_checked_covers_all_memory_that_is_taken(tmp_path, writ
 
 
 def test_the_limit_is_what_the_documentation_states():
-    assert os_errors.MAX_UNPACKED_BYTES == 1 << 30
+    assert system.MAX_UNPACKED_BYTES == 1 << 30
 
 
 HEAD = struct.pack(">IIBBBBB", 16, 16, 8, 0, 0, 0, 0)

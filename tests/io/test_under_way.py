@@ -210,7 +210,7 @@ def test_a_live_run_is_reconstructed_again_from_its_recording(tmp_path):
             if block is None:
                 return None
             part = slice(block.index, block.index + len(block.frames))
-            return io.Block(frames[part], block.index, block.time, travel=travel[part], lent=True)
+            return io.Block(frames[part], block.index, block.time, travel=travel[part], stays_valid=True)
 
         def positions(self):
             return {"travel": travel + 0.05}

@@ -14,7 +14,7 @@ def test_the_triangle_holds_the_normal_equations():
     triangle = np.zeros((11, PIXELS))
     for first in (0, 4):
         part = slice(first, first + 5 if first else 4)
-        lambert_add(FRAMES[part], LIGHTS[part], first == 0, np.array([3.0]), 10.0, 255.0, triangle)
+        lambert_add(FRAMES[part], LIGHTS[part], np.array([3.0]), 10.0, 255.0, triangle)
     upper = np.zeros((4, 4))
     upper[np.triu_indices(4)] = triangle[:10, 7]
     upper[3, 3] **= 0.5

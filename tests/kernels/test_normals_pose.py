@@ -59,8 +59,9 @@ def test_kernel_and_reference_agree(device, name, dtype, pressed):
     operation = engine.rotation.MovingNormals(
         zenith_gain=GAINS[dtype], zenith_offset=OFFSET, noise=NOISE, device=device
     )
-    operation.push(frames[:, np.newaxis], pose=pose, frame_weights=weights)
-    found, expected = operation.result(), reference(frames, pose, weights, GAINS[dtype])
+    run = engine.Run(operation)
+    run.push(frames[:, np.newaxis], pose=pose, frame_weights=weights)
+    found, expected = run.result(), reference(frames, pose, weights, GAINS[dtype])
     if name == "spiral":
         close = np.linalg.norm(found.normals[0] - expected.vectors, axis=1) < DEVIATIONS * expected.sigma
         sigma, known = found.normals_sigma[0], expected.sigma

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
+import rotations
 import walls
 from scipy import optimize
 from walls import PHASE, TILT, facing, light_of
 
-from mirrorskin.engine import estimate_normals
 from mirrorskin.engine.rotation.design_matrix import fit_matrix
 from mirrorskin.engine.rotation.response import make_response
 from mirrorskin.kernels.normals import Variance, contact_limits
@@ -143,7 +143,7 @@ def test_kernel_and_reference_agree(device, case):
     expected = scene.answer(frames, noise, weights)
     stack = frames.reshape(-1, *shape)
     known = {"response": scene.response, "noise": noise, "frame_weights": weights, "device": device}
-    found = estimate_normals(stack, scene.phase, tilt=TILT, **known)
+    found = rotations.estimate(stack, scene.phase, tilt=TILT, **known)
     told = np.isfinite(found.normals_sigma.ravel())
     # A sample at the very end of the wall may fall on either side.
     assert np.mean(told != np.isfinite(expected.sigma)) <= 0.01

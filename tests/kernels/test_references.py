@@ -366,6 +366,8 @@ def _(bits):  # counts end where the bits do
 
 # --- Focus and lamps
 
+WHOLE_ROWS = {"shape": (11, 130), "stride": 11 * 130}
+
 
 @case("focus_scan", DTYPES | {"radius": (1, 3), "reach": (1, 2), "first": (0, 4)}, rtol=2e-5)
 def _(dtype, radius, reach, first):
@@ -375,7 +377,7 @@ def _(dtype, radius, reach, first):
     state = np.zeros((11, 130), np.int32), np.zeros((2 * reach + 1, 11, 130)), np.zeros((reach, 11, 130))
     if first:
         focus.focus_scan(frames[:first], 0, radius, reach, *state)
-    known = {"frames": frames[first:], "first": first, "radius": radius, "reach": reach, "shape": (11, 130)}
+    known = {"frames": frames[first:], "first": first, "radius": radius, "reach": reach, **WHOLE_ROWS}
     return known | named("best peak recent", *state)
 
 
@@ -412,7 +414,7 @@ def _(reach, variance):
     arrays = named("places travel best peak", places, travel, best, peak)
     arrays |= {name: np.zeros(size) for name in ("height", "spread", "gain", "misfit", "sharpness")}
     numbers = named("radius least_contrast least_curvature unit count", 2, 5.0, 3.0, 0.02, 12)
-    arrays |= {"status": np.zeros(size, np.uint8), "shape": size, "macros": {"FRAME": "uchar"}}
+    arrays |= {"status": np.zeros(size, np.uint8), "macros": {"FRAME": "uchar"}, **WHOLE_ROWS}
     return arrays | numbers | {"reach": reach, "variance": variance}
 
 
@@ -422,18 +424,18 @@ def triangles(found, wanted, values):
     np.testing.assert_array_equal(found[10], wanted[10])
 
 
-@case("lambert_add", DTYPES | {"dark_step": (0, 1)}, checks={"triangle": triangles})
-def _(dtype, dark_step):
+@case("lambert_add", DTYPES, checks={"triangle": triangles})
+def _(dtype):
     rng, pixels = np.random.default_rng(0), 1100
     frames = (rng.integers(0, 256, (9, pixels)) * (200 if dtype == "uint16" else 1)).astype(dtype)
     if dtype == "float32":
         frames[3, 8] = np.nan
-    darks = rng.uniform(0, 9, pixels if dark_step else 1).astype(np.float32)
+    darks = rng.uniform(0, 9, pixels).astype(np.float32)
     known = {"darks": darks, "shadow": 10.0, "bright": float(frames[0].max())}
     triangle, lights = np.zeros((11, pixels)), rng.normal(size=(9, 3))
-    lambert.lambert_add(frames[:2], lights[:2], True, **known, triangle=triangle)
-    known |= {"frames": frames[2:], "lights": lights[2:], "fresh": 0, "triangle": triangle}
-    return known | {"dark_step": dark_step, "shape": (1, pixels)}
+    lambert.lambert_add(frames[:2], lights[:2], **known, triangle=triangle)
+    known |= {"frames": frames[2:], "lights": lights[2:], "triangle": triangle}
+    return known | {"shape": (1, pixels), "stride": pixels}
 
 
 def solved(found, wanted, values):
@@ -451,11 +453,11 @@ def _():
     lit = (rng.random((9, pixels)) < 0.85) & (np.arange(pixels) % 7 > np.arange(9)[:, None] - 5)
     frames = np.where(lit, lights @ normals * 50 + 300 + rng.normal(size=lit.shape), 0)
     triangle = np.zeros((11, pixels))
-    lambert.lambert_add(frames, lights, True, np.array([0.0]), 10.0, 1e6, triangle)
+    lambert.lambert_add(frames, lights, np.array([0.0]), 10.0, 1e6, triangle)
     triangle[:, 0], triangle[7, 1] = 0, 0  # without any lamp, and with two
     answers = {name: np.zeros(pixels) for name in SOLVED} | {"normals": np.zeros((pixels, 3))}
     answers |= {"samples": np.zeros(pixels, np.int32), "triangle": triangle}
-    return answers | {"shape": (1, pixels), "macros": {"FRAME": "uchar"}}
+    return answers | {"shape": (1, pixels), "stride": pixels, "macros": {"FRAME": "uchar"}}
 
 
 # --- Slopes and samples of arrays on a device
@@ -475,11 +477,15 @@ def _(shape):
     return {"weight": weight, "least": 0.5, "most": 3.0, "shape": shape}
 
 
-@case("samples_take", DTYPES, per=lambda _, values: values["lines"] * values["count"])
+@case(
+    "samples_take", DTYPES, per=lambda _, values: math.prod(values[one] for one in ("lines", "rows", "count"))
+)
 def _(dtype):
     values = np.random.default_rng(0).normal(100, 20, (40, 50)).astype(dtype)
     macros = {"VALUE": C_TYPES[dtype]}
-    return {"values": values, "macros": macros} | named("lines count first apart step", 13, 12, 52, 150, 4)
+    return {"values": values, "macros": macros} | named(
+        "lines rows count first apart down step", 5, 3, 12, 52, 400, 100, 4
+    )
 
 
 # --- Limits of memory and arithmetic

@@ -30,8 +30,7 @@ from suite.scenes import (
 )
 
 from mirrorskin import engine
-from mirrorskin.engine.live import LiveOperation
-from mirrorskin.engine.streaming import push_block
+from mirrorskin.engine.live import LiveRun
 from mirrorskin.io import Block, Header, pixel_axes
 from mirrorskin.kernels.device import Device
 
@@ -206,12 +205,13 @@ def live_press(device: Device) -> Call:
         "vertical", pixel_size=(PIXEL, PIXEL), **dict(zip(("dark", "bright"), levels, strict=True))
     )
     source: Any = Memory(header, frames.shape)
-    live = LiveOperation(source, engine.Press(device=device))
+    live = LiveRun(source, engine.Press(device=device))
     numbers = iter(range(count))
 
     def push() -> object:
         n = next(numbers)
-        push_block(live, Block(frames[n : n + 1], n, time=np.array([n / 100]), travel=np.array([0.01 * n])))
+        block = Block(frames[n : n + 1], n, time=np.array([n / 100]), travel=np.array([0.01 * n]))
+        live.push_block(block)
         return live.maps()
 
     return push
@@ -226,13 +226,13 @@ def live_rotation(device: Device) -> Call:
         "axial", pixel_size=(PIXEL, PIXEL), tilt=TILT, press=1.0, zenith_gain=gain, zenith_offset=offset
     )
     source: Any = Memory(header, (256, *VGA))
-    live = LiveOperation(source, engine.Rotation(window_frames=8, device=device))
+    live = LiveRun(source, engine.Rotation(window_frames=8, device=device))
     numbers = iter(range(256))
 
     def push() -> object:
         n = next(numbers)
         phase = np.array([2 * np.pi / 8 * n])
-        push_block(live, Block(frames[n % 8][np.newaxis], n, time=np.array([n / 66]), phase=phase))
+        live.push_block(Block(frames[n % 8][np.newaxis], n, time=np.array([n / 66]), phase=phase))
         return live.maps()
 
     for _ in range(16):  # a full window, and the first heights

@@ -37,6 +37,7 @@ By `make gpu-check`, on a device that is treated as a GPU with memory of its own
 with arrays on the host is made again. A small launch has fewer than {FEW} work-items. The time is predicted
 by a model: a launch {1e6 * LAUNCH:g} µs, a wait {1e6 * WAIT:g} µs, copies {BUS / 1e9:g} GB/s, memory
 {MEMORY / 1e12:g} TB/s, and {1e6 * ACCESS:g} µs for each {WORD} bytes that one work-item reads or writes.
+Maps stay on the device with frames that are there, except for copies of those that checks look at.
 
 | call | {" | ".join(COUNTS)} | predicted, ms | longest kernels, predicted ms |
 |---{"|---" * (len(COUNTS) + 2)}|

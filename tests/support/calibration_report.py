@@ -23,10 +23,7 @@ from calibration_scorer import Judge, Score, Surface
 from mirrorskin import engine, io
 from mirrorskin.engine.calibration import brightness, gel, references, tilt, tilt_tracks, wall
 from mirrorskin.engine.calibration.gel import ball_onset
-from mirrorskin.engine.method import Context
 from mirrorskin.engine.rotation.rotation import Rotation
-from mirrorskin.engine.rotation.steps import RegistrationErrors
-from mirrorskin.engine.streaming import feed
 
 APART = 3.9  # mm between the calibration's balls
 REACH = 10.0  # mm, that held-out objects go from the middle
@@ -100,9 +97,7 @@ def normals_of(frames: Frames, calibration: io.Calibration, **options: Any) -> i
     frames.rewind()
     source = io.Calibrated(frames, calibration)
     plan = Rotation(**options).plan(source)
-    stream = plan.stream or source
-    feed(stream, plan.operation, plan.frames)
-    return RegistrationErrors().apply(plan.operation.finish(), Context(source, plan.operation, stream))
+    return engine.Run(replace(plan, steps=[]), source).complete()
 
 
 def field_scores(

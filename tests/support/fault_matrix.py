@@ -218,6 +218,7 @@ def _opened(frames: Any, positions: dict[str, Any], header: dict[str, Any], faul
     return source
 
 
+@functools.cache
 def _press(surface: Surface, step: float, fault: Fault, seed: int) -> ArrayRecording:
     travel = np.arange(0.2, 1.1, step)
     frames = record(_touched(surface), travel, fault, seed)
@@ -235,6 +236,7 @@ def _press(surface: Surface, step: float, fault: Fault, seed: int) -> ArrayRecor
     return source
 
 
+@functools.cache
 def _turn(surface: Surface, fault: Fault, seed: int, count: int = 16) -> ArrayRecording:
     phase = np.arange(count) * 2 * np.pi / count
     frames = record(_leaning(surface), phase, fault, seed)
@@ -249,16 +251,24 @@ def _scale(fault: Fault) -> dict[str, float]:
     }
 
 
-def _onset(surface: Surface, step: float, **options: Any) -> Callable[[Fault, int], Answer]:
+def _reconstruct_press(source: ArrayRecording) -> Result:
+    return engine.reconstruct(source, fill=False)
+
+
+def _onset(
+    surface: Surface, step: float, compute: Callable[[ArrayRecording], Result] = _reconstruct_press
+) -> Callable[[Fault, int], Answer]:
     truth = surface(*centres(SHAPE, PIXEL))[0]
 
     def answer(fault: Fault, seed: int) -> Answer:
-        result, warned = _watched(
-            lambda: engine.reconstruct(_press(surface, step, fault, seed), fill=False, **options)
-        )
+        result, warned = _watched(lambda: compute(_press(surface, step, fault, seed)))
         return Answer(result.height - truth, result.height_sigma, warned)
 
     return answer
+
+
+def _change_point(source: ArrayRecording) -> Result:
+    return engine.reconstruct(source, fill=False, method="change-point")
 
 
 def _angle(found: NDArray[Any], true: Floats) -> Floats:
@@ -266,43 +276,64 @@ def _angle(found: NDArray[Any], true: Floats) -> Floats:
     return np.arctan2(across, np.sum(found * true, axis=-1))
 
 
-def _rotation(fault: Fault, seed: int) -> Answer:
+@functools.cache
+def _reconstruct_turn(fault: Fault, seed: int) -> tuple[Result, bool]:
+    return _watched(lambda: engine.reconstruct(_turn(_waves, fault, seed), **_scale(fault)))
+
+
+Turn = Callable[[Fault, int], tuple[Result, bool]]
+"""Return the result of a rotation, and whether it has a warning."""
+
+
+def _rotation(fault: Fault, seed: int, compute: Turn = _reconstruct_turn) -> Answer:
     truth = _normals(_waves, *centres(SHAPE, PIXEL))
-    result, warned = _watched(lambda: engine.reconstruct(_turn(_waves, fault, seed), **_scale(fault)))
+    result, warned = compute(fault, seed)
     return Answer(_angle(result.normals, truth), result.normals_sigma, warned)
 
 
-def _integrated(fault: Fault, seed: int) -> Answer:
+def _integrated(fault: Fault, seed: int, compute: Turn = _reconstruct_turn) -> Answer:
     truth = _waves(*centres(SHAPE, PIXEL))[0]
-    result, warned = _watched(lambda: engine.reconstruct(_turn(_waves, fault, seed), **_scale(fault)))
+    result, warned = compute(fault, seed)
     largest = np.bincount(result.component[result.component >= 0]).argmax()
     error = np.where(result.component == largest, result.height - truth, np.nan)
     return Answer(error - np.nanmean(error), result.height_sigma, warned)
 
 
-def _fused(fault: Fault, seed: int) -> Answer:
-    truth = _waves(*centres(SHAPE, PIXEL))[0]
+def _fuse_recordings(fault: Fault, seed: int) -> Result:
     press, turn = _press(_waves, 0.05, fault, seed), _turn(_waves, fault, seed + 2)
-    result, warned = _watched(lambda: engine.fuse(press, turn, rotation=_scale(fault), register=False))
+    return engine.fuse(press, turn, rotation=_scale(fault), register=False)
+
+
+def _fused(fault: Fault, seed: int, compute: Callable[[Fault, int], Result] = _fuse_recordings) -> Answer:
+    truth = _waves(*centres(SHAPE, PIXEL))[0]
+    result, warned = _watched(lambda: compute(fault, seed))
     return Answer(result.height - truth, result.height_sigma, warned)
 
 
-def _of_fringes(fault: Fault, seed: int) -> Answer:
+def _fit_recording(source: ArrayRecording) -> Result:
+    return engine.run(source, engine.fringes.Fringes)
+
+
+def _of_fringes(
+    fault: Fault, seed: int, compute: Callable[[ArrayRecording], Result] = _fit_recording
+) -> Answer:
     phase = _fringes(*points(SHAPE, PIXEL))
     shift = np.arange(8) * np.pi / 4
     frames = record(lambda at: 0.5 + 0.4 * np.cos(phase - at), shift, fault, seed)
-    source = _opened(frames, {"phase": shift}, {}, fault)
-    result, warned = _watched(lambda: engine.run(source, engine.fringes.Fringes))
+    result, warned = _watched(lambda: compute(_opened(frames, {"phase": shift}, {}, fault)))
     error = result.phase - _fringes(*centres(SHAPE, PIXEL))
     return Answer(np.arctan2(np.sin(error), np.cos(error)), result.phase_sigma, warned)
 
 
-def _photometric(fault: Fault, seed: int) -> Answer:
+def _light_recording(source: ArrayRecording, **options: Any) -> Result:
+    return engine.run(source, engine.photometric.PhotometricStereo(**options))
+
+
+def _photometric(fault: Fault, seed: int, compute: Callable[..., Result] = _light_recording) -> Answer:
     truth, azimuth = _normals(_waves, *centres(SHAPE, PIXEL)), np.arange(12) * np.pi / 6
     frames = record(_lit, azimuth, fault, seed)
     source = _opened(frames, {"phase": azimuth}, {"dark": np.float32(DARK * fault.scale)}, fault)
-    operation = engine.photometric.PhotometricStereo(zenith=ZENITH, shadow=6 * fault.scale)
-    result, warned = _watched(lambda: engine.run(source, operation))
+    result, warned = _watched(lambda: compute(source, zenith=ZENITH, shadow=6 * fault.scale))
     return Answer(_angle(result.normals, truth), result.normals_sigma, warned)
 
 
@@ -314,12 +345,18 @@ def _moved(fault: Fault, seed: int) -> Answer:
     return Answer(result.displacement[0, ..., 0] - SHIFT, result.displacement_sigma[0, ..., 0], warned)
 
 
-def _by_focus(fault: Fault, seed: int) -> Answer:
+def _focus_recording(source: ArrayRecording, noise: float) -> Result:
+    return engine.run(source, engine.focus.Focus(noise=noise))
+
+
+def _by_focus(
+    fault: Fault, seed: int, compute: Callable[[ArrayRecording, float], Result] = _focus_recording
+) -> Answer:
     travel = np.arange(0.2, 1.0, 0.05)
     frames = record(_focused, travel, fault, seed)
     source = _opened(frames, {"travel": travel}, {}, fault)
     noise = math.hypot(READ_NOISE, 0.8) * fault.scale
-    result, warned = _watched(lambda: engine.run(source, engine.focus.Focus(noise=noise)))
+    result, warned = _watched(lambda: compute(source, noise))
     return Answer(result.height - _waves(*centres(SHAPE, PIXEL))[0], result.height_sigma, warned)
 
 
@@ -340,8 +377,8 @@ ESTIMATORS: Mapping[str, Callable[[Any, int], Answer]] = {
     "threshold, steps of 20 µm": _onset(_waves, 0.02),
     "threshold, steps of 100 µm": _onset(_waves, 0.1),
     "threshold, rim of a crater": _onset(_crater, 0.02),
-    "change-point, steps of 20 µm": _onset(_waves, 0.02, method="change-point"),
-    "change-point, steps of 50 µm": _onset(_waves, 0.05, method="change-point"),
+    "change-point, steps of 20 µm": _onset(_waves, 0.02, _change_point),
+    "change-point, steps of 50 µm": _onset(_waves, 0.05, _change_point),
     "normals of a rotation": _rotation,
     "heights of a rotation": _integrated,
     "press and rotation, fused": _fused,
@@ -353,6 +390,81 @@ ESTIMATORS: Mapping[str, Callable[[Any, int], Answer]] = {
     "integrate with weights": _of_slopes(weights=True),
     "integrate robustly": _of_slopes(robust=True),
 }
+
+
+# --- The same by functions on arrays -------------------------------------------------------------------
+
+
+def _frames(source: ArrayRecording) -> NDArray[Any]:
+    source.rewind()
+    block = source.lend(source.shape[0])
+    assert block is not None
+    return block.frames
+
+
+def _levels(source: ArrayRecording) -> dict[str, Any]:
+    return {"dark": source.header.dark, "bright": source.header.bright}
+
+
+def _find_onset(source: ArrayRecording) -> Result:
+    return engine.find_onset(_frames(source), source.travel, **_levels(source))
+
+
+def _find_change_point(source: ArrayRecording) -> Result:
+    return engine.find_change_point(_frames(source), source.travel, **_levels(source))
+
+
+def _estimate_normals(fault: Fault, seed: int) -> Result:
+    source = _turn(_waves, fault, seed)
+    return engine.estimate_normals(_frames(source), source.phase, tilt=TILT, **_scale(fault))
+
+
+def _integrate_normals(fault: Fault, seed: int) -> Result:
+    normals = _estimate_normals(fault, seed)
+    return engine.integrate(
+        normals=normals.normals,
+        mask=normals.contact,
+        pixel_size=PIXEL,
+        slope_weights=normals.normals_sigma**-2,
+    )
+
+
+def _fuse_maps(fault: Fault, seed: int) -> Result:
+    heights = _find_onset(_press(_waves, 0.05, fault, seed))
+    return engine.fuse(heights, _estimate_normals(fault, seed + 2), PIXEL)
+
+
+def _fit_array(source: ArrayRecording) -> Result:
+    return engine.fringes.fit_fringes(_frames(source), source.phase)
+
+
+def _light_array(source: ArrayRecording, **options: Any) -> Result:
+    dark = source.header.dark
+    return engine.photometric.photometric_stereo(_frames(source), source.phase, dark=dark, **options)
+
+
+def _focus_array(source: ArrayRecording, noise: float) -> Result:
+    return engine.focus.find_focus(_frames(source), source.travel, noise=noise)
+
+
+def _turn_by(compute: Callable[[Fault, int], Result]) -> Turn:
+    return lambda fault, seed: _watched(lambda: compute(fault, seed))
+
+
+FUNCTIONS: Mapping[str, Callable[[Any, int], Answer]] = {
+    "threshold, steps of 20 µm": _onset(_waves, 0.02, _find_onset),
+    "threshold, steps of 100 µm": _onset(_waves, 0.1, _find_onset),
+    "threshold, rim of a crater": _onset(_crater, 0.02, _find_onset),
+    "change-point, steps of 20 µm": _onset(_waves, 0.02, _find_change_point),
+    "change-point, steps of 50 µm": _onset(_waves, 0.05, _find_change_point),
+    "normals of a rotation": functools.partial(_rotation, compute=_turn_by(_estimate_normals)),
+    "heights of a rotation": functools.partial(_integrated, compute=_turn_by(_integrate_normals)),
+    "press and rotation, fused": functools.partial(_fused, compute=_fuse_maps),
+    "fringes": functools.partial(_of_fringes, compute=_fit_array),
+    "photometric stereo": functools.partial(_photometric, compute=_light_array),
+    "focus": functools.partial(_by_focus, compute=_focus_array),
+}
+"""The estimators that have a function on arrays, which is not what they call above."""
 
 
 PRESS = [name for name in ESTIMATORS if name.startswith(("threshold", "change-point"))]
@@ -379,15 +491,26 @@ def faults_of(estimator: str) -> tuple[Any, ...]:
     return tuple(fault for fault in FAULTS if applies(estimator, fault))
 
 
+def faults_of_arrays(estimator: str) -> tuple[Fault, ...]:
+    """Return the faults of frames in an array, with which nobody states anything, not even a compression."""
+    return tuple(fault for fault in faults_of(estimator) if not (fault.stated or fault.codec))
+
+
 def row(estimator: str, part_of_name: str = "", seed: int = 1) -> dict[str, Cell]:
     """Return the cells of an estimator by the name of the fault."""
-    faults = faults_of(estimator)
-    usual = _rms(_inside(ESTIMATORS[estimator](faults[0], seed).error))
-    return {
-        fault.name: _cell(ESTIMATORS[estimator](fault, seed), usual)
-        for fault in faults
-        if part_of_name in fault.name
-    }
+    return _row(ESTIMATORS[estimator], faults_of(estimator), part_of_name, seed)
+
+
+def row_of_arrays(estimator: str, part_of_name: str = "", seed: int = 1) -> dict[str, Cell]:
+    """Return the cells of a function on arrays by the name of the fault."""
+    return _row(FUNCTIONS[estimator], faults_of_arrays(estimator), part_of_name, seed)
+
+
+def _row(
+    answer: Callable[[Any, int], Answer], faults: tuple[Any, ...], part_of_name: str, seed: int
+) -> dict[str, Cell]:
+    usual = _rms(_inside(answer(faults[0], seed).error))
+    return {fault.name: _cell(answer(fault, seed), usual) for fault in faults if part_of_name in fault.name}
 
 
 def _rms(values: Floats) -> float:
@@ -426,12 +549,14 @@ def _stored() -> dict[str, Any]:
     return (
         dict(json.loads(_STORED.read_text(encoding="utf-8")))
         if _STORED.exists()
-        else {"open": {}, "cells": {}}
+        else {"open": {}, "cells": {}, "functions": {}}
     )
 
 
-def freeze(table: Mapping[str, Mapping[str, Cell]]) -> None:
+def freeze(table: Mapping[str, Mapping[str, Cell]], arrays: Mapping[str, Mapping[str, Cell]]) -> None:
     """Store cells, and write the page; SystemExit if a standard deviation became wrong.
+
+    ``arrays`` are the cells of functions on arrays.
 
     ``first`` keeps the chi^2 with which a cell was first stored.
     """
@@ -452,7 +577,12 @@ def freeze(table: Mapping[str, Mapping[str, Cell]]) -> None:
         }
     if worse:
         raise SystemExit("not stored, as these became wrong:\n" + "\n".join(worse))
-    _STORED.write_text(json.dumps({"open": known, "cells": before}, indent=1) + "\n", encoding="utf-8")
+    functions = stored["functions"] | {
+        name: {fault: _rounded(cell) | {"open": not cell.honest} for fault, cell in cells.items()}
+        for name, cells in arrays.items()
+    }
+    content = {"open": known, "cells": before, "functions": functions}
+    _STORED.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     text = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(with_tables(text), encoding="utf-8")
 
@@ -472,15 +602,43 @@ def with_tables(page: str) -> str:
     """Return the text of the page with the stored cells in its tables."""
     cells, opened = _stored()["cells"], open_cells()
     for number, (names, faults) in enumerate(((PRESS, FAULTS), (OTHERS, FAULTS), (SLOPES, SLOPE_FAULTS))):
-        start, end = f"<!-- cells {number} -->\n", f"<!-- end {number} -->"
-        head, rest = page.split(start)
-        table = [["fault", *names], ["---"] * (len(names) + 1)]
-        table += [
+        rows = [
             [fault.name, *(_shown(cells, opened, name, fault.name) for name in names)] for fault in faults
         ]
-        lines = "".join(f"| {' | '.join(line)} |\n" for line in table)
-        page = head + start + "\n" + lines + "\n" + end + rest.split(end, 1)[1]
-    return page
+        page = _with_part(page, str(number), _table(["fault", *names], rows))
+    return _with_part(page, "of functions", _about_functions())
+
+
+def _with_part(page: str, name: str, text: str) -> str:
+    """Return a page with a text between the marks of a name."""
+    start, end = f"<!-- cells {name} -->\n", f"<!-- end {name} -->"
+    head, rest = page.split(start)
+    return head + start + "\n" + text + "\n" + end + rest.split(end, 1)[1]
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    return "".join(f"| {' | '.join(line)} |\n" for line in (head, ["---"] * len(head), *rows))
+
+
+def _about_functions() -> str:
+    """Return the numbers of wrong cells of functions on arrays, and a table of those right in recordings."""
+    cells, opened = _stored()["functions"], open_cells()
+    wrong = {(name, fault) for name in cells for fault, cell in cells[name].items() if cell["open"]}
+    also = {(name, fault) for name in cells for fault in opened[name] if fault in cells[name]}
+    text = (
+        f"Of {sum(map(len, cells.values()))} cells, {len(wrong)} are bold for functions on arrays,"
+        f" {len(also)} for recordings.\n"
+    )
+    only = wrong - also
+    if not only:
+        return text
+    names = [name for name in cells if any(name == other for other, _ in only)]
+    faults = [fault.name for fault in FAULTS if any(fault.name == other for _, other in only)]
+    rows = [
+        [fault, *(_digits(cells[name][fault]["chi2"]) if (name, fault) in only else "" for name in names)]
+        for fault in faults
+    ]
+    return text + "\n" + _table(["$\\chi^2$", *names], rows)
 
 
 def _shown(cells: Mapping[str, Any], opened: Mapping[str, list[str]], estimator: str, fault: str) -> str:
@@ -510,14 +668,22 @@ def main() -> None:
     parser.add_argument("--freeze", action="store_true", help="store all cells of these, and write the page")
     asked = parser.parse_args()
     names = [one for one in ESTIMATORS if not asked.estimator or any(part in one for part in asked.estimator)]
-    table = {}
+    table, arrays = {}, {}
+    fault = "" if asked.freeze else asked.fault
     for name in names:
-        table[name] = row(name, "" if asked.freeze else asked.fault)
-        print(name)
-        for fault, cell in table[name].items():
-            print(f"  {fault:18} {cell}")
+        table[name] = row(name, fault)
+        _print(name, table[name])
+        if name in FUNCTIONS:
+            arrays[name] = row_of_arrays(name, fault)
+            _print(f"{name}, function on arrays", arrays[name])
     if asked.freeze:
-        freeze(table)
+        freeze(table, arrays)
+
+
+def _print(name: str, cells: Mapping[str, Cell]) -> None:
+    print(name)
+    for fault, cell in cells.items():
+        print(f"  {fault:18} {cell}")
 
 
 if __name__ == "__main__":

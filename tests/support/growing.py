@@ -38,7 +38,7 @@ class Feed:
         motion="vertical",
         shape=SHAPE,
         dtype="u1",
-        lent=True,
+        stays_valid=True,
         fails=None,
         rate=None,
         announced=None,
@@ -47,7 +47,7 @@ class Feed:
         self.motion, self.dtype = motion, np.dtype(dtype)
         self.shape = (announced or count, *shape)
         self.read_so_far, self.left, self.entered = 0, False, False
-        self._count, self._cuts, self._lent = count, itertools.cycle(cuts), lent
+        self._count, self._cuts, self._stays_valid = count, itertools.cycle(cuts), stays_valid
         self._fails, self._rate, self._start = fails, rate, time.monotonic()
         self._room = np.empty((max(cuts), *shape), dtype)
 
@@ -62,14 +62,14 @@ class Feed:
         if self._rate is not None:
             time.sleep(max(0.0, self._start + self.read_so_far / self._rate - time.monotonic()))
         frames = frames_of(numbers, self.shape[1:], self.dtype)
-        if not self._lent:
+        if not self._stays_valid:
             self._room[:n] = frames
             frames = self._room[:n]
         return io.Block(
             frames,
             int(numbers[0]),
             time=numbers * 1.0 if self._rate is None else np.full(n, time.monotonic()),
-            lent=self._lent,
+            stays_valid=self._stays_valid,
             dropped=int(numbers[0]) % 3,
             **self.positions_of(numbers, 0.0),
         )

@@ -5,13 +5,14 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from bare import Parts
 from live_frames import phases, press_frames, turn_frames
 from numpy.typing import NDArray
 from speckle import Speckle
@@ -90,19 +91,20 @@ class Case:
         named = {"tilt": LEAN, "phase": 0 * LEAN} if "pose" in self.positions else self.positions
         return Readable(self.frames, header, time=0.01 * np.arange(len(self.frames)), **named)
 
-    def push(self, operation: engine.Operation, part: slice) -> None:
+    def loop(self, **options: Any) -> engine.Run:
+        """Return a run whose frames are pushed."""
+        return engine.Run(self.make(**options))
+
+    def push(self, run: engine.Run, part: slice) -> None:
         """Push some of the frames."""
         where = {name: values[part] for name, values in self.given.items()}
-        operation.push(self.frames[part], **where)
+        run.push(self.frames[part], **where)
 
-    def whole(self, **options: Any) -> Result:
-        """Return the result of all frames in one push."""
+    def whole(self, cuts: Sequence[int] = (), **options: Any) -> Result:
+        """Return the result of all frames, which are read in parts that end at cuts."""
         operation = self.make(**options)
-        for number in range(operation.passes):
-            if number:
-                operation.next_pass()
-            self.push(operation, slice(None))
-        return operation.result()
+        source = Parts(self.frames, operation, self.given, cuts)
+        return engine.Run(operation.plan(source), source).complete()
 
 
 WEIGHTS = {"frame_weights": np.where(np.arange(COUNT) % 7 == 2, 0.0, 1 + 0.5 * np.cos(np.arange(COUNT)))}
@@ -118,8 +120,10 @@ CASES = {
     "Onset between estimated levels": Case(
         engine.Onset, PRESS, ON_TRAVEL, {**LEVELS, "dark_sigma": 1.0, "bright_sigma": 2.0}, engine.find_onset
     ),
-    "Levels": Case(Levels, PRESS, ON_TRAVEL, {"thresholds": [0.3, 0.7], "inclinations": [0.2, 0.4]}),
-    "Strokes": Case(engine.press.Strokes, PRESS, {"travel": STROKES}),
+    "Levels": Case(
+        Levels, PRESS, ON_TRAVEL, {"thresholds": [0.3, 0.7], "inclinations": [0.2, 0.4], **LEVELS}
+    ),
+    "Strokes": Case(engine.press.Strokes, PRESS, {"travel": STROKES}, LEVELS),
     "ChangePoint": Case(engine.ChangePoint, PRESS, ON_TRAVEL, LEVELS, engine.find_change_point),
     "ChangePoint between unknown levels": Case(
         engine.ChangePoint, PRESS, ON_TRAVEL, function=engine.find_change_point

@@ -41,7 +41,7 @@ def compare(noise, pixels=1000, seed=1, dark=20, bright=220, device=None):
     The best threshold is the one whose error over all pixels is the least, of all thresholds and holds; the
     best for each width alone, which nobody could choose beforehand, comes third, as RMS errors, (widths,).
     """
-    from mirrorskin.engine import find_change_point, find_onset
+    from bare import find_change_point, find_onset
 
     frames, middle = ramps(noise, pixels, seed, dark, bright)
     known = {"dark": dark, "bright": bright, "noise": float(np.hypot(noise, 1 / np.sqrt(12)))}

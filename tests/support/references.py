@@ -114,7 +114,7 @@ def agree(
     arrays = {}
     for key in kernel.arguments:
         given = values[key] if key in values else _untouched(expected[key], items)
-        if key == "frames" and "stride" in kernel.arguments:  # of whose rows the reference sees the pixels
+        if key == "frames" and values.get("stride", 0) > pixels:  # the reference sees the pixels of rows
             given = expected[key] = np.pad(given, ((0, 0), (0, 3)), constant_values=77)
         if key in pairs.split():
             given = np.stack([given.astype(np.float32), given - given.astype(np.float32)], axis=-1)

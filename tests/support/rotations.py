@@ -12,11 +12,15 @@ places on a small circle.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfc
+
+from mirrorskin.engine import Normals, Run
+from mirrorskin.engine.operation import Plan
+from mirrorskin.io import Result
 
 Map = NDArray[np.float64]
 
@@ -132,6 +136,15 @@ def expose(normals: Map, setup: Setup, seed: int) -> NDArray[np.generic]:
     counts = clean + np.random.default_rng([seed, 8]).normal(0, setup.noise, clean.shape)
     counts = counts if setup.dtype == "float32" else np.rint(counts)
     return np.clip(counts, *setup.range).astype(setup.dtype)
+
+
+def estimate(
+    frames: NDArray[np.generic], phase: ArrayLike, frame_weights: ArrayLike | None = None, **options: Any
+) -> Result:
+    """Return the normals of frames that show no surface, whose neighbours are no neighbours: unchecked."""
+    run = Run(Plan(Normals(**options), checked=False))
+    run.push(frames, phase=phase, frame_weights=frame_weights)
+    return run.result()
 
 
 def draw(setup: Setup, draws: int, seed: int, bins: ArrayLike = BINS) -> Stack:

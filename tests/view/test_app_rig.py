@@ -7,7 +7,7 @@ import panel as pn
 import pytest
 from simulated import simulate
 
-from mirrorskin import io
+from mirrorskin import engine, io
 from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.view.app import App
@@ -227,6 +227,41 @@ def test_a_run_shows_heights_records_and_returns_a_result(ready, tmp_path):
     assert ready.control.recorded == path
     with io.open_recording(path) as recording:
         assert recording.motion == "vertical"
+
+
+class Light(engine.Operation):
+    """Number of frames in which a pixel is bright."""
+
+    light = io.Map("number of bright frames", "frames", dtype="int64", title="Bright frames")
+    brightest = io.Map("largest brightness", "counts", axes="none", dtype="float64")
+
+    def start(self, shape, dtype):
+        self.light_frames, self.most = np.zeros(shape, np.int64), 0.0
+
+    def push(self, frames):
+        self.light_frames += (frames > 100).sum(axis=0)
+        self.most = max(self.most, float(frames.max()))
+
+    def result(self):
+        return {"light": self.light_frames, "brightest": self.most}
+
+
+def test_a_run_shows_the_maps_and_numbers_of_an_own_operation(emulated):
+    control = RigControl(emulated.rig.settings, emulated.clock, Light)
+    emulated.control = control
+    pane = RigPane(control, lambda name, source: None)
+    control.connect()
+    emulated.until(lambda: control.state == "ready")
+    control.run(vertical_plan(0.0, 1.5, 0.5))
+    emulated.until(lambda: control.result is not None and control.state == "ready")
+    pane.refresh()
+    control.close()
+    assert control.problem == ""
+    assert control.seen.update.first == "light"
+    np.testing.assert_array_equal(control.seen.update.light, control.result.light)
+    assert pane.growing.figure.title.text == "Light (frames), while the stage moves"
+    assert "Brightest" in pane.run.object
+    assert " counts" in pane.run.object
 
 
 def test_a_recording_that_exists_is_not_replaced(ready, tmp_path):

@@ -8,15 +8,19 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine.live import SHOWN, Latency, Status, Update
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, Map, Result
 from mirrorskin.view import live, viewer
 
 SHAPE = (5, 8)
+DECLARED = {
+    "wear": Map("depth of the wear", "mm", title="Worn", displayed="µm"),
+    "contact_area": Map(unit="mm²", axes="none"),
+}
 
 
 def update(frames=1, **maps):
     picture = np.arange(40, dtype=np.uint16).reshape(SHAPE)
-    return Update(frames, frames / 30, "vertical", 0.1, picture, **maps)
+    return Update(frames, frames / 30, "vertical", 0.1, picture, Result(maps, declarations=DECLARED))
 
 
 def known():
@@ -24,7 +28,8 @@ def known():
     height[:, 3] = np.nan
     normals = np.zeros((*SHAPE, 3), np.float32)
     normals[..., 2] = 1
-    return update(2, height=height, normals=normals, contact_area=3.5)
+    wear = np.full(SHAPE, 0.002, np.float32)
+    return update(2, height=height, normals=normals, wear=wear, contact_area=3.5)
 
 
 STATUS = Status(2, 2, 0, 0, 2, 0.1, 30.0, {SHOWN: Latency(0.01, 0.02)})
@@ -63,7 +68,7 @@ def test_a_file_keeps_all_that_was_shown(tmp_path):
     view.close()
     command = [sys.executable, "-m", "rerun_cli", "rrd", "print", str(path)]
     told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    for name in ("/camera", "/height", "/normals", "/section/surface", "/contact/area", "/status"):
+    for name in ("/camera", "/maps/height", "/maps/normals", "/maps/wear", "/section/surface", "/status"):
         assert name in told
 
 
@@ -74,7 +79,9 @@ def test_the_display_is_described_in_words(tmp_path):
     view.close()
     assert "30.0 frames/s" in told
     assert "10.0 ms, 99 % below 20.0 ms" in told
-    assert "contact 3.50 mm²" in told
+    assert "Height from -1.000 (violet) to -1.000 mm (yellow)" in told
+    assert "Worn from 2.000 (violet) to 2.000 µm (yellow)" in told
+    assert "Contact area 3.5 mm²" in told
 
 
 def test_a_viewer_in_the_browser_listens_on_this_machine_only(monkeypatch):

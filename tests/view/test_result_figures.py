@@ -86,7 +86,7 @@ def test_only_what_is_asked_for_is_drawn_in_the_usual_order():
 
 
 def test_what_a_result_does_not_have_is_said_and_what_it_has():
-    with pytest.raises(io.InputError, match=r"^it has no normals to draw: it has status$"):
+    with pytest.raises(io.InputError, match=r"^it has no picture normals: it has status$"):
         overview(only("status"), name="it", maps=["status", "normals"])
     with pytest.raises(io.InputError, match=r"^it has no map to draw: 'mirrorskin export' writes all"):
         figures_of(io.Result(force=1.0), name="it")

@@ -84,18 +84,18 @@ def test_heights_come_from_wherever_they_are(kind, tmp_path):
     ball[:, 30:] = ball[2, 2] - 0.1  # so that left and right differ
     ball[:9] -= 0.05
     sigma = np.full(ball.shape, 0.002)
-    process = {"travel": 0.3}
+    fitted = io.Fitted(travel=0.3)
     sigma[18:22, 18:22] = np.nan  # filled: their standard deviation is that of the nearest pixel
     expected = find_force(ball, 0.3, PIXEL, MODULUS, sigma=0.002)
     declared = io.Result(
         {"depth": ball, "depth_sigma": sigma},
         x=x,
         y=-x,
-        process=process,
+        fitted=fitted,
         declarations={"depth": io.Map("depth", "mm", "float64", quantity="height")},
     )
     io.save_result(declared, tmp_path / "worn.h5")
-    dataset = io.Result(height=ball, height_sigma=sigma, x=x, y=-x, process=process).to_xarray()
+    dataset = io.Result(height=ball, height_sigma=sigma, x=x, y=-x, fitted=fitted).to_xarray()
     metres = dataset / 1000
     metres.attrs = dataset.attrs
     for name in ("height", "height_sigma"):
@@ -107,7 +107,7 @@ def test_heights_come_from_wherever_they_are(kind, tmp_path):
             "height_sigma": sigma,
             "x": x,
             "y": -x,
-            "process": {"travel": 0.3},
+            "travel": 0.3,
         },
         "dataset": dataset,
         "metres": metres,

@@ -120,7 +120,7 @@ def test_filled_heights_are_measured_separately(ball):
         assert np.isfinite(told[name].sigma)
     assert np.isnan(told["volume above rim with filled"].sigma)
     # What a press fills it touched, or else surrounded: nobody knows.
-    pressed = engine.measure(ball.assign(filled=filled, height_sigma=sigma, process={"event": "onset"}))
+    pressed = engine.measure(ball.assign(filled=filled, height_sigma=sigma, fitted=io.Fitted(event="onset")))
     assert pressed.quantities["contact area with filled"] == whole["measured area"]
     assert not {"contact area", "contact area with filled"} & set(told)
     contact = np.isfinite(ball.height).astype(np.uint8)

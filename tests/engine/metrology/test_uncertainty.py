@@ -5,7 +5,7 @@ import pytest
 from height_maps import places, result_of
 from scipy import ndimage
 
-from mirrorskin import engine
+from mirrorskin import engine, io
 from mirrorskin.engine.metrology import PARAMETERS, profile_parameters, roughness
 
 SHAPE, SIZE = (90, 110), (0.04, 0.04)
@@ -139,8 +139,8 @@ def test_realisations_are_the_same_in_each_call():
 
 def test_a_noise_length_is_taken_from_the_result():
     sigma = 3e-5
-    fused = result_of(surface(), SIZE, sigma=sigma, process={"height_correlation": 0.2})
-    slopes = result_of(surface(), SIZE, sigma=sigma, process={"integration": "multigrid"})
+    fused = result_of(surface(), SIZE, sigma=sigma, fitted=io.Fitted(height_correlation=0.2))
+    slopes = result_of(surface(), SIZE, sigma=sigma, fitted=io.Fitted(integration="multigrid"))
     said = {"correlated over 0.2 mm": fused, "those of integrated slopes": slopes}
     for words, result in said.items():
         assert any(words in note for note in engine.measure(result).notes)

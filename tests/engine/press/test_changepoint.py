@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from bare import Parts, bare, find_change_point
 from changes import assert_near, numpy_change, numpy_split
 from presses import LEVELS, SPEC, assert_equal, random_press
 from ramps import NOISES, WIDTHS, compare, errors, ramps, rms
 
-from mirrorskin.engine import ChangePoint, find_change_point
+from mirrorskin.engine import ChangePoint, Run
+from mirrorskin.engine.operation import Plan
 from mirrorskin.io import InputError
 
 DTYPES = sorted(SPEC)
@@ -23,12 +25,7 @@ def stroke(dtype, count, shape, event="onset", **options):
 
 
 def search_in_blocks(search, frames, travel, cuts=()):
-    for turn in range(search.passes):
-        if turn:
-            search.next_pass()
-        for part in np.split(np.arange(len(frames)), cuts):
-            search.push(frames[part], travel=travel[part])
-    return search.result()
+    return bare(search, frames, cuts, travel=travel)
 
 
 @pytest.mark.parametrize("noise", [pytest.param(n, marks=[SLOW] if n != 5 else []) for n in NOISES])
@@ -92,7 +89,6 @@ def test_a_device_agrees_with_the_reference_however_the_stack_is_cut(device, dty
         known = {"dark": dark, "bright": bright, "device": device, **options}
         search = ChangePoint(**known)
         for cuts in (range(1, 40), [1, 2, 39]):
-            search.reset()
             assert_equal(search_in_blocks(search, frames, travel, list(cuts)), found)
 
 
@@ -107,7 +103,6 @@ def test_a_device_agrees_with_the_reference_on_unknown_levels(device, dtype, eve
         assert_near(found, numpy_split(frames, travel, **options), travel)
         search = ChangePoint(device=device, **options)
         for cuts in (range(1, 40), range(7, 40, 7)):
-            search.reset()
             assert_equal(search_in_blocks(search, frames, travel, list(cuts)), found)
 
 
@@ -119,10 +114,10 @@ def test_less_room_gives_the_same_answer(small_device, limit, known):
     whole = find_change_point(frames, travel, device=small_device, **options)
     small_device.max_allocation = limit
     search = ChangePoint(device=small_device, **options)
-    search.begin(frames.shape[1:], frames.dtype)
-    assert (len(search._bands) > 1) == (limit < 40_000)
-    assert_equal(search_in_blocks(search, frames, travel, range(4, 30, 4)), whole)
-    assert_equal(search.result(), whole)
+    run = Run(Plan(search, checked=False), Parts(frames, search, {"travel": travel}, range(4, 30, 4)))
+    assert (len(run.operation._picture.bands) > 1) == (limit < 40_000)
+    assert_equal(run.complete(), whole)
+    assert_equal(run.result(), whole)
 
 
 @SLOW
@@ -313,20 +308,8 @@ def test_bad_input_is_refused(change, words):
     assert "\n" not in str(caught.value)
 
 
-def test_passes_that_do_not_match_are_refused():
+def test_frames_that_are_pushed_once_are_refused_without_levels():
     frames, travel = random_press("uint8", 8, (4, 5)), np.arange(8.0)
-    search = ChangePoint()
-    with pytest.raises(InputError, match="at least 2 frames; none have been pushed"):
-        search.next_pass()
-    search.begin((4, 5), "uint8")
-    with pytest.raises(InputError, match=r"frames are uint8 \(8, 3, 5\): uint8 \(n, 4, 5\)"):
-        search.push(frames[:, 1:], travel=travel)
-    search.push(frames, travel=travel)
-    with pytest.raises(InputError, match="needs all frames twice"):
-        search.result()
-    search.next_pass()
-    search.push(frames[:7], travel=travel[:7])
-    with pytest.raises(InputError, match="needs all frames twice"):
-        search.result()
-    with pytest.raises(InputError, match="second pass has more frames"):
-        search.push(frames[:2], travel=[7.0, 8.0])
+    run = Run(ChangePoint())
+    with pytest.raises(InputError, match="ChangePoint needs all frames twice: give them"):
+        run.push(frames, travel=travel)

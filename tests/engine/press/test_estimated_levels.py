@@ -77,3 +77,11 @@ def test_where_nothing_turns_light_the_range_of_the_type_is_taken_and_reported()
     result = engine.reconstruct(frames, travel=TRAVEL, fill=False)
     assert result.process["bright"] == "range of the type"
     assert not np.isfinite(result.height).any()
+
+
+def test_frames_are_scanned_once(device):
+    frames, _ = press(gains=0.05)
+    device.profile.clear()
+    engine.find_onset(frames, TRAVEL, device=device)
+    scans = {one.name: one.runs for one in device.profile.records() if "scan" in one.name}
+    assert sum(scans.values()) <= -(-frames.nbytes // 64_000_000)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contact_theory
 import numpy as np
 import pytest
+from bare import bare
 from commands import run
 from scipy import optimize
 
@@ -131,20 +132,13 @@ def test_the_frames_are_read_once_if_the_travel_is_known_and_twice_otherwise(ela
     operation = engine.press.Growth().configured_for(source)
     assert (operation.passes, engine.press.Growth(**known).passes) == (1, 2)
     once = engine.run(source, engine.press.Growth(pixel_size=(PIXEL, PIXEL)))
-    blocks = engine.press.Growth(**known)
-    for number in range(2):
-        if number:
-            blocks.next_pass()
-        for part in np.split(np.arange(len(frames)), [3, 50]):
-            blocks.push(frames[part], travel=DITHER[part])
-    for other in (once, blocks.result()):
+    blocks = bare(engine.press.Growth(**known), frames, [3, 50], travel=DITHER)
+    for other in (once, blocks):
         for name in ("growth", "growth_sigma", "azimuth", "residual"):
             np.testing.assert_array_equal(other[name], found[name])
         assert other.process["area_growth"] == found.process["area_growth"]
-    blocks.reset()
-    blocks.push(frames, travel=DITHER)
     with pytest.raises(io.InputError, match="needs all frames twice"):
-        blocks.result()
+        engine.Run(engine.press.Growth(**known)).push(frames, travel=DITHER)
 
 
 def test_a_recording_of_a_dither_has_growth_and_correlation(elastic, tmp_path):

@@ -7,6 +7,7 @@ import math
 import cv2
 import numpy as np
 import pytest
+from bare import bare
 from commands import run
 from stacks import record
 
@@ -76,9 +77,7 @@ def test_invalid_pixels_have_no_bounds():
     frames = np.zeros((6, 1, 4), np.float32)
     frames[3:, 0] = [0, 0.3, 0.9, np.nan]
     options = {"thresholds": [0.2, 0.8], "inclinations": [0.25, 0.5], "dark": 0, "bright": 1, "noise": 0.01}
-    search = Levels(**options)
-    search.push(frames, travel=0.1 * np.arange(6))
-    found = search.result()
+    found = bare(Levels(**options), frames, travel=0.1 * np.arange(6))
     np.testing.assert_array_equal(found.slope_min, np.array([[0, 0.25, 0.5, np.nan]], np.float32))
     np.testing.assert_array_equal(found.slope_max, np.array([[0.25, 0.5, np.nan, np.nan]], np.float32))
 

@@ -1,13 +1,17 @@
 """Onset and release: kernels equal their NumPy references, and these a loop over pixels."""
 
 import math
+import re
 
 import numpy as np
 import pytest
+from bare import bare, bare_run, find_onset
 from presses import LEVELS, SPEC, assert_equal, assert_within_an_ulp, first_run, numpy_onset, random_press
 
 from mirrorskin import engine, io
-from mirrorskin.engine import Onset, find_onset
+from mirrorskin.engine import Onset, Run
+from mirrorskin.engine.array_source import ArraySource
+from mirrorskin.engine.operation import Plan
 from mirrorskin.io import InputError
 from mirrorskin.kernels import onset as reference
 
@@ -46,11 +50,7 @@ def stroke(dtype, count, shape, event="onset", **options):
 
 
 def search_in_blocks(frames, travel, cuts, **options):
-    search = Onset(**options)
-    for part in np.split(np.arange(len(frames)), cuts):
-        if len(part):
-            search.push(frames[part], travel=travel[part])
-    return search.result()
+    return bare(Onset(**options), frames, cuts, travel=travel)
 
 
 def by_reference(frames, travel, dark, bright, **options):
@@ -269,7 +269,7 @@ def test_what_never_changes_has_no_height(device, dtype):
     for value, status in ((20, 2), (200, 3)):
         frames = np.full((6, 5, 7), value, dtype)
         with pytest.warns(io.MirrorskinWarning, match="find_onset: no height at any pixel"):
-            found = find_onset(frames, np.arange(6.0), dark=20, bright=220, device=device)
+            found = engine.find_onset(frames, np.arange(6.0), dark=20, bright=220, device=device)
         assert np.all(found.status == status)
         assert np.all(found.frame == (0 if status == 3 else -1))
         assert np.isnan(found.height).all()
@@ -374,11 +374,12 @@ def test_levels_are_those_of_the_reference_to_the_last_bit(device, dtype, event)
     dark, bright, noise = dark.astype(np.float32), bright.astype(np.float32), 0.01 * top
     for threshold in (0.0, 0.55, 1.0):
         known = {"dark": dark, "bright": bright, "threshold": threshold, "noise": noise, "event": event}
+        frames = np.zeros((2, *shape), dtype)
         search = Onset(device=device, **known)
-        search.begin(shape, dtype)
-        (band,) = search._searches[0]._bands
+        run = Run(Plan(search, checked=False), ArraySource(frames, search, {"travel": [0.0, 1.0]}))
+        (band,) = run.operation._picture.bands
         levels = band.maps["levels"].read()[:, : band.pixels].reshape(2, *shape)
-        search.push(np.zeros((1, *shape), dtype), travel=[0.0])  # looks for what is surely dark
+        run.push(frames[:1], travel=[0.0])  # looks for what is surely dark
         level, plateau, light = reference.onset_levels(
             bright, dark, threshold - 1e-12, np.dtype(dtype), release=event == "release"
         )
@@ -437,12 +438,9 @@ def test_nothing_is_left_of_the_press_before(device):
     frames[[0, 1]], frames[6:] = 200, 124
     travel = np.arange(40) * 0.1
     search = Onset(**LEVELS["uint8"], hold=5, noise=1.5, device=device)
-    search.push(before, travel=travel)
-    search.reset()
-    for part in (slice(0, 2), slice(2, 12)):
-        search.push(frames[part], travel=travel[part])
+    bare(search, before, travel=travel)
     expected = by_reference(frames, travel[:12], 20, 220, noise=1.5, hold=5)
-    assert_within_an_ulp(search.result(), expected, travel[:12])
+    assert_within_an_ulp(bare(search, frames, [2], travel=travel[:12]), expected, travel[:12])
 
 
 def test_a_hold_longer_than_any_stack_waits_for_the_end(device):
@@ -484,8 +482,8 @@ def test_a_release_of_the_complement_is_an_onset(device):
     frames, travel = stroke("uint8", 40, ODD, "release", seed=11, noise=0.1)
     frames = frames[::-1].copy()
     known = {"noise": 2.0, "device": device}
-    onset = engine.run(frames, engine.Onset(bright=221, **known), travel=-travel)  # the level is 110.5
-    release = engine.run(~frames, engine.Onset(dark=255 - 221, **known, **RELEASE), travel=travel)
+    onset = bare(Onset(bright=221, **known), frames, travel=-travel)  # the level is 110.5
+    release = bare(Onset(dark=255 - 221, **known, **RELEASE), ~frames, travel=travel)
     assert {1, 2, 3} <= set(onset.status.flat)
     np.testing.assert_array_equal(release.frame, onset.frame)
     np.testing.assert_array_equal(release.status, np.array([0, 1, 3, 2])[onset.status])
@@ -522,7 +520,7 @@ def test_bad_input_is_refused(change, words):
 
 
 def test_frames_that_do_not_follow_are_refused():
-    search = Onset()
+    search = bare_run(Onset())
     search.push(np.zeros((1, 3, 3), np.uint8), travel=[1.0])
     with pytest.raises(InputError, match="at least 2 frames; 1 has been pushed"):
         search.result()
@@ -547,12 +545,11 @@ def twelve_bits():
     return np.rint(frames).astype(np.uint16), 0.1 * np.arange(9)
 
 
-def test_levels_that_are_not_given_are_estimated_with_a_warning():
+def test_levels_that_are_not_given_are_estimated_with_a_note():
     frames, travel = twelve_bits()
-    said = r"dark 2\d\d and bright 32\d\d counts are estimated from the frames; give dark= and bright="
-    with pytest.warns(io.MirrorskinWarning, match=said) as seen:
-        found = find_onset(frames, travel)
-    assert seen[0].filename == __file__
+    found = engine.find_onset(frames, travel)
+    said = r"no dark and bright given: estimated as 2\d\d and 32\d\d counts \(give dark and bright, or .*"
+    assert re.fullmatch(said, found.process["notes"])
     expected = engine.reconstruct(frames, travel=travel)
     np.testing.assert_array_equal(found.height, expected.height)
     np.testing.assert_array_equal(found.height_sigma, expected.height_sigma)
@@ -565,6 +562,6 @@ def test_levels_of_other_counts_than_the_frames_are_reported():
     shares = (frames / 4096).astype(np.float32)
     said = r"samples are 0\.\d+ to 0\.\d+, below the threshold of 1700 between dark 200 and bright 3200: are"
     with pytest.warns(io.MirrorskinWarning, match=said):
-        find_onset(shares, travel, dark=200, bright=3200)
+        engine.find_onset(shares, travel, dark=200, bright=3200)
     with pytest.warns(io.MirrorskinWarning, match=said):
         engine.reconstruct(shares, travel=travel, dark=200, bright=3200)

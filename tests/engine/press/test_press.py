@@ -1,6 +1,7 @@
 """From a source of a press or its release to a result: used frames and levels, and accuracy."""
 
 import dataclasses
+from functools import partial
 from typing import get_args
 
 import geometry
@@ -11,14 +12,13 @@ from stacks import MadeUp, ball, record
 
 from mirrorskin import engine, io
 from mirrorskin.engine.press.press import PressMethod
-from mirrorskin.engine.streaming import push_block
 from mirrorskin.kernels.device import open_device
 
 DOWN = 0.1 * np.arange(1, 31)
 STROKE = np.concatenate([DOWN, DOWN[::-1]])  # rests for two frames at its greatest travel
 SHAPE = (120, 120)
 METHODS = get_args(PressMethod)
-FIND = {"threshold": engine.find_onset, "change-point": engine.find_change_point}
+FIND = {"threshold": engine.find_onset, "change-point": partial(engine.find_change_point, blur=0)}
 
 
 def twin(travel=STROKE, **header):
@@ -127,13 +127,15 @@ def test_a_change_between_unknown_levels_is_read_twice(missing):
     options = {"method": "change-point", "blur": 0, "fill": False}
     result = engine.reconstruct(source, **options, memory_limit=limit, progress=done.append)
     source.rewind()
-    assert_found(result, engine.find_change_point(frames_of(source), DOWN))
+    assert_found(result, engine.find_change_point(frames_of(source), DOWN, blur=0))
     assert done == [16, 30, 16, 30]
     assert result.process["dark"] == result.process["bright"] == "each pixel's own"
     source = twin(**missing)
     result = engine.reconstruct(source, event="release", **options)
     source.rewind()
-    assert_found(result, engine.find_change_point(frames_of(source)[29:], STROKE[29:], event="release"))
+    assert_found(
+        result, engine.find_change_point(frames_of(source)[29:], STROKE[29:], event="release", blur=0)
+    )
 
 
 def test_a_source_that_cannot_be_read_twice_needs_its_levels():
@@ -199,14 +201,11 @@ def test_a_result_outlives_its_recording(tmp_path):
     path = tmp_path / "press.h5"
     with io.Recorder(MadeUp(frames, io.Header("vertical"), travel=travel), path) as recorder:
         recorder.drain(lambda done: None)
-    search = engine.Onset(noise=5.0, device=open_device())
     with io.open_recording(path) as recording:
-        search.begin(recording.shape[1:], recording.dtype)
-        while (block := recording.read(search.room)) is not None:
-            push_block(search, block)
+        result = engine.run(recording, engine.Onset(noise=5.0, device=open_device()))
     path.unlink()
     expected = engine.run(frames, engine.Onset(noise=5.0), travel=travel)
-    np.testing.assert_array_equal(search.result().height, expected.height)
+    np.testing.assert_array_equal(result.height, expected.height)
 
 
 class Spiked:

@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from bare import bare, find_onset
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.live import LiveOperation
+from mirrorskin.engine.live import LiveRun
 from mirrorskin.hw.twin import Camera, Vertical, oscillating_travel
 
 DARK, BRIGHT, NOISE = 20.0, 220.0, 2.0
@@ -38,9 +39,7 @@ def strokes_of(frames, travel, blocks=(), **options):
     results = []
     for event in ("onset", "release"):
         strokes = engine.press.Strokes(event=event, **({"dark": DARK, "bright": BRIGHT} | options))
-        for part in np.split(np.arange(len(frames)), blocks):
-            strokes.push(frames[part], travel=travel[part])
-        results.append(strokes.result())
+        results.append(bare(strokes, frames, blocks, travel=travel))
     return Found(*results)
 
 
@@ -86,7 +85,7 @@ def test_hysteresis_is_the_difference_of_both():
 def test_strokes_that_pass_other_places_contain_more_information_than_their_mean_would():
     """Intervals overlap in ever less: of n strokes the error falls as 1 / n, a mean's as 1 / sqrt(n)."""
     found = strokes_of(made_press(UNEVEN, DEPTH), UNEVEN)
-    single = engine.find_onset(made_press(UNEVEN, DEPTH)[:9], UNEVEN[:9], dark=DARK, bright=BRIGHT)
+    single = find_onset(made_press(UNEVEN, DEPTH)[:9], UNEVEN[:9], dark=DARK, bright=BRIGHT)
     rms = [np.sqrt(np.nanmean((one.height + DEPTH) ** 2)) for one in (single, found.onset)]
     assert rms[1] < 0.7 * rms[0] / np.sqrt(np.median(found.onset.strokes))
 
@@ -111,7 +110,7 @@ def test_samples_on_the_way_are_averaged_by_inverse_variance():
 def test_one_stroke_is_the_press_bit_by_bit():
     travel = np.linspace(0, 1.2, 30)
     frames = made_press(travel, DEPTH)
-    found, press = strokes_of(frames, travel), engine.find_onset(frames, travel, dark=DARK, bright=BRIGHT)
+    found, press = strokes_of(frames, travel), find_onset(frames, travel, dark=DARK, bright=BRIGHT)
     for field in ("height", "height_sigma", "status", "frame"):
         np.testing.assert_array_equal(getattr(found.onset, field), getattr(press, field))
     assert found.onset.process["noise"] == press.process["noise"]
@@ -162,11 +161,11 @@ def test_a_source_that_oscillates_is_reconstructed_from_all_its_strokes(dither):
 
 def test_it_works_live_and_through_a_file(dither, tmp_path):
     exact = engine.reconstruct(dither, fill=False)
-    live = LiveOperation(dither, engine.Press(fill=False))
-    live.warm()
+    live = LiveRun(dither, engine.Press(fill=False))
+    live.precompile()
     dither.rewind()
-    while (block := dither.read(live.room[:5])) is not None:
-        live.push(block.frames, travel=block.travel)
+    while (block := dither.read(live.staging_buffer[:5])) is not None:
+        live.push_block(block)
         live.maps()
     found = live.result()
     io.save_result(exact, tmp_path / "result.h5")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from bare import find_change_point, find_onset
 from stacks import MadeUp
 
 from mirrorskin import engine, io
@@ -21,7 +22,7 @@ def jittered(seed):
     return np.clip(np.rint(counts), 0, 255).astype(np.uint8), travel, onset
 
 
-@pytest.mark.parametrize(("find", "least"), [(engine.find_onset, 0.5), (engine.find_change_point, 0.2)])
+@pytest.mark.parametrize(("find", "least"), [(find_onset, 0.5), (find_change_point, 0.2)])
 def test_heights_of_a_travel_that_jitters_have_true_errors(find, least):
     squares = []
     for seed in range(8):

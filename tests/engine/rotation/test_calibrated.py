@@ -13,10 +13,9 @@ from rotations import EIGHTHS, TILT
 from stacks import MadeUp
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.live import LiveOperation
+from mirrorskin.engine.live import LiveRun
 from mirrorskin.engine.rotation.registration import Registered, Sight
 from mirrorskin.engine.rotation.rotation import first_turn
-from mirrorskin.engine.streaming import push_block
 from mirrorskin.hw.twin import Axial, Body, Camera
 
 SHAPE, PIXEL, PRESS = (68, 71), 0.085, 0.7
@@ -169,8 +168,8 @@ def test_a_uniform_pattern_leaves_the_wave_alone():
 
 def test_live_normals_are_those_of_the_calibration():
     source = scene().source()
-    live = LiveOperation(source, engine.Rotation(window_frames=8, noise=1.05))
-    push_block(live, source.read(np.empty_like(scene().frames)))
+    live = LiveRun(source, engine.Rotation(window_frames=8, noise=1.05))
+    live.push_block(source.read(np.empty_like(scene().frames)))
     assert np.isfinite(live.maps()["normals"]).any()
     result = live.result()
     # The pivot is far from the ball, and live frames are not registered: this is no measure of errors.

@@ -5,7 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mirrorskin.engine import Correlate, correlate
+from mirrorskin.engine import Correlate, Run, correlate
+from mirrorskin.engine.array_source import ArraySource
+from mirrorskin.engine.operation import Plan
 from mirrorskin.io import InputError, MirrorskinWarning
 from mirrorskin.kernels.errors import DeviceError
 
@@ -57,17 +59,17 @@ def stacked(found):
     return np.stack([found.mean, found.cosine, found.sine, found.residual])
 
 
-def push(operation, frames, phase, weights=None, cuts=(), **options):
+def push(run, frames, phase, weights=None, cuts=()):
     """Push frames in blocks that are cut as told."""
     for start, stop in pairwise([0, *cuts, len(frames)]):
         part = None if weights is None else weights[start:stop]
-        operation.push(frames[start:stop], phase=phase[start:stop], frame_weights=part, **options)
-    return operation
+        run.push(frames[start:stop], phase=phase[start:stop], frame_weights=part)
+    return run
 
 
 def same(one, other):
     np.testing.assert_array_equal(stacked(one), stacked(other))
-    assert one.process == other.process
+    assert one.process["frames"] == other.process["frames"]
 
 
 @pytest.mark.parametrize(
@@ -97,10 +99,10 @@ def test_it_is_least_squares(device, dtype, phases):
 
 def in_window(frames, weight, device):
     """The same by a window that other frames have passed through."""
-    operation = Correlate(window_frames=8, device=device)
-    push(operation, frames[::-1].copy(), np.arange(8.0))
-    push(operation, frames[:3], np.arange(3.0), [0.25, 0, 1])
-    return push(operation, frames, MEASURED, weight, cuts=[1, 4]).result()
+    run = Run(Correlate(window_frames=8, device=device))
+    push(run, frames[::-1].copy(), np.arange(8.0))
+    push(run, frames[:3], np.arange(3.0), [0.25, 0, 1])
+    return push(run, frames, MEASURED, weight, cuts=[1, 4]).result()
 
 
 @pytest.mark.parametrize(
@@ -120,8 +122,8 @@ def test_frames_count_by_their_weights(device, dtype, weights):
 def test_a_window_forgets_what_has_left_it(device, dtype):
     phase = 0.7 * np.arange(150.0)
     frames, cuts = swing(dtype, phase, noise=0.1), np.unique(np.random.default_rng(3).integers(1, 150, 15))
-    operation = push(Correlate(window_frames=9, device=device), frames, phase, cuts=cuts)
-    same(operation.result(), correlate(frames[-9:], phase[-9:], device=device))
+    run = push(Run(Correlate(window_frames=9, device=device)), frames, phase, cuts=cuts)
+    same(run.result(), correlate(frames[-9:], phase[-9:], device=device))
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
@@ -132,7 +134,7 @@ def test_counts_without_noise_leave_no_residual(device, dtype):
     cosine, sine = np.rint([np.cos(phase), np.sin(phase)])[:, :, None, None]
     light = (mean + cosine * swings - sine * (swings // 2)).astype(dtype)
     for window in (None, 8):
-        found = push(Correlate(window_frames=window, device=device), light, phase).result()
+        found = push(Run(Correlate(window_frames=window, device=device)), light, phase).result()
         np.testing.assert_allclose(found.mean, mean, rtol=1e-7)
         np.testing.assert_allclose(found.cosine, swings, rtol=3e-7, atol=1e-6)
         np.testing.assert_allclose(found.sine, -(swings // 2), rtol=3e-7, atol=1e-6)
@@ -158,12 +160,12 @@ def test_no_sum_overflows(device, dtype, window):
     phase = np.repeat([0, 2.0, 4.0], [62, 1, 1])
     frames = np.full((64, 1, 2), top, dtype)
     frames[62:, 0, 1] = 0
-    operation = Correlate(window_frames=window, device=device)
+    run = Run(Correlate(window_frames=window, device=device))
     for _ in range(10):
-        push(operation, frames, phase)
+        push(run, frames, phase)
     turns = 1 if window else 10
     expected = least_squares(np.tile(frames, (turns, 1, 1)), np.tile(phase, turns))
-    np.testing.assert_allclose(stacked(operation.result())[:3], expected[:3], rtol=2e-7, atol=1e-6 * top)
+    np.testing.assert_allclose(stacked(run.result())[:3], expected[:3], rtol=2e-7, atol=1e-6 * top)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -171,11 +173,11 @@ def test_a_sample_that_is_not_a_number_spoils_its_pixel_while_it_is_in_the_windo
     phase = PHASES["turns"]
     frames = swing("float32", phase)
     frames[2, 1, 3] = bad
-    clean, operation = np.isfinite(frames[2]), Correlate(window_frames=8, device=device)
+    clean, run = np.isfinite(frames[2]), Run(Correlate(window_frames=8, device=device))
     for start in range(12):
-        push(operation, frames[start : start + 1], phase[start : start + 1])
+        push(run, frames[start : start + 1], phase[start : start + 1])
         if start >= 4:
-            found = stacked(operation.result())
+            found = stacked(run.result())
             assert np.all(np.isfinite(found[:, clean]))
             assert np.all(np.isnan(found[:, ~clean])) == (start <= 9)
     whole = correlate(frames, phase, device=device)
@@ -194,50 +196,50 @@ def test_what_a_missing_frame_holds_does_not_matter(device, missing):
 
 def test_a_window_answers_as_soon_as_its_phases_determine_a_fit(device):
     frames = swing("uint8", MEASURED)
-    operation = Correlate(window_frames=8, device=device)
+    run = Run(Correlate(window_frames=8, device=device))
     for count in range(3):
         message = f"{count} frames? at {count}.* phases?" if count else "none have been pushed"
         with pytest.raises(InputError, match=message):
-            operation.result()
-        push(operation, frames[count : count + 1], MEASURED[count : count + 1])
-    three = operation.result()
+            run.result()
+        push(run, frames[count : count + 1], MEASURED[count : count + 1])
+    three = run.result()
     assert np.isnan(three.residual).all()
     np.testing.assert_allclose(stacked(three)[:3], least_squares(frames[:3], MEASURED[:3])[:3], rtol=1e-5)
-    five = push(operation, frames[3:5], MEASURED[3:5]).result()
+    five = push(run, frames[3:5], MEASURED[3:5]).result()
     assert (three.process["frames"], five.process["frames"]) == (3, 5)
     np.testing.assert_allclose(five.residual, least_squares(frames[:5], MEASURED[:5])[3], rtol=1e-3)
 
 
 @pytest.mark.parametrize("window", [None, 6])
-def test_frames_may_be_written_into_the_room(device, window):
+def test_frames_may_be_written_into_the_staging_buffer(device, window):
     frames, weights = swing("uint8", MEASURED), [1, 1, 1, 0.5, 1, 1, 0, 1]
-    operation, elsewhere = (Correlate(window_frames=window, device=device) for _ in range(2))
-    operation.begin(SHAPE, frames.dtype)
-    operation.room[:8] = frames
-    push(operation, operation.room[:8], MEASURED, weights)
-    same(operation.result(), push(elsewhere, frames, MEASURED, weights).result())
+    operation = Correlate(window_frames=window, device=device)
+    run = Run(Plan(operation, checked=False), ArraySource(frames, operation, {"phase": MEASURED}))
+    run.staging_buffer[:8] = frames
+    push(run, run.staging_buffer[:8], MEASURED, weights)
+    same(run.result(), push(Run(operation), frames, MEASURED, weights).result())
 
 
 @pytest.mark.parametrize(
     ("dtype", "window", "weights"),
     [("uint8", None, "late"), ("uint8", 8, "all"), ("uint16", 8, "late"), ("float32", None, "all")],
 )
-def test_less_room_gives_the_same_answer(small_device, dtype, window, weights):
+def test_less_memory_gives_the_same_answer(small_device, dtype, window, weights):
     phase, shape = PHASES["turns"][:10], (9, 48)
     frames = swing(dtype, phase, shape)
     weight = None if WEIGHTS[weights] is None else [1, 1, *WEIGHTS[weights]]
     found = []
     for limit in (10**9, 3100):
         small_device.max_allocation = limit
-        operation = Correlate(window_frames=window, device=small_device)
-        push(operation, frames[:4], phase[:4], None if weight is None else weight[:4]).result()
-        push(operation, frames[4:], phase[4:], None if weight is None else weight[4:])
-        found.append(operation.result())
-    assert len(operation._sums.bands) > 1
+        run = Run(Correlate(window_frames=window, device=small_device))
+        push(run, frames[:4], phase[:4], None if weight is None else weight[:4]).result()
+        push(run, frames[4:], phase[4:], None if weight is None else weight[4:])
+        found.append(run.result())
+    assert len(run.operation._sums.bands) > 1
     same(*found)
     small_device.max_allocation = 400
     with pytest.raises(DeviceError, match="one row of 800 pixels does not fit"):
-        Correlate(device=small_device).push(np.zeros((1, 4, 800), np.uint8), phase=[0])
+        Run(Correlate(device=small_device)).push(np.zeros((1, 4, 800), np.uint8), phase=[0])
 
 
 @pytest.mark.parametrize(
@@ -273,8 +275,8 @@ def test_a_window_has_3_to_64_frames(window):
 def test_a_block_that_does_not_fit_is_refused_and_changes_nothing(window, monkeypatch):
     monkeypatch.setattr("mirrorskin.engine.rotation.correlation._MAX_FRAMES", 12)
     frames = swing("uint8", MEASURED)
-    operation = push(Correlate(window_frames=window), frames, MEASURED)
-    before = operation.result()
+    run = push(Run(Correlate(window_frames=window)), frames, MEASURED)
+    before = run.result()
     wrong = [
         (frames.astype(np.uint16), MEASURED, None, "uint8 .* is needed"),
         (frames[:, 1:], MEASURED, None, r"uint8 \(n, 3, 5\) is needed"),
@@ -287,11 +289,11 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing(window, monkey
         wrong.append((frames, MEASURED, None, "at most 12 frames can be summed"))
     for block, phase, weights, message in wrong:
         with pytest.raises(InputError, match=message):
-            operation.push(block, phase=phase, frame_weights=weights)
-    same(operation.result(), before)
+            run.push(block, phase=phase, frame_weights=weights)
+    same(run.result(), before)
 
 
 def test_phases_in_degrees_are_reported():
     frames = swing("uint8", MEASURED)
-    with pytest.warns(MirrorskinWarning, match="phase is in radians; yours steps by 4[0-9.]* rad: are they"):
+    with pytest.warns(MirrorskinWarning, match="phases step by 4[0-9.]* rad from frame to frame: are they"):
         correlate(frames, np.degrees(MEASURED))

@@ -75,7 +75,7 @@ def test_a_harmonic_is_the_fit_of_a_multiple_of_the_phase(harmonic, dtype, devic
     phase = np.arange(16) * np.pi / 8 + 0.1
     found = engine.correlate(frames, phase, harmonic=harmonic, device=device)
     same = engine.correlate(frames, harmonic * phase, device=device)
-    blocks = engine.Correlate(harmonic=harmonic, device=device)
+    blocks = engine.Run(engine.Correlate(harmonic=harmonic, device=device))
     for part in np.split(np.arange(16), [5, 6]):
         blocks.push(frames[part], phase=phase[part])
     for name in ("mean", "cosine", "sine", "residual"):

@@ -10,6 +10,8 @@ from rotations import EIGHTHS, TILT, Setup
 
 from mirrorskin import engine
 from mirrorskin.engine import Normals, estimate_normals
+from mirrorskin.engine.array_source import ArraySource
+from mirrorskin.engine.operation import Plan
 from mirrorskin.io import InputError
 from mirrorskin.kernels.errors import DeviceError
 
@@ -42,22 +44,21 @@ def known(setup=SETUP, **given):
     }
 
 
-def estimator_of(device, setup=SETUP, shape=SHAPE, **given):
-    operation = Normals(device=device, **known(setup, **given))
-    operation.begin(shape, setup.dtype)
-    return operation
+def run_of(device, setup=SETUP, **given):
+    return engine.Run(Normals(device=device, **known(setup, **given)))
 
 
-def push(estimator, frames, phase, cuts=(), weights=None):
+def push(run, frames, phase, cuts=(), weights=None):
     """Push frames in blocks that are cut as told."""
     for start, stop in pairwise([0, *cuts, len(frames)]):
         part = None if weights is None else weights[start:stop]
-        estimator.push(frames[start:stop], phase=phase[start:stop], frame_weights=part)
-    return estimator
+        run.push(frames[start:stop], phase=phase[start:stop], frame_weights=part)
+    return run
 
 
 def same(one, other):
-    assert one.process == other.process
+    for name in ("noise", "shot_noise", "tilt", "turns", "frames"):
+        assert one.process[name] == other.process[name]
     assert [*one] == [*other]
     for name in one:
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
@@ -76,30 +77,32 @@ def test_blocks_make_no_difference_where_the_first_turn_determines_nothing(devic
     frames, phase, weights = frames_of(turns=3), phases(SETUP, 3), np.ones(24)
     weights[:8] = 0
     weights[kept] = 1
-    whole = push(estimator_of(device, noise=None), frames, phase, weights=weights).result()
+    whole = push(run_of(device, noise=None), frames, phase, weights=weights).result()
     assert (whole.process["turns"], whole.process["frames"]) == (2, 16)
-    single = push(estimator_of(device, noise=None), frames, phase, range(1, 24), weights)
+    single = push(run_of(device, noise=None), frames, phase, range(1, 24), weights)
     same(single.result(), whole)
 
 
-def test_frames_may_be_written_into_the_room(device):
+def test_frames_may_be_written_into_the_staging_buffer(device):
     frames, phase, weights = frames_of(turns=3), phases(SETUP, 3), np.array([1, 1, 0, 1, 1, 0, 0, 1] * 3)
-    elsewhere = push(estimator_of(device), frames, phase, weights=weights).result()
-    estimator, start = estimator_of(device, memory_limit=1, longest=8), 0
+    elsewhere = push(run_of(device), frames, phase, weights=weights).result()
+    operation, start = Normals(device=device, longest=8, memory_limit=1, **known()), 0
+    source = ArraySource(frames, operation, {"phase": phase})
+    run = engine.Run(Plan(operation, checked=False), source)
     while start < len(frames):
-        room = estimator.room[: min(5, len(frames) - start)]
-        part = slice(start, start + len(room))
-        room[:] = frames[part]
-        estimator.push(room, phase=phase[part], frame_weights=weights[part])
+        buffer = run.staging_buffer[: min(5, len(frames) - start)]
+        part = slice(start, start + len(buffer))
+        buffer[:] = frames[part]
+        run.push(buffer, phase=phase[part], frame_weights=weights[part])
         start = part.stop
-    same(estimator.result(), elsewhere)
+    same(run.result(), elsewhere)
 
 
 def test_turns_are_averaged_by_inverse_variance_or_given_alone(device):
     frames, phase = frames_of(turns=2), phases(SETUP, 2)
     frames[8, 2, 3:5] = 65_535  # which leaves less to the second turn
     both = estimate_normals(frames, phase, **known(), device=device)
-    each = push(estimator_of(device, per_turn=True), frames, phase).result()
+    each = push(run_of(device, per_turn=True), frames, phase).result()
     assert each.zenith.shape == each.azimuth.shape == each.modulation.shape == (2, *SHAPE)
     for turn in range(2):
         part = slice(8 * turn, 8 * turn + 8)
@@ -157,21 +160,21 @@ def test_a_frame_of_weight_0_or_of_no_numbers_is_a_missing_one(device):
 
 
 @pytest.mark.parametrize("per_pixel", [False, True])
-def test_less_room_gives_the_same_answer(small_device, per_pixel):
+def test_less_memory_gives_the_same_answer(small_device, per_pixel):
     shape, setup = (5, 65), replace(SETUP, phase=tuple(2 * np.pi * np.arange(9) / 9))
     frames, phase, found = frames_of(setup, 3, shape), phases(setup, 3), []
     gain = np.full(shape, setup.slope)
     given = {"zenith_gain": gain, "dark": gain * 0 + 120, "bright": 64_000.0} if per_pixel else {}
     for limit in (10**9, 3000, 1536):
         small_device.max_allocation = limit
-        estimator = estimator_of(small_device, setup, shape, noise=None, longest=9, **given)
-        assert (len(estimator._bands) > 1) == (limit < 10**9)
-        push(estimator, frames, phase, [4, 13, 20])
-        found += [estimator.result(), estimator.result()]
+        run = run_of(small_device, setup, noise=None, longest=9, **given)
+        push(run, frames, phase, [4, 13, 20])
+        assert (len(run.operation._bands) > 1) == (limit < 10**9)
+        found += [run.result(), run.result()]
     for other in found[1:]:
         same(other, found[0])
     with pytest.raises(DeviceError, match="one row of 150 pixels does not fit"):
-        estimator_of(small_device, shape=(4, 150))
+        push(run_of(small_device), np.zeros((8, 4, 150), SETUP.dtype), phases(SETUP, 1))
 
 
 def test_a_turn_may_have_64_frames_and_no_more(device):
@@ -186,7 +189,7 @@ def test_a_turn_may_have_64_frames_and_no_more(device):
     with pytest.raises(InputError, match=message):
         estimate_normals(frames[:65], 0.01 * np.arange(65), **known(setup), dark=3, device=device)
     with pytest.raises(InputError, match="a turn of 9 frames"):
-        push(estimator_of(device, setup, longest=8, dark=3), frames[:9], 0.01 * np.arange(9), range(1, 9))
+        push(run_of(device, setup, longest=8, dark=3), frames[:9], 0.01 * np.arange(9), range(1, 9))
 
 
 def test_three_frames_are_enough_where_the_noise_is_known(device):
@@ -265,7 +268,7 @@ def test_a_sample_far_off_the_others_makes_the_normal_as_uncertain_as_it_is(devi
     normals = facing((30, 40), (15, 50))
     frames = rotations.expose(normals, setup, 3)
     frames[5] = 250  # as of a hot pixel
-    found = estimate_normals(frames, setup.phase, device=device, **known(setup))
+    found = rotations.estimate(frames, setup.phase, device=device, **known(setup))
     error = np.linalg.norm(np.cross(found.normals.astype(float), normals), axis=-1)
     assert 0.5 < np.nanmean((error / found.normals_sigma) ** 2) < 2  # 400 by noise alone
 
@@ -366,10 +369,10 @@ def test_what_cannot_be_used_is_refused_in_one_line(case):
 
 def test_a_block_that_does_not_fit_is_refused_and_changes_nothing():
     frames, phase = frames_of(turns=2), phases(SETUP, 2)
-    estimator = estimator_of(None)
+    run = run_of(None)
     with pytest.raises(InputError, match="none have been pushed"):
-        estimator.result()
-    push(estimator, frames[:10], phase[:10])
+        run.result()
+    push(run, frames[:10], phase[:10])
     wrong = [
         (frames.astype(np.uint8), phase, None, "uint16 .* is needed"),
         (frames[:, 1:], phase, None, r"uint16 \(n, 5, 7\) is needed"),
@@ -386,9 +389,9 @@ def test_a_block_that_does_not_fit_is_refused_and_changes_nothing():
     ]
     for block, where, weights, message in wrong:
         with pytest.raises(InputError, match=message):
-            estimator.push(block, phase=where, frame_weights=weights)
-    push(estimator, frames[10:], phase[10:])
-    same(estimator.result(), estimate_normals(frames, phase, **known()))
+            run.push(block, phase=where, frame_weights=weights)
+    push(run, frames[10:], phase[10:])
+    same(run.result(), estimate_normals(frames, phase, **known()))
 
 
 def test_a_pixel_without_a_scale_has_no_answer(device):

@@ -26,7 +26,7 @@ def drawn(name):
 def estimate(frames, setup, device, **given):
     """Estimate with what a lab knows: phases, tilt, gain, offset, and the noise of a sample."""
     known = {"noise": setup.spread, "device": device, **given}
-    return engine.estimate_normals(
+    return rotations.estimate(
         frames, setup.phase, tilt=setup.tilt, zenith_gain=setup.slope, zenith_offset=setup.offset, **known
     )
 

@@ -7,7 +7,6 @@ import pytest
 import rotations
 from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
-from mirrorskin.engine import estimate_normals
 from mirrorskin.engine.rotation.normals_to_height import find_slopes
 
 ONE = np.ones((1, 1), np.float32)
@@ -86,7 +85,7 @@ def test_slopes_have_true_errors_and_no_bias(phase, azimuth):
     for zenith in (0, 1, 4, *STEEP):
         true = np.tile(rotations.direction(np.radians(zenith), np.radians(azimuth)), (100, 100, 1))
         frames = rotations.expose(true, setup, seed=zenith)
-        normals = estimate_normals(frames, **known, noise=setup.spread)
+        normals = rotations.estimate(frames, **known, noise=setup.spread)
         found = find_slopes(normals.normals, normals.normals_sigma, np.ones_like(normals.contact), TILT)
         steepness = np.tan(np.radians(zenith))
         slopes = found.dz_dx, found.dz_dy

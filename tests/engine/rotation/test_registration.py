@@ -226,7 +226,7 @@ def test_it_is_a_source_like_its_own():
     assert source.phase is PHASES
     with source as entered:
         block = entered.read()
-    assert (block.index, block.phase, block.lent) == (0, [0.0], False)
+    assert (block.index, block.phase, block.stays_valid) == (0, [0.0], False)
     assert own.left
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rotations
 import walls
 from calibrations import a_precession
 from stacks import MadeUp
@@ -67,7 +68,7 @@ def test_a_defect_and_what_is_next_to_the_body_have_no_answer():
     np.testing.assert_array_equal(np.isfinite(per_count), expected)
     with np.errstate(invalid="ignore"):
         frames = np.random.default_rng(0).integers(90, 110, (8, *SHAPE)).astype(np.uint8)
-    normals = estimate_normals(frames, PHASE, tilt=TILT, response=found, noise=1.0)
+    normals = rotations.estimate(frames, PHASE, tilt=TILT, response=found, noise=1.0)
     assert np.isnan(normals.normals_sigma[~expected]).all()
     assert np.isfinite(normals.normals_sigma[expected]).any()
 
@@ -75,7 +76,7 @@ def test_a_defect_and_what_is_next_to_the_body_have_no_answer():
 def test_mirrors_that_face_one_way_are_found_to_do_so_all_over_the_picture(device):
     response = made(pivot=walls.PIVOT)
     frames, normal = frames_of(response, 0.5, 2.0)
-    found = estimate_normals(frames, PHASE, tilt=TILT, response=response, noise=1.0, device=device)
+    found = rotations.estimate(frames, PHASE, tilt=TILT, response=response, noise=1.0, device=device)
     error = np.linalg.norm(found.normals - normal, axis=-1) / found.normals_sigma
     assert np.mean(error**2) == pytest.approx(1, abs=0.25)
     assert found.contact.mean() > 0.98

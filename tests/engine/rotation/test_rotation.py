@@ -10,8 +10,8 @@ from rotations import EIGHTHS, TILT, Setup
 from stacks import MadeUp, assert_same
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.method import Context
-from mirrorskin.engine.rotation.steps import Edges, Integration
+from mirrorskin.engine.operation import Plan
+from mirrorskin.engine.rotation.steps import Edges, Integration, take_slopes
 from mirrorskin.hw.twin import Axial, Body, Camera
 
 SHAPE = (20, 24)
@@ -235,8 +235,8 @@ def test_heights_that_do_not_converge_are_refused(monkeypatch, robust, residual,
     def miss(*slopes, **options):
         assert options.pop("robust") == robust
         found = engine.integrate(*slopes, **options)
-        process = {**found.process, "integration_converged": False, "integration_residual": residual}
-        return found.assign(process=process, edges=broken if robust else None)
+        found = found.with_fitted(integration_converged=False, integration_residual=residual)
+        return found.assign(edges=broken if robust else None)
 
     monkeypatch.setattr("mirrorskin.engine.rotation.normals_to_height.integrate", miss)
     if accepted:
@@ -316,38 +316,53 @@ def test_operations_run_over_a_source_with_its_properties():
     with pytest.raises(io.InputError, match="tilt is missing"):
         engine.run(source(replace(HEADER, tilt=None)), engine.Normals)
     with pytest.raises(io.InputError, match="window have no weights"):
-        engine.Normals(window_frames=8, **known).push(
-            frames(), phase=PHASE, frame_weights=np.ones(len(PHASE))
+        engine.run(
+            frames(),
+            engine.Normals(window_frames=8, **known),
+            phase=PHASE,
+            frame_weights=np.ones(len(PHASE)),
         )
 
 
-@pytest.mark.parametrize("operation", [engine.Normals, engine.Correlate])
-def test_a_stack_that_is_lent_may_be_followed_by_other_frames(operation):
+@pytest.mark.parametrize("kind", [engine.Normals, engine.Correlate])
+def test_a_stack_that_stays_valid_may_be_followed_by_other_frames(kind):
     known = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
-    known = known if operation is engine.Normals else {}
-    lent, copied = operation(**known), operation(**known)
-    lent.push(frames()[:12], phase=PHASE[:12], lent=True)
-    first = lent.result()
-    alike(lent.result(), first)
-    assert lent.room.shape[1:] == SHAPE
-    for part in np.split(np.arange(12, len(PHASE)), [5]):
-        lent.push(frames()[part], phase=PHASE[part])
+    operation = kind(**known) if kind is engine.Normals else kind()
+    blocks = [
+        io.Block(frames()[part], part[0], phase=PHASE[part], stays_valid=True)
+        for part in np.split(np.arange(len(PHASE)), [12, 17])
+    ]
+    whole, copied = (engine.Run(Plan(operation, checked=False), source()) for _ in range(2))
+    whole.push_block(blocks[0])
+    first = whole.result()
+    alike(whole.result(), first)
+    assert whole.staging_buffer.shape[1:] == SHAPE
+    for block in blocks[1:]:
+        whole.push_block(replace(block, stays_valid=False))
     copied.push(frames(), phase=PHASE)
-    alike(lent.result(), copied.result())
-    lent.reset()
-    lent.push(frames()[:12], phase=PHASE[:12])
-    alike(lent.result(), first)
+    alike(whole.result(), copied.result())
 
 
-def test_steps_may_be_applied_to_the_result_of_an_operation():
+def test_steps_may_follow_any_operation():
     made = source(OF_A_SURFACE)
     operation = engine.Normals(window_frames=24, noise=20.0).configured_for(made)
-    operation.push(frames(), phase=PHASE)
-    context = Context(made, operation, made)
-    result = Integration().apply(Edges().apply(operation.result(), context), context)
+    result = engine.Run(Plan(operation, [Edges(), Integration()]), made).complete()
     whole = reconstruct(OF_A_SURFACE, noise=20.0)
     assert np.median(np.abs(result.height - whole.height)) < 0.002
     assert (result.edges.shape, result.offset_unknown.tolist()) == (SHAPE, [1])
+
+
+def test_slopes_may_be_kept_instead_of_heights():
+    made = source(OF_A_SURFACE)
+    plan = engine.Rotation(noise=20.0).slope_plan(made)
+    result, slopes = take_slopes(engine.Run(plan, made).complete())
+    whole = reconstruct(OF_A_SURFACE, noise=20.0)
+    assert set(whole) - set(result) == {"height", "height_sigma", "component", "offset_unknown"}
+    pixel = OF_A_SURFACE.pixel_size
+    surface = engine.integrate(
+        slopes.dz_dx, slopes.dz_dy, pixel, mask=slopes.known, slope_weights=slopes.weights
+    )
+    np.testing.assert_allclose(surface.height, whole.height, atol=1e-4)
 
 
 def test_heights_may_be_a_map_a_result_or_a_file(tmp_path):

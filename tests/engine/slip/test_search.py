@@ -77,9 +77,9 @@ def search(**options):
 @pytest.fixture(scope="module")
 def slid():
     frames, places = slide()
-    operation = search()
-    operation.push(frames, displacement=places)
-    return operation.result(), float(places[-1, 0])
+    run = engine.Run(search())
+    run.push(frames, displacement=places)
+    return run.result(), float(places[-1, 0])
 
 
 def test_slip_and_stick_are_distinguished_within_a_pixel(slid):
@@ -96,9 +96,9 @@ def test_slip_and_stick_are_distinguished_within_a_pixel(slid):
 
 def test_texture_that_seems_drawn_to_halves_of_a_pixel_does_not_pass_for_slip():
     frames, places = slide(count=18, drawn=0.06)
-    operation = search()
-    operation.push(frames, displacement=places)
-    found, true = operation.result(), onset(COLUMN, ROW) * PIXEL
+    run = engine.Run(search())
+    run.push(frames, displacement=places)
+    found, true = run.result(), onset(COLUMN, ROW) * PIXEL
     assert np.sqrt(np.nanmean((found.slip_onset - true)[INSIDE] ** 2)) < 0.3 * STEP * PIXEL
     assert (found.status[INSIDE] == 1).sum() == pytest.approx((true[INSIDE] < places[-1, 0]).sum(), rel=0.02)
 
@@ -131,16 +131,16 @@ def test_the_displacement_is_that_of_the_skin(slid):
 
 def test_the_direction_of_a_slide_does_not_matter(slid):
     frames, places = slide((-0.6, 0.8))
-    operation = search()
-    operation.push(frames, displacement=places)
-    assert operation.result().stick_ratio[-1] == pytest.approx(slid[0].stick_ratio[-1], rel=0.05)
+    run = engine.Run(search())
+    run.push(frames, displacement=places)
+    assert run.result().stick_ratio[-1] == pytest.approx(slid[0].stick_ratio[-1], rel=0.05)
 
 
 def test_contact_is_estimated_if_it_is_not_given(slid):
     frames, places = slide()
-    operation = search(contact=None)
-    operation.push(frames, displacement=places)
-    found = operation.result()
+    run = engine.Run(search(contact=None))
+    run.push(frames, displacement=places)
+    found = run.result()
     assert found.contact[INSIDE].mean() > 0.97
     assert found.contact.sum() < 1.1 * INSIDE.sum()
     stuck = [np.count_nonzero(one.status == 2) for one in (found, slid[0])]
@@ -149,9 +149,9 @@ def test_contact_is_estimated_if_it_is_not_given(slid):
 
 def test_skin_that_sticks_does_so_to_the_end():
     frames = np.stack([SPECKLE.frame(SHAPE, -0.4 * k, 0, NOISE, k) for k in range(8)])
-    operation = search()
-    operation.push(frames, displacement=0.4 * PIXEL * np.arange(8)[:, None] * [1, 0])
-    found = operation.result()
+    run = engine.Run(search())
+    run.push(frames, displacement=0.4 * PIXEL * np.arange(8)[:, None] * [1, 0])
+    found = run.result()
     assert (found.status[INSIDE] == 1).mean() < 0.01
     assert (found.stick_ratio > 0.99).all()
 
@@ -159,9 +159,9 @@ def test_skin_that_sticks_does_so_to_the_end():
 def test_a_body_that_turns_back_is_followed_until_then():
     frames, places = slide()
     way = np.r_[np.arange(20), np.arange(18, 14, -1)]
-    operation = search()
-    operation.push(frames[way], displacement=places[way])
-    found = operation.result()
+    run = engine.Run(search())
+    run.push(frames[way], displacement=places[way])
+    found = run.result()
     assert np.isfinite(found.stick_ratio[:20]).all()
     assert np.isnan(found.stick_ratio[20:]).all()
 
@@ -176,9 +176,9 @@ def test_centre_and_angle_of_a_twist_are_those_of_the_skin_that_sticks():
 
     frames = np.stack([SPECKLE.frame(SHAPE, *turned(angle), NOISE, k) for k, angle in enumerate(steps)])
     centre = (about[0] * PIXEL, about[1] * PIXEL)
-    operation = search(motion="twist", centre=centre)
-    operation.push(frames, twist=steps)
-    found = operation.result()
+    run = engine.Run(search(motion="twist", centre=centre))
+    run.push(frames, twist=steps)
+    found = run.result()
     assert found.process["angle"] == pytest.approx(-0.12, abs=2e-4)
     assert (found.process["centre_x"], found.process["centre_y"]) == pytest.approx((0, 0), abs=0.1 * PIXEL)
     assert found.twist_angle.tolist() == pytest.approx(steps)
@@ -188,10 +188,10 @@ def test_centre_and_angle_of_a_twist_are_those_of_the_skin_that_sticks():
 
 def test_a_clear_sheet_is_refused():
     frames = np.random.default_rng(1).normal(100, NOISE, (4, *SHAPE)).astype(np.float32)
-    operation = search()
-    operation.push(frames, displacement=0.01 * np.arange(4)[:, None] * [1, 0])
+    run = engine.Run(search())
+    run.push(frames, displacement=0.01 * np.arange(4)[:, None] * [1, 0])
     with pytest.raises(InputError, match="no texture beyond the noise"):
-        operation.result()
+        run.result()
 
 
 def test_bad_input_is_one_line():
@@ -207,19 +207,19 @@ def test_bad_input_is_one_line():
         ({"pixel_size": None}, "the pixel size is missing"),
     ]:
         with pytest.raises(InputError, match=message):
-            search(**options).push(frames, displacement=places)
-    operation = search()
+            engine.run(frames, search(**options), displacement=places)
+    run = engine.Run(search())
     with pytest.raises(InputError, match="displacement is missing: Slip needs it of each frame"):
-        operation.push(frames)
-    with pytest.raises(InputError, match=r"Slip does not take twist\. It takes displacement"):
-        operation.push(frames, displacement=places, twist=np.arange(20.0))
+        run.push(frames)
+    with pytest.raises(InputError, match="Slip has no position twist: it has displacement"):
+        run.push(frames, displacement=places, twist=np.arange(20.0))
     with pytest.raises(InputError, match=r"displacement has shape \(20,\) for 20 frames: two numbers"):
-        operation.push(frames, displacement=places[:, 0])
-    with pytest.raises(InputError, match="Slip needs at least 3 frames; none have been pushed"):
-        operation.result()
-    operation.push(frames[:4], displacement=0 * places[:4])
+        run.push(frames, displacement=places[:, 0])
+    with pytest.raises(InputError, match="Slip needs at least 3 frames; none have been pushed so far"):
+        run.result()
+    run.push(frames[:4], displacement=0 * places[:4])
     with pytest.raises(InputError, match="the body does not move"):
-        operation.result()
+        run.result()
 
 
 def test_a_source_is_reconstructed_as_the_operation_does(slid):
@@ -253,9 +253,9 @@ def test_the_contact_comes_from_wherever_there_is_one(kind, slid, tmp_path):
         "heights": heights,
     }[kind]
     frames, places = slide()
-    operation = search(contact=contact)
-    operation.push(frames, displacement=places)
-    found = operation.result()
+    run = engine.Run(search(contact=contact))
+    run.push(frames, displacement=places)
+    found = run.result()
     np.testing.assert_array_equal(found.contact, INSIDE)
     np.testing.assert_array_equal(found.slip_onset, slid[0].slip_onset)
     assert found.process["contact"] == ("given, by light" if kind == "heights" else "given")
@@ -275,9 +275,9 @@ def test_a_modulus_gives_traction_and_force(slid):
 
 def test_free_skin_in_windows_at_the_rim_of_an_estimated_contact_does_not_look_like_early_slip():
     frames, places = slide(count=14)  # to 0.4 of the way at which all slides
-    operation = search(contact=None)
-    operation.push(frames, displacement=places)
-    found = operation.result()
+    run = engine.Run(search(contact=None))
+    run.push(frames, displacement=places)
+    found = run.result()
     error = (found.slip_onset - onset(COLUMN, ROW) * PIXEL)[INSIDE]
     assert abs(np.nanmean(error)) < 0.3 * STEP * PIXEL  # 1.1 frames early with all windows
     assert 0.2 < np.nanmean((error / found.slip_onset_sigma[INSIDE]) ** 2) < 1.5  # 12 with all windows

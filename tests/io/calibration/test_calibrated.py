@@ -94,7 +94,7 @@ def test_frames_are_the_source_s_own_and_stay_lent():
     source = calibrated(["references", "precession"], feed)
     while (block := source.read()) is not None:
         assert block.frames is handed[-1].frames
-        assert block.lent
+        assert block.stays_valid
         assert block.dropped == handed[-1].dropped
         np.testing.assert_array_equal(block.phase, a_precession().phase(handed[-1].phase))
     assert handed[-1] is None

@@ -1,0 +1,123 @@
+"""Maps of a picture in bands or on several devices are those of the whole, and stay where the frames are."""
+
+import gc
+import weakref
+
+import numpy as np
+import pytest
+from bare import bare, bare_run
+
+from mirrorskin import engine, io
+from mirrorskin.engine.focus import Focus
+from mirrorskin.engine.photometric import PhotometricStereo
+from mirrorskin.engine.picture import PerFrame, Picture
+from mirrorskin.engine.tiling import Planes
+from mirrorskin.kernels.device import Device
+
+SHAPE, COUNT = (23, 31), 9
+FRAMES = np.random.default_rng(3).integers(20, 200, (COUNT, *SHAPE)).astype(np.uint8)
+DARKS = np.random.default_rng(4).uniform(0, 10, SHAPE)
+LEVELS = {"dark": 20, "bright": 200, "noise": 9.0}
+CASES = {
+    "focus": (Focus(noise=1.0, radius=3), {"travel": np.arange(COUNT) * 0.1}, 6000),
+    "onset": (engine.Onset(**LEVELS), {"travel": np.arange(COUNT) * 0.1}, 3 * 64 * 4),
+    "change-point": (engine.ChangePoint(**LEVELS), {"travel": np.arange(COUNT) * 0.1}, 64 * 25),
+    "lamps": (PhotometricStereo(zenith=0.6, dark=DARKS), {"phase": np.arange(COUNT) * 0.7}, 64 * 4 * 11),
+}
+SOURCE = """
+#include "common.clh"
+__kernel void add(__global const FRAME *frames, const int count, const int first, const int pixels,
+                  const int stride, MAP weights, OUT sums, __global int *last) {
+    const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
+    for (int k = 0; k < count; ++k)
+        for (int p = low; p < end; ++p) {
+            sums[p] += frames[k * pixels + p];
+            sums[stride + p] += weights[k] * frames[k * pixels + p];
+            last[p] = first + k;
+        }
+}
+"""
+
+
+class Sums(engine.Operation):
+    """Sums of the brightness, weighted by travel and not."""
+
+    dtypes = (np.dtype("u1"),)
+    for_device = True
+
+    total = io.Map("sum", "counts")
+    moment = io.Map("sum, weighted by travel", "counts mm")
+    last = io.Map("number of the last frame", dtype="int32")
+
+    def start(self, shape, dtype):
+        self.picture = Picture(self, SOURCE, {"sums": Planes(2, np.float32), "last": np.int32})
+        self.picture.fill("sums", 0)
+        self.picture.fill("last", np.arange(shape[1]))
+
+    def push(self, frames, *, travel):
+        self.picture.scan("add", frames, weights=PerFrame(travel))
+
+    def result(self):
+        total, moment, last = self.picture.take(("sums", 0), ("sums", 1), "last")
+        return {"total": total, "moment": moment, "last": last}
+
+
+CASES["own"] = (Sums(), {"travel": np.arange(COUNT)}, 64 * 4 * 2)
+
+
+def same(found, expected):
+    assert list(found) == list(expected)
+    for name in expected:
+        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_bands_have_the_maps_of_the_whole(small_device, name):
+    operation, positions, smallest = CASES[name]
+    operation = operation.with_options(device=small_device)
+    whole = bare(operation, FRAMES, **positions)
+    small_device.max_allocation = smallest
+    run = bare_run(operation)
+    for start in range(0, COUNT, 4):
+        part = slice(start, start + 4)
+        run.push(FRAMES[part], **{name: values[part] for name, values in positions.items()})
+    assert len(run.operation._picture.bands) > 2
+    for _ in range(2):
+        same(run.result(), whole)
+    same(bare(operation, FRAMES, [2, 3], **positions), whole)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_several_devices_have_the_maps_of_one(device, name):
+    operation, positions, _ = CASES[name]
+    other = Device(device.context.devices[0])
+    other.info, other.layout = device.info, device.layout
+    expected = bare(operation.with_options(device=device), FRAMES, **positions)
+    same(bare(operation.with_options(device=[device, other]), FRAMES, **positions), expected)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_maps_stay_on_the_device_of_the_frames(device, name):
+    operation, positions, _ = CASES[name]
+    found = bare(operation, device.from_host("frames", FRAMES, FRAMES.dtype), **positions)
+    assert found.on_device(next(iter(found))) is not None
+    same(found, bare(operation.with_options(device=device), FRAMES, **positions))
+
+
+def test_the_sums_are_those_of_numpy():
+    found = bare(Sums(), FRAMES, [4], travel=np.arange(COUNT))
+    np.testing.assert_array_equal(found.total, FRAMES.sum(axis=0))
+    np.testing.assert_array_equal(found.moment, np.tensordot(np.arange(COUNT), FRAMES, 1))
+    assert (found["last"] == COUNT - 1).all()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_memory_is_free_with_the_last_reference(device, name):
+    operation, positions, _ = CASES[name]
+    run = bare_run(operation.with_options(device=device))
+    run.push(FRAMES, **positions)
+    band = weakref.ref(run.operation._picture.bands[0])
+    gc.disable()
+    del run
+    gc.enable()
+    assert band() is None
