@@ -1,4 +1,4 @@
-"""The tables of maps, status codes and parameters in docs/formats.md and docs/calibration.md.
+"""The tables of maps, of ``fitted``, status codes and parameters in docs/formats.md and docs/calibration.md.
 
 ``python docs/site/map_tables.py`` (in the environment) writes them into the pages, from the
 declarations; a test compares them.
@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
 
-from mirrorskin.io import Map
+from mirrorskin.io import Fitted, Map
 from mirrorskin.io.calibration.parameters import Parameter, parameters
 from mirrorskin.io.calibration.types import PARTS
 from mirrorskin.io.maps import (
@@ -29,7 +30,7 @@ from mirrorskin.io.maps import (
 )
 
 DOCS = Path(__file__).resolve().parents[1]
-_STORED = {"text": "text", "names": "text", "integer": "i8", "integers": "i8"}
+_STORED = {"text": "text", "names": "text", "integer": "i8", "integers": "i8", "flag": "bool"}
 _CAMERA = (
     ["`camera/name`", "text", "", "name in the rig file; empty if unknown"],
     ["`camera/shape`", "(2,)", "", "H, W"],
@@ -65,9 +66,11 @@ def tables() -> dict[str, dict[str, str]]:
         for kind in PARTS.values()
         for name, one in parameters(kind).items()
     ]
+    facts = (_stored(name, replace(one, optional=False)) for name, one in parameters(Fitted).items())
     return {
         "formats.md": {
             "map": as_table(["map", "shape, type", "unit", "undefined", "content"], rows),
+            "fitted": as_table(["fitted", "shape, type", "unit", "content"], facts),
             "code": as_table(["code", *_STATUS], meanings),
         },
         "calibration.md": {
@@ -78,9 +81,7 @@ def tables() -> dict[str, dict[str, str]]:
 
 def _stored(name: str, one: Parameter) -> list[str]:
     """Return the row of a parameter of a calibration."""
-    dtype = {"text": "text", "names": "text", "integer": "i8", "integers": "i8"}.get(
-        one.kind, one.dtype.str[1:]
-    )
+    dtype = _STORED.get(one.kind, one.dtype.str[1:])
     place = f"`{name}/NAME`" if one.kind == "mapping" else f"`{name}`"
     return [f"{place} *" if one.optional else place, f"{one.size} {dtype}".strip(), one.unit, one.text]
 

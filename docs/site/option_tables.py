@@ -18,7 +18,7 @@ from map_tables import as_table
 
 from mirrorskin.engine.method import Method
 from mirrorskin.engine.operation import Operation
-from mirrorskin.engine.options import Option
+from mirrorskin.engine.options import Option, plain
 
 DOCS = Path(__file__).resolve().parents[1]
 OPTIONS = "options.md"
@@ -29,6 +29,7 @@ _PACKAGES = ("", ".press", ".rotation", ".slip", ".focus", ".fringes", ".photome
 _COMMON = ("device", "memory_limit")  # described once, above the tables
 _FUNCTIONS = {"MovingNormals": "estimate_normals"}  # which chooses between two operations
 _KINDS = {"flag": "`True` or `False`", "file": "path, result or array", "object": "object"}
+_KINDS |= {"text": "text", "path": "path"}
 
 
 def classes(base: type) -> dict[str, Any]:
@@ -110,11 +111,11 @@ def _value(one: Option) -> str:
     if one.choices:
         return ", ".join(f'`"{choice}"`' for choice in one.choices)
     if one.kind == "map":
-        return f"number or map, {one.unit}"
-    value = _KINDS.get(one.kind) or one.needed.removeprefix("a ")
+        return f"number or map, {one.unit}" if one.unit else "number or array"
+    value = _KINDS.get(str(one.kind)) or one.needed.removeprefix("a ")
     if one.kind == "integer" and value.startswith("number of at"):
         value = f"integer {value.removeprefix('number ')}"
-    if one.kind == "numbers":
+    if one.kind in ("numbers", "integers"):
         value = f"list, each a {value}"
     return " or ".join([value, *(f'`"{word}"`' for word in one.words)])
 
@@ -122,7 +123,7 @@ def _value(one: Option) -> str:
 def _default(one: Option) -> str:
     if one.shown_default or one.default is None:
         return one.shown_default or "none"
-    return f"`{one.default!r}`".replace("'", '"')
+    return f"`{plain(one.default)!r}`".replace("'", '"')
 
 
 def _linked(name: str) -> str:
