@@ -73,7 +73,7 @@ def released(rig_file):
 
 def test_heights_grow_and_the_result_is_shown(opened):
     run(opened, 0.5)
-    opened.get_by_text("Contact", exact=True).wait_for()
+    opened.get_by_text("Contact area", exact=True).wait_for()
     if SCREENSHOTS:
         opened.screenshot(path=f"{SCREENSHOTS}/app-rig.png")
     opened.get_by_text("Show the result").click()
