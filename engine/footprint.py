@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,8 @@ def with_curvature(height: NDArray[Any], sigma: NDArray[Any], variance: float) -
     are differences between pixels that are its standard deviation apart, rounded up, and their squares are
     averaged over 3 x 3 of these.
     """
+    import cv2  # slow to import, and unneeded by most presses
+
     reach, (rows, columns) = math.ceil(math.sqrt(variance)), height.shape
     padded = cv2.copyMakeBorder(height[::reach, ::reach].astype(np.float32), 2, 2, 2, 2, cv2.BORDER_REPLICATE)
     found, factor = np.empty(height.shape, np.float32), np.float32((variance / (2 * reach**2)) ** 2)
@@ -45,6 +46,8 @@ _ALONG = _ACROSS.T.copy()
 
 def _curvature(height: NDArray[Any]) -> NDArray[Any]:
     """Return the mean of square second differences, without the outer 2 rows and columns."""
+    import cv2
+
     across, along = (cv2.filter2D(height, -1, kernel) for kernel in (_ACROSS, _ALONG))
     squares = np.maximum(cv2.multiply(across, along, scale=2), np.float32(0))
     for differences in (across, along, cv2.filter2D(height, -1, _MIXED)):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any, cast
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -143,6 +142,8 @@ def _width(
 
 def _rise(height: NDArray[Any]) -> NDArray[np.float32]:
     """Return by how much heights change over a pixel."""
+    import cv2  # slow to import, and unneeded if the levels are certain
+
     kernel = np.array([[-0.5, 0, 0.5]], np.float32)
     source = height.astype(np.float32)
     across, along = (
