@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,7 +66,8 @@ class LevelUncertainty(Step):
             rise = np.asarray(bright, np.float64) - np.asarray(dark, np.float64)
             share = scatter / float(np.nanmedian(rise))
         if samples is not None:
-            errors = _find_errors(samples, context.positions("travel"), result.height, dark, bright)
+            seen = _Seen.of(samples, context.positions("travel"), dark, bright, result.height.shape)
+            errors = _find_errors(seen, -samples.of_map(result.height).astype(np.float64))
             share = math.hypot(share, *(error / math.sqrt(2) for error in errors))
             if any(errors):
                 said = " and ".join(
@@ -78,27 +79,42 @@ class LevelUncertainty(Step):
                 result = with_findings(result, Finding("levels", text, False))
         if not share:
             return result
-        travel = context.positions("travel")
-        width = 0.0 if samples is None else _width(samples, travel, result, dark, bright)
         slope = _rise(result.height)
+        width = 0.0 if samples is None else _width(seen, samples.of_map(slope))
         known = np.isfinite(slope)  # not at the border of the contact
         usual = np.median(slope[known]) if known.any() else np.float32(0)
         moved = np.float32(share) * np.hypot(np.where(known, slope, usual), np.float32(width))
         return result.assign(height_sigma=np.hypot(result.height_sigma, moved))
 
 
-def _find_errors(
-    samples: FrameSamples, travel: Doubles, height: NDArray[Any], dark: ArrayLike, bright: ArrayLike
-) -> tuple[float, float]:
+class _Seen(NamedTuple):
+    """What a grid of pixels shows from the least travel on, and their levels."""
+
+    values: NDArray[Any]  # (T, rows, columns)
+    travel: Doubles
+    dark: NDArray[np.float32]
+    bright: NDArray[np.float32]
+
+    @classmethod
+    def of(
+        cls,
+        samples: FrameSamples,
+        travel: Doubles,
+        dark: ArrayLike,
+        bright: ArrayLike,
+        shape: tuple[int, ...],
+    ) -> _Seen:
+        """Return the samples of a press or a release."""
+        low, high = (
+            samples.of_map(np.broadcast_to(np.asarray(level, np.float32), shape)) for level in (dark, bright)
+        )
+        forward = slice(None, None, -1 if travel[-1] < travel[0] else 1)
+        return cls(samples.values[forward], travel[forward], low, high)
+
+
+def _find_errors(seen: _Seen, onset: Doubles) -> tuple[float, float]:
     """Return by how much dark and light differ from the references, in shares of the rise; 0 if hardly."""
-    onset = -samples.of_map(height).astype(np.float64)
-    low, high = (
-        samples.of_map(np.broadcast_to(np.asarray(level, np.float32), height.shape))
-        for level in (dark, bright)
-    )
-    values = samples.values
-    if travel[-1] < travel[0]:  # of a release
-        values = values[::-1]
+    values, travel, low, high = seen
     few, least, most = max(1, round(_PART * len(travel))), float(travel.min()), float(travel.max())
     away = _AWAY * (most - least)
     found = []
@@ -118,24 +134,17 @@ def _find_errors(
     return found[0], found[1]
 
 
-def _width(
-    samples: FrameSamples, travel: Doubles, result: Result, dark: ArrayLike, bright: ArrayLike
-) -> float:
+def _width(seen: _Seen, slope: NDArray[np.float32]) -> float:
     """Return the travel in which the flattest pixels turn light in addition to their slopes, mm."""
-    low, high = (
-        samples.of_map(np.broadcast_to(np.asarray(level, np.float32), result.height.shape))
-        for level in (dark, bright)
-    )
-    values, rise = samples.values, samples.of_map(_rise(result.height))
-    if travel[-1] < travel[0]:  # of a release
-        values, travel = values[::-1], travel[::-1]
+    values, travel, low, high = seen
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = ((values - low) / (high - low)).reshape(len(travel), -1)
     width = 2 * (first_travel(shares, travel, 0.75) - first_travel(shares, travel, 0.25))
-    known = np.isfinite(width) & np.isfinite(rise.ravel())
+    slope = slope.ravel()
+    known = np.isfinite(width) & np.isfinite(slope)
     if np.count_nonzero(known) < _FEWEST:
         return 0.0
-    width, slope = width[known], rise.ravel()[known]
+    width, slope = width[known], slope[known]
     flat = slope <= np.quantile(slope, _FLAT)
     return math.sqrt(max(0.0, float(np.median(width[flat] ** 2 - slope[flat] ** 2))))
 

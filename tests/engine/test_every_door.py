@@ -198,8 +198,6 @@ def device_array(task: Task) -> io.Result:
 
 
 def own_loop(task: Task) -> io.Result:
-    if not hasattr(engine, "Run"):
-        pytest.skip("there is no engine.Run")
     operation = task.configured()
     if operation.passes == 2:
         pytest.skip("it needs all frames twice")
