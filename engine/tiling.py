@@ -34,7 +34,7 @@ _PIECE = 64_000_000  # bytes that are copied to discrete memory at once: enough 
 
 @dataclass(frozen=True, slots=True)
 class Planes:
-    """Several maps in one array, each padded to full words of the frames' samples."""
+    """Several maps in one array, each padded to full words; ``("f4", 3)`` is the type of maps of vectors."""
 
     count: int
     dtype: DTypeLike
@@ -76,8 +76,8 @@ class _Maps(dict[str, Array]):
         if isinstance(kind, Planes):
             shape, dtype = (kind.count, self._stride), np.dtype(kind.dtype)
         else:
-            shape, dtype = (*self._shape, *np.dtype(kind).shape), np.dtype(kind).base
-        array = self[name] = self._device.array(name, shape, dtype, zeroed=False)
+            shape, dtype = self._shape, np.dtype(kind)
+        array = self[name] = self._device.array(name, (*shape, *dtype.shape), dtype.base, zeroed=False)
         return array
 
 
@@ -95,7 +95,7 @@ class Band:
     stride : int
         Pixels from plane to plane.
     maps : dict of Array, (rows, W), or (count, stride) for `Planes`
-        Uninitialised at first.
+        Uninitialised at first; vectors have a third axis.
     length : int
         Number of frames that fit in the memory.
     stop : Event
@@ -157,22 +157,21 @@ class Band:
         if plane is None and not any(values.strides):
             array.fill(values.flat[0].item())
         else:
-            array.write(np.broadcast_to(values, array.shape if plane is None else self._shape), plane or 0)
+            array.write(np.broadcast_to(values, (*self._shape, *array.shape[2:])), plane or 0)
+        if not self._only:
+            self._park()
 
-    def picture(self, plane: NDArray[Any]) -> NDArray[Any]:
-        """Return a plane, (stride,), without its padding, (rows, W)."""
-        return plane[: self.pixels].reshape(self._shape)
+    def own_rows(self, values: NDArray[Any], plane: int | None) -> NDArray[Any]:
+        """Return a map, (rows, W), or one of several planes, of the rows that belong to no other band."""
+        if plane is not None:
+            values = values[plane, : self.pixels].reshape(*self._shape, *values.shape[2:])
+        return values[self.own]
 
-    def own_rows(self, values: NDArray[Any], plane: int) -> NDArray[Any]:
-        """Return a map, or one of its planes, of the rows that belong to no other band."""
-        padded = values.ndim == 2 and values.shape[1] == self.stride
-        return (self.picture(values[plane]) if padded else values)[self.own]
-
-    def cut(self, name: str, plane: int = 0, components: int = 0) -> Array:
-        """Return a copy on the device of a map, (rows, W), of one of several planes, or of vectors."""
+    def cut(self, name: str, plane: int = 0) -> Array:
+        """Return a copy on the device of a map, (rows, W), or of one of several planes."""
         array = self.maps[name]
-        shape = (*self._shape, components) if components else (*self._shape, *array.shape[2:])
-        return array.cut(plane * self.stride, shape)
+        vector = array.shape[2:]
+        return array.cut(plane * self.stride * math.prod(vector), (*self._shape, *vector))
 
     def fetch(self, parts: Mapping[str, int | slice], keep: Collection[str] = ()) -> list[NDArray[Any]]:
         """Wait once, and return planes or rows of maps, (count, stride) or (rows, W).

@@ -61,7 +61,7 @@ typedef long Narrow;
 
 // One of several frames whose samples are added to a pixel's sums a, b, c and d together.
 #define SIDE(i) \
-    __global const FRAME *restrict frame##i = frames + (size_t)place[t + i] * stride + low; \
+    __global const FRAME *restrict frame##i = frames + (size_t)place[t + i] * each + low; \
     const Narrow cosine##i = basis[3 * (t + i) + 1], sine##i = basis[3 * (t + i) + 2];
 #define TAKE(i) \
     now = frame##i[p]; \
@@ -94,7 +94,7 @@ typedef long Narrow;
     }
 
 __kernel void correlation_window(
-    __global const FRAME *restrict frames, const int count, const int pixels, const int stride,
+    __global const FRAME *restrict frames, const int count, const int pixels, const int each,
     __global const int *restrict place, __global const int *restrict basis, const int used, const long cosines,
     const long sines, MAP fit, OUT mean, OUT cosine_part, OUT sine_part, OUT residual)
 {
@@ -107,14 +107,14 @@ __kernel void correlation_window(
 }
 
 __kernel void correlation_add(
-    __global const FRAME *restrict frames, const int count, const int pixels, const int stride,
-    __global const int *restrict place, __global const int *restrict basis, const int fresh,
+    __global const FRAME *restrict frames, const int count, const int pixels, const int each,
+    __global const int *restrict place, __global const int *restrict basis, const int first,
     __global long *restrict total, __global long *restrict cosine, __global long *restrict sine,
     __global long *restrict square)
 {
     const int low = get_global_id(0) * TILE, width = min(TILE, pixels - low);
     for (int start = 0; start < count; start += WINDOW) {
-        const int stop = min(count, start + WINDOW), known = !fresh || start > 0;
+        const int stop = min(count, start + WINDOW), known = first > 0 || start > 0;
         SUM(start, stop)
         for (int p = 0; p < width; ++p) {
             total[low + p] = totals[p] + (known ? total[low + p] : 0);
@@ -175,18 +175,18 @@ typedef struct {
 // Adds frames; before the first one, its sample becomes the reference. Inlined, because a GPU's lane would
 // otherwise keep its sums in memory.
 __attribute__((always_inline)) void add(
-    Sums *restrict sums, const int fresh, const int width, __global const FRAME *restrict frames, const int count,
-    const int stride, __global const int *restrict place, MAP basis)
+    Sums *restrict sums, const int first, const int width, __global const FRAME *restrict frames, const int count,
+    const int each, __global const int *restrict place, MAP basis)
 {
-    for (int p = 0; p < width && fresh; ++p) {
-        sums->reference[p] = frames[(size_t)place[0] * stride + p];
+    for (int p = 0; p < width && first == 0; ++p) {
+        sums->reference[p] = frames[(size_t)place[0] * each + p];
         SET(TOTAL, ((Pair){0, 0}))
         SET(COSINE, ((Pair){0, 0}))
         SET(SINE, ((Pair){0, 0}))
         SET(SQUARE, ((Pair){0, 0}))
     }
     for (int t = 0; t < count; ++t) {
-        __global const FRAME *restrict frame = frames + (size_t)place[t] * stride;
+        __global const FRAME *restrict frame = frames + (size_t)place[t] * each;
         const float weight = basis[3 * t], cosine = basis[3 * t + 1], sine = basis[3 * t + 2];
         for (int p = 0; p < width; ++p) {
             const float sample = (float)frame[p] - sums->reference[p];
@@ -204,20 +204,20 @@ __attribute__((always_inline)) void add(
 #define PAIR(pair) ((Pair){(pair).x, (pair).y})
 
 __kernel void correlation_sum(
-    __global const FRAME *restrict frames, const int count, const int pixels, const int stride,
-    __global const int *restrict place, MAP basis, const int fresh, OUT reference, __global float2 *restrict total,
+    __global const FRAME *restrict frames, const int count, const int pixels, const int each,
+    __global const int *restrict place, MAP basis, const int first, OUT reference, __global float2 *restrict total,
     __global float2 *restrict cosine, __global float2 *restrict sine, __global float2 *restrict square)
 {
     const int low = get_global_id(0) * TILE, width = min(TILE, pixels - low);
     Sums here, *sums = &here;
-    for (int p = 0; p < width && !fresh; ++p) {
+    for (int p = 0; p < width && first > 0; ++p) {
         sums->reference[p] = reference[low + p];
         SET(TOTAL, PAIR(total[low + p]))
         SET(COSINE, PAIR(cosine[low + p]))
         SET(SINE, PAIR(sine[low + p]))
         SET(SQUARE, PAIR(square[low + p]))
     }
-    add(sums, fresh, width, frames + low, count, stride, place, basis);
+    add(sums, first, width, frames + low, count, each, place, basis);
     for (int p = 0; p < width; ++p) {
         reference[low + p] = sums->reference[p];
         total[low + p] = (float2)(sums->high[TOTAL][p], sums->rest[TOTAL][p]);
@@ -239,12 +239,12 @@ __kernel void correlation_solve_pairs(
 
 // Both at once, if the samples are not kept.
 __kernel void correlation_window_pairs(
-    __global const FRAME *restrict frames, const int count, const int pixels, const int stride,
+    __global const FRAME *restrict frames, const int count, const int pixels, const int each,
     __global const int *restrict place, MAP basis, MAP fit, OUT mean, OUT cosine_part, OUT sine_part, OUT residual)
 {
     const int low = get_global_id(0) * TILE, width = min(TILE, pixels - low);
     Sums here, *sums = &here;
-    add(sums, 1, width, frames + low, count, stride, place, basis);
+    add(sums, 0, width, frames + low, count, each, place, basis);
     for (int p = 0; p < width; ++p)
         ANSWER(low + p, sums->reference[p], EXACT(GET(TOTAL)), EXACT(GET(COSINE)), EXACT(GET(SINE)), EXACT(GET(SQUARE)))
 }

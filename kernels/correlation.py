@@ -45,13 +45,13 @@ def correlation_window(frames: Array, place: Array, basis: Array, used: int, cos
     It combines ``correlation_add`` and ``correlation_solve_counts``; the kernel's sums are int32 for uint8.
     """
     total, cosine, sine, square = sums = np.zeros((4, frames.shape[1]), np.int64)
-    correlation_add(frames, place, basis, True, *sums)
+    correlation_add(frames, place, basis, 0, *sums)
     return correlation_solve_counts(used, cosines, sines, total, cosine, sine, square, fit)
 
 
-def correlation_add(frames: Array, place: Array, basis: Array, fresh: bool, total: Counts, cosine: Counts,
+def correlation_add(frames: Array, place: Array, basis: Array, first: int, total: Counts, cosine: Counts,
                     sine: Counts, square: Counts) -> None:  # fmt: skip
-    """Add frames of weight 1 to sums, or start new sums if ``fresh``.
+    """Add frames of weight 1 to sums, or start new sums if ``first`` is 0.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def correlation_add(frames: Array, place: Array, basis: Array, fresh: bool, tota
     total, cosine, sine, square : (P,), sums of the samples, of their products with cosine and sine, in units,
         and of their squares
     """
-    if fresh:
+    if first == 0:
         for array in (total, cosine, sine, square):
             array[:] = 0
     for number, (_, along, across) in zip(place, basis.astype(np.int64), strict=True):
@@ -92,15 +92,16 @@ def correlation_convert(used: int, cosines: int, sines: int, unit: float, total:
     return reference, sums[0], unit * sums[1], unit * sums[2], sums[3]
 
 
-def correlation_sum(frames: Array, place: Array, basis: Array, fresh: bool, reference: Array, total: Floats,
+def correlation_sum(frames: Array, place: Array, basis: Array, first: int, reference: Array, total: Floats,
                     cosine: Floats, sine: Floats, square: Floats) -> None:  # fmt: skip
     """Add frames of any weights to sums.
 
-    If ``fresh``, new sums start with the first sample as the reference, which is subtracted from all samples.
+    If ``first`` is 0, new sums start with the first sample as the reference, which is subtracted from all
+    samples.
     ``basis``, (m, 3), contains for each frame its weight, and the weight times cosine and sine of its phase.
     The kernel stores each sum as a pair of floats.
     """
-    if fresh:
+    if first == 0:
         reference[:] = frames[place[0]]
         for array in (total, cosine, sine, square):
             array[:] = 0
@@ -122,7 +123,7 @@ def correlation_solve_pairs(
 def correlation_window_pairs(frames: Array, place: Array, basis: Array, fit: Array) -> Answers:
     """Return mean, cosine, sine and residual, counts, of frames of any weights, without keeping sums."""
     reference, total, cosine, sine, square = sums = np.zeros((5, frames.shape[1]))
-    correlation_sum(frames, place, basis, True, *sums)
+    correlation_sum(frames, place, basis, 0, *sums)
     return correlation_solve_pairs(reference, total, cosine, sine, square, fit)
 
 

@@ -381,7 +381,7 @@ class Device:
         name : str
             The function in it.
         **defines : str or int
-            Macros to set; ``WORDS`` and ``TILE`` are set by the device's layout.
+            Macros to set; ``TILE`` is set by the device's layout.
 
         Raises
         ------
@@ -400,8 +400,8 @@ class Device:
         key = file, name, self.layout, *defines.items()
         kernel = self._kernels.get(key)
         if kernel is None:
-            cut = {"WORDS": self.layout.words, "TILE": self.layout.tile}
-            options = tuple(f"-D{key}={value}" for key, value in sorted({**cut, **defines}.items()))
+            macros = {"TILE": self.layout.tile, **defines}
+            options = tuple(f"-D{key}={value}" for key, value in sorted(macros.items()))
             kernel = self._kernels.setdefault(key, self._make_kernel(file, name, options))
         return kernel
 

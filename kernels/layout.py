@@ -7,22 +7,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The size of a work-item; all but the group are macros of the kernels.
+    """The size of a work-item and of a work-group.
 
     Attributes
     ----------
-    words : int
-        Vectors per work-item, in kernels that process vectors of pixels.
     tile : int
-        Pixels per work-item, in kernels that process single pixels.
+        Pixels per work-item, a macro of the kernels.
     group : int
         Work-items of a work-group.
     """
 
-    words: int
     tile: int
     group: int
 
 
-CPU_LAYOUT = Layout(words=128, tile=1024, group=1)
-GPU_LAYOUT = Layout(words=1, tile=1, group=128)
+CPU_LAYOUT = Layout(tile=1024, group=1)
+GPU_LAYOUT = Layout(tile=1, group=128)

@@ -3,7 +3,7 @@
 
 #include "normals.clh"
 
-#define PART (WORDS < 4 ? WORDS : 4)  // vectors processed at once
+#define PART (TILE / LANES < 4 ? TILE / LANES : 4)  // vectors processed at once
 #define STEADY 1e-6f  // amplitude, radians, below which rounding determines the azimuth
 
 // The expected zenith of a sample, and its derivatives along the meridian, across it and with respect to the
@@ -120,7 +120,7 @@ __kernel void normals_exact(ARGUMENTS)
     GATHER_ARGUMENTS
     float weights = 0.0f;
     for (int k = 0; k < count; ++k) {
-        const float root = tables[(table * PLANES + ROOT_WEIGHT) * ROOM + k];
+        const float root = table[ROOT_WEIGHT * ROOM + k];
         weights += root * root;
     }
     for (int from = first; from < end; from += PART * LANES) {

@@ -1,9 +1,8 @@
 // Surface normals from samples at any known poses. Specification: normals_pose.py; macros and arguments: normals.clh.
 //
-// tables   after the planes of a turn: the body's axis in each frame, its derivative with respect to the tilt, and travel
+// table    after the planes of a turn: the body's axis in each frame, its derivative with respect to the tilt, and travel
 // presses  whether travel differs from frame to frame
 
-#define PLANES (TURN_PLANES + 7)
 #include "normals.clh"
 
 enum { AXIS_X = TURN_PLANES, AXIS_Y, AXIS_Z, LEAN_X, LEAN_Y, LEAN_Z, TRAVEL };

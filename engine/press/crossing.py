@@ -209,7 +209,7 @@ class Crossing:
             "status": Planes(1, np.uint8),
             **({"samples": Planes(5, dtype)} if self._subframe else {}),  # those around an open run
         }
-        self._maps = Picture(operation, "onset", planes, tile=_TILE, BITS=8 * dtype.itemsize)
+        self._maps = Picture(operation, "onset", planes, tile=_TILE)
         dark, bright = reference_maps(operation.dark, operation.bright, shape, dtype)
         share = threshold - _ROUNDING
         coarse = float(np.float32(share))

@@ -45,7 +45,7 @@ class FollowingHeights:
         self._estimates += 1
         if self._step is not None:
             return
-        maps = {name: normals.on_device(name) for name in ("vectors", "sigma", "contact")}
+        maps = {name: normals.maps.array(name) for name in ("vectors", "sigma", "contact")}
         for array in maps.values():  # this queue waits for the estimate
             array.arrived = array.latest
         self._slopes.find(normals.model.tilt, maps, self._integrator.maps)

@@ -103,11 +103,10 @@ class LastTurn(Normals):
             return Result()
         window.estimate()
         started = time.perf_counter()
+        normals, contact = window.maps.read("vectors", "contact")
+        self._has_estimate = True
         if heights is not None:
             heights.follow(window)
-        self._has_estimate = True
-        normals, contact = (window.fetch_early(name) for name in ("vectors", "contact"))
-        if heights is not None:
             heights.wait(seconds - (time.perf_counter() - started))
         height = None if heights is None else heights.height
         self._updates += 1
@@ -202,7 +201,7 @@ class IdleEdges:
     def _part(self, window: NormalWindow) -> None:
         """Start a drawing, continue it by one part, or fetch its lines."""
         if self._steps is None:
-            self._drawing.take(*(window.fetch(name) for name in ("vectors", "sigma", "contact")))
+            self._drawing.take(*window.maps.read("vectors", "sigma", "contact"))
             self._steps = self._drawing.steps(_PARTS)
         elif next(self._steps, self) is self:
             self.lines, self._steps = self._drawing.lines(), None

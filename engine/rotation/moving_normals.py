@@ -59,8 +59,8 @@ class MovingNormals(NormalsOperation):
     _kernel_maps = (*MAPS, *SLOPE_MAPS)
     _width = 4
 
-    def _make_kernel(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> NormalKernel:
-        return NormalKernel(self, self.devices, shape, dtype, poses=True)
+    def _make_kernel(self, shape: tuple[int, int]) -> NormalKernel:
+        return NormalKernel(self, shape, poses=True)
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare for frames of a shape and type."""

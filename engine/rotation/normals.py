@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -27,7 +27,6 @@ from mirrorskin.engine.rotation.normals_kernel import (
     MAPS,
     NormalKernel,
     NormalMethod,
-    Samples,
     SensorOptions,
     TurnModel,
     azimuth_of,
@@ -44,7 +43,6 @@ from mirrorskin.engine.rotation.poses import PoseFit
 from mirrorskin.engine.rotation.response import Response, initial_response, wall_response_of
 from mirrorskin.engine.rotation.scale import check_gain
 from mirrorskin.engine.rotation.tilt import check_tilt
-from mirrorskin.engine.tiling import Band, cut_into_bands, for_each_band, join_rows, staging_buffer_of
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE
 from mirrorskin.io.positions import check_phase
@@ -107,18 +105,14 @@ class NormalsOperation(SensorOptions, Operation):
             **{name: getattr(source.header, name) for name in names if getattr(self, name) is None}
         )
 
-    def _make_kernel(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> NormalKernel:
+    def _make_kernel(self, shape: tuple[int, int]) -> NormalKernel:
         raise NotImplementedError
 
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare for frames of a shape and type."""
         self._longest = LONGEST if self.longest is None else self.longest
-        self._kernel = self._make_kernel(shape, dtype)
-        least = self._longest + 1
-        length = max(least, self.frames_at_once)
-        self._bands = cut_into_bands(self.devices, shape, dtype, self._kernel.planes, length, least)
-        for band in self._bands:
-            self._kernel.write_scale(band)
+        self._kernel = self._make_kernel(shape)
+        self._maps = self._kernel.picture(self, self._longest + 1)
         self._model = self._kernel.model
         self._stack: AnyArray | None = None  # all frames, if they stay valid: they are used without a copy
         self._phase = np.empty((0, self._width) if self._width else 0)  # phases of the frames in the buffer
@@ -126,10 +120,10 @@ class NormalsOperation(SensorOptions, Operation):
         self._turns = self._frames = 0  # numbers of turns and frames in the maps
         self._each: list[list[NDArray[Any]]] = []
 
-    @cached_property
+    @property
     def _buffer(self) -> NDArray[Any]:
         """Buffer with the frames of the current turn, and space for more."""
-        return staging_buffer_of(self._bands, min(band.length for band in self._bands))
+        return self._maps.staging_buffer
 
     @property
     def staging_buffer(self) -> NDArray[Any]:
@@ -174,15 +168,14 @@ class NormalsOperation(SensorOptions, Operation):
             return self._complete()
         state = self._model, self._turns, self._frames, self._phase.copy(), self._weights.copy()
         frames = self._open[: len(self._phase)].copy() if np.any(self._weights == 0) else None
-        closed = for_each_band(self._bands, self._copy_maps) if self._turns and not self.per_turn else []
+        closed = self._maps.read(*self._kernel_maps) if self._turns and not self.per_turn else []
         try:
             return self._complete()
         finally:  # more frames may follow: open the last turn again
             self._model, self._turns, self._frames, self._phase, self._weights = state
             del self._each[self._turns :]
-            for band, maps in zip(self._bands, closed, strict=False):
-                for name, values in maps.items():
-                    band.write(name, values)
+            for name, values in zip(self._kernel_maps, closed, strict=False):
+                self._maps.fill(name, values)
             if frames is not None:
                 self._buffer[: len(frames)] = frames
 
@@ -198,7 +191,7 @@ class NormalsOperation(SensorOptions, Operation):
         if self.per_turn:
             maps = [np.stack(turns) for turns in zip(*self._each, strict=True)]
         else:
-            maps = self._take_maps()
+            maps = self._maps.take(*self._kernel_maps, on_host=self._stack is None)
         return self._as_result(maps, self._model)
 
     def _as_result(self, maps: list[NDArray[Any]], model: TurnModel) -> Result:
@@ -247,16 +240,10 @@ class NormalsOperation(SensorOptions, Operation):
 
         The first turn that determines a normal is used, and later ones if their phases go all round.
         """
-        fitted: list[tuple[slice, TurnFit | PoseFit]] = []
         for turn in turns:
             turn = self._without_missing(turn)
-            fit = self._fit_of(self._phase[turn], self._weights[turn], first=not (self._turns or fitted))
+            fit = self._fit_of(self._phase[turn], self._weights[turn], first=not self._turns)
             if fit is not None:
-                fitted.append((turn, fit))
-        for start in range(0, len(fitted), self._kernel.tables_at_once):
-            group = fitted[start : start + self._kernel.tables_at_once]
-            self._kernel.write_tables([fit for _, fit in group])
-            for turn, fit in group:
                 self._estimate_turn(turn, fit)
 
     def _without_missing(self, turn: slice) -> slice:
@@ -270,43 +257,14 @@ class NormalsOperation(SensorOptions, Operation):
 
     def _estimate_turn(self, turn: slice, fit: TurnFit | PoseFit) -> None:
         """Add a turn to the maps."""
-        count = turn.stop - turn.start
+        frames = self._open[turn]
         if self._model is None:
-            self._model = self._kernel.estimate_model(thinned(self._open[turn]), fit)
+            self._model = self._kernel.estimate_model(thinned(frames), fit)
         self._turns += 1
-        self._frames += count
-        turns = 1 if self.per_turn else self._turns
-        frames, model = self._open[turn], self._model
-
-        def run(band: Band) -> None:
-            with band.resident():
-                for staged in band.stage(frames, whole=True):
-                    self._kernel.run(band, Samples(staged.array, 0, count), fit, model, turns)
-
-        for_each_band(self._bands, run)
+        self._frames += len(frames)
+        self._kernel.run(self._maps, frames, fit, self._model, 1 if self.per_turn else self._turns)
         if self.per_turn:
-            self._each.append(self._take_maps())
-
-    def _copy_maps(self, band: Band) -> dict[str, NDArray[Any]]:
-        """Return copies of a band's maps, including their padding."""
-        names = self._kernel_maps
-        return dict(zip(names, band.fetch(dict.fromkeys(names, slice(None)), keep=names), strict=True))
-
-    def _take_maps(self) -> list[Any]:
-        """Return the maps of all rows in the order of `_kernel_maps`, on the device if the frames are."""
-        if self._stack is not None and self._on_device and not self.per_turn:
-            (band,) = self._bands
-            return [band.cut(name, components=3 * (name == "vectors")) for name in self._kernel_maps]
-        parts = for_each_band(self._bands, self._take_band_maps)
-        return [join_rows(part) for part in zip(*parts, strict=True)]
-
-    def _take_band_maps(self, band: Band) -> list[NDArray[Any]]:
-        """Return the maps of a band's rows in the order of `_kernel_maps`."""
-        planes = band.fetch(dict.fromkeys(self._kernel_maps, slice(None)))
-        vectors, *others = (plane.reshape(-1) for plane in planes)
-        rows = (-1, self.shape[1])
-        flat = [values[: band.pixels].reshape(rows) for values in others]
-        return [vectors[: 3 * band.pixels].reshape(*rows, 3), *flat]
+            self._each.append(self._maps.read(*self._kernel_maps))
 
 
 def normals_result(maps: list[Any], model: TurnModel, turns: int, frames: int) -> Result:
@@ -418,16 +376,12 @@ class Normals(NormalsOperation):
         if self.window_frames is None:
             super().start(shape, dtype)
         else:
-            kernel = self._make_kernel(shape, dtype)
-            self._window = NormalWindow(kernel, shape, dtype, self.window_frames)
+            self._window = NormalWindow(self, self._make_kernel(shape), self.window_frames)
 
-    def _make_kernel(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> NormalKernel:
+    def _make_kernel(self, shape: tuple[int, int]) -> NormalKernel:
         if self.tilt is None:
             raise InputError("tilt is missing: give the half-angle of the precession, such as 2.5deg")
-        devices = self.devices if self.window_frames is None else [self.device]
-        return NormalKernel(
-            self, devices, shape, dtype, tilt=self.tilt, method=self.method, response=self.response
-        )
+        return NormalKernel(self, shape, tilt=self.tilt, method=self.method, response=self.response)
 
     @property
     def window(self) -> NormalWindow:
@@ -437,7 +391,7 @@ class Normals(NormalsOperation):
     @property
     def staging_buffer(self) -> NDArray[Any]:
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
-        return super().staging_buffer if self.window_frames is None else self._window.staging_buffer
+        return super().staging_buffer if self.window_frames is None else self._window.maps.staging_buffer
 
     def after_last_frame(self, samples: FrameSamples) -> Self | None:
         """Return the operation that corrects the light of each frame, if it is not steady."""
@@ -507,5 +461,4 @@ class Normals(NormalsOperation):
             return super().result()
         window = self._window
         window.estimate(bare=False)
-        maps = [window.fetch(name) for name in MAPS]
-        return normals_result(maps, window.model, 1, window.length)
+        return normals_result(window.maps.read(*MAPS), window.model, 1, window.length)

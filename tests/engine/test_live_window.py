@@ -88,7 +88,7 @@ def test_a_device_with_little_memory_works_in_bands(small_device):
     small_device.max_allocation = 3500
     run = make(device=small_device, noise=1.3)
     push(run, frames, [2, 19])
-    assert len(run.operation.window.bands) > 1
+    assert len(run.operation.window.maps.bands) > 1
     found = run.result()
     assert np.mean(np.isclose(found.normals, exact.result().normals, atol=1e-5, equal_nan=True)) > 0.99
     assert found.normals.shape == (*SHAPE[1:], 3)

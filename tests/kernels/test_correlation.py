@@ -12,7 +12,7 @@ def test_the_reference_is_least_squares_in_fractions() -> None:
     counts = [[10, 200], [17, 3], [12, 250], [200, 0]]
     rows = np.array([[1, c, s] for c, s in phases], np.int32)
     sums = np.zeros((4, 2), np.int64)
-    correlation.correlation_add(np.array(counts, np.uint8), np.arange(4, dtype=np.int32), rows, True, *sums)
+    correlation.correlation_add(np.array(counts, np.uint8), np.arange(4, dtype=np.int32), rows, 0, *sums)
     upper = np.diag([2, np.sqrt(2), np.sqrt(2)])
     project = np.linalg.inv(upper).ravel()
     high = project.astype(np.float32)

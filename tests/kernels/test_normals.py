@@ -8,8 +8,8 @@ import rotations
 from rotations import EIGHTHS, UNEVEN, Setup
 from scipy import optimize, special
 
+from mirrorskin.engine.picture import vector_lanes
 from mirrorskin.engine.rotation.design_matrix import fit_matrix
-from mirrorskin.engine.rotation.normals_kernel import vector_lanes
 from mirrorskin.kernels import normals
 from mirrorskin.kernels.device import C_TYPES
 from mirrorskin.kernels.normals import Answer, Variance, contact_limits
@@ -76,12 +76,10 @@ class Answers:
     def take(self, method, turn, start=0):
         """Run the kernel on a turn that begins with frame `start` of its stack."""
         count, self.turns = len(turn.frames), self.turns + 1
-        # As in an estimator's room: frames before, and one behind, of which the last vector may see some.
-        frame = np.zeros_like(turn.frames[:1])
-        stack = np.concatenate([*[frame] * start, turn.frames, frame])
-        # Of several tables, it is not always the first.
-        tables, scale = np.full((start + 1, 6, ROOM), np.nan, np.float32), turn.scale.astype(np.float32)
-        tables[start, :, :count] = turn.table
+        # A ring buffer, and a frame behind it, of which the last vector may see some.
+        stack = np.concatenate([np.roll(turn.frames, start, axis=0), np.zeros_like(turn.frames[:1])])
+        table, scale = np.full((6, ROOM), np.nan, np.float32), turn.scale.astype(np.float32)
+        table[:, :count] = turn.table
         if scale.ndim == 2:
             scale = np.pad(scale, [(0, 0), (0, self.stride - self.pixels)], constant_values=np.nan)
         still = turn.limits.still - (turn.tilt if method == "exact" else 0)
@@ -95,8 +93,8 @@ class Answers:
             turn.limits.rest,
         )
         per_pixel = int(scale.ndim == 2)
-        whole = start, start, count, start + count, self.pixels, self.pixels, self.stride, self.turns
-        arrays = [self.put(stack), self.put(tables), self.put(scale)]
+        whole = start, count, self.pixels, self.pixels, self.stride, self.turns
+        arrays = [self.put(stack), self.put(table), self.put(scale)]
         arguments = [*arrays, *whole, per_pixel, 0, *reals, *self.maps.values()]
         if method == "paper":
             arguments += [*turn.spread]
@@ -104,7 +102,7 @@ class Answers:
         kernel = self.device.kernel(
             "normals", f"normals_{method}", FRAME=C_TYPES[turn.frames.dtype.name], LANES=lanes
         )
-        items = -(-self.pixels // (lanes * self.device.layout.words))
+        items = -(-self.pixels // self.device.layout.tile)
         kernel(items, moved=0, **dict(zip(kernel.arguments, arguments, strict=True)))
         return self
 

@@ -101,15 +101,15 @@ class Fit:
         self.used = named("used cosines sines", *(turns * self.rows.sum(axis=0, dtype=np.int64)).tolist())
         totals = np.zeros((4 if whole else 5, shape[1]), np.int64 if whole else float)
         add = correlation.correlation_add if whole else correlation.correlation_sum
-        add(self.frames, ORDER, self.rows, True, *totals)
+        add(self.frames, ORDER, self.rows, 0, *totals)
         self.totals = named(TOTALS if whole else f"reference {TOTALS}", *turns * totals)
 
 
-@case("correlation_add", PIXELS | WHOLE | {"count": (1, 11, 150), "fresh": (0, 1)})
-def _(shape, dtype, count, fresh):
+@case("correlation_add", PIXELS | WHOLE | {"count": (1, 11, 150), "first": (0, 1)})
+def _(shape, dtype, count, first):
     made, place = Fit(shape, dtype, whole=True), np.arange(count, dtype=np.int32) * 5 % len(PHASES)
     totals = named(TOTALS, *np.random.default_rng(1).integers(-(10**6), 10**6, (4, shape[1])))
-    some = {"frames": made.frames, "place": place, "basis": made.rows[place], "fresh": fresh}
+    some = {"frames": made.frames, "place": place, "basis": made.rows[place], "first": first}
     return totals | some | {"shape": shape, "macros": made.fit["macros"]}
 
 
@@ -155,11 +155,11 @@ def _(shape, dtype, turns):
     return made.used | made.totals | made.fit | {"unit": 1 / STEPS[dtype], "fit": None}
 
 
-@case("correlation_sum", PIXELS | DTYPES | {"fresh": (0, 1)}, pairs=TOTALS, rtol=1e-13, atol=1e-13)
-def _(shape, dtype, fresh):
-    made, place = Fit(shape, dtype), np.array([3, 1, 4] if fresh else [0, 9], np.int32)
+@case("correlation_sum", PIXELS | DTYPES | {"first": (0, 1)}, pairs=TOTALS, rtol=1e-13, atol=1e-13)
+def _(shape, dtype, first):
+    made, place = Fit(shape, dtype), np.array([0, 9] if first else [3, 1, 4], np.int32)
     basis = np.random.default_rng(2).normal(1, 3, (len(place), 3)).astype(np.float32)
-    return made.totals | made.fit | {"frames": made.frames, "place": place, "basis": basis, "fresh": fresh}
+    return made.totals | made.fit | {"frames": made.frames, "place": place, "basis": basis, "first": first}
 
 
 @case("correlation_window_pairs", PIXELS | DTYPES, **FIT)

@@ -96,7 +96,8 @@ def agree(
         macros = {"FRAME": C_TYPES[frames.dtype.name]} | macros
     kernel = device.kernel(KERNELS[name], name, **macros)
     pixels, tile = rows * columns, device.layout.tile
-    sizes = {"rows": rows, "columns": columns, "pixels": pixels, "stride": pixels + 3}
+    sizes = {"rows": rows, "columns": columns, "pixels": pixels}
+    sizes |= {"stride": pixels + 3, "each": pixels + 3}
     sizes |= {"count": len(values.get("place", frames if isinstance(frames, np.ndarray) else ()))}
     values |= {key: size for key, size in sizes.items() if key in kernel.arguments and key not in values}
     counts = {"picture": -(-pixels // tile), "row": rows * -(-columns // min(tile, 256))}
@@ -114,7 +115,8 @@ def agree(
     arrays = {}
     for key in kernel.arguments:
         given = values[key] if key in values else _untouched(expected[key], items)
-        if key == "frames" and values.get("stride", 0) > pixels:  # the reference sees the pixels of rows
+        if key == "frames" and max(values.get("each", 0), values.get("stride", 0)) > pixels:
+            # The reference sees the pixels of rows.
             given = expected[key] = np.pad(given, ((0, 0), (0, 3)), constant_values=77)
         if key in pairs.split():
             given = np.stack([given.astype(np.float32), given - given.astype(np.float32)], axis=-1)

@@ -235,7 +235,7 @@ def test_less_memory_gives_the_same_answer(small_device, dtype, window, weights)
         push(run, frames[:4], phase[:4], None if weight is None else weight[:4]).result()
         push(run, frames[4:], phase[4:], None if weight is None else weight[4:])
         found.append(run.result())
-    assert len(run.operation._sums.bands) > 1
+    assert len(run.operation._picture.bands) > 1
     same(*found)
     small_device.max_allocation = 400
     with pytest.raises(DeviceError, match="one row of 800 pixels does not fit"):
