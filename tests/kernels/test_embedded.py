@@ -370,9 +370,19 @@ def test_the_processor_of_the_variable_replaces_the_recognised_one(asked, monkey
     assert asked("znver3") == ["called", "haswell"]
 
 
-@pytest.mark.parametrize(("processor", "width"), [("", 16), ("haswell", 8), ("skylake-avx512", 16)])
+@pytest.mark.parametrize(
+    ("processor", "width"),
+    [
+        ("unknown", 16),
+        ("haswell", 8),
+        ("znver3", 8),
+        ("skylake-avx512", 16),
+        ("rocketlake", 16),
+        ("skylake", 8),
+    ],
+)
 def test_vectors_are_as_wide_as_registers_of_the_processor(monkeypatch, processor, width):
-    monkeypatch.setenv("MIRRORSKIN_PROCESSOR", processor)
+    monkeypatch.setattr(embedded, "_processor", processor)
     assert embedded.vector_width(SimpleNamespace(native_vector_width_float=16)) == width
 
 
