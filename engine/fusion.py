@@ -18,7 +18,7 @@ from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.method import Method
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.blur import PIXEL, LensBlur
-from mirrorskin.engine.press.intervals import heights_as_intervals, repeated_heights_as_intervals
+from mirrorskin.engine.press.intervals import heights_as_intervals, stored_heights_as_intervals
 from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.reconstruction import calibrated
@@ -145,8 +145,10 @@ def fuse(
     -----
     Errors of normals are assumed to be independent and normally distributed. Each height is assumed to be
     within sqrt(3) ``height_sigma`` of the surface, with equal probability everywhere in this interval. A
-    height that is rounded to multiples of a step fits this with step / sqrt(12) as its sigma. Of results,
-    heights that many pixels share are taken as the middles of the intervals between frames.
+    height that is rounded to multiples of a step fits this with step / sqrt(12) as its sigma. Heights of a
+    press are moved to the middles of the intervals between its frames; those of a result only if at least a
+    quarter are there already, because it may have been changed. Without the travel of the frames, heights
+    that several pixels share are the middles.
 
     If normals are those of a rotation whose frames were not registered, the differences between heights and
     surface are part of ``height_sigma``.
@@ -236,14 +238,17 @@ def _fuse_maps(
     height = absolute_heights(height_maps)
     assert height is not None
     values, sigma = (np.asarray(map_, np.float64) for map_ in (height, height_maps.height_sigma))
-    known = AbsoluteHeights.of(*repeated_heights_as_intervals(values, sigma), wanted)
+    travel = height_maps.fitted.frame_travel
+    intervals = stored_heights_as_intervals(values, sigma, None if travel is None else np.array(travel))
+    known = AbsoluteHeights.of(*intervals, wanted)
     tilt = normal_maps.fitted.tilt
     moved = 0.0  # pixels that points move in frames that were not registered
     if tilt is not None and not normal_maps.fitted.registered:
         moved = math.sin(tilt) * float(np.max(np.abs(known.height), initial=0, where=known.known)) / min(size)
     slopes = _slopes_of_maps(normal_maps, wanted, moved)
     opened = device_of_maps(device, height_maps, normal_maps)
-    solver = FusionSolver(known, size, robust, opened, doubtful=moved > 0)
+    footprint = height_maps.fitted.footprint or PIXEL
+    solver = FusionSolver(known, size, robust, opened, footprint, doubtful=moved > 0)
     surface = solver.filled(solver.surface(slopes))
     x, y = pixel_axes(wanted.shape, size)
     if height_maps.x is not None and height_maps.y is not None:
