@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.device_arrays import device_of_maps
 from mirrorskin.engine.fusion_solver import AbsoluteHeights, FusionSolver
-from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
+from mirrorskin.engine.inputs import Maps, pixel_size_of, required_maps
 from mirrorskin.engine.method import Method
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.blur import PIXEL, LensBlur
@@ -22,7 +22,12 @@ from mirrorskin.engine.press.intervals import heights_as_intervals, stored_heigh
 from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.reconstruction import calibrated
-from mirrorskin.engine.rotation.normals_to_height import Slopes, describe_integration, slopes_of
+from mirrorskin.engine.rotation.normals_to_height import (
+    Slopes,
+    describe_integration,
+    separate_errors,
+    slopes_of,
+)
 from mirrorskin.engine.rotation.response import wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, at_poses
 from mirrorskin.engine.rotation.steps import take_slopes
@@ -39,7 +44,6 @@ from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.types import ProcessValue, exclusive_use
 from mirrorskin.io.url import path_of
 from mirrorskin.kernels.device import Choice, open_devices
-from mirrorskin.kernels.registration import MEAN_NOISE_GAIN
 
 Mask = NDArray[np.bool_]
 
@@ -231,8 +235,8 @@ def _fuse_maps(
     device: Choice,
 ) -> Result:
     """Return the surface of heights and normals."""
-    height_maps = _maps_of("heights", heights, "height", "height_sigma")
-    normal_maps = _maps_of("normals", normals, "normals", "normals_sigma")
+    height_maps = required_maps("heights", heights, "height", "height_sigma")
+    normal_maps = required_maps("normals", normals, "normals", "normals_sigma")
     wanted = _check_shapes(height_maps, normal_maps, mask)
     size = pixel_size_of(height_maps, "heights", pixel_size)
     height = absolute_heights(height_maps)
@@ -280,18 +284,7 @@ def _slopes_of_maps(normals: Result, wanted: Mask, moved: float) -> Slopes:
     contact[~wanted] = 0
     sigma = np.asarray(normals.normals_sigma, np.float32)
     sigma = np.where((sigma >= 0) & (sigma < _SHARPEST), np.float32(_SHARPEST), sigma)
-    gain = np.float32(MEAN_NOISE_GAIN if normals.fitted.registered else 1)
-    return slopes_of(normals.assign(normals_sigma=sigma), sigma / gain, contact)
-
-
-def _maps_of(name: str, maps: Maps, *needed: str) -> Result:
-    """Return maps as a result; InputError if it lacks a required map."""
-    result = as_result(maps, name, quantity=needed[0])
-    missing = [one for one in needed if result.name_of(one) is None]
-    if missing:
-        has = ", ".join(result) or "no maps"
-        raise InputError(f"{name} has no map {missing[0]}: it has {has}")
-    return result
+    return slopes_of(*separate_errors(normals.assign(normals_sigma=sigma)), contact)
 
 
 def _check_shapes(heights: Result, normals: Result, mask: ArrayLike | None) -> Mask:

@@ -37,6 +37,12 @@ class Fitted:
         "range of the swing of the brightness, as a share, that a linear response does not explain",
         default=None,
     )
+    light_variance: tuple[float, float] | None = parameter(
+        "variance a + b sin(zenith)^2 of the normals because of the light of frames, which is part of"
+        " `normals_sigma`: a and b",
+        "rad^2",
+        default=None,
+    )
     slope_direction: float | None = parameter(
         "direction of `slope`, counter-clockwise from x", "rad", default=None
     )
