@@ -14,15 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.device_arrays import device_of_maps
 from mirrorskin.engine.fusion_solver import AbsoluteHeights, FusionSolver
-from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
+from mirrorskin.engine.inputs import Maps, pixel_size_of, required_maps
 from mirrorskin.engine.method import Method
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.blur import PIXEL, LensBlur
-from mirrorskin.engine.press.intervals import heights_as_intervals, repeated_heights_as_intervals
+from mirrorskin.engine.press.intervals import heights_as_intervals, stored_heights_as_intervals
 from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.reconstruction import calibrated
-from mirrorskin.engine.rotation.normals_to_height import Slopes, describe_integration, slopes_of
+from mirrorskin.engine.rotation.normals_to_height import (
+    Slopes,
+    describe_integration,
+    separate_errors,
+    slopes_of,
+)
 from mirrorskin.engine.rotation.response import wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, at_poses
 from mirrorskin.engine.rotation.steps import take_slopes
@@ -39,7 +44,6 @@ from mirrorskin.io.result import absolute_heights
 from mirrorskin.io.types import ProcessValue, exclusive_use
 from mirrorskin.io.url import path_of
 from mirrorskin.kernels.device import Choice, open_devices
-from mirrorskin.kernels.registration import MEAN_NOISE_GAIN
 
 Mask = NDArray[np.bool_]
 
@@ -145,8 +149,10 @@ def fuse(
     -----
     Errors of normals are assumed to be independent and normally distributed. Each height is assumed to be
     within sqrt(3) ``height_sigma`` of the surface, with equal probability everywhere in this interval. A
-    height that is rounded to multiples of a step fits this with step / sqrt(12) as its sigma. Of results,
-    heights that many pixels share are taken as the middles of the intervals between frames.
+    height that is rounded to multiples of a step fits this with step / sqrt(12) as its sigma. Heights of a
+    press are moved to the middles of the intervals between its frames; those of a result only if at least a
+    quarter are there already, because it may have been changed. Without the travel of the frames, heights
+    that several pixels share are the middles.
 
     If normals are those of a rotation whose frames were not registered, the differences between heights and
     surface are part of ``height_sigma``.
@@ -229,21 +235,24 @@ def _fuse_maps(
     device: Choice,
 ) -> Result:
     """Return the surface of heights and normals."""
-    height_maps = _maps_of("heights", heights, "height", "height_sigma")
-    normal_maps = _maps_of("normals", normals, "normals", "normals_sigma")
+    height_maps = required_maps("heights", heights, "height", "height_sigma")
+    normal_maps = required_maps("normals", normals, "normals", "normals_sigma")
     wanted = _check_shapes(height_maps, normal_maps, mask)
     size = pixel_size_of(height_maps, "heights", pixel_size)
     height = absolute_heights(height_maps)
     assert height is not None
     values, sigma = (np.asarray(map_, np.float64) for map_ in (height, height_maps.height_sigma))
-    known = AbsoluteHeights.of(*repeated_heights_as_intervals(values, sigma), wanted)
+    travel = height_maps.fitted.frame_travel
+    intervals = stored_heights_as_intervals(values, sigma, None if travel is None else np.array(travel))
+    known = AbsoluteHeights.of(*intervals, wanted)
     tilt = normal_maps.fitted.tilt
     moved = 0.0  # pixels that points move in frames that were not registered
     if tilt is not None and not normal_maps.fitted.registered:
         moved = math.sin(tilt) * float(np.max(np.abs(known.height), initial=0, where=known.known)) / min(size)
     slopes = _slopes_of_maps(normal_maps, wanted, moved)
     opened = device_of_maps(device, height_maps, normal_maps)
-    solver = FusionSolver(known, size, robust, opened, doubtful=moved > 0)
+    footprint = height_maps.fitted.footprint or PIXEL
+    solver = FusionSolver(known, size, robust, opened, footprint, doubtful=moved > 0)
     surface = solver.filled(solver.surface(slopes))
     x, y = pixel_axes(wanted.shape, size)
     if height_maps.x is not None and height_maps.y is not None:
@@ -275,18 +284,7 @@ def _slopes_of_maps(normals: Result, wanted: Mask, moved: float) -> Slopes:
     contact[~wanted] = 0
     sigma = np.asarray(normals.normals_sigma, np.float32)
     sigma = np.where((sigma >= 0) & (sigma < _SHARPEST), np.float32(_SHARPEST), sigma)
-    gain = np.float32(MEAN_NOISE_GAIN if normals.fitted.registered else 1)
-    return slopes_of(normals.assign(normals_sigma=sigma), sigma / gain, contact)
-
-
-def _maps_of(name: str, maps: Maps, *needed: str) -> Result:
-    """Return maps as a result; InputError if it lacks a required map."""
-    result = as_result(maps, name, quantity=needed[0])
-    missing = [one for one in needed if result.name_of(one) is None]
-    if missing:
-        has = ", ".join(result) or "no maps"
-        raise InputError(f"{name} has no map {missing[0]}: it has {has}")
-    return result
+    return slopes_of(*separate_errors(normals.assign(normals_sigma=sigma)), contact)
 
 
 def _check_shapes(heights: Result, normals: Result, mask: ArrayLike | None) -> Mask:

@@ -16,7 +16,7 @@ from mirrorskin.engine.fusion_agreement import (
     describe_disagreement,
     find_disagreement,
 )
-from mirrorskin.engine.integration.integration import integrate
+from mirrorskin.engine.integration.arrays import integrate_arrays
 from mirrorskin.engine.press.blur import PIXEL
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.intervals import estimate_interval_errors, fit_paraboloids, interval_evidence
@@ -164,7 +164,7 @@ class FusionSolver:
         return _join(_fill(surface, self._pixel_size))
 
     def _solve(self, slopes: Slopes, height: Doubles, weight: Doubles, **options: Any) -> Result:
-        return integrate(
+        return integrate_arrays(
             slopes.dz_dx,
             slopes.dz_dy,
             self._pixel_size,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeAlias, Union
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, Union
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,6 +64,21 @@ def as_result(
     return result.assign(x=x, y=y)
 
 
+def is_maps(value: Any) -> TypeGuard[Maps]:
+    """Return whether an argument of the type `Maps` contains maps by name; otherwise it is an array."""
+    return isinstance(value, Mapping | str | os.PathLike) or hasattr(value, "data_vars")
+
+
+def required_maps(name: str, maps: Maps, *needed: str, pixel_size: ArrayLike | None = None) -> Result:
+    """Return maps as `as_result` does; InputError if a needed one is missing. An array is the first one."""
+    result = as_result(maps, name, quantity=needed[0], pixel_size=pixel_size)
+    missing = [one for one in needed if result.name_of(one) is None]
+    if missing:
+        has = ", ".join(result) or "no maps"
+        raise InputError(f"{name} has no map {missing[0]}: it has {has}")
+    return result
+
+
 def pixel_size_of(result: Result, name: str, pixel_size: ArrayLike | None = None) -> tuple[float, float]:
     """Return millimetres along x and y of a pixel, as given, or from the result.
 
@@ -94,9 +109,9 @@ def _converted(maps: Any, name: str, quantity: str) -> Result:
         return open_result(os.fspath(maps))
     if type(maps).__module__.partition(".")[0] == "xarray":
         dataset = maps if hasattr(maps, "data_vars") else maps.to_dataset(name=maps.name or quantity)
-        return _of_one_size(Result.from_xarray(dataset), name)
+        return of_one_size(Result.from_xarray(dataset), name)
     if isinstance(maps, Mapping):
-        return _of_one_size(_of_mapping(maps, name), name)
+        return of_one_size(_of_mapping(maps, name), name)
     if maps is None or type(maps) is object:
         raise InputError(
             f"{name} is {maps!r:.40}: a Result, a mapping, a dataset, a path or an array is needed"
@@ -134,7 +149,7 @@ def _of_mapping(maps: Mapping[Any, Any], name: str) -> Result:
     return Result(arrays, **{**fields, "process": process, "fitted": fitted})
 
 
-def _of_one_size(result: Result, name: str) -> Result:
+def of_one_size(result: Result, name: str) -> Result:
     """Return a result; raise InputError unless its maps have one size."""
     size = map_shape(result)[-2:]
     if len(size) < 2:

@@ -6,7 +6,7 @@ Result files and the documentation are derived from these declarations.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,6 +37,12 @@ class Fitted:
         "range of the swing of the brightness, as a share, that a linear response does not explain",
         default=None,
     )
+    light_variance: tuple[float, float] | None = parameter(
+        "variance a + b sin(zenith)^2 of the normals because of the light of frames, which is part of"
+        " `normals_sigma`: a and b",
+        "rad^2",
+        default=None,
+    )
     slope_direction: float | None = parameter(
         "direction of `slope`, counter-clockwise from x", "rad", default=None
     )
@@ -45,6 +51,18 @@ class Fitted:
     )
     event: str | None = parameter("event of a press whose heights these are: onset or release", default=None)
     first_frame: int | None = parameter("number of the first frame that was used", default=None)
+    frame_travel: tuple[float, ...] | None = parameter(
+        "travel of the frames between which an event was searched for, in their order",
+        "mm",
+        shape=("T",),
+        default=None,
+        valid=lambda travel: bool(np.isfinite(travel).all()),
+    )
+    footprint: float | None = parameter(
+        "variance of the area that a pixel sees, if it is clearly larger than the pixel",
+        "pixels^2",
+        default=None,
+    )
     threshold: float | None = parameter("share of the range from dark to bright of an event", default=None)
     dark_level: float | None = parameter(
         "level of dark pixels, if it is the same for all", "counts", default=None
@@ -128,10 +146,19 @@ def _as_declared(value: Any, declared: Parameter) -> Any:
     """Return a value in its declared type, or None if it has another one."""
     value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, list | tuple):
-        whole = (len(value),) == declared.shape and all(type(one) is int for one in value)
-        return tuple(value) if whole and (declared.valid is None or declared.valid(value)) else None
+        return _as_declared_tuple(value, declared)
     if isinstance(value, bool) != (declared.kind == "flag"):
         return None
     if declared.kind == "number" and isinstance(value, int | float):
         return float(value)
     return value if isinstance(value, _TYPES.get(declared.kind, ())) else None
+
+
+def _as_declared_tuple(values: Sequence[Any], declared: Parameter) -> tuple[Any, ...] | None:
+    """Return several values in their declared type, or None if they have another one."""
+    numbers = declared.kind == "numbers"
+    fits = all(type(one) in ((int, float) if numbers else (int,)) for one in values)
+    fits &= declared.kind.endswith("s") and declared.shape[0] in (len(values), "T")
+    if not fits or (declared.valid is not None and not declared.valid(values)):
+        return None
+    return tuple(map(float, values)) if numbers else tuple(values)

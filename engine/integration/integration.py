@@ -2,37 +2,24 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.engine.device_arrays import as_any_array, as_any_array_or_number, device_of, on_host
+from mirrorskin.engine.device_arrays import as_any_array, as_any_array_or_number, device_of_maps
+from mirrorskin.engine.inputs import Maps, is_maps, of_one_size, pixel_size_of, required_maps
+from mirrorskin.engine.integration.arrays import integrate_arrays
 from mirrorskin.engine.integration.camera import Camera
-from mirrorskin.engine.integration.device_inputs import check_device_inputs
-from mirrorskin.engine.integration.slope_errors import add_gain
 from mirrorskin.engine.integration.surface import IntegrationOptions, SurfaceSolver
-from mirrorskin.engine.integration.validation import (
-    Inputs,
-    check_inputs,
-    check_map,
-    logarithm,
-)
+from mirrorskin.engine.integration.validation import check_inputs
+from mirrorskin.engine.rotation.normals_to_height import integrate_result
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import Check, as_array_or_number, check_pixel_size, checked, in_unit
-from mirrorskin.kernels.array import Array
+from mirrorskin.io.findings import carried
 from mirrorskin.kernels.device import Device, open_device
-
-# Maximum number of pixels for which the memory of the last call is cached on the device, about 100 bytes per
-# pixel: allocation takes as long as a solution (512 x 512 within a mask: 12 ms with the cache, 26 without).
-_LARGEST_CACHED = 2**23
-_OUTSIDE = {"height": np.nan, "height_sigma": np.nan, "component": -1, "filled": 0, "edges": 0}
-
 
 _MAPS: Mapping[str, Check] = {
     **dict.fromkeys(("dz_dx", "dz_dy"), as_any_array_or_number),
@@ -41,18 +28,23 @@ _MAPS: Mapping[str, Check] = {
 }
 
 
+def _or_maps(check: Check) -> Check:
+    """Return a check that also allows maps with normals."""
+    return lambda name, value: value if is_maps(value) else check(name, value)
+
+
 @checked(
-    **_MAPS,
+    **{**_MAPS, "dz_dx": _or_maps(as_any_array_or_number)},
     pixel_size=in_unit("mm"),
-    normals=partial(as_any_array, components=True),
+    normals=_or_maps(partial(as_any_array, components=True)),
     initial_heights=in_unit("mm"),
 )
 def integrate(
-    dz_dx: ArrayLike | None = None,
+    dz_dx: Maps | None = None,
     dz_dy: ArrayLike | None = None,
     pixel_size: ArrayLike | None = None,
     *,
-    normals: ArrayLike | None = None,
+    normals: Maps | None = None,
     camera: Camera | None = None,
     mask: ArrayLike | None = None,
     slope_weights: ArrayLike | None = None,
@@ -62,7 +54,7 @@ def integrate(
     initial_heights: ArrayLike | None = None,
     **options: Any,
 ) -> Result:
-    """Integrate slopes to heights that fit slopes and known heights best.
+    """Integrate slopes, or the normals of a result, to heights that fit them and known heights best.
 
     Neighbouring pixels i and j with slopes are linked. The heights u minimise ::
 
@@ -78,18 +70,26 @@ def integrate(
     `mirrorskin.io.Result.on_device`. They are copied to the host first with ``robust``, a camera, known or
     initial heights, or a map of weights.
 
+    The normals of a result are integrated as `reconstruct` integrates those of a rotation: weighted by their
+    standard deviations, where there is contact, with the same heights and standard deviations, bit by bit.
+    The result states which errors all normals have in common; an array of normals does not. Of the other
+    arguments, only ``pixel_size``, ``robust`` and ``device`` are allowed then.
+
     Parameters
     ----------
     dz_dx, dz_dy : array_like or device array, (H, W) or (K, H, W), optional
         Slopes along x (to the right) and along y (up the picture); not finite where undefined. K surfaces
         with the same other arguments are solved together, several times as fast as one after the other. A
         pixel has slopes if all surfaces have them; the first surface determines the links of ``edges``.
+
+        Instead of dz_dx also a Result, mapping, xarray.Dataset or path of a result file, with ``normals``,
+        ``normals_sigma`` and, optionally, ``contact``.
     pixel_size : array_like, optional
-        Millimetres, one number or (x, y). Not allowed with a camera.
+        Millimetres, one number or (x, y); by default that of the result. Not allowed with a camera.
     normals : array_like or device array, (H, W, 3), optional
         Surface normals instead of slopes: components along x, y and z, which points to the camera; of any
         length. Not finite or 0 where undefined. Normals of surfaces that face away, or within 0.6 degrees of
-        edge-on, are ignored.
+        edge-on, are ignored. Or a result, as for dz_dx.
     camera : mirrorskin.engine.integration.Camera, optional
         The pinhole camera that saw the normals; by default all lines of sight are along z. With a camera,
         ``height``, known and initial heights are *depths* Z > 0: distances from the pinhole along the optical
@@ -140,6 +140,8 @@ def integrate(
 
         ``x`` and ``y``: pixel centres, without a camera.
 
+        Of a result, also its ``fitted``; its warnings and notes are in ``process``.
+
         ``process``: the method ("direct", "multigrid" or "robust") as ``integration``; the solver's
         ``integration_iterations`` and final ``integration_residual``, each the largest of several surfaces;
         ``integration_converged``: whether the residual is within the tolerance, or, without one, below 0.3;
@@ -148,11 +150,18 @@ def integrate(
     Raises
     ------
     mirrorskin.io.InputError
-        Maps of different sizes, or without anything to integrate; numbers outside of their limits.
+        Maps of different sizes, or without anything to integrate; numbers outside of their limits; a result
+        without normals or a pixel size, or with other arguments than those allowed.
     NotConverged
         The tolerance was not reached.
     mirrorskin.kernels.errors.DeviceError
         No device, or too little memory for the maps.
+
+    Notes
+    -----
+    Of results of registered frames, the factor by which registration reduces the noise is assumed to be that
+    for evenly distributed shifts; errors of a calibrated response count as independent from pixel to pixel.
+    `reconstruct` has both for each pixel.
 
     Examples
     --------
@@ -161,62 +170,49 @@ def integrate(
     >>> surface = engine.integrate(np.full((2, 3), 0.5), np.zeros((2, 3)), 1.0)
     >>> round(float(surface.height[0, 2]), 6)
     0.5
+
+    Normals of a rotation, of a plane that is inclined by 0.3 rad:
+
+    >>> phase = np.arange(8) * np.pi / 4
+    >>> cosine = np.cos(0.3) * np.cos(0.05) - np.sin(0.3) * np.sin(0.05) * np.cos(phase)
+    >>> frames = (500 * np.arccos(cosine)[:, None, None] * np.ones((4, 5))).astype(np.float32)
+    >>> turn = engine.estimate_normals(frames, phase, tilt=0.05, zenith_gain=500, noise=1.0)
+    >>> surface = engine.integrate(turn, pixel_size=0.1)
+    >>> round(float(surface.height[0, 4] - surface.height[0, 0]), 3)
+    -0.124
     """
-    on_device = any(isinstance(one, Array) for one in (dz_dx, dz_dy, normals))
-    if on_device:
-        options["device"] = device_of(options.get("device"), dz_dx, dz_dy, normals)
-    chosen = IntegrationOptions(**options)
-    others = camera, known_heights, initial_heights
-    one_weight = slope_weights is None or np.ndim(slope_weights) == 0
-    if on_device and one_weight and not chosen.robust and all(one is None for one in others):
-        inputs = check_device_inputs(dz_dx, dz_dy, normals, pixel_size, mask, slope_weights, edges)
-    else:
-        dz_dx, dz_dy, normals = (on_host(one) for one in (dz_dx, dz_dy, normals))
-        inputs = check_inputs(
-            *(dz_dx, dz_dy, pixel_size, mask, slope_weights, edges, known_heights, known_height_weights),
-            normals=normals,
-            camera=camera,
-            robust=chosen.robust,
-            crop=True,
-            several=not chosen.robust and initial_heights is None,
-        )
-    start = None
-    if initial_heights is not None:
-        start = check_map("initial_heights", initial_heights, inputs.picture)[inputs.box]
-        start = start.astype(np.float64) if camera is None else logarithm("initial_heights", start)
-    with _cached_solver(chosen.device, inputs) as solver:
-        result = add_gain(solver.solve(inputs, chosen, start), chosen.slope_gain_sigma)
-    if camera is not None:
-        depth = np.exp(result.height)
-        sigma = None if result.height_sigma is None else depth * result.height_sigma
-        result = result.assign(height=depth, height_sigma=sigma)
-    else:
-        x, y = pixel_axes(inputs.picture, inputs.pixel_size)
-        result = result.assign(x=x, y=y)
-    return result if inputs.shape == inputs.picture else _uncropped(result, inputs)
+    arrays: dict[str, Any] = {
+        "dz_dy": dz_dy,
+        "camera": camera,
+        "mask": mask,
+        "slope_weights": slope_weights,
+        "edges": edges,
+        "known_heights": known_heights,
+        "known_height_weights": known_height_weights,
+        "initial_heights": initial_heights,
+    }
+    if is_maps(dz_dx):
+        return _integrate_maps(dz_dx, pixel_size, arrays | {"normals": normals}, options)
+    if is_maps(normals):
+        return _integrate_maps(normals, pixel_size, arrays | {"dz_dx": dz_dx}, options)
+    return integrate_arrays(dz_dx, pixel_size=pixel_size, normals=normals, **arrays, **options)
 
 
-def _uncropped(result: Result, inputs: Inputs) -> Result:
-    """Return the maps of the whole picture."""
-    maps = {}
-    for name, part in result.maps().items():
-        maps[name] = np.full((*part.shape[:-2], *inputs.picture), _OUTSIDE[name], part.dtype)
-        maps[name][(..., *inputs.box)] = part
-    invalid = (result.fitted.integration_invalid or 0) + inputs.lost
-    return result.assign(maps).with_fitted(integration_invalid=invalid)
-
-
-@contextmanager
-def _cached_solver(device: Device, inputs: Inputs) -> Iterator[SurfaceSolver]:
-    """Use the solver of the last call again if it fits, and keep it for the next call."""
-    key = inputs.shape, inputs.pixel_size
-    cached_key, solver = device.cache.pop("integration", (None, None))  # atomic: one thread gets it
-    if cached_key != key:
-        solver = SurfaceSolver(device, inputs.shape)
-    yield solver  # after an exception it is not kept
-    solver.reset()
-    if math.prod(inputs.shape) <= _LARGEST_CACHED:
-        device.cache["integration"] = key, solver
+def _integrate_maps(
+    maps: Maps, pixel_size: ArrayLike | None, arrays: Mapping[str, Any], options: Mapping[str, Any]
+) -> Result:
+    """Return the surface of the normals of a result."""
+    robust = IntegrationOptions(**options).robust
+    others = {name: value for name, value in options.items() if name not in ("robust", "device")}
+    for name, value in {**arrays, **others}.items():
+        if value is not None:
+            raise InputError(f"{name} is for arrays: leave it out, or give normals=result.normals")
+    needed = "normals", "normals_sigma"
+    result = of_one_size(required_maps("normals", maps, *needed, pixel_size=pixel_size), "normals")
+    size, device = pixel_size_of(result, "normals", pixel_size), device_of_maps(options.get("device"), result)
+    surface = integrate_result(result, size, robust=robust, device=device)
+    process = {**surface.process, **carried(surface.process, normals=result.process)}
+    return surface.assign(x=result.x, y=result.y, process=process, fitted=result.fitted | surface.fitted)
 
 
 class Integrator(ThreadSafe):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -58,10 +58,14 @@ class StatedBlur(Step):
         footprint = self.footprint(result, context)
         if footprint is None:
             return result
-        blur = {"blur": round(math.sqrt(footprint.variance - PIXEL), 2)} if footprint.clear else {}
+        sigma = with_curvature(result.height, result.height_sigma, footprint.variance)
+        if not footprint.clear:
+            return result.assign(height_sigma=sigma)
+        blur = {"blur": round(math.sqrt(footprint.variance - PIXEL), 2)}
         return result.assign(
-            height_sigma=with_curvature(result.height, result.height_sigma, footprint.variance),
+            height_sigma=sigma,
             process={**result.process, **blur},
+            fitted=replace(result.fitted, footprint=footprint.variance),
         )
 
     def footprint(self, result: Result, context: Context) -> Footprint | None:

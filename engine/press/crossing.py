@@ -112,7 +112,9 @@ class PressOperation(Operation):
             float(np.asarray(level)) if level is not None and np.ndim(level) == 0 else None
             for level in (self.dark, self.bright)
         )
-        result = result.assign(fitted=Fitted(event=self.event, dark_level=dark, bright_level=bright))
+        travel = tuple(self.positions_so_far("travel").tolist())
+        fitted = Fitted(event=self.event, dark_level=dark, bright_level=bright, frame_travel=travel)
+        result = result.assign(fitted=fitted)
         return with_travel_error(result, self.travel_sigma) if self.travel_sigma else result
 
     def after_last_frame(self, samples: FrameSamples) -> Self | None:

@@ -21,7 +21,7 @@ from mirrorskin.kernels.array_types import Doubles
 
 _USUAL = 0.9, 1.5  # range of the sigma of a height between two frames, in sigmas of the interval
 _ROUNDED = 1e-3  # error of a height by its rounding, as a share of an interval
-_SHARED_BY, _LEAST_SHARED = 4, 0.25  # samples that have the middle of an interval; least share of all samples
+_LEAST_EXACT, _SHARED_BY = 0.25, 4  # least share of heights that are a middle; samples that show one
 _ADJOIN = 0.6  # least distance of the middles of intervals, in their widths by sigma
 _LEAST = 0.02  # minimum blur of an interval's ends, as a share of its half-width
 _FAR = 6.0  # blurs outside an interval beyond which an onset is an outlier
@@ -72,51 +72,56 @@ def heights_as_intervals(height: Doubles, sigma: Doubles, travel: Doubles) -> In
     travel : ndarray, (T,), float64
         Travel of the frames, mm.
     """
-    ends = np.unique(travel)
-    if ends.size < 2:
-        return Intervals(height, sigma)
-    # A crossing may be exactly at the later frame, and its height is rounded.
-    earlier = -np.nan_to_num(height) - np.sign(travel[-1] - travel[0]) * _ROUNDED * np.min(np.diff(ends))
-    place = np.clip(np.searchsorted(ends, earlier), 1, ends.size - 1)
-    width = ends[place] - ends[place - 1]
-    usual = width / math.sqrt(12)
-    between = (sigma > _USUAL[0] * usual) & (sigma < _USUAL[1] * usual)
-    between &= (-height >= ends[0]) & (-height <= ends[-1])
-    middle = -(ends[place] + ends[place - 1]) / 2
+    middle, usual, between = _between_frames(height, sigma, travel)
     return Intervals(np.where(between, middle, height), np.where(between, usual, sigma))
 
 
-def repeated_heights_as_intervals(height: Doubles, sigma: Doubles) -> Intervals:
+def stored_heights_as_intervals(height: Doubles, sigma: Doubles, travel: Doubles | None) -> Intervals:
     """Return heights of a result, moved to the middles of their intervals between two frames.
 
-    As `heights_as_intervals`, without the travel: most heights between two frames are their exact middle, so
-    it is a value that many pixels share. If less than a quarter of the pixels share one, such as after a
-    correction for the elastomer, or if shared values are much nearer than intervals, all are unchanged.
-
-    Parameters
-    ----------
-    height, sigma : ndarray, (H, W), float64
-        Heights and their standard deviations, mm; NaN where unknown.
+    As `heights_as_intervals`, for heights that may have been changed since. Most heights between two frames
+    are their exact middle: if less than a quarter are, such as after a correction for the elastomer, all are
+    unchanged. Their sigma shows by how much checks have enlarged that of an interval. Without a travel,
+    middles are the heights that several pixels share.
     """
     known = np.isfinite(height) & np.isfinite(sigma)
-    thin = slice(None, None, max(1, -(-np.count_nonzero(known) // _SAMPLES)))
-    samples, sigmas = height[known][thin], sigma[known][thin]
-    values, place, count = np.unique(samples, return_inverse=True, return_counts=True)
-    shared = count >= _SHARED_BY
-    if np.sum(count[shared]) <= _LEAST_SHARED * samples.size:
+    if travel is None:
+        travel = _estimated_travel(height[known], sigma[known])
+    middle, usual, between = _between_frames(height, sigma, travel)
+    exact = between & (np.abs(height - middle) < _ROUNDED * usual)
+    if np.count_nonzero(exact) <= _LEAST_EXACT * np.count_nonzero(known):
         return Intervals(height, sigma)
-    middles, of_middle = values[shared], shared[place]
-    between = (middles[1:] + middles[:-1]) / 2
-    number = np.searchsorted(between, samples[of_middle])
-    usual = np.bincount(number, sigmas[of_middle]) / np.bincount(number)
-    wide = math.sqrt(3) * (usual[1:] + usual[:-1])
-    if np.any(np.diff(middles) < _ADJOIN * wide):
-        return Intervals(height, sigma)
-    nearest = np.searchsorted(between, np.where(known, height, 0.0))
-    middle, width = middles[nearest], usual[nearest]
-    inside = known & (sigma > _USUAL[0] * width) & (sigma < _USUAL[1] * width)
-    inside &= np.abs(height - middle) <= math.sqrt(3) * width
-    return Intervals(np.where(inside, middle, height), np.where(inside, width, sigma))
+    larger = np.median(sigma[exact] / usual[exact])
+    return Intervals(np.where(between, middle, height), np.where(between, larger * usual, sigma))
+
+
+def _estimated_travel(height: Doubles, sigma: Doubles) -> Doubles:
+    """Return the travel of frames between heights that several pixels share.
+
+    It is empty if there are none, or if they are much nearer than intervals of their sigma.
+    """
+    values, count = np.unique(height[:: -(-height.size // _SAMPLES) or 1], return_counts=True)
+    middles = -values[count >= _SHARED_BY][::-1]
+    if middles.size < 2 or np.min(np.diff(middles)) < _ADJOIN * math.sqrt(12) * np.median(sigma):
+        return np.empty(0)
+    half = np.diff(middles) / 2
+    return np.concatenate([middles[:1] - half[0], middles[:-1] + half, middles[-1:] + half[-1]])
+
+
+def _between_frames(
+    height: Doubles, sigma: Doubles, travel: Doubles
+) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
+    """Return middles and sigmas of the intervals between frames, and which heights are in one."""
+    ends = np.unique(travel)
+    if ends.size < 2:
+        return height, sigma, np.zeros(height.shape, bool)
+    # A crossing may be exactly at the later frame, and its height is rounded.
+    earlier = -np.nan_to_num(height) - np.sign(travel[-1] - travel[0]) * _ROUNDED * np.min(np.diff(ends))
+    place = np.clip(np.searchsorted(ends, earlier), 1, ends.size - 1)
+    usual = (ends[place] - ends[place - 1]) / math.sqrt(12)
+    between = (sigma > _USUAL[0] * usual) & (sigma < _USUAL[1] * usual)
+    between &= (-height >= ends[0]) & (-height <= ends[-1])
+    return -(ends[place] + ends[place - 1]) / 2, usual, between
 
 
 class IntervalErrors(NamedTuple):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.integration.integration import integrate
+from mirrorskin.engine.integration.arrays import integrate_arrays
 from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
@@ -53,7 +53,7 @@ def coarse_heights(
     count, hole = cv2.connectedComponents(unlit.view(np.uint8), connectivity=8)
     deepest = np.append(np.inf, ndimage.maximum(far, hole, np.arange(1, count)))[hole]
     remaining = np.asarray(1 - np.minimum(far / (deepest + 0.5), 1))  # of the nearest slope
-    surface = integrate(
+    surface = integrate_arrays(
         remaining * east[tuple(nearest)],
         remaining * north[tuple(nearest)],
         size,

@@ -77,11 +77,12 @@ class FrameLight:
         """Kinds of findings that were corrected."""
         return tuple(name for name in ("flicker", "drift") if getattr(self, name) > 0)
 
-    def sigma(self, normals: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return the standard deviation of normals, (..., 3), because of the errors of gains and offsets."""
-        least, rise = self.variance
-        sine = 1 - normals[..., 2].astype(np.float64) ** 2
-        return np.asarray(np.sqrt(np.maximum(least + rise * sine, 0)), np.float32)
+
+def light_sigma(normals: NDArray[np.floating], variance: tuple[float, float]) -> NDArray[np.float32]:
+    """Return the standard deviation of normals, (..., 3), because of the light; see `FrameLight.variance`."""
+    least, rise = variance
+    sine = 1 - normals[..., 2].astype(np.float64) ** 2
+    return np.asarray(np.sqrt(np.maximum(least + rise * sine, 0)), np.float32)
 
 
 def find_frame_light(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -22,7 +23,7 @@ from mirrorskin.engine.rotation.design_matrix import (
     longest_turn,
     turn_fit,
 )
-from mirrorskin.engine.rotation.frame_light import FrameLight, find_frame_light
+from mirrorskin.engine.rotation.frame_light import FrameLight, find_frame_light, light_sigma
 from mirrorskin.engine.rotation.normals_kernel import (
     MAPS,
     NormalKernel,
@@ -431,18 +432,16 @@ class Normals(NormalsOperation):
         assert self.frame_light is not None
         return self.frame_light.remove(frames, first, 0.0 if self.dark is None else self.dark)
 
-    def systematic_sigma(self, normals: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return the part of the standard deviation of normals that is common to all pixels, radians."""
-        if self.frame_light is None:
-            return np.zeros(normals.shape[:-1], np.float32)
-        return self.frame_light.sigma(normals)
-
     def _as_result(self, maps: list[NDArray[Any]], model: TurnModel) -> Result:
         result = super()._as_result(maps, model)
-        if self.frame_light is None:
+        light = self.frame_light
+        if light is None:
             return result
-        sigma = np.hypot(result.normals_sigma, self.systematic_sigma(result.normals))
-        return result.assign(normals_sigma=sigma, process={**result.process, **self.frame_light.process})
+        return result.assign(
+            normals_sigma=np.hypot(result.normals_sigma, light_sigma(result.normals, light.variance)),
+            process={**result.process, **light.process},
+            fitted=replace(result.fitted, light_variance=light.variance),
+        )
 
     def push(self, frames: NDArray[Any], *, phase: ArrayLike, frame_weights: ArrayLike | None = None) -> None:
         """Process the next frames, (n, H, W), the phase of each, (n,) radians, and their weights, (n,)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,14 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.integration.arrays import integrate_arrays
 from mirrorskin.engine.integration.device_inputs import sample_evenly
-from mirrorskin.engine.integration.integration import integrate
 from mirrorskin.engine.integration.surface import explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
+from mirrorskin.engine.rotation.frame_light import light_sigma
 from mirrorskin.io import Fitted, Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.registration import MEAN_NOISE_GAIN
 from mirrorskin.kernels.slopes import find, weigh
 
 Floats = NDArray[np.float32]
@@ -41,6 +43,60 @@ class Slopes:
     def known(self) -> NDArray[np.bool_]:
         """Where there are slopes, (H, W)."""
         return np.asarray(self.weights[0] > 0)
+
+
+def integrate_result(
+    result: Result,
+    pixel_size: tuple[float, float],
+    *,
+    robust: bool,
+    device: Device,
+    noise_gain: Floats | None = None,
+) -> Result:
+    """Return the heights that fit the normals of a result, with the errors that all have in common.
+
+    Errors of slopes that are common to all pixels, such as those of the light of a frame, change slopes, and
+    with them heights, by about the same share everywhere. For ``noise_gain`` see `separate_errors`.
+    """
+    separate, independent_sigma = separate_errors(result, noise_gain)
+    surface = integrate_normals(separate, independent_sigma, pixel_size, robust=robust, device=device)
+    for share in _common_shares(result):
+        sigma = np.hypot(surface.height_sigma, np.float32(share) * surface.height)
+        surface = surface.assign(height_sigma=sigma)
+    return surface
+
+
+def separate_errors(result: Result, noise_gain: Floats | None = None) -> tuple[Result, Floats]:
+    """Return a result without errors of the response, and the errors that differ from pixel to pixel.
+
+    Those of pixels are without registration: it reduces errors but correlates those of neighbours, so that
+    means over many pixels are not better. ``noise_gain``, (H, W), is the factor of the noise of registered
+    samples; by default the mean one, if frames were registered.
+    """
+    fitted, sigma = result.fitted, np.asarray(result.normals_sigma, np.float32)
+    if fitted.swing_range is not None:
+        sigma = _without(sigma, np.float32(fitted.swing_range) * result.zenith)
+    independent = sigma
+    if fitted.light_variance is not None:
+        independent = _without(sigma, light_sigma(result.normals, fitted.light_variance))
+    if noise_gain is not None:
+        independent = independent / noise_gain
+    elif fitted.registered:
+        independent = independent / np.float32(MEAN_NOISE_GAIN)
+    return result.assign(normals_sigma=sigma), independent
+
+
+def _common_shares(result: Result) -> Iterator[float]:
+    """Yield by which shares all heights may be wrong together."""
+    fitted = result.fitted
+    if fitted.light_variance is not None:
+        cosine = result.normals[..., 2].astype(np.float64)
+        error = light_sigma(result.normals, fitted.light_variance) / cosine**2
+        known = np.isfinite(error) & (True if result.contact is None else result.contact > 0)
+        steepness = np.sqrt(1 / cosine[known] ** 2 - 1)
+        yield math.sqrt(float(np.mean(error[known] ** 2) / np.mean(steepness**2)))
+    if fitted.swing_range is not None:
+        yield fitted.swing_range
 
 
 def slopes_of(
@@ -135,12 +191,12 @@ def integrate_normals(
     component is 0; components are numbered over all turns. With ``robust``, edges are breaks of the surface,
     and the mean of components that breaks separate is 0 together.
     """
-    per_turn = result.contact.ndim == 3
+    per_turn = result.normals.ndim == 4
     each, sigmas = [result], [independent_sigma]
     if per_turn:
         once = replace(result.fitted, turns=1)
-        names = "normals", "normals_sigma", "contact"
-        maps = zip(*(result[name] for name in names), strict=True)
+        names = [name for name in ("normals", "normals_sigma", "contact") if result.name_of(name)]
+        maps = zip(*(getattr(result, name) for name in names), strict=True)
         each = [Result(dict(zip(names, turn, strict=True)), fitted=once) for turn in maps]
         sigmas = list(independent_sigma)
     surfaces = [
@@ -152,8 +208,10 @@ def integrate_normals(
         np.where(surface.component >= 0, surface.component + np.int32(shift), np.int32(-1))
         for surface, shift in zip(surfaces, before, strict=False)
     ]
-    names = ("height", "height_sigma", "edges")
-    stacked = {name: _stack([getattr(surface, name) for surface in surfaces], per_turn) for name in names}
+    stacked = {
+        name: _stack([getattr(surface, name) for surface in surfaces], per_turn)
+        for name in ("height", "height_sigma", "edges")
+    }
     return Result(
         stacked,
         component=_stack(components, per_turn),
@@ -184,7 +242,7 @@ def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, de
             offset_unknown=np.zeros(0, np.uint8),
             fitted=Fitted(integration="multigrid", integration_iterations=0, integration_residual=0.0),
         )
-    surface = integrate(
+    surface = integrate_arrays(
         slopes.dz_dx,
         slopes.dz_dy,
         pixel_size,

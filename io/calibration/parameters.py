@@ -28,6 +28,7 @@ _KINDS: dict[str, Kind] = {
     "str": "text",
     "Floats": "array",
     "tuple[str, ...]": "names",
+    "tuple[float, ...]": "numbers",
     "Mapping[str, float]": "mapping",
 }
 _FACTORS = {"%": 100.0, "px": 1.0, "deg": math.degrees(1)}  # for units that `ratio` does not convert
@@ -37,6 +38,7 @@ _TYPES = {
     "flag": "bool",
     "text": "str",
     "names": "tuple of str",
+    "numbers": "tuple of float",
     "mapping": "mapping of str to float",
 }
 _COLUMNS = 100  # maximum length of the lines of a docstring
@@ -102,7 +104,7 @@ class Parameter:
         elif annotation.startswith("NDArray"):
             kind, shape = "map", ("rows", "columns")
             dtype = np.dtype(annotation.removeprefix("NDArray[np.").removesuffix("]"))
-        elif kind not in ("array", "names"):
+        elif kind not in ("array", "names", "numbers"):
             shape = ()
         hidden = kind in ("array", "numbers", "integers", "names", "mapping") and not self.components
         return replace(
@@ -130,8 +132,8 @@ class Parameter:
         """Return the type in Python and the unit, such as ``(float, float), mm``."""
         if self.kind in ("map", "array"):
             kind = f"ndarray, {self.size}, {self.dtype.name}"
-        elif self.kind in ("numbers", "integers"):
-            kind = f"({', '.join([_TYPES[self.kind[:-1]]] * int(self.shape[0]))})"
+        elif self.kind in ("numbers", "integers") and isinstance(count := self.shape[0], int):
+            kind = f"({', '.join([_TYPES[self.kind[:-1]]] * count)})"
         else:
             kind = _TYPES[self.kind]
         return f"{kind}, {self.unit}" if self.unit else kind

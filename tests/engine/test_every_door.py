@@ -1,7 +1,7 @@
 """Every door gives the same answer: maps, standard deviations, findings and fitted values, bit by bit.
 
-A door is a way to start a computation: a function on arrays, `engine.run`, a command, a batch, a live run.
-One frame of each recording is repeated, which is a finding.
+A door is a way to start a computation: a function on arrays, `engine.run`, a command, a batch, a live run,
+the application. One frame of each recording is repeated, which is a finding.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import done
+from numpy.typing import NDArray
 from operations import (
     CASES,
     COUNT,
@@ -45,10 +46,14 @@ from mirrorskin.engine.batch.jobs import TABLES, Job, Plan
 from mirrorskin.engine.batch.local import default_devices, run_local
 from mirrorskin.engine.batch.work import Outcome, run_job
 from mirrorskin.engine.live import LiveRun, Loop, Stream
+from mirrorskin.hw.twin import Axial, Twin, Vertical
 from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.io.layout import POSITIONS
+from mirrorskin.io.result import FIELDS
 from mirrorskin.io.zarr_export import save_zarr
 from mirrorskin.kernels.device import open_device
+from mirrorskin.view.app import Opening
+from mirrorskin.view.app.session import Session, run_now
 
 pytestmark = pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 
@@ -306,6 +311,19 @@ def words_of(kind: Any, options: Any) -> list[str]:
     return words
 
 
+def application(task: Task) -> io.Result:
+    operation = "" if task.is_method else name_of(task.case.kind)
+    computations: list[Any] = []
+    session = Session(task.recording(), Opening(operation=operation), lambda *one: computations.append(one))
+    for name, value in task.case.options.items():
+        session.choose(name, value)
+    session.run = run_now
+    run_now(*computations[-1])
+    session.close()
+    assert session.now is not None, session.problem
+    return session.now.result
+
+
 def stream(task: Task) -> io.Result:
     check_live(task)
     frames = task.case.frames
@@ -365,6 +383,7 @@ RECORDINGS: dict[str, Door] = {
     "batch": batch,
     "worker": worker,
     "command": command,
+    "application": application,
 }
 LIVE: dict[str, Door] = {"live, again": live_again, "live": live, "Stream": stream}
 DOORS = {**ARRAYS, **RECORDINGS, **LIVE}
@@ -376,7 +395,8 @@ def doors_of(name: str) -> dict[str, Door]:
     if EVERYTHING[name].weights:  # recordings have none
         return ARRAYS
     # Every format is read by the same loop, and batches call the function of workers.
-    left_out = {"worker"} if name in TWICE or name in OWN else {"worker", "Zarr"}
+    own = name in TWICE or name in OWN
+    left_out = {"worker"} if own else {"worker", "Zarr", "application"}
     return {door: run for door, run in DOORS.items() if door not in left_out}
 
 
@@ -412,7 +432,7 @@ def answers(tmp_path_factory):
 
 
 def findings(result: io.Result) -> dict[str, Any]:
-    return {kind: result.process.get(kind) for kind in ("warnings", "notes")}
+    return {name: text for name, text in result.process.items() if name.endswith(("warnings", "notes"))}
 
 
 def fitted(result: io.Result) -> Any:
@@ -435,14 +455,18 @@ def pairs() -> list[Any]:
     return [pytest.param(*one, id=", ".join(one)) for one in found if one not in OTHER_PLAN]
 
 
+def assert_same(found: io.Result, expected: io.Result) -> None:
+    assert sorted(found) == sorted(expected)
+    for one, values in expected.items():
+        np.testing.assert_array_equal(found[one], values, err_msg=one, strict=True)
+    np.testing.assert_equal(fitted(found), fitted(expected))
+
+
 @pytest.mark.parametrize(("name", "door"), pairs())
 def test_maps_are_the_same_through_every_door(answers, name, door):
     expected = answers(name, reference_of(name, door))[-1]
     for found in answers(name, door):
-        assert sorted(found) == sorted(expected)
-        for one, values in expected.items():
-            np.testing.assert_array_equal(found[one], values, err_msg=one, strict=True)
-        np.testing.assert_equal(fitted(found), fitted(expected))
+        assert_same(found, expected)
 
 
 @pytest.mark.parametrize(("name", "door"), pairs())
@@ -454,3 +478,141 @@ def test_findings_are_the_same_through_every_door(answers, name, door):
 @pytest.mark.parametrize("name", [name for name in EVERYTHING if "HDF5" in doors_of(name)])
 def test_the_repeated_frame_is_found(answers, name):
     assert "identical to the one before" in findings(answers(name, "HDF5")[-1])["warnings"]
+
+
+# --- Heights of normals, and surfaces of a press and a rotation ------------------------------------------
+
+UNEVEN = (TURNS * np.linspace(0.9, 1.1, TURNS.shape[2])).clip(0, 255).astype(np.uint8)
+NORMALS = {name: EVERYTHING[name] for name in ("Normals", "Normals in flickering light")}
+NORMALS["Normals in uneven light"] = with_fewer_frames(replace(CASES["Normals"], frames=UNEVEN))
+
+
+@pytest.mark.parametrize("name", NORMALS)
+def test_heights_of_normals_are_those_of_a_rotation(name):
+    case = NORMALS[name]
+    given = {**case.given, **case.options}
+    found = engine.integrate(engine.estimate_normals(case.frames, **given), pixel_size=PIXEL)
+    expected = engine.reconstruct(case.frames, pixel_size=PIXEL, **given)
+    assert_same(found, io.Result({one: expected[one] for one in found}, fitted=expected.fitted))
+
+
+def kept(result: io.Result, folder: Path, name: str) -> Path:
+    path = folder / f"{name}.h5"
+    io.save_result(result, path, overwrite=True)
+    return path
+
+
+MAPS: dict[str, Callable[[io.Result, Path, str], Any]] = {
+    "result": lambda result, folder, name: result,
+    "mapping": lambda result, folder, name: {**result, **{one: getattr(result, one) for one in FIELDS}},
+    "dataset": lambda result, folder, name: result.to_xarray(),
+    "file": kept,
+}
+
+
+BOTH = "vertical", "axial"
+
+
+@functools.cache
+def repeating(motion: str) -> tuple[NDArray[Any], io.Header, dict[str, Any]]:
+    """Return frames of a press or a rotation, one of which is repeated, with their header and positions."""
+    movement, series = Vertical(0.1 * np.arange(1, 26)), {"travel": 0.1 * np.arange(1, 26)}
+    if motion == "axial":
+        series = {"phase": np.pi / 4 * np.arange(16)}
+        movement = Axial(series["phase"], tilt=0.05, press=1.5)
+    pattern = "linear" if motion == "axial" else "uniform"
+    twin = Twin(object="sphere", shape=(40, 44), pixel_size=0.1, movement=movement, pattern=pattern)
+    frames = np.empty(twin.shape, twin.dtype)
+    twin.read(frames)
+    frames[12] = frames[11]
+    return frames, twin.header, series
+
+
+def as_source(motion: str) -> Readable:
+    frames, header, series = repeating(motion)
+    return Readable(frames, header, **series)
+
+
+def in_array(motion: str) -> ArrayRecording:
+    frames, header, series = repeating(motion)
+    names = [one.name for one in dataclasses.fields(header) if one.name != "motion"]
+    return ArrayRecording(frames, series, {name: getattr(header, name) for name in names}, motion)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Recordings of both, and their results."""
+
+    folder: Path
+
+    @functools.cached_property
+    def recordings(self) -> list[Path]:
+        return [record(as_source(motion), self.folder / f"{motion}.h5") for motion in BOTH]
+
+    @functools.cached_property
+    def results(self) -> list[io.Result]:
+        press, turn = map(as_source, BOTH)
+        return [engine.reconstruct(press, fill=False), engine.reconstruct(turn)]
+
+    @functools.cached_property
+    def fused(self) -> dict[str, io.Result]:
+        return {door: fuse(self) for door, fuse in FUSIONS.items()}
+
+
+def fused_by_command(pair: Pair) -> io.Result:
+    output = pair.folder / "fused.h5"
+    done("fuse", *pair.recordings, "-o", output, "--overwrite")
+    return io.open_result(output)
+
+
+def fused_in_zarr(pair: Pair) -> io.Result:
+    paths = [path.with_suffix(".zarr") for path in pair.recordings]
+    for recording, path in zip(pair.recordings, paths, strict=True):
+        save_zarr(recording, path)
+    return engine.fuse(*paths)
+
+
+FUSIONS: dict[str, Callable[[Pair], io.Result]] = {
+    "HDF5": lambda pair: engine.fuse(*pair.recordings),
+    "source": lambda pair: engine.fuse(*map(as_source, BOTH)),
+    "ArrayRecording": lambda pair: engine.fuse(*map(in_array, BOTH)),
+    "Zarr": fused_in_zarr,
+    "command": fused_by_command,
+}
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    return Pair(tmp_path_factory.mktemp("pair"))
+
+
+@pytest.mark.parametrize("door", FUSIONS)
+def test_a_fused_surface_is_the_same_through_every_door(pair, door):
+    assert_same(pair.fused[door], pair.fused["HDF5"])
+
+
+@pytest.mark.parametrize("door", FUSIONS)
+def test_findings_of_a_fused_surface_are_the_same_through_every_door(pair, door):
+    assert findings(pair.fused[door]) == findings(pair.fused["HDF5"])
+
+
+@pytest.mark.parametrize("kind", MAPS)
+def test_a_surface_of_results_does_not_depend_on_how_they_are_kept(pair, kind):
+    given = [MAPS[kind](one, pair.folder, f"{place}") for place, one in enumerate(pair.results)]
+    assert_same(engine.fuse(*given), engine.fuse(*pair.results))
+
+
+@pytest.mark.parametrize("kind", MAPS)
+def test_heights_of_normals_do_not_depend_on_how_they_are_kept(pair, kind):
+    turned = pair.results[1]
+    assert_same(engine.integrate(MAPS[kind](turned, pair.folder, "turned")), engine.integrate(turned))
+
+
+def test_heights_of_normals_have_the_findings_of_their_input(pair):
+    warnings = engine.integrate(pair.results[1]).process["warnings"]
+    assert re.match("normals: .*identical to the one before", warnings)
+
+
+def test_a_surface_of_results_has_the_findings_of_both(pair):
+    warnings = engine.fuse(*pair.results).process["warnings"]
+    assert warnings.count("identical to the one before") == 2

@@ -10,11 +10,6 @@ from fault_matrix import ESTIMATORS, FUNCTIONS, PAGE, open_cells, row, row_of_ar
 
 SLOW = pytest.mark.slow
 row_of = functools.cache(row)
-# Arrays of normals and heights do not tell which of their errors are common to all pixels.
-OPEN = {
-    "heights of a rotation": {"drift 4 counts", "vignetting 10 %"},
-    "press and rotation, fused": {"jitter 0.1 steps"},
-}
 
 
 @SLOW
@@ -41,8 +36,7 @@ def test_nothing_is_warned_of_without_a_fault(estimator):
 @pytest.mark.parametrize("estimator", FUNCTIONS)
 def test_a_function_on_arrays_is_as_honest_as_a_recording(estimator):
     wrong = {fault: str(cell) for fault, cell in row_of_arrays(estimator).items() if not cell.honest}
-    worse = {fault: cell for fault, cell in wrong.items() if row_of(estimator)[fault].honest}
-    assert {fault: cell for fault, cell in worse.items() if fault not in OPEN.get(estimator, ())} == {}
+    assert {fault: cell for fault, cell in wrong.items() if row_of(estimator)[fault].honest} == {}
 
 
 def test_the_page_shows_the_stored_cells():

@@ -420,13 +420,7 @@ def _estimate_normals(fault: Fault, seed: int) -> Result:
 
 
 def _integrate_normals(fault: Fault, seed: int) -> Result:
-    normals = _estimate_normals(fault, seed)
-    return engine.integrate(
-        normals=normals.normals,
-        mask=normals.contact,
-        pixel_size=PIXEL,
-        slope_weights=normals.normals_sigma**-2,
-    )
+    return engine.integrate(_estimate_normals(fault, seed), pixel_size=PIXEL)
 
 
 def _fuse_maps(fault: Fault, seed: int) -> Result:
@@ -638,7 +632,8 @@ def _about_functions() -> str:
         [fault, *(_digits(cells[name][fault]["chi2"]) if (name, fault) in only else "" for name in names)]
         for fault in faults
     ]
-    return text + "\n" + _table(["$\\chi^2$", *names], rows)
+    bold = "The table contains the cells that are bold for the function on arrays only.\n"
+    return text + bold + "\n" + _table(["$\\chi^2$", *names], rows)
 
 
 def _shown(cells: Mapping[str, Any], opened: Mapping[str, list[str]], estimator: str, fault: str) -> str:

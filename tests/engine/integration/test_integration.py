@@ -367,6 +367,8 @@ def test_a_surface_that_did_not_converge_is_not_returned(monkeypatch):
 
 
 MAP = np.zeros(SHAPE)
+NORMALS = io.Result(normals=np.tile(np.float32([0, 0, 1]), (3, 4, 1)), normals_sigma=np.ones((3, 4), "f4"))
+OF_RESULT = {"dz_dx": NORMALS, "dz_dy": None}
 BAD = {
     "shapes (49, 62) and (62, 49)": {"dz_dy": MAP.T},
     "shapes (49,) and": {"dz_dx": MAP[:, 0]},
@@ -388,6 +390,16 @@ BAD = {
     "nothing to integrate": {"mask": MAP},
     "nothing to integrate: no wanted pixel": {"dz_dx": MAP * np.nan},
     "nothing to integrate: no wanted pixel has": {"slope_weights": 0},
+    "normals has no map normals_sigma: it has normals": {**OF_RESULT, "dz_dx": {"normals": NORMALS.normals}},
+    "map normals_sigma of normals has size (2, 3)": {
+        **OF_RESULT,
+        "dz_dx": {**NORMALS, "normals_sigma": MAP[:2, :3]},
+    },
+    "normals has no pixel size: specify pixel_size, in mill": {**OF_RESULT, "pixel_size": None},
+    "mask is for arrays: leave it out": {**OF_RESULT, "mask": np.ones((3, 4))},
+    "dz_dx is for arrays: leave it out": {"dz_dy": None, "normals": NORMALS},
+    "sigma is for arrays: leave it out": {**OF_RESULT, "sigma": False},
+    "no option robust_: did you mean robust?": {**OF_RESULT, "robust_": True},
 }
 
 
@@ -572,3 +584,10 @@ def test_levels_halve_and_never_overlap():
         for fine, coarse in itertools.pairwise(levels):
             assert (coarse.rows, coarse.columns) == (-(-fine.rows // 2), -(-fine.columns // 2))
             assert coarse.base >= fine.end
+
+
+def test_heights_of_several_turns_are_those_of_each():
+    turns = NORMALS.assign({name: np.stack([NORMALS[name]] * 2) for name in NORMALS})
+    alone = engine.integrate(NORMALS, pixel_size=0.1)
+    for height in engine.integrate(turns, pixel_size=0.1).height:
+        np.testing.assert_array_equal(height, alone.height)
