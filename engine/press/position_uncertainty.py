@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -88,7 +89,7 @@ class _Errors:
     travel: Doubles
     step: float
     error: Doubles
-    covariance: Doubles
+    covariance: Callable[[], Doubles]
     clear: NDArray[np.bool_]
     jumps: Doubles
     jump_errors: Doubles
@@ -104,9 +105,11 @@ class _Errors:
             return 0.0
         differences = np.diff(np.eye(len(self.error)), 3, axis=0)[clear] / math.sqrt(20)
         jitter = mad_sigma(differences @ self.error)
-        variance = np.einsum("ij,jk,ik->i", differences, self.covariance, differences)
+        if jitter < _LEAST_JITTER * self.step:
+            return 0.0
+        variance = np.einsum("ij,jk,ik->i", differences, self.covariance(), differences)
         error = math.sqrt(float(np.median(variance)))
-        if jitter < max(_LEAST_JITTER * self.step, _CLEARER * error):
+        if jitter < _CLEARER * error:
             return 0.0
         return math.sqrt(jitter**2 - error**2)
 
@@ -128,7 +131,7 @@ class _Errors:
 class _Rows:
     """Rows of four pixels: their bend relative to their rise, and how errors of frames change it.
 
-    bend = bends[i] + sum of change[i, j] * error[frame[i, j]] over the 8 frames next to the pixels.
+    bend = bends[i] + sum of change[j, i] * error[frame[j, i]] over the 8 frames next to the pixels.
     """
 
     bends: Doubles
@@ -150,7 +153,7 @@ class _Rows:
         Second differences from frame to frame of what each error would change, in standard errors.
         """
         weight = 1 / np.sqrt(1 + (self.bends / (2 * self.bend)) ** 2)
-        gradient = ((weight * self.bends)[:, np.newaxis] * self.change).ravel()
+        gradient = (weight * self.bends * self.change).ravel()
         frame, count = self.frame.ravel(), len(clear) + 1
         total, square = (np.bincount(frame, part, minlength=count) for part in (gradient, gradient**2))
         usable = self.seen(count) >= _SEEN
@@ -162,8 +165,11 @@ class _Rows:
 
     def between(self, first: int, stop: int) -> _Rows:
         """Return the rows that lie between two frames, which are then numbered from the first."""
-        inside = ((self.frame >= first) & (self.frame < stop)).all(axis=1)
-        return _Rows(self.bends[inside], self.frame[inside] - first, self.change[inside])
+        inside = ((self.frame >= first) & (self.frame < stop)).all(axis=0)
+        if inside.all():
+            return _Rows(self.bends, self.frame - first, self.change)
+        frame, change = (one.compress(inside, axis=1) for one in (self.frame, self.change))
+        return _Rows(self.bends[inside], frame - first, change)
 
 
 def _find_errors(height: NDArray[Any], pushed: Doubles) -> _Errors | None:
@@ -184,11 +190,13 @@ def _find_errors(height: NDArray[Any], pushed: Doubles) -> _Errors | None:
     reach = 1 + int(np.searchsorted(_FARTHER, step / float(np.median(rise))))
     if reach > 1:
         pixels = _pixels_of(height, reach, _FEW)
-    if not _rows_of(pixels, travel, step).suspicious(clear):
-        return None
-    pixels = _pixels_of(height, reach, _MOST)
-    clear = _spread(pixels[0][np.isfinite(pixels[0])], travel)
     rows = _rows_of(pixels, travel, step)
+    if not rows.suspicious(clear):
+        return None
+    more = _pixels_of(height, reach, _MOST)
+    if more.shape != pixels.shape:
+        rows = _rows_of(more, travel, step)
+    clear = _spread(more[0][np.isfinite(more[0])], travel)
     seen = np.flatnonzero(rows.seen(len(travel)) >= _SEEN)
     if len(seen) < _FEWEST:
         return None
@@ -232,16 +240,14 @@ def _rows_of(pixels: Doubles, travel: Doubles, step: float) -> _Rows:
     each = np.diff(pixels, axis=0)
     rises = (each > 0).all(axis=0) | (each < 0).all(axis=0)
     rises &= np.abs(pixels[3] - pixels[0] + pixels[2] - pixels[1]) > 4 * _LEAST_RISE * step
-    pixels = pixels[:, rises]
+    pixels = pixels.compress(rises, axis=1)
     rise = np.sum(_RISE[:, np.newaxis] * pixels, axis=0)
     bends = np.sum(_BEND[:, np.newaxis] * pixels, axis=0) / rise
     frame = np.clip(np.searchsorted(travel, pixels, side="right") - 1, 0, len(travel) - 2)
     share = (pixels - travel[frame]) / (travel[frame + 1] - travel[frame])
     change = (_BEND[:, np.newaxis] - bends * _RISE[:, np.newaxis]) / rise
     return _Rows(
-        bends,
-        np.concatenate([frame, frame + 1]).T,
-        np.concatenate([change * (1 - share), change * share]).T,
+        bends, np.concatenate([frame, frame + 1]), np.concatenate([change * (1 - share), change * share])
     )
 
 
@@ -258,30 +264,35 @@ def _spread(heights: Doubles, travel: Doubles) -> NDArray[np.bool_]:
 
 def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], reach: int) -> _Errors:
     """Fit the errors of all frames, and those of a single jump between any two of them."""
-    count = len(travel)
-    pairs = (rows.frame[:, :, np.newaxis] * count + rows.frame[:, np.newaxis, :]).ravel()
-    products = rows.change[:, :, np.newaxis] * rows.change[:, np.newaxis, :]
+    count, (one, other) = len(travel), np.triu_indices(len(rows.frame))
+    pairs = (count * rows.frame[one] + rows.frame[other]).ravel()
+    products = rows.change[one] * rows.change[other]
+    products[one == other] /= 2  # the other half of the matrix is the transposed one
+    weighted = np.empty_like(products)  # used again, because new memory costs as much as the products
 
     def normal(weight: Doubles) -> Doubles:
         """Return the sum of weighted products of changes, (n, n)."""
-        weighted = (weight[:, np.newaxis, np.newaxis] * products).ravel()
-        return np.bincount(pairs, weighted, minlength=count**2).reshape(count, count).astype(np.float64)
+        np.multiply(weight, products, out=weighted)
+        half = np.bincount(pairs, weighted.ravel(), minlength=count**2).reshape(count, count)
+        return np.asarray(half + half.T)
 
     degree = max(2, count // _SMOOTH)
     smooth, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, count), degree))
+    of_surface = np.sum(smooth[:, np.newaxis] * smooth[np.newaxis], axis=2)
     bend, error, left = rows.bend, np.zeros(count), rows.bends
     for _ in range(_ROUNDS):
         weight = 1 / np.sqrt(1 + (left / (2 * bend)) ** 2)
         squares = normal(weight)
-        gradient = -np.bincount(
-            rows.frame.ravel(), ((weight * rows.bends)[:, np.newaxis] * rows.change).ravel(), minlength=count
-        )
+        slope = (weight * rows.bends * rows.change).ravel()
+        gradient = -np.bincount(rows.frame.ravel(), slope, minlength=count)
         whole = squares + np.eye(count) * (bend / (_PRIOR * step)) ** 2
-        whole += 10 * np.trace(whole) * np.sum(smooth[:, np.newaxis] * smooth[np.newaxis], axis=2)
+        whole += 10 * np.trace(whole) * of_surface
         inverse = np.linalg.inv(whole)
         error = np.sum(inverse * gradient, axis=1)
-        left = rows.bends + np.sum(rows.change * error[rows.frame], axis=1)
-    covariance = _OVERLAP * inverse @ normal((weight * left) ** 2) @ inverse
+        left = rows.bends + np.sum(rows.change * error[rows.frame], axis=0)
+
+    def covariance() -> Doubles:
+        return _OVERLAP * inverse @ normal((weight * left) ** 2) @ inverse
 
     after = np.tri(count, count - 1, -1)  # a jump between two frames shifts all that follow
     inner = np.linalg.pinv(smooth.T @ squares @ smooth)

@@ -90,7 +90,9 @@ def _regression(curl: Doubles, divergence: Doubles, place: Doubles, overlap: flo
             return None
         fit = np.linalg.solve(matrix, np.einsum("ni,n->i", columns[kept], curl[kept]))
         left = curl - np.einsum("ni,i->n", columns, fit)
-        kept = np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+        before, kept = kept, np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+        if np.array_equal(before, kept):
+            break
     spread = np.sqrt(np.diag(np.linalg.inv(matrix)) * float(np.mean(left[kept] ** 2)) * overlap)
     explained = 1 - float(np.var(left[kept])) / max(float(np.var(curl[kept])), 1e-30)
     clear = (np.abs(fit) > _CLEAR * spread) & (np.abs(fit) > math.tan(_SMALLEST)) & (explained > _EXPLAINED)

@@ -151,7 +151,9 @@ def _fit(swing: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing
         inverse = np.linalg.inv(matrix)
         fit = inverse @ np.sum(weighted * (swing[kept] / noise[kept])[:, np.newaxis], axis=0)
         left = (swing - np.sum(columns * fit, axis=1)) / noise
-        kept = np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+        before, kept = kept, np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+        if np.array_equal(before, kept):
+            break
     covariance = inverse * max(1.0, float(np.mean(left[kept] ** 2)))
 
     products = _gram(columns[kept])
