@@ -461,10 +461,11 @@ class Traces:
         return way != 0 and bool(np.all(np.diff(travel) * way >= 0))
 
 
-def _medians(values: Samples, count: NDArray[np.intp] | int | None = None) -> Samples:
+def _medians(values: NDArray[Any], count: NDArray[np.intp] | None = None) -> NDArray[Any]:
     """Return the median of each row, (T, n), or of its ``count`` smallest values."""
-    ordered, count = np.sort(values, axis=1), np.asarray(values.shape[1] if count is None else count)
-    row = np.arange(len(values))
+    if count is None:
+        count = np.full(len(values), values.shape[1])
+    ordered, row = np.sort(values, axis=1), np.arange(len(values))
     return np.asarray((ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2)
 
 

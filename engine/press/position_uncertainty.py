@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray, stored_map
 from mirrorskin.engine.press.crossing import PressOperation, with_travel_error
 from mirrorskin.engine.steps import Context, Step
 from mirrorskin.io import Result
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.samples import Grid, take_grids
 
 _BEND = np.array([-1.0, 3.0, -3.0, 1.0])  # third difference of four pixels in a row
 _RISE = np.array([-1.0, -1.0, 1.0, 1.0]) / 4  # mean difference of neighbours
@@ -56,7 +58,7 @@ class PositionUncertainty(Step):
         """Return a result with larger standard deviations, or a warning, where positions do not fit."""
         operation = cast("PressOperation", context.operation)
         travel = context.positions("travel")
-        errors = _find_errors(result.height, travel)
+        errors = _find_errors(stored_map(result, "height"), travel)
         if errors is None:
             return result
         jump = errors.lost_frame()
@@ -172,7 +174,7 @@ class _Rows:
         return _Rows(self.bends[inside], frame - first, change)
 
 
-def _find_errors(height: NDArray[Any], pushed: Doubles) -> _Errors | None:
+def _find_errors(height: AnyArray, pushed: Doubles) -> _Errors | None:
     """Return the errors of the frames' positions; None if the heights do not show any."""
     travel = np.unique(pushed)
     if len(travel) < _FEWEST:
@@ -219,20 +221,22 @@ def _apart(travel: Doubles, least: float) -> Doubles:
     return travel[kept]
 
 
-def _pixels_of(height: NDArray[Any], reach: int, most: int) -> Doubles:
+def _pixels_of(height: AnyArray, reach: int, most: int) -> Doubles:
     """Return depths of rows of four pixels, ``reach`` apart, from rows and columns all over, (4, n)."""
-    parts = []
-    for lines in (height, height.T):
-        count = lines.shape[1] - 3 * reach
+    grids, (rows, columns) = [], height.shape
+    for lines, length, down, across in ((rows, columns, columns, 1), (columns, rows, 1, columns)):
+        count = length - 3 * reach
         if count > 0:
-            thinner = max(1, lines.shape[0] * count // most)
+            thinner = max(1, lines * count // most)
             skip = math.isqrt(thinner)
             each = -(-thinner // skip)
-            chosen = lines[each // 2 % lines.shape[0] :: each]
-            parts.append([chosen[:, n * reach : n * reach + count : skip].ravel() for n in range(4)])
-    if not parts:
+            first = each // 2 % lines
+            steps = reach * across, each * down, skip * across
+            shape = 4, -(-(lines - first) // each), -(-count // skip)
+            grids.append(Grid(height, first * down, steps, shape))
+    if not grids:
         return np.empty((4, 0))
-    return -np.concatenate(parts, axis=1).astype(np.float64)
+    return -np.concatenate([part.reshape(4, -1) for part in take_grids(*grids)], axis=1).astype(np.float64)
 
 
 def _rows_of(pixels: Doubles, travel: Doubles, step: float) -> _Rows:
