@@ -94,6 +94,12 @@ def operand_of(
     return device.share(name, np.ascontiguousarray(flags, dtype))
 
 
+def stored_map(result: Result, quantity: str) -> AnyArray:
+    """Return a map of a result where it is: on a device, or on the host."""
+    there = result.on_device(quantity)
+    return getattr(result, quantity) if there is None else there
+
+
 def on_host(value: Any) -> Any:
     """Return an argument that is on a device as an array on the host, any other unchanged."""
     return value.read() if isinstance(value, Array) else value

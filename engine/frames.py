@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -15,7 +16,7 @@ from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.least_squares import mad_sigma
-from mirrorskin.kernels.samples import take_samples
+from mirrorskin.kernels.samples import Grid, take_grids, take_samples
 
 SAMPLES = 65536
 """Smallest number of pixels from which the noise of a larger frame is estimated."""
@@ -113,6 +114,56 @@ def take_grid(frames: AnyArray, grid: FrameSamples) -> NDArray[Any]:
     down, step = (int(one[1] - one[0]) if len(one) > 1 else 0 for one in (rows, columns))
     steps, shape = (height * width, down * width, step), (count, len(rows), len(columns))
     return take_samples(frames, int(rows[0] * width + columns[0]), steps, shape)
+
+
+def take_neighbours(values: AnyArray, grid: FrameSamples) -> list[NDArray[Any]]:
+    """Return a map, (H, W), at the pixels of a grid, and at those to the left, right, above and below them.
+
+    At the border of the map, a pixel is next to itself.
+    """
+    height, width = values.shape
+    rows, columns = grid.rows, grid.columns
+    at_border = 0 in (rows[0], columns[0]) or rows[-1] == height - 1 or columns[-1] == width - 1
+    if isinstance(values, Array) and not at_border:
+        down, step = (int(one[1] - one[0]) for one in (rows, columns))
+        first, shape = int(rows[0] * width + columns[0]), (3, len(rows), len(columns))
+        across, along = take_grids(
+            *(Grid(values, first - apart, (apart, down * width, step), shape) for apart in (1, width))
+        )
+        return [across[1], across[0], across[2], along[0], along[2]]
+    array: NDArray[Any] = np.asarray(values)
+    left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, width - 1)
+    above, below = np.maximum(rows - 1, 0), np.minimum(rows + 1, height - 1)
+    places = (rows, columns), (rows, left), (rows, right), (above, columns), (below, columns)
+    return [array[np.ix_(*place)] for place in places]
+
+
+def take_places(
+    maps: Sequence[AnyArray], rows: range, columns: range, places: Sequence[tuple[int, int]]
+) -> list[list[NDArray[Any]]]:
+    """Return maps, (H, W) or (H, W, components), at rows and columns moved down and right to each place.
+
+    They are (rows, columns) or (components, rows, columns), and only views if the maps are on the host.
+    """
+    if any(isinstance(one, np.ndarray) for one in maps):
+        parts = [
+            tuple(slice(each[0] + by, each[-1] + by + 1, each.step) for each, by in moved)
+            for moved in (((rows, down), (columns, right)) for down, right in places)
+        ]
+        hosts: list[Any] = [
+            (np.moveaxis(one, -1, 0) if one.ndim == 3 else one) for one in map(np.asarray, maps)
+        ]
+        return [[one[(..., *part)] for part in parts] for one in hosts]
+    grids = []
+    for one in maps:
+        width, components = one.shape[1], math.prod(one.shape[2:])
+        steps = 1, components * width * rows.step, components * columns.step
+        shape = components, len(rows), len(columns)
+        for down, right in places:
+            first = components * ((rows[0] + down) * width + columns[0] + right)
+            grids.append(Grid(one, first, steps, shape))
+    found = iter(take_grids(*grids))
+    return [[next(found) if one.ndim == 3 else next(found)[0] for _ in places] for one in maps]
 
 
 def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], integer: bool) -> float:

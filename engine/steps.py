@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from numpy.typing import NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray, stored_map
+from mirrorskin.engine.frames import take_neighbours
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import Configured
 from mirrorskin.io import Calibrated
@@ -41,6 +43,8 @@ class Context:
         The maps of the operation, before all steps.
     earlier : dict of Result
         The maps before each step so far, by its class; see `before`.
+    sampled : dict
+        Heights on the grid, by the map that they are of; see `neighbours`.
     """
 
     source: Source
@@ -51,10 +55,19 @@ class Context:
     time: NDArray[np.float64] | None
     computed: Result
     earlier: dict[type[Step], Result] = field(default_factory=dict)
+    sampled: dict[int, tuple[AnyArray, list[NDArray[Any]]]] = field(default_factory=dict)
 
     def before(self, step: type[Step], result: Result) -> Result:
         """Return the maps before a step was applied; the given ones if it was not."""
         return self.earlier.get(step, result)
+
+    def neighbours(self, result: Result) -> list[NDArray[Any]]:
+        """Return the heights at the grid of samples, and to the left, right, above and below its pixels."""
+        assert self.samples is not None
+        height = stored_map(result, "height")
+        if id(height) not in self.sampled:
+            self.sampled[id(height)] = height, take_neighbours(height, self.samples)  # which keeps the id
+        return self.sampled[id(height)][1]
 
     def positions(self, name: str) -> NDArray[np.float64]:
         """Return the positions of the frames, such as their ``travel``."""

@@ -128,7 +128,8 @@ class Traces:
         self._stored = samples.reshape(len(samples), math.prod(samples.shape[1:]))
         self._integer = samples.dtype.kind == "u"
         self._counts = self._stored.astype(np.float32)
-        self._counts = self._counts[:, np.isfinite(self._counts).all(axis=0)]
+        if not (finite := np.isfinite(self._counts).all(axis=0)).all():
+            self._counts = self._counts.compress(finite, axis=1)
         self._motion, self._series = motion, series
         self._known = self._counts.shape[1] >= _FEWEST and len(self._counts) > 2
         if self._known:
@@ -233,7 +234,7 @@ class Traces:
     def _noise(self) -> float:
         """Return an estimate of the standard deviation of a sample, from the smallest changes."""
         steps = np.diff(self._counts, axis=0)
-        found = [_MAD * float(np.median(np.median(np.abs(steps), axis=1))) / math.sqrt(2)]
+        found = [_MAD * float(np.median(_medians(np.abs(steps)))) / math.sqrt(2)]
         if self._fit is not None:
             left = np.abs(self._counts - self._fit)
             found.append(_MAD * float(np.median(left)))
@@ -303,7 +304,7 @@ class Traces:
                 " heights near them are wrong: look for defective pixels, or for errors of the transmission",
             )
         travel = self._series["travel"]
-        rises, falls = self._changes(self._counts[:, self._responding], np.sign(travel[-1] - travel[0]))
+        rises, falls = self._changes(self._of_responding, np.sign(travel[-1] - travel[0]))
         if falls > _MOST_OF * (rises + falls) and falls > 0.2:
             yield Finding(
                 "reversed",
@@ -330,6 +331,11 @@ class Traces:
         apart = (np.minimum(steps[:-1], -steps[1:]) > limit) | (np.maximum(steps[:-1], -steps[1:]) < -limit)
         of_frame = apart.mean(axis=1)
         return float(np.mean(np.where(of_frame < _FLASH, of_frame, 0)))
+
+    @functools.cached_property
+    def _of_responding(self) -> Samples:
+        """The brightness of responding pixels, (T, n)."""
+        return self._counts.compress(self._responding, axis=1)  # in C order, unlike selection by a mask
 
     @property
     def _pictures(self) -> Samples:
@@ -363,7 +369,7 @@ class Traces:
         step = float(np.median(np.abs(np.diff(phase))))
         if step > math.pi / 2 or abs(turned[last] - 2 * math.pi) > 1.5 * step:  # a body may also rock
             return
-        counts, extent = self._counts[:, self._responding], self._range[self._responding]
+        counts, extent = self._of_responding, self._range[self._responding]
         jump = float(np.median(np.abs(counts[last] - counts[0]) / extent))
         if jump > 0.5:
             yield Finding(
@@ -379,8 +385,9 @@ class Traces:
         if np.count_nonzero(enough) < 5:
             return None
         counts, used, counted = counts[enough], used[enough], counted[enough]
-        levels = np.sum(counts, axis=0, where=used) / np.maximum(np.count_nonzero(used, axis=0), 1)
-        offset = np.nanmedian(np.where(used, counts - levels, np.nan), axis=1)
+        lit = np.where(used, counts, 0)
+        levels = np.sum(lit, axis=0) / np.maximum(np.count_nonzero(used, axis=0), 1)
+        offset = _medians(np.where(used, counts - levels, np.inf), counted)
         errors = _OF_MEDIAN * self.noise / np.sqrt(counted)
         return offset, errors, float(np.sum(levels * used) / np.sum(counted))
 
@@ -391,7 +398,7 @@ class Traces:
             left = self._counts - self._fit
             if float(np.mean(left**2)) > 0.02 * float(np.var(self._counts)):
                 return None  # harmonics do not describe the brightness
-            wave = swing_of(self._counts[:, self._responding], self._series["phase"])
+            wave = swing_of(self._of_responding, self._series["phase"])
             if wave.size and abs(np.mean(wave / np.abs(wave))) > _AS_ONE:
                 return None  # on a flat object, light that is not a cosine would look the same
             gain = np.median(left / np.maximum(self._fit, 1e-3 * self._highest.max()), axis=1)
@@ -399,7 +406,7 @@ class Traces:
             return float(np.std(gain)), error
         if not self._goes_down() or self._share < _FEW:
             return None
-        counts = self._counts[:, self._responding]
+        counts = self._of_responding
         lit = counts - self._lowest[self._responding] > 0.8 * self._range[self._responding]
         lit[2:] &= lit[:-2]  # for two frames
         lit[:2] = False
@@ -427,7 +434,7 @@ class Traces:
         means = np.stack([part.mean(axis=0) for part in parts])
         change = np.maximum.accumulate([np.abs(part - means[0]).max(axis=0) for part in parts])
         dark = (change < self._response) & (means[0] < self._lowest.min() + _DARK * self.span)
-        start = counts[: len(parts[0]) + len(parts[1]), dark[2]]
+        start = counts[: len(parts[0]) + len(parts[1])].compress(dark[2], axis=1)
         if start.shape[1] < _FEWEST:
             return None
         noise = _MAD / math.sqrt(2) * float(np.median(np.abs(np.diff(start, axis=0))))
@@ -452,6 +459,14 @@ class Traces:
             return False
         way = float(travel[-1] - travel[0])
         return way != 0 and bool(np.all(np.diff(travel) * way >= 0))
+
+
+def _medians(values: NDArray[Any], count: NDArray[np.intp] | None = None) -> NDArray[Any]:
+    """Return the median of each row, (T, n), or of its ``count`` smallest values."""
+    if count is None:
+        count = np.full(len(values), values.shape[1])
+    ordered, row = np.sort(values, axis=1), np.arange(len(values))
+    return np.asarray((ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2)
 
 
 def _percent(share: float) -> str:

@@ -36,11 +36,12 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.kernels.array_types import Doubles
 
 _MEDIAN = 0.6744897501960817  # median magnitude of a standard normal variate
+_SAMPLES = 4096  # values that show where a median is
 _TOLERANCE = 1e-8  # relative decrease of the cost that ends the iteration
 _STEPS = 100  # maximum number of steps
 _RIDGE = 1e-12  # relative to the curvature: keeps the damped matrix regular
@@ -48,6 +49,21 @@ _SINGULAR = 1e-13  # relative to the largest eigenvalue of scaled equations: dir
 _DIFFERENCE = 1e-8  # step of forward differences; relative for parameters above 1
 _ROUNDS = 8  # maximum number of fits with noise estimated from the preceding fit
 _ALIKE = 0.01  # relative change of this noise that ends the repetition
+
+
+def median(values: NDArray[Any]) -> Any:
+    """Return the median of finite values as `numpy.median` does, which takes ten times as long for many.
+
+    Samples show between which values it probably is, so that only these are sorted.
+    """
+    flat = values.ravel()
+    some, middle = np.sort(flat[:: max(1, flat.size // _SAMPLES)]), (flat.size - 1) // 2
+    low, high = some[int(0.45 * some.size)], some[int(0.55 * some.size)]
+    inside, below = flat[(flat >= low) & (flat <= high)], int(np.count_nonzero(flat < low))
+    if not below <= middle < below + inside.size - 1:
+        return np.median(flat)
+    first, second = np.partition(inside, (middle - below, middle - below + 1))[middle - below :][:2]
+    return first if flat.size % 2 else (first + second) / 2
 
 
 def mad_sigma(residuals: Doubles) -> float:

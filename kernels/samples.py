@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
+from mirrorskin.kernels.array import Array, fetch
 from mirrorskin.kernels.device import C_TYPES
-
-if TYPE_CHECKING:
-    from mirrorskin.kernels.array import Array
 
 
 def samples_take(
@@ -25,15 +24,34 @@ def samples_take(
     return as_strided(flat, (lines, rows, count), strides, writeable=False).copy()
 
 
+class Grid(NamedTuple):
+    """Evenly spaced values of an array on the host or on a device; see `samples_take`."""
+
+    array: NDArray[Any] | Array
+    first: int
+    steps: tuple[int, int, int]
+    shape: tuple[int, int, int]
+
+
 def take_samples(
     array: Array, first: int, steps: tuple[int, int, int], shape: tuple[int, int, int]
 ) -> NDArray[Any]:
     """Return the result of `samples_take` for an array on a device; nothing else is copied to the host."""
-    samples = array.device.array("samples", shape, array.dtype, zeroed=False)
-    kernel = array.device.kernel("samples", "samples_take", VALUE=C_TYPES[array.dtype.name])
-    (lines, rows, count), (apart, down, step) = shape, steps
-    kernel(
-        lines * rows * count, lines=lines, rows=rows, count=count, values=array, first=first, apart=apart,
-        down=down, step=step, samples=samples, moved=2 * samples.nbytes,
-    )  # fmt: skip
-    return samples.read()
+    return take_grids(Grid(array, first, steps, shape))[0]
+
+
+def take_grids(*grids: Grid) -> list[NDArray[Any]]:
+    """Return the values of several grids, all on the host or all on one device, which is waited for once."""
+    parts = []
+    for array, first, steps, shape in grids:
+        if isinstance(array, np.ndarray):
+            return [samples_take(*one.shape, np.asarray(one.array), one.first, *one.steps) for one in grids]
+        samples = array.device.array("samples", shape, array.dtype, zeroed=False)
+        kernel = array.device.kernel("samples", "samples_take", VALUE=C_TYPES[array.dtype.name])
+        (lines, rows, count), (apart, down, step) = shape, steps
+        kernel(
+            lines * rows * count, lines=lines, rows=rows, count=count, values=array, first=first, apart=apart,
+            down=down, step=step, samples=samples, moved=2 * samples.nbytes,
+        )  # fmt: skip
+        parts.append((samples, slice(None)))
+    return fetch(parts)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -58,7 +59,7 @@ class StatedBlur(Step):
         footprint = self.footprint(result, context)
         if footprint is None:
             return result
-        sigma = with_curvature(result.height, result.height_sigma, footprint.variance)
+        sigma = partial(_with_footprint, result, footprint.variance)
         if not footprint.clear:
             return result.assign(height_sigma=sigma)
         blur = {"blur": round(math.sqrt(footprint.variance - PIXEL), 2)}
@@ -88,7 +89,8 @@ class LensBlur(StatedBlur):
             return super().footprint(result, context)
         if samples is None or len(travel) < _LEAST_FRAMES:
             return None
-        return _footprint(samples, travel, cast("PressOperation", context.operation), result.height)
+        operation, heights = cast("PressOperation", context.operation), context.neighbours(result)
+        return _footprint(samples, travel, operation, heights)
 
 
 class PixelBlur(LensBlur):
@@ -133,30 +135,36 @@ class _Quarter:
         return cls(float(np.median(slope)), middle, error, spread.size)
 
 
+def _with_footprint(result: Result, variance: float) -> NDArray[np.float32]:
+    return with_curvature(result.height, result.height_sigma, variance)
+
+
 def _footprint(
-    samples: FrameSamples, travel: Doubles, operation: PressOperation, height: NDArray[Any]
+    samples: FrameSamples,
+    travel: Doubles,
+    operation: PressOperation,
+    heights: list[NDArray[Any]],
 ) -> Footprint | None:
     """Return a pixel's footprint; None if it is sharp or not resolved."""
-    rows, columns = samples.rows, samples.columns
-    inner = np.ix_((rows > 0) & (rows < height.shape[0] - 1), (columns > 0) & (columns < height.shape[1] - 1))
+    rows, columns, shape = samples.rows, samples.columns, operation.shape
+    inner = np.ix_((rows > 0) & (rows < shape[0] - 1), (columns > 0) & (columns < shape[1] - 1))
     row, column = (part[inner].ravel() for part in np.meshgrid(rows, columns, indexing="ij"))
-    across = (height[row, column + 1] - height[row, column - 1]) / 2
-    along = (height[row + 1, column] - height[row - 1, column]) / 2
-    slope = np.hypot(across, along).astype(np.float64)
-    sloped = np.isfinite(slope) & np.isfinite(height[row, column]) & (slope > 0)
+    middle, left, right, above, below = (one[inner].ravel() for one in heights)
+    slope = np.hypot((right - left) / 2, (below - above) / 2).astype(np.float64)
+    sloped = np.isfinite(slope) & np.isfinite(middle) & (slope > 0)
     if np.count_nonzero(sloped) < _FEWEST:
         return None
     ordered = np.sort(slope[sloped])
     least, most = (ordered[round(share * (len(ordered) - 1))] for share in (1 - _STEEPEST, _STEEPEST))
     sloped &= (slope <= least) | (slope >= most)  # the others show less
     row, column, slope = row[sloped], column[sloped], slope[sloped]
-    values = samples.values[:, *inner].reshape(len(travel), -1)[:, sloped].astype(np.float32)
+    values = samples.values[(slice(None), *inner)].reshape(len(travel), -1)[:, sloped].astype(np.float32)
     if travel[-1] < travel[0]:  # of a release
         values, travel = values[::-1], travel[::-1]
     few = max(1, len(travel) // 10)
     ends = values[:few].mean(axis=0), values[-few:].mean(axis=0)
     dark, bright = (
-        end if level is None else np.broadcast_to(np.asarray(level, np.float32), height.shape)[row, column]
+        end if level is None else np.broadcast_to(np.asarray(level, np.float32), shape)[row, column]
         for level, end in zip((operation.dark, operation.bright), ends, strict=True)
     )
     with np.errstate(divide="ignore", invalid="ignore"):

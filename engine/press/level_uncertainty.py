@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -16,7 +17,7 @@ from mirrorskin.io import Result
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.io.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.least_squares import mad_sigma, median
 
 _PART = 0.1  # of the frames, at each end, in which levels are compared with the references
 _AWAY = 0.3  # of the travel, least distance of these frames from the onset of a pixel
@@ -66,8 +67,9 @@ class LevelUncertainty(Step):
             rise = np.asarray(bright, np.float64) - np.asarray(dark, np.float64)
             share = scatter / float(np.nanmedian(rise))
         if samples is not None:
-            seen = _Seen.of(samples, context.positions("travel"), dark, bright, result.height.shape)
-            errors = _find_errors(seen, -samples.of_map(result.height).astype(np.float64))
+            seen = _Seen.of(samples, context.positions("travel"), dark, bright, operation.shape)
+            height, *beside = context.neighbours(result)
+            errors = _find_errors(seen, -height.astype(np.float64))
             share = math.hypot(share, *(error / math.sqrt(2) for error in errors))
             if any(errors):
                 said = " and ".join(
@@ -79,12 +81,8 @@ class LevelUncertainty(Step):
                 result = with_findings(result, Finding("levels", text, False))
         if not share:
             return result
-        slope = _rise(result.height)
-        width = 0.0 if samples is None else _width(seen, samples.of_map(slope))
-        known = np.isfinite(slope)  # not at the border of the contact
-        usual = np.median(slope[known]) if known.any() else np.float32(0)
-        moved = np.float32(share) * np.hypot(np.where(known, slope, usual), np.float32(width))
-        return result.assign(height_sigma=np.hypot(result.height_sigma, moved))
+        width = 0.0 if samples is None else _width(seen, _rise(*beside))
+        return result.assign(height_sigma=partial(_with_levels, result, share, width))
 
 
 class _Seen(NamedTuple):
@@ -149,13 +147,22 @@ def _width(seen: _Seen, slope: NDArray[np.float32]) -> float:
     return math.sqrt(max(0.0, float(np.median(width[flat] ** 2 - slope[flat] ** 2))))
 
 
-def _rise(height: NDArray[Any]) -> NDArray[np.float32]:
-    """Return by how much heights change over a pixel."""
-    import cv2  # slow to import, and unneeded if the levels are certain
+def _with_levels(result: Result, share: float, width: float) -> NDArray[np.float32]:
+    """Return the standard deviations of heights with that of levels, a share of the rise to light."""
+    height = np.pad(np.asarray(result.height, np.float32), 1, "edge")
+    moved = _rise(height[1:-1, :-2], height[1:-1, 2:], height[:-2, 1:-1], height[2:, 1:-1])
+    known = np.isfinite(moved)  # not at the border of the contact
+    moved[~known] = median(moved[known]) if known.any() else 0
+    np.hypot(moved, np.float32(width), out=moved)
+    moved *= np.float32(share)
+    return np.asarray(np.hypot(result.height_sigma, moved))
 
-    kernel = np.array([[-0.5, 0, 0.5]], np.float32)
-    source = height.astype(np.float32)
-    across, along = (
-        cv2.filter2D(source, -1, one, borderType=cv2.BORDER_REPLICATE) for one in (kernel, kernel.T.copy())
-    )
-    return np.asarray(np.abs(across) + np.abs(along))
+
+def _rise(
+    left: NDArray[Any], right: NDArray[Any], above: NDArray[Any], below: NDArray[Any]
+) -> NDArray[np.float32]:
+    """Return by how much heights change over a pixel, from those next to it."""
+    rise: NDArray[np.float32] = np.abs(right - left)
+    rise += np.abs(below - above)
+    rise /= 2
+    return rise

@@ -21,7 +21,8 @@ class NoAnswer(Step):
 
     def apply(self, result: Result, context: Context) -> Result:
         """Return the result; its process says why there is no height at any pixel."""
-        if np.isfinite(result.height).any():
+        on_grid = () if context.samples is None else context.neighbours(result)
+        if np.isfinite(on_grid).any() or np.isfinite(result.height).any():
             return result
         return with_findings(result, Finding("no height", _reason(result, context)))
 

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray, stored_map
 from mirrorskin.engine.press.crossing import PressOperation, with_travel_error
 from mirrorskin.engine.steps import Context, Step
 from mirrorskin.io import Result
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.samples import Grid, take_grids
 
 _BEND = np.array([-1.0, 3.0, -3.0, 1.0])  # third difference of four pixels in a row
 _RISE = np.array([-1.0, -1.0, 1.0, 1.0]) / 4  # mean difference of neighbours
@@ -55,7 +58,7 @@ class PositionUncertainty(Step):
         """Return a result with larger standard deviations, or a warning, where positions do not fit."""
         operation = cast("PressOperation", context.operation)
         travel = context.positions("travel")
-        errors = _find_errors(result.height, travel)
+        errors = _find_errors(stored_map(result, "height"), travel)
         if errors is None:
             return result
         jump = errors.lost_frame()
@@ -88,7 +91,7 @@ class _Errors:
     travel: Doubles
     step: float
     error: Doubles
-    covariance: Doubles
+    covariance: Callable[[], Doubles]
     clear: NDArray[np.bool_]
     jumps: Doubles
     jump_errors: Doubles
@@ -104,9 +107,11 @@ class _Errors:
             return 0.0
         differences = np.diff(np.eye(len(self.error)), 3, axis=0)[clear] / math.sqrt(20)
         jitter = mad_sigma(differences @ self.error)
-        variance = np.einsum("ij,jk,ik->i", differences, self.covariance, differences)
+        if jitter < _LEAST_JITTER * self.step:
+            return 0.0
+        variance = np.einsum("ij,jk,ik->i", differences, self.covariance(), differences)
         error = math.sqrt(float(np.median(variance)))
-        if jitter < max(_LEAST_JITTER * self.step, _CLEARER * error):
+        if jitter < _CLEARER * error:
             return 0.0
         return math.sqrt(jitter**2 - error**2)
 
@@ -128,7 +133,7 @@ class _Errors:
 class _Rows:
     """Rows of four pixels: their bend relative to their rise, and how errors of frames change it.
 
-    bend = bends[i] + sum of change[i, j] * error[frame[i, j]] over the 8 frames next to the pixels.
+    bend = bends[i] + sum of change[j, i] * error[frame[j, i]] over the 8 frames next to the pixels.
     """
 
     bends: Doubles
@@ -150,7 +155,7 @@ class _Rows:
         Second differences from frame to frame of what each error would change, in standard errors.
         """
         weight = 1 / np.sqrt(1 + (self.bends / (2 * self.bend)) ** 2)
-        gradient = ((weight * self.bends)[:, np.newaxis] * self.change).ravel()
+        gradient = (weight * self.bends * self.change).ravel()
         frame, count = self.frame.ravel(), len(clear) + 1
         total, square = (np.bincount(frame, part, minlength=count) for part in (gradient, gradient**2))
         usable = self.seen(count) >= _SEEN
@@ -162,11 +167,14 @@ class _Rows:
 
     def between(self, first: int, stop: int) -> _Rows:
         """Return the rows that lie between two frames, which are then numbered from the first."""
-        inside = ((self.frame >= first) & (self.frame < stop)).all(axis=1)
-        return _Rows(self.bends[inside], self.frame[inside] - first, self.change[inside])
+        inside = ((self.frame >= first) & (self.frame < stop)).all(axis=0)
+        if inside.all():
+            return _Rows(self.bends, self.frame - first, self.change)
+        frame, change = (one.compress(inside, axis=1) for one in (self.frame, self.change))
+        return _Rows(self.bends[inside], frame - first, change)
 
 
-def _find_errors(height: NDArray[Any], pushed: Doubles) -> _Errors | None:
+def _find_errors(height: AnyArray, pushed: Doubles) -> _Errors | None:
     """Return the errors of the frames' positions; None if the heights do not show any."""
     travel = np.unique(pushed)
     if len(travel) < _FEWEST:
@@ -184,11 +192,13 @@ def _find_errors(height: NDArray[Any], pushed: Doubles) -> _Errors | None:
     reach = 1 + int(np.searchsorted(_FARTHER, step / float(np.median(rise))))
     if reach > 1:
         pixels = _pixels_of(height, reach, _FEW)
-    if not _rows_of(pixels, travel, step).suspicious(clear):
-        return None
-    pixels = _pixels_of(height, reach, _MOST)
-    clear = _spread(pixels[0][np.isfinite(pixels[0])], travel)
     rows = _rows_of(pixels, travel, step)
+    if not rows.suspicious(clear):
+        return None
+    more = _pixels_of(height, reach, _MOST)
+    if more.shape != pixels.shape:
+        rows = _rows_of(more, travel, step)
+    clear = _spread(more[0][np.isfinite(more[0])], travel)
     seen = np.flatnonzero(rows.seen(len(travel)) >= _SEEN)
     if len(seen) < _FEWEST:
         return None
@@ -211,20 +221,22 @@ def _apart(travel: Doubles, least: float) -> Doubles:
     return travel[kept]
 
 
-def _pixels_of(height: NDArray[Any], reach: int, most: int) -> Doubles:
+def _pixels_of(height: AnyArray, reach: int, most: int) -> Doubles:
     """Return depths of rows of four pixels, ``reach`` apart, from rows and columns all over, (4, n)."""
-    parts = []
-    for lines in (height, height.T):
-        count = lines.shape[1] - 3 * reach
+    grids, (rows, columns) = [], height.shape
+    for lines, length, down, across in ((rows, columns, columns, 1), (columns, rows, 1, columns)):
+        count = length - 3 * reach
         if count > 0:
-            thinner = max(1, lines.shape[0] * count // most)
+            thinner = max(1, lines * count // most)
             skip = math.isqrt(thinner)
             each = -(-thinner // skip)
-            chosen = lines[each // 2 % lines.shape[0] :: each]
-            parts.append([chosen[:, n * reach : n * reach + count : skip].ravel() for n in range(4)])
-    if not parts:
+            first = each // 2 % lines
+            steps = reach * across, each * down, skip * across
+            shape = 4, -(-(lines - first) // each), -(-count // skip)
+            grids.append(Grid(height, first * down, steps, shape))
+    if not grids:
         return np.empty((4, 0))
-    return -np.concatenate(parts, axis=1).astype(np.float64)
+    return -np.concatenate([part.reshape(4, -1) for part in take_grids(*grids)], axis=1).astype(np.float64)
 
 
 def _rows_of(pixels: Doubles, travel: Doubles, step: float) -> _Rows:
@@ -232,16 +244,14 @@ def _rows_of(pixels: Doubles, travel: Doubles, step: float) -> _Rows:
     each = np.diff(pixels, axis=0)
     rises = (each > 0).all(axis=0) | (each < 0).all(axis=0)
     rises &= np.abs(pixels[3] - pixels[0] + pixels[2] - pixels[1]) > 4 * _LEAST_RISE * step
-    pixels = pixels[:, rises]
+    pixels = pixels.compress(rises, axis=1)
     rise = np.sum(_RISE[:, np.newaxis] * pixels, axis=0)
     bends = np.sum(_BEND[:, np.newaxis] * pixels, axis=0) / rise
     frame = np.clip(np.searchsorted(travel, pixels, side="right") - 1, 0, len(travel) - 2)
     share = (pixels - travel[frame]) / (travel[frame + 1] - travel[frame])
     change = (_BEND[:, np.newaxis] - bends * _RISE[:, np.newaxis]) / rise
     return _Rows(
-        bends,
-        np.concatenate([frame, frame + 1]).T,
-        np.concatenate([change * (1 - share), change * share]).T,
+        bends, np.concatenate([frame, frame + 1]), np.concatenate([change * (1 - share), change * share])
     )
 
 
@@ -258,30 +268,35 @@ def _spread(heights: Doubles, travel: Doubles) -> NDArray[np.bool_]:
 
 def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], reach: int) -> _Errors:
     """Fit the errors of all frames, and those of a single jump between any two of them."""
-    count = len(travel)
-    pairs = (rows.frame[:, :, np.newaxis] * count + rows.frame[:, np.newaxis, :]).ravel()
-    products = rows.change[:, :, np.newaxis] * rows.change[:, np.newaxis, :]
+    count, (one, other) = len(travel), np.triu_indices(len(rows.frame))
+    pairs = (count * rows.frame[one] + rows.frame[other]).ravel()
+    products = rows.change[one] * rows.change[other]
+    products[one == other] /= 2  # the other half of the matrix is the transposed one
+    weighted = np.empty_like(products)  # used again, because new memory costs as much as the products
 
     def normal(weight: Doubles) -> Doubles:
         """Return the sum of weighted products of changes, (n, n)."""
-        weighted = (weight[:, np.newaxis, np.newaxis] * products).ravel()
-        return np.bincount(pairs, weighted, minlength=count**2).reshape(count, count).astype(np.float64)
+        np.multiply(weight, products, out=weighted)
+        half = np.bincount(pairs, weighted.ravel(), minlength=count**2).reshape(count, count)
+        return np.asarray(half + half.T)
 
     degree = max(2, count // _SMOOTH)
     smooth, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, count), degree))
+    of_surface = np.sum(smooth[:, np.newaxis] * smooth[np.newaxis], axis=2)
     bend, error, left = rows.bend, np.zeros(count), rows.bends
     for _ in range(_ROUNDS):
         weight = 1 / np.sqrt(1 + (left / (2 * bend)) ** 2)
         squares = normal(weight)
-        gradient = -np.bincount(
-            rows.frame.ravel(), ((weight * rows.bends)[:, np.newaxis] * rows.change).ravel(), minlength=count
-        )
+        slope = (weight * rows.bends * rows.change).ravel()
+        gradient = -np.bincount(rows.frame.ravel(), slope, minlength=count)
         whole = squares + np.eye(count) * (bend / (_PRIOR * step)) ** 2
-        whole += 10 * np.trace(whole) * np.sum(smooth[:, np.newaxis] * smooth[np.newaxis], axis=2)
+        whole += 10 * np.trace(whole) * of_surface
         inverse = np.linalg.inv(whole)
         error = np.sum(inverse * gradient, axis=1)
-        left = rows.bends + np.sum(rows.change * error[rows.frame], axis=1)
-    covariance = _OVERLAP * inverse @ normal((weight * left) ** 2) @ inverse
+        left = rows.bends + np.sum(rows.change * error[rows.frame], axis=0)
+
+    def covariance() -> Doubles:
+        return _OVERLAP * inverse @ normal((weight * left) ** 2) @ inverse
 
     after = np.tri(count, count - 1, -1)  # a jump between two frames shifts all that follow
     inner = np.linalg.pinv(smooth.T @ squares @ smooth)

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray
+from mirrorskin.engine.frames import take_places
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 
@@ -42,7 +44,7 @@ class AzimuthError:
 
 
 def find_azimuth_error(
-    normals: NDArray[np.floating], contact: NDArray[Any], pixel_size: tuple[float, float]
+    normals: AnyArray, contact: NDArray[Any], pixel_size: tuple[float, float]
 ) -> AzimuthError | None:
     """Return the rotation of the slopes of normals, (H, W, 3), in contact; None if it is not significant."""
     rows, columns = contact.shape
@@ -50,29 +52,22 @@ def find_azimuth_error(
     half, thin = max(_LEAST, extent // _LOOPS), max(1, extent // _LINES)
     if min(rows, columns) <= 2 * half:
         return None
-    up, right = np.arange(half, rows - half, thin), np.arange(half, columns - half, thin)
-
-    def slopes(down: int, across: int) -> tuple[Doubles, Doubles]:
-        at = np.ix_(up + down, right + across)
-        x, y, z = np.moveaxis(normals[at].astype(np.float64), -1, 0)
-        z = np.where(contact[at] > 0, z, np.nan)
-        return -x / z, -y / z
-
-    along = half // 2
-    sides = [
-        [np.mean(one, axis=0) for one in zip(*(slopes(*place) for place in places), strict=True)]
-        for places in (
-            [(-half, -along), (-half, along)],
-            [(half, -along), (half, along)],
-            [(-along, half), (along, half)],
-            [(-along, -half), (along, -half)],
-        )
-    ]
+    down, right, along = range(half, rows - half, thin), range(half, columns - half, thin), half // 2
+    places = [(-half, -along), (-half, along), (half, -along), (half, along)]
+    places += [(-along, half), (along, half), (-along, -half), (along, -half)]
+    (vectors,), (touched,) = (take_places([one], down, right, places) for one in (normals, contact))
+    slopes = []
+    for vector, touches in zip(vectors, touched, strict=True):
+        x, y, z = vector.astype(np.float64)
+        z = np.where(touches > 0, z, np.nan)
+        slopes.append((-x / z, -y / z))
+    pairs = zip(slopes[::2], slopes[1::2], strict=True)
+    sides = [[(one + other) / 2 for one, other in zip(*pair, strict=True)] for pair in pairs]
     (p_up, q_up), (p_down, q_down), (p_right, q_right), (p_left, q_left) = sides
     across, upwards = 1 / pixel_size[0], 1 / pixel_size[1]
     curl = (q_right - q_left) * across - (p_up - p_down) * upwards
     divergence = (p_right - p_left) * across + (q_up - q_down) * upwards
-    place = np.broadcast_to((1 - 2 * up / (rows - 1))[:, np.newaxis], curl.shape)
+    place = np.broadcast_to((1 - 2 * np.array(down) / (rows - 1))[:, np.newaxis], curl.shape)
     known = np.isfinite(curl) & np.isfinite(divergence)
     if np.count_nonzero(known) < _FEWEST:
         return None
@@ -90,7 +85,9 @@ def _regression(curl: Doubles, divergence: Doubles, place: Doubles, overlap: flo
             return None
         fit = np.linalg.solve(matrix, np.einsum("ni,n->i", columns[kept], curl[kept]))
         left = curl - np.einsum("ni,i->n", columns, fit)
-        kept = np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+        before, kept = kept, np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+        if np.array_equal(before, kept):
+            break
     spread = np.sqrt(np.diag(np.linalg.inv(matrix)) * float(np.mean(left[kept] ** 2)) * overlap)
     explained = 1 - float(np.var(left[kept])) / max(float(np.var(curl[kept])), 1e-30)
     clear = (np.abs(fit) > _CLEAR * spread) & (np.abs(fit) > math.tan(_SMALLEST)) & (explained > _EXPLAINED)

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.frames import QUANTUM, thin_out
+from mirrorskin.engine.device_arrays import AnyArray, stored_map
+from mirrorskin.engine.frames import QUANTUM, take_places, thin_out
 from mirrorskin.engine.rotation.curl import AzimuthError, find_azimuth_error
 from mirrorskin.engine.rotation.normals_kernel import azimuth_of
 from mirrorskin.engine.rotation.registration import Registered
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from mirrorskin.engine.rotation.normals import Normals
 
 _PARTS, _POINTS = 8, 128  # of the extent of the normals: distance between slopes; slopes along a side
+_GRID = 64  # points along a side that show this extent
 _FEWEST, _CLEAR, _ALIKE = 100, 6.0, 0.1  # points, standard errors, and correlation that decide
 _REACH = 5  # pixels: size of the neighbourhood whose loss of contact affects a registered sample
 
@@ -67,17 +69,19 @@ class PhaseUncertainty(Step):
 
     def apply(self, result: Result, context: Context) -> Result:
         """Return the result with other normals, or with a warning, if the slopes contradict the phases."""
-        if _mirrored(result.normals if result.normals.ndim == 3 else result.normals[0]):
+        normals = stored_map(result, "normals")
+        several = normals.ndim == 4
+        if _mirrored(normals[0] if several else normals):
             found = Finding(
                 "mirrored",
                 "the slopes fit together better with the phases reversed: do phases count counter-clockwise"
                 " in the picture?",
             )
             return with_findings(result, found)
-        if result.normals.ndim == 4:
+        if several:
             return result
         size = context.source.header.pixel_size or (1.0, 1.0)
-        error = find_azimuth_error(result.normals, result.contact, size)
+        error = find_azimuth_error(normals, result.contact, size)
         if error is None:
             return result
         normals = error.remove(result.normals)
@@ -101,23 +105,25 @@ class ResponseUncertainty(Step):
         operation = cast("Normals", context.operation)
         fitted = result.fitted
         noise, slope, frames, tilt = fitted.noise, fitted.shot_noise, fitted.frames, fitted.tilt
-        if operation.response is not None or result.normals.ndim == 4:
+        normals, mean = (stored_map(result, name) for name in ("normals", "mean"))
+        if operation.response is not None or normals.ndim == 4:
             return result
         if noise is None or slope is None or frames is None or tilt is None:  # of a class with its own result
             return result
-        base = noise**2 - slope * _median(result.mean)
+        cosine, sine = (stored_map(context.computed, name) for name in ("cosine", "sine"))
+        base = noise**2 - slope * _median(mean)
         swing = find_swing(
-            result.normals,
-            result.mean,
-            result.modulation,
+            normals,
+            mean,
+            cosine,
+            sine,
             result.contact,
             cast("ArrayLike", operation.zenith_gain),
             tilt,
             CountNoise(base / frames, slope / frames, QUANTUM**2 / frames),
         )
         if swing.gain > 0:
-            sigma = np.hypot(result.normals_sigma, np.float32(swing.gain) * result.zenith)
-            result = result.assign(normals_sigma=sigma).with_fitted(pixel_gain_sigma=swing.gain)
+            result = _with_share_of_zenith(result, swing.gain).with_fitted(pixel_gain_sigma=swing.gain)
         if (share := max(swing.response, swing.light)) > 0:
             result = result.with_fitted(swing_range=share)
         return with_findings(result, *_uneven(swing))
@@ -137,12 +143,17 @@ class SystematicUncertainty(Step):
         response, share = cast("Normals", context.operation).response, result.fitted.swing_range
         if response is not None:
             return result.assign(normals_sigma=np.hypot(result.normals_sigma, response.sigma))
-        if share is None:
-            return result
-        return result.assign(normals_sigma=np.hypot(result.normals_sigma, np.float32(share) * result.zenith))
+        return result if share is None else _with_share_of_zenith(result, share)
 
 
-def _median(values: NDArray[np.floating]) -> float:
+def _with_share_of_zenith(result: Result, share: float) -> Result:
+    """Return a result with a share of zeniths added to the errors of normals, when these are used."""
+    return result.assign(
+        normals_sigma=lambda: np.hypot(result.normals_sigma, np.float32(share) * result.zenith)
+    )
+
+
+def _median(values: AnyArray) -> float:
     """Return the median of some of the values that are numbers; 0 if none is."""
     some = thin_out(values)
     some = some[np.isfinite(some)]
@@ -188,25 +199,26 @@ def _rotated(error: AzimuthError) -> Finding:
     return Finding("rotated slopes", f"the curl of the slopes shows that azimuths are wrong {text}")
 
 
-def _mirrored(normals: NDArray[np.floating]) -> bool:
+def _mirrored(normals: AnyArray) -> bool:
     """Return whether the slopes are those of a surface if one of them has the other sign.
 
     Slopes p and q of a surface satisfy dp/dy = dq/dx; with the phases reversed, q has the other sign. So the
     mean of their product is positive for a surface, and negative for a mirrored one.
     """
-    known = int(np.count_nonzero(np.isfinite(normals[..., 2])))
-    reach, thin = max(1, math.isqrt(known) // _PARTS), max(1, math.isqrt(known) // _POINTS)
-    here, across, down = (
-        normals[rows, columns][::thin, ::thin].astype(np.float64)
-        for rows, columns in (
-            (slice(None, -reach), slice(None, -reach)),
-            (slice(None, -reach), slice(reach, None)),
-            (slice(reach, None), slice(None, -reach)),
-        )
-    )
+    shape = normals.shape[:2]
+    step = max(1, math.isqrt(math.prod(shape)) // _GRID)
+    rows, columns = (range(0, length, step) for length in shape)
+    [[(*_, z)]] = take_places([normals], rows, columns, [(0, 0)])
+    extent = step * math.isqrt(int(np.count_nonzero(np.isfinite(z))))
+    reach, thin = max(1, extent // _PARTS), max(1, extent // _POINTS)
+    rows, columns = (range(0, length - reach, thin) for length in shape)
+    if not (rows and columns):
+        return False
+    ((here, across, down),) = take_places([normals], rows, columns, ((0, 0), (0, reach), (reach, 0)))
+    here, across, down = (one.astype(np.float64) for one in (here, across, down))
     with np.errstate(divide="ignore", invalid="ignore"):
-        dp_dy = down[..., 0] / down[..., 2] - here[..., 0] / here[..., 2]  # y points up
-        dq_dx = here[..., 1] / here[..., 2] - across[..., 1] / across[..., 2]
+        dp_dy = down[0] / down[2] - here[0] / here[2]  # y points up
+        dq_dx = here[1] / here[2] - across[1] / across[2]
     defined = np.isfinite(dp_dy) & np.isfinite(dq_dx)
     if np.count_nonzero(defined) < _FEWEST:
         return False

@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.device_arrays import AnyArray
+from mirrorskin.engine.frames import take_places
 from mirrorskin.engine.rotation.residual_noise import CountNoise
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
@@ -60,9 +62,10 @@ class Swing:
 
 
 def find_swing(
-    normals: NDArray[np.floating],
-    mean: NDArray[np.floating],
-    modulation: NDArray[np.floating],
+    normals: AnyArray,
+    mean: AnyArray,
+    cosine: AnyArray,
+    sine: AnyArray,
     usable: NDArray[Any],
     zenith_gain: ArrayLike,
     tilt: float,
@@ -70,42 +73,41 @@ def find_swing(
 ) -> Swing:
     """Return what the swing of brightness shows.
 
-    ``normals``, (H, W, 3), ``mean`` and ``modulation``, (H, W) counts, are used at ``usable`` pixels, (H, W).
+    ``normals``, (H, W, 3), and the fit of ``mean``, ``cosine`` and ``sine``, (H, W) counts, are used at
+    ``usable`` pixels, (H, W).
     """
     rows, columns = usable.shape
     thin = max(1, math.isqrt(int(np.count_nonzero(usable))) // _LINES)
     if min(rows, columns) <= 2 * _REACH:
         return Swing()
-    down, right = np.arange(_REACH, rows - _REACH, thin), np.arange(_REACH, columns - _REACH, thin)
+    down, right = range(_REACH, rows - _REACH, thin), range(_REACH, columns - _REACH, thin)
+    places = (0, 0), (0, _REACH), (0, -_REACH), (-_REACH, 0), (_REACH, 0)
     scale = np.broadcast_to(np.abs(np.asarray(zenith_gain, np.float64)), usable.shape)
+    used, scales = take_places([usable, scale], down, right, places)
+    vectors, means, cosines, sines = take_places([normals, mean, cosine, sine], down, right, places)
 
-    def look(rows_down: int, columns_right: int) -> tuple[Doubles, ...]:
+    def look(place: int) -> tuple[Doubles, ...]:
         """Return zenith, its sine's direction and the ratio of the swing, NaN where it is not usable."""
-        at = np.ix_(down + rows_down, right + columns_right)
-        x, y, z = np.moveaxis(normals[at].astype(np.float64), -1, 0)
-        flat = np.hypot(x, y)
-        zenith = np.where((usable[at] > 0) & (flat > math.sin(_STEEP * tilt)), np.arctan2(flat, z), np.nan)
-        return zenith, x / flat, y / flat, modulation[at] / (scale[at] * _expected(zenith, tilt))
+        x, y, z = vectors[place].astype(np.float64)
+        flat, swing = np.hypot(x, y), np.hypot(cosines[place], sines[place])
+        zenith = np.where((used[place] > 0) & (flat > math.sin(_STEEP * tilt)), np.arctan2(flat, z), np.nan)
+        return zenith, x / flat, y / flat, swing / (scales[place] * _expected(zenith, tilt))
 
     with np.errstate(divide="ignore", invalid="ignore"):
-        middle = look(0, 0)
-        east, west, north, south = (
-            look(*place) for place in ((0, _REACH), (0, -_REACH), (-_REACH, 0), (_REACH, 0))
-        )
+        middle, east, west, north, south = map(look, range(len(places)))
         apart = 2 * _REACH
         pairs = (east, west), (north, south)
         turning = np.sum([((one[k] - other[k]) / apart) ** 2 for one, other in pairs for k in (1, 2)], axis=0)
         bending = ((east[0] - west[0]) * middle[1] + (north[0] - south[0]) * middle[2]) / apart
         zenith = (east[0] + west[0] + north[0] + south[0]) / 4  # without the error of this pixel
         rough = middle[3] - (east[3] + west[3] + north[3] + south[3]) / 4
-        at = np.ix_(down, right)
-        noise = math.sqrt(2) * noise_of_mean.at(mean[at]) / (scale[at] * tilt)
+        noise = math.sqrt(2) * noise_of_mean.at(means[0]) / (scales[0] * tilt)
     known = np.isfinite(rough) & np.isfinite(turning) & np.isfinite(noise) & (noise > 0)
     if np.count_nonzero(known) < _FEWEST:
         return Swing()
     y, x = (
         np.broadcast_to(one, known.shape)[known]
-        for one in np.ix_(1 - 2 * down / (rows - 1), 2 * right / (columns - 1) - 1)
+        for one in np.ix_(1 - 2 * np.array(down) / (rows - 1), 2 * np.array(right) / (columns - 1) - 1)
     )
     noise, rough = noise[known], rough[known]
     gain = _gain(rough, noise)
@@ -151,7 +153,9 @@ def _fit(swing: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing
         inverse = np.linalg.inv(matrix)
         fit = inverse @ np.sum(weighted * (swing[kept] / noise[kept])[:, np.newaxis], axis=0)
         left = (swing - np.sum(columns * fit, axis=1)) / noise
-        kept = np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+        before, kept = kept, np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+        if np.array_equal(before, kept):
+            break
     covariance = inverse * max(1.0, float(np.mean(left[kept] ** 2)))
 
     products = _gram(columns[kept])

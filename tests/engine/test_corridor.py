@@ -44,15 +44,15 @@ def test_library_run(recordings, levels):
         with io.open_recording(recordings / "press.h5") as recording:
             engine.run(recording, engine.Onset(**levels))
 
-    assert_few(run, 373, 50)
+    assert_few(run, 379, 52)
 
 
 @pytest.mark.parametrize(
     ("line", "functions", "files"),
     [
-        ("reconstruct press.h5", 535, 68),
-        ("reconstruct turn.h5", 691, 88),
-        ("fuse press.h5 turn.h5", 871, 107),
+        ("reconstruct press.h5", 540, 70),
+        ("reconstruct turn.h5", 692, 88),
+        ("fuse press.h5 turn.h5", 876, 108),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):
