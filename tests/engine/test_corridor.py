@@ -44,14 +44,14 @@ def test_library_run(recordings, levels):
         with io.open_recording(recordings / "press.h5") as recording:
             engine.run(recording, engine.Onset(**levels))
 
-    assert_few(run, 379, 52)
+    assert_few(run, 381, 53)
 
 
 @pytest.mark.parametrize(
     ("line", "functions", "files"),
     [
-        ("reconstruct press.h5", 540, 70),
-        ("reconstruct turn.h5", 692, 88),
+        ("reconstruct press.h5", 543, 71),
+        ("reconstruct turn.h5", 703, 89),
         ("fuse press.h5 turn.h5", 876, 108),
     ],
 )
