@@ -7,7 +7,8 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,10 @@ import numpy as np
 
 from mirrorskin import engine
 from mirrorskin.cli.bench.records import Case, Row, Target, Timing
-from mirrorskin.cli.bench.timing import OURS
+from mirrorskin.cli.bench.timing import OURS, ROUNDS, Work, take_turns
 from mirrorskin.hw.twin import Axial, Twin, Vertical
-from mirrorskin.io import Recorder
+from mirrorskin.io import MirrorskinWarning, Recorder
+from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
 from suite.files import new_folder
@@ -41,6 +43,7 @@ from suite.scenes import (
 
 _HD, _QUICK = (1080, 1920), (48, 64)
 _PRESS = 16  # frames
+_SIZES, _TRAVELS, _TURN = ((48, 64), (480, 640), (1024, 1024)), 64, 16  # pictures; frames of both motions
 _WORKING = 400  # bytes per pixel for maps and cached memory
 _BYTE = np.dtype(np.uint8)
 
@@ -102,6 +105,49 @@ def run_function(function: str, device: Device, quick: bool) -> Case:
     return time_call(
         name, title.format(f"{shape[0]} x {shape[1]}"), call, moved, device, quick, frames=frames
     )
+
+
+def run_sizes(device: Device, quick: bool) -> Case:
+    """Time functions on arrays of several sizes, whose checks do not grow with them; also processor time."""
+    works, used, most = dict[str, Work](), dict[str, list[float]](), max(map(math.prod, _SIZES))
+    check_memory("call-sizes", (_WORKING + 2 * (_TRAVELS + _TURN)) * most)
+    for shape in _SIZES[:1] if quick else _SIZES:
+        for title, call in _of_size(shape, device):
+            name = f"{OURS} {title}, {shape[0]} x {shape[1]}"
+            works[name] = Work(partial(_add_processor_time, call, used.setdefault(name, [])))
+    rows = take_turns(works, 1 if quick else ROUNDS, device.profile)
+    notes = (
+        f"{name}: {1e3 * row.wall.median:.2f} ms, {1e3 * np.median(used[name][1:]):.2f} of the processors,"
+        f" {1e3 * row.kernel:.2f} in kernels"
+        for name, row in rows.items()
+    )
+    title = f"functions on a press of {_TRAVELS} and a turn of {_TURN} uint8"
+    return Case("call-sizes", title, list(rows.values()), {}, tuple(notes))
+
+
+def _of_size(shape: Shape, device: Device) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Yield titles and calls of functions on arrays."""
+    frames, turns = (np.empty((count, *shape), np.uint8) for count in (_TRAVELS, _TURN))
+    fill_press(frames)
+    fill_turns(turns)
+    travel, (dark, bright), (offset, gain, _) = travel_of(_TRAVELS), LEVELS[_BYTE.name], SCALES[_BYTE.name]
+    levels: dict[str, Any] = {"dark": dark, "bright": bright}
+    sensor: dict[str, Any] = {"tilt": TILT, "zenith_gain": gain, "zenith_offset": offset}
+    press = ArrayRecording(frames, {"travel": travel}, levels)
+    yield "find_onset", partial(engine.find_onset, frames, travel, **levels, device=device)
+    yield "find_onset, no levels", partial(engine.find_onset, frames, travel, device=device)
+    yield "reconstruct a press", partial(engine.reconstruct, press, device=device)
+    yield "estimate_normals", partial(engine.estimate_normals, turns, phases(_TURN), **sensor, device=device)
+    yield "correlate", partial(engine.correlate, turns, phases(_TURN), device=device)
+
+
+def _add_processor_time(call: Callable[[], object], seconds: list[float]) -> object:
+    """Return what a call returns, and add its seconds on all processors to a list."""
+    start = time.process_time()
+    with warnings.catch_warnings(action="ignore", category=MirrorskinWarning):  # frames are made up
+        result = call()
+    seconds.append(time.process_time() - start)
+    return result
 
 
 def run_commands(device: Device, quick: bool) -> Case:
@@ -174,6 +220,7 @@ def _time_process(name: str, command: list[str], rounds: int, output: Path | Non
 
 CASES: Cases = {
     **{f"call-{function}": partial(run_function, function) for function in _FUNCTIONS},
+    "call-sizes": run_sizes,
     "call-commands": run_commands,
     "call-import": run_import,
 }

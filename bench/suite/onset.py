@@ -94,6 +94,8 @@ _OPTIONS: dict[str, tuple[Shape, StackName, bool]] = {
     "equation4-uint8": (_HD, "random", False),
     "equation4-memory": (_MEMORY, "random", False),
     "full-uint8": (_HD, "press", True),
+    "full-small": ((64, 48, 64), "press", True),
+    "full-vga": ((64, 480, 640), "press", True),
     "full-memory": (_MEMORY, "press", True),
     "full-random": (_HD, "random", True),
 }

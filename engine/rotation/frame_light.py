@@ -107,7 +107,8 @@ def find_frame_light(
         return None
     counts = samples[:, whole].astype(np.float64)
     per_angle, base, low = (one[whole] for one in scale)
-    wave = np.linalg.lstsq(basis(phase), (counts - base) / per_angle, rcond=None)[0]
+    # Not by lstsq: the threads that it starts for many pixels wait for those of OpenCL.
+    wave = np.linalg.pinv(basis(phase)) @ ((counts - base) / per_angle)
     swing = np.hypot(wave[1], wave[2]) / tilt  # 1 if the response is as stated
     usable = (wave[0] > _STEEP * tilt) & (wave[0] < _UPRIGHT) & (swing > 1 / _SWING) & (swing < _SWING)
     facing = np.exp(1j * np.arctan2(wave[2], wave[1]))[usable]
