@@ -114,6 +114,8 @@ def find_frame_light(
     facing = np.exp(1j * np.arctan2(wave[2], wave[1]))[usable]
     if np.count_nonzero(usable) < _FEWEST_PIXELS or abs(np.mean(facing)) > _AS_ONE:
         return None
+    if not _is_suspect(counts[:, usable], phase):  # level pixels are not cosines, and may lose contact
+        return None
     steep = wave[0] > np.median(wave[0][usable])
     parts = [usable, usable & steep, usable & ~steep]
     chosen = [
