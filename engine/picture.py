@@ -71,6 +71,8 @@ class Picture:
         The kernels; see `mirrorskin.kernels.device.Device.kernel`.
     maps : mapping of dtype or Planes
         The maps by name, (H, W), uninitialised; such as ``("f4", 3)`` for vectors, (H, W, 3).
+    constants : mapping of ndarray
+        Other arrays that kernels get by name; each is copied to a device once.
     whole : int
         Number of frames that kernels need in one piece.
     around : int
@@ -87,6 +89,7 @@ class Picture:
         source: str | Path,
         maps: Mapping[str, DTypeLike | Planes],
         *,
+        constants: Mapping[str, NDArray[Any]] | None = None,
         whole: int = 1,
         around: int = 0,
         tile: int = 0,
@@ -99,6 +102,10 @@ class Picture:
         self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "BITS": 8 * self._itemsize}
         self._macros |= macros
         self.bands = cut_into_bands(devices, self._shape, dtype, maps, self._length, whole, around)
+        self._constants = {
+            device: {name: _copied(device, name, values) for name, values in (constants or {}).items()}
+            for device in {band.device for band in self.bands}
+        }
         operation._picture = self  # frames are read into its staging buffer
 
     @cached_property
@@ -226,6 +233,7 @@ class Picture:
         kernel = device.kernel(source or self._source, name, **macros)
         known: dict[str, Any] = {name: band.maps[name] for name in self._kinds if name in kernel.arguments}
         moved = sum(array.nbytes for array in known.values()) if whole else 0
+        known |= self._constants[device]
         known |= {"pixels": band.pixels, "rows": band.rows.stop - band.rows.start}
         known |= {"columns": self._shape[1], "stride": band.stride, "each": band.stride}
         if scanned is not None:
@@ -245,9 +253,12 @@ def _on(band: Band, name: str, value: Any) -> Any:
     if isinstance(value, PerPixel):
         rows = value.values[band.rows] if value.values.ndim else value.values.reshape(1)
         return band.device.share(name, np.ascontiguousarray(rows))
-    if not isinstance(value, np.ndarray):
-        return value
-    return band.device.from_host(name, value, np.float32 if value.dtype.kind == "f" else value.dtype)
+    return _copied(band.device, name, value) if isinstance(value, np.ndarray) else value
+
+
+def _copied(device: Device, name: str, values: NDArray[Any]) -> Array:
+    """Return an array on a device, floats as float32."""
+    return device.from_host(name, values, np.float32 if values.dtype.kind == "f" else values.dtype)
 
 
 def vector_lanes(device: Device) -> int:

@@ -69,7 +69,7 @@ class ChangePoint(PressOperation):
         """Prepare for frames of a shape and type."""
         self._release, self._twice = self.event == "release", self.passes == 2
         self._noise = Noise(self.noise, dtype.kind == "u")
-        top = {} if dtype.kind == "f" else {"TOP": int(np.iinfo(dtype).max)}
+        top: dict[str, Any] = {} if dtype.kind == "f" else {"TOP": int(np.iinfo(dtype).max)}
         self._maps = Picture(self, "changepoint", self._planes(), **top)
         # A release is a change from bright to dark: its first level is the bright one.
         self._level = 1 - self.threshold if self._release else self.threshold

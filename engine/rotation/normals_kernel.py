@@ -110,7 +110,6 @@ class NormalKernel:
         self._method, self._step, self._poses = method, thinning(shape), poses
         levels = options.zenith_gain, options.zenith_offset, options.dark, options.bright
         self._scale = response or make_scale(*levels, shape)
-        self._wall = None if response is None else response.table
 
     @property
     def model(self) -> TurnModel | None:
@@ -133,7 +132,7 @@ class NormalKernel:
             steep = samples.compress(clear, axis=1)
             noise = residual_noise(steep if steep.shape[1] >= _ENOUGH else samples, fit.phase, fit.weights)
         if tilt is None:
-            if self._wall is not None:
+            if isinstance(self._scale, Response):
                 raise InputError(
                     "the tilt cannot be estimated with a calibrated response: calibrate it, or give it,"
                     " such as 2.5deg"
@@ -145,14 +144,18 @@ class NormalKernel:
         """Return the maps of an operation, and others; kernels need so many frames in one piece."""
         kinds: dict[str, Planes] = {name: Planes(1, np.float32) for name in MAPS}
         kinds |= {"vectors": Planes(1, ("f4", 3)), "contact": Planes(1, np.uint8)}
-        if self._scale.per_pixel:
-            kinds["scale"] = Planes(len(self._scale.planes), np.float32)
+        scale, constants = self._scale, dict[str, NDArray[Any]]()
+        if isinstance(scale, Response):
+            constants["wall_numbers"] = scale.table
+        if scale.per_pixel:
+            kinds["scale"] = Planes(len(scale.planes), np.float32)
+        else:
+            constants["scale"] = scale.planes
         if self._poses:
             kinds |= {name: Planes(1, np.float32) for name in SLOPE_MAPS}
-        picture = Picture(operation, "normals", kinds | others, whole=whole)
-        if self._scale.per_pixel:
-            for plane, values in enumerate(self._scale.planes):
-                picture.fill("scale", values, plane)
+        picture = Picture(operation, "normals", kinds | others, constants=constants, whole=whole)
+        for plane, values in enumerate(scale.planes if scale.per_pixel else ()):
+            picture.fill("scale", values, plane)
         return picture
 
     def run(
@@ -176,7 +179,7 @@ class NormalKernel:
         file, name = "normals", f"normals_{self._method}"
         limits = contact_limits(count - 3, tilt)
         fitted = tilt if self._method == "exact" else 0.0  # the exact method fits the excess over this tilt
-        further: dict[str, Any] = {} if scale.per_pixel else {"scale": scale.planes}
+        further = dict[str, Any]()
         if isinstance(fit, PoseFit):
             file, name = "normals_pose", "normals_pose" if fit.direction is None else "normals_rock"
             further["presses"] = int(fit.presses)
@@ -184,7 +187,7 @@ class NormalKernel:
             file = name = "normals_wall"
             wall = scale.wall
             sizes = {"curve_length": len(wall.curve), "inverse_length": len(wall.inverse)}
-            further |= {"wall_numbers": self._wall, "follows": int(wall.follows), **sizes}
+            further |= {"follows": int(wall.follows), **sizes}
         elif self._method == "paper":
             (mean, *_), (_, cosine, both), (*_, sine) = fit.covariance
             further |= {"of_mean": mean, "of_cosine": cosine, "of_both": both, "of_sine": sine}

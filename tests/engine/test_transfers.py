@@ -46,11 +46,11 @@ CALLS = {
     "change point": (engine.find_change_point, (PRESS, TRAVEL), LEVELS, Moved(2, FRAMES, 4, 13, 1)),
     # Frames, their places, the basis and the fit.
     "correlation": (engine.correlate, (TURNS, PHASE), {}, Moved(4, FRAMES, 4, 16, 1)),
-    # Frames, scale and phases of each of two turns.
+    # Frames and phases of each of two turns, and the scale.
     "normals": (
         *(engine.estimate_normals, (TURNS, PHASE)),
         {"tilt": 0.05, "zenith_gain": 300, "noise": 1.0},
-        Moved(6, FRAMES, 7, 33, 1),
+        Moved(5, FRAMES, 7, 33, 1),
     ),
     "heights": (engine.integrate, (*SLOPES, 0.1), {"sigma": False}, Moved(2, 8, 1, 4, 1)),
     # Slopes, mask and offsets; flags, heights and sums, and those of conjugate gradients twice.

@@ -15,6 +15,7 @@ from mirrorskin.kernels.least_squares import (
     huber,
     inverse,
     mad_sigma,
+    median,
     soft_l1,
 )
 
@@ -148,3 +149,13 @@ def test_a_model_that_becomes_undefined_is_not_entered():
 
 def test_a_model_without_arrays_needs_only_its_cost_and_equations():
     assert least_squares.descend(Parabola, np.zeros(2)).parameters == pytest.approx([3, 3])
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 4095, 100_000, 100_001])
+@pytest.mark.parametrize("spread", ["even", "equal", "sorted", "two values"])
+def test_a_median_is_that_of_numpy(size, spread):
+    values = np.random.default_rng(size).random(size).astype(np.float32)
+    values = {
+        "even": values, "equal": 0 * values, "sorted": np.sort(values), "two values": np.rint(values)
+    }[spread]  # fmt: skip
+    assert median(values) == np.median(values)

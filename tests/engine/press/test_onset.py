@@ -377,31 +377,25 @@ def test_levels_are_those_of_the_reference_to_the_last_bit(device, dtype, event)
         frames = np.zeros((2, *shape), dtype)
         search = Onset(device=device, **known)
         run = Run(Plan(search, checked=False), ArraySource(frames, search, {"travel": [0.0, 1.0]}))
-        (band,) = run.operation._picture.bands
-        levels = band.maps["levels"].read()[:, : band.pixels].reshape(2, *shape)
+        read = run.operation._picture.read
+        levels = read(("levels", 0), ("levels", 1))
         run.push(frames[:1], travel=[0.0])  # looks for what is surely dark
         level, plateau, light = reference.onset_levels(
             bright, dark, threshold - 1e-12, np.dtype(dtype), release=event == "release"
         )
         alive = np.isfinite(level)
-        np.testing.assert_array_equal(band.own_rows(band.maps["left"].read(slice(0, 0 + 1)), 0) > 0, alive)
+        np.testing.assert_array_equal(read("left")[0] > 0, alive)
         # A level that is 0 but for rounding is so in float64, too.
         zero = np.abs(level) < 1e-6
         np.testing.assert_array_equal(levels[0][alive & ~zero], level[alive & ~zero])
         np.testing.assert_allclose(levels[0][alive & zero], level[alive & zero], rtol=0, atol=1e-9)
         np.testing.assert_array_equal(levels[1][alive], plateau[alive])
-        np.testing.assert_array_equal(
-            band.own_rows(band.maps["marks"].read(slice(0, 0 + 1)), 0)[alive], light[alive]
-        )
+        np.testing.assert_array_equal(read(("marks", 0))[0][alive], light[alive])
         sure = reference.onset_sure(level, light, 6 * noise)
-        np.testing.assert_array_equal(
-            band.own_rows(band.maps["marks"].read(slice(1, 1 + 1)), 0)[alive], sure[alive]
-        )
+        np.testing.assert_array_equal(read(("marks", 1))[0][alive], sure[alive])
         plane = reference.complement(np.zeros(shape, dtype)) if event == "release" else plateau
         near = reference.onset_near(level, plane, sure)
-        np.testing.assert_array_equal(
-            band.own_rows(band.maps["marks"].read(slice(2, 2 + 1)), 0)[alive], near[alive]
-        )
+        np.testing.assert_array_equal(read(("marks", 2))[0][alive], near[alive])
 
 
 def test_the_whole_range_of_uint16(device):
