@@ -8,10 +8,10 @@ from typing import Any, ParamSpec, Protocol, cast
 
 from numpy.typing import ArrayLike
 
-from mirrorskin.engine.array_source import ArraySource
 from mirrorskin.engine.operation import COMPONENTS, Operation
 from mirrorskin.engine.options import documented, signature_of
 from mirrorskin.engine.running import check_taken, run_over
+from mirrorskin.engine.sources import ArraySource
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.arguments import unknown_argument
 from mirrorskin.io.interpreter_end import computes

@@ -16,12 +16,12 @@ from mirrorskin.engine.device_arrays import device_of_maps
 from mirrorskin.engine.fusion_solver import AbsoluteHeights, FusionSolver
 from mirrorskin.engine.inputs import Maps, pixel_size_of, required_maps
 from mirrorskin.engine.method import Method
-from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.press.blur import PIXEL, LensBlur
 from mirrorskin.engine.press.intervals import heights_as_intervals, stored_heights_as_intervals
 from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.provenance import naming
 from mirrorskin.engine.reconstruction import calibrated
+from mirrorskin.engine.resample import fill_with_nearest
 from mirrorskin.engine.rotation.normals_to_height import (
     Slopes,
     describe_integration,

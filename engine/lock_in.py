@@ -14,8 +14,8 @@ from mirrorskin.engine.operation import Plan
 from mirrorskin.engine.options import option
 from mirrorskin.engine.press.growth import Growth
 from mirrorskin.engine.rotation.correlation import Correlate
-from mirrorskin.engine.rotation.edited import EditedSource
 from mirrorskin.engine.rotation.frequency import Frequency, frequency_of
+from mirrorskin.engine.sources import EditedSource
 from mirrorskin.io import Block, InputError
 from mirrorskin.kernels.array_types import Doubles
 

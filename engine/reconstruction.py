@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, cast
 from numpy.typing import ArrayLike
 
 from mirrorskin import io
-from mirrorskin.engine.array_source import ArraySource, IteratorSource
 from mirrorskin.engine.method import Method
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.running import Progress, check_taken, run_over
+from mirrorskin.engine.sources import ArraySource, IteratorSource
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import is_array
 from mirrorskin.io.interpreter_end import computes

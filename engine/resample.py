@@ -1,4 +1,4 @@
-"""Interpolation between the pixels of a map with undefined pixels and labels."""
+"""Maps at other places than their pixels: resampled, and filled with the nearest value."""
 
 from __future__ import annotations
 
@@ -106,3 +106,17 @@ def _pair(place: ArrayLike, size: int) -> tuple[list[NDArray[np.intp]], list[Dou
     share = place - low
     shares = [np.where(low >= 0, 1 - share, 0.0), np.where(low + 1 < size, share, 0.0)]
     return [np.maximum(low, 0), np.minimum(low + 1, size - 1)], shares, inside
+
+
+def fill_with_nearest(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a map, (H, W), with NaN replaced by the nearest number; distances are accurate to 2 %."""
+    import cv2
+
+    known = np.isfinite(values)
+    if known.all():
+        return values
+    gaps = (~known).view(np.uint8)
+    _, label = cv2.distanceTransformWithLabels(gaps, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    numbers = np.full(label.max() + 1, np.nan, values.dtype)
+    numbers[label[known]] = values[known]
+    return np.asarray(numbers[label])

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from mirrorskin.engine.array_source import ENDLESS, PushedSource, as_frames, block_of
 from mirrorskin.engine.device_arrays import device_of, on_host
 from mirrorskin.engine.frames import take_grid
 from mirrorskin.engine.operation import Operation, Plan
 from mirrorskin.engine.options import RESERVED
 from mirrorskin.engine.provenance import attach_provenance, describe, naming
-from mirrorskin.engine.reading import CorrectedSource, blocks_of
+from mirrorskin.engine.sources import ENDLESS, CorrectedSource, PushedSource, as_frames, block_of, blocks_of
 from mirrorskin.engine.steps import Context, Step
 from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import Block, InputError, Map, Result

@@ -10,8 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.integration.camera import Camera, Slopes, find_slopes
-from mirrorskin.engine.integration.crop import Box, Mask, find_box
+from mirrorskin.engine.integration.camera import Box, Camera, Mask, Slopes, find_box, find_slopes
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import check_pixel_size
 

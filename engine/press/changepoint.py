@@ -11,12 +11,11 @@ from mirrorskin.engine.frames import Noise, reference_pair
 from mirrorskin.engine.functions import travel_function
 from mirrorskin.engine.picture import Picture
 from mirrorskin.engine.press.blur import PixelBlur
+from mirrorskin.engine.press.brightness_levels import LevelUncertainty
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Event, PressOperation
-from mirrorskin.engine.press.level_uncertainty import LevelUncertainty
-from mirrorskin.engine.press.no_answer import NoAnswer
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.position_uncertainty import PositionUncertainty
-from mirrorskin.engine.press.rolling_shutter import RollingShutter
+from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.positions import check_travel
 from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT

@@ -12,9 +12,9 @@ from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.method import Method
 from mirrorskin.engine.operation import Plan
 from mirrorskin.engine.options import option
+from mirrorskin.engine.press.brightness_levels import frames_of
 from mirrorskin.engine.press.changepoint import ChangePoint
 from mirrorskin.engine.press.crossing import Event, PressOperation
-from mirrorskin.engine.press.estimated_levels import frames_of
 from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.strokes import Strokes

@@ -11,11 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.device_arrays import on_host
 from mirrorskin.engine.press.blur import StatedBlur
+from mirrorskin.engine.press.brightness_levels import EstimatedLevelNote, with_estimated_levels
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, CrossingOperation, Event, EventMaps
-from mirrorskin.engine.press.estimated_levels import EstimatedLevelNote, with_estimated_levels
-from mirrorskin.engine.press.no_answer import NoAnswer
 from mirrorskin.engine.press.onset import Onset
-from mirrorskin.engine.press.rolling_shutter import RollingShutter
+from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import Result
 from mirrorskin.io.maps import TABLE, PressStatus
 from mirrorskin.io.positions import check_strokes, stroke_starts

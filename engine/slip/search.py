@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.inputs import Maps, as_result
-from mirrorskin.engine.nearest_fill import fill_with_nearest
 from mirrorskin.engine.operation import Operation
 from mirrorskin.engine.options import option
+from mirrorskin.engine.resample import fill_with_nearest
 from mirrorskin.engine.slip.displacement import (
     Texture,
     bending_variance,

@@ -44,15 +44,15 @@ def test_library_run(recordings, levels):
         with io.open_recording(recordings / "press.h5") as recording:
             engine.run(recording, engine.Onset(**levels))
 
-    assert_few(run, 381, 53)
+    assert_few(run, 381, 51)
 
 
 @pytest.mark.parametrize(
     ("line", "functions", "files"),
     [
-        ("reconstruct press.h5", 543, 71),
+        ("reconstruct press.h5", 543, 69),
         ("reconstruct turn.h5", 703, 89),
-        ("fuse press.h5 turn.h5", 876, 108),
+        ("fuse press.h5 turn.h5", 866, 105),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):

@@ -31,8 +31,8 @@ from gpu_check import ROOT, frozen_cases, taken_for_gpu
 
 from mirrorskin.cli.bench.limits import measure_limits
 from mirrorskin.cli.bench.records import describe_run
+from mirrorskin.kernels.array import Mapping
 from mirrorskin.kernels.device import Device, list_devices, open_device
-from mirrorskin.kernels.mapping import Mapping
 
 LOOSER = 10  # times the tolerance of the frozen answers, which are those of one machine's arithmetic
 FEW = 1e-3  # of an array may differ by more: pixels on the other side of a threshold

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine import Correlate, Run, correlate
-from mirrorskin.engine.array_source import ArraySource
 from mirrorskin.engine.operation import Plan
+from mirrorskin.engine.sources import ArraySource
 from mirrorskin.io import InputError, MirrorskinWarning
 from mirrorskin.kernels.errors import DeviceError
 
