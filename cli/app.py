@@ -67,7 +67,7 @@ def command(
     with ExitStack() as stack:
         control = None
         if rig is not None:
-            from mirrorskin.engine.reconstruction import load_operation
+            from mirrorskin.engine.base.reconstruction import load_operation
             from mirrorskin.hw.rig_file import load_rig
             from mirrorskin.view.app.rig_control import RigControl
 

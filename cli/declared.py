@@ -28,7 +28,7 @@ from mirrorskin.cli.groups import (
 )
 
 if TYPE_CHECKING:
-    from mirrorskin.engine.options import Option
+    from mirrorskin.engine.base.options import Option
 
 _FILE = re.compile(r"\.[A-Za-z]\w*$")
 _NAME = re.compile(r"[A-Za-z_][\w-]*")  # of an operation of an installed package
@@ -239,7 +239,7 @@ class ClassCommand(Command):
 
     def _load(self, name: str) -> tuple[type[Any], list[DeclaredOption]]:
         """Return the class with this name, and its options."""
-        from mirrorskin.engine.reconstruction import load_operation
+        from mirrorskin.engine.base.reconstruction import load_operation
         from mirrorskin.io import InputError
 
         kind = load_operation(name)
@@ -309,7 +309,7 @@ def terms_of(kinds: Mapping[str, type[Any]]) -> list[Term]:
 
 def term_of(one: Option) -> Term:
     """Return the term of a declaration."""
-    from mirrorskin.engine.options import plain
+    from mirrorskin.engine.base.options import plain
 
     shown, default = one.shown_default, plain(one.default)
     if not shown and default is not None:
@@ -354,8 +354,8 @@ def _by_motion(variants: list[Term], name: str) -> str:
 
 def declarations() -> dict[str, list[dict[str, Any]]]:
     """Return what ``declared.json`` contains: the options of each command."""
-    from mirrorskin.engine.lock_in import Correlation
-    from mirrorskin.engine.reconstruction import method_for
+    from mirrorskin.engine.base.reconstruction import method_for
+    from mirrorskin.engine.correlation.lock_in import Correlation
 
     methods: dict[str, type[Any]] = {one: method_for(one) for one in MOTIONS}
     fused = ("tilt", "zenith_gain", "zenith_offset", "robust")

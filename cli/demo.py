@@ -19,7 +19,7 @@ from mirrorskin.cli.output import print_json, print_table, progress
 
 if TYPE_CHECKING:
     from mirrorskin import hw, io
-    from mirrorskin.engine.scoring import Score
+    from mirrorskin.engine.metrology.scoring import Score
     from mirrorskin.hw.twin import Movement
 
 Results = dict[str, "io.Result"]
@@ -227,7 +227,7 @@ def _surfaces(
 def _fuse(folder: Path, device: str | None, overwrite: bool) -> io.Result:
     """Fuse the recordings of the press and of the rotation, and save the result."""
     from mirrorskin import engine, io
-    from mirrorskin.engine.fusion import frames_to_read
+    from mirrorskin.engine.fusion.fusion import frames_to_read
 
     with (
         io.open_recording(folder / f"{_FUSED_PRESS}.h5") as vertical,

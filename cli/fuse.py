@@ -42,8 +42,8 @@ def command(
         save_and_report,
     )
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.engine.fusion import frames_to_read
-    from mirrorskin.engine.reconstruction import calibrated
+    from mirrorskin.engine.base.reconstruction import calibrated
+    from mirrorskin.engine.fusion.fusion import frames_to_read
 
     make_strict(strict)
     files = [value for value in chosen.values() if isinstance(value, Path)]

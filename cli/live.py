@@ -19,9 +19,9 @@ from mirrorskin.cli.groups import Option, make_command
 
 if TYPE_CHECKING:
     from mirrorskin.cli.status import Newest
+    from mirrorskin.engine.base.method import Method
+    from mirrorskin.engine.base.operation import Operation
     from mirrorskin.engine.live import LiveRun, Loop
-    from mirrorskin.engine.method import Method
-    from mirrorskin.engine.operation import Operation
     from mirrorskin.hw.rig.plans import Plan
     from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.hw.rig_file import RigSettings
@@ -79,7 +79,7 @@ def command(
     """Reconstruct while the stage moves. Ctrl-C stops it, and keeps what was computed and recorded."""
     from mirrorskin import io
     from mirrorskin.cli.quantity import duration
-    from mirrorskin.engine.reconstruction import load_operation, method_for
+    from mirrorskin.engine.base.reconstruction import load_operation, method_for
     from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.hw.rig_file import load_rig
 

@@ -47,7 +47,7 @@ def report_saved(
     Without an answer at any pixel, the command then ends with exit code 1 and the reason, if it
     ``must_answer``.
     """
-    from mirrorskin.engine.summary import status_shares, summarise
+    from mirrorskin.engine.base.summary import status_shares, summarise
     from mirrorskin.kernels.device import open_devices
 
     summary, pieces = summarise(result), _pieces(result)

@@ -33,7 +33,7 @@ def command(
     from mirrorskin import engine, io
     from mirrorskin.cli import output as outputs
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.engine.reconstruction import calibrated
+    from mirrorskin.engine.base.reconstruction import calibrated
 
     outputs.make_strict(strict)
     files = [value for value in chosen.values() if isinstance(value, Path)]

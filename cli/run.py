@@ -35,7 +35,7 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.output import make_strict, progress, report_notes, report_unverified, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.engine.reconstruction import load_operation, run_class
+    from mirrorskin.engine.base.reconstruction import load_operation, run_class
     from mirrorskin.kernels.device import open_devices
 
     make_strict(strict)

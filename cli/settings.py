@@ -11,9 +11,9 @@ from msgspec import Meta, Struct, defstruct, field, structs
 
 from mirrorskin.cli.declared import Term, term_of
 from mirrorskin.cli.stack import STACK, stack_options
+from mirrorskin.engine.base.options import Option
+from mirrorskin.engine.base.reconstruction import load_operation, method_for
 from mirrorskin.engine.batch.jobs import TABLES, Plan
-from mirrorskin.engine.options import Option
-from mirrorskin.engine.reconstruction import load_operation, method_for
 from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.io import InputError
 from mirrorskin.io.settings_file import load_toml

@@ -1,40 +1,39 @@
 from . import (
     calibration,
-    focus,
+    correlation,
     force,
-    fringes,
     integration,
     live,
     metrology,
-    photometric,
+    optical,
     pose,
     press,
     rotation,
     slip,
 )
-from .errors import NotConverged
-from .functions import function_of
-from .fusion import fuse
+from .base.errors import NotConverged
+from .base.functions import function_of
+from .base.method import Method
+from .base.operation import Operation
+from .base.options import option
+from .base.reconstruction import reconstruct, run
+from .base.running import Run
+from .base.steps import Step
+from .base.tiling import free_memory
+from .correlation.correlation import Correlate, correlate
+from .fusion.fusion import fuse
 from .integration.integration import Integrator, integrate
-from .method import Method
 from .metrology.measures import measure
-from .operation import Operation
-from .options import option
+from .metrology.scoring import score
 from .press.changepoint import ChangePoint, find_change_point
 from .press.holes import fill_holes
 from .press.onset import Onset, find_onset
 from .press.press import Press
-from .reconstruction import reconstruct, run
-from .rotation.correlation import Correlate, correlate
 from .rotation.edges import find_edges
 from .rotation.moving_normals import estimate_normals
 from .rotation.normals import Normals
 from .rotation.rotation import Rotation
-from .running import Run
-from .scoring import score
 from .slip.slip import Sliding
-from .steps import Step
-from .tiling import free_memory
 
 __all__ = [
     "ChangePoint",
@@ -52,15 +51,14 @@ __all__ = [
     "Step",
     "calibration",
     "correlate",
+    "correlation",
     "estimate_normals",
     "fill_holes",
     "find_change_point",
     "find_edges",
     "find_onset",
-    "focus",
     "force",
     "free_memory",
-    "fringes",
     "function_of",
     "fuse",
     "integrate",
@@ -68,8 +66,8 @@ __all__ = [
     "live",
     "measure",
     "metrology",
+    "optical",
     "option",
-    "photometric",
     "pose",
     "press",
     "reconstruct",

@@ -8,8 +8,8 @@ through the middle.
 import numpy as np
 
 from mirrorskin import engine, hw
+from mirrorskin.engine.base.summary import summarise
 from mirrorskin.engine.metrology import section
-from mirrorskin.engine.summary import summarise
 from mirrorskin.hw.twin import Camera, Vertical
 from mirrorskin.view.result import figures_of
 

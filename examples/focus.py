@@ -32,7 +32,7 @@ for position in travel:
     frames.append(frame + rng.normal(0, 1, frame.shape))
 stack = np.rint(frames).clip(0, 255).astype(np.uint8)
 
-found = engine.focus.find_focus(stack, travel, noise=1.0, radius=5)
+found = engine.optical.find_focus(stack, travel, noise=1.0, radius=5)
 error = 1e3 * (found.height - height)
 inside = np.isfinite(error)
 print(f"heights at {100 * inside.mean():.0f} % of the pixels, RMS error {np.std(error[inside]):.1f} µm")

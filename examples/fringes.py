@@ -34,8 +34,8 @@ def measured(axis):
     for rate in RATES:
         phase = 2 * np.pi * rate * (seen(axis) / SCREEN + 0.5)
         light = 110 + 80 * np.cos(phase - SHIFTS[:, None, None]) + rng.normal(0, 1.5, (8, SIZE, SIZE))
-        fits.append(engine.fringes.fit_fringes(np.rint(light).astype(np.uint8), SHIFTS))
-    found = engine.fringes.unwrap_frequencies(fits, RATES)
+        fits.append(engine.optical.fit_fringes(np.rint(light).astype(np.uint8), SHIFTS))
+    found = engine.optical.unwrap_frequencies(fits, RATES)
     turns = 2 * np.pi * RATES[-1]
     place = np.where(found.risk <= 1e-3, SCREEN * (found.phase / turns - 0.5), np.nan)
     slope = np.tan(0.5 * np.arctan((place - places[axis]) / DISTANCE))

@@ -30,7 +30,7 @@ lamps = np.column_stack(
 light = print_pattern * np.maximum(np.einsum("hwk,tk->thw", normals, lamps), 0)
 frames = np.rint(light + rng.normal(0, 1, light.shape)).clip(0, 255).astype(np.uint8)
 
-found = engine.photometric.photometric_stereo(frames, azimuth, zenith=ZENITH, shadow=4)
+found = engine.optical.photometric_stereo(frames, azimuth, zenith=ZENITH, shadow=4)
 angle = np.degrees(np.arccos(np.clip(np.sum(found.normals * normals, axis=-1), -1, 1)))
 slopes = -found.normals[..., :2] / found.normals[..., 2:]
 surface = engine.integrate(slopes[..., 0], slopes[..., 1], PIXEL)

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from mirrorskin import engine, io
-from mirrorskin.engine.summary import summarise
+from mirrorskin.engine.base.summary import summarise
 from mirrorskin.view.result import figures_of
 
 # A file of another program: sixteen frames, 0.1 mm apart, of a cone whose sides fall by 0.4 mm per mm.

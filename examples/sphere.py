@@ -8,7 +8,7 @@ smoothly and marked in `filled`. The errors are known from the ground truth of t
 import numpy as np
 
 from mirrorskin import engine, hw
-from mirrorskin.engine.summary import summarise
+from mirrorskin.engine.base.summary import summarise
 from mirrorskin.hw.twin import Camera, Vertical
 from mirrorskin.view.result import figures_of
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-LOOP = "engine/running.py"
+LOOP = "engine/base/running.py"
 CALLS = {"push", "result", "finish", "next_pass", "start_second_pass", "after_last_frame", "apply"}
 NAMES = {"operation", "step", "configured", "kind"}  # of operations, steps and their classes, in any module
 COPIES = {"with_options", "configured_for", "copy_for_run"}  # methods that return an operation

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.undistort import distorted
+from mirrorskin.engine.base.undistort import distorted
 from mirrorskin.io import Calibration, InputError
 from mirrorskin.io.calibration.parameters import Part, parameters
 from mirrorskin.io.calibration.types import BITS, Lens, Precession, References

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.scoring import angle_between, true_normals
+from mirrorskin.engine.metrology.scoring import angle_between, true_normals
 from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.types import Floats
 from mirrorskin.view.canvas import draw_image, exceeded, extent, filled_colours, new_figure, save_figure

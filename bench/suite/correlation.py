@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mirrorskin.cli.bench.records import THREADS, Case
 from mirrorskin.cli.bench.timing import OURS
 from mirrorskin.engine import correlate
-from mirrorskin.engine.rotation.design_matrix import basis, fit_matrix
+from mirrorskin.engine.correlation.design_matrix import basis, fit_matrix
 from mirrorskin.kernels.device import Device
 from suite.harness import Cases, agree, check_memory, missing, time_call
 from suite.scenes import STEPS, fill_turns, phases

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mirrorskin.cli.bench.records import THREADS, Case
 from mirrorskin.cli.bench.timing import OURS
 from mirrorskin.engine import find_onset
-from mirrorskin.engine.frames import estimate_noise, reference_maps, thin_out
+from mirrorskin.engine.base.frames import estimate_noise, reference_maps, thin_out
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.onset import BENT, DARK, onset_heights, onset_levels, onset_near, onset_sure
 from suite.harness import Cases, agree, check_memory, missing, time_call

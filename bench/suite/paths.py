@@ -27,7 +27,7 @@ from mirrorskin.cli.bench.limits import time_works
 from mirrorskin.cli.bench.records import Case, Target
 from mirrorskin.cli.bench.timing import OURS, Work
 from mirrorskin.engine import reconstruct
-from mirrorskin.engine.tiling import MEMORY_LIMIT
+from mirrorskin.engine.base.tiling import MEMORY_LIMIT
 from mirrorskin.io.url import path_of
 from mirrorskin.kernels.device import Device, list_devices, open_device
 from suite.files import (

@@ -142,7 +142,7 @@ def _one_camera(sources: Sequence[Source], calibration: Calibration | None, outp
 
 def process_of(source: Source | None = None, **facts: ProcessValue | list[Path]) -> dict[str, ProcessValue]:
     """Return the provenance of a part: program, date, facts, and the pixel size of a source."""
-    from mirrorskin.engine.provenance import signature
+    from mirrorskin.engine.base.provenance import signature
     from mirrorskin.io.calibration.source import size_facts
 
     size = None if source is None else source.header.pixel_size

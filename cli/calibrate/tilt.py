@@ -98,9 +98,9 @@ def _brightness(
 
     import numpy as np
 
+    from mirrorskin.engine.base.provenance import naming
     from mirrorskin.engine.calibration.brightness import LinearBrightness, WallBrightness
     from mirrorskin.engine.calibration.sources import pixel_size_of
-    from mirrorskin.engine.provenance import naming
     from mirrorskin.io.calibration.source import check_sizes
 
     header, shape = source.header, source.shape[1:]

@@ -1,8 +1,8 @@
 """An extension of griffe for the Python reference.
 
 Griffe reads the source without running it, but signatures and docstrings of operations, steps, methods and
-functions on arrays are generated when a module is imported (engine/options.py, engine/operation.py). They are
-replaced by those of the imported object.
+functions on arrays are generated when a module is imported (engine/base/options.py,
+engine/base/operation.py). They are replaced by those of the imported object.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 import griffe
 
-from mirrorskin.engine.options import Configured
+from mirrorskin.engine.base.options import Configured
 
 _KINDS: dict[Any, griffe.ParameterKind] = {
     inspect.Parameter.POSITIONAL_OR_KEYWORD: griffe.ParameterKind.positional_or_keyword,

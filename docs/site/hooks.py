@@ -43,9 +43,8 @@ _PACKAGES = {
         "engine.pose": "motion of an object between results; stitching of results",
         "engine.force": "pressure, traction and forces from heights or displacements",
         "engine.metrology": "planes, spheres, sections, steps, texture and profiles, with uncertainties",
-        "engine.fringes": "phase of fringes, and its unwrapping",
-        "engine.photometric": "normals and albedo from several lamps",
-        "engine.focus": "heights from a focus stack",
+        "engine.correlation": "correlation with the movement, its frequency, growth of the contact",
+        "engine.optical": "heights from focus, phases of fringes, normals from several lamps",
     },
     "Calibration": {"engine.calibration": "references, lens, zenith, tilt, gel and modulus of a sensor"},
     "Files, pictures, hardware": {

@@ -16,9 +16,9 @@ from typing import Any
 
 from map_tables import as_table
 
-from mirrorskin.engine.method import Method
-from mirrorskin.engine.operation import Operation
-from mirrorskin.engine.options import Option, plain
+from mirrorskin.engine.base.method import Method
+from mirrorskin.engine.base.operation import Operation
+from mirrorskin.engine.base.options import Option, plain
 
 DOCS = Path(__file__).resolve().parents[1]
 OPTIONS = "options.md"

@@ -20,9 +20,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from mirrorskin.engine.base.provenance import program_version
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.batch.work import Outcome
-from mirrorskin.engine.provenance import program_version
 from mirrorskin.io import InputError
 from mirrorskin.io.atomic import remove_leftovers
 from mirrorskin.io.system import as_input_error, lock

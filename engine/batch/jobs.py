@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from mirrorskin.engine.method import Method
-from mirrorskin.engine.operation import Operation
-from mirrorskin.engine.options import plain
-from mirrorskin.engine.provenance import program_version
-from mirrorskin.engine.reconstruction import load_operation, method_for
-from mirrorskin.engine.tiling import MEMORY_LIMIT
+from mirrorskin.engine.base.method import Method
+from mirrorskin.engine.base.operation import Operation
+from mirrorskin.engine.base.options import plain
+from mirrorskin.engine.base.provenance import program_version
+from mirrorskin.engine.base.reconstruction import load_operation, method_for
+from mirrorskin.engine.base.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion
 from mirrorskin.io.own_class import importable_name, name_of
 from mirrorskin.io.url import Url

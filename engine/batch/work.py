@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from mirrorskin import io
+from mirrorskin.engine.base.errors import NotConverged
+from mirrorskin.engine.base.provenance import naming
+from mirrorskin.engine.base.reconstruction import run_class
+from mirrorskin.engine.base.running import Progress
+from mirrorskin.engine.base.summary import summarise
 from mirrorskin.engine.batch.jobs import Job, Plan
-from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.provenance import naming
-from mirrorskin.engine.reconstruction import run_class
-from mirrorskin.engine.running import Progress
-from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Recording
 from mirrorskin.io.result_file import open_process
 from mirrorskin.io.system import as_input_error

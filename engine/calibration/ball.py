@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.rotation.design_matrix import basis, check_phases
+from mirrorskin.engine.correlation.design_matrix import basis, check_phases
 from mirrorskin.io import InputError, pixel_axes
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import geman_mcclure

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.base.provenance import naming
+from mirrorskin.engine.base.reconstruction import reconstruct
 from mirrorskin.engine.calibration.ball import see_ball
 from mirrorskin.engine.calibration.sources import check_ball_radius
-from mirrorskin.engine.provenance import naming
-from mirrorskin.engine.reconstruction import reconstruct
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
 from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from mirrorskin.engine.base.errors import NotConverged
+from mirrorskin.engine.base.running import Progress
 from mirrorskin.engine.calibration.sources import pixel_size_of
-from mirrorskin.engine.errors import NotConverged
 from mirrorskin.engine.force.normal import press_within
 from mirrorskin.engine.press.elastic import LEARNED_AT, fit_press
 from mirrorskin.engine.press.press import Press
-from mirrorskin.engine.running import Progress
 from mirrorskin.io import Calibrated, Calibration, Gel, InputError, Source, Stiffness
 from mirrorskin.kernels.array_types import Doubles
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.base.undistort import distorted, picture_places
 from mirrorskin.engine.calibration.board import FEWEST, Board, Charuco
 from mirrorskin.engine.calibration.marks import Marks, centre_marks, find_marks, scale_contrast
-from mirrorskin.engine.undistort import distorted, picture_places
 from mirrorskin.io import InputError, Lens
 from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.base.provenance import naming
 from mirrorskin.engine.calibration.ball import follow_ball, see_ball
 from mirrorskin.engine.calibration.brightness import Brightness, LinearBrightness
 from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of, read_turn
-from mirrorskin.engine.provenance import naming
-from mirrorskin.engine.rotation.design_matrix import check_phases
+from mirrorskin.engine.correlation.design_matrix import check_phases
 from mirrorskin.io import InputError, Source, pixel_axes
 from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.base.provenance import naming
 from mirrorskin.engine.calibration.ball import find_ball, moved
 from mirrorskin.engine.calibration.sources import pixel_size_of, read_turn
 from mirrorskin.engine.calibration.wall_model import (
@@ -22,7 +23,6 @@ from mirrorskin.engine.calibration.wall_model import (
     linearise,
     predict,
 )
-from mirrorskin.engine.provenance import naming
 from mirrorskin.io import InputError, Precession, References, Source, pixel_axes
 from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.inputs import Maps, as_result, pixel_size_of
+from mirrorskin.engine.base.errors import NotConverged
+from mirrorskin.engine.base.inputs import Maps, as_result, pixel_size_of
+from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.press.halfspace import HalfSpace, Pressed, load_gradient, press
-from mirrorskin.engine.resample import fill_with_nearest
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import check_number, checked, in_unit
 from mirrorskin.io.findings import carried

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mirrorskin.engine.device_arrays import AnyArray, device_of, on_host
+from mirrorskin.engine.base.device_arrays import AnyArray, device_of, on_host
 from mirrorskin.engine.integration.camera import Camera
 from mirrorskin.engine.integration.device_inputs import check_device_inputs
 from mirrorskin.engine.integration.slope_errors import add_gain

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.integration.graph import Links, find_components
 from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.engine.integration.surface import IntegrationOptions

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.device_arrays import on_host
+from mirrorskin.engine.base.device_arrays import on_host
 from mirrorskin.engine.integration.validation import Inputs
 from mirrorskin.io import Result
 from mirrorskin.io.types import ProcessValue

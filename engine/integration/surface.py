@@ -10,7 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.base.errors import NotConverged
+from mirrorskin.engine.base.operation import OnDevice
+from mirrorskin.engine.base.options import option
 from mirrorskin.engine.integration.graph import (
     Components,
     Levelling,
@@ -25,8 +27,6 @@ from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.slope_errors import correlation_of
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
-from mirrorskin.engine.operation import OnDevice
-from mirrorskin.engine.options import option
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array

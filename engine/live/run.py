@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from mirrorskin.engine.method import Method
-from mirrorskin.engine.operation import Operation
-from mirrorskin.engine.provenance import naming
-from mirrorskin.engine.running import Run, check_motion
-from mirrorskin.engine.steps import Undistortion
+from mirrorskin.engine.base.method import Method
+from mirrorskin.engine.base.operation import Operation
+from mirrorskin.engine.base.provenance import naming
+from mirrorskin.engine.base.running import Run, check_motion
+from mirrorskin.engine.base.steps import Undistortion
 from mirrorskin.io import InputError, LiveSource, Map, Result, pixel_axes
 from mirrorskin.io.layout import POSITIONS
 

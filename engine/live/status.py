@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.thread_safe import ThreadSafe
+from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.io import Motion, Result
 from mirrorskin.io.result import display_order
 

@@ -14,13 +14,13 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.device_arrays import on_host
-from mirrorskin.engine.frames import as_frames, check_dtype
+from mirrorskin.engine.base.device_arrays import on_host
+from mirrorskin.engine.base.frames import as_frames, check_dtype
+from mirrorskin.engine.base.method import Method
+from mirrorskin.engine.base.operation import COMPONENTS, Operation
 from mirrorskin.engine.live.loop import LATENCY, Loop
 from mirrorskin.engine.live.run import LiveRun
 from mirrorskin.engine.live.status import Status, Update
-from mirrorskin.engine.method import Method
-from mirrorskin.engine.operation import COMPONENTS, Operation
 from mirrorskin.io import Block, Header, InputError, Motion, Result
 from mirrorskin.io.arguments import check_number, unknown_argument
 from mirrorskin.io.layout import LIVE, POSITIONS, as_series

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.engine.inputs import Maps, as_result
+from mirrorskin.engine.base.inputs import Maps, as_result
 from mirrorskin.engine.metrology.extent import areas, border, heights, volume
 from mirrorskin.engine.metrology.forms import Plane, Sphere, fit_plane, fit_sphere
 from mirrorskin.engine.metrology.noise import realisations

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.inputs import spacing
+from mirrorskin.engine.base.inputs import spacing
 from mirrorskin.io import InputError, Region, Result
 from mirrorskin.io.result import select_turn
 from mirrorskin.kernels.array_types import Doubles

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.inputs import Maps, as_result, spacing
+from mirrorskin.engine.base.inputs import Maps, as_result, spacing
+from mirrorskin.engine.base.resample import SamplePoints
 from mirrorskin.engine.metrology.fitting import covariance
 from mirrorskin.engine.metrology.patch import heights_of
 from mirrorskin.engine.metrology.quantity import Quantity
-from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import as_array, checked
 from mirrorskin.io.findings import findings_of

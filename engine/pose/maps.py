@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.device_arrays import operand_of
+from mirrorskin.engine.base.device_arrays import operand_of
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.io.result import shape_of

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from mirrorskin.engine.device_arrays import device_of_maps
-from mirrorskin.engine.inputs import Maps, as_result
+from mirrorskin.engine.base.device_arrays import device_of_maps
+from mirrorskin.engine.base.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import Equations, PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import Motion

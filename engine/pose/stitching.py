@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from mirrorskin.engine.inputs import Maps, as_result
+from mirrorskin.engine.base.inputs import Maps, as_result
+from mirrorskin.engine.base.provenance import signature
+from mirrorskin.engine.base.resample import SamplePoints
 from mirrorskin.engine.pose.fit import PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
-from mirrorskin.engine.provenance import signature
-from mirrorskin.engine.resample import SamplePoints
 from mirrorskin.io import InputError, Result, select_turn
 from mirrorskin.io.findings import carried
 from mirrorskin.io.maps import StitchStatus, status_of

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.frames import Noise, reference_pair
-from mirrorskin.engine.functions import travel_function
-from mirrorskin.engine.picture import Picture
-from mirrorskin.engine.press.blur import PixelBlur
-from mirrorskin.engine.press.brightness_levels import LevelUncertainty
+from mirrorskin.engine.base.frames import Noise, reference_pair
+from mirrorskin.engine.base.functions import travel_function
+from mirrorskin.engine.base.picture import Picture
+from mirrorskin.engine.diagnosis.blur import PixelBlur
+from mirrorskin.engine.diagnosis.brightness_levels import LevelUncertainty
+from mirrorskin.engine.diagnosis.position_uncertainty import PositionUncertainty
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Event, PressOperation
 from mirrorskin.engine.press.onset import Onset
-from mirrorskin.engine.press.position_uncertainty import PositionUncertainty
 from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.positions import check_travel

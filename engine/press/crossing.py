@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.device_arrays import AnyArray
-from mirrorskin.engine.frames import Noise, estimate_noise_of_all, reference_maps
-from mirrorskin.engine.operation import Operation
-from mirrorskin.engine.options import option
-from mirrorskin.engine.picture import PerPixel, Picture
-from mirrorskin.engine.tiling import Planes
+from mirrorskin.engine.base.device_arrays import AnyArray
+from mirrorskin.engine.base.frames import Noise, estimate_noise_of_all, reference_maps
+from mirrorskin.engine.base.operation import Operation
+from mirrorskin.engine.base.options import option
+from mirrorskin.engine.base.picture import PerPixel, Picture
+from mirrorskin.engine.base.tiling import Planes
 from mirrorskin.io import Fitted, Map, Result
 from mirrorskin.io.maps import TABLE, PressStatus, ReleaseStatus, status_of
 from mirrorskin.io.positions import check_travel

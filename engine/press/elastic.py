@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
-from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.press.cells import Cells, cut_into_cells, touched
 from mirrorskin.engine.press.halfspace import (
     HalfSpace,

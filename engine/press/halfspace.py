@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, sparse, special
 
-from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
 

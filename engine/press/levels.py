@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mirrorskin.engine.options import option
+from mirrorskin.engine.base.options import option
 from mirrorskin.engine.press.onset import ThresholdOperation
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.maps import TABLE, PressStatus

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.functions import travel_function
-from mirrorskin.engine.options import option
-from mirrorskin.engine.press.blur import LensBlur
-from mirrorskin.engine.press.brightness_levels import (
+from mirrorskin.engine.base.functions import travel_function
+from mirrorskin.engine.base.options import option
+from mirrorskin.engine.diagnosis.blur import LensBlur
+from mirrorskin.engine.diagnosis.brightness_levels import (
     EstimatedLevelNote,
     LevelUncertainty,
     with_estimated_levels,
 )
+from mirrorskin.engine.diagnosis.position_uncertainty import PositionUncertainty
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, CrossingOperation, Event, EventMaps
-from mirrorskin.engine.press.position_uncertainty import PositionUncertainty
 from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import Result
 
@@ -78,7 +78,7 @@ class Onset(ThresholdOperation):
 
     A pixel has the height f = -s at the travel s at which it turns light, or dark again. Levels of dark and
     light that are not given are those of the recording, or estimated from the frames; their uncertainty is
-    added to the standard deviation, see `mirrorskin.engine.press.brightness_levels`.
+    added to the standard deviation, see `mirrorskin.engine.diagnosis.brightness_levels`.
 
     Examples
     --------

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.method import Method
-from mirrorskin.engine.operation import Plan
-from mirrorskin.engine.options import option
-from mirrorskin.engine.press.brightness_levels import frames_of
+from mirrorskin.engine.base.errors import NotConverged
+from mirrorskin.engine.base.method import Method
+from mirrorskin.engine.base.operation import Plan
+from mirrorskin.engine.base.options import option
+from mirrorskin.engine.base.provenance import estimated_level, level_origin
+from mirrorskin.engine.base.steps import Context, Step
+from mirrorskin.engine.diagnosis.brightness_levels import frames_of
 from mirrorskin.engine.press.changepoint import ChangePoint
 from mirrorskin.engine.press.crossing import Event, PressOperation
 from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.strokes import Strokes
-from mirrorskin.engine.provenance import estimated_level, level_origin
-from mirrorskin.engine.steps import Context, Step
 from mirrorskin.io import Calibrated, InputError, Result
 from mirrorskin.io.maps import PressStatus
 from mirrorskin.io.positions import stroke_starts

@@ -7,10 +7,10 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.engine.options import option
+from mirrorskin.engine.base.options import option
+from mirrorskin.engine.base.steps import Context, Step
+from mirrorskin.engine.base.summary import status_shares
 from mirrorskin.engine.press.crossing import PressOperation
-from mirrorskin.engine.steps import Context, Step
-from mirrorskin.engine.summary import status_shares
 from mirrorskin.io import InputError, Recording, Result
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles

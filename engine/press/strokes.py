@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.device_arrays import on_host
-from mirrorskin.engine.press.blur import StatedBlur
-from mirrorskin.engine.press.brightness_levels import EstimatedLevelNote, with_estimated_levels
+from mirrorskin.engine.base.device_arrays import on_host
+from mirrorskin.engine.diagnosis.blur import StatedBlur
+from mirrorskin.engine.diagnosis.brightness_levels import EstimatedLevelNote, with_estimated_levels
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, CrossingOperation, Event, EventMaps
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.steps import NoAnswer, RollingShutter

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.integration.arrays import integrate_arrays
-from mirrorskin.engine.resample import fill_with_nearest
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 

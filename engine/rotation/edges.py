@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.device_arrays import AnyArray, as_any_array, device_of
+from mirrorskin.engine.base.device_arrays import AnyArray, as_any_array, device_of
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked, in_unit
 from mirrorskin.kernels.array import Array

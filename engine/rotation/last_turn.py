@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.options import option
+from mirrorskin.engine.base.options import option
+from mirrorskin.engine.correlation.design_matrix import LONGEST
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
-from mirrorskin.engine.rotation.design_matrix import LONGEST
 from mirrorskin.engine.rotation.edges import EdgeDrawing
 from mirrorskin.engine.rotation.following_heights import FollowingHeights
 from mirrorskin.engine.rotation.normals import Normals

@@ -8,11 +8,11 @@ from typing import Any, ParamSpec, Protocol, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.functions import ABOUT_WEIGHTS, function_of
-from mirrorskin.engine.operation import Operation
+from mirrorskin.engine.base.functions import ABOUT_WEIGHTS, function_of
+from mirrorskin.engine.base.operation import Operation
+from mirrorskin.engine.diagnosis.normals_uncertainty import PhaseUncertainty
 from mirrorskin.engine.rotation.normals import Normals, NormalsOperation, normals_result
 from mirrorskin.engine.rotation.normals_kernel import MAPS, SLOPE_MAPS, NormalKernel, TurnModel
-from mirrorskin.engine.rotation.normals_uncertainty import PhaseUncertainty
 from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows, pose_fit, rocks
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.layout import as_series

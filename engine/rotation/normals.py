@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.device_arrays import AnyArray, on_host
-from mirrorskin.engine.frames import thin_out, thinned
-from mirrorskin.engine.operation import Operation
-from mirrorskin.engine.options import option
-from mirrorskin.engine.rotation.design_matrix import (
+from mirrorskin.engine.base.device_arrays import AnyArray, on_host
+from mirrorskin.engine.base.frames import thin_out, thinned
+from mirrorskin.engine.base.operation import Operation
+from mirrorskin.engine.base.options import option
+from mirrorskin.engine.correlation.design_matrix import (
     LONGEST,
     TurnFit,
     check_phases,
@@ -23,7 +23,13 @@ from mirrorskin.engine.rotation.design_matrix import (
     longest_turn,
     turn_fit,
 )
-from mirrorskin.engine.rotation.frame_light import FrameLight, find_frame_light, light_sigma
+from mirrorskin.engine.diagnosis.frame_light import FrameLight, find_frame_light, light_sigma
+from mirrorskin.engine.diagnosis.normals_uncertainty import (
+    PhaseUncertainty,
+    RegistrationUncertainty,
+    ResponseUncertainty,
+    SystematicUncertainty,
+)
 from mirrorskin.engine.rotation.normals_kernel import (
     MAPS,
     NormalKernel,
@@ -32,12 +38,6 @@ from mirrorskin.engine.rotation.normals_kernel import (
     TurnModel,
     azimuth_of,
     zenith_of,
-)
-from mirrorskin.engine.rotation.normals_uncertainty import (
-    PhaseUncertainty,
-    RegistrationUncertainty,
-    ResponseUncertainty,
-    SystematicUncertainty,
 )
 from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.engine.rotation.poses import PoseFit

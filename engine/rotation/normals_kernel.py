@@ -9,22 +9,22 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.frames import thinning
-from mirrorskin.engine.options import Configured, option
-from mirrorskin.engine.picture import Picture
-from mirrorskin.engine.rotation.design_matrix import LONGEST, TurnFit
+from mirrorskin.engine.base.frames import thinning
+from mirrorskin.engine.base.options import Configured, option
+from mirrorskin.engine.base.picture import Picture
+from mirrorskin.engine.base.tiling import Planes
+from mirrorskin.engine.correlation.design_matrix import LONGEST, TurnFit
+from mirrorskin.engine.diagnosis.residual_noise import CountNoise, residual_noise
 from mirrorskin.engine.rotation.poses import PoseFit
-from mirrorskin.engine.rotation.residual_noise import CountNoise, residual_noise
 from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.rotation.scale import make_scale
 from mirrorskin.engine.rotation.tilt import estimate_tilt
-from mirrorskin.engine.tiling import Planes
 from mirrorskin.io import InputError
 from mirrorskin.kernels.normals import contact_limits
 
 if TYPE_CHECKING:
-    from mirrorskin.engine.device_arrays import AnyArray
-    from mirrorskin.engine.operation import Operation
+    from mirrorskin.engine.base.device_arrays import AnyArray
+    from mirrorskin.engine.base.operation import Operation
 
 NormalMethod = Literal["exact", "paper"]
 MAPS = "vectors", "sigma", "contact", "mean", "cosines", "sines", "residual"

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.errors import NotConverged
+from mirrorskin.engine.base.errors import NotConverged
+from mirrorskin.engine.diagnosis.frame_light import light_sigma
 from mirrorskin.engine.integration.arrays import integrate_arrays
 from mirrorskin.engine.integration.device_inputs import sample_evenly
 from mirrorskin.engine.integration.surface import explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
-from mirrorskin.engine.rotation.frame_light import light_sigma
 from mirrorskin.io import Fitted, Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array

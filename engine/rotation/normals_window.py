@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.frames import thinned
-from mirrorskin.engine.rotation.correlation import WindowSums
-from mirrorskin.engine.rotation.design_matrix import TurnFit, check_phases, turn_fit
+from mirrorskin.engine.base.frames import thinned
+from mirrorskin.engine.correlation.correlation import WindowSums
+from mirrorskin.engine.correlation.design_matrix import TurnFit, check_phases, turn_fit
 from mirrorskin.engine.rotation.normals_kernel import NormalKernel, TurnModel
 from mirrorskin.io import InputError, Result
 from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
-    from mirrorskin.engine.operation import Operation
+    from mirrorskin.engine.base.operation import Operation
 
 
 class NormalWindow:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.rotation.design_matrix import LONGEST
+from mirrorskin.engine.correlation.design_matrix import LONGEST
 from mirrorskin.engine.rotation.tilt import check_tilts
 from mirrorskin.io import InputError
 from mirrorskin.io.positions import check_phase

@@ -9,8 +9,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.frames import check_dtype
-from mirrorskin.engine.sources import DerivedSource
+from mirrorskin.engine.base.frames import check_dtype
+from mirrorskin.engine.base.sources import DerivedSource
 from mirrorskin.io import Block, Header, InputError, Source, pixel_axes
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import block_memory

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.provenance import naming
+from mirrorskin.engine.base.provenance import naming
 from mirrorskin.engine.rotation.registration import Sight
 from mirrorskin.io import Calibrated, Header, InputError, Source, WallResponse, pixel_axes
 from mirrorskin.kernels.array_types import Doubles

@@ -14,15 +14,18 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.inputs import as_result
-from mirrorskin.engine.method import Method
-from mirrorskin.engine.operation import Plan
-from mirrorskin.engine.options import option
-from mirrorskin.engine.provenance import level_origin, parameter_origin
-from mirrorskin.engine.resample import fill_with_nearest
+from mirrorskin.engine.base.inputs import as_result
+from mirrorskin.engine.base.method import Method
+from mirrorskin.engine.base.operation import Plan
+from mirrorskin.engine.base.options import option
+from mirrorskin.engine.base.provenance import level_origin, parameter_origin
+from mirrorskin.engine.base.resample import fill_with_nearest
+from mirrorskin.engine.base.running import Run
+from mirrorskin.engine.base.sources import EditedSource
+from mirrorskin.engine.base.steps import Step
+from mirrorskin.engine.correlation.correlation import Correlate
+from mirrorskin.engine.correlation.design_matrix import LONGEST, check_turning, cut_into_turns
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
-from mirrorskin.engine.rotation.correlation import Correlate
-from mirrorskin.engine.rotation.design_matrix import LONGEST, check_turning, cut_into_turns
 from mirrorskin.engine.rotation.last_turn import LastTurn
 from mirrorskin.engine.rotation.moving_normals import MovingNormals
 from mirrorskin.engine.rotation.normals import Normals
@@ -31,9 +34,6 @@ from mirrorskin.engine.rotation.poses import even_windows, rocks
 from mirrorskin.engine.rotation.registration import Registered, check_heights
 from mirrorskin.engine.rotation.response import HALF_WAY, Response, initial_response, wall_response_of
 from mirrorskin.engine.rotation.steps import Edges, Integration, SlopeMaps
-from mirrorskin.engine.running import Run
-from mirrorskin.engine.sources import EditedSource
-from mirrorskin.engine.steps import Step
 from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Source, WallResponse, open_heights
 from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.io.findings import carried

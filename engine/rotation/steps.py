@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.options import option
+from mirrorskin.engine.base.options import option
+from mirrorskin.engine.base.steps import Context, Step
+from mirrorskin.engine.diagnosis.normals_uncertainty import SystematicUncertainty
 from mirrorskin.engine.rotation.edges import find_edges
 from mirrorskin.engine.rotation.normals_to_height import (
     Slopes,
@@ -13,9 +15,7 @@ from mirrorskin.engine.rotation.normals_to_height import (
     separate_errors,
     slopes_of,
 )
-from mirrorskin.engine.rotation.normals_uncertainty import SystematicUncertainty
 from mirrorskin.engine.rotation.registration import Registered
-from mirrorskin.engine.steps import Context, Step
 from mirrorskin.io import Result
 
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.rotation.design_matrix import TurnFit, basis
-from mirrorskin.engine.rotation.residual_noise import CountNoise, valid
+from mirrorskin.engine.correlation.design_matrix import TurnFit, basis
+from mirrorskin.engine.diagnosis.residual_noise import CountNoise, valid
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array_types import Doubles
 

@@ -9,9 +9,9 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.device_arrays import AnyArray, device_of, on_host
-from mirrorskin.engine.frames import as_frames, check_frames
-from mirrorskin.engine.resample import fill_with_nearest
+from mirrorskin.engine.base.device_arrays import AnyArray, device_of, on_host
+from mirrorskin.engine.base.frames import as_frames, check_frames
+from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker, invert_symmetric
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import check_count, check_number, check_pixel_size, checked, in_unit

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.inputs import Maps, as_result
-from mirrorskin.engine.operation import Operation
-from mirrorskin.engine.options import option
-from mirrorskin.engine.resample import fill_with_nearest
+from mirrorskin.engine.base.inputs import Maps, as_result
+from mirrorskin.engine.base.operation import Operation
+from mirrorskin.engine.base.options import option
+from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.slip.displacement import (
     Texture,
     bending_variance,

@@ -8,14 +8,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.engine.errors import NotConverged
-from mirrorskin.engine.inputs import Maps
-from mirrorskin.engine.method import Method
-from mirrorskin.engine.operation import Plan
-from mirrorskin.engine.options import option
+from mirrorskin.engine.base.errors import NotConverged
+from mirrorskin.engine.base.inputs import Maps
+from mirrorskin.engine.base.method import Method
+from mirrorskin.engine.base.operation import Plan
+from mirrorskin.engine.base.options import option
+from mirrorskin.engine.base.steps import Context, Step
+from mirrorskin.engine.base.summary import status_shares
 from mirrorskin.engine.slip.search import Slip
-from mirrorskin.engine.steps import Context, Step
-from mirrorskin.engine.summary import status_shares
 from mirrorskin.io import Calibrated, InputError, Result, Source
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.io.maps import SlipStatus

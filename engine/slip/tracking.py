@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.device_arrays import AnyArray, on_host
+from mirrorskin.engine.base.device_arrays import AnyArray, on_host
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import C_TYPES, Device

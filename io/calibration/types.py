@@ -86,7 +86,7 @@ class Lens(Part):
     """Mapping from pixels to positions on the sheet.
 
     The undistorted map has as many pixels as the picture, all of one size, and the same centre. See
-    ``mirrorskin.engine.undistort``.
+    ``mirrorskin.engine.base.undistort``.
     """
 
     command: ClassVar[str] = "scale"

@@ -11,7 +11,7 @@ from commands import run
 from mirrorskin.cli import declared
 from mirrorskin.cli.declared import Term, term_of, terms_of
 from mirrorskin.engine import option
-from mirrorskin.engine.options import Configured
+from mirrorskin.engine.base.options import Configured
 from mirrorskin.io import InputError
 
 COPY = Path(declared.__file__).with_suffix(".json")

@@ -18,8 +18,8 @@ from shown import panel
 from stacks import assert_same
 
 from mirrorskin import engine, io
-from mirrorskin.engine.summary import summarise
-from mirrorskin.engine.undistort import undistort
+from mirrorskin.engine.base.summary import summarise
+from mirrorskin.engine.base.undistort import undistort
 from mirrorskin.view.report.words import map_rows, picture_texts
 from mirrorskin.view.result import overview
 

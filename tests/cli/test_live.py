@@ -22,8 +22,8 @@ from speckle import Speckle
 from mirrorskin import engine, io
 from mirrorskin.cli import live
 from mirrorskin.cli.status import Board, Newest, summary
+from mirrorskin.engine.base.reconstruction import load_operation
 from mirrorskin.engine.live import SHOWN, Latency, Status
-from mirrorskin.engine.reconstruction import load_operation
 from mirrorskin.hw import HardwareError, Position
 from mirrorskin.hw import rig_file as file
 from mirrorskin.hw.rig import rig
@@ -408,10 +408,10 @@ OWN = str(Path(__file__).parents[2] / "examples" / "steepest_rise.py") + ":Steep
             "--thresholds 0.2,0.7 --inclinations 0.2rad,0.5rad --dark 0 --bright 255",
             {"thresholds": [0.2, 0.7], "inclinations": [0.2, 0.5], "dark": 0, "bright": 255},
         ),
-        (PRESS, "engine.focus:Focus", "--noise 1", {"noise": 1}),
+        (PRESS, "engine.optical:Focus", "--noise 1", {"noise": 1}),
         (TURN, "engine:Correlate", "", {}),
         (TURN, "engine:Normals", "", {"tilt": math.radians(2.5)}),
-        (TURN, "engine.fringes:Fringes", "--noise 1", {"noise": 1}),
+        (TURN, "engine.optical:Fringes", "--noise 1", {"noise": 1}),
     ],
 )
 def test_a_built_in_operation_gives_the_same_live_as_over_the_recording(

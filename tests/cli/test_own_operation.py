@@ -18,7 +18,7 @@ from shown import panel
 from stacks import MadeUp, record
 
 from mirrorskin import engine, io
-from mirrorskin.engine.reconstruction import load_operation
+from mirrorskin.engine.base.reconstruction import load_operation
 from mirrorskin.view.app.session import Opening, Session
 from mirrorskin.view.app.wording import as_command, as_python
 from mirrorskin.view.result import overview

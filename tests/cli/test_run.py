@@ -12,7 +12,7 @@ from commands import done, refused, run
 from stacks import MadeUp, assert_same, record, sphere
 
 from mirrorskin import engine, io
-from mirrorskin.engine.reconstruction import load_operation
+from mirrorskin.engine.base.reconstruction import load_operation
 
 ROOT = Path(__file__).parents[2]
 MINE = """

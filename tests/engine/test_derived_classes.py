@@ -14,8 +14,8 @@ from operations import CASES, PRESS, TRAVEL, Readable
 from stacks import record
 
 from mirrorskin import engine, io
+from mirrorskin.engine.base.operation import Plan
 from mirrorskin.engine.live import LiveRun, Stream
-from mirrorskin.engine.operation import Plan
 from mirrorskin.engine.press.press import HoleFilling
 
 pytestmark = pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")

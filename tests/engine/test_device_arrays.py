@@ -59,10 +59,10 @@ ON_FRAMES = {
         *(engine.estimate_normals, TURNS, PHASE, SENSOR | {"frame_weights": np.arange(FRAMES) != 3}),
         set(),
     ),
-    "fringes": (engine.fringes.fit_fringes, TURNS, PHASE, {}, set()),
-    "focus": (engine.focus.find_focus, PRESS, TRAVEL, {"noise": 2.0}, {"height", "status", "sharpness"}),
+    "fringes": (engine.optical.fit_fringes, TURNS, PHASE, {}, set()),
+    "focus": (engine.optical.find_focus, PRESS, TRAVEL, {"noise": 2.0}, {"height", "status", "sharpness"}),
     "lamps": (
-        *(engine.photometric.photometric_stereo, TURNS, PHASE, {"zenith": 0.7}),
+        *(engine.optical.photometric_stereo, TURNS, PHASE, {"zenith": 0.7}),
         {"normals", "albedo", "residual", "samples"},
     ),
 }

@@ -8,7 +8,7 @@ import rotations
 from rotations import EIGHTHS, TILT
 
 from mirrorskin import engine, io
-from mirrorskin.engine.undistort import undistort
+from mirrorskin.engine.base.undistort import undistort
 from mirrorskin.io.export_formats import FORMATS
 from mirrorskin.view.report import write_report
 
@@ -78,11 +78,11 @@ CONSUMERS = {
         f"displacement: {LOST}",
     ),
     "unwrap_frequencies": (
-        lambda: engine.fringes.unwrap_frequencies([phases(), phases()], [1, 4]).process["warnings"],
+        lambda: engine.optical.unwrap_frequencies([phases(), phases()], [1, 4]).process["warnings"],
         f"fringes[0]: {LOST}; fringes[1]: {LOST}",
     ),
     "unwrap_gray": (
-        lambda: engine.fringes.unwrap_gray(phases(), stripes()).process["warnings"],
+        lambda: engine.optical.unwrap_gray(phases(), stripes()).process["warnings"],
         f"fringes: {LOST}; stripes: {FLICKER}",
     ),
     "assign": (lambda: touch().assign(zenith=X).process["warnings"], LOST),

@@ -7,7 +7,7 @@ import pytest
 from bare import bare
 
 from mirrorskin import engine, io
-from mirrorskin.engine.focus import Focus
+from mirrorskin.engine.optical.focus import Focus
 from mirrorskin.io.arrays import ArrayRecording
 
 SHAPE = (48, 48)
@@ -144,7 +144,7 @@ FRAMES = textured().astype(np.float32)
 )
 def test_bad_input_is_one_line(arguments, line):
     with pytest.raises(io.InputError, match=re.escape(line)):
-        engine.focus.find_focus(**{"frames": FRAMES, "travel": TRAVEL, "noise": 1, **arguments})
+        engine.optical.find_focus(**{"frames": FRAMES, "travel": TRAVEL, "noise": 1, **arguments})
 
 
 def test_texture_that_is_uneven_on_a_slope_is_part_of_the_error():

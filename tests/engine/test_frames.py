@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine
-from mirrorskin.engine.frames import SAMPLES, estimate_noise, thin_out
+from mirrorskin.engine.base.frames import SAMPLES, estimate_noise, thin_out
 from mirrorskin.io import InputError
 
 RANDOM = np.random.default_rng(0)

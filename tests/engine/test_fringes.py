@@ -7,7 +7,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from mirrorskin import engine, io
-from mirrorskin.engine.fringes import Fringes, decode_gray, fit_fringes, unwrap_frequencies, unwrap_gray
+from mirrorskin.engine.optical.fringes import (
+    Fringes,
+    decode_gray,
+    fit_fringes,
+    unwrap_frequencies,
+    unwrap_gray,
+)
 
 TURN = 2 * np.pi
 EVEN = np.arange(5) * TURN / 5

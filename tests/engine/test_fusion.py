@@ -12,7 +12,7 @@ from scipy.stats import norm
 from stacks import MadeUp, record
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.fusion import frames_to_read
+from mirrorskin.engine.fusion.fusion import frames_to_read
 from mirrorskin.hw.twin import Axial, Body, Camera, Vertical
 from mirrorskin.io.arrays import ArrayRecording
 

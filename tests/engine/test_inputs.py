@@ -9,7 +9,7 @@ from height_maps import cap, places
 from moved_surfaces import bumpy, sampled
 
 from mirrorskin import engine, io
-from mirrorskin.engine.inputs import as_result
+from mirrorskin.engine.base.inputs import as_result
 from mirrorskin.engine.metrology import section
 
 SHAPE, PIXEL = (60, 80), (0.05, 0.05)

@@ -11,8 +11,8 @@ from live_frames import PIXEL, paced, press_header
 from stacks import TRAVEL, MadeUp, random_stack, record, sphere
 
 from mirrorskin import engine, io
+from mirrorskin.engine.base.options import Option
 from mirrorskin.engine.live import LiveRun, Loop
-from mirrorskin.engine.options import Option
 
 FRAMES = random_stack("uint16", (8, 5, 7))
 HEADER = io.Header("vertical", pixel_size=(0.5, 0.6))

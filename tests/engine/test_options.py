@@ -19,11 +19,11 @@ from stacks import record, sphere
 from mirrorskin import engine, io
 from mirrorskin.cli.declared import term_of
 from mirrorskin.cli.settings import read_settings
+from mirrorskin.engine.base.options import Configured, option
+from mirrorskin.engine.base.provenance import describe
+from mirrorskin.engine.base.reconstruction import load_operation
 from mirrorskin.engine.batch.cluster import run_cluster
 from mirrorskin.engine.batch.jobs import Plan, make_jobs
-from mirrorskin.engine.options import Configured, option
-from mirrorskin.engine.provenance import describe
-from mirrorskin.engine.reconstruction import load_operation
 from mirrorskin.kernels.device import open_device
 
 MODULE = """

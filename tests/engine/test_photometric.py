@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from stacks import MadeUp
 
 from mirrorskin import engine, io
-from mirrorskin.engine.photometric import PhotometricStereo, photometric_stereo
+from mirrorskin.engine.optical.photometric import PhotometricStereo, photometric_stereo
 from mirrorskin.io.arrays import ArrayRecording
 
 AZIMUTH = np.arange(12) * 2 * np.pi / 12

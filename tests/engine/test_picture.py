@@ -8,10 +8,10 @@ import pytest
 from bare import bare, bare_run
 
 from mirrorskin import engine, io
-from mirrorskin.engine.focus import Focus
-from mirrorskin.engine.photometric import PhotometricStereo
-from mirrorskin.engine.picture import PerFrame, Picture
-from mirrorskin.engine.tiling import Planes
+from mirrorskin.engine.base.picture import PerFrame, Picture
+from mirrorskin.engine.base.tiling import Planes
+from mirrorskin.engine.optical.focus import Focus
+from mirrorskin.engine.optical.photometric import PhotometricStereo
 from mirrorskin.kernels.device import Device
 
 SHAPE, COUNT = (23, 31), 9

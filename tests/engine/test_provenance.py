@@ -5,7 +5,7 @@ import pytest
 from stacks import MadeUp, record, sphere
 
 from mirrorskin import io
-from mirrorskin.engine.provenance import attach_provenance, naming, parameter_origin
+from mirrorskin.engine.base.provenance import attach_provenance, naming, parameter_origin
 from mirrorskin.kernels.device import open_device
 
 

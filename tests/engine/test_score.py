@@ -5,7 +5,7 @@ import pytest
 from rotations import direction
 
 from mirrorskin import engine, io
-from mirrorskin.engine.summary import summarise
+from mirrorskin.engine.base.summary import summarise
 from mirrorskin.io.maps import SlipStatus, status_of
 
 NAN = np.float32(np.nan)

@@ -12,7 +12,7 @@ from operations import CASES, assert_same
 from presses import LEVELS, random_press
 
 from mirrorskin import engine, io
-from mirrorskin.engine.tiling import cut_into_bands, for_each_band
+from mirrorskin.engine.base.tiling import cut_into_bands, for_each_band
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.errors import DeviceError
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine import Operation, Run
-from mirrorskin.engine.operation import Plan
+from mirrorskin.engine.base.operation import Plan
 from mirrorskin.io import Block, Header, InputError
 
 

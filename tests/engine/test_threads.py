@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine
+from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.engine.live import STAGES
 from mirrorskin.engine.live.status import Monitor
-from mirrorskin.engine.thread_safe import ThreadSafe
 from mirrorskin.io import InputError
 
 SHAPE = 24, 32

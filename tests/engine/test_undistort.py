@@ -3,7 +3,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mirrorskin.engine.undistort import picture_places, undistort
+from mirrorskin.engine.base.undistort import picture_places, undistort
 from mirrorskin.io import Fitted, InputError, Lens, Result, pixel_axes
 
 SIZES = [(1, 1), (1, 9), (7, 11), (33, 20)]

@@ -20,6 +20,7 @@ from golden import FITTED, Answer, Tolerance, case
 from scenes import EIGHTHS, TILT, dome, places, turn
 
 from mirrorskin import engine, hw, io
+from mirrorskin.engine.base.undistort import undistort
 from mirrorskin.engine.calibration import (
     BallTrack,
     Dots,
@@ -30,7 +31,6 @@ from mirrorskin.engine.calibration import (
     measure_references,
 )
 from mirrorskin.engine.live import LiveRun
-from mirrorskin.engine.undistort import undistort
 
 
 def still(level: Any, count: int, seed: int, name: str) -> Source:

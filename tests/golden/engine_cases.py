@@ -38,16 +38,16 @@ from scenes import (
 )
 
 from mirrorskin import engine, io
-from mirrorskin.engine.lock_in import Correlation
+from mirrorskin.engine.base.operation import Plan
+from mirrorskin.engine.base.summary import summarise as engine_summarise
+from mirrorskin.engine.correlation.lock_in import Correlation
 from mirrorskin.engine.metrology import Quantity
 from mirrorskin.engine.metrology import fit_plane as engine_fit_plane
 from mirrorskin.engine.metrology import fit_sphere as engine_fit_sphere
 from mirrorskin.engine.metrology import roughness as engine_roughness
 from mirrorskin.engine.metrology import section as engine_section
 from mirrorskin.engine.metrology import step_height as engine_step_height
-from mirrorskin.engine.operation import Plan
 from mirrorskin.engine.rotation.registration import Registered
-from mirrorskin.engine.summary import summarise as engine_summarise
 
 PROCESS = Tolerance(1e-3, 1e-6)  # numbers of solved heights
 ONSET = {"height": HEIGHT, "height_sigma": HEIGHT, "process": FITTED}
@@ -318,7 +318,7 @@ def correlate_a_sliding_window() -> Answer:
 @case(phase=FITTED, phase_sigma=RESIDUAL_SIGMA, process=FITTED)
 def fit_fringes() -> Answer:
     return named(
-        **{d: result_maps(engine.fringes.fit_fringes(turn(d, SMALL, UNEVEN)[0], UNEVEN)) for d in LEVELS}
+        **{d: result_maps(engine.optical.fit_fringes(turn(d, SMALL, UNEVEN)[0], UNEVEN)) for d in LEVELS}
     )
 
 
@@ -328,7 +328,7 @@ def find_focus() -> Answer:
     sharp = np.exp(-((travel[:, None, None] + 2 * dome(SMALL)[0] - 0.6) ** 2))
     answers = {}
     for dtype in LEVELS:
-        found = engine.focus.find_focus(counted(texture * sharp, dtype), travel, noise=0.01)
+        found = engine.optical.find_focus(counted(texture * sharp, dtype), travel, noise=0.01)
         answers[dtype] = result_maps(found)
     return named(**answers)
 
@@ -349,7 +349,7 @@ def photometric_stereo() -> Answer:
     share += np.random.default_rng(4).normal(0, 0.01, share.shape)
     answers = {}
     for dtype, (dark, _) in LEVELS.items():
-        found = engine.photometric.photometric_stereo(counted(share, dtype), light=light, dark=dark)
+        found = engine.optical.photometric_stereo(counted(share, dtype), light=light, dark=dark)
         answers[dtype] = result_maps(found)
     return named(**answers)
 

@@ -8,8 +8,8 @@ import rotations
 from rotations import EIGHTHS, UNEVEN, Setup
 from scipy import optimize, special
 
-from mirrorskin.engine.picture import vector_lanes
-from mirrorskin.engine.rotation.design_matrix import fit_matrix
+from mirrorskin.engine.base.picture import vector_lanes
+from mirrorskin.engine.correlation.design_matrix import fit_matrix
 from mirrorskin.kernels import normals
 from mirrorskin.kernels.device import C_TYPES
 from mirrorskin.kernels.normals import Answer, Variance, contact_limits

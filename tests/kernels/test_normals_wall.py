@@ -9,7 +9,7 @@ import walls
 from scipy import optimize
 from walls import PHASE, TILT, facing, light_of
 
-from mirrorskin.engine.rotation.design_matrix import fit_matrix
+from mirrorskin.engine.correlation.design_matrix import fit_matrix
 from mirrorskin.engine.rotation.response import make_response
 from mirrorskin.kernels.normals import Variance, contact_limits
 from mirrorskin.kernels.normals_wall import _places, _rotations, normals_wall

@@ -77,7 +77,7 @@ def presses(shape: Shape, device: Device, frames: int) -> Iterator[tuple[str, Ca
     if frames <= 64:
         change_point = partial(engine.find_change_point, press, travel, **levels)
         yield f"find_change_point, {frames} frames", change_point
-        focus = partial(engine.focus.find_focus, press, travel, noise=2.0, device=device)
+        focus = partial(engine.optical.find_focus, press, travel, noise=2.0, device=device)
         yield f"find_focus, {frames} frames", focus
 
 
@@ -87,7 +87,7 @@ def rotations(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
     there = placed(turns, device)
     yield "correlate, 16 frames", partial(engine.correlate, turns, phase, device=device)
     yield "correlate, 16 frames on the device", partial(engine.correlate, there, phase)
-    yield "fit_fringes, 16 frames", partial(engine.fringes.fit_fringes, turns, phase, device=device)
+    yield "fit_fringes, 16 frames", partial(engine.optical.fit_fringes, turns, phase, device=device)
     yield (
         "estimate_normals, 16 frames",
         partial(engine.estimate_normals, turns, phase, device=device, **TURN),
@@ -102,7 +102,7 @@ def rotations(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
         ),
     )
     lamps: dict[str, Any] = {"zenith": 0.7, "dark": DARK, "device": device}
-    stereo = partial(engine.photometric.photometric_stereo, turns, phase, **lamps)
+    stereo = partial(engine.optical.photometric_stereo, turns, phase, **lamps)
     yield "photometric_stereo, 16 frames", stereo
 
 

@@ -3,8 +3,8 @@
 from itertools import pairwise
 
 from mirrorskin.engine import ChangePoint, Onset, Run
-from mirrorskin.engine.operation import Plan
-from mirrorskin.engine.sources import ArraySource
+from mirrorskin.engine.base.operation import Plan
+from mirrorskin.engine.base.sources import ArraySource
 
 
 class Parts(ArraySource):

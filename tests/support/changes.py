@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mirrorskin.engine.frames import reference_pair
+from mirrorskin.engine.base.frames import reference_pair
 from mirrorskin.io import Result
 from mirrorskin.kernels import changepoint as reference
 

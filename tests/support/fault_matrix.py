@@ -311,7 +311,7 @@ def _fused(fault: Fault, seed: int, compute: Callable[[Fault, int], Result] = _f
 
 
 def _fit_recording(source: ArrayRecording) -> Result:
-    return engine.run(source, engine.fringes.Fringes)
+    return engine.run(source, engine.optical.Fringes)
 
 
 def _of_fringes(
@@ -326,7 +326,7 @@ def _of_fringes(
 
 
 def _light_recording(source: ArrayRecording, **options: Any) -> Result:
-    return engine.run(source, engine.photometric.PhotometricStereo(**options))
+    return engine.run(source, engine.optical.PhotometricStereo(**options))
 
 
 def _photometric(fault: Fault, seed: int, compute: Callable[..., Result] = _light_recording) -> Answer:
@@ -346,7 +346,7 @@ def _moved(fault: Fault, seed: int) -> Answer:
 
 
 def _focus_recording(source: ArrayRecording, noise: float) -> Result:
-    return engine.run(source, engine.focus.Focus(noise=noise))
+    return engine.run(source, engine.optical.Focus(noise=noise))
 
 
 def _by_focus(
@@ -429,16 +429,16 @@ def _fuse_maps(fault: Fault, seed: int) -> Result:
 
 
 def _fit_array(source: ArrayRecording) -> Result:
-    return engine.fringes.fit_fringes(_frames(source), source.phase)
+    return engine.optical.fit_fringes(_frames(source), source.phase)
 
 
 def _light_array(source: ArrayRecording, **options: Any) -> Result:
     dark = source.header.dark
-    return engine.photometric.photometric_stereo(_frames(source), source.phase, dark=dark, **options)
+    return engine.optical.photometric_stereo(_frames(source), source.phase, dark=dark, **options)
 
 
 def _focus_array(source: ArrayRecording, noise: float) -> Result:
-    return engine.focus.find_focus(_frames(source), source.travel, noise=noise)
+    return engine.optical.find_focus(_frames(source), source.travel, noise=noise)
 
 
 def _turn_by(compute: Callable[[Fault, int], Result]) -> Turn:

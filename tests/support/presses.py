@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mirrorskin.engine.frames import reference_maps
+from mirrorskin.engine.base.frames import reference_maps
 from mirrorskin.io import Result
 from mirrorskin.kernels import onset as reference
 

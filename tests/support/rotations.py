@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import erfc
 
 from mirrorskin.engine import Normals, Run
-from mirrorskin.engine.operation import Plan
+from mirrorskin.engine.base.operation import Plan
 from mirrorskin.io import Result
 
 Map = NDArray[np.float64]

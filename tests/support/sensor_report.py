@@ -23,7 +23,7 @@ from scipy import optimize, sparse
 from scipy.sparse.linalg import spsolve
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.scoring import true_normals
+from mirrorskin.engine.metrology.scoring import true_normals
 from mirrorskin.hw.twin import Axial, Body, Camera, Sphere, Vertical, visible_zenith
 from mirrorskin.hw.twin.view import View
 

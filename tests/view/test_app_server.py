@@ -21,7 +21,7 @@ from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 
 from mirrorskin import hw
-from mirrorskin.engine.reconstruction import load_operation
+from mirrorskin.engine.base.reconstruction import load_operation
 from mirrorskin.hw.twin import Vertical
 from mirrorskin.io import InputError
 from mirrorskin.view.app import App, Opening

@@ -8,7 +8,7 @@ from typing import Any
 
 import panel as pn
 
-from mirrorskin.engine.options import Option, plain
+from mirrorskin.engine.base.options import Option, plain
 from mirrorskin.io import InputError
 from mirrorskin.view.app.look import TALL, problem, text
 from mirrorskin.view.app.session import Session

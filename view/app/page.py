@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import panel as pn
 
 from mirrorskin import io
-from mirrorskin.engine.summary import summarise
+from mirrorskin.engine.base.summary import summarise
 from mirrorskin.io.findings import warnings_in
 from mirrorskin.view.app.look import text
 from mirrorskin.view.app.options import OptionsPane

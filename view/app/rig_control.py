@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import io
+from mirrorskin.engine.base.method import Method
+from mirrorskin.engine.base.operation import Operation
+from mirrorskin.engine.base.reconstruction import method_for
 from mirrorskin.engine.live import LiveRun, Loop
 from mirrorskin.engine.live.status import Status, Update
-from mirrorskin.engine.method import Method
-from mirrorskin.engine.operation import Operation
-from mirrorskin.engine.reconstruction import method_for
 from mirrorskin.engine.rotation.last_turn import choose_window
 from mirrorskin.engine.rotation.rotation import Rotation
 from mirrorskin.hw.clock import SYSTEM, Clock

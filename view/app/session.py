@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import engine, io
-from mirrorskin.engine.options import Option, plain
-from mirrorskin.engine.reconstruction import calibrated, load_operation, method_for, run_class
+from mirrorskin.engine.base.options import Option, plain
+from mirrorskin.engine.base.reconstruction import calibrated, load_operation, method_for, run_class
 from mirrorskin.io.foreign import kind_of_frames
 from mirrorskin.io.recording import is_result
 from mirrorskin.io.result import map_shape

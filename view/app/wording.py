@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from mirrorskin import io
-from mirrorskin.engine.options import Option, plain
+from mirrorskin.engine.base.options import Option, plain
 from mirrorskin.view.app.session import Session
 
 _WITH_UNIT = ("mm", "rad", "MPa", "N", "s")
@@ -64,7 +64,7 @@ def as_python(session: Session) -> str:
     else:
         lines = [
             "from mirrorskin import io",
-            "from mirrorskin.engine.reconstruction import load_operation, run_class",
+            "from mirrorskin.engine.base.reconstruction import load_operation, run_class",
         ]
         where = f"load_operation({session.kind_name!r})"
         places = ["None", *calibration] if calibration else []

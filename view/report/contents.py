@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.base.summary import summarise
 from mirrorskin.engine.metrology import Quantity
-from mirrorskin.engine.summary import summarise
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.findings import warnings_in
 from mirrorskin.io.opencv import encode

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.summary import summarise
+from mirrorskin.engine.base.summary import summarise
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.arguments import unknown_argument
 from mirrorskin.io.findings import warnings_in

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy import special
 
+from mirrorskin.engine.base.undistort import picture_places
 from mirrorskin.engine.calibration.board import Charuco, Dots, paint_board
 from mirrorskin.engine.calibration.lens import calibrate_lens, fit_lens
 from mirrorskin.engine.calibration.marks import Marks, centre_marks
-from mirrorskin.engine.undistort import picture_places
 from mirrorskin.io import InputError
 
 CHARUCO, DOTS = Charuco(7, 5, 2.0, 1.5), Dots(11, 9, 1.0)

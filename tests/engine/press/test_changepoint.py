@@ -8,7 +8,7 @@ from presses import LEVELS, SPEC, assert_equal, random_press
 from ramps import NOISES, WIDTHS, compare, errors, ramps, rms
 
 from mirrorskin.engine import ChangePoint, Run
-from mirrorskin.engine.operation import Plan
+from mirrorskin.engine.base.operation import Plan
 from mirrorskin.io import InputError
 
 DTYPES = sorted(SPEC)

@@ -10,8 +10,8 @@ from presses import LEVELS, SPEC, assert_equal, assert_within_an_ulp, first_run,
 
 from mirrorskin import engine, io
 from mirrorskin.engine import Onset, Run
-from mirrorskin.engine.operation import Plan
-from mirrorskin.engine.sources import ArraySource
+from mirrorskin.engine.base.operation import Plan
+from mirrorskin.engine.base.sources import ArraySource
 from mirrorskin.io import InputError
 from mirrorskin.kernels import onset as reference
 

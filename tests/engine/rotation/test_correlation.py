@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine import Correlate, Run, correlate
-from mirrorskin.engine.operation import Plan
-from mirrorskin.engine.sources import ArraySource
+from mirrorskin.engine.base.operation import Plan
+from mirrorskin.engine.base.sources import ArraySource
 from mirrorskin.io import InputError, MirrorskinWarning
 from mirrorskin.kernels.errors import DeviceError
 
@@ -273,7 +273,7 @@ def test_a_window_has_3_to_64_frames(window):
 
 @pytest.mark.parametrize("window", [None, 8])
 def test_a_block_that_does_not_fit_is_refused_and_changes_nothing(window, monkeypatch):
-    monkeypatch.setattr("mirrorskin.engine.rotation.correlation._MAX_FRAMES", 12)
+    monkeypatch.setattr("mirrorskin.engine.correlation.correlation._MAX_FRAMES", 12)
     frames = swing("uint8", MEASURED)
     run = push(Run(Correlate(window_frames=window)), frames, MEASURED)
     before = run.result()

@@ -8,7 +8,7 @@ import rotations
 from rotations import Setup
 
 from mirrorskin import engine, io
-from mirrorskin.engine.rotation.curl import find_azimuth_error
+from mirrorskin.engine.diagnosis.curl import find_azimuth_error
 from mirrorskin.io.arrays import ArrayRecording
 
 SHAPE, PIXEL = (60, 80), (0.05, 0.06)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mirrorskin.engine.rotation.design_matrix import (
+from mirrorskin.engine.correlation.design_matrix import (
     check_phases,
     cut_into_turns,
     fit_matrix,

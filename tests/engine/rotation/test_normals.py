@@ -10,8 +10,8 @@ from rotations import EIGHTHS, TILT, Setup
 
 from mirrorskin import engine
 from mirrorskin.engine import Normals, estimate_normals
-from mirrorskin.engine.operation import Plan
-from mirrorskin.engine.sources import ArraySource
+from mirrorskin.engine.base.operation import Plan
+from mirrorskin.engine.base.sources import ArraySource
 from mirrorskin.io import InputError
 from mirrorskin.kernels.errors import DeviceError
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rotations import EIGHTHS, UNEVEN
 
-from mirrorskin.engine.rotation.residual_noise import residual_noise
+from mirrorskin.engine.diagnosis.residual_noise import residual_noise
 from mirrorskin.io import InputError
 
 PIXELS = 10_000

@@ -10,7 +10,7 @@ from rotations import EIGHTHS, TILT, Setup
 from stacks import MadeUp, assert_same
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.operation import Plan
+from mirrorskin.engine.base.operation import Plan
 from mirrorskin.engine.rotation.steps import Edges, Integration, take_slopes
 from mirrorskin.hw.twin import Axial, Body, Camera
 

@@ -7,8 +7,8 @@ import pytest
 import rotations
 from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
-from mirrorskin.engine.rotation.design_matrix import turn_fit
-from mirrorskin.engine.rotation.residual_noise import CountNoise
+from mirrorskin.engine.correlation.design_matrix import turn_fit
+from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.engine.rotation.tilt import estimate_tilt, zenith_seen
 from mirrorskin.io import InputError
 

@@ -1,0 +1,1 @@
+"""What every computation is made of: options, operations, sources, runs, and pictures on devices."""

@@ -1,0 +1,98 @@
+"""Rotation of all slopes about the axis of the camera, from their curl.
+
+The slopes of a surface z are free of curl. Slopes that are rotated by the angle psi have the curl
+sin(psi) laplace(z) and the divergence cos(psi) laplace(z), so the tangent of psi is the regression of the one
+on the other: a wrong phase of the first frame. If psi changes from row to row, rows are exposed one after the
+other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.base.device_arrays import AnyArray
+from mirrorskin.engine.base.frames import take_places
+from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.least_squares import mad_sigma
+
+_LOOPS, _LEAST, _LINES = 40, 3, 48  # of the extent of the normals: half a side of a loop; its least; loops
+_FEWEST = 200  # loops
+_ROUNDS, _OUTLYING = 4, 4.0  # iterations, and standard deviations beyond which a loop is left out
+_EXPLAINED = np.array([0.2, 0.5])  # least share of the curl that an angle explains, and one that changes
+_CLEAR, _SMALLEST = 8.0, math.radians(1.5)  # standard errors and angle from which on a rotation is one
+
+
+@dataclass(frozen=True, slots=True)
+class AzimuthError:
+    """Angle by which slopes are rotated, radians: ``first`` in the first row, ``last`` in the last."""
+
+    first: float
+    last: float
+    sigma: float
+
+    def remove(self, normals: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return normals, (H, W, 3), without the error."""
+        angle = -np.linspace(self.first, self.last, len(normals))[:, np.newaxis]
+        cosine, sine = np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
+        x, y, z = np.moveaxis(normals, -1, 0)
+        return np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=-1)
+
+
+def find_azimuth_error(
+    normals: AnyArray, contact: NDArray[Any], pixel_size: tuple[float, float]
+) -> AzimuthError | None:
+    """Return the rotation of the slopes of normals, (H, W, 3), in contact; None if it is not significant."""
+    rows, columns = contact.shape
+    extent = math.isqrt(int(np.count_nonzero(contact)))
+    half, thin = max(_LEAST, extent // _LOOPS), max(1, extent // _LINES)
+    if min(rows, columns) <= 2 * half:
+        return None
+    down, right, along = range(half, rows - half, thin), range(half, columns - half, thin), half // 2
+    places = [(-half, -along), (-half, along), (half, -along), (half, along)]
+    places += [(-along, half), (along, half), (-along, -half), (along, -half)]
+    (vectors,), (touched,) = (take_places([one], down, right, places) for one in (normals, contact))
+    slopes = []
+    for vector, touches in zip(vectors, touched, strict=True):
+        x, y, z = vector.astype(np.float64)
+        z = np.where(touches > 0, z, np.nan)
+        slopes.append((-x / z, -y / z))
+    pairs = zip(slopes[::2], slopes[1::2], strict=True)
+    sides = [[(one + other) / 2 for one, other in zip(*pair, strict=True)] for pair in pairs]
+    (p_up, q_up), (p_down, q_down), (p_right, q_right), (p_left, q_left) = sides
+    across, upwards = 1 / pixel_size[0], 1 / pixel_size[1]
+    curl = (q_right - q_left) * across - (p_up - p_down) * upwards
+    divergence = (p_right - p_left) * across + (q_up - q_down) * upwards
+    place = np.broadcast_to((1 - 2 * np.array(down) / (rows - 1))[:, np.newaxis], curl.shape)
+    known = np.isfinite(curl) & np.isfinite(divergence)
+    if np.count_nonzero(known) < _FEWEST:
+        return None
+    overlap = max(1.0, (2 * half / thin) ** 2 / 12)  # of loops, whose errors are then correlated
+    return _regression(curl[known], divergence[known], place[known], overlap)
+
+
+def _regression(curl: Doubles, divergence: Doubles, place: Doubles, overlap: float) -> AzimuthError | None:
+    """Fit a rotation that may change with the place of the row, 1 for the first and -1 for the last."""
+    columns = np.stack([divergence, divergence * place], axis=1)
+    kept = np.full(len(curl), True)
+    for _ in range(_ROUNDS):
+        matrix = np.einsum("ni,nj->ij", columns[kept], columns[kept])
+        if np.linalg.cond(matrix) > 1e9:
+            return None
+        fit = np.linalg.solve(matrix, np.einsum("ni,n->i", columns[kept], curl[kept]))
+        left = curl - np.einsum("ni,i->n", columns, fit)
+        before, kept = kept, np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+        if np.array_equal(before, kept):
+            break
+    spread = np.sqrt(np.diag(np.linalg.inv(matrix)) * float(np.mean(left[kept] ** 2)) * overlap)
+    explained = 1 - float(np.var(left[kept])) / max(float(np.var(curl[kept])), 1e-30)
+    clear = (np.abs(fit) > _CLEAR * spread) & (np.abs(fit) > math.tan(_SMALLEST)) & (explained > _EXPLAINED)
+    if not clear.any():
+        return None
+    middle, change = fit[0], fit[1] if clear[1] else 0.0
+    first, last = math.atan(middle + change), math.atan(middle - change)
+    return AzimuthError(first, last, float(np.hypot(spread[0], spread[1] if clear[1] else 0.0)))

@@ -1,0 +1,188 @@
+"""What the swing of the brightness of a rotation shows about its response.
+
+The mean of a pixel's brightness determines the zenith; how much it swings follows from the slope of the
+response there. Three errors change the swing, each in its own way:
+
+- a response that is not as stated (gamma): it depends on the zenith, and uneven light (vignetting): on the
+  place in the picture;
+- gains of pixels: it differs from pixel to pixel, in excess of noise;
+- blur: it is smaller where the azimuth changes from pixel to pixel.
+
+Points that move in the picture while the body leans change it where the surface is curved; a sphere shows
+nothing of all this, as its zenith, its place and its curvature change together.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.base.device_arrays import AnyArray
+from mirrorskin.engine.base.frames import take_places
+from mirrorskin.engine.diagnosis.residual_noise import CountNoise
+from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.least_squares import mad_sigma
+
+_STEEP = 3.0  # tilts, from which on the zenith and the swing are independent
+_REACH, _LINES = 2, 48  # pixels between the middle and its neighbours; lines of pixels that are used
+_FEWEST = 400  # pixels
+_ROUNDS, _OUTLYING = 4, 4.0  # iterations, and standard deviations beyond which a pixel is left out
+_CLEAR, _CLEAR_GAIN = 6.0, 5.0  # standard errors from which on an effect is one
+_UNEVEN = 0.03  # least range of the swing, as a share of it, that is a response or uneven light
+_ALONE = 0.25  # least share of an effect's variance that the others do not explain
+_JOINED = 1.25  # ratio of that error to that of independent values
+_WIDELY, _TURNING = 100, 0.02  # pixels: a tip is not blur; square of the turning of azimuths, 1/pixel^2
+_BLUR = 0.4  # pixels: least standard deviation of a lens's point spread
+_GAIN = 0.01  # least standard deviation of the gains of pixels
+
+
+@dataclass(frozen=True, slots=True)
+class Swing:
+    """Effects on the swing of the brightness; 0 if one is not significant.
+
+    Attributes
+    ----------
+    response, light : float
+        Range of the swing, as a share of it, over the zeniths and over the places of the picture.
+    gain : float
+        Standard deviation of the gains of pixels.
+    blur : float
+        Standard deviation of the point spread, pixels.
+    """
+
+    response: float = 0.0
+    light: float = 0.0
+    gain: float = 0.0
+    blur: float = 0.0
+
+
+def find_swing(
+    normals: AnyArray,
+    mean: AnyArray,
+    cosine: AnyArray,
+    sine: AnyArray,
+    usable: NDArray[Any],
+    zenith_gain: ArrayLike,
+    tilt: float,
+    noise_of_mean: CountNoise,
+) -> Swing:
+    """Return what the swing of brightness shows.
+
+    ``normals``, (H, W, 3), and the fit of ``mean``, ``cosine`` and ``sine``, (H, W) counts, are used at
+    ``usable`` pixels, (H, W).
+    """
+    rows, columns = usable.shape
+    thin = max(1, math.isqrt(int(np.count_nonzero(usable))) // _LINES)
+    if min(rows, columns) <= 2 * _REACH:
+        return Swing()
+    down, right = range(_REACH, rows - _REACH, thin), range(_REACH, columns - _REACH, thin)
+    places = (0, 0), (0, _REACH), (0, -_REACH), (-_REACH, 0), (_REACH, 0)
+    scale = np.broadcast_to(np.abs(np.asarray(zenith_gain, np.float64)), usable.shape)
+    used, scales = take_places([usable, scale], down, right, places)
+    vectors, means, cosines, sines = take_places([normals, mean, cosine, sine], down, right, places)
+
+    def look(place: int) -> tuple[Doubles, ...]:
+        """Return zenith, its sine's direction and the ratio of the swing, NaN where it is not usable."""
+        x, y, z = vectors[place].astype(np.float64)
+        flat, swing = np.hypot(x, y), np.hypot(cosines[place], sines[place])
+        zenith = np.where((used[place] > 0) & (flat > math.sin(_STEEP * tilt)), np.arctan2(flat, z), np.nan)
+        return zenith, x / flat, y / flat, swing / (scales[place] * _expected(zenith, tilt))
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        middle, east, west, north, south = map(look, range(len(places)))
+        apart = 2 * _REACH
+        pairs = (east, west), (north, south)
+        turning = np.sum([((one[k] - other[k]) / apart) ** 2 for one, other in pairs for k in (1, 2)], axis=0)
+        bending = ((east[0] - west[0]) * middle[1] + (north[0] - south[0]) * middle[2]) / apart
+        zenith = (east[0] + west[0] + north[0] + south[0]) / 4  # without the error of this pixel
+        rough = middle[3] - (east[3] + west[3] + north[3] + south[3]) / 4
+        noise = math.sqrt(2) * noise_of_mean.at(means[0]) / (scales[0] * tilt)
+    known = np.isfinite(rough) & np.isfinite(turning) & np.isfinite(noise) & (noise > 0)
+    if np.count_nonzero(known) < _FEWEST:
+        return Swing()
+    y, x = (
+        np.broadcast_to(one, known.shape)[known]
+        for one in np.ix_(1 - 2 * np.array(down) / (rows - 1), 2 * np.array(right) / (columns - 1) - 1)
+    )
+    noise, rough = noise[known], rough[known]
+    gain = _gain(rough, noise)
+    columns_of = np.stack([
+        np.ones_like(x), turning[known], bending[known], zenith[known] - np.mean(zenith[known]),
+        x, y, x * x, x * y, y * y,
+    ], axis=1)  # fmt: skip
+    return _fit(middle[3][known], columns_of, np.hypot(noise, gain), gain)
+
+
+def _expected(zenith: Doubles, tilt: float) -> Doubles:
+    """Return the swing of the angle to the body's axis, radians."""
+    return np.asarray(np.interp(zenith, *_swings(tilt)))
+
+
+@functools.lru_cache(4)
+def _swings(tilt: float) -> tuple[Doubles, Doubles]:
+    """Return zeniths, and the swing of the angle to the body's axis at each."""
+    zenith = np.linspace(0, math.pi / 2, 256)
+    phase = np.arange(32) * 2 * math.pi / 32
+    lean = np.multiply.outer(np.sin(zenith) * math.sin(tilt), np.cos(phase))
+    angle = np.arccos(np.clip((np.cos(zenith) * math.cos(tilt))[:, np.newaxis] - lean, -1, 1))
+    return zenith, np.abs(2 * np.mean(angle * np.cos(phase), axis=1))
+
+
+def _gain(rough: Doubles, noise: Doubles) -> float:
+    """Return the standard deviation of gains, from what differs from the mean of four neighbours."""
+    ratio = rough / (noise * math.sqrt(1.25))
+    # Neighbours are in several means, so that the error of the variance is larger than of independent values.
+    excess = float(np.mean(ratio[np.abs(ratio) <= _OUTLYING * mad_sigma(ratio)] ** 2)) - 1
+    gain = math.sqrt(max(excess, 0)) * float(np.median(noise))
+    return gain if excess > _CLEAR_GAIN * _JOINED * math.sqrt(2 / len(rough)) and gain > _GAIN else 0.0
+
+
+def _fit(swing: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing:
+    """Fit the effects to the ratio of the swing to the expected one."""
+    kept = np.full(len(swing), True)
+    for _ in range(_ROUNDS):
+        weighted = columns[kept] / noise[kept, np.newaxis]
+        matrix = _gram(weighted)
+        if np.linalg.cond(matrix) > 1e12:
+            return Swing(gain=gain)
+        inverse = np.linalg.inv(matrix)
+        fit = inverse @ np.sum(weighted * (swing[kept] / noise[kept])[:, np.newaxis], axis=0)
+        left = (swing - np.sum(columns * fit, axis=1)) / noise
+        before, kept = kept, np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+        if np.array_equal(before, kept):
+            break
+    covariance = inverse * max(1.0, float(np.mean(left[kept] ** 2)))
+
+    products = _gram(columns[kept])
+    sums, number = products[0], products[0, 0]  # the first column is 1
+
+    def effect(chosen: slice) -> float:
+        """Return the range of an effect if it is significant, and not that of another one."""
+        part, others = fit[chosen], np.delete(np.arange(len(fit)), np.r_[chosen])
+        mixed = part @ products[chosen, others]
+        square = float(part @ products[chosen, chosen] @ part)
+        spare = square - float(mixed @ np.linalg.solve(products[np.ix_(others, others)], mixed))
+        alone = spare > _ALONE * (square - float(part @ sums[chosen]) ** 2 / number)
+        chi2 = float(part @ np.linalg.solve(covariance[chosen, chosen], part))
+        extent = float(np.ptp(np.percentile(columns[kept, chosen] @ part, [5, 95]))) / abs(float(fit[0]))
+        return extent if alone and chi2 > len(part) * _CLEAR**2 else 0.0
+
+    turning = columns[kept, 1]
+    deciding = float(np.sum(turning**2)) ** 2 / float(np.sum(turning**4))  # pixels
+    spread = math.sqrt(-2 * min(float(fit[1]), 0.0))
+    widely = deciding > _WIDELY and float(np.percentile(turning, 95)) > _TURNING
+    blurs = spread > _BLUR and widely and effect(slice(1, 2)) > 0
+    response, light = (
+        extent if extent > _UNEVEN else 0.0 for extent in (effect(slice(3, 4)), effect(slice(4, 9)))
+    )
+    return Swing(response, light, gain, spread if blurs else 0.0)
+
+
+def _gram(columns: Doubles) -> Doubles:
+    """Return the products of columns; unlike a product of matrices, it starts no threads."""
+    return np.asarray(np.einsum("ni,nj->ij", columns, columns))

@@ -1,0 +1,1 @@
+"""One surface from a press and a rotation."""

@@ -1,0 +1,388 @@
+"""A surface from absolute heights and slopes, with inverse-variance weights."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.diagnosis.blur import PIXEL
+from mirrorskin.engine.fusion.agreement import (
+    Disagreement,
+    SlopeError,
+    describe_disagreement,
+    find_disagreement,
+)
+from mirrorskin.engine.integration.arrays import integrate_arrays
+from mirrorskin.engine.press.holes import fill_holes
+from mirrorskin.engine.press.intervals import estimate_interval_errors, fit_paraboloids, interval_evidence
+from mirrorskin.engine.rotation.normals_to_height import Slopes
+from mirrorskin.io import InputError, Result
+from mirrorskin.io.arguments import check_pixel_size
+from mirrorskin.io.types import ProcessValue
+from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.device import Device
+
+Mask = NDArray[np.bool_]
+
+_UNIFORM = np.sqrt(3.0)  # half the width of a uniform distribution, in its standard deviations
+_SHARPEST = 1e-5  # smallest standard deviation of a height, mm
+_NARROWEST, _WIDEST = 2.0, 8.0  # range of the standard deviation of windows for slopes of heights, pixels
+_NEAR = 3.0  # largest distance from a normal at which slopes of heights are used, in windows
+_LEVEL = 0.05  # smallest slope from which the width of terraces is computed
+_FIRM = 30.0  # standard deviation of a press' height over that of the surface near normals
+_OFF = 4.0  # standard deviations from the heights around, above which a height is an outlier
+_ROUGH = 3.0  # mean squared misfit, in standard deviations, above which a surface is not smooth
+_OVERSTATED = 2.0  # ratio of errors of heights to their sigmas up to which the sigmas are not changed
+_SEVERAL = 6.0  # smallest range of heights, in half intervals, for uniformly distributed errors
+_NEARLY_ALL = 0.9  # quantile of the errors from which the used share of the intervals is estimated
+_LEAST_USED = 0.5  # smallest used share of the intervals
+_FIRST = 1e-4  # tolerance of the surfaces before the last; with 1e-5, errors are the same within 0.1 %
+_USUAL_MISFIT = 0.25  # median square misfit of slopes whose errors are as stated, in variances
+_FEWEST = 1000  # slopes that tell it
+_LEAST_MISFIT = 1.15  # ratio of the median to this from which on it is no chance
+_COMPARED = 1 << 16  # slopes whose misfit is computed
+_CORRECTIONS = 3  # largest number of corrections of the slopes
+_IMPROVED = 0.5  # share of the disagreement that a correction must leave at most
+_ITERATIONS = 5  # largest number of updates of the components' offsets
+_SETTLED = 1e-3  # change of an offset, in half intervals, that ends them
+
+
+@dataclass(frozen=True, slots=True)
+class AbsoluteHeights:
+    """Heights with standard deviations, such as those of a press."""
+
+    height: Doubles  # (H, W), float64: millimetres; NaN where unknown
+    sigma: Doubles  # (H, W), float64: standard deviations, mm; NaN where unknown
+
+    @classmethod
+    def of(cls, height: NDArray[np.floating], sigma: NDArray[np.floating], mask: Mask | bool = True) -> Self:
+        """Return the finite heights of a map within a mask; sigmas are raised to at least the median."""
+        height, sigma = np.asarray(height, np.float64), np.asarray(sigma, np.float64)
+        known = mask & np.isfinite(height) & (sigma >= 0) & (sigma < np.inf)
+        # Most pixels with a far smaller sigma than others have an unusual rise of the light.
+        least = max(float(np.median(sigma[known])), _SHARPEST) if known.any() else _SHARPEST
+        return cls(np.where(known, height, np.nan), np.where(known, np.maximum(sigma, least), np.nan))
+
+    @property
+    def known(self) -> Mask:
+        """Pixels with a known height, (H, W)."""
+        return np.isfinite(self.height)
+
+    @property
+    def weight(self) -> Doubles:
+        """Inverse variances, 0 where unknown."""
+        return np.nan_to_num(1 / self.sigma**2)
+
+
+class FusionSolver:
+    """Integrates heights and slopes in three passes: as given, with slopes from heights, and with intervals.
+
+    Later slopes, of the same frames after another registration, are integrated in one pass: the last surface
+    replaces the first two. `surface` raises InputError without any height or slope, and NotConverged if the
+    integration does not converge. If slopes are ``doubtful``, as those of frames that were not registered,
+    their difference from the heights is part of ``height_sigma`` even if chance explains it.
+    """
+
+    def __init__(
+        self,
+        press: AbsoluteHeights,
+        pixel_size: ArrayLike,
+        robust: bool,
+        device: Device,
+        footprint: float = PIXEL,
+        doubtful: bool = False,
+    ) -> None:
+        self._press, self._pixel_size = press, check_pixel_size(pixel_size)
+        self._robust, self._device, self._footprint = robust, device, footprint
+        self._doubtful = doubtful
+        self._near: Result | None = None
+        self._slope_error, self._disagreement = SlopeError(), Disagreement()
+        self._correlation, self._scatter = 0.0, 1.0
+
+    def surface(self, slopes: Slopes, *, sigma: bool = True) -> Result:
+        """Return the surface of the heights and given slopes.
+
+        If heights and slopes contradict each other, the error of the zenith that explains it best is removed
+        from the slopes, and the difference that is left is part of ``height_sigma``.
+        """
+        if not (slopes.known | self._press.known).any():
+            raise InputError("there is nothing to fuse: no pixel has a height or a normal")
+        surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
+        if self._disagreement.clear:  # perhaps only because the first surface was too far from the last
+            surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
+        doubtful = self._doubtful and math.isfinite(self._disagreement.rms)
+        contradict = doubtful or self._disagreement.clear or self._slope_error != SlopeError()
+        for _ in range(_CORRECTIONS):
+            if not self._disagreement.clear or self._disagreement.slope_error is None:
+                break
+            before, near = (surface, self._disagreement, self._slope_error), self._near
+            self._slope_error = self._disagreement.slope_error.after(self._slope_error)
+            surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
+            if not self._disagreement.chi2 < _IMPROVED * before[1].chi2:
+                (surface, self._disagreement, self._slope_error), self._near = before, near
+                break
+        if not contradict or surface.height_sigma is None:
+            return surface
+        larger = np.hypot(surface.height_sigma, np.float32(self._disagreement.rms))
+        return surface.assign(height_sigma=larger)
+
+    @property
+    def process(self) -> dict[str, ProcessValue]:
+        """Facts about the last surface: contradictions, and the correlation of the errors of heights."""
+        said = describe_disagreement(self._disagreement, self._slope_error, self._scatter)
+        return {**said, "height_correlation": self._correlation}
+
+    def _fit(self, slopes: Slopes, sigma: bool) -> tuple[Result, Disagreement]:
+        """Return the surface of heights and slopes, and their disagreement."""
+        press, near = self._press, self._near
+        if near is None:
+            near = self._solve(slopes, press.height, press.weight, sigma=False, tolerance=_FIRST)
+        press = _correct_overstated(press, near, slopes)
+        extended = _extend(slopes, near, press, self._pixel_size)
+        if self._near is None and extended is not slopes:
+            first: dict[str, Any] = {"initial_heights": near.height, "sigma": False, "tolerance": _FIRST}
+            near = self._solve(extended, press.height, press.weight, **first)
+        height, weight = _use_intervals(near, press, slopes)
+        surface = self._solve(extended, height, weight, initial_heights=near.height, sigma=sigma)
+        # Outliers are not part of the surface, but may count in the next call.
+        self._near = near.assign(height=np.where(surface.component < 0, near.height, surface.height))
+        found = find_disagreement(surface.height, height, weight, slopes, self._pixel_size)
+        self._correlation = _correlation_length(extended, weight)
+        if surface.height_sigma is not None:
+            self._scatter = _scatter(surface.height, slopes, self._pixel_size)
+            surface = surface.assign(height_sigma=surface.height_sigma * np.float32(self._scatter))
+            surface = _add_error_of_averaging(_set_sigma_of_lone_pixels(surface, weight), self._footprint)
+        return surface, found
+
+    def filled(self, surface: Result) -> Result:
+        """Return a surface with its holes filled."""
+        return _join(_fill(surface, self._pixel_size))
+
+    def _solve(self, slopes: Slopes, height: Doubles, weight: Doubles, **options: Any) -> Result:
+        return integrate_arrays(
+            slopes.dz_dx,
+            slopes.dz_dy,
+            self._pixel_size,
+            mask=slopes.known | (weight > 0),
+            slope_weights=slopes.weights,
+            known_heights=np.where(weight > 0, height, np.nan),
+            known_height_weights=weight,
+            robust=self._robust,
+            device=self._device,
+            **options,
+        )
+
+
+def _correlation_length(slopes: Slopes, weight: Doubles) -> float:
+    """Return the length, mm, over which errors of heights are correlated: their sigma over that of slopes.
+
+    See `mirrorskin.engine.metrology.noise`. Heights without a weight make the others less dense.
+    """
+    known = slopes.known
+    if not known.any():
+        return 0.0
+    height_weight = float(np.mean(weight[known | (weight > 0)]))
+    slope_deviation = float(np.mean(np.sqrt(slopes.weights[:, known])))
+    return slope_deviation / math.sqrt(height_weight) if height_weight > 0 else math.inf
+
+
+def _correct_overstated(press: AbsoluteHeights, surface: Result, slopes: Slopes) -> AbsoluteHeights:
+    """Raise sigmas to the size of the errors, if the slopes show that most are much too small."""
+    both = press.known & slopes.known
+    if not both.any():
+        return press
+    off = press.height[both] - surface.height[both]
+    # The median of a uniform distribution's magnitude is half of its half-width.
+    usual = float(np.median(np.abs(off - np.median(off)))) * 2 / _UNIFORM
+    if usual < _OVERSTATED * float(np.median(press.sigma[both])):
+        return press
+    return AbsoluteHeights(press.height, np.maximum(press.sigma, usual))
+
+
+def _extend(
+    slopes: Slopes, surface: Result, press: AbsoluteHeights, pixel_size: tuple[float, float]
+) -> Slopes:
+    """Add slopes, fitted to heights in a window, at pixels near normals that have a height but no normal.
+
+    The window spans at least a terrace. Windows overlap, so each slope counts only for its share of a window.
+    No slopes are added where heights do not fit a smooth surface.
+    """
+    gaps = press.known & ~slopes.known
+    if not gaps.any() or not slopes.known.any():
+        return slopes
+    sigma = float(np.median(press.sigma[press.known]))
+    width = _window(slopes, sigma, min(pixel_size))
+    size = 2 * int(_NEAR * width) + 1
+    gaps &= cv2.dilate(slopes.known.view(np.uint8), np.ones((size, size), np.uint8)) > 0
+    height = np.where(gaps, press.height, surface.height)
+    firm = slopes.known & np.isfinite(height)
+    weight = np.where(firm, (_FIRM / sigma) ** 2, np.where(gaps, 1 / press.sigma**2, 0.0))
+    trend = fit_paraboloids(height, weight, gaps, width)
+    off = np.abs(height[gaps] - trend.height) > _OFF * press.sigma[gaps]
+    if off.any():  # fit again without outliers
+        weight[gaps] = np.where(off, 0.0, weight[gaps])
+        trend = fit_paraboloids(height, weight, gaps, width)
+    smooth = trend.misfit < _ROUGH
+    gaps[gaps] = smooth
+    along = trend.along[:, smooth] / np.array([[pixel_size[0]], [-pixel_size[1]]])
+    variance = trend.variance[:, smooth] * trend.pixels[smooth] / np.square(pixel_size)[:, np.newaxis]
+    dz_dx, dz_dy, weights = slopes.dz_dx.copy(), slopes.dz_dy.copy(), slopes.weights.copy()
+    dz_dx[gaps], dz_dy[gaps] = along
+    weights[:, gaps] = 1 / variance
+    return Slopes(dz_dx, dz_dy, weights)
+
+
+def _window(slopes: Slopes, sigma: float, pixel: float) -> float:
+    """Return the width of windows, in pixels, that span a terrace at the median slope."""
+    steepness = np.hypot(slopes.dz_dx[slopes.known], slopes.dz_dy[slopes.known])
+    terrace = 2 * _UNIFORM * sigma / (pixel * max(float(np.median(steepness)), _LEVEL))
+    return float(np.clip(terrace, _NARROWEST, _WIDEST))
+
+
+def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> tuple[Doubles, Doubles]:
+    """Return known heights and their weights from their intervals, given an approximate surface.
+
+    Heights far from the surface are outliers, with weight 0. So are heights without a normal, which are at
+    rims and often late, if their component has others. If no height of a component is near an end of its
+    interval, the component is on one terrace, and all of its heights together count as one.
+    """
+    size = _sizes(surface)
+    joined = press.known & (size[surface.component] > 1)
+    both = joined & slopes.known
+    has_both = np.bincount(surface.component[both], minlength=size.size) > 0
+    joined &= slopes.known | ~has_both[surface.component]
+    height, weight = press.height.copy(), press.weight
+    if not joined.any():
+        return height, weight
+    label, half = surface.component[joined], _UNIFORM * press.sigma[joined]
+    middle, shape = press.height[joined], surface.height[joined].astype(np.float64)
+    # The offset of the solver is a mean, which outliers affect; the median is robust.
+    lift = _medians(middle - shape, label, size.size)
+    half *= _share_used(middle - shape - lift[label], half, shape)
+    for _ in range(_ITERATIONS):
+        at = shape + lift[label]
+        spread = estimate_interval_errors(middle - at, half)
+        inside = interval_evidence(at, middle, half, spread)
+        firm = np.bincount(label, inside.weight, size.size)
+        move = np.bincount(label, inside.weight * (inside.height - at), size.size) / np.where(firm, firm, 1)
+        lift += move
+        if np.max(np.abs(move)) < _SETTLED * float(np.median(half)):
+            break
+    weight = np.nan_to_num(1 / (press.sigma**2 + spread.blur**2))
+    weight[has_both[surface.component] & ~slopes.known & (surface.component >= 0)] = 0.0
+    near = inside.weight > 0
+    count = np.maximum(np.bincount(label, near, size.size), 1)
+    plain = np.where(near, weight[joined] / count[label], 0.0)
+    ends = (firm > np.bincount(label, plain, size.size))[label]
+    height[joined] = np.where(ends, inside.height, middle)
+    weight[joined] = np.where(ends, inside.weight, plain)
+    return height, weight
+
+
+def _medians(values: Doubles, label: NDArray[np.integer], count: int) -> Doubles:
+    """Return the median of each label's values, 0 without any."""
+    ordered = np.append(values[np.lexsort((values, label))], 0.0)
+    members = np.bincount(label, minlength=count)
+    first = np.cumsum(members) - members
+    middles = (ordered[first + (members - 1) // 2 * (members > 0)] + ordered[first + members // 2]) / 2
+    return np.where(members, middles, 0.0)
+
+
+def _share_used(error: Doubles, half: Doubles, height: Doubles) -> float:
+    """Return the share of the intervals within which errors are, if heights span several intervals.
+
+    Samples may determine the onset better than within an interval. With intervals that are too long, the few
+    errors outside of them would determine the surface.
+    """
+    if np.ptp(height) < _SEVERAL * float(np.median(half)):
+        return 1.0
+    used = np.quantile(np.abs(error) / half, _NEARLY_ALL) / _NEARLY_ALL
+    return float(np.clip(used, _LEAST_USED, 1.0))
+
+
+def _sizes(surface: Result) -> NDArray[np.intp]:
+    """Return the number of pixels of each component."""
+    return np.bincount(surface.component[surface.component >= 0], minlength=len(surface.offset_unknown))
+
+
+def _set_sigma_of_lone_pixels(surface: Result, weight: Doubles) -> Result:
+    """Set the standard deviations of components of one pixel to those of their heights."""
+    lone = (surface.component >= 0) & (weight > 0) & (_sizes(surface)[surface.component] == 1)
+    sigma = surface.height_sigma.copy()
+    sigma[lone] = 1 / np.sqrt(weight[lone])
+    return surface.assign(height_sigma=sigma)
+
+
+def _scatter(surface: NDArray[np.floating], slopes: Slopes, pixel_size: tuple[float, float]) -> float:
+    """Return by which factor the errors of slopes exceed those stated, from their misfit; at least 1.
+
+    Errors that are the same in all frames, such as a gain of each pixel, do not show in the residuals of
+    the frames, but make neighbouring slopes contradict each other. Errors of the zenith are in one of two
+    directions: their variance is then larger by 2 r - 1, if that of both together is larger by r.
+    """
+    misfits = []
+    for axis, slope, variance in (
+        (1, slopes.dz_dx * pixel_size[0], pixel_size[0] ** 2),
+        (0, -slopes.dz_dy * pixel_size[1], pixel_size[1] ** 2),
+    ):
+        maps = [surface, slope, slopes.weights[1 - axis]]
+        height, rise, weight = (values.T if axis == 0 else values for values in maps)
+        each = max(1, height.size // _COMPARED)
+        height, rise, weight = (values[::each].astype(np.float64) for values in (height, rise, weight))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = np.diff(height, axis=1) - (rise[:, 1:] + rise[:, :-1]) / 2
+            misfits.append(error**2 / (variance * (1 / weight[:, 1:] + 1 / weight[:, :-1]) / 4))
+    misfit = np.concatenate([one[np.isfinite(one)] for one in misfits])
+    ratio = float(np.median(misfit)) / _USUAL_MISFIT if misfit.size >= _FEWEST else 0.0
+    return float(np.sqrt(2 * ratio - 1)) if ratio > _LEAST_MISFIT else 1.0
+
+
+def _add_error_of_averaging(surface: Result, footprint: float) -> Result:
+    """Add what a pixel's mean over its area differs from its middle, where the surface is curved, to sigma.
+
+    The mean of a height z over an area with the variances a^2, b^2 exceeds that in its middle by
+    (a^2 z_xx + b^2 z_yy) / 2.
+    """
+    height, inside = surface.height.astype(np.float64), surface.component >= 0
+    if surface.edges is not None:
+        inside &= surface.edges == 0
+    bend = np.zeros(height.shape)
+    for axis in (0, 1):
+        if height.shape[axis] > 2:
+            middle = tuple(slice(1, -1) if axis == one else slice(None) for one in (0, 1))
+            bend[middle] += np.diff(np.where(inside, height, np.nan), 2, axis=axis)
+    sigma = np.hypot(surface.height_sigma, np.nan_to_num(bend) * footprint / 2)
+    return surface.assign(height_sigma=sigma.astype(np.float32))
+
+
+def _fill(surface: Result, pixel_size: ArrayLike) -> Result:
+    """Fill holes from the absolute heights around them; relative heights do not change."""
+    absolute = (surface.component >= 0) & ~_relative(surface)
+    height, filled = fill_holes(np.where(absolute, surface.height, np.nan), surface.height_sigma, pixel_size)
+    filled = np.where(surface.component < 0, filled, 0).astype(np.uint8)
+    return surface.assign(height=np.where(filled, height, surface.height), filled=filled)
+
+
+def _relative(surface: Result) -> Mask:
+    """Return the pixels with a relative height, of components without a known one."""
+    return np.asarray(np.append(surface.offset_unknown, 0)[surface.component] != 0)
+
+
+def _join(surface: Result) -> Result:
+    """Merge adjacent components with absolute heights, although no slope connects them."""
+    answered = (surface.component >= 0) | (surface.filled > 0)
+    relative = _relative(surface)
+    count, labels = cv2.connectedComponents((answered & ~relative).view(np.uint8), connectivity=4)
+    names = np.where(relative, count + surface.component, labels - 1)
+    _, first, rank = np.unique(names[answered], return_index=True, return_inverse=True)
+    order = np.argsort(np.argsort(first))
+    component = np.full(answered.shape, -1, np.int32)
+    component[answered] = order[rank]
+    offset_unknown = np.zeros(len(first), np.uint8)
+    offset_unknown[component[relative]] = 1
+    return surface.assign(component=component, offset_unknown=offset_unknown)
