@@ -26,7 +26,7 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.output import progress, report_unverified, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.engine.correlation.lock_in import Correlation
+    from mirrorskin.engine.vibration.lock_in import Correlation
 
     phases = chosen.get("phases")
     known = stack_options(chosen)

@@ -355,7 +355,7 @@ def _by_motion(variants: list[Term], name: str) -> str:
 def declarations() -> dict[str, list[dict[str, Any]]]:
     """Return what ``declared.json`` contains: the options of each command."""
     from mirrorskin.engine.base.reconstruction import method_for
-    from mirrorskin.engine.correlation.lock_in import Correlation
+    from mirrorskin.engine.vibration.lock_in import Correlation
 
     methods: dict[str, type[Any]] = {one: method_for(one) for one in MOTIONS}
     fused = ("tilt", "zenith_gain", "zenith_offset", "robust")

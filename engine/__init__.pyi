@@ -10,6 +10,7 @@ from . import (
     press,
     rotation,
     slip,
+    vibration,
 )
 from .base.errors import NotConverged
 from .base.functions import function_of
@@ -75,4 +76,5 @@ __all__ = [
     "run",
     "score",
     "slip",
+    "vibration",
 ]

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.correlation.lock_in import Correlation
+from mirrorskin.engine.vibration.lock_in import Correlation
 from mirrorskin.hw.twin import Camera, HeightMap, Leaning, Vertical
 from mirrorskin.io.positions import stroke_starts
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.kernels.array_types import Doubles
 
@@ -466,3 +466,15 @@ def normalise(vectors: Doubles) -> Doubles:
     """Return vectors, (n, 3), of length 1."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def zenith_of(normals: ArrayLike) -> NDArray[np.float32]:
+    """Return the angle to the body's axis in the mean pose, (H, W), radians."""
+    x, y, z = np.moveaxis(np.asarray(normals), -1, 0)
+    return np.asarray(np.arctan2(np.hypot(x, y), z))
+
+
+def azimuth_of(normals: ArrayLike) -> NDArray[np.float32]:
+    """Return the direction in which the surface faces, (H, W), radians from x towards y; NaN where level."""
+    x, y, _ = np.moveaxis(np.asarray(normals), -1, 0)
+    return np.where((x == 0) & (y == 0), np.float32(np.nan), np.arctan2(y, x))

@@ -1,6 +1,6 @@
 """Slopes and their weights from normals: ``slopes.cl`` in NumPy with float64.
 
-See `mirrorskin.engine.rotation.normals_to_height.find_slopes` for the variances and the bias.
+See `mirrorskin.engine.integration.normals_to_height.find_slopes` for the variances and the bias.
 """
 
 from __future__ import annotations

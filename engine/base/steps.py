@@ -32,7 +32,7 @@ class Context:
         What the maps were computed by: its options, device, and the positions of the frames.
     stream : Source
         Where the frames were read: the source, or one that changes its frames, such as
-        `mirrorskin.engine.rotation.registration.Registered`.
+        `mirrorskin.engine.diagnosis.registration.Registered`.
     first_frame : int
         Number in the source of the first frame that was used.
     samples : FrameSamples, optional

@@ -1,4 +1,4 @@
-"""Quadrature correlation of the brightness of each pixel with the movement, and what it is used for."""
+"""Quadrature correlation of the brightness of each pixel with the movement."""
 
 import lazy_loader
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.footprint import with_curvature
-from mirrorskin.engine.press.crossing import PressOperation
 from mirrorskin.io import Result
 from mirrorskin.io.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
+
+if TYPE_CHECKING:
+    from mirrorskin.engine.press.crossing import PressOperation
 
 PIXEL = 1 / 12
 """Variance of a pixel's area, square pixels."""

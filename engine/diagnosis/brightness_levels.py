@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,12 +15,14 @@ from mirrorskin.engine.base.frames import estimate_noise, thin_out
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.blur import first_travel
-from mirrorskin.engine.press.crossing import Event, PressOperation
 from mirrorskin.io import Block, Result, Source
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.io.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma, median
+
+if TYPE_CHECKING:
+    from mirrorskin.engine.press.crossing import Event, PressOperation
 
 _FEWEST = 16  # pixels that must have turned light
 _RISE = 8.0  # standard deviations of the noise: least rise of brightness between dark and light
@@ -34,7 +36,7 @@ _CLEAR, _LEAST = 5.0, 0.01  # standard errors, and share of the rise to light, f
 _COMMON = 2.0  # standard deviations of the pixels' own differences: a smaller one is not common to them
 
 
-T = TypeVar("T", bound=PressOperation)
+T = TypeVar("T", bound="PressOperation")
 
 
 def with_estimated_levels(operation: T, source: Source, oscillates: bool = False) -> T:

@@ -15,13 +15,13 @@ from mirrorskin.engine.base.device_arrays import AnyArray, stored_map
 from mirrorskin.engine.base.frames import QUANTUM, take_places, thin_out
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.curl import AzimuthError, find_azimuth_error
+from mirrorskin.engine.diagnosis.registration import Registered
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.engine.diagnosis.swing import Swing, find_swing
-from mirrorskin.engine.rotation.normals_kernel import azimuth_of
-from mirrorskin.engine.rotation.registration import Registered
 from mirrorskin.io import Result
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.normals import azimuth_of
 
 if TYPE_CHECKING:
     from mirrorskin.engine.rotation.normals import Normals

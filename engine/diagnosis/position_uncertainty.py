@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.base.device_arrays import AnyArray, stored_map
 from mirrorskin.engine.base.steps import Context, Step
-from mirrorskin.engine.press.crossing import PressOperation, with_travel_error
 from mirrorskin.io import Result
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.least_squares import mad_sigma
 from mirrorskin.kernels.samples import Grid, take_grids
+
+if TYPE_CHECKING:
+    from mirrorskin.engine.press.crossing import PressOperation
 
 _BEND = np.array([-1.0, 3.0, -3.0, 1.0])  # third difference of four pixels in a row
 _RISE = np.array([-1.0, -1.0, 1.0, 1.0]) / 4  # mean difference of neighbours
@@ -305,3 +307,15 @@ def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], re
     weights = np.maximum(weights, 1e-9 * np.trace(squares))
     jumps = (after.T @ gradient - mixed.T @ inner @ (smooth.T @ gradient)) / weights
     return _Errors(travel, step, error, covariance, clear, jumps, bend * np.sqrt(_OVERLAP / weights), reach)
+
+
+def with_travel_error(result: Result, sigma: float) -> Result:
+    """Return a result whose heights also have errors of the travel of each frame, mm.
+
+    The variance of a height between two frames, at the share w, is (w^2 + (1 - w)^2) sigma^2: on average
+    2/3 sigma^2.
+    """
+    error = np.float32(math.sqrt(2 / 3) * sigma)
+    names = [name for name in ("height_sigma", "hysteresis_sigma") if name in result]
+    more = {name: error * (math.sqrt(2) if name != "height_sigma" else 1) for name in names}
+    return result.assign({name: np.hypot(result[name], np.float32(more[name])) for name in names})

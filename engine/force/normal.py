@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.base.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.base.resample import fill_with_nearest
-from mirrorskin.engine.press.halfspace import HalfSpace, Pressed, load_gradient, press
+from mirrorskin.engine.force.halfspace import HalfSpace, Pressed, load_gradient, press
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import check_number, checked, in_unit
 from mirrorskin.io.findings import carried
@@ -47,7 +47,7 @@ def find_force(
     """Find the pressure on a rigid object of known shape, pressed into the elastomer without friction.
 
     The elastomer is an incompressible half-space, E* = E / (1 - 1/4) = 4/3 E; the contact is found by
-    `mirrorskin.engine.press.halfspace.press`. Errors are propagated to first order: the force changes with a
+    `mirrorskin.engine.force.halfspace.press`. Errors are propagated to first order: the force changes with a
     height in contact by the pressure there under a flat punch of the contact's shape (Betti's reciprocity).
 
     Parameters

@@ -12,8 +12,8 @@ from scipy.optimize import brentq
 from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.base.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.base.resample import fill_with_nearest
+from mirrorskin.engine.force.halfspace import spectrum_of
 from mirrorskin.engine.force.normal import modulus_of
-from mirrorskin.engine.press.halfspace import spectrum_of
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import as_array_or_number, check_count, check_number, checked, in_unit
 from mirrorskin.io.findings import carried

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.rotation.normals_to_height import Slopes
+from mirrorskin.engine.integration.normals_to_height import Slopes
 from mirrorskin.io.findings import Finding, in_process
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array_types import Doubles

@@ -23,14 +23,14 @@ from mirrorskin.engine.base.steps import Context, Step, undistorted
 from mirrorskin.engine.base.tiling import MEMORY_LIMIT
 from mirrorskin.engine.diagnosis.blur import PIXEL, LensBlur
 from mirrorskin.engine.fusion.solver import AbsoluteHeights, FusionSolver
-from mirrorskin.engine.press.intervals import heights_as_intervals, stored_heights_as_intervals
-from mirrorskin.engine.press.press import Press
-from mirrorskin.engine.rotation.normals_to_height import (
+from mirrorskin.engine.integration.normals_to_height import (
     Slopes,
     describe_integration,
     separate_errors,
     slopes_of,
 )
+from mirrorskin.engine.press.intervals import heights_as_intervals, stored_heights_as_intervals
+from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.rotation.response import wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, at_poses
 from mirrorskin.engine.rotation.steps import take_slopes

@@ -18,9 +18,9 @@ from mirrorskin.engine.fusion.agreement import (
     find_disagreement,
 )
 from mirrorskin.engine.integration.arrays import integrate_arrays
+from mirrorskin.engine.integration.normals_to_height import Slopes
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.intervals import estimate_interval_errors, fit_paraboloids, interval_evidence
-from mirrorskin.engine.rotation.normals_to_height import Slopes
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.io.types import ProcessValue

@@ -13,9 +13,9 @@ from mirrorskin.engine.base.inputs import Maps, is_maps, of_one_size, pixel_size
 from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.engine.integration.arrays import integrate_arrays
 from mirrorskin.engine.integration.camera import Camera
+from mirrorskin.engine.integration.normals_to_height import integrate_result
 from mirrorskin.engine.integration.surface import IntegrationOptions, SurfaceSolver
 from mirrorskin.engine.integration.validation import check_inputs
-from mirrorskin.engine.rotation.normals_to_height import integrate_result
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import Check, as_array_or_number, check_pixel_size, checked, in_unit
 from mirrorskin.io.findings import carried

@@ -16,6 +16,7 @@ from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.picture import PerPixel, Picture
 from mirrorskin.engine.base.tiling import Planes
+from mirrorskin.engine.diagnosis.position_uncertainty import with_travel_error
 from mirrorskin.io import Fitted, Map, Result
 from mirrorskin.io.maps import TABLE, PressStatus, ReleaseStatus, status_of
 from mirrorskin.io.positions import check_travel
@@ -137,18 +138,6 @@ class PressOperation(Operation):
     def declarations(self) -> Mapping[str, Map]:
         """Declarations of the maps; the legend of the status depends on the event."""
         return {**self.maps, "status": STATUS[self.event]}
-
-
-def with_travel_error(result: Result, sigma: float) -> Result:
-    """Return a result whose heights also have errors of the travel of each frame, mm.
-
-    The variance of a height between two frames, at the share w, is (w^2 + (1 - w)^2) sigma^2: on average
-    2/3 sigma^2.
-    """
-    error = np.float32(math.sqrt(2 / 3) * sigma)
-    names = [name for name in ("height_sigma", "hysteresis_sigma") if name in result]
-    more = {name: error * (math.sqrt(2) if name != "height_sigma" else 1) for name in names}
-    return result.assign({name: np.hypot(result[name], np.float32(more[name])) for name in names})
 
 
 class CrossingOperation(PressOperation):

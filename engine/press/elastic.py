@@ -12,8 +12,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from mirrorskin.engine.base.errors import NotConverged
-from mirrorskin.engine.press.cells import Cells, cut_into_cells, touched
-from mirrorskin.engine.press.halfspace import (
+from mirrorskin.engine.force.halfspace import (
     HalfSpace,
     Pressed,
     SlopeFit,
@@ -22,6 +21,7 @@ from mirrorskin.engine.press.halfspace import (
     press,
     sweep,
 )
+from mirrorskin.engine.press.cells import Cells, cut_into_cells, touched
 from mirrorskin.engine.press.spline import CellSplines
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 from mirrorskin.io.arguments import check_pixel_size

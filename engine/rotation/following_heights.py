@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.integration.normals_to_height import SlopeKernels
 from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
-from mirrorskin.engine.rotation.normals_to_height import SlopeKernels
 from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.kernels.device import Device
 

@@ -36,8 +36,6 @@ from mirrorskin.engine.rotation.normals_kernel import (
     NormalMethod,
     SensorOptions,
     TurnModel,
-    azimuth_of,
-    zenith_of,
 )
 from mirrorskin.engine.rotation.normals_window import NormalWindow
 from mirrorskin.engine.rotation.poses import PoseFit
@@ -51,6 +49,7 @@ from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES, ProcessValue
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.correlation import WINDOW
+from mirrorskin.kernels.normals import azimuth_of, zenith_of
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source

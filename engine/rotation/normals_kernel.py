@@ -212,15 +212,3 @@ class NormalKernel:
             picture.run(name, source=file, count=count, **further)
         else:
             picture.scan(name, frames, source=file, whole=True, **further)
-
-
-def zenith_of(normals: ArrayLike) -> NDArray[np.float32]:
-    """Return the angle to the body's axis in the mean pose, (H, W), radians."""
-    x, y, z = np.moveaxis(np.asarray(normals), -1, 0)
-    return np.asarray(np.arctan2(np.hypot(x, y), z))
-
-
-def azimuth_of(normals: ArrayLike) -> NDArray[np.float32]:
-    """Return the direction in which the surface faces, (H, W), radians from x towards y; NaN where level."""
-    x, y, _ = np.moveaxis(np.asarray(normals), -1, 0)
-    return np.where((x == 0) & (y == 0), np.float32(np.nan), np.arctan2(y, x))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.provenance import naming
-from mirrorskin.engine.rotation.registration import Sight
+from mirrorskin.engine.diagnosis.registration import Sight
 from mirrorskin.io import Calibrated, Header, InputError, Source, WallResponse, pixel_axes
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.normals_wall import Wall

@@ -25,13 +25,13 @@ from mirrorskin.engine.base.sources import EditedSource
 from mirrorskin.engine.base.steps import Step
 from mirrorskin.engine.correlation.correlation import Correlate
 from mirrorskin.engine.correlation.design_matrix import LONGEST, check_turning, cut_into_turns
+from mirrorskin.engine.diagnosis.registration import Registered, check_heights
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.last_turn import LastTurn
 from mirrorskin.engine.rotation.moving_normals import MovingNormals
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.normals_kernel import NormalMethod
 from mirrorskin.engine.rotation.poses import even_windows, rocks
-from mirrorskin.engine.rotation.registration import Registered, check_heights
 from mirrorskin.engine.rotation.response import HALF_WAY, Response, initial_response, wall_response_of
 from mirrorskin.engine.rotation.steps import Edges, Integration, SlopeMaps
 from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Source, WallResponse, open_heights

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.normals_uncertainty import SystematicUncertainty
-from mirrorskin.engine.rotation.edges import find_edges
-from mirrorskin.engine.rotation.normals_to_height import (
+from mirrorskin.engine.diagnosis.registration import Registered
+from mirrorskin.engine.integration.normals_to_height import (
     Slopes,
     integrate_result,
     separate_errors,
     slopes_of,
 )
-from mirrorskin.engine.rotation.registration import Registered
+from mirrorskin.engine.rotation.edges import find_edges
 from mirrorskin.io import Result
 
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"

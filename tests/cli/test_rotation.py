@@ -111,7 +111,7 @@ def test_a_surface_that_was_not_found_is_one_line_and_no_file(monkeypatch):
         raise engine.NotConverged("the residual is 0.3 after 100 iterations: allow more")
 
     turn()
-    monkeypatch.setattr("mirrorskin.engine.rotation.normals_to_height.integrate_arrays", fails)
+    monkeypatch.setattr("mirrorskin.engine.integration.normals_to_height.integrate_arrays", fails)
     before = set(Path().iterdir())
     ended = run("reconstruct turn.h5")
     line = "mirrorskin: turn.h5: the residual is 0.3 after 100 iterations: allow more\n"

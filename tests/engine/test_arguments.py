@@ -416,7 +416,7 @@ UNIT_CASES = {
     "travel of a force": lambda q: (
         engine.force.find_force(-FLAT, q(0.5, "mm", 500, "um"), 0.1, modulus=0.1).pressure
     ),
-    "time": lambda q: engine.correlation.estimate_frequency(
+    "time": lambda q: engine.vibration.estimate_frequency(
         np.cos(0.8 * np.arange(64.0)), q(0.125 * np.arange(64.0), "s", 125 * np.arange(64.0), "ms")
     ),
 }
@@ -446,11 +446,11 @@ def test_a_dataset_of_quantities_is_converted():
 
 def test_time_differences_are_seconds():
     wave, time = np.cos(0.8 * np.arange(64.0)), 0.125 * np.arange(64.0)
-    expected = engine.correlation.estimate_frequency(wave, time)
+    expected = engine.vibration.estimate_frequency(wave, time)
     days = np.datetime64("2026-01-01") + (1000 * time).astype("m8[ms]")
-    assert engine.correlation.estimate_frequency(wave, days - days[0]) == expected
+    assert engine.vibration.estimate_frequency(wave, days - days[0]) == expected
     with pytest.raises(io.InputError, match=r"time is .*datetime64.*: numbers are needed, as in time - time"):
-        engine.correlation.estimate_frequency(wave, days)
+        engine.vibration.estimate_frequency(wave, days)
 
 
 def test_values_for_a_file_have_units(tmp_path):

@@ -40,14 +40,14 @@ from scenes import (
 from mirrorskin import engine, io
 from mirrorskin.engine.base.operation import Plan
 from mirrorskin.engine.base.summary import summarise as engine_summarise
-from mirrorskin.engine.correlation.lock_in import Correlation
+from mirrorskin.engine.diagnosis.registration import Registered
 from mirrorskin.engine.metrology import Quantity
 from mirrorskin.engine.metrology import fit_plane as engine_fit_plane
 from mirrorskin.engine.metrology import fit_sphere as engine_fit_sphere
 from mirrorskin.engine.metrology import roughness as engine_roughness
 from mirrorskin.engine.metrology import section as engine_section
 from mirrorskin.engine.metrology import step_height as engine_step_height
-from mirrorskin.engine.rotation.registration import Registered
+from mirrorskin.engine.vibration.lock_in import Correlation
 
 PROCESS = Tolerance(1e-3, 1e-6)  # numbers of solved heights
 ONSET = {"height": HEIGHT, "height_sigma": HEIGHT, "process": FITTED}

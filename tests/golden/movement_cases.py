@@ -12,7 +12,7 @@ from scenes import LEVELS, PIXEL, counted, dome, places
 from speckle import Speckle
 
 from mirrorskin import engine
-from mirrorskin.engine import correlation, force, pose, press, rotation, slip
+from mirrorskin.engine import force, pose, press, rotation, slip, vibration
 
 MOVED = Tolerance(1e-3, 1e-5)  # mm: a thousandth of a pixel, where Gauss-Newton steps end
 POSE = Tolerance(1e-3, 2e-6)  # radians and mm
@@ -128,7 +128,7 @@ def normals_of_poses() -> Answer:
 def estimate_frequency() -> Answer:
     time = np.arange(120) / 30
     wave = 100 + 20 * np.cos(math.tau * 3.21 * time)[:, None, None] * np.linspace(0.5, 1, 12).reshape(3, 4)
-    found = correlation.estimate_frequency(wave + np.random.default_rng(1).normal(0, 1, wave.shape), time)
+    found = vibration.estimate_frequency(wave + np.random.default_rng(1).normal(0, 1, wave.shape), time)
     return {"numbers": np.array([found.hertz, found.sigma])}
 
 

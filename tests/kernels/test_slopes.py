@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mirrorskin.engine.rotation.normals_to_height import SlopeKernels, find_slopes
+from mirrorskin.engine.integration.normals_to_height import SlopeKernels, find_slopes
 from mirrorskin.kernels import slopes
 
 SHAPES = [(1, 1), (1, 9), (9, 1), (7, 5), (23, 37), (40, 300), (33, 520), (19, 128)]

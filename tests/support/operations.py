@@ -20,11 +20,11 @@ from stacks import MadeUp
 from suite.scenes import SCALES, TILT
 
 from mirrorskin import engine
-from mirrorskin.engine.correlation.growth import Growth
 from mirrorskin.engine.optical.fringes import Fringes, fit_fringes
 from mirrorskin.engine.optical.photometric import PhotometricStereo, photometric_stereo
 from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.rotation.last_turn import LastTurn
+from mirrorskin.engine.vibration.growth import Growth
 from mirrorskin.io import Header, Result
 from mirrorskin.io.types import body_axes
 
@@ -128,7 +128,7 @@ CASES = {
     "ChangePoint between unknown levels": Case(
         engine.ChangePoint, PRESS, ON_TRAVEL, function=engine.find_change_point
     ),
-    "Growth": Case(Growth, PRESS, {"travel": DITHER}, LEVELS, engine.correlation.find_growth),
+    "Growth": Case(Growth, PRESS, {"travel": DITHER}, LEVELS, engine.vibration.find_growth),
     "Focus": Case(engine.optical.Focus, PRESS, ON_TRAVEL, {"noise": 2.0}, engine.optical.find_focus),
     "Correlate": Case(engine.Correlate, TURNS, ON_PHASE, {}, engine.correlate, **ROTATION),
     "Correlate of a window": Case(

@@ -7,13 +7,13 @@ import pytest
 from contact_theory import Pressed, cone, paraboloid, rectangle_responses, sphere
 
 from mirrorskin.engine import NotConverged
+from mirrorskin.engine.force.halfspace import HalfSpace, press
 from mirrorskin.engine.press.cells import touched
 from mirrorskin.engine.press.elastic import (
     correct_press,
     fit_press,
     threshold_at,
 )
-from mirrorskin.engine.press.halfspace import HalfSpace, press
 from mirrorskin.engine.press.spline import CellSplines
 from mirrorskin.hw.twin import Body, visible_zenith
 from mirrorskin.io import Gel, InputError, Result, pixel_axes

@@ -10,7 +10,7 @@ from commands import run
 from scipy import optimize
 
 from mirrorskin import engine, hw, io
-from mirrorskin.engine.correlation.lock_in import Correlation
+from mirrorskin.engine.vibration.lock_in import Correlation
 from mirrorskin.hw.twin import Camera, Vertical
 from mirrorskin.io.arrays import ArrayRecording
 
@@ -24,7 +24,7 @@ def test_a_disc_grows_as_hertz_says():
     x, y = io.pixel_axes((SIZE, SIZE), (PIXEL, PIXEL))
     square = x**2 + y[:, np.newaxis] ** 2
     frames = np.where(square <= RADIUS * DITHER[:, np.newaxis, np.newaxis], 220, 20).astype(np.uint8)
-    found = engine.correlation.find_growth(frames, DITHER, dark=20, bright=220, pixel_size=(PIXEL, PIXEL))
+    found = engine.vibration.find_growth(frames, DITHER, dark=20, bright=220, pixel_size=(PIXEL, PIXEL))
     assert (found.process["travel"], found.process["travel_amplitude"]) == pytest.approx(
         (DEPTH, SWING), rel=1e-3
     )
@@ -65,7 +65,7 @@ def test_the_light_of_the_elastic_twin_grows_as_the_surface_around_a_ball(elasti
     frames = elastic.read(np.empty(elastic.shape, elastic.dtype)).frames
     dark, bright = elastic.header.dark, elastic.header.bright
     options = {"dark": dark, "bright": bright, "pixel_size": (PIXEL, PIXEL)}
-    found = engine.correlation.find_growth(frames, DITHER, **options)
+    found = engine.vibration.find_growth(frames, DITHER, **options)
     light = np.sum((frames.astype(float) - dark) / (bright - dark), axis=(1, 2)) * PIXEL**2
     assert found.process["area_growth"] == pytest.approx(np.polyfit(DITHER - DEPTH, light, 2)[1], rel=0.01)
     # Half the light is at the slope of the inner border, which lies on the ball itself.
@@ -82,7 +82,7 @@ def test_it_is_as_sure_as_it_says():
     steep = random.uniform(0.2, 3, (60, 70))
     counts = 100 + 200 * steep * (DITHER - DEPTH)[:, np.newaxis, np.newaxis]
     frames = (counts + random.normal(0, 4, counts.shape)).astype(np.float32)
-    found = engine.correlation.find_growth(frames, DITHER, dark=0, bright=200, pixel_size=(0.1, 0.1))
+    found = engine.vibration.find_growth(frames, DITHER, dark=0, bright=200, pixel_size=(0.1, 0.1))
     error = found.growth - steep
     assert np.mean((error / found.growth_sigma) ** 2) == pytest.approx(1, abs=0.06)
     assert abs(found.process["area_growth"] - 0.01 * steep.sum()) < 4 * found.process["area_growth_sigma"]
@@ -99,7 +99,7 @@ def test_the_command_adds_it_to_the_correlation(elastic, tmp_path):
     elastic.rewind()
     frames = elastic.read(np.empty(elastic.shape, elastic.dtype)).frames
     header = elastic.header
-    found = engine.correlation.find_growth(
+    found = engine.vibration.find_growth(
         frames, DITHER, dark=header.dark, bright=header.bright, pixel_size=(PIXEL, PIXEL)
     )
     np.testing.assert_allclose(result.growth, found.growth, atol=1e-3)
@@ -120,7 +120,7 @@ def test_the_command_adds_it_to_the_correlation(elastic, tmp_path):
 def test_a_travel_that_is_not_a_dither_is_one_line(travel, line):
     frames = np.zeros((len(travel), 2, 3), np.uint8)
     with pytest.raises(io.InputError, match=line) as caught:
-        engine.correlation.find_growth(frames, travel)
+        engine.vibration.find_growth(frames, travel)
     assert "\n" not in str(caught.value)
 
 
@@ -128,18 +128,18 @@ def test_the_frames_are_read_once_if_the_travel_is_known_and_twice_otherwise(ela
     elastic.rewind()
     frames = elastic.read(np.empty(elastic.shape, elastic.dtype)).frames.copy()
     known = {"dark": elastic.header.dark, "bright": elastic.header.bright, "pixel_size": (PIXEL, PIXEL)}
-    found = engine.correlation.find_growth(frames, DITHER, **known)
+    found = engine.vibration.find_growth(frames, DITHER, **known)
     source = ArrayRecording(frames, {"travel": DITHER}, {"dark": known["dark"], "bright": known["bright"]})
-    operation = engine.correlation.Growth().configured_for(source)
-    assert (operation.passes, engine.correlation.Growth(**known).passes) == (1, 2)
-    once = engine.run(source, engine.correlation.Growth(pixel_size=(PIXEL, PIXEL)))
-    blocks = bare(engine.correlation.Growth(**known), frames, [3, 50], travel=DITHER)
+    operation = engine.vibration.Growth().configured_for(source)
+    assert (operation.passes, engine.vibration.Growth(**known).passes) == (1, 2)
+    once = engine.run(source, engine.vibration.Growth(pixel_size=(PIXEL, PIXEL)))
+    blocks = bare(engine.vibration.Growth(**known), frames, [3, 50], travel=DITHER)
     for other in (once, blocks):
         for name in ("growth", "growth_sigma", "azimuth", "residual"):
             np.testing.assert_array_equal(other[name], found[name])
         assert other.process["area_growth"] == found.process["area_growth"]
     with pytest.raises(io.InputError, match="needs all frames twice"):
-        engine.Run(engine.correlation.Growth(**known)).push(frames, travel=DITHER)
+        engine.Run(engine.vibration.Growth(**known)).push(frames, travel=DITHER)
 
 
 def test_a_recording_of_a_dither_has_growth_and_correlation(elastic, tmp_path):
@@ -148,7 +148,7 @@ def test_a_recording_of_a_dither_has_growth_and_correlation(elastic, tmp_path):
         recorder.drain(lambda count: None)
     with io.open_recording(tmp_path / "d.h5") as recording:
         result = Correlation(dither=True).run(recording)
-        alone = engine.run(recording, engine.correlation.Growth)
+        alone = engine.run(recording, engine.vibration.Growth)
         with pytest.raises(io.InputError, match="takes the phase from the travel: leave harmonic out"):
             Correlation(dither=True, harmonic=2).run(recording)
     said = {

@@ -13,8 +13,8 @@ from rotations import EIGHTHS, TILT
 from stacks import MadeUp
 
 from mirrorskin import engine, hw, io
+from mirrorskin.engine.diagnosis.registration import Registered, Sight
 from mirrorskin.engine.live import LiveRun
-from mirrorskin.engine.rotation.registration import Registered, Sight
 from mirrorskin.engine.rotation.rotation import first_turn
 from mirrorskin.hw.twin import Axial, Body, Camera
 

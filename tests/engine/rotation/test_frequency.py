@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine, io
-from mirrorskin.engine.correlation import estimate_frequency
-from mirrorskin.engine.correlation.lock_in import Correlation
+from mirrorskin.engine.vibration import estimate_frequency
+from mirrorskin.engine.vibration.lock_in import Correlation
 from mirrorskin.io.arrays import ArrayRecording
 
 RATE, COUNT, HERTZ = 60.0, 150, 7.321

@@ -7,7 +7,7 @@ import pytest
 import rotations
 from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
-from mirrorskin.engine.rotation.normals_to_height import find_slopes
+from mirrorskin.engine.integration.normals_to_height import find_slopes
 
 ONE = np.ones((1, 1), np.float32)
 

@@ -11,7 +11,7 @@ import pytest
 from stacks import MadeUp, read_all
 
 from mirrorskin import hw, io
-from mirrorskin.engine.rotation.registration import Registered
+from mirrorskin.engine.diagnosis.registration import Registered
 from mirrorskin.hw.twin import Axial, Body, Camera
 
 TILT, PRESS = np.radians(2.5), 1.2
@@ -186,7 +186,7 @@ def test_blocks_make_no_difference(device, monkeypatch):
     source.rewind()
     assert np.isnan(source.noise_gain).all()
     answers.append((read_all(source, 2).frames, source.noise_gain))
-    monkeypatch.setattr("mirrorskin.engine.rotation.registration._BLOCK", 2 * frames[0].nbytes)
+    monkeypatch.setattr("mirrorskin.engine.diagnosis.registration._BLOCK", 2 * frames[0].nbytes)
     small = Registered(made_up(frames), some_heights(), device=device)
     assert len(small.read(np.empty((6, *SHAPE), np.float32)).frames) == 2
     with pytest.raises(ValueError, match="needed is"):

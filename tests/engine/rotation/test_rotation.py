@@ -238,7 +238,7 @@ def test_heights_that_do_not_converge_are_refused(monkeypatch, robust, residual,
         found = found.with_fitted(integration_converged=False, integration_residual=residual)
         return found.assign(edges=broken if robust else None)
 
-    monkeypatch.setattr("mirrorskin.engine.rotation.normals_to_height.integrate_arrays", miss)
+    monkeypatch.setattr("mirrorskin.engine.integration.normals_to_height.integrate_arrays", miss)
     if accepted:
         assert reconstruct(OF_A_SURFACE, robust=robust).edges[3, 4] == 1
     else:

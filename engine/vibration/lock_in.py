@@ -14,8 +14,8 @@ from mirrorskin.engine.base.operation import Plan
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.sources import EditedSource
 from mirrorskin.engine.correlation.correlation import Correlate
-from mirrorskin.engine.correlation.frequency import Frequency, frequency_of
-from mirrorskin.engine.correlation.growth import Growth
+from mirrorskin.engine.vibration.frequency import Frequency, frequency_of
+from mirrorskin.engine.vibration.growth import Growth
 from mirrorskin.io import Block, InputError
 from mirrorskin.kernels.array_types import Doubles
 
@@ -32,7 +32,7 @@ class Correlation(Method):
         unit="Hz",
         above=0,
         help="frequency, or estimate it: the phase is 2 pi times frequency times the time since the first"
-        " frame. To estimate it, the source is read twice; see `engine.correlation.estimate_frequency`",
+        " frame. To estimate it, the source is read twice; see `engine.vibration.estimate_frequency`",
         shown_default="the phase of the source",
     )
     frame_rate: float | None = option(
@@ -45,7 +45,7 @@ class Correlation(Method):
     dither: bool = option(
         default=False,
         help="the phase is that of the travel of a press that dithers, and the growth of the contact is"
-        " added; see `mirrorskin.engine.correlation.Growth`",
+        " added; see `mirrorskin.engine.vibration.Growth`",
     )
     harmonic: int = Correlate.harmonic
     window_frames: int | None = Correlate.window_frames

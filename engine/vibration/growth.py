@@ -14,8 +14,8 @@ from mirrorskin.engine.base.functions import travel_function
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.correlation.correlation import Correlate, CorrelationOperation
 from mirrorskin.engine.correlation.design_matrix import basis
-from mirrorskin.engine.correlation.frequency import estimate_frequency
 from mirrorskin.engine.press.crossing import PressOperation
+from mirrorskin.engine.vibration.frequency import estimate_frequency
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.io.maps import TABLE
@@ -60,7 +60,7 @@ class Growth(CorrelationOperation):
     >>> from mirrorskin import engine
     >>> travel = 1 + 0.02 * np.cos(0.7 * np.arange(90))
     >>> frames = (100 + 300 * (travel - 1)[:, None, None] * np.ones((2, 3))).astype(np.float32)
-    >>> result = engine.run(frames, engine.correlation.Growth(dark=0, bright=200), travel=travel)
+    >>> result = engine.run(frames, engine.vibration.Growth(dark=0, bright=200), travel=travel)
     >>> round(result.process["travel_amplitude"], 3)
     0.02
     """

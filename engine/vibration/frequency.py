@@ -57,7 +57,7 @@ def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     >>> from mirrorskin import engine
     >>> time = np.arange(100) / 30
     >>> wave = 100 + 20 * np.cos(2 * np.pi * 3.21 * time) + np.random.default_rng(1).normal(0, 1, 100)
-    >>> found = engine.correlation.estimate_frequency(wave, time)
+    >>> found = engine.vibration.estimate_frequency(wave, time)
     >>> round(found.hertz, 2), found.sigma < 0.01
     (3.21, True)
     """
