@@ -6,11 +6,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mirrorskin import cli, engine, hw, io, kernels, view
+    from mirrorskin import cli, engine, hw, io, kernels, twin, view
 
     __version__: str
 
-__all__ = ["__version__", "cli", "engine", "hw", "io", "kernels", "view"]
+__all__ = ["__version__", "cli", "engine", "hw", "io", "kernels", "twin", "view"]
 
 
 def __getattr__(name: str) -> Any:

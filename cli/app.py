@@ -68,7 +68,7 @@ def command(
         control = None
         if rig is not None:
             from mirrorskin.engine.base.reconstruction import load_operation
-            from mirrorskin.hw.rig_file import load_rig
+            from mirrorskin.hw.base.rig_file import load_rig
             from mirrorskin.view.app.rig_control import RigControl
 
             kind = None if operation is None else load_operation(operation)

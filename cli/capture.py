@@ -28,10 +28,10 @@ def command(
 ) -> None:
     """Move the stage, and record what the camera sees; what was taken is kept whatever happens."""
     from mirrorskin import io
+    from mirrorskin.hw.base.rig_file import load_rig
     from mirrorskin.hw.rig.rig import open_rig
     from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.hw.rig.sweep import make_scan
-    from mirrorskin.hw.rig_file import load_rig
     from mirrorskin.kernels.correlation import WINDOW
 
     settings = load_rig(rig_file)

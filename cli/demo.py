@@ -18,9 +18,9 @@ from mirrorskin.cli.groups import Option
 from mirrorskin.cli.output import print_json, print_table, progress
 
 if TYPE_CHECKING:
-    from mirrorskin import hw, io
+    from mirrorskin import io
     from mirrorskin.engine.metrology.scoring import Score
-    from mirrorskin.hw.twin import Movement
+    from mirrorskin.twin import Movement, Twin
 
 Results = dict[str, "io.Result"]
 Scores = dict[str, "Score"]
@@ -48,9 +48,10 @@ class Press(Experiment):
 
     def movement(self) -> Movement:
         """Return the steps of the press."""
-        from mirrorskin import hw, io
+        from mirrorskin import io
+        from mirrorskin.twin import Vertical
 
-        return hw.twin.Vertical(io.Steps(self.step, self.step).positions(self.frames))
+        return Vertical(io.Steps(self.step, self.step).positions(self.frames))
 
 
 @dataclass(frozen=True)
@@ -62,10 +63,11 @@ class Turn(Experiment):
 
     def movement(self) -> Movement:
         """Return one turn of even steps."""
-        from mirrorskin import hw, io
+        from mirrorskin import io
+        from mirrorskin.twin import Axial
 
         phase = io.Steps(2 * math.pi / self.frames).positions(self.frames)
-        return hw.twin.Axial(phase, math.radians(self.tilt), self.press)
+        return Axial(phase, math.radians(self.tilt), self.press)
 
 
 PRESSES = {
@@ -254,19 +256,17 @@ def _record(
     return twin.truth
 
 
-def _twin(experiment: Press | Turn, device: str | None, **sensor: str) -> hw.Twin:
+def _twin(experiment: Press | Turn, device: str | None, **sensor: str) -> Twin:
     """Return the paper's ideal sensor; its camera has noise, uneven pixels and a lens."""
-    from mirrorskin import hw
+    from mirrorskin.twin import Camera, Twin
 
     options: dict[str, Any] = sensor
-    return hw.Twin(
+    return Twin(
         object=experiment.object,
         shape=(experiment.size, experiment.size),
         pixel_size=experiment.pixel_size,
         movement=experiment.movement(),
-        camera=hw.twin.Camera(
-            noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5
-        ),
+        camera=Camera(noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5),
         device=device,
         **options,
     )

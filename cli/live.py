@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from mirrorskin.engine.base.method import Method
     from mirrorskin.engine.base.operation import Operation
     from mirrorskin.engine.live import LiveRun, Loop
+    from mirrorskin.hw.base.rig_file import RigSettings
     from mirrorskin.hw.rig.plans import Plan
     from mirrorskin.hw.rig.scan import PlannedScan
-    from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, LiveSource
 
 _ENDING = "SIGINT", "SIGTERM", "SIGHUP"
@@ -80,8 +80,8 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.quantity import duration
     from mirrorskin.engine.base.reconstruction import load_operation, method_for
+    from mirrorskin.hw.base.rig_file import load_rig
     from mirrorskin.hw.rig.scan import PlannedScan
-    from mirrorskin.hw.rig_file import load_rig
 
     rig = load_rig(rig_file)
     planned = {one.name for one in scans.PLAN.terms}
@@ -139,7 +139,7 @@ class _Live:
     def run(self) -> None:
         """Reconstruct while the stage moves, and save the result."""
         from mirrorskin.cli.status import summary
-        from mirrorskin.hw.errors import HardwareError
+        from mirrorskin.hw.base.errors import HardwareError
         from mirrorskin.io import InputError
 
         name = self._settings.name

@@ -16,9 +16,9 @@ from mirrorskin.cli.groups import Argument, Group, Option
 from mirrorskin.cli.output import print_json, print_table, printable
 
 if TYPE_CHECKING:
+    from mirrorskin.hw.base.rig_file import RigSettings
+    from mirrorskin.hw.base.stage import Stage
     from mirrorskin.hw.rig.check import CheckResult
-    from mirrorskin.hw.rig_file import RigSettings
-    from mirrorskin.hw.stage import Stage
 
 app = Group(
     help="Check a stage and a camera before they are used, and move it by hand.", no_args_is_help=True
@@ -49,7 +49,7 @@ def new(
     output: Annotated[Path, Option("--output", "-o", metavar="RIG.toml", help="File to write.")],
 ) -> None:
     """Write a template of a rig file, in which every key is described."""
-    from mirrorskin.hw.rig_file import TEMPLATE
+    from mirrorskin.hw.base.rig_file import TEMPLATE
     from mirrorskin.io import InputError
     from mirrorskin.io.atomic import write_new
 
@@ -66,9 +66,9 @@ def check(
     as_json: options.Json = False,
 ) -> None:
     """Open a rig and compare it with its file; nothing moves without --move."""
-    from mirrorskin.hw.errors import HardwareError
+    from mirrorskin.hw.base.errors import HardwareError
+    from mirrorskin.hw.base.rig_file import load_rig
     from mirrorskin.hw.rig.check import check_rig
-    from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig)
     findings: list[CheckResult] = []
@@ -113,7 +113,7 @@ def jog(
     from dataclasses import replace
 
     from mirrorskin.cli.quantity import angle, length
-    from mirrorskin.hw.rig_file import load_rig
+    from mirrorskin.hw.base.rig_file import load_rig
     from mirrorskin.io import InputError
 
     known = load_rig(rig).stage.axes.get(axis.value)
@@ -138,10 +138,10 @@ def probe(
 ) -> None:
     """Lower the body until the picture shows contact, lift it, and print the zero of the travel."""
     from mirrorskin.cli.quantity import length
+    from mirrorskin.hw.base.rig_file import load_rig
     from mirrorskin.hw.rig.plans import check_plan
     from mirrorskin.hw.rig.probe import contact_plan, find_contact
     from mirrorskin.hw.rig.rig import open_rig
-    from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig)
     travel, each = settings.stage.travel, length(step, "--step")
@@ -169,9 +169,9 @@ def unlock(rig: RigFile) -> None:
 @contextmanager
 def _opened(rig: Path, unlock: bool = False) -> Iterator[Stage]:
     """Open only the stage; print its position at the end."""
+    from mirrorskin.hw.base.rig_file import load_rig
     from mirrorskin.hw.rig.check import in_words
     from mirrorskin.hw.rig.rig import open_stage
-    from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig)
     with closing(open_stage(settings.stage, unlock=unlock)) as stage:

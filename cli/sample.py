@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from mirrorskin import hw
     from mirrorskin.io.existing import Replaces
+    from mirrorskin.twin import Axial, Camera, Movement, Twin
 
 _SHAPE, _PIXEL = (320, 320), 0.0375  # rows and columns, and mm: a field of 12 mm
 _SEED = 11
@@ -98,21 +98,18 @@ _HOLDS = {
 }
 
 
-def _twin(
-    diameter: float, movement: hw.twin.Movement, at: tuple[float, float] = (0.0, 0.0), **more: Any
-) -> hw.Twin:
+def _twin(diameter: float, movement: Movement, at: tuple[float, float] = (0.0, 0.0), **more: Any) -> Twin:
     """Return a ball under a sensor whose camera has noise of both kinds, uneven pixels and a lens."""
-    from mirrorskin import hw
-    from mirrorskin.hw.twin import Camera, Sphere
+    from mirrorskin.twin import Camera, Sphere, Twin
 
     camera = Camera(
         noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5, seed=_SEED
     )
     known: dict[str, Any] = {"shape": _SHAPE, "pixel_size": _PIXEL, "camera": camera, "movement": movement}
-    return hw.Twin(object=Sphere(diameter), object_shift=at, **known | more)
+    return Twin(object=Sphere(diameter), object_shift=at, **known | more)
 
 
-def _record(twin: hw.Twin, path: Path, replaces: Replaces) -> None:
+def _record(twin: Twin, path: Path, replaces: Replaces) -> None:
     from mirrorskin import io
     from mirrorskin.cli.output import progress
 
@@ -123,9 +120,9 @@ def _record(twin: hw.Twin, path: Path, replaces: Replaces) -> None:
         recorder.drain(show)
 
 
-def _pressed() -> hw.Twin:
+def _pressed() -> Twin:
     from mirrorskin import io
-    from mirrorskin.hw.twin import Vertical
+    from mirrorskin.twin import Vertical
 
     return _twin(10.0, Vertical(io.Steps(_STEP).positions(_FRAMES)))
 
@@ -138,9 +135,9 @@ def _make_turn(path: Path, replaces: Replaces) -> None:
     _record(_twin(10.0, _turn(1.5), pattern="linear"), path, replaces)
 
 
-def _turn(press: float) -> hw.twin.Axial:
+def _turn(press: float) -> Axial:
     from mirrorskin import io
-    from mirrorskin.hw.twin import Axial
+    from mirrorskin.twin import Axial
 
     return Axial(io.Steps(math.pi / 4).positions(8), math.radians(2.5), press, _PIVOT)
 
@@ -148,7 +145,7 @@ def _turn(press: float) -> hw.twin.Axial:
 def _make_slide(path: Path, replaces: Replaces) -> None:
     import numpy as np
 
-    from mirrorskin.hw.twin import Horizontal, SheetTexture
+    from mirrorskin.twin import Horizontal, SheetTexture
 
     way = np.stack([0.01 * np.arange(30), np.zeros(30)], axis=1)
     small: dict[str, Any] = {"shape": (96, 96), "pixel_size": 0.05, "contact": "elastic"}
@@ -208,7 +205,7 @@ def _make_calibration(folder: Path, replaces: Replaces) -> None:
     """Record the calibration frames of a sensor with a real wall, uneven lamps and a lens near the sheet."""
     import numpy as np
 
-    from mirrorskin.hw.twin import Body, Camera, Vertical
+    from mirrorskin.twin import Body, Camera, Vertical
 
     camera = Camera(noise=1.5, gain_deviation=0.05, distance=200.0, seed=_SEED)
     body = Body(asymmetry=0.05, asymmetry_azimuth=0.7)
@@ -223,13 +220,13 @@ def _make_calibration(folder: Path, replaces: Replaces) -> None:
     _write_picture(folder / "photo.png", _photograph(), replaces)
 
 
-def _record_flat(path: Path, camera: hw.twin.Camera, light: float, replaces: Replaces) -> None:
+def _record_flat(path: Path, camera: Camera, light: float, replaces: Replaces) -> None:
     """Record a uniform field."""
     import numpy as np
 
     from mirrorskin import io
-    from mirrorskin.hw.twin.camera import Sensor
     from mirrorskin.io.arrays import ArrayRecording
+    from mirrorskin.twin.camera import Sensor
 
     sensor, field = Sensor(camera, _SHAPE), np.full(_SHAPE, light, np.float32)
     frames = np.empty((_FLAT_FRAMES, *_SHAPE), sensor.dtype)

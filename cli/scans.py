@@ -14,9 +14,9 @@ from mirrorskin.cli.groups import Argument, Option, refuse_foreign
 from mirrorskin.cli.options import MotionName
 
 if TYPE_CHECKING:
+    from mirrorskin.hw.base.rig_file import RigSettings
     from mirrorskin.hw.rig.plans import Plan
     from mirrorskin.hw.rig.scan import PlannedScan
-    from mirrorskin.hw.rig_file import RigSettings
     from mirrorskin.io import Calibration, StreamRecorder
 
 SETTLE = 0.1
@@ -130,7 +130,7 @@ def check_recording(
 @contextmanager
 def kept(recorder: StreamRecorder | None) -> Iterator[None]:
     """Report which frames of an interrupted recording were kept, and where; the exit code is 1."""
-    from mirrorskin.hw.errors import HardwareError
+    from mirrorskin.hw.base.errors import HardwareError
     from mirrorskin.io import InputError
     from mirrorskin.io.layout import COMPLETE
 

@@ -53,7 +53,7 @@ def sensor_terms(size: str, pixel_size: str) -> Terms:
 
 def sensor_options(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keywords of `mirrorskin.hw.Twin` that these options describe."""
-    from mirrorskin.hw.twin import SheetTexture
+    from mirrorskin.twin import SheetTexture
 
     columns, rows = values["size"]
     texture = None

@@ -15,7 +15,7 @@ from mirrorskin.cli.groups import Argument, refuse_foreign
 from mirrorskin.cli.sensor import sensor_options, sensor_terms
 
 if TYPE_CHECKING:
-    from mirrorskin.hw.twin import Movement
+    from mirrorskin.twin import Movement
 
 FRAMES_MAX = 10**7
 _FRAMES = 30
@@ -129,10 +129,10 @@ def command(
     """Record what the twin sees, with the truth."""
     import numpy as np
 
-    from mirrorskin import hw, io
+    from mirrorskin import io
     from mirrorskin.cli.output import printable, progress
     from mirrorskin.cli.quantity import vector
-    from mirrorskin.hw.twin import Body, Camera
+    from mirrorskin.twin import Body, Camera, Twin
 
     values = TWIN.filled(given)
     # A name without a suffix is a shape, and not a file to keep.
@@ -140,7 +140,7 @@ def command(
     io.check_output(output, *files, replaces="anything" if overwrite else "nothing")
     refuse_foreign(context, motion)
     right, up = vector(values["object_shift"], 2, "--object-shift")
-    twin = hw.Twin(
+    twin = Twin(
         object=values["object"],
         object_shift=(right, up),
         **sensor_options(values),
@@ -173,9 +173,8 @@ def make_movement(motion: str, values: Mapping[str, Any]) -> Movement:
     """Return the twin's movement that options describe."""
     import numpy as np
 
-    from mirrorskin import io
+    from mirrorskin import io, twin
     from mirrorskin.cli.quantity import vector
-    from mirrorskin.hw import twin
 
     frames, press = values["frames"], values["press"]
     count = frames or _FRAMES

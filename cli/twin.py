@@ -61,7 +61,7 @@ def serve(
     if background and ready is None:
         _start_in_background()
         return
-    from mirrorskin.hw.emulator.rig import EmulatedRig
+    from mirrorskin.twin.emulator.rig import EmulatedRig
 
     values = RIG.filled(given)
     EmulatedRig.check_folder(output)
@@ -89,7 +89,7 @@ def serve(
 
 def _start_in_background() -> None:
     """Run this command in a separate session; return when it is ready, or exit with its code."""
-    from mirrorskin.hw.errors import HardwareError
+    from mirrorskin.hw.base.errors import HardwareError
 
     reading, writing = os.pipe()
     own = [sys.executable, "-P", "-m", "mirrorskin.cli.main", *sys.argv[1:], "--ready-fd", str(writing)]

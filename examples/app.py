@@ -8,8 +8,8 @@ notebook, an `App` as the last line of a cell shows the page itself.
 import numpy as np
 from matplotlib.figure import Figure
 
-from mirrorskin import hw, io
-from mirrorskin.hw.twin import Axial, Vertical
+from mirrorskin import io
+from mirrorskin.twin import Axial, Twin, Vertical
 from mirrorskin.view.app import App, trace_of
 
 PIXEL = 80, 115  # row and column
@@ -20,7 +20,7 @@ MOVEMENTS = {
 figure = Figure(figsize=(8, 3.4), layout="constrained")
 axes = figure.subplots(1, 2)
 for axis, (name, movement) in zip(axes, MOVEMENTS.items(), strict=True):
-    twin = hw.Twin(
+    twin = Twin(
         object="sphere",
         shape=(160, 160),
         pixel_size=0.065,

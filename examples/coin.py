@@ -7,13 +7,13 @@ through the middle.
 
 import numpy as np
 
-from mirrorskin import engine, hw
+from mirrorskin import engine
 from mirrorskin.engine.base.summary import summarise
 from mirrorskin.engine.metrology import section
-from mirrorskin.hw.twin import Camera, Vertical
+from mirrorskin.twin import Camera, Twin, Vertical
 from mirrorskin.view.result import figures_of
 
-press = hw.Twin(
+press = Twin(
     object="coin",
     shape=(260, 260),
     pixel_size=0.09,

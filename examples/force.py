@@ -9,11 +9,11 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.engine.calibration.force import fit_stiffness, known_press
 from mirrorskin.engine.calibration.gel import ball_onset, fit_gel
 from mirrorskin.engine.press.press import Press
-from mirrorskin.hw.twin import Body, Camera, Sphere, Vertical
+from mirrorskin.twin import Body, Camera, Sphere, Twin, Vertical
 
 SIZE, PIXEL = 56, 8.64 / 56  # pixels of a side, and mm
 STEP, MODULUS, SCALE_ERROR = 0.03, 0.1, 0.001  # mm, MPa, N
@@ -24,7 +24,7 @@ def press(diameter, depth, seed):
     camera = Camera(
         noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5, seed=seed
     )
-    return hw.Twin(
+    return Twin(
         object=Sphere(diameter),
         shape=(SIZE, SIZE),
         pixel_size=PIXEL,

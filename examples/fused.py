@@ -7,13 +7,13 @@ crater of the press is closed, and the ball's radius is correct.
 
 import numpy as np
 
-from mirrorskin import engine, hw, io
-from mirrorskin.hw.twin import Axial, Camera, Vertical
+from mirrorskin import engine, io
+from mirrorskin.twin import Axial, Camera, Twin, Vertical
 from mirrorskin.view.result import figures_of
 
 ball = {"object": "sphere", "shape": (128, 128), "pixel_size": 0.08, "camera": Camera(electrons=40)}
-press = hw.Twin(movement=Vertical(0.1 * np.arange(1, 31)), **ball)
-turn = hw.Twin(
+press = Twin(movement=Vertical(0.1 * np.arange(1, 31)), **ball)
+turn = Twin(
     movement=Axial(phase=np.radians(45) * np.arange(8), tilt=np.radians(2.5), press=1.5),
     pattern="linear",
     **ball,

@@ -8,11 +8,11 @@ import math
 import matplotlib.pyplot as plt
 import numpy as np
 
-from mirrorskin import engine, hw
-from mirrorskin.hw.twin import Camera, Vertical
+from mirrorskin import engine
+from mirrorskin.twin import Camera, Twin, Vertical
 
 SIZE, PIXEL, STEP, COUNT = 200, 0.05, 0.02, 90  # pixels of a side, mm, mm a frame, frames
-press = hw.Twin(
+press = Twin(
     object="coin",
     shape=(SIZE, SIZE),
     pixel_size=PIXEL,

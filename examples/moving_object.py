@@ -10,8 +10,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mirrorskin import engine, hw, io
-from mirrorskin.hw.twin import Axial, Camera, HeightMap, Vertical
+from mirrorskin import engine, io
+from mirrorskin.twin import Axial, Camera, HeightMap, Twin, Vertical
 
 TOUCHES, SIZE, FIELD = 10, 80, 5.0  # touches, pixels of a side, mm
 SIDE, SAMPLES = 9.0, 240  # of the object: mm, and samples of its height map
@@ -40,7 +40,7 @@ def touch(thing, depth, seed):
     turn = Axial(math.tau / 12 * np.arange(12), math.radians(2.5), depth, (0.0, 0.0, depth))
     movements = {"uniform": Vertical(0.05 * np.arange(1, 31)), "linear": turn}
     press, rotation = (
-        hw.Twin(
+        Twin(
             object=thing,
             shape=(SIZE, SIZE),
             pixel_size=FIELD / SIZE,

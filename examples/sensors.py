@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mirrorskin import engine, hw, view
-from mirrorskin.hw.twin import Camera, Vertical
+from mirrorskin import engine, view
+from mirrorskin.twin import Camera, Twin, Vertical
 
 CONTACTS = {"conform": "ideal contact", "elastic": "elastic body"}
 LIGHTS = {"ideal": "ideal light", "cylinder": "lit wall"}
@@ -23,7 +23,7 @@ def compare(thing, title, size, pixel_size, step, *, surface=False):
     results, truths = {}, []
     for contact, first in CONTACTS.items():
         for optics, second in LIGHTS.items():
-            press = hw.Twin(
+            press = Twin(
                 object=thing,
                 shape=(size, size),
                 pixel_size=pixel_size,

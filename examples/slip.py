@@ -11,8 +11,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy import special
 
-from mirrorskin import engine, hw, io
-from mirrorskin.hw.twin import Body, Camera, Horizontal, SheetTexture, Sphere, Twist
+from mirrorskin import engine, io
+from mirrorskin.twin import Body, Camera, Horizontal, SheetTexture, Sphere, Twin, Twist
 
 RADIUS, PRESS, FRICTION = 5.0, 0.5, 0.5  # mm, mm
 FRAMES, SIZE, PIXEL = 16, 128, 0.03  # frames, pixels of a side, mm
@@ -20,7 +20,7 @@ FRAMES, SIZE, PIXEL = 16, 128, 0.03  # frames, pixels of a side, mm
 
 def find_slip(movement):
     """Simulate a movement; return its result, its truth, and where the skin touched the ball before."""
-    twin = hw.Twin(
+    twin = Twin(
         object=Sphere(2 * RADIUS),
         shape=(SIZE, SIZE),
         pixel_size=PIXEL,

@@ -7,12 +7,12 @@ smoothly and marked in `filled`. The errors are known from the ground truth of t
 
 import numpy as np
 
-from mirrorskin import engine, hw
+from mirrorskin import engine
 from mirrorskin.engine.base.summary import summarise
-from mirrorskin.hw.twin import Camera, Vertical
+from mirrorskin.twin import Camera, Twin, Vertical
 from mirrorskin.view.result import figures_of
 
-press = hw.Twin(
+press = Twin(
     object="sphere",
     shape=(160, 160),
     pixel_size=0.065,

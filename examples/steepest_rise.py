@@ -5,8 +5,9 @@ mirrorskin run examples/steepest_rise.py:SteepestRise press.h5 -o heights.h5
 
 import numpy as np
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.io.maps import TABLE
+from mirrorskin.twin import Twin, Vertical
 
 
 class SteepestRise(engine.Operation):
@@ -41,9 +42,7 @@ class SteepestRise(engine.Operation):
 
 
 if __name__ == "__main__":
-    press = hw.Twin(
-        object="sphere", shape=(60, 80), pixel_size=0.1, movement=hw.twin.Vertical(np.arange(0, 1.5, 0.05))
-    )
+    press = Twin(object="sphere", shape=(60, 80), pixel_size=0.1, movement=Vertical(np.arange(0, 1.5, 0.05)))
     result = engine.run(press, SteepestRise)
     error = result.height - press.truth.height
     print(f"{np.isfinite(error).sum()} heights, median error {np.nanmedian(np.abs(error)):.3f} mm")

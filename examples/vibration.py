@@ -11,10 +11,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy import ndimage
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.engine.vibration.lock_in import Correlation
-from mirrorskin.hw.twin import Camera, HeightMap, Leaning, Vertical
 from mirrorskin.io.positions import stroke_starts
+from mirrorskin.twin import Camera, HeightMap, Leaning, Twin, Vertical
 
 SIZE, FIELD = 110, 6.0  # pixels of a side, mm
 LAB = Camera(noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5)
@@ -23,7 +23,7 @@ LAB = Camera(noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.
 def simulate(thing, movement, *, camera=LAB, **sensor):
     """Return a twin, and its frames."""
     known = {"shape": (SIZE, SIZE), "pixel_size": FIELD / SIZE, "camera": camera, **sensor}
-    twin = hw.Twin(object=thing, movement=movement, **known)
+    twin = Twin(object=thing, movement=movement, **known)
     frames = np.empty(twin.shape, twin.dtype)
     twin.read(frames)
     twin.rewind()

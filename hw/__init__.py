@@ -1,4 +1,4 @@
-"""Hardware: stage, camera, the rig of both, and the digital twin.
+"""Hardware: stages, cameras, and rigs of both.
 
 ``__init__.pyi`` lists the public names; each is imported from its module on first use.
 """

@@ -1,38 +1,31 @@
-from . import twin as twin
-from .camera import Camera
-from .camera_thread import ThreadedCamera
-from .emulator.rig import EmulatedRig
-from .errors import HardwareError
-from .genicam import GenicamCamera
-from .grbl.stage import GrblStage
+from .base.camera import Camera
+from .base.errors import HardwareError
+from .base.rig_file import load_rig
+from .base.stage import Limits, Position, Stage
+from .cameras.camera_thread import ThreadedCamera
+from .cameras.genicam import GenicamCamera
+from .cameras.video import VideoCamera
 from .rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan, VerticalPlan
 from .rig.rig import Rig, open_rig
 from .rig.scan import StepScan
 from .rig.sweep import SweepScan
-from .rig_file import load_rig
-from .simulated_clock import SimulatedClock
-from .stage import Limits, Position
-from .twin import Live, Twin
-from .video import VideoCamera
+from .stages.grbl import GrblStage
 
 __all__ = [
     "AxialPlan",
     "Camera",
-    "EmulatedRig",
     "GenicamCamera",
     "GrblStage",
     "HardwareError",
     "HorizontalPlan",
     "Limits",
-    "Live",
     "Position",
     "Rig",
     "RockPlan",
-    "SimulatedClock",
+    "Stage",
     "StepScan",
     "SweepScan",
     "ThreadedCamera",
-    "Twin",
     "TwistPlan",
     "VerticalPlan",
     "VideoCamera",

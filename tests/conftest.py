@@ -9,11 +9,11 @@ import signal
 import pytest
 from gpu_check import taken_for_gpu
 
-from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels import embedded
 from mirrorskin.kernels.device import Device, list_devices
 from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 # The processes that tests start, a hundred of them, need not each compile all modules anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -13,7 +13,8 @@ import pytest
 import sensor_report
 from stacks import ball
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
+from mirrorskin.twin import Axial, Twin
 
 DOCS = Path(__file__).parents[1] / "docs"
 TRAVEL = np.round(np.arange(0.0, 1.3, 0.1), 10)
@@ -40,11 +41,11 @@ def datasets(path):
 
 
 def turn(phases=8):
-    return hw.Twin(
+    return Twin(
         object="sphere",
         shape=(21, 24),
         pixel_size=0.3,
-        movement=hw.twin.Axial(2 * np.pi / phases * np.arange(phases), 0.05, 1.2),
+        movement=Axial(2 * np.pi / phases * np.arange(phases), 0.05, 1.2),
         pattern="linear",
     )
 

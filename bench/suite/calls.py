@@ -18,11 +18,11 @@ import numpy as np
 from mirrorskin import engine
 from mirrorskin.cli.bench.records import Case, Row, Target, Timing
 from mirrorskin.cli.bench.timing import OURS, ROUNDS, Work, take_turns
-from mirrorskin.hw.twin import Axial, Twin, Vertical
 from mirrorskin.io import MirrorskinWarning, Recorder
 from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
+from mirrorskin.twin import Axial, Twin, Vertical
 from suite.files import new_folder
 from suite.harness import Cases, check_memory, time_call
 from suite.scenes import (

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mirrorskin.cli.bench.records import Case, Target
 from mirrorskin.engine import Press, Rotation
 from mirrorskin.engine.live import RAISED, LiveRun, Loop, Status, Update
-from mirrorskin.hw.clock import SYSTEM, Clock
+from mirrorskin.hw.base.clock import SYSTEM, Clock
 from mirrorskin.io import Block, Header
 from mirrorskin.io.types import Closing, Floats
 from mirrorskin.kernels.device import Device

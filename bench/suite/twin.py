@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from mirrorskin.cli.bench.limits import time_works
 from mirrorskin.cli.bench.records import Case
 from mirrorskin.cli.bench.timing import OURS, Work
-from mirrorskin.hw.twin import Axial, Camera, Movement, Twin, Vertical
 from mirrorskin.kernels.device import Device
+from mirrorskin.twin import Axial, Camera, Movement, Twin, Vertical
 from suite.harness import Cases
 
 _SHAPE, _QUICK = (128, 480, 640), (12, 48, 64)

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from mirrorskin import engine, hw
+from mirrorskin import engine
 from mirrorskin.cli.bench.limits import call_works, measure_limits, time_works
 from mirrorskin.cli.bench.records import Case
 from mirrorskin.cli.bench.timing import ROUNDS
 from mirrorskin.kernels.device import Device
+from mirrorskin.twin import Axial, Camera, Movement, Twin, Vertical
 
 Shape = tuple[int, int, int]
 
@@ -29,7 +30,7 @@ _SLOPE, _WAVELENGTH, _NOISE = 0.3, 1.5, 0.02  # amplitude, mm, and standard devi
 def measure_onset(device: Device, quick: bool) -> Case:
     """Time `find_onset` on a press of a ball, with references of each pixel."""
     shape = _sized(_PRESS, quick)
-    twin = _twin(shape, hw.twin.Vertical(np.linspace(0.05, 3.0, shape[0])), device)
+    twin = _twin(shape, Vertical(np.linspace(0.05, 3.0, shape[0])), device)
     header, frames = twin.header, _frames(twin)
     call = partial(
         engine.find_onset,
@@ -46,7 +47,7 @@ def measure_correlation(device: Device, quick: bool) -> Case:
     """Time `correlate` on whole turns of an axial rotation on a ball."""
     shape = _sized(_TURNS, quick)
     phase = np.arange(shape[0]) * (2 * np.pi / _STEPS)
-    twin = _twin(shape, hw.twin.Axial(phase, math.radians(2.5), 1.5), device, pattern="linear")
+    twin = _twin(shape, Axial(phase, math.radians(2.5), 1.5), device, pattern="linear")
     frames = _frames(twin)
     call = partial(engine.correlate, frames, phase, device=device)
     moved = frames.nbytes + _MAPS * math.prod(shape[1:])
@@ -98,20 +99,20 @@ def _words(shape: Shape) -> str:
     return f"{' x '.join(map(str, shape))} uint8"
 
 
-def _twin(shape: Shape, movement: hw.twin.Movement, device: Device, **sensor: Any) -> hw.Twin:
+def _twin(shape: Shape, movement: Movement, device: Device, **sensor: Any) -> Twin:
     pixel_size = _FIELD / shape[2]
-    return hw.Twin(
+    return Twin(
         object="sphere",
         shape=shape[1:],
         pixel_size=pixel_size,
         movement=movement,
-        camera=hw.twin.Camera(noise=1.5, electrons=40.0),
+        camera=Camera(noise=1.5, electrons=40.0),
         device=device,
         **sensor,
     )
 
 
-def _frames(twin: hw.Twin) -> Any:
+def _frames(twin: Twin) -> Any:
     frames = np.empty(twin.shape, twin.dtype)
     twin.read(frames)
     return frames

@@ -261,11 +261,11 @@ def take(
     from mirrorskin import io
     from mirrorskin.cli.output import progress
     from mirrorskin.cli.quantity import duration
+    from mirrorskin.hw.base.rig_file import load_rig
     from mirrorskin.hw.rig.plans import check_plan
     from mirrorskin.hw.rig.rig import open_rig
     from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.hw.rig.sweep import make_scan
-    from mirrorskin.hw.rig_file import load_rig
 
     settings = load_rig(rig_file)
     seconds = None if settle is None else duration(settle, "--settle")
@@ -319,8 +319,8 @@ def turn_plan(press: str | None, tilt: float | None, phase_step: float | None, e
 
 def still_plan(rig_file: Path, travel: float | None = None) -> VerticalPlan:
     """Return a plan in which the body hardly moves, lifted or at a travel, mm."""
+    from mirrorskin.hw.base.rig_file import load_rig
     from mirrorskin.hw.rig.plans import VerticalPlan
-    from mirrorskin.hw.rig_file import load_rig
 
     start = load_rig(rig_file).stage.limits.travel[0] if travel is None else travel - _STILL
     return VerticalPlan(start, start + _STILL, step=_STILL)

@@ -54,7 +54,7 @@ _PACKAGES = {
         "view.result": "figures of one result",
         "view.report": "a result as one page for a browser",
         "hw": "stage, camera, and both as a rig",
-        "hw.twin": "the digital twin: objects, body, camera, movements",
+        "twin": "the digital twin: objects, body, camera, movements",
         "kernels.device": "OpenCL devices, their arrays and kernels",
     },
 }

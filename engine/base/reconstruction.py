@@ -218,9 +218,10 @@ def reconstruct(
     >>> reconstruct(frames, travel=[0.0, 0.1, 0.2, 0.3, 0.4], pixel_size=0.03).height[0].tolist()
     [-0.25, -0.25, -0.25, -0.25]
 
-    >>> from mirrorskin import engine, hw
-    >>> from mirrorskin.hw.twin import Vertical
-    >>> press = hw.Twin(object="sphere", shape=(40, 40), pixel_size=0.26, movement=Vertical([0.1, 0.2, 0.3]))
+    >>> from mirrorskin import engine
+    >>> from mirrorskin.twin import Twin
+    >>> from mirrorskin.twin import Vertical
+    >>> press = Twin(object="sphere", shape=(40, 40), pixel_size=0.26, movement=Vertical([0.1, 0.2, 0.3]))
     >>> engine.reconstruct(press).height.shape
     (40, 40)
     """

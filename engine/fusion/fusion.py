@@ -163,12 +163,13 @@ def fuse(
 
     Examples
     --------
-    >>> from mirrorskin import engine, hw
-    >>> from mirrorskin.hw.twin import Axial, Vertical
+    >>> from mirrorskin import engine
+    >>> from mirrorskin.twin import Twin
+    >>> from mirrorskin.twin import Axial, Vertical
     >>> ball = {"object": "sphere", "shape": (50, 50), "pixel_size": 0.1}
-    >>> press = hw.Twin(movement=Vertical(0.1 * np.arange(1, 31)), **ball)
+    >>> press = Twin(movement=Vertical(0.1 * np.arange(1, 31)), **ball)
     >>> eighths = np.pi / 4 * np.arange(8)
-    >>> turn = hw.Twin(movement=Axial(eighths, tilt=0.05, press=1.5), pattern="linear", **ball)
+    >>> turn = Twin(movement=Axial(eighths, tilt=0.05, press=1.5), pattern="linear", **ball)
     >>> surface = engine.fuse(press, turn)
     >>> error = engine.score(surface, turn.truth).height
     >>> error.rms < 0.005  # mm

@@ -136,10 +136,11 @@ class Press(Method):
 
     Examples
     --------
-    >>> from mirrorskin import engine, hw
+    >>> from mirrorskin import engine
+    >>> from mirrorskin.twin import Twin, Vertical
     >>> travel = 0.1 * np.arange(12)
-    >>> press = hw.Twin(
-    ...     object="sphere", shape=(40, 40), pixel_size=0.26, movement=hw.twin.Vertical(travel)
+    >>> press = Twin(
+    ...     object="sphere", shape=(40, 40), pixel_size=0.26, movement=Vertical(travel)
     ... )
     >>> result = engine.Press(fill=False).run(press)
     >>> bool(np.nanmax(np.abs(result.height - press.truth.height)) < 0.05)  # half of a step of the travel

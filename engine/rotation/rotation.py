@@ -69,9 +69,10 @@ class Rotation(Method):
 
     Examples
     --------
-    >>> from mirrorskin import engine, hw
-    >>> movement = hw.twin.Axial(np.pi / 4 * np.arange(8), tilt=0.05, press=1.0)
-    >>> turn = hw.Twin(
+    >>> from mirrorskin import engine
+    >>> from mirrorskin.twin import Axial, Twin
+    >>> movement = Axial(np.pi / 4 * np.arange(8), tilt=0.05, press=1.0)
+    >>> turn = Twin(
     ...     object="sphere", shape=(40, 40), pixel_size=0.26, movement=movement, pattern="linear"
     ... )
     >>> result = engine.Rotation().run(turn)

@@ -13,12 +13,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.camera import Camera, Counts
-from mirrorskin.hw.clock import SYSTEM, Clock
+from mirrorskin.hw.base.camera import Camera, Counts
+from mirrorskin.hw.base.clock import SYSTEM, Clock
+from mirrorskin.hw.base.rig_file import Axis, CameraSettings, RigSettings, StageSettings
+from mirrorskin.hw.base.stage import Limits, Position, Report, Stage
 from mirrorskin.hw.rig.rig import longest_wait, open_camera, open_stage
 from mirrorskin.hw.rig.trigger import Trigger
-from mirrorskin.hw.rig_file import Axis, CameraSettings, RigSettings, StageSettings
-from mirrorskin.hw.stage import Limits, Position, Report, Stage
 from mirrorskin.io import InputError
 
 Verdict = Literal["ok", "warning", "failed"]

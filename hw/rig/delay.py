@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl.moves import SLOWEST
-from mirrorskin.hw.rig.plans import AxialPlan, Plan, RockPlan, Trapezoid, VerticalPlan
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.rig_file import Axis
+from mirrorskin.hw.base.stage import Position
+from mirrorskin.hw.rig.plans import AxialPlan, Plan, RockPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Move, Rig
 from mirrorskin.hw.rig.track import Track, even_times
-from mirrorskin.hw.rig_file import Axis
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.stages.moves import SLOWEST
+from mirrorskin.hw.stages.trajectory import Trapezoid
 from mirrorskin.io.types import Floats, InputError
 
 # Parameters of the move

@@ -7,79 +7,17 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from mirrorskin.hw.rig_file import StageSettings
-from mirrorskin.hw.stage import Position, Stage
+from mirrorskin.hw.base.rig_file import StageSettings
+from mirrorskin.hw.base.stage import Position, Stage
+from mirrorskin.hw.stages.trajectory import Trapezoid
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Floats, Motion
 
-_RAMP = 0.1  # assumed acceleration time of a stage, seconds, before it is known
 _STEPS_MAX = 10**6
 _TURNS_MAX = 10_000
 _STROKES_MAX = 10_000
 _ROUNDING = 1e-9  # of a step
-
-
-@dataclass(frozen=True, slots=True)
-class Trapezoid:
-    """A trajectory from rest to rest with a trapezoidal speed profile.
-
-    It may consist of several equal legs, each from rest to rest.
-    """
-
-    length: float  # total of all legs, mm or radians, above 0
-    speed: float  # speed in the middle of a leg, mm/s or rad/s; not reached on a short leg
-    acceleration: float
-    legs: int = 1
-
-    @classmethod
-    def planned(cls, length: float, speed: float, legs: int = 1) -> Trapezoid:
-        """Return a trajectory with an assumed acceleration."""
-        return cls(length, speed, speed / _RAMP, legs)
-
-    @property
-    def leg(self) -> float:
-        """Length of a leg."""
-        return self.length / self.legs
-
-    @property
-    def ramp(self) -> float:
-        """Duration of the acceleration, seconds."""
-        return min(self.speed, math.sqrt(self.leg * self.acceleration)) / self.acceleration
-
-    @property
-    def duration(self) -> float:
-        """Total duration, seconds."""
-        return self.legs * self._leg_duration
-
-    @property
-    def _leg_duration(self) -> float:
-        return self.leg / (self.acceleration * self.ramp) + self.ramp
-
-    def place(self, time: ArrayLike) -> Floats:
-        """Return the distance travelled after a time, seconds; constant before start and after end."""
-        t = np.clip(np.asarray(time, np.float64), 0, self.duration)
-        number = np.clip(t // self._leg_duration, 0, self.legs - 1)
-        t = t - number * self._leg_duration
-        left = self._leg_duration - t
-        up, down = np.minimum(t, self.ramp), np.minimum(left, self.ramp)
-        cruise = self.acceleration * self.ramp * (t - self.ramp / 2)
-        early, late = self.acceleration / 2 * up**2, self.leg - self.acceleration / 2 * down**2
-        return number * self.leg + np.where(t < self.ramp, early, np.where(left < self.ramp, late, cruise))
-
-    def time(self, place: ArrayLike) -> Floats:
-        """Return the time at which a distance is reached, seconds; the inverse of ``place``."""
-        s = np.clip(np.asarray(place, np.float64), 0, self.length)
-        number = np.clip(s // self.leg, 0, self.legs - 1)
-        s = s - number * self.leg
-        left = np.maximum(self.leg - s, 0)
-        ramp_end = self.acceleration / 2 * self.ramp**2
-        early = np.sqrt(2 * s / self.acceleration)
-        late = self._leg_duration - np.sqrt(2 * left / self.acceleration)
-        cruise = s / (self.acceleration * self.ramp) + self.ramp / 2
-        within = np.where(s < ramp_end, early, np.where(left < ramp_end, late, cruise))
-        return number * self._leg_duration + within
 
 
 class Plan:
@@ -607,7 +545,7 @@ def check_plan(plan: Plan, settings: StageSettings, name: str, stage: Stage | No
     and the retreat are within the limits if both ends of the scan are. An open stage also knows the limits of
     its controller.
     """
-    from mirrorskin.hw.grbl.moves import Axes
+    from mirrorskin.hw.stages.moves import Axes
 
     limits = settings.limits if stage is None else stage.limits
     for place in (plan.first, *plan.ends):

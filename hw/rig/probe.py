@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.stage import Limits
 from mirrorskin.hw.rig.delay import block_means
 from mirrorskin.hw.rig.plans import VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
-from mirrorskin.hw.stage import Limits
 from mirrorskin.io.types import Floats, InputError
 
 _FRAMES, _PLACES = 4, 4  # frames at a position, and number of preceding positions to compare with

@@ -9,12 +9,12 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import cast
 
-from mirrorskin.hw.camera import Camera, Frames
-from mirrorskin.hw.clock import SYSTEM, Clock
-from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.base.camera import Camera, Frames
+from mirrorskin.hw.base.clock import SYSTEM, Clock
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.rig_file import CameraSettings, RigSettings, StageSettings
+from mirrorskin.hw.base.stage import Position, Report, Stage
 from mirrorskin.hw.rig.trigger import Trigger, no_trigger
-from mirrorskin.hw.rig_file import CameraSettings, RigSettings, StageSettings
-from mirrorskin.hw.stage import Position, Report, Stage
 from mirrorskin.io import InputError
 from mirrorskin.io.own_class import load_class
 from mirrorskin.io.types import Closing
@@ -260,7 +260,7 @@ def open_stage(settings: StageSettings, unlock: bool = False, clock: Clock = SYS
     """
     firmware = settings.firmware
     if firmware == "grbl":
-        from mirrorskin.hw.grbl.stage import GrblStage
+        from mirrorskin.hw.stages.grbl import GrblStage
 
         return GrblStage(settings, unlock=unlock, clock=clock)
     if unlock:
@@ -268,7 +268,7 @@ def open_stage(settings: StageSettings, unlock: bool = False, clock: Clock = SYS
             f"stage {settings.port}: only GRBL can be unlocked; switch this controller off and on"
         )
     if firmware == "marlin":
-        from mirrorskin.hw.marlin.stage import MarlinStage
+        from mirrorskin.hw.stages.marlin import MarlinStage
 
         return MarlinStage(settings, clock=clock)
     return _open_own(settings)
@@ -293,7 +293,7 @@ def _open_own(settings: StageSettings) -> Stage:
         if hasattr(stage, "close"):
             stage.close()
         raise InputError(
-            f"{name} has no {', no '.join(lacking)}: mirrorskin.hw.stage.Stage lists the methods of a stage"
+            f"{name} has no {', no '.join(lacking)}: mirrorskin.hw.Stage lists the methods of a stage"
         )
     return cast("Stage", stage)
 
@@ -301,10 +301,10 @@ def _open_own(settings: StageSettings) -> Stage:
 def open_camera(settings: CameraSettings, clock: Clock = SYSTEM) -> Camera:
     """Open the camera that a rig file describes; InputError if it is missing or does not match."""
     if settings.genicam:
-        from mirrorskin.hw.genicam import GenicamCamera
+        from mirrorskin.hw.cameras.genicam import GenicamCamera
 
         return GenicamCamera(settings, clock=clock)
-    from mirrorskin.hw.video import VideoCamera
+    from mirrorskin.hw.cameras.video import VideoCamera
 
     return VideoCamera(settings, clock=clock)
 

@@ -13,12 +13,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.references import read_reference
+from mirrorskin.hw.base.rig_file import RigSettings
+from mirrorskin.hw.base.stage import Position, Report
 from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, RockPlan, TwistPlan, check_plan
-from mirrorskin.hw.rig.references import read_reference
 from mirrorskin.hw.rig.rig import Rig
-from mirrorskin.hw.rig_file import RigSettings
-from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
 
 SETTLE = 0.1

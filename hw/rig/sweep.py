@@ -9,12 +9,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.camera import Frames
+from mirrorskin.hw.base.camera import Frames
 from mirrorskin.hw.rig.delay import Delay, measure_delay
-from mirrorskin.hw.rig.plans import AxialPlan, Plan, Trapezoid
+from mirrorskin.hw.rig.plans import AxialPlan, Plan
 from mirrorskin.hw.rig.rig import Move, Rig, untriggered
 from mirrorskin.hw.rig.scan import MARGIN, SETTLE, Scan, StepScan, check_there
 from mirrorskin.hw.rig.track import LiveTrack, Progress, Track, even_times
+from mirrorskin.hw.stages.trajectory import Trapezoid
 from mirrorskin.io.types import Block, Floats
 
 _SLOWER = 1.01  # factor by which a turn may be slower than planned without having too many frames

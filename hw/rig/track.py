@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.hw.rig.plans import Plan, Trapezoid
-from mirrorskin.hw.stage import Report
+from mirrorskin.hw.base.stage import Report
+from mirrorskin.hw.rig.plans import Plan
+from mirrorskin.hw.stages.trajectory import Trapezoid
 from mirrorskin.io.types import Floats
 from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.least_squares import mad_sigma

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 
-from mirrorskin.hw.camera import Camera, Frames
-from mirrorskin.hw.clock import Clock
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig_file import CameraSettings
-from mirrorskin.hw.stage import Stage
+from mirrorskin.hw.base.camera import Camera, Frames
+from mirrorskin.hw.base.clock import Clock
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.rig_file import CameraSettings
+from mirrorskin.hw.base.stage import Stage
 from mirrorskin.io import InputError
 
 _PATIENCE = 2.0  # seconds that a frame may take, in addition to exposure and delay

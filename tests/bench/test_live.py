@@ -6,7 +6,7 @@ from live_frames import paced, phases, turn_frames, turn_header
 from suite.live import Ran, judge_press, judge_rotation
 
 from mirrorskin.engine.live import RAISED, Latency, Status, Update
-from mirrorskin.hw.simulated_clock import SimulatedClock
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 SHAPE = (20, 5, 7)
 

@@ -9,8 +9,8 @@ import time
 
 import pytest
 
+from mirrorskin.hw.base.rig_file import load_rig
 from mirrorskin.hw.rig.rig import open_stage
-from mirrorskin.hw.rig_file import load_rig
 from mirrorskin.io import InputError
 
 PATIENCE = 60.0  # seconds

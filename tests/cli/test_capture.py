@@ -12,9 +12,9 @@ from simulated import simulated_rig
 from stacks import record, sphere
 
 from mirrorskin import io
-from mirrorskin.hw.grbl.stage import GrblStage
 from mirrorskin.hw.rig import rig as rigs
-from mirrorskin.hw.twin import Axial
+from mirrorskin.hw.stages.grbl import GrblStage
+from mirrorskin.twin import Axial
 
 SHAPE = (24, 32)
 

@@ -11,8 +11,8 @@ import pytest
 from commands import done, refused, run
 from stacks import record
 
-from mirrorskin import engine, hw, io
-from mirrorskin.hw.twin import Axial, Camera, Vertical
+from mirrorskin import engine, io
+from mirrorskin.twin import Axial, Camera, Twin, Vertical
 
 SHAPE, PIXEL = (44, 48), 0.25
 TRAVEL = 0.1 * np.arange(1, 21)
@@ -21,7 +21,7 @@ DETECTOR = "entry/instrument/detector"
 
 
 def twin(movement, pattern="uniform", pixel_size=PIXEL, shape=SHAPE):
-    return hw.Twin(
+    return Twin(
         object="sphere",
         shape=shape,
         pixel_size=pixel_size,

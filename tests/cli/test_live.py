@@ -25,7 +25,7 @@ from mirrorskin.cli.status import Board, Newest, summary
 from mirrorskin.engine.base.reconstruction import load_operation
 from mirrorskin.engine.live import SHOWN, Latency, Status
 from mirrorskin.hw import HardwareError, Position
-from mirrorskin.hw import rig_file as file
+from mirrorskin.hw.base import rig_file as file
 from mirrorskin.hw.rig import rig
 from mirrorskin.kernels.errors import DeviceError
 

@@ -13,8 +13,8 @@ from simulated import write_film_rig
 
 from mirrorskin.cli import rig as command
 from mirrorskin.hw import load_rig
-from mirrorskin.hw.emulator.port import GrblLine, GrblMachine
 from mirrorskin.hw.rig.check import CheckResult
+from mirrorskin.twin.emulator.port import GrblLine, GrblMachine
 
 RIG = """
 [stage]
@@ -52,7 +52,7 @@ def controller(folder, simulated, monkeypatch):
     def plug_in(home=False, **settings):
         told = MACHINE | {22: float(home)} | {int(name[1:]): value for name, value in settings.items()}
         line = GrblLine(GrblMachine(told, start=dict.fromkeys("XYZ", -1.0), clock=simulated))
-        monkeypatch.setattr("mirrorskin.hw.grbl.stage.open_port", lambda *_: line.open())
+        monkeypatch.setattr("mirrorskin.hw.stages.grbl.open_port", lambda *_: line.open())
         write_film_rig(folder, RIG.format(port=line.url, home=str(home).lower()))
         return line
 

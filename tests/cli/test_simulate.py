@@ -14,9 +14,10 @@ import pytest
 from commands import done, refused, run
 from stacks import read_all
 
-from mirrorskin import hw, io
-from mirrorskin.hw.twin import OBJECT_NAMES, Body, Camera, SheetTexture
+import mirrorskin.twin
+from mirrorskin import io
 from mirrorskin.io.types import MOTIONS
+from mirrorskin.twin import OBJECT_NAMES, Body, Camera, SheetTexture, Twin
 
 SMALL = ["--size", "24x18", "--pixel-size", "0.4mm"]
 SHAPE, PIXEL = (18, 24), 0.4
@@ -156,13 +157,13 @@ def documented():
 def asked(monkeypatch):
     """What the twin was asked for, call by call."""
     calls = []
-    twin = hw.Twin
+    twin = Twin
 
     def spy(**given):
         calls.append(given)
         return twin(**given)
 
-    monkeypatch.setattr(hw, "Twin", spy)
+    monkeypatch.setattr(mirrorskin.twin, "Twin", spy)
     return calls
 
 
@@ -200,7 +201,7 @@ def test_without_options_the_field_is_the_documented_one(asked, monkeypatch):
         asked.append(given)
         raise io.InputError("enough is known")
 
-    monkeypatch.setattr(hw, "Twin", refuse)
+    monkeypatch.setattr(mirrorskin.twin, "Twin", refuse)
     refused("enough is known", "simulate vertical -o a.h5")
     rows, columns = asked[0]["shape"]
     assert f"{columns}x{rows}" == told["--size"] == "480x480"

@@ -18,7 +18,7 @@ from background import end, install, process_of
 from commands import refused
 
 from mirrorskin.hw import load_rig
-from mirrorskin.hw.rig_file import RigSettings
+from mirrorskin.hw.base.rig_file import RigSettings
 
 PATIENCE = 60.0  # seconds, for a busy machine
 SMALL = ("--size", "42x31", "--pixel-size", "0.3mm")

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from stacks import record
 
-from mirrorskin import hw
-from mirrorskin.hw.twin import Vertical
+from mirrorskin.twin import Twin, Vertical
 
 EXITING = """
 import itertools, sys, threading
@@ -61,7 +60,7 @@ def press(tmp_path_factory):
     """A recording that is read block by block."""
     path = tmp_path_factory.mktemp("exit") / "press.h5"
     movement = Vertical(0.1 * np.arange(12))
-    record(hw.Twin(object="sphere", shape=(100, 100), pixel_size=0.1, movement=movement), path)
+    record(Twin(object="sphere", shape=(100, 100), pixel_size=0.1, movement=movement), path)
     return path
 
 

@@ -14,7 +14,7 @@ from stacks import record
 import mirrorskin
 from mirrorskin import engine, io
 from mirrorskin.engine.base.undistort import undistort
-from mirrorskin.hw.twin import Axial, Body, Camera, Horizontal, SheetTexture, Sphere, Twin, Vertical
+from mirrorskin.twin import Axial, Body, Camera, Horizontal, SheetTexture, Sphere, Twin, Vertical
 
 PIXEL, SHAPE = 0.1, (50, 52)
 BALL = {"object": "sphere", "shape": SHAPE, "pixel_size": PIXEL}

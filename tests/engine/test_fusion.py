@@ -11,10 +11,10 @@ from rotations import EIGHTHS, TILT, Setup
 from scipy.stats import norm
 from stacks import MadeUp, record
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.engine.fusion.fusion import frames_to_read
-from mirrorskin.hw.twin import Axial, Body, Camera, Vertical
 from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.twin import Axial, Body, Camera, Twin, Vertical
 
 NAN = np.float32(np.nan)
 RADIUS = 5.0
@@ -24,14 +24,14 @@ def press(shape, pixel, step=0.1, depth=3.0, **changes):
     """As in Figure 5 of the paper: on a ball of 10 mm, in steps of 0.1 mm."""
     travel = step * np.arange(1, round(depth / step) + 1)
     camera = changes.pop("camera", Camera(seed=1))
-    return hw.Twin(
+    return Twin(
         object="sphere", shape=shape, pixel_size=pixel, movement=Vertical(travel), camera=camera, **changes
     )
 
 
 def rotation(shape, pixel, pivot=(0.0, 0.0, 0.0), body=None, **camera):
     """As in Figure 10 (a), on the same ball; the wall is linear from zenith 0 on unless a body is given."""
-    return hw.Twin(
+    return Twin(
         object="sphere",
         shape=shape,
         pixel_size=pixel,

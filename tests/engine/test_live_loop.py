@@ -9,8 +9,8 @@ from live_frames import paced, turn_header
 
 from mirrorskin.engine.live import PUSHED, RAISED, SHOWN, UPDATED, WAITED, Loop
 from mirrorskin.engine.live.status import Monitor
-from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.io import InputError, Result
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 COUNT, RATE = 40, 100.0
 FRAMES = np.arange(COUNT, dtype=np.uint8)[:, np.newaxis, np.newaxis] * np.ones((2, 3), np.uint8)

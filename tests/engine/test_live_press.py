@@ -8,8 +8,8 @@ from suite.scenes import references
 from mirrorskin import engine
 from mirrorskin.engine import Press, find_onset
 from mirrorskin.engine.live import LiveRun, Loop
-from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.io import InputError
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 SHAPE = (30, 17, 23)
 TRAVEL = np.sort(np.random.default_rng(3).uniform(0, 1.5, SHAPE[0]))

@@ -13,8 +13,8 @@ from mirrorskin.engine.integration.normals_to_height import find_slopes
 from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
 from mirrorskin.engine.live import LiveRun, Loop
 from mirrorskin.engine.rotation.last_turn import choose_window
-from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.io import InputError, open_result, save_result
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 SHAPE, WINDOW = (24, 40, 52), 8
 PHASE = phases(SHAPE[0])

@@ -14,10 +14,11 @@ from live_frames import press_frames, press_header, turn_header
 from operations import CASES, Readable
 from stacks import record
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.io.calibration.types import CameraId
 from mirrorskin.io.zarr_export import save_zarr
+from mirrorskin.twin import Axial, Twin, Vertical
 
 THREADS, RUNS = 4, 4  # runs of each thread
 SHAPE = (24, 20, 28)
@@ -115,9 +116,7 @@ FILES = {
 }
 SOURCES = {
     "array": lambda: ArrayRecording(FRAMES, {"travel": TRAVEL}, {}),
-    "twin": lambda: hw.Twin(
-        object="sphere", shape=SHAPE[1:], pixel_size=0.26, movement=hw.twin.Vertical(TRAVEL)
-    ),
+    "twin": lambda: Twin(object="sphere", shape=SHAPE[1:], pixel_size=0.26, movement=Vertical(TRAVEL)),
     "own source": lambda: Readable(FRAMES, press_header(), travel=TRAVEL),
 }
 DOORS = {
@@ -266,11 +265,9 @@ def test_functions_on_arrays_give_each_thread_what_one_thread_gets(name):
 def test_fusions_that_share_recordings_give_each_thread_what_one_thread_gets():
     size, pixel = (24, 24), 0.26
     common = {"object": "sphere", "shape": size, "pixel_size": pixel}
-    movement = hw.twin.Axial(np.pi / 4 * np.arange(8), tilt=0.05, press=1.0)
-    rotation = hw.Twin(**common, movement=movement, pattern="linear")
-    press, other = (
-        hw.Twin(**common, movement=hw.twin.Vertical(step * np.arange(1, 12))) for step in (0.1, 0.11)
-    )
+    movement = Axial(np.pi / 4 * np.arange(8), tilt=0.05, press=1.0)
+    rotation = Twin(**common, movement=movement, pattern="linear")
+    press, other = (Twin(**common, movement=Vertical(step * np.arange(1, 12))) for step in (0.1, 0.11))
     assert_as_alone(
         lambda: engine.fuse(press, rotation),
         lambda: engine.fuse(other, rotation),

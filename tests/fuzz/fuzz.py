@@ -242,7 +242,7 @@ def _make_stacks(folder: Path, frames: np.ndarray[Any, Any]) -> None:
 
 def _make_texts(folder: Path) -> None:
     """Write settings, tables, meshes and replies."""
-    from mirrorskin.hw.rig_file import TEMPLATE
+    from mirrorskin.hw.base.rig_file import TEMPLATE
 
     (folder / "rig.toml").write_text(TEMPLATE)
     (folder / "batch.toml").write_text(BATCH)
@@ -423,8 +423,8 @@ def _readers(suffix: str) -> list[Callable[[Any], object]]:
     from mirrorskin import io
     from mirrorskin.cli.settings import read_settings
     from mirrorskin.cli.stack import read_phases, read_travel
-    from mirrorskin.hw.rig_file import load_rig
-    from mirrorskin.hw.twin.object_files import load_height_map
+    from mirrorskin.hw.base.rig_file import load_rig
+    from mirrorskin.twin.object_files import load_height_map
 
     stores = [io.describe, io.open_heights, io.open_result, io.open_calibration, reconstruct, show]
     readers: dict[str, list[Callable[[Any], object]]] = {
@@ -493,7 +493,7 @@ def reconstruct(path: str) -> object:
 
 def listen(path: str) -> None:
     """Hear what a controller says, in pieces as they arrive."""
-    from mirrorskin.hw.grbl.replies import Splitter, parse, salvage
+    from mirrorskin.hw.stages.replies import Splitter, parse, salvage
 
     data, splitter = Path(path).read_bytes(), Splitter()
     for at in range(0, len(data), 7):

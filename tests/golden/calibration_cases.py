@@ -19,7 +19,7 @@ from engine_cases import (
 from golden import FITTED, Answer, Tolerance, case
 from scenes import EIGHTHS, TILT, dome, places, turn
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.engine.base.undistort import undistort
 from mirrorskin.engine.calibration import (
     BallTrack,
@@ -31,6 +31,7 @@ from mirrorskin.engine.calibration import (
     measure_references,
 )
 from mirrorskin.engine.live import LiveRun
+from mirrorskin.twin import Axial, Body, Camera, Twin
 
 
 def still(level: Any, count: int, seed: int, name: str) -> Source:
@@ -138,15 +139,15 @@ class Ball:
 def fit_a_wall() -> Answer:
     presses = []
     for number, place in enumerate(((0.2, 0.1), (-3.6, -3.4), (3.5, -3.6), (-3.4, 3.6), (3.6, 3.3)), 1):
-        twin = hw.Twin(
+        twin = Twin(
             object=Ball(*place),
             shape=(48, 48),
             pixel_size=0.25,
-            movement=hw.twin.Axial(EIGHTHS, TILT, 0.9),
+            movement=Axial(EIGHTHS, TILT, 0.9),
             optics="cylinder",
             pattern="linear",
-            body=hw.twin.Body(asymmetry=0.05, asymmetry_azimuth=1.0),
-            camera=hw.twin.Camera(noise=1.0, seed=number, distance=150.0),
+            body=Body(asymmetry=0.05, asymmetry_azimuth=1.0),
+            camera=Camera(noise=1.0, seed=number, distance=150.0),
             references="exact",
         )
         frames = np.empty(twin.shape, twin.dtype)

@@ -3,7 +3,7 @@
 import pytest
 from scripted_grbl import ScriptedGrbl, stage_settings
 
-from mirrorskin.hw.grbl.stage import GrblStage
+from mirrorskin.hw.stages.grbl import GrblStage
 
 
 @pytest.fixture

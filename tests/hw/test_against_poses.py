@@ -8,10 +8,10 @@ import pytest
 import rays
 from geometry import pixel_centres
 
-from mirrorskin.hw.twin import Axial, Camera, Twin, Vertical
-from mirrorskin.hw.twin.movement import Movement
-from mirrorskin.hw.twin.objects import Cone, Object, Plane, Sphere
-from mirrorskin.hw.twin.skin import Sheet
+from mirrorskin.twin import Axial, Camera, Twin, Vertical
+from mirrorskin.twin.movement import Movement
+from mirrorskin.twin.objects import Cone, Object, Plane, Sphere
+from mirrorskin.twin.skin import Sheet
 
 SHAPE, PIXEL_SIZE = (53, 71), 0.6
 # Radians: the twin's target, before its camera model.

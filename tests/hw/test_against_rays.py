@@ -12,14 +12,14 @@ import rays
 from geometry import pixel_centres
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin import Axial, Camera, Horizontal, Movement, Plane, Twin, Twist
-from mirrorskin.hw.twin.body import Body
-from mirrorskin.hw.twin.optics import Ideal, Wall
-from mirrorskin.hw.twin.pattern import Linear, Pattern, Picture, Uniform
-from mirrorskin.hw.twin.skin import Sheet
-from mirrorskin.hw.twin.view import View
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.layout import CPU_LAYOUT
+from mirrorskin.twin import Axial, Camera, Horizontal, Movement, Plane, Twin, Twist
+from mirrorskin.twin.body import Body
+from mirrorskin.twin.optics import Ideal, Wall
+from mirrorskin.twin.pattern import Linear, Pattern, Picture, Uniform
+from mirrorskin.twin.skin import Sheet
+from mirrorskin.twin.view import View
 
 Map = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from mirrorskin.hw.twin.camera import Camera, Sensor
 from mirrorskin.io import InputError
 from mirrorskin.kernels import exposure
 from mirrorskin.kernels.device import Device
+from mirrorskin.twin.camera import Camera, Sensor
 
 SHAPE = (96, 128)
 KINDS = [("uint8", 8), ("uint16", 10), ("uint16", 12), ("uint16", 16)]

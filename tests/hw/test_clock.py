@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from mirrorskin.hw.clock import SYSTEM
-from mirrorskin.hw.simulated_clock import DeadlockError, SimulatedClock
+from mirrorskin.hw.base.clock import SYSTEM
+from mirrorskin.twin.emulator.simulated_clock import DeadlockError, SimulatedClock
 
 
 @pytest.fixture(params=["system", "simulated"])

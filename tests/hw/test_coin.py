@@ -6,8 +6,8 @@ import geometry
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.coin import Coin
-from mirrorskin.hw.twin.objects import zenith_azimuth
+from mirrorskin.twin.coin import Coin
+from mirrorskin.twin.objects import zenith_azimuth
 
 PIXEL = 0.04
 SHAPE = (660, 660)

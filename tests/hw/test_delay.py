@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.base.errors import HardwareError
 from mirrorskin.hw.rig.delay import block_means, estimate_delay, frame_times
-from mirrorskin.hw.rig.plans import Trapezoid
+from mirrorskin.hw.stages.trajectory import Trapezoid
 
 PATH = Trapezoid(1.0, 0.6, 10.0)
 THERE, BACK = 0.3, 2.4

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import optimize
 
-from mirrorskin.hw.twin import elastic
-from mirrorskin.hw.twin.elastic import TOLERANCE, Contact, HalfSpace, press
+from mirrorskin.twin import elastic
+from mirrorskin.twin.elastic import TOLERANCE, Contact, HalfSpace, press
 
 Map = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mirrorskin.hw.emulator.port import GrblMachine
-from mirrorskin.hw.simulated_clock import SimulatedClock
+from mirrorskin.twin.emulator.port import GrblMachine
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 RATE, ACCELERATION = 30.0, 500.0  # the defaults, mm/s and mm/s^2
 BANNER = ["", "Grbl 1.1h ['$' for help]"]

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 import serial
 
-from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
+from mirrorskin.twin.emulator.port import GrblMachine, GrblPort
 
 SOON = 30.0  # seconds: a limit for a busy machine
 

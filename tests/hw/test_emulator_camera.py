@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw.camera import Frames
-from mirrorskin.hw.emulator.camera import TwinCamera, pose_at
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.simulated_clock import SimulatedClock
-from mirrorskin.hw.stage import Position
-from mirrorskin.hw.twin import (
+from mirrorskin.hw.base.camera import Frames
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.stage import Position
+from mirrorskin.io import InputError
+from mirrorskin.twin import (
     Axial,
     Body,
     Camera,
@@ -27,8 +26,9 @@ from mirrorskin.hw.twin import (
     Twist,
     Vertical,
 )
-from mirrorskin.hw.twin.movement import Movement, Pose, pose_at_lean
-from mirrorskin.io import InputError
+from mirrorskin.twin.emulator.camera import TwinCamera, pose_at
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
+from mirrorskin.twin.movement import Movement, Pose, pose_at_lean
 
 SHAPE = (33, 47)
 TRAVEL = [-0.3, 0.0, 0.2, 0.9, 1.4, 0.6]

@@ -15,15 +15,15 @@ import pytest
 from msgspec import structs
 from numpy.typing import NDArray
 
-from mirrorskin.hw.emulator.rig import EmulatedRig
+from mirrorskin.hw.base.rig_file import load_rig
+from mirrorskin.hw.base.stage import Position
 from mirrorskin.hw.rig.plans import VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.sweep import SweepScan
-from mirrorskin.hw.rig_file import load_rig
-from mirrorskin.hw.simulated_clock import SimulatedClock
-from mirrorskin.hw.stage import Position
-from mirrorskin.hw.twin import Axial, Camera, Horizontal, SheetTexture, Sphere, Twin, Twist, Vertical
 from mirrorskin.io import InputError
+from mirrorskin.twin import Axial, Camera, Horizontal, SheetTexture, Sphere, Twin, Twist, Vertical
+from mirrorskin.twin.emulator.rig import EmulatedRig
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 SMALL: dict[str, Any] = {"shape": (31, 42), "pixel_size": 0.3, "rate": 100.0}
 

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw.camera_thread import ThreadedCamera
-from mirrorskin.hw.emulator.server import FrameServer
+from mirrorskin.hw.cameras.camera_thread import ThreadedCamera
 from mirrorskin.io import InputError
+from mirrorskin.twin.emulator.server import FrameServer
 
 PATIENCE = 20.0  # seconds, for a busy machine
 

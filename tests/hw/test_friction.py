@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin import friction
-from mirrorskin.hw.twin.elastic import HalfSpace
-from mirrorskin.hw.twin.friction import Friction
+from mirrorskin.twin import friction
+from mirrorskin.twin.elastic import HalfSpace
+from mirrorskin.twin.friction import Friction
 
 Map = NDArray[np.float64]
 

@@ -12,11 +12,11 @@ from contextlib import closing, contextmanager
 import numpy as np
 import pytest
 
-from mirrorskin.hw import genicam
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.genicam import DeviceClock, GenicamCamera, count_lost, load_aravis
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.rig_file import CameraSettings
+from mirrorskin.hw.cameras import genicam
+from mirrorskin.hw.cameras.genicam import DeviceClock, GenicamCamera, count_lost, load_aravis
 from mirrorskin.hw.rig.rig import open_camera
-from mirrorskin.hw.rig_file import CameraSettings
 from mirrorskin.io import InputError
 
 SOON = 20.0  # seconds, that nothing here takes on the slowest machine

@@ -12,14 +12,14 @@ from line_faults import CHANGES, outcomes
 from msgspec import structs
 from scripted_grbl import stage_settings
 
-from mirrorskin.hw.clock import SYSTEM
-from mirrorskin.hw.emulator.port import GrblLine, GrblMachine, GrblPort
-from mirrorskin.hw.emulator.rig import EmulatedRig
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl.stage import GrblStage
-from mirrorskin.hw.simulated_clock import SimulatedClock
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.base.clock import SYSTEM
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.stage import Position
+from mirrorskin.hw.stages.grbl import GrblStage
 from mirrorskin.io import InputError
+from mirrorskin.twin.emulator.port import GrblLine, GrblMachine, GrblPort
+from mirrorskin.twin.emulator.rig import EmulatedRig
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 LEAN = math.radians(2.5)
 SOON = 30.0  # seconds

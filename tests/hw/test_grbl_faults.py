@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from scripted_grbl import ScriptedGrbl
 
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.stage import Position
 
 SOON = 0.1  # seconds in which everything that happens in motion is noticed
 
@@ -331,9 +331,9 @@ def test_closing_that_is_interrupted_leaves_nothing_open(moving, clock):
 
 
 FORGETFUL = """
-from mirrorskin.hw.emulator.port import GrblLine, GrblMachine
-from mirrorskin.hw.grbl.stage import GrblStage
-from mirrorskin.hw.stage import Position
+from mirrorskin.twin.emulator.port import GrblLine, GrblMachine
+from mirrorskin.hw.stages.grbl import GrblStage
+from mirrorskin.hw.base.stage import Position
 from scripted_grbl import stage_settings
 
 class Loud(GrblLine):

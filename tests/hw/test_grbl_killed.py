@@ -15,12 +15,12 @@ import pytest
 from msgspec import structs
 from scripted_grbl import stage_settings
 
-from mirrorskin.hw.emulator.motion import BLOCKS
-from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
-from mirrorskin.hw.grbl.moves import PIECE, Axes
-from mirrorskin.hw.grbl.replies import AHEAD, Window
-from mirrorskin.hw.simulated_clock import SimulatedClock
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.base.stage import Position
+from mirrorskin.hw.stages.moves import PIECE, Axes
+from mirrorskin.hw.stages.replies import AHEAD, Window
+from mirrorskin.twin.emulator.motion import BLOCKS
+from mirrorskin.twin.emulator.port import GrblMachine, GrblPort
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 SETTINGS = dict.fromkeys((110, 111, 112), 6000) | dict.fromkeys((120, 121, 122), 100)
 ZEROED = {name: structs.replace(axis, zero=0.0) for name, axis in stage_settings().axes.items()}
@@ -101,8 +101,8 @@ HOST = """
 import sys
 from msgspec import structs
 from scripted_grbl import stage_settings
-from mirrorskin.hw.grbl.stage import GrblStage
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.stages.grbl import GrblStage
+from mirrorskin.hw.base.stage import Position
 
 axes = {name: structs.replace(axis, zero=0.0) for name, axis in stage_settings().axes.items()}
 # A controller on a busy machine may be late, which is no fault here.

@@ -5,7 +5,7 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mirrorskin.hw.grbl.replies import AHEAD, LONGEST, Noise, Splitter, Window
+from mirrorskin.hw.stages.replies import AHEAD, LONGEST, Noise, Splitter, Window
 
 TEXT = st.binary(max_size=40).map(lambda text: text.replace(b"\n", b"").replace(b"\r", b""))
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scripted_grbl import stage_settings
 
-from mirrorskin.hw.grbl.moves import PIECE, Axes
-from mirrorskin.hw.rig.plans import Trapezoid
-from mirrorskin.hw.rig_file import TiltAxis, TravelAxis
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.base.rig_file import TiltAxis, TravelAxis
+from mirrorskin.hw.base.stage import Position
+from mirrorskin.hw.stages.moves import PIECE, Axes
+from mirrorskin.hw.stages.trajectory import Trapezoid
 from mirrorskin.io import InputError
 
 OFFSET = {"X": 1.0, "Y": -2.0, "Z": 3.0, "A": 7.0, "B": 11.0}

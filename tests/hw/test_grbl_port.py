@@ -11,13 +11,13 @@ from contextlib import suppress
 import pytest
 from scripted_grbl import stage_settings
 
-from mirrorskin.hw.emulator.port import GrblMachine, GrblPort
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl.link import open_port
-from mirrorskin.hw.grbl.stage import GrblStage
-from mirrorskin.hw.rig_file import TravelAxis
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.rig_file import TravelAxis
+from mirrorskin.hw.base.stage import Position
+from mirrorskin.hw.stages.grbl import GrblStage
+from mirrorskin.hw.stages.link import open_port
 from mirrorskin.io import InputError
+from mirrorskin.twin.emulator.port import GrblMachine, GrblPort
 
 PATIENT = {"timeout": 60.0, "silence": 5.0}  # seconds, for a busy machine
 AXES = {"travel": TravelAxis(letter="Z", limits=(-5.0, 6.0), speed=20.0), "pitch": None, "roll": None}

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from mirrorskin.hw.grbl.replies import (
+from mirrorskin.hw.stages.replies import (
     Alarm,
     Banner,
     Message,

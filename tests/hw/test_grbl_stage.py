@@ -7,9 +7,9 @@ import pytest
 from msgspec import structs
 from scripted_grbl import ScriptedGrbl, stage_settings
 
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig_file import TiltAxis, TravelAxis
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.rig_file import TiltAxis, TravelAxis
+from mirrorskin.hw.base.stage import Position
 from mirrorskin.io import InputError
 
 DOWN = TravelAxis(letter="Z", direction=-1, zero=-5.0, limits=(-5.0, 3.0), speed=20.0)

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from mirrorskin.hw.grbl.link import HOLDING, Stopping
-from mirrorskin.hw.grbl.report_times import ReportTimes
+from mirrorskin.hw.stages.link import HOLDING, Stopping
+from mirrorskin.hw.stages.report_times import ReportTimes
 
 
 def answered(watch, asked, trip):

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.catalogue import make_object
-from mirrorskin.hw.twin.object_files import load_height_map
-from mirrorskin.hw.twin.objects import Sphere
 from mirrorskin.io import InputError
+from mirrorskin.twin.catalogue import make_object
+from mirrorskin.twin.object_files import load_height_map
+from mirrorskin.twin.objects import Sphere
 
 SHAPE = (40, 56)
 PIXEL = 0.1

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.hw import Live, Twin
-from mirrorskin.hw.simulated_clock import SimulatedClock
-from mirrorskin.hw.twin import Axial, Vertical
 from mirrorskin.io import InputError
+from mirrorskin.twin import Axial, Live, Twin, Vertical
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 COUNT, RATE = 40, 20.0
 TRAVEL = 0.05 * np.arange(COUNT)

@@ -12,14 +12,14 @@ from rig_fakes import FakeCamera, settings
 from simulated import write_film_rig
 
 from mirrorskin import io
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.marlin.stage import MarlinStage
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.stage import Position
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig, open_stage
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
-from mirrorskin.hw.simulated_clock import SimulatedClock
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.stages.marlin import MarlinStage
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 RIG = settings((4, 4), delay=0.0, dark=5.0)
 STAGE = msgspec.structs.replace(RIG.stage, firmware="marlin", x=None, y=None, twist=None)
@@ -171,7 +171,7 @@ def test_what_is_not_a_stage_is_refused(line, clock, instead, message):
 
 
 def test_the_rig_file_chooses_it(line, clock, monkeypatch):
-    monkeypatch.setattr("mirrorskin.hw.marlin.stage.open_port", lambda *_: line.open())
+    monkeypatch.setattr("mirrorskin.hw.stages.marlin.open_port", lambda *_: line.open())
     stage = open_stage(STAGE, clock=clock)
     stage.close()
     assert stage.firmware == "Marlin 2.1.2 (Nov 24 2026)"
@@ -281,7 +281,7 @@ speed = 8.0
 @pytest.fixture
 def capture(line, simulated, tmp_path, monkeypatch):
     """Run commands on a rig file: the controller is the fake one, and the camera a film of 200 s."""
-    monkeypatch.setattr("mirrorskin.hw.marlin.stage.open_port", lambda *_: line.open())
+    monkeypatch.setattr("mirrorskin.hw.stages.marlin.open_port", lambda *_: line.open())
     monkeypatch.chdir(tmp_path)
     write_film_rig(tmp_path, RIG_FILE)
     return lambda words: run("capture", "vertical", *words.split(), "--rig", "rig.toml", "-o", "press.h5")

@@ -11,10 +11,10 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.catalogue import make_object
-from mirrorskin.hw.twin.object_files import top_surface
-from mirrorskin.hw.twin.objects import Object
 from mirrorskin.io import InputError
+from mirrorskin.twin.catalogue import make_object
+from mirrorskin.twin.object_files import top_surface
+from mirrorskin.twin.objects import Object
 
 SHAPE = (120, 160)
 PIXEL = 0.05

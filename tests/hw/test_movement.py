@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mirrorskin.hw.twin import Axial, Body, Cylinder, Horizontal, Object, Plane, Sphere, Twist, Vertical
-from mirrorskin.hw.twin.movement import Movement
-from mirrorskin.hw.twin.obstacle import meet
-from mirrorskin.hw.twin.view import View
 from mirrorskin.io import InputError
+from mirrorskin.twin import Axial, Body, Cylinder, Horizontal, Object, Plane, Sphere, Twist, Vertical
+from mirrorskin.twin.movement import Movement
+from mirrorskin.twin.obstacle import meet
+from mirrorskin.twin.view import View
 
 POINTS = np.random.default_rng(3).uniform(-8, 8, (50, 3))
 

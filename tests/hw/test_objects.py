@@ -6,11 +6,11 @@ import geometry
 import numpy as np
 import pytest
 
-from mirrorskin.hw.twin.catalogue import make_object
-from mirrorskin.hw.twin.coin import Coin
-from mirrorskin.hw.twin.object_files import HeightMap
-from mirrorskin.hw.twin.objects import Cone, Cylinder, Object, Plane, Sphere, Step, Texture, zenith_azimuth
-from mirrorskin.hw.twin.optics import uniform_response
+from mirrorskin.twin.catalogue import make_object
+from mirrorskin.twin.coin import Coin
+from mirrorskin.twin.object_files import HeightMap
+from mirrorskin.twin.objects import Cone, Cylinder, Object, Plane, Sphere, Step, Texture, zenith_azimuth
+from mirrorskin.twin.optics import uniform_response
 
 PIXEL = 0.05
 SHAPES = [(211, 230), (1, 1)]

@@ -9,19 +9,19 @@ import cv2
 import numpy as np
 import pytest
 
-from mirrorskin.hw.twin.body import Body
-from mirrorskin.hw.twin.optics import (
+from mirrorskin.io.types import Floats, InputError
+from mirrorskin.kernels.device import Device
+from mirrorskin.twin.body import Body
+from mirrorskin.twin.optics import (
     Ideal,
     Wall,
     design_range,
     scatter_rays,
     visible_zenith,
 )
-from mirrorskin.hw.twin.pattern import Linear, Pattern, Picture, Uniform, linear_pattern, make_pattern
-from mirrorskin.hw.twin.skin import Sheet
-from mirrorskin.hw.twin.view import View
-from mirrorskin.io.types import Floats, InputError
-from mirrorskin.kernels.device import Device
+from mirrorskin.twin.pattern import Linear, Pattern, Picture, Uniform, linear_pattern, make_pattern
+from mirrorskin.twin.skin import Sheet
+from mirrorskin.twin.view import View
 
 BODY = Body()
 LINEAR = linear_pattern(BODY)

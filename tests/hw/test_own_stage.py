@@ -14,13 +14,13 @@ from rig_fakes import FakeCamera, settings
 from simulated import on_clock, write_film_rig
 
 from mirrorskin import io
-from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.rig_file import StageSettings, TravelAxis
+from mirrorskin.hw.base.stage import Position
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig, open_stage
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
-from mirrorskin.hw.rig_file import StageSettings, TravelAxis
-from mirrorskin.hw.stage import Position
 
 STAGE = StageSettings(
     port="/dev/ttyUSB0", press=2.0, travel=TravelAxis(letter="Z", limits=(-10.0, 3.0), speed=100.0)
@@ -225,7 +225,7 @@ def test_commands_move_it_from_a_rig_file(folder):
         (
             "home",
             ("def home(", "def seek("),
-            "my_stage.py:LabStage has no home: mirrorskin.hw.stage.Stage",
+            "my_stage.py:LabStage has no home: mirrorskin.hw.Stage",
         ),
         ("unlock", ("", ""), "only GRBL can be unlocked"),
         ("lift", (":LabStage", ":NoStage"), "has no class NoStage"),
@@ -235,7 +235,7 @@ def test_commands_move_it_from_a_rig_file(folder):
         (
             "check",
             ("def precess(", "def spin("),
-            "my_stage.py:LabStage has no precess: mirrorskin.hw.stage.Stage",
+            "my_stage.py:LabStage has no precess: mirrorskin.hw.Stage",
         ),
     ],
 )

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mirrorskin.hw.twin.camera import Camera, Sensor
+from mirrorskin.twin.camera import Camera, Sensor
 
 SHAPE = (41, 50)
 

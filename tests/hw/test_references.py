@@ -11,8 +11,7 @@ import pytest
 from geometry import pixel_centres
 from numpy.typing import NDArray
 
-from mirrorskin.hw import Twin
-from mirrorskin.hw.twin import Body, Camera, Vertical
+from mirrorskin.twin import Body, Camera, Twin, Vertical
 
 Counts = NDArray[np.float32]
 

@@ -8,14 +8,14 @@ import pytest
 from msgspec import structs
 
 from mirrorskin import engine
-from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
-from mirrorskin.hw.simulated_clock import SimulatedClock
-from mirrorskin.hw.twin import Axial, Vertical
 from mirrorskin.io.types import Block, Closing
+from mirrorskin.twin import Axial, Vertical
+from mirrorskin.twin.emulator.rig import EmulatedRig
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 pytestmark = pytest.mark.slow
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from mirrorskin.hw.camera import Counts, Frames
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig.check import check_camera, check_moves, check_rig, check_stage
-from mirrorskin.hw.rig_file import (
+from mirrorskin.hw.base.camera import Counts, Frames
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.rig_file import (
     CameraSettings,
     RigSettings,
     ShiftAxis,
@@ -21,7 +20,8 @@ from mirrorskin.hw.rig_file import (
     TravelAxis,
     TwistAxis,
 )
-from mirrorskin.hw.stage import Position, Report
+from mirrorskin.hw.base.stage import Position, Report
+from mirrorskin.hw.rig.check import check_camera, check_moves, check_rig, check_stage
 from mirrorskin.io import InputError
 
 DEGREE = math.pi / 180

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from mirrorskin.hw.rig.references import read_reference
-from mirrorskin.hw.rig_file import (
+from mirrorskin.hw.base.references import read_reference
+from mirrorskin.hw.base.rig_file import (
     TEMPLATE,
     CameraSettings,
     RigFile,
@@ -24,7 +24,7 @@ from mirrorskin.hw.rig_file import (
     TwistAxis,
     load_rig,
 )
-from mirrorskin.hw.stage import Limits
+from mirrorskin.hw.base.stage import Limits
 from mirrorskin.io import InputError
 
 DOCS = Path(__file__).parents[2] / "docs" / "rig.md"

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rig_fakes import fake_rig
 
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.stage import Position
 
 SOON = 1.0  # seconds, in which the guard notices everything
 

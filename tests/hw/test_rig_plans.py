@@ -5,16 +5,9 @@ import pytest
 from msgspec import structs
 from rig_fakes import settings
 
-from mirrorskin.hw.rig.plans import (
-    AxialPlan,
-    HorizontalPlan,
-    RockPlan,
-    Trapezoid,
-    TwistPlan,
-    VerticalPlan,
-    check_plan,
-)
-from mirrorskin.hw.stage import Position
+from mirrorskin.hw.base.stage import Position
+from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan, VerticalPlan, check_plan
+from mirrorskin.hw.stages.trajectory import Trapezoid
 from mirrorskin.io import InputError
 
 # -5 to 3 mm, press 2 mm, 0.1 rad; x and y to 1 mm, twist to 0.5 rad; 20 mm/s, 20 rad/s

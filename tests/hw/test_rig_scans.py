@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from rig_fakes import fake_rig, settings, spreading
 
-from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.stage import Position, Report
 from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan, VerticalPlan
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
-from mirrorskin.hw.stage import Position, Report
 from mirrorskin.io import InputError, StreamRecorder
 
 TILT = 0.04

@@ -8,8 +8,8 @@ import pytest
 from bare import bare, ready
 
 from mirrorskin.engine.press.onset import Onset
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.ring import MEMORY, Ring, usual_slots
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.cameras.ring import MEMORY, Ring, usual_slots
 from mirrorskin.io import Block
 
 SHAPE = (5, 7)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin import Axial, Body, Horizontal, Sphere, Twist, Vertical
-from mirrorskin.hw.twin.movement import Movement, Pose, pose_at_press
-from mirrorskin.hw.twin.optics import Ideal
-from mirrorskin.hw.twin.pattern import Uniform
-from mirrorskin.hw.twin.scene import Imprint, Optics, Scene, Skin, Witness
-from mirrorskin.hw.twin.skin import Conform, Sheet
-from mirrorskin.hw.twin.view import View
+from mirrorskin.twin import Axial, Body, Horizontal, Sphere, Twist, Vertical
+from mirrorskin.twin.movement import Movement, Pose, pose_at_press
+from mirrorskin.twin.optics import Ideal
+from mirrorskin.twin.pattern import Uniform
+from mirrorskin.twin.scene import Imprint, Optics, Scene, Skin, Witness
+from mirrorskin.twin.skin import Conform, Sheet
+from mirrorskin.twin.view import View
 
 Map = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin.catalogue import OBJECT_NAMES, check_fits, make_object
-from mirrorskin.hw.twin.objects import Cylinder, Object, Sphere, Step, Texture, zenith_azimuth
 from mirrorskin.io import InputError
+from mirrorskin.twin.catalogue import OBJECT_NAMES, check_fits, make_object
+from mirrorskin.twin.objects import Cylinder, Object, Sphere, Step, Texture, zenith_azimuth
 
 SHAPE, PIXEL = (480, 480), 0.025
 

@@ -9,11 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from mirrorskin.hw import Twin
-from mirrorskin.hw.twin import Axial, Body, Camera, Horizontal, SheetTexture, Sphere, Twist, Vertical
-from mirrorskin.hw.twin.movement import Movement
-from mirrorskin.hw.twin.texture import TEXTURES
 from mirrorskin.io import InputError
+from mirrorskin.twin import Axial, Body, Camera, Horizontal, SheetTexture, Sphere, Twin, Twist, Vertical
+from mirrorskin.twin.movement import Movement
+from mirrorskin.twin.texture import TEXTURES
 
 SHAPE, PIXEL, DIFFUSE = (80, 90), 0.05, 0.25
 DARK, SPAN = 16.0, 208.0

@@ -10,11 +10,11 @@ from geometry import pixel_centres
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from mirrorskin.hw.twin import Axial, Body, Coin, Object, Plane, Sphere
-from mirrorskin.hw.twin.movement import Pose, pose_at_press
-from mirrorskin.hw.twin.skin import Conform, Elastic, Sheet
-from mirrorskin.hw.twin.view import View
 from mirrorskin.io import InputError
+from mirrorskin.twin import Axial, Body, Coin, Object, Plane, Sphere
+from mirrorskin.twin.movement import Pose, pose_at_press
+from mirrorskin.twin.skin import Conform, Elastic, Sheet
+from mirrorskin.twin.view import View
 
 Map = NDArray[np.float64]
 

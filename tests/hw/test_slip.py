@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw.twin import Body, Horizontal, Sphere, Twist
-from mirrorskin.hw.twin.movement import pose_at_press
-from mirrorskin.hw.twin.skin import Elastic
-from mirrorskin.hw.twin.slip import SkinHistory
-from mirrorskin.hw.twin.view import View
 from mirrorskin.io import InputError
 from mirrorskin.io.types import Floats
 from mirrorskin.kernels.device import open_device
+from mirrorskin.twin import Body, Horizontal, Sphere, Twist
+from mirrorskin.twin.movement import pose_at_press
+from mirrorskin.twin.skin import Elastic
+from mirrorskin.twin.slip import SkinHistory
+from mirrorskin.twin.view import View
 
 BALL, SIDE, FRAMES = Sphere(20.0), 91, 13
 SHARES = np.linspace(0, 0.9, FRAMES)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from mirrorskin.hw.stage import Limits, Position
+from mirrorskin.hw.base.stage import Limits, Position
 from mirrorskin.io import InputError
 
 LIMITS = Limits(travel=(-2.0, 10.0), tilt=math.radians(3), press=4.0)

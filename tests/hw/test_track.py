@@ -4,9 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mirrorskin.hw.rig.plans import AxialPlan, Trapezoid, VerticalPlan
+from mirrorskin.hw.base.stage import Position, Report
+from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.track import LiveTrack, Progress, Track, even_times
-from mirrorskin.hw.stage import Position, Report
+from mirrorskin.hw.stages.trajectory import Trapezoid
 
 LENGTH, SPEED = 2.0, 1.0
 TRUE = Trapezoid(LENGTH, 0.97, 8.0)  # a stage that is slower than planned

@@ -8,11 +8,11 @@ from firmware import PROGRAM, Firmware, is_hal
 from scripted_grbl import ScriptedGrbl
 from transcript import REST, SETTINGS, play, read
 
-from mirrorskin.hw.emulator.port import GrblMachine
-from mirrorskin.hw.grbl.replies import parse
-from mirrorskin.hw.rig_file import TwistAxis
-from mirrorskin.hw.simulated_clock import SimulatedClock
+from mirrorskin.hw.base.rig_file import TwistAxis
+from mirrorskin.hw.stages.replies import parse
 from mirrorskin.io import InputError
+from mirrorskin.twin.emulator.port import GrblMachine
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 GRBL, HAL = (read(Path(__file__).with_name(name)) for name in ("grbl-1.1h.txt", "grblhal-1.1f.txt"))
 FIRMWARE = HAL if is_hal(PROGRAM) else GRBL

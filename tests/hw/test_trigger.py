@@ -13,8 +13,7 @@ from rig_fakes import fake_rig
 from simulated import simulate
 
 from mirrorskin import io
-from mirrorskin.hw.emulator.rig import EmulatedRig
-from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.base.errors import HardwareError
 from mirrorskin.hw.rig import check
 from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.hw.rig.plans import VerticalPlan
@@ -22,6 +21,7 @@ from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
 from mirrorskin.io import InputError
+from mirrorskin.twin.emulator.rig import EmulatedRig
 
 SCENE = {"shape": (24, 32), "pixel_size": 0.2, "rate": 40.0}
 STEPS = ("--stop", "1mm", "--step", "500um", "--settle", "0s", "--frames", "2")

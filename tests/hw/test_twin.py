@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw import Twin
-from mirrorskin.hw.twin import OBJECT_NAMES, Camera, HeightMap, Vertical
 from mirrorskin.io import InputError, Source
+from mirrorskin.twin import OBJECT_NAMES, Camera, HeightMap, Twin, Vertical
 
 SHAPE = (61, 84)
 PIXEL = 0.13

@@ -6,10 +6,9 @@ import contact_theory
 import numpy as np
 import pytest
 
-from mirrorskin.hw import Twin
-from mirrorskin.hw.twin import Axial, Body, Camera, Horizontal, Sphere, Twist, Vertical
-from mirrorskin.hw.twin.movement import Movement
 from mirrorskin.io.types import Floats
+from mirrorskin.twin import Axial, Body, Camera, Horizontal, Sphere, Twin, Twist, Vertical
+from mirrorskin.twin.movement import Movement
 
 MODULUS, MU, PIXEL = 0.35, 0.6, 0.05
 PRESSED = [contact_theory.sphere(10.0, radius, MODULUS) for radius in (0.5, 1.0, 1.5)]

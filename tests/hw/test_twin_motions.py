@@ -11,22 +11,22 @@ import poses
 import pytest
 from numpy.typing import NDArray
 
-from mirrorskin.hw import Twin
-from mirrorskin.hw.twin import (
+from mirrorskin.io import InputError
+from mirrorskin.kernels.device import Device
+from mirrorskin.twin import (
     Axial,
     Body,
     Camera,
     Cylinder,
     Horizontal,
     Sphere,
+    Twin,
     Twist,
     Vertical,
     design_range,
 )
-from mirrorskin.hw.twin import twin as twin_module
-from mirrorskin.hw.twin.movement import Movement
-from mirrorskin.io import InputError
-from mirrorskin.kernels.device import Device
+from mirrorskin.twin import twin as twin_module
+from mirrorskin.twin.movement import Movement
 
 Frames = NDArray[Any]
 

@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 import pytest
 
-from mirrorskin.hw import video
-from mirrorskin.hw.camera_thread import FrameCounter
-from mirrorskin.hw.clock import SYSTEM, Clock
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.rig_file import CameraSettings
-from mirrorskin.hw.simulated_clock import SimulatedClock
-from mirrorskin.hw.video import VideoCamera, to_grey
+from mirrorskin.hw.base.clock import SYSTEM, Clock
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.rig_file import CameraSettings
+from mirrorskin.hw.cameras import video
+from mirrorskin.hw.cameras.camera_thread import FrameCounter
+from mirrorskin.hw.cameras.video import VideoCamera, to_grey
 from mirrorskin.io import InputError
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 SHAPE = (480, 640)
 SMALL = (24, 32)

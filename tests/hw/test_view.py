@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.hw.twin.body import Body
-from mirrorskin.hw.twin.view import View
 from mirrorskin.io.types import InputError
+from mirrorskin.twin.body import Body
+from mirrorskin.twin.view import View
 
 SHAPE, PIXEL = (13, 17), (2.0, 2.4)
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from stacks import SHAPE, TRAVEL, MadeUp, assert_same, put, random_stack, read_all, record
 
-from mirrorskin import hw, io
+from mirrorskin import io
 from mirrorskin.io.types import MOTIONS
+from mirrorskin.twin import Axial, Horizontal, Twin, Twist, Vertical
 
 DETECTOR, STAGE, TRUTH = "entry/instrument/detector", "entry/instrument/stage", "entry/truth"
 TIME = np.arange(8) / 30
@@ -137,16 +138,16 @@ def test_what_is_known_of_the_skin_comes_back_of_the_part_that_is_read(tmp_path,
 
 
 MOVEMENTS = {
-    "vertical": hw.twin.Vertical(TRAVEL),
-    "axial": hw.twin.Axial(PHASE, 0.04, 0.8, (0.0, 0.5, 10.0)),
-    "horizontal": hw.twin.Horizontal(DISPLACEMENT, 0.8),
-    "twist": hw.twin.Twist(TWIST, 0.8),
+    "vertical": Vertical(TRAVEL),
+    "axial": Axial(PHASE, 0.04, 0.8, (0.0, 0.5, 10.0)),
+    "horizontal": Horizontal(DISPLACEMENT, 0.8),
+    "twist": Twist(TWIST, 0.8),
 }
 
 
 @EACH
 def test_the_twin_s_recording_is_the_twin(tmp_path, motion):
-    twin = hw.Twin(
+    twin = Twin(
         object="sphere",
         shape=(10, 12),
         pixel_size=(0.5, 0.6),

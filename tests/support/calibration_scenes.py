@@ -19,8 +19,9 @@ from calibration_scorer import Map, Rig, Surface
 from numpy.typing import NDArray
 from stacks import MadeUp
 
-from mirrorskin import hw, io
-from mirrorskin.hw.twin.camera import Sensor
+from mirrorskin import io
+from mirrorskin.twin import Axial, Body, Camera, Twin, Vertical
+from mirrorskin.twin.camera import Sensor
 
 EIGHTHS = tuple(float(phase) for phase in np.arange(8) * np.pi / 4)
 BALL = 4.0  # mm, that the calibration is made with
@@ -97,16 +98,14 @@ class Lab:
     cache: Path | None = None
 
     @property
-    def body(self) -> hw.twin.Body:
+    def body(self) -> Body:
         """The twin's body."""
-        return hw.twin.Body(
-            scatter=self.scatter, asymmetry=self.asymmetry, asymmetry_azimuth=self.lamp_azimuth
-        )
+        return Body(scatter=self.scatter, asymmetry=self.asymmetry, asymmetry_azimuth=self.lamp_azimuth)
 
     @property
-    def camera(self) -> hw.twin.Camera:
+    def camera(self) -> Camera:
         """The twin's camera, with noise."""
-        return hw.twin.Camera(
+        return Camera(
             noise=self.noise, seed=self.seed, gain_deviation=self.gain_deviation, distance=self.distance
         )
 
@@ -147,7 +146,7 @@ class Lab:
 
     def turned(self, surface: Surface, press: float, take: int) -> Frames:
         """Return an axial recording of an object."""
-        movement = hw.twin.Axial(np.array(self.phase), self.tilt, press, self.pivot)
+        movement = Axial(np.array(self.phase), self.tilt, press, self.pivot)
         light = self._light(surface, movement, ("axial", self.phase, self.tilt, press, self.pivot))
         x, y, z = self.pivot
         header = replace(
@@ -162,7 +161,7 @@ class Lab:
 
     def pressed(self, surface: Surface, travel: Map, take: int, compliance: float = 0.0) -> Frames:
         """Return a vertical recording of an object under an elastic body."""
-        movement = hw.twin.Vertical(travel, compliance=compliance)
+        movement = Vertical(travel, compliance=compliance)
         key = ("elastic", travel.tolist(), compliance)
         light = self._light(surface, movement, key, contact="elastic")
         header = replace(movement.header(), title=surface.name, pixel_size=self._pixel)
@@ -187,8 +186,8 @@ class Lab:
         kept = None if self.cache is None else self.cache / f"{name}.npy"
         if kept is not None and kept.exists():
             return np.asarray(np.load(kept))
-        camera = hw.twin.Camera(distance=self.distance, **_LIGHT)
-        twin = hw.Twin(
+        camera = Camera(distance=self.distance, **_LIGHT)
+        twin = Twin(
             object=Thing(surface),
             shape=self.shape,
             pixel_size=self.pixel_size,

@@ -19,7 +19,7 @@ import tty
 from collections.abc import Mapping
 from pathlib import Path
 
-from mirrorskin.hw.clock import SYSTEM
+from mirrorskin.hw.base.clock import SYSTEM
 from mirrorskin.io.types import Closing
 
 PROGRAM = os.environ.get("GRBL")

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from poses import rotation_y, rotation_z
 
-from mirrorskin.hw.twin import Axial, Body, Camera, Twin
-from mirrorskin.hw.twin.movement import Pose
+from mirrorskin.twin import Axial, Body, Camera, Twin
+from mirrorskin.twin.movement import Pose
 
 Map = NDArray[np.float64]
 

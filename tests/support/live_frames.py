@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from suite import scenes
 from suite.live import Paced
 
-from mirrorskin.hw.simulated_clock import SimulatedClock
 from mirrorskin.io import Block, Header
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 PIXEL = 0.05
 

@@ -15,13 +15,13 @@ from msgspec import structs
 from rig_faults import AFTERWARDS, FAULTS, FIRMWARE_ONLY
 
 from mirrorskin import io
-from mirrorskin.hw.clock import SYSTEM, Clock
-from mirrorskin.hw.emulator.rig import EmulatedRig
-from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.base.clock import SYSTEM, Clock
+from mirrorskin.hw.base.errors import HardwareError
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.sweep import SweepScan
-from mirrorskin.hw.simulated_clock import SimulatedClock
+from mirrorskin.twin.emulator.rig import EmulatedRig
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 SOON = 0.2
 """Seconds within which a stage must rest after a mishap."""
@@ -110,7 +110,7 @@ class Child:
 
     def __init__(self, folder: Path, rig_file: Path, words: list[str], limit: int | None = None) -> None:
         self.recording = folder / "cut.h5"
-        unmeasured = "from mirrorskin.hw.rig_file import CameraSettings; CameraSettings.streamed = False"
+        unmeasured = "from mirrorskin.hw.base.rig_file import CameraSettings; CameraSettings.streamed = False"
         program = f"{unmeasured}; from mirrorskin.cli.main import main; main()"
         if limit is not None:
             program = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit},) * 2); {program}"

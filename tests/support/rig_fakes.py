@@ -9,12 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mirrorskin.hw.camera import Counts, Frames
-from mirrorskin.hw.errors import HardwareError
-from mirrorskin.hw.grbl.moves import Axes
-from mirrorskin.hw.rig.plans import Trapezoid
-from mirrorskin.hw.rig.rig import Rig
-from mirrorskin.hw.rig_file import (
+from mirrorskin.hw.base.camera import Counts, Frames
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.rig_file import (
     CameraSettings,
     RigSettings,
     ShiftAxis,
@@ -23,8 +20,11 @@ from mirrorskin.hw.rig_file import (
     TravelAxis,
     TwistAxis,
 )
-from mirrorskin.hw.simulated_clock import SimulatedClock
-from mirrorskin.hw.stage import Limits, Position, Report
+from mirrorskin.hw.base.stage import Limits, Position, Report
+from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.hw.stages.moves import Axes
+from mirrorskin.hw.stages.trajectory import Trapezoid
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 LIMITS = Limits((-5.0, 3.0), 0.1, 2.0, (-1.0, 1.0), (-1.0, 1.0), (-0.5, 0.5))
 PERIOD = 0.05  # seconds between reports

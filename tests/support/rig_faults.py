@@ -24,13 +24,13 @@ from firmware import Firmware, is_hal
 from msgspec import structs
 
 from mirrorskin import io
-from mirrorskin.hw.clock import SYSTEM
-from mirrorskin.hw.emulator.rig import MACHINE, EmulatedRig
-from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.base.clock import SYSTEM
+from mirrorskin.hw.base.errors import HardwareError
 from mirrorskin.hw.rig.plans import VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.sweep import SweepScan
-from mirrorskin.hw.simulated_clock import SimulatedClock
+from mirrorskin.twin.emulator.rig import MACHINE, EmulatedRig
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 LATE = 5.0
 """Seconds after which everybody must have been told."""

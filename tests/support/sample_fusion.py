@@ -13,12 +13,13 @@ from unittest import mock
 
 import numpy as np
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.cli import sample
+from mirrorskin.twin import Twin
 
 
 @cache
-def sources_of(seed: int) -> tuple[hw.Twin, hw.Twin]:
+def sources_of(seed: int) -> tuple[Twin, Twin]:
     """Return the press and the turn of the sample, with another seed."""
     with mock.patch.object(sample, "_SEED", seed):
         return sample._pressed(), sample._twin(10.0, sample._turn(1.5), pattern="linear")

@@ -7,7 +7,7 @@ import re
 
 from scripted_port import ScriptedPort
 
-from mirrorskin.hw.rig_file import StageSettings, TiltAxis, TravelAxis
+from mirrorskin.hw.base.rig_file import StageSettings, TiltAxis, TravelAxis
 
 SLOTS = 4
 SETTINGS = {13: 0, 20: 1, 21: 0, 22: 0, 25: 3000} | dict.fromkeys((110, 111, 112), 6000)

@@ -6,7 +6,7 @@ import math
 
 import serial
 
-from mirrorskin.hw.grbl.report_times import SLICE
+from mirrorskin.hw.stages.report_times import SLICE
 
 
 class ScriptedPort:

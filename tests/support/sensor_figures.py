@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mirrorskin.hw.twin import Body, visible_zenith
+from mirrorskin.twin import Body, visible_zenith
 
 TICKS = (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
 

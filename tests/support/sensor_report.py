@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from scipy import optimize, sparse
 from scipy.sparse.linalg import spsolve
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.engine.metrology.scoring import true_normals
-from mirrorskin.hw.twin import Axial, Body, Camera, Sphere, Vertical, visible_zenith
-from mirrorskin.hw.twin.view import View
+from mirrorskin.twin import Axial, Body, Camera, Sphere, Twin, Vertical, visible_zenith
+from mirrorskin.twin.view import View
 
 PIXEL = 0.05
 SHAPE = (160, 160)
@@ -279,7 +279,7 @@ def pivots() -> Table:
     return Table("The pivot: RMS angle of normals without noise, degrees", head, rows)
 
 
-def _reconstruct_about(twin: hw.Twin, pivot: tuple[float, float, float]) -> io.Result:
+def _reconstruct_about(twin: Twin, pivot: tuple[float, float, float]) -> io.Result:
     """Reconstruct a turn whose frames are registered about another pivot."""
     wrong = _Header(twin, replace(twin.header, pivot=pivot))
     return engine.reconstruct(wrong, heights=twin.truth.height)
@@ -288,7 +288,7 @@ def _reconstruct_about(twin: hw.Twin, pivot: tuple[float, float, float]) -> io.R
 class _Header:
     """A twin that says something else of itself."""
 
-    def __init__(self, twin: hw.Twin, header: io.Header) -> None:
+    def __init__(self, twin: Twin, header: io.Header) -> None:
         self._twin, self.header = twin, header
 
     def __getattr__(self, name: str) -> Any:
@@ -381,9 +381,9 @@ def _ball_radius(result: io.Result) -> float:
 # --- the twin, and how far results are from it --------------------------------------------------------------
 
 
-def _twin(thing: Any, movement: Any, **options: Any) -> hw.Twin:
+def _twin(thing: Any, movement: Any, **options: Any) -> Twin:
     given = {"shape": SHAPE, "pixel_size": PIXEL, "camera": Camera(seed=1), **options}
-    return hw.Twin(object=thing, movement=movement, **given)
+    return Twin(object=thing, movement=movement, **given)
 
 
 def _turn(
@@ -391,7 +391,7 @@ def _turn(
     tilt: float = TILT,
     pivot: tuple[float, float, float] = (0.0, 0.0, 0.0),
     **options: Any,
-) -> hw.Twin:
+) -> Twin:
     return _twin(Sphere(), Axial(phase, tilt, PRESS, pivot), pattern="linear", **options)
 
 

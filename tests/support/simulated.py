@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from mirrorskin.hw.emulator.rig import EmulatedRig
 from mirrorskin.hw.rig import check
 from mirrorskin.hw.rig import rig as rigs
-from mirrorskin.hw.simulated_clock import SimulatedClock
+from mirrorskin.twin.emulator.rig import EmulatedRig
+from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 
 def simulate(

@@ -17,10 +17,11 @@ import h5py
 import numpy as np
 import stacks
 
-from mirrorskin import hw, io
+from mirrorskin import io
 from mirrorskin.engine.batch import worker
 from mirrorskin.engine.batch.jobs import Job
 from mirrorskin.engine.batch.work import Outcome
+from mirrorskin.twin import Axial, Body, Camera, Twin
 
 PRESSES, TURNS = 6, 1
 _ONCE = (7,)
@@ -75,19 +76,19 @@ def make_recordings(folder: Path) -> list[Path]:
     return files
 
 
-def _press(seed: int) -> hw.Twin:
+def _press(seed: int) -> Twin:
     return stacks.ball((48, 64), (0.1, 0.1), np.arange(24) * 0.05, seed=seed)
 
 
-def _turn(seed: int) -> hw.Twin:
-    return hw.Twin(
+def _turn(seed: int) -> Twin:
+    return Twin(
         object="sphere",
         shape=(20, 24),
         pixel_size=(0.1, 0.1),
-        movement=hw.twin.Axial(np.arange(8) * np.pi / 4, np.radians(2.5), press=1.45),
+        movement=Axial(np.arange(8) * np.pi / 4, np.radians(2.5), press=1.45),
         pattern="linear",
-        body=hw.twin.Body(height=1e5, scatter=0.0),
-        camera=hw.twin.Camera(seed=seed),
+        body=Body(height=1e5, scatter=0.0),
+        camera=Camera(seed=seed),
     )
 
 

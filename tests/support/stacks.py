@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from mirrorskin import hw, io
+from mirrorskin import io
 from mirrorskin.io.result import FIELDS
+from mirrorskin.twin import Camera, Twin, Vertical
 
 SHAPE = (8, 5, 7)
 TRAVEL = np.round(np.arange(8) * 0.3, 10)
@@ -28,12 +29,12 @@ def random_stack(dtype="uint8", shape=SHAPE, seed=0):
 
 def ball(shape, pixel_size, travel, **camera):
     """The twin, pressed on a ball of 10 mm: what its camera makes of the paper's own idealisation."""
-    return hw.Twin(
+    return Twin(
         object="sphere",
         shape=shape,
         pixel_size=pixel_size,
-        movement=hw.twin.Vertical(travel),
-        camera=hw.twin.Camera(**camera),
+        movement=Vertical(travel),
+        camera=Camera(**camera),
     )
 
 

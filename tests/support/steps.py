@@ -50,7 +50,7 @@ def on_grid(
 
 def on_coin(x: float, y: float, shape: tuple[int, int], pixel: float = 0.016) -> Case:
     """Look at the twin's coin, round a place in mm."""
-    from mirrorskin.hw.twin.coin import Coin
+    from mirrorskin.twin.coin import Coin
 
     columns, rows = surfaces.places(shape)
     place = x + pixel * columns, y + pixel * rows

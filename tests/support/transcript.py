@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 from firmware import Firmware
 
-from mirrorskin.hw.clock import SYSTEM, Clock
-from mirrorskin.hw.emulator.port import GrblMachine
+from mirrorskin.hw.base.clock import SYSTEM, Clock
+from mirrorskin.twin.emulator.port import GrblMachine
 
 SETTINGS = {20: 0, 22: 0} | {
     base + axis: value for base, value in ((100, 250.0), (110, 1200.0), (120, 200.0)) for axis in range(3)

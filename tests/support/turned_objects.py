@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mirrorskin import engine, hw, io
-from mirrorskin.hw.twin import Axial, Camera
-from mirrorskin.hw.twin.objects import Object
+from mirrorskin import engine, io
 from mirrorskin.io.types import Floats
+from mirrorskin.twin import Axial, Camera, Twin
+from mirrorskin.twin.objects import Object
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Moved:
 @functools.cache
 def turned(thing: Object, seed: int, size: int = 128, pixel: float = 0.07) -> tuple[io.Result, float]:
     """Return a result, and how much higher its heights are than the true ones."""
-    twin = hw.Twin(
+    twin = Twin(
         object=thing,
         shape=(size, size),
         pixel_size=pixel,

@@ -10,14 +10,14 @@ from calibration_scenes import Frames, Thing
 from calibration_scorer import ball
 from numpy.typing import NDArray
 
-from mirrorskin import hw
 from mirrorskin.io import WallResponse
 from mirrorskin.kernels.response import shade_terms, sight_slopes, wall_light
+from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE, PIXEL = (48, 48), 0.25
 DIAMETER, PRESS = 4.0, 0.9
 FIVE = ((0.2, 0.1), (-3.6, -3.4), (3.5, -3.6), (-3.4, 3.6), (3.6, 3.3))
-BODY = hw.twin.Body(asymmetry=0.05, asymmetry_azimuth=1.0)
+BODY = Body(asymmetry=0.05, asymmetry_azimuth=1.0)
 DISTANCE = 150.0
 
 
@@ -38,15 +38,15 @@ def light_of_response(response: WallResponse, place: Any, z: float, normals: Any
 
 def _press(place: tuple[float, float], number: int) -> Frames:
     phase = np.arange(8) * np.pi / 4
-    twin = hw.Twin(
+    twin = Twin(
         object=Thing(ball(DIAMETER, place)),
         shape=SHAPE,
         pixel_size=PIXEL,
-        movement=hw.twin.Axial(phase, math.radians(2.5), PRESS),
+        movement=Axial(phase, math.radians(2.5), PRESS),
         optics="cylinder",
         pattern="linear",
         body=BODY,
-        camera=hw.twin.Camera(noise=1.0, seed=number, distance=DISTANCE),
+        camera=Camera(noise=1.0, seed=number, distance=DISTANCE),
         references="exact",
     )
     frames: NDArray[Any] = np.empty(twin.shape, twin.dtype)

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mirrorskin.hw.twin.view import View
 from mirrorskin.io import WallResponse
+from mirrorskin.twin.view import View
 
 RADIUS, RIM, SCATTER = 17.5, 40.0, math.radians(3.0)
 TILT = math.radians(2.5)

@@ -9,9 +9,9 @@ import pytest
 from shown import ball
 from stacks import record
 
-from mirrorskin import engine, hw, io
-from mirrorskin.hw.twin import Axial, Vertical
+from mirrorskin import engine, io
 from mirrorskin.io.maps import TABLE
+from mirrorskin.twin import Axial, Twin, Vertical
 from mirrorskin.view.app import App, Opening
 from mirrorskin.view.app.options import read, widget_of
 from mirrorskin.view.app.picture import show_map
@@ -30,7 +30,7 @@ TOUCHED = 20, 32  # a pixel that turns light, away from the top, which is filled
 def press(tmp_path_factory):
     """A recording of a press on a ball."""
     path = tmp_path_factory.mktemp("app") / "press.h5"
-    twin = hw.Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=Vertical(TRAVEL))
+    twin = Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=Vertical(TRAVEL))
     record(twin, path)
     return path
 
@@ -40,7 +40,7 @@ def turn(tmp_path_factory):
     """A recording of a rotation on a ball."""
     path = tmp_path_factory.mktemp("app") / "turn.h5"
     movement = Axial(np.arange(8) * np.pi / 4, tilt=0.04, press=1.0)
-    record(hw.Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=movement, pattern="linear"), path)
+    record(Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=movement, pattern="linear"), path)
     return path
 
 

@@ -11,10 +11,10 @@ from commands import done
 from shown import ball
 from stacks import record
 
-from mirrorskin import hw, io
+from mirrorskin import io
 from mirrorskin.cli.main import app as mirrorskin
 from mirrorskin.cli.stack import stack_words
-from mirrorskin.hw.twin import Axial, Vertical
+from mirrorskin.twin import Axial, Twin, Vertical
 from mirrorskin.view.app.save import SavePane, files
 from mirrorskin.view.app.session import Opening, Session
 from mirrorskin.view.app.wording import as_command, as_python
@@ -29,7 +29,7 @@ def press(tmp_path, monkeypatch):
     folder = tmp_path / "it's a press"
     folder.mkdir()
     monkeypatch.chdir(folder)
-    twin = hw.Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=Vertical(0.1 * np.arange(12)))
+    twin = Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=Vertical(0.1 * np.arange(12)))
     return record(twin, folder / "press.h5")
 
 
@@ -37,7 +37,7 @@ def press(tmp_path, monkeypatch):
 def turn(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     movement = Axial(np.arange(8) * np.pi / 4, tilt=0.04, press=1.0)
-    twin = hw.Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=movement, pattern="linear")
+    twin = Twin(object="sphere", shape=SHAPE, pixel_size=PIXEL, movement=movement, pattern="linear")
     return record(twin, tmp_path / "turn.h5")
 
 

@@ -8,8 +8,8 @@ import pytest
 from simulated import simulate
 
 from mirrorskin import engine, io
-from mirrorskin.hw.emulator.rig import EmulatedRig
-from mirrorskin.hw.grbl.stage import GrblStage
+from mirrorskin.hw.stages.grbl import GrblStage
+from mirrorskin.twin.emulator.rig import EmulatedRig
 from mirrorskin.view.app import App
 from mirrorskin.view.app.page import pages
 from mirrorskin.view.app.rig import RigPane

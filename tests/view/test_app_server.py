@@ -20,10 +20,9 @@ from tornado.httpclient import HTTPRequest
 from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 
-from mirrorskin import hw
 from mirrorskin.engine.base.reconstruction import load_operation
-from mirrorskin.hw.twin import Vertical
 from mirrorskin.io import InputError
+from mirrorskin.twin import Twin, Vertical
 from mirrorskin.view.app import App, Opening
 from mirrorskin.view.app.server import AppServer, StopServer, open_browser
 
@@ -280,7 +279,7 @@ def blocked(tmp_path, monkeypatch):
 def test_pages_are_served_while_one_computes(blocked, tmp_path):
     kind, name = blocked
     events = sys.modules[kind.__module__]
-    twin = hw.Twin(object="sphere", shape=(20, 20), pixel_size=0.5, movement=Vertical(0.1 * np.arange(4)))
+    twin = Twin(object="sphere", shape=(20, 20), pixel_size=0.5, movement=Vertical(0.1 * np.arange(4)))
     record(twin, tmp_path / "press.h5")
     computed = threading.Event()
 

@@ -55,9 +55,10 @@ class App:
 
     Examples
     --------
-    >>> from mirrorskin import engine, hw
-    >>> from mirrorskin.hw.twin import Vertical
-    >>> press = hw.Twin(object="sphere", shape=(40, 40), pixel_size=0.26, movement=Vertical([0.1, 0.2, 0.3]))
+    >>> from mirrorskin import engine
+    >>> from mirrorskin.twin import Twin
+    >>> from mirrorskin.twin import Vertical
+    >>> press = Twin(object="sphere", shape=(40, 40), pixel_size=0.26, movement=Vertical([0.1, 0.2, 0.3]))
     >>> app = App(engine.reconstruct(press))
     >>> app.session.now.result.height.shape
     (40, 40)

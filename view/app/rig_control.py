@@ -19,15 +19,15 @@ from mirrorskin.engine.live import LiveRun, Loop
 from mirrorskin.engine.live.status import Status, Update
 from mirrorskin.engine.rotation.last_turn import choose_window
 from mirrorskin.engine.rotation.rotation import Rotation
-from mirrorskin.hw.clock import SYSTEM, Clock
-from mirrorskin.hw.errors import HardwareError
+from mirrorskin.hw.base.clock import SYSTEM, Clock
+from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.base.rig_file import RigSettings, StageSettings
+from mirrorskin.hw.base.stage import Position, Stage
 from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import PlannedScan
 from mirrorskin.hw.rig.sweep import make_scan
-from mirrorskin.hw.rig_file import RigSettings, StageSettings
-from mirrorskin.hw.stage import Position, Stage
 
 State = Literal["disconnected", "connecting", "ready", "moving"]
 

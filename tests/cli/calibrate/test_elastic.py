@@ -12,7 +12,7 @@ from mirrorskin import io
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.engine.calibration import gel as gel_module
 from mirrorskin.hw import VerticalPlan
-from mirrorskin.hw.twin import Axial, Camera, Sphere, Twin, Vertical
+from mirrorskin.twin import Axial, Camera, Sphere, Twin, Vertical
 
 
 def twin(movement, **options):

@@ -14,7 +14,7 @@ from rotations import TILT, Setup, between, direction, expose
 from stacks import MadeUp, record
 
 from mirrorskin import engine, io
-from mirrorskin.hw import rig_file as file
+from mirrorskin.hw.base import rig_file as file
 from mirrorskin.hw.rig import rig
 
 SHAPE = (9, 11)

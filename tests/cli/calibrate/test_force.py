@@ -9,7 +9,7 @@ from commands import done, refused, run
 from stacks import record
 
 from mirrorskin import io
-from mirrorskin.hw.twin import Body, Camera, Sphere, Twin, Vertical
+from mirrorskin.twin import Body, Camera, Sphere, Twin, Vertical
 
 GEL = io.Gel(threshold=np.arctan2(17.5, 40) / 2, compliance=0.0, curvature=1 / 17.5)
 MODULUS = 0.12

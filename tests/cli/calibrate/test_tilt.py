@@ -14,7 +14,7 @@ from mirrorskin import io
 from mirrorskin.cli.calibrate import inputs
 from mirrorskin.cli.calibrate.tilt import warnings
 from mirrorskin.hw import AxialPlan
-from mirrorskin.hw.twin import Axial, Body, Twin
+from mirrorskin.twin import Axial, Body, Twin
 
 SHAPE = (64, 64)
 TALL = Body(height=1e5, scatter=0.0)  # whose wall reaches up to the camera

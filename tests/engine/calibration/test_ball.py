@@ -6,8 +6,8 @@ from leaning_turns import EIGHTHS, Ball, circle, pictures
 from poses import leaning
 
 from mirrorskin.engine.calibration.ball import find_ball, follow_ball, moved, rotations, see_ball, smooth_turn
-from mirrorskin.hw.twin import Camera
 from mirrorskin.io import InputError, pixel_axes
+from mirrorskin.twin import Camera
 
 RADIUS, DEPTH = 2.0, 0.6
 CENTRE = (1.0, -0.5, DEPTH - RADIUS)

@@ -10,7 +10,7 @@ from walls import response_of_twin
 
 from mirrorskin import io
 from mirrorskin.engine.calibration.check import check_ball
-from mirrorskin.hw.twin import Axial, Body, Camera, Twin
+from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE, PIXEL = (71, 80), 0.08
 TRAVEL = np.arange(0, 1.3, 0.02)

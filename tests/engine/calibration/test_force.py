@@ -9,7 +9,7 @@ import pytest
 
 from mirrorskin import io
 from mirrorskin.engine.calibration.force import KnownPress, fit_stiffness, known_press
-from mirrorskin.hw.twin import Axial, Body, Camera, Sphere, Twin, Vertical
+from mirrorskin.twin import Axial, Body, Camera, Sphere, Twin, Vertical
 
 GEL = io.Gel(threshold=np.arctan2(17.5, 40) / 2, compliance=0.0, curvature=1 / 17.5)
 KNOWN = io.Calibration(io.CameraId("", (48, 48), np.dtype(np.uint8)), gel=GEL)

@@ -10,9 +10,9 @@ from mirrorskin import io
 from mirrorskin.engine.calibration.gel import BallOnset, ball_onset, fit_gel, sphere_slope, sphere_travel
 from mirrorskin.engine.press.elastic import fit_press
 from mirrorskin.engine.press.press import Press
-from mirrorskin.hw.twin import Camera, Sphere, Twin, Vertical, visible_zenith
-from mirrorskin.hw.twin.body import Body
 from mirrorskin.io import InputError, Result
+from mirrorskin.twin import Camera, Sphere, Twin, Vertical, visible_zenith
+from mirrorskin.twin.body import Body
 
 COMPLIANCE = 0.05
 STEP = 0.04

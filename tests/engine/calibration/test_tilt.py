@@ -12,8 +12,8 @@ from mirrorskin.engine.calibration.ball import moved
 from mirrorskin.engine.calibration.brightness import LinearBrightness, WallBrightness
 from mirrorskin.engine.calibration.tilt import fit_precession
 from mirrorskin.engine.calibration.tilt_tracks import BallTrack, PlateTrack, track_ball, track_plate
-from mirrorskin.hw.twin import Axial, Body, Camera, Twin
 from mirrorskin.io import Header, InputError, Precession, WallResponse
+from mirrorskin.twin import Axial, Body, Camera, Twin
 
 RADIUS, DEPTH = 2.0, 0.45
 PIXEL = (0.1, 0.1)

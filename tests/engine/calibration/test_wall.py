@@ -11,12 +11,12 @@ from wall_presses import BODY, DISTANCE, SHAPE, light_of_response, wall_presses
 from mirrorskin import io
 from mirrorskin.engine.calibration.wall import fit_zenith
 from mirrorskin.engine.calibration.wall_fit import pivot_of, read_press
-from mirrorskin.hw.twin.optics import Wall
-from mirrorskin.hw.twin.pattern import make_pattern
-from mirrorskin.hw.twin.skin import Sheet
-from mirrorskin.hw.twin.view import View
 from mirrorskin.io import pixel_axes
 from mirrorskin.kernels.device import open_device
+from mirrorskin.twin.optics import Wall
+from mirrorskin.twin.pattern import make_pattern
+from mirrorskin.twin.skin import Sheet
+from mirrorskin.twin.view import View
 
 SIDE, Z = 5, 0.6
 ZENITH = np.radians(np.arange(15, 44.1, 1.0))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine.calibration.wall_response import full_light, threshold_zenith
-from mirrorskin.hw.twin import Body, visible_zenith
 from mirrorskin.io import WallResponse
+from mirrorskin.twin import Body, visible_zenith
 
 BODY = Body()
 NOTHING = np.zeros((2, 2), np.float32)

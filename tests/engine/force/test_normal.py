@@ -10,7 +10,7 @@ from contact_theory import paraboloid, sphere
 
 from mirrorskin import engine, io
 from mirrorskin.engine.force import find_force
-from mirrorskin.hw.twin import Body, Camera, Sphere, Twin, Vertical
+from mirrorskin.twin import Body, Camera, Sphere, Twin, Vertical
 
 MODULUS, PIXEL = 0.12, 0.05
 GEL = io.Gel(

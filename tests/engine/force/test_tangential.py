@@ -9,7 +9,7 @@ from contact_theory import paraboloid, pushed, traction_response
 from mirrorskin import io
 from mirrorskin.engine.force import find_force, find_tangential_force
 from mirrorskin.engine.slip import find_displacement
-from mirrorskin.hw.twin import Body, Camera, Horizontal, SheetTexture, Sphere, Twin
+from mirrorskin.twin import Body, Camera, Horizontal, SheetTexture, Sphere, Twin
 
 MODULUS, PIXEL = 0.1, 0.05
 SHEAR = MODULUS / 3

@@ -11,7 +11,7 @@ from moved_surfaces import RADIUS, ball, bumpy, error_at, error_of, plane, rod, 
 from turned_objects import Moved, turned
 
 from mirrorskin import engine, io
-from mirrorskin.hw.twin import make_object
+from mirrorskin.twin import make_object
 
 
 def draw(rng: np.random.Generator, size: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

@@ -15,8 +15,8 @@ from mirrorskin.engine.press.elastic import (
     threshold_at,
 )
 from mirrorskin.engine.press.spline import CellSplines
-from mirrorskin.hw.twin import Body, visible_zenith
 from mirrorskin.io import Gel, InputError, Result, pixel_axes
+from mirrorskin.twin import Body, visible_zenith
 
 THRESHOLD = np.arctan2(17.5, 40) / 2
 GEL = Gel(threshold=THRESHOLD, compliance=0.05)

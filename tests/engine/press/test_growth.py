@@ -9,10 +9,10 @@ from bare import bare
 from commands import run
 from scipy import optimize
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.engine.vibration.lock_in import Correlation
-from mirrorskin.hw.twin import Camera, Vertical
 from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.twin import Camera, Twin, Vertical
 
 RADIUS, DEPTH, SWING = 5.0, 1.0, 0.05
 DITHER = DEPTH + SWING * np.cos(2 * np.pi / 7.3 * np.arange(110))
@@ -38,7 +38,7 @@ def test_a_disc_grows_as_hertz_says():
 
 @pytest.fixture(scope="module")
 def elastic():
-    return hw.Twin(
+    return Twin(
         object="sphere",
         shape=(SIZE, SIZE),
         pixel_size=PIXEL,

@@ -13,7 +13,7 @@ from stacks import record
 
 from mirrorskin import engine, io
 from mirrorskin.engine.press import Levels
-from mirrorskin.hw.twin import Camera, Sphere, Twin, Vertical
+from mirrorskin.twin import Camera, Sphere, Twin, Vertical
 
 HEIGHT, RADIUS = 40.0, 17.5  # of the twin's wall, mm
 STEPS = [math.atan2(RADIUS, HEIGHT) / 2, math.radians(20), math.radians(30)]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from bare import bare, find_onset
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.engine.live import LiveRun
-from mirrorskin.hw.twin import Camera, Vertical, oscillating_travel
+from mirrorskin.twin import Camera, Twin, Vertical, oscillating_travel
 
 DARK, BRIGHT, NOISE = 20.0, 220.0, 2.0
 
@@ -141,7 +141,7 @@ def test_a_rest_before_a_stroke_up_is_not_a_stroke():
 @pytest.fixture(scope="module")
 def dither():
     travel = oscillating_travel(0.0, 1.2, 9, 83)
-    return hw.Twin(
+    return Twin(
         object="sphere", shape=(48, 48), pixel_size=0.16, movement=Vertical(travel), camera=Camera(seed=4)
     )
 

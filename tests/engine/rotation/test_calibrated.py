@@ -12,11 +12,11 @@ import walls
 from rotations import EIGHTHS, TILT
 from stacks import MadeUp
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.engine.diagnosis.registration import Registered, Sight
 from mirrorskin.engine.live import LiveRun
 from mirrorskin.engine.rotation.rotation import first_turn
-from mirrorskin.hw.twin import Axial, Body, Camera
+from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE, PIXEL, PRESS = (68, 71), 0.085, 0.7
 PIVOT = (0.3, -0.2, 4.0)
@@ -76,7 +76,7 @@ class Scene(NamedTuple):
 
 @cache
 def scene():
-    made = hw.Twin(
+    made = Twin(
         object=Ball(),
         shape=SHAPE,
         pixel_size=PIXEL,

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from rotations import EIGHTHS, TILT, UNEVEN
 from stacks import read_all
 
-from mirrorskin import engine, hw
+from mirrorskin import engine
+from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE = (111, 110)
 # So high that the wall's rim is seen at zenith 0, and a mirror without flakes: light is linear from there on.
-BODY = hw.twin.Body(height=1e5, scatter=0.0)
+BODY = Body(height=1e5, scatter=0.0)
 
 
 class Turn(NamedTuple):
@@ -50,14 +51,14 @@ CASES = {
 @cache
 def turn(name):
     case = CASES[name]
-    twin = hw.Twin(
+    twin = Twin(
         object="sphere",
         shape=SHAPE,
         pixel_size=case.pixel,
-        movement=hw.twin.Axial(case.phase, TILT, press=case.press, pivot=case.pivot),
+        movement=Axial(case.phase, TILT, press=case.press, pivot=case.pivot),
         pattern="linear",
         body=BODY,
-        camera=hw.twin.Camera(dtype=case.dtype, noise=case.noise, seed=5),
+        camera=Camera(dtype=case.dtype, noise=case.noise, seed=5),
     )
     x, y = pixel_centres(SHAPE, case.pixel)
     touches = np.stack(

@@ -11,7 +11,8 @@ from geometry import pixel_centres
 from rotations import EIGHTHS, TILT, Setup
 from stacks import read_all
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
+from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE, PIXEL = (93, 98), 0.05
 PRESS = {"pyramid": 0.9, "hip roof": 0.8, "frustum": 0.7, "cone on a plate": 2.0, "dome": 3.0}
@@ -112,14 +113,14 @@ def rotation(name):
     """Frames of the rotating twin on an object, and the lines that are true all the turn."""
     relief = next(one for one in RELIEFS if one.name == name)
     press = {"pyramid": 0.5, "cone on a plate": 0.4, "dome": 0.45}[name]
-    twin = hw.Twin(
+    twin = Twin(
         object=relief,
         shape=SHAPE,
         pixel_size=PIXEL,
-        movement=hw.twin.Axial(EIGHTHS, TILT, press=press),
+        movement=Axial(EIGHTHS, TILT, press=press),
         pattern="linear",
-        body=hw.twin.Body(height=1e5, scatter=0.0),
-        camera=hw.twin.Camera(noise=1.0, seed=3),
+        body=Body(height=1e5, scatter=0.0),
+        camera=Camera(noise=1.0, seed=3),
     )
     lines = creases.edges_of(relief, creases.turned(relief, press, EIGHTHS, TILT), SHAPE, PIXEL)
     return read_all(twin, 8).frames, twin.header, lines

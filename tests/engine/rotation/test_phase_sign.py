@@ -5,16 +5,16 @@ import warnings
 import numpy as np
 import pytest
 
-from mirrorskin import engine, hw, io
-from mirrorskin.hw.twin import Axial
+from mirrorskin import engine, io
 from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.twin import Axial, Twin
 
 
 def warnings_of(shape, sign):
     """Return the warnings of a rotation whose phases have a sign."""
     phase = np.arange(8) * np.pi / 4
     movement = Axial(phase, np.radians(2.5), 1.0)
-    twin = hw.Twin(object=shape, shape=(160, 160), pixel_size=0.04, movement=movement, pattern="linear")
+    twin = Twin(object=shape, shape=(160, 160), pixel_size=0.04, movement=movement, pattern="linear")
     header = twin.header
     known = {name: getattr(header, name) for name in ("pixel_size", "tilt", "zenith_gain", "zenith_offset")}
     frames = twin.read(np.empty(twin.shape, twin.dtype)).frames

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import rotations
 
-from mirrorskin import engine, hw, io
-from mirrorskin.hw.twin import Leaning
+from mirrorskin import engine, io
 from mirrorskin.io.types import body_axes
+from mirrorskin.twin import Camera, Leaning, Plane, Twin
 
 GAIN, OFFSET, NOISE = 500.0, 40.0, 1.5
 COUNT, SHAPE = 48, (60, 70)
@@ -159,18 +159,18 @@ def test_poses_that_determine_nothing_are_one_line(where, line):
     assert "\n" not in str(caught.value)
 
 
-PLANE = hw.twin.Plane(np.radians(24), 0.7, 2.0)
+PLANE = Plane(np.radians(24), 0.7, 2.0)
 
 
 def recorded(movement, tmp_path):
     """A twin's recording of a plane, opened again."""
-    twin = hw.Twin(
+    twin = Twin(
         object=PLANE,
         shape=(44, 44),
         pixel_size=0.08,
         movement=movement,
         pattern="linear",
-        camera=hw.twin.Camera(np.uint16, noise=2.0, seed=3),
+        camera=Camera(np.uint16, noise=2.0, seed=3),
     )
     with io.Recorder(twin, tmp_path / "a.h5", truth=lambda: twin.truth) as recorder:
         recorder.drain(lambda count: None)

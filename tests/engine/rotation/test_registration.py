@@ -10,9 +10,9 @@ import poses
 import pytest
 from stacks import MadeUp, read_all
 
-from mirrorskin import hw, io
+from mirrorskin import io
 from mirrorskin.engine.diagnosis.registration import Registered
-from mirrorskin.hw.twin import Axial, Body, Camera
+from mirrorskin.twin import Axial, Body, Camera, Twin
 
 TILT, PRESS = np.radians(2.5), 1.2
 # Uneven, out of order, and more than a turn.
@@ -84,7 +84,7 @@ def test_each_pixel_sees_where_its_point_has_gone(device, pivot):
 @pytest.mark.parametrize(("name", "pivot"), [("sphere", "40 mm up"), ("cone", "off the axis")])
 def test_equation_10_holds_for_the_normal_of_the_mean_pose(name, pivot):
     # A wall so high that brightness is linear from zenith 0 to 45 degrees.
-    twin = hw.Twin(
+    twin = Twin(
         object=name,
         shape=(61, 71),
         pixel_size=0.05,

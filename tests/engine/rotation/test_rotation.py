@@ -9,10 +9,10 @@ import rotations
 from rotations import EIGHTHS, TILT, Setup
 from stacks import MadeUp, assert_same
 
-from mirrorskin import engine, hw, io
+from mirrorskin import engine, io
 from mirrorskin.engine.base.operation import Plan
 from mirrorskin.engine.rotation.steps import Edges, Integration, take_slopes
-from mirrorskin.hw.twin import Axial, Body, Camera
+from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE = (20, 24)
 SETUP = Setup(gain=60.0, noise=20.0, offset=150.0, dtype="uint16")
@@ -248,7 +248,7 @@ def test_heights_that_do_not_converge_are_refused(monkeypatch, robust, residual,
 
 @pytest.mark.parametrize("camera", [{}, {"electrons": 40.0, "gain_deviation": 0.02, "offset_deviation": 0.5}])
 def test_registered_frames_of_the_twin_have_true_errors(camera):
-    made = hw.Twin(
+    made = Twin(
         object="sphere",
         shape=(90, 90),
         pixel_size=0.065,

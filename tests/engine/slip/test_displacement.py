@@ -10,8 +10,8 @@ from speckle import Speckle
 
 from mirrorskin import io
 from mirrorskin.engine.slip import find_displacement
-from mirrorskin.hw.twin import SheetTexture
 from mirrorskin.io import InputError
+from mirrorskin.twin import SheetTexture
 
 SHAPE, NOISE, PIXEL = (96, 128), 2.0, (0.1, 0.05)
 SPECKLE = Speckle()

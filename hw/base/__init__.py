@@ -1,0 +1,1 @@
+"""What stages, cameras and rigs share: their protocols and settings, the clock, and errors."""

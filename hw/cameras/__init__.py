@@ -1,0 +1,1 @@
+"""Cameras, and the thread that reads from them."""

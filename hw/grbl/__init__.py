@@ -1,1 +1,0 @@
-"""The GRBL driver: replies, the serial line, moves, and the stage."""

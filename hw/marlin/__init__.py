@@ -1,1 +1,0 @@
-"""The driver for Marlin, the firmware of 3D printers."""

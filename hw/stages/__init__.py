@@ -1,0 +1,1 @@
+"""Stages: how they report and move, and the firmwares GRBL and Marlin."""
