@@ -30,7 +30,7 @@ from suite import (
 )
 from suite.harness import Cases, DisagreementError, InaccurateError
 
-from mirrorskin.cli.bench.records import Case, describe_run, open_run
+from mirrorskin.cli.commands.bench.records import Case, describe_run, open_run
 from mirrorskin.io import InputError, check_output
 from mirrorskin.io.atomic import write_new
 from mirrorskin.kernels.device import open_device

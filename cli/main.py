@@ -113,7 +113,7 @@ app: LazyGroup = make_command(
     "mirrorskin",
     _common,
     LazyGroup,
-    package="mirrorskin.cli",
+    package="mirrorskin.cli.commands",
     purposes=PURPOSES,
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},

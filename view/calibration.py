@@ -8,66 +8,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mirrorskin.engine.base.undistort import distorted
 from mirrorskin.io import Calibration, InputError
-from mirrorskin.io.calibration.parameters import Part, parameters
 from mirrorskin.io.calibration.types import BITS, Lens, Precession, References
 from mirrorskin.io.types import Floats
-from mirrorskin.view.canvas import (
+from mirrorskin.view.drawing.canvas import (
     check_drawing,
     draw_classes,
     draw_image,
-    exceeded,
+    draw_parameter,
+    draw_pixels,
     extent,
     new_figure,
+    new_sheet,
     round_length,
     save_figure,
 )
-from mirrorskin.view.colours import DIVERGING, ERROR, SEQUENTIAL
+from mirrorskin.view.drawing.colours import DIVERGING, ERROR, SEQUENTIAL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from mirrorskin.engine.calibration.check import Check, Errors
-
-_SHOWN = 1.0, 99.0  # percentiles at the ends of the colour scale
-
-
-def new_sheet(width: float, height: float) -> Figure:
-    """Return an empty figure, in inches, on which colour bars stay next to their maps."""
-    figure = new_figure(width, height)
-    figure.set_layout_engine("compressed")
-    return figure
-
-
-def draw_pixels(
-    axes: Axes, values: ArrayLike, title: str, label: str, colours: str = SEQUENTIAL, even: bool = False
-) -> None:
-    """Draw a map of all pixels, with a colour bar."""
-    shown = np.asarray(values, np.float64)
-    known = shown[np.isfinite(shown)]
-    low, high = (float(v) for v in np.percentile(known, _SHOWN)) if known.size else (0.0, 1.0)
-    if even:
-        high = max(abs(low), abs(high))
-        low = -high
-    if high - low <= 1e-6 * max(abs(low), abs(high)):  # a single value has no range
-        low, high = low - 0.5, high + 0.5
-    beyond = exceeded(known, low, high)
-    draw_image(axes, shown, label=label, extend=beyond, cmap=colours, vmin=low, vmax=high)
-    summary = f"median {np.median(known):.4g} {label.split()[0]}" if known.size else "no answer"
-    blue = "; blue: no answer" if 0 < known.size < shown.size else ""
-    axes.set(title=f"{title}\n{summary}{blue}", xlabel="column (px)", ylabel="row (px)")
-
-
-def draw_parameter(axes: Axes, part: Part, name: str, colours: str = SEQUENTIAL) -> None:
-    """Draw a map of a calibration, with the text and in the unit that are declared."""
-    one = parameters(part)[name]
-    values = getattr(part, name) * one.factor
-    draw_pixels(axes, values, one.text.partition(";")[0], one.shown_unit, colours)
-
 
 _COLOURS = {
     "sound": "0.9",

@@ -13,9 +13,8 @@ from mirrorskin.engine.press.elastic import threshold_at
 from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import Gel, Stiffness, WallResponse
 from mirrorskin.io.types import Floats
-from mirrorskin.view.calibration import draw_parameter, new_sheet
-from mirrorskin.view.canvas import explain_colours
-from mirrorskin.view.colours import DIVERGING, ERROR, MISSING
+from mirrorskin.view.drawing.canvas import draw_parameter, explain_colours, new_sheet
+from mirrorskin.view.drawing.colours import DIVERGING, ERROR, MISSING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

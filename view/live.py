@@ -14,7 +14,7 @@ from mirrorskin.io import Result, pixel_axes
 from mirrorskin.io.maps import is_deviation
 from mirrorskin.io.result import display_order
 from mirrorskin.io.units import numbers_with_unit
-from mirrorskin.view.colours import Colours, grey, height_colours, normal_colours
+from mirrorskin.view.drawing.colours import Colours, grey, height_colours, normal_colours
 from mirrorskin.view.result.scale import displayed_values, in_figure_unit
 from mirrorskin.view.result.sheet import sheet_of
 from mirrorskin.view.viewer import close_stream, load_rerun, open_stream

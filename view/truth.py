@@ -13,8 +13,15 @@ from numpy.typing import NDArray
 from mirrorskin.engine.metrology.scoring import angle_between, true_normals
 from mirrorskin.io import InputError, Result, Truth
 from mirrorskin.io.types import Floats
-from mirrorskin.view.canvas import draw_image, exceeded, extent, filled_colours, new_figure, save_figure
-from mirrorskin.view.colours import DIVERGING, ERROR, FILLED, SEQUENTIAL, span
+from mirrorskin.view.drawing.canvas import (
+    draw_image,
+    exceeded,
+    extent,
+    filled_colours,
+    new_figure,
+    save_figure,
+)
+from mirrorskin.view.drawing.colours import DIVERGING, ERROR, FILLED, SEQUENTIAL, span
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.cli.bench.records import Case, Target
+from mirrorskin.cli.commands.bench.records import Case, Target
 from mirrorskin.engine import (
     estimate_normals,
     find_change_point,

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import io
-from mirrorskin.cli.bench.limits import time_works
-from mirrorskin.cli.bench.records import Case, Target
-from mirrorskin.cli.bench.timing import OURS, Work
+from mirrorskin.cli.commands.bench.limits import time_works
+from mirrorskin.cli.commands.bench.records import Case, Target
+from mirrorskin.cli.commands.bench.timing import OURS, Work
 from mirrorskin.engine import find_onset
 from mirrorskin.engine.batch.jobs import Job, Plan, make_jobs
 from mirrorskin.engine.batch.local import run_local

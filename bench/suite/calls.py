@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from mirrorskin import engine
-from mirrorskin.cli.bench.records import Case, Row, Target, Timing
-from mirrorskin.cli.bench.timing import OURS, ROUNDS, Work, take_turns
+from mirrorskin.cli.commands.bench.records import Case, Row, Target, Timing
+from mirrorskin.cli.commands.bench.timing import OURS, ROUNDS, Work, take_turns
 from mirrorskin.io import MirrorskinWarning, Recorder
 from mirrorskin.io.arrays import ArrayRecording
 from mirrorskin.kernels.device import Device

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from mirrorskin.cli.bench.records import Case, Row, Run, as_ms, as_percent
+from mirrorskin.cli.commands.bench.records import Case, Row, Run, as_ms, as_percent
 from mirrorskin.io import InputError
 
 Verdict = Literal["faster", "slower", "as before", "unknown"]

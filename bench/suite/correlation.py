@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.cli.bench.records import THREADS, Case
-from mirrorskin.cli.bench.timing import OURS
+from mirrorskin.cli.commands.bench.records import THREADS, Case
+from mirrorskin.cli.commands.bench.timing import OURS
 from mirrorskin.engine import correlate
 from mirrorskin.engine.correlation.design_matrix import basis, fit_matrix
 from mirrorskin.kernels.device import Device

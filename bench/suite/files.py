@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import io
-from mirrorskin.cli.bench.timing import OURS
+from mirrorskin.cli.commands.bench.timing import OURS
 from mirrorskin.engine import reconstruct
 from mirrorskin.io.recorder import Compression
 from mirrorskin.io.types import Closing, Floats

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
 
-from mirrorskin.cli.bench.records import Case, as_ms
+from mirrorskin.cli.commands.bench.records import Case, as_ms
 
 HEAD = ("call", "limit", "mirrorskin", "fastest peer", "times as fast")
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.cli.bench.limits import call_works, time_works
-from mirrorskin.cli.bench.records import Case, Row, Target
-from mirrorskin.cli.bench.timing import FIRST, OURS, Work
+from mirrorskin.cli.commands.bench.limits import call_works, time_works
+from mirrorskin.cli.commands.bench.records import Case, Row, Target
+from mirrorskin.cli.commands.bench.timing import FIRST, OURS, Work
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import Device
 

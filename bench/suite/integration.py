@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import engine
-from mirrorskin.cli.bench.limits import time_works
-from mirrorskin.cli.bench.records import THREADS, Case, Row, Target
-from mirrorskin.cli.bench.timing import FIRST, OURS, Work
+from mirrorskin.cli.commands.bench.limits import time_works
+from mirrorskin.cli.commands.bench.records import THREADS, Case, Row, Target
+from mirrorskin.cli.commands.bench.timing import FIRST, OURS, Work
 from mirrorskin.engine import Integrator
 from mirrorskin.kernels.device import Device
 from suite.harness import Cases, agree, call_targets, check_memory, missing, ratio_target

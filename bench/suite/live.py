@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.cli.bench.records import Case, Target
+from mirrorskin.cli.commands.bench.records import Case, Target
 from mirrorskin.engine import Press, Rotation
 from mirrorskin.engine.live import RAISED, LiveRun, Loop, Status, Update
 from mirrorskin.hw.base.clock import SYSTEM, Clock

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from mirrorskin.cli.bench.records import Case
+from mirrorskin.cli.commands.bench.records import Case
 from mirrorskin.engine import estimate_normals
 from mirrorskin.kernels.device import Device
 from suite.harness import Cases, check_memory, time_call

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.cli.bench.records import THREADS, Case
-from mirrorskin.cli.bench.timing import OURS
+from mirrorskin.cli.commands.bench.records import THREADS, Case
+from mirrorskin.cli.commands.bench.timing import OURS
 from mirrorskin.engine import find_onset
 from mirrorskin.engine.base.frames import estimate_noise, reference_maps, thin_out
 from mirrorskin.kernels.device import Device

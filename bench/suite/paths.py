@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import io
-from mirrorskin.cli.bench.limits import time_works
-from mirrorskin.cli.bench.records import Case, Target
-from mirrorskin.cli.bench.timing import OURS, Work
+from mirrorskin.cli.commands.bench.limits import time_works
+from mirrorskin.cli.commands.bench.records import Case, Target
+from mirrorskin.cli.commands.bench.timing import OURS, Work
 from mirrorskin.engine import reconstruct
 from mirrorskin.engine.base.tiling import MEMORY_LIMIT
 from mirrorskin.io.url import path_of

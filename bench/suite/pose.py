@@ -7,9 +7,9 @@ import time
 
 import numpy as np
 
-from mirrorskin.cli.bench.limits import time_works
-from mirrorskin.cli.bench.records import Case, Target
-from mirrorskin.cli.bench.timing import OURS, Work
+from mirrorskin.cli.commands.bench.limits import time_works
+from mirrorskin.cli.commands.bench.records import Case, Target
+from mirrorskin.cli.commands.bench.timing import OURS, Work
 from mirrorskin.engine.pose import Pose, PoseTracker
 from mirrorskin.io import Result, pixel_axes
 from mirrorskin.kernels.device import Device

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mirrorskin.cli.bench.records import Case, Row, Run, as_ms, as_percent
-from mirrorskin.cli.bench.timing import FIRST, OURS
+from mirrorskin.cli.commands.bench.records import Case, Row, Run, as_ms, as_percent
+from mirrorskin.cli.commands.bench.timing import FIRST, OURS
 from suite import glance
 
 HEAD = ("work", "ms", "quartiles", "kernels", "copies", "GB/s", "frames/s", "of limit", "kernels")

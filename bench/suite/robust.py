@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import engine
-from mirrorskin.cli.bench.records import Case, Row, Timing
-from mirrorskin.cli.bench.timing import OURS, Work, take_turns
+from mirrorskin.cli.commands.bench.records import Case, Row, Timing
+from mirrorskin.cli.commands.bench.timing import OURS, Work, take_turns
 from mirrorskin.kernels.device import Device
 from suite.bilateral import integrate_bilaterally
 from suite.depth_scenes import HELD_OUT, SCENES, Scene

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.cli.bench.limits import time_works
-from mirrorskin.cli.bench.records import Case
-from mirrorskin.cli.bench.timing import OURS, Work
+from mirrorskin.cli.commands.bench.limits import time_works
+from mirrorskin.cli.commands.bench.records import Case
+from mirrorskin.cli.commands.bench.timing import OURS, Work
 from mirrorskin.kernels.device import Device
 from mirrorskin.twin import Axial, Camera, Movement, Twin, Vertical
 from suite.harness import Cases

@@ -9,8 +9,8 @@ from suite import integration
 from suite.harness import DisagreementError, InaccurateError, agree, call_targets
 from suite.scenes import blob_mask, noisy_slopes, random_cuts
 
-from mirrorskin.cli.bench.records import Case, Target, describe_run, open_run
-from mirrorskin.cli.bench.timing import FIRST, OURS
+from mirrorskin.cli.commands.bench.records import Case, Target, describe_run, open_run
+from mirrorskin.cli.commands.bench.timing import FIRST, OURS
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import open_device
 

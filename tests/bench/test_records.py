@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from bench_runs import case, row, run, save, target
 
-from mirrorskin.cli.bench import TABLE
-from mirrorskin.cli.bench.records import open_run
+from mirrorskin.cli.commands.bench import TABLE
+from mirrorskin.cli.commands.bench.records import open_run
 from mirrorskin.io import InputError
 
 COMMITTED = sorted((Path(__file__).parents[2] / "bench" / "results").glob("*.json"))

@@ -6,7 +6,7 @@ from bench_runs import case, row, run, target
 from suite import glance
 from suite.report import as_chart, as_markdown, as_page, as_rows, as_targets
 
-from mirrorskin.cli.bench.records import Case, Row, Target, Timing, describe_run, open_run
+from mirrorskin.cli.commands.bench.records import Case, Row, Target, Timing, describe_run, open_run
 from mirrorskin.kernels.device import open_device
 
 ROOT = Path(__file__).parents[2]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mirrorskin.cli.bench import timing
-from mirrorskin.cli.bench.timing import Work, take_turns
+from mirrorskin.cli.commands.bench import timing
+from mirrorskin.cli.commands.bench.timing import Work, take_turns
 from mirrorskin.kernels.profile import Profile
 
 

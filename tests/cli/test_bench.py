@@ -6,9 +6,9 @@ import pytest
 from bench_runs import case, row, run, save
 from commands import run as mirrorskin
 
-from mirrorskin.cli import bench
-from mirrorskin.cli.bench import operations
-from mirrorskin.cli.bench.records import open_run
+from mirrorskin.cli.commands import bench
+from mirrorskin.cli.commands.bench import operations
+from mirrorskin.cli.commands.bench.records import open_run
 
 CASES = ["limits", "onset", "correlation", "integration"]
 

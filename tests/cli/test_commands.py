@@ -195,7 +195,8 @@ def test_a_terminated_simulation_leaves_nothing(tmp_path):
 
 PROGRAM = """
 import signal, sys, time
-from mirrorskin.cli import info, main
+from mirrorskin.cli import main
+from mirrorskin.cli.commands import info
 {command}
 info.command = command
 sys.argv = ["mirrorskin", "info"]

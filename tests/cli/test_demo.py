@@ -12,8 +12,8 @@ import pytest
 from commands import done, refused, run, small_presses, small_turn
 
 from mirrorskin import io, view
-from mirrorskin.cli import demo
-from mirrorskin.view import canvas
+from mirrorskin.cli.commands import demo
+from mirrorskin.view.drawing import canvas
 
 FIGURES = "fig5", "fig6", "fig10a", "fig10b", "fused"
 PRESSED = "sub-frame", "eq. 4"
@@ -131,7 +131,7 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
 
 
 def test_without_matplotlib_nothing_is_computed(tmp_path, monkeypatch):
-    monkeypatch.setattr("mirrorskin.view.canvas.find_spec", lambda name: None)
+    monkeypatch.setattr("mirrorskin.view.drawing.canvas.find_spec", lambda name: None)
     refused("pip install 'mirrorskin", "demo -o", tmp_path / "demo")
     assert not (tmp_path / "demo").exists()
 

@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 import pytest
 from commands import done
 
-from mirrorskin.cli import doctor
+from mirrorskin.cli.commands import doctor
 from mirrorskin.kernels import device
 from mirrorskin.kernels.errors import DeviceError
 

@@ -20,8 +20,8 @@ from rig_fakes import fake_rig, settings, spreading
 from speckle import Speckle
 
 from mirrorskin import engine, io
-from mirrorskin.cli import live
-from mirrorskin.cli.status import Board, Newest, summary
+from mirrorskin.cli.commands import live
+from mirrorskin.cli.commands.status import Board, Newest, summary
 from mirrorskin.engine.base.reconstruction import load_operation
 from mirrorskin.engine.live import SHOWN, Latency, Status
 from mirrorskin.hw import HardwareError, Position

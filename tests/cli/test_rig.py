@@ -11,7 +11,7 @@ import pytest
 from commands import refused, run
 from simulated import write_film_rig
 
-from mirrorskin.cli import rig as command
+from mirrorskin.cli.commands import rig as command
 from mirrorskin.hw import load_rig
 from mirrorskin.hw.rig.check import CheckResult
 from mirrorskin.twin.emulator.port import GrblLine, GrblMachine

@@ -48,7 +48,7 @@ def folder(tmp_path_factory):
 def test_a_command_imports_only_what_it_needs(words, needed, folder, monkeypatch):
     monkeypatch.chdir(folder)
     modules = loaded(*words.split())
-    assert {f"mirrorskin.cli.{words.split()[0]}", "numpy"} <= modules
+    assert {f"mirrorskin.cli.commands.{words.split()[0]}", "numpy"} <= modules
     assert modules & SLOW == needed
 
 

@@ -8,9 +8,9 @@ from commands import run
 from shown import ball
 
 from mirrorskin import io
-from mirrorskin.cli import view as command
+from mirrorskin.cli.commands import view as command
 from mirrorskin.cli.groups import make_command
-from mirrorskin.view import canvas
+from mirrorskin.view.drawing import canvas
 
 app = make_command(None, command.command)
 
@@ -126,7 +126,7 @@ def test_a_picture_is_not_written_over_a_result_that_is_called_like_one(result):
 
 
 def test_without_matplotlib_the_remedy_is_named(result, monkeypatch):
-    monkeypatch.setattr("mirrorskin.view.canvas.find_spec", lambda name: None)
+    monkeypatch.setattr("mirrorskin.view.drawing.canvas.find_spec", lambda name: None)
     assert "pip install 'mirrorskin[view]'" in str(view(result).exception)
 
 

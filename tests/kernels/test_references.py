@@ -10,7 +10,7 @@ from references import CASES, KERNELS, agree, case, named, near
 from scipy.spatial.transform import Rotation
 from speckle import Speckle
 
-from mirrorskin.cli.bench.limits import CHAINS, CORES, LANES
+from mirrorskin.cli.commands.bench.limits import CHAINS, CORES, LANES
 from mirrorskin.kernels import correlation, displacement, focus, lambert, pose, pose_maps, registration
 from mirrorskin.kernels.breaks import DOWN, RIGHT
 from mirrorskin.kernels.device import C_TYPES

@@ -29,8 +29,8 @@ import numpy as np
 import pyopencl as cl
 from gpu_check import ROOT, frozen_cases, taken_for_gpu
 
-from mirrorskin.cli.bench.limits import measure_limits
-from mirrorskin.cli.bench.records import describe_run
+from mirrorskin.cli.commands.bench.limits import measure_limits
+from mirrorskin.cli.commands.bench.records import describe_run
 from mirrorskin.kernels.array import Mapping
 from mirrorskin.kernels.device import Device, list_devices, open_device
 

@@ -83,7 +83,7 @@ def time_calls(calls: Sequence[str], layout: str) -> Column:
     import gpu_calls
     import numpy as np
 
-    from mirrorskin.cli.bench.records import describe_run
+    from mirrorskin.cli.commands.bench.records import describe_run
     from mirrorskin.kernels.device import open_device
     from mirrorskin.kernels.layout import CPU_LAYOUT, GPU_LAYOUT
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from mirrorskin.cli.bench.records import Case, Machine, Row, Run, Target, Timing
+from mirrorskin.cli.commands.bench.records import Case, Machine, Row, Run, Target, Timing
 
 
 def timing(seconds: float, spread: float = 0.05, rounds: int = 7) -> Timing:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
 
-from mirrorskin.cli import demo
+from mirrorskin.cli.commands import demo
 from mirrorskin.cli.main import main
 from mirrorskin.io import MirrorskinWarning
 

@@ -14,7 +14,7 @@ from unittest import mock
 import numpy as np
 
 from mirrorskin import engine, io
-from mirrorskin.cli import sample
+from mirrorskin.cli.commands import sample
 from mirrorskin.twin import Twin
 
 

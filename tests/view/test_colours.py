@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from mirrorskin.view import colours
+from mirrorskin.view.drawing import colours
 
 
 def test_normals_have_the_customary_colours():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 
-from mirrorskin.view.colours import MISSING_RGB
+from mirrorskin.view.drawing.colours import MISSING_RGB
 from mirrorskin.view.result.maps import height_picture
 
 

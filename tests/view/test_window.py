@@ -5,7 +5,7 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
-from mirrorskin.view import canvas as window
+from mirrorskin.view.drawing import canvas as window
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ from mirrorskin.io import Region
 from mirrorskin.io.maps import SIGMA
 from mirrorskin.io.opencv import encode
 from mirrorskin.view.app.look import plain_axes
-from mirrorskin.view.colours import DIVERGING, FILLED_RGB, MISSING_RGB, apart, normal_colours, span
+from mirrorskin.view.drawing.colours import DIVERGING, FILLED_RGB, MISSING_RGB, apart, normal_colours, span
 from mirrorskin.view.result.maps import ball_colours, code_colours
 from mirrorskin.view.result.scale import UNDEFINED_NOTE, displayed_values, scale_of
 from mirrorskin.view.result.sheet import Sheet, percent

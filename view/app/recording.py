@@ -24,7 +24,7 @@ from mirrorskin.view.app.picture import (
 )
 from mirrorskin.view.app.session import Session
 from mirrorskin.view.app.trace import Trace, trace_of
-from mirrorskin.view.canvas import extent
+from mirrorskin.view.drawing.canvas import extent
 
 _PICTURE = 480, 520  # largest size, CSS pixels
 _GRAPH = 515, 330

@@ -30,7 +30,7 @@ from mirrorskin.view.app.picture import (
     show_map,
 )
 from mirrorskin.view.app.session import Computed, Session
-from mirrorskin.view.colours import FILLED_RGB, MISSING_RGB
+from mirrorskin.view.drawing.colours import FILLED_RGB, MISSING_RGB
 from mirrorskin.view.result.scale import labelled, title_of_height
 from mirrorskin.view.result.sheet import Sheet, percent
 

@@ -17,7 +17,7 @@ from mirrorskin.io import InputError, pixel_axes
 from mirrorskin.view.app.look import heading, hint, plain_axes, problem, table, text
 from mirrorskin.view.app.picture import Picture, show_frame, show_map
 from mirrorskin.view.app.rig_control import RigControl, axial_plan, judge, vertical_plan
-from mirrorskin.view.canvas import extent
+from mirrorskin.view.drawing.canvas import extent
 from mirrorskin.view.result.scale import in_figure_unit
 from mirrorskin.view.result.sheet import sheet_of
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import Result, pixel_axes
 from mirrorskin.io.types import Floats
-from mirrorskin.view.colours import FILLED_RGB, SEQUENTIAL, span
+from mirrorskin.view.drawing.colours import FILLED_RGB, SEQUENTIAL, span
 
 MOST_EXAGGERATED = 20
 """Largest vertical exaggeration."""

@@ -16,7 +16,7 @@ from mirrorskin.engine.base.summary import summarise
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.arguments import unknown_argument
 from mirrorskin.io.findings import warnings_in
-from mirrorskin.view.canvas import figure_pixels, new_figure
+from mirrorskin.view.drawing.canvas import figure_pixels, new_figure
 from mirrorskin.view.result.maps import draw_declared, draw_height
 from mirrorskin.view.result.section import draw_histogram, draw_section
 from mirrorskin.view.result.sheet import BOX, TEXT, Sheet, sheet_of

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.maps import Map
 from mirrorskin.io.types import Floats
-from mirrorskin.view.canvas import draw_classes, explain_colours, filled_colours, round_length
-from mirrorskin.view.colours import (
+from mirrorskin.view.drawing.canvas import draw_classes, explain_colours, filled_colours, round_length
+from mirrorskin.view.drawing.colours import (
     MISSING,
     MISSING_RGB,
     SEQUENTIAL,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.maps import Map
 from mirrorskin.io.types import Floats
-from mirrorskin.view.canvas import exceeded
-from mirrorskin.view.colours import CYCLIC, DIVERGING, ERROR, SEQUENTIAL, apart, span
+from mirrorskin.view.drawing.canvas import exceeded
+from mirrorskin.view.drawing.colours import CYCLIC, DIVERGING, ERROR, SEQUENTIAL, apart, span
 from mirrorskin.view.result.sheet import Sheet
 
 UNDEFINED_NOTE = "blue: no answer"

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.types import Floats
-from mirrorskin.view.canvas import BESIDE, round_length
-from mirrorskin.view.colours import FILLED, apart, span
+from mirrorskin.view.drawing.canvas import BESIDE, round_length
+from mirrorskin.view.drawing.colours import FILLED, apart, span
 from mirrorskin.view.result.maps import outlined
 from mirrorskin.view.result.scale import title_of_height
 from mirrorskin.view.result.sheet import BOX, SMALL, TEXT, Sheet, entitle

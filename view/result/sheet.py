@@ -13,7 +13,7 @@ from mirrorskin.io.maps import Map
 from mirrorskin.io.result import map_shape
 from mirrorskin.io.types import Floats
 from mirrorskin.io.units import numbers_with_unit
-from mirrorskin.view.canvas import Extent, draw_image, extent
+from mirrorskin.view.drawing.canvas import Extent, draw_image, extent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,7 @@ from commands import done, refused, run
 from stacks import record
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.commands.calibrate import inputs
 from mirrorskin.engine.calibration import gel as gel_module
 from mirrorskin.hw import VerticalPlan
 from mirrorskin.twin import Axial, Camera, Sphere, Twin, Vertical

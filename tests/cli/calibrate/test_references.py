@@ -11,7 +11,7 @@ from reference_frames import expose, pixels, rolled, source
 from stacks import record
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.commands.calibrate import inputs
 
 SHAPE = (21, 33)
 NOISE = 1.5

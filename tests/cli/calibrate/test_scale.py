@@ -13,7 +13,7 @@ from commands import done, run
 from stacks import MadeUp, record
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate.scale import board_command, command
+from mirrorskin.cli.commands.calibrate.scale import board_command, command
 from mirrorskin.engine.calibration import Charuco, Dots, calibrate_lens, paint_board
 from mirrorskin.io.calibration.source import size_facts
 

@@ -10,7 +10,7 @@ from calibrations import a_calibration
 from commands import done, run
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate import show
+from mirrorskin.cli.commands.calibrate import show
 from mirrorskin.cli.groups import make_command
 
 

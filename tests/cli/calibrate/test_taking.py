@@ -12,7 +12,7 @@ from simulated import simulated_rig
 from stacks import record
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.commands.calibrate import inputs
 from mirrorskin.hw import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig import rig as rigs
 

@@ -11,8 +11,8 @@ from leaning_turns import EIGHTHS, Ball, Flat, pictures
 from stacks import MadeUp, record
 
 from mirrorskin import io
-from mirrorskin.cli.calibrate import inputs
-from mirrorskin.cli.calibrate.tilt import warnings
+from mirrorskin.cli.commands.calibrate import inputs
+from mirrorskin.cli.commands.calibrate.tilt import warnings
 from mirrorskin.hw import AxialPlan
 from mirrorskin.twin import Axial, Body, Twin
 

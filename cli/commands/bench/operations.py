@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from mirrorskin import engine
-from mirrorskin.cli.bench.limits import call_works, measure_limits, time_works
-from mirrorskin.cli.bench.records import Case
-from mirrorskin.cli.bench.timing import ROUNDS
+from mirrorskin.cli.commands.bench.limits import call_works, measure_limits, time_works
+from mirrorskin.cli.commands.bench.records import Case
+from mirrorskin.cli.commands.bench.timing import ROUNDS
 from mirrorskin.kernels.device import Device
 from mirrorskin.twin import Axial, Camera, Movement, Twin, Vertical
 

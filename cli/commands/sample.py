@@ -244,7 +244,7 @@ def _photograph() -> NDArray[np.uint8]:
     import cv2
     import numpy as np
 
-    from mirrorskin.cli.calibrate.scale import board_of
+    from mirrorskin.cli.commands.calibrate.scale import board_of
     from mirrorskin.engine.calibration.board import paint_board
 
     print_ = paint_board(board_of(_BOARD), _DPI)

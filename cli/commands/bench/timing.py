@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from mirrorskin.cli.bench.records import Row, Timing
+from mirrorskin.cli.commands.bench.records import Row, Timing
 from mirrorskin.kernels.profile import Kind, Profile, Record
 
 OURS = "mirrorskin"

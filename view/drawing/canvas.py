@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io import InputError
 from mirrorskin.io.atomic import write_new
+from mirrorskin.io.calibration.parameters import Part, parameters
 from mirrorskin.io.maps import FILLED_SHADES
 from mirrorskin.io.text import printable
 from mirrorskin.io.types import Floats
-from mirrorskin.view.colours import MISSING
+from mirrorskin.view.drawing.colours import MISSING, SEQUENTIAL
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -40,6 +41,9 @@ _DPI = 110  # pixels per inch in files
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 """Suffixes of files that figures are written to: pixels, or lines and texts."""
+
+
+_SHOWN = 1.0, 99.0  # percentiles at the ends of the colour scale
 
 
 def check_drawing() -> None:
@@ -240,3 +244,36 @@ def show_figure(figure: Figure, title: str) -> None:
     # pyplot creates windows only for figures that it creates itself.
     pyplot.figure(num=title, FigureClass=cast("type[Figure]", ready))
     pyplot.show()
+
+
+def new_sheet(width: float, height: float) -> Figure:
+    """Return an empty figure, in inches, on which colour bars stay next to their maps."""
+    figure = new_figure(width, height)
+    figure.set_layout_engine("compressed")
+    return figure
+
+
+def draw_pixels(
+    axes: Axes, values: ArrayLike, title: str, label: str, colours: str = SEQUENTIAL, even: bool = False
+) -> None:
+    """Draw a map of all pixels, with a colour bar."""
+    shown = np.asarray(values, np.float64)
+    known = shown[np.isfinite(shown)]
+    low, high = (float(v) for v in np.percentile(known, _SHOWN)) if known.size else (0.0, 1.0)
+    if even:
+        high = max(abs(low), abs(high))
+        low = -high
+    if high - low <= 1e-6 * max(abs(low), abs(high)):  # a single value has no range
+        low, high = low - 0.5, high + 0.5
+    beyond = exceeded(known, low, high)
+    draw_image(axes, shown, label=label, extend=beyond, cmap=colours, vmin=low, vmax=high)
+    summary = f"median {np.median(known):.4g} {label.split()[0]}" if known.size else "no answer"
+    blue = "; blue: no answer" if 0 < known.size < shown.size else ""
+    axes.set(title=f"{title}\n{summary}{blue}", xlabel="column (px)", ylabel="row (px)")
+
+
+def draw_parameter(axes: Axes, part: Part, name: str, colours: str = SEQUENTIAL) -> None:
+    """Draw a map of a calibration, with the text and in the unit that are declared."""
+    one = parameters(part)[name]
+    values = getattr(part, name) * one.factor
+    draw_pixels(axes, values, one.text.partition(";")[0], one.shown_unit, colours)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.commands.sensor import sensor_options, sensor_terms
 from mirrorskin.cli.declared import Terms, term
 from mirrorskin.cli.groups import Argument, refuse_foreign
-from mirrorskin.cli.sensor import sensor_options, sensor_terms
 
 if TYPE_CHECKING:
     from mirrorskin.twin import Movement

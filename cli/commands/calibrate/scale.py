@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.commands.calibrate import inputs
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.stack import STACK
 

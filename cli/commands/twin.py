@@ -12,9 +12,9 @@ from typing import Annotated, Any
 import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.commands.sensor import sensor_options, sensor_terms
 from mirrorskin.cli.declared import Terms, term
 from mirrorskin.cli.groups import Group, Option
-from mirrorskin.cli.sensor import sensor_options, sensor_terms
 
 _LOOK = 0.2  # seconds between checks of the camera
 _LOG = "twin.log"

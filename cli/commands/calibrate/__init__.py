@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mirrorskin.cli.calibrate import check, elastic, force, references, scale, show, tilt, zenith
+from mirrorskin.cli.commands.calibrate import check, elastic, force, references, scale, show, tilt, zenith
 from mirrorskin.cli.groups import Group
 
 app = Group(

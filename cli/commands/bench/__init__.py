@@ -13,7 +13,7 @@ from mirrorskin.cli.groups import Option
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from mirrorskin.cli.bench.records import Case, Row, Run
+    from mirrorskin.cli.commands.bench.records import Case, Row, Run
 
 TABLE = Path(__file__).with_name("table.json")
 _HEAD = ["work", "ms", "quartiles", "kernels", "rate", "of limit", "table, ms", "times as fast"]
@@ -43,8 +43,8 @@ def command(
     and launches; compares both with a table. Takes about half a minute.
     """
     from mirrorskin import io
-    from mirrorskin.cli.bench.operations import MEASUREMENTS
-    from mirrorskin.cli.bench.records import describe_run, open_run
+    from mirrorskin.cli.commands.bench.operations import MEASUREMENTS
+    from mirrorskin.cli.commands.bench.records import describe_run, open_run
     from mirrorskin.cli.output import progress
     from mirrorskin.io.atomic import write_new
     from mirrorskin.kernels.device import open_device
@@ -87,7 +87,7 @@ def _print(run: Run, table: Run) -> None:
 
 def _cells(case: Case, row: Row, before: Row | None) -> Iterator[str]:
     """Return the cells of a row, with those of the same row of the table."""
-    from mirrorskin.cli.bench.records import as_ms, as_percent
+    from mirrorskin.cli.commands.bench.records import as_ms, as_percent
 
     wall = row.wall
     yield row.name

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mirrorskin.cli.bench.records import Case, Row
-from mirrorskin.cli.bench.timing import FIRST, OURS, ROUNDS, Work, renamed, take_turns
+from mirrorskin.cli.commands.bench.records import Case, Row
+from mirrorskin.cli.commands.bench.timing import FIRST, OURS, ROUNDS, Work, renamed, take_turns
 from mirrorskin.engine import free_memory
 from mirrorskin.kernels.device import Device
 

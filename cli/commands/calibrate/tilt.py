@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from mirrorskin.cli import options
-from mirrorskin.cli.calibrate import inputs
+from mirrorskin.cli.commands.calibrate import inputs
 from mirrorskin.cli.declared import declared
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.stack import STACK

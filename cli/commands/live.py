@@ -18,7 +18,7 @@ from mirrorskin.cli.declared import ClassCommand, declared
 from mirrorskin.cli.groups import Option, make_command
 
 if TYPE_CHECKING:
-    from mirrorskin.cli.status import Newest
+    from mirrorskin.cli.commands.status import Newest
     from mirrorskin.engine.base.method import Method
     from mirrorskin.engine.base.operation import Operation
     from mirrorskin.engine.live import LiveRun, Loop
@@ -138,7 +138,7 @@ class _Live:
 
     def run(self) -> None:
         """Reconstruct while the stage moves, and save the result."""
-        from mirrorskin.cli.status import summary
+        from mirrorskin.cli.commands.status import summary
         from mirrorskin.hw.base.errors import HardwareError
         from mirrorskin.io import InputError
 
@@ -159,7 +159,7 @@ class _Live:
 
     def _reconstruct(self) -> None:
         """Open source and devices, start when the work is compiled, and leave the stage at rest."""
-        from mirrorskin.cli.status import show_status
+        from mirrorskin.cli.commands.status import show_status
         from mirrorskin.engine.live import Loop
         from mirrorskin.hw.rig.rig import open_rig
         from mirrorskin.hw.rig.sweep import make_scan
@@ -291,7 +291,7 @@ class _Guard:
 @contextmanager
 def _viewer(where: str, shape: tuple[int, int], settings: RigSettings) -> Iterator[Newest]:
     """Show pictures in a separate thread; report at the end if that failed."""
-    from mirrorskin.cli.status import Newest
+    from mirrorskin.cli.commands.status import Newest
     from mirrorskin.view.live import LiveView
 
     viewer = Newest(LiveView(where, shape, settings.camera.pixel_sides))

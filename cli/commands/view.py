@@ -59,7 +59,7 @@ def command(
 def _check(output: Path, result: Path) -> None:
     """Raise InputError for a place that cannot be written to, before anything is drawn."""
     from mirrorskin import io
-    from mirrorskin.view.canvas import FIGURE_SUFFIXES
+    from mirrorskin.view.drawing.canvas import FIGURE_SUFFIXES
 
     if output.suffix.lower() in FIGURE_SUFFIXES:
         io.check_output(output, result)
@@ -77,7 +77,7 @@ def _show(
 ) -> None:
     """Draw maps into a window, a picture or a folder."""
     from mirrorskin import io
-    from mirrorskin.view.canvas import FIGURE_SUFFIXES, has_screen, show_figure, write_figure
+    from mirrorskin.view.drawing.canvas import FIGURE_SUFFIXES, has_screen, show_figure, write_figure
     from mirrorskin.view.result import figures_of, overview
 
     if output is None and has_screen():
