@@ -470,7 +470,7 @@ class Device:
 
     def _build(self, file: str | Path, options: tuple[str, ...], more: str) -> _Program:
         written = isinstance(file, str) and "{" in file
-        path = Path("text.cl") if written else file if isinstance(file, Path) else _FOLDER / f"{file}.cl"
+        path = Path("text.cl") if written else file if isinstance(file, Path) else source_file(f"{file}.cl")
         try:
             text = str(file) if written else path.read_text(encoding="utf-8")
             source = _with_includes(path.name, text) + more
@@ -811,6 +811,12 @@ def _is_all(choice: object) -> bool:
     return isinstance(choice, str) and choice.casefold().strip() == ALL
 
 
+@functools.cache
+def source_file(name: str) -> Path:
+    """Return the file of kernels with a name, such as ``onset.cl``, in this folder or one below it."""
+    return next(_FOLDER.glob(f"*/{name}"), _FOLDER / name)
+
+
 def _with_includes(name: str, text: str) -> str:
     """Return kernels with the files that they include, which is the key of the compiled program."""
     lines = [f'#line 1 "{name}"']
@@ -822,7 +828,7 @@ def _with_includes(name: str, text: str) -> str:
 
 def _shared(name: str) -> str:
     """Return the text of a file that kernels include."""
-    return _with_includes(name, (_FOLDER / name).read_text(encoding="utf-8"))
+    return _with_includes(name, source_file(name).read_text(encoding="utf-8"))
 
 
 def _explain_build(path: Path, source: str, log: str, info: DeviceInfo) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.types import Floats
-from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
+from mirrorskin.kernels.numerics.conjugate_gradients import Face, conjugate_gradients
 
 Spectrum = NDArray[np.complex64]
 

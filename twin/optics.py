@@ -205,7 +205,7 @@ class Wall:
     """The lit wall in the mirror, by ray tracing.
 
     At each pixel the line of sight is reflected at the sheet's normal and scattered by its flakes
-    (`scatter_rays`), and each ray is followed to the wall (`mirrorskin.kernels.wall`). A ray is dark if it
+    (`scatter_rays`), and each ray reaches the wall (`mirrorskin.kernels.twin.wall`). A ray is dark if it
 
     - passes over the rim and leaves by the body's top;
     - goes down below the rest plane: it meets the sheet before the wall, and second reflections are ignored;
@@ -274,7 +274,7 @@ class Wall:
 
 
 def scatter_rays(scatter: float) -> Floats:
-    """Return rays scattered about a reflected one, as used by `mirrorskin.kernels.wall.wall_light`.
+    """Return rays scattered about a reflected one, as used by `mirrorskin.kernels.twin.wall.wall_light`.
 
     A ray deviates from the reflected one by the vector (u, v) across it, of length at most a = scatter. Its
     density ::

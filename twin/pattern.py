@@ -23,7 +23,7 @@ class Pattern(Protocol):
     """A patterned sheet around the body."""
 
     def table(self, body: Body, /) -> NDArray[np.float32]:
-        """Return its transmittance, (rows + 2, columns + 2), as `mirrorskin.kernels.wall` reads it."""
+        """Return its transmittance, (rows + 2, columns + 2), as `mirrorskin.kernels.twin.wall` reads it."""
 
 
 @dataclass(frozen=True, slots=True)

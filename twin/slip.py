@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.types import Floats, InputError
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.skin import drive, material, on_object
+from mirrorskin.kernels.twin.skin import drive, material, on_object
 from mirrorskin.twin.elastic import HalfSpace, Window
 from mirrorskin.twin.friction import Friction
 from mirrorskin.twin.movement import Horizontal, Twist, pose_at_press
@@ -32,7 +32,7 @@ class _Course(NamedTuple):
 
 
 class Drag(NamedTuple):
-    """The displacement of the skin by friction at one moment: see `mirrorskin.kernels.skin`.
+    """The displacement of the skin by friction at one moment: see `mirrorskin.kernels.twin.skin`.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class SkinHistory:
     """Stick and slip along a horizontal movement or a twist, and the displacement of each point of the skin.
 
     The pressure of the press moves with the object. In the object's frame it is constant, and there
-    `Friction` computes the traction q and the displacement u of the surface by q. `mirrorskin.kernels.skin`
+    `Friction` computes the traction q and the displacement u of the surface by q. `kernels/twin/skin.py`
     computes the resulting displacement of the skin.
 
     The number of steps per frame is such that full sliding takes at least 16. A point breaks loose when its

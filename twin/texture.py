@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.types import Floats, InputError
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.skin import FLAKES
+from mirrorskin.kernels.twin.skin import FLAKES
 from mirrorskin.twin.body import check_values
 from mirrorskin.twin.movement import Pose
 from mirrorskin.twin.optics import Ideal, Wall

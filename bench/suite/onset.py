@@ -16,7 +16,7 @@ from mirrorskin.cli.commands.bench.timing import OURS
 from mirrorskin.engine import find_onset
 from mirrorskin.engine.base.frames import estimate_noise, reference_maps, thin_out
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.onset import BENT, DARK, onset_heights, onset_levels, onset_near, onset_sure
+from mirrorskin.kernels.press.onset import BENT, DARK, onset_heights, onset_levels, onset_near, onset_sure
 from suite.harness import Cases, agree, check_memory, missing, time_call
 from suite.scenes import LEVELS, StackName, fill_press, press_noise, references, travel_of
 

@@ -32,7 +32,7 @@ def command(
     from mirrorskin.hw.rig.rig import open_rig
     from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.hw.rig.sweep import make_scan
-    from mirrorskin.kernels.correlation import WINDOW
+    from mirrorskin.kernels.rotation.correlation import WINDOW
 
     settings = load_rig(rig_file)
     plan = scans.make_plan(context, given, settings)

@@ -15,8 +15,8 @@ from mirrorskin.io.samples import convert_samples, frame_dtype
 from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.least_squares import mad_sigma
-from mirrorskin.kernels.samples import Grid, take_grids, take_samples
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.samples import Grid, take_grids, take_samples
 
 SAMPLES = 65536
 """Smallest number of pixels from which the noise of a larger frame is estimated."""

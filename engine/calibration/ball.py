@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.correlation.design_matrix import basis, check_phases
 from mirrorskin.io import InputError, pixel_axes
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import geman_mcclure
+from mirrorskin.kernels.numerics.least_squares import geman_mcclure
 
 
 class BallSight(NamedTuple):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import Header, InputError, WallResponse, pixel_axes
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.response import sight_slopes, wall_light
+from mirrorskin.kernels.rotation.response import sight_slopes, wall_light
 
 Mask = NDArray[np.bool_]
 Pixels = NDArray[np.intp]

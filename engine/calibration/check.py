@@ -14,10 +14,10 @@ from mirrorskin.engine.base.reconstruction import reconstruct
 from mirrorskin.engine.calibration.ball import see_ball
 from mirrorskin.engine.calibration.sources import check_ball_radius
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
-from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.response import sight_slopes
+from mirrorskin.kernels.numerics import least_squares
+from mirrorskin.kernels.rotation.response import sight_slopes
 
 _FEWEST = 20  # minimum number of pixels with errors in a cell
 _LEAST = 100  # minimum number of pixels of the ball

@@ -14,9 +14,9 @@ from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_
 from mirrorskin.engine.press.elastic import threshold_at
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 from mirrorskin.io.maps import PressStatus
-from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma, soft_l1
+from mirrorskin.kernels.numerics import least_squares
+from mirrorskin.kernels.numerics.least_squares import mad_sigma, soft_l1
 
 _NODES = 24  # number of nodes of the Gauss-Legendre quadrature over punches
 _THINNEST = 1e-3  # minimum depth of the mirror below the surface, in radii of the ball

@@ -14,9 +14,9 @@ from mirrorskin.engine.base.undistort import distorted, picture_places
 from mirrorskin.engine.calibration.board import FEWEST, Board, Charuco
 from mirrorskin.engine.calibration.marks import Marks, centre_marks, find_marks, scale_contrast
 from mirrorskin.io import InputError, Lens
-from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma, soft_l1
+from mirrorskin.kernels.numerics import least_squares
+from mirrorskin.kernels.numerics.least_squares import mad_sigma, soft_l1
 
 _ROUNDS = 8  # maximum number of fits; each predicts further marks
 _ADJACENT = 1.5  # pitches: distance from located marks within which others are predicted

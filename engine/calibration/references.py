@@ -25,7 +25,7 @@ from mirrorskin.engine.calibration.sources import check_one_camera, read_blocks
 from mirrorskin.io import Block, InputError, References, Source
 from mirrorskin.io.calibration.types import DEAD, HOT, SATURATED
 from mirrorskin.io.types import Floats
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _CHUNK = 8_000_000  # bytes of float64 samples that are processed at a time
 _MEMORY = 256_000_000  # bytes of frames of a rolled ball that are kept in memory

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from mirrorskin.engine.calibration.ball import rotations, smooth_turn
 from mirrorskin.engine.calibration.tilt_tracks import BallTrack, PlateTrack
 from mirrorskin.io import InputError, Precession
-from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics import least_squares
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 NAMES = ("tilt", "phase_offset", "oval_x", "oval_y", "centre_x", "centre_y", "pivot_x", "pivot_y", "pivot_z")
 """The parameters of the body; in a fit, three for each ball and two for each wedge follow."""

@@ -14,9 +14,9 @@ from mirrorskin.engine.calibration.brightness import Brightness, LinearBrightnes
 from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of, read_turn
 from mirrorskin.engine.correlation.design_matrix import check_phases
 from mirrorskin.io import InputError, Source, pixel_axes
-from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics import least_squares
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _MOST_BYTES = 2_000_000_000  # maximum size of frames in memory
 _PHASES = 4  # minimum number of phases for an ellipse and its mean

@@ -17,7 +17,7 @@ from mirrorskin.engine.calibration.wall_response import make_response
 from mirrorskin.io import InputError, Precession, References, Source, WallResponse
 from mirrorskin.io.calibration.types import PATTERNS
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 Mask = NDArray[np.bool_]
 Numbers = NDArray[np.intp]

@@ -24,8 +24,8 @@ from mirrorskin.engine.calibration.wall_model import (
     predict,
 )
 from mirrorskin.io import InputError, Precession, References, Source, pixel_axes
-from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.numerics import least_squares
 
 _STEEPEST = math.radians(50.0)  # maximum zenith of the ball at a sample
 _BEYOND = 1.35  # maximum distance of a sample from the ball's centre, relative to the outline of the light

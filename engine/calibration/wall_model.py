@@ -2,8 +2,8 @@
 
 A printed pattern is a monotone curve of light, blurred by scatter: a ray is spread evenly over the angles by
 which the sheet's flakes deflect it, and rays above the rim or below the rest plane are dark. Otherwise the
-formula is the same as in `mirrorskin.kernels.response`. The position on the wall is a share u: 0 at the rim
-and 1 at the rest plane, linear in the elevation seen from the centre of the sheet.
+formula is the same as in `mirrorskin.kernels.rotation.response`. The position on the wall is a share u: 0 at
+the rim and 1 at the rest plane, linear in the elevation seen from the centre of the sheet.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.calibration.ball import rotations
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.response import Ray, follow, lamp_light, shade_terms, sight_of, sight_slopes
+from mirrorskin.kernels.rotation.response import Ray, follow, lamp_light, shade_terms, sight_of, sight_slopes
 
 _PIECES = 8  # pieces of the curve, which represent a gamma of 2.2 within 2e-4 of full light
 _CUBIC = 3  # degree of the curve

@@ -17,7 +17,14 @@ from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import InputError, Source, WallResponse, pixel_axes
 from mirrorskin.io.arguments import check_number, checked, in_unit
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.response import follow, half_tangent, lamp_light, level, sight_of, sight_slopes
+from mirrorskin.kernels.rotation.response import (
+    follow,
+    half_tangent,
+    lamp_light,
+    level,
+    sight_of,
+    sight_slopes,
+)
 
 _ZENITHS = 16  # number of zeniths at which the first light is searched for
 _HALVINGS = 16  # number of bisections of the interval of the first light

@@ -3,7 +3,7 @@
 A device stores four sums per pixel, of E, E cos alpha, E sin alpha and E^2, and solves the fit from them.
 Integer samples of frames with weights 0 and 1 are summed as integers, with cosines rounded to multiples of
 2^-17 or 2^-23: these sums are exact and do not depend on how frames are divided into blocks. Other samples
-are summed as pairs of floats, in the order of the frames. See `mirrorskin.kernels.correlation`.
+are summed as pairs of floats, in the order of the frames. See `mirrorskin.kernels.rotation.correlation`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.correlation import WINDOW
+from mirrorskin.kernels.rotation.correlation import WINDOW
 
 _STEPS = {1: 2**17, 2: 2**23}  # steps per unit of a cosine, by bytes of a sample: no integer sum overflows
 _MAX_FRAMES = 2**23  # limit of integer sums
@@ -362,7 +362,7 @@ def _counted(rows: NDArray[np.int32]) -> dict[str, Any]:
 
 
 def _fit_table(phase: Doubles, rows: NDArray[Any]) -> NDArray[np.float32]:
-    """Return the table "fit" of `mirrorskin.kernels.correlation`, (28,) float32.
+    """Return the table "fit" of `mirrorskin.kernels.rotation.correlation`, (28,) float32.
 
     ``rows``, (N, 3), is Z: the factors of the samples in the sums, the weights first.
     """

@@ -16,7 +16,7 @@ from mirrorskin.engine.diagnosis.footprint import with_curvature
 from mirrorskin.io import Result
 from mirrorskin.io.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 if TYPE_CHECKING:
     from mirrorskin.engine.press.crossing import PressOperation

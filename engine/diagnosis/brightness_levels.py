@@ -19,7 +19,7 @@ from mirrorskin.io import Block, Result, Source
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.io.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma, median
+from mirrorskin.kernels.numerics.least_squares import mad_sigma, median
 
 if TYPE_CHECKING:
     from mirrorskin.engine.press.crossing import Event, PressOperation

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.device_arrays import AnyArray
 from mirrorskin.engine.base.frames import take_places
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _LOOPS, _LEAST, _LINES = 40, 3, 48  # of the extent of the normals: half a side of a loop; its least; loops
 _FEWEST = 200  # loops

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.correlation.design_matrix import basis
 from mirrorskin.engine.diagnosis.residual_noise import valid
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _FEWEST_PIXELS, _FEWEST_FRAMES, _MOST_FRAMES = 64, 7, 128
 _STEEP, _UPRIGHT = 1.5, math.radians(80)  # range of zeniths: minimum in tilts, and maximum

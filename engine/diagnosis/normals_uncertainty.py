@@ -20,8 +20,8 @@ from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.engine.diagnosis.swing import Swing, find_swing
 from mirrorskin.io import Result
 from mirrorskin.io.findings import Finding, with_findings
-from mirrorskin.kernels.least_squares import mad_sigma
-from mirrorskin.kernels.normals import azimuth_of
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
+from mirrorskin.kernels.rotation.normals import azimuth_of
 
 if TYPE_CHECKING:
     from mirrorskin.engine.rotation.normals import Normals

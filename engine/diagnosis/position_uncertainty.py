@@ -15,8 +15,8 @@ from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.io import Result
 from mirrorskin.io.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
-from mirrorskin.kernels.samples import Grid, take_grids
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.samples import Grid, take_grids
 
 if TYPE_CHECKING:
     from mirrorskin.engine.press.crossing import PressOperation

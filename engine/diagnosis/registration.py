@@ -15,7 +15,7 @@ from mirrorskin.io import Block, Header, InputError, Source, pixel_axes
 from mirrorskin.io.positions import check_phase
 from mirrorskin.io.types import block_memory
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
-from mirrorskin.kernels.registration import BORDER
+from mirrorskin.kernels.rotation.registration import BORDER
 
 _BLOCK = 16_000_000  # bytes of the source's frames that are read at once
 
@@ -51,10 +51,11 @@ class Registered(DerivedSource):
 
         k (p'.z - p.z) (X - axis) + k p.z (p' - p)
 
-    A sample is interpolated from the 16 nearest pixels; see `mirrorskin.kernels.registration`. It is NaN if
-    any of these is outside the picture, clipped (at either end of an integer type) or not finite, or if the
-    height is NaN. If ``zenith_gain`` and ``zenith_offset`` are maps, counts are converted to the scale of the
-    output pixel; a pixel without a scale, such as a defect, gets the mean of two opposite neighbours.
+    A sample is interpolated from the 16 nearest pixels; see `kernels/rotation/registration.py`. It is NaN
+    if any of these is outside the picture, clipped (at either end of an integer type) or not finite, or if
+    the height is NaN. If ``zenith_gain`` and ``zenith_offset`` are maps, counts are converted to the scale
+    of the output pixel; a pixel without a scale, such as a defect, gets the mean of two opposite
+    neighbours.
 
     The sheet is assumed to touch all points in every pose, and no point to be hidden: a mirror skin conforms
     to the object, and a camera along the body's axis sees all parts that do not overhang.

@@ -14,7 +14,7 @@ from mirrorskin.engine.base.frames import QUANTUM
 from mirrorskin.engine.correlation.design_matrix import basis
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import huber
+from mirrorskin.kernels.numerics.least_squares import huber
 
 _FLOAT_NOISE = 1e-6  # minimum noise of float frames, as a share of the maximum count
 _FRAMES_OF_TWO = 7  # minimum number of frames for a fit with the second harmonic

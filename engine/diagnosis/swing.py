@@ -26,7 +26,7 @@ from mirrorskin.engine.base.device_arrays import AnyArray
 from mirrorskin.engine.base.frames import take_places
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _STEEP = 3.0  # tilts, from which on the zenith and the swing are independent
 _REACH, _LINES = 2, 48  # pixels between the middle and its neighbours; lines of pixels that are used

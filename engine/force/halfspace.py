@@ -14,7 +14,7 @@ from scipy import fft, sparse, special
 
 from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
+from mirrorskin.kernels.numerics.conjugate_gradients import Face, conjugate_gradients
 
 Singles = NDArray[np.float32]
 Real = TypeVar("Real", np.float32, np.float64)

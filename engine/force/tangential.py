@@ -18,7 +18,7 @@ from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.arguments import as_array_or_number, check_count, check_number, checked, in_unit
 from mirrorskin.io.findings import carried
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
+from mirrorskin.kernels.numerics.conjugate_gradients import Face, conjugate_gradients
 
 Mask = NDArray[np.bool_]
 

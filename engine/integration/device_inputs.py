@@ -22,7 +22,7 @@ from mirrorskin.engine.integration.validation import (
 from mirrorskin.io import InputError
 from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.samples import take_samples
+from mirrorskin.kernels.numerics.samples import take_samples
 
 
 def check_device_inputs(

@@ -13,7 +13,7 @@ from mirrorskin.engine.integration.device_inputs import sample_grid
 from mirrorskin.engine.integration.validation import Flags, Inputs
 from mirrorskin.kernels.array import Array, Operand
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
+from mirrorskin.kernels.integration.links import DOWN, KNOWN, RIGHT, SLOPE
 
 Labels = NDArray[np.int32]
 Plane = tuple[float, float, float]
@@ -48,9 +48,9 @@ class Links:
 class PixelGraph:
     """A picture's maps and links on a device; memory is reused for the next picture.
 
-    ``flags`` is the state of each pixel (see ``mirrorskin.kernels.links``). ``known_heights`` are the maps of
-    heights above the inputs' datum and of their weights, if any. Weights are multiplied by ``scale``, so that
-    they are about 1.
+    ``flags`` is the state of each pixel (see ``kernels/integration/links.py``). ``known_heights`` are the
+    maps of heights above the inputs' datum and of their weights, if any. Weights are multiplied by
+    ``scale``, so that they are about 1.
     """
 
     device: Device
@@ -177,7 +177,7 @@ class PixelGraph:
         return self._arrays[name]
 
     def _items(self, name: str) -> int:
-        """Return the number of work-items of a kernel; see ``kernels/links.cl``."""
+        """Return the number of work-items of a kernel; see ``kernels/integration/links.cl``."""
         (rows, columns), tile = self.shape, self.device.layout.tile
         strip = _STRIP if tile >= _CHUNK and name in ("links_flags", "links_join", "links_misfit") else 1
         return -(-rows // strip) * -(-columns // min(tile, _CHUNK))

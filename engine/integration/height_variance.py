@@ -48,7 +48,7 @@ from mirrorskin.engine.integration.hierarchy import Hierarchy, place_of_coarse
 from mirrorskin.engine.integration.validation import Floats
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.links import KNOWN, SLOPE
+from mirrorskin.kernels.integration.links import KNOWN, SLOPE
 
 COARSE = 64
 """Largest number of nodes per side of the level whose variance is computed exactly."""
@@ -71,7 +71,7 @@ def find_graph_variance(
 ) -> None:
     """Write the heights' variance to the finest level of the first array; the others are scratch memory.
 
-    ``flags``, (H, W), are the flags of the pixels; see ``mirrorskin.kernels.links``.
+    ``flags``, (H, W), are the flags of the pixels; see ``mirrorskin.kernels.integration.links``.
     """
     h = hierarchy
     number = next(

@@ -12,7 +12,7 @@ from mirrorskin.engine.integration.graph import Links
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, Kernel
-from mirrorskin.kernels.multigrid import COARSEST, ROUNDS
+from mirrorskin.kernels.integration.multigrid import COARSEST, ROUNDS
 
 Ints = NDArray[np.int64]
 
@@ -34,7 +34,7 @@ _BEYOND = 64  # nodes after the last level, which vectors may read
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """A grid of nodes among others in one array; see ``kernels/multigrid.cl``."""
+    """A grid of nodes among others in one array; see ``kernels/integration/multigrid.cl``."""
 
     base: int  # index of its start
     rows: int
@@ -80,8 +80,8 @@ class Hierarchy:
     """All levels of a graph.
 
     ``graph`` contains the links of the nodes, and the weights of known heights as ``anchor`` (see
-    ``kernels/multigrid.cl``). ``inverse`` is the inverse of the diagonal, which cycles compute for large
-    levels when they are prepared. ``to`` marks nodes that belong to the aggregate of another block.
+    ``kernels/integration/multigrid.cl``). ``inverse`` is the inverse of the diagonal, which cycles compute
+    for large levels when they are prepared. ``to`` marks nodes that belong to the aggregate of another block.
     ``moves`` is the number of aggregates of each level that differ from blocks for this reason, and
     ``changed`` lists them; ``changes`` are the same numbers on the device.
     """

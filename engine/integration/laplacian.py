@@ -16,7 +16,7 @@ from mirrorskin.io.arguments import as_array_or_number, check_number, checked, o
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.links import DOWN, KNOWN, RIGHT, SLOPE
+from mirrorskin.kernels.integration.links import DOWN, KNOWN, RIGHT, SLOPE
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator

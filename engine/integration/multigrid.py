@@ -15,7 +15,7 @@ from mirrorskin.engine.integration.height_variance import JOINED, LEAST, find_gr
 from mirrorskin.engine.integration.hierarchy import STRENGTH, Hierarchy, choose_lanes, part_of
 from mirrorskin.kernels.array import Array, fetch
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.links import KNOWN, SLOPE
+from mirrorskin.kernels.integration.links import KNOWN, SLOPE
 
 _USUAL = 40  # number of cycles after which coarse levels are replaced by a direct solver
 _CYCLES = 2  # number of cycles without a tolerance

@@ -20,8 +20,8 @@ from mirrorskin.io import Fitted, Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.registration import MEAN_NOISE_GAIN
-from mirrorskin.kernels.slopes import find, weigh
+from mirrorskin.kernels.integration.slopes import find, weigh
+from mirrorskin.kernels.rotation.registration import MEAN_NOISE_GAIN
 
 Floats = NDArray[np.float32]
 

@@ -22,11 +22,11 @@ from mirrorskin.engine.integration.parts import (
 )
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.breaks import DOWN, RIGHT
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.integration.breaks import DOWN, RIGHT
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _BROKEN = 6.0
-"""k r^2 (see ``mirrorskin.kernels.breaks``) above which a link crosses a discontinuity."""
+"""k r^2 (see ``mirrorskin.kernels.integration.breaks``) above which a link crosses a discontinuity."""
 
 _SCALES = 16.0, 8.0, 4.0, 2.0, 1.0  # tolerated misfits of a link, in 1 / sqrt(2 k)
 _MOST, _REST = 4, 0.02  # maximum number of steps at a scale; relative decrease of broken links to continue
@@ -74,7 +74,7 @@ def solve_robust(
     """Find heights that fit slopes and known heights, and the discontinuities between them.
 
     The initial confidence of a link is lower where the surface is seen obliquely, where it bends, and where
-    slopes contradict each other (curl; see ``mirrorskin.kernels.breaks``). The first heights are weighted
+    slopes contradict each other (curl; see ``kernels/integration/breaks.py``). The first heights are weighted
     least squares. Then links with a misfit lose weight, at smaller and smaller scales. Finally links with a
     misfit above 2.4 / sqrt(2 k) are cut, and the rest is solved to the tolerance. There are two searches,
     with contradictions counted locally and over 11 x 11 corners; the heights that break fewer links win.

@@ -14,7 +14,7 @@ from mirrorskin.io import Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _SIDES = 8, 16  # of the loops whose curl is compared with that of single corners, pixels
 _CROP = 128  # largest side of the part of a picture that is examined, pixels

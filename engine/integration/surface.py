@@ -31,7 +31,7 @@ from mirrorskin.io import InputError, Result
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
+from mirrorskin.kernels.integration.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
 
 Method = Literal["direct", "multigrid", "robust"]
 

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.metrology.quantity import Quantity, micrometres
-from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics import least_squares
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 Mask = NDArray[np.bool_]
 _Frame = tuple[Doubles, Doubles]

@@ -20,7 +20,7 @@ from mirrorskin.io import InputError, Map
 from mirrorskin.io.maps import TABLE, FocusStatus, status_of
 from mirrorskin.io.positions import check_strokes
 from mirrorskin.io.types import FRAME_DTYPES
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _LARGEST = 1e18  # noise whose square a float32 holds
 _LEAST_CONTRAST = 5.0  # smallest contrast of a peak above that of noise, in standard errors

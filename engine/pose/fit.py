@@ -19,7 +19,7 @@ from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.pose import BLOCK, PARTS
+from mirrorskin.kernels.skin.pose import BLOCK, PARTS
 
 FEWEST_SHARED = 20
 """Smallest number of pixels that two maps must share."""

@@ -18,7 +18,7 @@ from mirrorskin.io.result import shape_of
 from mirrorskin.kernels.array import Array, Operand, fetch
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.pose_maps import STRIP, SUMMARY
+from mirrorskin.kernels.skin.pose_maps import STRIP, SUMMARY
 
 Grid = tuple[float, float, float, float]
 """x and y of the first pixel, and the pixel's size along x and y, mm."""
@@ -45,7 +45,7 @@ class Extent:
 
     @classmethod
     def of(cls, strips: NDArray[np.float32]) -> Extent:
-        """Return the extent from the sums of `mirrorskin.kernels.pose_maps.pose_summary`."""
+        """Return the extent from the sums of `mirrorskin.kernels.skin.pose_maps.pose_summary`."""
         count, compared, *sums, spread = strips.astype(np.float64).T
         pixels, places = count.sum(), np.stack(sums, axis=-1)
         middle = places.sum(axis=0) / max(pixels, 1.0)
@@ -56,7 +56,7 @@ class Extent:
 
 @dataclass(frozen=True, eq=False)
 class PoseMap:
-    """Records of a map, (H, W, 8), as `mirrorskin.kernels.pose` defines them, and their positions.
+    """Records of a map, (H, W, 8), as `mirrorskin.kernels.skin.pose` defines them, and their positions.
 
     Attributes
     ----------

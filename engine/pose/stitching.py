@@ -24,7 +24,7 @@ from mirrorskin.io.maps import StitchStatus, status_of
 from mirrorskin.io.types import ProcessValue
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
-from mirrorskin.kernels.pose_maps import SHARPEST
+from mirrorskin.kernels.skin.pose_maps import SHARPEST
 
 _SHARED = 0.2  # smallest share of the smaller map's pixels that two touches must have in common
 _ALIKE = 4.0  # largest chi square of a link between two touches

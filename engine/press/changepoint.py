@@ -18,7 +18,7 @@ from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.positions import check_travel
-from mirrorskin.kernels.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
+from mirrorskin.kernels.press.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
 
 _EVIDENCE = 12.0  # minimum logarithm of the likelihood ratio of a change
 _RELEASED = np.array([0, 1, 3, 2], np.uint8)  # status of a release, from that of a press

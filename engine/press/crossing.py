@@ -23,7 +23,7 @@ from mirrorskin.io.positions import check_travel
 from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES
 from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.onset import DARK, complement
+from mirrorskin.kernels.press.onset import DARK, complement
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source

@@ -26,9 +26,9 @@ from mirrorskin.engine.press.spline import CellSplines
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 from mirrorskin.io.arguments import check_pixel_size
 from mirrorskin.io.maps import PressStatus
-from mirrorskin.kernels import least_squares
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics import least_squares
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 Mask = NDArray[np.bool_]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.least_squares import huber
+from mirrorskin.kernels.numerics.least_squares import huber
 
 if TYPE_CHECKING:
     from scipy import sparse

@@ -15,7 +15,7 @@ from mirrorskin.io import InputError
 from mirrorskin.io.arguments import checked, in_unit
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.edges import COARSE, FINE, MARGIN, NEAR, Limits, Pass, pairs
+from mirrorskin.kernels.rotation.edges import COARSE, FINE, MARGIN, NEAR, Limits, Pass, pairs
 
 LIMITS = Limits(
     jump=math.radians(10.0),

@@ -48,8 +48,8 @@ from mirrorskin.io.positions import check_phase
 from mirrorskin.io.traces import FrameSamples
 from mirrorskin.io.types import FRAME_DTYPES, ProcessValue
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.correlation import WINDOW
-from mirrorskin.kernels.normals import azimuth_of, zenith_of
+from mirrorskin.kernels.rotation.correlation import WINDOW
+from mirrorskin.kernels.rotation.normals import azimuth_of, zenith_of
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source

@@ -20,7 +20,7 @@ from mirrorskin.engine.rotation.response import Response
 from mirrorskin.engine.rotation.scale import make_scale
 from mirrorskin.engine.rotation.tilt import estimate_tilt
 from mirrorskin.io import InputError
-from mirrorskin.kernels.normals import contact_limits
+from mirrorskin.kernels.rotation.normals import contact_limits
 
 if TYPE_CHECKING:
     from mirrorskin.engine.base.device_arrays import AnyArray

@@ -35,7 +35,7 @@ class PoseFit:
     weights: Doubles  # (N,), above 0
     matrix: Doubles  # (3, N): from samples to mean, cosine and sine
     waves: Doubles  # (N, n): orthonormal basis of the samples of all normals, approximately
-    table: NDArray[np.float32]  # (13, N): see mirrorskin.kernels.normals_pose
+    table: NDArray[np.float32]  # (13, N): see mirrorskin.kernels.rotation.normals_pose
     tilt: float  # root mean square tilt of the frames, radians
     presses: bool  # whether travel differs between frames
     deep: NDArray[np.bool_]  # (N,): frames with at least the median travel

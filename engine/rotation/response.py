@@ -12,8 +12,8 @@ from mirrorskin.engine.base.provenance import naming
 from mirrorskin.engine.diagnosis.registration import Sight
 from mirrorskin.io import Calibrated, Header, InputError, Source, WallResponse, pixel_axes
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.normals_wall import Wall
-from mirrorskin.kernels.response import shade_terms
+from mirrorskin.kernels.rotation.normals_wall import Wall
+from mirrorskin.kernels.rotation.response import shade_terms
 
 _SAMPLES = 400  # samples of the curve from which its ends and its inverse are determined
 _INVERSE = 8  # coefficients of the inverse, which is only an initial value

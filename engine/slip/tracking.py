@@ -15,7 +15,7 @@ from mirrorskin.engine.base.device_arrays import AnyArray, on_host
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import C_TYPES, Device
-from mirrorskin.kernels.displacement import AFFINE, MARGIN, PARAMETERS
+from mirrorskin.kernels.skin.displacement import AFFINE, MARGIN, PARAMETERS
 
 ITERATIONS = 8
 """Largest number of iterations; 2 are needed with a good start."""

@@ -12,8 +12,8 @@ from mirrorskin.hw.base.stage import Report
 from mirrorskin.hw.rig.plans import Plan
 from mirrorskin.hw.stages.trajectory import Trapezoid
 from mirrorskin.io.types import Floats
-from mirrorskin.kernels import least_squares
-from mirrorskin.kernels.least_squares import mad_sigma
+from mirrorskin.kernels.numerics import least_squares
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _RECENT = 8  # number of latest reports that determine the current position
 _SLOPES = (0.2, 2.0)  # range of the ratio of planned to elapsed time

@@ -131,7 +131,7 @@ class Lens(Part):
 class WallResponse(Part):
     """Brightness of a mirror under a cylindrical wall, as a function of its normal and position.
 
-    A pixel sees (x, y) on the rest plane. ``kernels/response.py`` computes the brightness for a normal.
+    A pixel sees (x, y) on the rest plane. ``kernels/rotation/response.py`` computes the brightness.
     """
 
     command: ClassVar[str] = "zenith"

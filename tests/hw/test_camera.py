@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mirrorskin.io import InputError
-from mirrorskin.kernels import exposure
 from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.twin import exposure
 from mirrorskin.twin.camera import Camera, Sensor
 
 SHAPE = (96, 128)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from mirrorskin.kernels import breaks
-from mirrorskin.kernels.breaks import DOWN, RIGHT
+from mirrorskin.kernels.integration import breaks
+from mirrorskin.kernels.integration.breaks import DOWN, RIGHT
 
 SIZE = np.float32(0.4), np.float32(0.7)
 

@@ -7,8 +7,8 @@ import pytest
 
 from mirrorskin.engine.integration.graph import Levelling, PixelGraph, find_components
 from mirrorskin.engine.integration.validation import check_inputs
-from mirrorskin.kernels import components
-from mirrorskin.kernels.links import SLOPE
+from mirrorskin.kernels.integration import components
+from mirrorskin.kernels.integration.links import SLOPE
 
 SHAPES = [(1, 1), (1, 9), (9, 1), (23, 37), (130, 11), (5, 300)]
 PLANE = 0.3, -0.2, 0.7

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from mirrorskin.kernels.conjugate_gradients import Face, conjugate_gradients
+from mirrorskin.kernels.numerics.conjugate_gradients import Face, conjugate_gradients
 
 COUNT = 12
 EVERYWHERE = np.ones(COUNT, bool)

@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from mirrorskin.kernels import correlation
+from mirrorskin.kernels.rotation import correlation
 
 
 def test_the_reference_is_least_squares_in_fractions() -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import spline_filter
 from speckle import Speckle
 
-from mirrorskin.kernels.displacement import (
+from mirrorskin.kernels.skin.displacement import (
     MARGIN,
     PARAMETERS,
     basis,

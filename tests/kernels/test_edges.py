@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine.rotation.edges import LIMITS, EdgeDrawing, find_edges
-from mirrorskin.kernels import edges
-from mirrorskin.kernels.edges import COARSE, FINE, NEAR, PASSES
+from mirrorskin.kernels.rotation import edges
+from mirrorskin.kernels.rotation.edges import COARSE, FINE, NEAR, PASSES
 
 SHAPES = [(1, 1), (1, 9), (9, 1), (2, 3), (23, 37), (40, 131)]
 

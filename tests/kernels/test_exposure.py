@@ -8,7 +8,7 @@ from numpy.polynomial.hermite_e import hermegauss
 from numpy.typing import NDArray
 from scipy import stats
 
-from mirrorskin.kernels import exposure
+from mirrorskin.kernels.twin import exposure
 
 
 def moments(signal: float, read: float, grain: float) -> list[float]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mirrorskin.kernels.focus import focus_scan
+from mirrorskin.kernels.optical.focus import focus_scan
 
 SHAPE = (11, 130)
 FRAMES = np.random.default_rng(0).integers(0, 250, (9, *SHAPE))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mirrorskin.kernels.lambert import lambert_add
+from mirrorskin.kernels.optical.lambert import lambert_add
 
 PIXELS = 1100
 GENERATOR = np.random.default_rng(0)

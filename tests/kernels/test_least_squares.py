@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from mirrorskin.kernels import least_squares
-from mirrorskin.kernels.least_squares import (
+from mirrorskin.kernels.numerics import least_squares
+from mirrorskin.kernels.numerics.least_squares import (
     Prior,
     cauchy,
     fit,

@@ -9,8 +9,8 @@ import pytest
 
 from mirrorskin.engine.integration.graph import PixelGraph
 from mirrorskin.engine.integration.validation import Inputs, check_inputs
-from mirrorskin.kernels import links
-from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
+from mirrorskin.kernels.integration import links
+from mirrorskin.kernels.integration.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
 
 SHAPES = [(1, 1), (1, 2), (1, 9), (9, 1), (3, 2), (23, 37), (18, 300)]
 SIZE = 0.03, 0.04

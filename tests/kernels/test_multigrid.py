@@ -16,7 +16,7 @@ from mirrorskin.engine.integration.hierarchy import (
     part_of,
     place_of_coarse,
 )
-from mirrorskin.kernels import multigrid as twin
+from mirrorskin.kernels.integration import multigrid as twin
 
 SHAPE = 90, 300  # several tiles, parts of sums and items, none of them full
 GRAPHS = [("rectangle", False), ("holes", False), ("soft", False), ("cuts", True), ("uneven", True)]

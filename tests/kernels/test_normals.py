@@ -10,9 +10,9 @@ from scipy import optimize, special
 
 from mirrorskin.engine.base.picture import vector_lanes
 from mirrorskin.engine.correlation.design_matrix import fit_matrix
-from mirrorskin.kernels import normals
 from mirrorskin.kernels.device import C_TYPES
-from mirrorskin.kernels.normals import Answer, Variance, contact_limits
+from mirrorskin.kernels.rotation import normals
+from mirrorskin.kernels.rotation.normals import Answer, Variance, contact_limits
 
 ROOM = 64
 UNTOUCHED = 77  # what answers hold before a kernel runs

@@ -7,8 +7,8 @@ import rotations
 from mirrorskin import engine
 from mirrorskin.engine.rotation.poses import check_poses, pose_fit
 from mirrorskin.io.types import body_axes
-from mirrorskin.kernels import normals_pose
-from mirrorskin.kernels.normals import Variance, contact_limits
+from mirrorskin.kernels.rotation import normals_pose
+from mirrorskin.kernels.rotation.normals import Variance, contact_limits
 
 COUNT, OFFSET, NOISE = 40, 60.0, 1.5
 GAINS = {"uint8": 190.0, "uint16": 500.0, "float32": 500.0}  # of the first, some samples are clipped

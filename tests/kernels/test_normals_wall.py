@@ -11,9 +11,9 @@ from walls import PHASE, TILT, facing, light_of
 
 from mirrorskin.engine.correlation.design_matrix import fit_matrix
 from mirrorskin.engine.rotation.response import make_response
-from mirrorskin.kernels.normals import Variance, contact_limits
-from mirrorskin.kernels.normals_wall import _places, _rotations, normals_wall
-from mirrorskin.kernels.response import wall_light
+from mirrorskin.kernels.rotation.normals import Variance, contact_limits
+from mirrorskin.kernels.rotation.normals_wall import _places, _rotations, normals_wall
+from mirrorskin.kernels.rotation.response import wall_light
 
 DARK, BRIGHT = 10.0, 240.0
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mirrorskin.kernels.pose import BLOCK, PARTS, pose_equations
-from mirrorskin.kernels.pose_maps import pose_gradient
+from mirrorskin.kernels.skin.pose import BLOCK, PARTS, pose_equations
+from mirrorskin.kernels.skin.pose_maps import pose_gradient
 
 PIXEL = 0.05, 0.06
 

@@ -8,7 +8,7 @@ import pytest
 from mirrorskin.engine.integration.height_variance import expected_misfit
 from mirrorskin.engine.integration.rectangle import Rectangle, find_modes
 from mirrorskin.engine.integration.validation import check_inputs
-from mirrorskin.kernels.rectangle import (
+from mirrorskin.kernels.integration.rectangle import (
     rectangle_divide,
     rectangle_heights,
     rectangle_misfit,

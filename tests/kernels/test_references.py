@@ -11,10 +11,12 @@ from scipy.spatial.transform import Rotation
 from speckle import Speckle
 
 from mirrorskin.cli.commands.bench.limits import CHAINS, CORES, LANES
-from mirrorskin.kernels import correlation, displacement, focus, lambert, pose, pose_maps, registration
-from mirrorskin.kernels.breaks import DOWN, RIGHT
 from mirrorskin.kernels.device import C_TYPES
-from mirrorskin.kernels.skin import FLAKES
+from mirrorskin.kernels.integration.breaks import DOWN, RIGHT
+from mirrorskin.kernels.optical import focus, lambert
+from mirrorskin.kernels.rotation import correlation, registration
+from mirrorskin.kernels.skin import displacement, pose, pose_maps
+from mirrorskin.kernels.twin.skin import FLAKES
 
 DTYPES, WHOLE = {"dtype": ("uint8", "uint16", "float32")}, {"dtype": ("uint8", "uint16")}
 
@@ -823,4 +825,4 @@ def test_every_kernel_is_compared_with_its_reference():
     assert {file for name, file in KERNELS.items() if name not in here} == ELSEWHERE.keys()
     for file, test in ELSEWHERE.items():
         text = (Path(__file__).parents[1] / test).read_text(encoding="utf-8")
-        assert re.search(rf"kernels(\.| import .*\b){file}\b", text), test
+        assert re.search(rf"kernels\.\w+(\.| import .*\b){file}\b", text), test

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from mirrorskin.kernels.registration import BORDER, registration_admit, registration_resample, weights
+from mirrorskin.kernels.rotation.registration import (
+    BORDER,
+    registration_admit,
+    registration_resample,
+    weights,
+)
 
 ALIKE = np.zeros((1, 1), np.float32), np.ones((1, 1), np.float32)
 # Pixels to the right and down: a number, and what a column, a row and a millimetre of height add.

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 
-from mirrorskin.kernels.response import light_slopes, wall_light
+from mirrorskin.kernels.rotation.response import light_slopes, wall_light
 
 GEOMETRY = 17.5, 40.0, math.radians(1.5)
 LAMPS = 0.03, -0.04

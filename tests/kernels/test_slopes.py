@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine.integration.normals_to_height import SlopeKernels, find_slopes
-from mirrorskin.kernels import slopes
+from mirrorskin.kernels.integration import slopes
 
 SHAPES = [(1, 1), (1, 9), (9, 1), (7, 5), (23, 37), (40, 300), (33, 520), (19, 128)]
 TILT = 0.04

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.kernels.wall import wall_light
+from mirrorskin.kernels.twin.wall import wall_light
 
 RADIUS, RIM, INDEX = 17.5, 40.0, 1.41
 SCATTER = np.radians(3)

@@ -150,8 +150,10 @@ def frozen_cases() -> Iterator[tuple[str, Any]]:
 
 def examine(build: tuple[Build, set[str]], tools: tuple[str, str]) -> list[Row]:
     """Compile a file with its options for both; return what each kernel that runs takes."""
+    from mirrorskin.kernels.device import source_file
+
     (file, options), names = build
-    path = Path(file) if file.endswith(".cl") else ROOT / "kernels" / f"{file}.cl"
+    path = Path(file) if file.endswith(".cl") else source_file(f"{file}.cl")
     with tempfile.TemporaryDirectory() as folder:
         ptx, assembly = (
             compile_for(target, path, options, tools[0], Path(folder)) for target in (NVIDIA, AMD)

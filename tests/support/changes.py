@@ -6,7 +6,7 @@ import numpy as np
 
 from mirrorskin.engine.base.frames import reference_pair
 from mirrorskin.io import Result
-from mirrorskin.kernels import changepoint as reference
+from mirrorskin.kernels.press import changepoint as reference
 
 EVIDENCE = 12
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from mirrorskin.engine.base.frames import reference_maps
 from mirrorskin.io import Result
-from mirrorskin.kernels import onset as reference
+from mirrorskin.kernels.press import onset as reference
 
 SPEC = {"uint8": (20, 220), "uint16": (300, 3500), "float32": (0.1, 0.9)}
 LEVELS = {dtype: {"dark": dark, "bright": bright} for dtype, (dark, bright) in SPEC.items()}

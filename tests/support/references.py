@@ -16,7 +16,8 @@ import pytest
 from mirrorskin import kernels
 from mirrorskin.kernels.device import C_TYPES, Device
 
-SOURCES = {file.stem: file.read_text(encoding="utf-8") for file in Path(*kernels.__path__).glob("*.cl")}
+FILES = {file.stem: file for file in Path(*kernels.__path__).glob("*/*.cl")}
+SOURCES = {name: file.read_text(encoding="utf-8") for name, file in FILES.items()}
 KERNELS = {
     name: file
     for file, text in SOURCES.items()
@@ -104,7 +105,8 @@ def agree(
     counts |= {"whole row": rows * -(-columns // tile)}
     items = counts[per] if isinstance(per, str) else per(device, values)
 
-    function = getattr(importlib.import_module(f"mirrorskin.kernels.{KERNELS[name]}"), name)
+    file = FILES[KERNELS[name]]
+    function = getattr(importlib.import_module(f"mirrorskin.kernels.{file.parent.name}.{file.stem}"), name)
     known = inspect.signature(function).parameters
     expected = {key: np.copy(value) for key, value in values.items() if isinstance(value, np.ndarray)}
     answer = function(**{key: expected.get(key, value) for key, value in values.items() if key in known})

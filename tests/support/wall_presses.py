@@ -11,7 +11,7 @@ from calibration_scorer import ball
 from numpy.typing import NDArray
 
 from mirrorskin.io import WallResponse
-from mirrorskin.kernels.response import shade_terms, sight_slopes, wall_light
+from mirrorskin.kernels.rotation.response import shade_terms, sight_slopes, wall_light
 from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE, PIXEL = (48, 48), 0.25

@@ -23,7 +23,7 @@ from mirrorskin.engine.calibration.wall_model import (
     predict,
     split,
 )
-from mirrorskin.kernels.response import sight_of, wall_light
+from mirrorskin.kernels.rotation.response import sight_of, wall_light
 
 TRUE = {
     "radius": 17.2,

@@ -21,7 +21,7 @@ from mirrorskin.engine.calibration.wall_model import (
     predict,
 )
 from mirrorskin.engine.calibration.wall_response import make_response, threshold_zenith
-from mirrorskin.kernels.response import sight_of
+from mirrorskin.kernels.rotation.response import sight_of
 
 NOMINAL = dict.fromkeys(SENSOR, (0.0, 3.0)) | dict.fromkeys(SENSOR[-5:], (0.0, 0.02))
 NOMINAL |= {"radius": (17.5, 1.75), "rim": (40.0, 4.0), "axis_x": (0.0, 1.0), "axis_y": (0.0, 1.0)}

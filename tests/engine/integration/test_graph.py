@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.engine.integration.graph import find_components
-from mirrorskin.kernels.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
+from mirrorskin.kernels.integration.links import DOWN, KNOWN, LOST, RIGHT, SLOPE
 
 
 def walk(flags):

@@ -13,7 +13,7 @@ from mirrorskin.engine import Onset, Run
 from mirrorskin.engine.base.operation import Plan
 from mirrorskin.engine.base.sources import ArraySource
 from mirrorskin.io import InputError
-from mirrorskin.kernels import onset as reference
+from mirrorskin.kernels.press import onset as reference
 
 DTYPES = sorted(SPEC)
 EVENTS = ["onset", "release"]

@@ -1,6 +1,6 @@
 """Records of a map for the fit of a motion: ``pose_maps.cl`` in NumPy with float64.
 
-For the format of records see `mirrorskin.kernels.pose`.
+For the format of records see `mirrorskin.kernels.skin.pose`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.kernels.pose import FAR, NEAR, VAGUE
+from mirrorskin.kernels.skin.pose import FAR, NEAR, VAGUE
 
 Array = NDArray[Any]
 

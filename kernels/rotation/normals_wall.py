@@ -1,8 +1,9 @@
 """Surface normals with a cylindrical wall: ``normals_wall.cl`` in NumPy.
 
-Like `mirrorskin.kernels.normals.normals_exact`, but samples are lights (`mirrorskin.kernels.response`), not
-zeniths, and depend on the position. In the body's frame a normal n at phase alpha is Rz(alpha) Ry(tilt)
-Rz(-alpha) n, and the point p of the object is at pivot + Rz(alpha) Ry(tilt) Rz(-alpha) (p - pivot).
+Like `mirrorskin.kernels.rotation.normals.normals_exact`, but samples are lights
+(`mirrorskin.kernels.rotation.response`), not zeniths, and depend on the position. In the body's frame a
+normal n at phase alpha is Rz(alpha) Ry(tilt) Rz(-alpha) n, and the point p of the object is at pivot +
+Rz(alpha) Ry(tilt) Rz(-alpha) (p - pivot).
 
 The initial value is the height on the wall that shows the mean light to the centre, and the wave's azimuth,
 which is wrong by degrees. Gauss-Newton steps lead from there to the maximum-likelihood normal.
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.normals import (
+from mirrorskin.kernels.rotation.normals import (
     MORE,
     Answer,
     Limits,
@@ -30,7 +31,7 @@ from mirrorskin.kernels.normals import (
     step,
     tangents,
 )
-from mirrorskin.kernels.response import light_slopes, sight_slopes, wall_light
+from mirrorskin.kernels.rotation.response import light_slopes, sight_slopes, wall_light
 
 Array = NDArray[Any]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.links import KNOWN, Flags, Triple
+from mirrorskin.kernels.integration.links import KNOWN, Flags, Triple
 
 Array = NDArray[Any]
 Labels = NDArray[np.int32]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.kernels.onset import BENT
+from mirrorskin.kernels.press.onset import BENT
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]

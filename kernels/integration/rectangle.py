@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct
 
-from mirrorskin.kernels.links import link_slopes
+from mirrorskin.kernels.integration.links import link_slopes
 
 Floats = NDArray[np.floating[Any]]
 

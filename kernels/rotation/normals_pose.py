@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.normals import (
+from mirrorskin.kernels.rotation.normals import (
     _LEAST,
     _NO_ANSWER,
     _REACH,

@@ -1,0 +1,1 @@
+"""Least squares, conjugate gradients, samples of arrays, and the limits of a device."""

@@ -1,0 +1,1 @@
+"""Kernels of focus and of light from several directions."""

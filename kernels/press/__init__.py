@@ -1,0 +1,1 @@
+"""Kernels that search the frame in which a pixel turns light."""

@@ -1,0 +1,1 @@
+"""Kernels of a rotation: correlation, normals, edges and registration."""

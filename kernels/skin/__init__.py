@@ -1,0 +1,1 @@
+"""Kernels of displacements of the skin, and of poses."""

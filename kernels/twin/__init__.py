@@ -1,0 +1,1 @@
+"""Kernels of the twin's skin, wall and camera."""
