@@ -131,8 +131,8 @@ gpu-wheels: $(READY)
 	@rm -rf build/gpu-wheels build/lib build/bdist.*  # what lies there would be part of the wheel
 	$(PIP) wheel --no-deps --wheel-dir build/gpu-wheels .
 	$(PIP) download --no-deps --only-binary=:all: --dest build/gpu-wheels --python-version $(VERSION) \
-	    $(patsubst %,--platform manylinux%_x86_64,2014 _2_17 _2_27 _2_28 _2_34) click flexcache flexparser isal lazy_loader \
-	    msgspec pint platformdirs pyopencl pyserial pytools siphash24 tifffile typing_extensions
+	    $(patsubst %,--platform manylinux%_x86_64,2014 _2_17 _2_27 _2_28 _2_34) click isal lazy_loader \
+	    msgspec platformdirs pyopencl pyserial pytools siphash24 tifffile typing_extensions
 
 clean:
 	@rm -rf .venv build site dist *.egg-info .hypothesis .import_linter_cache

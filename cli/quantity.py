@@ -15,7 +15,8 @@ from mirrorskin.io.units import Kind, in_base
 
 NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 """Pattern of a number with a decimal point."""
-_UNIT = r"[A-Za-z\u00b5\u03bc]+|°"
+_LETTERS = "A-Za-z\u00b5\u03bc\u00c5\u212b\u00e5\u00f6"  # those of µm and of ångström, too
+_UNIT = rf"[{_LETTERS}]+(?:[-_][A-Za-z]+)*|[°'\"\u2032\u2033]"
 _EXAMPLES: dict[Kind, str] = {
     "length": "0.1mm",
     "angle": "2.5deg",

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 _VALUE = re.compile(rf"\s*(?:{quantity.NUMBER}|[+-]?(?:nan|inf))", re.IGNORECASE)
 _PLAIN = re.compile(rf"\s*{quantity.NUMBER}\s*")
-_SPACED_UNIT = re.compile(r"(?<=[\d.])[ \t]+(?=(?:[^\W\d_]+|°)(?:\s|$))")  # between a number and its unit
+# Blanks between a number and its unit.
+_SPACED_UNIT = re.compile(r"(?<=[\d.])[ \t]+(?=(?:[^\W\d_]+|[°'\"\u2032\u2033])(?:\s|$))")
 _BRACKETS = re.compile(r"[\[({]\s*([^\])}]*?)\s*[\])}]")
 _SLASH = re.compile(r"/\s*([^\s/]+)\s*$")
 _SEPARATOR = re.compile("sep=(.)", re.IGNORECASE)  # a first line that Excel writes and reads
@@ -131,7 +132,7 @@ def unit_of(heading: str, kind: Kind, where: str) -> str:
             in_base(unit, kind)
         except ValueError as error:
             raise InputError(
-                f"{where} states the unit {shortened(unit)!r}: {shortened(str(error), 60)}; "
+                f"{where} states the unit {shortened(unit)!r}: {shortened(str(error), 110)}; "
                 f"write a unit of {kind}, such as [{BASE[kind]}]"
             ) from error
     return unit

@@ -184,7 +184,7 @@ def _numbers_and_unit(value: Any) -> tuple[Any, str]:
     )
     if unit is None or numbers is None:
         return value, ""
-    # The short form of pint is found in a table; its long one needs pint's own table.
+    # The short form of pint is in the table of units; a long one, such as "force_kilogram", may not be.
     return numbers, (f"{unit:~}" if hasattr(unit, "dimensionality") else str(unit)) or "dimensionless"
 
 

@@ -35,7 +35,7 @@ def folder(tmp_path_factory):
     return place
 
 
-HEAVY = "{'numpy', 'h5py', 'pyopencl', 'matplotlib', 'cv2', 'pint', 'rich', 'scipy', 'trimesh'}"
+HEAVY = "{'numpy', 'h5py', 'pyopencl', 'matplotlib', 'cv2', 'rich', 'scipy', 'trimesh'}"
 
 
 def help_of(*words):

@@ -19,7 +19,6 @@ HEAVY = (
     "matplotlib",
     "numpy",
     "panel",
-    "pint",
     "pyopencl",
     "rerun",
     "rich",

@@ -16,7 +16,6 @@ SLOW = {
     "matplotlib",
     "numpy.polynomial",
     "numpy.testing",
-    "pint",
     "rich",
     "scipy",
     "tifffile",

@@ -60,7 +60,7 @@ def test_the_heading_states_the_unit_and_the_column(tmp_path, text):
         ("travel [s]\n0\n1", "the heading 'travel [s]' states the unit 's': seconds are not a length"),
         (
             "travel [steps]\n0\n1",
-            "states the unit 'steps': steps is not a known unit; write",
+            "states the unit 'steps': steps is not a known unit (um, mm, cm, m, in, mil, ...); write",
         ),
         ("travel_deg\n0\n1", "states the unit 'deg': degrees are not a length"),
         ("0,05\n0,10\n0,15", "travel.csv, line 1: 0,05: write the number with a decimal point, 0.05"),
