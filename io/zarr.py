@@ -167,9 +167,15 @@ class ZarrFile(Hdf5File):
 
     def _decode(self, name: str, rows: int | None = None) -> NDArray[Any]:
         """Read an array, or its first rows."""
-        with naming(f"{self.path}: {name}"):
+        where = f"{self.path}: {name}"
+        with naming(where):
             array = self._array(name)
-            return np.asarray(array[...] if rows is None else array[:rows])
+            try:
+                return np.asarray(array[...] if rows is None else array[:rows])
+            except MemoryError as error:  # a damaged text, for example, states any number of texts
+                raise InputError(
+                    f"{where} takes more memory than there is: copy it again, or only what is needed"
+                ) from error
 
     def load(self, node: h5py.Dataset, rows: int | None = None) -> NDArray[Any]:
         """Read an array, or its first rows; see `Hdf5File.load`."""
