@@ -27,8 +27,8 @@ Shape = tuple[int, ...]
 VALUES_LIMIT = MAX_UNPACKED_BYTES
 """Limit of the memory for everything but the frames of one file, unpacked, in bytes.
 
-It applies to HDF5 and Zarr: maps, texts, attributes and process values together. A larger file may take as
-many bytes as its own size, and ``memory_limit`` raises the limit.
+It applies to maps, texts, attributes and process values of HDF5 together. A larger file may take as many
+bytes as its own size, and ``memory_limit`` raises the limit.
 """
 
 _LINKS_DEEP = 16

@@ -7,14 +7,15 @@ in the same way. Values are read from the store when they are needed.
 from __future__ import annotations
 
 import base64
+import errno
 import hashlib
 import json
 import math
 import os
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -22,14 +23,15 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.atomic import fixed_text
+from mirrorskin.io.atomic import MAKE_ROOM, fixed_text
 from mirrorskin.io.fingerprint import State, state_of
 from mirrorskin.io.hdf5 import VALUES_LIMIT, Hdf5File, Shape
 from mirrorskin.io.layout import CHECKSUM, STACK
 from mirrorskin.io.selection import Place, Span
+from mirrorskin.io.system import reason
+from mirrorskin.io.text import one_line
 from mirrorskin.io.types import Closing, InputError
 from mirrorskin.io.url import Url, is_zarr, path_of
-from mirrorskin.io.zarr_errors import MissingChunkError, naming
 from mirrorskin.io.zarr_metadata import METADATA, ArrayMetadata, compressors_of, read_nodes
 
 if TYPE_CHECKING:
@@ -37,11 +39,50 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = "zarr.Array[Any]"
 
-_MOST_FRAMES = 1 << 26
-_MOST_PIECES = 1 << 16  # chunks or shards of an array that is read as a whole, or that contain a frame
-_SMALL, _MOST_EARLY = 1 << 16, 128  # maximum size, bytes, and number of arrays that are read on opening
+_SMALL = 1 << 16  # maximum size of arrays that are read on opening, bytes
 AT_ONCE = 16  # number of concurrent requests
 _SAMPLE = 16  # frames hashed for a fingerprint if there are no checksums
+_REFUSED = {"PermissionError", "NoCredentialsError", "CredentialRetrievalError"}
+_UNREACHABLE = {"ConnectionError", "TimeoutError", "ClientError", "BotoCoreError", "FSTimeoutError"}
+
+
+class MissingChunkError(Exception):
+    """A chunk is missing; Zarr would replace it by its fill value."""
+
+
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Convert errors of Zarr and of store libraries, of many classes, to one line with a remedy."""
+    try:
+        # Zarr adds the offsets of a damaged shard without checking for overflow.
+        with np.errstate(over="ignore"):
+            yield
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:
+        raise InputError(f"{what}: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return f"{reason(error)}: {MAKE_ROOM}"
+    if isinstance(error, PermissionError) and error.errno:
+        return f"{reason(error)}: check the permissions"
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    text = one_line(error)[:200] or type(error).__name__
+    if isinstance(error, MissingChunkError):
+        return text
+    if isinstance(error, ImportError):
+        return f"a package is missing ({text}): pip install 'mirrorskin[zarr]', of S3 'mirrorskin[s3]'"
+    if "rotocol not known" in text:
+        return f"{text}: check the address"
+    if isinstance(error, FileNotFoundError):
+        return "there is no Zarr array or group, or no such bucket: check the address"
+    if kinds & _REFUSED or getattr(error, "status", None) in (401, 403):
+        return f"access is refused ({text}): give the store's credentials, of S3 in AWS_PROFILE or the like"
+    if kinds & _UNREACHABLE:
+        return f"the store does not answer ({text}): check the address and the network, and start again"
+    return f"it is damaged ({text}): copy it again"
 
 
 def open_file(path: str | Path, memory_limit: int | None = None) -> Hdf5File:
@@ -71,9 +112,9 @@ class ZarrFile(Hdf5File):
         with naming(str(path)), ExitStack() as opening:
             from zarr.core.sync import sync
 
-            from mirrorskin.io.zarr_store import LimitedStore, opened_store
+            from mirrorskin.io.zarr_store import CompleteStore, opened_store
 
-            self._store = LimitedStore(opening.enter_context(opened_store(path)), path)
+            self._store = CompleteStore(opening.enter_context(opened_store(path)))
             nodes = sync(read_nodes(self._store, path))
             groups = {f"/{name}": attributes for name, attributes in nodes.groups.items()}
             self.arrays: dict[str, ArrayMetadata] = {
@@ -114,64 +155,48 @@ class ZarrFile(Hdf5File):
             if one.dtype is not None and one.nbytes <= _SMALL and one.shape == one.chunks and name != STACK
         ]
         with ThreadPoolExecutor(AT_ONCE, "mirrorskin-zarr") as pool:
-            self._early = {name: pool.submit(self._decode, name) for name in small[:_MOST_EARLY]}
+            self._early = {name: pool.submit(self._decode, name) for name in small}
 
     def _array(self, name: str) -> Array:
         """Return an array of zarr-python; InputError if a codec is not allowed."""
         if name not in self._known:
-            from mirrorskin.io.zarr_codecs import open_array
+            from mirrorskin.io.zarr_store import open_array
 
             self._known[name] = open_array(self._store, self.arrays[name], f"{self.path}: {name}")
         return self._known[name]
 
     def _decode(self, name: str, rows: int | None = None) -> NDArray[Any]:
         """Read an array, or its first rows."""
-        one, where = self.arrays[name], f"{self.path}: {name}"
-        most = max(VALUES_LIMIT, self.memory_limit or 0)
+        where = f"{self.path}: {name}"
         with naming(where):
             array = self._array(name)
-            if one.nbytes > most:
+            try:
+                return np.asarray(array[...] if rows is None else array[:rows])
+            except MemoryError as error:  # a damaged text, for example, states any number of texts
                 raise InputError(
-                    f"{where} claims {one.nbytes} bytes, and at most {most} are read: it is damaged: copy it "
-                    "again, or raise --memory"
-                )
-            if (pieces := _count_pieces(one.shape, array.chunks)) > _MOST_PIECES:
-                raise InputError(
-                    f"{where} is in {pieces} chunks, and at most {_MOST_PIECES} are read: write it in fewer"
-                )
-            return np.asarray(array[...] if rows is None else array[:rows])
+                    f"{where} takes more memory than there is: copy it again, or only what is needed"
+                ) from error
 
     def load(self, node: h5py.Dataset, rows: int | None = None) -> NDArray[Any]:
         """Read an array, or its first rows; see `Hdf5File.load`."""
         name = str(node.name)
-        one = self.arrays[name]
-        self.spend(one.nbytes)
         early = self._early.get(name)
         values = self._decode(name, rows) if early is None else early.result().copy()
-        if one.is_text:
-            self.spend(sum(len(text) for text in values.flat))
         return values if early is None or rows is None else values[:rows]
 
     def check_frames(self, stack: h5py.Dataset, count: int) -> None:
         """Raise InputError for missing frames, and for chunks that are too large for memory."""
-        one, where = self.arrays[str(stack.name)], self.where(stack)
-        with naming(where):
-            array = self._array(str(stack.name))
-        size = math.prod(array.chunks) * array.dtype.itemsize
-        largest = max(self.memory_limit or VALUES_LIMIT, array.dtype.itemsize * math.prod(array.shape[1:]))
-        if size > largest:
-            raise InputError(
-                f"{where} is in chunks of {size / 1e6:.3g} MB: raise --memory, or write smaller ones"
-            )
-        pieces = _count_pieces(one.shape[1:], array.chunks[1:])
-        if count > _MOST_FRAMES:
-            raise InputError(f"{where} claims {count} frames: it is damaged: copy it again")
-        if pieces > _MOST_PIECES:
-            raise InputError(f"{where} claims {pieces} chunks a frame: write it in fewer, of whole frames")
-        self._store.largest_chunk = max(largest, VALUES_LIMIT)
+        name = str(stack.name)
+        one, where = self.arrays[name], self.where(stack)
         with naming(where):
             from zarr.core.sync import sync
 
+            array = self._array(name)
+            size, frame = (math.prod(n) * array.dtype.itemsize for n in (array.chunks, array.shape[1:]))
+            if size > max(self.memory_limit or VALUES_LIMIT, frame):
+                raise InputError(
+                    f"{where} is in chunks of {size / 1e6:.3g} MB: raise --memory, or write smaller ones"
+                )
             last = ((n - 1) // piece for n, piece in zip(one.shape, one.chunks, strict=True))
             key = f"{one.path}/{array.metadata.encode_chunk_key(tuple(last))}".lstrip("/")
             if not sync(self._store.exists(key)):
@@ -217,10 +242,6 @@ class ZarrFile(Hdf5File):
                 with naming(self.where(stack)):
                     digest.update(np.asarray(array[number]).tobytes())
         return digest.hexdigest()
-
-
-def _count_pieces(shape: Shape, chunks: Shape) -> int:
-    return math.prod(-(-n // piece) for n, piece in zip(shape, chunks, strict=True))
 
 
 def _set_attributes(node: h5py.Group | h5py.Dataset, attributes: Mapping[str, Any]) -> None:

@@ -15,14 +15,14 @@ import h5py
 import numpy as np
 
 from mirrorskin.io.atomic import new_folder
-from mirrorskin.io.hdf5 import VALUES_LIMIT, Hdf5File, Node, first_value
+from mirrorskin.io.hdf5 import Hdf5File, Node, first_value
 from mirrorskin.io.layout import STACK
 from mirrorskin.io.recording import is_recording, open_recording
 from mirrorskin.io.system import as_input_error
 from mirrorskin.io.types import InputError, Source
 from mirrorskin.io.url import ZARR_SUFFIX, Url, path_of
-from mirrorskin.io.zarr import AT_ONCE, ZarrFile, open_file
-from mirrorskin.io.zarr_errors import naming
+from mirrorskin.io.zarr import AT_ONCE, ZarrFile, naming, open_file
+from mirrorskin.io.zarr_metadata import names_in
 
 _WHOLE: Any = {"write_empty_chunks": True}
 _CLAIM = ".mirrorskin-writer-"  # prefix of the object with which a writer claims a store
@@ -138,11 +138,9 @@ def _claim(store: Any, target: Url) -> str:
     from zarr.core.buffer import default_buffer_prototype
     from zarr.core.sync import sync
 
-    from mirrorskin.io.zarr_store import LimitedStore
-
     claim = f"{_CLAIM}{os.urandom(8).hex()}"
     sync(store.set(claim, default_buffer_prototype().buffer.from_bytes(b"1")))
-    if any(name.startswith(_CLAIM) and name != claim for name in sync(LimitedStore(store, target).names(""))):
+    if any(name.startswith(_CLAIM) and name != claim for name in sync(names_in(store, ""))):
         sync(store.delete(claim))
         raise InputError(f"{target} is being written by another program: name another output with -o")
     return claim
@@ -153,12 +151,6 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
     import zarr
 
     nodes = [node for _, node in file.objects() if isinstance(node, h5py.Dataset) and node.name != STACK]
-    size = sum(int(node.nbytes) for node in nodes if node.dtype.kind in "biuf")
-    if size > VALUES_LIMIT:
-        raise InputError(
-            f"{file.path} contains {size / 1e6:.4g} MB in addition to its frames; in Zarr at most "
-            f"{VALUES_LIMIT / 1e6:.4g} MB are read: keep it in HDF5"
-        )
 
     def write(node: h5py.Dataset) -> None:
         about: dict[str, Any] = {"name": node.name, "attributes": _attributes(file, node), "config": _WHOLE}

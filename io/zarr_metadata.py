@@ -1,4 +1,4 @@
-"""Zarr metadata, versions 2 and 3, checked before it is passed to zarr-python or a codec."""
+"""Zarr metadata, versions 2 and 3, with the list of codecs that are allowed."""
 
 from __future__ import annotations
 
@@ -17,21 +17,15 @@ from mirrorskin.io.types import InputError
 METADATA = "zarr.json", ".zarray", ".zgroup", ".zattrs", ".zmetadata"
 """The names of metadata documents in both versions of Zarr."""
 
-MOST_NODES = 10_000
-"""Limit of the groups and arrays in a store, and of the names in one of its folders."""
-
-COMPRESSORS = {"blosc": "Blosc", "gzip": "GZip", "lz4": "LZ4", "zlib": "Zlib", "zstd": "Zstd"}
-"""Codecs that unpack bytes, which `zarr_codecs` limits, with their names for messages."""
-
+_COMPRESSORS = {"blosc": "Blosc", "gzip": "GZip", "lz4": "LZ4", "zlib": "Zlib", "zstd": "Zstd"}
 _SHARDS = "sharding_indexed"
-_COMPRESSORS_2, _FILTERS_2 = set(COMPRESSORS), {"shuffle", "vlen-utf8"}
+_COMPRESSORS_2, _FILTERS_2 = set(_COMPRESSORS), {"shuffle", "vlen-utf8"}
 _CODECS_3 = {"blosc", "bytes", "crc32c", "gzip", "transpose", "vlen-utf8", "zstd", _SHARDS}
 _INDEX_CODECS = {"bytes", "crc32c"}
 _NUMBERS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 _NUMBERS_2 = re.compile(r"[<>|]([iu][1248]|f[248]|b1)")
-_DEEP = 8  # maximum number of nested groups
-_MOST_DIMENSIONS = 32
-_AT_ONCE = 16  # number of concurrent requests
+_DEEP = 8  # maximum number of nested groups; a folder may contain a link to itself
+_AT_ONCE = 16  # number of concurrent requests; others wait, and do not time out
 
 
 @dataclass(frozen=True)
@@ -39,7 +33,7 @@ class ArrayMetadata:
     """An array as described by its metadata.
 
     ``dtype`` is None if the array contains neither numbers nor texts, and is not read. ``path`` is its path
-    in the store, and ``chunks`` is the shape of its largest pieces in the store: its shards, if it has any.
+    in the store, and ``chunks`` is the shape of its objects in the store: of its shards, if it has any.
     """
 
     path: str
@@ -69,61 +63,57 @@ class Nodes:
 
 
 async def read_nodes(store: Any, path: Path) -> Nodes:
-    """Read the structure of a limited store; FileNotFoundError if it is neither a group nor an array."""
+    """Read the structure of a store; FileNotFoundError if it is neither a group nor an array."""
     root = await _read_document(store, "", 3) or await _read_document(store, "", 2)
     if root is None:
         raise FileNotFoundError(str(path))
     version = _version(root)
     documents = {"": root}
-    listed = await _consolidated(store, root, version)
-    if _is_array(root):
-        listed = {}
-    if listed is None:
-        await _walk(store, path, version, documents)
-    else:
-        documents |= listed
-    if len(documents) > MOST_NODES:
-        raise too_many(path)
+    if not _is_array(root):
+        listed = await _consolidated(store, root, version)
+        documents |= await _members(store, version) if listed is None else listed
     groups = {name: _attributes(one) for name, one in documents.items() if not _is_array(one)}
     arrays = {name: _array(name, one, version) for name, one in documents.items() if _is_array(one)}
     return Nodes(groups, arrays)
 
 
-async def _walk(store: Any, path: Path, version: int, documents: dict[str, dict[str, Any]]) -> None:
-    """Find the members of all groups concurrently."""
-    import asyncio  # slow to import, and unneeded for files
+async def names_in(store: Any, folder: str) -> list[str]:
+    """Return the names in a folder that are valid for groups and arrays."""
+    names = {name.strip("/") async for name in store.list_dir(folder)}
+    return sorted(name for name in names if _is_name(name) and name not in METADATA)
 
-    gate = asyncio.Semaphore(_AT_ONCE)
 
-    async def gated(work: Any) -> Any:
-        async with gate:
-            return await work
-
+async def _members(store: Any, version: int) -> dict[str, dict[str, Any]]:
+    """Return the documents of the members of all groups, read concurrently."""
+    documents: dict[str, dict[str, Any]] = {}
     groups = [""]
     for _ in range(_DEEP + 1):
-        names = await _all_of(gated(store.names(group)) for group in groups)
+        names = await _all_of(names_in(store, group) for group in groups)
         places = [
             f"{group}/{name}".lstrip("/")
             for group, members in zip(groups, names, strict=True)
             for name in members
         ]
-        if len(documents) + len(places) > MOST_NODES:
-            raise too_many(path)
-        found = await _all_of(gated(_read_document(store, place, version)) for place in places)
+        found = await _all_of(_read_document(store, place, version) for place in places)
         present = {place: one for place, one in zip(places, found, strict=True) if one is not None}
         documents |= present
         groups = [place for place, one in present.items() if not _is_array(one)]
-        if not groups:
-            return
+    return documents
 
 
 async def _all_of(works: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
-    """Run all concurrently; if one fails, cancel the others and raise its error."""
-    import asyncio
+    """Run all, some at once; if one fails, cancel the others and raise its error."""
+    import asyncio  # slow to import, and unneeded for files
+
+    gate = asyncio.Semaphore(_AT_ONCE)
+
+    async def run(work: Coroutine[Any, Any, Any]) -> Any:
+        async with gate:
+            return await work
 
     try:
         async with asyncio.TaskGroup() as group:
-            tasks = [group.create_task(work) for work in works]
+            tasks = [group.create_task(run(work)) for work in works]
     except BaseExceptionGroup as errors:
         raise errors.exceptions[0] from None
     return [task.result() for task in tasks]
@@ -155,26 +145,26 @@ async def _consolidated(store: Any, root: dict[str, Any], version: int) -> dict[
         if copies is None:
             return None
         members = _mapping(_mapping(copies, "consolidated_metadata").get("metadata"), "metadata")
-        return {_checked_name(name): _mapping(one, name) for name, one in members.items() if _near(name)}
+        return {
+            _checked_name(name): _mapping(one, name)
+            for name, one in members.items()
+            if name.count("/") <= _DEEP
+        }
     copies = await _read_json(store, "", ".zmetadata")
     if copies is None:
         return None
     found: dict[str, dict[str, Any]] = {}
     for key, value in _mapping(copies.get("metadata"), ".zmetadata").items():
         name, _, kind = key.rpartition("/")
-        if name and _near(name):
+        if name and name.count("/") <= _DEEP:
             one = found.setdefault(_checked_name(name), {"zarr_format": 2, "attributes": {}})
             document = _mapping(value, key)
             one |= {"attributes": document} if kind == ".zattrs" else document
     return found
 
 
-def _near(name: str) -> bool:
-    return name.count("/") <= _DEEP
-
-
 def _checked_name(name: str) -> str:
-    if not all(map(is_name, name.split("/"))):
+    if not all(map(_is_name, name.split("/"))):
         raise ValueError(f"the name {name[:80]!r}")
     return name
 
@@ -206,13 +196,14 @@ def _attributes(document: Mapping[str, Any]) -> dict[str, Any]:
 def _array(path: str, document: dict[str, Any], version: int) -> ArrayMetadata:
     if _version(document) != version:
         raise ValueError(f"{path} is of another version of Zarr than its group")
+    grid = document
+    if version == 3:
+        grid = _mapping(document.get("chunk_grid"), f"the chunk grid of {path}")
+        if grid.get("name") != "regular":
+            raise ValueError(f"the chunk grid of {path} is {str(grid.get('name'))[:40]!r}")
+        grid = _mapping(grid.get("configuration"), f"the chunk grid of {path}")
     shape = _sizes(document.get("shape"), 0, f"the shape of {path}")
-    if version == 2:
-        grid = document.get("chunks")
-    else:
-        configuration = _configuration(document.get("chunk_grid"), {"regular"}, f"the chunk grid of {path}")
-        grid = configuration.get("chunk_shape")
-    chunks = _sizes(grid, 1, f"the chunks of {path}")
+    chunks = _sizes(grid.get("chunks" if version == 2 else "chunk_shape"), 1, f"the chunks of {path}")
     if len(chunks) != len(shape):
         raise ValueError(f"{path} has {len(shape)} dimensions, and its chunks {len(chunks)}")
     kind = document.get("dtype" if version == 2 else "data_type")
@@ -220,18 +211,9 @@ def _array(path: str, document: dict[str, Any], version: int) -> ArrayMetadata:
 
 
 def _sizes(value: Any, least: int, what: str) -> tuple[int, ...]:
-    whole = isinstance(value, list) and len(value) <= _MOST_DIMENSIONS
-    if not whole or not all(type(one) is int and least <= one < 1 << 63 for one in value):
+    if not isinstance(value, list) or not all(type(one) is int and one >= least for one in value):
         raise ValueError(f"{what} is {str(value)[:80]}")
     return tuple(value)
-
-
-def _configuration(value: Any, names: set[str], what: str) -> dict[str, Any]:
-    """Return the configuration of a named part of a document, if its name is in ``names``."""
-    value = _mapping(value, what)
-    if value.get("name") not in names:
-        raise ValueError(f"{what} is {str(value.get('name'))[:40]!r}")
-    return _mapping(value.get("configuration") or {}, what)
 
 
 def _dtype(kind: Any, version: int) -> Any:
@@ -269,23 +251,20 @@ def check_codecs(array: ArrayMetadata, where: str) -> None:
         )
 
 
-def _codec_names(codecs: Any, allowed: set[str], where: str, depth: int = 0) -> Iterator[str]:
+def _codec_names(codecs: Any, allowed: set[str], where: str) -> Iterator[str]:
     """Yield the names of codecs, including those inside shards, if all are allowed."""
     for one in _sequence(codecs, where):
         name = _identifier(one, "name", allowed, where)
         yield name
         if name == _SHARDS:
             inside = _mapping(_mapping(one, where).get("configuration"), f"the shards of {where}")
-            if depth:
-                raise InputError(f"{where} has shards inside of shards: write it with one kind of shards")
-            yield from _codec_names(inside.get("codecs"), allowed, where, depth + 1)
-            for _ in _codec_names(inside.get("index_codecs", []), _INDEX_CODECS, where, depth + 1):
-                pass
+            yield from _codec_names(inside.get("codecs"), allowed, where)
+            list(_codec_names(inside.get("index_codecs", []), _INDEX_CODECS, where))
 
 
 def _sequence(value: Any, where: str) -> list[Any]:
-    if not isinstance(value, list) or len(value) > _MOST_DIMENSIONS:
-        raise InputError(f"{where} has codecs that are not a short list: it is damaged: copy it again")
+    if not isinstance(value, list):
+        raise InputError(f"{where} has codecs that are not a list: it is damaged: copy it again")
     return value
 
 
@@ -306,14 +285,9 @@ def compressors_of(array: ArrayMetadata) -> str:
         names = [(array.document.get("compressor") or {}).get("id")]
     else:
         names = list(_codec_names(array.document.get("codecs"), _CODECS_3, array.path))
-    return ", ".join(COMPRESSORS[name] for name in names if name in COMPRESSORS) or "raw"
+    return ", ".join(_COMPRESSORS[name] for name in names if name in _COMPRESSORS) or "raw"
 
 
-def too_many(path: Path) -> InputError:
-    """Return the error for a store with too many groups and arrays."""
-    return InputError(f"{path} contains more than {MOST_NODES} groups and arrays: copy what is needed")
-
-
-def is_name(name: str) -> bool:
+def _is_name(name: str) -> bool:
     """Return whether a group or an array can have a name; other names could lead out of the store."""
     return name not in ("", ".", "..") and not any(letter in name for letter in "/\\\0")
