@@ -32,7 +32,7 @@ from suite.harness import Cases, DisagreementError, InaccurateError
 
 from mirrorskin.cli.commands.bench.records import Case, describe_run, open_run
 from mirrorskin.io import InputError, check_output
-from mirrorskin.io.atomic import write_new
+from mirrorskin.io.storage.atomic import write_new
 from mirrorskin.kernels.device import open_device
 
 _MODULES = calls, onset, normals, correlation, integration, robust, twin, paths, batch, live, pose, accuracy

@@ -228,7 +228,7 @@ class ClassCommand(Command):
         if name is None:
             return super().parse_args(ctx, args)
         ctx.meta[_LOADED] = self._load(name)
-        from mirrorskin.io.arguments import unknown_argument
+        from mirrorskin.io.base.arguments import unknown_argument
 
         try:
             return super().parse_args(ctx, args)
@@ -287,7 +287,7 @@ def _installed(args: Sequence[str], first: bool) -> str | None:
     words += [word for word in args if _NAME.fullmatch(word)][:first]
     if not words:
         return None
-    from mirrorskin.io.own_class import OPERATIONS, installed_names
+    from mirrorskin.io.base.own_class import OPERATIONS, installed_names
 
     names = installed_names(OPERATIONS)
     return next((word for word in words if word in names), None)

@@ -42,7 +42,7 @@ def defaults() -> Mapping[str, str]:
 def _read(path: Path) -> Mapping[str, str]:
     from msgspec import Meta, defstruct, structs
 
-    from mirrorskin.io.settings_file import load_toml
+    from mirrorskin.io.base.settings_file import load_toml
 
     examples = {"device": "gpu", "rig": "rig.toml", "pixel_size": "0.03mm", "calibration": "cal.h5"}
     keys: list[Any] = []
@@ -82,6 +82,6 @@ def calibration_of(recording: Recording, given: Path | None) -> Path | None:
 
 
 def _note(recording: Recording, text: str) -> None:
-    from mirrorskin.io.findings import Finding
+    from mirrorskin.io.base.findings import Finding
 
     recording.findings += (Finding("defaults", f"{text} of {config_file()}", warning=False),)

@@ -192,7 +192,7 @@ class AnyPath(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path of a text."""
-        from mirrorskin.io.url import path_of
+        from mirrorskin.io.base.url import path_of
 
         return path_of(os.fsdecode(super().convert(value, param, ctx)))
 
@@ -202,7 +202,7 @@ class ExistingPath(AnyPath):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path of a file that exists, or an address."""
-        from mirrorskin.io.url import Url, path_of
+        from mirrorskin.io.base.url import Url, path_of
 
         path = path_of(value)
         try:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mirrorskin.io import text
+from mirrorskin.io.base import text
 
 if TYPE_CHECKING:
     from mirrorskin.io import Recording, Result
@@ -157,14 +157,14 @@ def make_strict(strict: bool) -> None:
 def report_notes(name: str, process: Mapping[str, object]) -> None:
     """Print what else was found about the frames; warnings are printed when they occur."""
     if "notes" in process:
-        from mirrorskin.io.findings import named
+        from mirrorskin.io.base.findings import named
 
         click.echo(printable(named(name, str(process["notes"]))), err=True)
 
 
 def report_unverified(recording: Recording) -> None:
     """Print that parts of frames cannot be compared with the checksums of whole frames."""
-    from mirrorskin.io.checksums import UNVERIFIED_PARTS
+    from mirrorskin.io.base.checksums import UNVERIFIED_PARTS
 
     if UNVERIFIED_PARTS in recording.findings:
         click.echo(printable(f"{recording.name}: {UNVERIFIED_PARTS.text}"), err=True)

@@ -10,8 +10,8 @@ import math
 import re
 
 from mirrorskin.io import InputError, Region
-from mirrorskin.io.text import shortened
-from mirrorskin.io.units import Kind, in_base
+from mirrorskin.io.base.text import shortened
+from mirrorskin.io.base.units import Kind, in_base
 
 NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 """Pattern of a number with a decimal point."""

@@ -103,7 +103,7 @@ def open_calibration(path: Path | None, settings: RigSettings) -> Calibration | 
     import numpy as np
 
     from mirrorskin import io
-    from mirrorskin.io.calibration.source import check_camera
+    from mirrorskin.io.model.calibrated import check_camera
 
     if path is None:
         return None
@@ -132,7 +132,7 @@ def kept(recorder: StreamRecorder | None) -> Iterator[None]:
     """Report which frames of an interrupted recording were kept, and where; the exit code is 1."""
     from mirrorskin.hw.base.errors import HardwareError
     from mirrorskin.io import InputError
-    from mirrorskin.io.layout import COMPLETE
+    from mirrorskin.io.storage.layout import COMPLETE
 
     try:
         yield

@@ -16,8 +16,8 @@ from mirrorskin.engine.base.reconstruction import load_operation, method_for
 from mirrorskin.engine.batch.jobs import TABLES, Plan
 from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.io import InputError
-from mirrorskin.io.settings_file import load_toml
-from mirrorskin.io.system import read_text
+from mirrorskin.io.base.settings_file import load_toml
+from mirrorskin.io.base.system import read_text
 
 _REMEDY = "write the tables [stack], [press], [rotation], [slip], or [stack] and [operation] in TOML"
 

@@ -12,8 +12,8 @@ from mirrorskin.cli.groups import MOTIONS
 
 if TYPE_CHECKING:
     from mirrorskin.io import Motion, Region
-    from mirrorskin.io.positions import Positions
-    from mirrorskin.io.types import Floats
+    from mirrorskin.io.base.types import Floats
+    from mirrorskin.io.model.positions import Positions
 
 
 class StackOptions(TypedDict, total=False):
@@ -182,7 +182,7 @@ def read_travel(path: Path) -> Listed:
     from mirrorskin.cli.table import read_column
 
     if path.suffix.lower() == ".npy":
-        from mirrorskin.io.arrays import read_array
+        from mirrorskin.io.files.arrays import read_array
 
         return Listed(path, "travels", tuple(map(float, read_array(path).reshape(-1))))
     remedy = "write one length a frame in it, such as 0.15mm"

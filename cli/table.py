@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from mirrorskin.cli import quantity
 from mirrorskin.io import InputError
-from mirrorskin.io.system import read_text
-from mirrorskin.io.text import shortened
-from mirrorskin.io.units import BASE, Kind, in_base, is_common
+from mirrorskin.io.base.system import read_text
+from mirrorskin.io.base.text import shortened
+from mirrorskin.io.base.units import BASE, Kind, in_base, is_common
 
 if TYPE_CHECKING:
     from pathlib import Path

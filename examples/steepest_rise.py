@@ -6,7 +6,7 @@ mirrorskin run examples/steepest_rise.py:SteepestRise press.h5 -o heights.h5
 import numpy as np
 
 from mirrorskin import engine, io
-from mirrorskin.io.maps import TABLE
+from mirrorskin.io.model.maps import TABLE
 from mirrorskin.twin import Twin, Vertical
 
 

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from mirrorskin import engine, io
 from mirrorskin.engine.vibration.lock_in import Correlation
-from mirrorskin.io.positions import stroke_starts
+from mirrorskin.io.model.positions import stroke_starts
 from mirrorskin.twin import Camera, HeightMap, Leaning, Twin, Vertical
 
 SIZE, FIELD = 110, 6.0  # pixels of a side, mm

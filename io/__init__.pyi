@@ -1,33 +1,6 @@
-from .arrays import ArrayRecording
-from .atomic import check_output, check_result_output
-from .calibration.file import open_calibration, save_calibration, update_calibration
-from .calibration.source import Calibrated
-from .calibration.types import (
-    Calibration,
-    CameraId,
-    Gel,
-    Lens,
-    Precession,
-    References,
-    Stiffness,
-    WallResponse,
-)
-from .description import describe
-from .export import export_result, save_table
-from .findings import Finding, MirrorskinWarning
-from .fitted import Fitted
-from .maps import Map
-from .mcap import save_messages
-from .mesh import Mesh, surface_mesh
-from .plausibility import check
-from .positions import Steps
-from .recorder import Recorder
-from .recording import Recording, open_heights, open_recording
-from .result import Result, select_turn
-from .result_file import open_result, save_result
-from .selection import Region
-from .streaming import StreamRecorder
-from .types import (
+from .base.findings import Finding, MirrorskinWarning
+from .base.selection import Region
+from .base.types import (
     Block,
     Header,
     InputError,
@@ -37,8 +10,38 @@ from .types import (
     Truth,
     pixel_axes,
 )
-from .watch import Check
-from .zarr_export import save_zarr
+from .files.arrays import ArrayRecording
+from .files.description import describe
+from .files.heights import open_heights
+from .files.opening import open_recording
+from .files.outputs import check_result_output
+from .files.plausibility import check
+from .files.recorder import Recorder
+from .files.recording import Recording
+from .files.result_file import open_result, save_result
+from .files.streaming import StreamRecorder
+from .files.zarr_export import save_zarr
+from .formats.export import export_result, save_table
+from .formats.mcap import save_messages
+from .model.calibrated import Calibrated
+from .model.calibration import (
+    Calibration,
+    CameraId,
+    Gel,
+    Lens,
+    Precession,
+    References,
+    Stiffness,
+    WallResponse,
+)
+from .model.fitted import Fitted
+from .model.maps import Map
+from .model.mesh import Mesh, surface_mesh
+from .model.positions import Steps
+from .model.result import Result, select_turn
+from .storage.atomic import check_output
+from .storage.calibration_file import open_calibration, save_calibration, update_calibration
+from .watch.watch import Check
 
 __all__ = [
     "ArrayRecording",

@@ -12,7 +12,7 @@ import pytest
 from commands import run
 
 from mirrorskin import io
-from mirrorskin.io.export_formats import FORMATS
+from mirrorskin.io.formats.export_formats import FORMATS
 
 pytestmark = pytest.mark.slow
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from mirrorskin.io.types import InputError
+from mirrorskin.io.base.types import InputError
 
 _SCATTER_MAX = math.radians(20.0)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from mirrorskin.io.types import FRAME_DTYPES, InputError
+from mirrorskin.io.base.types import FRAME_DTYPES, InputError
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.twin.body import check_values
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from mirrorskin.io.types import InputError
+from mirrorskin.io.base.types import InputError
 from mirrorskin.twin.body import Body
 from mirrorskin.twin.coin import Coin
 from mirrorskin.twin.object_files import (

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.twin.objects import difference_slope
 
 RADIUS = 11.0

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.kernels.numerics.conjugate_gradients import Face, conjugate_gradients
 
 Spectrum = NDArray[np.complex64]

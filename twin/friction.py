@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.kernels.numerics.conjugate_gradients import Face, conjugate_gradients
 from mirrorskin.twin.elastic import HalfSpace, Spectrum, Window, filter_roughly, rectangle, wavenumbers
 

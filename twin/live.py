@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.base.clock import SYSTEM, Clock
-from mirrorskin.io.types import Block, Closing, Header, InputError
+from mirrorskin.io.base.types import Block, Closing, Header, InputError
 from mirrorskin.twin.twin import Twin
 
 _QUEUE = 8  # frames that wait for a late reader, as in a camera's driver

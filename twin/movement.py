@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.io.positions import check_phase, check_strokes
-from mirrorskin.io.types import Block, Floats, Header, InputError, Motion
+from mirrorskin.io.base.types import Block, Floats, Header, InputError, Motion
+from mirrorskin.io.model.positions import check_phase, check_strokes
 
 TILT_MAX = math.radians(30.0)
 

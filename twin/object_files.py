@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.arrays import read_array
-from mirrorskin.io.pictures import decode_picture
-from mirrorskin.io.system import read_regular
-from mirrorskin.io.types import Floats, InputError, pixel_axes
+from mirrorskin.io.base.system import read_regular
+from mirrorskin.io.base.types import Floats, InputError, pixel_axes
+from mirrorskin.io.files.arrays import read_array
+from mirrorskin.io.formats.pictures import decode_picture
 from mirrorskin.twin.objects import difference_slope
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 
 
 class Object(Protocol):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.twin.movement import TILT_MAX, Pose
 from mirrorskin.twin.objects import Object
 from mirrorskin.twin.view import View

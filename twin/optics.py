@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.types import Floats, InputError
+from mirrorskin.io.base.types import Floats, InputError
 from mirrorskin.kernels.device import Device
 from mirrorskin.twin.body import Body
 from mirrorskin.twin.pattern import Linear, Pattern, Uniform, zenith_window

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.pictures import PICTURE_SUFFIXES, read_picture
-from mirrorskin.io.types import Floats, InputError
+from mirrorskin.io.base.types import Floats, InputError
+from mirrorskin.io.formats.pictures import PICTURE_SUFFIXES, read_picture
 from mirrorskin.twin.body import Body
 
 PATTERN_NAMES = ("uniform", "linear")

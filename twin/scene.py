@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.twin.movement import Pose
 from mirrorskin.twin.skin import Sheet
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.types import Floats, InputError
+from mirrorskin.io.base.types import Floats, InputError
 from mirrorskin.twin.body import Body
 from mirrorskin.twin.elastic import Contact, HalfSpace, press
 from mirrorskin.twin.movement import Pose, pose_at_press

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.types import Floats, InputError
+from mirrorskin.io.base.types import Floats, InputError
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.twin.skin import drive, material, on_object
 from mirrorskin.twin.elastic import HalfSpace, Window

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.io.types import Floats, InputError
+from mirrorskin.io.base.types import Floats, InputError
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.twin.skin import FLAKES
 from mirrorskin.twin.body import check_values

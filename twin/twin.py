@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.types import Block, Closing, Floats, Header, InputError, Truth
+from mirrorskin.io.base.types import Block, Closing, Floats, Header, InputError, Truth
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.twin.body import Body
 from mirrorskin.twin.camera import Camera, Sensor

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.types import Floats, InputError, pixel_axes
+from mirrorskin.io.base.types import Floats, InputError, pixel_axes
 from mirrorskin.twin.body import Body
 
 _ROUNDS = 100

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.base.undistort import distorted
 from mirrorskin.io import Calibration, InputError
-from mirrorskin.io.calibration.types import BITS, Lens, Precession, References
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
+from mirrorskin.io.model.calibration import BITS, Lens, Precession, References
 from mirrorskin.view.drawing.canvas import (
     check_drawing,
     draw_classes,

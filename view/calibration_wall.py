@@ -12,7 +12,7 @@ from mirrorskin.engine.calibration.wall_response import threshold_zenith
 from mirrorskin.engine.press.elastic import threshold_at
 from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import Gel, Stiffness, WallResponse
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.view.drawing.canvas import draw_parameter, explain_colours, new_sheet
 from mirrorskin.view.drawing.colours import DIVERGING, ERROR, MISSING
 

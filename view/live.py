@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.live.status import SHOWN, Status, Update
 from mirrorskin.io import Result, pixel_axes
-from mirrorskin.io.maps import is_deviation
-from mirrorskin.io.result import display_order
-from mirrorskin.io.units import numbers_with_unit
+from mirrorskin.io.base.units import numbers_with_unit
+from mirrorskin.io.model.maps import is_deviation
+from mirrorskin.io.model.result import display_order
 from mirrorskin.view.drawing.colours import Colours, grey, height_colours, normal_colours
 from mirrorskin.view.result.scale import displayed_values, in_figure_unit
 from mirrorskin.view.result.sheet import sheet_of

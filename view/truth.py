@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.metrology.scoring import angle_between, true_normals
 from mirrorskin.io import InputError, Result, Truth
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.view.drawing.canvas import (
     draw_image,
     exceeded,

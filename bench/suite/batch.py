@@ -90,7 +90,7 @@ def _frames_offset(path: Path) -> int:
     """Return the offset of the frames in a recording, bytes."""
     import h5py
 
-    from mirrorskin.io.layout import STACK
+    from mirrorskin.io.storage.layout import STACK
 
     with h5py.File(path) as file:
         return int(file[STACK].id.get_offset())

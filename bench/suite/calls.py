@@ -19,7 +19,7 @@ from mirrorskin import engine
 from mirrorskin.cli.commands.bench.records import Case, Row, Target, Timing
 from mirrorskin.cli.commands.bench.timing import OURS, ROUNDS, Work, take_turns
 from mirrorskin.io import MirrorskinWarning, Recorder
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.errors import DeviceError
 from mirrorskin.twin import Axial, Twin, Vertical

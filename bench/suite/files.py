@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from mirrorskin import io
 from mirrorskin.cli.commands.bench.timing import OURS
 from mirrorskin.engine import reconstruct
-from mirrorskin.io.recorder import Compression
-from mirrorskin.io.types import Closing, Floats
+from mirrorskin.io.base.types import Closing, Floats
+from mirrorskin.io.files.recorder import Compression
 from mirrorskin.kernels.device import Device
 from suite.scenes import STEPS, TILT, fill_press, fill_turns, phases, references
 

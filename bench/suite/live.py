@@ -21,7 +21,7 @@ from mirrorskin.engine import Press, Rotation
 from mirrorskin.engine.live import RAISED, LiveRun, Loop, Status, Update
 from mirrorskin.hw.base.clock import SYSTEM, Clock
 from mirrorskin.io import Block, Header
-from mirrorskin.io.types import Closing, Floats
+from mirrorskin.io.base.types import Closing, Floats
 from mirrorskin.kernels.device import Device
 from suite.files import shared_memory
 from suite.harness import Cases, Run

@@ -28,7 +28,7 @@ from mirrorskin.cli.commands.bench.records import Case, Target
 from mirrorskin.cli.commands.bench.timing import OURS, Work
 from mirrorskin.engine import reconstruct
 from mirrorskin.engine.base.tiling import MEMORY_LIMIT
-from mirrorskin.io.url import path_of
+from mirrorskin.io.base.url import path_of
 from mirrorskin.kernels.device import Device, list_devices, open_device
 from suite.files import (
     MAPS,
@@ -294,7 +294,7 @@ def _write_long(press: Frames, path: Path) -> None:
     import h5py
     import hdf5plugin
 
-    from mirrorskin.io.layout import CHECKSUM, SERIES, STACK
+    from mirrorskin.io.storage.layout import CHECKSUM, SERIES, STACK
 
     record(press.first(2), path)
     block, travel = press.block, SERIES["travel"][0]

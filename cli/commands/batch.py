@@ -114,8 +114,8 @@ def command(
 def _find(words: Sequence[str], folder: Path) -> list[Path]:
     """Return the recordings, without results among them."""
     from mirrorskin.io import InputError
-    from mirrorskin.io.url import Url, is_zarr, path_of
-    from mirrorskin.io.zarr import find_stores
+    from mirrorskin.io.base.url import Url, is_zarr, path_of
+    from mirrorskin.io.storage.zarr import find_stores
 
     found: list[Path] = []
     for word in words:
@@ -148,14 +148,14 @@ def _find(words: Sequence[str], folder: Path) -> list[Path]:
 def _is_result(path: Path, folder: Path) -> bool:
     """Return whether a file is a result, or was one in this folder before it was damaged."""
     from mirrorskin.io import InputError
-    from mirrorskin.io.hdf5 import Hdf5File
-    from mirrorskin.io.result_file import MARK
+    from mirrorskin.io.storage.hdf5 import Hdf5File
+    from mirrorskin.io.storage.layout import RESULT_MARK
 
     if not path.name.endswith(_RESULTS) or not path.is_file():
         return False
     try:
         with Hdf5File(path) as file:
-            return file.marked(MARK)
+            return file.marked(RESULT_MARK)
     except InputError:
         return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
@@ -163,8 +163,8 @@ def _is_result(path: Path, folder: Path) -> bool:
 def _prepare(folder: Path, jobs: Sequence[Job]) -> None:
     """Create the folder, check that it can be written to, and remove temporary files of a killed batch."""
     from mirrorskin import io
-    from mirrorskin.io.atomic import remove_leftovers
-    from mirrorskin.io.system import as_input_error
+    from mirrorskin.io.base.system import as_input_error
+    from mirrorskin.io.storage.atomic import remove_leftovers
 
     with as_input_error(f"{folder} cannot be created", "choose another folder with -o"):
         if folder.exists() and not folder.is_dir():

@@ -36,7 +36,7 @@ def command(
     from mirrorskin.cli.output import make_strict, print_json, printable, progress
     from mirrorskin.cli.quantity import lengths
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.io.findings import in_process, warn
+    from mirrorskin.io.base.findings import in_process, warn
 
     sides, travels = lengths(field, "--field"), lengths(extent, "--extent")
     stack = stack_options(chosen)

@@ -10,7 +10,7 @@ import click
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.stack import STACK
-from mirrorskin.io.export_formats import contents, suffixes_with
+from mirrorskin.io.formats.export_formats import contents, suffixes_with
 
 _APEX = "apex"
 
@@ -57,9 +57,9 @@ def command(
     from mirrorskin.cli.output import printable, progress
     from mirrorskin.cli.quantity import segment
     from mirrorskin.engine.metrology import section_columns
-    from mirrorskin.io.export import check_export
-    from mirrorskin.io.foreign import MCAP_SUFFIX
-    from mirrorskin.io.recording import is_recording
+    from mirrorskin.io.files.opening import is_recording
+    from mirrorskin.io.formats.export import check_export
+    from mirrorskin.io.formats.foreign import MCAP_SUFFIX
 
     suffixes = {path.suffix.lower() for path in output}
     chosen = {"map_name": map_name, "section": section, "points": points, "float32": float32}
@@ -91,8 +91,8 @@ def command(
 def _part(output: list[Path], result: Path, turn: int | None, map_name: str) -> tuple[list[Path], list[Path]]:
     """Check all outputs, and return those in Zarr and the others."""
     from mirrorskin.io import InputError, check_output
-    from mirrorskin.io.url import is_zarr
-    from mirrorskin.io.zarr_export import check_store
+    from mirrorskin.io.base.url import is_zarr
+    from mirrorskin.io.files.zarr_export import check_store
 
     for number, path in enumerate(output):
         if path.resolve() in (other.resolve() for other in output[:number]):

@@ -79,9 +79,9 @@ def command(
 def _open(path: Path, place: Motion, known: StackOptions, limit: int) -> Recording:
     """Open a recording; the command line determines the motion of a file in another layout."""
     from mirrorskin import io
-    from mirrorskin.io.foreign import kind_of_frames
-    from mirrorskin.io.layout import MARK
-    from mirrorskin.io.zarr import open_file
+    from mirrorskin.io.formats.foreign import kind_of_frames
+    from mirrorskin.io.storage.layout import MARK
+    from mirrorskin.io.storage.zarr import open_file
 
     ours = False
     if not kind_of_frames(path):

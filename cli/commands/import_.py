@@ -26,7 +26,7 @@ def command(
     """Convert frames of another program to a recording."""
     from mirrorskin import io
     from mirrorskin.cli.output import make_strict, printable, progress, report_notes
-    from mirrorskin.io.findings import in_process, warn
+    from mirrorskin.io.base.findings import in_process, warn
 
     make_strict(strict)
 

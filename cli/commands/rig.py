@@ -51,7 +51,7 @@ def new(
     """Write a template of a rig file, in which every key is described."""
     from mirrorskin.hw.base.rig_file import TEMPLATE
     from mirrorskin.io import InputError
-    from mirrorskin.io.atomic import write_new
+    from mirrorskin.io.storage.atomic import write_new
 
     if output.exists():
         raise InputError(f"{output} exists and is not replaced: choose another name with -o")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from mirrorskin.io.existing import Replaces
+    from mirrorskin.io.storage.existing import Replaces
     from mirrorskin.twin import Axial, Camera, Movement, Twin
 
 _SHAPE, _PIXEL = (320, 320), 0.0375  # rows and columns, and mm: a field of 12 mm
@@ -162,7 +162,7 @@ def _frames() -> NDArray[np.uint8]:
 
 
 def _make_stack(path: Path, replaces: Replaces) -> None:
-    from mirrorskin.io.atomic import new_hdf5
+    from mirrorskin.io.storage.atomic import new_hdf5
 
     with new_hdf5(path, replaces) as new:
         new.root["raw/images"] = _frames()
@@ -174,8 +174,8 @@ def _make_pictures(folder: Path, replaces: Replaces) -> None:
 
 
 def _write_picture(path: Path, picture: NDArray[np.uint8], replaces: Replaces) -> None:
-    from mirrorskin.io.atomic import write_new
-    from mirrorskin.io.pictures import encode_png
+    from mirrorskin.io.formats.pictures import encode_png
+    from mirrorskin.io.storage.atomic import write_new
 
     size = _PIXEL * 1e-3  # m
     write_new(path, encode_png(picture, (size, size)), replaces)
@@ -185,8 +185,8 @@ def _make_video(path: Path, replaces: Replaces) -> None:
     from io import BytesIO
 
     from mirrorskin.io import InputError
-    from mirrorskin.io.atomic import write_new
-    from mirrorskin.io.video import load_av
+    from mirrorskin.io.formats.video import load_av
+    from mirrorskin.io.storage.atomic import write_new
 
     if path.suffix.lower() != ".avi":
         raise InputError(f"{path}: cannot be written as a video. Choose a name that ends in .avi")
@@ -225,7 +225,7 @@ def _record_flat(path: Path, camera: Camera, light: float, replaces: Replaces) -
     import numpy as np
 
     from mirrorskin import io
-    from mirrorskin.io.arrays import ArrayRecording
+    from mirrorskin.io.files.arrays import ArrayRecording
     from mirrorskin.twin.camera import Sensor
 
     sensor, field = Sensor(camera, _SHAPE), np.full(_SHAPE, light, np.float32)

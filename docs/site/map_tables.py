@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from mirrorskin.io import Fitted, Map
-from mirrorskin.io.calibration.parameters import Parameter, parameters
-from mirrorskin.io.calibration.types import PARTS
-from mirrorskin.io.maps import (
+from mirrorskin.io.model.calibration import PARTS
+from mirrorskin.io.model.maps import (
     TABLE,
     TWIST,
     FocusStatus,
@@ -28,6 +27,7 @@ from mirrorskin.io.maps import (
     StitchStatus,
     status_of,
 )
+from mirrorskin.io.model.parameters import Parameter, parameters
 
 DOCS = Path(__file__).resolve().parents[1]
 _STORED = {"text": "text", "names": "text", "integer": "i8", "integers": "i8", "flag": "bool"}

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.arguments import as_array
-from mirrorskin.io.result import shape_of
+from mirrorskin.io.base.arguments import as_array
+from mirrorskin.io.model.result import shape_of
 from mirrorskin.kernels.array import Array, Operand, adopt
 from mirrorskin.kernels.device import Choice, Device, are_several, open_device, opened_devices
 

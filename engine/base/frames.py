@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.base.device_arrays import AnyArray, as_any_array
 from mirrorskin.io import InputError
-from mirrorskin.io.samples import convert_samples, frame_dtype
-from mirrorskin.io.traces import FrameSamples
-from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.io.base.samples import convert_samples, frame_dtype
+from mirrorskin.io.base.types import FRAME_DTYPES
+from mirrorskin.io.watch.traces import FrameSamples
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 from mirrorskin.kernels.numerics.samples import Grid, take_grids, take_samples

@@ -13,8 +13,8 @@ from mirrorskin.engine.base.options import documented, signature_of
 from mirrorskin.engine.base.running import check_taken, run_over
 from mirrorskin.engine.base.sources import ArraySource
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.arguments import unknown_argument
-from mirrorskin.io.interpreter_end import computes
+from mirrorskin.io.base.arguments import unknown_argument
+from mirrorskin.io.base.interpreter_end import computes
 
 P = ParamSpec("P")
 

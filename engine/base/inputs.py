@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.device_arrays import as_any_array
 from mirrorskin.io import Fitted, InputError, Result, open_result, pixel_axes
-from mirrorskin.io.arguments import as_array, check_pixel_size
-from mirrorskin.io.fitted import taken_from
-from mirrorskin.io.maps import declaration_of
-from mirrorskin.io.result import FIELDS, map_shape, shape_of, size_of_maps
+from mirrorskin.io.base.arguments import as_array, check_pixel_size
+from mirrorskin.io.model.fitted import taken_from
+from mirrorskin.io.model.maps import FIELDS, declaration_of
+from mirrorskin.io.model.result import map_shape, shape_of, size_of_maps
 
 if TYPE_CHECKING:
     import xarray

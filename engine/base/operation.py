@@ -16,17 +16,17 @@ from mirrorskin.engine.base.options import Configured, Option, option
 from mirrorskin.engine.base.provenance import describe
 from mirrorskin.engine.base.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Map
-from mirrorskin.io.arguments import unknown_argument
-from mirrorskin.io.result import check_maps
-from mirrorskin.io.traces import FrameSamples
-from mirrorskin.io.types import Motion
+from mirrorskin.io.base.arguments import unknown_argument
+from mirrorskin.io.base.types import Motion
+from mirrorskin.io.model.result import check_maps
+from mirrorskin.io.watch.traces import FrameSamples
 from mirrorskin.kernels.device import Choice, Device, open_devices
 
 if TYPE_CHECKING:
     from mirrorskin.engine.base.picture import Picture
     from mirrorskin.engine.base.steps import Step
     from mirrorskin.io import Source
-    from mirrorskin.io.types import ProcessValue
+    from mirrorskin.io.base.types import ProcessValue
 
 COMPONENTS = {"displacement": (2,), "pose": (4,)}
 """Shapes of positions of a frame that are not single numbers."""

@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import as_array, check_flag, nearest, shown, unknown_argument
-from mirrorskin.io.own_class import importable_name, load_class
+from mirrorskin.io.base.arguments import as_array, check_flag, nearest, shown, unknown_argument
+from mirrorskin.io.base.own_class import importable_name, load_class
 
 Kind = Literal[
     "number", "integer", "numbers", "integers", "flag", "choice", "text", "path", "map", "file", "object"
@@ -164,7 +164,7 @@ class Option:
 
     def _map(self, value: Any) -> Any:
         if isinstance(value, str | Path):
-            from mirrorskin.io.arrays import read_map
+            from mirrorskin.io.files.arrays import read_map
 
             return read_map(Path(value))
         return self._number(value) if isinstance(value, Real) else as_array(self.name, value, self.unit)
@@ -335,7 +335,7 @@ def option(
     >>> Crossing(threshold=2)
     Traceback (most recent call last):
     ...
-    mirrorskin.io.types.InputError: threshold 2: a share from 0 to 1 is needed, such as 0.5
+    mirrorskin.io.base.types.InputError: threshold 2: a share from 0 to 1 is needed, such as 0.5
     """
     return Option(default, unit, help, within, above, file, shown_default, python_only)
 

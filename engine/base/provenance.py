@@ -21,7 +21,7 @@ from mirrorskin.engine.base.options import plain
 if TYPE_CHECKING:
     from mirrorskin.engine.base.options import Configured
     from mirrorskin.io import Result, Source
-    from mirrorskin.io.types import ProcessValue
+    from mirrorskin.io.base.types import ProcessValue
     from mirrorskin.kernels.device import Device
 
 

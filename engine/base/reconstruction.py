@@ -16,9 +16,9 @@ from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.running import Progress, check_taken, run_over
 from mirrorskin.engine.base.sources import ArraySource, IteratorSource
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import is_array
-from mirrorskin.io.interpreter_end import computes
-from mirrorskin.io.own_class import OPERATIONS, load_class
+from mirrorskin.io.base.arguments import is_array
+from mirrorskin.io.base.interpreter_end import computes
+from mirrorskin.io.base.own_class import OPERATIONS, load_class
 
 if TYPE_CHECKING:
     from mirrorskin.io import Calibration, Motion, Result, Source
@@ -245,8 +245,8 @@ def _as_source(
         return opened
     if isinstance(source, str | Path):
         raise io.InputError(f"{source} is a path: open it with io.open_recording")
-    from mirrorskin.io.arguments import as_array, check_pixel_size
-    from mirrorskin.io.arrays import ArrayRecording
+    from mirrorskin.io.base.arguments import as_array, check_pixel_size
+    from mirrorskin.io.files.arrays import ArrayRecording
 
     size = None if pixel_size is None else check_pixel_size(pixel_size)
     return ArrayRecording(as_array("frames", source), positions, {"pixel_size": size})

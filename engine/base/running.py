@@ -26,20 +26,20 @@ from mirrorskin.engine.base.sources import (
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.io import Block, InputError, Map, Result
-from mirrorskin.io.arguments import nearest, unknown_argument
-from mirrorskin.io.findings import Finding, merged, warn, with_findings
-from mirrorskin.io.interpreter_end import computation
-from mirrorskin.io.layout import as_series
-from mirrorskin.io.maps import SIGMA, UNDECLARED, declaration_of
-from mirrorskin.io.result import result_of
-from mirrorskin.io.types import exclusive_use
-from mirrorskin.io.watch import Watch
+from mirrorskin.io.base.arguments import nearest, unknown_argument
+from mirrorskin.io.base.findings import Finding, merged, warn, with_findings
+from mirrorskin.io.base.interpreter_end import computation
+from mirrorskin.io.base.types import exclusive_use
+from mirrorskin.io.model.maps import SIGMA, UNDECLARED, declaration_of
+from mirrorskin.io.model.result import result_of
+from mirrorskin.io.storage.layout import as_series
+from mirrorskin.io.watch.watch import Watch
 from mirrorskin.kernels.array import Array
 
 if TYPE_CHECKING:
     from mirrorskin.engine.base.method import Method
     from mirrorskin.io import Source
-    from mirrorskin.io.types import ProcessValue
+    from mirrorskin.io.base.types import ProcessValue
 
 Progress = Callable[[int], None]
 

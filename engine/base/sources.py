@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.device_arrays import AnyArray, as_any_array, on_host
 from mirrorskin.engine.base.operation import Operation
 from mirrorskin.io import Block, Header, InputError, Motion, Source
-from mirrorskin.io.arguments import as_array, check_pixel_size
-from mirrorskin.io.layout import POSITIONS, as_series
-from mirrorskin.io.samples import convert_samples, frame_dtype
-from mirrorskin.io.types import Closing, Floats, block_memory
+from mirrorskin.io.base.arguments import as_array, check_pixel_size
+from mirrorskin.io.base.samples import convert_samples, frame_dtype
+from mirrorskin.io.base.types import Closing, Floats, block_memory
+from mirrorskin.io.storage.layout import POSITIONS, as_series
 from mirrorskin.kernels.array import Array
 
 

@@ -12,7 +12,7 @@ from mirrorskin.engine.base.frames import take_neighbours
 from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.options import Configured
 from mirrorskin.io import Calibrated
-from mirrorskin.io.traces import FrameSamples
+from mirrorskin.io.watch.traces import FrameSamples
 
 if TYPE_CHECKING:
     import numpy as np

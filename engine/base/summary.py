@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Result
-from mirrorskin.io.maps import SIGMA, SlipStatus, is_builtin, is_deviation, place_of, status_of
-from mirrorskin.io.units import numbers_with_unit
+from mirrorskin.io.base.units import numbers_with_unit
+from mirrorskin.io.model.maps import SIGMA, SlipStatus, is_builtin, is_deviation, place_of, status_of
 
 _STICKS = status_of(SlipStatus).codes[SlipStatus.STICKS]
 

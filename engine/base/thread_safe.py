@@ -9,7 +9,7 @@ from functools import wraps
 from types import FunctionType
 from typing import Any, Self
 
-from mirrorskin.io.interpreter_end import computation
+from mirrorskin.io.base.interpreter_end import computation
 
 
 class ThreadSafe:
@@ -17,8 +17,9 @@ class ThreadSafe:
 
     One thread at a time runs the public methods and properties of an object; others wait. A display may
     therefore call ``result()`` while another thread pushes, and gets the maps of all completed pushes.
-    Methods may call other methods of the same object. Public methods of subclasses are wrapped when the class
-    is created. Plain attributes are not locked. Methods are computations of `mirrorskin.io.interpreter_end`.
+    Methods may call other methods of the same object. Public methods of subclasses are wrapped when the
+    class is created. Plain attributes are not locked. Methods are computations of
+    `mirrorskin.io.base.interpreter_end`.
 
     Examples
     --------

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.resample import SamplePoints
 from mirrorskin.io import InputError, Lens, Result, pixel_axes
-from mirrorskin.io.maps import Map
-from mirrorskin.io.result import map_shape
+from mirrorskin.io.model.maps import Map
+from mirrorskin.io.model.result import map_shape
 from mirrorskin.kernels.array_types import Doubles
 
 

@@ -24,8 +24,8 @@ from mirrorskin.engine.base.provenance import program_version
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.batch.work import Outcome
 from mirrorskin.io import InputError
-from mirrorskin.io.atomic import remove_leftovers
-from mirrorskin.io.system import as_input_error, lock
+from mirrorskin.io.base.system import as_input_error, lock
+from mirrorskin.io.storage.atomic import remove_leftovers
 
 PATIENCE = 30.0
 """Timeout, s, of a scheduler after the first contact, and of a cluster without workers."""

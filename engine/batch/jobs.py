@@ -22,8 +22,8 @@ from mirrorskin.engine.base.provenance import program_version
 from mirrorskin.engine.base.reconstruction import load_operation, method_for
 from mirrorskin.engine.base.tiling import MEMORY_LIMIT
 from mirrorskin.io import InputError, Motion
-from mirrorskin.io.own_class import importable_name, name_of
-from mirrorskin.io.url import Url
+from mirrorskin.io.base.own_class import importable_name, name_of
+from mirrorskin.io.base.url import Url
 
 
 @dataclass(frozen=True, slots=True)

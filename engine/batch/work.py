@@ -17,10 +17,10 @@ from mirrorskin.engine.base.running import Progress
 from mirrorskin.engine.base.summary import summarise
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.io import InputError, Recording
-from mirrorskin.io.result_file import open_process
-from mirrorskin.io.system import as_input_error
-from mirrorskin.io.types import ProcessValue
-from mirrorskin.io.url import Url
+from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.types import ProcessValue
+from mirrorskin.io.base.url import Url
+from mirrorskin.io.files.result_file import open_process
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.errors import DeviceError
 

@@ -18,7 +18,7 @@ from distributed import WorkerPlugin, get_worker
 
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.batch.work import Outcome, keep_memory, run_job
-from mirrorskin.io.system import usable_cores
+from mirrorskin.io.base.system import usable_cores
 from mirrorskin.kernels.device import Device, list_devices, open_device
 from mirrorskin.kernels.errors import DeviceError
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of
 from mirrorskin.engine.press.elastic import threshold_at
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
-from mirrorskin.io.maps import PressStatus
+from mirrorskin.io.model.maps import PressStatus
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics import least_squares
 from mirrorskin.kernels.numerics.least_squares import mad_sigma, soft_l1

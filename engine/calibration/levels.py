@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 
 Mask = NDArray[np.bool_]
 

@@ -23,8 +23,8 @@ from mirrorskin.engine.calibration.levels import (
 )
 from mirrorskin.engine.calibration.sources import check_one_camera, read_blocks
 from mirrorskin.io import Block, InputError, References, Source
-from mirrorskin.io.calibration.types import DEAD, HOT, SATURATED
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
+from mirrorskin.io.model.calibration import DEAD, HOT, SATURATED
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _CHUNK = 8_000_000  # bytes of float64 samples that are processed at a time

@@ -15,7 +15,7 @@ from mirrorskin.engine.calibration.ball import moved
 from mirrorskin.engine.calibration.sources import check_ball_radius, pixel_size_of
 from mirrorskin.engine.calibration.wall_response import make_response
 from mirrorskin.io import InputError, Precession, References, Source, WallResponse
-from mirrorskin.io.calibration.types import PATTERNS
+from mirrorskin.io.model.calibration import PATTERNS
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 

@@ -15,7 +15,7 @@ from mirrorskin.engine.calibration.sources import pixel_size_of
 from mirrorskin.engine.calibration.wall_fit import WallFit
 from mirrorskin.engine.rotation.response import shade
 from mirrorskin.io import InputError, Source, WallResponse, pixel_axes
-from mirrorskin.io.arguments import check_number, checked, in_unit
+from mirrorskin.io.base.arguments import check_number, checked, in_unit
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.rotation.response import (
     follow,

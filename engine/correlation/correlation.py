@@ -22,9 +22,9 @@ from mirrorskin.engine.base.picture import PerFrame, Picture
 from mirrorskin.engine.base.tiling import Planes
 from mirrorskin.engine.correlation.design_matrix import basis, check_phases, check_weights
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.maps import TABLE
-from mirrorskin.io.positions import check_phase
-from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.io.base.types import FRAME_DTYPES
+from mirrorskin.io.model.maps import TABLE
+from mirrorskin.io.model.positions import check_phase
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.rotation.correlation import WINDOW

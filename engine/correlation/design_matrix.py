@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io import InputError
-from mirrorskin.io.positions import check_phase, step_in_degrees
+from mirrorskin.io.model.positions import check_phase, step_in_degrees
 from mirrorskin.kernels.array_types import Doubles
 
 LONGEST = 64

@@ -14,7 +14,7 @@ from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.footprint import with_curvature
 from mirrorskin.io import Result
-from mirrorskin.io.traces import FrameSamples
+from mirrorskin.io.watch.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 

@@ -16,8 +16,8 @@ from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.blur import first_travel
 from mirrorskin.io import Block, Result, Source
-from mirrorskin.io.findings import Finding, with_findings
-from mirrorskin.io.traces import FrameSamples
+from mirrorskin.io.base.findings import Finding, with_findings
+from mirrorskin.io.watch.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import mad_sigma, median
 

@@ -19,7 +19,7 @@ from mirrorskin.engine.diagnosis.registration import Registered
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.engine.diagnosis.swing import Swing, find_swing
 from mirrorskin.io import Result
-from mirrorskin.io.findings import Finding, with_findings
+from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 from mirrorskin.kernels.rotation.normals import azimuth_of
 

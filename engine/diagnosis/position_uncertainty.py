@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.device_arrays import AnyArray, stored_map
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.io import Result
-from mirrorskin.io.findings import Finding, with_findings
+from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 from mirrorskin.kernels.numerics.samples import Grid, take_grids

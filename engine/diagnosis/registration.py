@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.base.frames import check_dtype
 from mirrorskin.engine.base.sources import DerivedSource
 from mirrorskin.io import Block, Header, InputError, Source, pixel_axes
-from mirrorskin.io.positions import check_phase
-from mirrorskin.io.types import block_memory
+from mirrorskin.io.base.types import block_memory
+from mirrorskin.io.model.positions import check_phase
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.rotation.registration import BORDER
 

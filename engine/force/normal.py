@@ -13,8 +13,8 @@ from mirrorskin.engine.base.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.force.halfspace import HalfSpace, Pressed, load_gradient, press
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import check_number, checked, in_unit
-from mirrorskin.io.findings import carried
+from mirrorskin.io.base.arguments import check_number, checked, in_unit
+from mirrorskin.io.base.findings import carried
 
 if TYPE_CHECKING:
     from mirrorskin.engine.press.elastic import PressFit

@@ -15,8 +15,8 @@ from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.force.halfspace import spectrum_of
 from mirrorskin.engine.force.normal import modulus_of
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import as_array_or_number, check_count, check_number, checked, in_unit
-from mirrorskin.io.findings import carried
+from mirrorskin.io.base.arguments import as_array_or_number, check_count, check_number, checked, in_unit
+from mirrorskin.io.base.findings import carried
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.conjugate_gradients import Face, conjugate_gradients
 

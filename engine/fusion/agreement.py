@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.integration.normals_to_height import Slopes
-from mirrorskin.io.findings import Finding, in_process
-from mirrorskin.io.types import ProcessValue
+from mirrorskin.io.base.findings import Finding, in_process
+from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.kernels.array_types import Doubles
 
 _CELL, _IN_CELL = 16, 64  # pixels along the side of a cell, and least number of them with both

@@ -35,14 +35,14 @@ from mirrorskin.engine.rotation.response import wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, at_poses
 from mirrorskin.engine.rotation.steps import take_slopes
 from mirrorskin.io import InputError, Motion, Result, Source, open_recording, open_result, pixel_axes
-from mirrorskin.io.arguments import as_array_or_number, check_count, check_flag, checked, in_unit
-from mirrorskin.io.findings import Finding, carried, in_process, warn
-from mirrorskin.io.fitted import taken_from
-from mirrorskin.io.foreign import kind_of_frames
-from mirrorskin.io.recording import is_result
-from mirrorskin.io.result import absolute_heights
-from mirrorskin.io.types import ProcessValue, exclusive_use
-from mirrorskin.io.url import path_of
+from mirrorskin.io.base.arguments import as_array_or_number, check_count, check_flag, checked, in_unit
+from mirrorskin.io.base.findings import Finding, carried, in_process, warn
+from mirrorskin.io.base.types import ProcessValue, exclusive_use
+from mirrorskin.io.base.url import path_of
+from mirrorskin.io.files.opening import is_result
+from mirrorskin.io.formats.foreign import kind_of_frames
+from mirrorskin.io.model.fitted import taken_from
+from mirrorskin.io.model.result import absolute_heights
 from mirrorskin.kernels.device import Choice, open_devices
 
 Mask = NDArray[np.bool_]

@@ -22,8 +22,8 @@ from mirrorskin.engine.integration.normals_to_height import Slopes
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.intervals import estimate_interval_errors, fit_paraboloids, interval_evidence
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.arguments import check_pixel_size
-from mirrorskin.io.types import ProcessValue
+from mirrorskin.io.base.arguments import check_pixel_size
+from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 

@@ -20,7 +20,7 @@ from mirrorskin.engine.integration.validation import (
     split_weights,
 )
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import check_pixel_size
+from mirrorskin.io.base.arguments import check_pixel_size
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.numerics.samples import take_samples
 

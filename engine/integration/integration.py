@@ -17,8 +17,8 @@ from mirrorskin.engine.integration.normals_to_height import integrate_result
 from mirrorskin.engine.integration.surface import IntegrationOptions, SurfaceSolver
 from mirrorskin.engine.integration.validation import check_inputs
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import Check, as_array_or_number, check_pixel_size, checked, in_unit
-from mirrorskin.io.findings import carried
+from mirrorskin.io.base.arguments import Check, as_array_or_number, check_pixel_size, checked, in_unit
+from mirrorskin.io.base.findings import carried
 from mirrorskin.kernels.device import Device, open_device
 
 _MAPS: Mapping[str, Check] = {

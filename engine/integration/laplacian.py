@@ -12,7 +12,7 @@ from mirrorskin.engine.integration.graph import Links, find_components
 from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.engine.integration.surface import IntegrationOptions
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import as_array_or_number, check_number, checked, or_none
+from mirrorskin.io.base.arguments import as_array_or_number, check_number, checked, or_none
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device

@@ -17,7 +17,7 @@ from mirrorskin.engine.integration.device_inputs import sample_evenly
 from mirrorskin.engine.integration.surface import explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
 from mirrorskin.io import Fitted, Result
-from mirrorskin.io.types import ProcessValue
+from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.integration.slopes import find, weigh

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.device_arrays import on_host
 from mirrorskin.engine.integration.validation import Inputs
 from mirrorskin.io import Result
-from mirrorskin.io.types import ProcessValue
+from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import mad_sigma

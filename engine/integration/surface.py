@@ -28,7 +28,7 @@ from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.slope_errors import correlation_of
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.types import ProcessValue
+from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.integration.links import DOWN, KNOWN, LOST, RIGHT, SLOPE

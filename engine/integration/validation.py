@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.integration.camera import Box, Camera, Mask, Slopes, find_box, find_slopes
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import check_pixel_size
+from mirrorskin.io.base.arguments import check_pixel_size
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.uint8]

@@ -12,7 +12,7 @@ from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.engine.integration.graph import LEVEL, Levelling, PixelGraph, find_components
 from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.engine.integration.validation import Floats, Inputs
-from mirrorskin.io.arguments import check_pixel_size
+from mirrorskin.io.base.arguments import check_pixel_size
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 

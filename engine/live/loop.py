@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.live.run import LiveRun
 from mirrorskin.engine.live.status import PUSHED, RAISED, SHOWN, UPDATED, WAITED, Monitor, Status, Update
 from mirrorskin.io import Block, InputError, LiveSource
-from mirrorskin.io.layout import POSITIONS
+from mirrorskin.io.storage.layout import POSITIONS
 
 LATENCY = 0.1
 """Seconds after which a frame is too old, by default."""

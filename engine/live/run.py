@@ -15,10 +15,10 @@ from mirrorskin.engine.base.provenance import naming
 from mirrorskin.engine.base.running import Run, check_motion
 from mirrorskin.engine.base.steps import Undistortion
 from mirrorskin.io import InputError, LiveSource, Map, Result, pixel_axes
-from mirrorskin.io.layout import POSITIONS
+from mirrorskin.io.storage.layout import POSITIONS
 
 if TYPE_CHECKING:
-    from mirrorskin.io.types import ProcessValue
+    from mirrorskin.io.base.types import ProcessValue
 
 _FRAMES = 64  # largest number of frames of a push
 _AREA = {"contact_area": Map("area where sheet and object touch", "mm²", "float64", "none")}

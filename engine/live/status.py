@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.io import Motion, Result
-from mirrorskin.io.result import display_order
+from mirrorskin.io.model.result import display_order
 
 WAITED, PUSHED, UPDATED, SHOWN, RAISED = "waited", "push", "update", "frame to map", "frame to height"
 STAGES = (WAITED, PUSHED, UPDATED, SHOWN, RAISED)

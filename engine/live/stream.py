@@ -22,10 +22,10 @@ from mirrorskin.engine.live.loop import LATENCY, Loop
 from mirrorskin.engine.live.run import LiveRun
 from mirrorskin.engine.live.status import Status, Update
 from mirrorskin.io import Block, Header, InputError, Motion, Result
-from mirrorskin.io.arguments import check_number, unknown_argument
-from mirrorskin.io.layout import LIVE, POSITIONS, as_series
-from mirrorskin.io.positions import check_finite
-from mirrorskin.io.types import Closing, Floats
+from mirrorskin.io.base.arguments import check_number, unknown_argument
+from mirrorskin.io.base.types import Closing, Floats
+from mirrorskin.io.model.positions import check_finite
+from mirrorskin.io.storage.layout import LIVE, POSITIONS, as_series
 
 _WAITING = 64  # frames at most that wait to be processed
 _ENDLESS = 1 << 40  # frames that a stream may have

@@ -23,8 +23,8 @@ from mirrorskin.engine.metrology.sections import Point, along, as_point, step_he
 from mirrorskin.engine.metrology.sections import section as cut
 from mirrorskin.engine.metrology.texture import DRAWS, FormRemoval, roughness
 from mirrorskin.io import InputError, Region, Result
-from mirrorskin.io.arguments import check_number, checked, in_unit
-from mirrorskin.io.findings import findings_of
+from mirrorskin.io.base.arguments import check_number, checked, in_unit
+from mirrorskin.io.base.findings import findings_of
 from mirrorskin.kernels.array_types import Doubles
 
 FormName = Literal["plane", "sphere", "none"]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.base.inputs import spacing
 from mirrorskin.io import InputError, Region, Result
-from mirrorskin.io.result import select_turn
+from mirrorskin.io.model.result import select_turn
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]

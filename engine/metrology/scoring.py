@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.base.inputs import Maps, as_result
 from mirrorskin.io import InputError, Result, Truth
-from mirrorskin.io.arguments import check_kind, checked
-from mirrorskin.io.findings import findings_of
-from mirrorskin.io.maps import SlipStatus
-from mirrorskin.io.result import map_shape
+from mirrorskin.io.base.arguments import check_kind, checked
+from mirrorskin.io.base.findings import findings_of
+from mirrorskin.io.model.maps import SlipStatus
+from mirrorskin.io.model.result import map_shape
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]

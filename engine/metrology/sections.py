@@ -15,8 +15,8 @@ from mirrorskin.engine.metrology.fitting import covariance
 from mirrorskin.engine.metrology.patch import heights_of
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import as_array, checked
-from mirrorskin.io.findings import findings_of
+from mirrorskin.io.base.arguments import as_array, checked
+from mirrorskin.io.base.findings import findings_of
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]

@@ -17,9 +17,9 @@ from mirrorskin.engine.base.tiling import Planes
 from mirrorskin.engine.diagnosis.footprint import with_curvature
 from mirrorskin.engine.optical.focus_travel import TravelJump
 from mirrorskin.io import InputError, Map
-from mirrorskin.io.maps import TABLE, FocusStatus, status_of
-from mirrorskin.io.positions import check_strokes
-from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.io.base.types import FRAME_DTYPES
+from mirrorskin.io.model.maps import TABLE, FocusStatus, status_of
+from mirrorskin.io.model.positions import check_strokes
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _LARGEST = 1e18  # noise whose square a float32 holds

@@ -21,10 +21,10 @@ from mirrorskin.engine.correlation.correlation import CorrelationOperation
 from mirrorskin.engine.correlation.design_matrix import check_weights, fit_matrix
 from mirrorskin.engine.diagnosis.amplitude_blur import with_blur
 from mirrorskin.io import InputError, Map, Result
-from mirrorskin.io.arguments import as_array, as_array_or_number, check_number, checked, in_unit
-from mirrorskin.io.findings import carried
-from mirrorskin.io.maps import TABLE
-from mirrorskin.io.positions import check_phase
+from mirrorskin.io.base.arguments import as_array, as_array_or_number, check_number, checked, in_unit
+from mirrorskin.io.base.findings import carried
+from mirrorskin.io.model.maps import TABLE
+from mirrorskin.io.model.positions import check_phase
 from mirrorskin.kernels.array_types import Doubles
 
 _TURN = 2 * np.pi

@@ -17,11 +17,11 @@ from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.base.tiling import Planes
 from mirrorskin.engine.diagnosis.amplitude_blur import with_blur
 from mirrorskin.io import InputError, Map, Result
-from mirrorskin.io.arguments import as_array
-from mirrorskin.io.findings import Finding, with_findings
-from mirrorskin.io.maps import TABLE
-from mirrorskin.io.positions import check_phase
-from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.io.base.arguments import as_array
+from mirrorskin.io.base.findings import Finding, with_findings
+from mirrorskin.io.base.types import FRAME_DTYPES
+from mirrorskin.io.model.maps import TABLE
+from mirrorskin.io.model.positions import check_phase
 from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.base.device_arrays import operand_of
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import check_pixel_size
-from mirrorskin.io.result import shape_of
+from mirrorskin.io.base.arguments import check_pixel_size
+from mirrorskin.io.model.result import shape_of
 from mirrorskin.kernels.array import Array, Operand, fetch
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device

@@ -13,8 +13,8 @@ from mirrorskin.engine.base.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import Equations, PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import Motion
-from mirrorskin.io.arguments import as_array, checked, in_unit
-from mirrorskin.io.findings import findings_of
+from mirrorskin.io.base.arguments import as_array, checked, in_unit
+from mirrorskin.io.base.findings import findings_of
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 

@@ -19,9 +19,9 @@ from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
 from mirrorskin.io import InputError, Result, select_turn
-from mirrorskin.io.findings import carried
-from mirrorskin.io.maps import StitchStatus, status_of
-from mirrorskin.io.types import ProcessValue
+from mirrorskin.io.base.findings import carried
+from mirrorskin.io.base.types import ProcessValue
+from mirrorskin.io.model.maps import StitchStatus, status_of
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.skin.pose_maps import SHARPEST

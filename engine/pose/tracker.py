@@ -14,7 +14,7 @@ from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
 from mirrorskin.io import Result
-from mirrorskin.io.findings import findings_of
+from mirrorskin.io.base.findings import findings_of
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 

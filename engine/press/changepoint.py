@@ -17,7 +17,7 @@ from mirrorskin.engine.press.crossing import EVENT_MAPS, Event, PressOperation
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.positions import check_travel
+from mirrorskin.io.model.positions import check_travel
 from mirrorskin.kernels.press.changepoint import DECIDED, INVALID, REACH, SLOTS, UNIT
 
 _EVIDENCE = 12.0  # minimum logarithm of the likelihood ratio of a change

@@ -18,10 +18,10 @@ from mirrorskin.engine.base.picture import PerPixel, Picture
 from mirrorskin.engine.base.tiling import Planes
 from mirrorskin.engine.diagnosis.position_uncertainty import with_travel_error
 from mirrorskin.io import Fitted, Map, Result
-from mirrorskin.io.maps import TABLE, PressStatus, ReleaseStatus, status_of
-from mirrorskin.io.positions import check_travel
-from mirrorskin.io.traces import FrameSamples
-from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.io.base.types import FRAME_DTYPES
+from mirrorskin.io.model.maps import TABLE, PressStatus, ReleaseStatus, status_of
+from mirrorskin.io.model.positions import check_travel
+from mirrorskin.io.watch.traces import FrameSamples
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.press.onset import DARK, complement
 
@@ -156,9 +156,9 @@ EVENT_MAPS = "height", "height_sigma", "status", "frame"
 class EventMaps(NamedTuple):
     """The event at each pixel: height and its sigma, status, and number of the first frame after it.
 
-    Heights, mm, are NaN unless the status is 1 (see `mirrorskin.io.maps.PressStatus` and ``ReleaseStatus``);
-    frames are -1 without an event. They are NumPy arrays, or on the device; the frame is then a function that
-    returns it.
+    Heights, mm, are NaN unless the status is 1 (see `mirrorskin.io.model.maps.PressStatus` and
+    ``ReleaseStatus``); frames are -1 without an event. They are NumPy arrays, or on the device; the frame
+    is then a function that returns it.
     """
 
     height: Any

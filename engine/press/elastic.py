@@ -24,8 +24,8 @@ from mirrorskin.engine.force.halfspace import (
 from mirrorskin.engine.press.cells import Cells, cut_into_cells, touched
 from mirrorskin.engine.press.spline import CellSplines
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
-from mirrorskin.io.arguments import check_pixel_size
-from mirrorskin.io.maps import PressStatus
+from mirrorskin.io.base.arguments import check_pixel_size
+from mirrorskin.io.model.maps import PressStatus
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics import least_squares
 from mirrorskin.kernels.numerics.least_squares import mad_sigma

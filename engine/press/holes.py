@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.press.membrane import stretch
 from mirrorskin.engine.press.spline import Spline, fit_within
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import check_number, check_pixel_size, checked, in_unit
+from mirrorskin.io.base.arguments import check_number, check_pixel_size, checked, in_unit
 from mirrorskin.kernels.array_types import Doubles
 
 Floats = NDArray[np.float32]

@@ -12,7 +12,7 @@ import numpy as np
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.press.onset import ThresholdOperation
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.maps import TABLE, PressStatus
+from mirrorskin.io.model.maps import TABLE, PressStatus
 
 
 class Levels(ThresholdOperation):

@@ -21,13 +21,13 @@ from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.strokes import Strokes
 from mirrorskin.io import Calibrated, InputError, Result
-from mirrorskin.io.maps import PressStatus
-from mirrorskin.io.positions import stroke_starts
+from mirrorskin.io.model.maps import PressStatus
+from mirrorskin.io.model.positions import stroke_starts
 
 if TYPE_CHECKING:
     from mirrorskin.engine.press.elastic import PressFit
     from mirrorskin.io import Calibration, Source
-    from mirrorskin.io.types import ProcessValue
+    from mirrorskin.io.base.types import ProcessValue
 
 PressMethod = Literal["threshold", "change-point"]
 

@@ -12,7 +12,7 @@ from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.base.summary import status_shares
 from mirrorskin.engine.press.crossing import PressOperation
 from mirrorskin.io import InputError, Recording, Result
-from mirrorskin.io.findings import Finding, with_findings
+from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles
 
 

@@ -16,9 +16,9 @@ from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, CrossingOpera
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import Result
-from mirrorskin.io.maps import TABLE, PressStatus
-from mirrorskin.io.positions import check_strokes, stroke_starts
-from mirrorskin.io.types import ProcessValue
+from mirrorskin.io.base.types import ProcessValue
+from mirrorskin.io.model.maps import TABLE, PressStatus
+from mirrorskin.io.model.positions import check_strokes, stroke_starts
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source

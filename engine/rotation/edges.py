@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.base.device_arrays import AnyArray, as_any_array, device_of
 from mirrorskin.io import InputError
-from mirrorskin.io.arguments import checked, in_unit
+from mirrorskin.io.base.arguments import checked, in_unit
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.rotation.edges import COARSE, FINE, MARGIN, NEAR, Limits, Pass, pairs

@@ -15,9 +15,9 @@ from mirrorskin.engine.rotation.normals import Normals, NormalsOperation, normal
 from mirrorskin.engine.rotation.normals_kernel import MAPS, SLOPE_MAPS, NormalKernel, TurnModel
 from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows, pose_fit, rocks
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.layout import as_series
-from mirrorskin.io.maps import TABLE, PoseStatus, status_of
-from mirrorskin.io.types import body_axes
+from mirrorskin.io.base.types import body_axes
+from mirrorskin.io.model.maps import TABLE, PoseStatus, status_of
+from mirrorskin.io.storage.layout import as_series
 from mirrorskin.kernels.array_types import Doubles
 
 P = ParamSpec("P")

@@ -43,10 +43,10 @@ from mirrorskin.engine.rotation.response import Response, initial_response, wall
 from mirrorskin.engine.rotation.scale import check_gain
 from mirrorskin.engine.rotation.tilt import check_tilt
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.maps import TABLE
-from mirrorskin.io.positions import check_phase
-from mirrorskin.io.traces import FrameSamples
-from mirrorskin.io.types import FRAME_DTYPES, ProcessValue
+from mirrorskin.io.base.types import FRAME_DTYPES, ProcessValue
+from mirrorskin.io.model.maps import TABLE
+from mirrorskin.io.model.positions import check_phase
+from mirrorskin.io.watch.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.rotation.correlation import WINDOW
 from mirrorskin.kernels.rotation.normals import azimuth_of, zenith_of

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.correlation.design_matrix import LONGEST
 from mirrorskin.engine.rotation.tilt import check_tilts
 from mirrorskin.io import InputError
-from mirrorskin.io.positions import check_phase
-from mirrorskin.io.types import body_axes
+from mirrorskin.io.base.types import body_axes
+from mirrorskin.io.model.positions import check_phase
 from mirrorskin.kernels.array_types import Doubles
 
 PRESSES = 0.02

@@ -35,17 +35,17 @@ from mirrorskin.engine.rotation.poses import even_windows, rocks
 from mirrorskin.engine.rotation.response import HALF_WAY, Response, initial_response, wall_response_of
 from mirrorskin.engine.rotation.steps import Edges, Integration, SlopeMaps
 from mirrorskin.io import Block, Calibrated, Header, InputError, Recording, Source, WallResponse, open_heights
-from mirrorskin.io.arrays import ArrayRecording
-from mirrorskin.io.findings import carried
-from mirrorskin.io.positions import check_phase
-from mirrorskin.io.recording import is_result
-from mirrorskin.io.result import absolute_heights
-from mirrorskin.io.result_file import open_process
-from mirrorskin.io.types import exclusive_use
+from mirrorskin.io.base.findings import carried
+from mirrorskin.io.base.types import exclusive_use
+from mirrorskin.io.files.arrays import ArrayRecording
+from mirrorskin.io.files.opening import is_result
+from mirrorskin.io.files.result_file import open_process
+from mirrorskin.io.model.positions import check_phase
+from mirrorskin.io.model.result import absolute_heights
 from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
-    from mirrorskin.io.types import ProcessValue
+    from mirrorskin.io.base.types import ProcessValue
 
 _NO_GAIN = "none: the recording has no zenith gain"
 _ROUNDS = 2  # iterations of the height of the object

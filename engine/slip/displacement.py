@@ -14,8 +14,8 @@ from mirrorskin.engine.base.frames import as_frames, check_frames
 from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker, invert_symmetric
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.arguments import check_count, check_number, check_pixel_size, checked, in_unit
-from mirrorskin.io.maps import TABLE, DisplacementStatus, status_of
+from mirrorskin.io.base.arguments import check_count, check_number, check_pixel_size, checked, in_unit
+from mirrorskin.io.model.maps import TABLE, DisplacementStatus, status_of
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device

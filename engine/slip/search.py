@@ -27,16 +27,16 @@ from mirrorskin.engine.slip.displacement import (
 from mirrorskin.engine.slip.onset_map import Expected, OnsetMap, fit_onsets
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
 from mirrorskin.io import Calibrated, InputError, Map, Recording, Result, pixel_axes
-from mirrorskin.io.arguments import check_pixel_size
-from mirrorskin.io.findings import carried
-from mirrorskin.io.maps import TABLE, TWIST, DisplacementStatus, SlipStatus, status_of
-from mirrorskin.io.positions import check_finite
-from mirrorskin.io.types import FRAME_DTYPES
+from mirrorskin.io.base.arguments import check_pixel_size
+from mirrorskin.io.base.findings import carried
+from mirrorskin.io.base.types import FRAME_DTYPES
+from mirrorskin.io.model.maps import TABLE, TWIST, DisplacementStatus, SlipStatus, status_of
+from mirrorskin.io.model.positions import check_finite
 from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
-    from mirrorskin.io.types import ProcessValue
+    from mirrorskin.io.base.types import ProcessValue
 
 
 _EXPECTED = {  # see docs/method/slip.md

@@ -17,8 +17,8 @@ from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.base.summary import status_shares
 from mirrorskin.engine.slip.search import Slip
 from mirrorskin.io import Calibrated, InputError, Result, Source
-from mirrorskin.io.findings import Finding, with_findings
-from mirrorskin.io.maps import SlipStatus
+from mirrorskin.io.base.findings import Finding, with_findings
+from mirrorskin.io.model.maps import SlipStatus
 
 
 class Traction(Step):

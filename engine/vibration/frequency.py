@@ -11,7 +11,7 @@ from scipy import optimize
 
 from mirrorskin.engine.correlation.design_matrix import basis
 from mirrorskin.io import InputError, Source
-from mirrorskin.io.arguments import as_array, checked, in_unit
+from mirrorskin.io.base.arguments import as_array, checked, in_unit
 from mirrorskin.kernels.array_types import Doubles
 
 _FEWEST = 8  # minimum number of frames

@@ -17,10 +17,10 @@ from mirrorskin.engine.correlation.design_matrix import basis
 from mirrorskin.engine.press.crossing import PressOperation
 from mirrorskin.engine.vibration.frequency import estimate_frequency
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.arguments import check_pixel_size
-from mirrorskin.io.maps import TABLE
-from mirrorskin.io.positions import check_strokes
-from mirrorskin.io.types import ProcessValue
+from mirrorskin.io.base.arguments import check_pixel_size
+from mirrorskin.io.base.types import ProcessValue
+from mirrorskin.io.model.maps import TABLE
+from mirrorskin.io.model.positions import check_strokes
 from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:

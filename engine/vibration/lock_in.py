@@ -21,7 +21,7 @@ from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
-    from mirrorskin.io.types import ProcessValue
+    from mirrorskin.io.base.types import ProcessValue
 
 
 class Correlation(Method):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from mirrorskin.io.system import open_regular
+from mirrorskin.io.base.system import open_regular
 
 _HEADING = re.compile(r"# Emulated rig: port (\S+), process (\d+), started at (\d+)\.")
 _LONGEST = 1 << 20  # maximum size of a rig file, bytes

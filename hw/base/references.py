@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
-from mirrorskin.io.arrays import read_array
-from mirrorskin.io.pictures import PICTURE_SUFFIXES, read_picture
-from mirrorskin.io.system import check_regular
+from mirrorskin.io.base.system import check_regular
+from mirrorskin.io.files.arrays import read_array
+from mirrorskin.io.formats.pictures import PICTURE_SUFFIXES, read_picture
 
 if TYPE_CHECKING:
     from mirrorskin.hw.base.rig_file import CameraSettings

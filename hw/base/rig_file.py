@@ -20,7 +20,7 @@ from mirrorskin.hw.base.emulated_file import Emulator
 from mirrorskin.hw.base.references import SUFFIXES, check_references
 from mirrorskin.hw.base.stage import Limits
 from mirrorskin.io import InputError
-from mirrorskin.io.settings_file import load_toml
+from mirrorskin.io.base.settings_file import load_toml
 
 _USER = re.compile("//[^/]*@")
 _STEEPEST = 90.0  # degrees

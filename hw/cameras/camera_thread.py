@@ -13,7 +13,7 @@ from mirrorskin.hw.base.camera import Counts, Frames
 from mirrorskin.hw.base.clock import SYSTEM, Clock
 from mirrorskin.hw.base.errors import HardwareError
 from mirrorskin.hw.cameras.ring import Ring, usual_slots
-from mirrorskin.io.types import Closing
+from mirrorskin.io.base.types import Closing
 
 _WINDOW = 128  # number of frames from which the rate is measured
 _REVIEW = 16  # the median period is recomputed after this many frames

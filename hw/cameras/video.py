@@ -18,7 +18,7 @@ from mirrorskin.hw.base.clock import SYSTEM, Clock
 from mirrorskin.hw.base.rig_file import CameraSettings
 from mirrorskin.hw.cameras.reopened import OPEN_TIMEOUT, READ_TIMEOUT, ReopenedCamera, warn_of_other
 from mirrorskin.io import InputError
-from mirrorskin.io.opencv import quiet_opencv
+from mirrorskin.io.base.opencv import quiet_opencv
 
 _log = logging.getLogger("mirrorskin.hw")
 

@@ -19,7 +19,7 @@ from mirrorskin.hw.rig.rig import Move, Rig
 from mirrorskin.hw.rig.track import Track, even_times
 from mirrorskin.hw.stages.moves import SLOWEST
 from mirrorskin.hw.stages.trajectory import Trapezoid
-from mirrorskin.io.types import Floats, InputError
+from mirrorskin.io.base.types import Floats, InputError
 
 # Parameters of the move
 _SECONDS = 1.5  # minimum duration in one direction

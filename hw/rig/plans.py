@@ -12,7 +12,7 @@ from mirrorskin.hw.base.rig_file import StageSettings
 from mirrorskin.hw.base.stage import Position, Stage
 from mirrorskin.hw.stages.trajectory import Trapezoid
 from mirrorskin.io import InputError
-from mirrorskin.io.types import Floats, Motion
+from mirrorskin.io.base.types import Floats, Motion
 
 _STEPS_MAX = 10**6
 _TURNS_MAX = 10_000

@@ -12,7 +12,7 @@ from mirrorskin.hw.rig.delay import block_means
 from mirrorskin.hw.rig.plans import VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
-from mirrorskin.io.types import Floats, InputError
+from mirrorskin.io.base.types import Floats, InputError
 
 _FRAMES, _PLACES = 4, 4  # frames at a position, and number of preceding positions to compare with
 _SIGMAS = 8.0  # change of a block's mean on contact, in standard deviations

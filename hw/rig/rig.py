@@ -16,8 +16,8 @@ from mirrorskin.hw.base.rig_file import CameraSettings, RigSettings, StageSettin
 from mirrorskin.hw.base.stage import Position, Report, Stage
 from mirrorskin.hw.rig.trigger import Trigger, no_trigger
 from mirrorskin.io import InputError
-from mirrorskin.io.own_class import load_class
-from mirrorskin.io.types import Closing
+from mirrorskin.io.base.own_class import load_class
+from mirrorskin.io.base.types import Closing
 
 _TICK = 0.02  # interval of the guard's checks, seconds
 _PAUSE = 0.5  # delay of the guard after which the times of frames are unknown, seconds

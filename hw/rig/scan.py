@@ -19,7 +19,7 @@ from mirrorskin.hw.base.rig_file import RigSettings
 from mirrorskin.hw.base.stage import Position, Report
 from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, RockPlan, TwistPlan, check_plan
 from mirrorskin.hw.rig.rig import Rig
-from mirrorskin.io.types import Block, Closing, Floats, Header, InputError
+from mirrorskin.io.base.types import Block, Closing, Floats, Header, InputError
 
 SETTLE = 0.1
 """Seconds from rest to the first exposure, of a motion with stops, by default."""
@@ -34,7 +34,7 @@ _UNKNOWN_DELAY = 0.2  # assumed maximum delay of frames, seconds, if it is unkno
 
 
 class PlannedScan(Closing):
-    """A scan before its rig is opened: a `mirrorskin.io.types.LiveSource` without frames.
+    """A scan before its rig is opened: a `mirrorskin.io.base.types.LiveSource` without frames.
 
     What cannot be done with the scan is refused with it before anything moves. Its header is that of the
     scan, with 0 in place of a dark reference that is still to be taken.
@@ -76,7 +76,7 @@ class PlannedScan(Closing):
 
 
 class Scan(Closing):
-    """A `mirrorskin.io.types.LiveSource`: the stage moves according to a plan while the camera records.
+    """A `mirrorskin.io.base.types.LiveSource`: the stage moves according to a plan while the camera records.
 
     Reading the header or entering the scan lifts the body, takes the references, and moves to the start of
     the scan. Leaving it without an error lifts the body again; leaving it during a move or by an error stops

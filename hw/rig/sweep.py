@@ -16,7 +16,7 @@ from mirrorskin.hw.rig.rig import Move, Rig, untriggered
 from mirrorskin.hw.rig.scan import MARGIN, SETTLE, Scan, StepScan, check_there
 from mirrorskin.hw.rig.track import LiveTrack, Progress, Track, even_times
 from mirrorskin.hw.stages.trajectory import Trapezoid
-from mirrorskin.io.types import Block, Floats
+from mirrorskin.io.base.types import Block, Floats
 
 _SLOWER = 1.01  # factor by which a turn may be slower than planned without having too many frames
 

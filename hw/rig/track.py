@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from mirrorskin.hw.base.stage import Report
 from mirrorskin.hw.rig.plans import Plan
 from mirrorskin.hw.stages.trajectory import Trapezoid
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.kernels.numerics import least_squares
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 

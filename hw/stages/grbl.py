@@ -21,7 +21,7 @@ from mirrorskin.hw.stages.link import HOLDING, RESET, Link, TimedStatus, open_po
 from mirrorskin.hw.stages.moves import Axes, Command
 from mirrorskin.hw.stages.replies import BUFFER, Message, Setting, Status
 from mirrorskin.io import InputError
-from mirrorskin.io.types import Closing
+from mirrorskin.io.base.types import Closing
 
 if TYPE_CHECKING:
     import serial

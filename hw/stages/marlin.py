@@ -23,7 +23,7 @@ from mirrorskin.hw.stages.moves import Axes
 from mirrorskin.hw.stages.replies import Noise, Splitter
 from mirrorskin.hw.stages.trajectory import Trapezoid
 from mirrorskin.io import InputError
-from mirrorskin.io.types import Closing
+from mirrorskin.io.base.types import Closing
 
 if TYPE_CHECKING:
     import serial

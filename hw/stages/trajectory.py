@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 
 _RAMP = 0.1  # assumed acceleration time of a stage, seconds, before it is known
 

@@ -7,7 +7,7 @@ import pytest
 from batches import press, rotation
 from commands import done, refused, run
 
-from mirrorskin.io.layout import STACK
+from mirrorskin.io.storage.layout import STACK
 
 DAMAGE = "frame 3 differs from what was recorded: copy the file again, or use the frames as they are with"
 

@@ -7,7 +7,7 @@ import pytest
 
 from mirrorskin.cli.stack import read_phases
 from mirrorskin.io import InputError
-from mirrorskin.io.positions import Positions
+from mirrorskin.io.model.positions import Positions
 
 MEASURED = [178.1, 220.8, 280.5, 316.5, 7.6, 48.0, 96.3, 136.4]
 

@@ -16,7 +16,7 @@ from stacks import read_all
 
 import mirrorskin.twin
 from mirrorskin import io
-from mirrorskin.io.types import MOTIONS
+from mirrorskin.io.base.types import MOTIONS
 from mirrorskin.twin import OBJECT_NAMES, Body, Camera, SheetTexture, Twin
 
 SMALL = ["--size", "24x18", "--pixel-size", "0.4mm"]

@@ -15,7 +15,7 @@ from operations import CASES, assert_same
 
 from mirrorskin import engine, io
 from mirrorskin.engine.live import Stream
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 
 UNITS = pint.UnitRegistry()
 COUNT, SHAPE = 8, (4, 6)

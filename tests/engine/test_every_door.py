@@ -46,10 +46,10 @@ from mirrorskin.engine.batch.jobs import TABLES, Job, Plan
 from mirrorskin.engine.batch.local import default_devices, run_local
 from mirrorskin.engine.batch.work import Outcome, run_job
 from mirrorskin.engine.live import LiveRun, Loop, Stream
-from mirrorskin.io.arrays import ArrayRecording
-from mirrorskin.io.layout import POSITIONS
-from mirrorskin.io.result import FIELDS
-from mirrorskin.io.zarr_export import save_zarr
+from mirrorskin.io.files.arrays import ArrayRecording
+from mirrorskin.io.files.zarr_export import save_zarr
+from mirrorskin.io.model.result import FIELDS
+from mirrorskin.io.storage.layout import POSITIONS
 from mirrorskin.kernels.device import open_device
 from mirrorskin.twin import Axial, Twin, Vertical
 from mirrorskin.view.app import Opening

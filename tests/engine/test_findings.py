@@ -9,7 +9,7 @@ from rotations import EIGHTHS, TILT
 
 from mirrorskin import engine, io
 from mirrorskin.engine.base.undistort import undistort
-from mirrorskin.io.export_formats import FORMATS
+from mirrorskin.io.formats.export_formats import FORMATS
 from mirrorskin.view.report import write_report
 
 LOST, FLICKER = "3 frames were lost", "the light flickers by 5 %"

@@ -8,7 +8,7 @@ from bare import bare
 
 from mirrorskin import engine, io
 from mirrorskin.engine.optical.focus import Focus
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 
 SHAPE = (48, 48)
 TRAVEL = np.arange(0, 9, 0.5)

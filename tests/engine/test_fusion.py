@@ -13,7 +13,7 @@ from stacks import MadeUp, record
 
 from mirrorskin import engine, io
 from mirrorskin.engine.fusion.fusion import frames_to_read
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 from mirrorskin.twin import Axial, Body, Camera, Twin, Vertical
 
 NAN = np.float32(np.nan)

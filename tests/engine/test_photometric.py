@@ -9,7 +9,7 @@ from stacks import MadeUp
 
 from mirrorskin import engine, io
 from mirrorskin.engine.optical.photometric import PhotometricStereo, photometric_stereo
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 
 AZIMUTH = np.arange(12) * 2 * np.pi / 12
 ROW, COLUMN = np.mgrid[1:-1:60j, -1:1:60j]

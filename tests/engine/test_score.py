@@ -6,7 +6,7 @@ from rotations import direction
 
 from mirrorskin import engine, io
 from mirrorskin.engine.base.summary import summarise
-from mirrorskin.io.maps import SlipStatus, status_of
+from mirrorskin.io.model.maps import SlipStatus, status_of
 
 NAN = np.float32(np.nan)
 

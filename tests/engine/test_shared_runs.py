@@ -15,9 +15,9 @@ from operations import CASES, Readable
 from stacks import record
 
 from mirrorskin import engine, io
-from mirrorskin.io.arrays import ArrayRecording
-from mirrorskin.io.calibration.types import CameraId
-from mirrorskin.io.zarr_export import save_zarr
+from mirrorskin.io.files.arrays import ArrayRecording
+from mirrorskin.io.files.zarr_export import save_zarr
+from mirrorskin.io.model.calibration import CameraId
 from mirrorskin.twin import Axial, Twin, Vertical
 
 THREADS, RUNS = 4, 4  # runs of each thread

@@ -27,7 +27,7 @@ from typing import Any
 import mutations
 import numpy as np
 
-from mirrorskin.io.export_formats import FORMATS
+from mirrorskin.io.formats.export_formats import FORMATS
 
 PATIENCE = 30.0
 """Seconds of a processor's time after which a reader hangs, or ten times as many by the clock."""

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mirrorskin.io.types import Floats, InputError
+from mirrorskin.io.base.types import Floats, InputError
 from mirrorskin.kernels.device import Device
 from mirrorskin.twin.body import Body
 from mirrorskin.twin.optics import (

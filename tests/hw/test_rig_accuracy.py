@@ -12,7 +12,7 @@ from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import StepScan
 from mirrorskin.hw.rig.sweep import SweepScan
-from mirrorskin.io.types import Block, Closing
+from mirrorskin.io.base.types import Block, Closing
 from mirrorskin.twin import Axial, Vertical
 from mirrorskin.twin.emulator.rig import EmulatedRig
 from mirrorskin.twin.emulator.simulated_clock import SimulatedClock

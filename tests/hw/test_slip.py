@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.kernels.device import open_device
 from mirrorskin.twin import Body, Horizontal, Sphere, Twist
 from mirrorskin.twin.movement import pose_at_press

@@ -6,7 +6,7 @@ import contact_theory
 import numpy as np
 import pytest
 
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.twin import Axial, Body, Camera, Horizontal, Sphere, Twin, Twist, Vertical
 from mirrorskin.twin.movement import Movement
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mirrorskin.io.types import InputError
+from mirrorskin.io.base.types import InputError
 from mirrorskin.twin.body import Body
 from mirrorskin.twin.view import View
 

@@ -16,13 +16,13 @@ from growing import Feed, stream
 from stacks import record, sphere
 
 from mirrorskin import io
-from mirrorskin.io.atomic import new_hdf5, remove_leftovers, write_new
+from mirrorskin.io.storage.atomic import new_hdf5, remove_leftovers, write_new
 
 # Begins a file, says so, and waits to be killed.
 BEGIN = """
 import sys
 from pathlib import Path
-from mirrorskin.io.atomic import new_hdf5
+from mirrorskin.io.storage.atomic import new_hdf5
 with new_hdf5(Path(sys.argv[1])) as new:
     new.root["x"] = 1
     print("begun", flush=True)

@@ -35,7 +35,7 @@ def turned(phase=PHASE):
 
 
 def found(frames, *, pixel_size=(PIXEL, PIXEL), where=None, **series):
-    from mirrorskin.io.arrays import ArrayRecording
+    from mirrorskin.io.files.arrays import ArrayRecording
 
     names = series or {"travel": TRAVEL}
     return io.check(ArrayRecording(frames, names, {"pixel_size": pixel_size}), **(where or {}))
@@ -256,7 +256,7 @@ def test_a_path_is_opened_with_what_is_given(tmp_path):
 
 
 def test_what_belongs_to_the_opening_is_refused_for_an_open_source():
-    from mirrorskin.io.arrays import ArrayRecording
+    from mirrorskin.io.files.arrays import ArrayRecording
 
     source = ArrayRecording(noisy(pressed()), {"travel": TRAVEL}, {})
     with pytest.raises(io.InputError, match=r"is open: give pixel_size to io\.open_recording"):

@@ -9,9 +9,9 @@ import pytest
 from stacks import put, random_stack, read_all, record, sphere
 
 from mirrorskin import engine, io
-from mirrorskin.io.checksums import checksums
-from mirrorskin.io.layout import CHECKSUM, STACK
-from mirrorskin.io.recorder import COMPRESSIONS
+from mirrorskin.io.base.checksums import checksums
+from mirrorskin.io.files.recorder import COMPRESSIONS
+from mirrorskin.io.storage.layout import CHECKSUM, STACK
 
 REFUSED = (
     "frames 3, 6 differ from what was recorded: copy the file again, or use the frames as they are with"

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mirrorskin import io
-from mirrorskin.io.selection import Region
+from mirrorskin.io.base.selection import Region
 
 SHAPE = (11, 13, 17)
 REGION = Region((3, 11), (4, 12))
@@ -148,7 +148,7 @@ def test_a_file_that_is_cut_while_it_is_read_is_reported(tmp_path):
 
 
 def test_an_interrupt_leaves_no_thread_writing(tmp_path, monkeypatch):
-    from mirrorskin.io.chunks import Chunks
+    from mirrorskin.io.storage.chunks import Chunks
 
     path = write(tmp_path / "a.h5", compressible((30, 50, 70), "u2"), (1, 50, 70), PACKINGS["bitshuffle"])
     decode = Chunks._decode

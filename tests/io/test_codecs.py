@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from fetching import ONLY_HDF5, PACKINGS, compressible, write
 
-from mirrorskin.io import chunks
+from mirrorskin.io.storage import chunks
 
 CHECKED = [name for name in PACKINGS if name not in ("raw", "shuffle")]
 

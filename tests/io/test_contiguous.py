@@ -14,7 +14,7 @@ from fetching import GIVEN, compressible, ours, theirs, write
 from stacks import MadeUp
 
 from mirrorskin import io
-from mirrorskin.io.selection import Region
+from mirrorskin.io.base.selection import Region
 
 SHAPE = (9, 50, 70)
 
@@ -36,7 +36,7 @@ def test_what_is_lent_is_what_hdf5_gives(tmp_path, shape, dtype):
 
 
 def test_many_bytes_are_read_by_several_threads(tmp_path, monkeypatch):
-    monkeypatch.setattr("mirrorskin.io.stack._MANY", 10_000)
+    monkeypatch.setattr("mirrorskin.io.storage.stack._MANY", 10_000)
     path = write(tmp_path / "a.h5", compressible(SHAPE, "u2"))
     for room in (1, 2, 4, 9):
         np.testing.assert_array_equal(ours(path, room)[0], theirs(path))

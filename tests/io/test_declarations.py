@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import io
-from mirrorskin.io.maps import (
+from mirrorskin.io.model.maps import (
     LONGEST_DECLARATION,
     TABLE,
     TWIST,

@@ -10,7 +10,7 @@ from growing import Feed, stream
 from stacks import record, sphere
 
 from mirrorskin import io
-from mirrorskin.io.atomic import new_file, write_new
+from mirrorskin.io.storage.atomic import new_file, write_new
 
 MAP = np.zeros((2, 3), np.float32)
 CAMERA = io.CameraId("left", (2, 3), np.dtype(np.uint8))

@@ -13,9 +13,9 @@ import pytest
 from stacks import SHAPE, random_stack, read_all, record, sphere
 
 from mirrorskin import io
-from mirrorskin.io import hdf5
-from mirrorskin.io.hdf5 import Hdf5File
-from mirrorskin.io.zarr import open_file
+from mirrorskin.io.storage import hdf5
+from mirrorskin.io.storage.hdf5 import Hdf5File
+from mirrorskin.io.storage.zarr import open_file
 
 STACK = random_stack()
 GIVEN = {"motion": "vertical", "travel": io.Steps(0.3)}

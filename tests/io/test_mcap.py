@@ -22,7 +22,7 @@ from mcap_ros2.writer import Writer
 from stacks import record, sphere
 
 from mirrorskin import io
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 
 HEIGHT = np.array([[1.0, np.nan, 0.5], [0.25, 0.0, -1.0]], np.float32)
 AXIS = {"x": np.array([-1.0, 0.0, 1.0]), "y": np.array([0.5, -0.5])}
@@ -459,6 +459,6 @@ def test_a_chunk_that_unpacks_to_more_than_it_states_is_refused(tmp_path, compre
 
 
 def test_a_chunk_that_states_gigabytes_is_refused(film, monkeypatch):
-    monkeypatch.setattr("mirrorskin.io.system.check_unpacked.__defaults__", (100,))
+    monkeypatch.setattr("mirrorskin.io.base.system.check_unpacked.__defaults__", (100,))
     with pytest.raises(io.InputError, match=r"a chunk takes \d+ bytes of memory"):
         frames_of(film(("/a", np.zeros((20, 30), np.uint8))))

@@ -11,7 +11,7 @@ import pytest
 from stacks import SHAPE, TRAVEL, MadeUp, assert_same, put, random_stack, read_all, record
 
 from mirrorskin import io
-from mirrorskin.io.types import MOTIONS
+from mirrorskin.io.base.types import MOTIONS
 from mirrorskin.twin import Axial, Horizontal, Twin, Twist, Vertical
 
 DETECTOR, STAGE, TRUTH = "entry/instrument/detector", "entry/instrument/stage", "entry/truth"

@@ -15,7 +15,7 @@ from silx.io.nxdata import get_default
 from stacks import MadeUp, random_stack, record
 
 from mirrorskin import io
-from mirrorskin.io.streaming import GrowingRecording
+from mirrorskin.io.files.streaming import GrowingRecording
 
 T, H, W = 6, 5, 7
 X, Y = io.pixel_axes((H, W), (0.1, 0.2))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mirrorskin.io import InputError
-from mirrorskin.io.own_class import load_class
+from mirrorskin.io.base.own_class import load_class
 
 CLASS = """
 import {helper}

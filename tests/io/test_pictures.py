@@ -10,7 +10,7 @@ import tifffile
 from PIL import Image
 
 from mirrorskin.io import InputError, Source, Steps, open_recording
-from mirrorskin.io.pictures import decode_picture, read_picture
+from mirrorskin.io.formats.pictures import decode_picture, read_picture
 
 SHAPE = (6, 9)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.io import InputError
-from mirrorskin.io.positions import check_phase, check_strokes, check_travel, stroke_starts
+from mirrorskin.io.model.positions import check_phase, check_strokes, check_travel, stroke_starts
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from stacks import TRAVEL, MadeUp, assert_same, random_stack, read_all, record, sphere
 
 from mirrorskin import io
-from mirrorskin.io.recorder import COMPRESSIONS
+from mirrorskin.io.files.recorder import COMPRESSIONS
 
 PHASE = np.arange(8) * np.pi / 4
 
@@ -179,7 +179,7 @@ sys.path.insert(0, sys.argv[2])
 from pathlib import Path
 import numpy as np
 from mirrorskin import io
-from mirrorskin.io.recorder import COMPRESSIONS
+from mirrorskin.io.files.recorder import COMPRESSIONS
 from stacks import MadeUp, random_stack, record
 
 sys.dont_write_bytecode = True  # compiled modules would be cut off, too

@@ -10,7 +10,7 @@ import pytest
 from stacks import assert_same, plot_of, record, sphere
 
 from mirrorskin import io
-from mirrorskin.io.maps import declaration_of
+from mirrorskin.io.model.maps import declaration_of
 
 PROCESS = {"program": "mirrorskin", "threshold": 0.5, "hold": 2, "subframe": True, "source": "Münze 五円.h5"}
 KNOWN = io.Fitted(

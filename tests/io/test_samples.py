@@ -9,7 +9,7 @@ import xarray
 from stacks import read_all
 
 from mirrorskin import engine, io
-from mirrorskin.io.samples import order_of
+from mirrorskin.io.base.samples import order_of
 
 SHAPE = 9, 6, 5
 GIVEN = {"motion": "vertical", "travel": io.Steps(0.3)}

@@ -6,7 +6,7 @@ import pytest
 from msgspec import Meta
 
 from mirrorskin import io
-from mirrorskin.io.settings_file import load_toml
+from mirrorskin.io.base.settings_file import load_toml
 
 Length = Annotated[float, Meta(gt=0, description="a length above 0, in mm,", examples=[0.5])]
 

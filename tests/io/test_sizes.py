@@ -21,10 +21,10 @@ from numcodecs import blosc
 from PIL import Image as pil  # noqa: N813
 
 from mirrorskin import io
-from mirrorskin.io import system
-from mirrorskin.io.arrays import ArrayRecording, read_array, read_map
-from mirrorskin.io.hdf5 import Hdf5File
-from mirrorskin.io.pictures import decode_bytes, read_picture
+from mirrorskin.io.base import system
+from mirrorskin.io.files.arrays import ArrayRecording, read_array, read_map
+from mirrorskin.io.formats.pictures import decode_bytes, read_picture
+from mirrorskin.io.storage.hdf5 import Hdf5File
 
 POSITIONS = {"motion": "vertical", "travel": io.Steps(0.1)}
 
@@ -53,7 +53,7 @@ def small_archive(path, **more):
 def test_an_archive_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     path = bomb(tmp_path / "bomb.npz", (64, 1024, 1024))
     assert path.stat().st_size < 1 << 20
-    monkeypatch.setattr("mirrorskin.io.arrays.MAX_UNPACKED_BYTES", 1 << 20)
+    monkeypatch.setattr("mirrorskin.io.files.arrays.MAX_UNPACKED_BYTES", 1 << 20)
     tracemalloc.start()
     with pytest.raises(io.InputError, match=f"takes {64 << 20} bytes of memory, and at most {1 << 20} are"):
         io.open_recording(path, **POSITIONS)
@@ -64,7 +64,7 @@ def test_an_archive_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
 
 def test_the_memory_limit_raises_what_an_archive_may_take(tmp_path, monkeypatch):
     path = small_archive(tmp_path / "a.npz")
-    monkeypatch.setattr("mirrorskin.io.arrays.MAX_UNPACKED_BYTES", 100)
+    monkeypatch.setattr("mirrorskin.io.files.arrays.MAX_UNPACKED_BYTES", 100)
     with pytest.raises(io.InputError, match=r"raise --memory, or write it with numpy\.savez"):
         io.open_recording(path, **POSITIONS)
     with io.open_recording(path, memory_limit=300, **POSITIONS) as recording:
@@ -73,7 +73,7 @@ def test_the_memory_limit_raises_what_an_archive_may_take(tmp_path, monkeypatch)
 
 def test_an_archive_that_is_not_compressed_has_no_limit(tmp_path, monkeypatch):
     np.savez(tmp_path / "a.npz", frames=np.zeros((3, 8, 8), np.uint8))
-    monkeypatch.setattr("mirrorskin.io.arrays.MAX_UNPACKED_BYTES", 10)
+    monkeypatch.setattr("mirrorskin.io.files.arrays.MAX_UNPACKED_BYTES", 10)
     with io.open_recording(tmp_path / "a.npz", **POSITIONS) as recording:
         assert recording.shape == (3, 8, 8)
 
@@ -185,7 +185,7 @@ def test_a_folder_of_pictures_that_decoders_cannot_hold_is_refused(tmp_path):
 
 def test_a_map_is_refused_if_its_float32_copy_is_too_large(tmp_path, monkeypatch):
     cv2.imwrite(str(tmp_path / "dark.png"), np.zeros((300, 300), np.uint8))
-    monkeypatch.setattr("mirrorskin.io.system.check_unpacked.__defaults__", (4 * 90_000,))
+    monkeypatch.setattr("mirrorskin.io.base.system.check_unpacked.__defaults__", (4 * 90_000,))
     with pytest.raises(io.InputError, match=r"dark\.png, as float32, takes 450000 bytes of memory"):
         read_map(tmp_path / "dark.png")
 
@@ -198,7 +198,11 @@ from pathlib import Path
 import cv2, av, mcap.stream_reader, mcap_ros2.decoder, tifffile
 import numpy as np
 from mirrorskin import io
-from mirrorskin.io import arrays, mcap, opencv, system, video
+from mirrorskin.io.files import arrays
+from mirrorskin.io.formats import mcap
+from mirrorskin.io.base import opencv
+from mirrorskin.io.base import system
+from mirrorskin.io.formats import video
 
 def status(name):
     lines = Path("/proc/self/status").read_text().splitlines()

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mirrorskin.io import InputError
-from mirrorskin.io.system import check_regular, open_regular, read_regular
+from mirrorskin.io.base.system import check_regular, open_regular, read_regular
 
 LIMIT = 120  # seconds; opening a FIFO that nobody writes to would take for ever
 STEPS = ("--motion", "vertical", "--travel-step", "0.1mm", "-o", "out.h5")

@@ -19,9 +19,9 @@ from growing import Feed, frames_of, started, stream
 from stacks import plot_of, read_all
 
 from mirrorskin import io
-from mirrorskin.io import streaming
-from mirrorskin.io.recorder import COMPRESSIONS
-from mirrorskin.io.types import MOTIONS
+from mirrorskin.io.base.types import MOTIONS
+from mirrorskin.io.files import streaming
+from mirrorskin.io.files.recorder import COMPRESSIONS
 
 DETECTOR, STAGE = "/entry/instrument/detector", "/entry/instrument/stage"
 SUPPORT = Path(__file__).parents[1] / "support"

@@ -15,7 +15,7 @@ from growing import SHAPE, Feed, frames_of, started, stream
 from stacks import MadeUp, ball, read_all
 
 from mirrorskin import engine, io
-from mirrorskin.io.atomic import remove_leftovers
+from mirrorskin.io.storage.atomic import remove_leftovers
 
 DETECTOR, STAGE = "/entry/instrument/detector", "/entry/instrument/stage"
 

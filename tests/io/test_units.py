@@ -7,7 +7,7 @@ from pathlib import Path
 import pint
 import pytest
 
-from mirrorskin.io.units import BASE, conversion_factor, in_base, ratio, units_of
+from mirrorskin.io.base.units import BASE, conversion_factor, in_base, ratio, units_of
 
 ROOT = Path(__file__).parents[2]
 PINT = pint.UnitRegistry()

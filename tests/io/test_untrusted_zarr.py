@@ -25,7 +25,7 @@ from stacks import SHAPE, random_stack, read_all, record, sphere
 from traps import Trap
 
 from mirrorskin import io
-from mirrorskin.io.url import Url
+from mirrorskin.io.base.url import Url
 
 zarr = pytest.importorskip("zarr")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.io import InputError, Region, Source, Steps, open_recording
-from mirrorskin.io.video import times
+from mirrorskin.io.formats.video import times
 
 SHAPE = (48, 64)
 COUNT = 7
@@ -472,6 +472,8 @@ def test_a_list_that_names_other_files_or_addresses_is_not_followed(tmp_path, na
 
 def test_frames_that_take_gigabytes_are_refused(tmp_path, monkeypatch):
     encode(tmp_path / "a.avi", "MJPG")
-    monkeypatch.setattr("mirrorskin.io.system.check_unpacked.__defaults__", (3 * SHAPE[0] * SHAPE[1] - 1,))
+    monkeypatch.setattr(
+        "mirrorskin.io.base.system.check_unpacked.__defaults__", (3 * SHAPE[0] * SHAPE[1] - 1,)
+    )
     with pytest.raises(InputError, match=r"a frame takes \d+ bytes of memory"):
         opened(tmp_path / "a.avi")

@@ -16,11 +16,11 @@ import pytest
 from stacks import SHAPE, random_stack, read_all, record, sphere
 
 from mirrorskin import engine, io
-from mirrorskin.io import zarr_export
-from mirrorskin.io.atomic import remove_leftovers
-from mirrorskin.io.hdf5 import Hdf5File
-from mirrorskin.io.url import Url, path_of
-from mirrorskin.io.zarr import ZarrFile, ZarrFrames
+from mirrorskin.io.base.url import Url, path_of
+from mirrorskin.io.files import zarr_export
+from mirrorskin.io.storage.atomic import remove_leftovers
+from mirrorskin.io.storage.hdf5 import Hdf5File
+from mirrorskin.io.storage.zarr import ZarrFile, ZarrFrames
 
 zarr = pytest.importorskip("zarr")
 

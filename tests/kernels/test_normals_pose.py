@@ -6,7 +6,7 @@ import rotations
 
 from mirrorskin import engine
 from mirrorskin.engine.rotation.poses import check_poses, pose_fit
-from mirrorskin.io.types import body_axes
+from mirrorskin.io.base.types import body_axes
 from mirrorskin.kernels.rotation import normals_pose
 from mirrorskin.kernels.rotation.normals import Variance, contact_limits
 

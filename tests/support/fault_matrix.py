@@ -37,8 +37,8 @@ from slope_faults import SLOPE_FAULTS, integrated
 
 from mirrorskin import engine
 from mirrorskin.io import MirrorskinWarning, Result
-from mirrorskin.io.arrays import ArrayRecording
-from mirrorskin.io.frames import lossy
+from mirrorskin.io.files.arrays import ArrayRecording
+from mirrorskin.io.model.frames import lossy
 
 SHAPE, PIXEL = (48, 64), 0.05  # pixels; mm
 LIMITS = 2.0, 0.02  # of an honest cell: chi^2, and the share of errors beyond three standard deviations

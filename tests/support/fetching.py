@@ -9,8 +9,8 @@ import hdf5plugin
 import numpy as np
 
 from mirrorskin import io
-from mirrorskin.io.chunks import Chunks
-from mirrorskin.io.stack import Hdf5Frames
+from mirrorskin.io.storage.chunks import Chunks
+from mirrorskin.io.storage.stack import Hdf5Frames
 
 GIVEN = {"motion": "horizontal"}
 

@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mirrorskin.hw.base.clock import SYSTEM
-from mirrorskin.io.types import Closing
+from mirrorskin.io.base.types import Closing
 
 PROGRAM = os.environ.get("GRBL")
 """The program; `make test-hardware GRBL=PATH` gives it."""

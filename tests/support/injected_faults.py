@@ -19,7 +19,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from mirrorskin.io import atomic
+from mirrorskin.io.storage import atomic
 from mirrorskin.kernels import array, device, mapping, memory, transfer
 
 _CLOSE = os.close

@@ -26,7 +26,7 @@ from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.rotation.last_turn import LastTurn
 from mirrorskin.engine.vibration.growth import Growth
 from mirrorskin.io import Header, Result
-from mirrorskin.io.types import body_axes
+from mirrorskin.io.base.types import body_axes
 
 COUNT, SHAPE, PIXEL = 48, (23, 31), 0.05
 TRAVEL = np.linspace(0, 1.2, COUNT)

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from mirrorskin import io
-from mirrorskin.io.maps import PressStatus, status_of
+from mirrorskin.io.model.maps import PressStatus, status_of
 
 
 def ball(shape=(24, 32), pixel_size=(0.1, 0.12), radius=2.0, **maps):

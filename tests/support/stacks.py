@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from mirrorskin import io
-from mirrorskin.io.result import FIELDS
+from mirrorskin.io.model.result import FIELDS
 from mirrorskin.twin import Camera, Twin, Vertical
 
 SHAPE = (8, 5, 7)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mirrorskin import engine, io
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.twin import Axial, Camera, Twin
 from mirrorskin.twin.objects import Object
 

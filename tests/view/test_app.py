@@ -10,7 +10,7 @@ from shown import ball
 from stacks import record
 
 from mirrorskin import engine, io
-from mirrorskin.io.maps import TABLE
+from mirrorskin.io.model.maps import TABLE
 from mirrorskin.twin import Axial, Twin, Vertical
 from mirrorskin.view.app import App, Opening
 from mirrorskin.view.app.options import read, widget_of

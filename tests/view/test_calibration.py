@@ -8,7 +8,7 @@ import pytest
 from calibrations import a_calibration, a_lens, a_precession, a_response
 
 from mirrorskin import io
-from mirrorskin.io.calibration.parameters import Row
+from mirrorskin.io.model.parameters import Row
 from mirrorskin.view.calibration import calibration_figures, draw_lens, draw_precession, draw_references
 from mirrorskin.view.calibration_wall import draw_gel, draw_response
 

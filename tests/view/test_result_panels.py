@@ -9,7 +9,14 @@ from shown import ball, colours_at, rendered
 
 from mirrorskin import engine, io
 from mirrorskin.engine.metrology import section
-from mirrorskin.io.maps import FocusStatus, PoseStatus, PressStatus, ReleaseStatus, SlipStatus, status_of
+from mirrorskin.io.model.maps import (
+    FocusStatus,
+    PoseStatus,
+    PressStatus,
+    ReleaseStatus,
+    SlipStatus,
+    status_of,
+)
 from mirrorskin.view.drawing.colours import MISSING_RGB, normal_colours
 from mirrorskin.view.result.maps import draw_declared, draw_height, draw_normals
 from mirrorskin.view.result.section import draw_histogram, draw_section

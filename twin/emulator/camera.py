@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mirrorskin.hw.base.clock import SYSTEM, Clock
 from mirrorskin.hw.base.stage import Position
 from mirrorskin.hw.cameras.camera_thread import ThreadedCamera
-from mirrorskin.io.types import InputError
+from mirrorskin.io.base.types import InputError
 from mirrorskin.twin import Twin
 from mirrorskin.twin.movement import Pose, Twist, pose_at_lean, pose_at_press
 

@@ -16,7 +16,7 @@ import serial
 from mirrorskin.hw.base.clock import SYSTEM, Clock
 from mirrorskin.hw.stages.link import open_port
 from mirrorskin.hw.stages.report_times import SLICE
-from mirrorskin.io.types import Closing
+from mirrorskin.io.base.types import Closing
 from mirrorskin.twin.emulator.controller import Controller
 
 _CHUNK = 4096  # bytes read or written at once

@@ -33,9 +33,9 @@ from mirrorskin.hw.base.rig_file import (
 )
 from mirrorskin.hw.base.stage import Position
 from mirrorskin.hw.stages.grbl import GrblStage
-from mirrorskin.io.atomic import write_new
-from mirrorskin.io.system import as_input_error
-from mirrorskin.io.types import Floats, InputError
+from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.types import Floats, InputError
+from mirrorskin.io.storage.atomic import write_new
 from mirrorskin.twin import Axial, Camera, Object, Twin, Vertical
 from mirrorskin.twin.emulator.camera import TwinCamera, pose_at
 from mirrorskin.twin.emulator.port import GrblLine, GrblMachine, GrblPort

@@ -13,7 +13,7 @@ import numpy as np
 
 from mirrorskin.hw.base.camera import Camera
 from mirrorskin.hw.base.errors import HardwareError
-from mirrorskin.io.types import Closing, InputError
+from mirrorskin.io.base.types import Closing, InputError
 
 _COLOURS = {np.dtype(np.uint8): "mono", np.dtype(np.uint16): "mono16"}
 _QUEUE = 4  # frames that wait for a slow viewer

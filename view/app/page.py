@@ -13,7 +13,7 @@ import panel as pn
 
 from mirrorskin import io
 from mirrorskin.engine.base.summary import summarise
-from mirrorskin.io.findings import warnings_in
+from mirrorskin.io.base.findings import warnings_in
 from mirrorskin.view.app.look import text
 from mirrorskin.view.app.options import OptionsPane
 from mirrorskin.view.app.recording import RecordingPane

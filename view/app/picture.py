@@ -27,8 +27,8 @@ from bokeh.plotting import figure
 from numpy.typing import NDArray
 
 from mirrorskin.io import Region
-from mirrorskin.io.maps import SIGMA
-from mirrorskin.io.opencv import encode
+from mirrorskin.io.base.opencv import encode
+from mirrorskin.io.model.maps import SIGMA
 from mirrorskin.view.app.look import plain_axes
 from mirrorskin.view.drawing.colours import DIVERGING, FILLED_RGB, MISSING_RGB, apart, normal_colours, span
 from mirrorskin.view.result.maps import ball_colours, code_colours

@@ -14,7 +14,7 @@ from bokeh.plotting import figure
 from mirrorskin import engine
 from mirrorskin.engine.metrology import Measures, Section, section
 from mirrorskin.io import InputError
-from mirrorskin.io.result import display_order
+from mirrorskin.io.model.result import display_order
 from mirrorskin.view.app.look import hint, plain_axes, problem, table, text
 from mirrorskin.view.app.picture import (
     Dragging,

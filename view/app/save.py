@@ -13,8 +13,8 @@ import panel as pn
 from mirrorskin import io
 from mirrorskin.engine.metrology import section_columns
 from mirrorskin.io import InputError
-from mirrorskin.io.export import check_export
-from mirrorskin.io.export_formats import FORMATS
+from mirrorskin.io.formats.export import check_export
+from mirrorskin.io.formats.export_formats import FORMATS
 from mirrorskin.view.app.look import heading, problem, text
 from mirrorskin.view.app.session import Session
 from mirrorskin.view.app.wording import as_command, as_python

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from mirrorskin import engine, io
 from mirrorskin.engine.base.options import Option, plain
 from mirrorskin.engine.base.reconstruction import calibrated, load_operation, method_for, run_class
-from mirrorskin.io.foreign import kind_of_frames
-from mirrorskin.io.recording import is_result
-from mirrorskin.io.result import map_shape
+from mirrorskin.io.files.opening import is_result
+from mirrorskin.io.formats.foreign import kind_of_frames
+from mirrorskin.io.model.result import map_shape
 from mirrorskin.view.result.sheet import Sheet, sheet_of
 
 T = TypeVar("T")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.metrology import Quantity
 from mirrorskin.io import Fitted
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.view.app.session import Session
 
 _CURVE = 181  # points of the fitted cosine

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io import InputError
-from mirrorskin.io.atomic import write_new
-from mirrorskin.io.calibration.parameters import Part, parameters
-from mirrorskin.io.maps import FILLED_SHADES
-from mirrorskin.io.text import printable
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.text import printable
+from mirrorskin.io.base.types import Floats
+from mirrorskin.io.model.maps import FILLED_SHADES
+from mirrorskin.io.model.parameters import Part, parameters
+from mirrorskin.io.storage.atomic import write_new
 from mirrorskin.view.drawing.colours import MISSING, SEQUENTIAL
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.summary import summarise
 from mirrorskin.engine.metrology import Quantity
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.findings import warnings_in
-from mirrorskin.io.opencv import encode
+from mirrorskin.io.base.findings import warnings_in
+from mirrorskin.io.base.opencv import encode
 from mirrorskin.view.report.surface import surface_data
 from mirrorskin.view.report.words import PIXELS, UNITS, Rows, map_rows, picture_texts, split_process
 

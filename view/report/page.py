@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from mirrorskin.io import InputError, Result, select_turn
-from mirrorskin.io.atomic import MAKE_ROOM, new_file
-from mirrorskin.io.system import as_input_error
+from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.storage.atomic import MAKE_ROOM, new_file
 from mirrorskin.view.drawing.canvas import check_drawing
 from mirrorskin.view.report.contents import Ends, contents_of, surface_of
 

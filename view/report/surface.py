@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Result, pixel_axes
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.view.drawing.colours import FILLED_RGB, SEQUENTIAL, span
 
 MOST_EXAGGERATED = 20

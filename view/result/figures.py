@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.base.summary import summarise
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.arguments import unknown_argument
-from mirrorskin.io.findings import warnings_in
+from mirrorskin.io.base.arguments import unknown_argument
+from mirrorskin.io.base.findings import warnings_in
 from mirrorskin.view.drawing.canvas import figure_pixels, new_figure
 from mirrorskin.view.result.maps import draw_declared, draw_height
 from mirrorskin.view.result.section import draw_histogram, draw_section

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.maps import Map
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
+from mirrorskin.io.model.maps import Map
 from mirrorskin.view.drawing.canvas import draw_classes, explain_colours, filled_colours, round_length
 from mirrorskin.view.drawing.colours import (
     MISSING,

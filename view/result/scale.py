@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.maps import Map
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
+from mirrorskin.io.model.maps import Map
 from mirrorskin.view.drawing.canvas import exceeded
 from mirrorskin.view.drawing.colours import CYCLIC, DIVERGING, ERROR, SEQUENTIAL, apart, span
 from mirrorskin.view.result.sheet import Sheet

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.types import Floats
+from mirrorskin.io.base.types import Floats
 from mirrorskin.view.drawing.canvas import BESIDE, round_length
 from mirrorskin.view.drawing.colours import FILLED, apart, span
 from mirrorskin.view.result.maps import outlined

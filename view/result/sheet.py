@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Result, pixel_axes, select_turn
-from mirrorskin.io.maps import Map
-from mirrorskin.io.result import map_shape
-from mirrorskin.io.types import Floats
-from mirrorskin.io.units import numbers_with_unit
+from mirrorskin.io.base.types import Floats
+from mirrorskin.io.base.units import numbers_with_unit
+from mirrorskin.io.model.maps import Map
+from mirrorskin.io.model.result import map_shape
 from mirrorskin.view.drawing.canvas import Extent, draw_image, extent
 
 if TYPE_CHECKING:

@@ -46,7 +46,7 @@ def command(
     from mirrorskin.cli.commands.bench.operations import MEASUREMENTS
     from mirrorskin.cli.commands.bench.records import describe_run, open_run
     from mirrorskin.cli.output import progress
-    from mirrorskin.io.atomic import write_new
+    from mirrorskin.io.storage.atomic import write_new
     from mirrorskin.kernels.device import open_device
 
     if output is not None:

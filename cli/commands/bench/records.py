@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from mirrorskin.io import InputError
-from mirrorskin.io.system import read_text, usable_cores
+from mirrorskin.io.base.system import read_text, usable_cores
 from mirrorskin.kernels.device import Device
 
 THREADS = usable_cores()

@@ -82,7 +82,7 @@ def _table(path: Path) -> dict[str, float]:
     from mirrorskin.cli import table
     from mirrorskin.cli.quantity import force
     from mirrorskin.io import InputError
-    from mirrorskin.io.text import shortened
+    from mirrorskin.io.base.text import shortened
 
     read = table.read_table(path, _REMEDY)
     unit = table.unit_of(read.heading[1], "force", str(path)) if len(read.heading) == 2 else ""

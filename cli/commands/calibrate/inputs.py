@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
     from mirrorskin.hw.rig.scan import PlannedScan
     from mirrorskin.io import Calibration, CameraId, Recording, Source
-    from mirrorskin.io.calibration.parameters import Part
-    from mirrorskin.io.types import ProcessValue
+    from mirrorskin.io.base.types import ProcessValue
+    from mirrorskin.io.model.parameters import Part
 
 TILT, _PHASE_STEP = "2.5deg", "45deg"
 BALL = "put the ball at place {} of {}, all over the field"
@@ -87,7 +87,7 @@ def open_all(
 def _scaled(options: StackOptions, calibration: Calibration | None) -> StackOptions:
     """Return the options with the pixel size of the calibration's scale; another one is refused."""
     from mirrorskin.io import InputError
-    from mirrorskin.io.calibration.source import differ
+    from mirrorskin.io.model.calibrated import differ
 
     if calibration is None or calibration.lens is None:
         return options
@@ -104,7 +104,7 @@ def _scaled(options: StackOptions, calibration: Calibration | None) -> StackOpti
 def open_still(path: Path, **stack: Any) -> Recording:
     """Open frames at rest; those of other programs have no positions, and need none here."""
     from mirrorskin import io
-    from mirrorskin.io.foreign import kind_of_frames
+    from mirrorskin.io.formats.foreign import kind_of_frames
 
     if kind_of_frames(path):
         return io.open_recording(path, motion="vertical", travel=io.Steps(1.0), **stack)
@@ -124,7 +124,7 @@ def camera_name(names: Sequence[str]) -> str:
 def _one_camera(sources: Sequence[Source], calibration: Calibration | None, output: Path) -> CameraId:
     """Return the common camera of all recordings; a calibration must be of it too."""
     from mirrorskin import io
-    from mirrorskin.io.calibration.source import check_camera
+    from mirrorskin.io.model.calibrated import check_camera
 
     name = camera_name([source.header.camera for source in sources])
     cameras = [io.CameraId(source.header.camera, source.shape[1:], source.dtype) for source in sources]
@@ -143,7 +143,7 @@ def _one_camera(sources: Sequence[Source], calibration: Calibration | None, outp
 def process_of(source: Source | None = None, **facts: ProcessValue | list[Path]) -> dict[str, ProcessValue]:
     """Return the provenance of a part: program, date, facts, and the pixel size of a source."""
     from mirrorskin.engine.base.provenance import signature
-    from mirrorskin.io.calibration.source import size_facts
+    from mirrorskin.io.model.calibrated import size_facts
 
     size = None if source is None else source.header.pixel_size
     texts = {

@@ -172,7 +172,7 @@ def _missing(measured: Measured, noise: float | None, refuse: bool) -> dict[str,
 def _learned(measured: Measured) -> inputs.Learned:
     import numpy as np
 
-    from mirrorskin.io.calibration.types import BITS
+    from mirrorskin.io.model.calibration import BITS
 
     references = measured.references
     defects = {name: int(np.count_nonzero(references.defects & bit)) for name, bit in BITS.items()}

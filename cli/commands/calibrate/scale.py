@@ -57,7 +57,7 @@ def board_command(
     """Paint a board for printing in its true size."""
     from mirrorskin.engine.calibration.board import paint_board
     from mirrorskin.io import InputError, check_output
-    from mirrorskin.io.pictures import save_print
+    from mirrorskin.io.formats.pictures import save_print
 
     kind = board_of(board)
     if output.suffix.lower() != ".png":
@@ -97,8 +97,8 @@ def command(
     """
     from mirrorskin import io
     from mirrorskin.engine.calibration.lens import calibrate_lens
-    from mirrorskin.io.calibration.source import outdated
-    from mirrorskin.io.calibration.types import PARTS
+    from mirrorskin.io.model.calibrated import outdated
+    from mirrorskin.io.model.calibration import PARTS
 
     kind, paths = board_of(board), list(pictures or [])
     if not paths and rig is None:
@@ -133,8 +133,8 @@ def _read(
     """Return pictures and the means of recordings with their names, and the camera."""
     from mirrorskin import io
     from mirrorskin.engine.calibration.board import mean_of_still
-    from mirrorskin.io.foreign import kind_of_frames
-    from mirrorskin.io.pictures import read_picture
+    from mirrorskin.io.formats.foreign import kind_of_frames
+    from mirrorskin.io.formats.pictures import read_picture
 
     pictures, names, dtypes = [], [], []
     for path in paths:

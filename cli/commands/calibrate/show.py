@@ -13,7 +13,7 @@ from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
 
 if TYPE_CHECKING:
-    from mirrorskin.io.calibration.parameters import Row
+    from mirrorskin.io.model.parameters import Row
 
 _HEAD = "part", "what", "value", "standard error", "unit"
 _NUMBERS = "value", "standard error"

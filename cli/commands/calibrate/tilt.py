@@ -101,7 +101,7 @@ def _brightness(
     from mirrorskin.engine.base.provenance import naming
     from mirrorskin.engine.calibration.brightness import LinearBrightness, WallBrightness
     from mirrorskin.engine.calibration.sources import pixel_size_of
-    from mirrorskin.io.calibration.source import check_sizes
+    from mirrorskin.io.model.calibrated import check_sizes
 
     header, shape = source.header, source.shape[1:]
     if calibration is not None and calibration.references is not None:

@@ -91,7 +91,7 @@ def command(
 
 def _precession(calibration: Calibration, source: Source) -> Precession | None:
     """Return the calibration's precession, unless its pivot was measured with another pixel size."""
-    from mirrorskin.io.calibration.source import outdated
+    from mirrorskin.io.model.calibrated import outdated
 
     size = source.header.pixel_size
     if (

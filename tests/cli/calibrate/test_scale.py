@@ -15,7 +15,7 @@ from stacks import MadeUp, record
 from mirrorskin import io
 from mirrorskin.cli.commands.calibrate.scale import board_command, command
 from mirrorskin.engine.calibration import Charuco, Dots, calibrate_lens, paint_board
-from mirrorskin.io.calibration.source import size_facts
+from mirrorskin.io.model.calibrated import size_facts
 
 CHARUCO = "charuco:7x5:2mm:1.5mm"
 TO = ["--board", CHARUCO, "-o", "cal.h5"]

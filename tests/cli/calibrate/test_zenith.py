@@ -12,7 +12,7 @@ from stacks import MadeUp, record
 
 from mirrorskin import io
 from mirrorskin.engine.calibration import wall
-from mirrorskin.io.calibration.source import size_facts
+from mirrorskin.io.model.calibrated import size_facts
 
 SHAPE = (5, 7)
 PHASE = np.arange(8) * np.pi / 4

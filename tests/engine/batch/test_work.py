@@ -14,7 +14,7 @@ from mirrorskin.engine import NotConverged
 from mirrorskin.engine.batch import work
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.batch.work import run_job
-from mirrorskin.io.layout import CHECKSUM
+from mirrorskin.io.storage.layout import CHECKSUM
 from mirrorskin.kernels.errors import DeviceMemoryError
 
 

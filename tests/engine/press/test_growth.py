@@ -11,7 +11,7 @@ from scipy import optimize
 
 from mirrorskin import engine, io
 from mirrorskin.engine.vibration.lock_in import Correlation
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 from mirrorskin.twin import Camera, Twin, Vertical
 
 RADIUS, DEPTH, SWING = 5.0, 1.0, 0.05

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine, io
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 
 NOISE = float(np.hypot(1.5, 1 / np.sqrt(12)))
 TRAVEL = 0.02 * np.arange(60)

@@ -9,7 +9,7 @@ from rotations import Setup
 
 from mirrorskin import engine, io
 from mirrorskin.engine.diagnosis.curl import find_azimuth_error
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 
 SHAPE, PIXEL = (60, 80), (0.05, 0.06)
 PHASE = np.arange(16) * np.pi / 8

@@ -6,7 +6,7 @@ import rotations
 from rotations import Setup
 
 from mirrorskin import engine
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 
 SIZE, PIXEL, COUNT = 72, 0.05, 16
 SETUP = Setup(noise=1.2, offset=20.0, dtype="float32", phase=tuple(np.arange(COUNT) * 2 * np.pi / COUNT))

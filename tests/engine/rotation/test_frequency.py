@@ -8,7 +8,7 @@ import pytest
 from mirrorskin import engine, io
 from mirrorskin.engine.vibration import estimate_frequency
 from mirrorskin.engine.vibration.lock_in import Correlation
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 
 RATE, COUNT, HERTZ = 60.0, 150, 7.321
 TIME = np.arange(COUNT) / RATE

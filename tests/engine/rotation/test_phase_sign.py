@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine, io
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 from mirrorskin.twin import Axial, Twin
 
 

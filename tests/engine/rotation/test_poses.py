@@ -7,7 +7,7 @@ import pytest
 import rotations
 
 from mirrorskin import engine, io
-from mirrorskin.io.types import body_axes
+from mirrorskin.io.base.types import body_axes
 from mirrorskin.twin import Camera, Leaning, Plane, Twin
 
 GAIN, OFFSET, NOISE = 500.0, 40.0, 1.5

@@ -7,7 +7,7 @@ from rotations import Setup
 from scipy.ndimage import gaussian_filter
 
 from mirrorskin import engine, io
-from mirrorskin.io.arrays import ArrayRecording
+from mirrorskin.io.files.arrays import ArrayRecording
 
 SIZE, PIXEL, COUNT = 72, 0.05, 16
 SETUP = Setup(noise=1.2, offset=20.0, phase=tuple(np.arange(COUNT) * 2 * np.pi / COUNT))

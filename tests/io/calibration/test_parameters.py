@@ -9,8 +9,8 @@ import pytest
 from calibrations import SHAPE, a_calibration, assert_same
 
 from mirrorskin import io
-from mirrorskin.io.calibration import types
-from mirrorskin.io.calibration.parameters import parameter, parameters, part
+from mirrorskin.io.model import calibration as types
+from mirrorskin.io.model.parameters import parameter, parameters, part
 
 
 @part

@@ -9,7 +9,7 @@ from growing import Feed
 from stacks import MadeUp, random_stack
 
 from mirrorskin import io
-from mirrorskin.io.calibration.source import outdated, size_facts
+from mirrorskin.io.model.calibrated import outdated, size_facts
 
 PHASE = np.linspace(0.1, 7.0, 8)
 

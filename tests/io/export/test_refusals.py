@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mirrorskin import io
-from mirrorskin.io.export import check_export
-from mirrorskin.io.export_formats import FORMATS
+from mirrorskin.io.formats.export import check_export
+from mirrorskin.io.formats.export_formats import FORMATS
 
 PICTURES = ["out.png", "out.tif", "out.tiff"]
 IN_MILLIMETRES = ["out.ply", "out.stl", "out.xyz", "out.csv", *PICTURES]

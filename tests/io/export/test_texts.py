@@ -10,8 +10,8 @@ import pytest
 import tifffile
 
 from mirrorskin import io
-from mirrorskin.io.export_formats import FORMATS
-from mirrorskin.io.text import one_line, printable
+from mirrorskin.io.base.text import one_line, printable
+from mirrorskin.io.formats.export_formats import FORMATS
 
 ODD = {
     "program": "mirror\x1b]0;owned\x07skin \u5de5\u5177",

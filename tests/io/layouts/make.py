@@ -19,7 +19,7 @@ from calibrations import a_calibration
 from stacks import MadeUp, record
 
 from mirrorskin import io
-from mirrorskin.io.maps import PressStatus, status_of
+from mirrorskin.io.model.maps import PressStatus, status_of
 
 FOLDER = Path(__file__).parent
 SHAPE = (6, 5, 7)

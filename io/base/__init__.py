@@ -1,0 +1,1 @@
+"""What all of io needs: types, errors, units, arguments, samples, and the system."""

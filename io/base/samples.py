@@ -1,0 +1,398 @@
+"""Decoding of stored samples: packed and missing values (CF conventions), order of axes, integer types."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from mirrorskin.io.base.findings import Finding
+from mirrorskin.io.base.selection import Span
+from mirrorskin.io.base.types import FRAME_DTYPES, Closing, InputError
+
+ATTRIBUTES = (
+    "_Unsigned",
+    "_FillValue",
+    "missing_value",
+    "valid_range",
+    "valid_min",
+    "valid_max",
+    "scale_factor",
+    "add_offset",
+)
+"""Attributes of the CF conventions, sections 2.5.1 and 8.1, that define the meaning of stored values."""
+
+_EXACT = 1 << 24  # float32 is exact to half a count up to this number
+_PIECE = 8_000_000  # bytes of stored samples that are decoded at once
+_MOST_NUMBERS = 100  # maximum number of values in an attribute
+_TARGETS = {"b": np.uint8, "i": np.uint16, "u": np.uint16, "f": np.float32}  # by kind; int8 becomes uint8
+
+
+class Packing(NamedTuple):
+    """Encoding of stored values: ``value = stored * scale + offset``, unknown if missing or not valid.
+
+    ``unsigned``: stored integers are unsigned, although their type is signed.
+    """
+
+    scale: float = 1.0
+    offset: float = 0.0
+    missing: tuple[float, ...] = ()
+    valid: tuple[float, float] = (-math.inf, math.inf)
+    unsigned: bool = False
+
+    @property
+    def names(self) -> str:
+        """The attributes that have an effect, for messages."""
+        used = {
+            "scale_factor": self.scale != 1,
+            "add_offset": self.offset != 0,
+            "_FillValue": bool(self.missing),
+            "valid_range": self.valid != (-math.inf, math.inf),
+            "_Unsigned": self.unsigned,
+        }
+        *others, last = [name for name, effective in used.items() if effective]
+        return f"{', '.join(others)} and {last}" if others else last
+
+    def stored(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return stored values in their actual type, which may be unsigned."""
+        return values.view(values.dtype.str.replace("i", "u")) if self.unsigned else values
+
+    def unpack(self, values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
+        """Return the decoded values; NaN where they are unknown."""
+        stored = self.stored(values)
+        if not (self.missing or self.scale != 1 or self.offset != 0 or np.isfinite(self.valid).any()):
+            return stored
+        unpacked: NDArray[Any] = (stored * np.float64(self.scale) + self.offset).astype(dtype)
+        unknown = np.zeros(stored.shape, np.bool_)
+        for missing in self.missing:
+            unknown |= stored == missing
+        if np.isfinite(self.valid).any():
+            unknown |= (stored < self.valid[0]) | (stored > self.valid[1])
+        unpacked[unknown] = np.nan
+        return unpacked
+
+
+def packing_of(attributes: Mapping[str, Any], dtype: np.dtype[Any], where: str) -> Packing | None:
+    """Return how values are packed, from the attributes of the CF conventions; None if they are not.
+
+    Parameters
+    ----------
+    attributes : mapping
+        Numbers, arrays of numbers and texts by name; names not in `ATTRIBUTES` are ignored.
+    dtype : dtype
+        Type of the stored values.
+    where : str
+        Begins messages.
+
+    Raises
+    ------
+    InputError
+        An attribute is not a number.
+    """
+    unsigned = dtype.kind == "i" and str(attributes.get("_Unsigned", "")).lower() in ("true", "1")
+    stored = np.dtype(f"u{dtype.itemsize}") if unsigned else dtype
+
+    def numbers(name: str, *default: float) -> tuple[float, ...]:
+        if name not in attributes:
+            return default
+        values = np.asarray(attributes[name]).reshape(-1)
+        if values.dtype.kind not in "iuf" or not len(default) <= len(values) <= _MOST_NUMBERS:
+            raise InputError(f"{where}: its attribute {name} is not a number: correct it")
+        return tuple(float(value) for value in values)
+
+    def as_stored(values: tuple[float, ...]) -> tuple[float, ...]:
+        """Return numbers in the type of the stored values, if the attribute has that type."""
+        if unsigned:
+            return tuple(value + 2.0 ** (8 * dtype.itemsize) if value < 0 else value for value in values)
+        return tuple(float(dtype.type(value)) for value in values) if dtype.kind == "f" else values
+
+    missing = {*as_stored(numbers("_FillValue")), *as_stored(numbers("missing_value"))}
+    if stored.kind in "iu":
+        limits = np.iinfo(stored)
+        missing = {value for value in missing if limits.min <= value <= limits.max}
+    low, high = numbers("valid_range", -math.inf, math.inf)[:2]
+    found = Packing(
+        numbers("scale_factor", 1.0)[0],
+        numbers("add_offset", 0.0)[0],
+        tuple(sorted(value for value in missing if not math.isnan(value))),
+        (
+            as_stored(numbers("valid_min", low))[0],
+            as_stored(numbers("valid_max", high))[0],
+        ),
+        unsigned,
+    )
+    if not (math.isfinite(found.scale) and found.scale != 0 and math.isfinite(found.offset)):
+        raise InputError(
+            f"{where}: scale_factor {found.scale:g} and add_offset {found.offset:g}: correct them"
+        )
+    return None if found == Packing() else found
+
+
+def frame_dtype(dtype: DTypeLike, where: str) -> np.dtype[Any]:
+    """Return the type to which samples of a type are converted; InputError if there is none.
+
+    Samples of uint8, uint16 and float32 are unchanged. Booleans and other integers of 8 bits become uint8,
+    other integers uint16 if they are from 0 to 65535, and other floating-point numbers float32; see
+    `convert_samples`.
+    """
+    stored = np.dtype(dtype).newbyteorder("=")
+    if stored in FRAME_DTYPES:
+        return stored
+    if stored.kind not in "biuf":
+        raise InputError(
+            f"{where} is of type {stored}: frames are uint8, uint16 or float32; convert it first"
+        )
+    return np.dtype(np.uint8 if stored == np.int8 else _TARGETS[stored.kind])
+
+
+def convert_samples(
+    values: NDArray[Any], dtype: np.dtype[Any], where: str, first: int = 0, out: NDArray[Any] | None = None
+) -> NDArray[Any]:
+    """Return frames in the type of `frame_dtype`; InputError if that type cannot represent a sample.
+
+    Parameters
+    ----------
+    values : ndarray, (n, ...)
+    dtype : dtype
+        Type of the result.
+    where : str
+        Begins messages.
+    first : int
+        Number of the first frame, for messages.
+    out : ndarray, optional
+        Array for the result.
+    """
+    if values.size and values.dtype.newbyteorder("=") != dtype:
+        if dtype.kind == "u":
+            low, high = values.min().item(), values.max().item()
+            limits = 0, np.iinfo(dtype).max
+            remedy = "divide them, or write them as float32"
+        else:
+            low, high = float(np.fmin.reduce(values, None)), float(np.fmax.reduce(values, None))
+            if not (math.isfinite(low) and math.isfinite(high)):
+                finite = values[np.isfinite(values)]
+                low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+            limits, remedy = (-_EXACT, _EXACT), "divide them"
+        if low < limits[0] or high > limits[1]:
+            wrong = low if low < limits[0] else high
+            place = np.argwhere(values == wrong)[0]
+            which = f"frame {first + int(place[0])}" if values.ndim == 3 else "it"
+            raise InputError(
+                f"{where}: {which} has a sample of {wrong:g}; {values.dtype} is read as {dtype}, "
+                f"{limits[0]} to {limits[1]}: {remedy}"
+            )
+    if out is None:
+        return values.astype(dtype, copy=False)
+    out[...] = values
+    return out
+
+
+class Reader(Protocol):
+    """Reader of stored frames; ``chunk`` is the shape of one read, ``length`` its number of frames."""
+
+    how: str
+    length: int
+    scratch_bytes: int
+
+    @property
+    def chunk(self) -> Sequence[int]:
+        """Shape of one stored block."""
+
+    def fetch(self, spans: Sequence[Span], out: NDArray[Any], /) -> None:
+        """Write a part, one span for each axis, into ``out``."""
+
+    def close(self) -> None:
+        """Release the file."""
+
+
+@dataclass(frozen=True)
+class Decoding:
+    """Conversion of a stored array of three axes to frames.
+
+    Attributes
+    ----------
+    stored : dtype
+        Type of the stored samples, in the byte order of this machine.
+    order : (int, int, int)
+        Numbers of the stored axes for frames, rows and columns.
+    packing : Packing or None
+    names : tuple of str
+        Names of the stored axes; empty if unknown.
+    findings : tuple of Finding
+        The conversions.
+    where : str
+        The stack, for messages.
+    """
+
+    stored: np.dtype[Any]
+    order: tuple[int, int, int] = (0, 1, 2)
+    packing: Packing | None = None
+    names: tuple[str, ...] = ()
+    where: str = "the stack"
+    matlab: bool = False
+    dtype: np.dtype[Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        unpacked = self.stored
+        if self.packing is not None:
+            unpacked = self.packing.unpack(np.zeros(1, self.stored), np.float32).dtype
+        object.__setattr__(self, "dtype", frame_dtype(unpacked, self.where))
+
+    @property
+    def plain(self) -> bool:
+        """Whether the stored array can be used as frames without conversion."""
+        return self.order == (0, 1, 2) and self.packing is None and self.dtype == self.stored
+
+    def shape(self, stored: Sequence[int]) -> tuple[int, int, int]:
+        """Return frames, rows and columns of a stored shape."""
+        frames, rows, columns = (int(stored[axis]) for axis in self.order)
+        return frames, rows, columns
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """The conversions."""
+        found = []
+        if self.order != (0, 1, 2):
+            shown = "the order of MATLAB" if self.matlab else f"the dimensions ({', '.join(self.names)})"
+            axes = (
+                "third, first, second" if self.matlab else ", ".join(self.names[axis] for axis in self.order)
+            )
+            found.append(
+                Finding("order of axes", f"{self.where} has {shown}: frames, rows, columns are {axes}", False)
+            )
+        if self.packing is not None:
+            unknown = ", NaN where unknown" if self.dtype.kind == "f" else ""
+            text = f"{self.where}: {self.packing.names} applied; samples are {self.dtype}{unknown}"
+            found.append(Finding("packed samples", text, False))
+        elif self.dtype != self.stored:
+            text = f"{self.where} is of type {self.stored}; samples are converted to {self.dtype}"
+            found.append(Finding("converted samples", text, False))
+        return tuple(found)
+
+    def decode(self, values: NDArray[Any], first: int = 0, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Return frames, (n, H, W), from stored samples in this order of axes; see `convert_samples`."""
+        if self.packing is not None:
+            values = self.packing.unpack(values, np.float32)
+        return convert_samples(values, self.dtype, self.where, first, out)
+
+
+class DecodedFrames(Closing):
+    """Frames of a stored array that are decoded when they are read."""
+
+    def __init__(self, reader: Reader, decoding: Decoding, shape: tuple[int, ...]) -> None:
+        self._reader, self._decoding = reader, decoding
+        self.how: str = f"{reader.how}, converted"
+        self.shape, self.dtype = decoding.shape(shape), decoding.dtype
+        self.chunk = decoding.shape(reader.chunk)
+        self.length = self.chunk[0]
+        row, rows = math.prod(shape[1:]) * decoding.stored.itemsize, int(reader.chunk[0])
+        self._rows = max(1, _PIECE // (row * rows)) * rows
+        self.scratch_bytes: int = reader.scratch_bytes + self._rows * row
+
+    def fetch(self, spans: Sequence[Span], out: NDArray[Any]) -> None:
+        """Write frames, some rows and columns of each, into ``out``."""
+        order = self._decoding.order
+        stored: list[Span] = [(0, 0)] * 3
+        for axis, span in zip(order, spans, strict=True):
+            stored[axis] = span
+        cut, (start, stop) = order.index(0), stored[0]
+        at = start
+        while at < stop:
+            end = min(stop, (at // self._rows + 1) * self._rows)
+            spans_here = [(at, end), *stored[1:]]
+            values = np.empty([last - first for first, last in spans_here], self._decoding.stored)
+            self._reader.fetch(spans_here, values)
+            part = [slice(None)] * 3
+            part[cut] = slice(at - start, end - start)
+            first = at if cut == 0 else spans[0][0]
+            self._decoding.decode(values.transpose(order), first, out[*part])
+            at = end
+
+    def close(self) -> None:
+        """Release the file."""
+        self._reader.close()
+
+
+_ROWS = {"y", "row", "rows", "height", "lat", "latitude", "v"}
+_COLUMNS = {"x", "col", "cols", "column", "columns", "width", "lon", "longitude", "u"}
+_FRAMES = {
+    *("t", "time", "frame", "frames", "image", "images", "shot", "n", "step", "steps"),
+    *("travel", "phase", "displacement", "twist"),
+}
+_COLOURS = {"c", "channel", "channels", "band", "bands", "rgb", "colour", "color"}
+
+
+def order_of(names: Sequence[str], where: str) -> tuple[int, int, int]:
+    """Return the axes that are frames, rows and columns, from the names of three axes.
+
+    Unknown names are accepted if the known names determine the order, or agree with (T, H, W).
+
+    Raises
+    ------
+    InputError
+        The names contradict a stack of frames, or leave its order open.
+
+    Examples
+    --------
+    >>> order_of(("y", "x", "t"), "stack.nc")
+    (2, 0, 1)
+    """
+    kinds = [_kind_of(name) for name in names]
+    shown = f"{where} has the dimensions ({', '.join(names)})"
+    if "colours" in kinds:
+        raise InputError(f"{shown}: give one channel, as a stack (t, y, x)")
+    known = [kind for kind in kinds if kind]
+    if len({*known}) != len(known):
+        raise InputError(f"{shown}: name frames, rows and columns differently, such as (t, y, x)")
+    if len(known) == 2:
+        kinds[kinds.index("")] = next(iter({"frames", "rows", "columns"} - {*known}))
+    elif len(known) == 1 and known[0] == "frames":
+        rest = iter(("rows", "columns"))
+        kinds = [kind or next(rest) for kind in kinds]
+    elif len(known) == 1 and kinds.index(known[0]) != ("frames", "rows", "columns").index(known[0]):
+        raise InputError(f"{shown}, not (t, y, x), and the others are not known: name them t, y and x")
+    if "" in kinds:
+        return 0, 1, 2
+    return kinds.index("frames"), kinds.index("rows"), kinds.index("columns")
+
+
+def order_of_map(names: Sequence[str], where: str, components: bool = False) -> tuple[int, ...]:
+    """Return the order of axes in which frames come first, and rows before columns.
+
+    Other axes come before rows; of a map with components, the last one is that of the components.
+
+    Raises
+    ------
+    InputError
+        The names leave open which axes are rows and columns.
+
+    Examples
+    --------
+    >>> order_of_map(("x", "y", "turn"), "height"), order_of_map(("vector", "y", "x"), "normals", True)
+    ((2, 1, 0), (1, 2, 0))
+    """
+    kinds = [_kind_of(name) for name in names]
+    frames, rows, columns, others = (
+        [axis for axis, kind in enumerate(kinds) if kind in wanted]
+        for wanted in (("frames",), ("rows",), ("columns",), ("", "colours"))
+    )
+    if len(rows) == len(columns) == 1:
+        last = others[-1:] if components else []
+        return *frames, *others[: len(others) - len(last)], *rows, *columns, *last
+    end = len(names) - components
+    if len(names) > 1 and (rows not in ([], [end - 2]) or columns not in ([], [end - 1])):
+        raise InputError(f"{where} has the dimensions ({', '.join(names)}): name rows y and columns x")
+    return *frames, *(axis for axis in range(len(names)) if axis not in frames)
+
+
+def _kind_of(name: str) -> str:
+    """Return the kind of an axis from its name; "" if it is unknown."""
+    word = name.lower().strip()
+    for kind, names in (("rows", _ROWS), ("columns", _COLUMNS), ("frames", _FRAMES), ("colours", _COLOURS)):
+        if word in names:
+            return kind
+    return ""

@@ -1,1 +1,0 @@
-"""Calibration files: the parameters of a sensor."""

@@ -1,0 +1,1 @@
+"""Recordings and results in files: opened, written and described."""

@@ -1,0 +1,276 @@
+"""Opening recordings in files of any format."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.io.base.arguments import (
+    as_pixel_size,
+    check_count,
+    check_flag,
+    check_number,
+    check_path,
+    checked,
+    in_unit,
+)
+from mirrorskin.io.base.checksums import UNVERIFIED, UNVERIFIED_PARTS
+from mirrorskin.io.base.findings import Finding
+from mirrorskin.io.base.samples import Decoding, frame_dtype, order_of
+from mirrorskin.io.base.selection import Region
+from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.types import (
+    InputError,
+    Motion,
+)
+from mirrorskin.io.base.url import path_of
+from mirrorskin.io.files.recording import Recording, cut_out
+from mirrorskin.io.formats.foreign import kind_of_frames
+from mirrorskin.io.model.coordinates import Coordinates, read_coordinates
+from mirrorskin.io.model.positions import Positions, along
+from mirrorskin.io.storage.hdf5 import Hdf5File
+from mirrorskin.io.storage.layout import (
+    CHECKSUM,
+    MARK,
+    RESULT_MARK,
+    STACK,
+    Layout,
+    RecordingState,
+    as_series,
+    read_checksums,
+    read_state,
+)
+from mirrorskin.io.storage.stack import Stack
+from mirrorskin.io.storage.zarr import ZarrFile, open_file
+
+
+@checked(
+    path=check_path,
+    travel=as_series,
+    phase=as_series,
+    tilt=in_unit("rad", check_number),
+    pixel_size=as_pixel_size,
+    threads=check_count,
+    memory_limit=check_count,
+    live=check_flag,
+    override_motion=check_flag,
+    verify=check_flag,
+)
+def open_recording(
+    path: str | Path,
+    *,
+    dataset: str | None = None,
+    channel: int | None = None,
+    motion: Motion | None = None,
+    travel: ArrayLike | Positions | None = None,
+    phase: ArrayLike | Positions | None = None,
+    tilt: float | None = None,
+    pixel_size: tuple[float, float] | None = None,
+    region: Region | None = None,
+    frames: tuple[int, int | None] | None = None,
+    threads: int | None = None,
+    memory_limit: int | None = None,
+    live: bool = False,
+    override_motion: bool = False,
+    verify: bool = True,
+) -> Recording:
+    """Open a stack of frames: HDF5, Zarr, NPY, NPZ, TIFF, MCAP, a video, or a folder of numbered pictures.
+
+    Parameters
+    ----------
+    path : str or Path
+        For Zarr a folder ``NAME.zarr``, a zipped one, or an address such as ``s3://bucket/NAME.zarr``.
+    dataset : str, optional
+        Name of the stack, of an archive's array or of a topic, or number of a TIFF's series or a video's
+        stream; required if the file was not written by mirrorskin and contains several.
+    channel : int, optional
+        Channel of a TIFF with several, or colour (0 red, 1 green, 2 blue); by default colours become luma.
+    motion : str, optional
+        Motion, if the file does not contain it; it must not contradict the file.
+    travel, phase, tilt, pixel_size
+        Values that are missing in the file, or replace them: positions in mm or radians, one per frame or as
+        ``Steps``; half-angle in radians; pixel size in mm.
+    region : Region, optional
+        Part of the picture to read. Maps are cropped, and the pivot becomes relative to the centre of the
+        region.
+    frames : (int, int or None), optional
+        First frame and end of the frames to read; None for the end of the stack. Positions are given for the
+        whole stack, and are cropped.
+    threads : int, optional
+        Number of threads that unpack chunks; by default the number of cores.
+    memory_limit : int, optional
+        Limit of the memory for unpacked chunks of frames, or decoded frames of a video, in bytes.
+    live : bool, optional
+        Only the frames used by a live run, with the positions it used.
+    override_motion : bool, optional
+        Whether ``motion`` replaces the motion in the file, to correlate any stack with phases.
+    verify : bool, optional
+        Whether whole frames are compared with the checksums that were stored when they were recorded.
+
+    Returns
+    -------
+    Recording
+        Close it, or use it in a ``with``. For a file that is being written, it contains the present frames.
+
+    Raises
+    ------
+    InputError
+        The file, the stack, or one of its parameters cannot be used. Reading raises it for frames that differ
+        from what was recorded.
+
+    Examples
+    --------
+    >>> with open_recording("press.h5") as recording:  # doctest: +SKIP
+    ...     print(recording.motion, recording.shape)
+    vertical (240, 480, 640)
+    """
+    path = path_of(path)
+    kind = kind_of_frames(path)
+    if channel is not None and kind in ("", "array"):
+        raise InputError(f"{path}: only pictures, videos and MCAP files have channels: leave --channel out")
+    if kind:
+        from mirrorskin.io.files.arrays import open_stack
+
+        if live:
+            raise InputError(f"{path} is not a recording of a live run: leave --live out")
+        known = {"tilt": tilt, "pixel_size": pixel_size}
+        where = {"travel": travel, "phase": phase}
+        part = region, frames
+        return open_stack(
+            path, dataset, channel, where, known, motion, *part, memory_limit, override_motion, verify
+        )
+    with ExitStack() as opening:
+        file = opening.enter_context(open_file(path, memory_limit))
+        ours = file.marked(MARK)
+        file.check_layout(MARK)
+        stack, state, decoding = _find_stack(file, dataset, ours)
+        shape = (state.count, *decoding.shape(stack.shape)[1:])
+        cut = cut_out(str(path), shape, frames, region)
+        coordinates = Coordinates() if ours else read_coordinates(file, stack, decoding)
+        layout = Layout(file, ours, shape, cut, coordinates)
+        header = layout.header(motion, tilt, pixel_size, override_motion)
+        state, numbers = state.of(slice(*cut.frames)), np.arange(*cut.frames)
+        if live:
+            chosen = _used(str(path), state, travel, phase)
+            state, positions = state.of(chosen), layout.live(header.motion, chosen)
+            numbers = numbers[chosen]
+        else:
+            given = {"vertical": travel, "axial": phase}.get(header.motion)
+            positions = layout.positions(header.motion, along(given, shape[0]))
+        opened = file.frames(stack) if isinstance(file, ZarrFile) else None
+        expected, notes = _expected(file, stack, state, cut.region, verify)
+        frames_of = Stack(
+            stack, str(path), shape[0], numbers, cut.region, memory_limit, threads, decoding, opened, expected
+        )
+        recording = Recording(file, stack, frames_of, cut, header, positions, layout, state, shape, live)
+        recording.findings += (*decoding.findings, *coordinates.findings, *notes)
+        opening.pop_all()  # the recording closes the file from now on
+    return recording
+
+
+def _used(
+    path: str,
+    state: RecordingState,
+    travel: ArrayLike | Positions | None,
+    phase: ArrayLike | Positions | None,
+) -> NDArray[np.intp]:
+    """Return the numbers of the frames used by a live run."""
+    if travel is not None or phase is not None:
+        raise InputError(f"{path}: a live run has its own positions: leave --live out, or those given")
+    if state.used is None:
+        raise InputError(f"{path} does not state which frames a live run used: leave --live out")
+    used = np.flatnonzero(state.used)
+    if len(used) < 2:
+        raise InputError(
+            f"{path}: a live run used {len(used)} frames: at least 2 are needed; leave --live out"
+        )
+    return used
+
+
+def _expected(
+    file: Hdf5File, stack: h5py.Dataset, state: RecordingState, region: Region, verify: bool
+) -> tuple[NDArray[np.uint32] | None, tuple[Finding, ...]]:
+    """Return the checksums of the frames if they can be compared, and a note if not."""
+    node = file.find(CHECKSUM) if file.marked(MARK) and stack == file.find(STACK) else None
+    if node is None:
+        return None, ()
+    if not verify:
+        return None, (UNVERIFIED,)
+    if region != Region.whole(stack.shape[1:]):
+        return None, (UNVERIFIED_PARTS,)
+    return read_checksums(file, node, state), ()
+
+
+def _find_stack(
+    file: Hdf5File, dataset: str | None, ours: bool
+) -> tuple[h5py.Dataset, RecordingState, Decoding]:
+    """Return the stack of frames, its state and its decoding; InputError if it cannot be read."""
+    if dataset is None:
+        dataset = STACK if ours else _only_stack(file)
+    stack = file.follow(dataset, "name the stack with --dataset")
+    where = file.where(stack)
+    if not isinstance(stack, h5py.Dataset):
+        raise InputError(f"{where} is not a dataset: name one with --dataset")
+    with as_input_error(where):
+        shape = stack.shape
+    if shape is None or len(shape) != 3:
+        raise InputError(f"{where} has shape {shape}: a stack of frames, (T, H, W), is needed")
+    ours = ours and stack == file.find(STACK)
+    decoding = _decoding(file, stack, ours, where)
+    count, *picture = decoding.shape(shape)
+    if 0 in picture:
+        raise InputError(f"{where} has shape {shape}: its frames have no pixels; record it again")
+    state = read_state(file, ours, stack, count)
+    if state.count < 2:
+        frames = f"{state.count} frame{'' if state.count == 1 else 's'}"
+        raise InputError(f"{where} contains {frames}: at least 2 are needed; record more")
+    file.check_frames(stack, state.count if decoding.order[0] == 0 else shape[0])
+    return stack, state, decoding
+
+
+def _decoding(file: Hdf5File, stack: h5py.Dataset, ours: bool, where: str) -> Decoding:
+    """Return how frames are decoded from the stored values, according to attributes and axes of the stack."""
+    with as_input_error(where):
+        dtype = stack.dtype.newbyteorder("=")
+    frame_dtype(dtype, where)
+    packing = file.packing(stack)
+    if ours:
+        return Decoding(dtype, packing=packing, where=where)
+    if file.attribute_values(stack, "MATLAB_class") is not None:
+        # MATLAB stores the axes in the opposite order, and a stack of pictures is (H, W, T) there.
+        return Decoding(dtype, (0, 2, 1), packing, where=where, matlab=True)
+    names = file.dimensions(stack)
+    order = order_of(names, where) if names else (0, 1, 2)
+    return Decoding(dtype, order, packing, names, where)
+
+
+def is_recording(path: str | Path) -> bool:
+    """Return whether an HDF5 or Zarr file is a recording written by mirrorskin."""
+    with open_file(path) as file:
+        return file.marked(MARK)
+
+
+def is_result(path: str | Path) -> bool:
+    """Return whether an HDF5 or Zarr file is a result written by mirrorskin."""
+    with open_file(path) as file:
+        return file.marked(RESULT_MARK)
+
+
+def _only_stack(file: Hdf5File) -> str:
+    if file.marked(RESULT_MARK):
+        raise InputError(f"{file.path} is a result: give the recording that it was made from")
+    names = list(file.stacks())
+    if not names:
+        raise InputError(
+            f"{file.path} contains no stack of frames (T, H, W): if a link leads to one, name it with "
+            "--dataset"
+        )
+    if len(names) > 1:
+        raise InputError(
+            f"{file.path} contains {len(names)} stacks, {', '.join(names[:5])}: choose with --dataset"
+        )
+    return names[0]

@@ -1,0 +1,284 @@
+"""Result files: the maps of a reconstruction, their declarations, and their provenance."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.base.arguments import check_flag, check_kind, check_path, checked
+from mirrorskin.io.base.types import InputError, ProcessValue
+from mirrorskin.io.base.url import is_zarr, path_of
+from mirrorskin.io.files.outputs import replaced_by_result
+from mirrorskin.io.model.fitted import Fitted
+from mirrorskin.io.model.maps import (
+    SIGMA,
+    TABLE,
+    TWIST,
+    UNDECLARED,
+    FocusStatus,
+    Map,
+    PoseStatus,
+    PressStatus,
+    ReleaseStatus,
+    SlipStatus,
+    check_declarations,
+    declaration_of,
+    is_builtin,
+    may_name_a_map,
+    status_of,
+)
+from mirrorskin.io.model.result import Result, map_shape, size_of_maps
+from mirrorskin.io.storage.atomic import Item, fixed_text, process_items, write_file
+from mirrorskin.io.storage.calibration_file import (
+    CARRIED,
+    calibration_items,
+    carried_by,
+    read_record,
+    record_items,
+)
+from mirrorskin.io.storage.hdf5 import Hdf5File, Node, Shape, read_process
+from mirrorskin.io.storage.layout import RESULT_MARK
+from mirrorskin.io.storage.zarr import open_file
+
+_RESULT, _PROCESS, _FITTED, _OWN = "/entry/result", "/entry/process", "/entry/fitted", "own_maps"
+_DECLARATION = "declaration"  # attribute of a map that is not declared in the table
+_AGAIN = "reconstruct it again"
+_AXES = dict.fromkeys("xy", Map(unit="mm", dtype="float64"))
+_LAYOUT = 2  # version of the layout; in layout 1 maps were not declared, and some had other names
+
+
+@checked(result=check_kind(Result), path=check_path, overwrite=check_flag)
+def save_result(result: Result, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a result; the file appears complete or not at all.
+
+    Parameters
+    ----------
+    result : Result
+    path : str or Path
+        HDF5, or ``NAME.zarr``, also at an address such as ``s3://bucket/NAME.zarr``.
+    overwrite : bool, optional
+        Replace an existing result, or another file that can be computed again. A Zarr store is never
+        replaced.
+
+    Raises
+    ------
+    InputError
+        The file exists, or cannot be written.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin import io
+    >>> io.save_result(io.Result(height=np.zeros((2, 3), np.float32)), "flat.h5")  # doctest: +SKIP
+    """
+    target = path_of(path)
+    if not is_zarr(target):
+        write_file(target, _items(result), replaced_by_result(overwrite))
+        return
+    from mirrorskin.io.files.zarr_export import save_zarr
+
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        write_file(Path(folder, "result.h5"), _items(result))
+        save_zarr(Path(folder, "result.h5"), target)
+
+
+def _items(result: Result) -> Iterator[Item]:
+    yield Item("/", None, {"NX_class": "NXroot", "default": "entry"})
+    yield Item("/entry", None, {"NX_class": "NXentry", "default": "result", RESULT_MARK: _LAYOUT})
+    yield Item(_RESULT, None, {"NX_class": "NXdata", **_plot(result)})
+    yield Item(_PROCESS, None, {"NX_class": "NXprocess"})
+    yield from _map_items(result)
+    yield from process_items(_PROCESS, result.process)
+    yield from record_items(result.fitted, _FITTED)
+    if result.calibration is not None:
+        yield from calibration_items(result.calibration, CARRIED)
+    if result.height_sigma is not None:  # viewers use a dataset of this name for error bars
+        yield Item(f"{_RESULT}/height_errors", f"{_RESULT}/{result.name_of(f'height{SIGMA}')}", {})
+
+
+def _map_items(result: Result) -> Iterator[Item]:
+    """Yield the maps, and the axes of a plot: the turns, and the positions of the pixels."""
+    for name, values in result.items():
+        declared = result.declaration(name)
+        attributes = declared.attributes()
+        if declared.axes == "pixels" and not declared.components:
+            attributes["interpretation"] = "image"
+        if name in result.declarations:
+            attributes[_DECLARATION] = fixed_text(declared.encode())
+        yield Item(f"{_RESULT}/{name}", np.asarray(values), attributes)
+    own = [name for name in result if not is_builtin(name)]
+    if own:
+        yield Item(f"{_RESULT}/{_OWN}", fixed_text(own), {})
+    for name, positions in _axes(result).items():
+        yield Item(f"{_RESULT}/{name}", positions, {"units": "mm"} if name in _AXES else {})
+
+
+def _axes(result: Result) -> dict[str, NDArray[Any]]:
+    size = map_shape(result)
+    axes: dict[str, NDArray[Any]] = {}
+    if len(size) == 3:
+        axes["turn"] = np.arange(size[0], dtype=np.int32)
+    if result.x is not None and result.y is not None:
+        axes |= {"y": result.y, "x": result.x}
+    return axes
+
+
+def _plot(result: Result) -> dict[str, Any]:
+    """Return the attributes that viewers use to plot the maps; vectors cannot be plotted."""
+    plotted = [name for name in result.maps() if not result.declaration(name).components]
+    axes = list(_axes(result))
+    plot: dict[str, Any] = {"signal": plotted[0], "auxiliary_signals": plotted[1:]} if plotted else {}
+    if axes:
+        plot["axes"] = [*axes, *["."] * ((result[plotted[0]].ndim if plotted else 0) - len(axes))]
+    return plot
+
+
+@checked(path=check_path)
+def open_result(path: str | Path) -> Result:
+    """Read a result.
+
+    Raises
+    ------
+    InputError
+        The file does not exist, is not a result, or is damaged.
+
+    Examples
+    --------
+    >>> open_result("press-result.h5").height.shape  # doctest: +SKIP
+    (480, 640)
+    """
+    with _opened(path_of(path)) as file:
+        stored, declarations = _find_maps(file)
+        maps: dict[str, Any] = {}
+        _check_frames(path, stored, declarations)
+        for name, (node, shape) in stored.items():
+            declared = _AXES.get(name) or declaration_of(name, declarations)
+            if declared.axes == "pieces" and "component" in stored:
+                shape = (int(maps["component"].max(initial=-1)) + 1,)
+            values = file.read(node, shape, unit=declared.unit or None, remedy=_AGAIN)
+            dtype = values.dtype if declared is UNDECLARED else declared.dtype
+            maps[name] = values.astype(dtype, copy=False) if declared.axes != "none" else float(values)
+            if name == "component" and maps[name].min(initial=-1) < -1:
+                raise InputError(f"{file.where(node)} has numbers below -1: {_AGAIN}")
+        for name, direction in (("x", 1), ("y", -1)):
+            if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
+                raise InputError(f"{path}: {_RESULT}/{name} is not in the order of the pixels: {_AGAIN}")
+        process = read_process(file, _PROCESS)
+        if _layout(file) < _LAYOUT and "status" in maps:
+            declarations |= _status_of_layout_1(maps, process)
+        others: dict[str, Any] = {name: maps.pop(name, None) for name in _AXES}
+        others |= {"process": process, "fitted": read_record(file, _FITTED, Fitted, _AGAIN)}
+        return Result(maps, **others, calibration=carried_by(file), declarations=declarations)
+
+
+def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
+    """Read the provenance of a result, or some values of it; its maps are checked, but not read.
+
+    Missing values are left out. See ``open_result``.
+    """
+    with _opened(path_of(path)) as file:
+        for node, shape in _find_maps(file)[0].values():
+            if getattr(node, "shape", None) != shape:
+                raise InputError(f"{file.where(node)} is not of shape {shape}: {_AGAIN}")
+        return read_process(file, _PROCESS, names or None)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Hdf5File]:
+    with open_file(path) as file:
+        if not file.marked(RESULT_MARK):
+            raise InputError(
+                f"{path} is not a result: 'mirrorskin reconstruct' computes one from a recording"
+            )
+        file.check_layout(RESULT_MARK, _LAYOUT)
+        yield file
+
+
+def _layout(file: Hdf5File) -> int:
+    layout = file.attribute("/entry", RESULT_MARK)
+    return layout if isinstance(layout, int) else 1
+
+
+Found = dict[str, tuple[Node, Shape]]
+
+
+def _find_maps(file: Hdf5File) -> tuple[Found, dict[str, Map]]:
+    """Find the maps and axes in a file, with their required shapes and their declarations."""
+    group = file.find(_RESULT)
+    listed = file.find(f"{_RESULT}/{_OWN}")
+    own = () if listed is None else filter(may_name_a_map, file.texts(listed, _AGAIN))
+    builtin = (one for name in TABLE for one in (name, f"{name}{SIGMA}"))
+    names = {name: name for name in dict.fromkeys((*builtin, *own, *_AXES))}
+    declarations: dict[str, Map] = {}
+    if _layout(file) < _LAYOUT:
+        motion = file.find(f"{_PROCESS}/motion")
+        twist = motion is not None and file.value(motion) == "twist"
+        names |= {"normal_sigma": "normals_sigma", "way": "twist_angle" if twist else "slide_distance"}
+        declarations |= TWIST if twist else {}
+    nodes: dict[str, Node] = {}
+    for stored, name in names.items():
+        node = None if group is None else file.walk(group, stored)
+        if node is not None:
+            nodes[name] = node
+            text = file.attribute(f"{_RESULT}/{stored}", _DECLARATION)
+            if text is not None:
+                declarations[name] = Map.decode(str(text), file.where(node))
+    try:
+        check_declarations(declarations)
+    except InputError as error:
+        raise InputError(f"{file.path}: {error}") from error
+    return _shaped(file, nodes, declarations), declarations
+
+
+def _shaped(file: Hdf5File, nodes: Mapping[str, Node], declarations: Mapping[str, Map]) -> Found:
+    """Return the maps with their required shapes, which follow from the shape of the first one."""
+    shapes: dict[str, Shape] = {name: getattr(node, "shape", None) or () for name, node in nodes.items()}
+    declared = {name: declaration_of(name, declarations) for name in nodes if name not in _AXES}
+    size = next(
+        (size_of_maps(one, shapes[name]) for name, one in declared.items() if one.axes == "pixels"), ()
+    )
+    if len(size) not in (2, 3):
+        raise InputError(f"{file.path}: {_RESULT} contains no maps: {_AGAIN}")
+    needed: dict[str, Shape] = {"x": size[-1:], "y": size[-2:-1]}
+    for name, one in declared.items():
+        if one.axes == "pixels":
+            needed[name] = (*size, len(one.components)) if one.components else size
+            if one.per_frame and len(shapes[name]) > len(needed[name]):
+                needed[name] = (shapes[name][0], *needed[name])
+        else:
+            needed[name] = () if one.axes == "none" else shapes[name][:1] or (0,)
+    return {name: (node, needed[name]) for name, node in nodes.items()}
+
+
+def _check_frames(path: str | Path, found: Found, declarations: Mapping[str, Map]) -> None:
+    """Refuse series with different numbers of frames."""
+    counts = {}
+    for name, (_node, shape) in found.items():
+        declared = _AXES.get(name) or declaration_of(name, declarations)
+        if declared.axes == "frames" or (declared.per_frame and len(shape) == 4):
+            counts[name] = shape[0] if shape else 0
+    if len(set(counts.values())) > 1:
+        each = ", ".join(f"{name} of {count}" for name, count in counts.items())
+        raise InputError(f"{path}: {_RESULT} has values of different numbers of frames ({each}): {_AGAIN}")
+
+
+def _status_of_layout_1(maps: Mapping[str, Any], process: Mapping[str, ProcessValue]) -> dict[str, Map]:
+    """Return the declaration of ``status`` in a file of layout 1, derived from its other contents."""
+    if "sharpness" in maps:
+        return {"status": status_of(FocusStatus)}
+    if "estimator" in process:  # a user's own estimator
+        return {}
+    if "slip_onset" in maps:
+        return {"status": status_of(SlipStatus)}
+    if "zenith" in maps and "height" not in maps:
+        return {"status": status_of(PoseStatus)}
+    if "event" in process or "vertical_event" in process:
+        released = "release" in (process.get("event"), process.get("vertical_event"))
+        return {"status": status_of(ReleaseStatus if released else PressStatus)}
+    return {}

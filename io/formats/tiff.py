@@ -1,0 +1,408 @@
+"""Reading of TIFF files page by page, as the series of frames described by their metadata."""
+
+from __future__ import annotations
+
+import logging
+import re
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.base.findings import Finding
+from mirrorskin.io.base.opencv import check_picture, decode, is_coloured, to_grey
+from mirrorskin.io.base.system import check_regular, open_regular
+from mirrorskin.io.base.types import FRAME_DTYPES, InputError
+from mirrorskin.io.formats.colour_table import ColourTable
+from mirrorskin.io.model.frames import CONVERTED_COLOUR, WholeFrames, lossy
+
+TIFF_SUFFIXES = (".tif", ".tiff")
+
+_REMEDY = "copy it again, or save it again"
+_DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
+_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_KINDS = ("frame", "imagej", "multipage", "ome", "shaped", "sis", "tiled", "uniform", "virtual")
+"""Kinds of TIFF whose metadata are read; the metadata of others may name other files."""
+
+_FRAME_AXES = "TZIQ"  # time, depth, and pages in order
+_COLOURS = 4  # maximum number of channels that can be colours of one picture; more are frames
+_FORMATS = {1: "uint", 2: "int", 3: "float"}  # sample formats (TIFF 6.0, section 19)
+_WHITE_IS_ZERO, _BLACK_IS_ZERO, _PALETTE = 0, 1, 3  # photometric interpretations
+_PLAIN = tuple(dtype.name for dtype in FRAME_DTYPES)  # types accepted for colour samples as well
+_DECODED = {1, 5, 6, 7, 8, 32773, 32946}  # compressions: none, LZW, JPEG, deflate, PackBits
+_NONE, _LOSSY = 1, {6: "JPEG", 7: "JPEG", 34892: "JPEG"}  # compressions
+_SEPARATE = 2  # planar configuration: one plane per colour
+_MICROMETRE = ("micron", "um", "\\u00B5m")  # as ImageJ writes it
+# Tags of a page that describe the packing of its samples: type and number.
+_PACKING = {266: "H", 317: "H", 322: "I", 323: "I", 278: "I"}
+_JPEG_TABLES, _SUBSAMPLING, _ORIENTATION = 347, 530, 274
+_LAST_UPRIGHT = 4  # orientation; in the others rows and columns are exchanged
+
+
+class TiffFrames(WholeFrames):
+    """The frames of a TIFF: pages, or the time or depth of ImageJ and OME, (T, H, W).
+
+    Samples are read as stored, with three exceptions. If white is zero, they are inverted, so that more light
+    is a larger number. Indices of a colour table become the values of the table if it is grey, and are
+    unchanged if its brightness increases; any other table is refused. Colours become grey as in ``to_grey``.
+
+    Parameters
+    ----------
+    path : Path
+    series : str, optional
+        Number of the series, if the file has several.
+    channel : int, optional
+        Channel of a stack with several, or colour; the first is 0.
+    dtypes : sequence of str, optional
+        Accepted types of grey samples.
+    """
+
+    how = "page by page"
+
+    def __init__(
+        self,
+        path: Path,
+        series: str | None = None,
+        channel: int | None = None,
+        dtypes: Sequence[str] = _DTYPES,
+    ) -> None:
+        self._path, self.files, self._channel = path, (path,), channel
+        check_regular(path, _REMEDY)
+        with _quiet_tifffile(), ExitStack() as opening:
+            try:
+                self._file = opening.enter_context(_open(path))
+                found = list(self._file.series)
+                shaped = bool(found) and all(one.kind == "shaped" for one in found)
+                if shaped and len(found) > 1 and series is None:
+                    plain = opening.enter_context(_open(path, "shaped"))
+                    if sum(map(_frames_in, found)) == sum(map(_frames_in, plain.series)):  # were appended
+                        self._file, found = plain, list(plain.series)
+                elif shaped and sum(len(one.pages) for one in found) < len(self._file.pages):
+                    raise InputError(f"{path} has pages that its metadata do not describe: save it again")
+                complete = bool(found) and self._ends()
+                if self._file.is_imagej:  # without the samples that its metadata state, it is a plain TIFF
+                    complete = complete and found[0].kind == "imagej"
+                if not complete:
+                    raise self._damaged()
+                self._take(_chosen(path, found, series), dtypes)
+            except InputError:
+                raise
+            except OSError as error:
+                raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
+            except Exception as error:  # of many types
+                raise self._damaged() from error
+            self._close = opening.pop_all().close  # the file stays open until `close`
+
+    def close(self) -> None:
+        """Close the file."""
+        self._close()
+
+    def frames(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
+        """Decode frames."""
+        for number in range(start, stop):
+            name = self._name(number)
+            yield name, to_grey(self.page(number), name, self._colour)
+
+    def page(self, number: int) -> NDArray[Any]:
+        """Decode a frame, (H, W) or (H, W, channels): blue, green, red, opacity."""
+        name, index = self._name(number), int(self._numbers[number])
+        with _quiet_tifffile():
+            try:
+                samples = self._stored(index, name)
+            except InputError:
+                raise
+            except Exception as error:  # of many types
+                raise InputError(f"{name} cannot be read: it is damaged or cut off; copy it again") from error
+        if self._table is not None:
+            samples = self._table.look_up(samples)
+        if self._inverted:
+            samples = ~samples
+        return _upright(samples, self._orientation)
+
+    def _damaged(self) -> InputError:
+        with open_regular(self._path) as unread:
+            known = unread.read(4) in _MARKS
+        wrong = "is damaged or cut off" if known else "is not a TIFF"
+        return InputError(f"{self._path} {wrong}: {_REMEDY}")
+
+    def _ends(self) -> bool:
+        """Return whether the chain of pages ends; it does not in a truncated file."""
+        self._file.filehandle.seek(self._file.pages.next_page_offset or 0)
+        end = self._file.filehandle.read(self._file.tiff.offsetsize)
+        return len(end) == self._file.tiff.offsetsize and not any(end)
+
+    def _name(self, number: int) -> str:
+        return f"{self._path} (page {int(self._numbers[number]) + 1})"
+
+    def _take(self, series: Any, dtypes: Sequence[str]) -> None:
+        """Check the pages of a series, and find the frames among them."""
+        page, name = series.keyframe, str(self._path)
+        dtype = f"{_FORMATS.get(page.sampleformat, '')}{page.bitspersample}"
+        several = page.samplesperpixel > 1 or page.photometric != _BLACK_IS_ZERO
+        if page.samplesperpixel not in (1, 3, 4) or dtype not in (_PLAIN if several else dtypes):
+            raise InputError(
+                f"{name} (page {page.index + 1}) has {page.samplesperpixel} {dtype} a pixel: "
+                "save it in grey, as uint8, uint16 or float32"
+            )
+        if page.compression not in _DECODED:
+            kind = getattr(page.compression, "name", page.compression)
+            raise InputError(f"{name} is compressed by {kind}: save it with LZW or deflate, or uncompressed")
+        self.dtype, rows, columns = np.dtype(dtype), page.imagelength, page.imagewidth
+        size = rows * columns * page.samplesperpixel * self.dtype.itemsize
+        packed = 0 if page.compression == _NONE else min(sum(page.databytecounts), self._file.filehandle.size)
+        where, samples = f"{name} (page {page.index + 1})", page.samplesperpixel
+        check_picture(where, columns, rows, self.dtype.itemsize, samples, packed, copies=1)
+        self._numbers, self._colour = _numbers(name, series, self._channel)
+        self._orientation = _orientation(page)
+        turned = self._orientation > _LAST_UPRIGHT
+        self.shape = (len(self._numbers), *((columns, rows) if turned else (rows, columns)))
+        self._page, self._pages, self._offset = page, series.pages, series.dataoffset
+        self._size, self._stored_size = self._file.filehandle.size, size
+        self._check_complete()
+        self._inverted = page.photometric == _WHITE_IS_ZERO
+        if self._inverted and self.dtype.kind == "f":
+            raise InputError(
+                f"{name}: white is zero, but samples are {self.dtype}: save them with black as zero"
+            )
+        self._table = _table(name, page) if page.photometric == _PALETTE else None
+        self.findings = tuple(self._find(series))
+
+    def _check_complete(self) -> None:
+        """Check that the file contains the samples of all frames."""
+        if self._offset is not None:
+            end = self._offset + self._stored_size * (int(self._numbers.max(initial=0)) + 1)
+            if end > self._size:
+                raise self._damaged()
+            return
+        for number in self._numbers.tolist():
+            page = self._pages[number]
+            missing = page is None or not page.dataoffsets
+            if missing or max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=True))) > self._size:
+                raise self._damaged()
+
+    def _find(self, series: Any) -> Iterator[Finding]:
+        page = self._page
+        if page.compression in _LOSSY:
+            yield lossy(_LOSSY[page.compression])
+        if self._inverted:
+            text = "white is zero: samples are inverted, so that more light is more counts"
+            yield Finding("white is zero", text, warning=False)
+        if self._table is not None:
+            yield from self._table.findings
+        if page.samplesperpixel > 1 and page.planarconfig == _SEPARATE:
+            yield Finding(
+                "planar colour",
+                f"the {page.samplesperpixel} planes of a picture are read as its colours: if they are frames,"
+                " save them with photometric='minisblack'",
+            )
+        if page.samplesperpixel > 1 and self._colour is None and is_coloured(self.page(0)):
+            yield CONVERTED_COLOUR
+        if "C" in series.axes and series.axes[0] == "C":
+            text = f"{self.shape[0]} channels are read as frames"
+            yield Finding("channels", text, warning=False)
+        pixel = _pixel_size(self._file)
+        if pixel:
+            text = f"the file states pixels of {pixel}: give --pixel-size if this is their size at the sheet"
+            yield Finding("pixel size", text, warning=False)
+
+    def _stored(self, index: int, name: str) -> NDArray[Any]:
+        """Return the samples of a page, (H, W) or (H, W, channels): blue, green, red, opacity."""
+        page, rows, columns = self._page, self._page.imagelength, self._page.imagewidth
+        samples = page.samplesperpixel
+        planar = samples > 1 and page.planarconfig == _SEPARATE
+        shape = (samples, rows, columns) if planar else (rows, columns, samples)
+        if self._offset is not None:
+            place = self._offset + index * self._stored_size
+            self._file.filehandle.seek(place)
+            data = self._file.filehandle.read(self._stored_size)
+            values = np.frombuffer(data, self.dtype.newbyteorder(self._file.byteorder)).reshape(shape)
+        elif page.compression == _NONE:
+            values = np.asarray(self._pages[index].asarray(maxworkers=1)).reshape(shape)
+        else:
+            return self._decode(self._pages[index], planar, name)
+        values = values.astype(self.dtype, copy=False)
+        values = np.moveaxis(values, 0, -1) if planar else values
+        return values[..., 0] if samples == 1 else values[..., [2, 1, 0, 3][:samples]]
+
+    def _decode(self, page: Any, planar: bool, name: str) -> NDArray[Any]:
+        """Decode the samples of a compressed page with OpenCV, as a TIFF of one page."""
+        offsets, counts = page.dataoffsets, page.databytecounts
+        planes = self._page.samplesperpixel if planar else 1
+        each = len(offsets) // planes
+        decoded = []
+        for plane in range(planes):
+            part = slice(plane * each, (plane + 1) * each)
+            segments = []
+            for offset, count in zip(offsets[part], counts[part], strict=True):
+                self._file.filehandle.seek(offset)
+                segments.append(self._file.filehandle.read(count))
+            decoded.append(decode(self._packed(segments, 1 if planar else self._page.samplesperpixel), name))
+        if decoded[0].dtype != self.dtype:
+            raise InputError(f"{name} is compressed, and of type {self.dtype}: save it uncompressed")
+        return np.stack(decoded[2::-1] + decoded[3:], axis=-1) if planar else decoded[0]
+
+    def _packed(self, segments: list[bytes], samples: int) -> bytes:
+        """Return a TIFF of one page whose samples OpenCV decodes without conversion."""
+        page, order = self._page, self._file.byteorder
+        tags: dict[int, tuple[str, Sequence[int] | bytes]] = {
+            256: ("I", [page.imagewidth]),
+            257: ("I", [page.imagelength]),
+            258: ("H", [page.bitspersample] * samples),
+            259: ("H", [int(page.compression)]),
+            262: ("H", [int(page.photometric) if samples > 1 else 1]),
+            277: ("H", [samples]),
+            284: ("H", [1]),
+            339: ("H", [int(page.sampleformat)] * samples),
+        }
+        for code, kind in _PACKING.items():
+            if code in page.tags:
+                tags[code] = kind, [int(page.tags[code].value)]
+        for code, kind in ((_JPEG_TABLES, "B"), (_SUBSAMPLING, "H")):
+            if code in page.tags:
+                tags[code] = kind, page.tags[code].value
+        if samples == 4:
+            tags[338] = "H", [1]  # otherwise colours are multiplied by the opacity
+        tiled = page.is_tiled
+        tags[325 if tiled else 279] = "I", [len(one) for one in segments]
+        tags[324 if tiled else 273] = "I", [0] * len(segments)
+        return _write(tags, 324 if tiled else 273, segments, order)
+
+
+def _open(path: Path, *without: str) -> Any:
+    """Open a TIFF; its metadata are read only if their kind is supported, and not in ``without``."""
+    import tifffile
+
+    others = (tifffile.TIFF.FILE_FLAGS - {*_KINDS}) | {*without}
+    flags: dict[str, Any] = {f"is_{kind}": False for kind in others}
+    return tifffile.TiffFile(path, _multifile=False, **flags)
+
+
+def _frames_in(series: Any) -> int:
+    """Return the number of pictures in a series."""
+    return int(series.size) // max(1, int(series.keyframe.size))
+
+
+def _write(
+    tags: dict[int, tuple[str, Sequence[int] | bytes]], offsets: int, segments: list[bytes], order: str
+) -> bytes:
+    """Return the bytes of a TIFF; the values of the tag ``offsets`` are computed."""
+    codes = {"B": 7, "H": 3, "I": 4}
+    sizes = {code: struct.calcsize(f"={len(values)}{kind}") for code, (kind, values) in tags.items()}
+    start = 8 + 2 + 12 * len(tags) + 4
+    places = {}
+    for code, size in sizes.items():
+        if size > 4:
+            places[code], start = start, start + size + size % 2
+    at = []
+    for one in segments:
+        at.append(start)
+        start += len(one)
+    tags[offsets] = "I", at
+    entries, extra = b"", b""
+    for code in sorted(tags):
+        kind, values = tags[code]
+        packed = struct.pack(f"{order}{len(values)}{kind}", *values)
+        entries += struct.pack(f"{order}HHI", code, codes[kind], len(values))
+        entries += struct.pack(f"{order}I", places[code]) if code in places else packed.ljust(4, b"\0")
+    for code in places:
+        kind, values = tags[code]
+        packed = struct.pack(f"{order}{len(values)}{kind}", *values)
+        extra += packed + bytes(len(packed) % 2)
+    head = (b"II" if order == "<" else b"MM") + struct.pack(f"{order}HI", 42, 8)
+    return b"".join([head, struct.pack(f"{order}H", len(tags)), entries, bytes(4), extra, *segments])
+
+
+def _chosen(path: Path, found: list[Any], wanted: str | None) -> Any:
+    """Return a series of a file: the requested one, or the only one."""
+    if wanted is None and len(found) == 1:
+        return found[0]
+    if wanted is not None and wanted.isdecimal() and int(wanted) < len(found):
+        return found[int(wanted)]
+    sizes = ", ".join(f"{number}: {_describe(one)}" for number, one in enumerate(found[:5]))
+    if wanted is not None:
+        raise InputError(f"{path} has no series {wanted!r}: choose from {sizes}")
+    raise InputError(f"{path} contains {len(found)} series of pictures, {sizes}: choose one with --dataset")
+
+
+def _describe(series: Any) -> str:
+    return f"{' x '.join(map(str, series.shape))} {series.dtype} ({series.axes})"
+
+
+def _numbers(name: str, series: Any, channel: int | None) -> tuple[NDArray[np.intp], int | None]:
+    """Return the pages of a series that are frames, in order, and the colour to read from each."""
+    inner = len(series.keyframe.shape)  # axes within a page: rows, columns, and perhaps colours
+    axes, shape = series.axes, series.shape
+    if axes.endswith("S") and not series.keyframe.axes.endswith("S") and shape[-1] == 1:
+        axes, shape = axes[:-1], shape[:-1]
+    axes, shape = axes[: len(axes) - inner], shape[: len(shape) - inner]
+    pages = np.arange(int(np.prod(shape, dtype=np.int64)), dtype=np.intp).reshape(shape)
+    long = {axis: length for axis, length in zip(axes, shape, strict=True) if length > 1}
+    of_frames = [axis for axis in long if axis in _FRAME_AXES]
+    if len(of_frames) > 1 or set(long) - {*_FRAME_AXES, "C"}:
+        sizes = " x ".join(f"{length} {axis}" for axis, length in long.items())
+        raise InputError(
+            f"{name} has the axes {series.axes} ({sizes}), but frames have one order: save one of them"
+        )
+    if "C" in long and (of_frames or long["C"] <= _COLOURS):
+        count = long["C"]
+        if channel is None or not 0 <= channel < count:
+            what = f"--channel 0 to {count - 1} takes one of them"
+            chosen = "" if channel is None else f", and none is number {channel}"
+            alone = "" if of_frames else "; if they are frames, save them with the axes TYX"
+            raise InputError(f"{name} has {count} channels{chosen}: {what}{alone}")
+        return pages.take(channel, axis=axes.index("C")).reshape(-1), None
+    if channel is not None and series.keyframe.samplesperpixel == 1:
+        raise InputError(f"{name} has one channel: leave --channel out")
+    return pages.reshape(-1), channel
+
+
+def _orientation(page: Any) -> int:
+    """Return the orientation of a page, 1 to 8 (TIFF 6.0, section 8)."""
+    tag = page.tags.get(_ORIENTATION)
+    value = 1 if tag is None else tag.value
+    return int(value) if value in range(1, 9) else 1
+
+
+def _upright(picture: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Turn and mirror a picture for display."""
+    if orientation > _LAST_UPRIGHT:  # the first stored row is a column of the displayed picture
+        picture = picture.swapaxes(0, 1)
+    return picture[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]
+
+
+def _table(name: str, page: Any) -> ColourTable:
+    """Return the colour table of a page."""
+    colours = (np.asarray(page.colormap).T >> 8).astype(np.uint8)  # of 16 bits
+    return ColourTable(name, colours, np.dtype(f"u{page.bitspersample // 8}"))
+
+
+def _pixel_size(file: Any) -> str:
+    """Return the pixel size in the metadata of ImageJ or OME, as text."""
+    if file.is_ome and file.ome_metadata:
+        found = re.findall('PhysicalSize([XY])="([0-9.eE+-]{1,20})"', file.ome_metadata)
+        sizes, unit = dict(found), re.search('PhysicalSizeXUnit="([^"]{1,9})"', file.ome_metadata)
+        if {"X", "Y"} <= sizes.keys():
+            return f"{sizes['X']} x {sizes['Y']} {unit[1] if unit else 'µm'}"
+    if file.is_imagej and file.imagej_metadata:
+        name = str(file.imagej_metadata.get("unit", ""))
+        tags = [file.pages.first.tags.get(code) for code in (282, 283)]
+        if name not in ("", "pixel", "pixels") and all(tag is not None and tag.value[0] for tag in tags):
+            x, y = (tag.value[1] / tag.value[0] for tag in tags)
+            return f"{x:.4g} x {y:.4g} {'µm' if name in _MICROMETRE else name}"
+    return ""
+
+
+@contextmanager
+def _quiet_tifffile() -> Iterator[None]:
+    """Suppress tifffile's messages about damaged files."""
+    logger = logging.getLogger("tifffile")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)

@@ -1,0 +1,1 @@
+"""The data model: maps, results, positions, calibrations, and readers of frames."""

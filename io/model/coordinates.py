@@ -1,0 +1,126 @@
+"""Coordinates of the axes of other programs' stacks, identified by units: times, positions, pixel size."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.base.findings import Finding
+from mirrorskin.io.base.types import Floats, Motion
+from mirrorskin.io.base.units import Kind, in_base
+
+if TYPE_CHECKING:
+    from mirrorskin.io.base.samples import Decoding
+    from mirrorskin.io.storage.hdf5 import Hdf5File
+
+_SERIES: dict[Kind, str] = {"time": "time", "length": "travel", "angle": "phase"}
+_MOTIONS: dict[str, Motion] = {"travel": "vertical", "phase": "axial"}
+_SINCE = re.compile(r"(\w+) since .*", re.DOTALL)  # a time of the CF conventions
+_EVEN = 1e-3  # largest deviation of evenly spaced pixels from their positions, pixels
+_FIJI = "element_size_um"  # attribute that Fiji and ilastik write: the size of a voxel, (z, y, x)
+
+
+@dataclass
+class Coordinates:
+    """The information in the axes of a stack.
+
+    Attributes
+    ----------
+    series : dict of ndarray, (T,), float64
+        ``time``, s, ``travel``, mm, or ``phase``, rad, of the frames.
+    motion : str or None
+        The motion, if the axis of the frames is called travel or phase.
+    pixel_size : (float, float) or None
+        Millimetres along x and y.
+    findings : list of Finding
+    """
+
+    series: dict[str, Floats] = field(default_factory=dict)
+    motion: Motion | None = None
+    pixel_size: tuple[float, float] | None = None
+    findings: list[Finding] = field(default_factory=list)
+
+
+def read_coordinates(file: Hdf5File, stack: h5py.Dataset, decoding: Decoding) -> Coordinates:
+    """Read the coordinates of a stack of another program; coordinates without units are ignored."""
+    found = Coordinates()
+    if decoding.names:
+        group = str(stack.name).rpartition("/")[0]
+        shape = decoding.shape(stack.shape)
+        names = [decoding.names[axis] for axis in decoding.order]
+        axes = [
+            _axis(file, f"{group}/{name}", count) if name else None
+            for name, count in zip(names, shape, strict=True)
+        ]
+        if axes[0] is not None:
+            _take_series(found, names[0], *axes[0], decoding.where)
+        steps = [
+            _step(found, name, direction, axis, decoding.where)
+            for name, direction, axis in zip(names[1:], (-1, 1), axes[1:], strict=True)
+        ]
+        if steps[0] and steps[1]:
+            found.pixel_size = steps[1], steps[0]
+            _note(found, decoding.where, "the pixel size", f"{names[2]} and {names[1]}")
+    size = file.attribute_values(stack, _FIJI)
+    if found.pixel_size is None and size is not None and size.shape == (3,) and size.dtype.kind in "iuf":
+        found.pixel_size = float(size[2]) / 1000, float(size[1]) / 1000
+        _note(found, decoding.where, "the pixel size", _FIJI)
+    return found
+
+
+def _axis(file: Hdf5File, name: str, count: int) -> tuple[Kind, Floats] | None:
+    """Return the kind of a coordinate and its values in the base unit; None if there is none with a unit."""
+    node = file.find(name)
+    if not isinstance(node, h5py.Dataset) or node.shape != (count,) or node.dtype.kind not in "iuf":
+        return None
+    unit = str(file.attribute(name, "units") or "")
+    since = _SINCE.fullmatch(unit)
+    unit = since[1] if since else unit
+    for kind in _SERIES:
+        try:
+            factor = in_base(unit, kind) if unit else 0.0
+        except ValueError:
+            continue
+        if factor:
+            values = file.read(node, (count,)).astype(np.float64) * factor
+            return kind, values - values[0] if since else values
+    return None
+
+
+def _take_series(found: Coordinates, name: str, kind: Kind, values: Floats, where: str) -> None:
+    series = _SERIES[kind]
+    found.series[series] = values
+    found.motion = _MOTIONS.get(series) if name.lower() == series else None
+    _note(found, where, f"the {series} of each frame", name)
+
+
+def _step(
+    found: Coordinates, name: str, direction: int, axis: tuple[Kind, NDArray[Any]] | None, where: str
+) -> float | None:
+    """Return the distance of rows or columns, mm, if they are evenly spaced along a length."""
+    if axis is None or axis[0] != "length" or len(axis[1]) < 2:
+        return None
+    places = axis[1]
+    step = float(places[-1] - places[0]) / (len(places) - 1)
+    even = np.abs(places - places[0] - step * np.arange(len(places)))
+    if not step or not np.all(even <= _EVEN * abs(step)):
+        text = f"{where}: its coordinate {name} is not evenly spaced, and states no pixel size"
+        found.findings.append(Finding("uneven pixels", text))
+        return None
+    if step * direction < 0:
+        change, first = ("rises with the row", "top") if direction < 0 else ("falls with the column", "left")
+        text = (
+            f"{where}: its coordinate {name} {change}, and the first one is taken as the {first} of the "
+            "picture; reverse the axis if that is wrong"
+        )
+        found.findings.append(Finding("mirrored picture", text))
+    return abs(step)
+
+
+def _note(found: Coordinates, where: str, what: str, source: str) -> None:
+    found.findings.append(Finding("coordinates", f"{where}: {what} is read from {source}", False))

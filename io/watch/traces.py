@@ -1,0 +1,473 @@
+"""Facts and findings from the brightness of a grid of pixels over all frames."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.io.base.findings import Finding
+from mirrorskin.io.base.types import Floats, Motion
+from mirrorskin.io.watch.phase_check import PhaseCheck, swing_of
+
+_SIDE = 24  # pixels of the grid along each side
+_MOST = 1 << 22  # number of samples above which the grid becomes coarser
+_FEWEST = 64  # minimum number of pixels for findings
+_QUANTUM = 1 / math.sqrt(12)  # standard deviation of rounding, counts
+_MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
+_CLEAR = 10.0  # minimum change of a pixel that is a response, standard deviations of the noise
+_FEW = 0.05  # share of pixels below which their common behaviour is ignored
+_MOST_OF = 0.8  # share of pixels that must agree
+_CLIPPED = 0.1  # tolerated share of responding pixels that reach the end of the scale
+_FLICKER, _DRIFT = 0.01, 2.0  # tolerated flicker, share of the light; tolerated drift, counts of 8 bits
+_PARTS = 10  # of a press, in which its dark level is compared
+_DARK, _DARK_PIXELS = 0.25, 0.25  # brightest dark pixel, share of the span; fewest dark pixels, share
+_COMMON = 2.0  # minimum change in common, standard deviations of the pixels' own changes
+_OF_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
+_OUTLYING = 0.1  # minimum difference of an outlier from the samples before and after it, share of the span
+_OUTLIERS, _FLASH = 0.003, 0.2  # tolerated share of outliers; share in a frame from which it is a flash
+_NOISY = 0.3  # share of the pixels that differ between frames because of noise
+_AS_ONE = 0.5  # mean direction of the pixels' phases above which all respond alike
+_HARMONICS = 3  # number of harmonics of the phase that describe the brightness of a pixel
+_THIN = 4  # an axis shorter than both others by this factor may be in the wrong place
+
+
+Samples = NDArray[np.float32]
+
+
+class FrameSamples:
+    """Brightness of a grid of pixels in all frames.
+
+    Parameters
+    ----------
+    shape : (int, int, int)
+        Frames, rows and columns of the source.
+
+    Attributes
+    ----------
+    rows, columns : ndarray of int
+        Rows and columns of the grid in a frame.
+    count : int
+        Number of frames so far.
+
+    Examples
+    --------
+    >>> samples = FrameSamples((3, 2, 2))
+    >>> samples.push(np.arange(12, dtype=np.uint8).reshape(3, 2, 2))
+    >>> samples.values.shape
+    (3, 2, 2)
+    """
+
+    def __init__(self, shape: tuple[int, int, int]) -> None:
+        steps = [-(-length // _SIDE) for length in shape[1:]]
+        cuts = [slice((n - 1) % step // 2, None, step) for n, step in zip(shape[1:], steps, strict=True)]
+        self._grid = (slice(None), *cuts)
+        self.rows, self.columns = (np.arange(n)[cut] for n, cut in zip(shape[1:], cuts, strict=True))
+        self._parts: list[NDArray[Any]] = []
+        self.count = 0
+
+    @classmethod
+    def of(cls, frames: NDArray[Any]) -> Self:
+        """Return samples of a stack."""
+        samples = cls((len(frames), frames.shape[1], frames.shape[2]))
+        samples.push(frames)
+        return samples
+
+    def push(self, frames: NDArray[Any]) -> None:
+        """Add the next frames, (n, H, W)."""
+        self.push_samples(self.of_frames(frames))
+
+    def of_frames(self, frames: NDArray[Any]) -> NDArray[Any]:
+        """Return a copy of the samples of frames, (n, H, W), at the pixels of the grid."""
+        return frames[self._grid].copy()
+
+    def push_samples(self, values: NDArray[Any]) -> None:
+        """Add the samples of the next frames, (n, rows, columns)."""
+        self._parts.append(values)
+        self.count += len(values)
+        # The grid depends on the number of frames only, which live runs do not know in advance.
+        while (
+            self.count * len(self.rows) * len(self.columns) > _MOST and len(self.rows) + len(self.columns) > 4
+        ):
+            down, across = (2, 1) if len(self.rows) >= len(self.columns) else (1, 2)
+            self._parts = [part[:, ::down, ::across].copy() for part in self._parts]
+            self.rows, self.columns = self.rows[::down], self.columns[::across]
+            cuts = (
+                slice(int(one[0]), None, int(one[1] - one[0]) if len(one) > 1 else None)
+                for one in (self.rows, self.columns)
+            )
+            self._grid = (slice(None), *cuts)
+
+    def of_map(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return a map, (H, W), at the pixels of the grid."""
+        return values[self._grid[1:]]
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """Samples, (T, rows, columns), in the type of the frames."""
+        if len(self._parts) > 1:
+            self._parts = [np.concatenate(self._parts)]
+        return self._parts[0]
+
+
+def named_frames(numbers: Sequence[int] | NDArray[np.intp]) -> str:
+    """Return the names of some frames for a message."""
+    shown = ", ".join(str(number) for number in numbers[:3]) + (", ..." if len(numbers) > 3 else "")
+    return f"frame {shown}" if len(numbers) == 1 else f"frames {shown}"
+
+
+class Traces:
+    """The brightness of each pixel of the grid over the frames, with facts and findings."""
+
+    def __init__(self, samples: NDArray[Any], motion: Motion, series: Mapping[str, Floats]) -> None:
+        self._grid = samples.shape
+        self._stored = samples.reshape(len(samples), math.prod(samples.shape[1:]))
+        self._integer = samples.dtype.kind == "u"
+        self._counts = self._stored.astype(np.float32)
+        if not (finite := np.isfinite(self._counts).all(axis=0)).all():
+            self._counts = self._counts.compress(finite, axis=1)
+        self._motion, self._series = motion, series
+        self._known = self._counts.shape[1] >= _FEWEST and len(self._counts) > 2
+        if self._known:
+            self._lowest, self._highest = self._counts.min(axis=0), self._counts.max(axis=0)
+            self._range = self._highest - self._lowest
+            self.span = float(self._highest.max() - self._lowest.min())
+            self._fit = self._harmonics()
+            self.noise = self._noise()
+            self._response = max(_CLEAR * self.noise, 0.02 * self.span)  # minimum change of a response
+            self._responding = self._range > self._response
+            self._share = float(self._responding.mean())
+
+    def facts(self) -> dict[str, str]:
+        """Return numbers to print."""
+        if not self._known:
+            return {}
+        low, high = float(self._lowest.min()), float(self._highest.max())
+        facts = {"brightness": f"{low:.4g} to {high:.4g} counts{self._depth(high)}"}
+        facts["noise"] = f"about {self.noise:.2g} counts"
+        facts["cut off"] = f"{_percent(self._clipped)} of the pixels reach the end of the scale"
+        facts["respond"] = f"{_percent(self._share)} of the pixels"
+        if (flicker := self._flicker) is not None:
+            facts["flicker"] = f"{_percent(flicker[0])} of the light"
+        if (drift := self._drift) is not None:
+            facts["drift"] = f"{drift[0]:.2g} counts of the dark level"
+        return facts
+
+    def findings(self, shape: tuple[int, int, int], moved: bool, phased: bool) -> Iterator[Finding]:
+        """Yield all findings."""
+        if not self._known:
+            return
+        repeated = list(self._repeated())
+        yield from repeated
+        if phased:
+            yield from self._phases(bool(repeated))
+        if not moved:
+            return
+        if self._share == 0:
+            yield Finding(
+                "no response", "the brightness changes at no pixel: was there light, and did the body move?"
+            )
+            return
+        yield from self._axes(shape)
+        if self._share > _FEW:
+            yield from self._press() if self._motion == "vertical" else self._turn()
+        if (clipped := self._clipped) > _CLIPPED:
+            yield Finding(
+                "cut off",
+                f"{_percent(clipped)} of the pixels reach the end of the scale: shorten the exposure",
+            )
+        if (flicker := self._flicker) is not None and flicker[0] > max(_FLICKER, 5 * flicker[1]):
+            yield Finding(
+                "flicker",
+                f"the light flickers by {_percent(flicker[0])} from frame to frame: use a steady lamp",
+            )
+        if (drift := self._drift) is not None and drift[0] > max(_DRIFT * self._scale(), 10 * drift[1]):
+            yield Finding(
+                "drift",
+                f"the dark level drifts by {drift[0]:.2g} counts: let the camera warm up, and keep stray"
+                " light away",
+            )
+
+    def _scale(self) -> float:
+        """Return counts per count of 8 bits."""
+        return self.span / 255 if not self._integer or self.span > 255 else 1.0
+
+    def _depth(self, high: float) -> str:
+        """Return which bits of integers are in use."""
+        if not self._integer:
+            return ""
+        used = int(np.bitwise_or.reduce(self._stored, axis=None))
+        if not used:
+            return ""
+        idle = (used & -used).bit_length() - 1
+        lower = f", the lowest {idle} of them 0" if idle else ""
+        return f" ({int(high).bit_length()} bits in use{lower})"
+
+    def _end(self) -> float:
+        """Return the end of the scale, for the smallest common number of bits that represents all counts."""
+        if not self._integer:
+            return math.inf
+        bits = next(bits for bits in (8, 10, 12, 14, 16) if self._highest.max() < 2**bits)
+        return float(2**bits - 1)
+
+    @functools.cached_property
+    def _clipped(self) -> float:
+        return float(np.mean(self._highest >= self._end()))
+
+    def _harmonics(self) -> Floats | None:
+        """Return the brightness as fitted by harmonics of the phase, (T, n); None without a fit."""
+        phase = self._series.get("phase")
+        if self._motion != "axial" or phase is None:
+            return None
+        order = min(_HARMONICS, (len(phase) - 2) // 2)
+        if order < 1:
+            return None
+        angles = phase[:, np.newaxis] * np.arange(1, order + 1)
+        columns = np.column_stack([np.ones(len(phase)), np.cos(angles), np.sin(angles)])
+        basis = np.linalg.qr(columns)[0].astype(np.float32)
+        return np.asarray(basis @ (basis.T @ self._counts))
+
+    def _noise(self) -> float:
+        """Return an estimate of the standard deviation of a sample, from the smallest changes."""
+        steps = np.diff(self._counts, axis=0)
+        found = [_MAD * float(np.median(_medians(np.abs(steps)))) / math.sqrt(2)]
+        if self._fit is not None:
+            left = np.abs(self._counts - self._fit)
+            found.append(_MAD * float(np.median(left)))
+            if len(steps) > 1:
+                found.append(_MAD * float(np.median(np.abs(np.diff(steps, axis=0)))) / math.sqrt(6))
+        return max(min(found), _QUANTUM if self._integer else 0.0)
+
+    def _repeated(self) -> Iterator[Finding]:
+        """Yield a finding for frames identical to the preceding one, if other frames differ everywhere."""
+        counts = self._counts
+        inside = (counts[1:] > 0) & (counts[1:] < self._end())  # where noise is not clipped
+        differ = np.count_nonzero((counts[1:] != counts[:-1]) & inside, axis=1)
+        again = np.flatnonzero((differ == 0) & (inside.sum(axis=1) >= _FEWEST)) + 1
+        if len(again) and np.median(differ) > _NOISY * counts.shape[1]:
+            yield Finding(
+                "repeated frames",
+                f"{named_frames(again)}: identical to the one before, so later positions may be wrong:"
+                " remove it, or give the position of each frame",
+            )
+
+    def _phases(self, repeated: bool) -> Iterator[Finding]:
+        """Yield findings of a jump of the phase, and of a drift of the brightness of all pixels."""
+        phase = self._series.get("phase")
+        if self._motion != "axial" or phase is None:
+            return
+        check = PhaseCheck(self._counts, phase)
+        if not repeated and (jump := check.jump()) is not None:
+            frame, steps, step = jump
+            cause = "there twice" if steps < 0 else "missing"
+            frames = "a frame" if abs(steps) == 1 else f"{steps} frames"
+            yield Finding(
+                "phase jump",
+                f"from frame {frame} on, the brightness fits phases {abs(math.degrees(steps * step)):.3g}"
+                f" degrees {'further' if steps > 0 else 'back'}, as if {frames} before it"
+                f" {'was' if abs(steps) == 1 else 'were'} {cause}: give the phase of each frame",
+            )
+        drift = check.drift()
+        if drift is not None and abs(drift[0]) > max(_DRIFT * self._scale(), 10 * drift[1]):
+            yield Finding(
+                "drift",
+                f"the brightness of all pixels drifts by {drift[0]:.2g} counts: let camera and lamp warm up,"
+                " and keep stray light away",
+            )
+
+    def _axes(self, shape: tuple[int, int, int]) -> Iterator[Finding]:
+        """Yield a finding if the last axis seems to be the frames: short, with changing brightness."""
+        thin = min(shape[1:])
+        if _THIN * thin > min(shape[0], max(shape[1:])):
+            return
+        samples = self._pictures
+        over_time = samples.mean(axis=(1, 2))
+        along = samples.mean(axis=(0, 1 if shape[2] == thin else 2))
+        if np.nanvar(along) > 4 * np.nanvar(over_time):
+            yield Finding(
+                "axes",
+                f"{shape[0]} frames of {shape[2]} x {shape[1]} pixels, whose light changes along their"
+                f" {thin} pixels rather than over time: is the order of the axes (T, H, W)?",
+            )
+
+    def _press(self) -> Iterator[Finding]:
+        if not self._goes_down():
+            return
+        if (outliers := self._outliers()) > _OUTLIERS:
+            yield Finding(
+                "outliers",
+                f"{_percent(outliers)} of the samples differ from both the one before and the one after, so"
+                " heights near them are wrong: look for defective pixels, or for errors of the transmission",
+            )
+        travel = self._series["travel"]
+        rises, falls = self._changes(self._of_responding, np.sign(travel[-1] - travel[0]))
+        if falls > _MOST_OF * (rises + falls) and falls > 0.2:
+            yield Finding(
+                "reversed",
+                f"brightness falls with travel at {_percent(falls)} of the pixels that respond: are the"
+                " frames reversed, or is it a release (--event release)?",
+            )
+        elif rises + falls < 1 - _MOST_OF and (axis := self._rising_axis()):
+            yield Finding(
+                "axes",
+                f"brightness rises along the {axis} of the pictures rather than over time: is the order of"
+                " the axes (T, H, W)?",
+            )
+        elif rises + falls < 1 - _MOST_OF:
+            yield Finding(
+                "not a press",
+                f"brightness returns to where it began at {_percent(1 - rises - falls)} of the pixels that"
+                " respond, although the travel does not: is this a rotation?",
+            )
+
+    def _outliers(self) -> float:
+        """Return the share of samples of a press that differ from those before and after."""
+        steps = np.diff(self._counts, axis=0)
+        limit = max(_CLEAR * self.noise, _OUTLYING * self.span)
+        apart = (np.minimum(steps[:-1], -steps[1:]) > limit) | (np.maximum(steps[:-1], -steps[1:]) < -limit)
+        of_frame = apart.mean(axis=1)
+        return float(np.mean(np.where(of_frame < _FLASH, of_frame, 0)))
+
+    @functools.cached_property
+    def _of_responding(self) -> Samples:
+        """The brightness of responding pixels, (T, n)."""
+        return self._counts.compress(self._responding, axis=1)  # in C order, unlike selection by a mask
+
+    @property
+    def _pictures(self) -> Samples:
+        """The brightness of all pixels of the grid, (T, rows, columns)."""
+        return self._stored.reshape(self._grid).astype(np.float32)
+
+    @staticmethod
+    def _changes(counts: Samples, direction: float = 1.0) -> tuple[float, float]:
+        """Return the shares of series, (T, n), that end far above and far below their start."""
+        few = max(1, len(counts) // 10)
+        change = counts[-few:].mean(axis=0) - counts[:few].mean(axis=0)
+        change *= direction / np.ptp(counts, axis=0)
+        return float(np.mean(change > 0.5)), float(np.mean(change < -0.5))
+
+    def _rising_axis(self) -> str:
+        """Return the axis of the pictures along which brightness changes as in a press; "" if none."""
+        samples = self._pictures
+        for axis, name in ((2, "rows"), (1, "columns")):
+            series = np.moveaxis(samples, axis, 0).reshape(samples.shape[axis], -1)
+            series = series[:, np.ptp(series, axis=0) > self._response]
+            if series.shape[1] >= _FEWEST and max(self._changes(series)) > _MOST_OF:
+                return name
+        return ""
+
+    def _turn(self) -> Iterator[Finding]:
+        phase = self._series.get("phase")
+        if self._motion != "axial" or phase is None or len(phase) < 5:
+            return
+        turned = np.abs(phase - phase[0])
+        last = int(np.argmin(np.abs(turned - 2 * math.pi)))
+        step = float(np.median(np.abs(np.diff(phase))))
+        if step > math.pi / 2 or abs(turned[last] - 2 * math.pi) > 1.5 * step:  # a body may also rock
+            return
+        counts, extent = self._of_responding, self._range[self._responding]
+        jump = float(np.median(np.abs(counts[last] - counts[0]) / extent))
+        if jump > 0.5:
+            yield Finding(
+                "not a rotation",
+                f"brightness does not return after a whole turn: half of the pixels that respond end"
+                f" {_percent(jump)} of their range away: is this a press?",
+            )
+
+    def _common(self, counts: Samples, used: NDArray[np.bool_]) -> tuple[Floats, Floats, float] | None:
+        """Return the common deviation of used pixels in each frame, its error, and their level."""
+        counted = np.count_nonzero(used, axis=1)
+        enough = counted >= _FEWEST // 2
+        if np.count_nonzero(enough) < 5:
+            return None
+        counts, used, counted = counts[enough], used[enough], counted[enough]
+        lit = np.where(used, counts, 0)
+        levels = np.sum(lit, axis=0) / np.maximum(np.count_nonzero(used, axis=0), 1)
+        offset = _medians(np.where(used, counts - levels, np.inf), counted)
+        errors = _OF_MEDIAN * self.noise / np.sqrt(counted)
+        return offset, errors, float(np.sum(levels * used) / np.sum(counted))
+
+    @functools.cached_property
+    def _flicker(self) -> tuple[float, float] | None:
+        """Return the standard deviations of the common light, and of its noise, as shares."""
+        if self._fit is not None and len(self._counts) >= 2 * (2 * _HARMONICS + 1):
+            left = self._counts - self._fit
+            if float(np.mean(left**2)) > 0.02 * float(np.var(self._counts)):
+                return None  # harmonics do not describe the brightness
+            wave = swing_of(self._of_responding, self._series["phase"])
+            if wave.size and abs(np.mean(wave / np.abs(wave))) > _AS_ONE:
+                return None  # on a flat object, light that is not a cosine would look the same
+            gain = np.median(left / np.maximum(self._fit, 1e-3 * self._highest.max()), axis=1)
+            error = 1.25 * self.noise / math.sqrt(self._fit.shape[1]) / float(np.mean(self._fit))
+            return float(np.std(gain)), error
+        if not self._goes_down() or self._share < _FEW:
+            return None
+        counts = self._of_responding
+        lit = counts - self._lowest[self._responding] > 0.8 * self._range[self._responding]
+        lit[2:] &= lit[:-2]  # for two frames
+        lit[:2] = False
+        lit &= np.count_nonzero(lit, axis=0) >= 5
+        found = self._common(counts, lit)
+        if found is None or found[2] <= 0:
+            return None
+        offset, errors, level = found
+        return float(np.std(np.diff(offset)) / math.sqrt(2) / level), float(np.mean(errors) / level)
+
+    @functools.cached_property
+    def _drift(self) -> tuple[float, float] | None:
+        """Return the range of the dark level over the parts of a press, and its error, counts.
+
+        Each part is compared with the first, in the pixels that are still dark in the part after it: a pixel
+        that is about to turn light, perhaps after the last frame, becomes brighter without a drift. So does
+        a dark pixel next to light ones, because lenses blur. It is brighter than others then, whereas a drift
+        is common to many pixels: the differences between them that noise does not explain are small.
+        """
+        if not self._goes_down() or len(self._counts) < 5:
+            return None
+        travel = self._series["travel"]
+        counts = self._counts if travel[-1] > travel[0] else self._counts[::-1]
+        parts = np.array_split(counts, min(_PARTS, len(counts)))
+        means = np.stack([part.mean(axis=0) for part in parts])
+        change = np.maximum.accumulate([np.abs(part - means[0]).max(axis=0) for part in parts])
+        dark = (change < self._response) & (means[0] < self._lowest.min() + _DARK * self.span)
+        start = counts[: len(parts[0]) + len(parts[1])].compress(dark[2], axis=1)
+        if start.shape[1] < _FEWEST:
+            return None
+        noise = _MAD / math.sqrt(2) * float(np.median(np.abs(np.diff(start, axis=0))))
+        noise = max(noise, _QUANTUM if self._integer else 0.0)
+        levels, error = [0.0], 0.0
+        for part, mean, used in zip(parts[1:-1], means[1:-1], dark[2:], strict=True):
+            pixels = np.count_nonzero(used)
+            if pixels < max(_FEWEST, _DARK_PIXELS * used.size):
+                break
+            rise = (mean - means[0])[used]
+            common = float(np.median(rise))
+            spread = _MAD * float(np.median(np.abs(rise - common)))
+            by_noise = noise * math.sqrt(1 / len(parts[0]) + 1 / len(part))
+            levels.append(common if common**2 > _COMMON**2 * (spread**2 - by_noise**2) else 0.0)
+            error = max(error, _OF_MEDIAN * by_noise / math.sqrt(pixels))
+        return (max(levels) - min(levels), error) if len(levels) > 1 else None
+
+    def _goes_down(self) -> bool:
+        """Return whether the travel of a press only rises, or only falls."""
+        travel = self._series.get("travel")
+        if self._motion != "vertical" or travel is None:
+            return False
+        way = float(travel[-1] - travel[0])
+        return way != 0 and bool(np.all(np.diff(travel) * way >= 0))
+
+
+def _medians(values: NDArray[Any], count: NDArray[np.intp] | None = None) -> NDArray[Any]:
+    """Return the median of each row, (T, n), or of its ``count`` smallest values."""
+    if count is None:
+        count = np.full(len(values), values.shape[1])
+    ordered, row = np.sort(values, axis=1), np.arange(len(values))
+    return np.asarray((ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
