@@ -36,7 +36,7 @@ FILLED_IN = re.compile(
 )
 COMMAND = app
 NAMING = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
-FOLDERS = "bench", "cli", "docs", "engine", "examples", "hw", "io", "kernels", "tests", "view"
+FOLDERS = "bench", "cli", "docs", "engine", "examples", "hw", "io", "kernels", "tests", "twin", "view"
 SOURCES = [
     "/setup.py",
     *(f"/{path.relative_to(ROOT)}" for name in FOLDERS for path in (ROOT / name).rglob("*.*")),
@@ -63,7 +63,7 @@ def test_a_command_of_the_documentation_is_understood(page, words, monkeypatch, 
 
 
 def test_messages_that_troubleshooting_tells_of_are_those_of_the_program():
-    folders = ("cli", "engine", "hw", "io", "kernels", "view")
+    folders = ("cli", "engine", "hw", "io", "kernels", "twin", "view")
     files = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
     source = "".join(file.read_text(encoding="utf-8") for file in files)
     joined = re.sub(r"""["']\s*\n\s*f?["']""", "", source)
@@ -140,7 +140,7 @@ def test_source_files_that_a_page_names_exist(page):
 
 @pytest.mark.parametrize("page", NAMING, ids=lambda page: page.name)
 def test_python_names_of_a_page_exist(page):
-    pattern = r"((?:mirrorskin\.)?(?:engine|hw|io|kernels|view)\.[\w.]+)(?:\(.*\))?"
+    pattern = r"((?:mirrorskin\.)?(?:engine|hw|io|kernels|twin|view)\.[\w.]+)(?:\(.*\))?"
     for name in (match[1] for text in named_in(page) if (match := re.fullmatch(pattern, text))):
         pkgutil.resolve_name("mirrorskin." + name.removeprefix("mirrorskin."))
 
@@ -160,7 +160,7 @@ def test_phrases_that_contributing_asks_to_avoid_are_not_used():
     ]
     phrase, files, without = (re.compile(hooks[0][key]) for key in ("entry", "files", "exclude"))
     phrase = re.compile(phrase.pattern, re.IGNORECASE)
-    folders = ("cli", "docs", "engine", "hw", "io", "kernels", "view")
+    folders = ("cli", "docs", "engine", "hw", "io", "kernels", "twin", "view")
     paths = [ROOT / "README.md", *(path for name in folders for path in (ROOT / name).rglob("*.*"))]
     names = [path.relative_to(ROOT).as_posix() for path in paths]
     checked = [name for name in names if files.search(name) and not without.search(name)]

@@ -14,7 +14,7 @@ from commands import done
 from mirrorskin import engine, io
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = "kernels", "io", "engine", "hw", "view"
+FOLDERS = "kernels", "io", "engine", "hw", "twin", "view"
 FILES = [
     file for name in FOLDERS for file in sorted((ROOT / name).rglob("*.py")) if ">>> " in file.read_text()
 ]

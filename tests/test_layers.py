@@ -39,6 +39,6 @@ def test_the_package_has_its_parts_and_its_version():
 
     assert mirrorskin.__version__ == importlib.metadata.version("mirrorskin")
     assert callable(mirrorskin.engine.reconstruct)
-    assert {"engine", "hw", "io", "view"} <= set(dir(mirrorskin))
+    assert {"engine", "hw", "io", "twin", "view"} <= set(dir(mirrorskin))
     with pytest.raises(AttributeError, match="nothing"):
         _ = mirrorskin.nothing

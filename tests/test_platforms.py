@@ -33,7 +33,7 @@ _DEVICE = "from mirrorskin.kernels.device import open_device; open_device()\n"  
 _EXTRAS = "import distributed, matplotlib.pyplot, panel\n"
 _IMPORT = """
 import importlib, pkgutil
-for name in ("io", "kernels", "engine", "hw", "view", "cli"):
+for name in ("io", "kernels", "engine", "hw", "twin", "view", "cli"):
     package = importlib.import_module(f"mirrorskin.{name}")
     for module in pkgutil.walk_packages(package.__path__, f"mirrorskin.{name}."):
         importlib.import_module(module.name)

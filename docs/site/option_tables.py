@@ -25,7 +25,7 @@ OPTIONS = "options.md"
 OPERATIONS = "operations.md"
 MARK = "<!-- The rest is generated: python docs/site/option_tables.py -->\n"
 
-_PACKAGES = ("", ".press", ".rotation", ".slip", ".focus", ".fringes", ".photometric")
+_PACKAGES = ("", ".press", ".rotation", ".correlation", ".vibration", ".slip", ".optical")
 _COMMON = ("device", "memory_limit")  # described once, above the tables
 _FUNCTIONS = {"MovingNormals": "estimate_normals"}  # which chooses between two operations
 _KINDS = {"flag": "`True` or `False`", "file": "path, result or array", "object": "object"}

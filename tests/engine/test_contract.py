@@ -56,7 +56,7 @@ def test_maps_are_as_declared_and_each_has_its_standard_deviation_by_name(name):
     case, found = CASES[name], whole(name)
     for one, values in found.items():
         declared = found.declaration(one)
-        assert declared is not io.maps.UNDECLARED, one
+        assert declared is not io.model.maps.UNDECLARED, one
         assert np.asarray(values).dtype == declared.dtype, one
         if declared.axes == "pixels":
             shape = case.frames.shape[1:] + (len(declared.components),) * bool(declared.components)

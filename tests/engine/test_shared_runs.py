@@ -228,7 +228,7 @@ class Reused(engine.Method):
     operation = Total(memory_limit=SMALL)
 
     def plan(self, source):
-        return engine.method.Plan(self.operation)
+        return engine.base.method.Plan(self.operation)
 
 
 def turn():

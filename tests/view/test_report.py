@@ -191,7 +191,7 @@ def test_a_page_contains_numbers_parameters_and_their_origin(page):
 
 
 def test_every_built_in_map_has_a_caption():
-    assert [name for name, declared in io.maps.TABLE.items() if not declared.caption] == []
+    assert [name for name, declared in io.model.maps.TABLE.items() if not declared.caption] == []
 
 
 def decoded(data):
