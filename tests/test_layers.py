@@ -5,9 +5,11 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 import pytest
+from import_graph import FILES, folder_of, imports, knots
 
 ROOT = Path(__file__).parent.parent
 
@@ -25,6 +27,65 @@ def test_every_folder_is_under_the_rule():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
     assert packages == {name.removeprefix("mirrorskin.") for layer in layers for name in layer.split(" | ")}
+
+
+def test_no_modules_import_each_other():
+    assert knots(imports()) == []
+
+
+def test_no_packages_import_each_other():
+    pairs = {(folder_of(module), folder_of(other)) for module, other in imports()}
+    assert knots((one, other) for one, other in pairs if one != other) == []
+
+
+@pytest.mark.parametrize(
+    ("pairs", "groups"),
+    [
+        ({("a", "b"), ("b", "c")}, []),
+        ({("a", "b"), ("b", "c"), ("c", "a"), ("d", "a")}, [{"a", "b", "c"}]),
+        ({("a", "b"), ("b", "a"), ("c", "d"), ("d", "c")}, [{"a", "b"}, {"c", "d"}]),
+    ],
+    ids=["none", "three", "two pairs"],
+)
+def test_knots_are_found(pairs, groups):
+    assert sorted(knots(pairs), key=min) == groups
+
+
+@pytest.mark.parametrize(
+    "pair",
+    [
+        ("mirrorskin.engine.base.reconstruction", "mirrorskin.io.storage.calibration_file"),
+        ("mirrorskin.io.files.result_file", "mirrorskin.io.files.zarr_export"),  # in a function
+        ("mirrorskin.engine.press.press", "mirrorskin.engine.base.method"),
+    ],
+    ids=["by a public name", "in a function", "at the top"],
+)
+def test_imports_are_found(pair):
+    assert pair in imports()
+
+
+def test_no_folder_has_more_than_20_modules():
+    modules = [folder_of(module) for module, file in FILES.items() if file.stem != "__init__"]
+    counts = Counter(folder for folder in modules if folder != "cli/commands")  # a module for each command
+    assert {folder: count for folder, count in counts.items() if count > 20} == {}
+
+
+SMALL = {
+    "engine/base/errors.py": "other packages import it alone",
+    "hw/base/errors.py": "other packages import it alone",
+    "kernels/array_types.py": "all references import it alone",
+    "kernels/bitcode.py": "the one place that knows how PoCL keeps programs",
+    "kernels/errors.py": "other packages import it alone",
+    "kernels/layout.py": "tests choose a layout without the device",
+    "kernels/rotation/facing.py": "it belongs to facing.cl",
+}
+"""Why a module has less than 40 lines; a command may."""
+
+
+def test_small_modules_have_a_reason():
+    files = [file for file in FILES.values() if file.stem != "__init__" and file.parent.name != "commands"]
+    lines = {file.relative_to(ROOT).as_posix(): len(file.read_text().splitlines()) for file in files}
+    assert {name for name, count in lines.items() if count < 40} == SMALL.keys()
 
 
 def test_the_package_imports_no_development_tool():

@@ -109,7 +109,17 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
 @cache
 def _functions() -> dict[str, Callable[..., Any]]:
     """Return the public functions of the engine, and of its sub-packages for single computations."""
-    packages = "correlation", "force", "integration", "optical", "pose", "press", "rotation", "slip", "vibration"
+    packages = (
+        "correlation",
+        "force",
+        "integration",
+        "optical",
+        "pose",
+        "press",
+        "rotation",
+        "slip",
+        "vibration",
+    )
     found = {}
     for package in [engine, *(getattr(engine, name) for name in packages)]:
         names = getattr(package, "__all__", None) or [name for name in vars(package) if name[0] != "_"]
