@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 from mirrorskin.cli.declared import Term, Terms, term
 from mirrorskin.cli.groups import MOTIONS
+from mirrorskin.io.formats.registry import sources
 
 if TYPE_CHECKING:
     from mirrorskin.io import Motion, Region
@@ -71,10 +72,7 @@ STACK = Terms(
 RECORDING = STACK.without("tilt")
 CHOICE = STACK.only("dataset", "channel")
 IMPORTED = STACK.without("motion", "region", "frames")
-FORMATS = (
-    "HDF5, Zarr, NPY, NPZ, TIFF, MCAP, a video (AVI, MP4, MOV, MKV), or a folder of numbered pictures"
-    " (PNG, TIFF, BMP, PGM, JPEG)"
-)
+FORMATS = sources()
 """Source of the frames."""
 
 

@@ -21,8 +21,10 @@ from .files.recording import Recording
 from .files.result_file import open_result, save_result
 from .files.streaming import StreamRecorder
 from .files.zarr_export import save_zarr
-from .formats.export import export_result, save_table
+from .formats.export import export_result
 from .formats.mcap import save_messages
+from .formats.registry import Format
+from .formats.tables import save_table
 from .model.calibrated import Calibrated
 from .model.calibration import (
     Calibration,
@@ -35,6 +37,7 @@ from .model.calibration import (
     WallResponse,
 )
 from .model.fitted import Fitted
+from .model.frames import FrameReader
 from .model.maps import Map
 from .model.mesh import Mesh, surface_mesh
 from .model.positions import Steps
@@ -52,6 +55,8 @@ __all__ = [
     "Check",
     "Finding",
     "Fitted",
+    "Format",
+    "FrameReader",
     "Gel",
     "Header",
     "InputError",

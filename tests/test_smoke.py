@@ -12,12 +12,12 @@ import pytest
 from commands import run
 
 from mirrorskin import io
-from mirrorskin.io.formats.export_formats import FORMATS
+from mirrorskin.io.formats.registry import export_suffixes
 
 pytestmark = pytest.mark.slow
 
 SMALL = "--size", "96x80", "--pixel-size", "0.12mm"
-EXPORTS = tuple(suffix.removeprefix(".") for suffix in FORMATS)
+EXPORTS = tuple(suffix.removeprefix(".") for suffix in export_suffixes())
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import click
 from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.stack import STACK
-from mirrorskin.io.formats.export_formats import contents, suffixes_with
+from mirrorskin.io.formats.registry import contents
 
 _APEX = "apex"
 
@@ -59,20 +59,21 @@ def command(
     from mirrorskin.engine.metrology import section_columns
     from mirrorskin.io.files.opening import is_recording
     from mirrorskin.io.formats.export import check_export
-    from mirrorskin.io.formats.foreign import MCAP_SUFFIX
+    from mirrorskin.io.formats.registry import export_format, export_suffixes
 
     suffixes = {path.suffix.lower() for path in output}
     chosen = {"map_name": map_name, "section": section, "points": points, "float32": float32}
     for option, given in chosen.items():
-        taken, name = suffixes_with(option), option.removesuffix("_name")
+        taken, name = export_suffixes(option), option.removesuffix("_name")
         if given and not suffixes & {*taken}:
             raise io.InputError(f"--{name} is for a {taken[0]} file: name one with -o, or leave --{name} out")
     ends = None if section in (None, _APEX) else segment(section, "--section")
     stores, output = _part(output, result, turn, map_name)
-    if all(path.suffix.lower() == MCAP_SUFFIX for path in output) and is_recording(result):
+    forms = {path: form for path in output if (form := export_format(path.suffix.lower()))}
+    if all(path in forms and forms[path].of_recordings for path in output) and is_recording(result):
         with io.open_recording(result, **stack) as recording:
-            for path in output:
-                click.echo(printable(f"{path}: {io.save_messages(recording, path)}"))
+            for path, form in forms.items():
+                click.echo(printable(f"{path}: {form.load(form.encoder)(recording, path)}"))
     elif output:
         found = io.select_turn(io.open_result(result), turn)
         for path in output:

@@ -79,12 +79,12 @@ def command(
 def _open(path: Path, place: Motion, known: StackOptions, limit: int) -> Recording:
     """Open a recording; the command line determines the motion of a file in another layout."""
     from mirrorskin import io
-    from mirrorskin.io.formats.foreign import kind_of_frames
+    from mirrorskin.io.formats.registry import is_of_others
     from mirrorskin.io.storage.layout import MARK
     from mirrorskin.io.storage.zarr import open_file
 
     ours = False
-    if not kind_of_frames(path):
+    if not is_of_others(path):
         with open_file(path) as file:
             ours = file.marked(MARK)
     mine: Any = {**known, "dataset": None, "channel": None} if ours else {**known, "motion": place}

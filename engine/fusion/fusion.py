@@ -40,7 +40,7 @@ from mirrorskin.io.base.findings import Finding, carried, in_process, warn
 from mirrorskin.io.base.types import ProcessValue, exclusive_use
 from mirrorskin.io.base.url import path_of
 from mirrorskin.io.files.opening import is_result
-from mirrorskin.io.formats.foreign import kind_of_frames
+from mirrorskin.io.formats.registry import is_of_others
 from mirrorskin.io.model.fitted import taken_from
 from mirrorskin.io.model.result import absolute_heights
 from mirrorskin.kernels.device import Choice, open_devices
@@ -215,7 +215,7 @@ def _opened(name: str, value: Any, memory_limit: int, opening: ExitStack) -> Any
     """Return a source, or maps; a file is opened as what it is."""
     if isinstance(value, str | os.PathLike):
         path = path_of(os.fspath(value))
-        if not kind_of_frames(path) and is_result(path):
+        if not is_of_others(path) and is_result(path):
             return open_result(path)
         return opening.enter_context(open_recording(path, memory_limit=memory_limit))
     if getattr(value, "ndim", None) == 3 and (name == "heights" or value.shape[-1] != 3):

@@ -29,7 +29,7 @@ from mirrorskin.io.base.system import (
 )
 from mirrorskin.io.base.types import FRAME_DTYPES, MOTIONS, Block, Header, InputError, Motion, block_memory
 from mirrorskin.io.files.recording import Recording, cut_out
-from mirrorskin.io.formats.foreign import kind_of_frames, open_reader
+from mirrorskin.io.formats.registry import Format, open_reader
 from mirrorskin.io.model.frames import FrameReader, WholeFrames
 from mirrorskin.io.model.positions import Positions, along, check_finite
 from mirrorskin.io.storage.fingerprint import State, check_unchanged, fingerprint_of_files, modified, state_of
@@ -377,6 +377,7 @@ def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, head: _Head)
 
 def open_stack(
     path: Path,
+    form: Format | None,
     dataset: str | None,
     channel: int | None,
     positions: Mapping[str, ArrayLike | Positions | None],
@@ -388,23 +389,23 @@ def open_stack(
     override_motion: bool = False,
     verify: bool = True,
 ) -> ArrayRecording:
-    """Open a stack that is neither HDF5 nor Zarr; see ``open_recording``.
+    """Open a stack of a format of another program, or without one of NumPy; see ``open_recording``.
 
     The file may contain ``travel``, ``phase``, ``displacement`` or ``twist`` of each frame, and properties
     such as ``dark`` and ``bright``. Arguments take precedence over them.
     """
     with ExitStack() as opening:
-        kind = kind_of_frames(path)
-        if kind == "array":
+        if form is None:
             with _naming(path):
                 check_regular(path)
                 files = {path: state_of(path.stat())}
                 frames, arrays = _open_array(path, dataset, memory_limit)
             held: dict[str, Any] = {**arrays}
         else:
-            if kind == "video":  # fail before decoding if there are no positions
+            if not form.has_positions:  # fail before decoding if there are none
                 _motion(str(path), positions, motion)
-            frames = opening.enter_context(open_reader(path, dataset, channel, memory_limit, verify))
+            options = {"dataset": dataset, "channel": channel, "memory_limit": memory_limit, "verify": verify}
+            frames = opening.enter_context(open_reader(path, form, **options))
             with as_input_error(str(path)):
                 files = {file: state_of(file.stat()) for file in frames.files}
             held = {**frames.positions, **frames.header}

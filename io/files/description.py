@@ -15,7 +15,7 @@ from mirrorskin.io.files.arrays import list_arrays
 from mirrorskin.io.files.opening import open_recording
 from mirrorskin.io.files.recording import Recording
 from mirrorskin.io.files.result_file import open_result
-from mirrorskin.io.formats.foreign import kind_of_frames, open_reader
+from mirrorskin.io.formats.registry import format_of_frames, holds_arrays, open_reader
 from mirrorskin.io.model.calibration import PARTS, Calibration
 from mirrorskin.io.model.frames import FrameReader
 from mirrorskin.io.model.result import Result
@@ -46,14 +46,14 @@ def describe(path: str | Path, *, dataset: str | None = None, channel: int | Non
     'vertical'
     """
     path = path_of(path)
-    kind = kind_of_frames(path)
-    if (dataset, channel) != (None, None) and kind in ("", "array"):
+    form = format_of_frames(path)
+    if (dataset, channel) != (None, None) and form is None:
         raise InputError(f"{path}: all stacks of such a file are listed: leave --dataset and --channel out")
-    if kind == "array":
+    if holds_arrays(path):
         return {"kind": "NumPy array", **list_arrays(path)}
-    if kind:
-        with open_reader(path, dataset, channel, verify=False) as frames:
-            return _frames(kind, frames)
+    if form is not None:
+        with open_reader(path, form, dataset=dataset, channel=channel, verify=False) as frames:
+            return _frames(form.name, frames)
     with open_file(path) as file:
         ours, result = file.marked(MARK), file.marked(RESULT_MARK)
         calibration = file.marked(CALIBRATION_MARK)
@@ -72,7 +72,7 @@ def describe(path: str | Path, *, dataset: str | None = None, channel: int | Non
 def _frames(kind: str, frames: FrameReader) -> dict[str, str]:
     """Describe the frames of a folder, TIFF, video or MCAP file."""
     count, rows, columns = frames.shape
-    facts = {"kind": "folder of pictures" if kind == "folder" else kind}
+    facts = {"kind": kind}
     facts |= {"frames": f"{count} of {columns} x {rows}, {frames.dtype.name}", "storage": frames.how}
     facts |= _range("time", frames.time, "s")
     for name, unit in (("travel", "mm"), ("phase", "rad"), ("twist", "rad")):

@@ -29,7 +29,7 @@ from mirrorskin.io.base.types import (
 )
 from mirrorskin.io.base.url import path_of
 from mirrorskin.io.files.recording import Recording, cut_out
-from mirrorskin.io.formats.foreign import kind_of_frames
+from mirrorskin.io.formats.registry import format_of_frames, holds_arrays
 from mirrorskin.io.model.coordinates import Coordinates, read_coordinates
 from mirrorskin.io.model.positions import Positions, along
 from mirrorskin.io.storage.hdf5 import Hdf5File
@@ -129,10 +129,10 @@ def open_recording(
     vertical (240, 480, 640)
     """
     path = path_of(path)
-    kind = kind_of_frames(path)
-    if channel is not None and kind in ("", "array"):
+    form = format_of_frames(path)
+    if channel is not None and form is None:
         raise InputError(f"{path}: only pictures, videos and MCAP files have channels: leave --channel out")
-    if kind:
+    if form is not None or holds_arrays(path):
         from mirrorskin.io.files.arrays import open_stack
 
         if live:
@@ -141,7 +141,7 @@ def open_recording(
         where = {"travel": travel, "phase": phase}
         part = region, frames
         return open_stack(
-            path, dataset, channel, where, known, motion, *part, memory_limit, override_motion, verify
+            path, form, dataset, channel, where, known, motion, *part, memory_limit, override_motion, verify
         )
     with ExitStack() as opening:
         file = opening.enter_context(open_file(path, memory_limit))

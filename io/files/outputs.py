@@ -7,12 +7,11 @@ from pathlib import Path
 from mirrorskin.io.base.system import as_input_error
 from mirrorskin.io.base.types import InputError
 from mirrorskin.io.base.url import ZARR_SUFFIX, is_zarr
-from mirrorskin.io.formats.export_formats import FORMATS
+from mirrorskin.io.formats.registry import export_format
 from mirrorskin.io.storage.atomic import check_output
 from mirrorskin.io.storage.existing import Replaces
 
 _OTHER_FORMATS = {  # suffixes that a result cannot have, with the command that makes one from it
-    **{suffix.removeprefix("."): "export" for suffix in FORMATS if suffix != ZARR_SUFFIX},
     **dict.fromkeys(("pdf", "svg"), "view"),
     "html": "report",
     **dict.fromkeys(("jpg", "jpeg", "npy", "avi", "mp4", "json", "toml"), ""),
@@ -58,7 +57,7 @@ def replaced_by_result(overwrite: bool) -> Replaces:
 def _check_format(path: Path) -> None:
     """Raise InputError if the suffix of a result belongs to another format."""
     suffix = path.suffix.lower().removeprefix(".")
-    if suffix in _OTHER_FORMATS:
-        command = _OTHER_FORMATS[suffix]
+    if suffix in _OTHER_FORMATS or export_format(path.suffix.lower()) is not None:
+        command = _OTHER_FORMATS.get(suffix, "export")
         then = f", then 'mirrorskin {command}' makes .{suffix} of it" if command else ""
         raise InputError(f"{path}: a result is HDF5 (.h5) or Zarr (.zarr): write it so{then}")

@@ -15,6 +15,7 @@ from mirrorskin.io.base.arguments import check_flag, check_kind, check_path, che
 from mirrorskin.io.base.types import InputError, ProcessValue
 from mirrorskin.io.base.url import is_zarr, path_of
 from mirrorskin.io.files.outputs import replaced_by_result
+from mirrorskin.io.formats.registry import Format
 from mirrorskin.io.model.fitted import Fitted
 from mirrorskin.io.model.maps import (
     SIGMA,
@@ -46,6 +47,14 @@ from mirrorskin.io.storage.hdf5 import Hdf5File, Node, Shape, read_process
 from mirrorskin.io.storage.layout import RESULT_MARK
 from mirrorskin.io.storage.zarr import open_file
 
+ZARR = Format(
+    name="Zarr",
+    suffixes=(".zarr",),
+    content="everything in the file",
+    encoder="save_result",
+    needs_heights=False,
+    writes_itself=True,
+)
 _RESULT, _PROCESS, _FITTED, _OWN = "/entry/result", "/entry/process", "/entry/fitted", "own_maps"
 _DECLARATION = "declaration"  # attribute of a map that is not declared in the table
 _AGAIN = "reconstruct it again"

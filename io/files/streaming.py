@@ -14,7 +14,7 @@ from collections.abc import Collection, Mapping
 from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import h5py
 import numpy as np
@@ -31,8 +31,7 @@ from mirrorskin.io.files.recorder import (
     write_header,
     write_plot,
 )
-from mirrorskin.io.formats.foreign import MCAP_SUFFIX
-from mirrorskin.io.formats.mcap import GrowingMessages, load_writer
+from mirrorskin.io.formats.registry import export_format
 from mirrorskin.io.model.calibration import Calibration
 from mirrorskin.io.storage.atomic import (
     MAKE_ROOM,
@@ -57,6 +56,9 @@ from mirrorskin.io.storage.layout import (
     UNDER_WAY,
     USED,
 )
+
+if TYPE_CHECKING:
+    from mirrorskin.io.formats.mcap import GrowingMessages
 
 _POLL = 0.5  # seconds between checks whether the main program is still running
 _BACKLOG = 256_000_000  # bytes of frames that may wait to be written
@@ -157,11 +159,15 @@ class StreamRecorder(TeeSource[LiveSource]):
         self._older: _Identity | None = None  # identity of the file that has the name at the start
         self.count = self.written = 0
         self._period = period
-        self._messages = self.path.suffix.lower() == MCAP_SUFFIX
-        if self._messages:
-            load_writer()  # if it is missing, fail before hardware moves
+        form = export_format(self.path.suffix.lower())
+        self._messages: type[GrowingMessages] | None = None  # what writes files of another program
+        if form is not None and form.recorder:
+            self._messages = form.load(form.recorder)
+            self._messages.check_installed()
             if calibration is not None:
-                raise InputError(f"{path}: an MCAP file cannot contain a calibration; record to a file .h5")
+                raise InputError(
+                    f"{path}: an {form.name} file cannot contain a calibration; record to a file .h5"
+                )
         self._queue: queue.SimpleQueue[Block | _Mark | _Maps | _End] = queue.SimpleQueue()
         self._backlog, self._lock = 0, threading.Lock()
         self._error: BaseException | None = None
@@ -218,7 +224,7 @@ class StreamRecorder(TeeSource[LiveSource]):
 
     def add_maps(self, time: float, height: NDArray[np.float32] | None, contact_area: float | None) -> None:
         """Write maps computed from the frames up to a time, mm and mm^2; not supported for HDF5."""
-        if self._messages and self.count:
+        if self._messages is not None and self.count:
             maps = _Maps(time, height, contact_area)
             self._reserve(maps.size)
             self._queue.put(maps)
@@ -341,8 +347,8 @@ class StreamRecorder(TeeSource[LiveSource]):
         )
 
     def _open(self, descriptor: int, block: Block) -> GrowingRecording | GrowingMessages:
-        if self._messages:
-            return GrowingMessages(self.path, descriptor, self.header)
+        if self._messages is not None:
+            return self._messages(self.path, descriptor, self.header)
         known = self.header, self.shape, self.dtype, self._compression, self._calibration
         series = [name for name in SERIES if getattr(block, name) is not None]
         return GrowingRecording(self.path, descriptor, *known, series)

@@ -16,7 +16,17 @@ from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.opencv import to_grey
 from mirrorskin.io.base.types import InputError
 from mirrorskin.io.formats.pictures import PICTURE_SUFFIXES, decode_picture
+from mirrorskin.io.formats.registry import Format
 from mirrorskin.io.model.frames import WholeFrames, lost_frames
+
+PICTURES = Format(
+    name="folder of pictures",
+    suffixes=("/",),
+    source="a folder of numbered pictures (PNG, TIFF, BMP, PGM, JPEG)",
+    reader="FolderFrames",
+    takes=("channel",),
+)
+
 
 _WHOLE, _DECIMAL = "[0-9]+", r"[0-9]+\.[0-9]+"
 _Families = dict[tuple[str, int, str], list[tuple[int, Path]]]

@@ -23,6 +23,7 @@ from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, as_input_error, check_
 from mirrorskin.io.base.text import one_line
 from mirrorskin.io.base.types import MOTIONS, Block, Closing, Floats, Header, InputError
 from mirrorskin.io.formats.pictures import Picture, decode_bytes
+from mirrorskin.io.formats.registry import Format
 from mirrorskin.io.formats.surface import check_heights, points_of
 from mirrorskin.io.model.frames import CONVERTED_COLOUR, WholeFrames, lost_frames
 from mirrorskin.io.model.result import Result
@@ -34,6 +35,20 @@ if TYPE_CHECKING:
     from mcap_ros2.writer import Writer
 
     from mirrorskin.io.files.recording import Recording
+
+MCAP = Format(
+    name="MCAP",
+    suffixes=(".mcap",),
+    source="MCAP",
+    reader="MessageFrames",
+    takes=("dataset", "channel", "verify"),
+    content="ROS 2 messages",
+    encoder="save_messages",
+    writes_itself=True,
+    of_recordings=True,
+    recorder="GrowingMessages",
+)
+
 
 IMAGES = "/camera/image"
 _METRE = 1e-3  # m per mm
@@ -249,6 +264,11 @@ class GrowingMessages(Closing):
     m^2. An incomplete file has no index; the program ``mcap recover`` creates it.
     """
 
+    @staticmethod
+    def check_installed() -> None:
+        """Raise InputError if a package is missing, before hardware moves."""
+        load_writer()
+
     def __init__(self, path: Path, descriptor: int, header: Header) -> None:
         self.count: int = 0
         self._path = path
@@ -344,7 +364,7 @@ class MessageFrames(WholeFrames):
     Parameters
     ----------
     path : Path
-    topic : str, optional
+    dataset : str, optional
         Topic of the images, if the file has more than one.
     channel : int, optional
         Colour to read: 0 red, 1 green, 2 blue; by default luma.
@@ -355,12 +375,12 @@ class MessageFrames(WholeFrames):
     how = "message by message"
 
     def __init__(
-        self, path: Path, topic: str | None = None, channel: int | None = None, verify: bool = True
+        self, path: Path, dataset: str | None = None, channel: int | None = None, verify: bool = True
     ) -> None:
         self._path, self.files, self._channel, self._verify = path, (path,), channel, verify
         self._summary = self._read_summary()
         self._known: dict[str, _Stamps] = {}
-        self._topic = self._choose(topic)
+        self._topic = self._choose(dataset)
         stamps = self._stamps_of(self._topic)
         count = len(stamps.times)
         if not count:

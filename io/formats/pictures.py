@@ -7,21 +7,29 @@ import struct
 import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.opencv import check_picture, decode, encode, is_coloured, to_grey
-from mirrorskin.io.base.system import read_regular
+from mirrorskin.io.base.system import check_regular, read_regular
 from mirrorskin.io.base.types import FRAME_DTYPES, InputError
 from mirrorskin.io.formats.colour_table import ColourTable
-from mirrorskin.io.formats.tiff import TIFF_SUFFIXES, TiffFrames
+from mirrorskin.io.formats.registry import Format
+from mirrorskin.io.formats.tiff import TIFF, TiffFrames
 from mirrorskin.io.model.frames import CONVERTED_COLOUR, lossy
 from mirrorskin.io.storage.atomic import write_new
 
-PICTURE_SUFFIXES = (".png", ".bmp", ".pgm", ".jpg", ".jpeg", *TIFF_SUFFIXES)
+PICTURE = Format(
+    name="picture",
+    suffixes=(".png", ".bmp", ".pgm", ".jpg", ".jpeg"),
+    reader="refuse_picture",
+)
+
+
+PICTURE_SUFFIXES = (*PICTURE.suffixes, *TIFF.suffixes)
 
 _DTYPES = tuple(dtype.name for dtype in FRAME_DTYPES)
 _PNG_MARK = b"\x89PNG\r\n\x1a\n"
@@ -46,6 +54,12 @@ class Picture(NamedTuple):
     findings: tuple[Finding, ...] = ()
 
 
+def refuse_picture(path: Path) -> NoReturn:
+    """Raise InputError: one picture is no stack of frames."""
+    check_regular(path)
+    raise InputError(f"{path} is one picture, not a stack: name the folder that contains its frames")
+
+
 def read_picture(path: Path) -> NDArray[Any]:
     """Read the only picture in a file as grey, (H, W), uint8, uint16 or float32; see ``to_grey``."""
     return to_grey(decode_picture(path).samples, str(path))
@@ -57,7 +71,7 @@ def decode_picture(path: Path, dtypes: Sequence[str] = _DTYPES) -> Picture:
     Indices of a colour table become samples as in `TiffFrames`. Samples of fewer than 8 bits are scaled to 0
     to 255; others are returned unchanged, whatever the number of bits in use.
     """
-    if path.suffix.lower() not in TIFF_SUFFIXES:
+    if path.suffix.lower() not in TIFF.suffixes:
         return decode_bytes(read_regular(path), str(path))
     with TiffFrames(path, None, None, dtypes) as tiff:
         if tiff.shape[0] != 1:

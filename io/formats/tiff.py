@@ -18,9 +18,17 @@ from mirrorskin.io.base.opencv import check_picture, decode, is_coloured, to_gre
 from mirrorskin.io.base.system import check_regular, open_regular
 from mirrorskin.io.base.types import FRAME_DTYPES, InputError
 from mirrorskin.io.formats.colour_table import ColourTable
+from mirrorskin.io.formats.registry import Format
 from mirrorskin.io.model.frames import CONVERTED_COLOUR, WholeFrames, lossy
 
-TIFF_SUFFIXES = (".tif", ".tiff")
+TIFF = Format(
+    name="TIFF",
+    suffixes=(".tif", ".tiff"),
+    source="TIFF",
+    reader="TiffFrames",
+    takes=("dataset", "channel"),
+)
+
 
 _REMEDY = "copy it again, or save it again"
 _DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
@@ -53,7 +61,7 @@ class TiffFrames(WholeFrames):
     Parameters
     ----------
     path : Path
-    series : str, optional
+    dataset : str, optional
         Number of the series, if the file has several.
     channel : int, optional
         Channel of a stack with several, or colour; the first is 0.
@@ -66,7 +74,7 @@ class TiffFrames(WholeFrames):
     def __init__(
         self,
         path: Path,
-        series: str | None = None,
+        dataset: str | None = None,
         channel: int | None = None,
         dtypes: Sequence[str] = _DTYPES,
     ) -> None:
@@ -77,7 +85,7 @@ class TiffFrames(WholeFrames):
                 self._file = opening.enter_context(_open(path))
                 found = list(self._file.series)
                 shaped = bool(found) and all(one.kind == "shaped" for one in found)
-                if shaped and len(found) > 1 and series is None:
+                if shaped and len(found) > 1 and dataset is None:
                     plain = opening.enter_context(_open(path, "shaped"))
                     if sum(map(_frames_in, found)) == sum(map(_frames_in, plain.series)):  # were appended
                         self._file, found = plain, list(plain.series)
@@ -88,7 +96,7 @@ class TiffFrames(WholeFrames):
                     complete = complete and found[0].kind == "imagej"
                 if not complete:
                     raise self._damaged()
-                self._take(_chosen(path, found, series), dtypes)
+                self._take(_chosen(path, found, dataset), dtypes)
             except InputError:
                 raise
             except OSError as error:

@@ -16,8 +16,35 @@ import numpy as np
 
 from mirrorskin.io.base.text import one_line
 from mirrorskin.io.base.types import InputError
-from mirrorskin.io.formats.surface import Encoded, grid_of, notes_of, pixel_size_of, what_is
+from mirrorskin.io.formats.registry import Format
+from mirrorskin.io.formats.surface import Encoded, grid_of, notes_of, pixel_size_of
 from mirrorskin.io.model.result import Result
+
+X3P = Format(
+    name="X3P",
+    suffixes=(".x3p",),
+    content="a surface",
+    encoder="encode_x3p",
+    package="x3pio",
+    extra="metrology",
+)
+SUR = Format(
+    name="SUR",
+    suffixes=(".sur",),
+    content="a surface",
+    encoder="encode_sur",
+    package="surfalize",
+    extra="metrology",
+)
+GSF = Format(
+    name="GSF",
+    suffixes=(".gsf",),
+    content="a surface",
+    encoder="encode_gsf",
+    package="gsffile",
+    extra="metrology",
+)
+
 
 _METRE, _MICROMETRE = 1e-3, 1e3  # of a millimetre
 _LONGEST = 32_000  # bytes of a comment in a SUR file, whose length has 16 bits
@@ -85,34 +112,6 @@ def encode_gsf(result: Result) -> Encoded:
         path = Path(folder, "height.gsf")
         gsffile.write_gsf(path, (height * np.float64(_METRE)).astype(np.float32), fields)
         return Encoded([path.read_bytes()], _holds(result))
-
-
-def encode_float_tiff(result: Result, map_name: str = "") -> Encoded:
-    """Encode heights in mm, or a map in its unit, as a TIFF of float32, NaN where undefined."""
-    import tifffile
-
-    values, x, y = grid_of(result, map_name)
-    width, step = pixel_size_of(x, y)
-    lines = {
-        "unit": result.declaration(map_name).unit if map_name else "mm",
-        "pixel size": f"{width!r} x {step!r} mm",
-        "first pixel": f"x {float(x[0])!r} mm, y {float(y[0])!r} mm",
-    } | notes_of(result)
-    description = "".join(f"{name}: {one_line(note)}\n" for name, note in lines.items())
-    file = BytesIO()
-    tifffile.imwrite(
-        file,
-        values.astype(np.float32),
-        photometric="minisblack",
-        resolution=(_CENTIMETRE / width, _CENTIMETRE / step),
-        resolutionunit="CENTIMETER",
-        description=description.encode("ascii", "backslashreplace"),
-        metadata=None,
-    )
-    rows, columns = values.shape
-    return Encoded(
-        [file.getvalue()], f"{rows} x {columns} {what_is(result, map_name) if map_name else 'heights'}"
-    )
 
 
 def _holds(result: Result) -> str:

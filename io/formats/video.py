@@ -19,6 +19,7 @@ from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, check_regular, check_u
 from mirrorskin.io.base.text import one_line
 from mirrorskin.io.base.types import Floats, InputError
 from mirrorskin.io.formats.colour_table import ColourTable
+from mirrorskin.io.formats.registry import Format
 from mirrorskin.io.model.frames import CONVERTED_COLOUR, WholeFrames, lossy, lost_frames
 
 if TYPE_CHECKING:
@@ -26,10 +27,34 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
     from av.video.stream import VideoStream
 
-VIDEO_SUFFIXES = (
-    *(".avi", ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".mpg", ".mpeg", ".ts"),
-    *(".wmv", ".asf", ".flv", ".ogv", ".ogg", ".nut", ".3gp", ".3g2", ".mj2"),
+VIDEO = Format(
+    name="video",
+    suffixes=(
+        ".avi",
+        ".mp4",
+        ".mov",
+        ".m4v",
+        ".mkv",
+        ".webm",
+        ".mpg",
+        ".mpeg",
+        ".ts",
+        ".wmv",
+        ".asf",
+        ".flv",
+        ".ogv",
+        ".ogg",
+        ".nut",
+        ".3gp",
+        ".3g2",
+        ".mj2",
+    ),
+    source="a video (AVI, MP4, MOV, MKV)",
+    reader="VideoFrames",
+    has_positions=False,
+    takes=("dataset", "channel", "memory_limit"),
 )
+
 
 # Playlists are not opened, because they name other files and addresses. Edit lists are ignored: all frames in
 # the file are read, and the frames that players omit are counted.
@@ -77,7 +102,7 @@ class VideoFrames(WholeFrames):
     Parameters
     ----------
     path : Path
-    stream : str, optional
+    dataset : str, optional
         Number of the video stream, if there are several.
     channel : int, optional
         Colour to read: 0 red, 1 green, 2 blue; by default luma.
@@ -88,12 +113,12 @@ class VideoFrames(WholeFrames):
     def __init__(
         self,
         path: Path,
-        stream: str | None = None,
+        dataset: str | None = None,
         channel: int | None = None,
         memory_limit: int | None = None,
     ) -> None:
         check_regular(path, "name a video, a TIFF or a folder of pictures")
-        self._path, self.files, self._wanted, self._channel = path, (path,), stream, channel
+        self._path, self.files, self._wanted, self._channel = path, (path,), dataset, channel
         self._next, self._kept, self._closed = 0, list[NDArray[Any]](), False
         self._container: InputContainer | None = None
         try:

@@ -128,7 +128,7 @@ def test_a_fingerprint_changes_with_the_file(path):
 @pytest.mark.parametrize("command", ["reconstruct", "info", "check", "correlate", "import"])
 def test_help_lists_the_formats(command):
     said = " ".join(run(command, "--help").out.split())
-    assert "TIFF, MCAP, a video (AVI, MP4, MOV, MKV)" in said
+    assert "MCAP, TIFF, a video (AVI, MP4, MOV, MKV)" in said
 
 
 def test_a_channel_is_chosen_on_the_command_line(tmp_path, monkeypatch, frames):

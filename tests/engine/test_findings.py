@@ -9,7 +9,7 @@ from rotations import EIGHTHS, TILT
 
 from mirrorskin import engine, io
 from mirrorskin.engine.base.undistort import undistort
-from mirrorskin.io.formats.export_formats import FORMATS
+from mirrorskin.io.formats.registry import export_suffixes
 from mirrorskin.view.report import write_report
 
 LOST, FLICKER = "3 frames were lost", "the light flickers by 5 %"
@@ -131,7 +131,9 @@ def test_paths_are_named_where_their_warnings_are_carried(tmp_path):
     assert f"{tmp_path / 'a.h5'}: {LOST}" in stitched.result.process["warnings"]
 
 
-TEXTS = [suffix for suffix in FORMATS if suffix not in (".stl", ".zarr")]  # STL has room for 80 letters only
+TEXTS = [
+    suffix for suffix in export_suffixes() if suffix not in (".stl", ".zarr")
+]  # STL has room for 80 letters only
 
 
 @pytest.mark.parametrize("suffix", TEXTS)

@@ -27,7 +27,7 @@ from typing import Any
 import mutations
 import numpy as np
 
-from mirrorskin.io.formats.export_formats import FORMATS
+from mirrorskin.io.formats.registry import export_suffixes
 
 PATIENCE = 30.0
 """Seconds of a processor's time after which a reader hangs, or ten times as many by the clock."""
@@ -110,7 +110,7 @@ dots:11x9:1mm
 NAMES = ["\x1b[2J", "$\\frac{$", "\u5de5\u5177", "<b>", "-", "a b"]
 """How names of files may begin."""
 
-EXPORTS = tuple(FORMATS)
+EXPORTS = export_suffixes()
 
 
 def make_samples(folder: Path) -> list[Path]:

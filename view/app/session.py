@@ -16,7 +16,7 @@ from mirrorskin import engine, io
 from mirrorskin.engine.base.options import Option, plain
 from mirrorskin.engine.base.reconstruction import calibrated, load_operation, method_for, run_class
 from mirrorskin.io.files.opening import is_result
-from mirrorskin.io.formats.foreign import kind_of_frames
+from mirrorskin.io.formats.registry import is_of_others
 from mirrorskin.io.model.result import map_shape
 from mirrorskin.view.result.sheet import Sheet, sheet_of
 
@@ -358,7 +358,7 @@ class Session:
 
 def holds_result(path: Path) -> bool:
     """Return whether a file is a result, not frames."""
-    return not kind_of_frames(path) and is_result(path)
+    return not is_of_others(path) and is_result(path)
 
 
 def shown(value: Any) -> str:

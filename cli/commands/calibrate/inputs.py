@@ -104,9 +104,9 @@ def _scaled(options: StackOptions, calibration: Calibration | None) -> StackOpti
 def open_still(path: Path, **stack: Any) -> Recording:
     """Open frames at rest; those of other programs have no positions, and need none here."""
     from mirrorskin import io
-    from mirrorskin.io.formats.foreign import kind_of_frames
+    from mirrorskin.io.formats.registry import is_of_others
 
-    if kind_of_frames(path):
+    if is_of_others(path):
         return io.open_recording(path, motion="vertical", travel=io.Steps(1.0), **stack)
     return io.open_recording(path, **stack)
 

@@ -133,8 +133,8 @@ def _read(
     """Return pictures and the means of recordings with their names, and the camera."""
     from mirrorskin import io
     from mirrorskin.engine.calibration.board import mean_of_still
-    from mirrorskin.io.formats.foreign import kind_of_frames
     from mirrorskin.io.formats.pictures import read_picture
+    from mirrorskin.io.formats.registry import format_of_frames
 
     pictures, names, dtypes = [], [], []
     for path in paths:
@@ -142,7 +142,8 @@ def _read(
             raise io.InputError(
                 f"{path} is a sequence: name pictures of the board one by one, or a recording"
             )
-        if kind_of_frames(path) in ("picture", "TIFF"):
+        form = format_of_frames(path)
+        if form is not None and form.name in ("picture", "TIFF"):
             pictures.append(read_picture(path))
             continue
         with inputs.open_still(path, **stack) as recording:

@@ -10,7 +10,7 @@ import pytest
 
 from mirrorskin import io
 from mirrorskin.io.formats.export import check_export
-from mirrorskin.io.formats.export_formats import FORMATS
+from mirrorskin.io.formats.registry import export_suffixes
 
 PICTURES = ["out.png", "out.tif", "out.tiff"]
 IN_MILLIMETRES = ["out.ply", "out.stl", "out.xyz", "out.csv", *PICTURES]
@@ -30,7 +30,7 @@ def refused(result, path, **options):
 def test_a_suffix_that_is_unknown_names_those_that_are_known(slope, tmp_path, name, wrong):
     line = refused(slope, tmp_path / name)
     assert wrong in line
-    assert line.endswith(f"name a file that ends with one of {' '.join(FORMATS)}")
+    assert line.endswith(f"name a file that ends with one of {' '.join(export_suffixes())}")
 
 
 @pytest.mark.parametrize("name", IN_MILLIMETRES[:2])

@@ -11,7 +11,7 @@ import tifffile
 
 from mirrorskin import io
 from mirrorskin.io.base.text import one_line, printable
-from mirrorskin.io.formats.export_formats import FORMATS
+from mirrorskin.io.formats.registry import export_suffixes
 
 ODD = {
     "program": "mirror\x1b]0;owned\x07skin \u5de5\u5177",
@@ -20,7 +20,7 @@ ODD = {
     "date": "2026\x7f\udcff",
 }
 SECTION = {"distance": np.arange(3.0), "height": np.array([0.0, np.nan, 1.0])}
-SUFFIXES = tuple(FORMATS)
+SUFFIXES = export_suffixes()
 
 
 @pytest.fixture

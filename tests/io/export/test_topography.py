@@ -111,6 +111,6 @@ def test_no_export_replaces_a_surface_of_another_program(exported, suffix):
 
 @pytest.mark.parametrize("suffix", [".x3p", ".sur", ".gsf"])
 def test_a_package_that_is_missing_is_one_line(slope, tmp_path, suffix, monkeypatch):
-    monkeypatch.setattr("mirrorskin.io.formats.export.find_spec", lambda name: None)
+    monkeypatch.setattr("mirrorskin.io.formats.registry.find_spec", lambda name: None)
     with pytest.raises(io.InputError, match=r"needs the package \w+: pip install 'mirrorskin\[metrology\]'$"):
         io.export_result(slope, tmp_path / f"a{suffix}")

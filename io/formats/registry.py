@@ -1,0 +1,214 @@
+"""The formats of other programs. Each is declared once, in its own module, and packages may add more.
+
+A module of this folder declares a format as ``NAME = Format(...)`` with literal arguments: help texts and
+errors list formats without importing their modules. An installed package names its own by an entry point in
+the group `FORMATS`, such as ``mine = "my_package.my_format:MINE"``. Nothing heavy is imported here.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mirrorskin.io.base.url import is_zarr
+
+if TYPE_CHECKING:
+    from mirrorskin.io.model.frames import FrameReader
+
+FORMATS = "mirrorskin.formats"
+"""Group of entry points by which packages add formats."""
+
+FOLDER = "/"
+"""What stands for a folder among suffixes."""
+
+_DECLARATION = re.compile(r"^\w+ = (Format\([^\n]*\)|Format\(\n.*?^\))$", re.MULTILINE | re.DOTALL)
+_HERE = Path(__file__).parent
+_OURS = (".h5", ".hdf5", ".nxs", ".mat", ".zarr", "")  # for which no package is asked
+_NUMPY = (".npy", ".npz")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Format:
+    """A format of files of other programs, with frames, for results, or both.
+
+    Attributes
+    ----------
+    name : str
+        What a file of it is, such as "TIFF".
+    suffixes : tuple of str
+        In lower case, such as ".tif"; `FOLDER` for folders.
+    source : str
+        How lists of sources of frames name it, such as "a video (AVI, MP4)"; "" if it has no frames.
+    reader : str
+        Name of the class that reads its frames, a `FrameReader`, in the module of the declaration. Its
+        arguments are the path, and by name those of ``takes``.
+    has_positions : bool
+        Whether files may contain positions or times of the frames.
+    takes : tuple of str
+        Which of the options "dataset", "channel", "memory_limit" and "verify" the reader takes.
+    content : str
+        What an exported file contains, such as "a mesh"; formats with the same content are listed together.
+    encoder : str
+        Name of the function that encodes a `Result`, in the module of the declaration. Its arguments are the
+        result, and by name those of ``options``. It returns the parts of the file and a description. With
+        ``writes_itself`` the arguments are the result and the path, and it returns the description.
+    options : tuple of str
+        Which of the options "map_name", "section", "points" and "float32" of ``export_result`` it takes.
+    needs_heights : bool
+        Whether heights in millimetres are needed to export it.
+    writes_itself : bool
+        Whether the encoder writes the file.
+    of_recordings : bool
+        Whether the encoder takes a recording, too.
+    recorder : str
+        Name of the class that writes frames while they come, in the module of the declaration; "" if none
+        does. See `mirrorskin.io.formats.mcap.GrowingMessages`.
+    package, extra : str
+        Package that exporting it needs, and the extra of mirrorskin that installs it.
+    module : str
+        Module of the declaration; it is set when the format is found.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    source: str = ""
+    reader: str = ""
+    has_positions: bool = True
+    takes: tuple[str, ...] = ()
+    content: str = ""
+    encoder: str = ""
+    options: tuple[str, ...] = ()
+    needs_heights: bool = True
+    writes_itself: bool = False
+    of_recordings: bool = False
+    recorder: str = ""
+    package: str = ""
+    extra: str = ""
+    module: str = ""
+
+    def load(self, name: str) -> Any:
+        """Return what is called so in the format's module."""
+        return getattr(import_module(self.module), name)
+
+
+@functools.cache
+def _built_in() -> tuple[Format, ...]:
+    """Return the formats that the modules of this folder, and that of our Zarr stores, declare."""
+    found = []
+    for file in (*sorted(_HERE.glob("*.py")), _HERE.parent / "files" / "result_file.py"):
+        for text in _DECLARATION.findall(file.read_text(encoding="utf-8")):
+            (call,) = ast.parse(text).body
+            assert isinstance(call, ast.Expr)
+            assert isinstance(call.value, ast.Call)
+            values = {str(one.arg): ast.literal_eval(one.value) for one in call.value.keywords}
+            found.append(Format(module=f"mirrorskin.io.{file.parent.name}.{file.stem}", **values))
+    return tuple(found)
+
+
+def _installed() -> Iterator[Format]:
+    """Yield the formats that installed packages add."""
+    from importlib.metadata import entry_points
+
+    from mirrorskin.io.base.types import InputError
+
+    for point in entry_points(group=FORMATS):
+        found = point.load()
+        if not isinstance(found, Format):
+            raise InputError(f"{point.value}, in the entry points {FORMATS}, is no mirrorskin.io.Format")
+        yield replace(found, module=point.module)
+
+
+def formats(installed: bool = True) -> tuple[Format, ...]:
+    """Return all formats, or the built-in ones."""
+    return (*_built_in(), *(_installed() if installed else ()))
+
+
+def _named(suffix: str, use: str) -> Format | None:
+    """Return the format of a suffix that has a reader or an encoder."""
+    built_in = (one for one in _built_in() if suffix in one.suffixes and getattr(one, use))
+    others = (one for one in _installed() if suffix in one.suffixes and getattr(one, use))
+    return next(built_in, None) or (None if suffix in _OURS else next(others, None))
+
+
+def format_of_frames(path: Path) -> Format | None:
+    """Return the format of a path with frames of another program; None for HDF5, Zarr and arrays."""
+    if is_zarr(path):
+        return None
+    try:
+        suffix = FOLDER if path.is_dir() else path.suffix.lower()
+    except OSError:  # reported when it is opened
+        suffix = path.suffix.lower()
+    return None if suffix in _NUMPY else _named(suffix, "reader")
+
+
+def holds_arrays(path: Path) -> bool:
+    """Return whether a path is a file of NumPy."""
+    return not is_zarr(path) and path.suffix.lower() in _NUMPY and not path.is_dir()
+
+
+def is_of_others(path: Path) -> bool:
+    """Return whether a path is neither HDF5 nor Zarr, by its suffix or as a folder."""
+    return holds_arrays(path) or format_of_frames(path) is not None
+
+
+def open_reader(path: Path, form: Format, **options: Any) -> FrameReader:
+    """Open frames of another program, with the options that are given and that its reader takes."""
+    from mirrorskin.io.base.types import InputError
+
+    for name in ("dataset", "channel"):
+        if options.get(name) is not None and name not in form.takes:
+            raise InputError(f"{path}: a {form.name} has no --{name}: leave it out")
+    reader: FrameReader = form.load(form.reader)(path, **{name: options.get(name) for name in form.takes})
+    return reader
+
+
+def sources() -> str:
+    """Return the sources of frames for help texts: "HDF5, ..., TIFF, MCAP, or a folder of pictures"."""
+    others = sorted((one.source for one in formats(installed=False) if one.source), key=len)
+    listed = ["HDF5", "Zarr", "NPY", "NPZ", *others]
+    return ", ".join([*listed[:-1], f"or {listed[-1]}"])
+
+
+def export_format(suffix: str) -> Format | None:
+    """Return the format that results are exported to by a suffix."""
+    return _named(suffix, "encoder")
+
+
+def export_suffixes(option: str = "", installed: bool = True) -> tuple[str, ...]:
+    """Return the suffixes of exports, or of those that take an option.
+
+    Examples
+    --------
+    >>> export_suffixes("points")
+    ('.ply',)
+    """
+    return tuple(
+        suffix
+        for one in formats(installed)
+        if one.encoder and (not option or option in one.options)
+        for suffix in one.suffixes
+    )
+
+
+def contents() -> str:
+    """Return the contents and suffixes of exports: "a mesh .ply .stl, points .xyz"."""
+    kinds: dict[str, list[str]] = {}
+    for one in formats(installed=False):
+        if one.encoder:
+            kinds.setdefault(one.content, []).extend(one.suffixes)
+    return ", ".join(f"{kind} {' '.join(suffixes)}" for kind, suffixes in kinds.items())
+
+
+def missing_package(form: Format) -> str:
+    """Return what is missing to export a format, with the remedy; "" if nothing is."""
+    if not form.package or find_spec(form.package) is not None:
+        return ""
+    remedy = f"mirrorskin[{form.extra}]" if form.extra else form.package
+    return f"the package {form.package}: pip install '{remedy}'"
