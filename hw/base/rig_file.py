@@ -20,6 +20,7 @@ from mirrorskin.hw.base.emulated_file import Emulator
 from mirrorskin.hw.base.references import SUFFIXES, check_references
 from mirrorskin.hw.base.stage import Limits
 from mirrorskin.io import InputError
+from mirrorskin.io.base.own_class import class_of, installed_names
 from mirrorskin.io.base.settings_file import load_toml
 
 _USER = re.compile("//[^/]*@")
@@ -28,6 +29,10 @@ _ROUND = 360.0  # degrees
 _CELL = 65535  # rows or columns
 
 GENICAM = "genicam:"
+_CLASS = re.compile(r"(?!genicam:)(.*\.py|[^\W\d]\w*(\.[^\W\d]\w*)*):[^\W\d]\w*")
+
+CAMERAS, STAGES = "mirrorskin.cameras", "mirrorskin.stages"
+"""Groups of entry points by which packages give names to their cameras and stages."""
 """Prefix of the source of GigE Vision and USB3 Vision cameras."""
 
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*\Z")]
@@ -320,7 +325,7 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
             msgspec.structs.force_setattr(self, "name", _USER.sub("//", str(self.source)))
         if self.fourcc is not None:
             msgspec.structs.force_setattr(self, "fourcc", self.fourcc.ljust(4))
-            if self.genicam != self.fourcc.startswith("Mono"):
+            if not self.own and self.genicam != self.fourcc.startswith("Mono"):
                 known = "Mono8 to Mono16" if self.genicam else "two to four letters"
                 raise ValueError(f'fourcc is "{self.fourcc}": this source needs {known}; or leave it out')
         if self.trigger_input is not None and self.trigger is None:
@@ -342,6 +347,11 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
         return self.size[1], self.size[0]
+
+    @property
+    def own(self) -> bool:
+        """Whether it is a class of the user, FILE.py:CLASS or MODULE:CLASS."""
+        return isinstance(self.source, str) and not self.genicam and _CLASS.fullmatch(self.source) is not None
 
     @property
     def streamed(self) -> bool:
@@ -413,10 +423,10 @@ def load_rig(path: Path | str) -> RigSettings:
         if isinstance(given := getattr(camera, name), str)
     }
     if isinstance(camera.source, str) and not camera.streamed:
-        resolved["source"] = _next_to(path, camera.source)
+        resolved["source"] = _next_to(path, _own_class(path, camera.source, CAMERAS))
     camera = msgspec.structs.replace(camera, **resolved)
     check_references(camera, str(path))
-    stage = msgspec.structs.replace(file.stage, firmware=_own_stage(path, file.stage.firmware))
+    stage = msgspec.structs.replace(file.stage, firmware=_own_class(path, file.stage.firmware, STAGES))
     return RigSettings(path, file.name or path.stem, stage, camera)
 
 
@@ -432,11 +442,16 @@ def _check_emulator(path: Path) -> None:
     )
 
 
-def _own_stage(path: Path, name: str) -> str:
-    """Return the name of a stage class, with the path of its module if that is next to the rig file."""
-    place, _, kind = name.rpartition(":")
-    if not place:
+def _own_class(path: Path, name: str, group: str) -> str:
+    """Return a name with that of the class instead, if it is one of the entry points in a group.
+
+    The path of a class's module is added if this is next to the rig file.
+    """
+    if name.isidentifier() and name in installed_names(group):
+        return class_of(name, group)
+    if not _CLASS.fullmatch(name):
         return name
+    place, _, kind = name.rpartition(":")
     file = _next_to(path, place if place.endswith(".py") else f"{place.replace('.', '/')}.py")
     return f"{file}:{kind}" if Path(file).is_file() else name
 

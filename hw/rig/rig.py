@@ -271,31 +271,35 @@ def open_stage(settings: StageSettings, unlock: bool = False, clock: Clock = SYS
         from mirrorskin.hw.stages.marlin import MarlinStage
 
         return MarlinStage(settings, clock=clock)
-    return _open_own(settings)
+    return cast("Stage", _open_own(settings.firmware, settings, Stage, "stage"))
 
 
-def _open_own(settings: StageSettings) -> Stage:
-    """Open a stage with a class of the user."""
-    made = load_class(settings.firmware)
-    name = getattr(settings.firmware, "__name__", settings.firmware)
+def _open_own(
+    kind: str | type, settings: StageSettings | CameraSettings, protocol: type, what: str
+) -> Stage | Camera:
+    """Open a stage or a camera with a class of the user."""
+    made = load_class(kind)
+    name, wanted = getattr(kind, "__name__", kind), type(settings).__name__
     try:
         inspect.signature(made).bind(settings)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"{name}(settings) failed: {error}; a stage class takes one argument, the StageSettings"
+            f"{name}(settings) failed: {error}; a {what} class takes one argument, the {wanted}"
         ) from error
     try:
-        stage = made(settings)
+        opened = made(settings)
     except OSError as error:  # includes SerialException
-        raise InputError(f"{name}: cannot be opened: {error}; check stage.port") from error
-    lacking = [one for one in vars(Stage) if one[0] != "_" and not hasattr(stage, one)]
+        source = "stage.port" if what == "stage" else "camera.source"
+        raise InputError(f"{name}: cannot be opened: {error}; check {source}") from error
+    lacking = [one for one in vars(protocol) if one[0] != "_" and not hasattr(opened, one)]
     if lacking:
-        if hasattr(stage, "close"):
-            stage.close()
+        if hasattr(opened, "close"):
+            opened.close()
         raise InputError(
-            f"{name} has no {', no '.join(lacking)}: mirrorskin.hw.Stage lists the methods of a stage"
+            f"{name} has no {', no '.join(lacking)}: mirrorskin.hw.{protocol.__name__} lists the methods of a"
+            f" {what}"
         )
-    return cast("Stage", stage)
+    return cast("Stage | Camera", opened)
 
 
 def open_camera(settings: CameraSettings, clock: Clock = SYSTEM) -> Camera:
@@ -304,9 +308,27 @@ def open_camera(settings: CameraSettings, clock: Clock = SYSTEM) -> Camera:
         from mirrorskin.hw.cameras.genicam import GenicamCamera
 
         return GenicamCamera(settings, clock=clock)
+    if settings.own:
+        return _open_own_camera(settings)
     from mirrorskin.hw.cameras.video import VideoCamera
 
     return VideoCamera(settings, clock=clock)
+
+
+def _open_own_camera(settings: CameraSettings) -> Camera:
+    """Open a camera with a class of the user; its frames must be as the rig file states."""
+    camera = cast("Camera", _open_own(str(settings.source), settings, Camera, "camera"))
+    found, stated = (
+        f"{shape[1]} x {shape[0]}, {dtype}"
+        for shape, dtype in ((camera.shape, camera.dtype), (settings.shape, settings.dtype))
+    )
+    if found != stated:
+        camera.close()
+        raise InputError(
+            f"{settings.name}: frames are {found}, but camera.size and dtype in the rig file are {stated}:"
+            " correct the rig file"
+        )
+    return camera
 
 
 def open_rig(

@@ -41,7 +41,7 @@ def load_class(name: str | type, group: str = "") -> Callable[..., Any]:
     """
     if not isinstance(name, str):
         return name
-    place, _, kind = (_installed(name, group) if group and ":" not in name else name).rpartition(":")
+    place, _, kind = (class_of(name, group) if group and ":" not in name else name).rpartition(":")
     file = Path(place) if place.endswith(".py") else None
     if not place or not all(part.isidentifier() for part in kind.split(".")):
         raise InputError(f"{name}: name a class as MODULE:CLASS or FILE.py:CLASS")
@@ -74,8 +74,8 @@ def installed_names(group: str) -> list[str]:
     return sorted({one.name for one in entry_points(group=group)})
 
 
-def _installed(name: str, group: str) -> str:
-    """Return MODULE:CLASS of an entry point."""
+def class_of(name: str, group: str) -> str:
+    """Return MODULE:CLASS of an entry point; InputError if there is no such one."""
     for one in entry_points(group=group, name=name):
         return f"{one.module}:{one.attr}"
     close = nearest(name, installed_names(group))
