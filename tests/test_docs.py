@@ -103,6 +103,13 @@ def test_lines_of_a_page_are_short(page):
     assert [line for line in long if " " in re.sub(r"`[^`]*`", "", line.strip().removeprefix("- "))] == []
 
 
+def test_terms_of_the_glossary_are_in_alphabetical_order():
+    page = (DOCS / "glossary.md").read_text(encoding="utf-8")
+    terms = re.findall(r"^- \*\*([^*]+)\*\*", page, re.MULTILINE)
+    assert len(terms) > 80
+    assert terms == sorted(terms)
+
+
 def test_a_command_that_is_none_is_not_understood():
     with pytest.raises(Exception, match="such"):
         understood(["reconstruct", "press.h5", "--travel-stop", "1mm"])
