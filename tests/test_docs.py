@@ -86,6 +86,30 @@ def test_every_table_of_a_page_is_one(page):
             assert len({cells_of(row) for row in rows}) == 1, f"rows differ in length: {rows[0]}"
 
 
+LONGEST = 100  # columns
+WRAPPED = [
+    *sorted(ROOT.glob("*.md")),
+    *PAGES,
+    *sorted((ROOT / "tests").rglob("*.md")),
+    *sorted((ROOT / "bench").glob("*.md")),
+]
+WHOLE = ("|", "#", ">", "$$", "![")  # starts of a table, a heading, a message, a formula and a picture
+
+
+@pytest.mark.parametrize("page", WRAPPED, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_lines_of_a_page_are_short(page):
+    text = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    long = [line for line in text.splitlines() if len(line) > LONGEST and not line.lstrip().startswith(WHOLE)]
+    assert [line for line in long if " " in re.sub(r"`[^`]*`", "", line.strip().removeprefix("- "))] == []
+
+
+def test_terms_of_the_glossary_are_in_alphabetical_order():
+    page = (DOCS / "glossary.md").read_text(encoding="utf-8")
+    terms = re.findall(r"^- \*\*([^*]+)\*\*", page, re.MULTILINE)
+    assert len(terms) > 80
+    assert terms == sorted(terms)
+
+
 def test_a_command_that_is_none_is_not_understood():
     with pytest.raises(Exception, match="such"):
         understood(["reconstruct", "press.h5", "--travel-stop", "1mm"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -101,7 +103,7 @@ def as_markdown(run: Run) -> str:
 def as_page(runs: Mapping[Path, Run], chart: str) -> str:
     """Return the page of some runs; ``chart`` is the address of its chart, see `as_chart`."""
     machines = _gather(runs.values())
-    parts = ["# Benchmarks", _ABOUT]
+    parts = ["# Benchmarks", _wrap(_ABOUT)]
     if glance.entries(_first(machines)):
         parts.append(f"![Times of mirrorskin, other libraries, and the limit of memory]({chart})")
     for title, about, describe in (
@@ -112,7 +114,7 @@ def as_page(runs: Mapping[Path, Run], chart: str) -> str:
         ("Targets", _TARGETS, _targets),
     ):
         parts += _topic(title, about, machines, describe)
-    parts += ["## How to measure", _COMMANDS, _METHOD, "## Machine and runs", _runs(runs)]
+    parts += ["## How to measure", _COMMANDS, _wrap(_METHOD), "## Machine and runs", _runs(runs)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -120,6 +122,20 @@ def as_chart(runs: Mapping[Path, Run]) -> bytes | None:
     """Return the chart of a page, SVG, for the machine of the first run; None if it has no such works."""
     shown = glance.entries(_first(_gather(runs.values())))
     return glance.draw(shown) if shown else None
+
+
+def _wrap(text: str, start: str = "") -> str:
+    """Return a paragraph, or with ``start`` an item of a list, in lines of at most 100 columns."""
+    kept = re.sub("`[^`]*`", lambda code: code[0].replace(" ", "\0"), text)
+    filled = textwrap.fill(
+        kept,
+        100,
+        initial_indent=start,
+        subsequent_indent=" " * len(start),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return filled.replace("\0", " ")
 
 
 def _first(machines: Mapping[str, Machine]) -> Machine:
@@ -149,7 +165,7 @@ def _runs(runs: Mapping[Path, Run]) -> str:
         for name, version in run.versions.items():
             versions.setdefault(name, {}).update({version: None} if version else {})
     used = ", ".join(f"{name} {' and '.join(found)}" for name, found in versions.items() if found)
-    return "\n".join([*lines, f"- With {used}."])
+    return "\n".join([*lines, _wrap(f"With {used}.", "- ")])
 
 
 def _topic(
@@ -160,7 +176,7 @@ def _topic(
     for name, machine in machines.items():
         if mine := describe(machine):
             parts += [*([f"**{name}**"] if len(machines) > 1 else []), *mine]
-    return [f"## {title}", about, *parts] if parts else []
+    return [f"## {title}", _wrap(about), *parts] if parts else []
 
 
 def _glance(machine: Machine) -> list[str]:
@@ -214,7 +230,7 @@ def _peers(machine: Machine) -> list[str]:
             if _is_ours(row) and (alone or row.name in wanted)
         ]
     head = ("case", "work", "ms", "GB/s", "of limit", "fastest peer", "ms", "times as fast")
-    about = [f"- {name}: {machine[name].title}" for name in dict.fromkeys(row[0] for row in cells)]
+    about = [_wrap(f"{name}: {machine[name].title}", "- ") for name in dict.fromkeys(row[0] for row in cells)]
     return [as_table(head, cells), "\n".join(about)] if cells else []
 
 

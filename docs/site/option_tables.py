@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
+import textwrap
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -97,7 +98,8 @@ def options_section(name: str, kind: Any) -> str:
     """Return heading, summary and table of the options of a class."""
     options = {one: declared for one, declared in kind.options.items() if one not in _COMMON}
     table = as_table(["option", "value", "default", "meaning"], map(_option, options.values()))
-    return f"### `{name.rpartition('.')[2]}`\n\n`{name}`. {_summary(kind)}.\n\n{table}"
+    about = textwrap.fill(f"`{name}`. {_summary(kind)}.", 100, break_on_hyphens=False)
+    return f"### `{name.rpartition('.')[2]}`\n\n{about}\n\n{table}"
 
 
 def _option(one: Option) -> list[str]:

@@ -537,7 +537,8 @@ speed = 20.0
 # steps = 250.0
 
 [camera]
-source = 0                      # a camera's number, or in quotes a file, a URL, or genicam:SERIAL
+source = 0                      # a camera's number, or in quotes a file, a URL, genicam:SERIAL, or a
+                                # class of your own as "my_camera.py:MyCamera"
 size = [640, 480]               # columns, rows
 # name = "left"                 # name in recordings and calibrations; by default the source
 # dtype = "uint8"

@@ -489,7 +489,7 @@ def test_the_camera_of_the_documentation_works(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "vendor", vendor)
     made: dict[str, Any] = {}
     exec(example, made)
-    with made["VendorCamera"]("40123456") as opened:
+    with made["VendorCamera"](SimpleNamespace(name="40123456")) as opened:
         wait_until(SYSTEM, lambda: opened.error is not None)
         before, after = opened.take(9, SOON), opened.take(9, SOON)
         with pytest.raises(HardwareError, match=r"^camera 40123456 failed: the cable is out$"):

@@ -46,10 +46,11 @@ COLUMNS = (
 COUNTED = tuple(name for name in COLUMNS if name not in ("warps", "AMD waves"))
 HEAD = """# What kernels take on GPUs
 
-By `make gpu-check`, which compiles and runs nothing: for NVIDIA (`ptxas`, sm_90) and AMD (clang, gfx90a),
-the most that each kernel takes with any set of options that the frozen answers build for a GPU. Registers
-and bytes are a lane's. Warps are those that a multiprocessor has room for, of 64, waves of a SIMD, of 8.
-Doubles are instructions in double precision, byte loads those of single bytes from global memory.
+By `make gpu-check`, which compiles and runs nothing: for NVIDIA (`ptxas`, sm_90) and AMD (clang,
+gfx90a), the most that each kernel takes with any set of options that the frozen answers build for a
+GPU. Registers and bytes are a lane's. Warps are those that a multiprocessor has room for, of 64,
+waves of a SIMD, of 8. Doubles are instructions in double precision, byte loads those of single
+bytes from global memory.
 """
 
 # Frozen cases that take long in the GPU's cut and build nothing more; and those that

@@ -33,10 +33,11 @@ MORE = 1.1  # by which factor their counts may rise: processors round differentl
 NOT_COUNTED = "staging", "allocation"  # waits that depend on the moment and on the calls before
 HEAD = f"""# What each call would have a GPU do
 
-By `make gpu-check`, on a device that is treated as a GPU with memory of its own: what happens when a call
-with arrays on the host is made again. A small launch has fewer than {FEW} work-items. The time is predicted
-by a model: a launch {1e6 * LAUNCH:g} µs, a wait {1e6 * WAIT:g} µs, copies {BUS / 1e9:g} GB/s, memory
-{MEMORY / 1e12:g} TB/s, and {1e6 * ACCESS:g} µs for each {WORD} bytes that one work-item reads or writes.
+By `make gpu-check`, on a device that is treated as a GPU with memory of its own: what happens when
+a call with arrays on the host is made again. A small launch has fewer than {FEW} work-items. The
+time is predicted by a model: a launch {1e6 * LAUNCH:g} µs, a wait {1e6 * WAIT:g} µs,
+copies {BUS / 1e9:g} GB/s, memory {MEMORY / 1e12:g} TB/s,
+and {1e6 * ACCESS:g} µs for each {WORD} bytes that one work-item reads or writes.
 Maps stay on the device with frames that are there, except for copies of those that checks look at.
 
 | call | {" | ".join(COUNTS)} | predicted, ms | longest kernels, predicted ms |
