@@ -11,7 +11,7 @@ from mirrorskin import io
 from mirrorskin.hw.base.rig_file import CAMERAS, load_rig
 from mirrorskin.hw.rig.rig import open_camera
 
-CAMERA = """
+CAMERA = '''
 import threading
 import time
 
@@ -66,7 +66,7 @@ class Other:
 
     def __init__(self, serial, port):
         self.name = serial
-"""
+'''
 RIG = """
 [stage]
 port = "/dev/ttyUSB0"
@@ -121,7 +121,10 @@ def test_an_entry_point_names_a_camera(opened, tmp_path, monkeypatch):
     [
         ("Wide", "frames are 80 x 6, uint8, but camera.size and dtype in the rig file are 8 x 6, uint8"),
         ("Absent", "cannot be opened: no such device; check camera.source"),
-        ("Half", "has no shape, dtype, counts, latest, error, take, flush, close: mirrorskin.hw.Camera lists"),
+        (
+            "Half",
+            "has no shape, no dtype, no counts, no latest, no error, no take, no flush, no close: mirrorskin.hw",
+        ),
         ("Other", "a camera class takes one argument, the CameraSettings"),
         ("Stead", "did you mean Steady?"),
     ],
