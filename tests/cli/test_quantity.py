@@ -11,6 +11,7 @@ from mirrorskin.cli.quantity import (
     compliance,
     duration,
     force,
+    frame_range,
     frame_size,
     length,
     lengths,
@@ -182,6 +183,12 @@ def test_frame_sizes_are_columns_and_rows():
 def test_frame_sizes_that_are_none(text):
     with pytest.raises(InputError, match=r"--size.*write e\.g\. 640x480"):
         frame_size(text, "--size")
+
+
+@pytest.mark.parametrize("text", ["10:10", "10:9", ":0", "0:0"])
+def test_a_range_without_frames_is_refused(text):
+    with pytest.raises(InputError, match=r"--frames.* a later one that is left out are needed"):
+        frame_range(text, "--frames")
 
 
 ANGLES = "(rad, mrad, deg, arcmin, gon, turn, ...)"

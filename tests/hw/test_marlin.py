@@ -95,6 +95,14 @@ def test_a_refused_speed_stops_nothing(stage):
     assert stage.wait().position.travel == pytest.approx(1.0)
 
 
+def test_silence_in_motion_is_noticed_long_before_the_timeout(line, clock):
+    with MarlinStage(msgspec.structs.replace(STAGE, timeout=9.0), line, clock=clock) as stage:
+        begin_slow(stage)
+        line.silent = True
+        line.until(lambda: stage.error, SOON)
+        assert "no longer answers" in str(stage.error)
+
+
 @pytest.mark.parametrize("emergency", [True, False])
 def test_a_stop_in_motion_comes_at_once(clock, emergency):
     line = FakeMarlin(clock, emergency)

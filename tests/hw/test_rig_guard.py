@@ -138,6 +138,13 @@ def test_a_rig_that_is_left_while_it_moves_is_stopped(clock):
     assert camera.closed
 
 
+def test_a_rig_that_is_closed_while_it_moves_is_stopped(clock):
+    rig = fake_rig(dark, clock)
+    begin(rig)
+    rig.close()
+    assert rig.stage.stops
+
+
 def test_a_rig_that_rests_is_left_without_a_stop(clock):
     rig = fake_rig(dark, clock)
     stage = rig.stage

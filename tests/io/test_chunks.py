@@ -32,6 +32,14 @@ def test_every_packing_is_unpacked_past_hdf5(tmp_path, packing):
         assert how == f"chunks {'read' if packing == 'raw' else 'decoded'} by 2 threads"
 
 
+@pytest.mark.parametrize("columns", [8, 72])
+def test_a_last_block_of_eight_samples_is_unpacked(tmp_path, columns):
+    """Of blocks of 64 samples, the last one has the fewest samples whose bits are sorted."""
+    frames = compressible((3, 1, columns), "u2")
+    path = write(tmp_path / "a.h5", frames, (1, 1, columns), PACKINGS["small blocks"])
+    np.testing.assert_array_equal(ours(path, 3)[0], frames)
+
+
 @pytest.mark.parametrize("packing", ONLY_HDF5)
 def test_what_we_cannot_unpack_goes_through_hdf5(tmp_path, packing):
     path = write(tmp_path / "a.h5", compressible(SHAPE, "u2"), (3, 13, 17), ONLY_HDF5[packing])

@@ -58,6 +58,23 @@ def test_a_chunk_of_another_size_is_refused(tmp_path, packing):
             chunks.decode(found, 0, data[:length].copy(), np.zeros(frames.nbytes, "u1"))
 
 
+@pytest.mark.parametrize("packing", ["bitshuffle", "small blocks", "bitshuffle zstd"])
+def test_a_block_beyond_the_end_of_its_chunk_does_not_reach_the_library(tmp_path, monkeypatch, packing):
+    load, reached = chunks._function, []
+
+    def watched(library, name, *types):
+        function = load(library, name, *types)
+        if not name.startswith("bshuf_decompress"):
+            return function
+        return lambda *values: reached.append(name) or function(*values)
+
+    monkeypatch.setattr(chunks, "_function", watched)
+    data, frames, found = packed_chunk(tmp_path / "a.h5", PACKINGS[packing])
+    with pytest.raises(ValueError, match="a chunk gives"):
+        chunks.decode(found, 0, data[:-16].copy(), np.zeros(frames.nbytes, "u1"))
+    assert not reached
+
+
 @pytest.mark.parametrize("packing", CHECKED)
 def test_damage_and_noise_are_refused_or_give_something(tmp_path, packing):
     data, frames, found = packed_chunk(tmp_path / "a.h5", PACKINGS[packing])

@@ -1,5 +1,6 @@
 """ROS 2 messages in MCAP files, read by the reader of their own packages and by mirrorskin."""
 
+import struct
 import tracemalloc
 from contextlib import suppress
 from dataclasses import replace
@@ -424,18 +425,15 @@ def test_images_that_differ_are_used_without_verification(tmp_path):
         assert [recording.frame(number)[0, 0] for number in range(3)] == [100, 7, 102]
 
 
-def chunk_bomb(path, compression):
-    """Write a chunk of 8 MB of zeros, which states a size of 100 bytes."""
-    data = bytes(8 << 20)
-    packed = lz4.frame.compress(data) if compression == "lz4" else zstandard.compress(data)
-    write_messages(path, "/a", IMAGE, [(number, grey(number)) for number in range(3)])
+def replace_chunk(path, compression, packed, size):
+    """Replace the chunk of a file by another one, which states a size."""
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
         file.seek(0)
         whole = file.read()
     index = summary.chunk_indexes[0]
     record = RecordBuilder()
-    Chunk(compression, packed, 9, 0, 0, 100).write(record)
+    Chunk(compression, packed, 9, 0, 0, size).write(record)
     body = record.end()
     moved = replace(index, chunk_start_offset=len(whole), chunk_length=len(body), compression=compression)
     tail = RecordBuilder()
@@ -445,6 +443,45 @@ def chunk_bomb(path, compression):
     Footer(summary_crc=0, summary_offset_start=0, summary_start=start).write(tail)
     path.write_bytes(whole + body + tail.end() + whole[:8])
     return path
+
+
+def write_three(path):
+    """Write three images to one chunk."""
+    return write_messages(path, "/a", IMAGE, [(number, grey(number)) for number in range(3)])
+
+
+def chunk_bomb(path, compression):
+    """Write a chunk of 8 MB of zeros, which states a size of 100 bytes."""
+    data = bytes(8 << 20)
+    packed = lz4.frame.compress(data) if compression == "lz4" else zstandard.compress(data)
+    return replace_chunk(write_three(path), compression, packed, 100)
+
+
+def records_of(path):
+    """Return the records of the messages of a file, which begin with a code and a size."""
+    with path.open("rb") as file:
+        found = [(channel.id, one) for _, channel, one in make_reader(file).iter_messages()]
+    return [
+        struct.pack("<BQHIQQ", 5, 22 + len(one.data), channel, 0, one.log_time, 0) + one.data
+        for channel, one in found
+    ]
+
+
+def test_a_record_that_ends_beyond_its_chunk_is_refused(tmp_path):
+    path = write_three(tmp_path / "a.mcap")
+    records = b"".join(records_of(path))
+    replace_chunk(path, "", records[:-1], len(records) - 1)
+    with pytest.raises(io.InputError, match="a record is longer than its chunk"):
+        frames_of(path)
+
+
+def test_a_message_that_is_shorter_than_its_head_is_left_out(tmp_path):
+    path = write_three(tmp_path / "a.mcap")
+    first, *others = records_of(path)
+    short = first[:1] + struct.pack("<Q", 2) + first[9:11]
+    records = b"".join([first, short, *others])
+    replace_chunk(path, "", records, len(records))
+    assert frames_of(path).frames[:, 0, 0].tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize("compression", ["lz4", "zstd"])

@@ -310,6 +310,23 @@ def test_a_stack_that_is_cut_off_is_refused(tmp_path, options, kept):
         opened(path)
 
 
+def test_a_stack_without_the_last_byte_of_its_last_frame_is_refused(tmp_path):
+    path = write(tmp_path / "a.tif", stack(5), truncate=True)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(InputError, match=r"a\.tif is damaged or cut off"):
+        opened(path)
+
+
+@pytest.mark.parametrize("strip", [0, 1, 3])
+def test_a_strip_beyond_the_end_of_the_file_is_refused(tmp_path, strip):
+    path = write(tmp_path / "a.tif", stack(2), rowsperstrip=2, compression="zlib", metadata=None)
+    with tifffile.TiffFile(path, mode="r+") as file:
+        sizes = file.pages[1].tags["StripByteCounts"]
+        sizes.overwrite([60_000 if number == strip else size for number, size in enumerate(sizes.value)])
+    with pytest.raises(InputError, match=r"a\.tif is damaged or cut off"):
+        opened(path)
+
+
 def test_a_page_whose_strips_disagree_is_refused(tmp_path):
     path = write(tmp_path / "a.tif", stack(2), rowsperstrip=2, compression="zlib", metadata=None)
     with tifffile.TiffFile(path) as file:

@@ -386,6 +386,20 @@ def test_a_frame_that_cannot_be_decoded_is_named(tmp_path):
         opened(path)
 
 
+def test_a_picture_that_changes_its_size_is_refused(tmp_path):
+    path = tmp_path / "a.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg", rate=int(RATE))
+        stream.height, stream.width, stream.pix_fmt = *SHAPE, "yuvj420p"
+        for number, picture in enumerate([GREY[0], GREY[1], GREY[2, ::2, ::2]]):
+            packet = av.Packet(cv2.imencode(".jpg", picture)[1].tobytes())
+            packet.stream, packet.time_base, packet.is_keyframe = stream, Fraction(1, int(RATE)), True
+            packet.pts = packet.dts = number
+            container.mux(packet)
+    with pytest.raises(InputError, match="the size of the picture changes at frame 2: cut it there"):
+        opened(path)
+
+
 def test_of_several_streams_one_is_chosen(tmp_path):
     path = tmp_path / "a.mkv"
     with av.open(str(path), "w") as container:

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from weakref import WeakSet
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from injected_faults import lost
 
@@ -349,6 +350,19 @@ def test_the_profile_stays_bounded(device):
     assert len(device.profile._pending) < 1024
     runs = {record.name: record.runs for record in device.profile.records()}
     assert runs["copy_all"] == 2500
+
+
+def test_a_work_group_is_no_larger_than_its_kernel_allows(device, monkeypatch):
+    """A kernel that uses many registers allows less than its device."""
+    ask = cl.Kernel.get_work_group_info
+
+    def limited(kernel, param, on):
+        found = ask(kernel, param, on)
+        return 2 if param == cl.kernel_work_group_info.WORK_GROUP_SIZE else found
+
+    monkeypatch.setattr(cl.Kernel, "get_work_group_info", limited)
+    monkeypatch.setattr(device, "layout", replace(device.layout, group=64))
+    assert device.kernel("__kernel void limited(__global uchar *values) { }", "limited").group == 2
 
 
 PRESSED = """

@@ -1,5 +1,6 @@
 """Memory of arrays is reused, its amount is limited, and no two arrays share it."""
 
+import mmap
 import threading
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from mirrorskin import engine
 from mirrorskin.kernels import memory
+from mirrorskin.kernels.array import SLACK
 
 
 def test_memory_is_used_again():
@@ -52,6 +54,32 @@ def test_threads_do_not_get_each_others_memory():
     for thread in threads:
         thread.join()
     assert not wrong
+
+
+def test_memory_at_the_end_of_its_last_page_is_not_borrowed(device):
+    """A kernel may load up to 64 bytes after the last sample, which no page may contain."""
+    values = np.frombuffer(mmap.mmap(-1, memory.PAGE), np.uint8)
+    assert device.borrow("values", values[:-63]) is None
+
+
+@pytest.mark.parametrize(
+    "values",
+    [np.zeros((40, 50), np.float32)[:, ::2], np.zeros(400, np.uint8)[1:201].view(np.float32)],
+    ids=["with gaps", "not aligned"],
+)
+def test_values_that_a_kernel_cannot_read_in_place_are_not_borrowed(device, values):
+    assert device.borrow("values", values) is None
+
+
+def test_a_buffer_contains_the_bytes_that_follow_its_array(device):
+    """A kernel loads the last word of an array as a whole, on a device with its own memory as well."""
+    array = device.array("values", (10,), np.uint8)
+    assert array.buffer.size == 10 + SLACK
+
+
+def test_a_buffer_of_own_memory_contains_the_bytes_that_follow_its_array(card):
+    array = card.array("values", (10,), np.uint8)
+    assert array.buffer.size == 10 + SLACK
 
 
 @pytest.mark.parametrize("writeable", [True, False])
