@@ -14,11 +14,10 @@ from .files.arrays import ArrayRecording
 from .files.description import describe
 from .files.heights import open_heights
 from .files.opening import open_recording
-from .files.outputs import check_result_output
 from .files.plausibility import check
 from .files.recorder import Recorder
 from .files.recording import Recording
-from .files.result_file import open_result, save_result
+from .files.result_file import check_result_output, open_result, save_result
 from .files.streaming import StreamRecorder
 from .files.zarr_export import save_zarr
 from .formats.export import export_result

@@ -14,7 +14,7 @@ from mirrorskin.engine.base.running import check_taken, run_over
 from mirrorskin.engine.base.sources import ArraySource
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.arguments import unknown_argument
-from mirrorskin.io.base.interpreter_end import computes
+from mirrorskin.io.base.threads import computes
 
 P = ParamSpec("P")
 

@@ -8,7 +8,7 @@ from mirrorskin.engine.base.operation import OnDevice, Operation, Plan
 from mirrorskin.engine.base.options import Configured
 from mirrorskin.engine.base.running import Progress, run_over
 from mirrorskin.engine.base.steps import Undistortion
-from mirrorskin.io.base.interpreter_end import computes
+from mirrorskin.io.base.threads import computes
 
 if TYPE_CHECKING:
     from mirrorskin.io import Result, Source

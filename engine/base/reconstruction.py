@@ -17,8 +17,8 @@ from mirrorskin.engine.base.running import Progress, check_taken, run_over
 from mirrorskin.engine.base.sources import ArraySource, IteratorSource
 from mirrorskin.io import InputError
 from mirrorskin.io.base.arguments import is_array
-from mirrorskin.io.base.interpreter_end import computes
 from mirrorskin.io.base.own_class import OPERATIONS, load_class
+from mirrorskin.io.base.threads import computes
 
 if TYPE_CHECKING:
     from mirrorskin.io import Calibration, Motion, Result, Source

@@ -24,11 +24,10 @@ from mirrorskin.engine.base.sources import (
     blocks_of,
 )
 from mirrorskin.engine.base.steps import Context, Step
-from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.io import Block, InputError, Map, Result
 from mirrorskin.io.base.arguments import nearest, unknown_argument
 from mirrorskin.io.base.findings import Finding, merged, warn, with_findings
-from mirrorskin.io.base.interpreter_end import computation
+from mirrorskin.io.base.threads import ThreadSafe, computation
 from mirrorskin.io.base.types import exclusive_use
 from mirrorskin.io.model.maps import SIGMA, UNDECLARED, declaration_of
 from mirrorskin.io.model.result import result_of

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from mirrorskin.engine.base.device_arrays import as_any_array, as_any_array_or_number, device_of_maps
 from mirrorskin.engine.base.inputs import Maps, is_maps, of_one_size, pixel_size_of, required_maps
-from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.engine.integration.arrays import integrate_arrays
 from mirrorskin.engine.integration.camera import Camera
 from mirrorskin.engine.integration.normals_to_height import integrate_result
@@ -19,6 +18,7 @@ from mirrorskin.engine.integration.validation import check_inputs
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.base.arguments import Check, as_array_or_number, check_pixel_size, checked, in_unit
 from mirrorskin.io.base.findings import carried
+from mirrorskin.io.base.threads import ThreadSafe
 from mirrorskin.kernels.device import Device, open_device
 
 _MAPS: Mapping[str, Check] = {

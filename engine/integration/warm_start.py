@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.engine.integration.graph import LEVEL, Levelling, PixelGraph, find_components
 from mirrorskin.engine.integration.multigrid import Multigrid
 from mirrorskin.engine.integration.validation import Floats, Inputs
 from mirrorskin.io.base.arguments import check_pixel_size
+from mirrorskin.io.base.threads import ThreadSafe
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.io import Motion, Result
+from mirrorskin.io.base.threads import ThreadSafe
 from mirrorskin.io.model.result import display_order
 
 WAITED, PUSHED, UPDATED, SHOWN, RAISED = "waited", "push", "update", "frame to map", "frame to height"

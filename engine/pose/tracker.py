@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mirrorskin.engine.base.inputs import Maps, as_result
-from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.engine.pose.fit import FEWEST_SHARED, PairFit, complement
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
 from mirrorskin.io import Result
 from mirrorskin.io.base.findings import findings_of
+from mirrorskin.io.base.threads import ThreadSafe
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 

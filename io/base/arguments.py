@@ -13,8 +13,8 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.base.interpreter_end import computation
 from mirrorskin.io.base.samples import order_of, order_of_map, packing_of
+from mirrorskin.io.base.threads import computation
 from mirrorskin.io.base.types import InputError
 from mirrorskin.io.base.units import PLAIN, ratio
 

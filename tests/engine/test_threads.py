@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine
-from mirrorskin.engine.base.thread_safe import ThreadSafe
 from mirrorskin.engine.live import STAGES
 from mirrorskin.engine.live.status import Monitor
 from mirrorskin.io import InputError
+from mirrorskin.io.base.threads import ThreadSafe
 
 SHAPE = 24, 32
 
