@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.numerics.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import fit_clipped
 
 _LINES, _FEWEST = 48, 400  # lines of pixels along a side that are used; least number of pixels
-_ROUNDS, _OUTLYING = 4, 4.0  # iterations, and standard deviations beyond which a pixel is left out
 _CLEAR, _CLEAR_SIDE, _SMALLEST = 6.0, 2.0, 0.4  # standard errors, and pixels, from which on a blur is one
 
 
@@ -94,13 +93,8 @@ def find_blur(vectors: Sequence[NDArray[np.floating]], strength: NDArray[np.floa
 
 def _fit(terms: Doubles, values: Doubles) -> tuple[float, float]:
     """Return the variance of the point spread by the first of some terms, and its standard error."""
-    kept = np.full(len(values), True)
-    for _ in range(_ROUNDS):
-        matrix = np.einsum("ni,nj->ij", terms[kept], terms[kept])
-        if np.linalg.cond(matrix) > 1e12:
-            return 0.0, math.inf
-        inverse = np.linalg.inv(matrix)
-        fit = inverse @ np.einsum("ni,n->i", terms[kept], values[kept])
-        left = values - np.einsum("ni,i->n", terms, fit)
-        kept = np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
+    found = fit_clipped(terms, values)
+    if found is None:
+        return 0.0, math.inf
+    fit, inverse, left, kept = found
     return -2 * float(fit[0]), 2 * math.sqrt(inverse[0, 0] * float(np.mean(left[kept] ** 2)))

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.device_arrays import AnyArray
 from mirrorskin.engine.base.frames import take_places
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.numerics.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import fit_clipped
 
 _LOOPS, _LEAST, _LINES = 40, 3, 48  # of the extent of the normals: half a side of a loop; its least; loops
 _FEWEST = 200  # loops
-_ROUNDS, _OUTLYING = 4, 4.0  # iterations, and standard deviations beyond which a loop is left out
 _EXPLAINED = np.array([0.2, 0.5])  # least share of the curl that an angle explains, and one that changes
 _CLEAR, _SMALLEST = 8.0, math.radians(1.5)  # standard errors and angle from which on a rotation is one
 
@@ -78,17 +77,11 @@ def find_azimuth_error(
 def _regression(curl: Doubles, divergence: Doubles, place: Doubles, overlap: float) -> AzimuthError | None:
     """Fit a rotation that may change with the place of the row, 1 for the first and -1 for the last."""
     columns = np.stack([divergence, divergence * place], axis=1)
-    kept = np.full(len(curl), True)
-    for _ in range(_ROUNDS):
-        matrix = np.einsum("ni,nj->ij", columns[kept], columns[kept])
-        if np.linalg.cond(matrix) > 1e9:
-            return None
-        fit = np.linalg.solve(matrix, np.einsum("ni,n->i", columns[kept], curl[kept]))
-        left = curl - np.einsum("ni,i->n", columns, fit)
-        before, kept = kept, np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
-        if np.array_equal(before, kept):
-            break
-    spread = np.sqrt(np.diag(np.linalg.inv(matrix)) * float(np.mean(left[kept] ** 2)) * overlap)
+    found = fit_clipped(columns, curl, condition=1e9)
+    if found is None:
+        return None
+    fit, inverse, left, kept = found
+    spread = np.sqrt(np.diag(inverse) * float(np.mean(left[kept] ** 2)) * overlap)
     explained = 1 - float(np.var(left[kept])) / max(float(np.var(curl[kept])), 1e-30)
     clear = (np.abs(fit) > _CLEAR * spread) & (np.abs(fit) > math.tan(_SMALLEST)) & (explained > _EXPLAINED)
     if not clear.any():

@@ -26,12 +26,11 @@ from mirrorskin.engine.base.device_arrays import AnyArray
 from mirrorskin.engine.base.frames import take_places
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.numerics.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import OUTLYING, fit_clipped, gram, mad_sigma
 
 _STEEP = 3.0  # tilts, from which on the zenith and the swing are independent
 _REACH, _LINES = 2, 48  # pixels between the middle and its neighbours; lines of pixels that are used
 _FEWEST = 400  # pixels
-_ROUNDS, _OUTLYING = 4, 4.0  # iterations, and standard deviations beyond which a pixel is left out
 _CLEAR, _CLEAR_GAIN = 6.0, 5.0  # standard errors from which on an effect is one
 _UNEVEN = 0.03  # least range of the swing, as a share of it, that is a response or uneven light
 _ALONE = 0.25  # least share of an effect's variance that the others do not explain
@@ -137,28 +136,20 @@ def _gain(rough: Doubles, noise: Doubles) -> float:
     """Return the standard deviation of gains, from what differs from the mean of four neighbours."""
     ratio = rough / (noise * math.sqrt(1.25))
     # Neighbours are in several means, so that the error of the variance is larger than of independent values.
-    excess = float(np.mean(ratio[np.abs(ratio) <= _OUTLYING * mad_sigma(ratio)] ** 2)) - 1
+    excess = float(np.mean(ratio[np.abs(ratio) <= OUTLYING * mad_sigma(ratio)] ** 2)) - 1
     gain = math.sqrt(max(excess, 0)) * float(np.median(noise))
     return gain if excess > _CLEAR_GAIN * _JOINED * math.sqrt(2 / len(rough)) and gain > _GAIN else 0.0
 
 
 def _fit(swing: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing:
     """Fit the effects to the ratio of the swing to the expected one."""
-    kept = np.full(len(swing), True)
-    for _ in range(_ROUNDS):
-        weighted = columns[kept] / noise[kept, np.newaxis]
-        matrix = _gram(weighted)
-        if np.linalg.cond(matrix) > 1e12:
-            return Swing(gain=gain)
-        inverse = np.linalg.inv(matrix)
-        fit = inverse @ np.sum(weighted * (swing[kept] / noise[kept])[:, np.newaxis], axis=0)
-        left = (swing - np.sum(columns * fit, axis=1)) / noise
-        before, kept = kept, np.abs(left) <= _OUTLYING * max(mad_sigma(left), 1e-12)
-        if np.array_equal(before, kept):
-            break
+    found = fit_clipped(columns, swing, noise)
+    if found is None:
+        return Swing(gain=gain)
+    fit, inverse, left, kept = found
     covariance = inverse * max(1.0, float(np.mean(left[kept] ** 2)))
 
-    products = _gram(columns[kept])
+    products = gram(columns[kept])
     sums, number = products[0], products[0, 0]  # the first column is 1
 
     def effect(chosen: slice) -> float:
@@ -181,8 +172,3 @@ def _fit(swing: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing
         extent if extent > _UNEVEN else 0.0 for extent in (effect(slice(3, 4)), effect(slice(4, 9)))
     )
     return Swing(response, light, gain, spread if blurs else 0.0)
-
-
-def _gram(columns: Doubles) -> Doubles:
-    """Return the products of columns; unlike a product of matrices, it starts no threads."""
-    return np.asarray(np.einsum("ni,nj->ij", columns, columns))

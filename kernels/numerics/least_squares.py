@@ -234,6 +234,60 @@ def _scale(matrix: Doubles) -> Doubles:
     return np.asarray(1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
 
 
+# --- linear fits without outliers ---------------------------------------------------------------------------
+
+OUTLYING = 4.0
+"""Standard deviations beyond which a value is left out of a linear fit."""
+
+_CLIPS, _LEAST_SPREAD = 4, 1e-12  # rounds, and least standard deviation of residuals
+
+
+class ClippedFit(NamedTuple):
+    """A linear fit without outliers."""
+
+    parameters: Doubles  # (k,)
+    inverse: Doubles  # (k, k): the inverse of the normal matrix
+    residuals: Doubles  # (n,): of all values, in units of their noise
+    kept: NDArray[np.bool_]  # (n,): values that are no outliers
+
+
+def gram(columns: Doubles) -> Doubles:
+    """Return the products of columns, (k, k); unlike a product of matrices, it starts no threads."""
+    return np.asarray(np.einsum("ni,nj->ij", columns, columns))
+
+
+def fit_clipped(
+    columns: Doubles, values: Doubles, noise: Doubles | None = None, *, condition: float = 1e12
+) -> ClippedFit | None:
+    """Fit values, (n,), by columns, (n, k), and leave out those that are `OUTLYING` and more away.
+
+    ``noise`` are the standard deviations of the values, (n,). Returns None if the columns are alike: if the
+    condition of the normal matrix is above a limit.
+
+    Examples
+    --------
+    >>> columns = np.stack([np.ones(9), np.arange(9.0)], axis=1)
+    >>> values = 2 + 3 * np.arange(9.0)
+    >>> values[4] = 99
+    >>> fit_clipped(columns, values).parameters.round(6).tolist()
+    [2.0, 3.0]
+    """
+    if noise is not None:
+        columns, values = columns / noise[:, np.newaxis], values / noise
+    kept = np.full(len(values), True)
+    for _ in range(_CLIPS):
+        matrix = gram(columns[kept])
+        if np.linalg.cond(matrix) > condition:
+            return None
+        inverted = np.linalg.inv(matrix)
+        parameters: Doubles = inverted @ np.einsum("ni,n->i", columns[kept], values[kept])
+        residuals: Doubles = np.asarray(values - np.einsum("ni,i->n", columns, parameters))
+        before, kept = kept, np.abs(residuals) <= OUTLYING * max(mad_sigma(residuals), _LEAST_SPREAD)
+        if np.array_equal(before, kept):
+            break
+    return ClippedFit(parameters, inverted, residuals, kept)
+
+
 # --- fits of arrays -----------------------------------------------------------------------------------------
 
 

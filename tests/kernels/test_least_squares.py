@@ -159,3 +159,41 @@ def test_a_median_is_that_of_numpy(size, spread):
         "even": values, "equal": 0 * values, "sorted": np.sort(values), "two values": np.rint(values)
     }[spread]  # fmt: skip
     assert median(values) == np.median(values)
+
+
+def straight_line(count=400, noise=1.0, seed=0):
+    """Return columns, values of the line 2 + 3 x with noise, and the generator."""
+    random = np.random.default_rng(seed)
+    columns = np.stack([np.ones(count), np.linspace(-1, 1, count)], axis=1)
+    return columns, columns @ [2.0, 3.0] + random.normal(0, noise, count), random
+
+
+def test_a_clipped_fit_without_outliers_is_a_linear_fit():
+    columns, values, _ = straight_line(noise=0.0)
+    found = least_squares.fit_clipped(columns, values + 0.1 * np.cos(np.arange(400)))
+    expected = np.linalg.lstsq(columns, values + 0.1 * np.cos(np.arange(400)), rcond=None)[0]
+    np.testing.assert_allclose(found.parameters, expected, rtol=1e-12)
+
+
+def test_a_clipped_fit_leaves_outliers_out():
+    columns, values, random = straight_line()
+    stray = random.choice(400, 40, replace=False)
+    values[stray] += 50
+    found = least_squares.fit_clipped(columns, values)
+    assert not found.kept[stray].any()
+    assert np.count_nonzero(found.kept) == 360
+
+
+def test_errors_of_a_clipped_fit_are_those_of_repeated_fits():
+    noise = np.linspace(0.5, 2, 400)
+    fits = []
+    for seed in range(300):
+        columns, line, random = straight_line(noise=0.0, seed=seed)
+        fits.append(least_squares.fit_clipped(columns, line + noise * random.normal(size=400), noise))
+    spread = np.std([one.parameters for one in fits], axis=0)
+    np.testing.assert_allclose(spread, np.sqrt(np.diag(fits[0].inverse)), rtol=0.15)
+
+
+def test_columns_that_are_alike_have_no_clipped_fit():
+    _, values, _ = straight_line()
+    assert least_squares.fit_clipped(np.ones((400, 2)), values) is None
