@@ -279,7 +279,7 @@ def fit_clipped(
         matrix = gram(columns[kept])
         if np.linalg.cond(matrix) > condition:
             return None
-        inverted = np.linalg.inv(matrix)
+        inverted: Doubles = np.asarray(np.linalg.inv(matrix), np.float64)
         parameters: Doubles = inverted @ np.einsum("ni,n->i", columns[kept], values[kept])
         residuals: Doubles = np.asarray(values - np.einsum("ni,i->n", columns, parameters))
         before, kept = kept, np.abs(residuals) <= OUTLYING * max(mad_sigma(residuals), _LEAST_SPREAD)
