@@ -196,6 +196,33 @@ def test_a_folder_of_zarr_is_on_the_disk_before_its_name(tmp_path, steps):
     assert [*last].count("synchronise file") == files
 
 
+def test_the_names_in_a_folder_of_zarr_are_on_the_disk_before_its_name(tmp_path, steps):
+    write_result(tmp_path / "a.zarr")
+    folders = 1 + sum(one.is_dir() for one in (tmp_path / "a.zarr").rglob("*"))
+    last = itertools.takewhile(lambda step: step != "name", reversed(steps[:-2]))
+    assert [*last].count("synchronise folder") == folders
+
+
+def test_a_full_disk_that_is_only_reported_on_closing_is_an_error(tmp_path, monkeypatch):
+    """Some network file systems do this, so a copy of the descriptor is closed before the renaming."""
+    copy, close, copies = os.dup, os.close, set()
+
+    def watched(descriptor):
+        copies.add(copied := copy(descriptor))
+        return copied
+
+    def full(descriptor):
+        close(descriptor)
+        if descriptor in copies:
+            copies.remove(descriptor)
+            raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(os, "dup", watched)
+    monkeypatch.setattr(os, "close", full)
+    with pytest.raises(io.InputError, match=r"a\.h5 could not be written: No space left on device"):
+        write_table(tmp_path / "a.h5")
+
+
 def test_a_folder_that_cannot_be_synchronised_is_no_failure(tmp_path, monkeypatch):
     synchronise = os.fsync
 
