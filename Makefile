@@ -66,12 +66,12 @@ test-browser: .venv/.browser
 # The rig before GRBL's own firmware, the program GRBL; docs/rig.md tells how it is built.
 test-hardware: $(READY)
 	@test -x "$(GRBL)" || { echo 'make test-hardware GRBL=PATH: PATH must be a program (docs/rig.md)' >&2; exit 1; }
-	GRBL="$(realpath $(GRBL))" $(BIN)/python -m pytest tests/hw/test_transcript.py tests/hw/test_rig_faults.py tests/hw/test_grbl_emulated.py
+	GRBL="$(realpath $(GRBL))" $(BIN)/python -m pytest tests/hw/stages/test_transcript.py tests/hw/rig/test_faults.py tests/hw/stages/test_grbl_emulated.py
 	PYTHONPATH=tests/support $(BIN)/python tests/support/rig_faults.py "$(realpath $(GRBL))"
 
 # Aravis' fake cameras by GigE Vision; docs/camera.md tells what the system must bring.
 test-cameras: .venv/.genicam
-	@$(BIN)/python -m pytest tests/hw/test_genicam_camera.py
+	@$(BIN)/python -m pytest tests/hw/cameras/test_genicam.py
 
 # The site, in site/; warnings are errors.
 docs: .venv/.docs

@@ -13,7 +13,7 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedWriter, FileIO, TextIOWrapper
 from types import FrameType, TracebackType
@@ -33,6 +33,7 @@ _LESS = "take a smaller region or fewer frames, or end other programs"
 _LEAST = 512 << 20  # bytes of address space, without which NumPy's libraries end the process
 _REFUSED = ("failed to map segment", "annot allocate memory", "can't start new thread")
 """Messages of libraries that got no memory or thread from the system."""
+_Handler = Callable[[int, FrameType | None], None]
 _HELP = "NoArgsIsHelpError"  # of a group that no command was named of; its message is the group's help
 
 PURPOSES = {
@@ -188,19 +189,37 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 @contextmanager
-def _ended_by_signals() -> Iterator[None]:
+def _restored_handlers(is_program: bool) -> Iterator[Callable[[int, _Handler], None]]:
+    """Pass a function that installs the handler of a signal; the previous handlers are restored at the end.
+
+    Ctrl-C then ends the interpreter of a program without a traceback, unless the caller handles it.
+    """
+    previous: dict[int, Any] = {}
+
+    def install(number: int, handler: _Handler) -> None:
+        previous.setdefault(number, signal.getsignal(number))
+        signal.signal(number, handler)
+
+    try:
+        yield install
+    finally:
+        if hasattr(signal, "SIGALRM") and signal.SIGALRM in previous:
+            signal.setitimer(signal.ITIMER_REAL, 0)  # an alarm under way would meet the previous handler
+        for number, handler in previous.items():
+            if is_program and handler is signal.default_int_handler:
+                handler = signal.SIG_DFL
+            if handler is not None:  # one that C code installed cannot be restored
+                signal.signal(number, handler)
+
+
+@contextmanager
+def _ended_by_signals(is_program: bool) -> Iterator[None]:
     """Let signals end the program by an exception, so that no file remains half-written.
 
     Further signals must not interrupt the clean-up: the stage is stopped, files are completed, and threads
     are waited for, because OpenCL aborts a program that ends while it works.
     """
     _OneLine.signalled = _OneLine.insisted = 0
-
-    for name in ("SIGTERM", "SIGHUP"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), _end)
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where it is ignored
-        signal.signal(signal.SIGINT, _end)
     told = sys.unraisablehook
 
     def insist(lost: sys.UnraisableHookArgs) -> None:
@@ -213,14 +232,20 @@ def _ended_by_signals() -> Iterator[None]:
         def again(number: int, frame: object) -> None:
             raise kind(*given)
 
-        signal.signal(signal.SIGALRM, again)
+        install(signal.SIGALRM, again)
         signal.setitimer(signal.ITIMER_REAL, _SOON)
 
-    sys.unraisablehook = insist
-    try:
-        yield
-    finally:
-        sys.unraisablehook = told
+    with _restored_handlers(is_program) as install:
+        for name in ("SIGTERM", "SIGHUP"):
+            if hasattr(signal, name):
+                install(getattr(signal, name), _end)
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where it is ignored
+            install(signal.SIGINT, _end)
+        sys.unraisablehook = insist
+        try:
+            yield
+        finally:
+            sys.unraisablehook = told
 
 
 def _complete(instruction: str) -> None:
@@ -285,11 +310,11 @@ def _guard_streams() -> None:
         setattr(sys, name, guarded)
 
 
-def main() -> None:
-    """Run the command line, or answer a shell that completes one."""
+def main(*, is_program: bool = False) -> None:
+    """Run the command line, or answer a shell that completes one; ``is_program``: the process ends then."""
     words = sys.argv[1:] or ["--help"]
     completion = os.environ.get(_COMPLETE)
-    with _ended_by_signals(), _OneLine():
+    with _ended_by_signals(is_program), _OneLine():
         try:
             if completion:
                 _complete(completion)
@@ -307,9 +332,8 @@ def program() -> None:
     """Run the command line as a separate program."""
     _guard_streams()
     try:
-        main()
-    finally:  # everything is closed: another Ctrl-C ends the interpreter without a traceback
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        main(is_program=True)
+    finally:
         gc.freeze()  # the interpreter searches all that it leaves for garbage otherwise, for 80 ms
 
 

@@ -37,7 +37,7 @@ WAYS = [
 
 @pytest.fixture(autouse=True)
 def _default_interrupt():
-    """Shells start what runs in the background deaf to Ctrl-C, and commands leave their own handler."""
+    """Shells start what runs in the background deaf to Ctrl-C."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

@@ -3,6 +3,7 @@
 import pkgutil
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import click
@@ -176,6 +177,13 @@ def test_every_kind_of_finding_is_explained():
     page = (DOCS / "troubleshooting.md").read_text()
     assert len(kinds) > 20
     assert {kind for kind in kinds if f"`{kind}`" not in page} == set()
+
+
+def test_the_hook_and_the_environment_have_the_same_minor_version_of_ruff():
+    hook = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))["repos"][0]["rev"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    minor = int(re.fullmatch(r"v0\.(\d+)\.\d+", hook)[1])
+    assert f"ruff>=0.{minor},<0.{minor + 1}" in project["optional-dependencies"]["dev"]
 
 
 def test_phrases_that_contributing_asks_to_avoid_are_not_used():

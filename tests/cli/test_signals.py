@@ -64,6 +64,65 @@ def test_a_repeated_signal_ends_a_hanging_program_at_once_and_without_an_abort(p
     assert done.stderr == "mirrorskin: it is being stopped; two more Ctrl-C end it at once\n"
 
 
+HANDLED = [signal.SIGTERM, signal.SIGHUP, signal.SIGALRM, signal.SIGINT]
+
+
+def handlers():
+    return [signal.getsignal(number) for number in HANDLED]
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_handlers_of_the_caller_are_restored(press, monkeypatch, own):
+    before = handlers()
+
+    class Careless:
+        def __del__(self):
+            raise KeyboardInterrupt  # is lost, and raised again by an alarm
+
+    def describe(path):
+        Careless()
+        signal.pause()
+
+    try:
+        if own:
+            for number in HANDLED:
+                signal.signal(number, lambda *_: None)
+        installed = handlers()
+        assert run("info", press).code == 0
+        assert handlers() == installed
+        monkeypatch.setattr(io, "describe", describe)
+        assert run("info", press).code == 130
+        assert handlers() == installed
+        assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    finally:
+        for number, handler in zip(HANDLED, before, strict=True):
+            signal.signal(number, handler)
+
+
+# The handlers after the command line has run as a program: Ctrl-C ends the interpreter, without a traceback.
+RETURNED = """
+import contextlib, signal, sys
+from mirrorskin.cli.main import program
+own = lambda *_: None
+for name in sys.argv.pop().split(","):
+    signal.signal(getattr(signal, name), own)
+with contextlib.suppress(SystemExit):
+    program()
+names = {own: "own", signal.SIG_DFL: "default"}
+print([names[signal.getsignal(getattr(signal, name))] for name in ("SIGTERM", "SIGHUP", "SIGINT")])
+"""
+
+
+@pytest.mark.parametrize(
+    ("own", "expected"),
+    [("SIGTERM", ["own", "default", "default"]), ("SIGHUP,SIGINT", ["default", "own", "own"])],
+)
+def test_handlers_after_a_program(own, expected):
+    command = [sys.executable, "-c", RETURNED, "--version", own]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.splitlines()[1:] == [str(expected)]
+
+
 @pytest.mark.parametrize(("limit", "said"), [(400_000 << 10, "512 MB are needed"), (900 << 20, "PoCL needs")])
 def test_too_little_address_space_is_one_line(press, limit, said):
     # 400 000 KB is 'ulimit -v 400000', with which PoCL's threads aborted; LLVM crashed with 900 MB.

@@ -806,16 +806,16 @@ def test_a_kernel_computes_its_reference(device, name, function, chosen, options
 
 ELSEWHERE = {
     "changepoint": "support/changes.py",
-    "components": "kernels/test_components.py",
-    "edges": "kernels/test_edges.py",
-    "links": "kernels/test_links.py",
-    "multigrid": "kernels/test_multigrid.py",
-    "normals": "kernels/test_normals.py",
-    "normals_pose": "kernels/test_normals_pose.py",
-    "normals_wall": "kernels/test_normals_wall.py",
+    "components": "kernels/integration/test_components.py",
+    "edges": "kernels/rotation/test_edges.py",
+    "links": "kernels/integration/test_links.py",
+    "multigrid": "kernels/integration/test_multigrid.py",
+    "normals": "kernels/rotation/test_normals.py",
+    "normals_pose": "kernels/rotation/test_normals_pose.py",
+    "normals_wall": "kernels/rotation/test_normals_wall.py",
     "onset": "engine/press/test_onset.py",
-    "rectangle": "kernels/test_rectangle.py",
-    "slopes": "kernels/test_slopes.py",
+    "rectangle": "kernels/integration/test_rectangle.py",
+    "slopes": "kernels/integration/test_slopes.py",
 }
 """Where kernels that work on what the engine prepares, such as a graph, are compared with their reference."""
 

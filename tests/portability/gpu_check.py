@@ -124,7 +124,7 @@ def record() -> dict[Build, set[str]]:
         for _, case in frozen_cases():
             case.make()
     # No frozen case is under a cylinder's wall.
-    sys.path.insert(0, str(ROOT / "tests" / "kernels"))
+    sys.path.insert(0, str(ROOT / "tests" / "kernels" / "rotation"))
     import test_normals_wall
 
     for name in test_normals_wall.CASES:

@@ -1,7 +1,7 @@
 """Transcripts of real firmwares, with which emulated controller and driver are compared.
 
-``python tests/support/transcript.py PROGRAM > tests/hw/grbl-1.1h.txt`` makes it anew; docs/rig.md tells how
-the program is built.
+``python tests/support/transcript.py PROGRAM > tests/hw/stages/grbl-1.1h.txt`` makes it anew; docs/rig.md
+tells how the program is built.
 """
 
 from __future__ import annotations

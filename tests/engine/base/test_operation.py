@@ -149,7 +149,7 @@ def test_levels_that_are_not_given_are_those_of_the_recording(tmp_path):
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_a_kernel_of_the_user_s_gives_the_same_as_numpy(device, tmp_path, dtype):
-    page = (Path(__file__).parents[2] / "docs" / "operations.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "operations.md").read_text(encoding="utf-8")
     exec(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)[-1], known := {})
     frames = random_stack(dtype)
     record(MadeUp(frames, HEADER, travel=TRAVEL), tmp_path / "rec.h5")

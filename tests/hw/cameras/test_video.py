@@ -482,7 +482,7 @@ class Vendor(ModuleType):
 
 
 def test_the_camera_of_the_documentation_works(monkeypatch) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "camera.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "camera.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     pictures = noise(5)
     vendor = Vendor(pictures)

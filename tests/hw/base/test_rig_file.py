@@ -27,7 +27,7 @@ from mirrorskin.hw.base.rig_file import (
 from mirrorskin.hw.base.stage import Limits
 from mirrorskin.io import InputError
 
-DOCS = Path(__file__).parents[2] / "docs" / "rig.md"
+DOCS = Path(__file__).parents[3] / "docs" / "rig.md"
 
 EVERYTHING = """
 name = "bench 2"

@@ -24,7 +24,7 @@ from mirrorskin.io.files import streaming
 from mirrorskin.io.files.recorder import COMPRESSIONS
 
 DETECTOR, STAGE = "/entry/instrument/detector", "/entry/instrument/stage"
-SUPPORT = Path(__file__).parents[1] / "support"
+SUPPORT = Path(__file__).parents[2] / "support"
 
 
 def held(path):

@@ -9,7 +9,7 @@ import pytest
 
 from mirrorskin.io.base.units import BASE, conversion_factor, in_base, ratio, units_of
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PINT = pint.UnitRegistry()
 BASES = {**BASE, "pressure": "MPa"}
 KNOWN = [(kind, symbol) for kind in BASE for symbol in units_of(kind)]

@@ -113,7 +113,7 @@ stage.wait()
 
 
 def test_a_host_that_is_killed_leaves_a_stage_that_soon_rests():
-    support, speed = Path(__file__).parents[1] / "support", 0.1
+    support, speed = Path(__file__).parents[2] / "support", 0.1
     machine = GrblMachine(SETTINGS)
     with GrblPort(machine) as port:
         words = [sys.executable, "-c", HOST, port.url]

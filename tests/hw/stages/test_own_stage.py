@@ -25,7 +25,7 @@ from mirrorskin.hw.rig.sweep import SweepScan
 STAGE = StageSettings(
     port="/dev/ttyUSB0", press=2.0, travel=TravelAxis(letter="Z", limits=(-10.0, 3.0), speed=100.0)
 )
-PAGE = Path(__file__).parents[2] / "docs" / "stages.md"
+PAGE = Path(__file__).parents[3] / "docs" / "stages.md"
 EXAMPLE = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[0]
 
 

@@ -349,7 +349,7 @@ raise RuntimeError("forgot to close it")
 
 
 def test_a_program_that_ends_without_closing_stops_the_stage():
-    support = Path(__file__).parents[1] / "support"
+    support = Path(__file__).parents[2] / "support"
     ended = subprocess.run(
         [sys.executable, "-c", FORGETFUL],
         env={"PYTHONPATH": f"{support}:{':'.join(sys.path)}"},

@@ -71,7 +71,7 @@ def outcomes(lines):
     """Run commands in a process that is ended when one of them waits; return code and message of each."""
     import json
 
-    support = Path(__file__).parents[1] / "support"
+    support = Path(__file__).parents[2] / "support"
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, json.dumps(lines)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(support), os.environ.get("PYTHONPATH", "")])},
