@@ -26,6 +26,8 @@ from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.press.onset import DARK, complement
 
 if TYPE_CHECKING:
+    from mirrorskin.engine.press.onset import ThresholdOperation
+    from mirrorskin.engine.press.strokes import Strokes
     from mirrorskin.io import Source
 
 Event = Literal["onset", "release"]
@@ -140,15 +142,6 @@ class PressOperation(Operation):
         return {**self.maps, "status": STATUS[self.event]}
 
 
-class CrossingOperation(PressOperation):
-    """Base of operations that search for threshold crossings."""
-
-    subframe: bool = option(
-        default=True,
-        help="interpolate between the frames around the event; without it, the paper's equation 4 as printed",
-    )
-
-
 EVENT_MAPS = "height", "height_sigma", "status", "frame"
 """Names of `EventMaps` in a result."""
 
@@ -175,7 +168,7 @@ class Crossing:
 
     def __init__(
         self,
-        operation: CrossingOperation,
+        operation: ThresholdOperation | Strokes,
         shape: tuple[int, int],
         dtype: np.dtype[Any],
         *,

@@ -17,7 +17,7 @@ from mirrorskin.engine.diagnosis.brightness_levels import (
     with_estimated_levels,
 )
 from mirrorskin.engine.diagnosis.position_uncertainty import PositionUncertainty
-from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, CrossingOperation, Event, EventMaps
+from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, Event, EventMaps, PressOperation
 from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import Result
 
@@ -25,11 +25,15 @@ if TYPE_CHECKING:
     from mirrorskin.io import Source
 
 
-class ThresholdOperation(CrossingOperation):
+class ThresholdOperation(PressOperation):
     """Base of operations that search for one event at one or several thresholds."""
 
     checks = NoAnswer, PositionUncertainty, RollingShutter, LensBlur, LevelUncertainty, EstimatedLevelNote
 
+    subframe: bool = option(
+        default=True,
+        help="interpolate between the frames around the event; without it, the paper's equation 4 as printed",
+    )
     event: Event = option(
         default="onset",
         help="event to find: dark to light while travel increases, or light to dark while it decreases",

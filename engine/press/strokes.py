@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.base.device_arrays import on_host
 from mirrorskin.engine.diagnosis.blur import StatedBlur
 from mirrorskin.engine.diagnosis.brightness_levels import EstimatedLevelNote, with_estimated_levels
-from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, CrossingOperation, Event, EventMaps
+from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, Event, EventMaps, PressOperation
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import Result
@@ -29,7 +29,7 @@ _NOISY = 2.0  # standard deviations: displacement of a crossing by noise that is
 _UNLIKELY = 1e-3  # significance level of scatter beyond the predicted one
 
 
-class Strokes(CrossingOperation):
+class Strokes(PressOperation):
     """Height and hysteresis from a press that oscillates: the onsets and releases of all strokes.
 
     A stroke is a sequence of frames with the same direction of travel; turning points belong to both strokes.
@@ -51,6 +51,7 @@ class Strokes(CrossingOperation):
     checks = NoAnswer, RollingShutter, StatedBlur, EstimatedLevelNote
 
     threshold: float = Onset.threshold
+    subframe: bool = Onset.subframe
     event: Event = Onset.event
     line_time: float | None = Onset.line_time
     blur: float | None = Onset.blur
