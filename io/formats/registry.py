@@ -98,12 +98,21 @@ class Format:
         return getattr(import_module(self.module), name)
 
 
+def _read(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except OSError as error:
+        from mirrorskin.io.base.types import InputError
+
+        raise InputError(f"{file} cannot be read ({error}); reinstall mirrorskin") from error
+
+
 @functools.cache
 def _built_in() -> tuple[Format, ...]:
     """Return the formats that the modules of this folder, and that of our Zarr stores, declare."""
     found = []
     for file in (*sorted(_HERE.glob("*.py")), _HERE.parent / "files" / "result_file.py"):
-        for text in _DECLARATION.findall(file.read_text(encoding="utf-8")):
+        for text in _DECLARATION.findall(_read(file)):
             (call,) = ast.parse(text).body
             assert isinstance(call, ast.Expr)
             assert isinstance(call.value, ast.Call)

@@ -50,9 +50,9 @@ def test_library_run(recordings, levels):
 @pytest.mark.parametrize(
     ("line", "functions", "files"),
     [
-        ("reconstruct press.h5", 547, 69),
-        ("reconstruct turn.h5", 706, 89),
-        ("fuse press.h5 turn.h5", 868, 105),
+        ("reconstruct press.h5", 549, 69),
+        ("reconstruct turn.h5", 709, 89),
+        ("fuse press.h5 turn.h5", 871, 105),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):
