@@ -31,6 +31,8 @@ _CELL = 65535  # rows or columns
 GENICAM = "genicam:"
 _CLASS = re.compile(r"(?!genicam:)(.*\.py|[^\W\d]\w*(\.[^\W\d]\w*)*):[^\W\d]\w*")
 
+_FIRMWARES = "grbl", "marlin"
+
 CAMERAS, STAGES = "mirrorskin.cameras", "mirrorskin.stages"
 """Groups of entry points by which packages give names to their cameras and stages."""
 """Prefix of the source of GigE Vision and USB3 Vision cameras."""
@@ -190,7 +192,7 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
     firmware: Annotated[
         str,
         Meta(
-            pattern=r"^(grbl|marlin|[^\x00-\x1f\x7f]+:[A-Za-z_]\w*)\Z",
+            pattern=r"^([A-Za-z_]\w*|[^\x00-\x1f\x7f]+:[A-Za-z_]\w*)\Z",
             description='"grbl", "marlin", or a class as "module:Class" or "file.py:Class",',
             examples=["grbl"],
         ),
@@ -426,7 +428,14 @@ def load_rig(path: Path | str) -> RigSettings:
         resolved["source"] = _next_to(path, _own_class(path, camera.source, CAMERAS))
     camera = msgspec.structs.replace(camera, **resolved)
     check_references(camera, str(path))
-    stage = msgspec.structs.replace(file.stage, firmware=_own_class(path, file.stage.firmware, STAGES))
+    firmware = _own_class(path, file.stage.firmware, STAGES)
+    if firmware.isidentifier() and firmware not in _FIRMWARES:
+        known = ", ".join([*_FIRMWARES, *installed_names(STAGES)])
+        raise InputError(
+            f"{path}: stage.firmware is {firmware}, and there are {known}; or name a class, as in"
+            ' "my_stage.py:MyStage"'
+        )
+    stage = msgspec.structs.replace(file.stage, firmware=firmware)
     return RigSettings(path, file.name or path.stem, stage, camera)
 
 
@@ -447,7 +456,7 @@ def _own_class(path: Path, name: str, group: str) -> str:
 
     The path of a class's module is added if this is next to the rig file.
     """
-    if name.isidentifier() and name in installed_names(group):
+    if name.isidentifier() and name not in _FIRMWARES and name in installed_names(group):
         return class_of(name, group)
     if not _CLASS.fullmatch(name):
         return name

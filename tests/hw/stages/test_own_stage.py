@@ -15,7 +15,7 @@ from simulated import on_clock, write_film_rig
 
 from mirrorskin import io
 from mirrorskin.hw.base.errors import HardwareError
-from mirrorskin.hw.base.rig_file import StageSettings, TravelAxis
+from mirrorskin.hw.base.rig_file import STAGES, StageSettings, TravelAxis, load_rig
 from mirrorskin.hw.base.stage import Position
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig, open_stage
@@ -245,3 +245,26 @@ def test_what_a_class_lacks_is_refused_in_a_line(folder, words, change, said):
     ended = run("rig", words, folder / "rig.toml")
     assert (ended.code, ended.said.count("\n")) == (2, 1), ended
     assert said in ended.said
+
+
+@pytest.fixture
+def named_stage(tmp_path, monkeypatch):
+    """Install a package that gives the stage of the page a name."""
+    facts = tmp_path / "site" / "lab-1.0.dist-info"
+    facts.mkdir(parents=True)
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: lab\nVersion: 1.0\n")
+    (facts / "entry_points.txt").write_text(f"[{STAGES}]\nlab = lab_stage:LabStage\n")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+
+
+@pytest.mark.usefixtures("named_stage")
+def test_an_entry_point_names_a_stage(tmp_path):
+    write_film_rig(tmp_path, RIG.replace("my_stage:LabStage", "lab"))
+    assert load_rig(tmp_path / "rig.toml").stage.firmware == "lab_stage:LabStage"
+
+
+@pytest.mark.usefixtures("named_stage")
+def test_an_unknown_firmware_is_refused_with_those_that_exist(tmp_path):
+    write_film_rig(tmp_path, RIG.replace("my_stage:LabStage", "grlb"))
+    with pytest.raises(io.InputError, match=r"stage\.firmware is grlb, and there are grbl, marlin, lab"):
+        load_rig(tmp_path / "rig.toml")
