@@ -128,7 +128,13 @@ def _installed() -> Iterator[Format]:
     from mirrorskin.io.base.types import InputError
 
     for point in entry_points(group=FORMATS):
-        found = point.load()
+        try:
+            found = point.load()
+        except (ImportError, AttributeError) as error:
+            raise InputError(
+                f"the format {point.name} of an installed package cannot be loaded: {error}; repair or"
+                " uninstall the package"
+            ) from error
         if not isinstance(found, Format):
             raise InputError(f"{point.value}, in the entry points {FORMATS}, is no mirrorskin.io.Format")
         yield replace(found, module=point.module)

@@ -103,6 +103,21 @@ def test_exports_that_are_possible_are_listed_with_those_of_packages():
     assert refused("is not a supported format", "export", "r.h5", "-o", "r.off").endswith(".raw")
 
 
+@pytest.mark.parametrize(
+    ("value", "line"),
+    [
+        ("absent_module:RAW", "the format raw of an installed package cannot be loaded: No module named"),
+        ("raw_frames:ABSENT", "the format raw of an installed package cannot be loaded"),
+        ("raw_frames:encode", "raw_frames:encode, in the entry points mirrorskin.formats, is no mirrorskin"),
+    ],
+)
+def test_an_entry_point_that_is_no_format_is_refused_in_a_line(installed, tmp_path, value, line):
+    (tmp_path / "site" / "raw_frames-1.0.dist-info" / "entry_points.txt").write_text(
+        f"[{registry.FORMATS}]\nraw = {value}\n"
+    )
+    refused(line, "info", "press.raw")
+
+
 @pytest.fixture
 def without_mcap(tmp_path, monkeypatch):
     """Remove the file of a built-in format."""
