@@ -64,8 +64,8 @@ def command(
     suffixes = {path.suffix.lower() for path in output}
     chosen = {"map_name": map_name, "section": section, "points": points, "float32": float32}
     for option, given in chosen.items():
-        taken, name = export_suffixes(option), option.removesuffix("_name")
-        if given and not suffixes & {*taken}:
+        if given and not suffixes & {*(taken := export_suffixes(option))}:
+            name = option.removesuffix("_name")
             raise io.InputError(f"--{name} is for a {taken[0]} file: name one with -o, or leave --{name} out")
     ends = None if section in (None, _APEX) else segment(section, "--section")
     stores, output = _part(output, result, turn, map_name)
