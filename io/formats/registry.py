@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import functools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -146,10 +146,12 @@ def formats(installed: bool = True) -> tuple[Format, ...]:
 
 
 def _named(suffix: str, use: str) -> Format | None:
-    """Return the format of a suffix that has a reader or an encoder."""
-    built_in = (one for one in _built_in() if suffix in one.suffixes and getattr(one, use))
-    others = (one for one in _installed() if suffix in one.suffixes and getattr(one, use))
-    return next(built_in, None) or (None if suffix in _OURS else next(others, None))
+    """Return the format of a suffix that has a reader or an encoder; packages are only asked if none has."""
+
+    def found(candidates: Iterable[Format]) -> Format | None:
+        return next((one for one in candidates if suffix in one.suffixes and getattr(one, use)), None)
+
+    return found(_built_in()) or (None if suffix in _OURS else found(_installed()))
 
 
 def format_of_frames(path: Path) -> Format | None:
@@ -196,7 +198,12 @@ def export_format(suffix: str) -> Format | None:
     return _named(suffix, "encoder")
 
 
-def export_suffixes(option: str = "", installed: bool = True) -> tuple[str, ...]:
+def exports(installed: bool = True) -> dict[str, Format]:
+    """Return the formats that results are exported to, by suffix; all, or the built-in ones."""
+    return {suffix: one for one in formats(installed) if one.encoder for suffix in one.suffixes}
+
+
+def export_suffixes(option: str = "") -> tuple[str, ...]:
     """Return the suffixes of exports, or of those that take an option.
 
     Examples
@@ -204,20 +211,14 @@ def export_suffixes(option: str = "", installed: bool = True) -> tuple[str, ...]
     >>> export_suffixes("points")
     ('.ply',)
     """
-    return tuple(
-        suffix
-        for one in formats(installed)
-        if one.encoder and (not option or option in one.options)
-        for suffix in one.suffixes
-    )
+    return tuple(suffix for suffix, one in exports().items() if not option or option in one.options)
 
 
 def contents() -> str:
     """Return the contents and suffixes of exports: "a mesh .ply .stl, points .xyz"."""
     kinds: dict[str, list[str]] = {}
-    for one in formats(installed=False):
-        if one.encoder:
-            kinds.setdefault(one.content, []).extend(one.suffixes)
+    for suffix, one in exports(installed=False).items():
+        kinds.setdefault(one.content, []).append(suffix)
     return ", ".join(f"{kind} {' '.join(suffixes)}" for kind, suffixes in kinds.items())
 
 

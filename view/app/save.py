@@ -14,7 +14,7 @@ from mirrorskin import io
 from mirrorskin.engine.metrology import section_columns
 from mirrorskin.io import InputError
 from mirrorskin.io.formats.export import check_export
-from mirrorskin.io.formats.registry import formats
+from mirrorskin.io.formats.registry import exports
 from mirrorskin.view.app.look import heading, problem, text
 from mirrorskin.view.app.session import Session
 from mirrorskin.view.app.wording import as_command, as_python
@@ -30,12 +30,7 @@ _SAME = (".tiff", ".zarr")  # another name of .tif, and a folder, which a browse
 
 def files() -> dict[str, tuple[str, bool]]:
     """Return the suffix of each kind of file by its description, and whether it contains the section only."""
-    others = {
-        f"{form.content} ({suffix})": (suffix, False)
-        for form in formats()
-        if form.encoder
-        for suffix in form.suffixes
-    }
+    others = {f"{form.content} ({suffix})": (suffix, False) for suffix, form in exports().items()}
     return {**_OWN, **{text: kind for text, kind in others.items() if kind[0] not in _SAME}}
 
 
