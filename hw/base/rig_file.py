@@ -20,7 +20,7 @@ from mirrorskin.hw.base.emulated_file import Emulator
 from mirrorskin.hw.base.references import SUFFIXES, check_references
 from mirrorskin.hw.base.stage import Limits
 from mirrorskin.io import InputError
-from mirrorskin.io.base.own_class import class_of, installed_names
+from mirrorskin.io.base.own_class import installed_class, installed_names
 from mirrorskin.io.base.settings_file import load_toml
 
 _USER = re.compile("//[^/]*@")
@@ -29,7 +29,7 @@ _ROUND = 360.0  # degrees
 _CELL = 65535  # rows or columns
 
 GENICAM = "genicam:"
-_CLASS = re.compile(r"(?!genicam:)(.*\.py|[^\W\d]\w*(\.[^\W\d]\w*)*):[^\W\d]\w*")
+_CLASS = re.compile(rf"(?!{GENICAM})(.*\.py|[^\W\d]\w*(\.[^\W\d]\w*)*):[^\W\d]\w*")
 
 _FIRMWARES = "grbl", "marlin"
 
@@ -353,7 +353,7 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def own(self) -> bool:
         """Whether it is a class of the user, FILE.py:CLASS or MODULE:CLASS."""
-        return isinstance(self.source, str) and not self.genicam and _CLASS.fullmatch(self.source) is not None
+        return isinstance(self.source, str) and _CLASS.fullmatch(self.source) is not None
 
     @property
     def streamed(self) -> bool:
@@ -456,8 +456,8 @@ def _own_class(path: Path, name: str, group: str) -> str:
 
     The path of a class's module is added if this is next to the rig file.
     """
-    if name.isidentifier() and name not in _FIRMWARES and name in installed_names(group):
-        return class_of(name, group)
+    if name.isidentifier() and name not in _FIRMWARES:
+        name = installed_class(name, group) or name
     if not _CLASS.fullmatch(name):
         return name
     place, _, kind = name.rpartition(":")

@@ -271,14 +271,14 @@ def open_stage(settings: StageSettings, unlock: bool = False, clock: Clock = SYS
         from mirrorskin.hw.stages.marlin import MarlinStage
 
         return MarlinStage(settings, clock=clock)
-    return cast("Stage", _open_own(settings.firmware, settings, Stage, "stage"))
+    return cast("Stage", _open_own(settings.firmware, settings, Stage))
 
 
 def _open_own(
-    kind: str | type, settings: StageSettings | CameraSettings, protocol: type, what: str
+    kind: str | type, settings: StageSettings | CameraSettings, protocol: type[Stage] | type[Camera]
 ) -> Stage | Camera:
     """Open a stage or a camera with a class of the user."""
-    made = load_class(kind)
+    made, what = load_class(kind), protocol.__name__.lower()
     name, wanted = getattr(kind, "__name__", kind), type(settings).__name__
     try:
         inspect.signature(made).bind(settings)
@@ -317,7 +317,7 @@ def open_camera(settings: CameraSettings, clock: Clock = SYSTEM) -> Camera:
 
 def _open_own_camera(settings: CameraSettings) -> Camera:
     """Open a camera with a class of the user; its frames must be as the rig file states."""
-    camera = cast("Camera", _open_own(str(settings.source), settings, Camera, "camera"))
+    camera = cast("Camera", _open_own(str(settings.source), settings, Camera))
     found, stated = (
         f"{shape[1]} x {shape[0]}, {dtype}"
         for shape, dtype in ((camera.shape, camera.dtype), (settings.shape, settings.dtype))

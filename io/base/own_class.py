@@ -41,7 +41,7 @@ def load_class(name: str | type, group: str = "") -> Callable[..., Any]:
     """
     if not isinstance(name, str):
         return name
-    place, _, kind = (class_of(name, group) if group and ":" not in name else name).rpartition(":")
+    place, _, kind = (_class_of(name, group) if group and ":" not in name else name).rpartition(":")
     file = Path(place) if place.endswith(".py") else None
     if not place or not all(part.isidentifier() for part in kind.split(".")):
         raise InputError(f"{name}: name a class as MODULE:CLASS or FILE.py:CLASS")
@@ -74,13 +74,19 @@ def installed_names(group: str) -> list[str]:
     return sorted({one.name for one in entry_points(group=group)})
 
 
-def class_of(name: str, group: str) -> str:
-    """Return MODULE:CLASS of an entry point; InputError if there is no such one."""
-    for one in entry_points(group=group, name=name):
-        return f"{one.module}:{one.attr}"
-    close = nearest(name, installed_names(group))
-    remedy = f"did you mean {close}?" if close else "name a class as MODULE:CLASS or FILE.py:CLASS"
-    raise InputError(f"{name}: {remedy}")
+def installed_class(name: str, group: str) -> str | None:
+    """Return MODULE:CLASS of the entry point with a name in a group; None if there is no such one."""
+    return next((f"{one.module}:{one.attr}" for one in entry_points(group=group, name=name)), None)
+
+
+def _class_of(name: str, group: str) -> str:
+    """Return MODULE:CLASS of an entry point; InputError with the nearest name if there is no such one."""
+    installed = installed_class(name, group)
+    if installed is None:
+        close = nearest(name, installed_names(group))
+        remedy = f"did you mean {close}?" if close else "name a class as MODULE:CLASS or FILE.py:CLASS"
+        raise InputError(f"{name}: {remedy}")
+    return installed
 
 
 def name_of(kind: type) -> str:
