@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from commands import done, refused
+from installed_packages import install
 from numpy.typing import ArrayLike, NDArray
 from stacks import record, sphere
 
@@ -24,6 +25,7 @@ from mirrorskin.engine.base.provenance import describe
 from mirrorskin.engine.base.reconstruction import load_operation
 from mirrorskin.engine.batch.cluster import run_cluster
 from mirrorskin.engine.batch.jobs import Plan, make_jobs
+from mirrorskin.io.base.own_class import OPERATIONS
 from mirrorskin.kernels.device import open_device
 
 MODULE = """
@@ -330,12 +332,7 @@ def test_a_plan_takes_the_class_or_its_name(kinds):
 @pytest.fixture
 def installed(kinds, tmp_path):
     """An installed package that gives a name to an operation."""
-    folder = tmp_path / "kinds_of_a_test-1.0.dist-info"
-    folder.mkdir()
-    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: kinds-of-a-test\nVersion: 1.0\n")
-    (folder / "entry_points.txt").write_text(
-        "[mirrorskin.operations]\nsum-of-kinds = kinds_of_a_test:Kinds\n"
-    )
+    install(tmp_path, OPERATIONS, **{"sum-of-kinds": "kinds_of_a_test:Kinds"})
     return kinds
 
 

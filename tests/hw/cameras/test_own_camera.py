@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from installed_packages import install
 
 from mirrorskin import io
 from mirrorskin.hw.base.rig_file import CAMERAS, load_rig
@@ -103,11 +104,8 @@ def test_a_class_beside_the_rig_file_is_opened(opened, source):
 
 
 def test_an_entry_point_names_a_camera(opened, tmp_path, monkeypatch):
-    facts = tmp_path / "site" / "steady-1.0.dist-info"
-    facts.mkdir(parents=True)
+    install(tmp_path / "site", CAMERAS, steady="steady_camera:Steady")
     (tmp_path / "site" / "steady_camera.py").write_text(CAMERA, encoding="utf-8")
-    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: steady\nVersion: 1.0\n")
-    (facts / "entry_points.txt").write_text(f"[{CAMERAS}]\nsteady = steady_camera:Steady\n")
     monkeypatch.syspath_prepend(tmp_path / "site")
     camera = opened("steady")
     try:

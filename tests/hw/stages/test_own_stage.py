@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from commands import run
+from installed_packages import install
 from rig_fakes import FakeCamera, settings
 from simulated import on_clock, write_film_rig
 
@@ -250,10 +251,7 @@ def test_what_a_class_lacks_is_refused_in_a_line(folder, words, change, said):
 @pytest.fixture
 def named_stage(tmp_path, monkeypatch):
     """Install a package that gives the stage of the page a name."""
-    facts = tmp_path / "site" / "lab-1.0.dist-info"
-    facts.mkdir(parents=True)
-    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: lab\nVersion: 1.0\n")
-    (facts / "entry_points.txt").write_text(f"[{STAGES}]\nlab = lab_stage:LabStage\n")
+    install(tmp_path / "site", STAGES, lab="lab_stage:LabStage")
     monkeypatch.syspath_prepend(tmp_path / "site")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import done, refused
+from installed_packages import install
 
 from mirrorskin import io
 from mirrorskin.io.formats import registry
@@ -32,11 +33,8 @@ def press(count=12, shape=(6, 9)):
 def installed(tmp_path, monkeypatch):
     """Install a package with the format of the page, in whose folder commands run."""
     package = tmp_path / "site"
-    facts = package / "raw_frames-1.0.dist-info"
-    facts.mkdir(parents=True)
+    install(package, registry.FORMATS, raw="raw_frames:RAW")
     (package / "raw_frames.py").write_text(OWN, encoding="utf-8")
-    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: raw-frames\nVersion: 1.0\n")
-    (facts / "entry_points.txt").write_text(f"[{registry.FORMATS}]\nraw = raw_frames:RAW\n")
     monkeypatch.syspath_prepend(package)
     monkeypatch.chdir(tmp_path)
     frames = press()
@@ -112,9 +110,7 @@ def test_exports_that_are_possible_are_listed_with_those_of_packages():
     ],
 )
 def test_an_entry_point_that_is_no_format_is_refused_in_a_line(installed, tmp_path, value, line):
-    (tmp_path / "site" / "raw_frames-1.0.dist-info" / "entry_points.txt").write_text(
-        f"[{registry.FORMATS}]\nraw = {value}\n"
-    )
+    install(tmp_path / "site", registry.FORMATS, raw=value)
     refused(line, "info", "press.raw")
 
 
