@@ -219,8 +219,7 @@ def reconstruct(
     [-0.25, -0.25, -0.25, -0.25]
 
     >>> from mirrorskin import engine
-    >>> from mirrorskin.twin import Twin
-    >>> from mirrorskin.twin import Vertical
+    >>> from mirrorskin.twin import Twin, Vertical
     >>> press = Twin(object="sphere", shape=(40, 40), pixel_size=0.26, movement=Vertical([0.1, 0.2, 0.3]))
     >>> engine.reconstruct(press).height.shape
     (40, 40)

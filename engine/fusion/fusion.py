@@ -164,8 +164,7 @@ def fuse(
     Examples
     --------
     >>> from mirrorskin import engine
-    >>> from mirrorskin.twin import Twin
-    >>> from mirrorskin.twin import Axial, Vertical
+    >>> from mirrorskin.twin import Axial, Twin, Vertical
     >>> ball = {"object": "sphere", "shape": (50, 50), "pixel_size": 0.1}
     >>> press = Twin(movement=Vertical(0.1 * np.arange(1, 31)), **ball)
     >>> eighths = np.pi / 4 * np.arange(8)

@@ -56,8 +56,7 @@ class App:
     Examples
     --------
     >>> from mirrorskin import engine
-    >>> from mirrorskin.twin import Twin
-    >>> from mirrorskin.twin import Vertical
+    >>> from mirrorskin.twin import Twin, Vertical
     >>> press = Twin(object="sphere", shape=(40, 40), pixel_size=0.26, movement=Vertical([0.1, 0.2, 0.3]))
     >>> app = App(engine.reconstruct(press))
     >>> app.session.now.result.height.shape
