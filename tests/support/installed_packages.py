@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def install(folder: Path, group: str, **names: str) -> None:
-    """Write what is known of an installed package, its entry points in a group, in a folder of ``sys.path``."""
+    """Write the entry points of an installed package, in a group, to a folder of ``sys.path``."""
     facts = folder / "package_of_a_test-1.0.dist-info"
     facts.mkdir(parents=True, exist_ok=True)
     (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: package-of-a-test\nVersion: 1.0\n")
