@@ -107,7 +107,7 @@ class Array:
         self._mapped: Mapping | None = None
         self._parked: NDArray[Any] | None = None  # values while there is no memory on the device
         self._is_parked = False
-        self._is_lent = False  # whether others may still use the memory when this array is deleted
+        self._is_exported = False  # whether others may still use the memory when this array is deleted
         self._buffer: cl.Buffer | None = None
         self.shape, self.dtype, self._zeroed = shape, dtype, zeroed
         self._filling: Any = ZERO if zeroed and not self.is_shared else None  # pending fill value
@@ -151,7 +151,7 @@ class Array:
     def __getitem__(self, rows: int | slice) -> Array:
         """Return rows (an index, or a slice without a step) on the device: a copy unless all are selected."""
         start, shape = self._part(rows)
-        return self if shape == self.shape else self.cut(start // self.dtype.itemsize, shape)
+        return self if shape == self.shape else self.copy_region(start // self.dtype.itemsize, shape)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         if copy is False:
@@ -246,7 +246,7 @@ class Array:
         self._is_parked = True
 
     @_wrap_cl_errors
-    def cut(self, start: int, shape: tuple[int, ...]) -> Array:
+    def copy_region(self, start: int, shape: tuple[int, ...]) -> Array:
         """Return a copy, on the device, of the elements from index ``start`` on, with another shape."""
         copied = Array(self.device, self.name, shape, self.dtype, zeroed=False)
         if copied.nbytes == 0:
@@ -268,11 +268,11 @@ class Array:
         return copied
 
     @_wrap_cl_errors
-    def lend(self) -> pyopencl.array.Array:
+    def as_pyopencl(self) -> pyopencl.array.Array:
         """Return a `pyopencl.array.Array` in the same memory, on the device's queue."""
         from pyopencl.array import Array as OpenCLArray
 
-        buffer, self._is_lent = self.buffer, True
+        buffer, self._is_exported = self.buffer, True
         after = [] if self.latest is None else [self.latest]
         return OpenCLArray(self.device.queue, self.shape, self.dtype, data=buffer, events=after)
 
@@ -372,7 +372,7 @@ class Array:
     def _give_back(self) -> None:
         """Return the buffer to the pool; other arrays wait for commands that still use it."""
         buffer, self._buffer = self._buffer, None
-        if buffer is not None and not (self.is_shared or self._is_lent):
+        if buffer is not None and not (self.is_shared or self._is_exported):
             self.device.pool.give(buffer, self.latest)
 
     def _allocate(self) -> None:

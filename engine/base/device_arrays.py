@@ -49,14 +49,14 @@ def device_of(choice: Choice, *arrays: Any) -> Device:
 
     Arrays on the host are on no device.
     """
-    own = [array for array in arrays if isinstance(array, Array)]
-    if own and are_several(choice):
+    on_devices = [array for array in arrays if isinstance(array, Array)]
+    if on_devices and are_several(choice):
         raise InputError(
-            f"{own[0].name} is on {own[0].device.info.title}, but several devices are chosen: leave device"
-            " out to compute there, or pass a NumPy array"
+            f"{on_devices[0].name} is on {on_devices[0].device.info.title}, but several devices are chosen:"
+            " leave device out to compute there, or pass a NumPy array"
         )
-    device = own[0].device if own and choice is None else open_device(choice)
-    for array in own:
+    device = on_devices[0].device if on_devices and choice is None else open_device(choice)
+    for array in on_devices:
         if array.device.context != device.context:
             raise InputError(
                 f"{array.name} is on {array.device.info.title}, not on {device.info.title}: compute there, "
@@ -68,8 +68,8 @@ def device_of(choice: Choice, *arrays: Any) -> Device:
 def device_of_maps(choice: Choice, *results: Result) -> Device:
     """Return the chosen device, by default that of the first map of the results that is on one."""
     maps = (result.on_device(name) for result in results for name in result)
-    there = next((one for one in maps if isinstance(one, Array)), None)
-    return there.device if there is not None and choice is None else open_device(choice)
+    first = next((values for values in maps if isinstance(values, Array)), None)
+    return first.device if first is not None and choice is None else open_device(choice)
 
 
 def operand_of(
@@ -83,12 +83,12 @@ def operand_of(
     name = result.name_of(quantity)
     if name is None:
         return None
-    own = shape_of(result, name)
-    if own != shape:
-        raise InputError(f"{name} has shape {own}, but the height needs {shape}: give maps of one size")
-    there = result.on_device(name)
-    if isinstance(there, Array) and there.dtype == dtype and there.device.context == device.context:
-        return there
+    map_shape = shape_of(result, name)
+    if map_shape != shape:
+        raise InputError(f"{name} has shape {map_shape}, but the height needs {shape}: give maps of one size")
+    stored = result.on_device(name)
+    if isinstance(stored, Array) and stored.dtype == dtype and stored.device.context == device.context:
+        return stored
     values = np.asarray(result[name])
     flags = values != 0 if dtype == np.uint8 else values
     return device.share(name, np.ascontiguousarray(flags, dtype))
@@ -96,8 +96,8 @@ def operand_of(
 
 def stored_map(result: Result, quantity: str) -> AnyArray:
     """Return a map of a result where it is: on a device, or on the host."""
-    there = result.on_device(quantity)
-    return getattr(result, quantity) if there is None else there
+    stored = result.on_device(quantity)
+    return getattr(result, quantity) if stored is None else stored
 
 
 def on_host(value: Any) -> Any:

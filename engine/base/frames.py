@@ -61,16 +61,16 @@ class Noise:
     ``integer``: samples are integers.
     """
 
-    def __init__(self, given: float | None, integer: bool) -> None:
-        if given is not None and not 0 <= given < np.inf:
-            raise InputError(f"noise {given}: a standard deviation in counts is needed, such as 1.5")
-        self._given, self._integer = given, integer
+    def __init__(self, noise: float | None, integer: bool) -> None:
+        if noise is not None and not 0 <= noise < np.inf:
+            raise InputError(f"noise {noise}: a standard deviation in counts is needed, such as 1.5")
+        self._given, self._integer = noise, integer
         self.reset()
 
-    def reset(self, known: float | None = None) -> None:
-        """Forget the frames so far; the noise may be known from other frames."""
+    def reset(self, noise: float | None = None) -> None:
+        """Forget the frames so far; the noise may be specified, from other frames."""
         self._samples: list[NDArray[np.float64]] = []
-        self.value = self._given if known is None else known
+        self.value = self._given if noise is None else noise
 
     def look(self, frames: AnyArray) -> None:
         """Use the next frames, (n, H, W), if they are among the first two."""
@@ -111,7 +111,7 @@ def take_grid(frames: AnyArray, grid: FrameSamples) -> NDArray[Any]:
         return grid.of_frames(np.from_dlpack(cast(Any, frames)))
     rows, columns = grid.rows, grid.columns
     count, height, width = frames.shape
-    down, step = (int(one[1] - one[0]) if len(one) > 1 else 0 for one in (rows, columns))
+    down, step = (int(pixels[1] - pixels[0]) if len(pixels) > 1 else 0 for pixels in (rows, columns))
     steps, shape = (height * width, down * width, step), (count, len(rows), len(columns))
     return take_samples(frames, int(rows[0] * width + columns[0]), steps, shape)
 
@@ -125,16 +125,16 @@ def take_neighbours(values: AnyArray, grid: FrameSamples) -> list[NDArray[Any]]:
     rows, columns = grid.rows, grid.columns
     at_border = 0 in (rows[0], columns[0]) or rows[-1] == height - 1 or columns[-1] == width - 1
     if isinstance(values, Array) and not at_border:
-        down, step = (int(one[1] - one[0]) for one in (rows, columns))
+        down, step = (int(pixels[1] - pixels[0]) for pixels in (rows, columns))
         first, shape = int(rows[0] * width + columns[0]), (3, len(rows), len(columns))
         across, along = take_grids(
             *(Grid(values, first - apart, (apart, down * width, step), shape) for apart in (1, width))
         )
         return [across[1], across[0], across[2], along[0], along[2]]
     array: NDArray[Any] = np.asarray(values)
-    left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, width - 1)
+    before, after = np.maximum(columns - 1, 0), np.minimum(columns + 1, width - 1)
     above, below = np.maximum(rows - 1, 0), np.minimum(rows + 1, height - 1)
-    places = (rows, columns), (rows, left), (rows, right), (above, columns), (below, columns)
+    places = (rows, columns), (rows, before), (rows, after), (above, columns), (below, columns)
     return [array[np.ix_(*place)] for place in places]
 
 
@@ -145,25 +145,25 @@ def take_places(
 
     They are (rows, columns) or (components, rows, columns), and only views if the maps are on the host.
     """
-    if any(isinstance(one, np.ndarray) for one in maps):
+    if any(isinstance(values, np.ndarray) for values in maps):
         parts = [
             tuple(slice(each[0] + by, each[-1] + by + 1, each.step) for each, by in moved)
             for moved in (((rows, down), (columns, right)) for down, right in places)
         ]
         hosts: list[Any] = [
-            (np.moveaxis(one, -1, 0) if one.ndim == 3 else one) for one in map(np.asarray, maps)
+            (np.moveaxis(values, -1, 0) if values.ndim == 3 else values) for values in map(np.asarray, maps)
         ]
-        return [[one[(..., *part)] for part in parts] for one in hosts]
+        return [[values[(..., *part)] for part in parts] for values in hosts]
     grids = []
-    for one in maps:
-        width, components = one.shape[1], math.prod(one.shape[2:])
+    for values in maps:
+        width, components = values.shape[1], math.prod(values.shape[2:])
         steps = 1, components * width * rows.step, components * columns.step
         shape = components, len(rows), len(columns)
         for down, right in places:
             first = components * ((rows[0] + down) * width + columns[0] + right)
-            grids.append(Grid(one, first, steps, shape))
-    found = iter(take_grids(*grids))
-    return [[next(found) if one.ndim == 3 else next(found)[0] for _ in places] for one in maps]
+            grids.append(Grid(values, first, steps, shape))
+    samples = iter(take_grids(*grids))
+    return [[next(samples) if values.ndim == 3 else next(samples)[0] for _ in places] for values in maps]
 
 
 def estimate_noise(first: NDArray[np.float64], second: NDArray[np.float64], integer: bool) -> float:
@@ -231,13 +231,13 @@ def noise_of_residual(residual: NDArray[Any], freedom: ArrayLike) -> float:
     sqrt(chi^2 / n), in the approximation of Wilson and Hilferty (PNAS 17, 1931).
     """
     degrees = np.asarray(freedom)
-    known = (degrees > 0) & np.isfinite(residual)
-    if not known.any():
+    determined = (degrees > 0) & np.isfinite(residual)
+    if not determined.any():
         return math.nan
     if degrees.ndim:
-        degrees = degrees[known]
+        degrees = degrees[determined]
     ratio = (1 - 2 / (9 * np.maximum(degrees, 1).astype(residual.dtype))) ** 1.5
-    return float(np.median(residual[known] / ratio))
+    return float(np.median(residual[determined] / ratio))
 
 
 def reference_maps(
@@ -254,12 +254,12 @@ def reference_maps(
     top = 0 if dtype.kind == "f" else np.iinfo(dtype).max
     low = _as_map("dark", 0 if dark is None else dark, shape)
     high = _as_map("bright", top if bright is None else bright, shape)
-    known, usable = _count_usable(low, high)
-    if known == 0:
+    defined, usable = _count_usable(low, high)
+    if defined == 0:
         raise InputError("no pixel has a finite dark and bright: take the references again")
-    if 2 * usable <= known:
-        share = 100 * (1 - usable / known)
-        raise InputError(f"bright is not above dark at {share:.3g} % of the pixels: are they swapped?")
+    if 2 * usable <= defined:
+        percent = 100 * (1 - usable / defined)
+        raise InputError(f"bright is not above dark at {percent:.3g} % of the pixels: are they swapped?")
     return low, high
 
 
@@ -280,7 +280,7 @@ def reference_pair(
 
 def _count_usable(dark: NDArray[np.float32], bright: NDArray[np.float32]) -> tuple[int, int]:
     """Return the number of pixels where both are finite, and where bright is also above dark."""
-    known = usable = 0
+    defined = usable = 0
     if dark.ndim == bright.ndim == 0:
         dark, bright = np.atleast_1d(dark, bright)
     dark, bright = np.broadcast_arrays(dark, bright)
@@ -288,9 +288,9 @@ def _count_usable(dark: NDArray[np.float32], bright: NDArray[np.float32]) -> tup
     for start in range(0, len(dark), step):  # parts that stay in the cache
         with np.errstate(invalid="ignore", over="ignore"):
             span = bright[start : start + step] - dark[start : start + step]
-        known += int(np.count_nonzero(np.isfinite(span)))
+        defined += int(np.count_nonzero(np.isfinite(span)))
         usable += int(np.count_nonzero(span > 0) - np.count_nonzero(span == np.inf))
-    return known, usable
+    return defined, usable
 
 
 def _usable(dark: NDArray[np.float32], bright: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -86,31 +86,33 @@ def function_of(
         raise InputError(f"{kind} is not a class of operations: derive it from mirrorskin.engine.Operation")
     name = name or re.sub(r"(?<!^)(?=[A-Z])", "_", operation.__name__).lower()
     texts, optional = {**_POSITIONS, **(positions or {})}, dict(optional or {})
-    needed = {one: texts[one] for one, is_needed in operation.positions.items() if is_needed}
-    optional = {one: texts[one] for one in operation.positions if one not in needed} | optional
-    needed = {one: about for one, about in needed.items() if one not in optional}
-    options = {one: declared for one, declared in operation.options.items() if one != "memory_limit"}
+    needed = {position: texts[position] for position, is_needed in operation.positions.items() if is_needed}
+    optional = {
+        position: texts[position] for position in operation.positions if position not in needed
+    } | optional
+    needed = {position: about for position, about in needed.items() if position not in optional}
+    options = {key: declared for key, declared in operation.options.items() if key != "memory_limit"}
     signature = signature_of(options, ("frames", *needed), tuple(optional))
 
     @computes
     def function(*args: Any, **kwargs: Any) -> Result:
-        if unknown := next((one for one in kwargs if one not in signature.parameters), ""):
+        if unknown := next((key for key in kwargs if key not in signature.parameters), ""):
             raise TypeError(unknown_argument(f"{name}()", unknown, [*signature.parameters]))
-        given = signature.bind(*args, **kwargs).arguments
-        frames = given.pop("frames")
-        where = {one: given.pop(one, None) for one in (*needed, *optional)}
+        arguments = signature.bind(*args, **kwargs).arguments
+        frames = arguments.pop("frames")
+        where = {key: arguments.pop(key, None) for key in (*needed, *optional)}
         if choose is not None:  # it may return positions from which a block computes what the operation takes
-            chosen, where = choose(where, given)
+            chosen, where = choose(where, arguments)
         else:
-            chosen = operation(**given)
-            check_taken(chosen, {one: values for one, values in where.items() if values is not None})
+            chosen = operation(**arguments)
+            check_taken(chosen, {key: values for key, values in where.items() if values is not None})
         return run_over(ArraySource(frames, chosen, where, name=name), chosen)
 
     before = "frames : array_like or device array, (T, H, W)\n    Raw counts.\n"
     for names, end in ((needed, ""), (optional, ", optional")):
-        for one, about in names.items():
-            shape = ", ".join(("T", *map(str, COMPONENTS.get(one, ("",))))).rstrip(" ")
-            before += f"{one} : array_like, ({shape}){end}\n    {about}\n"
+        for position, about in names.items():
+            shape = ", ".join(("T", *map(str, COMPONENTS.get(position, ("",))))).rstrip(" ")
+            before += f"{position} : array_like, ({shape}){end}\n    {about}\n"
     function.__name__ = function.__qualname__ = name
     function.__module__ = operation.__module__
     function.__doc__ = documented(text or operation._text or f"{operation.__name__}.", options, before)

@@ -72,7 +72,7 @@ def is_maps(value: Any) -> TypeGuard[Maps]:
 def required_maps(name: str, maps: Maps, *needed: str, pixel_size: ArrayLike | None = None) -> Result:
     """Return maps as `as_result` does; InputError if a needed one is missing. An array is the first one."""
     result = as_result(maps, name, quantity=needed[0], pixel_size=pixel_size)
-    missing = [one for one in needed if result.name_of(one) is None]
+    missing = [quantity for quantity in needed if result.name_of(quantity) is None]
     if missing:
         has = ", ".join(result) or "no maps"
         raise InputError(f"{name} has no map {missing[0]}: it has {has}")
@@ -97,10 +97,10 @@ def pixel_size_of(result: Result, name: str, pixel_size: ArrayLike | None = None
 def spacing(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
     """Return the distances of pixel centres along x and y, mm; a single row or column has square pixels."""
     steps = [abs(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None for axis in (x, y)]
-    known = [float(step) for step in steps if step is not None]
-    if not known:
+    specified = [float(step) for step in steps if step is not None]
+    if not specified:
         raise InputError("the result has a single pixel, so its size is unknown: take more")
-    return known[0], known[-1]
+    return specified[0], specified[-1]
 
 
 def _converted(maps: Any, name: str, quantity: str) -> Result:
@@ -128,22 +128,22 @@ def _of_mapping(maps: Mapping[Any, Any], name: str) -> Result:
 
     Those that `mirrorskin.io.Fitted` declares, such as ``tilt``, are in its ``fitted``, too.
     """
-    fields = {one: value for one, value in maps.items() if one in FIELDS and value is not None}
+    fields = {key: value for key, value in maps.items() if key in FIELDS and value is not None}
     for axis in fields.keys() & {"x", "y"}:
         fields[axis] = np.asarray(as_array(f"{name}[{axis!r}]", fields[axis], "mm"), np.float64)
     arrays: dict[str, Any] = {}
     process: dict[str, Any] = {}
-    for one, value in maps.items():
-        if one in fields or value is None:
+    for key, value in maps.items():
+        if key in fields or value is None:
             continue
-        declared = declaration_of(one, fields.get("declarations"))
+        declared = declaration_of(key, fields.get("declarations"))
         values = value
         if not isinstance(value, str):
-            values = as_any_array(f"{name}[{one!r}]", value, declared.unit, bool(declared.components))
+            values = as_any_array(f"{name}[{key!r}]", value, declared.unit, bool(declared.components))
         if isinstance(values, str) or (not values.ndim and declared.axes != "none"):
-            process[one] = values if isinstance(values, str) else values.item()
+            process[key] = values if isinstance(values, str) else values.item()
         else:
-            arrays[one] = values if values.ndim else float(values)
+            arrays[key] = values if values.ndim else float(values)
     fitted = taken_from(process) | fields.get("fitted", Fitted())
     process |= fields.get("process", {})
     return Result(arrays, **{**fields, "process": process, "fitted": fitted})
@@ -154,11 +154,13 @@ def of_one_size(result: Result, name: str) -> Result:
     size = map_shape(result)[-2:]
     if len(size) < 2:
         raise InputError(f"the maps of {name} are not of size (H, W)")
-    for one in result:
-        declared = result.declaration(one)
-        own = size_of_maps(declared, shape_of(result, one))[-2:]
-        if declared.axes == "pixels" and own != size:
-            raise InputError(f"map {one} of {name} has size {own}, others have {size}: give maps of one size")
+    for map_name in result:
+        declared = result.declaration(map_name)
+        map_size = size_of_maps(declared, shape_of(result, map_name))[-2:]
+        if declared.axes == "pixels" and map_size != size:
+            raise InputError(
+                f"map {map_name} of {name} has size {map_size}, others have {size}: give maps of one size"
+            )
     for axis, length in zip("yx", size, strict=True):
         places = getattr(result, axis)
         if places is not None and np.shape(places) != (length,):

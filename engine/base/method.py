@@ -63,6 +63,6 @@ class Method(OnDevice):
         """
         return run_over(source, self, progress, [Undistortion()] if undistort else [])
 
-    def make(self, kind: type[Configured], **changes: Any) -> Any:
+    def configure(self, kind: type[Configured], **changes: Any) -> Any:
         """Return an operation or step with this method's values of its options."""
-        return kind(**{**self.part(kind), **changes})
+        return kind(**{**self.shared_options(kind), **changes})

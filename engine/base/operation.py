@@ -194,10 +194,10 @@ class Operation(OnDevice):
                 f"{cls.__name__} assigns maps: declare each map as a class attribute, such as"
                 ' wear = io.Map("depth of the wear", "mm")'
             )
-        found: dict[str, Map] = {}
+        maps: dict[str, Map] = {}
         for base in reversed(cls.__mro__):
-            found |= {name: one for name, one in vars(base).items() if isinstance(one, Map)}
-        cls.maps = found
+            maps |= {name: value for name, value in vars(base).items() if isinstance(value, Map)}
+        cls.maps = maps
         _check_class(cls)
         if "push" in vars(cls):
             cls._take_positions(vars(cls)["push"])
@@ -310,19 +310,19 @@ class Operation(OnDevice):
         copied = object.__new__(type(self))
         state = {name: value for name, value in vars(self).items() if name != "_opened_devices"}
         for name, value in state.items():
-            own = isinstance(value, list | dict | set | np.ndarray) and name not in self.options
-            vars(copied)[name] = copy(value) if own else value
+            is_state = isinstance(value, list | dict | set | np.ndarray) and name not in self.options
+            vars(copied)[name] = copy(value) if is_state else value
         copied._forget_frames()
         return copied
 
     def _begin(self, shape: tuple[int, ...], dtype: DTypeLike) -> None:
         """Prepare a copy for a run over frames of a shape, (H, W), and type."""
-        wanted = np.dtype(dtype)
-        if self.dtypes is not None and wanted not in self.dtypes:
+        sample_type = np.dtype(dtype)
+        if self.dtypes is not None and sample_type not in self.dtypes:
             *others, last = map(str, self.dtypes)
-            raise InputError(f"frames of type {wanted}: {', '.join(others)} or {last} are needed")
-        self.shape, self.dtype = (shape[0], shape[1]), wanted
-        self.start(self.shape, wanted)
+            raise InputError(f"frames of type {sample_type}: {', '.join(others)} or {last} are needed")
+        self.shape, self.dtype = (shape[0], shape[1]), sample_type
+        self.start(self.shape, sample_type)
 
     def _begin_second_pass(self) -> None:
         self.start_second_pass()
@@ -348,25 +348,27 @@ class Operation(OnDevice):
 
 def _check_class(cls: type[Operation]) -> None:
     """Raise InputError if a class has attributes that an operation must not have."""
-    own, name = vars(cls), cls.__name__
+    attributes, name = vars(cls), cls.__name__
     try:
         check_maps(cls.maps)
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
-    for one in cls.maps:
-        if one in cls.options:
-            raise InputError(f"{name}: {one} is an option and a map. Rename one of them")
-        if hasattr(Operation, one):
+    for map_name in cls.maps:
+        if map_name in cls.options:
+            raise InputError(f"{name}: {map_name} is an option and a map. Rename one of them")
+        if hasattr(Operation, map_name):
             raise InputError(
-                f"{name}: a map cannot be called {one!r}, which operations use. Choose another name"
+                f"{name}: a map cannot be called {map_name!r}, which operations use. Choose another name"
             )
-    if unknown := [one for one in cls.optional_maps if one not in cls.maps]:
+    if unknown := [map_name for map_name in cls.optional_maps if map_name not in cls.maps]:
         raise InputError(f"optional_maps: {unknown_argument(name, unknown[0], [*cls.maps], 'map')}")
-    for one, kind in inspect.get_annotations(cls).items():
-        if isinstance(own.get(one), Map) and getattr(kind, "__name__", kind) in _SIMPLE_TYPES:
-            raise InputError(f"{name}: {one} is an option and a map. Rename one of them")
-    if isinstance(own.get("passes"), int) and own["passes"] not in (1, 2):
-        raise InputError(f"{name}: passes is {own['passes']}. Frames are pushed once or twice: use 1 or 2")
+    for map_name, kind in inspect.get_annotations(cls).items():
+        if isinstance(attributes.get(map_name), Map) and getattr(kind, "__name__", kind) in _SIMPLE_TYPES:
+            raise InputError(f"{name}: {map_name} is an option and a map. Rename one of them")
+    if isinstance(attributes.get("passes"), int) and attributes["passes"] not in (1, 2):
+        raise InputError(
+            f"{name}: passes is {attributes['passes']}. Frames are pushed once or twice: use 1 or 2"
+        )
     if isinstance(cls.motions, str) or not set(cls.motions) <= {*get_args(Motion)}:
         motions = ", ".join(get_args(Motion))
         raise InputError(f'{name}: motions is {cls.motions!r}. Use a tuple of {motions}, such as ("axial",)')

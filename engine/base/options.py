@@ -110,10 +110,10 @@ class Option:
         InputError
             The declaration contradicts itself.
         """
-        made = replace(self, name=name)
+        completed = replace(self, name=name)
         if self.kind is None:
-            made = replace(made, **_meaning(name, annotation, self.file))
-            made = replace(made, optional=made.optional or self.default is None)
+            completed = replace(completed, **_meaning(name, annotation, self.file))
+            completed = replace(completed, optional=completed.optional or self.default is None)
         low, high = self.within
         if not self.help.strip():
             raise InputError(f"option {name} has no help: say in a sentence what it means")
@@ -121,8 +121,8 @@ class Option:
             raise InputError(f"option {name} has the unit {self.unit!r}. Use one of {', '.join(_UNITS[1:])}")
         if low is not None and high is not None and low > high:
             raise InputError(f"option {name}: no value is within {low:g} and {high:g}")
-        only = made.python_only or made.kind == "object"
-        return replace(made, default=made.check(self.default), python_only=only)
+        only = completed.python_only or completed.kind == "object"
+        return replace(completed, default=completed.check(self.default), python_only=only)
 
     def with_default(self, value: Any) -> Option:
         """Return the declaration with another default, which is checked as a value is."""
@@ -132,7 +132,7 @@ class Option:
 
     def described(self) -> str:
         """Return type and unit for a docstring, such as ``float, share, default 0.5``."""
-        quoted = [f'"{one}"' for one in self.choices]
+        quoted = [f'"{choice}"' for choice in self.choices]
         kind = "{" + ", ".join(quoted) + "}" if quoted else _TYPES[self.kind or "object"]
         kind = " or ".join([kind, *(f'"{word}"' for word in self.words)])
         unit = f", {self.unit}" if self.unit else ""
@@ -176,7 +176,7 @@ class Option:
             raise InputError(f"unknown {self.name} {shown(value)}. Use {' or '.join(self.choices)}")
         if self.instance_of is None:
             return str(value)
-        return next(one for one in cast(type[Enum], self.instance_of) if plain(one) == value)
+        return next(member for member in cast(type[Enum], self.instance_of) if plain(member) == value)
 
     def _object(self, value: Any) -> Any:
         """Return a text, a path or an object."""
@@ -194,7 +194,7 @@ class Option:
         values = value if several else np.atleast_1d(as_array(self.name, value, self.unit))
         if self.count is not None and len(values) != self.count:
             raise InputError(f"{self.name} is {shown(value)}: {self.count} numbers are needed")
-        return tuple(self._number(one) for one in values)
+        return tuple(self._number(number) for number in values)
 
     def _number(self, value: Any) -> Any:
         whole = self.kind in ("integer", "integers")
@@ -251,7 +251,7 @@ def _meaning(name: str, annotation: Any, file: str) -> dict[str, Any]:
         meaning: dict[str, Any] = {"kind": "file"}
     elif not types:
         meaning, words = {"kind": "choice", "choices": words}, ()
-    elif {*get_args(ArrayLike)} <= {*types} or any(np.ndarray in (one, get_origin(one)) for one in types):
+    elif {*get_args(ArrayLike)} <= {*types} or any(np.ndarray in (part, get_origin(part)) for part in types):
         meaning = {"kind": "map"}
     else:
         is_number = len(types) == 2 and {*types} == {int, float}
@@ -259,20 +259,20 @@ def _meaning(name: str, annotation: Any, file: str) -> dict[str, Any]:
     return {"optional": NoneType in parts, "words": words, **meaning}
 
 
-def _meaning_of_type(one: Any) -> dict[str, Any]:
+def _meaning_of_type(kind: Any) -> dict[str, Any]:
     """Return what a single type says of an option's values; see `_meaning`."""
     kinds: dict[Any, Kind] = {bool: "flag", int: "integer", float: "number", str: "text", Path: "path"}
-    if one in kinds:
-        return {"kind": kinds[one]}
-    items, origin = [part for part in get_args(one) if part is not ...], get_origin(one)
+    if kind in kinds:
+        return {"kind": kinds[kind]}
+    items, origin = [part for part in get_args(kind) if part is not ...], get_origin(kind)
     if origin in (list, tuple, Sequence) and {*items} <= {int, float}:
-        count = len(items) if origin is tuple and ... not in get_args(one) else None
+        count = len(items) if origin is tuple and ... not in get_args(kind) else None
         return {"kind": "integers" if {*items} == {int} else "numbers", "count": count}
-    if not isinstance(one, type) or getattr(one, "_is_protocol", False) or one is object:
+    if not isinstance(kind, type) or getattr(kind, "_is_protocol", False) or kind is object:
         return {"kind": "object"}
-    if issubclass(one, Enum):
-        return {"kind": "choice", "choices": tuple(map(plain, one)), "instance_of": one}
-    return {"kind": "object", "instance_of": one}
+    if issubclass(kind, Enum):
+        return {"kind": "choice", "choices": tuple(map(plain, kind)), "instance_of": kind}
+    return {"kind": "object", "instance_of": kind}
 
 
 def plain(value: Any) -> Any:
@@ -380,33 +380,33 @@ class Configured:
         unknown = options.keys() - self.options
         if unknown:
             raise InputError(unknown_argument(type(self).__name__, min(unknown), [*self.options], "option"))
-        for name, one in self.options.items():
-            value = options.get(name, one.default)
-            one.store(self, one.check(value))
+        for name, declared in self.options.items():
+            value = options.get(name, declared.default)
+            declared.store(self, declared.check(value))
         self.check_options()
 
     def __repr__(self) -> str:
-        values = ((name, value, self.options[name].default) for name, value in self.chosen().items())
-        given = (f"{name}={_text(value)}" for name, value, default in values if not _equal(value, default))
-        return f"{type(self).__name__}({', '.join(given)})"
+        values = ((name, value, self.options[name].default) for name, value in self.option_values().items())
+        changed = (f"{name}={_text(value)}" for name, value, default in values if not _equal(value, default))
+        return f"{type(self).__name__}({', '.join(changed)})"
 
     def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and _equal(self.chosen(), other.chosen())
+        return type(self) is type(other) and _equal(self.option_values(), other.option_values())
 
     def __hash__(self) -> int:
-        return hash((type(self), content_of(self.chosen())))
+        return hash((type(self), content_of(self.option_values())))
 
     def __copy__(self) -> Self:
-        return type(self)(**self.chosen())
+        return type(self)(**self.option_values())
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        return type(self)(**copy.deepcopy(self.chosen(), memo))
+        return type(self)(**copy.deepcopy(self.option_values(), memo))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _construct, (importable_name(type(self)), self.written())
 
     def __dask_tokenize__(self) -> tuple[str, str]:
-        kind, content = type(self), repr(content_of(self.chosen()))
+        kind, content = type(self), repr(content_of(self.option_values()))
         return f"{kind.__module__}:{kind.__qualname__}", hashlib.sha256(content.encode()).hexdigest()
 
     def check_options(self) -> None:
@@ -415,23 +415,26 @@ class Configured:
         The message starts with the name of the option to change.
         """
 
-    def chosen(self) -> dict[str, Any]:
+    def option_values(self) -> dict[str, Any]:
         """Return the value of each option by name."""
-        return {name: one.stored(self) for name, one in self.options.items()}
+        return {name: declared.stored(self) for name, declared in self.options.items()}
 
     def written(self) -> dict[str, Any]:
         """Return the value of each option by name, members of enumerations as text."""
         return {
-            name: plain(value) if isinstance(value, Enum) else value for name, value in self.chosen().items()
+            name: plain(value) if isinstance(value, Enum) else value
+            for name, value in self.option_values().items()
         }
 
     def with_options(self, **options: Any) -> Self:
         """Return an object of the same class in which some options differ."""
-        return type(self)(**{**self.chosen(), **options})
+        return type(self)(**{**self.option_values(), **options})
 
-    def part(self, kind: type[Configured]) -> dict[str, Any]:
+    def shared_options(self, kind: type[Configured]) -> dict[str, Any]:
         """Return the values of the options that another class also has."""
-        return {name: one.stored(self) for name, one in self.options.items() if name in kind.options}
+        return {
+            name: declared.stored(self) for name, declared in self.options.items() if name in kind.options
+        }
 
 
 def _construct(name: str, options: dict[str, Any]) -> Any:
@@ -446,14 +449,14 @@ def content_of(value: Any) -> Hashable:
         content = np.where(np.isnan(numbers), np.nan, numbers).tobytes()
         return value.shape, hashlib.sha256(content).hexdigest()
     if isinstance(value, Configured):
-        return f"{type(value).__module__}:{type(value).__qualname__}", content_of(value.chosen())
+        return f"{type(value).__module__}:{type(value).__qualname__}", content_of(value.option_values())
     if isinstance(value, Mapping):
         return tuple((str(name), content_of(value[name])) for name in value)
     if isinstance(value, list | tuple):
         return tuple(map(content_of, value))
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return type(value).__qualname__, tuple(
-            content_of(getattr(value, one.name)) for one in dataclasses.fields(value)
+            content_of(getattr(value, field.name)) for field in dataclasses.fields(value)
         )
     value = plain(value)
     if value is None or isinstance(value, str | int | float):
@@ -464,8 +467,8 @@ def content_of(value: Any) -> Hashable:
         return id(value)
 
 
-def _equal(one: Any, other: Any) -> bool:
-    return one is other or content_of(one) == content_of(other)
+def _equal(value: Any, other: Any) -> bool:
+    return value is other or content_of(value) == content_of(other)
 
 
 def _text(value: Any) -> str:
@@ -481,8 +484,8 @@ def _declared(cls: type) -> Iterator[tuple[str, Option]]:
     """Yield the options in the body of a class, completed, if their names can be used."""
     annotations = inspect.get_annotations(cls)
     taken = {name for base in cls.__mro__[1:] for name in (*vars(base), *getattr(base, "on_objects", ()))}
-    for name, one in list(vars(cls).items()):
-        if not isinstance(one, Option):
+    for name, declared in list(vars(cls).items()):
+        if not isinstance(declared, Option):
             continue
         inherited = next((vars(base)[name] for base in cls.__mro__[1:] if name in vars(base)), None)
         if name in RESERVED or (name in taken and not isinstance(inherited, Option)):
@@ -490,8 +493,8 @@ def _declared(cls: type) -> Iterator[tuple[str, Option]]:
                 f"{cls.__name__}: an option cannot have the name {name}, which has a meaning already"
             )
         try:
-            annotation = None if one.kind else _evaluated(cls, annotations.get(name))
-            yield name, one.settled(name, annotation)
+            annotation = None if declared.kind else _evaluated(cls, annotations.get(name))
+            yield name, declared.settled(name, annotation)
         except InputError as error:
             raise InputError(f"{cls.__name__}: {error}") from error
 
@@ -541,7 +544,7 @@ def signature_of(
     kinds = inspect.Parameter
     first = [kinds(name, kinds.POSITIONAL_OR_KEYWORD) for name in positional]
     first += [kinds(name, kinds.POSITIONAL_OR_KEYWORD, default=None) for name in optional]
-    rest = [kinds(name, kinds.KEYWORD_ONLY, default=one.default) for name, one in options.items()]
+    rest = [kinds(name, kinds.KEYWORD_ONLY, default=declared.default) for name, declared in options.items()]
     return inspect.Signature([*first, *rest])
 
 
@@ -555,13 +558,13 @@ def documented(text: str | None, options: Mapping[str, Option], before: str = ""
     head, *rest = inspect.cleandoc(text).split("\n\n")
     sections = next((k for k, part in enumerate(rest) if "\n---" in part), len(rest))
     lines = [before.rstrip()] if before else []
-    lines += [f"{name} : {one.described()}\n{_sentence(one)}" for name, one in options.items()]
+    lines += [f"{name} : {declared.described()}\n{_sentence(declared)}" for name, declared in options.items()]
     parameters = "\n".join(["Parameters", "----------", *lines])
     return "\n\n".join([head, *rest[:sections], parameters, *rest[sections:]])
 
 
-def _sentence(one: Option) -> str:
-    text = one.help[:1].upper() + one.help[1:]
-    default = f" By default {one.shown_default}." if one.shown_default else ""
+def _sentence(declared: Option) -> str:
+    text = declared.help[:1].upper() + declared.help[1:]
+    default = f" By default {declared.shown_default}." if declared.shown_default else ""
     sentence = f"{text}{'' if text.endswith('.') else '.'}{default}"
     return textwrap.fill(sentence, _COLUMNS, initial_indent="    ", subsequent_indent="    ")

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.base.tiling import (
     Band,
     Planes,
-    cut_into_bands,
     for_each_band,
     join_rows,
+    split_into_bands,
     staging_buffer_of,
 )
 from mirrorskin.kernels.device import C_TYPES, Device
@@ -101,7 +101,7 @@ class Picture:
         devices, dtype, self._itemsize = operation.devices, operation.dtype, operation.dtype.itemsize
         self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "BITS": 8 * self._itemsize}
         self._macros |= macros
-        self.bands = cut_into_bands(devices, self._shape, dtype, maps, self._length, whole, around)
+        self.bands = split_into_bands(devices, self._shape, dtype, maps, self._length, whole, around)
         self._constants = {
             device: {name: _copied(device, name, values) for name, values in (constants or {}).items()}
             for device in {band.device for band in self.bands}
@@ -168,11 +168,11 @@ class Picture:
                         continue
                     scanned = {"frames": staged.array, "count": len(places), "place": places.astype(np.int32)}
                     scanned |= {"first": before + int(np.count_nonzero(used[:start])), "each": band.pixels}
-                    given = {
+                    available = {
                         name: value.of(start + places) if isinstance(value, PerFrame) else value
                         for name, value in arguments.items()
                     }
-                    self._launch(band, source, kernel, given, scanned, whole)
+                    self._launch(band, source, kernel, available, scanned, whole)
 
         for_each_band(self.bands, launch)
 
@@ -184,7 +184,7 @@ class Picture:
         if on_host or not self._operation._on_device:
             return self._fetch(parts, keep=not self._operation.ended)
         (band,) = self.bands
-        return [band.cut(*_named(part)) for part in parts]
+        return [band.copy_map(*_named(part)) for part in parts]
 
     def read(self, *parts: Part) -> list[NDArray[Any]]:
         """Return copies of maps, or of planes of them, on the host."""
@@ -222,7 +222,7 @@ class Picture:
         band: Band,
         source: str | Path | None,
         name: str,
-        given: dict[str, Any],
+        arguments: dict[str, Any],
         scanned: Mapping[str, Any] | None = None,
         whole: bool = True,
     ) -> None:
@@ -231,15 +231,17 @@ class Picture:
         tile = self._tile if self._tile and device.layout.tile > 1 else device.layout.tile
         macros = {**self._macros, "TILE": tile, "LANES": vector_lanes(device)}
         kernel = device.kernel(source or self._source, name, **macros)
-        known: dict[str, Any] = {name: band.maps[name] for name in self._kinds if name in kernel.arguments}
-        moved = sum(array.nbytes for array in known.values()) if whole else 0
-        known |= self._constants[device]
-        known |= {"pixels": band.pixels, "rows": band.rows.stop - band.rows.start}
-        known |= {"columns": self._shape[1], "stride": band.stride, "each": band.stride}
+        available: dict[str, Any] = {
+            name: band.maps[name] for name in self._kinds if name in kernel.arguments
+        }
+        moved = sum(array.nbytes for array in available.values()) if whole else 0
+        available |= self._constants[device]
+        available |= {"pixels": band.pixels, "rows": band.rows.stop - band.rows.start}
+        available |= {"columns": self._shape[1], "stride": band.stride, "each": band.stride}
         if scanned is not None:
-            known |= scanned
+            available |= scanned
             moved += scanned["count"] * band.pixels * self._itemsize
-        needed = {name: value for name, value in known.items() if name in kernel.arguments} | given
+        needed = {name: value for name, value in available.items() if name in kernel.arguments} | arguments
         needed = {name: _on(band, name, value) for name, value in needed.items()}
         kernel(-(-band.pixels // tile), moved=moved, **needed)
 

@@ -44,33 +44,37 @@ def attach_provenance(
     result: Result, source: Source, devices: Sequence[Device], process: dict[str, ProcessValue]
 ) -> Result:
     """Return a result with coordinates, provenance, and the calibration if any."""
-    own = source.source if isinstance(source, io.Calibrated) else source
-    known: dict[str, ProcessValue] = {**signature(), "source": source.name}
+    recording = source.source if isinstance(source, io.Calibrated) else source
+    origin: dict[str, ProcessValue] = {**signature(), "source": source.name}
     if devices:
-        known["device"] = _listed([device.info.title for device in devices])
-        known["driver"] = "; ".join(dict.fromkeys(device.info.driver for device in devices))
+        origin["device"] = _listed([device.info.title for device in devices])
+        origin["driver"] = "; ".join(dict.fromkeys(device.info.driver for device in devices))
     x = y = None
     if source.header.pixel_size is not None:  # from the centre of the whole picture
-        shape = own.full_shape if isinstance(own, io.Recording) else own.shape
+        shape = recording.full_shape if isinstance(recording, io.Recording) else recording.shape
         x, y = io.pixel_axes(shape[1:], source.header.pixel_size)
-    if isinstance(own, io.Recording):
+    if isinstance(recording, io.Recording):
         if x is not None and y is not None:
-            (row, column), (_, rows, columns) = own.origin, own.shape
+            (row, column), (_, rows, columns) = recording.origin, recording.shape
             x, y = x[column : column + columns], y[row : row + rows]
-        known |= {
-            "dataset": own.dataset,
-            "source_fingerprint": own.fingerprint(),
-            "source_modified": own.modified,
-            "source_region": own.region.text,
-            "source_frames": own.which,
+        origin |= {
+            "dataset": recording.dataset,
+            "source_fingerprint": recording.fingerprint(),
+            "source_modified": recording.modified,
+            "source_region": recording.region.text,
+            "source_frames": recording.which,
         }
-        frames = None if own.used_live else (own.first_frame, own.first_frame + own.shape[0])
-        region = (*own.region.rows, *own.region.columns)
+        frames = (
+            None
+            if recording.used_live
+            else (recording.first_frame, recording.first_frame + recording.shape[0])
+        )
+        region = (*recording.region.rows, *recording.region.columns)
         result = result.assign(fitted=replace(result.fitted, source_frames=frames, source_region=region))
     if isinstance(source, io.Calibrated):
-        known |= {"calibration": source.whole.name, "calibration_parts": source.whole.contents}
+        origin |= {"calibration": source.whole.name, "calibration_parts": source.whole.contents}
         result = result.assign(calibration=source.whole)
-    return result.assign(x=x, y=y).with_process(known | process)
+    return result.assign(x=x, y=y).with_process(origin | process)
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -81,31 +85,31 @@ def _listed(names: Sequence[str]) -> str:
 
 def describe(configured: Configured, source: Source | None = None) -> dict[str, ProcessValue]:
     """Return the name of an operation, step or method, and its options, for ``process``."""
-    found: dict[str, ProcessValue] = {"operation": type(configured).__name__}
-    for name, value in configured.chosen().items():
+    process: dict[str, ProcessValue] = {"operation": type(configured).__name__}
+    for name, value in configured.option_values().items():
         if name in ("device", "memory_limit") or value is None or (isinstance(value, Sequence) and not value):
             continue
         if isinstance(text := plain(value), str | bool | int | float):
-            found[name] = text
+            process[name] = text
         elif isinstance(value, Sequence):
-            found[name] = str(list(value))
+            process[name] = str(list(value))
         elif isinstance(value, np.ndarray) and value.ndim < 2:
-            found[name] = str(value.tolist()) if value.ndim else float(value)
+            process[name] = str(value.tolist()) if value.ndim else float(value)
         elif isinstance(value, np.ndarray):
-            own = source is not None and getattr(source.header, name, None) is value
-            found[name] = "map of the recording" if own else "map given"
+            from_header = source is not None and getattr(source.header, name, None) is value
+            process[name] = "map of the recording" if from_header else "map given"
         else:
-            found[name] = "given"
-    return found
+            process[name] = "given"
+    return process
 
 
 def level_origin(
-    source: Source, name: Literal["dark", "bright"], given: ArrayLike | None = None
+    source: Source, name: Literal["dark", "bright"], option_value: ArrayLike | None = None
 ) -> ProcessValue:
     """Return the origin of the level of dark or bright pixels; see `parameter_origin`."""
     references = source.calibration.references if isinstance(source, io.Calibrated) else None
     whose = "recording" if references is None else "calibration"
-    return parameter_origin(given, getattr(source.header, name), _ASSUMED, whose)
+    return parameter_origin(option_value, getattr(source.header, name), _ASSUMED, whose)
 
 
 def estimated_level(counts: float) -> str:
@@ -114,14 +118,14 @@ def estimated_level(counts: float) -> str:
 
 
 def parameter_origin(
-    given: ArrayLike | None, own: ArrayLike | None, otherwise: str, whose: str = "recording"
+    option_value: ArrayLike | None, stored: ArrayLike | None, otherwise: str, whose: str = "recording"
 ) -> ProcessValue:
     """Return a parameter's value, or its origin in words: given, of the source, or a default."""
-    if given is not None:
-        return float(given) if np.ndim(given) == 0 else "map given"  # type: ignore[arg-type]
-    if own is None:
+    if option_value is not None:
+        return float(option_value) if np.ndim(option_value) == 0 else "map given"  # type: ignore[arg-type]
+    if stored is None:
         return otherwise
-    return f"map of the {whose}" if np.ndim(own) else float(np.asarray(own))
+    return f"map of the {whose}" if np.ndim(stored) else float(np.asarray(stored))
 
 
 @contextmanager

@@ -98,7 +98,7 @@ def run(
         operation = operation()
     if not isinstance(operation, Operation):
         raise _no_operation(operation)
-    if wrong := [one for one in positions if one in operation.options]:
+    if wrong := [name for name in positions if name in operation.options]:
         kind = type(operation).__name__
         raise InputError(f"{wrong[0]} is an option: give it to the class, {kind}({wrong[0]}=...)")
     return run_over(_frames_of(source, operation, positions, pixel_size), operation, progress)
@@ -224,8 +224,8 @@ def reconstruct(
     >>> engine.reconstruct(press).height.shape
     (40, 40)
     """
-    given = {"travel": travel, "phase": phase, "displacement": displacement, "twist": twist}
-    opened = calibrated(_as_source(source, given, pixel_size), calibration)
+    positions = {"travel": travel, "phase": phase, "displacement": displacement, "twist": twist}
+    opened = calibrated(_as_source(source, positions, pixel_size), calibration)
     return method_for(opened.motion)(**options).run(opened, progress)
 
 

@@ -30,9 +30,9 @@ class SamplePoints:
     @classmethod
     def at(cls, column: ArrayLike, row: ArrayLike, shape: tuple[int, int]) -> SamplePoints:
         """Return points, (n,), at distances in pixels from the first pixel's centre; NaN for none."""
-        (rows, low, i), (columns, left, j) = _pair(row, shape[0]), _pair(column, shape[1])
+        (rows, along_rows, i), (columns, along_columns, j) = _pair(row, shape[0]), _pair(column, shape[1])
         pixels = np.stack([y * shape[1] + x for y in rows for x in columns])
-        shares = np.stack([v * w for v in low for w in left])
+        shares = np.stack([v * w for v in along_rows for w in along_columns])
         closest = np.argmax(shares, axis=0)
         nearest = np.take_along_axis(pixels, closest[np.newaxis], axis=0)[0]
         inside = i & j
@@ -66,8 +66,8 @@ class SamplePoints:
         flat = values.reshape(-1, 3)
         mean = np.stack(self._mean(list(np.moveaxis(flat[self.pixels], -1, 0)), count))
         unit = (mean / np.sqrt(np.sum(mean * mean, axis=0))).astype(np.float32)
-        own = self.inside & self.on_pixel
-        return np.where(own[:, np.newaxis], flat[self.nearest], unit.T)
+        unmoved = self.inside & self.on_pixel
+        return np.where(unmoved[:, np.newaxis], flat[self.nearest], unit.T)
 
     def interpolate_angles(self, values: Floats, count: Mask | None = None) -> Floats:
         """Interpolate angles, (H, W), radians, along the shorter arc; see `interpolate`."""
@@ -103,8 +103,8 @@ def _pair(place: ArrayLike, size: int) -> tuple[list[NDArray[np.intp]], list[Dou
     whole = np.rint(place)
     place = np.where(abs(place - whole) < _ROUNDING, whole, place)
     low = np.floor(place).astype(np.intp)
-    share = place - low
-    shares = [np.where(low >= 0, 1 - share, 0.0), np.where(low + 1 < size, share, 0.0)]
+    fraction = place - low
+    shares = [np.where(low >= 0, 1 - fraction, 0.0), np.where(low + 1 < size, fraction, 0.0)]
     return [np.maximum(low, 0), np.minimum(low + 1, size - 1)], shares, inside
 
 
@@ -112,11 +112,11 @@ def fill_with_nearest(values: NDArray[Any]) -> NDArray[Any]:
     """Return a map, (H, W), with NaN replaced by the nearest number; distances are accurate to 2 %."""
     import cv2
 
-    known = np.isfinite(values)
-    if known.all():
+    finite = np.isfinite(values)
+    if finite.all():
         return values
-    gaps = (~known).view(np.uint8)
+    gaps = (~finite).view(np.uint8)
     _, label = cv2.distanceTransformWithLabels(gaps, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     numbers = np.full(label.max() + 1, np.nan, values.dtype)
-    numbers[label[known]] = values[known]
+    numbers[label[finite]] = values[finite]
     return np.asarray(numbers[label])

@@ -100,8 +100,8 @@ class Run(ThreadSafe):
         source, frames = self._stream, self._plan.frames
         if source is not None and shape[0] < ENDLESS:
             count = len(frames) if frames is not None else shape[0]
-            least = 2 * count * math.prod(shape[1:]) * dtype.itemsize
-            vars(self.operation)["memory_limit"] = max(1, min(self.operation.memory_limit, least))
+            required = 2 * count * math.prod(shape[1:]) * dtype.itemsize
+            vars(self.operation)["memory_limit"] = max(1, min(self.operation.memory_limit, required))
         on_device = getattr(source, "on_device", None)
         if on_device is not None:
             self._use_device_of(on_device)
@@ -191,12 +191,12 @@ class Run(ThreadSafe):
             if stream.rewindable:
                 stream.rewind()
             watch = None if number else self._watch
-            for done, block in blocks_of(stream, self.operation, self._plan.frames):
+            for processed, block in blocks_of(stream, self.operation, self._plan.frames):
                 if block is not None:
                     with computation():  # a daemon thread ends between two blocks
                         self._take(block, watch)
                 if progress:
-                    progress(done)
+                    progress(processed)
 
     # Live, or a loop of one's own: frames as they come.
 
@@ -230,9 +230,9 @@ class Run(ThreadSafe):
         if array.dtype != operation.dtype or array.shape[1:] != operation.shape or len(array) == 0:
             expected = f"{operation.dtype} (n, {operation.shape[0]}, {operation.shape[1]})"
             raise InputError(f"frames are {array.dtype} {array.shape}: {expected} is needed")
-        given = {name: as_series(name, one) for name, one in positions.items() if one is not None}
-        check_taken(operation, given)
-        self._take(block_of(array, operation.count, given, stays_valid=False), self._watch)
+        series = {name: as_series(name, values) for name, values in positions.items() if values is not None}
+        check_taken(operation, series)
+        self._take(block_of(array, operation.count, series, stays_valid=False), self._watch)
 
     def push_block(self, block: Block, part: slice = slice(None)) -> None:
         """Process a block of the source, or a part of it."""
@@ -247,22 +247,22 @@ class Run(ThreadSafe):
         if self._final is not None:
             raise InputError(f"the run of {type(operation).__name__} has ended: push frames into a new one")
         names = (*operation.positions, "frame_weights") if operation._weighted else operation.positions
-        given = {name: getattr(block, name, None) for name in names}
+        series = {name: getattr(block, name, None) for name in names}
         frames = block.frames if operation.for_device else on_host(block.frames)
         samples = None if watch is None else take_grid(frames, watch.samples)  # before frames are moved
-        self._push(frames, {k: v for k, v in given.items() if v is not None}, block.stays_valid)
+        self._push(frames, {k: v for k, v in series.items() if v is not None}, block.stays_valid)
         if watch is not None:
             watch.push(block, samples)
 
-    def _push(self, frames: Any, given: Mapping[str, Any], stay_valid: bool) -> None:
+    def _push(self, frames: Any, series: Mapping[str, Any], stay_valid: bool) -> None:
         operation = self.operation
         for name, needed in operation.positions.items():
-            if needed and name not in given:
+            if needed and name not in series:
                 raise InputError(f"{name} is missing: {type(operation).__name__} needs it of each frame")
         operation._stay_valid, operation._on_device = stay_valid, isinstance(frames, Array)
-        operation.push(frames, **given)
+        operation.push(frames, **series)
         operation.count += len(frames)
-        for name, values in given.items():
+        for name, values in series.items():
             if name in operation.positions:
                 operation._positions_so_far.setdefault(name, []).append(np.array(values, np.float64))
 
@@ -284,15 +284,15 @@ class Run(ThreadSafe):
         operation = self.operation
         if self._final is not None:
             return self._final
-        own = type(operation).preview is not Operation.preview
-        if operation.count < (1 if own else operation.least_frames):
+        has_preview = type(operation).preview is not Operation.preview
+        if operation.count < (1 if has_preview else operation.least_frames):
             return Result()
         operation.ended = False
         try:
             maps = operation.preview(seconds)
         except InputError:
             return Result()
-        return as_preview(operation, maps) if own else as_result(operation, maps, copied=True)
+        return as_preview(operation, maps) if has_preview else as_result(operation, maps, copied=True)
 
     def idle_work(self, seconds: float) -> None:
         """Do postponed work, for some seconds at most."""
@@ -333,15 +333,15 @@ class Run(ThreadSafe):
         used = {"frames": operation.count} | ({"first_frame": first} if plan.frames is not None else {})
         result = result.with_process(merged(used, plan.process, result.process, process or {}))
         result = attach_provenance(result, source, operation.opened_devices, dict(result.process))
-        checks = [kind(**operation.part(kind)) for kind in operation.checks] if plan.checked else []
+        checks = [kind(**operation.shared_options(kind)) for kind in operation.checks] if plan.checked else []
         for step in (*checks, *plan.steps):
             context.earlier[type(step)] = result
             if all(result.name_of(quantity) for quantity in step.needs):
                 result = step.apply(result, context)
-        found = () if watch is None else watch.findings()
+        findings = () if watch is None else watch.findings()
         kinds, usual = operation.corrected_kinds, operation.usual_findings
-        told = (_as_corrected(one, kinds) for one in found if one.kind not in usual)
-        result = with_findings(result, *([_ONE_READING] if one_reading else []), *told)
+        reported = (_as_corrected(finding, kinds) for finding in findings if finding.kind not in usual)
+        result = with_findings(result, *([_ONE_READING] if one_reading else []), *reported)
         self._final = result if ended else None
         return result
 
@@ -354,8 +354,8 @@ class Run(ThreadSafe):
         """Raise InputError if fewer frames have been pushed than a result needs."""
         operation = self.operation
         if operation.count < operation.least_frames:
-            least, count = operation.least_frames, operation.count
-            frames = "1 frame" if least == 1 else f"{least} frames"
+            minimum, count = operation.least_frames, operation.count
+            frames = "1 frame" if minimum == 1 else f"{minimum} frames"
             pushed = f"{count} has been" if count == 1 else f"{count or 'none'} have been"
             raise InputError(f"{type(operation).__name__} needs at least {frames}; {pushed} pushed so far")
 
@@ -394,7 +394,9 @@ def part_of(block: Block, part: slice) -> Block:
     """Return a part of a block."""
     names = ("frames", "time", "travel", "phase", "displacement", "twist", "tilt", "axes", "frame_weights")
     values = {name: getattr(block, name) for name in names}
-    parts: dict[str, Any] = {name: one if one is None else one[part] for name, one in values.items()}
+    parts: dict[str, Any] = {
+        name: series if series is None else series[part] for name, series in values.items()
+    }
     return replace(block, index=block.index + part.indices(len(block.frames))[0], **parts)
 
 
@@ -405,10 +407,10 @@ def _as_corrected(finding: Finding, corrected: Sequence[str]) -> Finding:
     return replace(finding, text=f"{finding.text.split(':')[0]}, which is corrected", warning=False)
 
 
-def check_taken(operation: Operation, given: Mapping[str, Any]) -> None:
+def check_taken(operation: Operation, series: Mapping[str, Any]) -> None:
     """Raise InputError if an operation does not take some positions."""
     taken = {*operation.positions, "time"} | ({"frame_weights"} if operation._weighted else set())
-    if foreign := given.keys() - taken:
+    if foreign := series.keys() - taken:
         kind = type(operation).__name__
         raise InputError(unknown_argument(kind, min(foreign), [*operation.positions], "position"))
 
@@ -442,8 +444,8 @@ def as_result(operation: Operation, returned: Any, copied: bool) -> Result:
 
 def _copied(result: Result) -> Result:
     """Return a result whose maps share no memory with an operation."""
-    arrays = {name: one for name, one in result._maps.items() if isinstance(one, np.ndarray)}
-    return result.assign({name: one.copy() for name, one in arrays.items()})
+    arrays = {name: values for name, values in result._maps.items() if isinstance(values, np.ndarray)}
+    return result.assign({name: values.copy() for name, values in arrays.items()})
 
 
 def as_preview(operation: Operation, shown: Mapping[str, Any]) -> Result:
@@ -454,20 +456,22 @@ def as_preview(operation: Operation, shown: Mapping[str, Any]) -> Result:
     if isinstance(shown, Result):
         return shown
     declared = operation.declarations
-    arrays = {name: one.copy() for name, one in shown.items() if isinstance(one, np.ndarray)}
-    known = {name: arrays.get(name, one) for name, one in shown.items() if name in declared or name in arrays}
+    arrays = {name: value.copy() for name, value in shown.items() if isinstance(value, np.ndarray)}
+    declared_values = {
+        name: arrays.get(name, value) for name, value in shown.items() if name in declared or name in arrays
+    }
     try:
-        return result_of(known, operation.shape, {}, declared)
+        return result_of(declared_values, operation.shape, {}, declared)
     except InputError as error:
         raise InputError(f"{type(operation).__name__}.preview(): {error}") from error
 
 
 def _is_rounded(value: Any, option_value: Any) -> bool:
     """Return whether a value equals that of an option, or its rounding to float32."""
-    left, right = np.asarray(value), np.asarray(option_value)
-    if left.dtype.kind in "uif" and right.dtype.kind in "uif":
-        left, right = left.astype(np.float32), right.astype(np.float32)
-    return (right.ndim == 0 or right.shape == left.shape) and bool(np.all(left == right))
+    first, second = np.asarray(value), np.asarray(option_value)
+    if first.dtype.kind in "uif" and second.dtype.kind in "uif":
+        first, second = first.astype(np.float32), second.astype(np.float32)
+    return (second.ndim == 0 or second.shape == first.shape) and bool(np.all(first == second))
 
 
 def _check_names(operation: Operation, returned: Mapping[str, Any]) -> None:

@@ -87,25 +87,27 @@ class ArraySource(Closing):
         name: str = "",
         pixel_size: Any = None,
     ) -> None:
-        given = _series_of(positions)
-        self.name, self._series = name or type(operation).__name__, given
+        series = _series_of(positions)
+        self.name, self._series = name or type(operation).__name__, series
         self._frames = _checked(as_frames(frames, operation, 0))
         self.on_device: Array | None = self._frames if isinstance(self._frames, Array) else None
         self.shape: tuple[int, int, int] = self._frames.shape
         self.dtype: np.dtype[Any] = np.dtype(self._frames.dtype)
         self._describe(operation, pixel_size)
-        check_series(given, self.shape[0], self.shape[2])
-        self.travel: Floats | None = given.get("travel")
-        self.phase: Floats | None = given.get("phase")
-        self.time: Floats | None = given.get("time")
+        check_series(series, self.shape[0], self.shape[2])
+        self.travel: Floats | None = series.get("travel")
+        self.phase: Floats | None = series.get("phase")
+        self.time: Floats | None = series.get("time")
         self._next = 0
 
     def _describe(self, operation: Operation, pixel_size: Any) -> None:
         """Set motion and header."""
-        possible = [_MOTIONS[one] for one in self._series if one in _MOTIONS]
-        fits = [one for one in possible if one in operation.motions] if operation.motions else possible
-        known = cast("list[Motion]", [*fits, *operation.motions, *possible, "vertical"])
-        self.motion: Motion = known[0]
+        possible = [_MOTIONS[name] for name in self._series if name in _MOTIONS]
+        fits = (
+            [motion for motion in possible if motion in operation.motions] if operation.motions else possible
+        )
+        motions = cast("list[Motion]", [*fits, *operation.motions, *possible, "vertical"])
+        self.motion: Motion = motions[0]
         size = None if pixel_size is None else check_pixel_size(pixel_size)
         self.header = Header(self.motion, pixel_size=size)
 
@@ -115,11 +117,11 @@ class ArraySource(Closing):
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
         """Return the next frames, at most ``len(out)``, where they are."""
-        return self.lend(1 if out is None else len(out))
+        return self.read_in_place(1 if out is None else len(out))
 
-    def lend(self, most: int) -> Block | None:
-        """Return the next frames, at most ``most``, where they are; None at the end."""
-        start, stop = self._next, min(self._next + most, self.shape[0])
+    def read_in_place(self, count: int) -> Block | None:
+        """Return the next frames, at most ``count``, where they are; None at the end."""
+        start, stop = self._next, min(self._next + count, self.shape[0])
         if start == stop:
             return None
         self._next = stop
@@ -168,7 +170,7 @@ class IteratorSource(ArraySource):
         """Refuse to go back."""
         raise RuntimeError("an iterator cannot be rewound")
 
-    def lend(self, most: int) -> Block | None:
+    def read_in_place(self, count: int) -> Block | None:
         """Return the next frame; None at the end."""
         frame = next(self._rest, None)
         if frame is None:
@@ -203,7 +205,7 @@ class PushedSource(ArraySource):
         self.shape, self.dtype = (ENDLESS, frames.shape[1], frames.shape[2]), np.dtype(frames.dtype)
         self._describe(operation, None)
 
-    def lend(self, most: int) -> Block | None:
+    def read_in_place(self, count: int) -> Block | None:
         """Refuse to read: frames are pushed."""
         raise InputError("frames were pushed into this run, which has no others. Call result()")
 
@@ -211,9 +213,9 @@ class PushedSource(ArraySource):
 def block_of(frames: AnyArray, first: int, series: Mapping[str, Any], stays_valid: bool) -> Block:
     """Return frames with the positions of each; InputError unless there is one of each of them."""
     check_series(series, len(frames), frames.shape[2])
-    given = dict(series)
-    given["axes"] = given.pop("pose", None)
-    return Block(frames, first, stays_valid=stays_valid, **cast(Any, given))
+    positions = dict(series)
+    positions["axes"] = positions.pop("pose", None)
+    return Block(frames, first, stays_valid=stays_valid, **cast(Any, positions))
 
 
 def _series_of(positions: Mapping[str, Any]) -> dict[str, Any]:
@@ -240,9 +242,9 @@ def _checked(array: AnyArray) -> AnyArray:
     return array
 
 
-def check_series(given: Mapping[str, Any], count: int, columns: int) -> None:
+def check_series(series: Mapping[str, Any], count: int, columns: int) -> None:
     """Raise InputError unless there is one of each of some frames."""
-    for name, values in given.items():
+    for name, values in series.items():
         if np.shape(values)[:1] != (count,):
             frames = "1 frame" if count == 1 else f"{count} frames"
             last = np.shape(values)[:1] == (columns,)
@@ -281,34 +283,36 @@ def blocks_of(
     while earlier ones are copied and processed.
     """
     chosen = range(source.shape[0]) if frames is None else frames
-    done = 0
-    for block in _read_in_place(source, operation, chosen.start):
-        done += len(block.frames)
-        yield done, None
+    processed = 0
+    for block in _read_into_buffer(source, operation, chosen.start):
+        processed += len(block.frames)
+        yield processed, None
     for block in _read(source, operation, len(chosen)):
-        done += len(block.frames)
-        yield done, block
+        processed += len(block.frames)
+        yield processed, block
 
 
 def _read(source: Source, operation: Operation, count: int) -> Iterator[Block]:
     """Read frames as it suits the operation, the device and the source."""
     if not operation.for_device:
-        yield from _read_in_place(source, operation, count)
+        yield from _read_into_buffer(source, operation, count)
         return
-    lend: Callable[[int], Block | None] = getattr(source, "lend", lambda most: None)
+    read_in_place: Callable[[int], Block | None] = getattr(source, "read_in_place", lambda count: None)
     frame_size = math.prod(source.shape[1:]) * source.dtype.itemsize
-    most = max(1, operation.device.max_allocation // frame_size)
+    limit = max(1, operation.device.max_allocation // frame_size)
     if getattr(source, "on_device", None) is not None:
-        most = count
-    while count > 0 and (block := lend(min(count, most))) is not None:  # where they are, as many as possible
+        limit = count
+    while (
+        count > 0 and (block := read_in_place(min(count, limit))) is not None
+    ):  # where they are, as many as possible
         yield block
         count -= len(block.frames)
     if count > 0:
         ahead = not operation.device.info.shares_memory or getattr(source, "read_ahead", False)
-        yield from (_read_ahead if ahead else _read_in_place)(source, operation, count)
+        yield from (_read_ahead if ahead else _read_into_buffer)(source, operation, count)
 
 
-def _read_in_place(source: Source, operation: Operation, count: int) -> Iterator[Block]:
+def _read_into_buffer(source: Source, operation: Operation, count: int) -> Iterator[Block]:
     """Read frames into the operation's own array."""
     while count > 0:
         block = source.read(operation.staging_buffer[:count])

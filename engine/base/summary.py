@@ -116,7 +116,7 @@ def status_shares(result: Result) -> str:
         return ""
     codes = result.declaration("status").codes
     shares = {text: 100 * float(np.mean(np.asarray(status) == code)) for code, text in codes.items()}
-    return ", ".join(f"{text} at {share:.3g} %" for text, share in shares.items() if share)
+    return ", ".join(f"{text} at {percent:.3g} %" for text, percent in shares.items() if percent)
 
 
 def _from_to(lowest: float, highest: float, unit: str) -> str:
@@ -159,13 +159,15 @@ def _leading(result: Result, relative: bool) -> tuple[str | None, str]:
     """Return the name of the summarised map, and the name of its pixels with a value."""
     maps = {name: result.declaration(name) for name in result.maps()}
     heights = result.name_of("height") if relative else None
-    called = {name: one.summary or (name if one.quantity else "") for name, one in maps.items()}
+    called = {
+        name: declared.summary or (name if declared.quantity else "") for name, declared in maps.items()
+    }
     order = sorted(maps, key=lambda name: (name == heights, place_of(maps[name].quantity or name)))
     for name in order:
         if called[name]:
             return name, called[name]
-    own = [name for name in maps if not is_builtin(name)] or [*maps]
-    return (own[0], own[0].replace("_", " ")) if own else (None, "")
+    custom = [name for name in maps if not is_builtin(name)] or [*maps]
+    return (custom[0], custom[0].replace("_", " ")) if custom else (None, "")
 
 
 def _counts(result: Result) -> Iterator[tuple[str, int]]:
@@ -181,9 +183,9 @@ def _counts(result: Result) -> Iterator[tuple[str, int]]:
 def _numbers(result: Result) -> Iterator[tuple[str, tuple[float, float | None, str]]]:
     numbers = result.numbers()
     for name, values in result.series().items():
-        known = values[np.isfinite(values)]
-        if result.declaration(name).summary and known.size:
-            yield name, (float(known[-1]), None, result.declaration(name).unit)
+        finite = values[np.isfinite(values)]
+        if result.declaration(name).summary and finite.size:
+            yield name, (float(finite[-1]), None, result.declaration(name).unit)
     for name, value in numbers.items():
         if not is_deviation(name):
             yield name, (value, numbers.get(f"{name}{SIGMA}"), result.declaration(name).unit)

@@ -89,7 +89,7 @@ class Band:
     device : Device
     rows : slice
         Rows of the picture.
-    own : slice
+    usable : slice
         Those of its rows that belong to no other band.
     pixels : int
     stride : int
@@ -104,7 +104,7 @@ class Band:
 
     device: Device
     rows: slice
-    own: slice
+    usable: slice
     pixels: int
     stop: Event
 
@@ -116,12 +116,12 @@ class Band:
         dtype: np.dtype[Any],
         maps: Mapping[str, DTypeLike | Planes],
         length: int,
-        least: int,
+        min_frames: int,
         stop: Event,
     ) -> None:
         self._shape = shape = (rows.stop - rows.start, columns)
         self.device, self._dtype, self.stop = device, dtype, stop
-        self.rows, self.own, self.pixels = rows, slice(0, shape[0]), shape[0] * shape[1]
+        self.rows, self.usable, self.pixels = rows, slice(0, shape[0]), shape[0] * shape[1]
         word = _LINE // dtype.itemsize
         self.stride: int = -(-self.pixels // word) * word
         if self.stride > _MOST_PIXELS:
@@ -130,10 +130,12 @@ class Band:
             )
         self.maps: dict[str, Array] = _Maps(device, maps, shape, self.stride)
         self._most = device.max_allocation // (self.pixels * dtype.itemsize)  # frames in one buffer
-        if self._most < least:
-            raise DeviceMemoryError(f"{device.info.title} has no memory for {least} frames")
+        if self._most < min_frames:
+            raise DeviceMemoryError(f"{device.info.title} has no memory for {min_frames} frames")
         self.length: int = min(length, self._most)
-        self._places = [] if device.info.shares_memory else _places(device, self.length, least, shape, dtype)
+        self._buffers = (
+            [] if device.info.shares_memory else _frame_buffers(device, self.length, min_frames, shape, dtype)
+        )
         self._borrowed: BorrowedBuffer | None = None
         self._only = True  # whether the picture has no other bands
         self._blank = set(maps)  # maps that are uninitialised
@@ -165,13 +167,13 @@ class Band:
         """Return a map, (rows, W), or one of several planes, of the rows that belong to no other band."""
         if plane is not None:
             values = values[plane, : self.pixels].reshape(*self._shape, *values.shape[2:])
-        return values[self.own]
+        return values[self.usable]
 
-    def cut(self, name: str, plane: int = 0) -> Array:
+    def copy_map(self, name: str, plane: int = 0) -> Array:
         """Return a copy on the device of a map, (rows, W), or of one of several planes."""
         array = self.maps[name]
         vector = array.shape[2:]
-        return array.cut(plane * self.stride * math.prod(vector), (*self._shape, *vector))
+        return array.copy_region(plane * self.stride * math.prod(vector), (*self._shape, *vector))
 
     def fetch(self, parts: Mapping[str, int | slice], keep: Collection[str] = ()) -> list[NDArray[Any]]:
         """Wait once, and return planes or rows of maps, (count, stride) or (rows, W).
@@ -218,7 +220,7 @@ class Band:
             if self.stop.is_set():
                 raise _StoppedError
             rest = frames[start:]
-            if self._places:
+            if self._buffers:
                 yield (staged := self._copy(rest, start))
             else:
                 yield (staged := self._share(rest[: self._most], start, whole))
@@ -242,41 +244,41 @@ class Band:
 
     def _copy(self, frames: NDArray[Any], start: int) -> Staged:
         """Start to copy frames to one of two buffers on the device, while kernels process the other."""
-        self._places.reverse()
-        part = frames[: self._places[0].shape[0]]
-        self._places[0].write(part)
-        return Staged(self._places[0], slice(start, start + len(part)))
+        self._buffers.reverse()
+        part = frames[: self._buffers[0].shape[0]]
+        self._buffers[0].write(part)
+        return Staged(self._buffers[0], slice(start, start + len(part)))
 
     def _park(self) -> None:
         for name, array in self.maps.items():
             array.park(keep=name not in self._blank)
-        for place in self._places:
+        for place in self._buffers:
             place.park(keep=False)
 
 
-def cut_into_bands(
+def split_into_bands(
     devices: Sequence[Device],
     shape: tuple[int, int],
     dtype: np.dtype[Any],
     maps: Mapping[str, DTypeLike | Planes],
     length: int,
-    least: int = 1,
+    min_frames: int = 1,
     around: int = 0,
 ) -> list[Band]:
     """Allocate the bands of a picture: one on each device if its memory is enough, else as few as possible.
 
     Devices get equal numbers of rows. ``shape`` is rows and columns of the picture, ``dtype`` that of
     samples, ``maps`` the arrays of pixels. A band has memory for ``length`` frames, or fewer if they do not
-    fit, but at least ``least``. It overlaps with others by ``around`` rows on each side. DeviceError if a
-    single row does not fit.
+    fit, but at least ``min_frames``. It overlaps with others by ``around`` rows on each side. DeviceError if
+    a single row does not fit.
     """
     stop = Event()
 
-    def cut(device: Device, start: int, end: int) -> list[Band]:
+    def split(device: Device, start: int, end: int) -> list[Band]:
         try:
             rows = slice(max(0, start - around), min(shape[0], end + around))
-            band = Band(device, rows, shape[1], dtype, maps, length, least, stop)
-            band.own = slice(start - rows.start, end - rows.start)
+            band = Band(device, rows, shape[1], dtype, maps, length, min_frames, stop)
+            band.usable = slice(start - rows.start, end - rows.start)
             return [band]
         except DeviceMemoryError as error:
             if end - start == 1:
@@ -284,14 +286,14 @@ def cut_into_bands(
                 raise DeviceError(message) from error
         middle, bands = (start + end) // 2, []
         for half in ((start, middle), (middle, end)):
-            bands += cut(device, *half)
+            bands += split(device, *half)
             for band in bands:
                 band.share_device()
         return bands
 
     used = devices[: shape[0]]
     cuts = [shape[0] * number // len(used) for number in range(len(used) + 1)]
-    return [band for device, rows in zip(used, pairwise(cuts), strict=True) for band in cut(device, *rows)]
+    return [band for device, rows in zip(used, pairwise(cuts), strict=True) for band in split(device, *rows)]
 
 
 def for_each_band(bands: Sequence[Band], work: Callable[[Band], T]) -> list[T]:
@@ -310,15 +312,17 @@ def for_each_band(bands: Sequence[Band], work: Callable[[Band], T]) -> list[T]:
     stop.clear()
     with ThreadPoolExecutor(len(by_device), "mirrorskin-device") as threads:
         try:
-            running = [threads.submit(_run_on_device, own, work, stop) for own in by_device.values()]
-            errors = [one.exception() for one in running]
+            running = [
+                threads.submit(_run_on_device, own_bands, work, stop) for own_bands in by_device.values()
+            ]
+            errors = [future.exception() for future in running]
         except BaseException:  # Ctrl-C
             stop.set()
             raise
     for error in errors:
         if error is not None and not isinstance(error, _StoppedError):
             raise error
-    return [value for one in running for value in one.result()]
+    return [value for future in running for value in future.result()]
 
 
 class _StoppedError(Exception):
@@ -355,11 +359,11 @@ def join_rows(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _places(
-    device: Device, length: int, least: int, shape: tuple[int, int], dtype: np.dtype[Any]
+def _frame_buffers(
+    device: Device, length: int, min_frames: int, shape: tuple[int, int], dtype: np.dtype[Any]
 ) -> list[Array]:
     """Allocate two buffers for frames on a device, up to a length; one if two do not fit."""
-    length = max(least, min(length, _PIECE // (math.prod(shape) * dtype.itemsize)))
+    length = max(min_frames, min(length, _PIECE // (math.prod(shape) * dtype.itemsize)))
     places: list[Array] = []
     while len(places) < 2:
         try:
@@ -367,7 +371,7 @@ def _places(
         except DeviceMemoryError:
             if places:
                 break
-            if length <= least:
+            if length <= min_frames:
                 raise
-            length = max(least, length // 2)
+            length = max(min_frames, length // 2)
     return places

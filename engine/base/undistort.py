@@ -24,10 +24,10 @@ def picture_places(lens: Lens, x: ArrayLike, y: ArrayLike) -> tuple[Doubles, Dou
     """
     across, up = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
     rays = _rays(lens, np.stack([across.ravel(), up.ravel(), np.ones(across.size)]))
-    seen = lens.matrix @ distorted(rays, lens.distortion)
+    projected = lens.matrix @ distorted(rays, lens.distortion)
     # Written such that a NaN ray remains NaN.
-    seen[:, ~(rays[0] ** 2 + rays[1] ** 2 < _fold(lens.distortion))] = np.nan
-    return seen[0].reshape(across.shape), seen[1].reshape(across.shape)
+    projected[:, ~(rays[0] ** 2 + rays[1] ** 2 < _fold(lens.distortion))] = np.nan
+    return projected[0].reshape(across.shape), projected[1].reshape(across.shape)
 
 
 def distorted(rays: Doubles, distortion: ArrayLike) -> Doubles:
@@ -53,10 +53,10 @@ def _fold(distortion: Doubles) -> float:
 def _rays(lens: Lens, points: Doubles) -> Doubles:
     """Return the rays, (3, n), to points of the sheet; NaN for points behind the camera."""
     whole = lens.camera @ lens.matrix
-    seen = np.linalg.solve(whole, points)
+    normalised = np.linalg.solve(whole, points)
     # The picture's centre is in front of the camera.
-    ahead = seen[2] * np.linalg.solve(whole, [0.0, 0.0, 1.0])[2] > 0
-    return np.asarray(seen / np.where(ahead, seen[2], np.nan))
+    ahead = normalised[2] * np.linalg.solve(whole, [0.0, 0.0, 1.0])[2] > 0
+    return np.asarray(normalised / np.where(ahead, normalised[2], np.nan))
 
 
 Maps = dict[str, NDArray[Any]]
@@ -106,7 +106,10 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
         raise InputError("there are no maps to undistort: reconstruct first")
     *turns, rows, columns = map_shape(result)
     declared = {name: result.declaration(name) for name in maps}
-    if any(maps[name].ndim > len(turns) + 2 + bool(one.components) for name, one in declared.items()):
+    if any(
+        maps[name].ndim > len(turns) + 2 + bool(declaration.components)
+        for name, declaration in declared.items()
+    ):
         raise InputError("displacements of each frame cannot be undistorted: leave per_frame out")
     region = result.fitted.region
     row, column = (region.origin if region else (0, 0)) if origin is None else origin
@@ -120,8 +123,8 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
     undistorted = {name: np.empty_like(values) for name, values in maps.items()}
     height = max(1, _BAND // columns)
     for band in (slice(first, min(first + height, rows)) for first in range(0, rows, height)):
-        seen = picture_places(lens, *np.meshgrid(x, y[band]))
-        points = SamplePoints.at(seen[0].ravel() - column, seen[1].ravel() - row, (rows, columns))
+        pixels = picture_places(lens, *np.meshgrid(x, y[band]))
+        points = SamplePoints.at(pixels[0].ravel() - column, pixels[1].ravel() - row, (rows, columns))
         turn: Any
         for turn in range(turns[0]) if turns else [...]:
             resampled = _resampled({name: values[turn] for name, values in maps.items()}, declared, points)
@@ -133,7 +136,7 @@ def undistort(result: Result, lens: Lens, origin: tuple[int, int] | None = None)
 
 def _resampled(maps: Maps, declared: Mapping[str, Map], points: SamplePoints) -> Maps:
     """Return all maps of one picture at points, (n,) or (n, components)."""
-    labels = {one.within for one in declared.values() if one.within in maps}
+    labels = {declaration.within for declaration in declared.values() if declaration.within in maps}
     same = {name: points.same_label(maps[name]) for name in labels}
     resampled = {name: _sample(values, declared[name], same, points) for name, values in maps.items()}
     return resampled | _directions(maps, resampled, points)
@@ -148,8 +151,8 @@ def _sample(
         outside = declared.undefined_value if values.dtype.kind == "f" else int(declared.undefined or 0)
         return points.nearest_values(values, outside)
     if declared.undefined is not None:  # interpolation skips NaN
-        known = np.where(values == declared.undefined, values.dtype.type(np.nan), values)
-        sampled = _sample(known, msgspec.structs.replace(declared, undefined=None), same, points)
+        with_nan = np.where(values == declared.undefined, values.dtype.type(np.nan), values)
+        sampled = _sample(with_nan, msgspec.structs.replace(declared, undefined=None), same, points)
         return np.where(np.isnan(sampled), values.dtype.type(declared.undefined), sampled)
     if declared.sampling == "direction":
         return points.interpolate_vectors(values, count)

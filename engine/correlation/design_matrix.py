@@ -140,7 +140,7 @@ def _turn_fit(phases: bytes, weighing: bytes) -> TurnFit | None:
     )
 
 
-def cut_into_turns(phase: Doubles) -> list[slice]:
+def split_into_turns(phase: Doubles) -> list[slice]:
     """Return the frames of each turn, in order; the last turn may be incomplete.
 
     A turn ends before the first frame that is a whole turn away from its first frame. Phases that jump back
@@ -161,7 +161,7 @@ def cut_into_turns(phase: Doubles) -> list[slice]:
 
 def longest_turn(phase: Doubles) -> int:
     """Return the number of frames of the longest turn."""
-    return max((turn.stop - turn.start for turn in cut_into_turns(phase)), default=0)
+    return max((turn.stop - turn.start for turn in split_into_turns(phase)), default=0)
 
 
 def goes_round(phase: Doubles) -> bool:

@@ -51,7 +51,7 @@ def with_estimated_levels(operation: T, source: Source, oscillates: bool = False
         return operation
     changes: dict[str, Any] = {name: getattr(levels, name) for name in missing}
     for name in ("dark_sigma", "bright_sigma"):
-        if operation.chosen().get(name) == 0:
+        if operation.option_values().get(name) == 0:
             changes[name] = getattr(levels, name)
     return operation.with_options(**changes, estimated_levels=missing)
 

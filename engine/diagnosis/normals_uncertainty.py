@@ -52,7 +52,7 @@ class RegistrationUncertainty(Step):
         lost = np.isfinite(sigma) & (contact == 0)
         near = [cv2.dilate(one.view(np.uint8), reach) for one in lost.reshape(-1, *lost.shape[-2:])]
         inside = contact * (np.reshape(near, lost.shape) == 0)
-        if context.operation.chosen()["noise"] is not None:
+        if context.operation.option_values()["noise"] is not None:
             sigma = sigma * context.stream.noise_gain
         fitted = replace(result.fitted, registered=True)
         return result.assign(normals_sigma=sigma, contact=inside, fitted=fitted)

@@ -381,7 +381,7 @@ def _passes(axial: Source, register: bool) -> int:
 
 def _options_of(method: Method | Mapping[str, Any] | None) -> Mapping[str, Any]:
     """Return the options of a method, or a mapping of options."""
-    return method.chosen() if isinstance(method, Method) else method or {}
+    return method.option_values() if isinstance(method, Method) else method or {}
 
 
 class _Evidence(Step):

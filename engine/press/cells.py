@@ -88,7 +88,7 @@ class Cells:
         return np.pad(values, self._margins, constant_values=np.nan)
 
 
-def cut_into_cells(lit: Mask, pixel_size: tuple[float, float]) -> Cells:
+def split_into_cells(lit: Mask, pixel_size: tuple[float, float]) -> Cells:
     """Divide the lit part of a picture into nearly square cells; at least one pixel must be lit."""
     spacing = pixel_size[1], pixel_size[0]
     ends = [np.flatnonzero(lit.any(axis=axis))[[0, -1]] for axis in (1, 0)]

@@ -107,7 +107,7 @@ class PressOperation(Operation):
     @property
     def lowest_threshold(self) -> float:
         """Share of the range from dark to bright at which heights are computed."""
-        return float(self.chosen()["threshold"])
+        return float(self.option_values()["threshold"])
 
     def with_event(self, result: Result) -> Result:
         """Return a result with its event and levels, whose heights also have the errors of the travel."""

@@ -21,7 +21,7 @@ from mirrorskin.engine.force.halfspace import (
     press,
     sweep,
 )
-from mirrorskin.engine.press.cells import Cells, cut_into_cells, touched
+from mirrorskin.engine.press.cells import Cells, split_into_cells, touched
 from mirrorskin.engine.press.spline import CellSplines
 from mirrorskin.io import Gel, InputError, Result, Source, pixel_axes
 from mirrorskin.io.base.arguments import check_pixel_size
@@ -249,7 +249,7 @@ def _scene_of(
     lit = np.isfinite(heights)
     if not lit.any():
         raise NotConverged("nothing turned light")
-    cells = cut_into_cells(lit, size)
+    cells = split_into_cells(lit, size)
     means = cells.means(heights)
     onsets = -means[np.isfinite(means)]
     if len(onsets) < _FEWEST:

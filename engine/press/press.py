@@ -180,7 +180,7 @@ class Press(Method):
         """Raise InputError if the method cannot be used with the other options."""
         if self.method == "threshold":
             if self._has_levels:
-                self.make(Levels)
+                self.configure(Levels)
             return
         if self._has_levels:
             raise InputError("thresholds and inclinations need method 'threshold'")
@@ -189,7 +189,7 @@ class Press(Method):
                 "subframe is False, but a change-point lies between frames: equation 4 as printed needs"
                 " method 'threshold'"
             )
-        self.make(ChangePoint)
+        self.configure(ChangePoint)
 
     def plan(self, source: Source) -> Plan:
         """Return the operation for a source, depending on its travel, the method and the available levels."""
@@ -200,7 +200,7 @@ class Press(Method):
             frames = range(source.shape[0])
         else:
             frames = _frames_of(source.name, travel, self.event)
-        operation: PressOperation = self.make(self._kind(source, oscillates)).configured_for(source)
+        operation: PressOperation = self.configure(self._kind(source, oscillates)).configured_for(source)
         process = self._process(source, operation)
         if self.method == "change-point" and operation.passes == 2:
             if not source.rewindable:
@@ -213,7 +213,7 @@ class Press(Method):
 
     def live_plan(self, source: Source) -> Plan:
         """Return the search for strokes, which does not need the travel in advance."""
-        operation: PressOperation = self.make(Strokes).configured_for(source)
+        operation: PressOperation = self.configure(Strokes).configured_for(source)
         process, frames = self._process(source, operation), range(source.shape[0])
         return Plan(operation, self._steps(operation), process, frames, _OMIT)
 
@@ -247,7 +247,7 @@ class Press(Method):
         return process
 
     def _steps(self, operation: PressOperation) -> list[Step]:
-        return [self.make(Elastomer, threshold=operation.lowest_threshold), self.make(HoleFilling)]
+        return [self.configure(Elastomer, threshold=operation.lowest_threshold), self.configure(HoleFilling)]
 
 
 def _frames_of(name: str, travel: NDArray[np.float64], event: Event) -> range:

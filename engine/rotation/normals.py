@@ -19,8 +19,8 @@ from mirrorskin.engine.correlation.design_matrix import (
     check_phases,
     check_turning,
     check_weights,
-    cut_into_turns,
     longest_turn,
+    split_into_turns,
     turn_fit,
 )
 from mirrorskin.engine.diagnosis.frame_light import FrameLight, find_frame_light, light_sigma
@@ -199,7 +199,7 @@ class NormalsOperation(SensorOptions, Operation):
 
     def _turns_in(self, where: Doubles) -> list[slice]:
         """Return the groups of frames that are fitted together, from the positions of the body."""
-        return cut_into_turns(where)
+        return split_into_turns(where)
 
     def _fit_of(self, where: Doubles, weights: Doubles, first: bool) -> TurnFit | PoseFit | None:
         """Return the fit to a group of frames, or None if they do not determine one."""

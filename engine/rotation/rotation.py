@@ -24,7 +24,7 @@ from mirrorskin.engine.base.running import Run
 from mirrorskin.engine.base.sources import EditedSource
 from mirrorskin.engine.base.steps import Step
 from mirrorskin.engine.correlation.correlation import Correlate
-from mirrorskin.engine.correlation.design_matrix import LONGEST, check_turning, cut_into_turns
+from mirrorskin.engine.correlation.design_matrix import LONGEST, check_turning, split_into_turns
 from mirrorskin.engine.diagnosis.registration import Registered, check_heights
 from mirrorskin.engine.rotation.coarse_height import coarse_heights
 from mirrorskin.engine.rotation.last_turn import LastTurn
@@ -106,7 +106,7 @@ class Rotation(Method):
         """Raise InputError if options do not fit together or cannot be those of a rotation."""
         if self.heights is not None and self.tilt == "estimate":
             raise InputError("heights register frames, which needs a tilt: give it instead of 'estimate'")
-        self.make(Normals)
+        self.configure(Normals)
 
     def plan(self, source: Source) -> Plan:
         """Return the operation for a source, depending on the poses and on the response."""
@@ -144,7 +144,7 @@ class Rotation(Method):
             return self._poses(source)
         if no_gain and wall is None:
             return self._correlation(source)
-        operation = self.make(LastTurn).configured_for(source)
+        operation = self.configure(LastTurn).configured_for(source)
         brightness = self._brightness(source) if wall is None else {"zenith": "calibrated"}
         process = {**self._process(), **brightness, "window_frames": operation.window_frames}
         return Plan(operation, self._steps(), process)
@@ -158,14 +158,14 @@ class Rotation(Method):
             raise InputError(
                 f"{source.name} has no zenith gain, so no normals, and no {what}: give zenith_gain"
             )
-        return Plan(self.make(Correlate), process={"method": "correlation", "zenith": _NO_GAIN})
+        return Plan(self.configure(Correlate), process={"method": "correlation", "zenith": _NO_GAIN})
 
     def _poses(self, source: Source) -> Plan:
         if self.heights is not None or self.method != "exact":
             what = f"method {self.method!r}" if self.heights is None else "registering frames with heights"
             raise InputError(f"{source.name}: {what} needs one tilt for all frames: leave it out")
         longest = even_windows(source.shape[0])
-        operation = self.make(MovingNormals, longest=longest).configured_for(source)
+        operation = self.configure(MovingNormals, longest=longest).configured_for(source)
         process = {"method": "exact", "tilt_from": "each frame: this is their root mean square"}
         tilt = source.header.tilt
 
@@ -239,7 +239,7 @@ class Rotation(Method):
 
     def _turns(self, stream: Source, header: Header, response: Response | None) -> Normals:
         """Return the operation for turns of a source or of registered frames."""
-        operation: Normals = self.make(
+        operation: Normals = self.configure(
             Normals,
             tilt="estimate" if header.tilt is None else header.tilt,
             response=response,
@@ -264,7 +264,7 @@ class Rotation(Method):
         )
 
     def _steps(self) -> list[Step]:
-        return [Edges(), self.make(Integration)]
+        return [Edges(), self.configure(Integration)]
 
     def _process(self) -> dict[str, ProcessValue]:
         origin = "estimate" if self.tilt == "estimate" else "recording" if self.tilt is None else "given"
@@ -331,7 +331,7 @@ def first_turn(source: Source) -> Recording:
     while len(frames) < LONGEST and (block := source.read()) is not None:
         more = check_phase(block.phase, len(block.frames), f"{source.name}: phase")
         phase = np.concatenate([phase, more])
-        if len(cut_into_turns(phase)) > 1:
+        if len(split_into_turns(phase)) > 1:
             break
         frames.extend(block.frames.copy())
     header = {

@@ -112,6 +112,6 @@ class Sliding(Method):
 
     def plan(self, source: Source) -> Plan:
         """Return the search for slip, with the source's motion and pixel size, and the step for the force."""
-        slip: Slip = self.make(Slip).configured_for(source)
+        slip: Slip = self.configure(Slip).configured_for(source)
         process = {"window_size": slip.window_size, "window_step": slip.window_step}
-        return Plan(slip, [self.make(NoContact), self.make(Traction)], process)
+        return Plan(slip, [self.configure(NoContact), self.configure(Traction)], process)

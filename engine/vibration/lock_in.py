@@ -63,7 +63,7 @@ class Correlation(Method):
             "zenith": "none: the recording has no zenith gain",
         }
         if self.dither:
-            return Plan(self.make(Growth).configured_for(source), process=process)
+            return Plan(self.configure(Growth).configured_for(source), process=process)
         if self.harmonic != 1:
             process["harmonic"] = self.harmonic
         stream = None
@@ -79,7 +79,7 @@ class Correlation(Method):
                 process["frequency_sigma"] = frequency.sigma
             phase = 2 * math.pi * frequency.hertz * (time - time[0])
             stream = EditedSource(source, partial(_with_phase, phase))
-        return Plan(self.make(Correlate), process=process, stream=stream)
+        return Plan(self.configure(Correlate), process=process, stream=stream)
 
     def _times(self, source: Source) -> Doubles:
         """Return the times of the frames, s, from the frame rate, otherwise from the source."""

@@ -143,7 +143,7 @@ class ArrayRecording(Recording):
         """Return the next frames, at most ``len(out)``: a view of the array, or copied to ``out``."""
         out = block_memory(out, self.shape, self.dtype)
         if isinstance(self._frames, np.ndarray):
-            return self.lend(len(out))
+            return self.read_in_place(len(out))
         start, stop = self._next, min(self._next + len(out), self.shape[0])
         if start == stop:
             return None
@@ -153,7 +153,7 @@ class ArrayRecording(Recording):
         block = self._block(self._part(start, out[: stop - start]))
         return block if lost is None else replace(block, dropped=int(lost[start]))
 
-    def lend(self, most: int) -> Block | None:
+    def read_in_place(self, most: int) -> Block | None:
         """Return the next frames, at most ``most``, as a view of the array; None at the end or for a file."""
         if not isinstance(self._frames, np.ndarray):
             return None

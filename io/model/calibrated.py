@@ -185,10 +185,10 @@ class Calibrated:
         """Read the source's next frames, with corrected phases; see ``Source.read``."""
         return self._corrected(self.source.read(out))
 
-    def lend(self, most: int) -> Block | None:
-        """Return the next frames of an array without a copy, or None; see ``ArrayRecording.lend``."""
-        lend: Callable[[int], Block | None] | None = getattr(self.source, "lend", None)
-        return None if lend is None else self._corrected(lend(most))
+    def read_in_place(self, most: int) -> Block | None:
+        """Return the next frames of an array without a copy, or None; see ``ArrayRecording``."""
+        read_in_place: Callable[[int], Block | None] | None = getattr(self.source, "read_in_place", None)
+        return None if read_in_place is None else self._corrected(read_in_place(most))
 
     def rewind(self) -> None:
         """Go back to the first frame."""

@@ -444,13 +444,13 @@ def test_an_array_is_copied_by_numpy_and_its_rows_stay_on_the_device(device):
     part = array[1:3]
     assert (len(part), part.ndim, part[1].shape) == (2, 3, (3, 2))
     np.testing.assert_array_equal(part.read(), values[1:3])
-    np.testing.assert_array_equal(array.cut(5, (2, 4)).read(), values.ravel()[5:13].reshape(2, 4))
+    np.testing.assert_array_equal(array.copy_region(5, (2, 4)).read(), values.ravel()[5:13].reshape(2, 4))
 
 
 def test_a_copy_that_is_dropped_at_once_is_not_written_to_the_next_arrays_memory(device):
     source = device.from_host("source", np.ones((64, 1 << 16)))
     for _ in range(20):
-        source.cut(0, source.shape)
+        source.copy_region(0, source.shape)
         kept = device.from_host("kept", np.zeros(source.shape))
         device.finish()
         assert not kept.read().any()
@@ -459,12 +459,12 @@ def test_a_copy_that_is_dropped_at_once_is_not_written_to_the_next_arrays_memory
 @pytest.mark.filterwarnings("ignore:Non-empty compiler output")  # Intel's is never empty
 def test_pyopencl_works_in_the_memory_of_an_array(device):
     array = device.from_host("values", np.arange(6.0))
-    lent = array.lend()
-    lent += 1
+    exported = array.as_pyopencl()
+    exported += 1
     np.testing.assert_array_equal(array.read(), np.arange(1.0, 7.0))
     del array
     others = [device.from_host("others", np.full(6, -1.0)) for _ in range(3)]
-    np.testing.assert_array_equal(lent.get(), np.arange(1.0, 7.0))
+    np.testing.assert_array_equal(exported.get(), np.arange(1.0, 7.0))
     assert len(others) == 3
 
 

@@ -14,8 +14,8 @@ class Parts(ArraySource):
         super().__init__(frames, operation, positions)
         self._parts = {start: stop - start for start, stop in pairwise([0, *cuts, len(frames)])}
 
-    def lend(self, most):
-        return super().lend(min(most, self._parts.get(self._next, most)))
+    def read_in_place(self, most):
+        return super().read_in_place(min(most, self._parts.get(self._next, most)))
 
 
 def bare_run(operation):

@@ -397,7 +397,7 @@ ESTIMATORS: Mapping[str, Callable[[Any, int], Answer]] = {
 
 def _frames(source: ArrayRecording) -> NDArray[Any]:
     source.rewind()
-    block = source.lend(source.shape[0])
+    block = source.read_in_place(source.shape[0])
     assert block is not None
     return block.frames
 

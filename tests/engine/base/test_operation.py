@@ -441,7 +441,7 @@ def number(default=1.0, **settings):
         (lambda: {"count": number(unit="mm")}, "an option cannot have the name count"),
         (lambda: {"shape": number()}, "an option cannot have the name shape"),
         (lambda: {"passes": number()}, "an option cannot have the name passes"),
-        (lambda: {"chosen": number()}, "an option cannot have the name chosen"),
+        (lambda: {"option_values": number()}, "an option cannot have the name option_values"),
         (lambda: {"version": number()}, "an option cannot have the name version"),
         (lambda: {"least": number(5.0, within=(0, 1))}, "least 5.0: a number from 0 to 1 is needed"),
         (lambda: {"least": number(within=(5, 1))}, "least: no value is within 5 and 1"),

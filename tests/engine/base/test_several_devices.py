@@ -12,7 +12,7 @@ from operations import CASES, assert_same
 from presses import LEVELS, random_press
 
 from mirrorskin import engine, io
-from mirrorskin.engine.base.tiling import cut_into_bands, for_each_band
+from mirrorskin.engine.base.tiling import for_each_band, split_into_bands
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.errors import DeviceError
 
@@ -80,7 +80,7 @@ def test_the_error_of_a_device_names_it(devices, monkeypatch):
 
 
 def bands_of(devices):
-    return cut_into_bands(devices, FRAMES.shape[1:], FRAMES.dtype, {}, 1)
+    return split_into_bands(devices, FRAMES.shape[1:], FRAMES.dtype, {}, 1)
 
 
 def test_a_device_stops_before_its_next_frames_if_another_one_fails(devices):

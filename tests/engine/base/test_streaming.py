@@ -77,7 +77,7 @@ def test_frames_that_a_source_lends_are_pushed_where_they_lie(device, longest):
     """The last of them has to be read."""
 
     class Lender(Source):
-        def lend(self, most):
+        def read_in_place(self, most):
             start, stop = self.next, min(self.next + min(most, longest), self.shape[0] - 1)
             self.next = stop
             frames = np.broadcast_to(np.arange(start, stop, dtype="u2")[:, None, None], (stop - start, 3, 5))

@@ -45,7 +45,7 @@ def test_bands_leave_the_device_to_each_other(small_device):
     search.push(FRAMES, travel=TRAVEL)
     search.result()
     arrays = [
-        array for band in search.operation._picture.bands for array in (*band.maps.values(), *band._places)
+        array for band in search.operation._picture.bands for array in (*band.maps.values(), *band._buffers)
     ]
     on_device = [array._buffer is not None for array in arrays]
     assert all(on_device) if small_device.info.shares_memory else not any(on_device)

@@ -5,10 +5,10 @@ import pytest
 
 from mirrorskin.engine.correlation.design_matrix import (
     check_phases,
-    cut_into_turns,
     fit_matrix,
     goes_round,
     longest_turn,
+    split_into_turns,
 )
 from mirrorskin.io import InputError
 
@@ -61,7 +61,7 @@ def test_phases_that_determine_no_fit_are_refused_in_one_line(phase, weights, me
 
 def lengths(phase):
     """Return how many frames each turn has; they must meet, and hold all frames."""
-    turns = cut_into_turns(np.asarray(phase, float))
+    turns = split_into_turns(np.asarray(phase, float))
     assert [turn.start for turn in turns] == [0, *(turn.stop for turn in turns[:-1])]
     assert turns[-1].stop == len(phase)
     return [turn.stop - turn.start for turn in turns]
@@ -89,7 +89,7 @@ def test_a_turn_ends_with_the_first_frame_a_whole_turn_on(phase, expected):
 
 
 def test_without_frames_there_is_no_turn():
-    assert cut_into_turns(np.empty(0)) == []
+    assert split_into_turns(np.empty(0)) == []
     assert longest_turn(np.empty(0)) == 0
 
 
