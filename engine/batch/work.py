@@ -100,15 +100,15 @@ def _compute(
         result = run_class(
             plan.kind(source.motion), source, progress, device=opened, **plan.options(source.motion)
         )
-    said, notes = (str(result.process.get(kind, "")) for kind in ("warnings", "notes"))
-    if plan.strict and said:
-        raise InputError(f"{source.name}: {said}")
+    warnings, notes = (str(result.process.get(kind, "")) for kind in ("warnings", "notes"))
+    if plan.strict and warnings:
+        raise InputError(f"{source.name}: {warnings}")
     process: dict[str, ProcessValue] = {**result.process, "batch_parameters": digest}
     io.save_result(result.assign(process=process), target, overwrite=True)
     return replace(
         outcome,
         state="done",
-        message="; ".join(filter(None, (str(summarise(result)), notes, said))),
+        message="; ".join(filter(None, (str(summarise(result)), notes, warnings))),
         bytes=math.prod(source.shape) * source.dtype.itemsize,
         device=opened.info.title,
     )

@@ -71,9 +71,9 @@ async def check_worker(sizes: Mapping[Path, int], trace: Path, dask_worker: Any)
 def run_on_worker(job: Job, plan: Plan) -> Outcome:
     """Run a job, whose paths are absolute, on the device of this worker."""
     worker: Any = get_worker()
-    share: Share = worker.mirrorskin_share
-    opening = {"threads": share.cores, **plan.opening}
-    return run_job(job, replace(plan, opening=opening), share.device)
+    own_share: Share = worker.mirrorskin_share
+    opening = {"threads": own_share.cores, **plan.opening}
+    return run_job(job, replace(plan, opening=opening), own_share.device)
 
 
 def dask_setup(worker: object) -> None:
@@ -110,12 +110,12 @@ def _take_number() -> tuple[int, int]:
 
 
 def _problem(sizes: Mapping[Path, int], trace: Path, worker: Any, workers: int) -> str | None:
-    share = "workers need the same folders under the same names as this machine"
+    remedy = "workers need the same folders under the same names as this machine"
     for recording, size in sizes.items():
         if not recording.is_file() or recording.stat().st_size != size:
-            return f"does not see {recording}: {share}"
+            return f"does not see {recording}: {remedy}"
     if not trace.is_file():
-        return f"does not see the folder {trace.parent} as it is here: {share}"
+        return f"does not see the folder {trace.parent} as it is here: {remedy}"
     if not os.access(trace.parent, os.W_OK):
         return f"cannot write to {trace.parent}: let it, or choose another folder with -o"
     try:

@@ -357,7 +357,7 @@ def _float_rows(phase: Doubles, weight: Doubles) -> Doubles:
 
 def _counted(rows: NDArray[np.int32]) -> dict[str, Any]:
     """Return the number of frames in integer sums, and the sums of their cosines and sines, in steps."""
-    used, cosines, sines = (int(one) for one in np.sum(rows, axis=0, dtype=np.int64).flat)
+    used, cosines, sines = (int(total) for total in np.sum(rows, axis=0, dtype=np.int64).flat)
     return {"used": used, "cosines": cosines, "sines": sines}
 
 
@@ -371,5 +371,7 @@ def _fit_table(phase: Doubles, rows: NDArray[Any]) -> NDArray[np.float32]:
     project = np.linalg.solve((rows.T @ exact).T, root.T).T.ravel()
     high = project.astype(np.float32)
     freedom = np.count_nonzero(weight) - 3
-    share = 1 / freedom if freedom > 0 else np.nan
-    return np.concatenate([high, project - high, np.linalg.inv(root).ravel(), [share]]).astype(np.float32)
+    per_freedom = 1 / freedom if freedom > 0 else np.nan
+    return np.concatenate([high, project - high, np.linalg.inv(root).ravel(), [per_freedom]]).astype(
+        np.float32
+    )

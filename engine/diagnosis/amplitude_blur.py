@@ -41,13 +41,15 @@ def with_blur(
     kernel[[0, reach, reach, -1], [reach, 0, -1, reach]] = 1 / reach**2
     kernel[reach, reach] = -4 / reach**2
     bent = [cv2.filter2D(part, -1, kernel, borderType=cv2.BORDER_REPLICATE) for part in direction]
-    along = np.sum([one * other for one, other in zip(bent, direction, strict=True)], axis=0)
+    along = np.sum([part * other for part, other in zip(bent, direction, strict=True)], axis=0)
     square = np.sum([part**2 for part in bent], axis=0) - along**2
     square = np.maximum(square, 0)
-    known = np.isfinite(square)
+    finite = np.isfinite(square)
     size = 2 * reach + 1, 2 * reach + 1
-    total, share = (cv2.blur(part.astype(np.float32), size) for part in (np.where(known, square, 0), known))
-    mean = np.divide(total, share, out=np.zeros_like(total), where=share > 0)
+    total, coverage = (
+        cv2.blur(part.astype(np.float32), size) for part in (np.where(finite, square, 0), finite)
+    )
+    mean = np.divide(total, coverage, out=np.zeros_like(total), where=coverage > 0)
     return np.asarray(np.hypot(sigma, np.float32(variance / 2) * np.sqrt(mean)), np.float32)
 
 
@@ -65,36 +67,37 @@ def find_blur(vectors: Sequence[NDArray[np.floating]], strength: NDArray[np.floa
 
     def look(by_rows: int, by_columns: int) -> Doubles:
         at = np.ix_(down + by_rows, right + by_columns)
-        found = np.stack([part[at] for part in vectors]).astype(np.float64)
+        components = np.stack([part[at] for part in vectors]).astype(np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(found / np.sqrt(np.sum(found**2, axis=0)))
+            return np.asarray(components / np.sqrt(np.sum(components**2, axis=0)))
 
-    across, upright = (look(*one) - look(*other) for one, other in (((0, 1), (0, -1)), ((1, 0), (-1, 0))))
+    across, upright = (
+        look(*first) - look(*second) for first, second in (((0, 1), (0, -1)), ((1, 0), (-1, 0)))
+    )
     turning = np.sum(across**2 + upright**2, axis=0) / 4
     level = strength[np.ix_(down, right)].astype(np.float64)
-    known = np.isfinite(turning) & (level > 0) & np.isfinite(level)
-    if np.count_nonzero(known) < _FEWEST:
+    usable = np.isfinite(turning) & (level > 0) & np.isfinite(level)
+    if np.count_nonzero(usable) < _FEWEST:
         return 0.0
     y, x = (
-        np.broadcast_to(one, known.shape)[known]
-        for one in np.ix_(2 * down / (rows - 1) - 1, 2 * right / (columns - 1) - 1)
+        np.broadcast_to(positions, usable.shape)[usable]
+        for positions in np.ix_(2 * down / (rows - 1) - 1, 2 * right / (columns - 1) - 1)
     )
-    turning, values = turning[known], np.log(level[known])
+    turning, values = turning[usable], np.log(level[usable])
     terms = np.stack([turning, np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     variance, error = _fit(terms, values)
     if not variance > max(_CLEAR * error, _SMALLEST**2):
         return 0.0
     # Reflectance that changes with the place may look like blur somewhere, but not on all sides.
     sides = (_fit(terms[half], values[half]) for half in (x < 0, x >= 0, y < 0, y >= 0))
-    return (
-        variance if all(one > max(variance / 2, _CLEAR_SIDE * its_error) for one, its_error in sides) else 0.0
-    )
+    clear = all(side > max(variance / 2, _CLEAR_SIDE * its_error) for side, its_error in sides)
+    return variance if clear else 0.0
 
 
 def _fit(terms: Doubles, values: Doubles) -> tuple[float, float]:
     """Return the variance of the point spread by the first of some terms, and its standard error."""
-    found = fit_clipped(terms, values)
-    if found is None:
+    result = fit_clipped(terms, values)
+    if result is None:
         return 0.0, math.inf
-    fit, inverse, left, kept = found
-    return -2 * float(fit[0]), 2 * math.sqrt(inverse[0, 0] * float(np.mean(left[kept] ** 2)))
+    fit, inverse, residual, kept = result
+    return -2 * float(fit[0]), 2 * math.sqrt(inverse[0, 0] * float(np.mean(residual[kept] ** 2)))

@@ -100,9 +100,9 @@ class PixelBlur(LensBlur):
 
     def footprint(self, result: Result, context: Context) -> Footprint | None:
         """Return a pixel's footprint."""
-        found = super().footprint(result, context)
+        footprint = super().footprint(result, context)
         few = context.samples is None or context.samples.count < _LEAST_FRAMES
-        return Footprint(PIXEL) if found is None and self.blur is None and not few else found
+        return Footprint(PIXEL) if footprint is None and self.blur is None and not few else footprint
 
 
 @dataclass(frozen=True)
@@ -151,14 +151,16 @@ def _footprint(
     rows, columns, shape = samples.rows, samples.columns, operation.shape
     inner = np.ix_((rows > 0) & (rows < shape[0] - 1), (columns > 0) & (columns < shape[1] - 1))
     row, column = (part[inner].ravel() for part in np.meshgrid(rows, columns, indexing="ij"))
-    middle, left, right, above, below = (one[inner].ravel() for one in heights)
-    slope = np.hypot((right - left) / 2, (below - above) / 2).astype(np.float64)
+    middle, before, after, above, below = (values[inner].ravel() for values in heights)
+    slope = np.hypot((after - before) / 2, (below - above) / 2).astype(np.float64)
     sloped = np.isfinite(slope) & np.isfinite(middle) & (slope > 0)
     if np.count_nonzero(sloped) < _FEWEST:
         return None
     ordered = np.sort(slope[sloped])
-    least, most = (ordered[round(share * (len(ordered) - 1))] for share in (1 - _STEEPEST, _STEEPEST))
-    sloped &= (slope <= least) | (slope >= most)  # the others show less
+    flattest, steepest = (
+        ordered[round(fraction * (len(ordered) - 1))] for fraction in (1 - _STEEPEST, _STEEPEST)
+    )
+    sloped &= (slope <= flattest) | (slope >= steepest)  # the others show less
     row, column, slope = row[sloped], column[sloped], slope[sloped]
     values = samples.values[(slice(None), *inner)].reshape(len(travel), -1)[:, sloped].astype(np.float32)
     if travel[-1] < travel[0]:  # of a release
@@ -172,7 +174,7 @@ def _footprint(
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = (values - dark) / (bright - dark)
     spread = (first_travel(shares, travel, _SHARES[1]) - first_travel(shares, travel, _SHARES[0])) / 2
-    flat, steep = (_Quarter.of(slope[part], spread[part]) for part in (slope <= least, slope >= most))
+    flat, steep = (_Quarter.of(slope[part], spread[part]) for part in (slope <= flattest, slope >= steepest))
     if min(flat.count, steep.count) < _FEWEST // 4 or steep.slope < _STEEPER * flat.slope:
         return None
     # What flat parts show as well is no footprint: interpolation, or a skin that touches slowly.

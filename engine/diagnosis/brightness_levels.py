@@ -72,11 +72,13 @@ def _pictures(source: Source, *numbers: int) -> list[NDArray[Any]]:
     read: Callable[[int], NDArray[Any]] | None = getattr(source, "frame", None)
     if read is not None:
         return [read(number) for number in numbers]
-    found: dict[int, NDArray[Any]] = {}
+    pictures: dict[int, NDArray[Any]] = {}
     for block in _blocks(source):
         here = range(block.index, block.index + len(block.frames))
-        found |= {number: block.frames[number - block.index].copy() for number in numbers if number in here}
-    return [found[number] for number in numbers]
+        pictures |= {
+            number: block.frames[number - block.index].copy() for number in numbers if number in here
+        }
+    return [pictures[number] for number in numbers]
 
 
 def _blocks(source: Source) -> Iterator[Block]:
@@ -155,9 +157,9 @@ def estimate_levels(
     if len(frames) < 2:
         return None
     part = travel[frames.start : frames.stop]
-    least, most = (frames.start + int(number) for number in (np.argmin(part), np.argmax(part)))
-    neighbour = least + (1 if least + 1 < frames.stop else -1)
-    pictures = _pictures(source, least, neighbour, most)
+    lowest, deepest = (frames.start + int(number) for number in (np.argmin(part), np.argmax(part)))
+    neighbour = lowest + (1 if lowest + 1 < frames.stop else -1)
+    pictures = _pictures(source, lowest, neighbour, deepest)
     samples = np.stack([thin_out(picture) for picture in pictures])
     first, second, last = samples[:, np.isfinite(samples).all(axis=0)]
     integer = pictures[0].dtype.kind == "u"
@@ -218,28 +220,30 @@ class LevelUncertainty(Step):
         dark, bright, samples = operation.dark, operation.bright, context.samples
         if dark is None or bright is None:
             return result
-        share, threshold = 0.0, operation.lowest_threshold
+        fraction, threshold = 0.0, operation.lowest_threshold
         if self.dark_sigma or self.bright_sigma:
             scatter = math.hypot((1 - threshold) * self.dark_sigma, threshold * self.bright_sigma)
             rise = np.asarray(bright, np.float64) - np.asarray(dark, np.float64)
-            share = scatter / float(np.nanmedian(rise))
+            fraction = scatter / float(np.nanmedian(rise))
         if samples is not None:
-            seen = _Seen.of(samples, context.positions("travel"), dark, bright, operation.shape)
+            trace = _Seen.of(samples, context.positions("travel"), dark, bright, operation.shape)
             height, *beside = context.neighbours(result)
-            errors = _find_errors(seen, -height.astype(np.float64))
-            share = math.hypot(share, *(error / math.sqrt(2) for error in errors))
+            errors = _find_errors(trace, -height.astype(np.float64))
+            fraction = math.hypot(fraction, *(error / math.sqrt(2) for error in errors))
             if any(errors):
-                said = " and ".join(
+                changes = " and ".join(
                     f"{name} by {100 * error:+.2g} %"
                     for name, error in zip(("dark", "light"), errors, strict=True)
                     if error
                 )
-                text = f"levels differ from their references, {said} of the rise; height_sigma includes this"
+                text = (
+                    f"levels differ from their references, {changes} of the rise; height_sigma includes this"
+                )
                 result = with_findings(result, Finding("levels", text, False))
-        if not share:
+        if not fraction:
             return result
-        width = 0.0 if samples is None else _width(seen, _rise(*beside))
-        return result.assign(height_sigma=partial(_with_levels, result, share, width))
+        width = 0.0 if samples is None else _width(trace, _rise(*beside))
+        return result.assign(height_sigma=partial(_with_levels, result, fraction, width))
 
 
 class _Seen(NamedTuple):
@@ -267,59 +271,59 @@ class _Seen(NamedTuple):
         return cls(samples.values[forward], travel[forward], low, high)
 
 
-def _find_errors(seen: _Seen, onset: Doubles) -> tuple[float, float]:
+def _find_errors(trace: _Seen, onset: Doubles) -> tuple[float, float]:
     """Return by how much dark and light differ from the references, in shares of the rise; 0 if hardly."""
-    values, travel, low, high = seen
-    few, least, most = max(1, round(_PART * len(travel))), float(travel.min()), float(travel.max())
-    away = _AWAY * (most - least)
-    found = []
+    values, travel, low, high = trace
+    few, start, end = max(1, round(_PART * len(travel))), float(travel.min()), float(travel.max())
+    away = _AWAY * (end - start)
+    level_errors = []
     for frames, level, usable in (
-        (values[:few], low, onset > least + away),
-        (values[-few:], high, onset < most - away),
+        (values[:few], low, onset > start + away),
+        (values[-few:], high, onset < end - away),
     ):
         error = ((frames.mean(axis=0) - level) / (high - low))[usable]
         error = error[np.isfinite(error)]
         if error.size < _FEWEST_OF_GRID:
-            found.append(0.0)
+            level_errors.append(0.0)
             continue
         middle = float(np.median(error))
         spread = mad_sigma(error - middle)
         clear = max(_LEAST, _COMMON * spread, _CLEAR * _OF_MEDIAN * spread / math.sqrt(error.size))
-        found.append(middle if abs(middle) > clear else 0.0)
-    return found[0], found[1]
+        level_errors.append(middle if abs(middle) > clear else 0.0)
+    return level_errors[0], level_errors[1]
 
 
-def _width(seen: _Seen, slope: NDArray[np.float32]) -> float:
+def _width(trace: _Seen, slope: NDArray[np.float32]) -> float:
     """Return the travel in which the flattest pixels turn light in addition to their slopes, mm."""
-    values, travel, low, high = seen
+    values, travel, low, high = trace
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = ((values - low) / (high - low)).reshape(len(travel), -1)
     width = 2 * (first_travel(shares, travel, 0.75) - first_travel(shares, travel, 0.25))
     slope = slope.ravel()
-    known = np.isfinite(width) & np.isfinite(slope)
-    if np.count_nonzero(known) < _FEWEST_OF_GRID:
+    finite = np.isfinite(width) & np.isfinite(slope)
+    if np.count_nonzero(finite) < _FEWEST_OF_GRID:
         return 0.0
-    width, slope = width[known], slope[known]
+    width, slope = width[finite], slope[finite]
     flat = slope <= np.quantile(slope, _FLAT)
     return math.sqrt(max(0.0, float(np.median(width[flat] ** 2 - slope[flat] ** 2))))
 
 
-def _with_levels(result: Result, share: float, width: float) -> NDArray[np.float32]:
+def _with_levels(result: Result, fraction: float, width: float) -> NDArray[np.float32]:
     """Return the standard deviations of heights with that of levels, a share of the rise to light."""
     height = np.pad(np.asarray(result.height, np.float32), 1, "edge")
     moved = _rise(height[1:-1, :-2], height[1:-1, 2:], height[:-2, 1:-1], height[2:, 1:-1])
-    known = np.isfinite(moved)  # not at the border of the contact
-    moved[~known] = median(moved[known]) if known.any() else 0
+    finite = np.isfinite(moved)  # not at the border of the contact
+    moved[~finite] = median(moved[finite]) if finite.any() else 0
     np.hypot(moved, np.float32(width), out=moved)
-    moved *= np.float32(share)
+    moved *= np.float32(fraction)
     return np.asarray(np.hypot(result.height_sigma, moved))
 
 
 def _rise(
-    left: NDArray[Any], right: NDArray[Any], above: NDArray[Any], below: NDArray[Any]
+    before: NDArray[Any], after: NDArray[Any], above: NDArray[Any], below: NDArray[Any]
 ) -> NDArray[np.float32]:
     """Return by how much heights change over a pixel, from those next to it."""
-    rise: NDArray[np.float32] = np.abs(right - left)
+    rise: NDArray[np.float32] = np.abs(after - before)
     rise += np.abs(below - above)
     rise /= 2
     return rise

@@ -54,35 +54,35 @@ def find_azimuth_error(
     down, right, along = range(half, rows - half, thin), range(half, columns - half, thin), half // 2
     places = [(-half, -along), (-half, along), (half, -along), (half, along)]
     places += [(-along, half), (along, half), (-along, -half), (along, -half)]
-    (vectors,), (touched,) = (take_places([one], down, right, places) for one in (normals, contact))
+    (vectors,), (touched,) = (take_places([values], down, right, places) for values in (normals, contact))
     slopes = []
     for vector, touches in zip(vectors, touched, strict=True):
         x, y, z = vector.astype(np.float64)
         z = np.where(touches > 0, z, np.nan)
         slopes.append((-x / z, -y / z))
     pairs = zip(slopes[::2], slopes[1::2], strict=True)
-    sides = [[(one + other) / 2 for one, other in zip(*pair, strict=True)] for pair in pairs]
+    sides = [[(first + second) / 2 for first, second in zip(*pair, strict=True)] for pair in pairs]
     (p_up, q_up), (p_down, q_down), (p_right, q_right), (p_left, q_left) = sides
     across, upwards = 1 / pixel_size[0], 1 / pixel_size[1]
     curl = (q_right - q_left) * across - (p_up - p_down) * upwards
     divergence = (p_right - p_left) * across + (q_up - q_down) * upwards
     place = np.broadcast_to((1 - 2 * np.array(down) / (rows - 1))[:, np.newaxis], curl.shape)
-    known = np.isfinite(curl) & np.isfinite(divergence)
-    if np.count_nonzero(known) < _FEWEST:
+    finite = np.isfinite(curl) & np.isfinite(divergence)
+    if np.count_nonzero(finite) < _FEWEST:
         return None
     overlap = max(1.0, (2 * half / thin) ** 2 / 12)  # of loops, whose errors are then correlated
-    return _regression(curl[known], divergence[known], place[known], overlap)
+    return _regression(curl[finite], divergence[finite], place[finite], overlap)
 
 
 def _regression(curl: Doubles, divergence: Doubles, place: Doubles, overlap: float) -> AzimuthError | None:
     """Fit a rotation that may change with the place of the row, 1 for the first and -1 for the last."""
     columns = np.stack([divergence, divergence * place], axis=1)
-    found = fit_clipped(columns, curl, condition=1e9)
-    if found is None:
+    result = fit_clipped(columns, curl, condition=1e9)
+    if result is None:
         return None
-    fit, inverse, left, kept = found
-    spread = np.sqrt(np.diag(inverse) * float(np.mean(left[kept] ** 2)) * overlap)
-    explained = 1 - float(np.var(left[kept])) / max(float(np.var(curl[kept])), 1e-30)
+    fit, inverse, residual, kept = result
+    spread = np.sqrt(np.diag(inverse) * float(np.mean(residual[kept] ** 2)) * overlap)
+    explained = 1 - float(np.var(residual[kept])) / max(float(np.var(curl[kept])), 1e-30)
     clear = (np.abs(fit) > _CLEAR * spread) & (np.abs(fit) > math.tan(_SMALLEST)) & (explained > _EXPLAINED)
     if not clear.any():
         return None

@@ -23,7 +23,7 @@ def with_curvature(height: NDArray[Any], sigma: NDArray[Any], variance: float) -
 
     reach, (rows, columns) = math.ceil(math.sqrt(variance)), height.shape
     padded = cv2.copyMakeBorder(height[::reach, ::reach].astype(np.float32), 2, 2, 2, 2, cv2.BORDER_REPLICATE)
-    found, factor = np.empty(height.shape, np.float32), np.float32((variance / (2 * reach**2)) ** 2)
+    combined, factor = np.empty(height.shape, np.float32), np.float32((variance / (2 * reach**2)) ** 2)
     coarse_rows, coarse_columns = (size - 4 for size in padded.shape)
     for start in range(0, coarse_rows, _AT_ONCE):  # parts that stay in the cache
         stop = min(start + _AT_ONCE, coarse_rows)
@@ -34,8 +34,8 @@ def with_curvature(height: NDArray[Any], sigma: NDArray[Any], variance: float) -
         part = slice(reach * start, min(reach * stop, rows))
         squares = squares[: part.stop - part.start, :columns]
         squares += np.square(sigma[part])
-        np.sqrt(squares, out=found[part])
-    return found
+        np.sqrt(squares, out=combined[part])
+    return combined
 
 
 _ACROSS, _MIXED = np.zeros((2, 3, 3), np.float32)
@@ -53,12 +53,12 @@ def _curvature(height: NDArray[Any]) -> NDArray[Any]:
     for differences in (across, along, cv2.filter2D(height, -1, _MIXED)):
         cv2.accumulateSquare(differences, squares)
     squares, inside = squares[1:-1, 1:-1], (slice(1, -1),) * 2
-    there = np.isfinite(squares)
-    if there.all():
+    finite = np.isfinite(squares)
+    if finite.all():
         return np.asarray(cv2.blur(squares, (3, 3)))[inside]
-    total, share = (
+    total, coverage = (
         np.asarray(cv2.blur(part, (3, 3)))[inside]
-        for part in (np.where(there, squares, np.float32(0)), there.astype(np.float32))
+        for part in (np.where(finite, squares, np.float32(0)), finite.astype(np.float32))
     )
-    mean: NDArray[Any] = np.divide(total, share, out=np.zeros_like(total), where=share > 0)
+    mean: NDArray[Any] = np.divide(total, coverage, out=np.zeros_like(total), where=coverage > 0)
     return mean

@@ -69,8 +69,8 @@ class FrameLight:
     @property
     def process(self) -> dict[str, str]:
         """Entries of a result's process about the correction."""
-        known = {"flicker": f"{100 * self.flicker:.2g} %", "drift": f"{self.drift:.2g} counts"}
-        return {name: f"{known[name]}, corrected" for name in self.kinds}
+        sizes = {"flicker": f"{100 * self.flicker:.2g} %", "drift": f"{self.drift:.2g} counts"}
+        return {name: f"{sizes[name]}, corrected" for name in self.kinds}
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -80,9 +80,9 @@ class FrameLight:
 
 def light_sigma(normals: NDArray[np.floating], variance: tuple[float, float]) -> NDArray[np.float32]:
     """Return the standard deviation of normals, (..., 3), because of the light; see `FrameLight.variance`."""
-    least, rise = variance
+    base, rise = variance
     sine = 1 - normals[..., 2].astype(np.float64) ** 2
-    return np.asarray(np.sqrt(np.maximum(least + rise * sine, 0)), np.float32)
+    return np.asarray(np.sqrt(np.maximum(base + rise * sine, 0)), np.float32)
 
 
 def find_frame_light(
@@ -101,16 +101,18 @@ def find_frame_light(
     if not _FEWEST_FRAMES <= count <= _MOST_FRAMES or count != len(phase):
         return None
     whole = valid(samples).all(axis=0)
-    scale = [np.broadcast_to(np.asarray(one, np.float64), whole.shape) for one in (gain, offset, dark)]
+    scale = [np.broadcast_to(np.asarray(values, np.float64), whole.shape) for values in (gain, offset, dark)]
     whole &= np.isfinite(scale).all(axis=0) & (scale[0] != 0)
     if np.count_nonzero(whole) < _FEWEST_PIXELS or not _is_suspect(samples[:, whole], phase):
         return None
     counts = samples[:, whole].astype(np.float64)
-    per_angle, base, low = (one[whole] for one in scale)
+    per_angle, base, low = (values[whole] for values in scale)
     # Not by lstsq: the threads that it starts for many pixels wait for those of OpenCL.
     wave = np.linalg.pinv(basis(phase)) @ ((counts - base) / per_angle)
-    swing = np.hypot(wave[1], wave[2]) / tilt  # 1 if the response is as stated
-    usable = (wave[0] > _STEEP * tilt) & (wave[0] < _UPRIGHT) & (swing > 1 / _SWING) & (swing < _SWING)
+    modulation = np.hypot(wave[1], wave[2]) / tilt  # 1 if the response is as stated
+    usable = (
+        (wave[0] > _STEEP * tilt) & (wave[0] < _UPRIGHT) & (modulation > 1 / _SWING) & (modulation < _SWING)
+    )
     facing = np.exp(1j * np.arctan2(wave[2], wave[1]))[usable]
     if np.count_nonzero(usable) < _FEWEST_PIXELS or abs(np.mean(facing)) > _AS_ONE:
         return None
@@ -119,12 +121,13 @@ def find_frame_light(
     steep = wave[0] > np.median(wave[0][usable])
     parts = [usable, usable & steep, usable & ~steep]
     chosen = [
-        (counts[:, one], phase, tilt, per_angle[one], base[one], low[one], wave[:, one]) for one in parts
+        (counts[:, part], phase, tilt, per_angle[part], base[part], low[part], wave[:, part])
+        for part in parts
     ]
     whole_fit = _fitted(*chosen[0])
-    if whole_fit is None or not whole_fit.known.any():
+    if whole_fit is None or not whole_fit.free.any():
         return None
-    at_steep, at_level = (_fitted(*one, whole_fit.known) for one in chosen[1:])
+    at_steep, at_level = (_fitted(*arguments, whole_fit.free) for arguments in chosen[1:])
     if at_steep is None or at_level is None:
         return None
     # A wrong response differs between zeniths; a change of the light does not.
@@ -135,19 +138,19 @@ def find_frame_light(
 
 def _fitted(
     counts: Doubles, phase: Doubles, tilt: float, gain: Doubles, base: Doubles, dark: Doubles, wave: Doubles,
-    known: NDArray[np.bool_] | None = None,
+    free: NDArray[np.bool_] | None = None,
 ) -> _Fit | None:  # fmt: skip
-    """Return the fit of known, or significant, errors to some pixels; None if too few follow it."""
+    """Return the fit of free, or significant, errors to some pixels; None if too few follow it."""
     fit = _Fit(counts, phase, tilt, gain, base, dark, wave)
-    if known is not None:
-        fit.leave_out(~known)
+    if free is not None:
+        fit.leave_out(~free)
     fit.keep(fit.misfit < _OUTLIER * float(np.median(fit.misfit)))
     for _ in range(_ROUNDS):
         fit.improve()
         fit.keep(fit.misfit < _OUTLIER * float(np.median(fit.misfit)))
         if fit.pixels < _FEWEST_PIXELS // 3:
             return None
-    while known is None and (steady := fit.known & ~fit.significant).any():
+    while free is None and (steady := fit.free & ~fit.significant).any():
         fit.leave_out(steady)
         fit.improve()
         fit.improve()
@@ -162,14 +165,14 @@ def _is_suspect(samples: NDArray[Any], phase: Doubles) -> bool:
     waves = np.linalg.qr(columns)[0].astype(np.float32)
     counts = samples.astype(np.float32)
     fit = waves @ (waves.T @ counts)
-    left = counts - fit
+    residual = counts - fit
     freedom = len(phase) - columns.shape[1]
     for common in (fit.mean(axis=0), np.ones(counts.shape[1], np.float32)):
         size = float(np.sum(common**2))
         if size == 0:
             continue
-        each = left @ common / size
-        noise = max(mad_sigma((left - np.outer(each, common)).astype(np.float64)), _LEAST_NOISE)
+        each = residual @ common / size
+        noise = max(mad_sigma((residual - np.outer(each, common)).astype(np.float64)), _LEAST_NOISE)
         usual = noise**2 * len(phase)  # residuals have less than the noise, by the degrees of freedom
         if float(np.sum(each**2)) * size > (1 + _SUSPECT * math.sqrt(2 / freedom)) * usual:
             return True
@@ -186,7 +189,7 @@ class _Fit:
         self._counts, self._phase, self._tilt = counts, phase[:, np.newaxis], tilt
         self._gain, self._base, self._dark = gain, base, dark
         self._zenith, self._azimuth = wave[0].copy(), np.arctan2(wave[2], wave[1])
-        self.known: NDArray[np.bool_] = np.array([True, True])  # whether gains and offsets are fitted
+        self.free: NDArray[np.bool_] = np.array([True, True])  # whether gains and offsets are fitted
         self._light = np.zeros((2, len(phase)))  # excess of the gain, offset
         self._prior = np.array([_PRIOR[0], _PRIOR[1] * float(np.median(counts))])
         self._look()
@@ -231,34 +234,34 @@ class _Fit:
         """Return the inverse of the normals' matrices, their products with the light's, and the light's."""
         freedom = self._left.size - 2 * self.pixels - self._light.size
         noise = max(float(np.sum(self._left**2)) / max(freedom, 1), _LEAST_NOISE**2)
-        own = np.linalg.inv(np.einsum("ati,bti->iab", self._by_normal, self._by_normal))
+        inverses = np.linalg.inv(np.einsum("ati,bti->iab", self._by_normal, self._by_normal))
         frames = self._light.shape[1]
         cross = np.einsum("ati,cti->iact", self._by_normal, self._by_light).reshape(-1, 2, 2 * frames)
-        through = own @ cross
+        through = inverses @ cross
         both = np.einsum("cti,dti->cdt", self._by_light, self._by_light)
         matrix = np.zeros((2, frames, 2, frames))
         each = np.arange(frames)
         matrix[:, each, :, each] = np.moveaxis(both, 2, 0)
         matrix = matrix.reshape(2 * frames, 2 * frames) - np.einsum("iak,ial->kl", cross, through)
         matrix += np.diag(noise / np.repeat(self._prior**2, frames))
-        return own, through, matrix, noise
+        return inverses, through, matrix, noise
 
     def improve(self) -> None:
         """Do one step, and update the standard deviations of gains and offsets."""
-        own, through, matrix, noise = self._normal_equations()
+        inverses, through, matrix, noise = self._normal_equations()
         frames = self._light.shape[1]
         push = np.einsum("ati,ti->ia", self._by_normal, self._left)
         pull = np.einsum("cti,ti->ct", self._by_light, self._left).ravel()
         pull -= np.einsum("iak,ia->k", through, push)
         pull -= noise / np.repeat(self._prior**2, frames) * self._light.ravel()
         step = np.linalg.solve(matrix, pull)
-        turn = np.einsum("iab,ib->ia", own, push) - through @ step
+        turn = np.einsum("iab,ib->ia", inverses, push) - through @ step
         self._light += step.reshape(2, frames)
         self._zenith += turn[:, 0]
         self._azimuth += turn[:, 1] / np.maximum(np.sin(self._zenith), 1e-3)
         self._light -= self._light.mean(axis=1, keepdims=True)
         spread = np.diag(np.linalg.inv(matrix)).reshape(2, frames) * noise
-        self._prior = np.where(self.known, np.sqrt(np.mean(self._light**2 + spread, axis=1)), _STEADY)
+        self._prior = np.where(self.free, np.sqrt(np.mean(self._light**2 + spread, axis=1)), _STEADY)
         self._look()
 
     @property
@@ -275,7 +278,7 @@ class _Fit:
     def leave_out(self, chosen: NDArray[np.bool_]) -> None:
         """Assume steady light for gains, offsets or both, (2,)."""
         self._light[chosen], self._prior[chosen] = 0.0, _STEADY
-        self.known &= ~chosen
+        self.free &= ~chosen
         self._look()
 
     def change(self, level: float) -> Doubles:
@@ -285,21 +288,21 @@ class _Fit:
 
     def light(self) -> FrameLight | None:
         """Return the light; None if it is steady."""
-        known = self.known
-        if not known.any() or np.std(self._light[0]) > _MOST:
+        free = self.free
+        if not free.any() or np.std(self._light[0]) > _MOST:
             return None
         _, through, matrix, noise = self._normal_equations()
         covariance = np.linalg.inv(matrix) * noise
-        excess, offset = self._light * known[:, np.newaxis]
+        excess, offset = self._light * free[:, np.newaxis]
         error = np.einsum("iak,kl,ial->i", through, covariance, through)
         # The means of gains and offsets are assumed to be as in the calibration.
         light = self._by_light[0].mean(axis=0)
         mean = light**2 * np.var(excess) / len(excess) + (_range(offset) / 2) ** 2
         error += mean / self._gain**2
         sine = np.sin(self._zenith) ** 2
-        rise, least = np.polyfit(sine, error, 1)
+        rise, base = np.polyfit(sine, error, 1)
         return FrameLight(
-            1 + excess, offset, (float(least), float(rise)), float(np.std(excess)), _range(offset)
+            1 + excess, offset, (float(base), float(rise)), float(np.std(excess)), _range(offset)
         )
 
 

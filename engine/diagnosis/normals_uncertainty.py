@@ -50,7 +50,7 @@ class RegistrationUncertainty(Step):
         sigma, contact = result.normals_sigma, result.contact
         reach = np.ones((_REACH, _REACH), np.uint8)
         lost = np.isfinite(sigma) & (contact == 0)
-        near = [cv2.dilate(one.view(np.uint8), reach) for one in lost.reshape(-1, *lost.shape[-2:])]
+        near = [cv2.dilate(lost_map.view(np.uint8), reach) for lost_map in lost.reshape(-1, *lost.shape[-2:])]
         inside = contact * (np.reshape(near, lost.shape) == 0)
         if context.operation.option_values()["noise"] is not None:
             sigma = sigma * context.stream.noise_gain
@@ -72,12 +72,12 @@ class PhaseUncertainty(Step):
         normals = stored_map(result, "normals")
         several = normals.ndim == 4
         if _mirrored(normals[0] if several else normals):
-            found = Finding(
+            finding = Finding(
                 "mirrored",
                 "the slopes fit together better with the phases reversed: do phases count counter-clockwise"
                 " in the picture?",
             )
-            return with_findings(result, found)
+            return with_findings(result, finding)
         if several:
             return result
         size = context.source.header.pixel_size or (1.0, 1.0)
@@ -112,7 +112,7 @@ class ResponseUncertainty(Step):
             return result
         cosine, sine = (stored_map(context.computed, name) for name in ("cosine", "sine"))
         base = noise**2 - slope * _median(mean)
-        swing = find_swing(
+        modulation = find_swing(
             normals,
             mean,
             cosine,
@@ -122,11 +122,13 @@ class ResponseUncertainty(Step):
             tilt,
             CountNoise(base / frames, slope / frames, QUANTUM**2 / frames),
         )
-        if swing.gain > 0:
-            result = _with_share_of_zenith(result, swing.gain).with_fitted(pixel_gain_sigma=swing.gain)
-        if (share := max(swing.response, swing.light)) > 0:
-            result = result.with_fitted(swing_range=share)
-        return with_findings(result, *_uneven(swing))
+        if modulation.gain > 0:
+            result = _with_share_of_zenith(result, modulation.gain).with_fitted(
+                pixel_gain_sigma=modulation.gain
+            )
+        if (fraction := max(modulation.response, modulation.light)) > 0:
+            result = result.with_fitted(swing_range=fraction)
+        return with_findings(result, *_uneven(modulation))
 
 
 class SystematicUncertainty(Step):
@@ -140,16 +142,16 @@ class SystematicUncertainty(Step):
 
     def apply(self, result: Result, context: Context) -> Result:
         """Return the result with other ``normals_sigma``, if the response has errors."""
-        response, share = cast("Normals", context.operation).response, result.fitted.swing_range
+        response, fraction = cast("Normals", context.operation).response, result.fitted.swing_range
         if response is not None:
             return result.assign(normals_sigma=np.hypot(result.normals_sigma, response.sigma))
-        return result if share is None else _with_share_of_zenith(result, share)
+        return result if fraction is None else _with_share_of_zenith(result, fraction)
 
 
-def _with_share_of_zenith(result: Result, share: float) -> Result:
+def _with_share_of_zenith(result: Result, fraction: float) -> Result:
     """Return a result with a share of zeniths added to the errors of normals, when these are used."""
     return result.assign(
-        normals_sigma=lambda: np.hypot(result.normals_sigma, np.float32(share) * result.zenith)
+        normals_sigma=lambda: np.hypot(result.normals_sigma, np.float32(fraction) * result.zenith)
     )
 
 
@@ -160,24 +162,24 @@ def _median(values: AnyArray) -> float:
     return float(np.median(some)) if some.size else 0.0
 
 
-def _uneven(swing: Swing) -> Iterator[Finding]:
-    if swing.gain > 0:
-        text = f"the gains of pixels differ by {100 * swing.gain:.2g} %, which is part of the errors"
+def _uneven(modulation: Swing) -> Iterator[Finding]:
+    if modulation.gain > 0:
+        text = f"the gains of pixels differ by {100 * modulation.gain:.2g} %, which is part of the errors"
         yield Finding("pixel gains", text, False)
     causes = []
-    if swing.response > 0:
-        causes.append(f"differs by {100 * swing.response:.2g} % from zenith to zenith, as with gamma")
-    if swing.light > 0:
-        light = f"differs by {100 * swing.light:.2g} % from place to place, as in uneven light"
-        if swing.response > 0 or swing.blur > 0:
+    if modulation.response > 0:
+        causes.append(f"differs by {100 * modulation.response:.2g} % from zenith to zenith, as with gamma")
+    if modulation.light > 0:
+        light = f"differs by {100 * modulation.light:.2g} % from place to place, as in uneven light"
+        if modulation.response > 0 or modulation.blur > 0:
             causes.append(light)
         else:
             text = (
                 f"the swing of the brightness {light} (or points move in the picture); the errors include it"
             )
             yield Finding("swing", text, False)
-    if swing.blur > 0:
-        causes.append(f"is weak at tops and edges, as if a lens blurs by {swing.blur:.2g} pixels")
+    if modulation.blur > 0:
+        causes.append(f"is weak at tops and edges, as if a lens blurs by {modulation.blur:.2g} pixels")
     if causes:
         yield Finding(
             "swing",
@@ -215,14 +217,14 @@ def _mirrored(normals: AnyArray) -> bool:
     if not (rows and columns):
         return False
     ((here, across, down),) = take_places([normals], rows, columns, ((0, 0), (0, reach), (reach, 0)))
-    here, across, down = (one.astype(np.float64) for one in (here, across, down))
+    here, across, down = (values.astype(np.float64) for values in (here, across, down))
     with np.errstate(divide="ignore", invalid="ignore"):
         dp_dy = down[0] / down[2] - here[0] / here[2]  # y points up
         dq_dx = here[1] / here[2] - across[1] / across[2]
     defined = np.isfinite(dp_dy) & np.isfinite(dq_dx)
     if np.count_nonzero(defined) < _FEWEST:
         return False
-    dp_dy, dq_dx = (_clip_outliers(one[defined]) for one in (dp_dy, dq_dx))
+    dp_dy, dq_dx = (_clip_outliers(values[defined]) for values in (dp_dy, dq_dx))
     product = dp_dy * dq_dx
     clear = -float(np.mean(product)) > _CLEAR * float(np.std(product)) / math.sqrt(len(product))
     return clear and bool(-np.sum(product) >= _ALIKE * math.sqrt(np.sum(dp_dy**2) * np.sum(dq_dx**2)))

@@ -172,7 +172,7 @@ class _Rows:
         inside = ((self.frame >= first) & (self.frame < stop)).all(axis=0)
         if inside.all():
             return _Rows(self.bends, self.frame - first, self.change)
-        frame, change = (one.compress(inside, axis=1) for one in (self.frame, self.change))
+        frame, change = (values.compress(inside, axis=1) for values in (self.frame, self.change))
         return _Rows(self.bends[inside], frame - first, change)
 
 
@@ -201,10 +201,10 @@ def _find_errors(height: AnyArray, pushed: Doubles) -> _Errors | None:
     if more.shape != pixels.shape:
         rows = _rows_of(more, travel, step)
     clear = _spread(more[0][np.isfinite(more[0])], travel)
-    seen = np.flatnonzero(rows.seen(len(travel)) >= _SEEN)
-    if len(seen) < _FEWEST:
+    covered = np.flatnonzero(rows.seen(len(travel)) >= _SEEN)
+    if len(covered) < _FEWEST:
         return None
-    first, stop = int(seen[0]), int(seen[-1]) + 1
+    first, stop = int(covered[0]), int(covered[-1]) + 1
     if stop - first > _MOST_FRAMES:
         middle = int(np.median(rows.frame))
         first = min(max(first, middle - _MOST_FRAMES // 2), stop - _MOST_FRAMES)
@@ -212,24 +212,24 @@ def _find_errors(height: AnyArray, pushed: Doubles) -> _Errors | None:
     return _fit(rows.between(first, stop), travel[first:stop], step, clear[first : stop - 1], reach)
 
 
-def _apart(travel: Doubles, least: float) -> Doubles:
+def _apart(travel: Doubles, distance: float) -> Doubles:
     """Return travel, in ascending order, without values closer to the one before than a distance."""
-    if np.diff(travel).min() >= least:
+    if np.diff(travel).min() >= distance:
         return travel
     kept = [0]
     for number in range(1, len(travel)):
-        if travel[number] - travel[kept[-1]] >= least:
+        if travel[number] - travel[kept[-1]] >= distance:
             kept.append(number)
     return travel[kept]
 
 
-def _pixels_of(height: AnyArray, reach: int, most: int) -> Doubles:
+def _pixels_of(height: AnyArray, reach: int, max_rows: int) -> Doubles:
     """Return depths of rows of four pixels, ``reach`` apart, from rows and columns all over, (4, n)."""
     grids, (rows, columns) = [], height.shape
     for lines, length, down, across in ((rows, columns, columns, 1), (columns, rows, 1, columns)):
         count = length - 3 * reach
         if count > 0:
-            thinner = max(1, lines * count // most)
+            thinner = max(1, lines * count // max_rows)
             skip = math.isqrt(thinner)
             each = -(-thinner // skip)
             first = each // 2 % lines
@@ -250,18 +250,20 @@ def _rows_of(pixels: Doubles, travel: Doubles, step: float) -> _Rows:
     rise = np.sum(_RISE[:, np.newaxis] * pixels, axis=0)
     bends = np.sum(_BEND[:, np.newaxis] * pixels, axis=0) / rise
     frame = np.clip(np.searchsorted(travel, pixels, side="right") - 1, 0, len(travel) - 2)
-    share = (pixels - travel[frame]) / (travel[frame + 1] - travel[frame])
+    fraction = (pixels - travel[frame]) / (travel[frame + 1] - travel[frame])
     change = (_BEND[:, np.newaxis] - bends * _RISE[:, np.newaxis]) / rise
     return _Rows(
-        bends, np.concatenate([frame, frame + 1]), np.concatenate([change * (1 - share), change * share])
+        bends,
+        np.concatenate([frame, frame + 1]),
+        np.concatenate([change * (1 - fraction), change * fraction]),
     )
 
 
 def _spread(heights: Doubles, travel: Doubles) -> NDArray[np.bool_]:
     """Return for each interval between frames whether the heights in it differ enough."""
     interval = np.clip(np.searchsorted(travel, heights, side="right") - 1, 0, len(travel) - 2)
-    share = (heights - travel[interval]) / (travel[interval + 1] - travel[interval])
-    part = np.clip((share * _BINS).astype(np.intp), 0, _BINS - 1)
+    fraction = (heights - travel[interval]) / (travel[interval + 1] - travel[interval])
+    part = np.clip((fraction * _BINS).astype(np.intp), 0, _BINS - 1)
     count = np.bincount(interval * _BINS + part, minlength=(len(travel) - 1) * _BINS)
     count = count.reshape(-1, _BINS).astype(np.float64)
     total = count.sum(axis=1)
@@ -270,10 +272,10 @@ def _spread(heights: Doubles, travel: Doubles) -> NDArray[np.bool_]:
 
 def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], reach: int) -> _Errors:
     """Fit the errors of all frames, and those of a single jump between any two of them."""
-    count, (one, other) = len(travel), np.triu_indices(len(rows.frame))
-    pairs = (count * rows.frame[one] + rows.frame[other]).ravel()
-    products = rows.change[one] * rows.change[other]
-    products[one == other] /= 2  # the other half of the matrix is the transposed one
+    count, (first, second) = len(travel), np.triu_indices(len(rows.frame))
+    pairs = (count * rows.frame[first] + rows.frame[second]).ravel()
+    products = rows.change[first] * rows.change[second]
+    products[first == second] /= 2  # the other half of the matrix is the transposed one
     weighted = np.empty_like(products)  # used again, because new memory costs as much as the products
 
     def normal(weight: Doubles) -> Doubles:
@@ -285,9 +287,9 @@ def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], re
     degree = max(2, count // _SMOOTH)
     smooth, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, count), degree))
     of_surface = np.sum(smooth[:, np.newaxis] * smooth[np.newaxis], axis=2)
-    bend, error, left = rows.bend, np.zeros(count), rows.bends
+    bend, error, residual = rows.bend, np.zeros(count), rows.bends
     for _ in range(_ROUNDS):
-        weight = 1 / np.sqrt(1 + (left / (2 * bend)) ** 2)
+        weight = 1 / np.sqrt(1 + (residual / (2 * bend)) ** 2)
         squares = normal(weight)
         slope = (weight * rows.bends * rows.change).ravel()
         gradient = -np.bincount(rows.frame.ravel(), slope, minlength=count)
@@ -295,10 +297,10 @@ def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], re
         whole += 10 * np.trace(whole) * of_surface
         inverse = np.linalg.inv(whole)
         error = np.sum(inverse * gradient, axis=1)
-        left = rows.bends + np.sum(rows.change * error[rows.frame], axis=0)
+        residual = rows.bends + np.sum(rows.change * error[rows.frame], axis=0)
 
     def covariance() -> Doubles:
-        return _OVERLAP * inverse @ normal((weight * left) ** 2) @ inverse
+        return _OVERLAP * inverse @ normal((weight * residual) ** 2) @ inverse
 
     after = np.tri(count, count - 1, -1)  # a jump between two frames shifts all that follow
     inner = np.linalg.pinv(smooth.T @ squares @ smooth)

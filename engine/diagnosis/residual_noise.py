@@ -31,11 +31,11 @@ class CountNoise:
 
     base: float  # variance at 0 counts, extrapolated
     slope: float  # variance per count
-    least: float  # lower limit of the variance
+    floor: float  # lower limit of the variance
 
     def at(self, level: ArrayLike) -> Doubles:
         """Return the standard deviation of samples around a level, counts."""
-        return np.sqrt(np.maximum(self.base + self.slope * np.asarray(level, np.float64), self.least))
+        return np.sqrt(np.maximum(self.base + self.slope * np.asarray(level, np.float64), self.floor))
 
 
 def residual_noise(
@@ -63,8 +63,8 @@ def residual_noise(
     quantum = QUANTUM if samples.dtype.kind == "u" else _FLOAT_NOISE
     if not (good.sum(axis=0) >= 3).any():  # no pixel has a normal
         return CountNoise(quantum**2, 0.0, quantum**2)
-    share = good.mean(axis=1)
-    frames = share > share.max() / 2
+    valid_fraction = good.mean(axis=1)
+    frames = valid_fraction > valid_fraction.max() / 2
     pixels = good[frames].all(axis=0)
     if np.count_nonzero(frames) <= coefficients or not pixels.any():
         raise InputError(
@@ -133,17 +133,17 @@ def _share_beyond(freedom: int, square: float) -> float:
 
 
 @functools.cache
-def _chi_square_beyond(freedom: int, share: float) -> float:
+def _chi_square_beyond(freedom: int, probability: float) -> float:
     """Return the value that chi^2 exceeds with a probability, to double precision, by bisection."""
     low, high = 0.0, 1.0
-    while _share_beyond(freedom, high) > share:
+    while _share_beyond(freedom, high) > probability:
         low, high = high, 2 * high
     while low < (middle := (low + high) / 2) < high:
-        low, high = (middle, high) if _share_beyond(freedom, middle) > share else (low, middle)
+        low, high = (middle, high) if _share_beyond(freedom, middle) > probability else (low, middle)
     return high
 
 
-def _line(levels: Doubles, variances: Doubles, least: float) -> CountNoise:
+def _line(levels: Doubles, variances: Doubles, floor: float) -> CountNoise:
     """Fit a non-decreasing line to variances by iteratively reweighted least squares."""
     weights = 1 / variances
     base, slope = float(np.median(variances)), 0.0
@@ -154,6 +154,6 @@ def _line(levels: Doubles, variances: Doubles, least: float) -> CountNoise:
         rise = np.sum(weights**2 * off_centre * (variances - mean)) / np.sum(weights**2 * off_centre**2)
         slope = max(0.0, float(rise))
         base = float(mean - slope * centre)
-        fitted = np.maximum(base + slope * levels, least)
+        fitted = np.maximum(base + slope * levels, floor)
         weights = np.sqrt(huber(_OUTLYING).weights((variances - fitted) / fitted)) / fitted
-    return CountNoise(base, slope, least)
+    return CountNoise(base, slope, floor)

@@ -88,33 +88,35 @@ def find_swing(
     def look(place: int) -> tuple[Doubles, ...]:
         """Return zenith, its sine's direction and the ratio of the swing, NaN where it is not usable."""
         x, y, z = vectors[place].astype(np.float64)
-        flat, swing = np.hypot(x, y), np.hypot(cosines[place], sines[place])
+        flat, amplitude = np.hypot(x, y), np.hypot(cosines[place], sines[place])
         zenith = np.where((used[place] > 0) & (flat > math.sin(_STEEP * tilt)), np.arctan2(flat, z), np.nan)
-        return zenith, x / flat, y / flat, swing / (scales[place] * _expected(zenith, tilt))
+        return zenith, x / flat, y / flat, amplitude / (scales[place] * _expected(zenith, tilt))
 
     with np.errstate(divide="ignore", invalid="ignore"):
         middle, east, west, north, south = map(look, range(len(places)))
         apart = 2 * _REACH
         pairs = (east, west), (north, south)
-        turning = np.sum([((one[k] - other[k]) / apart) ** 2 for one, other in pairs for k in (1, 2)], axis=0)
+        turning = np.sum(
+            [((first[k] - second[k]) / apart) ** 2 for first, second in pairs for k in (1, 2)], axis=0
+        )
         bending = ((east[0] - west[0]) * middle[1] + (north[0] - south[0]) * middle[2]) / apart
         zenith = (east[0] + west[0] + north[0] + south[0]) / 4  # without the error of this pixel
         rough = middle[3] - (east[3] + west[3] + north[3] + south[3]) / 4
         noise = math.sqrt(2) * noise_of_mean.at(means[0]) / (scales[0] * tilt)
-    known = np.isfinite(rough) & np.isfinite(turning) & np.isfinite(noise) & (noise > 0)
-    if np.count_nonzero(known) < _FEWEST:
+    finite = np.isfinite(rough) & np.isfinite(turning) & np.isfinite(noise) & (noise > 0)
+    if np.count_nonzero(finite) < _FEWEST:
         return Swing()
     y, x = (
-        np.broadcast_to(one, known.shape)[known]
-        for one in np.ix_(1 - 2 * np.array(down) / (rows - 1), 2 * np.array(right) / (columns - 1) - 1)
+        np.broadcast_to(positions, finite.shape)[finite]
+        for positions in np.ix_(1 - 2 * np.array(down) / (rows - 1), 2 * np.array(right) / (columns - 1) - 1)
     )
-    noise, rough = noise[known], rough[known]
+    noise, rough = noise[finite], rough[finite]
     gain = _gain(rough, noise)
     columns_of = np.stack([
-        np.ones_like(x), turning[known], bending[known], zenith[known] - np.mean(zenith[known]),
+        np.ones_like(x), turning[finite], bending[finite], zenith[finite] - np.mean(zenith[finite]),
         x, y, x * x, x * y, y * y,
     ], axis=1)  # fmt: skip
-    return _fit(middle[3][known], columns_of, np.hypot(noise, gain), gain)
+    return _fit(middle[3][finite], columns_of, np.hypot(noise, gain), gain)
 
 
 def _expected(zenith: Doubles, tilt: float) -> Doubles:
@@ -141,13 +143,13 @@ def _gain(rough: Doubles, noise: Doubles) -> float:
     return gain if excess > _CLEAR_GAIN * _JOINED * math.sqrt(2 / len(rough)) and gain > _GAIN else 0.0
 
 
-def _fit(swing: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing:
+def _fit(ratio: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing:
     """Fit the effects to the ratio of the swing to the expected one."""
-    found = fit_clipped(columns, swing, noise)
-    if found is None:
+    result = fit_clipped(columns, ratio, noise)
+    if result is None:
         return Swing(gain=gain)
-    fit, inverse, left, kept = found
-    covariance = inverse * max(1.0, float(np.mean(left[kept] ** 2)))
+    fit, inverse, residual, kept = result
+    covariance = inverse * max(1.0, float(np.mean(residual[kept] ** 2)))
 
     products = gram(columns[kept])
     sums, number = products[0], products[0, 0]  # the first column is 1
@@ -157,8 +159,8 @@ def _fit(swing: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing
         part, others = fit[chosen], np.delete(np.arange(len(fit)), np.r_[chosen])
         mixed = part @ products[chosen, others]
         square = float(part @ products[chosen, chosen] @ part)
-        spare = square - float(mixed @ np.linalg.solve(products[np.ix_(others, others)], mixed))
-        alone = spare > _ALONE * (square - float(part @ sums[chosen]) ** 2 / number)
+        unexplained = square - float(mixed @ np.linalg.solve(products[np.ix_(others, others)], mixed))
+        alone = unexplained > _ALONE * (square - float(part @ sums[chosen]) ** 2 / number)
         chi2 = float(part @ np.linalg.solve(covariance[chosen, chosen], part))
         extent = float(np.ptp(np.percentile(columns[kept, chosen] @ part, [5, 95]))) / abs(float(fit[0]))
         return extent if alone and chi2 > len(part) * _CLEAR**2 else 0.0

@@ -138,7 +138,7 @@ def _solve(
     space: HalfSpace, surface: Doubles, compliance: float, tolerance: float, contact: Mask, strain: Doubles
 ) -> tuple[Doubles, Doubles]:
     """Return the strain for which the sheet follows the surface in contact, and the gap everywhere."""
-    found = conjugate_gradients(
+    solution = conjugate_gradients(
         _opening(space, compliance),
         surface,
         Face.of(contact, space.pressed),
@@ -146,9 +146,9 @@ def _solve(
         steps=_STEPS,
         start=strain,
     )
-    if not found.converged:
+    if not solution.converged:
         raise NotConverged(f"the pressure in contact was not found in {_STEPS} steps")
-    return found.x, found.product - surface
+    return solution.x, solution.product - surface
 
 
 def _opening(space: HalfSpace, compliance: float) -> Callable[[NDArray[Real]], NDArray[Real]]:
@@ -321,7 +321,7 @@ def _pressed_by(space: HalfSpace, contact: Mask, heights: Singles, compliance: f
     window, space = _window(space, contact)
     contact, heights = contact[window], heights[(slice(None), *window)]
     enough = _ROUGH**2 * _square(heights)
-    found = conjugate_gradients(
+    solution = conjugate_gradients(
         _opening(space, compliance),
         heights,
         Face.of(contact, space.pressed),
@@ -329,7 +329,7 @@ def _pressed_by(space: HalfSpace, contact: Mask, heights: Singles, compliance: f
         steps=_ROUGH_STEPS,
         axes=(1, 2),
     )
-    return np.asarray(found.x[:, contact], np.float64)
+    return np.asarray(solution.x[:, contact], np.float64)
 
 
 def _window(space: HalfSpace, contact: Mask) -> tuple[tuple[slice, slice], HalfSpace]:

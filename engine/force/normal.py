@@ -108,8 +108,8 @@ def find_force(
     young, young_sigma = modulus_of(result, modulus, modulus_sigma)
     _check(travel=(travel, -math.inf), travel_sigma=(travel_sigma, 0.0), modulus_sigma=(modulus_sigma, 0.0))
     _check(compliance=(compliance, 0.0))
-    own = 0.0 if result.height_sigma is None else result.height_sigma
-    errors = np.asarray(own if sigma is None else sigma, np.float64)
+    height_sigma = 0.0 if result.height_sigma is None else result.height_sigma
+    errors = np.asarray(height_sigma if sigma is None else sigma, np.float64)
     if errors.shape not in ((), surface.shape):
         raise InputError(f"sigma has shape {errors.shape}: give one number, or one a pixel {surface.shape}")
     if errors.ndim and np.isfinite(errors).any():
@@ -173,29 +173,29 @@ def check_modulus(modulus: float) -> float:
 
 
 def _check(**values: tuple[float, float]) -> None:
-    for name, (value, least) in values.items():
-        if not (math.isfinite(value) and value >= least):
-            bound = "a finite number" if least == -math.inf else f"{least:g} or more"
+    for name, (value, minimum) in values.items():
+        if not (math.isfinite(value) and value >= minimum):
+            bound = "a finite number" if minimum == -math.inf else f"{minimum:g} or more"
             raise InputError(f"{name} {value:g} is not possible: give {bound}")
 
 
-def force_of_press(fit: PressFit, known: Stiffness | float) -> Result:
+def force_of_press(fit: PressFit, stiffness: Stiffness | float) -> Result:
     """Return the force of a press whose surface was fitted to the onsets, at the greatest travel.
 
     A stiffness calibrated by presses of known force corrects errors of the gel's shape; with a specified
     modulus, these errors are propagated. NotConverged if much of the load is outside of the picture.
     """
     pressed = press_within(fit)
-    own, by_gel = fit.load_errors(pressed)
-    if isinstance(known, float):
-        modulus = known
-        force, spread = modulus * pressed.load, modulus * math.hypot(own, *by_gel)
+    load_sigma, by_gel = fit.load_errors(pressed)
+    if isinstance(stiffness, float):
+        modulus = stiffness
+        force, spread = modulus * pressed.load, modulus * math.hypot(load_sigma, *by_gel)
     else:
-        modulus = known.modulus
-        force = modulus * (pressed.load + float(np.sum(by_gel * known.gel_shift)))
+        modulus = stiffness.modulus
+        force = modulus * (pressed.load + float(np.sum(by_gel * stiffness.gel_shift)))
         terms = np.append(pressed.load, by_gel)
-        learned = math.sqrt(np.einsum("i,ij,j", terms, known.covariance, terms))
-        spread = math.hypot(modulus * own, learned, known.scatter * force)
+        learned = math.sqrt(np.einsum("i,ij,j", terms, stiffness.covariance, terms))
+        spread = math.hypot(modulus * load_sigma, learned, stiffness.scatter * force)
     pressure = (force / pressed.load * fit.on_pixels(pressed.strain)).astype(np.float32)
     contact = fit.on_pixels(pressed.contact.astype(np.float64)) >= 0.5
     return _force(np.where(contact, pressure, np.float32(0)), contact, force, spread)

@@ -125,10 +125,10 @@ def find_tangential_force(
     force = young * np.sum(weights * target, axis=(1, 2, 3)) * _UP.ravel()
     window = (0, 0, window_size, window_size)
     shared = ndimage.uniform_filter(weights * spread, window, mode="constant") * window_size
-    own = young * np.sqrt(np.sum(shared**2, axis=(1, 2, 3)))
+    from_measurement = young * np.sqrt(np.sum(shared**2, axis=(1, 2, 3)))
     strain = system.damped(target, spread)
     traction[rows, columns] = np.moveaxis(young * strain * _UP, 0, -1)
-    force_sigma = np.hypot(own, young_sigma / young * force)
+    force_sigma = np.hypot(from_measurement, young_sigma / young * force)
     return Result(
         traction=traction,
         force_x=float(force[0]),
@@ -158,24 +158,24 @@ def _checked(
     if contact is None and pressure is None:
         contact, pressure = result.contact, result.pressure
     touches = _touches(contact, pressure, moved.shape[:2])
-    own = 0.0 if result.displacement_sigma is None else result.displacement_sigma
-    spread = np.asarray(own if sigma is None else sigma, np.float64)
+    displacement_sigma = 0.0 if result.displacement_sigma is None else result.displacement_sigma
+    spread = np.asarray(displacement_sigma if sigma is None else sigma, np.float64)
     spread = spread[-1] if sigma is None and spread.ndim == 4 else spread
     if spread.shape not in ((), moved.shape[:2], moved.shape):
         raise InputError(f"sigma has shape {spread.shape}: it must be that of the map, {moved.shape[:2]}")
     spread = np.broadcast_to(spread[..., np.newaxis] if spread.ndim == 2 else spread, moved.shape)
     if window_size < 1:
         raise InputError(f"window_size {window_size} is not possible: give pixels, 1 or more")
-    known = np.isfinite(moved).all(axis=-1)
-    if known.any() and not (farthest := np.abs(moved[known]).max()) < _FARTHEST:
+    finite = np.isfinite(moved).all(axis=-1)
+    if finite.any() and not (farthest := np.abs(moved[finite]).max()) < _FARTHEST:
         raise InputError(f"a displacement is {farthest:.3g} mm: less than {_FARTHEST:g} are needed")
-    share = np.count_nonzero(known & touches) / np.count_nonzero(touches)
+    fraction = np.count_nonzero(finite & touches) / np.count_nonzero(touches)
     if not np.isfinite(spread).any() or np.any(spread < 0):
         raise InputError("sigma is below 0, or nowhere known: give millimetres, 0 or more")
-    if share < _LEAST_KNOWN:
-        raise InputError(f"{share:.0%} of the contact has a displacement: {_LEAST_KNOWN:.0%} are needed")
+    if fraction < _LEAST_KNOWN:
+        raise InputError(f"{fraction:.0%} of the contact has a displacement: {_LEAST_KNOWN:.0%} are needed")
     filled = (
-        np.stack([fill_with_nearest(np.where(known, part, np.nan)) for part in np.moveaxis(values, -1, 0)])
+        np.stack([fill_with_nearest(np.where(finite, part, np.nan)) for part in np.moveaxis(values, -1, 0)])
         for values in (moved, spread)
     )
     return next(filled), next(filled), touches
@@ -223,16 +223,16 @@ class _System:
         """Return the traction for a displacement of the contact, by preconditioned conjugate gradients."""
         goal = tolerance * float(np.abs(target).max())
         shape = self._contact.shape
-        found = conjugate_gradients(
+        solution = conjugate_gradients(
             lambda strain: self.displaced(strain) + damping * strain,
             target,
             Face.of(self._contact, lambda residual: _filtered(residual, self._inverse, shape)),
             converged=lambda residual: float(np.abs(residual).max()) <= goal,
             steps=_STEPS,
         )
-        if not found.converged:
+        if not solution.converged:
             raise NotConverged(f"the traction in contact was not found in {_STEPS} steps")
-        return np.asarray(found.x)
+        return np.asarray(solution.x)
 
     def damped(self, target: Doubles, sigma: Doubles) -> Doubles:
         """Return the damped traction whose misfit equals the standard deviation of the displacements."""

@@ -32,7 +32,7 @@ _LEVEL = 0.05  # least slope at which an offset of the zenith has a direction
 
 
 @dataclass(frozen=True, slots=True)
-class SlopeError:
+class ZenithBias:
     """Error of the zenith of slopes: it is (1 + gain) times the true zenith, plus the offset, radians."""
 
     gain: float = 0.0
@@ -40,7 +40,7 @@ class SlopeError:
 
     def corrected(self, slopes: Slopes) -> Slopes:
         """Return slopes without this error."""
-        if self == SlopeError():
+        if self == ZenithBias():
             return slopes
         steepness = np.hypot(slopes.dz_dx, slopes.dz_dy)
         zenith = np.arctan(steepness)
@@ -49,9 +49,9 @@ class SlopeError:
             factor = np.where(steepness > 0, np.tan(true) / steepness, 1.0).astype(np.float32)
         return replace(slopes, dz_dx=slopes.dz_dx * factor, dz_dy=slopes.dz_dy * factor)
 
-    def after(self, other: SlopeError) -> SlopeError:
+    def after(self, other: ZenithBias) -> ZenithBias:
         """Return this error and another one, which was removed before."""
-        return SlopeError(
+        return ZenithBias(
             (1 + self.gain) * (1 + other.gain) - 1, self.offset * (1 + other.gain) + other.offset
         )
 
@@ -69,14 +69,14 @@ class Disagreement:
         Whether this mean is above 1 by more than chance.
     rms : float
         RMS difference, weighted as in the surface, mm; without contradiction, that of the means of cells.
-    slope_error : SlopeError, optional
+    zenith_bias : ZenithBias, optional
         The error of the slopes, if they disagree and one is significant.
     """
 
     chi2: float = math.nan
     clear: bool = False
     rms: float = math.nan
-    slope_error: SlopeError | None = None
+    zenith_bias: ZenithBias | None = None
 
 
 def find_disagreement(
@@ -87,7 +87,7 @@ def find_disagreement(
     pixel_size: tuple[float, float],
 ) -> Disagreement:
     """Compare a surface, (H, W), with the heights and weights from which it was computed with slopes."""
-    both = slopes.known & (weight > 0) & np.isfinite(surface)
+    both = slopes.defined & (weight > 0) & np.isfinite(surface)
     firm = np.where(both, weight, 0.0)
     error = np.where(both, height - surface, 0.0)
     pixels, total, first = (_cells(values) for values in (both, firm, firm * error))
@@ -101,18 +101,20 @@ def find_disagreement(
     square = np.sum(firm * error**2) / np.sum(firm) if clear else np.average(mean**2, weights=total[enough])
     rms = math.sqrt(float(square))
     return Disagreement(
-        chi2, clear, rms, find_slope_error(slopes, height, firm, pixel_size) if clear else None
+        chi2, clear, rms, find_zenith_bias(slopes, height, firm, pixel_size) if clear else None
     )
 
 
-def describe_disagreement(found: Disagreement, error: SlopeError, scatter: float) -> dict[str, ProcessValue]:
+def describe_disagreement(
+    disagreement: Disagreement, error: ZenithBias, scatter: float
+) -> dict[str, ProcessValue]:
     """Return what a result's process says of a disagreement, and of the error that was removed before.
 
     ``scatter`` is the factor by which the errors of slopes exceed those stated.
     """
     process: dict[str, ProcessValue] = {}
     findings = []
-    if error != SlopeError():
+    if error != ZenithBias():
         process |= {"slope_gain_error": error.gain, "slope_offset_error": error.offset}
         findings.append(
             Finding(
@@ -122,14 +124,14 @@ def describe_disagreement(found: Disagreement, error: SlopeError, scatter: float
                 " normals. Calibrate the zenith's gain and offset",
             )
         )
-    if found.clear:
-        process["disagreement"] = found.rms
+    if disagreement.clear:
+        process["disagreement"] = disagreement.rms
         findings.append(
             Finding(
                 "disagreement",
-                f"heights and normals disagree by {1000 * found.rms:.2g} µm, which height_sigma includes:"
-                " do both show the same surface, is the zenith's response calibrated, and is the light"
-                " steady?",
+                f"heights and normals disagree by {1000 * disagreement.rms:.2g} µm, which height_sigma"
+                " includes: do both show the same surface, is the zenith's response calibrated, and is the"
+                " light steady?",
             )
         )
     if scatter > 1:
@@ -141,9 +143,9 @@ def describe_disagreement(found: Disagreement, error: SlopeError, scatter: float
     return process | in_process(findings, {})
 
 
-def find_slope_error(
+def find_zenith_bias(
     slopes: Slopes, height: Doubles, weight: Doubles, pixel_size: tuple[float, float]
-) -> SlopeError | None:
+) -> ZenithBias | None:
     """Return the error of the zenith that heights and their weights show; None if it is not significant.
 
     Slopes are summed along parts of rows and columns. To first order, an error of the zenith theta by
@@ -161,7 +163,7 @@ def find_slope_error(
         )
     parts = []
     for slope, size, turned in ((dz_dx, pixel_size[0], False), (-dz_dy, pixel_size[1], True)):
-        maps = [slope * size, *(factor * slope * size for factor in factors), slopes.known, height, weight]
+        maps = [slope * size, *(factor * slope * size for factor in factors), slopes.defined, height, weight]
         parts += _parts([values.T for values in maps] if turned else maps)
     if len(parts) < _FEWEST_PARTS:
         return None
@@ -177,17 +179,17 @@ def find_slope_error(
     gain, offset = (float(value) for value in error)
     if not chi2 > _SIGNIFICANT or abs(gain) > _MOST_GAIN or abs(offset) > _MOST_OFFSET:
         return None
-    return SlopeError(gain, offset)
+    return ZenithBias(gain, offset)
 
 
 def _parts(maps: Sequence[NDArray[Any]]) -> list[tuple[Doubles, Doubles]]:
     """Return the normal equations of parts of rows: of errors that raise the slopes, less a common height."""
-    slope, by_gain, by_offset, known, height, weight = maps
+    slope, by_gain, by_offset, defined, height, weight = maps
     rows = slope.shape[0]
     parts = []
     step = max(_APART, -(-rows // _LINES))
     for row in range(step // 2, rows, step):
-        ends = np.flatnonzero(np.diff(known[row].astype(np.int8), prepend=0, append=0))
+        ends = np.flatnonzero(np.diff(defined[row].astype(np.int8), prepend=0, append=0))
         for start, end in zip(ends[::2], ends[1::2], strict=True):
             for first in range(start, end, _LONGEST):
                 part = row, slice(first, min(first + _LONGEST, end))

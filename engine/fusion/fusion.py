@@ -237,24 +237,28 @@ def _fuse_maps(
     """Return the surface of heights and normals."""
     height_maps = required_maps("heights", heights, "height", "height_sigma")
     normal_maps = required_maps("normals", normals, "normals", "normals_sigma")
-    wanted = _check_shapes(height_maps, normal_maps, mask)
+    selected = _check_shapes(height_maps, normal_maps, mask)
     size = pixel_size_of(height_maps, "heights", pixel_size)
     height = absolute_heights(height_maps)
     assert height is not None
     values, sigma = (np.asarray(map_, np.float64) for map_ in (height, height_maps.height_sigma))
     travel = height_maps.fitted.frame_travel
     intervals = stored_heights_as_intervals(values, sigma, None if travel is None else np.array(travel))
-    known = AbsoluteHeights.of(*intervals, wanted)
+    absolute = AbsoluteHeights.of(*intervals, selected)
     tilt = normal_maps.fitted.tilt
     moved = 0.0  # pixels that points move in frames that were not registered
     if tilt is not None and not normal_maps.fitted.registered:
-        moved = math.sin(tilt) * float(np.max(np.abs(known.height), initial=0, where=known.known)) / min(size)
-    slopes = _slopes_of_maps(normal_maps, wanted, moved)
+        moved = (
+            math.sin(tilt)
+            * float(np.max(np.abs(absolute.height), initial=0, where=absolute.defined))
+            / min(size)
+        )
+    slopes = _slopes_of_maps(normal_maps, selected, moved)
     opened = device_of_maps(device, height_maps, normal_maps)
     footprint = height_maps.fitted.footprint or PIXEL
-    solver = FusionSolver(known, size, robust, opened, footprint, doubtful=moved > 0)
+    solver = FusionSolver(absolute, size, robust, opened, footprint, doubtful=moved > 0)
     surface = solver.filled(solver.surface(slopes))
-    x, y = pixel_axes(wanted.shape, size)
+    x, y = pixel_axes(selected.shape, size)
     if height_maps.x is not None and height_maps.y is not None:
         x, y = height_maps.x, height_maps.y
     process = describe_integration([surface]) | solver.process
@@ -266,14 +270,14 @@ def _fuse_maps(
     return surface.assign(x=x, y=y, process=process, fitted=fitted)
 
 
-def _slopes_of_maps(normals: Result, wanted: Mask, moved: float) -> Slopes:
+def _slopes_of_maps(normals: Result, selected: Mask, moved: float) -> Slopes:
     """Return the slopes of a result's normals, in frames whose points moved by some pixels.
 
     Where the contact ends, but not at single pixels without it, a pixel shows points outside of the contact
     in some frames: such normals are not used. If frames were registered, which interpolates them, the errors
     of neighbours are correlated.
     """
-    contact = np.ones(wanted.shape, np.uint8)
+    contact = np.ones(selected.shape, np.uint8)
     if normals.contact is not None:
         contact = (np.asarray(normals.contact) != 0).astype(np.uint8)
     if moved > 0:
@@ -281,7 +285,7 @@ def _slopes_of_maps(normals: Result, wanted: Mask, moved: float) -> Slopes:
         whole = cv2.morphologyEx(contact, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         inner = cv2.erode(whole, np.ones((2 * border + 1, 2 * border + 1), np.uint8), borderValue=1)
         contact[inner == 0] = 0
-    contact[~wanted] = 0
+    contact[~selected] = 0
     sigma = np.asarray(normals.normals_sigma, np.float32)
     sigma = np.where((sigma >= 0) & (sigma < _SHARPEST), np.float32(_SHARPEST), sigma)
     return slopes_of(*separate_errors(normals.assign(normals_sigma=sigma)), contact)
@@ -325,19 +329,19 @@ def _fuse_sources(
     common: dict[str, Any] = {"memory_limit": memory_limit, "device": opened}
     turn = Rotation(**{**_options_of(rotation), **common})
     _check_rotation(axial, turn)
-    own = _options_of(press)
-    taken = _Evidence(blur=own.get("blur"))
-    method = Press(**{**own, **common, "fill": False, "blur": 0.0})
+    press_options = _options_of(press)
+    taken = _Evidence(blur=press_options.get("blur"))
+    method = Press(**{**press_options, **common, "fill": False, "blur": 0.0})
     pressed = run_over(vertical, method, progress, [taken])
     if not np.isfinite(pressed.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
     before = fill_with_nearest(pressed.height)
-    solver = FusionSolver(taken.known, pixel_size, robust, opened[0], taken.footprint)
+    solver = FusionSolver(taken.heights, pixel_size, robust, opened[0], taken.footprint)
     passes = _passes(axial, register)
     for number in range(passes):
         registered = turn.with_options(heights=before) if register else turn
-        done = vertical.shape[0] + number * axial.shape[0]
-        turned, slopes = _rotate(registered, axial, _after(progress, done))
+        processed = vertical.shape[0] + number * axial.shape[0]
+        turned, slopes = _rotate(registered, axial, _after(progress, processed))
         # The first of several surfaces is rarely the last one, so its sigma is not needed.
         surface = solver.surface(slopes, sigma=number > 0 or passes == 1)
         assert turned.fitted.tilt is not None
@@ -400,7 +404,7 @@ class _Evidence(Step):
         middle, between = heights_as_intervals(height, sigma, context.positions("travel"))
         # Checks and steps, such as the correction for the elastomer, move heights and change their sigma.
         larger = result.height_sigma * (between / sigma)
-        self.known = AbsoluteHeights.of(result.height + (middle - height), larger)
+        self.heights = AbsoluteHeights.of(result.height + (middle - height), larger)
         footprint = LensBlur(blur=self.blur).footprint(result, context)
         self.footprint = footprint.variance if footprint is not None and footprint.clear else PIXEL
         return result
@@ -416,8 +420,8 @@ def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:
     """Return the pixel size that both sources have, or raise InputError."""
     if (vertical.motion, axial.motion) == ("axial", "vertical"):
         raise InputError(f"{vertical.name} is the rotation and {axial.name} the press: give the press first")
-    wanted: dict[Motion, Source] = {"vertical": vertical, "axial": axial}
-    for motion, source in wanted.items():
+    by_motion: dict[Motion, Source] = {"vertical": vertical, "axial": axial}
+    for motion, source in by_motion.items():
         if source.motion != motion:
             raise InputError(
                 f"{source.name} has {source.motion} motion: a vertical one and an axial one are needed"
@@ -446,8 +450,8 @@ def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:
 
 def _check_rotation(axial: Source, rotation: Rotation) -> None:
     """Raise InputError unless a rotation has the normals of one picture."""
-    known = axial.header.zenith_gain is not None or wall_response_of(axial) is not None
-    if not known and rotation.zenith_gain is None:
+    has_gain = axial.header.zenith_gain is not None or wall_response_of(axial) is not None
+    if not has_gain and rotation.zenith_gain is None:
         raise InputError(
             f"{axial.name} has no zenith gain, so no normals to fuse: give the gain, or a calibration"
         )
@@ -467,9 +471,9 @@ def _moved(
     return float(np.percentile(change, 99) * np.sin(tilt) / min(pixel_size)) if change.size else 0.0
 
 
-def _after(progress: Progress | None, done: int) -> Progress | None:
+def _after(progress: Progress | None, processed: int) -> Progress | None:
     """Return a progress that starts at a number of frames."""
-    return None if progress is None else lambda count: progress(done + count)
+    return None if progress is None else lambda count: progress(processed + count)
 
 
 def _both(vertical: Mapping[str, ProcessValue], axial: Mapping[str, ProcessValue]) -> dict[str, ProcessValue]:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.diagnosis.blur import PIXEL
 from mirrorskin.engine.fusion.agreement import (
     Disagreement,
-    SlopeError,
+    ZenithBias,
     describe_disagreement,
     find_disagreement,
 )
@@ -63,14 +63,16 @@ class AbsoluteHeights:
     def of(cls, height: NDArray[np.floating], sigma: NDArray[np.floating], mask: Mask | bool = True) -> Self:
         """Return the finite heights of a map within a mask; sigmas are raised to at least the median."""
         height, sigma = np.asarray(height, np.float64), np.asarray(sigma, np.float64)
-        known = mask & np.isfinite(height) & (sigma >= 0) & (sigma < np.inf)
+        usable = mask & np.isfinite(height) & (sigma >= 0) & (sigma < np.inf)
         # Most pixels with a far smaller sigma than others have an unusual rise of the light.
-        least = max(float(np.median(sigma[known])), _SHARPEST) if known.any() else _SHARPEST
-        return cls(np.where(known, height, np.nan), np.where(known, np.maximum(sigma, least), np.nan))
+        lowest_sigma = max(float(np.median(sigma[usable])), _SHARPEST) if usable.any() else _SHARPEST
+        return cls(
+            np.where(usable, height, np.nan), np.where(usable, np.maximum(sigma, lowest_sigma), np.nan)
+        )
 
     @property
-    def known(self) -> Mask:
-        """Pixels with a known height, (H, W)."""
+    def defined(self) -> Mask:
+        """Pixels with a height, (H, W)."""
         return np.isfinite(self.height)
 
     @property
@@ -101,7 +103,7 @@ class FusionSolver:
         self._robust, self._device, self._footprint = robust, device, footprint
         self._doubtful = doubtful
         self._near: Result | None = None
-        self._slope_error, self._disagreement = SlopeError(), Disagreement()
+        self._zenith_bias, self._disagreement = ZenithBias(), Disagreement()
         self._correlation, self._scatter = 0.0, 1.0
 
     def surface(self, slopes: Slopes, *, sigma: bool = True) -> Result:
@@ -110,21 +112,21 @@ class FusionSolver:
         If heights and slopes contradict each other, the error of the zenith that explains it best is removed
         from the slopes, and the difference that is left is part of ``height_sigma``.
         """
-        if not (slopes.known | self._press.known).any():
+        if not (slopes.defined | self._press.defined).any():
             raise InputError("there is nothing to fuse: no pixel has a height or a normal")
-        surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
+        surface, self._disagreement = self._fit(self._zenith_bias.corrected(slopes), sigma)
         if self._disagreement.clear:  # perhaps only because the first surface was too far from the last
-            surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
+            surface, self._disagreement = self._fit(self._zenith_bias.corrected(slopes), sigma)
         doubtful = self._doubtful and math.isfinite(self._disagreement.rms)
-        contradict = doubtful or self._disagreement.clear or self._slope_error != SlopeError()
+        contradict = doubtful or self._disagreement.clear or self._zenith_bias != ZenithBias()
         for _ in range(_CORRECTIONS):
-            if not self._disagreement.clear or self._disagreement.slope_error is None:
+            if not self._disagreement.clear or self._disagreement.zenith_bias is None:
                 break
-            before, near = (surface, self._disagreement, self._slope_error), self._near
-            self._slope_error = self._disagreement.slope_error.after(self._slope_error)
-            surface, self._disagreement = self._fit(self._slope_error.corrected(slopes), sigma)
+            before, near = (surface, self._disagreement, self._zenith_bias), self._near
+            self._zenith_bias = self._disagreement.zenith_bias.after(self._zenith_bias)
+            surface, self._disagreement = self._fit(self._zenith_bias.corrected(slopes), sigma)
             if not self._disagreement.chi2 < _IMPROVED * before[1].chi2:
-                (surface, self._disagreement, self._slope_error), self._near = before, near
+                (surface, self._disagreement, self._zenith_bias), self._near = before, near
                 break
         if not contradict or surface.height_sigma is None:
             return surface
@@ -134,8 +136,8 @@ class FusionSolver:
     @property
     def process(self) -> dict[str, ProcessValue]:
         """Facts about the last surface: contradictions, and the correlation of the errors of heights."""
-        said = describe_disagreement(self._disagreement, self._slope_error, self._scatter)
-        return {**said, "height_correlation": self._correlation}
+        process = describe_disagreement(self._disagreement, self._zenith_bias, self._scatter)
+        return {**process, "height_correlation": self._correlation}
 
     def _fit(self, slopes: Slopes, sigma: bool) -> tuple[Result, Disagreement]:
         """Return the surface of heights and slopes, and their disagreement."""
@@ -151,13 +153,13 @@ class FusionSolver:
         surface = self._solve(extended, height, weight, initial_heights=near.height, sigma=sigma)
         # Outliers are not part of the surface, but may count in the next call.
         self._near = near.assign(height=np.where(surface.component < 0, near.height, surface.height))
-        found = find_disagreement(surface.height, height, weight, slopes, self._pixel_size)
+        disagreement = find_disagreement(surface.height, height, weight, slopes, self._pixel_size)
         self._correlation = _correlation_length(extended, weight)
         if surface.height_sigma is not None:
             self._scatter = _scatter(surface.height, slopes, self._pixel_size)
             surface = surface.assign(height_sigma=surface.height_sigma * np.float32(self._scatter))
             surface = _add_error_of_averaging(_set_sigma_of_lone_pixels(surface, weight), self._footprint)
-        return surface, found
+        return surface, disagreement
 
     def filled(self, surface: Result) -> Result:
         """Return a surface with its holes filled."""
@@ -168,7 +170,7 @@ class FusionSolver:
             slopes.dz_dx,
             slopes.dz_dy,
             self._pixel_size,
-            mask=slopes.known | (weight > 0),
+            mask=slopes.defined | (weight > 0),
             slope_weights=slopes.weights,
             known_heights=np.where(weight > 0, height, np.nan),
             known_height_weights=weight,
@@ -183,17 +185,17 @@ def _correlation_length(slopes: Slopes, weight: Doubles) -> float:
 
     See `mirrorskin.engine.metrology.noise`. Heights without a weight make the others less dense.
     """
-    known = slopes.known
-    if not known.any():
+    defined = slopes.defined
+    if not defined.any():
         return 0.0
-    height_weight = float(np.mean(weight[known | (weight > 0)]))
-    slope_deviation = float(np.mean(np.sqrt(slopes.weights[:, known])))
+    height_weight = float(np.mean(weight[defined | (weight > 0)]))
+    slope_deviation = float(np.mean(np.sqrt(slopes.weights[:, defined])))
     return slope_deviation / math.sqrt(height_weight) if height_weight > 0 else math.inf
 
 
 def _correct_overstated(press: AbsoluteHeights, surface: Result, slopes: Slopes) -> AbsoluteHeights:
     """Raise sigmas to the size of the errors, if the slopes show that most are much too small."""
-    both = press.known & slopes.known
+    both = press.defined & slopes.defined
     if not both.any():
         return press
     off = press.height[both] - surface.height[both]
@@ -212,15 +214,15 @@ def _extend(
     The window spans at least a terrace. Windows overlap, so each slope counts only for its share of a window.
     No slopes are added where heights do not fit a smooth surface.
     """
-    gaps = press.known & ~slopes.known
-    if not gaps.any() or not slopes.known.any():
+    gaps = press.defined & ~slopes.defined
+    if not gaps.any() or not slopes.defined.any():
         return slopes
-    sigma = float(np.median(press.sigma[press.known]))
+    sigma = float(np.median(press.sigma[press.defined]))
     width = _window(slopes, sigma, min(pixel_size))
     size = 2 * int(_NEAR * width) + 1
-    gaps &= cv2.dilate(slopes.known.view(np.uint8), np.ones((size, size), np.uint8)) > 0
+    gaps &= cv2.dilate(slopes.defined.view(np.uint8), np.ones((size, size), np.uint8)) > 0
     height = np.where(gaps, press.height, surface.height)
-    firm = slopes.known & np.isfinite(height)
+    firm = slopes.defined & np.isfinite(height)
     weight = np.where(firm, (_FIRM / sigma) ** 2, np.where(gaps, 1 / press.sigma**2, 0.0))
     trend = fit_paraboloids(height, weight, gaps, width)
     off = np.abs(height[gaps] - trend.height) > _OFF * press.sigma[gaps]
@@ -239,7 +241,7 @@ def _extend(
 
 def _window(slopes: Slopes, sigma: float, pixel: float) -> float:
     """Return the width of windows, in pixels, that span a terrace at the median slope."""
-    steepness = np.hypot(slopes.dz_dx[slopes.known], slopes.dz_dy[slopes.known])
+    steepness = np.hypot(slopes.dz_dx[slopes.defined], slopes.dz_dy[slopes.defined])
     terrace = 2 * _UNIFORM * sigma / (pixel * max(float(np.median(steepness)), _LEVEL))
     return float(np.clip(terrace, _NARROWEST, _WIDEST))
 
@@ -252,10 +254,10 @@ def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> t
     interval, the component is on one terrace, and all of its heights together count as one.
     """
     size = _sizes(surface)
-    joined = press.known & (size[surface.component] > 1)
-    both = joined & slopes.known
+    joined = press.defined & (size[surface.component] > 1)
+    both = joined & slopes.defined
     has_both = np.bincount(surface.component[both], minlength=size.size) > 0
-    joined &= slopes.known | ~has_both[surface.component]
+    joined &= slopes.defined | ~has_both[surface.component]
     height, weight = press.height.copy(), press.weight
     if not joined.any():
         return height, weight
@@ -274,7 +276,7 @@ def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> t
         if np.max(np.abs(move)) < _SETTLED * float(np.median(half)):
             break
     weight = np.nan_to_num(1 / (press.sigma**2 + spread.blur**2))
-    weight[has_both[surface.component] & ~slopes.known & (surface.component >= 0)] = 0.0
+    weight[has_both[surface.component] & ~slopes.defined & (surface.component >= 0)] = 0.0
     near = inside.weight > 0
     count = np.maximum(np.bincount(label, near, size.size), 1)
     plain = np.where(near, weight[joined] / count[label], 0.0)
@@ -337,7 +339,7 @@ def _scatter(surface: NDArray[np.floating], slopes: Slopes, pixel_size: tuple[fl
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.diff(height, axis=1) - (rise[:, 1:] + rise[:, :-1]) / 2
             misfits.append(error**2 / (variance * (1 / weight[:, 1:] + 1 / weight[:, :-1]) / 4))
-    misfit = np.concatenate([one[np.isfinite(one)] for one in misfits])
+    misfit = np.concatenate([values[np.isfinite(values)] for values in misfits])
     ratio = float(np.median(misfit)) / _USUAL_MISFIT if misfit.size >= _FEWEST else 0.0
     return float(np.sqrt(2 * ratio - 1)) if ratio > _LEAST_MISFIT else 1.0
 
@@ -354,7 +356,7 @@ def _add_error_of_averaging(surface: Result, footprint: float) -> Result:
     bend = np.zeros(height.shape)
     for axis in (0, 1):
         if height.shape[axis] > 2:
-            middle = tuple(slice(1, -1) if axis == one else slice(None) for one in (0, 1))
+            middle = tuple(slice(1, -1) if axis == inner_axis else slice(None) for inner_axis in (0, 1))
             bend[middle] += np.diff(np.where(inside, height, np.nan), 2, axis=axis)
     sigma = np.hypot(surface.height_sigma, np.nan_to_num(bend) * footprint / 2)
     return surface.assign(height_sigma=sigma.astype(np.float32))

@@ -41,16 +41,16 @@ def integrate_arrays(
     **options: Any,
 ) -> Result:
     """Return the surface of slopes or normals in arrays."""
-    on_device = any(isinstance(one, Array) for one in (dz_dx, dz_dy, normals))
+    on_device = any(isinstance(values, Array) for values in (dz_dx, dz_dy, normals))
     if on_device:
         options["device"] = device_of(options.get("device"), dz_dx, dz_dy, normals)
     chosen = IntegrationOptions(**options)
     others = camera, known_heights, initial_heights
     one_weight = slope_weights is None or np.ndim(slope_weights) == 0
-    if on_device and one_weight and not chosen.robust and all(one is None for one in others):
+    if on_device and one_weight and not chosen.robust and all(values is None for values in others):
         inputs = check_device_inputs(dz_dx, dz_dy, normals, pixel_size, mask, slope_weights, edges)
     else:
-        dz_dx, dz_dy, normals = (on_host(one) for one in (dz_dx, dz_dy, normals))
+        dz_dx, dz_dy, normals = (on_host(values) for values in (dz_dx, dz_dy, normals))
         inputs = check_inputs(
             *(dz_dx, dz_dy, pixel_size, mask, slope_weights, edges, known_heights, known_height_weights),
             normals=normals,

@@ -42,17 +42,17 @@ class Cycle:
 
     b: Array
     x: Array
-    spare: Array
+    other_x: Array
 
     def __init__(self, hierarchy: Hierarchy, lanes: int = 1) -> None:
         h, self._lanes = hierarchy, lanes
         self._h = h
         names = "right side", "heights", "other heights", "residual"
-        self.b, self.x, self.spare, self._rest = (h.array(name, lanes=lanes) for name in names)
+        self.b, self.x, self.other_x, self._rest = (h.array(name, lanes=lanes) for name in names)
         self._tail = h.first_of_tail(lanes)
         # Levels from this one on are visited twice (W-cycle), with any number of right sides.
         self._first_w_level: int = h.first_of_tail(1) if near_nodes(h.device, 1) else _FIRST_W_LEVEL
-        tiles = [self._tiles(one) for one in h.levels[: self._tail]]
+        tiles = [self._tiles(level) for level in h.levels[: self._tail]]
         self._first_tile = np.cumsum([0, *tiles])
         self.parts: Array = h.array("parts", self._tiles(h.levels[0]), lanes=lanes)
         self._live = h.array("live", max(1, int(self._first_tile[-1])), dtype=np.uint8)
@@ -137,7 +137,7 @@ class Cycle:
             again=again,
             x_before=self.x,
             keep=keep,
-            t=self.spare,
+            t=self.other_x,
             residual=self._rest,
             coarse_b=self.b,
         )
@@ -146,7 +146,7 @@ class Cycle:
         twice = self._first_w_level <= number + 1 < self._tail
         for second in (False, True)[: 1 + twice]:
             self._go(number + 1, again=second)
-        arrays = {"e": self.x, "to": h.to, "t": self.spare, "x_new": self.x, "parts": self.parts}
+        arrays = {"e": self.x, "to": h.to, "t": self.other_x, "x_new": self.x, "parts": self.parts}
         self._half("ascend", number, moved_nodes=h.moves[number], **arrays)
 
     def _run_tail(self) -> None:
@@ -162,7 +162,7 @@ class Cycle:
             "changes": h.changes,
             "b": self.b,
             "x": self.x,
-            "t": self.spare,
+            "t": self.other_x,
         }
         arguments |= {"from": self._tail, "last": last, "twice": self._tail >= self._first_w_level}
         arguments["residual"] = self._rest

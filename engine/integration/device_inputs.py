@@ -33,13 +33,16 @@ def check_device_inputs(
     maps = [normals] if normals is not None else [dz_dx, dz_dy]
     axes = 3 if normals is not None else 2
     if (
-        not all(isinstance(one, Array) and one.dtype == np.float32 and one.ndim == axes for one in maps)
-        or any(one.shape != maps[0].shape for one in maps)
+        not all(
+            isinstance(values, Array) and values.dtype == np.float32 and values.ndim == axes
+            for values in maps
+        )
+        or any(values.shape != maps[0].shape for values in maps)
         or (normals is not None and maps[0].shape[2] != 3)
     ):
-        kinds = ", ".join(f"{getattr(one, 'dtype', one)} {np.shape(one)}" for one in maps)
-        wanted = "normals (H, W, 3)" if axes == 3 else "two maps of slopes (H, W)"
-        raise InputError(f"on the device are {kinds}: {wanted} of float32 are needed")
+        kinds = ", ".join(f"{getattr(values, 'dtype', values)} {np.shape(values)}" for values in maps)
+        expected = "normals (H, W, 3)" if axes == 3 else "two maps of slopes (H, W)"
+        raise InputError(f"on the device are {kinds}: {expected} of float32 are needed")
     shape = maps[0].shape[:2]
     weight, _ = split_weights("slope_weights", slope_weights, shape)
     planes: list[Array] = []

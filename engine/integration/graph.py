@@ -185,7 +185,7 @@ class PixelGraph:
     def _run(self, name: str, macros: dict[str, int], **arguments: Any) -> None:
         counts = {"WEIGHTS": len(self._weights), "HEIGHTS": len(self.known_heights)}
         kernel = self.device.kernel("links", name, **{"MASK": 0, "KEEP": 0, **counts, **macros})
-        moved = sum(one.nbytes for one in arguments.values() if isinstance(one, Operand))
+        moved = sum(operand.nbytes for operand in arguments.values() if isinstance(operand, Operand))
         rows, columns = self.shape
         kernel(self._items(name), rows=rows, columns=columns, **arguments, moved=moved)
 
@@ -203,17 +203,17 @@ class Components:
         return len(self.offset_unknown)
 
 
-def find_components(flags: Flags, cut: bool) -> Components:
-    """Label connected pixels. ``cut``: neighbours with an answer may have no link."""
+def find_components(flags: Flags, by_links: bool) -> Components:
+    """Label connected pixels. ``by_links``: neighbours with an answer may have no link."""
     import cv2
 
     grid = (flags & (SLOPE | KNOWN) != 0).view(np.uint8)
-    if cut:  # links between the pixels
+    if by_links:  # links between the pixels
         grid = np.zeros((2 * flags.shape[0] - 1, 2 * flags.shape[1] - 1), np.uint8)
         grid[::2, ::2] = flags & (SLOPE | KNOWN)
         grid[::2, 1::2], grid[1::2, ::2] = flags[:, :-1] & RIGHT, flags[:-1] & DOWN
     count, numbers = cv2.connectedComponents(grid, connectivity=4)
-    step = 2 if cut else 1
+    step = 2 if by_links else 1
     labels, count = np.subtract(numbers[::step, ::step], 1, dtype=np.int32), count - 1
     unknown = np.ones(count, bool)
     unknown[labels[flags & KNOWN != 0]] = False
@@ -280,14 +280,16 @@ class Levelling:
         rows, count, layout = self._graph.shape[0], self._count, self._device.layout
         together = layout.group if layout.tile == 1 else 1
         group = together if count <= _FEW else 1
-        most = _PARTIAL_SUMS if layout.tile > 1 else 4 * _PARTIAL_SUMS if group > 1 else rows
-        strip = max(-(-rows // most), -(-rows * count // _MOST_SUMS))
+        max_strips = _PARTIAL_SUMS if layout.tile > 1 else 4 * _PARTIAL_SUMS if group > 1 else rows
+        strip = max(-(-rows // max_strips), -(-rows * count // _MOST_SUMS))
         strips = -(-rows // strip)
         sums, totals = (self._array(name, (strips, count)) for name in ("sums", "totals"))
-        known = {"heights": None, "height_weights": None, **maps}
+        height_maps = {"heights": None, "height_weights": None, **maps}
         sizes = {"strip": strip, "components": count}
         items = strips * (count * group if group > 1 else 1)
-        self._run("components_sum", items, relief, **known, **sizes, sums=sums, totals=totals, group=group)
+        self._run(
+            "components_sum", items, relief, **height_maps, **sizes, sums=sums, totals=totals, group=group
+        )
         high = np.float32(mean)
         self._device.kernel("components", "components_offsets", ONE=0, GROUP=together)(
             count * together, strips=strips, components=count, sums=sums, totals=totals,

@@ -120,10 +120,10 @@ def _modes(length: int) -> tuple[Floats, Floats]:
     """Return for each mode the squared responses m of differences, and t^2 of averages along links."""
     half = np.pi * np.arange(length) / (2 * length)
     pairs, fours = np.cos(half) ** 2, ((13 * np.cos(half) - np.cos(3 * half)) / 12) ** 2
-    share = max(0, length - 3) / max(1, length - 1)  # share of links with two more pixels in line
+    inner_fraction = max(0, length - 3) / max(1, length - 1)  # share of links with two more pixels in line
     return (
         (4 * np.sin(half) ** 2).astype(np.float32),
-        (pairs + share * (fours - pairs)).astype(np.float32),
+        (pairs + inner_fraction * (fours - pairs)).astype(np.float32),
     )
 
 
@@ -150,16 +150,18 @@ def _plane(weight: float, axis: int) -> tuple[Doubles, Doubles]:
     return np.expand_dims(4 * weight * np.sin(half) ** 2, 1 - axis), np.expand_dims(fours, 1 - axis)
 
 
-def expected_misfit(links: int, pixels: int, known: int, free: int, weights: tuple[float, float]) -> float:
+def expected_misfit(
+    links: int, pixels: int, known_heights: int, free: int, weights: tuple[float, float]
+) -> float:
     """Return the expected least-squares sum for noise of variance 1.
 
-    ``known`` of the ``pixels`` have a known height, and ``free`` components have none.
+    ``known_heights`` of the ``pixels`` have a known height, and ``free`` components have none.
     """
     (m_x, t_x), (m_y, t_y) = _plane(weights[0], 1), _plane(weights[1], 0)
     square = (2 * 13**2 + 2) / 24**2  # variance of the average along a link
-    left = 2 * square - float(np.mean((m_x * t_x + m_y * t_y) / (m_x + m_y)))
+    residual = 2 * square - float(np.mean((m_x * t_x + m_y * t_y) / (m_x + m_y)))
     loops = max(0, links - pixels + free)
-    return (loops + known) * (left - _BORDER * max(0.0, 1 - loops / pixels))
+    return (loops + known_heights) * (residual - _BORDER * max(0.0, 1 - loops / pixels))
 
 
 def find_exact_variance(

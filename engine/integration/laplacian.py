@@ -113,17 +113,19 @@ class _Solver:
 
     def __init__(self, device: Device, maps: list[Doubles], tolerance: float | None) -> None:
         self._tolerance = tolerance
-        (right, down, diagonal), weights = maps, np.concatenate([one.ravel() for one in maps])
+        (right, down, diagonal), weights = maps, np.concatenate([plane.ravel() for plane in maps])
         weights = weights[weights > 0]
         self._unit = float(np.median(weights)) if weights.size else 1.0
         whole = np.pad(right, ((0, 0), (0, 1))), np.pad(down, ((0, 1), (0, 0))), diagonal
-        weigh = [np.asarray(one / self._unit, np.float32) for one in whole]
+        weigh = [np.asarray(plane / self._unit, np.float32) for plane in whole]
         bits = zip(weigh, (RIGHT, DOWN, KNOWN), strict=True)
-        flags = np.bitwise_or.reduce([np.where(one > 0, bit, SLOPE).astype(np.uint8) for one, bit in bits])
-        components = find_components(flags | np.uint8(SLOPE), cut=True)
+        flags = np.bitwise_or.reduce(
+            [np.where(plane > 0, bit, SLOPE).astype(np.uint8) for plane, bit in bits]
+        )
+        components = find_components(flags | np.uint8(SLOPE), by_links=True)
         self._labels = components.labels.ravel()
         self._free, self._pixels = components.offset_unknown, np.bincount(self._labels)
-        arrays = [device.from_host("links", one) for one in weigh]
+        arrays = [device.from_host("links", plane) for plane in weigh]
         anchor = arrays[2] if weigh[2].any() else None
         source = device.from_host("source", np.zeros(diagonal.shape))
         self._links = Links(device, diagonal.shape, arrays[0], arrays[1], anchor, source)
@@ -145,15 +147,16 @@ class _Solver:
         return solution.T.reshape(np.shape(sources))
 
     def _solve(self, maps: Array) -> Array:
-        found = self._multigrid.solve_many(maps, tolerance=self._tolerance)
-        if not found.converged:
+        solutions = self._multigrid.solve_many(maps, tolerance=self._tolerance)
+        if not solutions.converged:
             raise NotConverged(
-                f"the Laplacian's solution did not converge: {found.iterations} iterations left a residual of"
-                f" {found.residual:.2g}, more than {self._tolerance:.2g}; give a larger tolerance"
+                f"the Laplacian's solution did not converge: {solutions.iterations} iterations left a"
+                f" residual of {solutions.residual:.2g}, more than {self._tolerance:.2g};"
+                " give a larger tolerance"
             )
-        return found.height
+        return solutions.height
 
     def _centred(self, values: Doubles) -> Doubles:
         """Return values, (K, N), minus the mean of each component whose offset is free."""
-        means = [np.bincount(self._labels, one) / self._pixels for one in values]
+        means = [np.bincount(self._labels, map_) / self._pixels for map_ in values]
         return values - np.where(self._free, means, 0.0)[:, self._labels]

@@ -165,7 +165,7 @@ class Multigrid:
             self.rebuild(self._links, strength=JOINED)
         h, solver = self._hierarchy, self._alone
         cycle = solver.cycle
-        find_graph_variance(h, flags, (cycle.x, cycle.b, cycle.spare, solver.before, solver.p))
+        find_graph_variance(h, flags, (cycle.x, cycle.b, cycle.other_x, solver.before, solver.p))
         sigma = self._device.array("sigma", self._links.shape, np.float32)
         limits: dict[str, Any] = {"least": LEAST, "wanted": SLOPE | KNOWN, "flags": flags}
         h.copy_picture("deviation", cycle.x, sigma, inverse=h.inverse, **limits)
@@ -235,19 +235,19 @@ class _Gradients:
         """Solve; return the number of cycles, and the residuals."""
         enough = _FAILED if tolerance is None else tolerance
         count, goal = (_CYCLES, 0.0) if tolerance is None else (limit, tolerance)
-        done, residual = self._iterate(goal, min(count, _USUAL), deadline)
+        cycles, residual = self._iterate(goal, min(count, _USUAL), deadline)
         ready = time.perf_counter() + _FACTORS * sum(level.nodes for level in self._h.levels[1:2])
         late = deadline is not None and ready > deadline
         assert self._given is not None
-        left = 0 if np.isnan(self._given).any() else _CYCLES if tolerance is None else count - done
-        if (residual > enough).any() and left > 0 and not late and self.cycle.factorise():
+        remaining = 0 if np.isnan(self._given).any() else _CYCLES if tolerance is None else count - cycles
+        if (residual > enough).any() and remaining > 0 and not late and self.cycle.factorise():
             self._take()
             self.copy("admit", self.source, self._sources, self._batch)
             self.find_residual()
             self._dot(self.cycle.b, self.cycle.b, self._squares)
-            more, residual = self._iterate(goal, left, deadline)
-            done += more
-        return done, residual
+            more, residual = self._iterate(goal, remaining, deadline)
+            cycles += more
+        return cycles, residual
 
     def finish(self, map_: Array, batch: slice = slice(0, 1)) -> None:
         """Add the last step to the heights, and copy them to a batch of maps."""
@@ -281,18 +281,18 @@ class _Gradients:
     @np.errstate(all="ignore")  # the iteration stops on overflow
     def _iterate(self, goal: float, limit: int, deadline: float | None) -> tuple[int, Doubles]:
         """Do conjugate gradient steps; return their number, and the residuals."""
-        done, residual, energy = 0, np.full(self.lanes, np.inf), np.zeros(self.lanes)
+        cycles, residual, energy = 0, np.full(self.lanes, np.inf), np.zeros(self.lanes)
         best, progress = residual.copy(), np.zeros(self.lanes, int)
         last, untested = np.ones(self.lanes), 1
         moving = np.ones(self.lanes, bool)
-        while done < limit and moving.any():
-            begun, first = time.perf_counter(), done
+        while cycles < limit and moving.any():
+            begun, first = time.perf_counter(), cycles
             if (moving != self._active).any():
                 self._moving.write(moving.astype(np.float32))
                 self._active = moving.copy()
-            unseen = not (done or self.started) and deadline is None and goal < _DEEP
-            least = _CYCLES + (self._waits_long and goal <= _DEEPEST)
-            count = min(least if unseen else untested if deadline is None else 1, limit - done)
+            unseen = not (cycles or self.started) and deadline is None and goal < _DEEP
+            min_cycles = _CYCLES + (self._waits_long and goal <= _DEEPEST)
+            count = min(min_cycles if unseen else untested if deadline is None else 1, limit - cycles)
             for number in range(count):
                 self._step(first + number)
             arrays = (self._sides,) if self._given is None and self.started else ()
@@ -306,7 +306,7 @@ class _Gradients:
                     return self._iterate(goal, limit, deadline)
             # A step of length 0, where a product is not positive, leaves heights and residual unchanged.
             steps = int((history[:, 0] > 0).any(axis=1).sum())
-            done = first + steps
+            cycles = first + steps
             product, _, rest = history[max(steps, 1) - 1]
             after = history[steps, 2] if 0 < steps < count else _sum(parts)
             residual[moving & ~(product > 0) & (rest <= _ROUNDING**2 * self._given)] = 0
@@ -321,16 +321,16 @@ class _Gradients:
             error = np.sqrt(_ratio(_ratio(product * after, rest, valid), energy, valid))
             residual[moving] = np.where(valid, error, np.inf)[moving]
             untested = (
-                _cycles_to(goal, residual[moving], last[moving], done - first) if self._waits_long else 1
+                _cycles_to(goal, residual[moving], last[moving], cycles - first) if self._waits_long else 1
             )
             last = residual.copy()
             better = residual < _PROGRESS * best
-            best, progress = np.where(better, residual, best), np.where(better, done, progress)
-            moving &= (residual > goal) & (residual <= _WORSE * best) & (done - progress < _PATIENCE)
+            best, progress = np.where(better, residual, best), np.where(better, cycles, progress)
+            moving &= (residual > goal) & (residual <= _WORSE * best) & (cycles - progress < _PATIENCE)
             now = time.perf_counter()
             if deadline is not None and now + (now - begun) > deadline:
                 break
-        return done, residual
+        return cycles, residual
 
     def _step(self, number: int) -> None:
         """Enqueue a cycle and a step; the history gets a row of this number."""
@@ -373,8 +373,8 @@ class _Gradients:
 
     def _read(self, *arrays: Array, rows: slice = slice(None)) -> list[Doubles]:
         """Wait once for the device, and return arrays, of the first one some rows, as float64."""
-        wanted = [(array, slice(None) if number else rows) for number, array in enumerate(arrays)]
-        return [part.astype(np.float64) for part in fetch(wanted, [True] * len(arrays))]
+        requests = [(array, slice(None) if number else rows) for number, array in enumerate(arrays)]
+        return [part.astype(np.float64) for part in fetch(requests, [True] * len(arrays))]
 
 
 def _cycles_to(goal: float, residual: Doubles, last: Doubles, cycles: int) -> int:

@@ -40,7 +40,7 @@ class Slopes:
     weights: Floats  # (2, H, W): inverse variances of both; 0 where undefined
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def defined(self) -> NDArray[np.bool_]:
         """Where there are slopes, (H, W)."""
         return np.asarray(self.weights[0] > 0)
 
@@ -60,8 +60,8 @@ def integrate_result(
     """
     separate, independent_sigma = separate_errors(result, noise_gain)
     surface = integrate_normals(separate, independent_sigma, pixel_size, robust=robust, device=device)
-    for share in _common_shares(result):
-        sigma = np.hypot(surface.height_sigma, np.float32(share) * surface.height)
+    for fraction in _common_shares(result):
+        sigma = np.hypot(surface.height_sigma, np.float32(fraction) * surface.height)
         surface = surface.assign(height_sigma=sigma)
     return surface
 
@@ -92,9 +92,9 @@ def _common_shares(result: Result) -> Iterator[float]:
     if fitted.light_variance is not None:
         cosine = result.normals[..., 2].astype(np.float64)
         error = light_sigma(result.normals, fitted.light_variance) / cosine**2
-        known = np.isfinite(error) & (True if result.contact is None else result.contact > 0)
-        steepness = np.sqrt(1 / cosine[known] ** 2 - 1)
-        yield math.sqrt(float(np.mean(error[known] ** 2) / np.mean(steepness**2)))
+        finite = np.isfinite(error) & (True if result.contact is None else result.contact > 0)
+        steepness = np.sqrt(1 / cosine[finite] ** 2 - 1)
+        yield math.sqrt(float(np.mean(error[finite] ** 2) / np.mean(steepness**2)))
     if fitted.swing_range is not None:
         yield fitted.swing_range
 
@@ -136,7 +136,7 @@ def _with_zenith_errors(slopes: Slopes, sigma: Floats) -> Slopes:
     square = slopes.dz_dx**2 + slopes.dz_dy**2
     factor = ((1 + square) * sigma) ** 2 / np.maximum(square, np.float32(1e-12))
     parts = np.stack([slopes.dz_dx**2 * factor, slopes.dz_dy**2 * factor])
-    weights = np.where(slopes.known, slopes.weights / (1 + slopes.weights * np.nan_to_num(parts)), 0)
+    weights = np.where(slopes.defined, slopes.weights / (1 + slopes.weights * np.nan_to_num(parts)), 0)
     return replace(slopes, weights=weights.astype(np.float32))
 
 
@@ -169,11 +169,11 @@ def find_slopes(
     ``independent_sigma`` replaces sigma in the weights: independent errors with the same mean over many
     pixels. The zenith is limited to 80 degrees.
     """
-    least = math.inf if tilt is None else math.sin(tilt) ** 2
+    floor = math.inf if tilt is None else math.sin(tilt) ** 2
     white = sigma if independent_sigma is None else independent_sigma
     usable = (contact != 0) & (white > 0) & (white < np.inf)
-    dz_dx, dz_dy, *squares = find(least, normals, np.float32(math.sqrt(turns)) * sigma, usable)
-    weights = weigh(least, (0.0, math.inf), white, dz_dx, *squares)
+    dz_dx, dz_dy, *squares = find(floor, normals, np.float32(math.sqrt(turns)) * sigma, usable)
+    weights = weigh(floor, (0.0, math.inf), white, dz_dx, *squares)
     return Slopes(dz_dx, dz_dy, np.stack(weights))
 
 
@@ -226,15 +226,15 @@ def describe_integration(surfaces: Sequence[Result]) -> dict[str, ProcessValue]:
     each = [surface.fitted for surface in surfaces]
     return {
         "integration": each[0].integration or "",
-        "integration_iterations": max(one.integration_iterations or 0 for one in each),
-        "integration_residual": max(one.integration_residual or 0.0 for one in each),
+        "integration_iterations": max(surface.integration_iterations or 0 for surface in each),
+        "integration_residual": max(surface.integration_residual or 0.0 for surface in each),
     }
 
 
 def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, device: Device) -> Result:
     """Return the surface of one picture; it has no pixels if there are no normals."""
-    if not slopes.known.any():
-        nan, shape = np.full(slopes.known.shape, np.nan, np.float32), slopes.known.shape
+    if not slopes.defined.any():
+        nan, shape = np.full(slopes.defined.shape, np.nan, np.float32), slopes.defined.shape
         return Result(
             height=nan,
             height_sigma=nan.copy(),
@@ -246,7 +246,7 @@ def _integrate(slopes: Slopes, pixel_size: tuple[float, float], robust: bool, de
         slopes.dz_dx,
         slopes.dz_dy,
         pixel_size,
-        mask=slopes.known,
+        mask=slopes.defined,
         slope_weights=slopes.weights,
         robust=robust,
         budget=_NO_LIMIT,
@@ -287,12 +287,12 @@ class SlopeKernels:
         """
         rows, columns = self._shape
         pixels, tile = rows * columns, self._device.layout.tile
-        width, least = 8 if tile > 1 else 1, math.sin(tilt) ** 2
+        width, floor = 8 if tile > 1 else 1, math.sin(tilt) ** 2
         find = self._device.kernel("slopes", "slopes_find", WIDTH=width)
         find(
             -(-pixels // tile),
             pixels=pixels,
-            least=least,
+            least=floor,
             vectors=normals["vectors"],
             sigma=normals["sigma"],
             contact=normals["contact"],
@@ -302,13 +302,13 @@ class SlopeKernels:
             moved=33 * pixels,
         )
         if math.isnan(self.typical):
-            self._weigh(least, width, (0.0, math.inf), normals["sigma"], to)
+            self._weigh(floor, width, (0.0, math.inf), normals["sigma"], to)
             self.typical = _typical(to["weight_x"], to["weight_y"])
         typical = 1.0 if math.isnan(self.typical) else self.typical
-        self._weigh(least, width, (LEAST * typical, MOST * typical), normals["sigma"], to)
+        self._weigh(floor, width, (LEAST * typical, MOST * typical), normals["sigma"], to)
 
     def _weigh(
-        self, least: float, width: int, bounds: tuple[float, float], sigma: Array, to: Mapping[str, Array]
+        self, floor: float, width: int, bounds: tuple[float, float], sigma: Array, to: Mapping[str, Array]
     ) -> None:
         rows, columns = self._shape
         tile = self._device.layout.tile
@@ -318,7 +318,7 @@ class SlopeKernels:
             -(-rows // strip) * -(-columns // min(tile, _CHUNK)),
             rows=rows,
             columns=columns,
-            least=least,
+            least=floor,
             lowest=bounds[0],
             highest=bounds[1],
             sigma=sigma,

@@ -106,12 +106,12 @@ def find_doubt(difference: Floats, labels: Labels) -> Floats:
 
 
 def place_parts(
-    labels: Labels, ties: Ties, difference: Floats, components: Components, known: Floats
+    labels: Labels, ties: Ties, difference: Floats, components: Components, known_heights: Floats
 ) -> Floats:
     """Return by how much each part has to be lifted.
 
-    ``difference`` is the plain surface less the robust one, and ``known`` the weight of known heights. The
-    lifts d of the parts minimise ::
+    ``difference`` is the plain surface less the robust one, and ``known_heights`` the weight of known
+    heights. The lifts d of the parts minimise ::
 
         sum of g (d_a - d_b)^2  over the ties between parts, of confidence g
         + sum of c n / N (d_a - m_a)^2  +  sum of k d_a^2  over parts of n of the N pixels of a component
@@ -136,7 +136,7 @@ def place_parts(
     ends = np.concatenate([second, first, first, second])
     weights = np.concatenate([-confidence, -confidence, confidence, confidence])
     matrix = sparse.coo_array((weights, (rows, ends)), (count, count)).tocsc()
-    matrix += sparse.diags_array(prior + np.bincount(part, known[answered], count), format="csc")
+    matrix += sparse.diags_array(prior + np.bincount(part, known_heights[answered], count), format="csc")
     return np.atleast_1d(spsolve(matrix, pull)).astype(np.float32)
 
 
@@ -147,7 +147,7 @@ def find_ties(labels: Labels, right: Floats, down: Floats) -> Ties:
     for first, second, confidence in pairs:
         between = (first != second) & (confidence > 0) & (first >= 0) & (second >= 0)
         ends.append([first[between], second[between], confidence[between]])
-    first, second, confidence = (np.concatenate(one) for one in zip(*ends, strict=True))
+    first, second, confidence = (np.concatenate(ends_of_all) for ends_of_all in zip(*ends, strict=True))
     return _sum_ties(first, second, confidence, int(labels.max(initial=-1)) + 1)
 
 

@@ -53,7 +53,7 @@ def make_plan(length: int, lanes: int) -> dict[str, Table]:
     plan = np.stack([radices, size // np.cumprod(radices, dtype=np.intp)], axis=1).astype(np.intp)
     roots, turns = np.exp(-2j * np.pi * np.arange(size) / size), np.exp(0.5j * np.pi * mode / length)
     numbers = {"roots": roots, "turns": turns, "chirp": chirp, "other": other}
-    parts = {name: np.stack([one.real, one.imag], axis=-1) for name, one in numbers.items()}
+    parts = {name: np.stack([values.real, values.imag], axis=-1) for name, values in numbers.items()}
     return {"plan": plan, "place": place, **parts}
 
 
@@ -199,11 +199,11 @@ class Rectangle:
             self._deviation = screening, np.sqrt(variance)
         return self._deviation[1]
 
-    def _excess(self, misfit: float, known: bool) -> float:
+    def _excess(self, misfit: float, anchored: bool) -> float:
         """Return the misfit over that expected for noise of variance 1; NaN without a loop of links."""
         rows, columns = self.shape[-2:]
         links, pixels = rows * (columns - 1) + (rows - 1) * columns, rows * columns
-        unit = expected_misfit(links, pixels, pixels * known, int(not known), self._weights)
+        unit = expected_misfit(links, pixels, pixels * anchored, int(not anchored), self._weights)
         return misfit / unit if unit > 0 else math.nan
 
     def _rates(
@@ -216,17 +216,17 @@ class Rectangle:
     def _prepare(self, length: int, groups: int) -> tuple[int, dict[str, int], dict[str, Any]]:
         """Return the number of work-groups for lines of a length, the kernels' macros, and their tables."""
         tables = make_plan(length, self._lanes)
-        steps, size, room = len(tables["plan"]), len(tables["roots"]), _MOST_ROOM
+        steps, size, capacity = len(tables["plan"]), len(tables["roots"]), _MOST_ROOM
         if self._lanes == 1:
-            room = max(_LEAST_ROOM, 1 << (size - 1).bit_length())
-        inside = size <= room <= _MOST_ROOM
+            capacity = max(_LEAST_ROOM, 1 << (size - 1).bit_length())
+        inside = size <= capacity <= _MOST_ROOM
         scratch = self._array("scratch", (1 if inside else groups * size * 2 * self._lanes,))
         odd = int(tables["plan"][:, 0].max(initial=0) >= _RARE)
         arrays = {
             name: self._device.from_host(name, table, np.int32 if table.dtype == np.intp else np.float32)
             for name, table in tables.items()
         }
-        macros = {"LANES": self._lanes, "ROOM": room if inside else 0, "ODD": odd}
+        macros = {"LANES": self._lanes, "ROOM": capacity if inside else 0, "ODD": odd}
         sizes = {"length": length, "size": size, "steps": steps}
         return groups, macros, {**sizes, **arrays, "scratch": scratch}
 

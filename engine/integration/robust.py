@@ -174,10 +174,10 @@ class _Search:
                 heights = self._solve(heights, _LOOSE).height
         return heights
 
-    def link(self, heights: Array, scale: float = 1.0, most: float = math.inf) -> float:
+    def link(self, heights: Array, scale: float = 1.0, cap: float = math.inf) -> float:
         """Compute the weights of links from the misfit of heights; return the number of broken links."""
         names = "weight_x", "weight_y", "rise_x", "rise_y", "right", "down", "source"
-        numbers = {"sharpness": self._sharpness / scale**2, "most": min(most, _GONE), "slack": _SLACK}
+        numbers = {"sharpness": self._sharpness / scale**2, "most": min(cap, _GONE), "slack": _SLACK}
         maps = {**{name: self._maps[name] for name in names}, **self._slopes}
         maps |= {"held": self._held, "heights": heights, "sums": self._sums}
         self._run("links", **maps, **self._size, **numbers)
@@ -197,10 +197,10 @@ class _Search:
         self, heights: Array, flags: Flags, tolerance: float, plain: Floats, components: Components
     ) -> Robust:
         """Cut broken links, solve the rest to the tolerance, place the parts, and return the surface."""
-        done = not self.late()
+        complete = not self.late()
         self.link(heights)
         right, down = self._confidence()
-        self.link(heights, most=_BROKEN)
+        self.link(heights, cap=_BROKEN)
         last = self._solve(heights, tolerance)
         for _ in range(_AGAIN):  # a restart recomputes the residual, whose rounding errors stop the iteration
             if last.converged or self.late():
@@ -208,9 +208,9 @@ class _Search:
             last = self._solver.solve(last.height, tolerance=tolerance, deadline=self._deadline)
         answered = components.labels >= 0
         parts, relief = find_parts(right, down, answered), last.height.read()
-        known = np.zeros_like(relief) if self._links.anchor is None else self._links.anchor.read()
+        anchor_weight = np.zeros_like(relief) if self._links.anchor is None else self._links.anchor.read()
         ties = find_ties(parts, right, down)
-        lifts = place_parts(parts, ties, plain - relief, components, known)
+        lifts = place_parts(parts, ties, plain - relief, components, anchor_weight)
         joined = join_fragments(parts, ties)
         largest = largest_within(parts, joined)
         relief += np.where(answered, lifts[largest], 0)
@@ -231,7 +231,7 @@ class _Search:
             doubt=doubt,
             iterations=self._steps,
             residual=last.residual,
-            converged=done and last.converged,
+            converged=complete and last.converged,
         )
 
     def _confidence(self) -> tuple[Floats, Floats]:
@@ -245,8 +245,8 @@ class _Search:
         for link, trusted, full in maps:
             weight = full.read()
             with np.errstate(invalid="ignore", divide="ignore"):
-                share = np.sqrt(self._maps[trusted].read() / weight)
-                confidence = self._maps[link].read() / weight * share
+                trust = np.sqrt(self._maps[trusted].read() / weight)
+                confidence = self._maps[link].read() / weight * trust
             confidences.append(np.where(weight > 0, confidence, np.float32(0)))
         return confidences[0], confidences[1]
 
@@ -277,10 +277,10 @@ class _Search:
         size = {name: length / mean for name, length in self._size.items()}
         self._run("curl", flags=self._given("flags", flags, np.uint8), **self._slopes, **size, curl=curl)
         sizes = np.abs(curl.read())
-        most, step = float(sizes.max()), max(1, sizes.size // _SAMPLES)
+        largest, step = float(sizes.max()), max(1, sizes.size // _SAMPLES)
         samples = sizes.ravel()[::step][(flags & (RIGHT | DOWN) == RIGHT | DOWN).ravel()[::step]]
         noise = mad_sigma(samples)
-        self.contradicted = most > _CLEAR * noise
+        self.contradicted = largest > _CLEAR * noise
         return curl, noise
 
     def _array(self, name: str, shape: tuple[int, ...]) -> Array:

@@ -114,9 +114,9 @@ def _curls(sums: tuple[Doubles, Doubles], gaps: tuple[Doubles, Doubles] | None, 
     """Return the sums around squares of side x side links where all slopes exist, (loops,)."""
     if min(sums[0].shape) <= side:
         return np.zeros(0)
-    sides = [_around(one, side) for one in (sums, gaps) if one is not None]
-    top, bottom, left, right = sides[0]
-    curl = bottom - top + right - left
+    sides = [_around(values, side) for values in (sums, gaps) if values is not None]
+    top, bottom, before, after = sides[0]
+    curl = bottom - top + after - before
     return curl.ravel() if gaps is None else curl[np.sum(sides[1], axis=0) == 0]
 
 

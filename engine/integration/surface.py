@@ -274,14 +274,14 @@ class SurfaceSolver:
 
     def _above_plane(self, start: NDArray[np.floating], inputs: Inputs, plane: Plane) -> Floats:
         """Return first heights above the plane, 0 where they are unknown."""
-        known = np.isfinite(start)
+        finite = np.isfinite(start)
         along_x, along_y, begin = self._graph.steps(plane)
         row, column = np.ogrid[: start.shape[0], : start.shape[1]]
         above = start - (begin + along_x * column + along_y * row)
         datum = inputs.datum
         if inputs.known_heights is None:
-            datum = float(np.mean(above, where=known)) if known.any() else 0.0
-        return np.where(known, above - datum, 0.0).astype(np.float32)
+            datum = float(np.mean(above, where=finite)) if finite.any() else 0.0
+        return np.where(finite, above - datum, 0.0).astype(np.float32)
 
     def _finish(self, inputs: Inputs, options: IntegrationOptions, relief: _Relief) -> Result:
         """Add plane and offsets to the relief, and estimate the standard deviation."""
@@ -313,8 +313,8 @@ class SurfaceSolver:
         if self._cache.components is None:
             flags = self._cache.flags
             alone = (flags & (SLOPE | KNOWN)) == KNOWN
-            cut = inputs.edges is not None or inputs.weight_y is not None or bool(alone.any())
-            self._cache.components = find_components(flags, cut)
+            by_links = inputs.edges is not None or inputs.weight_y is not None or bool(alone.any())
+            self._cache.components = find_components(flags, by_links)
         return self._cache.components
 
     def _find_sigma(self, inputs: Inputs, relief: _Relief, components: Components, factor: float) -> Floats:
@@ -348,15 +348,15 @@ class SurfaceSolver:
         flags = self._cache.flags if relief.flags is None else relief.flags
         ends = self._link_weights(inputs)
         count = {bit: int(np.count_nonzero(flags & bit)) for bit in (RIGHT, DOWN, KNOWN, SLOPE | KNOWN)}
-        links, share = count[RIGHT] + count[DOWN], 1.0
+        links, loop_fraction = count[RIGHT] + count[DOWN], 1.0
         if relief.links is not None:  # the mean weight is this share of the full weight
             maps = relief.links.right, relief.links.down
             total = sum(
                 float(link.read().sum(dtype=np.float64)) / w for link, w in zip(maps, ends, strict=True)
             )
-            share = total / max(1, links)
+            loop_fraction = total / max(1, links)
         free = int(np.count_nonzero(components.offset_unknown))
-        unit = share * expected_misfit(links, count[SLOPE | KNOWN], count[KNOWN], free, ends)
+        unit = loop_fraction * expected_misfit(links, count[SLOPE | KNOWN], count[KNOWN], free, ends)
         misfit = 0.0
         each = inputs.each()
         for number, (surface, plane) in enumerate(zip(each, relief.planes, strict=True)):

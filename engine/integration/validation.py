@@ -78,8 +78,10 @@ class Inputs:
         """Return inputs whose slopes have the weights of equally noisy normals."""
         if self.steep is None:
             return self
-        given = [plane for plane in (self.weight_x, self.weight_y) if plane is not None]
-        planes = [self.steep * plane for plane in given] or [np.float32(self.typical_weight) * self.steep]
+        given_planes = [plane for plane in (self.weight_x, self.weight_y) if plane is not None]
+        planes = [self.steep * plane for plane in given_planes] or [
+            np.float32(self.typical_weight) * self.steep
+        ]
         typical = _median(planes)
         planes = [_clipped(plane, typical * LEAST, typical * MOST) for plane in planes]
         second = planes[1] if len(planes) > 1 else None
@@ -133,7 +135,7 @@ def check_inputs(
     if steep is not None and not robust:
         planes = [steep * plane for plane in planes] or [np.float32(weight) * steep]
     typical = _median(planes) if planes else weight
-    known, datum = None, 0.0
+    relative_heights, datum = None, 0.0
     if heights is not None and height_weight:
         exact = np.asarray(heights[box], np.float64)
         if camera is not None:
@@ -145,7 +147,7 @@ def check_inputs(
             counted &= plane > 0
         if counted.any():  # relative to their mean, because float32 would lose digits
             datum = float(np.mean(exact, where=counted))
-            known = np.where(counted, exact - datum, np.nan).astype(np.float32)
+            relative_heights = np.where(counted, exact - datum, np.nan).astype(np.float32)
     largest = _LARGEST_HEIGHT_WEIGHT * typical / min(size) ** 2
     planes = [_clipped(plane, typical * LEAST, typical * MOST) for plane in planes]
     height_planes = [_clipped(plane, 0.0, largest) for plane in height_planes]
@@ -160,8 +162,8 @@ def check_inputs(
         typical_weight=typical,
         weights_given=slope_weights is not None,
         steep=steep,
-        known_heights=known,
-        known_height_weights=height_planes[0] if height_planes and known is not None else None,
+        known_heights=relative_heights,
+        known_height_weights=height_planes[0] if height_planes and relative_heights is not None else None,
         known_height_weight=min(height_weight, largest),
         datum=datum,
         picture=shape,
@@ -214,24 +216,24 @@ def _may_answer(
     box: Box, slopes: Callable[[Box], Slopes], mask: Flags | None, heights: NDArray[Any] | None
 ) -> Mask:
     """Return which pixels of a box have slopes or a known height."""
-    wanted: Mask | None = None if mask is None else mask[box] != 0
-    if wanted is not None and not wanted.any():
-        return wanted
+    selected: Mask | None = None if mask is None else mask[box] != 0
+    if selected is not None and not selected.any():
+        return selected
     x, y, _ = slopes(box)
     answered: Mask = np.isfinite(x) & np.isfinite(y)
     if answered.ndim == 3:
         answered = np.logical_and.reduce(answered)
     if heights is not None:
         answered |= np.isfinite(heights[box])
-    return answered if wanted is None else answered & wanted
+    return answered if selected is None else answered & selected
 
 
 def _count(box: Box, mask: Flags | None, weights: list[Floats]) -> int:
     """Return the number of pixels of a box whose slopes are wanted."""
-    wanted = np.ones([part.stop - part.start for part in box], bool) if mask is None else mask[box] != 0
+    selected = np.ones([part.stop - part.start for part in box], bool) if mask is None else mask[box] != 0
     if weights:
-        wanted = wanted & np.logical_or.reduce([plane[box] > 0 for plane in weights])
-    return int(np.count_nonzero(wanted))
+        selected = selected & np.logical_or.reduce([plane[box] > 0 for plane in weights])
+    return int(np.count_nonzero(selected))
 
 
 def logarithm(name: str, depths: NDArray[Any]) -> NDArray[np.float64]:
@@ -261,7 +263,7 @@ def as_marks(name: str, values: ArrayLike | None, shape: tuple[int, ...]) -> Fla
 
 
 def split_weights(
-    name: str, values: ArrayLike | None, shape: tuple[int, ...], most: int = 2
+    name: str, values: ArrayLike | None, shape: tuple[int, ...], max_planes: int = 2
 ) -> tuple[float, list[Floats]]:
     """Return a factor, and the maps to be multiplied by it; no maps if all weights are equal."""
     if values is None:
@@ -272,8 +274,8 @@ def split_weights(
         if not 0 <= weight < math.inf:
             raise InputError(f"{name} {weight}: an inverse variance of 0 or more is needed")
         return weight, []
-    if array.shape != shape and (most == 1 or array.shape != (2, *shape)):
-        pairs = " or (2, H, W)" if most == 2 else ""
+    if array.shape != shape and (max_planes == 1 or array.shape != (2, *shape)):
+        pairs = " or (2, H, W)" if max_planes == 2 else ""
         raise InputError(f"{name}: shape {array.shape}; one number, (H, W){pairs} as the slopes is needed")
     if not (array.min() >= 0 and array.max() < math.inf):
         raise InputError(f"{name}: some are negative or not finite; give inverse variances, 0 where unknown")
@@ -293,9 +295,9 @@ def _median(planes: list[Floats]) -> float:
     return median_weight([plane[step // 2 :: step, step // 2 :: step] for plane in planes])
 
 
-def _clipped(plane: Floats, least: float, most: float) -> Floats:
+def _clipped(plane: Floats, lowest: float, highest: float) -> Floats:
     """Return weights, clipped where they are above 0."""
     positive = plane > 0
-    if np.min(plane, where=positive, initial=np.inf) >= least and plane.max() <= most:
+    if np.min(plane, where=positive, initial=np.inf) >= lowest and plane.max() <= highest:
         return plane
-    return np.where(positive, np.clip(plane, least, most), 0).astype(np.float32)
+    return np.where(positive, np.clip(plane, lowest, highest), 0).astype(np.float32)

@@ -67,7 +67,7 @@ class WarmStartIntegrator(ThreadSafe):
         return self._height
 
     def _level(self) -> Floats:
-        components = find_components(self._graph.flags.read(after=self._flagged), cut=False)
+        components = find_components(self._graph.flags.read(after=self._flagged), by_links=False)
         if components.count == 0:
             self._steps = 0
             return np.full(self._shape, np.nan, np.float32)

@@ -73,12 +73,12 @@ class Loop:
         mark: Mark | None = None,
         guard: Callable[[], AbstractContextManager[Any]] = nullcontext,
     ) -> None:
-        most = run.operation.updates_per_second if updates is None else updates
-        for name, number in (("latency", latency), ("updates", most)):
+        rate_limit = run.operation.updates_per_second if updates is None else updates
+        for name, number in (("latency", latency), ("updates", rate_limit)):
             if not number > 0:
                 raise InputError(f"{name} {number}: a number above 0 is needed")
         self._source, self._run = source, run
-        self._latency, self._period = latency, 1 / most
+        self._latency, self._period = latency, 1 / rate_limit
         self._on_update, self._stop, self._mark, self._guard = on_update, stop, mark, guard
         self._monitor = Monitor()
         self._taken = self._updated = -math.inf  # time of the newest frame that was pushed, of an update
@@ -138,16 +138,16 @@ class Loop:
         (at, position, picture), frames = self._newest, self._monitor.used
         maps = self._run.maps(max(_PATIENCE, self._idle()))
         update = Update(frames, at, self._source.motion, position, picture.copy(), maps)
-        done = self._source.now()
+        finished = self._source.now()
         self._updated, self._pending = started, False
         self._monitor.updated()
-        self._monitor.time(UPDATED, done - started)
+        self._monitor.time(UPDATED, finished - started)
         self._arrived.append(self._taken)
         if update.first is not None:
-            self._monitor.time(SHOWN, done - self._taken)
+            self._monitor.time(SHOWN, finished - self._taken)
         if update.height is not None:
             lag = min(update.height_lag, len(self._arrived) - 1)
-            self._monitor.time(RAISED, done - self._arrived[-1 - lag])
+            self._monitor.time(RAISED, finished - self._arrived[-1 - lag])
         if self._on_update is not None:
             self._on_update(update, self._monitor.status())
 

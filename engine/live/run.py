@@ -51,8 +51,8 @@ class LiveRun(Run):
             plan = getattr(operation, "live_plan", operation.plan)(source)
             steps = [*plan.steps, Undistortion()] if hasattr(operation, "live_plan") else plan.steps
             _check_positions(source, plan.operation)
-            most = 2 * _FRAMES * math.prod(source.shape[1:]) * source.dtype.itemsize
-            configured = plan.operation.with_options(memory_limit=most)
+            limit = 2 * _FRAMES * math.prod(source.shape[1:]) * source.dtype.itemsize
+            configured = plan.operation.with_options(memory_limit=limit)
             super().__init__(replace(plan, operation=configured, steps=steps), source)
         rocks = source.motion == "axial" and source.header.tilt is None
         self.position: str = "tilt" if rocks else POSITIONS[source.motion]

@@ -287,8 +287,8 @@ class _Pushed(Closing):
         part = out[: len(taken)]
         np.stack(frames, out=part)
         first, self._count = self._count, self._count + len(taken)
-        known: dict[str, Any] = {name: np.array([one[name] for one in places]) for name in places[0]}
-        return Block(part, first, time=np.array(times), dropped=lost, **known)
+        positions: dict[str, Any] = {name: np.array([place[name] for place in places]) for name in places[0]}
+        return Block(part, first, time=np.array(times), dropped=lost, **positions)
 
     def wait(self) -> None:
         """Wait until no frame waits and the reader asks for more."""

@@ -81,9 +81,9 @@ class Equations:
         deviations.
         """
         full = self.normal_matrix + _FLOOR * np.trace(self.normal_matrix) / 6 * np.eye(6)
-        share, directions = eigh((self.unbiased + self.unbiased.T) / 2, full)
+        eigenvalues, directions = eigh((self.unbiased + self.unbiased.T) / 2, full)
         noise = noise or max(self.chi_square, 1.0)
-        return np.linalg.qr(directions[:, share < noise / (1 + noise)])[0]
+        return np.linalg.qr(directions[:, eigenvalues < noise / (1 + noise)])[0]
 
     def covariance(self, free: Doubles) -> Doubles:
         """Return the covariance of the motion, except in some directions.
@@ -146,7 +146,7 @@ class PairFit:
         rows, columns = first.shape
         side = BLOCK * step
         blocks = -(-rows // side) * -(-columns // side)
-        maps = *second.extent.middle, *first.grid, *second.grid, first.least, second.least
+        maps = *second.extent.middle, *first.grid, *second.grid, first.flat_limit, second.flat_limit
         rows_of_poses = [[*motion.turn.ravel(), *motion.shift, *maps] for motion in motions]
         shape = len(motions), blocks, PARTS[-1 if unbiased else -2]
         if shape not in self._arrays:
@@ -226,13 +226,13 @@ class PairFit:
             merit = (chi[overlap, 0] - gain) / np.maximum(compared[overlap, 0], 1e-9)
             candidates += zip(merit, itertools.compress(starts, overlap), strict=True)
         candidates.sort(key=lambda candidate: candidate[0])
-        best, least = None, math.inf
+        best, lowest = None, math.inf
         for _, start in candidates[:_TRIED]:
             motion = self.refine(start)
             if motion is not None:
                 now = self.equations(motion)
-                if now.pixels > _SHARED * self.first.extent.pixels and now.typical < least:
-                    best, least = motion, now.typical
+                if now.pixels > _SHARED * self.first.extent.pixels and now.typical < lowest:
+                    best, lowest = motion, now.typical
         return best
 
     def _starts(self) -> Iterator[list[Motion]]:

@@ -63,14 +63,14 @@ class PoseMap:
     records : Array, (H, W, 8), float32
         On the device.
     grid : tuple of float
-    least : float
+    flat_limit : float
         Squared sine of the tilt with which the normals were measured, or 1.
     extent : Extent
     """
 
     records: Array
     grid: Grid
-    least: float
+    flat_limit: float
     extent: Extent
 
     @classmethod
@@ -101,18 +101,18 @@ class PoseMap:
         return np.stack([x + column * step_x, y - row * step_y, height], axis=-1)
 
 
-def coarser(maps: Sequence[PoseMap], least: int) -> list[list[PoseMap]]:
-    """Return maps at half of their resolution, a quarter and so on, while the first has ``least`` pixels.
+def coarser(maps: Sequence[PoseMap], min_size: int) -> list[list[PoseMap]]:
+    """Return maps at half of their resolution, a quarter and so on, while the first has ``min_size`` pixels.
 
     They are means of 2 x 2 pixels, if all four are valid.
     """
-    levels = [[(one.records, one.grid) for one in maps]]
-    while min(levels[-1][0][0].shape[:2]) >= 2 * least and min(levels[-1][-1][0].shape[:2]) >= 2:
-        levels.append([_halved(*one) for one in levels[-1]])
-    pairs = [one for level in levels[1:] for one in level]
+    levels = [[(map_.records, map_.grid) for map_ in maps]]
+    while min(levels[-1][0][0].shape[:2]) >= 2 * min_size and min(levels[-1][-1][0].shape[:2]) >= 2:
+        levels.append([_halved(*pair) for pair in levels[-1]])
+    pairs = [pair for level in levels[1:] for pair in level]
     extents = iter(_extents(pairs) if pairs else ())
     return [
-        [PoseMap(*one, map_.least, next(extents)) for one, map_ in zip(level, maps, strict=True)]
+        [PoseMap(*pair, map_.flat_limit, next(extents)) for pair, map_ in zip(level, maps, strict=True)]
         for level in levels[1:]
     ]
 
@@ -141,7 +141,7 @@ def _extents(maps: Sequence[tuple[Array, Grid]]) -> list[Extent]:
             summary=summary, moved=records.nbytes,
         )  # fmt: skip
         summaries.append(summary)
-    return [Extent.of(values) for values in fetch([(one, slice(None)) for one in summaries])]
+    return [Extent.of(values) for values in fetch([(summary, slice(None)) for summary in summaries])]
 
 
 def _grid(result: Result, pixel_size: ArrayLike | None) -> Grid:
@@ -187,7 +187,7 @@ def _records(result: Result, grid: Grid, device: Device, curved: bool) -> Array:
         "records": device.array("records", (*shape, 8), np.float32, zeroed=False),
         "slopes": device.array("slopes", (2, *shape), np.float32, zeroed=False),
     }
-    moved = sum(one.nbytes for one in maps.values() if one is not None)
+    moved = sum(values.nbytes for values in maps.values() if values is not None)
     _run(device, "pose_records", rows, columns, **maps, moved=moved)
     records: Array = maps["records"]
     if curved:

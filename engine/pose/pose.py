@@ -172,8 +172,8 @@ def estimate_pose(
     before, after = (PoseMap.of(result, pixel_size, opened) for result in results.values())
     fit = PairFit(before, after, opened)
     pose = pose_of(fit, *fit.solve(None if start is None else start.motion))
-    findings = [one for name, result in results.items() for one in findings_of(name, result.process)]
-    return replace(pose, notes=tuple(one.text for one in findings))
+    findings = [finding for name, result in results.items() for finding in findings_of(name, result.process)]
+    return replace(pose, notes=tuple(finding.text for finding in findings))
 
 
 def pose_of(fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose:

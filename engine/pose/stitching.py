@@ -127,7 +127,7 @@ def stitch(
     graph = _Graph(maps, names, opened)
     poses = graph.solve()
     merged = _merged(touches, maps, poses, names)
-    inherited = carried({}, **{str(name): one.process for name, one in zip(names, touches, strict=True)})
+    inherited = carried({}, **{str(name): touch.process for name, touch in zip(names, touches, strict=True)})
     merged = merged.assign(process={**merged.process, **inherited})
     return Stitch(merged, tuple(poses), len(graph.links))
 
@@ -183,21 +183,21 @@ class _Graph:
         """Return the motion from the first touch to each, by least squares over all links."""
         count, motions = 6 * (len(self._maps) - 1), self._motions
         for _ in range(_ROUNDS):
-            normal, right = np.zeros((count, count)), np.zeros(count)
+            normal, gradient = np.zeros((count, count)), np.zeros(count)
             for (first, second), link in self.links.items():
                 between = motions[first].inverse().then(motions[second])
                 error = link.motion.inverse().then(between)
                 rest = np.concatenate([Rotation.from_matrix(error.turn).as_rotvec(), error.shift])
                 weight = _information(link)
                 parts = {first: -between.adjoint(), second: np.eye(6)}
-                for i, left in parts.items():
+                for i, jacobian_i in parts.items():
                     for k, jacobian in parts.items():
                         if i and k:
-                            normal[_part(i), _part(k)] += left.T @ weight @ jacobian
+                            normal[_part(i), _part(k)] += jacobian_i.T @ weight @ jacobian
                     if i:
-                        right[_part(i)] -= left.T @ weight @ rest
+                        gradient[_part(i)] -= jacobian_i.T @ weight @ rest
             covariance = np.linalg.pinv(normal, _UNFIT, hermitian=True)
-            step = (covariance @ right).reshape(-1, 6)
+            step = (covariance @ gradient).reshape(-1, 6)
             steps = zip(motions[1:], step, strict=True)
             motions = [STILL, *(motion.small_step(d, np.zeros(3)) for motion, d in steps)]
         poses = [IDENTITY]
@@ -238,10 +238,10 @@ def _merged(
     with_normals = all(touch.normals is not None and touch.normals_sigma is not None for touch in touches)
     unknown = touches[0].offset_unknown is not None and bool(np.any(touches[0].offset_unknown))
     placed: list[_Moved] = []
-    for touch, known, pose in zip(touches, maps, poses, strict=True):
+    for touch, map_, pose in zip(touches, maps, poses, strict=True):
         relative = unknown or (touch.offset_unknown is not None and bool(touch.offset_unknown.any()))
         before = sums if relative and placed else None
-        moved = _Moved.of(touch, known, pose, x, y, with_normals, before)
+        moved = _Moved.of(touch, map_, pose, x, y, with_normals, before)
         sums.add(moved)
         placed.append(moved)
     return sums.result(placed, x, y, poses, names, unknown)
@@ -252,8 +252,8 @@ def _axes(maps: Sequence[PoseMap], poses: Sequence[Pose]) -> tuple[Doubles, Doub
     x, y, step_x, step_y = maps[0].grid
     moved = [pose.inverse().apply(map_.points)[:, :2] for map_, pose in zip(maps, poses, strict=True)]
     points = np.concatenate(moved)
-    (left, low), (right, high) = points.min(axis=0), points.max(axis=0)
-    columns = np.arange(np.round((left - x) / step_x), np.round((right - x) / step_x) + 1)
+    (lowest_x, low), (highest_x, high) = points.min(axis=0), points.max(axis=0)
+    columns = np.arange(np.round((lowest_x - x) / step_x), np.round((highest_x - x) / step_x) + 1)
     rows = np.arange(np.round((y - high) / step_y), np.round((y - low) / step_y) + 1)
     return x + columns * step_x, y - rows * step_y
 
@@ -273,7 +273,7 @@ class _Moved:
     def of(
         cls,
         touch: Result,
-        known: PoseMap,
+        map_: PoseMap,
         pose: Pose,
         x: Doubles,
         y: Doubles,
@@ -282,7 +282,7 @@ class _Moved:
     ) -> _Moved:
         """Move a touch; an unknown offset is determined from earlier touches."""
         assert touch.height is not None
-        left, top, step_x, step_y = known.grid
+        x0, y0, step_x, step_y = map_.grid
         height = np.asarray(touch.height, np.float32).copy()
         if touch.filled is not None:
             height[touch.filled != 0] = np.nan
@@ -290,32 +290,34 @@ class _Moved:
         motion, size = pose.motion, (len(y), len(x))
         down, right = np.gradient(height)
         slopes = right / step_x, -down / step_y
-        above = np.full(across.shape, float(np.nanmedian(pose.inverse().apply(known.points)[:, 2])))
+        above = np.full(across.shape, float(np.nanmedian(pose.inverse().apply(map_.points)[:, 2])))
         level, middle, of_level = 0.0, np.zeros(6), 0.0
         for _ in range(1 if before is None else _LEVELLINGS):
             motion = Motion(motion.turn, motion.shift - [0.0, 0.0, level * motion.turn[2, 2]])
             for _ in range(_NEWTON):
                 place = motion.apply(np.stack([across, up, above], axis=-1))
                 points = SamplePoints.at(
-                    (place[:, 0] - left) / step_x, (top - place[:, 1]) / step_y, height.shape
+                    (place[:, 0] - x0) / step_x, (y0 - place[:, 1]) / step_y, height.shape
                 )
-                found = points.interpolate(height).astype(np.float64)
-                here = np.nan_to_num(found - place[:, 2])
+                surface = points.interpolate(height).astype(np.float64)
+                here = np.nan_to_num(surface - place[:, 2])
                 above = above + here / motion.turn[2, 2]
             p, q = (np.nan_to_num(points.interpolate(np.asarray(slope, np.float32))) for slope in slopes)
             upright = np.stack([-p, -q, np.ones_like(p)], axis=-1)
             steep = upright @ motion.turn[:, 2]  # change of the surface's distance per change of z
             lever = np.concatenate([np.cross(place, upright), upright], axis=-1) / steep[:, np.newaxis]
-            own = points.interpolate(_variance_of(touch).astype(np.float32)).astype(np.float64) / steep**2
+            touch_variance = (
+                points.interpolate(_variance_of(touch).astype(np.float32)).astype(np.float64) / steep**2
+            )
             if before is not None:
-                heights = np.where(np.isfinite(found), above, np.nan)
-                level, middle, of_level = before.level(heights, own, lever)
+                heights = np.where(np.isfinite(surface), above, np.nan)
+                level, middle, of_level = before.level(heights, touch_variance, lever)
             if not np.isfinite(level):
                 break
         lever -= middle  # levelling removes the mean effect of the pose's error
         common = np.einsum("ni,ij,nj->n", lever, pose.covariance, lever) + of_level
-        above, variance = above + level, own + common
-        answered = np.isfinite(found) & np.isfinite(variance)
+        above, variance = above + level, touch_variance + common
+        answered = np.isfinite(surface) & np.isfinite(variance)
         touched = np.isfinite(touch.height) if touch.contact is None else touch.contact != 0
         contact = points.nearest_values(touched, False) & points.inside
         normals = square = None
@@ -350,8 +352,8 @@ class _Sums:
         self._contact = np.zeros(shape, bool)
 
     def add(self, moved: _Moved) -> None:
-        known = np.isfinite(moved.height)
-        weight = np.where(known, 1 / moved.variance, 0.0)
+        finite = np.isfinite(moved.height)
+        weight = np.where(finite, 1 / moved.variance, 0.0)
         self._weight += weight
         self._height += weight * np.nan_to_num(moved.height)
         self._common += weight * np.nan_to_num(moved.common)
@@ -401,14 +403,14 @@ class _Sums:
             off = np.nan_to_num(moved.height - height)
             apart = np.fmax(apart, off**2 / np.where(np.isfinite(moved.variance), moved.variance, 1.0))
             spread += np.where(np.isfinite(moved.variance), off**2 / moved.variance, 0.0)
-        known = self._weight > 0
-        differs = known & (apart > _APART**2)
+        covered = self._weight > 0
+        differs = covered & (apart > _APART**2)
         with np.errstate(invalid="ignore", divide="ignore"):
             sigma = np.where(differs, np.maximum(sigma, np.sqrt(spread / self._weight)), sigma)
         status = np.where(
             differs,
             StitchStatus.INCONSISTENT,
-            np.where(known, StitchStatus.CONSISTENT, StitchStatus.NO_HEIGHT),
+            np.where(covered, StitchStatus.CONSISTENT, StitchStatus.NO_HEIGHT),
         ).astype(np.uint8)
         maps: dict[str, Any] = {}
         if self._normal_weight.any():
@@ -418,7 +420,7 @@ class _Sums:
             maps["normals"] = normals.astype(np.float32)
             maps["normals_sigma"] = np.where(self._normal_weight > 0, spread, np.nan).astype(np.float32)
         if unknown:
-            maps["component"] = np.where(known, 0, -1).astype(np.int32)
+            maps["component"] = np.where(covered, 0, -1).astype(np.int32)
             maps["offset_unknown"] = np.ones(1, np.uint8)
         process: dict[str, ProcessValue] = {**signature(), "method": "stitch", "touches": len(placed)}
         for number, (name, pose) in enumerate(zip(names, poses, strict=True)):
@@ -426,8 +428,8 @@ class _Sums:
             parts = ", ".join(f"{part:.6g}" for part in (*pose.rotation, *pose.translation))
             process[f"pose_{number}"] = f"{parts} (rad, mm)"
         return Result(
-            height=np.where(known, height, np.nan).astype(np.float32),
-            height_sigma=np.where(known, sigma, np.nan).astype(np.float32),
+            height=np.where(covered, height, np.nan).astype(np.float32),
+            height_sigma=np.where(covered, sigma, np.nan).astype(np.float32),
             status=status,
             contact=self._contact.astype(np.uint8),
             x=x,

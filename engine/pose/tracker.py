@@ -80,7 +80,9 @@ class PoseTracker(ThreadSafe):
             ignored.
         """
         result = as_result(maps, "result")
-        self._notes = tuple(one.text for one in findings_of(f"result {self._results}", result.process))
+        self._notes = tuple(
+            finding.text for finding in findings_of(f"result {self._results}", result.process)
+        )
         pose = self._find(result)
         self._results += 1
         return self._noted(pose)

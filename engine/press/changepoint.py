@@ -116,8 +116,8 @@ class ChangePoint(PressOperation):
         self._noise.look(frames)
         if not self._twice:
             level = round(self._level * UNIT)
-            least = self.hold * (UNIT - level)
-            self._maps.scan("changepoint_scan", frames, level=level, least=least, quiet=self._quiet())
+            lowest_drift = self.hold * (UNIT - level)
+            self._maps.scan("changepoint_scan", frames, level=level, least=lowest_drift, quiet=self._quiet())
         elif self._weight is None:
             self._maps.scan("changepoint_sum", frames)
         elif self.count + len(frames) < len(self._weight):
@@ -149,7 +149,9 @@ class ChangePoint(PressOperation):
 
     def _estimate_levels(self, noise: float) -> None:
         """Compute the levels from the best splits, where they are significant."""
-        score, mean, start = (one.astype(np.float64) for one in self._maps.read("score", "mean", "start"))
+        score, mean, start = (
+            values.astype(np.float64) for values in self._maps.read("score", "mean", "start")
+        )
         changed = score**2 * self.count / 2 > (_EVIDENCE + np.log(self.count)) * noise**2
         split = np.where(changed, start, 1)
         rest = np.sqrt((self.count - split) / split)

@@ -195,10 +195,10 @@ class Crossing:
         }
         self._maps = Picture(operation, "onset", planes, tile=_TILE)
         dark, bright = reference_maps(operation.dark, operation.bright, shape, dtype)
-        share = threshold - _ROUNDING
-        coarse = float(np.float32(share))
+        fraction = threshold - _ROUNDING
+        coarse = float(np.float32(fraction))
         self._maps.run(
-            "onset_levels", release=self._release, share=coarse, share_rest=share - coarse,
+            "onset_levels", release=self._release, share=coarse, share_rest=fraction - coarse,
             darks=PerPixel(dark), dark_step=dark.ndim // 2, brights=PerPixel(bright),
             bright_step=bright.ndim // 2,
         )  # fmt: skip

@@ -84,12 +84,12 @@ def stored_heights_as_intervals(height: Doubles, sigma: Doubles, travel: Doubles
     unchanged. Their sigma shows by how much checks have enlarged that of an interval. Without a travel,
     middles are the heights that several pixels share.
     """
-    known = np.isfinite(height) & np.isfinite(sigma)
+    finite = np.isfinite(height) & np.isfinite(sigma)
     if travel is None:
-        travel = _estimated_travel(height[known], sigma[known])
+        travel = _estimated_travel(height[finite], sigma[finite])
     middle, usual, between = _between_frames(height, sigma, travel)
     exact = between & (np.abs(height - middle) < _ROUNDED * usual)
-    if np.count_nonzero(exact) <= _LEAST_EXACT * np.count_nonzero(known):
+    if np.count_nonzero(exact) <= _LEAST_EXACT * np.count_nonzero(finite):
         return Intervals(height, sigma)
     larger = np.median(sigma[exact] / usual[exact])
     return Intervals(np.where(between, middle, height), np.where(between, larger * usual, sigma))
@@ -161,12 +161,12 @@ def estimate_interval_errors(error: Doubles, half: Doubles) -> IntervalErrors:
         outliers = share(density)
         return -float(np.sum(np.log(outliers / span + (1 - outliers) * density)))
 
-    least = np.log(_LEAST * middle)
-    most = np.log(max(float(np.max(np.abs(error))), middle)) + 1.0
-    sizes = np.linspace(least, most, 12)
+    lowest = np.log(_LEAST * middle)
+    highest = np.log(max(float(np.max(np.abs(error))), middle)) + 1.0
+    sizes = np.linspace(lowest, highest, 12)
     best = int(np.argmin([unlikely(size) for size in sizes]))
     low, high = sizes[max(best - 1, 0)], sizes[min(best + 1, sizes.size - 1)]
-    size = min((least, _lowest(unlikely, low, high)), key=unlikely)
+    size = min((lowest, _lowest(unlikely, low, high)), key=unlikely)
     outliers = share(_chance(error, half, float(np.exp(size))) / (2 * half))
     return IntervalErrors(float(np.exp(size)), outliers / (1 - outliers) / span)
 
@@ -192,9 +192,11 @@ def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: I
     near = (below < _FAR) & (above > -_FAR)
     below, above = np.where(near, below, -1.0), np.where(near, above, 1.0)
     chance = normal_distribution(above) - normal_distribution(below)
-    left, right = (np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) / chance for end in (below, above))
-    pull = left - right
-    weight = np.clip(pull**2 - (below * left - above * right), _FAINT, 1.0)
+    density_below, density_above = (
+        np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) / chance for end in (below, above)
+    )
+    pull = density_below - density_above
+    weight = np.clip(pull**2 - (below * density_below - above * density_above), _FAINT, 1.0)
     sound = chance / (chance + 2 * half * outlier_density)
     return Evidence(height + blur * pull / weight, np.where(near, sound * weight / blur**2, 0.0))
 
@@ -220,17 +222,17 @@ def _lowest(function: Callable[[float], float], low: float, high: float) -> floa
     Loading SciPy's minimiser, which a fusion does not need otherwise, would take a quarter of a second.
     """
     golden = (math.sqrt(5) - 1) / 2
-    left, right = high - golden * (high - low), low + golden * (high - low)
-    lefts, rights = function(left), function(right)
+    first, second = high - golden * (high - low), low + golden * (high - low)
+    firsts, seconds = function(first), function(second)
     while high - low > _NEAR:
-        if lefts < rights:
-            high, right, rights = right, left, lefts
-            left = high - golden * (high - low)
-            lefts = function(left)
+        if firsts < seconds:
+            high, second, seconds = second, first, firsts
+            first = high - golden * (high - low)
+            firsts = function(first)
         else:
-            low, left, lefts = left, right, rights
-            right = low + golden * (high - low)
-            rights = function(right)
+            low, first, firsts = first, second, seconds
+            second = low + golden * (high - low)
+            seconds = function(second)
     return (low + high) / 2
 
 

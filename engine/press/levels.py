@@ -83,9 +83,9 @@ class Levels(ThresholdOperation):
         light = [np.isin(maps.status, (PressStatus.ONSET, PressStatus.LIGHT_AT_START)) for maps in levels]
         passed = np.sum(np.logical_and.accumulate(light), axis=0).astype(np.intp)
         passed[levels[0].status == PressStatus.INVALID_INPUT] = -1  # the last entry of the bounds, NaN
-        least = np.array([0, *self.inclinations, np.nan], np.float32)
+        lowest = np.array([0, *self.inclinations, np.nan], np.float32)
         greatest = np.array([*self.inclinations, np.nan, np.nan], np.float32)
-        return self.as_result(levels[0], slope_min=least[passed], slope_max=greatest[passed])
+        return self.as_result(levels[0], slope_min=lowest[passed], slope_max=greatest[passed])
 
 
 def _listed(numbers: Any) -> str:

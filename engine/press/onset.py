@@ -56,7 +56,7 @@ class ThresholdOperation(PressOperation):
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare a search for each threshold."""
         self._searches = [
-            Crossing(self, shape, dtype, threshold=share, event=self.event) for share in self.shares
+            Crossing(self, shape, dtype, threshold=threshold, event=self.event) for threshold in self.shares
         ]
 
     @property

@@ -88,15 +88,15 @@ class RollingShutter(Step):
         time = context.time[kept]
         rows, columns = result.height.shape
         top, whole = 0, rows
-        own = getattr(source, "source", source)
-        if isinstance(own, Recording):
-            top, whole = own.origin[0], own.full_shape[1]
+        recording = getattr(source, "source", source)
+        if isinstance(recording, Recording):
+            top, whole = recording.origin[0], recording.full_shape[1]
         late = line_time * (top + np.arange(rows) - (whole - 1) / 2)
-        known = np.isfinite(result.height)
-        when = np.interp(-result.height[known], travel, time)
-        when += np.broadcast_to(late[:, np.newaxis], (rows, columns))[known]
+        finite = np.isfinite(result.height)
+        when = np.interp(-result.height[finite], travel, time)
+        when += np.broadcast_to(late[:, np.newaxis], (rows, columns))[finite]
         height = result.height.copy()
-        height[known] = -_travel_at(when, time, travel)
+        height[finite] = -_travel_at(when, time, travel)
         return result.assign(height=height, process={**result.process, "line_time": line_time})
 
 

@@ -39,8 +39,8 @@ def coarse_heights(
 
     shape = contact.shape
     step = -(-max(shape) // _CELLS)
-    east, north, share, level = _cells(vectors, contact, too_level, step)
-    valid = share > 0
+    east, north, coverage, level = _cells(vectors, contact, too_level, step)
+    valid = coverage > 0
     if not valid.any():
         return np.full(shape, float(press))
     size = step * pixel_size[0], step * pixel_size[1]
@@ -67,8 +67,8 @@ def coarse_heights(
     tops = ndimage.maximum(surface.height, label, np.arange(surface.component.max() + 1))
     heights = np.where(label >= 0, surface.height - np.asarray(tops)[label], np.nan)
     places = np.meshgrid(*((np.arange(length) + 0.5) / step - 0.5 for length in shape), indexing="ij")
-    found = ndimage.map_coordinates(fill_with_nearest(heights), places, order=1, mode="nearest")
-    return np.asarray(np.clip(press + found, 0.0, max(press, 0.0)))
+    interpolated = ndimage.map_coordinates(fill_with_nearest(heights), places, order=1, mode="nearest")
+    return np.asarray(np.clip(press + interpolated, 0.0, max(press, 0.0)))
 
 
 def _cells(vectors: NDArray[np.float32], contact: NDArray[np.uint8], too_level: Mask, step: int) -> Doubles:

@@ -202,8 +202,8 @@ class EdgeDrawing:
         part = -(-items // (parts * kernel.group)) * kernel.group  # so that no item is run twice
         for first in range(0, items, part):
             count = min(part, items - first)
-            share = moved * count // items
-            kernel(count, rows=rows, columns=columns, **arguments, moved=share, first_item=first)
+            part_bytes = moved * count // items
+            kernel(count, rows=rows, columns=columns, **arguments, moved=part_bytes, first_item=first)
             yield
 
 

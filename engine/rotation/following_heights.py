@@ -57,8 +57,8 @@ class FollowingHeights:
     def wait(self, seconds: float) -> None:
         """Wait for the running step, with a timeout, and take its heights."""
         if self._step is not None:
-            done, _ = wait_for([self._step], None if seconds == math.inf else max(0.0, seconds))
-            if done:
+            finished, _ = wait_for([self._step], None if seconds == math.inf else max(0.0, seconds))
+            if finished:
                 step, self._step = self._step, None
                 self.height, self._in_height = step.result(), self._in_step
 

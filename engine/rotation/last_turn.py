@@ -161,14 +161,14 @@ class LastTurn(Normals):
         """Return a frame of a plane whose zenith is in the middle of the visible range."""
         gain = None if self.zenith_gain is None else np.asarray(self.zenith_gain, np.float64)
         tilt = None if self.tilt is None or isinstance(self.tilt, str) else np.asarray(self.tilt, np.float64)
-        swing = 1.0 if gain is None or tilt is None else gain * tilt
+        amplitude = 1.0 if gain is None or tilt is None else gain * tilt
         offset = np.asarray(0.0 if self.zenith_offset is None else self.zenith_offset, np.float64)
         level = offset if self.zenith_offset is None else offset + (0.5 if gain is None else 0.5 * gain)
         ends = [np.asarray(end, np.float64) for end in (self.dark, self.bright) if end is not None]
         if len(ends) == 2:
             level = np.mean(np.stack(np.broadcast_arrays(*ends)), axis=0)
-        most = np.iinfo(self.dtype).max if self.dtype.kind == "u" else np.inf
-        frame = np.clip(level + swing * math.cos(phase), 0, most)
+        greatest = np.iinfo(self.dtype).max if self.dtype.kind == "u" else np.inf
+        frame = np.clip(level + amplitude * math.cos(phase), 0, greatest)
         return np.broadcast_to(np.nan_to_num(frame), (1, *self.shape)).astype(self.dtype)
 
 

@@ -143,14 +143,14 @@ class NormalsFunction(Protocol[P]):
 
 def _choose(positions: dict[str, Any], options: dict[str, Any]) -> tuple[Operation, dict[str, Any]]:
     """Return the operation for the given positions, turns of one tilt, or poses; and its positions."""
-    given = {name: None if one is None else as_series(name, one) for name, one in positions.items()}
-    phase, axis, travel, weights = (given[name] for name in ("phase", "axis", "travel", "frame_weights"))
+    series = {name: None if values is None else as_series(name, values) for name, values in positions.items()}
+    phase, axis, travel, weights = (series[name] for name in ("phase", "axis", "travel", "frame_weights"))
     tilt = options.pop("tilt", None)
     angle = None if tilt is None or isinstance(tilt, str) else as_series("tilt", tilt).astype(np.float64)
     varies = angle is not None and (angle.ndim > 0 or rocks(phase))
     if axis is None and travel is None and not varies:
         return Normals(tilt=tilt, **options), {"phase": phase, "frame_weights": weights}
-    count = next((len(one) for one in (phase, axis) if one is not None and np.ndim(one)), 0)
+    count = next((len(values) for values in (phase, axis) if values is not None and np.ndim(values)), 0)
     pose = check_poses(count, phase, angle, axis, travel)
     for name in (Normals.options.keys() - MovingNormals.options) & options.keys():
         if options.pop(name) != Normals.options[name].default:

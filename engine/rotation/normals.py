@@ -402,8 +402,8 @@ class Normals(NormalsOperation):
         if tilt is None:
             return None
         maps = self.zenith_gain, self.zenith_offset, self.dark
-        scale = [np.asarray(0.0 if one is None else one, np.float64) for one in maps]
-        at_grid = [one if one.ndim == 0 else samples.of_map(one).ravel() for one in scale]
+        scale = [np.asarray(0.0 if values is None else values, np.float64) for values in maps]
+        at_grid = [values if values.ndim == 0 else samples.of_map(values).ravel() for values in scale]
         values = samples.values
         light = find_frame_light(
             values.reshape(len(values), -1), self.positions_so_far("phase"), tilt, *at_grid

@@ -201,7 +201,7 @@ class NormalKernel:
             "sin_tilt": math.sin(tilt),
             "noise_base": noise.base,
             "noise_slope": noise.slope,
-            "noise_least": noise.least,
+            "noise_least": noise.floor,
             "noise_limit": limits.noise,
             "limit": limits.model,
             "still_below": limits.still - fitted,

@@ -126,8 +126,8 @@ def pose_fit(pose: Doubles, weights: Doubles, rocked: float | None = None) -> Po
     matrix = np.linalg.pinv(design * root[:, np.newaxis], rcond=_PLANE) * root
     with np.errstate(divide="ignore", invalid="ignore"):
         outwards = np.where(across[:, np.newaxis] > 0, axes[:, :2] / across[:, np.newaxis], 0.0)
-    share = tilts / tilt
-    leaning = share * np.stack([*(np.cos(tilts) * outwards.T), -np.sin(tilts)])
+    relative_tilt = tilts / tilt
+    leaning = relative_tilt * np.stack([*(np.cos(tilts) * outwards.T), -np.sin(tilts)])
     return PoseFit(
         weights,
         matrix,

@@ -68,10 +68,10 @@ class Response:
         ``wave``, (3, n), is the mean, cosine and sine of the samples, counts.
         """
         offset, per_count = self.thinned(step)[:2]
-        mean, swing = (wave[0] - offset) * per_count, np.hypot(*wave[1:]) * np.abs(per_count)
+        mean, amplitude = (wave[0] - offset) * per_count, np.hypot(*wave[1:]) * np.abs(per_count)
         low, high = self.wall.ends
         with np.errstate(invalid="ignore"):
-            return np.asarray((mean - swing > low) & (mean + swing < high))
+            return np.asarray((mean - amplitude > low) & (mean + amplitude < high))
 
     def too_level(self, mean: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return where the surface is so level that it reflects the space above the wall's rim."""

@@ -138,7 +138,7 @@ class Texture:
     ----------
     covariance : ndarray, (rows, columns, 2, 2), float64
         Covariance of a displacement, pixels^2, to the right and down.
-    there : ndarray, (rows, columns), bool
+    textured : ndarray, (rows, columns), bool
         Whether the texture's derivatives exceed those of noise, in every direction.
     usable : ndarray, (rows, columns), bool
         Whether the window has enough samples.
@@ -149,7 +149,7 @@ class Texture:
     """
 
     covariance: Doubles
-    there: NDArray[np.bool_]
+    textured: NDArray[np.bool_]
     usable: NDArray[np.bool_]
     variance: Doubles
     noise: float
@@ -161,25 +161,25 @@ class Texture:
         Both the reference and a frame have noise, so that the covariance is 2 variance / information.
         """
         level = tracker.finest
-        known = variance[np.isfinite(variance)] if noise is None else np.array([noise**2])
-        usual = float(np.median(known)) if known.size else np.nan
+        variances = variance[np.isfinite(variance)] if noise is None else np.array([noise**2])
+        usual = float(np.median(variances)) if variances.size else np.nan
         variance = np.where(np.isfinite(variance) & (noise is None), variance, usual)
         spurious = GRADIENT_NOISE * variance * level.measured
         first, mixed, last = level.information
         mean, half = (first + last) / 2, (first - last) / 2
-        least = mean - spurious - np.sqrt(half**2 + mixed**2)  # smaller eigenvalue
-        there = least >= np.maximum(spurious, np.finfo(float).tiny)
+        smallest = mean - spurious - np.sqrt(half**2 + mixed**2)  # smaller eigenvalue
+        textured = smallest >= np.maximum(spurious, np.finfo(float).tiny)
         inverse = 2 * variance * invert_symmetric(level.information)
-        covariance = np.where(there, inverse[[0, 1, 1, 2]], np.nan)
+        covariance = np.where(textured, inverse[[0, 1, 1, 2]], np.nan)
         covariance = np.moveaxis(covariance, 0, -1).reshape(*level.grid, 2, 2)
-        return cls(covariance, there, level.usable, variance, float(np.sqrt(usual)))
+        return cls(covariance, textured, level.usable, variance, float(np.sqrt(usual)))
 
     def refuse_clear(self, name: str) -> None:
         """Raise InputError if hardly any window has texture."""
-        share = float(np.mean(self.there))
-        if share < _LEAST_TEXTURED:
+        fraction = float(np.mean(self.textured))
+        if fraction < _LEAST_TEXTURED:
             raise InputError(
-                f"{name}: {100 * (1 - share):.0f} % of the windows show no texture beyond the noise of"
+                f"{name}: {100 * (1 - fraction):.0f} % of the windows show no texture beyond the noise of"
                 f" {self.noise:.2g} counts: displacement needs a speckled or printed sheet"
             )
 
@@ -194,11 +194,11 @@ def _at_nodes(
 ) -> tuple[Doubles, Doubles, NDArray[np.uint8]]:
     """Return a frame's displacement, sigma, mm, and status, of all nodes."""
     status = node_status(field, texture)
-    known = (status == DisplacementStatus.FOUND)[..., None]
-    displacement = np.where(known, field.moved.transpose(1, 2, 0) * [size[0], -size[1]], np.nan)
+    found_nodes = (status == DisplacementStatus.FOUND)[..., None]
+    displacement = np.where(found_nodes, field.moved.transpose(1, 2, 0) * [size[0], -size[1]], np.nan)
     noisy = (sigma * misfit(field, texture, window)) ** 2
     sigma = np.sqrt(noisy + bending_variance(displacement, sigma**2, tracker.finest.step, window))
-    return displacement, np.where(known, sigma, np.nan), status
+    return displacement, np.where(found_nodes, sigma, np.nan), status
 
 
 def misfit(field: NodeField, texture: Texture, window: int) -> Doubles:
@@ -234,16 +234,16 @@ def bending_variance(displacement: Doubles, variance: Doubles, step: int, window
 
 def node_status(field: NodeField, texture: Texture) -> NDArray[np.uint8]:
     """Return the status of a frame's nodes, (rows, columns)."""
-    status = np.where(field.found, DisplacementStatus.FOUND, DisplacementStatus.NOT_FOUND)
+    status = np.where(field.converged, DisplacementStatus.FOUND, DisplacementStatus.NOT_FOUND)
     status = np.where(np.isfinite(field.moved[0]), status, DisplacementStatus.INVALID_INPUT)
-    status = np.where(texture.there, status, DisplacementStatus.NO_TEXTURE)
+    status = np.where(texture.textured, status, DisplacementStatus.NO_TEXTURE)
     return np.where(texture.usable, status, DisplacementStatus.INVALID_INPUT).astype(np.uint8)
 
 
 def check_windows(shape: tuple[int, ...], window_size: int, window_step: int) -> None:
     """Raise InputError unless windows fit into a picture, and nodes are close enough."""
-    most = min(shape)
-    if not 6 <= window_size <= most:
-        raise InputError(f"window_size {window_size}: 6 to {most} pixels are possible in frames of {shape}")
-    if not 1 <= window_step <= min(_MOST_STEP, most):
-        raise InputError(f"window_step {window_step}: 1 to {min(_MOST_STEP, most)} pixels are possible")
+    side = min(shape)
+    if not 6 <= window_size <= side:
+        raise InputError(f"window_size {window_size}: 6 to {side} pixels are possible in frames of {shape}")
+    if not 1 <= window_step <= min(_MOST_STEP, side):
+        raise InputError(f"window_step {window_step}: 1 to {min(_MOST_STEP, side)} pixels are possible")

@@ -119,22 +119,22 @@ def _fit(
 ) -> _Fit | None:
     """Return the best fit; None without a departure. For many nodes, every second one is fitted first."""
     power = expected.power
-    known = np.isfinite(departure).all(axis=0) & np.isfinite(sigma)
-    scale = np.divide(1.0, sigma, out=np.zeros(sigma.shape), where=known)
-    data = _whitened(np.where(known, departure * scale, 0.0))
+    measured = np.isfinite(departure).all(axis=0) & np.isfinite(sigma)
+    scale = np.divide(1.0, sigma, out=np.zeros(sigma.shape), where=measured)
+    data = _whitened(np.where(measured, departure * scale, 0.0))
     times = (distance / distance[-1])[:, None, None]
-    locks = _whitened(np.where(known, locking * scale, 0.0))
-    second, third = (_bending(known.shape, order) for order in (2, 3))
+    locks = _whitened(np.where(measured, locking * scale, 0.0))
+    second, third = (_bending(measured.shape, order) for order in (2, 3))
     onset_stiff = third * (radius**3 / expected.onset_bend) ** 2
     stiff = sparse.block_diag([onset_stiff, second * (radius**2 / expected.growth_bend) ** 2], format="csc")
     prior = stiff + _FLOOR * sparse.identity(stiff.shape[0], format="csc")
 
     coarse, number = None, 0
-    if known.size > _MANY:
+    if measured.size > _MANY:
         half = np.s_[..., ::2, ::2]
         coarse = _fit(departure[half], sigma[half], distance, window / 2, radius / 2, expected, locking[half])
     if coarse is not None:
-        onset, log_growth = (_finer(values, known.shape) for values in (coarse.onset, coarse.log_growth))
+        onset, log_growth = (_finer(values, measured.shape) for values in (coarse.onset, coarse.log_growth))
         lock, number = coarse.lock, _WIDE
     else:
         first = _first_onsets(data, scale, times, onset_stiff, power)
@@ -156,12 +156,12 @@ def _fit(
         if ends:
             break
         off = np.stack([onset, log_growth]).ravel()
-        left = data - shape - np.tensordot(lock, locks, 1)
-        step, more = system.solve(columns, left, -(stiff @ off), -lock / _LOCKING**2)
+        residual = data - shape - np.tensordot(lock, locks, 1)
+        step, more = system.solve(columns, residual, -(stiff @ off), -lock / _LOCKING**2)
         change = np.clip(step[0], -_FARTHEST, _FARTHEST)
         onset, log_growth, lock = onset + change, log_growth + np.clip(step[1], -0.3, 0.3), lock + more
         # Others, which no frame shows, never settle.
-        moved = float(np.abs(change[known & (onset < 1.0)]).max(initial=0.0))
+        moved = float(np.abs(change[measured & (onset < 1.0)]).max(initial=0.0))
         number += 1
     other = _whitened(growth * _blurred(times - onset, half, power + _POWER_SIGMA)[0])
     return _Fit(onset, log_growth, lock, system, system.solve(columns, other - shape)[0][0])
@@ -184,20 +184,22 @@ class _Normal:
         self._shape, self._locks = columns.shape[2:], locks
         self._cross = np.einsum("ityx,ktyx->iyxk", columns, locks).reshape(-1, len(locks))
         self._freed = np.asarray(self._lu.solve(self._cross))
-        own = np.einsum("ityx,jtyx->ij", locks, locks) + np.identity(len(locks)) / _LOCKING**2
-        self._inner = np.linalg.inv(own - self._cross.T @ self._freed)
+        locks_normal = np.einsum("ityx,jtyx->ij", locks, locks) + np.identity(len(locks)) / _LOCKING**2
+        self._inner = np.linalg.inv(locks_normal - self._cross.T @ self._freed)
 
     def solve(
         self,
         columns: Doubles,
-        left: Doubles,
+        residual: Doubles,
         pull: Doubles | float = 0.0,
         lock_pull: Doubles | float = 0.0,
     ) -> tuple[Doubles, Doubles]:
         """Return the step of the maps, (2, rows, columns), and of the locking, from residuals and priors."""
-        step = self._lu.solve(np.sum(columns * left, axis=1).ravel() + pull)
-        more = self._inner @ (np.einsum("ktyx,tyx->k", self._locks, left) + lock_pull - self._cross.T @ step)
-        return np.asarray((step - self._freed @ more).reshape(2, *left.shape[1:])), more
+        step = self._lu.solve(np.sum(columns * residual, axis=1).ravel() + pull)
+        more = self._inner @ (
+            np.einsum("ktyx,tyx->k", self._locks, residual) + lock_pull - self._cross.T @ step
+        )
+        return np.asarray((step - self._freed @ more).reshape(2, *residual.shape[1:])), more
 
     def variances(self) -> Doubles:
         """Return the variances of the first map."""

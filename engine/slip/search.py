@@ -151,10 +151,10 @@ class Slip(Operation):
         changes: dict[str, Any] = {"motion": source.motion}
         if self.pixel_size is None:
             changes["pixel_size"] = source.header.pixel_size
-        own = source.source if isinstance(source, Calibrated) else source
-        if isinstance(own, Recording) and source.header.pixel_size is not None:
-            _, rows, columns = own.full_shape
-            right, up = own.region.centre((rows, columns), source.header.pixel_size)
+        recording = source.source if isinstance(source, Calibrated) else source
+        if isinstance(recording, Recording) and source.header.pixel_size is not None:
+            _, rows, columns = recording.full_shape
+            right, up = recording.region.centre((rows, columns), source.header.pixel_size)
             changes["centre"] = -right, -up
         return self.with_options(**changes)
 
@@ -209,7 +209,7 @@ class Slip(Operation):
         if self._tracker is None or not self._fields:
             return Result()
         field = self._fields[-1]
-        moved = np.where(field.found, field.moved, np.nan)
+        moved = np.where(field.converged, field.moved, np.nan)
         return Result(displacement=self._tracker.to_pixels(np.moveaxis(moved, 0, -1) * self._scale))
 
     @property
@@ -259,8 +259,8 @@ class Slip(Operation):
             **self._findings,
         }
         if self.motion == "twist":
-            found = codes == DisplacementStatus.FOUND
-            (x, y), angle = self._turn(tracker, moved[-1], found, onsets.onset, course, touched)
+            detected = codes == DisplacementStatus.FOUND
+            (x, y), angle = self._turn(tracker, moved[-1], detected, onsets.onset, course, touched)
             process |= {"angle": angle, "centre_x": x - self.centre[0], "centre_y": y - self.centre[1]}
         maps = {
             "displacement": self._each(tracker, moved) if self.per_frame else last,
@@ -280,9 +280,9 @@ class Slip(Operation):
 
     def _in_mm(self, tracker: Tracker, fields: list[NodeField], texture: Texture) -> Doubles:
         """Return the displacement of the nodes, (T - 1, rows, columns, 2), mm; NaN where it was not found."""
-        found = [(node_status(field, texture) == DisplacementStatus.FOUND)[..., None] for field in fields]
+        detected = [(node_status(field, texture) == DisplacementStatus.FOUND)[..., None] for field in fields]
         moved = [np.moveaxis(field.moved, 0, -1) * self._scale for field in fields]
-        return np.where(np.stack(found), np.stack(moved), np.nan)
+        return np.where(np.stack(detected), np.stack(moved), np.nan)
 
     def _covariance(self, texture: Texture) -> Doubles:
         """Return the covariance of a displacement, (rows, columns, 2, 2), mm^2 along x and y."""
@@ -306,10 +306,10 @@ class Slip(Operation):
             return np.asarray(tracker.at_nearest_pixels(self._contact))
         distance = course.distance[: course.forward, None, None] * course.reach
         with np.errstate(invalid="ignore", divide="ignore"):
-            share = departure[: course.forward] / distance
-        known = np.isfinite(share).any(axis=0)
-        lag = np.full(share.shape[1:], np.nan)
-        lag[known] = np.nanmedian(share[:, known], axis=0)
+            fraction = departure[: course.forward] / distance
+        measured = np.isfinite(fraction).any(axis=0)
+        lag = np.full(fraction.shape[1:], np.nan)
+        lag[measured] = np.nanmedian(fraction[:, measured], axis=0)
         touched: NDArray[np.bool_] = np.nan_to_num(fill_with_nearest(lag), nan=1.0) < 1 - _FOLLOWS
         return touched
 
@@ -334,18 +334,18 @@ class Slip(Operation):
             expected, radius = _EXPECTED[self.motion], math.sqrt(touched.sum() / math.pi)
             if self._contact is None:
                 expected = replace(expected, onset_bend=_BEND_ESTIMATED[self.motion])
-            known = np.where(self._inside(touched), overlap * sigma, np.nan)
+            lock_sigma = np.where(self._inside(touched), overlap * sigma, np.nan)
             locking = -np.nan_to_num(course.along(drawn * np.identity(2)[:, None, None, None]))
-            found = fit_onsets(
+            fit = fit_onsets(
                 departure[: course.forward, *box],
-                known[box],
+                lock_sigma[box],
                 course.distance[: course.forward],
                 self.window_size / self.window_step,
                 radius,
                 expected,
                 locking[:, : course.forward, *box],
             )
-            onset[box], spread[box] = found.onset, found.sigma
+            onset[box], spread[box] = fit.onset, fit.sigma
         return OnsetMap(onset, spread)
 
     def _inside(self, touched: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -381,13 +381,13 @@ class Slip(Operation):
         self,
         tracker: Tracker,
         moved: Doubles,
-        found: NDArray[np.bool_],
+        detected: NDArray[np.bool_],
         onset: Doubles,
         course: _Course,
         touched: NDArray[np.bool_],
     ) -> tuple[tuple[float, float], float]:
         """Return centre and angle of the rotation of the skin that sticks (least squares: Kabsch, 1976)."""
-        stuck = touched & found & ~(onset < course.end)
+        stuck = touched & detected & ~(onset < course.end)
         if np.count_nonzero(stuck) < _LEAST_STUCK:
             return (math.nan, math.nan), math.nan
         first = course.x[stuck] + 1j * course.y[stuck]

@@ -43,14 +43,14 @@ class NodeField:
         Pixels to the right and down; NaN where a window leaves the picture or has no texture.
     variance : ndarray, (rows, columns), float64
         Variance of a sample, counts^2, from the residual in the window.
-    found : ndarray, (rows, columns), bool
+    converged : ndarray, (rows, columns), bool
         Whether the frame was warped back to within half a pixel, and then has at least half of the
         reference's contrast.
     """
 
     moved: Doubles
     variance: Doubles
-    found: NDArray[np.bool_]
+    converged: NDArray[np.bool_]
 
 
 class Tracker:
@@ -100,12 +100,12 @@ class Tracker:
         begin = last + stride * (last - before)
         best, field = self.finest.follow(frame, begin)
         for correlated in (False, True):
-            if np.mean(best.found) >= _ENOUGH * np.mean(self.finest.usable):
+            if np.mean(best.converged) >= _ENOUGH * np.mean(self.finest.usable):
                 break
             frame = on_host(frame)
-            found, other = self._follow_down(frame, self._correlated(frame) if correlated else begin)
-            if np.mean(found.found) > np.mean(best.found):
-                best, field = found, other
+            displacement, other = self._follow_down(frame, self._correlated(frame) if correlated else begin)
+            if np.mean(displacement.converged) > np.mean(best.converged):
+                best, field = displacement, other
         self._fields = [field, last]
         return best
 
@@ -159,10 +159,12 @@ class Tracker:
             frames.append(cv2.pyrDown(frames[-1].astype(np.float32)))
         for number in reversed(range(len(self._levels))):
             level = self._levels[number]
-            found, field = level.follow(frames[number], level.at_nodes(field, self.finest, 2.0**number))
+            displacement, field = level.follow(
+                frames[number], level.at_nodes(field, self.finest, 2.0**number)
+            )
             if level is not self.finest:
                 field = self.finest.at_nodes(field, level, 0.5**number)
-        return found, field
+        return displacement, field
 
     def _correlated(self, frame: NDArray[Any]) -> Doubles:
         """Return the field of a uniform displacement, by phase correlation of the whole picture."""
@@ -232,18 +234,22 @@ class _Level:
             halo=self._halo,
             **{name: maps[name] for name in ("coefficients", "planes", "difference")},
         )
-        found = {name: maps[name] for name in ("planes", "inverse", "summary")}
-        self._launch("normals", math.prod(self.grid), **self._sizes, first=self._first + self._halo, **found)
+        results = {name: maps[name] for name in ("planes", "inverse", "summary")}
+        self._launch(
+            "normals", math.prod(self.grid), **self._sizes, first=self._first + self._halo, **results
+        )
 
     def to_pixels(self, values: Doubles, logarithms: bool, on_device: bool) -> AnyArray:
         """Return values, or their exponentials, (rows, columns) or ([T,] rows, columns, n), at all pixels."""
         kind = values.shape[values.ndim - 1 :] if values.ndim > 2 else ()
         nodes = np.moveaxis(values.reshape(-1, *self.grid, math.prod(kind)), -1, 1)
         nbytes = 4 * math.prod(self.shape) * math.prod(kind)
-        most = max(1, self._device.max_allocation // nbytes)
-        if on_device and len(nodes) <= most:
+        limit = max(1, self._device.max_allocation // nbytes)
+        if on_device and len(nodes) <= limit:
             return self._pixels(nodes, logarithms)
-        parts = [self._pixels(nodes[k : k + most], logarithms).release() for k in range(0, len(nodes), most)]
+        parts = [
+            self._pixels(nodes[k : k + limit], logarithms).release() for k in range(0, len(nodes), limit)
+        ]
         pixels = parts[0] if len(parts) == 1 else np.concatenate(parts)
         return pixels.reshape(*values.shape[:-3], *self.shape, *kind)
 
@@ -308,8 +314,8 @@ class _Level:
             # The reference's noise is multiplied by the gain.
             variances += (gain**2 - 1) * self.measured
             variance = squares / (variances * (1 - PARAMETERS / self.measured))
-            found = (np.abs(moved - last).max(axis=0) < 0.5) & (gain > _LIKE)
-        return NodeField(moved, variance, found), field
+            converged = (np.abs(moved - last).max(axis=0) < 0.5) & (gain > _LIKE)
+        return NodeField(moved, variance, converged), field
 
     def _solve(self, field: Doubles) -> Doubles:
         """Warp the frame back by a field, and solve all windows."""
@@ -329,18 +335,18 @@ class _Level:
         Each window predicts the displacement of its neighbours, (6, rows, columns), so that an affine field
         remains affine and continues where windows leave the picture. Far from all windows, the field is kept.
         """
-        known = np.isfinite(affine[0])
-        weight = np.where(known, self._trust, 0.0)
+        finite = np.isfinite(affine[0])
+        weight = np.where(finite, self._trust, 0.0)
         hold = _HOLD * np.median(self._trust)
         y, x = np.meshgrid(*(2 * self.step / self._window * np.arange(n) for n in self.grid), indexing="ij")
         total = self._over_nodes(weight) + hold
         parts = []
-        for own, centre, right, down in zip(field, affine[:2], affine[2::2], affine[3::2], strict=True):
-            step = np.clip(np.nan_to_num(centre - own), -_FARTHEST, _FARTHEST)
+        for coarse, centre, right, down in zip(field, affine[:2], affine[2::2], affine[3::2], strict=True):
+            step = np.clip(np.nan_to_num(centre - coarse), -_FARTHEST, _FARTHEST)
             along_x, along_y = (weight * np.clip(np.nan_to_num(part), -1, 1) for part in (right, down))
-            here = weight * (own + step) - along_x * x - along_y * y
-            there = self._over_nodes(along_x) * x + self._over_nodes(along_y) * y
-            parts.append((self._over_nodes(here) + there + hold * own) / total)
+            here = weight * (coarse + step) - along_x * x - along_y * y
+            position = self._over_nodes(along_x) * x + self._over_nodes(along_y) * y
+            parts.append((self._over_nodes(here) + position + hold * coarse) / total)
         return np.stack(parts)
 
     def _over_nodes(self, values: Doubles) -> Doubles:

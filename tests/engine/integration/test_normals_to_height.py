@@ -17,7 +17,7 @@ def slopes_at(zenith, azimuth, sigma=0.001, contact=1, tilt=None, **options):
     vectors = rotations.direction(np.radians(zenith), np.radians(azimuth)).astype(np.float32)
     touched = np.full((1, 1), contact, np.uint8)
     found = find_slopes(vectors[np.newaxis, np.newaxis], np.float32(sigma) * ONE, touched, tilt, **options)
-    return found.dz_dx[0, 0], found.dz_dy[0, 0], *found.weights[:, 0, 0], found.known[0, 0]
+    return found.dz_dx[0, 0], found.dz_dy[0, 0], *found.weights[:, 0, 0], found.defined[0, 0]
 
 
 @pytest.mark.parametrize(("zenith", "azimuth"), [(0, 0), (1, 30), (30, 135), (60, -90)])

@@ -46,7 +46,7 @@ def edges_of(found, device=None):
 def best_heights(normals):
     slopes = find_slopes(normals.normals, normals.normals_sigma, normals.contact, normals.process["tilt"])
     weights = slopes.weights
-    return integrate(slopes.dz_dx, slopes.dz_dy, PIXEL, mask=slopes.known, slope_weights=weights).height
+    return integrate(slopes.dz_dx, slopes.dz_dy, PIXEL, mask=slopes.defined, slope_weights=weights).height
 
 
 def test_an_update_is_of_the_last_turn(device):

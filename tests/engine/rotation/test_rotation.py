@@ -360,7 +360,7 @@ def test_slopes_may_be_kept_instead_of_heights():
     assert set(whole) - set(result) == {"height", "height_sigma", "component", "offset_unknown"}
     pixel = OF_A_SURFACE.pixel_size
     surface = engine.integrate(
-        slopes.dz_dx, slopes.dz_dy, pixel, mask=slopes.known, slope_weights=slopes.weights
+        slopes.dz_dx, slopes.dz_dy, pixel, mask=slopes.defined, slope_weights=slopes.weights
     )
     np.testing.assert_allclose(surface.height, whole.height, atol=1e-4)
 

@@ -33,7 +33,7 @@ def test_kernels_and_reference_agree(device, shape, heights, parts):
     )
     room = PixelGraph(device, shape)
     flags = room.upload(inputs).copy()
-    found = find_components(flags, cut=False)
+    found = find_components(flags, by_links=False)
     assert min(shape) < 9 or (found.count > 20) == (parts == "many")
     relief = random.normal(0, 1, shape).astype(np.float32)
     array = device.from_host("relief", np.stack([2 * relief, relief]))
