@@ -1,4 +1,4 @@
-"""The tables of maps, of ``fitted``, status codes and parameters in docs/formats.md and docs/calibration.md.
+"""The tables of maps, ``fitted``, status codes, parameters, exports, stages and cameras in the pages.
 
 ``python docs/site/map_tables.py`` (in the environment) writes them into the pages, from the
 declarations; a test compares them.
@@ -12,9 +12,13 @@ from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
+from mirrorskin.hw.base.drivers import CAMERAS, STAGES, Driver, built_in
+from mirrorskin.hw.base.rig_file import StageSettings
 from mirrorskin.io import Fitted, Map
+from mirrorskin.io.formats.registry import exports
 from mirrorskin.io.model.calibration import PARTS
 from mirrorskin.io.model.maps import (
     TABLE,
@@ -72,11 +76,42 @@ def tables() -> dict[str, dict[str, str]]:
             "map": as_table(["map", "shape, type", "unit", "undefined", "content"], rows),
             "fitted": as_table(["fitted", "shape, type", "unit", "content"], facts),
             "code": as_table(["code", *_STATUS], meanings),
+            "suffix": as_table(
+                ["suffix", "content", "unit, and where it is stated", "holes", "filled heights", "opens in"],
+                _rows_of_exports(),
+            ),
+        },
+        "stages.md": {
+            "`firmware`": as_table(["`firmware`", "controller", "scans"], map(_stage, built_in(STAGES)))
+        },
+        "camera.md": {
+            "`source` starts with": as_table(
+                ["`source` starts with", "cameras", "extra"],
+                map(_camera, sorted(built_in(CAMERAS), key=lambda driver: not driver.name)),
+            )
         },
         "calibration.md": {
             "dataset": as_table(["dataset", "shape, type", "unit", "content"], [*_CAMERA, *stored, _PROCESS])
         },
     }
+
+
+def _rows_of_exports() -> list[list[str]]:
+    """Return what exported files contain, in the order of the declarations."""
+    return [list(row) for form in dict.fromkeys(exports(installed=False).values()) for row in form.exported]
+
+
+def _stage(driver: Driver) -> list[str]:
+    (default,) = (
+        field.default for field in msgspec.structs.fields(StageSettings) if field.name == "firmware"
+    )
+    name = f'`"{driver.name}"`, the default' if driver.name == default else f'`"{driver.name}"`'
+    return [name, driver.help, "steps" if driver.motion == "steps" else "steps, sweeps and rotations"]
+
+
+def _camera(driver: Driver) -> list[str]:
+    extra = f"`mirrorskin[{driver.extra}]`" if driver.extra else ""
+    return [f"`{driver.name}:`" if driver.name else "anything else", driver.help, extra]
 
 
 def _stored(name: str, one: Parameter) -> list[str]:

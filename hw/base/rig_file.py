@@ -16,11 +16,11 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
+from mirrorskin.hw.base.drivers import CAMERAS, STAGES, built_in, camera_driver, driver_names, is_class
 from mirrorskin.hw.base.emulated_file import Emulator
 from mirrorskin.hw.base.references import SUFFIXES, check_references
 from mirrorskin.hw.base.stage import Limits
 from mirrorskin.io import InputError
-from mirrorskin.io.base.own_class import installed_class, installed_names
 from mirrorskin.io.base.settings_file import load_toml
 
 _USER = re.compile("//[^/]*@")
@@ -28,14 +28,18 @@ _STEEPEST = 90.0  # degrees
 _ROUND = 360.0  # degrees
 _CELL = 65535  # rows or columns
 
-GENICAM = "genicam:"
-_CLASS = re.compile(rf"(?!{GENICAM})(.*\.py|[^\W\d]\w*(\.[^\W\d]\w*)*):[^\W\d]\w*")
-
-_FIRMWARES = "grbl", "marlin"
-
-CAMERAS, STAGES = "mirrorskin.cameras", "mirrorskin.stages"
-"""Groups of entry points by which packages give names to their cameras and stages."""
-"""Prefix of the source of GigE Vision and USB3 Vision cameras."""
+# What rig files can name, from the declarations of the drivers.
+_STAGES = [f'"{driver.name}"' for driver in built_in(STAGES)]
+_CAMERAS = [f"{driver.name}:" for driver in built_in(CAMERAS) if driver.name]
+_FORMATS = [driver for driver in reversed(built_in(CAMERAS)) if driver.formats]
+_FIRMWARE_HELP = ", ".join([*_STAGES, 'or a class as "module:Class" or "file.py:Class",'])
+_SOURCE_HELP = "".join(f"{name}, " for name in _CAMERAS)
+_FOURCC = rf"^({'|'.join(driver.formats for driver in _FORMATS)})\Z"
+_FOURCC_HELP = ", or ".join(driver.formats_help for driver in _FORMATS)
+# Parts of the template.
+_OTHER_STAGES = ", ".join(_STAGES[1:])
+_SERIALS = "".join(f"{name}SERIAL, " for name in _CAMERAS)
+_TRIGGERED = " or ".join(_CAMERAS)
 
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*\Z")]
 Line = Literal["coolant", "spindle"]
@@ -193,7 +197,7 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
         str,
         Meta(
             pattern=r"^([A-Za-z_]\w*|[^\x00-\x1f\x7f]+:[A-Za-z_]\w*)\Z",
-            description='"grbl", "marlin", or a class as "module:Class" or "file.py:Class",',
+            description=_FIRMWARE_HELP,
             examples=["grbl"],
         ),
     ] = "grbl"
@@ -276,7 +280,8 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
     source: Annotated[
         Annotated[int, Meta(ge=0, lt=1000)] | Text,
         Meta(
-            description="a camera's number from 0 on, or genicam:, a path or a URL in quotes,", examples=[0]
+            description=f"a camera's number from 0 on, or {_SOURCE_HELP}a path or a URL in quotes,",
+            examples=[0],
         ),
     ]
     size: Annotated[
@@ -286,9 +291,10 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
     name: Annotated[Text, Meta(description="what the camera is called, in quotes,", examples=["left"])] = ""
     dtype: Literal["uint8", "uint16", "float32"] = "uint8"
     fourcc: Annotated[
-        Annotated[str, Meta(pattern=r"^((?!.{5})[!-~]{2,4} {0,2}|Mono(8|10|12|14|16))\Z")] | None,
+        Annotated[str, Meta(pattern=_FOURCC)] | None,
         Meta(
-            description="a format of two to four letters, or Mono8 to Mono16, in quotes,", examples=["GREY"]
+            description=f"a format of {_FOURCC_HELP}, in quotes,",
+            examples=["GREY"],
         ),
     ] = None
     exposure: Annotated[
@@ -327,9 +333,11 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
             msgspec.structs.force_setattr(self, "name", _USER.sub("//", str(self.source)))
         if self.fourcc is not None:
             msgspec.structs.force_setattr(self, "fourcc", self.fourcc.ljust(4))
-            if not self.own and self.genicam != self.fourcc.startswith("Mono"):
-                known = "Mono8 to Mono16" if self.genicam else "two to four letters"
-                raise ValueError(f'fourcc is "{self.fourcc}": this source needs {known}; or leave it out')
+            driver = camera_driver(self.source)
+            if driver.formats and not re.fullmatch(driver.formats, self.fourcc):
+                raise ValueError(
+                    f'fourcc is "{self.fourcc}": this source needs {driver.formats_help}; or leave it out'
+                )
         if self.trigger_input is not None and self.trigger is None:
             raise ValueError("trigger_input is given without trigger: add trigger, or remove trigger_input")
         if self.zenith_gain == 0:
@@ -341,19 +349,9 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
             )
 
     @property
-    def genicam(self) -> bool:
-        """Whether it is a GigE Vision or USB3 Vision camera."""
-        return str(self.source).startswith(GENICAM)
-
-    @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
         return self.size[1], self.size[0]
-
-    @property
-    def own(self) -> bool:
-        """Whether it is a class of the user, FILE.py:CLASS or MODULE:CLASS."""
-        return isinstance(self.source, str) and _CLASS.fullmatch(self.source) is not None
 
     @property
     def streamed(self) -> bool:
@@ -425,17 +423,17 @@ def load_rig(path: Path | str) -> RigSettings:
         if isinstance(given := getattr(camera, name), str)
     }
     if isinstance(camera.source, str) and not camera.streamed:
-        resolved["source"] = _next_to(path, _own_class(path, camera.source, CAMERAS))
+        driver = camera_driver(camera.source)
+        resolved["source"] = camera.source if driver.name else _next_to(path, camera.source)
     camera = msgspec.structs.replace(camera, **resolved)
     check_references(camera, str(path))
-    firmware = _own_class(path, file.stage.firmware, STAGES)
-    if firmware.isidentifier() and firmware not in _FIRMWARES:
-        known = ", ".join([*_FIRMWARES, *installed_names(STAGES)])
+    firmware = file.stage.firmware
+    if firmware.isidentifier() and firmware not in (names := driver_names(STAGES)):
         raise InputError(
-            f"{path}: stage.firmware is {firmware}, and there are {known}; or name a class, as in"
+            f"{path}: stage.firmware is {firmware}, and there are {', '.join(names)}; or name a class, as in"
             ' "my_stage.py:MyStage"'
         )
-    stage = msgspec.structs.replace(file.stage, firmware=firmware)
+    stage = msgspec.structs.replace(file.stage, firmware=_next_to(path, firmware))
     return RigSettings(path, file.name or path.stem, stage, camera)
 
 
@@ -451,29 +449,20 @@ def _check_emulator(path: Path) -> None:
     )
 
 
-def _own_class(path: Path, name: str, group: str) -> str:
-    """Return a name with that of the class instead, if it is one of the entry points in a group.
-
-    The path of a class's module is added if this is next to the rig file.
-    """
-    if name.isidentifier() and name not in _FIRMWARES:
-        name = installed_class(name, group) or name
-    if not _CLASS.fullmatch(name):
-        return name
-    place, _, kind = name.rpartition(":")
-    file = _next_to(path, place if place.endswith(".py") else f"{place.replace('.', '/')}.py")
-    return f"{file}:{kind}" if Path(file).is_file() else name
-
-
 def _next_to(path: Path, name: str) -> str:
-    """Return the path of a file relative to the rig file; other names are returned unchanged."""
+    """Return the path of a file, or of a class's module, next to the rig file; other names as they are."""
+    place, _, kind = name.rpartition(":") if is_class(name) else (name, "", "")
+    file = path.parent / (f"{place.replace('.', '/')}.py" if kind and not place.endswith(".py") else place)
     try:
-        return str(path.parent / name) if (path.parent / name).exists() else name
+        present = file.is_file() if kind else file.exists()
     except OSError:  # too long, or the folder cannot be read
+        present = False
+    if not present:
         return name
+    return f"{file}:{kind}" if kind else str(file)
 
 
-TEMPLATE = """\
+TEMPLATE = f"""\
 # A rig for mirrorskin: the stage that moves the sensor's body, and the camera that watches its skin.
 # Lines that start with # show optional settings.
 
@@ -481,7 +470,7 @@ name = "bench"
 
 [stage]
 port = "/dev/ttyUSB0"           # or COM3, socket://192.168.0.7:23, rfc2217://host:port
-# firmware = "grbl"             # or "marlin", or a class of your own as "my_stage.py:MyStage"
+# firmware = "grbl"             # or {_OTHER_STAGES}, or a class of your own as "my_stage.py:MyStage"
 # baud = 115200
 home = true                     # the stage has limit switches, and must be homed before it moves
 # timeout = 2.0                 # s to wait for an answer
@@ -546,7 +535,7 @@ speed = 20.0
 # steps = 250.0
 
 [camera]
-source = 0                      # a camera's number, or in quotes a file, a URL, genicam:SERIAL, or a
+source = 0                      # a camera's number, or in quotes a file, a URL, {_SERIALS}or a
                                 # class of your own as "my_camera.py:MyCamera"
 size = [640, 480]               # columns, rows
 # name = "left"                 # name in recordings and calibrations; by default the source
@@ -556,7 +545,7 @@ size = [640, 480]               # columns, rows
 # gain = 1.0
 # rate = 60.0                   # Hz
 # trigger = "coolant"           # or "spindle": the controller's output that triggers camera or lamp, in steps
-# trigger_input = "Line0"       # the input of a genicam: camera to which this output is connected
+# trigger_input = "Line0"       # the input of a {_TRIGGERED} camera to which this output is connected
 # stall = 0.1                   # s without a frame, in motion, after which the stage is stopped
 # delay = 0.03                  # s from the middle of the exposure to the arrival; measured for a stream
 # line_time = 15e-6             # s from row to row of a rolling shutter; negative if the last is first

@@ -11,9 +11,20 @@ from typing import Any
 import numpy as np
 
 from mirrorskin.hw.base.clock import SYSTEM, Clock
-from mirrorskin.hw.base.rig_file import GENICAM, CameraSettings
+from mirrorskin.hw.base.drivers import Driver
+from mirrorskin.hw.base.rig_file import CameraSettings
 from mirrorskin.hw.cameras.reopened import READ_TIMEOUT, ReopenedCamera, warn_of_other
 from mirrorskin.io import InputError
+
+GENICAM = Driver(
+    name="genicam",
+    help="GigE Vision and USB3 Vision cameras, by Aravis",
+    loads="GenicamCamera",
+    takes=("clock",),
+    formats=r"Mono(8|10|12|14|16)",
+    formats_help="Mono8 to Mono16",
+    extra="genicam",
+)
 
 _BUFFERS = 16  # buffers that Aravis may fill before they are read
 _LOOK = 0.2  # interval at which the thread checks whether to end, seconds
@@ -102,7 +113,7 @@ class GenicamCamera(ReopenedCamera):
             stream.push_buffer(buffer)
 
     def _open(self) -> Any:
-        wanted = str(self._settings.source).removeprefix(GENICAM)
+        wanted = str(self._settings.source).partition(":")[2]
         aravis = self._aravis
         aravis.update_device_list()
         there: dict[str, set[str]] = {}

@@ -15,10 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.hw.base.clock import SYSTEM, Clock
+from mirrorskin.hw.base.drivers import Driver
 from mirrorskin.hw.base.rig_file import CameraSettings
 from mirrorskin.hw.cameras.reopened import OPEN_TIMEOUT, READ_TIMEOUT, ReopenedCamera, warn_of_other
 from mirrorskin.io import InputError
 from mirrorskin.io.base.opencv import quiet_opencv
+
+VIDEO = Driver(
+    name="",
+    help="cameras of the system, streams and video files, by OpenCV",
+    loads="VideoCamera",
+    takes=("clock",),
+    formats=r"(?!.{5})[!-~]{2,4} {0,2}",
+    formats_help="two to four letters",
+)
 
 _log = logging.getLogger("mirrorskin.hw")
 

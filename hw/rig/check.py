@@ -120,7 +120,7 @@ def check_stage(stage: Stage, settings: StageSettings, clock: Clock = SYSTEM) ->
     yield _state(report, settings)
     yield _position(report, stage, settings)
     yield from _reports(stage, settings, clock)
-    if settings.firmware == "grbl":
+    if hasattr(stage, "parameters"):
         yield from _controller(stage, settings)
     if not getattr(stage, "homing_stops", True):
         remedy = "build the firmware with EMERGENCY_PARSER, or be ready to switch off the power"

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from mirrorskin.hw.base.drivers import stage_driver
 from mirrorskin.hw.base.rig_file import StageSettings
 from mirrorskin.hw.base.stage import Position, Stage
 from mirrorskin.hw.stages.trajectory import Trapezoid
@@ -552,9 +553,10 @@ def check_plan(plan: Plan, settings: StageSettings, name: str, stage: Stage | No
         limits.check(place, name)
     if plan.in_steps:  # moves between steps use the maximum speed
         return
-    if stage is None and settings.firmware == "marlin":  # before it is homed unnecessarily
-        raise InputError(f"{name}: Marlin does not report its position while it moves; use steps")
-    if stage is None and settings.firmware != "grbl":  # checked when the stage is open
+    driver = stage_driver(settings.firmware)
+    if stage is None and driver.motion == "steps":  # before it is homed unnecessarily
+        raise InputError(f"{name}: {driver.title} does not report its position while it moves; use steps")
+    if stage is None and driver.motion != "continuous":  # checked when the stage is open
         return
     able = Axes(settings, name) if stage is None else stage
     if isinstance(plan, AxialPlan):  # one turn suffices for the check

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from types import TracebackType
-from typing import cast
+from typing import Any, cast
 
 from mirrorskin.hw.base.camera import Camera, Frames
 from mirrorskin.hw.base.clock import SYSTEM, Clock
+from mirrorskin.hw.base.drivers import STAGES, Driver, built_in, camera_driver, stage_driver
 from mirrorskin.hw.base.errors import HardwareError
 from mirrorskin.hw.base.rig_file import CameraSettings, RigSettings, StageSettings
 from mirrorskin.hw.base.stage import Position, Report, Stage
 from mirrorskin.hw.rig.trigger import Trigger, no_trigger
 from mirrorskin.io import InputError
-from mirrorskin.io.base.own_class import load_class
 from mirrorskin.io.base.types import Closing
 
 _TICK = 0.02  # interval of the guard's checks, seconds
@@ -258,77 +258,61 @@ def open_stage(settings: StageSettings, unlock: bool = False, clock: Clock = SYS
     which have none; if the class or the stage does not exist; or if the stage does not match the file. A
     stage class of the user has its own clock.
     """
-    firmware = settings.firmware
-    if firmware == "grbl":
-        from mirrorskin.hw.stages.grbl import GrblStage
-
-        return GrblStage(settings, unlock=unlock, clock=clock)
-    if unlock:
+    driver = stage_driver(settings.firmware)
+    if unlock and "unlock" not in driver.takes:
+        titles = " or ".join(known.title for known in built_in(STAGES) if "unlock" in known.takes)
         raise InputError(
-            f"stage {settings.port}: only GRBL can be unlocked; switch this controller off and on"
+            f"stage {settings.port}: only {titles} can be unlocked; switch this controller off and on"
         )
-    if firmware == "marlin":
-        from mirrorskin.hw.stages.marlin import MarlinStage
-
-        return MarlinStage(settings, clock=clock)
-    return cast("Stage", _open_own(settings.firmware, settings, Stage))
-
-
-def _open_own(
-    kind: str | type, settings: StageSettings | CameraSettings, protocol: type[Stage] | type[Camera]
-) -> Stage | Camera:
-    """Open a stage or a camera with a class of the user."""
-    made, what = load_class(kind), protocol.__name__.lower()
-    name, wanted = getattr(kind, "__name__", kind), type(settings).__name__
-    try:
-        inspect.signature(made).bind(settings)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"{name}(settings) failed: {error}; a {what} class takes one argument, the {wanted}"
-        ) from error
-    try:
-        opened = made(settings)
-    except OSError as error:  # includes SerialException
-        source = "stage.port" if what == "stage" else "camera.source"
-        raise InputError(f"{name}: cannot be opened: {error}; check {source}") from error
-    lacking = [one for one in vars(protocol) if one[0] != "_" and not hasattr(opened, one)]
-    if lacking:
-        if hasattr(opened, "close"):
-            opened.close()
-        raise InputError(
-            f"{name} has no {', no '.join(lacking)}: mirrorskin.hw.{protocol.__name__} lists the methods of a"
-            f" {what}"
-        )
-    return cast("Stage | Camera", opened)
+    return cast("Stage", _open(driver, settings, Stage, {"unlock": unlock, "clock": clock}))
 
 
 def open_camera(settings: CameraSettings, clock: Clock = SYSTEM) -> Camera:
     """Open the camera that a rig file describes; InputError if it is missing or does not match."""
-    if settings.genicam:
-        from mirrorskin.hw.cameras.genicam import GenicamCamera
-
-        return GenicamCamera(settings, clock=clock)
-    if settings.own:
-        return _open_own_camera(settings)
-    from mirrorskin.hw.cameras.video import VideoCamera
-
-    return VideoCamera(settings, clock=clock)
-
-
-def _open_own_camera(settings: CameraSettings) -> Camera:
-    """Open a camera with a class of the user; its frames must be as the rig file states."""
-    camera = cast("Camera", _open_own(str(settings.source), settings, Camera))
-    found, stated = (
+    camera = cast("Camera", _open(camera_driver(settings.source), settings, Camera, {"clock": clock}))
+    frames, stated = (
         f"{shape[1]} x {shape[0]}, {dtype}"
         for shape, dtype in ((camera.shape, camera.dtype), (settings.shape, settings.dtype))
     )
-    if found != stated:
+    if frames != stated:
         camera.close()
         raise InputError(
-            f"{settings.name}: frames are {found}, but camera.size and dtype in the rig file are {stated}:"
+            f"{settings.name}: frames are {frames}, but camera.size and dtype in the rig file are {stated}:"
             " correct the rig file"
         )
     return camera
+
+
+def _open(
+    driver: Driver,
+    settings: StageSettings | CameraSettings,
+    protocol: type[Stage] | type[Camera],
+    options: Mapping[str, Any],
+) -> Stage | Camera:
+    """Open a stage or a camera with those of the options that its class takes."""
+    device_class, what = driver.load(), protocol.__name__.lower()
+    options = {name: options[name] for name in driver.takes}
+    try:
+        inspect.signature(device_class).bind(settings, **options)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{driver}(settings) failed: {error}; a {what} class takes one argument, the"
+            f" {type(settings).__name__}"
+        ) from error
+    try:
+        device = device_class(settings, **options)
+    except OSError as error:  # includes SerialException
+        source = "stage.port" if what == "stage" else "camera.source"
+        raise InputError(f"{driver}: cannot be opened: {error}; check {source}") from error
+    lacking = [name for name in vars(protocol) if name[0] != "_" and not hasattr(device, name)]
+    if lacking:
+        if hasattr(device, "close"):
+            device.close()
+        raise InputError(
+            f"{driver} has no {', no '.join(lacking)}: mirrorskin.hw.{protocol.__name__} lists the methods of"
+            f" a {what}"
+        )
+    return cast("Stage | Camera", device)
 
 
 def open_rig(
@@ -349,7 +333,7 @@ def open_rig(
     """
     if settings.camera.trigger is not None and not steps:
         raise untriggered(settings)
-    if settings.camera.trigger is not None and settings.stage.firmware == "marlin":
+    if settings.camera.trigger is not None and not stage_driver(settings.stage.firmware).outputs:
         raise no_trigger(f"stage {settings.stage.port}")
     with ExitStack() as opening:
         camera = open_camera(settings.camera)

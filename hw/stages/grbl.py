@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from mirrorskin.hw.base.clock import SYSTEM, Clock
+from mirrorskin.hw.base.drivers import Driver
 from mirrorskin.hw.base.errors import HardwareError
 from mirrorskin.hw.base.rig_file import Line, StageSettings
 from mirrorskin.hw.base.stage import Limits, Position, Report
@@ -25,6 +26,15 @@ from mirrorskin.io.base.types import Closing
 
 if TYPE_CHECKING:
     import serial
+
+GRBL = Driver(
+    name="grbl",
+    title="GRBL",
+    help="GRBL 1.1 or grblHAL",
+    loads="GrblStage",
+    takes=("unlock", "clock"),
+    motion="continuous",
+)
 
 _SWITCHES: dict[tuple[Line, bool], str] = {
     ("coolant", True): "M8",

@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from mirrorskin.hw.base.clock import SYSTEM, Clock
+from mirrorskin.hw.base.drivers import Driver
 from mirrorskin.hw.base.errors import HardwareError
 from mirrorskin.hw.base.rig_file import StageSettings
 from mirrorskin.hw.base.stage import Limits, Position, Report
@@ -27,6 +28,16 @@ from mirrorskin.io.base.types import Closing
 
 if TYPE_CHECKING:
     import serial
+
+MARLIN = Driver(
+    name="marlin",
+    title="Marlin",
+    help="Marlin, the firmware of 3D printers",
+    loads="MarlinStage",
+    takes=("clock",),
+    motion="steps",
+    outputs=False,
+)
 
 _BOOT = 12.0  # seconds that a controller may take to start; many restart when the port is opened
 _KNOCK = 1.0  # seconds after which the identification is queried again

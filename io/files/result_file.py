@@ -55,6 +55,16 @@ ZARR = Format(
     encoder="save_result",
     needs_heights=False,
     writes_itself=True,
+    exported=(
+        (
+            "`.zarr`",
+            "[everything in the result's file](#zarr); a folder, or an address",
+            "`units`",
+            "NaN, and the codes above",
+            "`filled`",
+            "zarr-python",
+        ),
+    ),
 )
 _RESULT, _PROCESS, _FITTED, _OWN = "/entry/result", "/entry/process", "/entry/fitted", "own_maps"
 _DECLARATION = "declaration"  # attribute of a map that is not declared in the table

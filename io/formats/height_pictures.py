@@ -25,13 +25,47 @@ from mirrorskin.io.formats.surface import (
 )
 from mirrorskin.io.model.result import Result
 
-PNG = Format(name="PNG", suffixes=(".png",), content="heights in 16 bits", encoder="encode_png")
+PNG = Format(
+    name="PNG",
+    suffixes=(".png",),
+    content="heights in 16 bits",
+    encoder="encode_png",
+    exported=(
+        (
+            "`.png`",
+            "heights in 16 bits",
+            "texts: `height = offset + step x count` in mm, pixel size; resolution (pHYs); `Gwy::` "
+            "keys of Gwyddion, in m",
+            "count 0",
+            "number of them in a text",
+            "anything; Gwyddion with the scale",
+        ),
+    ),
+)
 TIFF = Format(
     name="TIFF",
     suffixes=(".tif", ".tiff"),
     content="heights in 16 bits",
     encoder="encode_tiff",
     options=("float32", "map_name"),
+    exported=(
+        (
+            "`.tif`, `.tiff`",
+            "heights in 16 bits",
+            "description that ImageJ reads: `c0`, `c1`, `vunit`; resolution in pixels per cm",
+            "count 0, also as GDAL's no-data tag",
+            "number of them in the description",
+            "ImageJ with the scale, anything",
+        ),
+        (
+            "`.tif --float32`",
+            "heights, float32",
+            "mm; pixel size and position of the first pixel in the description",
+            "NaN",
+            "number of them in the description",
+            "scientific programs",
+        ),
+    ),
 )
 
 

@@ -47,6 +47,16 @@ MCAP = Format(
     writes_itself=True,
     of_recordings=True,
     recorder="GrowingMessages",
+    exported=(
+        (
+            "`.mcap`",
+            "[ROS 2 messages](#ros-2-messages)",
+            "metres, the ROS convention",
+            "no point, NaN",
+            "not marked",
+            "ROS 2, Foxglove, PlotJuggler",
+        ),
+    ),
 )
 
 

@@ -25,9 +25,64 @@ from mirrorskin.io.formats.surface import (
 from mirrorskin.io.model.mesh import Mesh, face_vectors, normals_around, surface_mesh
 from mirrorskin.io.model.result import Result
 
-PLY = Format(name="PLY", suffixes=(".ply",), content="a mesh", encoder="encode_ply", options=("points",))
-STL = Format(name="STL", suffixes=(".stl",), content="a mesh", encoder="encode_stl")
-OBJ = Format(name="OBJ", suffixes=(".obj",), content="a mesh", encoder="encode_obj")
+PLY = Format(
+    name="PLY",
+    suffixes=(".ply",),
+    content="a mesh",
+    encoder="encode_ply",
+    options=("points",),
+    exported=(
+        (
+            "`.ply`",
+            "triangles between pixels with a height; each vertex with `x y z`, normal `nx ny nz`, "
+            "`sigma`, `filled`",
+            "mm; comments in the header",
+            "no triangle",
+            "`filled` = 1, `sigma` NaN",
+            "MeshLab, CloudCompare, trimesh",
+        ),
+        (
+            "`.ply --points`",
+            "all points, no triangles",
+            "the same",
+            "no point",
+            "the same",
+            "the same",
+        ),
+    ),
+)
+STL = Format(
+    name="STL",
+    suffixes=(".stl",),
+    content="a mesh",
+    encoder="encode_stl",
+    exported=(
+        (
+            "`.stl`",
+            "triangles only, binary",
+            "mm; in the 80-byte header, as STL has no field for it",
+            "no triangle",
+            "not marked",
+            "CAD, slicers",
+        ),
+    ),
+)
+OBJ = Format(
+    name="OBJ",
+    suffixes=(".obj",),
+    content="a mesh",
+    encoder="encode_obj",
+    exported=(
+        (
+            "`.obj`",
+            "triangles only, text",
+            "mm; in a comment",
+            "no triangle",
+            "not marked",
+            "anything for meshes",
+        ),
+    ),
+)
 
 
 _PLY_TYPES = {"f4": "float", "u1": "uchar"}

@@ -7,9 +7,7 @@ the group `FORMATS`, such as ``mine = "my_package.my_format:MINE"``. Nothing hea
 
 from __future__ import annotations
 
-import ast
 import functools
-import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -17,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mirrorskin.io.base import declarations
 from mirrorskin.io.base.url import is_zarr
 
 if TYPE_CHECKING:
@@ -28,7 +27,6 @@ FORMATS = "mirrorskin.formats"
 FOLDER = "/"
 """What stands for a folder among suffixes."""
 
-_DECLARATION = re.compile(r"^\w+ = (Format\([^\n]*\)|Format\(\n.*?^\))$", re.MULTILINE | re.DOTALL)
 _HERE = Path(__file__).parent
 _OURS = (".h5", ".hdf5", ".nxs", ".mat", ".zarr", "")  # for which no package is asked
 _NUMPY = (".npy", ".npz")
@@ -72,6 +70,9 @@ class Format:
         does. See `mirrorskin.io.formats.mcap.GrowingMessages`.
     package, extra : str
         Package that exporting it needs, and the extra of mirrorskin that installs it.
+    exported : tuple of tuples of str
+        Rows of the table of exports in the documentation: suffix and option, content, unit and where it is
+        stated, holes, filled heights, programs that open it.
     module : str
         Module of the declaration; it is set when the format is found.
     """
@@ -91,6 +92,7 @@ class Format:
     recorder: str = ""
     package: str = ""
     extra: str = ""
+    exported: tuple[tuple[str, ...], ...] = ()
     module: str = ""
 
     def load(self, name: str) -> Any:
@@ -98,46 +100,21 @@ class Format:
         return getattr(import_module(self.module), name)
 
 
-def _read(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8")
-    except OSError as error:
-        from mirrorskin.io.base.types import InputError
-
-        raise InputError(f"{file} cannot be read ({error}); reinstall mirrorskin") from error
-
-
 @functools.cache
 def _built_in() -> tuple[Format, ...]:
     """Return the formats that the modules of this folder, and that of our Zarr stores, declare."""
-    found = []
-    for file in (*sorted(_HERE.glob("*.py")), _HERE.parent / "files" / "result_file.py"):
-        for text in _DECLARATION.findall(_read(file)):
-            (call,) = ast.parse(text).body
-            assert isinstance(call, ast.Expr)
-            assert isinstance(call.value, ast.Call)
-            values = {str(one.arg): ast.literal_eval(one.value) for one in call.value.keywords}
-            found.append(Format(module=f"mirrorskin.io.{file.parent.name}.{file.stem}", **values))
-    return tuple(found)
+    files = (*sorted(_HERE.glob("*.py")), _HERE.parent / "files" / "result_file.py")
+    return declarations.declared(Format, files, "mirrorskin.io")
 
 
 def _installed() -> Iterator[Format]:
     """Yield the formats that installed packages add."""
-    from importlib.metadata import entry_points
+    for point, form in declarations.installed(FORMATS, "format"):
+        if not isinstance(form, Format):
+            from mirrorskin.io.base.types import InputError
 
-    from mirrorskin.io.base.types import InputError
-
-    for point in entry_points(group=FORMATS):
-        try:
-            found = point.load()
-        except (ImportError, AttributeError) as error:
-            raise InputError(
-                f"the format {point.name} of an installed package cannot be loaded: {error}; repair or"
-                " uninstall the package"
-            ) from error
-        if not isinstance(found, Format):
             raise InputError(f"{point.value}, in the entry points {FORMATS}, is no mirrorskin.io.Format")
-        yield replace(found, module=point.module)
+        yield replace(form, module=point.module)
 
 
 def formats(installed: bool = True) -> tuple[Format, ...]:

@@ -26,13 +26,47 @@ from mirrorskin.io.formats.surface import (
 from mirrorskin.io.model.result import Result
 from mirrorskin.io.storage.atomic import write_new
 
-XYZ = Format(name="XYZ", suffixes=(".xyz",), content="points", encoder="encode_xyz")
+XYZ = Format(
+    name="XYZ",
+    suffixes=(".xyz",),
+    content="points",
+    encoder="encode_xyz",
+    exported=(
+        (
+            "`.xyz`",
+            "text, one point per line, after lines with `#`; columns as in PLY",
+            "mm; in the last `#` line, `x[mm]`",
+            "no line",
+            "column `filled`",
+            "CloudCompare, anything",
+        ),
+    ),
+)
 CSV = Format(
     name="CSV",
     suffixes=(".csv",),
     content="a matrix or a cross-section",
     encoder="encode_csv",
     options=("section", "map_name"),
+    exported=(
+        (
+            "`.csv`",
+            "heights as a matrix, a row of the picture per line",
+            "mm; pixel size and position of the first value in lines with `#`",
+            "`nan`",
+            "number of them in a line",
+            "spreadsheets, NumPy, MATLAB",
+        ),
+        (
+            "`.csv --section`",
+            "a cross-section, between two points or across the `apex`: `distance, x, y, height`, "
+            "`sigma`, `filled`",
+            "mm; in the names, `height [mm]`",
+            "empty cell",
+            "column `filled`",
+            "spreadsheets",
+        ),
+    ),
 )
 NPZ = Format(
     name="NPZ",
@@ -41,6 +75,16 @@ NPZ = Format(
     encoder="encode_npz",
     options=("map_name",),
     needs_heights=False,
+    exported=(
+        (
+            "`.npz`",
+            "all maps unchanged, `x`, `y`, and `units`, `legends`, `process` and `fitted` as JSON",
+            "`units`",
+            "NaN, and the codes above",
+            "`filled`",
+            "NumPy",
+        ),
+    ),
 )
 
 

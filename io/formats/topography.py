@@ -27,6 +27,16 @@ X3P = Format(
     encoder="encode_x3p",
     package="x3pio",
     extra="metrology",
+    exported=(
+        (
+            "`.x3p`",
+            "heights, ISO 25178-72",
+            "m; position of the first pixel; program, date and notes in the metadata",
+            "NaN",
+            "number of them in the comment",
+            "programs of metrology, forensics; x3pio",
+        ),
+    ),
 )
 SUR = Format(
     name="SUR",
@@ -35,6 +45,16 @@ SUR = Format(
     encoder="encode_sur",
     package="surfalize",
     extra="metrology",
+    exported=(
+        (
+            "`.sur`",
+            "heights, Digital Surf",
+            "µm; no position, as surfalize writes none",
+            "their own code",
+            "number of them in the comment",
+            "MountainsMap, Gwyddion; surfalize",
+        ),
+    ),
 )
 GSF = Format(
     name="GSF",
@@ -43,6 +63,16 @@ GSF = Format(
     encoder="encode_gsf",
     package="gsffile",
     extra="metrology",
+    exported=(
+        (
+            "`.gsf`",
+            "heights, Gwyddion Simple Field, float32",
+            "m; size and position of the picture",
+            "NaN",
+            "number of them in `Comment`",
+            "Gwyddion; gsffile",
+        ),
+    ),
 )
 
 

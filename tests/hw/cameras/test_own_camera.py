@@ -9,7 +9,8 @@ import pytest
 from installed_packages import install
 
 from mirrorskin import io
-from mirrorskin.hw.base.rig_file import CAMERAS, load_rig
+from mirrorskin.hw.base.drivers import CAMERAS, built_in, camera_driver
+from mirrorskin.hw.base.rig_file import load_rig
 from mirrorskin.hw.rig.rig import open_camera
 
 CAMERA = '''
@@ -138,4 +139,5 @@ def test_a_class_that_is_no_camera_is_refused_in_a_line(opened, kind, line):
 def test_other_sources_are_no_classes(tmp_path, source):
     (tmp_path / "rig.toml").write_text(RIG.format(source=source), encoding="utf-8")
     camera = load_rig(Path(tmp_path, "rig.toml")).camera
-    assert (camera.own, camera.source) == (False, source)
+    assert camera.source == source
+    assert camera_driver(source) in built_in(CAMERAS)

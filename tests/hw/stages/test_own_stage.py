@@ -15,8 +15,9 @@ from rig_fakes import FakeCamera, settings
 from simulated import on_clock, write_film_rig
 
 from mirrorskin import io
+from mirrorskin.hw.base.drivers import STAGES, stage_driver
 from mirrorskin.hw.base.errors import HardwareError
-from mirrorskin.hw.base.rig_file import STAGES, StageSettings, TravelAxis, load_rig
+from mirrorskin.hw.base.rig_file import StageSettings, TravelAxis, load_rig
 from mirrorskin.hw.base.stage import Position
 from mirrorskin.hw.rig.plans import AxialPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig, open_stage
@@ -252,13 +253,14 @@ def test_what_a_class_lacks_is_refused_in_a_line(folder, words, change, said):
 def named_stage(tmp_path, monkeypatch):
     """Install a package that gives the stage of the page a name."""
     install(tmp_path / "site", STAGES, lab="lab_stage:LabStage")
+    (tmp_path / "site" / "lab_stage.py").write_text("class LabStage:\n    pass\n", encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path / "site")
 
 
 @pytest.mark.usefixtures("named_stage")
 def test_an_entry_point_names_a_stage(tmp_path):
     write_film_rig(tmp_path, RIG.replace("my_stage:LabStage", "lab"))
-    assert load_rig(tmp_path / "rig.toml").stage.firmware == "lab_stage:LabStage"
+    assert str(stage_driver(load_rig(tmp_path / "rig.toml").stage.firmware)) == "lab_stage:LabStage"
 
 
 @pytest.mark.usefixtures("named_stage")
