@@ -77,9 +77,9 @@ class OfAstropy(np.ndarray):
 
 
 def of_astropy(values, unit):
-    found = np.asarray(values).view(OfAstropy)
-    found.unit = unit
-    return found
+    array = np.asarray(values).view(OfAstropy)
+    array.unit = unit
+    return array
 
 
 def labelled(*names, **more):
@@ -88,9 +88,9 @@ def labelled(*names, **more):
 
 
 def of_pandas(values, unit):
-    found = pandas.Series(values)
-    found.attrs["units"] = unit
-    return found
+    series = pandas.Series(values)
+    series.attrs["units"] = unit
+    return series
 
 
 def of_zarr(frames):
@@ -133,7 +133,7 @@ FRAMES_OF_KIND = {
     "xarray, columns first": (labelled("x", "y", "travel"), FRAMES),
     "xarray of Dask": (lambda frames: labelled("y", "x", "travel")(dask.array.from_array(frames)), FRAMES),
     "xarray of pint": (lambda frames: labelled("y", "x", "travel")(frames * UNITS.count), FRAMES),
-    "list of xarray": (lambda frames: [one.T for one in labelled("travel", "y", "x")(frames)], FRAMES),
+    "list of xarray": (lambda frames: [array.T for array in labelled("travel", "y", "x")(frames)], FRAMES),
     "packed xarray": (
         labelled("y", "x", "travel", attrs={"scale_factor": 2.0, "add_offset": 5.0}),
         (2.0 * FRAMES + 5).astype(np.float32),
@@ -160,7 +160,7 @@ TRAVEL_OF_KIND = {
     "list of different units": [
         UNITS.Quantity(value * 10.0 ** (3 * (k % 2)), ("mm", "um")[k % 2]) for k, value in enumerate(TRAVEL)
     ],
-    "objects of pint": np.array([None, *[UNITS.Quantity(one, "mm") for one in TRAVEL]], object)[1:],
+    "objects of pint": np.array([None, *[UNITS.Quantity(travel, "mm") for travel in TRAVEL]], object)[1:],
     "astropy": of_astropy(1e-3 * TRAVEL, "m"),
     "xarray": xarray.DataArray(TRAVEL, dims="travel"),
     "xarray with a unit": xarray.DataArray(1e3 * TRAVEL, dims="travel", attrs={"units": "um"}),
@@ -196,40 +196,42 @@ EACH_DOOR = pytest.mark.parametrize("door", DOORS)
 
 def answer(door, frames, travel, dtype=np.uint8):
     """Return the maps of an entry point, as bytes by name; ``dtype`` is the type of a stream's samples."""
-    found = DOORS[door](frames, travel, dtype)
-    return {name: (found[name].dtype, found[name].tobytes()) for name in ("height", "height_sigma", "status")}
+    result = DOORS[door](frames, travel, dtype)
+    return {
+        name: (result[name].dtype, result[name].tobytes()) for name in ("height", "height_sigma", "status")
+    }
 
 
 @pytest.mark.parametrize("kind", FRAMES_OF_KIND)
 @EACH_DOOR
 def test_frames_of_any_kind_are_those_of_a_plain_array(door, kind):
     convert, plain = FRAMES_OF_KIND[kind]
-    found = answer(door, convert(FRAMES), TRAVEL, plain.dtype)
-    assert found == answer(door, plain, TRAVEL, plain.dtype)
+    result = answer(door, convert(FRAMES), TRAVEL, plain.dtype)
+    assert result == answer(door, plain, TRAVEL, plain.dtype)
 
 
 @pytest.mark.parametrize("kind", FRAMES_OF_KIND)
 def test_own_operations_receive_any_kind_of_frames_as_plain_arrays(kind):
     convert, plain = FRAMES_OF_KIND[kind]
-    found = engine.run(convert(FRAMES), Brightest, travel=UNITS.Quantity(1e3 * TRAVEL, "um"))
+    result = engine.run(convert(FRAMES), Brightest, travel=UNITS.Quantity(1e3 * TRAVEL, "um"))
     np.testing.assert_array_equal(
-        found["brightest"], np.nanmax(np.pad(plain, ((1, 0), (0, 0), (0, 0))), axis=0)
+        result["brightest"], np.nanmax(np.pad(plain, ((1, 0), (0, 0), (0, 0))), axis=0)
     )
-    assert found.process["at"] == TRAVEL[-1]
+    assert result.process["at"] == TRAVEL[-1]
 
 
 @pytest.mark.parametrize("kind", ["masked", "big-endian", "int64", "float16", "xarray", "list of dlpack"])
 def test_an_iterator_yields_any_kind_of_frames(kind):
     convert, plain = FRAMES_OF_KIND[kind]
-    found = answer("run", iter(convert(FRAMES)), UNITS.Quantity(1e3 * TRAVEL, "um"))
-    assert found == answer("run", plain, TRAVEL)
+    result = answer("run", iter(convert(FRAMES)), UNITS.Quantity(1e3 * TRAVEL, "um"))
+    assert result == answer("run", plain, TRAVEL)
 
 
 @pytest.mark.parametrize("kind", TRAVEL_OF_KIND)
 @EACH_DOOR
 def test_positions_of_any_kind_are_those_of_a_plain_array(door, kind):
-    found = DOORS[door](FRAMES, TRAVEL_OF_KIND[kind], np.uint8)
-    np.testing.assert_allclose(found.height, DOORS[door](FRAMES, TRAVEL, np.uint8).height, rtol=1e-6)
+    result = DOORS[door](FRAMES, TRAVEL_OF_KIND[kind], np.uint8)
+    np.testing.assert_allclose(result.height, DOORS[door](FRAMES, TRAVEL, np.uint8).height, rtol=1e-6)
 
 
 WRONG_TRAVEL = {
@@ -316,8 +318,8 @@ def test_every_function_takes_arrays_of_other_libraries_as_plain_ones(name):
     for argument, plain in arguments.items():
         if isinstance(plain, np.ndarray):
             for kind, convert in OTHERS.items():
-                found = content(function(**{**arguments, argument: convert(plain)}))
-                assert found == expected, f"{argument}, {kind}"
+                result = content(function(**{**arguments, argument: convert(plain)}))
+                assert result == expected, f"{argument}, {kind}"
 
 
 @pytest.mark.parametrize("name", calls())
@@ -332,8 +334,8 @@ def test_every_function_refuses_a_unit_that_no_argument_has(name):
 
 def test_counts_in_units_of_a_camera_are_counts():
     dark = xarray.DataArray(np.full(SHAPE, 20.0), dims=("y", "x"), attrs={"units": "DN"})
-    found = engine.find_onset(FRAMES, TRAVEL, **{**LEVELS, "dark": dark})
-    assert content(found) == content(engine.find_onset(FRAMES, TRAVEL, **LEVELS))
+    onset = engine.find_onset(FRAMES, TRAVEL, **{**LEVELS, "dark": dark})
+    assert content(onset) == content(engine.find_onset(FRAMES, TRAVEL, **LEVELS))
 
 
 @pytest.mark.parametrize("hold", [2.7, np.float64(2.7), np.array(2.7), xarray.DataArray(2.7)])
@@ -377,7 +379,10 @@ SIZED = {"x": 0.1 * (np.arange(8) - 3.5), "y": 0.1 * (2.5 - np.arange(6))}
 def in_micrometres(*names):
     """Return maps of a surface, some of them in micrometres: with pint, or in a dataset of xarray."""
     plain = {"height": FLAT, "height_sigma": FLAT_SIGMA, **SIZED}
-    return {name: UNITS.Quantity(1e3 * one, "um") if name in names else one for name, one in plain.items()}
+    return {
+        name: UNITS.Quantity(1e3 * number, "um") if name in names else number
+        for name, number in plain.items()
+    }
 
 
 def area(maps, **options):
@@ -426,11 +431,11 @@ UNIT_CASES = {
 def test_a_quantity_in_another_unit_is_converted(case):
     call = UNIT_CASES[case]
     plain = call(lambda value, unit, other_value, other_unit: value)
-    for found in (
+    for result in (
         call(lambda value, unit, other_value, other_unit: UNITS.Quantity(value, unit)),
         call(lambda value, unit, other_value, other_unit: UNITS.Quantity(other_value, other_unit)),
     ):
-        np.testing.assert_allclose(found, plain, rtol=1e-6)
+        np.testing.assert_allclose(result, plain, rtol=1e-6)
 
 
 @pytest.mark.parametrize("names", [["height", "height_sigma"], ["x", "y"]])
@@ -440,7 +445,7 @@ def test_maps_in_other_units_are_converted(names):
 
 def test_a_dataset_of_quantities_is_converted():
     height = xarray.DataArray(UNITS.Quantity(1e3 * FLAT, "um"), dims=("y", "x"))
-    dataset = xarray.Dataset({"height": height}, coords={name: (name, one) for name, one in SIZED.items()})
+    dataset = xarray.Dataset({"height": height}, coords={name: (name, axis) for name, axis in SIZED.items()})
     np.testing.assert_allclose(io.Result.from_xarray(dataset).height, FLAT, rtol=1e-12)
 
 
@@ -485,12 +490,14 @@ CHANGES = {
 def test_arrays_and_recordings_give_what_the_function_gives(name, change):
     case = CASES[name]
     is_estimated = case.kind is not engine.optical.Focus
-    options = {one: value for one, value in case.options.items() if one != "noise" or not is_estimated}
+    options = {
+        option: value for option, value in case.options.items() if option != "noise" or not is_estimated
+    }
     frames = np.rint(CHANGES[change](case.frames.astype(float))).clip(0, 255).astype(case.frames.dtype)
     expected = case.function(frames, **case.given, **options)
-    found = engine.run(frames, case.kind(**options), **case.given)
-    assert_same(found, expected)
-    assert found.process.get("warnings") == expected.process.get("warnings")
+    result = engine.run(frames, case.kind(**options), **case.given)
+    assert_same(result, expected)
+    assert result.process.get("warnings") == expected.process.get("warnings")
     if not case.weights:
         recording = dataclasses.replace(case, frames=frames).source()
         assert_same(engine.run(recording, case.kind(**options)), expected)

@@ -24,8 +24,10 @@ ONCE = pytest.mark.parametrize("name", [name for name, case in CASES.items() if 
 
 def of_type(name, dtype=None):
     case = CASES[name]
-    known = {**LEVELS, **case.options} if dtype == "float32" and hasattr(case.kind, "dark") else case.options
-    return replace(case, frames=case.frames.astype(dtype or case.frames.dtype), options=known)
+    options = (
+        {**LEVELS, **case.options} if dtype == "float32" and hasattr(case.kind, "dark") else case.options
+    )
+    return replace(case, frames=case.frames.astype(dtype or case.frames.dtype), options=options)
 
 
 @functools.cache
@@ -53,42 +55,44 @@ def content(result):
 
 @EACH
 def test_maps_are_as_declared_and_each_has_its_standard_deviation_by_name(name):
-    case, found = CASES[name], whole(name)
-    for one, values in found.items():
-        declared = found.declaration(one)
-        assert declared is not io.model.maps.UNDECLARED, one
-        assert np.asarray(values).dtype == declared.dtype, one
+    case, result = CASES[name], whole(name)
+    for map_name, values in result.items():
+        declared = result.declaration(map_name)
+        assert declared is not io.model.maps.UNDECLARED, map_name
+        assert np.asarray(values).dtype == declared.dtype, map_name
         if declared.axes == "pixels":
             shape = case.frames.shape[1:] + (len(declared.components),) * bool(declared.components)
-            assert np.shape(values)[-len(shape) :] == shape, one
-            assert np.ndim(values) - len(shape) in (0, 1), one  # 1: of each frame or turn
-    assert {one.removesuffix("_sigma") for one in found if one.endswith("_sigma")} <= set(found)
+            assert np.shape(values)[-len(shape) :] == shape, map_name
+            assert np.ndim(values) - len(shape) in (0, 1), map_name  # 1: of each frame or turn
+    assert {map_name.removesuffix("_sigma") for map_name in result if map_name.endswith("_sigma")} <= set(
+        result
+    )
 
 
 @EACH
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_the_result_does_not_depend_on_how_frames_are_divided_nor_on_memory(device, name, dtype):
     case = of_type(name, dtype)
-    for cut in CUTS.values():
-        ends = [part.stop for part in cut(len(case.frames))]
+    for cuts in CUTS.values():
+        ends = [part.stop for part in cuts(len(case.frames))]
         assert_same(case.whole(ends, device=device), whole(name, device, dtype))
     assert_same(case.whole(device=device, memory_limit=1), whole(name, device, dtype))
 
 
 @ONCE
 def test_an_intermediate_result_is_that_of_the_frames_so_far_and_stays(device, name):
-    case, seen = CASES[name], []
+    case, earlier = CASES[name], []
     run = case.loop(device=device)
     for part in CUTS["unevenly"](len(case.frames)):
         case.push(run, part)
-        found = answer(run)
-        assert content(answer(run)) == content(found)
+        result = answer(run)
+        assert content(answer(run)) == content(result)
         so_far = case.loop(device=device)
         case.push(so_far, slice(part.stop))
-        assert content(answer(so_far)) == content(found)
-        seen.append((found, content(found)))
-    assert all(content(found) == before for found, before in seen)
-    assert len({before for _, before in seen}) > 1
+        assert content(answer(so_far)) == content(result)
+        earlier.append((result, content(result)))
+    assert all(content(result) == before for result, before in earlier)
+    assert len({before for _, before in earlier}) > 1
 
 
 @EACH
@@ -97,14 +101,14 @@ def test_an_operation_keeps_nothing_of_a_run(device, name):
     operation = case.make(device=device)
     before = dict(vars(operation))
     engine.run(case.frames[::-1].copy(), operation, **reversed_positions(case))
-    assert {one: vars(operation)[one] for one in before} == before
+    assert {option: vars(operation)[option] for option in before} == before
     assert_same(engine.run(case.frames, operation, **case.given), whole(name, device))
 
 
 def at(offset, frames):
     """Copy frames to so many bytes behind the begin of a page."""
-    room = np.zeros(frames.nbytes + 2 * mmap.PAGESIZE, np.uint8)
-    placed = np.ndarray(frames.shape, frames.dtype, room.data, -room.ctypes.data % mmap.PAGESIZE + offset)
+    buffer = np.zeros(frames.nbytes + 2 * mmap.PAGESIZE, np.uint8)
+    placed = np.ndarray(frames.shape, frames.dtype, buffer.data, -buffer.ctypes.data % mmap.PAGESIZE + offset)
     placed[:] = frames
     return placed
 
@@ -148,8 +152,8 @@ def test_it_does_not_matter_where_frames_are_and_they_do_not_change(device, name
         placed = replace(case, frames=put(case.frames))
         assert_same(placed.whole(device=device), whole(name, device, dtype))
         np.testing.assert_array_equal(placed.frames, case.frames, err_msg=place)
-    room = np.zeros(case.frames.nbytes + 64, np.uint8)  # the bytes behind borrowed frames can be read
-    borrowed = replace(case, frames=np.ndarray(case.frames.shape, dtype, room.data))
+    buffer = np.zeros(case.frames.nbytes + 64, np.uint8)  # the bytes behind borrowed frames can be read
+    borrowed = replace(case, frames=np.ndarray(case.frames.shape, dtype, buffer.data))
     borrowed.frames[:] = case.frames
     assert_same(borrowed.whole(device=device), whole(name, device, dtype))
 
@@ -157,30 +161,34 @@ def test_it_does_not_matter_where_frames_are_and_they_do_not_change(device, name
 @EACH
 def test_what_memory_held_before_and_what_comes_after_changes_nothing(device, name, monkeypatch):
     def soiled(nbytes, zeroed):
-        found = take(nbytes, zeroed)
+        maps = take(nbytes, zeroed)
         if not zeroed:
-            found[:] = 0x7F
-        return found
+            maps[:] = 0x7F
+        return maps
 
     take, case = memory.take, CASES[name]
     monkeypatch.setattr(memory, "take", soiled)
-    found = case.whole(device=device)
+    maps = case.whole(device=device)
     replace(case, frames=255 - case.frames).whole(device=device)
     engine.free_memory()
-    assert_same(found, whole(name, device))
-    for values in found.values():
+    assert_same(maps, whole(name, device))
+    for values in maps.values():
         np.asarray(values)[...] = 1  # it is the caller's
 
 
 @EACH
 def test_running_it_over_a_recording_gives_the_same(name):
     case = replace(CASES[name], weights={})
-    found = engine.run(case.source(), case.make())
-    assert_same(found, case.whole())
-    assert found.process["operation"] == case.kind.__name__
-    numbers = {one: value for one, value in case.options.items() if isinstance(value, bool | int | float)}
-    chosen = {one: value for one, value in numbers.items() if one not in ("tilt", "noise")}  # estimated
-    assert {one: found.process[one] for one in chosen} == chosen
+    result = engine.run(case.source(), case.make())
+    assert_same(result, case.whole())
+    assert result.process["operation"] == case.kind.__name__
+    numbers = {
+        option: value for option, value in case.options.items() if isinstance(value, bool | int | float)
+    }
+    chosen = {
+        option: value for option, value in numbers.items() if option not in ("tilt", "noise")
+    }  # estimated
+    assert {option: result.process[option] for option in chosen} == chosen
 
 
 @EACH
@@ -209,7 +217,7 @@ def uneven(option, value):
     """Return a value of an option that float32 cannot hold."""
     added, alone = UNEVEN[option.unit]
     if isinstance(value, list | tuple):
-        return [one + added / 10 for one in value]
+        return [entry + added / 10 for entry in value]
     number = (
         LEVEL.get(option.name, alone) if value is None or isinstance(value, str) else float(value) + added
     )
@@ -235,7 +243,7 @@ def test_a_value_that_float32_cannot_hold_is_kept(name, option, value):
     if case.function:
         answers.append(case.function(case.frames, **case.given, **options))
     kept = str(list(value)) if isinstance(value, list | tuple) else value
-    assert [found.process.get(option, kept) for found in answers] == [kept] * len(answers)
+    assert [result.process.get(option, kept) for result in answers] == [kept] * len(answers)
 
 
 @EACH
@@ -251,9 +259,9 @@ def test_live_gives_the_same_or_refuses_before_anything_moves(name):
     while (block := source.read(live.staging_buffer[:5])) is not None:
         live.push_block(block)
         live.maps(0.0)
-    found = live.result()
-    assert found.process["live"] is True
-    assert_same(found, case.whole())
+    result = live.result()
+    assert result.process["live"] is True
+    assert_same(result, case.whole())
 
 
 @ONCE
@@ -264,7 +272,7 @@ def test_frames_that_do_not_fit_are_refused_and_change_nothing(name, wrong):
     case.push(run, part)
     frames = {name: case.frames[part].astype(kind) for name, kind in (("type", "i4"), ("byte order", ">u2"))}
     frames |= {"shape": case.frames[part, 1:], "none": case.frames[:0], "positions": case.frames[:7]}
-    where = {one: values[part] for one, values in case.given.items()}
+    where = {position: values[part] for position, values in case.given.items()}
     if wrong == "positions" and not where:
         return
     with pytest.raises(io.InputError):
@@ -288,11 +296,11 @@ def test_each_answer_next_to_pushes_is_that_of_a_single_thread(name):
         return LiveRun(case.source(), case.make()) if name in LIVE else case.loop()
 
     parts = [slice(start, start + 2) for start in range(0, len(case.frames), 2)]
-    alone, shared, start, done = make(), make(), threading.Barrier(3), threading.Event()
-    known = {None}
+    alone, shared, start, finished = make(), make(), threading.Barrier(3), threading.Event()
+    expected = {None}
     for part in parts:
         case.push(alone, part)
-        known |= set() if slow else {content(answer(alone))}
+        expected |= set() if slow else {content(answer(alone))}
 
     def push():
         start.wait()
@@ -300,31 +308,35 @@ def test_each_answer_next_to_pushes_is_that_of_a_single_thread(name):
             for part in parts:
                 case.push(shared, part)
         finally:
-            done.set()
+            finished.set()
 
     def look_on():
-        seen = []
+        earlier = []
         start.wait()
         for _ in range(10 if slow else 10**6):
-            if done.is_set():
+            if finished.is_set():
                 break
-            found = answer(shared)
-            seen = [*seen[:2], *seen[-2:], (found, content(found))]
-            assert slow or seen[-1][1] in known
-            if found:
+            result = answer(shared)
+            earlier = [*earlier[:2], *earlier[-2:], (result, content(result))]
+            assert slow or earlier[-1][1] in expected
+            if result:
                 assert (shared.preview(0.0) if name in LIVE else shared.staging_buffer) is not None
-        return seen
+        return earlier
 
     with ThreadPoolExecutor(3) as pool:
         pushing, *looking = pool.submit(push), pool.submit(look_on), pool.submit(look_on)
         pushing.result()
-        seen = [one for each in looking for one in each.result()]
+        earlier = [pair for each in looking for pair in each.result()]
     assert content(shared.result()) == content(alone.result())
-    assert all(content(found) == before for found, before in seen)  # nothing wrote to them later
+    assert all(content(result) == before for result, before in earlier)  # nothing wrote to them later
 
 
 def test_every_operation_has_a_case():
-    operations = (one for one in engine_classes() if issubclass(one, engine.Operation) and one.maps)
-    kinds = {one for one in operations if one.push is not engine.Operation.push}
+    operations = (
+        candidate
+        for candidate in engine_classes()
+        if issubclass(candidate, engine.Operation) and candidate.maps
+    )
+    kinds = {candidate for candidate in operations if candidate.push is not engine.Operation.push}
     bases = {base for kind in kinds for base in kind.__mro__[1:]}
     assert kinds - bases <= {case.kind for case in CASES.values()}

@@ -182,8 +182,8 @@ class Task:
 def function(task: Task) -> io.Result:
     case = task.case
     if task.is_method:
-        given = {**case.positions, **case.options, "pixel_size": PIXEL, "memory_limit": task.memory_limit}
-        return engine.reconstruct(case.frames, **given)
+        arguments = {**case.positions, **case.options, "pixel_size": PIXEL, "memory_limit": task.memory_limit}
+        return engine.reconstruct(case.frames, **arguments)
     if case.function is None:
         pytest.skip("there is no such function")
     return case.function(case.frames, **case.given, **case.options)
@@ -218,8 +218,8 @@ def spawned() -> ProcessPoolExecutor:
 
 
 def elsewhere(task: Task) -> io.Result:
-    given = task.configured(), task.case.frames, dict(task.case.given)
-    maps, process, fitted = spawned().submit(run_elsewhere, *given).result(60)
+    task_inputs = task.configured(), task.case.frames, dict(task.case.given)
+    maps, process, fitted = spawned().submit(run_elsewhere, *task_inputs).result(60)
     result = io.Result(maps, process=process)
     if fitted is not None:
         object.__setattr__(result, "fitted", fitted)
@@ -254,9 +254,9 @@ def two_threads(task: Task) -> io.Result:
     inverted.frames = task.case.frames.max() - task.case.frames
     with ThreadPoolExecutor(2) as pool:
         other = pool.submit(task.run, inverted, shared)
-        found = pool.submit(task.run, task.source(), shared).result()
+        result = pool.submit(task.run, task.source(), shared).result()
         other.result()
-    return found
+    return result
 
 
 def job_of(task: Task, name: str) -> tuple[Job, Plan]:
@@ -306,7 +306,10 @@ def words_of(kind: Any, options: Any) -> list[str]:
             words.append(flag if value else f"--no-{flag[2:]}")
             continue
         values = value if isinstance(value, list) else [value]
-        texts = [one if isinstance(one, str) else f"{one!r}{UNITS.get(declared.unit, '')}" for one in values]
+        texts = [
+            option if isinstance(option, str) else f"{option!r}{UNITS.get(declared.unit, '')}"
+            for option in values
+        ]
         words.append(f"{flag}={','.join(texts)}")
     return words
 
@@ -314,7 +317,9 @@ def words_of(kind: Any, options: Any) -> list[str]:
 def application(task: Task) -> io.Result:
     operation = "" if task.is_method else name_of(task.case.kind)
     computations: list[Any] = []
-    session = Session(task.recording(), Opening(operation=operation), lambda *one: computations.append(one))
+    session = Session(
+        task.recording(), Opening(operation=operation), lambda *computation: computations.append(computation)
+    )
     for name, value in task.case.options.items():
         session.choose(name, value)
     session.run = run_now
@@ -395,8 +400,8 @@ def doors_of(name: str) -> dict[str, Door]:
     if EVERYTHING[name].weights:  # recordings have none
         return ARRAYS
     # Every format is read by the same loop, and batches call the function of workers.
-    own = name in TWICE or name in OWN
-    left_out = {"worker"} if own else {"worker", "Zarr", "application"}
+    of_user = name in TWICE or name in OWN
+    left_out = {"worker"} if of_user else {"worker", "Zarr", "application"}
     return {door: run for door, run in DOORS.items() if door not in left_out}
 
 
@@ -451,28 +456,32 @@ OTHER_PLAN = {  # while frames come, another operation computes
 
 def pairs() -> list[Any]:
     """Return all operations and methods with all doors."""
-    found = ((name, door) for name in EVERYTHING for door in doors_of(name))
-    return [pytest.param(*one, id=", ".join(one)) for one in found if one not in OTHER_PLAN]
+    combinations = ((name, door) for name in EVERYTHING for door in doors_of(name))
+    return [
+        pytest.param(*combination, id=", ".join(combination))
+        for combination in combinations
+        if combination not in OTHER_PLAN
+    ]
 
 
-def assert_same(found: io.Result, expected: io.Result) -> None:
-    assert sorted(found) == sorted(expected)
-    for one, values in expected.items():
-        np.testing.assert_array_equal(found[one], values, err_msg=one, strict=True)
-    np.testing.assert_equal(fitted(found), fitted(expected))
+def assert_same(actual: io.Result, expected: io.Result) -> None:
+    assert sorted(actual) == sorted(expected)
+    for field, values in expected.items():
+        np.testing.assert_array_equal(actual[field], values, err_msg=field, strict=True)
+    np.testing.assert_equal(fitted(actual), fitted(expected))
 
 
 @pytest.mark.parametrize(("name", "door"), pairs())
 def test_maps_are_the_same_through_every_door(answers, name, door):
     expected = answers(name, reference_of(name, door))[-1]
-    for found in answers(name, door):
-        assert_same(found, expected)
+    for result in answers(name, door):
+        assert_same(result, expected)
 
 
 @pytest.mark.parametrize(("name", "door"), pairs())
 def test_findings_are_the_same_through_every_door(answers, name, door):
     expected = findings(answers(name, reference_of(name, door))[-1])
-    assert [findings(found) for found in answers(name, door)] == [expected] * len(answers(name, door))
+    assert [findings(result) for result in answers(name, door)] == [expected] * len(answers(name, door))
 
 
 @pytest.mark.parametrize("name", [name for name in EVERYTHING if "HDF5" in doors_of(name)])
@@ -490,10 +499,10 @@ NORMALS["Normals in uneven light"] = with_fewer_frames(replace(CASES["Normals"],
 @pytest.mark.parametrize("name", NORMALS)
 def test_heights_of_normals_are_those_of_a_rotation(name):
     case = NORMALS[name]
-    given = {**case.given, **case.options}
-    found = engine.integrate(engine.estimate_normals(case.frames, **given), pixel_size=PIXEL)
-    expected = engine.reconstruct(case.frames, pixel_size=PIXEL, **given)
-    assert_same(found, io.Result({one: expected[one] for one in found}, fitted=expected.fitted))
+    arguments = {**case.given, **case.options}
+    surface = engine.integrate(engine.estimate_normals(case.frames, **arguments), pixel_size=PIXEL)
+    expected = engine.reconstruct(case.frames, pixel_size=PIXEL, **arguments)
+    assert_same(surface, io.Result({field: expected[field] for field in surface}, fitted=expected.fitted))
 
 
 def kept(result: io.Result, folder: Path, name: str) -> Path:
@@ -504,7 +513,7 @@ def kept(result: io.Result, folder: Path, name: str) -> Path:
 
 MAPS: dict[str, Callable[[io.Result, Path, str], Any]] = {
     "result": lambda result, folder, name: result,
-    "mapping": lambda result, folder, name: {**result, **{one: getattr(result, one) for one in FIELDS}},
+    "mapping": lambda result, folder, name: {**result, **{field: getattr(result, field) for field in FIELDS}},
     "dataset": lambda result, folder, name: result.to_xarray(),
     "file": kept,
 }
@@ -535,7 +544,7 @@ def as_source(motion: str) -> Readable:
 
 def in_array(motion: str) -> ArrayRecording:
     frames, header, series = repeating(motion)
-    names = [one.name for one in dataclasses.fields(header) if one.name != "motion"]
+    names = [entry.name for entry in dataclasses.fields(header) if entry.name != "motion"]
     return ArrayRecording(frames, series, {name: getattr(header, name) for name in names}, motion)
 
 
@@ -598,8 +607,8 @@ def test_findings_of_a_fused_surface_are_the_same_through_every_door(pair, door)
 
 @pytest.mark.parametrize("kind", MAPS)
 def test_a_surface_of_results_does_not_depend_on_how_they_are_kept(pair, kind):
-    given = [MAPS[kind](one, pair.folder, f"{place}") for place, one in enumerate(pair.results)]
-    assert_same(engine.fuse(*given), engine.fuse(*pair.results))
+    sources = [MAPS[kind](result, pair.folder, f"{place}") for place, result in enumerate(pair.results)]
+    assert_same(engine.fuse(*sources), engine.fuse(*pair.results))
 
 
 @pytest.mark.parametrize("kind", MAPS)

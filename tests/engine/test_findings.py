@@ -202,5 +202,5 @@ class Suspicious(engine.Operation):
 
 def test_warnings_of_an_own_operation_are_issued_and_in_the_process():
     with pytest.warns(io.MirrorskinWarning, match=f"^Suspicious: {LOST}$"):
-        found = engine.run(np.ones((4, 3, 3)), Suspicious)
-    assert found.process["warnings"] == LOST
+        result = engine.run(np.ones((4, 3, 3)), Suspicious)
+    assert result.process["warnings"] == LOST

@@ -89,11 +89,11 @@ def bare(request, tmp_path):
     return lambda result: request.param(result, tmp_path)
 
 
-def assert_equal(found, expected):
-    assert list(found) == list(expected)
+def assert_equal(result, expected):
+    assert list(result) == list(expected)
     for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
-    assert found.fitted == expected.fitted
+        np.testing.assert_array_equal(result[name], values, err_msg=name)
+    assert result.fitted == expected.fitted
 
 
 @pytest.mark.parametrize("name", ["press", "turn", "registered", "fused", "fused results", "slide"])
@@ -119,27 +119,27 @@ def test_a_fusion_of_results_does_not_read_the_process(bare, name):
 
 
 def test_a_registration_with_heights_does_not_read_the_process(bare):
-    found = engine.reconstruct(turn(), heights=bare(results()["press"]))
-    assert_equal(found, results()["registered"])
+    result = engine.reconstruct(turn(), heights=bare(results()["press"]))
+    assert_equal(result, results()["registered"])
 
 
 def test_motions_and_stitched_touches_do_not_read_the_process(bare):
     assert results()["fused"].fitted.tilt == 0.05
-    left, right = results()["fused"], results()["fused"].assign(x=results()["fused"].x + 0.3)
-    found, expected = (engine.pose.stitch(pair) for pair in ((bare(left), bare(right)), (left, right)))
-    assert_equal(found.result, expected.result)
-    assert [str(pose) for pose in found.poses] == [str(pose) for pose in expected.poses]
-    pairs = (bare(left), bare(right)), (left, right)
-    found, expected = (engine.pose.estimate_pose(*pair) for pair in pairs)
-    assert str(found) == str(expected)
+    first, right = results()["fused"], results()["fused"].assign(x=results()["fused"].x + 0.3)
+    actual, expected = (engine.pose.stitch(pair) for pair in ((bare(first), bare(right)), (first, right)))
+    assert_equal(actual.result, expected.result)
+    assert [str(pose) for pose in actual.poses] == [str(pose) for pose in expected.poses]
+    pairs = (bare(first), bare(right)), (first, right)
+    actual, expected = (engine.pose.estimate_pose(*pair) for pair in pairs)
+    assert str(actual) == str(expected)
 
 
 def test_forces_and_slip_do_not_read_the_process(bare):
     pressed = results()["press"].with_fitted(travel=1.5)
-    assert_equal(*(engine.force.find_force(one, modulus=0.1) for one in (bare(pressed), pressed)))
+    assert_equal(*(engine.force.find_force(touched, modulus=0.1) for touched in (bare(pressed), pressed)))
     contact = io.Result(contact=slide().truth.contact)
-    found, expected = (engine.reconstruct(slide(), contact=one) for one in (bare(contact), contact))
-    assert_equal(found, expected)
+    actual, expected = (engine.reconstruct(slide(), contact=touched) for touched in (bare(contact), contact))
+    assert_equal(actual, expected)
     for undistorted in (contact.with_fitted(undistorted=True), bare(contact.with_fitted(undistorted=True))):
         with pytest.raises(io.InputError, match="the contact is undistorted"):
             engine.reconstruct(slide(), contact=undistorted)
@@ -149,8 +149,8 @@ def test_maps_of_a_region_are_undistorted_without_the_process(bare, tmp_path):
     result = of_a_region(tmp_path)
     camera = np.array([[0.1, 0.001, -2.55], [0.0, -0.1, 2.45], [0.0, 1e-4, 1.0]])
     lens = io.Lens((PIXEL, PIXEL), camera, np.zeros(5), np.eye(3), SHAPE, 0.0)
-    found, expected = undistort(bare(result), lens), undistort(result, lens)
-    assert_equal(found, expected)
+    actual, expected = undistort(bare(result), lens), undistort(result, lens)
+    assert_equal(actual, expected)
     assert result.fitted.region == REGION
     for once in (expected, bare(expected)):
         with pytest.raises(io.InputError, match="which is done once"):
@@ -168,8 +168,8 @@ class Blind(engine.Step):
 
     def apply(self, result, context):
         kept = {name: result.process[name] for name in ("warnings", "notes") if name in result.process}
-        done = self.step.apply(result.assign(process=kept), context)
-        return done.assign(process={**result.process, **done.process})
+        applied = self.step.apply(result.assign(process=kept), context)
+        return applied.assign(process={**result.process, **applied.process})
 
 
 def blind(method):
@@ -230,12 +230,12 @@ def test_what_an_operation_reports_is_in_fitted_and_displayed():
 
     class Doubled(Tilted):
         def result(self):
-            found = super().result()
-            return io.Result(brightest=2 * found.pop("brightest")).with_fitted(**found | {"turns": 2})
+            result = super().result()
+            return io.Result(brightest=2 * result.pop("brightest")).with_fitted(**result | {"turns": 2})
 
-    found = engine.run(np.ones((3, 4, 5)), Tilted)
-    assert found.fitted == io.Fitted(frames=3, tilt=0.5, registered=True)
-    assert (found.process["tilt"], found.process["registered"], found.process["turns"]) == (0.5, True, 1.5)
-    found = engine.run(np.ones((3, 4, 5)), Doubled)
-    assert found.fitted == io.Fitted(frames=3, tilt=0.5, registered=True, turns=2)
-    assert found.process["turns"] == 2
+    result = engine.run(np.ones((3, 4, 5)), Tilted)
+    assert result.fitted == io.Fitted(frames=3, tilt=0.5, registered=True)
+    assert (result.process["tilt"], result.process["registered"], result.process["turns"]) == (0.5, True, 1.5)
+    result = engine.run(np.ones((3, 4, 5)), Doubled)
+    assert result.fitted == io.Fitted(frames=3, tilt=0.5, registered=True, turns=2)
+    assert result.process["turns"] == 2

@@ -37,29 +37,29 @@ def integrated():
 
 def copied(device):
     """Return the bytes that were copied between host and device."""
-    return sum(one.bytes for one in device.profile.records() if one.kind in ("upload", "download"))
+    return sum(record.bytes for record in device.profile.records() if record.kind in ("upload", "download"))
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_operations_copy_nothing_and_have_the_answers_of_a_card(integrated, card, name):
-    found = CASES[name].whole(device=integrated)
+    result = CASES[name].whole(device=integrated)
     assert copied(integrated) == 0
-    assert_same(found, CASES[name].whole(device=card))
+    assert_same(result, CASES[name].whole(device=card))
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_integrations_copy_nothing_and_have_the_heights_of_a_card(integrated, card, name):
-    found, expected = (
-        engine.integrate(*SLOPES, 0.05, **PROBLEMS[name], device=one) for one in (integrated, card)
+    result, expected = (
+        engine.integrate(*SLOPES, 0.05, **PROBLEMS[name], device=device) for device in (integrated, card)
     )
     assert copied(integrated) == 0
-    np.testing.assert_array_equal(found.height, expected.height)
+    np.testing.assert_array_equal(result.height, expected.height)
 
 
 def test_edges_copy_nothing_and_are_those_of_a_card(integrated, card):
-    found, expected = (engine.find_edges(*roof(SHAPE), device=one) for one in (integrated, card))
+    result, expected = (engine.find_edges(*roof(SHAPE), device=device) for device in (integrated, card))
     assert copied(integrated) == 0
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(result, expected)
 
 
 def test_frames_are_used_where_they_are(integrated):

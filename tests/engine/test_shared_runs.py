@@ -53,8 +53,8 @@ def assert_as_alone(*calls):
         return [(place, content(calls[place]())) for place in places]
 
     with ThreadPoolExecutor(THREADS) as pool:
-        found = [one for each in pool.map(run, range(THREADS)) for one in each]
-    wrong = {name for place, maps in found for name in maps if maps[name] != alone[place][name]}
+        results = [result for each in pool.map(run, range(THREADS)) for result in each]
+    wrong = {name for place, maps in results for name in maps if maps[name] != alone[place][name]}
     assert not wrong
 
 
@@ -132,8 +132,8 @@ def assert_one_source_serves_all_threads(door, *sources):
 @pytest.mark.parametrize("door", DOORS)
 @pytest.mark.parametrize("kind", FILES)
 def test_one_open_file_gives_each_thread_what_one_thread_gets(tmp_path, kind, door):
-    known = {} if kind in ("HDF5", "compressed HDF5", "Zarr") else {"travel": TRAVEL}
-    with io.open_recording(FILES[kind](tmp_path), **known) as recording:
+    options = {} if kind in ("HDF5", "compressed HDF5", "Zarr") else {"travel": TRAVEL}
+    with io.open_recording(FILES[kind](tmp_path), **options) as recording:
         assert_one_source_serves_all_threads(door, recording)
 
 
@@ -163,7 +163,7 @@ def test_a_check_next_to_runs_does_not_disturb_them(tmp_path):
 @pytest.mark.parametrize("kind", ["chunks of several frames", "video"])
 def test_single_frames_next_to_a_run_do_not_disturb_it(tmp_path, kind):
     """Both unpack chunks into the same memory, and use the same decoder."""
-    path, done = tmp_path / "chunks.h5", threading.Event()
+    path, finished = tmp_path / "chunks.h5", threading.Event()
     if kind == "video":
         path = video(tmp_path)
     else:
@@ -176,15 +176,15 @@ def test_single_frames_next_to_a_run_do_not_disturb_it(tmp_path, kind):
             try:
                 return [content(DOORS["run"](recording)) for _ in range(THREADS * RUNS)]
             finally:
-                done.set()
+                finished.set()
 
         expected = content(DOORS["run"](recording))
         with ThreadPoolExecutor(1) as pool:
             running = pool.submit(run)
-            while not done.is_set():
+            while not finished.is_set():
                 for number in (0, 20, 9):
                     np.testing.assert_array_equal(recording.frame(number), FRAMES[number])
-            assert all(found == expected for found in running.result())
+            assert all(result == expected for result in running.result())
 
 
 @pytest.mark.parametrize("name", CASES)

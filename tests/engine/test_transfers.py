@@ -83,13 +83,13 @@ def moved(device, call):
 
 @pytest.mark.parametrize("name", CALLS)
 def test_a_call_moves_no_more_than_it_must(card, name):
-    function, arrays, options, most = CALLS[name]
-    found, allocations = moved(card, lambda: function(*arrays, **options, device=card))
-    assert found.uploads <= most.uploads
-    assert found.up <= most.up + SMALL
-    assert found.downloads <= most.downloads
-    assert found.down == pytest.approx(most.down, abs=SMALL)
-    assert found.waits <= most.waits
+    function, arrays, options, limits = CALLS[name]
+    result, allocations = moved(card, lambda: function(*arrays, **options, device=card))
+    assert result.uploads <= limits.uploads
+    assert result.up <= limits.up + SMALL
+    assert result.downloads <= limits.downloads
+    assert result.down == pytest.approx(limits.down, abs=SMALL)
+    assert result.waits <= limits.waits
     assert allocations == 0
 
 
@@ -100,9 +100,9 @@ def test_answers_are_those_of_shared_memory(card, name):
     if not shared.info.shares_memory:
         pytest.skip("the device does not share the host's memory")
     shared.layout = GPU_LAYOUT
-    expected, found = (function(*arrays, **options, device=device) for device in (shared, card))
+    expected, result = (function(*arrays, **options, device=device) for device in (shared, card))
     for key in expected:
-        np.testing.assert_array_equal(found[key], expected[key], err_msg=key)
+        np.testing.assert_array_equal(result[key], expected[key], err_msg=key)
 
 
 def test_maps_of_a_press_that_goes_on_are_copies(card):

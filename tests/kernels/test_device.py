@@ -185,16 +185,16 @@ def test_a_kernel_that_is_not_in_the_source_is_one_line(device):
 
 
 def test_a_kernel_that_has_the_name_of_a_function_of_opencl_runs_or_is_one_line(device):
-    values, said = device.array("values", (1,), np.float32), ""
+    values, message = device.array("values", (1,), np.float32), ""
     try:  # NVIDIA's compiler allows it
         source = "__kernel void cross(__global float *values) { values[0] = 7; }"
         device.kernel(source, "cross")(1, values=values, moved=4)
     except DeviceError as error:
-        said = str(error)
-    assert "cross is a function of OpenCL: rename the kernel" in said or values.read() == 7
+        message = str(error)
+    assert "cross is a function of OpenCL: rename the kernel" in message or values.read() == 7
 
 
-def test_arguments_are_named_and_numbers_become_what_the_source_says(device):
+def test_arguments_are_named_and_numbers_get_the_type_of_the_source(device):
     numbers = device.from_host("numbers", np.ones((8, 16), np.float32))
     kernel = device.kernel("limits", "multiply_all", LANES=16, WORDS=8, STRIDE=1)
     kernel(1, summand=np.float64(0.5), factor=2, numbers=numbers, steps=np.int64(1), count=8, moved=0)
@@ -300,9 +300,9 @@ def test_parts_of_several_arrays_are_waited_for_once(device):
     arrays = [device.from_host(name, np.full((3, 4), n), np.int32) for n, name in enumerate("abc")]
     for keep in (True, False):
         device.profile.clear()
-        found = fetch([(arrays[0], slice(None)), (arrays[1], 2), (arrays[2], slice(1, 3))], [keep] * 3)
-        assert [part.shape for part in found] == [(3, 4), (4,), (2, 4)]
-        assert [int(part.max()) for part in found] == [int(part.min()) for part in found] == [0, 1, 2]
+        parts = fetch([(arrays[0], slice(None)), (arrays[1], 2), (arrays[2], slice(1, 3))], [keep] * 3)
+        assert [part.shape for part in parts] == [(3, 4), (4,), (2, 4)]
+        assert [int(part.max()) for part in parts] == [int(part.min()) for part in parts] == [0, 1, 2]
         records = [record for record in device.profile.records() if record.kind == "download"]
         assert sum(record.bytes for record in records) == (0 if device.info.shares_memory else 4 * 24)
         if not device.info.shares_memory:
@@ -357,8 +357,8 @@ def test_a_work_group_is_no_larger_than_its_kernel_allows(device, monkeypatch):
     ask = cl.Kernel.get_work_group_info
 
     def limited(kernel, param, on):
-        found = ask(kernel, param, on)
-        return 2 if param == cl.kernel_work_group_info.WORK_GROUP_SIZE else found
+        limit = ask(kernel, param, on)
+        return 2 if param == cl.kernel_work_group_info.WORK_GROUP_SIZE else limit
 
     monkeypatch.setattr(cl.Kernel, "get_work_group_info", limited)
     monkeypatch.setattr(device, "layout", replace(device.layout, group=64))
@@ -388,7 +388,7 @@ def test_work_groups_are_no_larger_than_the_device_allows():
     assert child.stdout == "64 True\n", child.stderr
 
 
-def test_a_cache_that_cannot_be_written_is_said_so(device, monkeypatch):
+def test_a_cache_that_cannot_be_written_is_reported(device, monkeypatch):
     def refuse(file, options):
         raise PermissionError(13, "Permission denied", "/home/cache")
 
@@ -397,12 +397,12 @@ def test_a_cache_that_cannot_be_written_is_said_so(device, monkeypatch):
         device.kernel("limits", "copy_all", ANEW=1, **MACROS)
 
 
-def test_a_kernel_that_cannot_be_read_is_said_so(device, tmp_path):
+def test_a_kernel_that_cannot_be_read_is_reported(device, tmp_path):
     with pytest.raises(DeviceError, match=r"gone\.cl cannot be read .*; reinstall mirrorskin"):
         device.kernel(tmp_path / "gone.cl", "copy_all")
 
 
-def test_a_queue_that_is_lost_is_said_so(device, monkeypatch):
+def test_a_lost_queue_is_reported(device, monkeypatch):
     def flush():
         raise lost()
 
@@ -432,8 +432,8 @@ os.wait()
 
 def test_a_forked_process_is_refused_instead_of_waiting_for_ever(device):
     script = FORKED.format(choice=device.info.title)
-    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert "forked from one that had used OpenCL" in said.stdout
+    completed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert "forked from one that had used OpenCL" in completed.stdout
 
 
 def test_an_array_is_copied_by_numpy_and_its_rows_stay_on_the_device(device):

@@ -219,9 +219,9 @@ def test_a_home_that_cannot_be_written_is_replaced_by_a_temporary_cache(tmp_path
     environment = {**os.environ, "HOME": home, "TMPDIR": str(tmp_path)}
     del environment["XDG_CACHE_HOME"]
     command = [sys.executable, "-c", _NEW_PROCESS]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout.endswith(" 0 1 2 3 0 1 2 3\n")
-    (note,) = done.stderr.splitlines()
+    completed = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert completed.stdout.endswith(" 0 1 2 3 0 1 2 3\n")
+    (note,) = completed.stderr.splitlines()
     assert re.fullmatch(
         rf"PoCL cannot write its cache folder {home}/.cache/pocl/kcache \(.+\); set XDG_CACHE_HOME to a"
         " writable folder; until then kernels are compiled again by every command",
@@ -257,7 +257,7 @@ def test_hidden_drivers_and_broken_libraries_are_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    ("name", "value", "message"),
     [
         (
             "POCL_DEVICES",
@@ -270,7 +270,7 @@ def test_hidden_drivers_and_broken_libraries_are_named(tmp_path, monkeypatch):
         ("PYOPENCL_BUILD_OPTIONS", "-bogus", "kernels here: PYOPENCL_BUILD_OPTIONS is '-bogus'; unset it"),
     ],
 )
-def test_the_variable_that_hides_the_device_or_breaks_it_is_named(tmp_path, name, value, said):
+def test_the_variable_that_hides_the_device_or_breaks_it_is_named(tmp_path, name, value, message):
     run = "from mirrorskin.kernels.device import open_device; open_device()"
     environment = {key: text for key, text in os.environ.items() if not key.startswith("POCL_")}
     ended = subprocess.run(
@@ -282,7 +282,7 @@ def test_the_variable_that_hides_the_device_or_breaks_it_is_named(tmp_path, name
         check=False,
     )
     last = ended.stderr.strip().splitlines()[-1]
-    assert re.search(said, ended.stderr), last
+    assert re.search(message, ended.stderr), last
 
 
 def test_a_pocl_that_cannot_run_leaves_the_work_to_a_sound_one(pocl, monkeypatch, caplog):
@@ -338,9 +338,9 @@ def asked(monkeypatch):
     """Begin as a new process does, with a library whose function is made up; return what it was given."""
 
     def prepare(names, size=83, changed=False):
-        libc, given = ctypes.CDLL(None), []
+        libc, calls = ctypes.CDLL(None), []
         libc.strdup.restype = ctypes.c_void_p
-        ask = ctypes.CFUNCTYPE(ctypes.c_void_p)(lambda: given.append("called") or libc.strdup(names.encode()))
+        ask = ctypes.CFUNCTYPE(ctypes.c_void_p)(lambda: calls.append("called") or libc.strdup(names.encode()))
         library = SimpleNamespace(pocl_get_llvm_cpu_name=ask)
         code = ctypes.string_at(processor_name._address(ask), 83)
         digest = hashlib.sha256(code[:-1] + b"?" if changed else code).hexdigest()
@@ -348,9 +348,9 @@ def asked(monkeypatch):
         monkeypatch.setattr(processor_name, "_NAME_FUNCTION_SHA256", digest)
         monkeypatch.setattr(processor_name, "look_up", lambda _: (None, size))
         monkeypatch.setattr(processor_name, "_read_flags", lambda: SKYLAKE)
-        monkeypatch.setattr(processor_name, "_answer_with", lambda _, name: given.append(name))
+        monkeypatch.setattr(processor_name, "_answer_with", lambda _, name: calls.append(name))
         embedded.prepare()
-        return given
+        return calls
 
     monkeypatch.setattr(embedded, "_processor", None)
     monkeypatch.setattr(embedded, "_patched", False)
@@ -358,10 +358,10 @@ def asked(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("names", "given"), [("znver3", ["called"]), ("generic", ["called", "skylake-avx512"])]
+    ("names", "expected"), [("znver3", ["called"]), ("generic", ["called", "skylake-avx512"])]
 )
-def test_the_known_function_is_patched_for_unknown_processors(asked, names, given):
-    assert asked(names) == given
+def test_the_known_function_is_patched_for_unknown_processors(asked, names, expected):
+    assert asked(names) == expected
     assert ("patched" in embedded.note("3.0")) == (names == "generic")
 
 
@@ -413,8 +413,8 @@ print(processor_name._digest(processor_name._address(function)) == processor_nam
 
 @pytest.mark.usefixtures("pocl")
 def test_the_function_of_the_wheel_is_the_known_one():
-    done = subprocess.run([sys.executable, "-c", _WHICH], capture_output=True, text=True, check=True)
-    assert done.stdout == "True\n"
+    completed = subprocess.run([sys.executable, "-c", _WHICH], capture_output=True, text=True, check=True)
+    assert completed.stdout == "True\n"
 
 
 def test_the_library_and_the_size_of_a_function_are_looked_up():
@@ -450,13 +450,13 @@ def test_zig_is_found_next_to_its_package(zig):
 
 
 def test_compiler_libraries_are_left_out_and_the_rest_is_kept_in_order(zig, tmp_path):
-    wanted = ["--hash-style=both", "-shared", "-o", "a.so", "-L/usr/lib/gcc/12", "a's.o", "-lcrystal"]
+    remaining = ["--hash-style=both", "-shared", "-o", "a.so", "-L/usr/lib/gcc/12", "a's.o", "-lcrystal"]
     dropped = ["-lgcc", "-lgcc_s", "-lc", "-lm", "/usr/lib/crti.o", "crtbeginS.o"]
     folder = embedded.write_linker(tmp_path / "cache", [str(zig), "ld.lld"])
     assert [file.name for file in folder.iterdir()] == ["ld"]
-    given = [*dropped, *wanted[:5], *dropped, *wanted[5:], *dropped]
-    called = subprocess.run([folder / "ld", *given], capture_output=True, text=True, check=True)
-    assert called.stdout.splitlines() == ["ld.lld", *wanted]
+    arguments = [*dropped, *remaining[:5], *dropped, *remaining[5:], *dropped]
+    called = subprocess.run([folder / "ld", *arguments], capture_output=True, text=True, check=True)
+    assert called.stdout.splitlines() == ["ld.lld", *remaining]
     failing = embedded.write_linker(tmp_path / "cache", ["sh", "-c", "exit 3"])
     assert failing != folder
     assert subprocess.run([failing / "ld"]).returncode == 3

@@ -40,14 +40,14 @@ EXP = [1, pytest.approx(2.7182817), pytest.approx(7.389056)]
 @pytest.fixture
 def start(tmp_path):
     """Start a process that changes numbers, with caches of the test's own."""
-    if not any(bitcode.works_with(one.driver) and "Portable" in one.platform for one in list_devices()):
+    if not any(bitcode.works_with(info.driver) and "Portable" in info.platform for info in list_devices()):
         pytest.skip("another OpenCL than PoCL 3.0")
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     environment.pop("POCL_CACHE_DIR", None)
 
     def begin(change, **variables):
-        command, given = [sys.executable, "-c", CHANGE, change], {**environment, **variables}
-        return subprocess.Popen(command, env=given, stdout=subprocess.PIPE, text=True)
+        command, environ = [sys.executable, "-c", CHANGE, change], {**environment, **variables}
+        return subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, text=True)
 
     return begin
 

@@ -90,11 +90,11 @@ def test_what_can_be_written_is_not_read_only_to_a_device(device, writeable):
     if device.info.shares_memory:
         borrowed = device.borrow("values", values)
         assert bool(borrowed.buffer.flags & cl.mem_flags.READ_ONLY) == (not writeable)
-    seen = device.share("values", values)
+    shared = device.share("values", values)
     copied = device.array("copied", values.shape, np.uint8)
     source = "__kernel void copy(__global const uchar *from, __global uchar *to)"
     kernel = device.kernel(
         f"{source} {{ int i = get_global_id(0); if (i < {values.size}) to[i] = from[i]; }}", "copy"
     )
-    kernel(values.size, moved=2 * values.nbytes, **{"from": seen, "to": copied})
+    kernel(values.size, moved=2 * values.nbytes, **{"from": shared, "to": copied})
     np.testing.assert_array_equal(copied.read(), values)

@@ -34,14 +34,14 @@ def linked(shape, normal="", **others):
     flags[:, -1] &= DOWN
     flags[-1] &= RIGHT
     links = [np.where(flags & bit, rng.uniform(0.1, 2, shape), 0) for bit in (RIGHT, DOWN)]
-    made = {name: rng.normal(0, 0.5, shape) for name in normal.split()} | {"shape": shape} | others
-    return flags, *links, rng.uniform(0.05, 1, shape), made
+    maps = {name: rng.normal(0, 0.5, shape) for name in normal.split()} | {"shape": shape} | others
+    return flags, *links, rng.uniform(0.05, 1, shape), maps
 
 
 @case("breaks_curl", **BREAKS)
 def _(shape):
-    flags, *_, made = linked(shape, "slope_x slope_y", **SIZE)
-    return made | {"flags": flags}
+    flags, *_, maps = linked(shape, "slope_x slope_y", **SIZE)
+    return maps | {"flags": flags}
 
 
 @case("breaks_sum", **SUMS)
@@ -60,17 +60,17 @@ RIGHTWARDS, DOWNWARDS = near(1e-5, 1e-6, of="right"), near(1e-5, 1e-6, of="down"
 @case("breaks_trust", **BREAKS, checks=named("weight_x weight_y rise_x rise_y", *[RIGHTWARDS, DOWNWARDS] * 2))
 def _(shape):
     numbers = {"noise": 0.01, "bend": 0.5, "tear": 2.0, "least": 1e-3}
-    _, *links, facing, made = linked(shape, "slope_x slope_y tears", **numbers)
-    tears = np.pad(np.abs(made["tears"])[:-1, :-1], (0, 1))
-    return made | named("right down facing tears", *links, facing, tears)
+    _, *links, facing, maps = linked(shape, "slope_x slope_y tears", **numbers)
+    tears = np.pad(np.abs(maps["tears"])[:-1, :-1], (0, 1))
+    return maps | named("right down facing tears", *links, facing, tears)
 
 
 # A square of 6 is cut, or not, by its last digit.
 @case("breaks_links", **BREAKS, checks=dict.fromkeys(("right", "down", "source"), near(0, 2e-5, share=0.002)))
 def _(shape):
     numbers = SIZE | {"slack": 0.25, "sharpness": 4.0, "most": 6.0}
-    _, *links, held, made = linked(shape, "slope_x slope_y rise_x rise_y heights", **numbers)
-    return made | named("weight_x weight_y held", *links, held)
+    _, *links, held, maps = linked(shape, "slope_x slope_y rise_x rise_y heights", **numbers)
+    return maps | named("weight_x weight_y held", *links, held)
 
 
 # --- Correlation
@@ -109,38 +109,38 @@ class Fit:
 
 @case("correlation_add", PIXELS | WHOLE | {"count": (1, 11, 150), "first": (0, 1)})
 def _(shape, dtype, count, first):
-    made, place = Fit(shape, dtype, whole=True), np.arange(count, dtype=np.int32) * 5 % len(PHASES)
+    fit, place = Fit(shape, dtype, whole=True), np.arange(count, dtype=np.int32) * 5 % len(PHASES)
     totals = named(TOTALS, *np.random.default_rng(1).integers(-(10**6), 10**6, (4, shape[1])))
-    some = {"frames": made.frames, "place": place, "basis": made.rows[place], "first": first}
-    return totals | some | {"shape": shape, "macros": made.fit["macros"]}
+    some = {"frames": fit.frames, "place": place, "basis": fit.rows[place], "first": first}
+    return totals | some | {"shape": shape, "macros": fit.fit["macros"]}
 
 
 @case("correlation_solve_counts", PIXELS | WHOLE, **FIT)
 def _(shape, dtype):
-    made = Fit(shape, dtype, whole=True)
-    return made.used | made.totals | made.fit
+    fit = Fit(shape, dtype, whole=True)
+    return fit.used | fit.totals | fit.fit
 
 
 @case("correlation_window", PIXELS | WHOLE | {"largest": (0, 1)}, **FIT)
 def _(shape, dtype, largest):
-    made = Fit(shape, dtype, whole=True)
+    fit = Fit(shape, dtype, whole=True)
     if not largest:
-        return made.stack | made.used | made.fit
+        return fit.stack | fit.used | fit.fit
     # The largest sums there can be: saturated samples where all cosines are 1.
     basis = np.tile(np.array([1, STEPS[dtype], -STEPS[dtype]], np.int32), (correlation.WINDOW, 1))
     basis[::9, 1:] = 0
     frames = np.full((correlation.WINDOW, shape[1]), np.iinfo(dtype).max, dtype)
     used = named("used cosines sines", *basis.sum(axis=0, dtype=np.int64).tolist())
     stack = {"frames": frames, "place": np.arange(correlation.WINDOW, dtype=np.int32), "basis": basis}
-    return stack | used | made.fit | {"fit": np.full(28, 0.001, np.float32)}
+    return stack | used | fit.fit | {"fit": np.full(28, 0.001, np.float32)}
 
 
-def as_pairs(found, wanted, values):
+def as_pairs(actual, expected, values):
     """Compare sums of samples less a whole number next to their mean; one next to a half may be either."""
     clear = np.abs(values["total"] / values["used"] % 1 - 0.5) > 1e-3
     assert clear.mean() > 0.9
-    held = found.view(np.float32).reshape(len(found), -1).sum(axis=1, dtype=np.float64)
-    np.testing.assert_allclose(held[clear], wanted[clear], rtol=1e-13)
+    held = actual.view(np.float32).reshape(len(actual), -1).sum(axis=1, dtype=np.float64)
+    np.testing.assert_allclose(held[clear], expected[clear], rtol=1e-13)
 
 
 LESS = f"reference {TOTALS}"
@@ -153,27 +153,27 @@ LESS = f"reference {TOTALS}"
     checks=dict.fromkeys(LESS.split(), as_pairs),
 )
 def _(shape, dtype, turns):
-    made = Fit(shape, dtype, True, turns)
-    return made.used | made.totals | made.fit | {"unit": 1 / STEPS[dtype], "fit": None}
+    fit = Fit(shape, dtype, True, turns)
+    return fit.used | fit.totals | fit.fit | {"unit": 1 / STEPS[dtype], "fit": None}
 
 
 @case("correlation_sum", PIXELS | DTYPES | {"first": (0, 1)}, pairs=TOTALS, rtol=1e-13, atol=1e-13)
 def _(shape, dtype, first):
-    made, place = Fit(shape, dtype), np.array([0, 9] if first else [3, 1, 4], np.int32)
+    fit, place = Fit(shape, dtype), np.array([0, 9] if first else [3, 1, 4], np.int32)
     basis = np.random.default_rng(2).normal(1, 3, (len(place), 3)).astype(np.float32)
-    return made.totals | made.fit | {"frames": made.frames, "place": place, "basis": basis, "first": first}
+    return fit.totals | fit.fit | {"frames": fit.frames, "place": place, "basis": basis, "first": first}
 
 
 @case("correlation_window_pairs", PIXELS | DTYPES, **FIT)
 def _(shape, dtype):
-    made, order = Fit(shape, dtype), (ORDER + 3) % len(PHASES)
-    return made.fit | {"frames": made.frames[np.argsort(order)], "place": order, "basis": made.rows}
+    fit, order = Fit(shape, dtype), (ORDER + 3) % len(PHASES)
+    return fit.fit | {"frames": fit.frames[np.argsort(order)], "place": order, "basis": fit.rows}
 
 
 @case("correlation_solve_pairs", PIXELS | DTYPES, **FIT, pairs=TOTALS)
 def _(shape, dtype):
-    made = Fit(shape, dtype)
-    return made.totals | made.fit
+    fit = Fit(shape, dtype)
+    return fit.totals | fit.fit
 
 
 # --- Displacement of a texture
@@ -211,27 +211,27 @@ def _(dtype):
     checks={"filtered": near(1e-4, 1e-3, inside=COEFFICIENTS)},
 )
 def _(step):
-    _, padded, made = textures()
+    _, padded, values = textures()
     arrays = {"source": padded, "filtered": 0 * padded, "step": step, "shape": padded.shape}
-    return arrays | {"macros": made["macros"]}
+    return arrays | {"macros": values["macros"]}
 
 
 @case("displacement_warp", per="whole row", **CLOSE)
 def _():
-    _, padded, made = textures()
-    difference, start = np.zeros((2, *made["planes"].shape[1:])), FIRST + (WINDOW - 1) / 2
-    return NODES | made | {"start": start, "coefficients": padded, "difference": difference}
+    _, padded, values = textures()
+    difference, start = np.zeros((2, *values["planes"].shape[1:])), FIRST + (WINDOW - 1) / 2
+    return NODES | values | {"start": start, "coefficients": padded, "difference": difference}
 
 
 @case("displacement_solve", per=lambda device, values: math.prod(GRID), **CLOSE)
 def _():
-    (_, padded, made), rng, count = textures(), np.random.default_rng(2), math.prod(GRID)
+    (_, padded, texture), rng, count = textures(), np.random.default_rng(2), math.prod(GRID)
     inverse = rng.normal(0, 1e-4, (displacement.PARAMETERS, displacement.PARAMETERS, count))
-    arrays = {"difference": np.zeros((2, *made["planes"].shape[1:])), "answer": np.zeros((9, count))}
+    arrays = {"difference": np.zeros((2, *texture["planes"].shape[1:])), "answer": np.zeros((9, count))}
     start = FIRST + (WINDOW - 1) / 2
-    maps = made["planes"], made["field"], arrays["difference"]
+    maps = texture["planes"], texture["field"], arrays["difference"]
     displacement.displacement_warp(STEP, start, HALO, padded, *maps)
-    return NODES | made | arrays | {"first": FIRST + HALO, "window": WINDOW, "inverse": inverse}
+    return NODES | texture | arrays | {"first": FIRST + HALO, "window": WINDOW, "inverse": inverse}
 
 
 def measured(dtype):
@@ -247,21 +247,21 @@ def measured(dtype):
     displacement.displacement_filter(1, padded, half)
     displacement.displacement_filter(padded.shape[1], half, coefficients)
     wide = PICTURE[0] + 2 * HALO, PICTURE[1] + 2 * HALO
-    made = named("frame coefficients sums counts", frame, coefficients, *np.full((2, *PICTURE), np.nan))
-    made |= named("planes difference", np.full((4, *wide), np.nan), np.full((2, *wide), np.nan))
-    made |= {"window": WINDOW, "halo": HALO, "shape": PICTURE, "macros": {"WINDOW": WINDOW, **top}}
-    return made | {"macros": made["macros"] | {"FRAME": C_TYPES[dtype]}}
+    values = named("frame coefficients sums counts", frame, coefficients, *np.full((2, *PICTURE), np.nan))
+    values |= named("planes difference", np.full((4, *wide), np.nan), np.full((2, *wide), np.nan))
+    values |= {"window": WINDOW, "halo": HALO, "shape": PICTURE, "macros": {"WINDOW": WINDOW, **top}}
+    return values | {"macros": values["macros"] | {"FRAME": C_TYPES[dtype]}}
 
 
 def by_plane(atol, correlations=False):
     """Return a check relative to the largest value of each plane, or of matrices to their diagonal."""
 
-    def check(found, wanted, values):
-        scale = np.maximum(np.nanmax(np.abs(wanted), axis=(-2, -1), keepdims=True), 1e-9)
+    def check(actual, expected, values):
+        scale = np.maximum(np.nanmax(np.abs(expected), axis=(-2, -1), keepdims=True), 1e-9)
         if correlations:  # those of windows with hardly any texture lose digits in float32
-            diagonal = np.sqrt(wanted[range(len(wanted)), range(len(wanted))])
+            diagonal = np.sqrt(expected[range(len(expected)), range(len(expected))])
             scale = diagonal * diagonal[:, np.newaxis]
-        np.testing.assert_allclose(found / scale, wanted / scale, rtol=2e-3, atol=atol)
+        np.testing.assert_allclose(actual / scale, expected / scale, rtol=2e-3, atol=atol)
 
     return check
 
@@ -271,8 +271,8 @@ MEASURED = named("sums counts planes difference summary", *[by_plane(2e-5)] * 5)
 
 @case("displacement_across", DTYPES, per="whole row", checks=MEASURED)
 def _(dtype):
-    made = measured(dtype)
-    return {name: made[name] for name in ("frame", "window", "sums", "counts", "shape", "macros")}
+    values = measured(dtype)
+    return {name: values[name] for name in ("frame", "window", "sums", "counts", "shape", "macros")}
 
 
 def wide_rows(device, values):
@@ -282,9 +282,9 @@ def wide_rows(device, values):
 
 @case("displacement_planes", DTYPES, per=wide_rows, checks=MEASURED)
 def _(dtype):
-    made = measured(dtype)
-    displacement.displacement_across(WINDOW, made["frame"], made["sums"], made["counts"])
-    return made
+    values = measured(dtype)
+    displacement.displacement_across(WINDOW, values["frame"], values["sums"], values["counts"])
+    return values
 
 
 @case(
@@ -292,16 +292,16 @@ def _(dtype):
     checks=MEASURED | {"inverse": by_plane(3e-4, correlations=True)},
 )  # fmt: skip
 def _(dtype):
-    made = measured(dtype)
-    displacement.displacement_across(WINDOW, made["frame"], made["sums"], made["counts"])
-    arrays = (made[name] for name in ("frame", "coefficients", "sums", "counts", "planes", "difference"))
+    values = measured(dtype)
+    displacement.displacement_across(WINDOW, values["frame"], values["sums"], values["counts"])
+    arrays = (values[name] for name in ("frame", "coefficients", "sums", "counts", "planes", "difference"))
     displacement.displacement_planes(HALO, WINDOW, *arrays)
     size = displacement.PARAMETERS
     answers = {"inverse": np.zeros((size, size, *GRID)), "summary": np.zeros((4, *GRID))}
     return (
         NODES
         | answers
-        | {"planes": made["planes"], "first": FIRST + HALO, "window": WINDOW, "macros": made["macros"]}
+        | {"planes": values["planes"], "first": FIRST + HALO, "window": WINDOW, "macros": values["macros"]}
     )
 
 
@@ -330,17 +330,17 @@ KEYS = {"key": ((0, 0), (2**32 + 5, 2**40 + 3), (2**64 - 1, 2**64 - 1)), "quarte
 
 def exposed(dtype, *maps, read=0.0, grain=0.0, top=255.0, key=(0, 0)):
     macros = {"FRAME": C_TYPES[dtype], "WHOLE": int(dtype != "float32"), "SHOT": int(grain > 0)}
-    given = named("light offset span", *maps) | {"read": read, "grain": grain, "top": top, "macros": macros}
+    values = named("light offset span", *maps) | {"read": read, "grain": grain, "top": top, "macros": macros}
     pixels = len(maps[0])
-    given |= {"shape": (1, pixels // 4), "quarter": pixels // 4, "counts": np.zeros(pixels, dtype)}
-    return given | named("frame seed", *key)
+    values |= {"shape": (1, pixels // 4), "quarter": pixels // 4, "counts": np.zeros(pixels, dtype)}
+    return values | named("frame seed", *key)
 
 
-def ties(found, expected, values):
+def ties(actual, expected, values):
     """A float32 errs by some 1e-7 of its value; counts that fall so near to a half may go either way."""
-    difference, whole = np.abs(found.astype(np.float64) - expected), found.dtype.kind == "u"
+    difference, whole = np.abs(actual.astype(np.float64) - expected), actual.dtype.kind == "u"
     assert difference.max() <= (1 if whole else 2e-6 * values["top"])
-    assert difference.sum() <= 3 + 5e-8 * values["top"] * len(found) or not whole
+    assert difference.sum() <= 3 + 5e-8 * values["top"] * len(actual) or not whole
 
 
 @case("expose", {"sensor": SENSORS, "quarter": (1, 7, 4099)}, checks={"counts": ties})
@@ -379,18 +379,18 @@ def _(dtype, radius, reach, first):
     state = np.zeros((11, 130), np.int32), np.zeros((2 * reach + 1, 11, 130)), np.zeros((reach, 11, 130))
     if first:
         focus.focus_scan(frames[:first], 0, radius, reach, *state)
-    known = {"frames": frames[first:], "first": first, "radius": radius, "reach": reach, **WHOLE_ROWS}
-    return known | named("best peak recent", *state)
+    values = {"frames": frames[first:], "first": first, "radius": radius, "reach": reach, **WHOLE_ROWS}
+    return values | named("best peak recent", *state)
 
 
 def sound(rtol, atol=0.0):
     """Return a check of pixels whose peak is sound, but for those where float32 decides of a limit."""
 
-    def check(found, wanted, values):
-        part = (values["status"] == 1) & np.isfinite(wanted)
-        largest = np.max(np.abs(wanted[part]), initial=0.0)
+    def check(actual, expected, values):
+        part = (values["status"] == 1) & np.isfinite(expected)
+        largest = np.max(np.abs(expected[part]), initial=0.0)
         assert (
-            np.mean(~np.isclose(found[part], wanted[part], rtol, atol * largest)) < 1e-3
+            np.mean(~np.isclose(actual[part], expected[part], rtol, atol * largest)) < 1e-3
             if part.any()
             else True
         )
@@ -420,10 +420,10 @@ def _(reach, variance):
     return arrays | numbers | {"reach": reach, "variance": variance}
 
 
-def triangles(found, wanted, values):
-    scale = np.abs(wanted[:10]).max(axis=1, keepdims=True)
-    np.testing.assert_allclose(found[:10] / scale, wanted[:10] / scale, atol=2e-6)
-    np.testing.assert_array_equal(found[10], wanted[10])
+def triangles(actual, expected, values):
+    scale = np.abs(expected[:10]).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(actual[:10] / scale, expected[:10] / scale, atol=2e-6)
+    np.testing.assert_array_equal(actual[10], expected[10])
 
 
 @case("lambert_add", DTYPES, checks={"triangle": triangles})
@@ -433,16 +433,16 @@ def _(dtype):
     if dtype == "float32":
         frames[3, 8] = np.nan
     darks = rng.uniform(0, 9, pixels).astype(np.float32)
-    known = {"darks": darks, "shadow": 10.0, "bright": float(frames[0].max())}
+    values = {"darks": darks, "shadow": 10.0, "bright": float(frames[0].max())}
     triangle, lights = np.zeros((11, pixels)), rng.normal(size=(9, 3))
-    lambert.lambert_add(frames[:2], lights[:2], **known, triangle=triangle)
-    known |= {"frames": frames[2:], "lights": lights[2:], "triangle": triangle}
-    return known | {"shape": (1, pixels), "stride": pixels}
+    lambert.lambert_add(frames[:2], lights[:2], **values, triangle=triangle)
+    values |= {"frames": frames[2:], "lights": lights[2:], "triangle": triangle}
+    return values | {"shape": (1, pixels), "stride": pixels}
 
 
-def solved(found, wanted, values):
-    np.testing.assert_allclose(found, np.where(np.isfinite(wanted), wanted, np.nan), rtol=2e-3)
-    assert np.isfinite(wanted).mean() > 0.9
+def solved(actual, expected, values):
+    np.testing.assert_allclose(actual, np.where(np.isfinite(expected), expected, np.nan), rtol=2e-3)
+    assert np.isfinite(expected).mean() > 0.9
 
 
 SOLVED = dict.fromkeys(("normals", "normals_spread", "albedo", "albedo_spread", "residual"), solved)
@@ -480,7 +480,7 @@ def _(shape):
 
 
 @case(
-    "samples_take", DTYPES, per=lambda _, values: math.prod(values[one] for one in ("lines", "rows", "count"))
+    "samples_take", DTYPES, per=lambda _, values: math.prod(values[key] for key in ("lines", "rows", "count"))
 )
 def _(dtype):
     values = np.random.default_rng(0).normal(100, 20, (40, 50)).astype(dtype)
@@ -528,8 +528,8 @@ def _(limits, count):
 )
 def _(limits, count):
     numbers = np.arange(count * limits.lanes, dtype=np.float32).reshape(count, limits.lanes) % 97
-    known = {"numbers": numbers, "count": count, "macros": limits.macros, "stride": limits.stride}
-    return known | {"steps": 7, "factor": -2.0, "summand": 3.0}
+    values = {"numbers": numbers, "count": count, "macros": limits.macros, "stride": limits.stride}
+    return values | {"steps": 7, "factor": -2.0, "summand": 3.0}
 
 
 # --- Poses
@@ -550,10 +550,10 @@ def waves(shape, tilt, seed=0):
     return records
 
 
-def summed(found, wanted, values):
-    scale = np.abs(wanted).max(axis=(0, 1)) + 1e-9
-    assert wanted[..., pose.PARTS[5]].any()
-    np.testing.assert_allclose(found / scale, wanted / scale, atol=1e-4)
+def summed(actual, expected, values):
+    scale = np.abs(expected).max(axis=(0, 1)) + 1e-9
+    assert expected[..., pose.PARTS[5]].any()
+    np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-4)
 
 
 POSES = {"size": (((24, 33), 1), ((3, 2), 1), ((40, 30), 2)), "least": (1.0, 0.002), "beside": (0, 1)}
@@ -596,18 +596,18 @@ NONE_BUT_HEIGHTS = dict.fromkeys(
 def _(shape, maps):
     rng, records = np.random.default_rng(3), waves(shape, 0.2)
     x, y = records[..., 0], records[..., 1]
-    given = NONE_BUT_HEIGHTS | {"height": records[..., 3], "gradient": None, "shape": shape}
-    given |= named("records slopes", np.zeros((*shape, 8)), np.zeros((2, *shape)))
+    values = NONE_BUT_HEIGHTS | {"height": records[..., 3], "gradient": None, "shape": shape}
+    values |= named("records slopes", np.zeros((*shape, 8)), np.zeros((2, *shape)))
     if maps == "heights":
-        return given | {"gradient": np.stack([-x, -y], axis=-1), "height_sigma": np.sqrt(records[..., 4])}
-    given |= {"normals": np.dstack([x, y, np.sqrt(1 - x * x - y * y)])}
-    given |= {"normals_sigma": np.where(rng.random(shape) < 0.1, 0.0, 0.01)}
+        return values | {"gradient": np.stack([-x, -y], axis=-1), "height_sigma": np.sqrt(records[..., 4])}
+    values |= {"normals": np.dstack([x, y, np.sqrt(1 - x * x - y * y)])}
+    values |= {"normals_sigma": np.where(rng.random(shape) < 0.1, 0.0, 0.01)}
     if maps == "normals":
-        return given
-    flags = ((rng.random(shape) < share).astype(np.uint8) for share in (0.1, 0.98, 0.02))
-    given |= named("filled contact edges", *flags)
+        return values
+    flags = ((rng.random(shape) < density).astype(np.uint8) for density in (0.1, 0.98, 0.02))
+    values |= named("filled contact edges", *flags)
     apart = {"component": rng.integers(-1, 3, shape, dtype=np.int32)}
-    return given | apart | {"height_sigma": x**2, "offset_unknown": np.array([0, 1, 0], np.uint8)}
+    return values | apart | {"height_sigma": x**2, "offset_unknown": np.array([0, 1, 0], np.uint8)}
 
 
 @case("pose_curvature", MAPS, checks={"records": near(1e-4, 1e-4)})
@@ -625,12 +625,12 @@ def _(shape, odd):
 
 @case(
     "pose_summary",
-    MAPS | {"known": (True, False)},
+    MAPS | {"with_records": (True, False)},
     per=lambda device, values: len(values["summary"]),
     checks={"summary": near(1e-5, 1e-5)},
 )
-def _(shape, known):
-    records = waves(shape, 0.2) if known else np.full((*shape, 8), np.nan)
+def _(shape, with_records):
+    records = waves(shape, 0.2) if with_records else np.full((*shape, 8), np.nan)
     strips = shape[0] * math.ceil(shape[1] / pose_maps.STRIP)
     grid = named("x0 y0 step_x step_y", 100.0, -50.0, 0.05, 0.06)
     return {"records": records, "summary": np.zeros((strips, pose_maps.SUMMARY)), "shape": shape, **grid}
@@ -662,24 +662,24 @@ def clipped(dtype, shape):
 
 @case("registration_admit", FRAMES, **TURNED)
 def _(dtype, shape):
-    frame, known = clipped(dtype, shape)
-    return known | {"frame": frame}
+    frame, maps = clipped(dtype, shape)
+    return maps | {"frame": frame}
 
 
 def resampled(dtype, shape, shift=SHIFT):
     """Return heights with gaps, and shifts that leave the picture."""
-    rng, (frame, known) = np.random.default_rng(shape[0]), clipped(dtype, shape)
-    registration.registration_admit(frame, *(known[name] for name in ("offset", "gain", "padded")))
+    rng, (frame, maps) = np.random.default_rng(shape[0]), clipped(dtype, shape)
+    registration.registration_admit(frame, *(maps[name] for name in ("offset", "gain", "padded")))
     height = np.where(rng.random(shape) < 0.05, np.nan, rng.uniform(-1, 0, shape))
     arrays = named("height shift registered noise", height, shift, np.zeros(shape), np.zeros((2, *shape)))
-    return known | arrays
+    return maps | arrays
 
 
 case("registration_resample", FRAMES, **TURNED)(resampled)
 
 
-def nothing(found, wanted, values):
-    for answer in (found, wanted):
+def nothing(actual, expected, values):
+    for answer in (actual, expected):
         assert not np.any(answer) or np.isnan(answer).all()
 
 
@@ -745,9 +745,9 @@ WALLS = [(0, 0.0, NONE, 0), (1, 0.0, LAMPS[0], 1), (2, 0.0, NONE, 0), (0, 2.0, N
 WALLS += [(2, 0.6, LAMPS[1], 1), (3, 0.0, NONE, 0)]  # the last one without scatter
 
 
-def lit(found, expected, values):
+def lit(actual, expected, values):
     """Light grows as a root from the angle of total reflection on; hard by the side the way is uncertain."""
-    difference = np.abs(found - expected)
+    difference = np.abs(actual - expected)
     if values["scatter"] == 0:  # only rays at an edge may differ
         assert set(np.unique(expected)) == {0.0, 1.0}
         assert np.count_nonzero(difference) <= 1
@@ -821,7 +821,7 @@ ELSEWHERE = {
 
 
 def test_every_kernel_is_compared_with_its_reference():
-    here = {one.values[0] for one in CASES}
+    here = {parameters.values[0] for parameters in CASES}
     assert {file for name, file in KERNELS.items() if name not in here} == ELSEWHERE.keys()
     for file, test in ELSEWHERE.items():
         text = (Path(__file__).parents[1] / test).read_text(encoding="utf-8")

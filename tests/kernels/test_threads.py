@@ -48,12 +48,12 @@ def test_devices_that_compile_at_the_same_time_leave_the_filters_of_warnings_as_
     devices = [Device(device_layer._find()[0]) for _ in range(2)]
     build, ignored = Device._recall_or_compile, []
 
-    def in_turn(device, *given):
+    def in_turn(device, *arguments):
         both.wait(60)
         if device is devices[1]:
             assert first_is_built.wait(60)
             ignored.append(any(kind is cl.CompilerWarning for _, _, kind, *_ in warnings.filters))
-        return build(device, *given)
+        return build(device, *arguments)
 
     def compile_on(device):
         device.kernel(FILL, "fill")

@@ -56,8 +56,8 @@ def test_threads_share_the_staging_buffers_while_they_are_freed(opened):
     def work(number):
         for step in range(20):
             arrays = [opened.from_host("values", np.full(n, number + step), np.int32) for n in (5, 3000, 40)]
-            for found in fetch([(array, slice(None)) for array in arrays]):
-                assert np.all(found == number + step)
+            for values in fetch([(array, slice(None)) for array in arrays]):
+                assert np.all(values == number + step)
         return number
 
     with ThreadPoolExecutor(4) as pool:

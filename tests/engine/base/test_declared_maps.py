@@ -61,8 +61,8 @@ def test_a_class_whose_maps_cannot_be_returned_is_refused(maps, message):
 
 def test_a_standard_deviation_in_the_unit_of_its_map_is_accepted():
     maps = {"rise": io.Map(unit="mm", quantity="height"), "rise_sigma": io.Map("error of the rise", "mm")}
-    found = engine.run(FRAMES, operation(maps, rise=FLAT, rise_sigma=FLAT))
-    assert found.declaration("rise_sigma").caption == "error of the rise"
+    result = engine.run(FRAMES, operation(maps, rise=FLAT, rise_sigma=FLAT))
+    assert result.declaration("rise_sigma").caption == "error of the rise"
 
 
 def test_two_maps_of_heights_are_refused():
@@ -98,8 +98,8 @@ def test_a_code_that_is_not_in_the_legend_is_refused(codes, dtype, value):
 @pytest.mark.parametrize("codes", [CODES, {0: "flat", 200: "edge"}])
 def test_codes_of_the_legend_are_accepted(codes):
     values = np.resize([*codes], SHAPE)
-    found = engine.run(FRAMES, operation({"kind": io.Map(codes=codes)}, kind=values))
-    np.testing.assert_array_equal(found["kind"], values)
+    result = engine.run(FRAMES, operation({"kind": io.Map(codes=codes)}, kind=values))
+    np.testing.assert_array_equal(result["kind"], values)
 
 
 WEAR = {"wear": io.Map("depth of the wear", "mm"), "force": io.Map("force", "N", axes="none")}
@@ -141,9 +141,9 @@ def test_a_misspelt_map_in_what_a_subclass_adds_to_its_base_is_refused():
 
 
 def test_a_map_that_a_subclass_declares_and_nothing_returns_is_refused():
-    own = type("Own", (engine.Onset,), {"wear": WEAR["wear"]})
+    subclass = type("Own", (engine.Onset,), {"wear": WEAR["wear"]})
     with pytest.raises(io.InputError, match=r"^Own\.result\(\) does not return wear"):
-        engine.run(FRAMES, own, travel=[0.0, 1.0])
+        engine.run(FRAMES, subclass, travel=[0.0, 1.0])
 
 
 def test_a_map_of_a_base_that_looks_like_another_one_is_refused():
@@ -164,13 +164,13 @@ def test_a_result_that_replaces_that_of_a_base_may_have_other_maps():
 
 
 def test_a_map_that_may_be_missing_can_be_left_out():
-    own = type("Own", (operation(WEAR, wear=FLAT),), {"optional_maps": ("force",)})
-    assert list(engine.run(FRAMES, own)) == ["wear"]
+    subclass = type("Own", (operation(WEAR, wear=FLAT),), {"optional_maps": ("force",)})
+    assert list(engine.run(FRAMES, subclass)) == ["wear"]
 
 
 def test_maps_that_are_not_declared_may_be_returned_in_addition():
-    found = engine.run(FRAMES, operation(WEAR, wear=FLAT, force=1.0, area=FLAT, area_sigma=FLAT))
-    assert set(found) == {"wear", "force", "area", "area_sigma"}
+    result = engine.run(FRAMES, operation(WEAR, wear=FLAT, force=1.0, area=FLAT, area_sigma=FLAT))
+    assert set(result) == {"wear", "force", "area", "area_sigma"}
 
 
 def test_an_optional_map_that_is_not_declared_is_refused_where_the_class_is_defined():

@@ -29,10 +29,10 @@ def with_own_result(kind):
 
     class Own(kind):
         def result(self):
-            found = super().result()
-            if isinstance(found, io.Result):
-                return found.assign(process={**found.process, "own": True})
-            return {**found, "own": True}
+            result = super().result()
+            if isinstance(result, io.Result):
+                return result.assign(process={**result.process, "own": True})
+            return {**result, "own": True}
 
     return Own
 
@@ -55,8 +55,8 @@ def counting(kind):
             super().start(shape, dtype)
             self.total = 0
 
-        def push(self, frames, **given):
-            super().push(frames, **given)
+        def push(self, frames, **options):
+            super().push(frames, **options)
             self.total += len(frames)
 
     return Counting
@@ -69,15 +69,15 @@ def source():
 @EACH
 def test_a_run_over_a_recording_returns_the_result_of_a_subclass(name):
     case = CASES[name]
-    own = with_own_result(case.kind)(**case.options)
-    assert engine.run(case.source(), own).process["own"] is True
+    operation = with_own_result(case.kind)(**case.options)
+    assert engine.run(case.source(), operation).process["own"] is True
 
 
 @EACH
 def test_a_run_over_arrays_returns_the_result_of_a_subclass(name):
     case = CASES[name]
-    own = with_own_result(case.kind)(**case.options)
-    assert engine.run(case.frames, own, **case.positions).process["own"] is True
+    operation = with_own_result(case.kind)(**case.options)
+    assert engine.run(case.frames, operation, **case.positions).process["own"] is True
 
 
 @ONCE
@@ -138,10 +138,10 @@ def test_the_result_of_the_last_of_several_subclasses_counts():
 @EACH
 def test_each_run_starts_a_subclass_anew(name):
     case = CASES[name]
-    own = counting(case.kind)(**case.options)
-    source = Parts(case.frames, own, case.positions, ())
+    operation = counting(case.kind)(**case.options)
+    source = Parts(case.frames, operation, case.positions, ())
     for _ in range(2):
-        run = engine.Run(own.plan(source), source)
+        run = engine.Run(operation.plan(source), source)
         run.complete()
         assert run.operation.total == run.operation.passes * len(case.frames)
 
@@ -172,10 +172,10 @@ def test_a_live_run_follows_the_plan_of_a_subclass():
     options = {"dark": 16.0, "bright": 224.0, "noise": 1.0}
     with Stream(Halved(**options), PRESS.shape[1:], latency=math.inf) as stream:
         stream.push(PRESS, travel=TRAVEL)
-        found = stream.result()
+        result = stream.result()
     expected = engine.find_onset(PRESS, TRAVEL, **options)
-    np.testing.assert_array_equal(found.height, expected.height / 2)
-    assert found.process["frames"] == len(PRESS)
+    np.testing.assert_array_equal(result.height, expected.height / 2)
+    assert result.process["frames"] == len(PRESS)
 
 
 # Defaults
@@ -283,10 +283,10 @@ def test_a_changed_default_is_inherited():
 @pytest.mark.parametrize("plain", [True, False], ids=["a plain class", "an operation"])
 def test_with_several_bases_the_first_in_the_order_of_python_decides(plain):
     first = type("First", () if plain else (engine.Onset,), {"threshold": 0.2})
-    own = type("Own", (first, Early), {})
-    assert (own().threshold, own.options["threshold"].default) == (0.2, 0.2)
+    subclass = type("Own", (first, Early), {})
+    assert (subclass().threshold, subclass.options["threshold"].default) == (0.2, 0.2)
 
 
 def test_a_base_without_a_changed_default_does_not_hide_that_of_the_next():
-    own = type("Own", (type("Plain", (engine.Onset,), {}), Early), {})
-    assert (own().threshold, own.options["threshold"].default) == (0.3, 0.3)
+    subclass = type("Own", (type("Plain", (engine.Onset,), {}), Early), {})
+    assert (subclass().threshold, subclass.options["threshold"].default) == (0.3, 0.3)

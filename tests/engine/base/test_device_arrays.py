@@ -88,10 +88,12 @@ def copies(device, call):
     call()
     device.finish()
     device.profile.clear()
-    found = call()
+    result = call()
     records = device.profile.records()
-    up, down = (sum(one.bytes for one in records if one.kind == kind) for kind in ("upload", "download"))
-    return up / 288_000, down / 288_000, found
+    up, down = (
+        sum(record.bytes for record in records if record.kind == kind) for kind in ("upload", "download")
+    )
+    return up / 288_000, down / 288_000, result
 
 
 @pytest.mark.parametrize("put", [ours, of_pyopencl])
@@ -99,14 +101,14 @@ def copies(device, call):
 def test_frames_on_the_device_give_the_same_maps(device, name, put):
     function, frames, positions, options, stay = ON_FRAMES[name]
     expected = function(frames, positions, **options, device=device)
-    found = function(put(device, frames), positions, **options, device=device)
-    assert {key for key in found if found.on_device(key) is not None} == stay
-    assert list(found) == list(expected)
-    assert {**found.process, "date": ""} == {**expected.process, "date": ""}
+    result = function(put(device, frames), positions, **options, device=device)
+    assert {key for key in result if result.on_device(key) is not None} == stay
+    assert list(result) == list(expected)
+    assert {**result.process, "date": ""} == {**expected.process, "date": ""}
     for key in stay:
-        np.testing.assert_array_equal(found.on_device(key).read(), expected[key], err_msg=key)
+        np.testing.assert_array_equal(result.on_device(key).read(), expected[key], err_msg=key)
     for key in expected:
-        np.testing.assert_array_equal(found[key], expected[key], err_msg=key)
+        np.testing.assert_array_equal(result[key], expected[key], err_msg=key)
 
 
 @pytest.mark.parametrize("put", [ours, of_pyopencl])
@@ -114,35 +116,35 @@ def test_frames_on_the_device_give_the_same_maps(device, name, put):
 def test_slopes_and_normals_on_the_device_give_the_same_heights(device, name, put):
     maps, options = INTEGRATED[name]
     expected = engine.integrate(**maps, pixel_size=0.1, **options, device=device)
-    given = {key: put(device, np.ascontiguousarray(values)) for key, values in maps.items()}
-    found = engine.integrate(**given, pixel_size=0.1, **options, device=device)
-    assert isinstance(found.on_device("height"), Array)
+    placed = {key: put(device, np.ascontiguousarray(values)) for key, values in maps.items()}
+    surface = engine.integrate(**placed, pixel_size=0.1, **options, device=device)
+    assert isinstance(surface.on_device("height"), Array)
     # The kernel may divide by one unit of float32 differently than NumPy.
-    np.testing.assert_allclose(found.height, expected.height, atol=1e-6)
-    np.testing.assert_allclose(found.height_sigma, expected.height_sigma, rtol=1e-4)
-    np.testing.assert_array_equal(found.component, expected.component)
+    np.testing.assert_allclose(surface.height, expected.height, atol=1e-6)
+    np.testing.assert_allclose(surface.height_sigma, expected.height_sigma, rtol=1e-4)
+    np.testing.assert_array_equal(surface.component, expected.component)
 
 
 @pytest.mark.parametrize("name", ["robust", "known_heights", "slope_weights"])
 def test_what_is_solved_from_maps_on_the_host_takes_arrays_on_the_device(device, name):
-    given = {
+    placed = {
         "robust": True,
         "known_heights": np.where(RANDOM.random(SHAPE) < 0.01, 1.0, np.nan),
         "slope_weights": RANDOM.uniform(50, 100, SHAPE),
     }
-    options = {name: given[name], "pixel_size": 0.1, "device": device}
+    options = {name: placed[name], "pixel_size": 0.1, "device": device}
     expected = engine.integrate(normals=NORMALS, **options)
-    found = engine.integrate(normals=ours(device, NORMALS), **options)
-    np.testing.assert_array_equal(found.height, expected.height)
+    surface = engine.integrate(normals=ours(device, NORMALS), **options)
+    np.testing.assert_array_equal(surface.height, expected.height)
 
 
 def test_edges_of_normals_on_the_device_stay_there(device):
     maps = NORMALS / np.linalg.norm(NORMALS, axis=2, keepdims=True), np.full(SHAPE, 0.01, np.float32), MASK
     expected = engine.find_edges(*maps, device=device)
-    found = engine.find_edges(*(ours(device, values) for values in maps))
+    edges = engine.find_edges(*(ours(device, values) for values in maps))
     assert expected.any()
-    assert isinstance(found, Array)
-    np.testing.assert_array_equal(np.asarray(found), expected)
+    assert isinstance(edges, Array)
+    np.testing.assert_array_equal(np.asarray(edges), expected)
 
 
 @pytest.mark.parametrize("name", ["onset", "change point", "correlation", "normals"])
@@ -150,24 +152,24 @@ def test_frames_on_a_card_are_not_copied_and_maps_only_when_they_are_used_or_che
     function, frames, positions, options, stay = ON_FRAMES[name]
     options = options | {"noise": 1.0} if name != "correlation" else options
     placed = ours(card, np.tile(frames, (1, *LARGER)))
-    up, down, found = copies(card, lambda: function(placed, positions, **options))
+    up, down, result = copies(card, lambda: function(placed, positions, **options))
     # What checks look at; status and frame of a change-point are completed on the host.
     few = {"onset": 1, "change point": 7, "correlation": 0, "normals": 8}[name]
     assert up < TABLES
     assert down < few + SAMPLES
     card.profile.clear()
-    used = found[max(stay)]
-    down = sum(one.bytes for one in card.profile.records() if one.kind == "download")
+    used = result[max(stay)]
+    down = sum(record.bytes for record in card.profile.records() if record.kind == "download")
     assert down in (0, used.nbytes)  # 0: it was computed on the host
-    assert used is found[max(stay)]
+    assert used is result[max(stay)]
 
 
 def test_a_chain_from_frames_to_heights_copies_only_what_checks_look_at(card):
     frames = ours(card, np.tile(TURNS, (1, *LARGER)))
 
     def chain():
-        found = engine.estimate_normals(frames, PHASE, **SENSOR, noise=1.0)
-        normals, sigma, contact = map(found.on_device, ("normals", "normals_sigma", "contact"))
+        result = engine.estimate_normals(frames, PHASE, **SENSOR, noise=1.0)
+        normals, sigma, contact = map(result.on_device, ("normals", "normals_sigma", "contact"))
         surface = engine.integrate(normals=normals, pixel_size=0.1, sigma=False)
         return surface.on_device("height"), engine.find_edges(normals, sigma, contact)
 
@@ -202,30 +204,30 @@ def textures(dtype, larger=(1, 1)):
 def test_displacements_of_frames_on_the_device_stay_there(device, put, dtype):
     texture, moved = textures(dtype)
     expected = engine.slip.find_displacement(texture, moved, 0.1, device=device)
-    found = engine.slip.find_displacement(put(device, texture), put(device, moved), 0.1)
-    assert {name for name in found if found.on_device(name) is not None} == set(found) - {"status"}
+    slip = engine.slip.find_displacement(put(device, texture), put(device, moved), 0.1)
+    assert {name for name in slip if slip.on_device(name) is not None} == set(slip) - {"status"}
     for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name, strict=True)
+        np.testing.assert_array_equal(slip[name], values, err_msg=name, strict=True)
 
 
 def test_a_step_beyond_the_texture_s_grain_is_found_on_the_device(device):
     texture = np.kron(RANDOM.normal(100, 20, (15, 18)), np.ones((4, 4))).astype(np.float32)
     moved = np.roll(texture, 11, axis=1)[None]
-    expected, found = (
+    expected, slip = (
         engine.slip.find_displacement(put(texture), put(moved), 0.1, noise=1.0, device=device).displacement
         for put in (np.asarray, lambda values: ours(device, values))
     )
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(slip, expected)
 
 
 def test_frames_of_a_texture_on_a_card_are_not_copied_and_displacements_only_when_they_are_used(card):
     texture, moved = textures("uint8", LARGER)
     up, down, expected = copies(card, lambda: engine.slip.find_displacement(texture, moved, 0.1, device=card))
     placed = ours(card, texture), ours(card, moved)
-    fewer_up, fewer_down, found = copies(card, lambda: engine.slip.find_displacement(*placed, 0.1))
+    fewer_up, fewer_down, slip = copies(card, lambda: engine.slip.find_displacement(*placed, 0.1))
     assert up - fewer_up == pytest.approx(len(moved) + 1)
     assert down - fewer_down == pytest.approx(2 * 8 * len(moved))
-    np.testing.assert_array_equal(found.displacement, expected.displacement)
+    np.testing.assert_array_equal(slip.displacement, expected.displacement)
 
 
 def surfaces(shape):
@@ -256,25 +258,25 @@ def test_maps_on_the_device_give_the_same_motion(device, put, names):
         }
         for maps in pair
     ]
-    found = engine.pose.estimate_pose(*placed, 0.05)
-    np.testing.assert_array_equal(found.translation, expected.translation)
-    np.testing.assert_array_equal(found.covariance, expected.covariance)
+    motion = engine.pose.estimate_pose(*placed, 0.05)
+    np.testing.assert_array_equal(motion.translation, expected.translation)
+    np.testing.assert_array_equal(motion.covariance, expected.covariance)
 
 
 def test_maps_of_other_types_on_the_device_give_the_same_motion(device):
     pair = [{name: values.astype(np.float64) for name, values in maps.items()} for maps in surfaces(SHAPE)]
     expected = engine.pose.estimate_pose(*pair, 0.05, device=device)
     placed = [{name: ours(device, values) for name, values in maps.items()} for maps in pair]
-    found = engine.pose.estimate_pose(*placed, 0.05)
-    np.testing.assert_array_equal(found.translation, expected.translation)
+    motion = engine.pose.estimate_pose(*placed, 0.05)
+    np.testing.assert_array_equal(motion.translation, expected.translation)
 
 
 def test_maps_on_a_card_are_not_copied_for_a_motion(card):
     shape = SHAPE[0] * LARGER[0], SHAPE[1] * LARGER[1]
     placed = [{name: ours(card, values) for name, values in maps.items()} for maps in surfaces(shape)]
-    up, _, found = copies(card, lambda: engine.pose.estimate_pose(*placed, 0.05))
+    up, _, motion = copies(card, lambda: engine.pose.estimate_pose(*placed, 0.05))
     assert up < TABLES
-    np.testing.assert_allclose(found.translation, [0.02, 0, 0], atol=1e-3)
+    np.testing.assert_allclose(motion.translation, [0.02, 0, 0], atol=1e-3)
 
 
 def test_a_surface_is_fused_on_the_device_of_its_maps_which_are_copied_once(card):
@@ -285,11 +287,11 @@ def test_a_surface_is_fused_on_the_device_of_its_maps_which_are_copied_once(card
     )
     up, down, expected = copies(card, lambda: engine.fuse(heights, normals, 0.05, device=card))
     placed = [{name: ours(card, values) for name, values in kind.items()} for kind in (heights, normals)]
-    same_up, more_down, found = copies(card, lambda: engine.fuse(*placed, 0.05))
+    same_up, more_down, fused = copies(card, lambda: engine.fuse(*placed, 0.05))
     assert same_up == up
     nbytes = sum(values.nbytes for kind in (heights, normals) for values in kind.values())
     assert more_down - down == pytest.approx(nbytes / 288_000)
-    np.testing.assert_array_equal(found.height, expected.height)
+    np.testing.assert_array_equal(fused.height, expected.height)
 
 
 def test_a_result_keeps_maps_on_the_device_when_others_are_assigned(device):
@@ -322,15 +324,15 @@ def test_an_array_out_of_order_is_refused(device):
 
 
 @pytest.mark.parametrize(
-    ("slopes", "said"),
+    ("slopes", "message"),
     [
         ((SLOPES[0], SLOPES[1].astype(np.float64)), r"float64 \(60, 75\): two maps of slopes \(H, W\)"),
         ((SLOPES[0], np.ascontiguousarray(SLOPES[1][:9])), r"float32 \(9, 75\): two maps of slopes"),
     ],
     ids=["type", "shape"],
 )
-def test_slopes_that_cannot_be_used_are_refused(device, slopes, said):
-    with pytest.raises(io.InputError, match=said):
+def test_slopes_that_cannot_be_used_are_refused(device, slopes, message):
+    with pytest.raises(io.InputError, match=message):
         engine.integrate(*(ours(device, values) for values in slopes), 0.1)
 
 

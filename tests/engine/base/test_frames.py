@@ -48,8 +48,8 @@ def test_samples_are_taken_from_all_over_the_frame():
 def test_frames_of_other_types_are_converted(dtype):
     frames = np.zeros((5, 1, 2), dtype)
     frames[3:, 0, 0] = 1
-    found = engine.find_onset(frames, [0.0, 0.1, 0.2, 0.3, 0.4], dark=0, bright=1, noise=0.01)
-    np.testing.assert_allclose(found.height, [[-0.25, np.nan]], rtol=1e-6)
+    onset = engine.find_onset(frames, [0.0, 0.1, 0.2, 0.3, 0.4], dark=0, bright=1, noise=0.01)
+    np.testing.assert_allclose(onset.height, [[-0.25, np.nan]], rtol=1e-6)
 
 
 def test_the_frame_that_cannot_be_converted_is_named_across_pushes():
@@ -80,9 +80,9 @@ def test_masked_counts_are_unknown(name):
     frames[3:] = 200
     level = np.ma.masked_array(np.full((6, 8), 10, np.uint8), np.arange(48).reshape(6, 8) == 7)
     if name == "dark":
-        found = engine.find_onset(frames, 0.1 * np.arange(5), dark=level, bright=200)
-        assert np.isnan(found.height[0, 7])
-        assert np.isfinite(found.height).sum() == 47
+        onset = engine.find_onset(frames, 0.1 * np.arange(5), dark=level, bright=200)
+        assert np.isnan(onset.height[0, 7])
+        assert np.isfinite(onset.height).sum() == 47
     else:
         with pytest.raises(InputError, match="the reference has samples that are not finite"):
             engine.slip.find_displacement(level, frames.astype(np.float32), 0.1)

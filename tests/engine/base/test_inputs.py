@@ -17,13 +17,13 @@ X, Y = io.pixel_axes(SHAPE, PIXEL)
 KINDS = ["declared", "mapping", "lists", "dataset", "converted", "upwards", "file"]
 
 
-def given(result, kind, folder):
+def as_kind(result, kind, folder):
     """A result's heights and normals as a user has them."""
     maps = {name: result[name] for name in result}
     if kind == "declared":
-        own = {name.replace("height", "depth"): values for name, values in maps.items()}
+        renamed = {name.replace("height", "depth"): values for name, values in maps.items()}
         depth = io.Map("depth of the wear", "mm", quantity="height")
-        return io.Result(own, x=result.x, y=result.y, declarations={"depth": depth})
+        return io.Result(renamed, x=result.x, y=result.y, declarations={"depth": depth})
     if kind in ("mapping", "lists"):
         maps |= {"x": result.x, "y": result.y}
         return maps if kind == "mapping" else {name: values.tolist() for name, values in maps.items()}
@@ -53,30 +53,32 @@ def test_everything_is_measured_alike(kind, tmp_path):
         y=Y,
     )
     ends = (-1.0, 0.3), (1.0, -0.2)
-    expected, found = (engine.measure(one, section=ends) for one in (result, given(result, kind, tmp_path)))
-    assert found.notes == expected.notes
+    expected, actual = (
+        engine.measure(source, section=ends) for source in (result, as_kind(result, kind, tmp_path))
+    )
+    assert actual.notes == expected.notes
     for name, quantity in expected.quantities.items():
-        same = found.quantities[name]
+        same = actual.quantities[name]
         assert same.value == pytest.approx(quantity.value, rel=1e-5, abs=1e-9, nan_ok=True), name
         assert same.sigma == pytest.approx(quantity.sigma, rel=1e-5, abs=1e-9, nan_ok=True), name
     np.testing.assert_allclose(
-        section(given(result, kind, tmp_path), *ends).height, section(result, *ends).height, rtol=1e-6
+        section(as_kind(result, kind, tmp_path), *ends).height, section(result, *ends).height, rtol=1e-6
     )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_motions_are_estimated_and_touches_stitched_alike(kind, tmp_path):
     first, second = surface(), surface((0.02, -0.01, 0.05), (-0.4, 0.1, 0.02), 1)
-    other = given(second, kind, tmp_path)
-    expected, found = (engine.pose.estimate_pose(first, one) for one in (second, other))
-    np.testing.assert_allclose(found.translation, expected.translation, atol=1e-7)
-    np.testing.assert_allclose(found.sigma, expected.sigma, rtol=1e-4)
+    other = as_kind(second, kind, tmp_path)
+    expected, actual = (engine.pose.estimate_pose(first, touch) for touch in (second, other))
+    np.testing.assert_allclose(actual.translation, expected.translation, atol=1e-7)
+    np.testing.assert_allclose(actual.sigma, expected.sigma, rtol=1e-4)
     trackers = [engine.pose.PoseTracker() for _ in range(2)]
     for tracker in trackers:
         tracker.push(first)
-    expected, found = (tracker.push(one) for tracker, one in zip(trackers, (second, other), strict=True))
-    np.testing.assert_allclose(found.translation, expected.translation, atol=1e-7)
-    whole, together = (engine.pose.stitch([first, one]).result for one in (second, other))
+    expected, actual = (tracker.push(touch) for tracker, touch in zip(trackers, (second, other), strict=True))
+    np.testing.assert_allclose(actual.translation, expected.translation, atol=1e-7)
+    whole, together = (engine.pose.stitch([first, touch]).result for touch in (second, other))
     np.testing.assert_allclose(together.height, whole.height, atol=1e-6)
     assert together.process["touch_1"] == (str(other) if kind == "file" else "result 1")
 
@@ -85,18 +87,18 @@ def test_motions_are_estimated_and_touches_stitched_alike(kind, tmp_path):
 def test_errors_are_scored_alike(kind, tmp_path):
     result, flat = surface(), np.zeros(SHAPE, np.float32)
     truth = io.Truth(bumpy(*places(SHAPE, PIXEL))[0], flat, flat, np.ones(SHAPE, np.uint8))
-    expected, found = (engine.score(one, truth) for one in (result, given(result, kind, tmp_path)))
-    assert found.height.rms == pytest.approx(expected.height.rms, rel=1e-5)
-    assert found.height.chi_square == pytest.approx(expected.height.chi_square, rel=1e-5)
-    assert found.normal.rms == pytest.approx(expected.normal.rms, rel=1e-5)
+    expected, actual = (engine.score(heights, truth) for heights in (result, as_kind(result, kind, tmp_path)))
+    assert actual.height.rms == pytest.approx(expected.height.rms, rel=1e-5)
+    assert actual.height.chi_square == pytest.approx(expected.height.chi_square, rel=1e-5)
+    assert actual.normal.rms == pytest.approx(expected.normal.rms, rel=1e-5)
 
 
 def test_an_array_is_the_height():
     height = cap(SHAPE, PIXEL, 5.0, 1.2)
     expected = engine.measure(io.Result(height=height, x=X, y=Y))
     array = xarray.DataArray(height, dims=("y", "x"), coords={"x": X, "y": Y})
-    for found in (engine.measure(height, pixel_size=PIXEL), engine.measure(array)):
-        assert found.quantities["sphere radius"].value == pytest.approx(
+    for measured in (engine.measure(height, pixel_size=PIXEL), engine.measure(array)):
+        assert measured.quantities["sphere radius"].value == pytest.approx(
             expected.quantities["sphere radius"].value
         )
     masked = engine.measure(np.ma.masked_invalid(height), pixel_size=0.05)
@@ -104,12 +106,12 @@ def test_an_array_is_the_height():
 
 
 def test_numbers_and_texts_of_a_mapping_go_to_the_process_and_declared_ones_to_fitted():
-    found = as_result(
+    result = as_result(
         {"height": [[0.0, 1.0]], "travel": 0.5, "source": "scanner", "force": 2.0, "normals": None}
     )
-    assert found.process == {"travel": 0.5, "source": "scanner"}
-    assert found.fitted == io.Fitted(travel=0.5)
-    assert (found.force, found.normals, list(found)) == (2.0, None, ["height", "force"])
+    assert result.process == {"travel": 0.5, "source": "scanner"}
+    assert result.fitted == io.Fitted(travel=0.5)
+    assert (result.force, result.normals, list(result)) == (2.0, None, ["height", "force"])
 
 
 FLAT = np.zeros((2, 3))

@@ -44,12 +44,12 @@ def stack():
     return MadeUp(FRAMES, HEADER, travel=TRAVEL)
 
 
-def same(found, expected):
-    assert {name: values.dtype for name, values in found.items()} == {
+def same(actual, expected):
+    assert {name: values.dtype for name, values in actual.items()} == {
         name: values.dtype for name, values in expected.items()
     }
     for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values)
+        np.testing.assert_array_equal(actual[name], values)
 
 
 @pytest.fixture(scope="module")
@@ -69,9 +69,9 @@ def test_a_recording_gives_the_same_bits_however_it_is_cut(tmp_path, whole, comp
     record(stack(), tmp_path / "rec.h5", compression)
     moments = Moments(memory_limit=2 * at_once * FRAME)
     with io.open_recording(tmp_path / "rec.h5") as recording:
-        found = engine.run(recording, moments)
-    assert found.process["longest"] == min(at_once, 8)
-    same(found, whole)
+        result = engine.run(recording, moments)
+    assert result.process["longest"] == min(at_once, 8)
+    same(result, whole)
 
 
 def test_frames_that_come_one_by_one_give_the_same_bits(whole):
@@ -100,26 +100,26 @@ def test_maps_numbers_and_provenance_are_kept_in_a_file(tmp_path):
 
     record(stack(), tmp_path / "rec.h5")
     with io.open_recording(tmp_path / "rec.h5") as recording:
-        made = engine.run(recording, Mixed)
-    io.save_result(made, tmp_path / "res.h5")
-    found = io.open_result(tmp_path / "res.h5")
-    assert found.process == made.process
-    assert (found.process["operation"], found.process["count"]) == ("Mixed", 8)
-    assert found.process["factor"] == 1.0
-    assert {"source_fingerprint", "date", "version"} < set(found.process)
-    assert found.height.dtype == found.normals.dtype == np.float32
-    same(found, made)
-    assert list(found) == ["height", "normals", "light"]
-    np.testing.assert_array_equal(found.x, made.x)
+        result = engine.run(recording, Mixed)
+    io.save_result(result, tmp_path / "res.h5")
+    stored = io.open_result(tmp_path / "res.h5")
+    assert stored.process == result.process
+    assert (stored.process["operation"], stored.process["count"]) == ("Mixed", 8)
+    assert stored.process["factor"] == 1.0
+    assert {"source_fingerprint", "date", "version"} < set(stored.process)
+    assert stored.height.dtype == stored.normals.dtype == np.float32
+    same(stored, result)
+    assert list(stored) == ["height", "normals", "light"]
+    np.testing.assert_array_equal(stored.x, result.x)
 
 
 def test_maps_that_are_not_built_in_are_exported_and_displayed(tmp_path):
-    made = engine.run(FRAMES, Moments, travel=TRAVEL)
-    io.export_result(made, tmp_path / "maps.npz")
+    result = engine.run(FRAMES, Moments, travel=TRAVEL)
+    io.export_result(result, tmp_path / "maps.npz")
     with np.load(tmp_path / "maps.npz") as arrays:
-        same({name: arrays[name] for name in made}, made)
-    assert made.to_xarray().total.dims == ("y", "x")
-    assert "total" in repr(made)
+        same({name: arrays[name] for name in result}, result)
+    assert result.to_xarray().total.dims == ("y", "x")
+    assert "total" in repr(result)
 
 
 def test_select_turn_includes_maps_that_are_not_built_in():
@@ -131,26 +131,26 @@ def test_built_in_operations_are_run_as_well(device):
     press = sphere()
     frames = press.read(np.empty(press.shape, press.dtype)).frames.copy()
     onset = engine.find_onset(frames, TRAVEL, device=device)
-    found = engine.run(press, engine.Onset(device=device, memory_limit=1))
+    result = engine.run(press, engine.Onset(device=device, memory_limit=1))
     for name in ("height", "height_sigma", "status", "frame"):
-        np.testing.assert_array_equal(found[name], onset[name])
-    assert found.process["noise"] == onset.process["noise"]
-    assert found.process["device"] == device.info.title
+        np.testing.assert_array_equal(result[name], onset[name])
+    assert result.process["noise"] == onset.process["noise"]
+    assert result.process["device"] == device.info.title
 
 
 def test_levels_that_are_not_given_are_those_of_the_recording(tmp_path):
     frames = np.full((6, 1, 2), 10, np.uint8)
     frames[3:] = 30  # light, if the recording's levels are used
     header = io.Header("vertical", dark=np.float32(10), bright=np.float32(40))
-    found = engine.run(MadeUp(frames, header, travel=0.1 * np.arange(6)), engine.Onset(noise=1.0))
-    assert found.status.tolist() == [[1, 1]]
-    assert found.process["bright"] == 40.0
+    result = engine.run(MadeUp(frames, header, travel=0.1 * np.arange(6)), engine.Onset(noise=1.0))
+    assert result.status.tolist() == [[1, 1]]
+    assert result.process["bright"] == 40.0
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
 def test_a_kernel_of_the_user_s_gives_the_same_as_numpy(device, tmp_path, dtype):
     page = (Path(__file__).parents[3] / "docs" / "operations.md").read_text(encoding="utf-8")
-    exec(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)[-1], known := {})
+    exec(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)[-1], namespace := {})
     frames = random_stack(dtype)
     record(MadeUp(frames, HEADER, travel=TRAVEL), tmp_path / "rec.h5")
     sums = np.add.accumulate(frames, axis=0, dtype=np.float32)[-1]
@@ -160,9 +160,9 @@ def test_a_kernel_of_the_user_s_gives_the_same_as_numpy(device, tmp_path, dtype)
     for at_once in (1, 3, 100):
         with io.open_recording(tmp_path / "rec.h5") as recording:
             limit = 2 * at_once * frames[0].nbytes
-            found = engine.run(recording, known["FirstLight"](device=device, memory_limit=limit))
-        np.testing.assert_array_equal(found.height, height)
-    assert found.process["device"] == device.info.title
+            result = engine.run(recording, namespace["FirstLight"](device=device, memory_limit=limit))
+        np.testing.assert_array_equal(result.height, height)
+    assert result.process["device"] == device.info.title
 
 
 def test_live_updates_hold_the_heights_so_far_and_the_result_all_of_them():
@@ -374,10 +374,10 @@ class Twice(engine.Operation):
 def test_an_operation_of_two_passes_reads_a_recording_twice(tmp_path, at_once):
     record(stack(), tmp_path / "rec.h5")
     with io.open_recording(tmp_path / "rec.h5") as recording:
-        found = engine.run(recording, Twice(memory_limit=2 * at_once * FRAME))
-    np.testing.assert_array_equal(found["above"], np.sum(np.mean(FRAMES, axis=0) < FRAMES, axis=0))
-    same(engine.run(FRAMES, Twice), found)
-    same(engine.run(iter(FRAMES), Twice), found)
+        result = engine.run(recording, Twice(memory_limit=2 * at_once * FRAME))
+    np.testing.assert_array_equal(result["above"], np.sum(np.mean(FRAMES, axis=0) < FRAMES, axis=0))
+    same(engine.run(FRAMES, Twice), result)
+    same(engine.run(iter(FRAMES), Twice), result)
 
 
 def test_two_passes_are_refused_by_what_is_read_once_and_live():
@@ -406,10 +406,10 @@ def test_a_map_declared_in_the_class_is_written_with_its_unit_and_legend(tmp_pat
         def result(self):
             return {"wear": self.moment, "wear_sigma": self.moment / 10, "material": self.total > 9}
 
-    found = engine.run(FRAMES, Wear, travel=TRAVEL)
-    io.save_result(found, tmp_path / "wear.h5")
+    result = engine.run(FRAMES, Wear, travel=TRAVEL)
+    io.save_result(result, tmp_path / "wear.h5")
     read = io.open_result(tmp_path / "wear.h5")
-    np.testing.assert_array_equal(read.height_sigma, found.wear_sigma)
+    np.testing.assert_array_equal(read.height_sigma, result.wear_sigma)
     assert read.declaration("wear_sigma").unit == "mm"
     assert read.declaration("material").codes == {0: "unknown", 1: "steel"}
 
@@ -468,8 +468,8 @@ def test_an_impossible_class_is_refused_where_it_is_defined(attributes, line):
 
 @pytest.mark.parametrize("annotation", [float, "float"])
 def test_a_whole_number_as_the_default_of_a_float_is_a_number(annotation):
-    own = declared(level=number(5), __annotations__={"level": annotation})
-    assert own(level=2.5).level == 2.5
+    operation = declared(level=number(5), __annotations__={"level": annotation})
+    assert operation(level=2.5).level == 2.5
 
 
 def test_options_are_read_only():
@@ -494,21 +494,21 @@ def test_it_is_shown_with_the_options_that_are_given():
     ],
 )
 def test_impossible_results_are_refused_in_a_line(returned, line):
-    own = declared(result=lambda self: returned, level=number())
+    operation = declared(result=lambda self: returned, level=number())
     with pytest.raises(io.InputError, match=line) as caught:
-        engine.run(FRAMES, own)
+        engine.run(FRAMES, operation)
     assert "\n" not in str(caught.value)
 
 
 def test_arrays_have_the_pixel_size_that_is_given():
-    found = engine.run(FRAMES, Moments, travel=TRAVEL, pixel_size=(0.5, 0.6))
+    result = engine.run(FRAMES, Moments, travel=TRAVEL, pixel_size=(0.5, 0.6))
     x, y = io.pixel_axes((5, 7), (0.5, 0.6))
-    np.testing.assert_array_equal(found.x, x)
-    np.testing.assert_array_equal(found.y, y)
+    np.testing.assert_array_equal(result.x, x)
+    np.testing.assert_array_equal(result.y, y)
 
 
 @pytest.mark.parametrize(
-    ("given", "line"),
+    ("positions", "line"),
     [
         (
             {"travel": TRAVEL, "factor": 2.0},
@@ -517,15 +517,15 @@ def test_arrays_have_the_pixel_size_that_is_given():
         ({"pixel_size": 0.5}, "is a recording: give pixel_size to io.open_recording"),
     ],
 )
-def test_what_is_not_of_each_frame_is_refused_with_its_place(tmp_path, given, line):
+def test_what_is_not_of_each_frame_is_refused_with_its_place(tmp_path, positions, line):
     with io.open_recording(record(stack(), tmp_path / "own.h5")) as recording:
-        frames = recording if "pixel_size" in given else FRAMES
+        frames = recording if "pixel_size" in positions else FRAMES
         with pytest.raises(io.InputError, match=line):
-            engine.run(frames, Moments, **given)
+            engine.run(frames, Moments, **positions)
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (
             lambda: engine.find_onset(np.zeros((3, 2, 2), np.uint8), [0, 1, 2], zenith_gain=200.0),
@@ -536,6 +536,6 @@ def test_what_is_not_of_each_frame_is_refused_with_its_place(tmp_path, given, li
         (lambda: io.open_recording("a.h5", pixelsize=3), "did you mean pixel_size?"),
     ],
 )
-def test_an_argument_of_something_else_names_where_it_belongs(call, said):
-    with pytest.raises((TypeError, io.InputError), match=said):
+def test_an_argument_of_something_else_names_where_it_belongs(call, message):
+    with pytest.raises((TypeError, io.InputError), match=message):
         call()

@@ -120,8 +120,12 @@ def changed(kinds):
 
 
 def test_annotations_decide_the_kinds(kinds):
-    found = {name: one.kind for name, one in kinds.options.items() if name not in ("device", "memory_limit")}
-    assert found == {
+    kind_of = {
+        name: declared_option.kind
+        for name, declared_option in kinds.options.items()
+        if name not in ("device", "memory_limit")
+    }
+    assert kind_of == {
         "count_of": "integer",
         "level": "number",
         "fast": "flag",
@@ -135,11 +139,11 @@ def test_annotations_decide_the_kinds(kinds):
         "pulse": "number",
         "dark": "map",
     }
-    own = changed(kinds)
-    assert own.mode is sys.modules["kinds_of_a_test"].Mode.MEAN
-    assert kinds(mode=own.mode) == kinds(mode="MEAN")
-    assert (own.place, own.numbers, own.maybe) == (Path("a/b"), (4, 5), False)
-    written = describe(own)
+    operation = changed(kinds)
+    assert operation.mode is sys.modules["kinds_of_a_test"].Mode.MEAN
+    assert kinds(mode=operation.mode) == kinds(mode="MEAN")
+    assert (operation.place, operation.numbers, operation.maybe) == (Path("a/b"), (4, 5), False)
+    written = describe(operation)
     assert (written["mode"], written["place"], written["numbers"]) == ("MEAN", "a/b", "[4, 5]")
 
 
@@ -152,7 +156,7 @@ def test_the_command_line_and_settings_have_the_kinds(kinds):
     for name, value in EXPECTED.items():
         assert process[name] == (str(list(value)) if isinstance(value, tuple) else value)
     assert process["place"] == "a/b"
-    told = done("run kinds_of_a_test:Kinds --help").out
+    text = done("run kinds_of_a_test:Kinds --help").out
     for line in (
         "--mode [sum|MEAN]",
         "--title TEXT",
@@ -160,7 +164,7 @@ def test_the_command_line_and_settings_have_the_kinds(kinds):
         "--numbers N[,...]",
         "--pulse HZ|estimate",
     ):
-        assert line in told
+        assert line in text
     refused("--numbers 4.5: a whole number is needed", "run kinds_of_a_test:Kinds press.h5 --numbers 4.5")
 
 
@@ -249,33 +253,41 @@ def test_defaults_are_written_as_on_the_command_line():
         light: Light = option(default=Light.BLUE, help="light")
         angles: Sequence[float] = option(default=[np.pi], unit="rad", help="angles")
 
-    assert [term_of(one).shown_default for one in Own.options.values()] == ["blue", "180deg"]
+    assert [term_of(declared_option).shown_default for declared_option in Own.options.values()] == [
+        "blue",
+        "180deg",
+    ]
 
 
 def test_equal_options_make_equal_operations(kinds):
-    one, other = changed(kinds), changed(kinds)
-    assert one == other
-    assert hash(one) == hash(other)
-    assert len({one, other, kinds()}) == 2
-    assert one != one.with_options(dark=np.ones((2, 2)))
-    assert one != one.with_options(level=3.0)
+    first, other = changed(kinds), changed(kinds)
+    assert first == other
+    assert hash(first) == hash(other)
+    assert len({first, other, kinds()}) == 2
+    assert first != first.with_options(dark=np.ones((2, 2)))
+    assert first != first.with_options(level=3.0)
     assert engine.Onset() != engine.ChangePoint()
     assert engine.Press(hold=3) == engine.Press(hold=3)
 
 
 def test_the_representation_evaluates():
-    for one in (engine.Onset(), engine.Press(thresholds=[0.25, 0.75], inclinations=[0.1, 0.2], device="cpu")):
-        assert eval(repr(one), vars(engine)) == one
-    own = engine.Onset(dark=np.zeros((2, 2)), bright=np.full((30, 40), 9.0))
-    assert repr(own) == "Onset(dark=[[0.0, 0.0], [0.0, 0.0]], bright=<float64 (30, 40)>)"
+    for operation in (
+        engine.Onset(),
+        engine.Press(thresholds=[0.25, 0.75], inclinations=[0.1, 0.2], device="cpu"),
+    ):
+        assert eval(repr(operation), vars(engine)) == operation
+    with_arrays = engine.Onset(dark=np.zeros((2, 2)), bright=np.full((30, 40), 9.0))
+    assert repr(with_arrays) == "Onset(dark=[[0.0, 0.0], [0.0, 0.0]], bright=<float64 (30, 40)>)"
     assert repr(engine.Onset(device=open_device("cpu"))).startswith("Onset(device=")
 
 
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+@pytest.mark.parametrize(
+    "copied", [copy.copy, copy.deepcopy, lambda original: pickle.loads(pickle.dumps(original))]
+)
 def test_copies_are_equal(kinds, copied):
-    own = changed(kinds)
-    engine.run(np.ones((3, 2, 2), np.uint8), own)
-    assert copied(own) == own
+    operation = changed(kinds)
+    engine.run(np.ones((3, 2, 2), np.uint8), operation)
+    assert copied(operation) == operation
     device = open_device("cpu")
     devices = copied(engine.Onset(device=[device]))
     assert devices.devices == [device]
@@ -290,13 +302,13 @@ def answer(operation, frames):
 
 @pytest.mark.parametrize("name", ["kinds_of_a_test:Kinds", "kinds_of_a_test.py:Kinds"])
 def test_an_operation_runs_in_a_spawned_process(kinds, name):
-    own = changed(load_operation(name))
+    operation = changed(load_operation(name))
     frames = np.arange(12, dtype=np.uint8).reshape(3, 2, 2)
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        other, token, maps = pool.apply(answer, (own, frames))
-    assert other == own
-    assert token == own.__dask_tokenize__() != own.with_options(level=3.0).__dask_tokenize__()
-    np.testing.assert_array_equal(maps["total"], engine.run(frames, own)["total"])
+        other, token, maps = pool.apply(answer, (operation, frames))
+    assert other == operation
+    assert token == operation.__dask_tokenize__() != operation.with_options(level=3.0).__dask_tokenize__()
+    np.testing.assert_array_equal(maps["total"], engine.run(frames, operation)["total"])
 
 
 def test_dask_has_the_same_token_for_equal_operations(kinds):

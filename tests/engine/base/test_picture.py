@@ -65,10 +65,10 @@ class Sums(engine.Operation):
 CASES["own"] = (Sums(), {"travel": np.arange(COUNT)}, 64 * 4 * 2)
 
 
-def same(found, expected):
-    assert list(found) == list(expected)
+def same(actual, expected):
+    assert list(actual) == list(expected)
     for name in expected:
-        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
+        np.testing.assert_array_equal(actual[name], expected[name], err_msg=name)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -99,16 +99,16 @@ def test_several_devices_have_the_maps_of_one(device, name):
 @pytest.mark.parametrize("name", CASES)
 def test_maps_stay_on_the_device_of_the_frames(device, name):
     operation, positions, _ = CASES[name]
-    found = bare(operation, device.from_host("frames", FRAMES, FRAMES.dtype), **positions)
-    assert found.on_device(next(iter(found))) is not None
-    same(found, bare(operation.with_options(device=device), FRAMES, **positions))
+    result = bare(operation, device.from_host("frames", FRAMES, FRAMES.dtype), **positions)
+    assert result.on_device(next(iter(result))) is not None
+    same(result, bare(operation.with_options(device=device), FRAMES, **positions))
 
 
 def test_the_sums_are_those_of_numpy():
-    found = bare(Sums(), FRAMES, [4], travel=np.arange(COUNT))
-    np.testing.assert_array_equal(found.total, FRAMES.sum(axis=0))
-    np.testing.assert_array_equal(found.moment, np.tensordot(np.arange(COUNT), FRAMES, 1))
-    assert (found["last"] == COUNT - 1).all()
+    result = bare(Sums(), FRAMES, [4], travel=np.arange(COUNT))
+    np.testing.assert_array_equal(result.total, FRAMES.sum(axis=0))
+    np.testing.assert_array_equal(result.moment, np.tensordot(np.arange(COUNT), FRAMES, 1))
+    assert (result["last"] == COUNT - 1).all()
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -19,7 +19,7 @@ def made_up(**header):
 
 def test_a_parameters_origin_is_its_number_or_a_word():
     a_map = np.ones((3, 5))
-    for given, own, expected in (
+    for argument, header_value, expected in (
         (2.5, None, 2.5),
         (0, a_map, 0.0),
         (np.float32(0.5), 7.0, 0.5),
@@ -28,7 +28,7 @@ def test_a_parameters_origin_is_its_number_or_a_word():
         (None, a_map, "map of the recording"),
         (None, None, "range of the type"),
     ):
-        value = parameter_origin(given, own, "range of the type")
+        value = parameter_origin(argument, header_value, "range of the type")
         assert value == expected
         assert isinstance(value, str | float)
 
@@ -46,7 +46,7 @@ def test_errors_name_their_source_once_and_others_pass():
         raise ZeroDivisionError
 
 
-def test_a_result_says_its_source_and_its_device(device):
+def test_a_result_names_its_source_and_its_device(device):
     bare = io.Result(mean=np.zeros((3, 5), np.float32))
     signed = attach_provenance(
         bare, made_up(pixel_size=(0.1, 0.2)), [device], {"method": "exact", "tilt": 0.1}
@@ -72,8 +72,8 @@ def test_pixels_of_a_part_lie_where_they_do_in_the_whole_picture(tmp_path):
     with io.open_recording(path) as recording:
         whole = attach_provenance(io.Result(), recording, [open_device(None)], {})
         for name in ("fingerprint", "modified"):
-            own = getattr(recording, name)
-            assert whole.process[f"source_{name}"] == (own() if callable(own) else own)
+            levels = getattr(recording, name)
+            assert whole.process[f"source_{name}"] == (levels() if callable(levels) else levels)
         assert (whole.process["dataset"], whole.process["source"]) == (recording.dataset, recording.name)
         count, rows, columns = recording.shape
     part = io.Region((1, rows - 1), (2, columns - 1))

@@ -53,9 +53,9 @@ def test_an_iterator_may_reuse_the_memory_of_its_frames(frames, operation, posit
             memory[:] = frame
             yield memory
 
-    expected, found = (engine.run(each, operation, **positions) for each in (frames, reused()))
+    expected, actual = (engine.run(each, operation, **positions) for each in (frames, reused()))
     for name in expected:
-        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
+        np.testing.assert_array_equal(actual[name], expected[name], err_msg=name)
 
 
 @pytest.mark.parametrize("take", [lambda run: run.result(), lambda run: run.preview(1.0)])
@@ -121,9 +121,9 @@ def test_arrays_have_times_for_a_rolling_shutter(find):
     still, late = (
         find(FRAMES, TRAVEL, TRAVEL / 3, line_time=seconds, **levels).height for seconds in (None, 1e-3)
     )
-    known = np.isfinite(still)
+    valid = np.isfinite(still)
     rows = 1e-3 * (np.arange(6) - 2.5)[:, np.newaxis] * np.ones((1, 7))
-    np.testing.assert_allclose((still - late)[known], 3 * rows[known], atol=1e-6)
+    np.testing.assert_allclose((still - late)[valid], 3 * rows[valid], atol=1e-6)
 
 
 @pytest.mark.parametrize("method", ["threshold", "change-point"])
@@ -131,5 +131,5 @@ def test_scatter_of_levels_is_in_the_errors_of_both_methods(method):
     recording = io.ArrayRecording(FRAMES, {"travel": TRAVEL}, {})
     options = {"method": method, "dark": 0, "bright": 255, "noise": 1.0, "fill": False}
     exact, scattered = (engine.Press(dark_sigma=sigma, **options).run(recording) for sigma in (0.0, 20.0))
-    known = np.isfinite(exact.height_sigma)
-    assert (scattered.height_sigma[known] > exact.height_sigma[known]).all()
+    valid = np.isfinite(exact.height_sigma)
+    assert (scattered.height_sigma[valid] > exact.height_sigma[valid]).all()

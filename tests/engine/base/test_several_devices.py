@@ -42,9 +42,9 @@ def test_several_devices_have_the_answer_of_one(devices, name):
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.function])
 def test_functions_on_arrays_take_several_devices(devices, name):
     case = CASES[name]
-    given = {**case.options, **case.given}
-    found = case.function(case.frames, **given, device=devices)
-    assert_same(found, case.function(case.frames, **given, device=devices[0]))
+    options = {**case.options, **case.given}
+    result = case.function(case.frames, **options, device=devices)
+    assert_same(result, case.function(case.frames, **options, device=devices[0]))
 
 
 def kernels_run(device):
@@ -52,22 +52,22 @@ def kernels_run(device):
 
 
 def test_all_devices_work(devices):
-    before = [kernels_run(one) for one in devices]
+    before = [kernels_run(device) for device in devices]
     engine.find_onset(FRAMES, TRAVEL, **LEVELS["uint8"], device=devices[1:])
-    after = [kernels_run(one) for one in devices]
+    after = [kernels_run(device) for device in devices]
     assert [new > old for new, old in zip(after, before, strict=True)] == [False, True, True]
 
 
 def test_a_device_with_less_memory_divides_its_rows_further(devices):
     small = like(devices[0])
     small.max_allocation = 3 * 64 * 4  # three planes of frame numbers of one row
-    found = engine.find_onset(FRAMES, TRAVEL, **LEVELS["uint8"], device=[devices[0], small])
-    assert_same(found, engine.find_onset(FRAMES, TRAVEL, **LEVELS["uint8"], device=devices[0]))
+    onset = engine.find_onset(FRAMES, TRAVEL, **LEVELS["uint8"], device=[devices[0], small])
+    assert_same(onset, engine.find_onset(FRAMES, TRAVEL, **LEVELS["uint8"], device=devices[0]))
 
 
 def test_more_devices_than_rows_are_not_all_used(devices):
-    found = engine.find_onset(FRAMES[:, :2], TRAVEL, **LEVELS["uint8"], device=devices)
-    assert_same(found, engine.find_onset(FRAMES[:, :2], TRAVEL, **LEVELS["uint8"], device=devices[0]))
+    onset = engine.find_onset(FRAMES[:, :2], TRAVEL, **LEVELS["uint8"], device=devices)
+    assert_same(onset, engine.find_onset(FRAMES[:, :2], TRAVEL, **LEVELS["uint8"], device=devices[0]))
 
 
 def test_the_error_of_a_device_names_it(devices, monkeypatch):
@@ -90,8 +90,8 @@ def test_a_device_stops_before_its_next_frames_if_another_one_fails(devices):
         if band is bands[0]:
             raise DeviceError("it cannot run")
         for part in (FRAMES[:1], FRAMES[1:2]):
-            for one in band.stage(part, whole=True):
-                staged.append(one)
+            for block in band.stage(part, whole=True):
+                staged.append(block)
                 assert band.stop.wait(60)
 
     with pytest.raises(DeviceError, match="it cannot run"):
@@ -133,9 +133,9 @@ def test_frames_on_a_device_are_not_divided_among_several(devices):
 
 def test_a_chain_of_steps_takes_several_devices(devices):
     press = {"travel": TRAVEL, "pixel_size": 0.05, "dark": 20.0, "bright": 220.0}
-    found = engine.reconstruct(FRAMES, **press, device=devices)
-    assert_same(found, engine.reconstruct(FRAMES, **press, device=devices[0]))
-    assert found.process["device"] == f"3 x {devices[0].info.title}"
+    result = engine.reconstruct(FRAMES, **press, device=devices)
+    assert_same(result, engine.reconstruct(FRAMES, **press, device=devices[0]))
+    assert result.process["device"] == f"3 x {devices[0].info.title}"
 
 
 @pytest.fixture(scope="module")
@@ -164,6 +164,6 @@ def test_the_command_line_divides_a_picture_among_all_devices(tmp_path, two_proc
             [sys.executable, "-m", "mirrorskin.cli.main", *words, "-o", f"{choice}.h5"],
             cwd=tmp_path, env=two_processors, check=True, timeout=300,
         )  # fmt: skip
-    one, both = (io.open_result(tmp_path / f"{choice}.h5") for choice in ("0", "all"))
-    assert_same(both, one)
-    assert both.process["device"] == f"2 x {one.process['device']}"
+    single, both = (io.open_result(tmp_path / f"{choice}.h5") for choice in ("0", "all"))
+    assert_same(both, single)
+    assert both.process["device"] == f"2 x {single.process['device']}"

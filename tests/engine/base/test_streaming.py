@@ -37,8 +37,8 @@ class Keeper(Operation):
     for_device = True
     least_frames = 0
 
-    def __init__(self, device, room, fails=None):
-        super().__init__(device=device, memory_limit=2 * room * 3 * 5 * 2)
+    def __init__(self, device, rows, fails=None):
+        super().__init__(device=device, memory_limit=2 * rows * 3 * 5 * 2)
         self.seen, self.fails = [], fails
 
     def push(self, frames, *, travel):
@@ -52,24 +52,24 @@ class Keeper(Operation):
         return {"numbers": np.zeros(self.shape)}
 
 
-def feed(source, keeper, wanted, progress=None):
+def feed(source, keeper, frame_range, progress=None):
     """Return the numbers of the frames that an operation receives."""
-    run = Run(Plan(keeper, frames=wanted, checked=False), source)
+    run = Run(Plan(keeper, frames=frame_range, checked=False), source)
     try:
         run.complete(progress)
     finally:
         keeper.seen = run.operation.seen
 
 
-@pytest.mark.parametrize("room", [1, 3, 100])
-@pytest.mark.parametrize("wanted", [range(10), range(2, 7), range(9, 10), range(0)])
-def test_each_frame_is_pushed_once_and_in_order(device, room, wanted):
-    told = []
-    keeper = Keeper(device, room)
-    feed(Source(10), keeper, wanted, told.append)
-    assert keeper.seen == list(wanted)
-    assert told == sorted(told)
-    assert told[-1:] == ([wanted.stop] if wanted else [])
+@pytest.mark.parametrize("rows", [1, 3, 100])
+@pytest.mark.parametrize("frame_range", [range(10), range(2, 7), range(9, 10), range(0)])
+def test_each_frame_is_pushed_once_and_in_order(device, rows, frame_range):
+    counts = []
+    keeper = Keeper(device, rows)
+    feed(Source(10), keeper, frame_range, counts.append)
+    assert keeper.seen == list(frame_range)
+    assert counts == sorted(counts)
+    assert counts[-1:] == ([frame_range.stop] if frame_range else [])
 
 
 @pytest.mark.parametrize("longest", [3, 100])
@@ -77,8 +77,8 @@ def test_frames_that_a_source_lends_are_pushed_where_they_lie(device, longest):
     """The last of them has to be read."""
 
     class Lender(Source):
-        def read_in_place(self, most):
-            start, stop = self.next, min(self.next + min(most, longest), self.shape[0] - 1)
+        def read_in_place(self, limit):
+            start, stop = self.next, min(self.next + min(limit, longest), self.shape[0] - 1)
             self.next = stop
             frames = np.broadcast_to(np.arange(start, stop, dtype="u2")[:, None, None], (stop - start, 3, 5))
             return (
@@ -87,11 +87,11 @@ def test_frames_that_a_source_lends_are_pushed_where_they_lie(device, longest):
                 else None
             )
 
-    keeper, told = Keeper(device, 1), []
-    feed(Lender(10), keeper, range(2, 10), told.append)
+    keeper, counts = Keeper(device, 1), []
+    feed(Lender(10), keeper, range(2, 10), counts.append)
     assert keeper.seen == list(range(2, 10))
     if device.info.shares_memory:
-        assert told == ([1, 2, 5, 8, 9, 10] if longest == 3 else [1, 2, 9, 10])
+        assert counts == ([1, 2, 5, 8, 9, 10] if longest == 3 else [1, 2, 9, 10])
 
 
 def test_a_source_that_ends_early_is_not_an_error(device):

@@ -21,22 +21,22 @@ def slopes(number):
 
 def test_results_next_to_pushes_are_those_of_a_single_thread():
     """Of an integrator; operations have a contract."""
-    alone, shared, done = engine.Integrator(SHAPE, 0.1), engine.Integrator(SHAPE, 0.1), threading.Event()
-    known = set()
+    alone, shared, finished = engine.Integrator(SHAPE, 0.1), engine.Integrator(SHAPE, 0.1), threading.Event()
+    heights_of_one = set()
     for number in range(60):
         alone.push(*slopes(number))
-        known.add(alone.result().height.tobytes())
+        heights_of_one.add(alone.result().height.tobytes())
 
     def push():
         for number in range(60):
             shared.push(*slopes(number))
-        done.set()
+        finished.set()
 
     with ThreadPoolExecutor(1) as pool:
         pushing = pool.submit(push)
-        while not done.is_set() and not pushing.done():
+        while not finished.is_set() and not pushing.done():
             try:
-                assert shared.result().height.tobytes() in known
+                assert shared.result().height.tobytes() in heights_of_one
             except InputError:
                 continue  # nothing was pushed yet
         pushing.result()
@@ -87,18 +87,18 @@ def test_no_two_threads_are_in_an_object_at_once(kind):
         return shared.seen
 
     with ThreadPoolExecutor(4) as pool:
-        found = [pool.submit(use) for _ in range(4)]
-        assert {one.result() for one in found} == {1}
+        futures = [pool.submit(use) for _ in range(4)]
+        assert {future.result() for future in futures} == {1}
 
 
 def test_an_object_does_not_wait_for_another():
-    one, other = Meeting(), Meeting()
-    with one._thread_lock, ThreadPoolExecutor(1) as pool:
+    first, other = Meeting(), Meeting()
+    with first._thread_lock, ThreadPoolExecutor(1) as pool:
         assert pool.submit(other.push).result(timeout=60) is None
 
 
 def test_a_status_can_be_read_while_the_loop_counts():
-    monitor, start, done = Monitor(), threading.Barrier(3), threading.Event()
+    monitor, start, finished = Monitor(), threading.Barrier(3), threading.Event()
 
     def count():
         start.wait()
@@ -107,23 +107,23 @@ def test_a_status_can_be_read_while_the_loop_counts():
                 monitor.took(0.01 * number, 1, 1, 0)
                 monitor.time(STAGES[0], 0.1)
         finally:
-            done.set()
+            finished.set()
 
     def look_on():
         start.wait()
-        while not done.is_set():
+        while not finished.is_set():
             status = monitor.status(fresh=True)
             assert status.frames == status.used
 
     with ThreadPoolExecutor(3) as pool:
-        for one in [pool.submit(count), pool.submit(look_on), pool.submit(look_on)]:
-            one.result()
+        for future in [pool.submit(count), pool.submit(look_on), pool.submit(look_on)]:
+            future.result()
     assert monitor.status(fresh=True).frames == 3000
 
 
 def test_threads_that_integrate_at_once_get_what_each_gets_alone():
     inputs = [slopes(number) for number in range(1, 7)]
-    alone = [engine.integrate(*one, 0.1).height.tobytes() for one in inputs]
+    alone = [engine.integrate(*pair, 0.1).height.tobytes() for pair in inputs]
     with ThreadPoolExecutor(3) as pool:
-        found = list(pool.map(lambda one: engine.integrate(*one, 0.1).height.tobytes(), inputs * 3))
-    assert found == alone * 3
+        heights = list(pool.map(lambda pair: engine.integrate(*pair, 0.1).height.tobytes(), inputs * 3))
+    assert heights == alone * 3

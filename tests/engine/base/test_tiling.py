@@ -93,8 +93,8 @@ def test_lent_frames_give_the_same_answer_wherever_they_lie(device, dtype, size,
     placed = lent(frames, offset)
     dark, bright = SPEC[dtype]
     search = Onset(dark=dark, bright=bright, device=device, memory_limit=2 * frames.nbytes)
-    found = bare(search, placed, [33, 34], travel=travel)
-    assert_equal(found, find_onset(frames, travel, **LEVELS[dtype], device=device))
+    result = bare(search, placed, [33, 34], travel=travel)
+    assert_equal(result, find_onset(frames, travel, **LEVELS[dtype], device=device))
 
 
 def test_lent_frames_are_worked_on_where_they_lie(device):

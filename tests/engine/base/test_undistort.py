@@ -65,9 +65,9 @@ def test_a_lens_that_does_nothing_changes_no_bit(shape, turns):
     result = maps_of(shape, turns)
     same = undistort(result, plain(shape))
     for name, values in result.maps().items():
-        found = same.maps()[name]
-        assert (found.dtype, found.shape) == (values.dtype, values.shape)
-        assert found.tobytes() == values.tobytes(), name
+        undistorted = same.maps()[name]
+        assert (undistorted.dtype, undistorted.shape) == (values.dtype, values.shape)
+        assert undistorted.tobytes() == values.tobytes(), name
     assert same.offset_unknown is result.offset_unknown
 
 
@@ -75,9 +75,9 @@ def test_a_smooth_map_comes_back_to_the_error_of_interpolation():
     view = boards.View((121, 157), 0.05, 110.0, tilt=10.0, towards=30.0, distortion=BENT)
     x, y = view.sheet(*np.meshgrid(np.arange(157.0), np.arange(121.0)))
     wave = 2.0  # 1/mm
-    found = undistort(Result(height=np.sin(wave * x + y).astype(np.float32)), lens_of(view))
-    there_x, there_y = np.meshgrid(found.x, found.y)
-    off = abs(found.height - np.sin(wave * there_x + there_y))
+    undistorted = undistort(Result(height=np.sin(wave * x + y).astype(np.float32)), lens_of(view))
+    there_x, there_y = np.meshgrid(undistorted.x, undistorted.y)
+    off = abs(undistorted.height - np.sin(wave * there_x + there_y))
     column, row = places_of(view)
     between = (column > 0) & (column < 156) & (row > 0) & (row < 120)
     assert between.mean() > 0.8
@@ -91,7 +91,7 @@ def by_hand(values, column, row, apart=None):
     near = int(np.floor(row + 0.5)), int(np.floor(column + 0.5))
     if not (0 <= near[0] < rows and 0 <= near[1] < columns) or np.isnan(values[near]):
         return np.nan
-    total = share = 0.0
+    total = weight_sum = 0.0
     for i in (int(np.floor(row)), int(np.floor(row)) + 1):
         for j in (int(np.floor(column)), int(np.floor(column)) + 1):
             if not (0 <= i < rows and 0 <= j < columns) or np.isnan(values[i, j]):
@@ -99,8 +99,8 @@ def by_hand(values, column, row, apart=None):
             if apart is not None and apart[i, j] != apart[near]:
                 continue
             weight = (1 - abs(row - i)) * (1 - abs(column - j))
-            total, share = total + weight * values[i, j], share + weight
-    return total / share
+            total, weight_sum = total + weight * values[i, j], weight_sum + weight
+    return total / weight_sum
 
 
 def places_of(view):
@@ -115,12 +115,12 @@ def test_numbers_are_means_of_what_counts(name, apart):
     shape = (23, 31)
     view = boards.View(shape, 0.03, np.hypot(*shape) / 2 + 1, tilt=8.0, towards=40.0, distortion=BENT)
     result = maps_of(shape)
-    found = undistort(result, lens_of(view)).maps()[name]
+    undistorted = undistort(result, lens_of(view)).maps()[name]
     column, row = places_of(view)
     values, labels = result.maps()[name], result.maps()[apart]
-    wanted = np.array([by_hand(values, c, r, labels) for c, r in zip(column.flat, row.flat, strict=True)])
-    assert np.isnan(wanted).any()
-    np.testing.assert_allclose(found.ravel(), wanted, rtol=1e-6, atol=1e-7)
+    expected = np.array([by_hand(values, c, r, labels) for c, r in zip(column.flat, row.flat, strict=True)])
+    assert np.isnan(expected).any()
+    np.testing.assert_allclose(undistorted.ravel(), expected, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["status", "edges", "filled", "contact", "component"])
@@ -128,12 +128,12 @@ def test_labels_are_those_of_the_nearest_pixel(name):
     shape = (23, 31)
     view = boards.View(shape, 0.03, 40.0, tilt=8.0, towards=40.0, distortion=BENT)
     result = maps_of(shape)
-    column, row = (np.floor(one + 0.5).astype(int) for one in places_of(view))
+    column, row = (np.floor(place + 0.5).astype(int) for place in places_of(view))
     inside = (column >= 0) & (column < 31) & (row >= 0) & (row < 23)
     nearest = result.maps()[name][np.clip(row, 0, 22), np.clip(column, 0, 30)]
-    wanted = np.where(inside, nearest, -1 if name == "component" else 0)
+    expected = np.where(inside, nearest, -1 if name == "component" else 0)
     assert not inside.all()
-    np.testing.assert_array_equal(undistort(result, lens_of(view)).maps()[name], wanted)
+    np.testing.assert_array_equal(undistort(result, lens_of(view)).maps()[name], expected)
 
 
 def test_the_lens_is_that_of_opencv():
@@ -141,10 +141,12 @@ def test_the_lens_is_that_of_opencv():
     x, y = np.meshgrid(*pixel_axes((41, 57), (0.02, 0.02)))
     # Any plane before the camera will do that is seen as the sheet is.
     rays = np.linalg.solve(lens.camera @ lens.matrix, np.stack([x, y, np.ones_like(x)]).reshape(3, -1)).T
-    wanted = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)[0].reshape(-1, 2)
+    expected = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)[0].reshape(
+        -1, 2
+    )
     column, row = picture_places(lens, x, y)
-    np.testing.assert_allclose(column.ravel(), wanted[:, 0], atol=1e-9)
-    np.testing.assert_allclose(row.ravel(), wanted[:, 1], atol=1e-9)
+    np.testing.assert_allclose(column.ravel(), expected[:, 0], atol=1e-9)
+    np.testing.assert_allclose(row.ravel(), expected[:, 1], atol=1e-9)
 
 
 def test_no_answer_does_not_creep():
@@ -152,29 +154,29 @@ def test_no_answer_does_not_creep():
     height = np.ones(shape, np.float32)
     height[10:20, 12:25] = np.nan
     view = boards.View(shape, 0.03, 40.0, distortion=BENT)
-    column, row = (np.floor(one + 0.5).astype(int) for one in places_of(view))
+    column, row = (np.floor(place + 0.5).astype(int) for place in places_of(view))
     hole = (row >= 10) & (row < 20) & (column >= 12) & (column < 25)
     outside = (row < 0) | (row >= 31) | (column < 0) | (column >= 37)
-    found = undistort(Result(height=height), lens_of(view)).height
-    np.testing.assert_array_equal(np.isnan(found), hole | outside)
+    undistorted = undistort(Result(height=height), lens_of(view)).height
+    np.testing.assert_array_equal(np.isnan(undistorted), hole | outside)
 
 
 def test_normals_stay_unit_and_their_angles_fit():
-    found = undistort(maps_of((33, 47)), bent((33, 47)))
-    x, y, z = np.moveaxis(found.normals.astype(np.float64), -1, 0)
-    known = np.isfinite(z)
-    assert 0.3 < known.mean() < 0.95
-    np.testing.assert_allclose(np.sqrt(x**2 + y**2 + z**2)[known], 1, atol=2e-7)
-    np.testing.assert_allclose(found.zenith, np.arctan2(np.hypot(x, y), z), atol=1e-6)
-    np.testing.assert_allclose(found.azimuth, np.arctan2(y, x), atol=1e-5)
+    undistorted = undistort(maps_of((33, 47)), bent((33, 47)))
+    x, y, z = np.moveaxis(undistorted.normals.astype(np.float64), -1, 0)
+    valid = np.isfinite(z)
+    assert 0.3 < valid.mean() < 0.95
+    np.testing.assert_allclose(np.sqrt(x**2 + y**2 + z**2)[valid], 1, atol=2e-7)
+    np.testing.assert_allclose(undistorted.zenith, np.arctan2(np.hypot(x, y), z), atol=1e-6)
+    np.testing.assert_allclose(undistorted.azimuth, np.arctan2(y, x), atol=1e-5)
 
 
 def test_azimuths_are_interpolated_the_short_way_round():
     shape = (9, 11)
     azimuth = np.where(np.arange(11) % 2, 3.1, -3.1).astype(np.float32)
-    found = undistort(Result(azimuth=np.broadcast_to(azimuth, shape).copy()), bent(shape)).azimuth
-    assert np.isfinite(found).sum() > 30
-    assert np.nanmin(abs(found)) > 3.09
+    undistorted = undistort(Result(azimuth=np.broadcast_to(azimuth, shape).copy()), bent(shape)).azimuth
+    assert np.isfinite(undistorted).sum() > 30
+    assert np.nanmin(abs(undistorted)) > 3.09
 
 
 def test_no_standard_deviation_is_too_small():
@@ -191,37 +193,39 @@ def test_no_standard_deviation_is_too_small():
 
 def test_each_turn_is_undistorted_as_if_alone():
     result, lens = maps_of((17, 21), (3,)), bent((17, 21))
-    found = undistort(result, lens)
+    undistorted = undistort(result, lens)
     for turn in range(3):
         alone = result.assign({name: values[turn] for name, values in result.maps().items()})
         for name, values in undistort(alone, lens).maps().items():
-            np.testing.assert_array_equal(found.maps()[name][turn], values)
+            np.testing.assert_array_equal(undistorted.maps()[name][turn], values)
 
 
-@pytest.mark.parametrize("said", [True, False])
-def test_a_part_of_the_picture_is_that_part_of_the_map(said):
-    shape, top, left = (41, 57), 9, 15
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_part_of_the_picture_is_that_part_of_the_map(stated):
+    shape, top, first_column = (41, 57), 9, 15
     result = maps_of(shape).assign(component=None, contact=None)
-    part = slice(top, 30), slice(left, 49)
-    fitted = Fitted(source_region=(top, top + 21, left, left + 34) if said else None)
-    cut = result.assign({name: values[part] for name, values in result.maps().items()}, fitted=fitted)
+    part = slice(top, 30), slice(first_column, 49)
+    fitted = Fitted(source_region=(top, top + 21, first_column, first_column + 34) if stated else None)
+    part_of_result = result.assign(
+        {name: values[part] for name, values in result.maps().items()}, fitted=fitted
+    )
     whole = undistort(result, bent(shape))
-    found = undistort(cut, bent(shape), None if said else (top, left))
-    np.testing.assert_array_equal(found.x, whole.x[part[1]])
-    np.testing.assert_array_equal(found.y, whole.y[part[0]])
+    undistorted = undistort(part_of_result, bent(shape), None if stated else (top, first_column))
+    np.testing.assert_array_equal(undistorted.x, whole.x[part[1]])
+    np.testing.assert_array_equal(undistorted.y, whole.y[part[0]])
     inside = slice(4, -4), slice(4, -4)
-    assert np.isfinite(found.height[inside]).mean() > 0.5
+    assert np.isfinite(undistorted.height[inside]).mean() > 0.5
     for name in ("height", "normals", "azimuth", "status"):
-        np.testing.assert_array_equal(found.maps()[name][inside], whole.maps()[name][part][inside])
+        np.testing.assert_array_equal(undistorted.maps()[name][inside], whole.maps()[name][part][inside])
 
 
 def test_nothing_is_seen_beyond_where_the_model_folds_back():
     view = boards.View((101, 101), 0.05, 60.0, distortion=(-0.5, 0, 0, 0, 0))
-    found = undistort(Result(height=np.ones((101, 101), np.float32)), lens_of(view)).height
+    undistorted = undistort(Result(height=np.ones((101, 101), np.float32)), lens_of(view)).height
     x, y = np.meshgrid(*pixel_axes((101, 101), (0.05, 0.05)))
     radius = np.hypot(x, y) / (0.05 * 60.0)
-    assert np.isnan(found[radius > np.sqrt(2 / 3) + 1e-9]).all()
-    assert np.isfinite(found[radius < np.sqrt(2 / 3) - 0.05]).all()
+    assert np.isnan(undistorted[radius > np.sqrt(2 / 3) + 1e-9]).all()
+    assert np.isfinite(undistorted[radius < np.sqrt(2 / 3) - 0.05]).all()
 
 
 @pytest.mark.parametrize("origin", [None, (1, 0), (0, 1), (-1, 0)])
@@ -231,6 +235,6 @@ def test_maps_of_another_size_are_refused(origin):
 
 
 def test_maps_are_undistorted_once():
-    found = undistort(maps_of((8, 9)), plain((8, 9)))
+    undistorted = undistort(maps_of((8, 9)), plain((8, 9)))
     with pytest.raises(InputError, match="undistorted before"):
-        undistort(found, plain((8, 9)))
+        undistort(undistorted, plain((8, 9)))

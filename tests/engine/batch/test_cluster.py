@@ -97,18 +97,18 @@ def test_a_batch_on_a_cluster_is_done_and_then_kept_anywhere(recordings, address
 @pytest.fixture
 def slow_jobs(monkeypatch):
     """Jobs that take a while and do nothing; the list of how many each worker had at once."""
-    under_way, most = [], {}
+    under_way, at_once = [], {}
 
     def run(job, plan, device):
         name = distributed.get_worker().address
         under_way.append(name)
-        most[name] = max(most.get(name, 0), under_way.count(name))
+        at_once[name] = max(at_once.get(name, 0), under_way.count(name))
         time.sleep(0.03)
         under_way.remove(name)
         return Outcome(job, "done", str(job.source.is_absolute()), 0.0)
 
     monkeypatch.setattr(worker, "run_job", run)
-    return most
+    return at_once
 
 
 def test_a_worker_of_many_threads_does_one_job_at_a_time(recordings, address, tmp_path, slow_jobs):
@@ -147,9 +147,9 @@ def test_a_worker_that_comes_late_takes_part_if_it_can(fit, recordings, tmp_path
         if not fit:
             monkeypatch.setattr(worker, "version", lambda _: "0.0.9")
         running.scale(2)
-        said = running.scheduler.get_events
-        assert any(len(slow_jobs) == 2 if fit else said("mirrorskin") for _ in run)
-        assert fit or "is left out: it has mirrorskin 0.0.9" in said("mirrorskin")[0][1]
+        events = running.scheduler.get_events
+        assert any(len(slow_jobs) == 2 if fit else events("mirrorskin") for _ in run)
+        assert fit or "is left out: it has mirrorskin 0.0.9" in events("mirrorskin")[0][1]
     assert len(slow_jobs) == 1 + fit
 
 
@@ -171,7 +171,7 @@ def test_a_job_may_cost_three_workers_and_no_more(losses, state, recordings, tmp
     monkeypatch.setattr(worker, "run_job", lose)
     with start(6) as running:
         jobs = make_jobs(recordings, tmp_path)
-        outcomes = {one.job: one for one in run_cluster(jobs, PLAN, running.scheduler_address)}
+        outcomes = {outcome.job: outcome for outcome in run_cluster(jobs, PLAN, running.scheduler_address)}
     assert [outcomes[job].state for job in jobs] == [state, "done", "done", "done"]
     if state == "failed":
         assert f"each of 4 workers that had {recordings[0]} was lost" in outcomes[jobs[0]].message
@@ -224,11 +224,11 @@ def test_a_worker_that_cannot_take_part_is_refused(recordings, address, tmp_path
     def missing(name):
         raise PackageNotFoundError(name)
 
-    jobs, own = make_jobs(recordings, tmp_path), cluster.version("mirrorskin")
+    jobs, own_version = make_jobs(recordings, tmp_path), cluster.version("mirrorskin")
     with monkeypatch.context() as other:
         other.setattr(cluster, "program_version", lambda: "9.9")
         message = refusal(jobs, address)
-    assert f"has mirrorskin {own}, and this machine 9.9: install the same on both" in message
+    assert f"has mirrorskin {own_version}, and this machine 9.9: install the same on both" in message
     assert message.startswith("worker tcp://127.0.0.1:")
     with monkeypatch.context() as other:
         other.setattr(cluster, "version", missing)
@@ -279,7 +279,7 @@ def machine(tmp_path, monkeypatch):
 def test_workers_take_a_machines_gpus_in_turn(machine, monkeypatch):
     machine("cpu", "gpu", "other", "gpu")
     shares = [worker.take_share(5) for _ in range(5)]
-    assert [share.device for share in shares] == ["1", "3", "1", "3", "1"]
+    assert [part.device for part in shares] == ["1", "3", "1", "3", "1"]
     os.close(shares[1].number)
     assert worker.take_share(5).device == "3"  # it takes the place of the one that ended
     monkeypatch.setenv("PYOPENCL_CTX", "0")
@@ -294,22 +294,22 @@ def test_the_cores_of_a_machine_are_divided(workers, expected, machine, monkeypa
         monkeypatch.delenv("POCL_MAX_PTHREAD_COUNT", raising=False)
         shares.append(worker.take_share(workers))
         assert os.environ["POCL_MAX_PTHREAD_COUNT"] == str(shares[-1].cores)
-    assert [share.cores for share in shares] == expected
-    assert {share.device for share in shares} == {None}
+    assert [part.cores for part in shares] == expected
+    assert {part.device for part in shares} == {None}
     monkeypatch.setenv("POCL_MAX_PTHREAD_COUNT", "11")
     worker.take_share(workers)
     assert os.environ["POCL_MAX_PTHREAD_COUNT"] == "11"  # who set it is obeyed
 
 
-@pytest.mark.parametrize(("given", "expected"), [({}, 3), ({"threads": 7}, 7)])
-def test_a_share_of_the_cores_decodes_as_well(given, expected, monkeypatch):
+@pytest.mark.parametrize(("options", "expected"), [({}, 3), ({"threads": 7}, 7)])
+def test_a_share_of_the_cores_decodes_as_well(options, expected, monkeypatch):
     here = SimpleNamespace(mirrorskin_share=SimpleNamespace(cores=3, device=None))
     monkeypatch.setattr(worker, "get_worker", lambda: here)
     monkeypatch.setattr(worker, "run_job", lambda job, plan, device: plan)
-    plan = Plan({"dataset": "/a"} | given)
-    done = worker.run_on_worker(Job(Path("a"), Path("b")), plan)
-    assert done.opening == {"dataset": "/a", "threads": expected}
-    assert done.digest("vertical") == plan.digest("vertical")
+    plan = Plan({"dataset": "/a"} | options)
+    plan_of_worker = worker.run_on_worker(Job(Path("a"), Path("b")), plan)
+    assert plan_of_worker.opening == {"dataset": "/a", "threads": expected}
+    assert plan_of_worker.digest("vertical") == plan.digest("vertical")
 
 
 @pytest.mark.slow

@@ -40,9 +40,9 @@ def test_several_devices_work_at_the_same_time(jobs):
             met.wait(timeout=120)
 
     outcomes = list(run_local(jobs, Plan(), devices, watch))
-    assert {one.job for one in outcomes if one.state == "done"} == set(jobs)
+    assert {outcome.job for outcome in outcomes if outcome.state == "done"} == set(jobs)
     assert len(set(threads.values())) == 2
-    assert all(one.profile.records() for one in devices)
+    assert all(outcome.profile.records() for outcome in devices)
 
 
 def test_leaving_early_ends_the_batch(jobs, device):
@@ -56,7 +56,7 @@ def test_leaving_early_ends_the_batch(jobs, device):
 
 
 def test_ctrl_c_gives_up_the_job_under_way_and_keeps_the_finished_ones(jobs, device, monkeypatch):
-    done, ending, finish = [], threading.Event(), local._finish
+    finished, ending, finish = [], threading.Event(), local._finish
     monkeypatch.setattr(local, "_finish", lambda *threads: (ending.set(), finish(*threads)))
 
     def interrupt(job, frames):
@@ -66,10 +66,10 @@ def test_ctrl_c_gives_up_the_job_under_way_and_keeps_the_finished_ones(jobs, dev
 
     outcomes = run_local(jobs, Plan(memory_limit=5 * 7), [device], interrupt)
     with pytest.raises(KeyboardInterrupt):
-        done.extend(outcomes)
+        finished.extend(outcomes)
     assert io.open_result(jobs[0].target).height is not None
     assert [path.name for path in jobs[0].target.parent.iterdir()] == [jobs[0].target.name]
-    states = [one.state for one in run_local(jobs, Plan(memory_limit=5 * 7), [device])]
+    states = [outcome.state for outcome in run_local(jobs, Plan(memory_limit=5 * 7), [device])]
     assert states == ["kept", "done", "done", "done"]
 
 

@@ -13,7 +13,7 @@ from mirrorskin.engine.batch.jobs import Plan
 
 
 @pytest.mark.parametrize(
-    ("one", "other"),
+    ("first", "other"),
     [
         (Plan(press={"threshold": 0.5}), Plan()),
         (Plan(press={"hold": 3, "fill": False}), Plan(press={"fill": False, "hold": 3})),
@@ -24,9 +24,9 @@ from mirrorskin.engine.batch.jobs import Plan
         (Plan(opening={"phase": io.Steps(0.1), "tilt": 0.1}), Plan()),
     ],
 )
-def test_what_changes_no_press_changes_no_key_of_presses(one, other):
-    assert one.key("vertical") == other.key("vertical")
-    assert one.digest("vertical") == other.digest("vertical")
+def test_what_changes_no_press_changes_no_key_of_presses(first, other):
+    assert first.key("vertical") == other.key("vertical")
+    assert first.digest("vertical") == other.digest("vertical")
 
 
 @pytest.mark.parametrize(
@@ -61,10 +61,10 @@ def test_another_version_has_another_key(monkeypatch):
 
 def test_a_key_is_json_that_includes_defaults_too():
     plan = Plan({"travel": io.Steps(0.1), "dataset": "/x", "file": Path("a")}, {"dark": np.float32(2)})
-    told = json.loads(plan.key("vertical"))
-    assert told["opening"] == {"dataset": "/x", "travel": {"Steps": {"start": 0.0, "step": 0.1}}, "file": "a"}
-    assert (told["press"]["dark"], told["press"]["threshold"]) == (2.0, 0.5)
-    assert "memory_limit" not in told["press"]
+    key = json.loads(plan.key("vertical"))
+    assert key["opening"] == {"dataset": "/x", "travel": {"Steps": {"start": 0.0, "step": 0.1}}, "file": "a"}
+    assert (key["press"]["dark"], key["press"]["threshold"]) == (2.0, 0.5)
+    assert "memory_limit" not in key["press"]
 
 
 WEAR = """
@@ -80,18 +80,18 @@ def test_a_plan_with_a_user_s_operation_changes_with_its_options_and_its_code(tm
     for path in paths:
         path.parent.mkdir()
         path.write_text(WEAR)
-    one, again = (Plan(operation=f"{path}:Wear") for path in paths)
-    assert one.key("vertical") == one.key("axial")
-    told = json.loads(one.key("vertical"))
-    assert (told["operation"], told["options"]) == (f"{paths[0]}:Wear", {"offset": 0.5})
-    assert one.key("vertical") == Plan(operation=one.operation, operation_options={"offset": 0.5}).key(
+    plan, again = (Plan(operation=f"{path}:Wear") for path in paths)
+    assert plan.key("vertical") == plan.key("axial")
+    key = json.loads(plan.key("vertical"))
+    assert (key["operation"], key["options"]) == (f"{paths[0]}:Wear", {"offset": 0.5})
+    assert plan.key("vertical") == Plan(operation=plan.operation, operation_options={"offset": 0.5}).key(
         "vertical"
     )
-    assert one.key("vertical") != Plan(operation=one.operation, operation_options={"offset": 1.0}).key(
+    assert plan.key("vertical") != Plan(operation=plan.operation, operation_options={"offset": 1.0}).key(
         "vertical"
     )
-    code = told["code"]
+    code = key["code"]
     assert json.loads(again.key("vertical"))["code"] == code
     paths[1].write_text(WEAR.replace("0.5", "0.6"))
     assert json.loads(again.key("vertical"))["code"] != code
-    assert pickle.loads(pickle.dumps(one)) == one
+    assert pickle.loads(pickle.dumps(plan)) == plan

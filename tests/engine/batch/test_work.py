@@ -40,11 +40,11 @@ def test_a_result_is_that_of_reconstruct(tmp_path, make):
     with io.open_recording(job.source) as source:
         options = plan.press if make is press else plan.rotation
         expected = engine.reconstruct(source, **options)
-    found = io.open_result(job.target)
+    stored = io.open_result(job.target)
     for name, values in expected.maps().items():
-        np.testing.assert_array_equal(getattr(found, name), values, err_msg=name)
+        np.testing.assert_array_equal(getattr(stored, name), values, err_msg=name)
     added = {"batch_parameters": plan.digest(outcome.motion)}
-    assert {**found.process, "date": ""} == {**expected.process, **added, "date": ""}
+    assert {**stored.process, "date": ""} == {**expected.process, **added, "date": ""}
 
 
 def test_an_outcome_states_what_was_done(job):
@@ -108,17 +108,17 @@ def test_a_damaged_result_is_made_anew(job, spoil):
     whole = io.open_result(job.target)
     spoil(job.target)
     assert run_job(job, Plan()).state == "done"
-    found = io.open_result(job.target)
-    np.testing.assert_array_equal(found.height, whole.height)
+    stored = io.open_result(job.target)
+    np.testing.assert_array_equal(stored.height, whole.height)
     assert run_job(job, Plan()).state == "kept"
 
 
-@pytest.mark.parametrize(("make", "said"), BAD.items(), ids=[make.__name__ for make in BAD])
-def test_a_bad_recording_fails_in_one_line_and_leaves_nothing(tmp_path, make, said):
+@pytest.mark.parametrize(("make", "message"), BAD.items(), ids=[make.__name__ for make in BAD])
+def test_a_bad_recording_fails_in_one_line_and_leaves_nothing(tmp_path, make, message):
     job = Job(make(tmp_path / "bad.h5"), tmp_path / "out" / "bad-result.h5")
     outcome = run_job(job, Plan())
     assert outcome.state == "failed"
-    assert said in outcome.message
+    assert message in outcome.message
     assert "bad.h5" in outcome.message
     assert "\n" not in outcome.message
     assert not outcome.message.startswith("unexpected")
@@ -127,7 +127,7 @@ def test_a_bad_recording_fails_in_one_line_and_leaves_nothing(tmp_path, make, sa
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    ("error", "message"),
     [
         (NotConverged("it did not"), "it did not"),
         (DeviceMemoryError("no room"), "no room"),
@@ -135,14 +135,14 @@ def test_a_bad_recording_fails_in_one_line_and_leaves_nothing(tmp_path, make, sa
         (MemoryError("none"), "not enough memory (none): take a smaller region or fewer frames"),
     ],
 )
-def test_what_the_engine_raises_is_reported(job, monkeypatch, error, said):
+def test_what_the_engine_raises_is_reported(job, monkeypatch, error, message):
     def fail(*_, **__):
         raise error
 
     monkeypatch.setattr(work, "run_class", fail)
     outcome = run_job(job, Plan())
     assert (outcome.state, outcome.motion) == ("failed", "vertical")
-    assert outcome.message.endswith(said)
+    assert outcome.message.endswith(message)
 
 
 def touched(path):

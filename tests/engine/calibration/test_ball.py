@@ -23,31 +23,31 @@ PIXEL, SHAPE = (0.15, 0.15), (80, 80)
 
 
 def test_an_upright_ball_is_a_sphere_above_the_rest_plane():
-    seen = see_ball(STRAIGHT, CENTRE, RADIUS, UPRIGHT, (0, 0, 0))
+    points = see_ball(STRAIGHT, CENTRE, RADIUS, UPRIGHT, (0, 0, 0))
     away = (X - CENTRE[0]) ** 2 + (Y - CENTRE[1]) ** 2
-    touched = seen.contact[0]
+    touched = points.contact[0]
     assert np.array_equal(touched, away < RADIUS**2 - (RADIUS - DEPTH) ** 2)
     assert 50 < np.count_nonzero(touched) < X.size / 2
-    assert seen.z[0, touched] == pytest.approx(CENTRE[2] + np.sqrt(RADIUS**2 - away[touched]))
-    assert seen.normal[0, touched, 0] * RADIUS == pytest.approx(X[touched] - CENTRE[0])
-    assert seen.normal[0, touched, 1] * RADIUS == pytest.approx(Y[touched] - CENTRE[1])
-    assert np.array_equal(np.isfinite(seen.normal).all(axis=-1), seen.contact)
+    assert points.z[0, touched] == pytest.approx(CENTRE[2] + np.sqrt(RADIUS**2 - away[touched]))
+    assert points.normal[0, touched, 0] * RADIUS == pytest.approx(X[touched] - CENTRE[0])
+    assert points.normal[0, touched, 1] * RADIUS == pytest.approx(Y[touched] - CENTRE[1])
+    assert np.array_equal(np.isfinite(points.normal).all(axis=-1), points.contact)
     assert not see_ball(STRAIGHT, (0, 0, -RADIUS - 0.1), RADIUS, UPRIGHT, (0, 0, 0)).contact.any()
 
 
 def test_of_a_ball_beyond_its_equator_only_the_upper_half_is_seen():
     sight = np.array([[0.0, 0.9, 1.1], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
-    seen = see_ball(sight, (0, 0, 3.0), 1.0, UPRIGHT, (0, 0, 0))
-    assert seen.contact.tolist() == [[True, True, False]]
-    assert seen.z[0, :2] == pytest.approx([4.0, 3.0 + np.sqrt(1 - 0.81)])
+    points = see_ball(sight, (0, 0, 3.0), 1.0, UPRIGHT, (0, 0, 0))
+    assert points.contact.tolist() == [[True, True, False]]
+    assert points.z[0, :2] == pytest.approx([4.0, 3.0 + np.sqrt(1 - 0.81)])
 
 
 @pytest.mark.parametrize("sight", [STRAIGHT, SLANTED], ids=["straight", "slanted"])
 def test_what_is_seen_is_on_the_line_of_sight_and_on_the_ball_turned_back(sight):
-    seen = see_ball(sight, CENTRE, RADIUS, CIRCLE, PIVOT)
+    points = see_ball(sight, CENTRE, RADIUS, CIRCLE, PIVOT)
     for frame, phase in enumerate(PHASES):
-        touched = seen.contact[frame]
-        z = seen.z[frame, touched]
+        touched = points.contact[frame]
+        z = points.z[frame, touched]
         x, y, slope_x, slope_y = sight[:, touched]
         # The book's world: the untouched ball's top at the rest plane, the body lowered by the depth.
         pose = leaning(phase, TILT, DEPTH, PIVOT)
@@ -56,8 +56,8 @@ def test_what_is_seen_is_on_the_line_of_sight_and_on_the_ball_turned_back(sight)
         assert np.count_nonzero(touched) > 50
         assert (z > 0).all()
         assert np.linalg.norm(from_centre, axis=1) == pytest.approx(RADIUS)
-        assert seen.normal[frame, touched] == pytest.approx(from_centre @ pose.turn.T / RADIUS, abs=1e-12)
-        assert (seen.normal[frame, touched, 2] > 0).all()
+        assert points.normal[frame, touched] == pytest.approx(from_centre @ pose.turn.T / RADIUS, abs=1e-12)
+        assert (points.normal[frame, touched, 2] > 0).all()
 
 
 def test_the_rotation_is_that_of_equation_10():
@@ -100,8 +100,8 @@ def test_a_ball_is_followed_wherever_the_pivot_is(height):
 def test_phases_may_be_uneven_and_of_any_direction_and_zero():
     phase = np.radians([178.1, 220.8, 280.5, 316.5, 7.6, 48.0, 96.3, 136.4])
     frames = turn(2, 1, 0.6, (0, 0, 30), phase, pattern="linear")
-    for told in (phase, 1.0 - phase):
-        assert find_ball(frames, told, PIXEL, RADIUS)[:2] == pytest.approx((2, 1), abs=0.03)
+    for phases in (phase, 1.0 - phase):
+        assert find_ball(frames, phases, PIXEL, RADIUS)[:2] == pytest.approx((2, 1), abs=0.03)
     with pytest.raises(InputError, match="at least 3"):
         find_ball(frames[:2], phase[:2], PIXEL, RADIUS)
 

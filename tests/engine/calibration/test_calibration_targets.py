@@ -58,10 +58,10 @@ def test_held_out_objects_are_read_nearly_as_well_as_noise_lets_them(scores, ang
 def test_the_zenith_is_not_biased(scores):
     before, after = scores
     assert abs(after.zenith_bias) < 0.06
-    known = after.bins.expected > 300
-    assert known.sum() >= 3
-    assert np.abs(after.bins.zenith.bias[known]).max() < 0.2
-    assert np.abs(before.bins.zenith.bias[known]).max() > 0.4
+    populated = after.bins.expected > 300
+    assert populated.sum() >= 3
+    assert np.abs(after.bins.zenith.bias[populated]).max() < 0.2
+    assert np.abs(before.bins.zenith.bias[populated]).max() > 0.4
 
 
 def test_the_print_is_found_as_it_was_made(calibration):
@@ -69,23 +69,23 @@ def test_the_print_is_found_as_it_was_made(calibration):
 
 
 def test_the_movement_is_found_though_another_was_stated(calibration):
-    found = calibration.precession
-    turned = math.degrees(math.remainder(found.phase_offset - LAB.phase_error, math.tau))
-    assert found.direction == 1
-    assert math.degrees(found.tilt - LAB.tilt) == pytest.approx(0, abs=0.15)
+    precession = calibration.precession
+    turned = math.degrees(math.remainder(precession.phase_offset - LAB.phase_error, math.tau))
+    assert precession.direction == 1
+    assert math.degrees(precession.tilt - LAB.tilt) == pytest.approx(0, abs=0.15)
     assert turned == pytest.approx(0, abs=0.15)
-    assert found.pivot == pytest.approx(LAB.pivot, abs=0.4)
+    assert precession.pivot == pytest.approx(LAB.pivot, abs=0.4)
 
 
 def test_a_check_reports_the_residual_on_a_ball_that_was_not_used(calibration):
     ball = LAB.turned(scorer.ball(6.0, (0.5, -0.4)), 0.8, 60)
-    found = check_ball(ball, calibration, 6.0, cells=4)
-    assert found.place == pytest.approx((0.5, -0.4), abs=0.02)
-    before, after = found.before, found.after
+    result = check_ball(ball, calibration, 6.0, cells=4)
+    assert result.place == pytest.approx((0.5, -0.4), abs=0.02)
+    before, after = result.before, result.after
     assert abs(float(after["zenith"].whole.bias)) < 0.06
     assert float(after["zenith"].whole.rms) < 0.3
     assert float(before["zenith"].whole.rms) > 2 * float(after["zenith"].whole.rms)
     assert abs(float(after["azimuth"].whole.bias)) < 0.5
     assert float(after["height"].whole.rms) < 0.01 < float(before["height"].whole.rms)
     assert int(after["zenith"].whole.pixels) > 1000
-    assert [row[:2] for row in found.table()][:2] == [["zenith", "before"], ["zenith", "after"]]
+    assert [row[:2] for row in result.table()][:2] == [["zenith", "before"], ["zenith", "after"]]

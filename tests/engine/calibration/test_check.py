@@ -30,13 +30,13 @@ def calibration(shape=SHAPE, **parts):
 
 
 def test_a_sound_press_leaves_little(press):
-    found = check_ball(press, calibration(), 10.0)
-    height = found.after["height"]
-    assert found.place == pytest.approx((0, 0), abs=0.02)
+    check = check_ball(press, calibration(), 10.0)
+    height = check.after["height"]
+    assert check.place == pytest.approx((0, 0), abs=0.02)
     assert float(height.whole.bias) == pytest.approx(0, abs=0.005)
     assert float(height.whole.rms) < 0.02
     assert int(height.whole.pixels) > 1000
-    assert found.before == {}
+    assert check.before == {}
 
 
 def test_a_ball_of_another_size_shows(press):
@@ -56,9 +56,9 @@ def test_the_cells_add_up_to_the_whole(press):
     height = check_ball(press, calibration(), 10.0, cells=5).after["height"]
     assert height.cells.rms.shape == (5, 5)
     assert height.cells.pixels.sum() == int(height.whole.pixels) == np.isfinite(height.error).sum()
-    known = np.isfinite(height.cells.rms)
-    squares = (height.cells.pixels * height.cells.rms**2)[known].sum()
-    assert math.sqrt(squares / height.cells.pixels[known].sum()) == pytest.approx(
+    finite = np.isfinite(height.cells.rms)
+    squares = (height.cells.pixels * height.cells.rms**2)[finite].sum()
+    assert math.sqrt(squares / height.cells.pixels[finite].sum()) == pytest.approx(
         float(height.whole.rms), rel=0.1
     )
 
@@ -72,9 +72,9 @@ def test_what_the_table_has_no_number_for_is_explained(press):
     (height,) = fine.after.values()
     bare = replace(height, expected=math.nan)
     maps = {"zenith": bare, "azimuth": bare, "normal": height}
-    found = replace(fine, after=maps, before=maps | {"normal": bare})
-    assert found.notes()[0] == "expected: results contain no standard deviation of zenith or azimuth alone"
-    assert "of zenith and azimuth and normal that" in found.notes()[1]
+    check = replace(fine, after=maps, before=maps | {"normal": bare})
+    assert check.notes()[0] == "expected: results contain no standard deviation of zenith or azimuth alone"
+    assert "of zenith and azimuth and normal that" in check.notes()[1]
 
 
 @pytest.mark.parametrize(
@@ -131,12 +131,12 @@ def test_a_rotation_about_a_ball_is_judged_with_the_wall_and_as_it_was_designed(
     header, little = twin.header, np.full(shape, 0.1, np.float32)
     references = io.References(header.dark, header.bright, little, little, np.zeros(shape, np.uint8))
     zenith = response_of_twin(shape, pixel, body, distance)
-    known = io.Calibration(io.CameraId("", shape, np.dtype("uint8")), references, zenith=zenith)
-    found = check_ball(Frames("turn", frames, header, phase=phase), known, 6.0, cells=4)
-    assert found.place == pytest.approx((0.5, -0.4), abs=0.03)
-    before, after = found.before, found.after
+    calibrated = io.Calibration(io.CameraId("", shape, np.dtype("uint8")), references, zenith=zenith)
+    check = check_ball(Frames("turn", frames, header, phase=phase), calibrated, 6.0, cells=4)
+    assert check.place == pytest.approx((0.5, -0.4), abs=0.03)
+    before, after = check.before, check.after
     assert abs(float(after["zenith"].whole.bias)) < 0.2
     assert float(after["normal"].whole.rms) < 1.0
     assert float(before["zenith"].whole.rms) > 2 * float(after["zenith"].whole.rms)
     assert float(after["height"].whole.rms) < float(before["height"].whole.rms)
-    assert [row[:2] for row in found.table()][:2] == [["zenith", "before"], ["zenith", "after"]]
+    assert [row[:2] for row in check.table()][:2] == [["zenith", "before"], ["zenith", "after"]]

@@ -21,15 +21,18 @@ def presses(count, scatter, generator, reading=0.002):
     load = generator.uniform(0.5, 5.0, count)
     force = MODULUS * load * (1 + scatter * generator.normal(size=count))
     read = force + reading * generator.normal(size=count)
-    return [KnownPress(one, 0.0, NO_GEL, seen, reading) for one, seen in zip(load, read, strict=True)]
+    return [
+        KnownPress(applied, 0.0, NO_GEL, measured, reading)
+        for applied, measured in zip(load, read, strict=True)
+    ]
 
 
 def test_the_standard_error_of_the_modulus_is_true():
     generator = np.random.default_rng(2)
     fits = [fit_stiffness(presses(12, 0.02, generator), GEL).stiffness for _ in range(400)]
-    wrong = np.array([(one.modulus - MODULUS) / one.modulus_sigma for one in fits])
+    wrong = np.array([(fit.modulus - MODULUS) / fit.modulus_sigma for fit in fits])
     assert np.mean(wrong**2) == pytest.approx(1.15, abs=0.2)  # Student's t of 11 degrees of freedom: 11 / 9
-    assert np.median([one.scatter for one in fits]) == pytest.approx(0.02, rel=0.15)
+    assert np.median([fit.scatter for fit in fits]) == pytest.approx(0.02, rel=0.15)
 
 
 def test_a_scatter_that_noise_explains_is_that_of_the_model():
@@ -44,7 +47,7 @@ def test_each_force_is_held_out_once():
     assert fit.held_out[0] == pytest.approx(first, rel=0.1)
     assert (np.abs(fit.held_out) >= np.abs(fit.residual)).all()
     assert fit.stiffness.error == pytest.approx(
-        np.sqrt(np.mean((fit.held_out / [one.force for one in four]) ** 2))
+        np.sqrt(np.mean((fit.held_out / [press.force for press in four]) ** 2))
     )
 
 
@@ -58,14 +61,14 @@ def test_forces_correct_what_the_gel_is_wrong_by():
     rows = [KnownPress(*row, reading) for row in zip(load, 0 * load, by_gel, force, strict=True)]
     fit = fit_stiffness(rows[:10], GEL)
     assert fit.stiffness.gel_shift[1] == pytest.approx(2, abs=0.5)
-    found = [
+    fits = [
         fit.stiffness.modulus * (row.load + np.dot(row.by_gel, fit.stiffness.gel_shift)) for row in rows[10:]
     ]
-    np.testing.assert_allclose(found, force[10:], rtol=0.005)
+    np.testing.assert_allclose(fits, force[10:], rtol=0.005)
     assert abs(fit_stiffness(rows[:10], GEL).stiffness.error) < 0.005
 
 
-def test_one_press_gives_a_modulus_that_is_as_sure_as_the_gel():
+def test_the_modulus_of_one_press_has_the_error_of_the_gel():
     fit = fit_stiffness([KnownPress(2.0, 0.0, np.array([0.1, 0.0, 0.0]), 0.25, 0.0)], GEL)
     assert fit.stiffness.modulus == pytest.approx(0.125, rel=0.001)
     assert fit.stiffness.modulus_sigma == pytest.approx(6 * 0.05 * 0.125, rel=0.1)
@@ -88,11 +91,11 @@ def pressed(movement, **options):
 
 
 def test_loads_are_those_of_the_twin():
-    found = []
+    fits = []
     for deepest in (0.5, 0.8):
         twin = pressed(Vertical(np.arange(0.04, deepest, 0.04)))
-        found.append(known_press(twin, KNOWN, float(twin.truth.force[-1, 2]), 0.001))
-    fit = fit_stiffness(found, GEL)
+        fits.append(known_press(twin, KNOWN, float(twin.truth.force[-1, 2]), 0.001))
+    fit = fit_stiffness(fits, GEL)
     assert fit.stiffness.modulus == pytest.approx(MODULUS, rel=0.03)
     assert fit.stiffness.error < 0.03
 

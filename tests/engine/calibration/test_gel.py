@@ -62,14 +62,14 @@ def made_up(radius, threshold, compliance, zero, x, y, noise=0.0):
     return BallOnset(travel, np.full(travel.size, 0.005), across, up, radius, inner, 0.005)
 
 
-def test_a_ball_gives_way_as_sneddon_says():
+def test_a_ball_indents_as_in_sneddon_s_solution():
     touch = np.array([0.2, 0.9, 1.5])
     theory = [sphere(2.0, a, 1.0) for a in touch]
-    depths = [one.depth + COMPLIANCE * one.force for one in theory]
+    depths = [contact.depth + COMPLIANCE * contact.force for contact in theory]
     np.testing.assert_allclose(sphere_travel(touch, 2.0, COMPLIANCE), depths, rtol=1e-9)
-    for a, one in zip(touch, theory, strict=True):
+    for a, contact in zip(touch, theory, strict=True):
         r = np.array([a + 0.1, a + 0.5, a + 2.0])
-        slopes = (one.surface(r) - one.surface(r + 1e-5)) / 1e-5
+        slopes = (contact.surface(r) - contact.surface(r + 1e-5)) / 1e-5
         np.testing.assert_allclose(sphere_slope(r, a, 2.0), slopes, rtol=0.01)
         inside = np.array([0.3, 0.7]) * a
         np.testing.assert_allclose(sphere_slope(inside, a, 2.0), inside / np.sqrt(4 - inside**2), rtol=0.01)
@@ -87,15 +87,15 @@ def test_two_balls_by_theory_determine_all_numbers():
         made_up(2.0, 0.21, COMPLIANCE, 0.1, 0.3, -0.2, noise=0.003),
         made_up(4.0, 0.21, COMPLIANCE, -0.05, 0.0, 0.4, noise=0.003),
     ]
-    found = fit_gel(presses, sheet=0.0)
-    gel, sigma = found.gel, found.gel.sigma
+    fit = fit_gel(presses, sheet=0.0)
+    gel, sigma = fit.gel, fit.gel.sigma
     assert gel.threshold == pytest.approx(0.21, abs=min(0.01, 4 * sigma["threshold"]))
     assert gel.compliance == pytest.approx(COMPLIANCE, abs=0.01)
     assert gel.curvature < 0.02
-    for place, (x, y, zero) in zip(found.places, ((0.3, -0.2, 0.1), (0.0, 0.4, -0.05)), strict=True):
+    for place, (x, y, zero) in zip(fit.places, ((0.3, -0.2, 0.1), (0.0, 0.4, -0.05)), strict=True):
         assert (place.x, place.y) == pytest.approx((x, y), abs=0.005)
         assert place.travel_zero == pytest.approx(zero, abs=0.015)
-    assert gel.travel_zero == found.places[0].travel_zero
+    assert gel.travel_zero == fit.places[0].travel_zero
 
 
 def test_the_twins_ball_shows_when_light_comes(learned):
@@ -115,10 +115,10 @@ def test_a_gel_learned_on_a_small_ball_puts_larger_ones_right(learned, diameter)
     corrected, *_ = fit_press(
         result.height, result.height_sigma, result.status, size, learned.gel, deepest=1.2
     )
-    known = np.isfinite(corrected)
-    truth = twin.truth.height[known]
-    before, after = result.height[known] - truth, corrected[known] - truth
-    assert np.count_nonzero(known) > 0.4 * np.count_nonzero(result.status == 1)
+    valid = np.isfinite(corrected)
+    truth = twin.truth.height[valid]
+    before, after = result.height[valid] - truth, corrected[valid] - truth
+    assert np.count_nonzero(valid) > 0.4 * np.count_nonzero(result.status == 1)
     assert before.mean() < -0.1
     assert abs(after.mean()) < abs(before.mean()) / 5
     assert np.sqrt(np.mean(after**2)) < np.sqrt(np.mean(before**2)) / 3
@@ -130,12 +130,12 @@ def test_numbers_that_a_press_does_not_determine_are_left_at_zero_and_named():
     few = BallOnset(
         *(part[narrow] for part in (whole.travel, whole.sigma, whole.x, whole.y)), 2.0, 0.417, 0.005
     )
-    found = fit_gel([few], sheet=0.0)
-    assert found.undetermined
-    for name in found.undetermined:
-        assert getattr(found.gel, name) == 0
-        assert name not in found.gel.sigma
-    assert found.gel.threshold == pytest.approx(0.21, abs=0.01)
+    fit = fit_gel([few], sheet=0.0)
+    assert fit.undetermined
+    for name in fit.undetermined:
+        assert getattr(fit.gel, name) == 0
+        assert name not in fit.gel.sigma
+    assert fit.gel.threshold == pytest.approx(0.21, abs=0.01)
 
 
 def test_presses_that_contain_no_information_are_refused():

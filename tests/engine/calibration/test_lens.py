@@ -26,11 +26,11 @@ def left_over(view, lens, reach):
         np.linspace(-1, 1, 15) * reach * (rows - 1) / 2 * lens.pixel_size[1],
     )
     column, row = picture_places(lens, x, y)
-    seen = (column > 0) & (column < columns - 1) & (row > 0) & (row < rows - 1)
-    assert seen.mean() > 0.8
-    mine = x[seen] + 1j * y[seen]
+    inside = (column > 0) & (column < columns - 1) & (row > 0) & (row < rows - 1)
+    assert inside.mean() > 0.8
+    mine = x[inside] + 1j * y[inside]
     true = np.empty_like(mine)
-    true.real, true.imag = view.sheet(column[seen], row[seen])
+    true.real, true.imag = view.sheet(column[inside], row[inside])
     mine, true = mine - mine.mean(), true - true.mean()
     turn = np.vdot(mine, true) / np.vdot(mine, mine)
     off = abs(true - turn / abs(turn) * mine) / lens.pixel_size[0]
@@ -127,15 +127,15 @@ def chessboard(column, row, angle, shear, blur):
     return 128 + 90 * special.erf(first / blur) * special.erf(second / blur)
 
 
-@pytest.mark.parametrize(("blur", "least"), [(0.9, 0.003), (1.4, 0.001), (2.8, 0.001)])
-def test_corners_are_centred_without_bias(blur, least):
+@pytest.mark.parametrize(("blur", "smallest"), [(0.9, 0.003), (1.4, 0.001), (2.8, 0.001)])
+def test_corners_are_centred_without_bias(blur, smallest):
     random = np.random.default_rng(0)
     for _ in range(20):
         true = random.uniform(18, 22, 2)
         shown = chessboard(*true, random.uniform(0, 6), random.uniform(-0.2, 0.2), blur)
-        places, found = centre_marks(shown, true[np.newaxis] + random.uniform(-2, 2, (1, 2)), 7.0)
-        assert found.all()
-        np.testing.assert_allclose(places[0], true, atol=least)
+        places, centred = centre_marks(shown, true[np.newaxis] + random.uniform(-2, 2, (1, 2)), 7.0)
+        assert centred.all()
+        np.testing.assert_allclose(places[0], true, atol=smallest)
 
 
 FAMILIES = [cv2.aruco.DICT_5X5_100, cv2.aruco.DICT_6X6_250, cv2.aruco.DICT_7X7_50]
@@ -161,16 +161,16 @@ def test_a_painted_board_has_its_true_size(board):
     x, y = np.meshgrid((np.arange(columns) + 0.5) / 20, (np.arange(rows) + 0.5) / 20)
     x, y = x - columns / 40, rows / 40 - y
     if isinstance(board, Dots):
-        wanted = boards.dots(board.columns, board.rows, board.pitch, board.pitch / 2)(x, y)
+        expected = boards.dots(board.columns, board.rows, board.pitch, board.pitch / 2)(x, y)
     else:
-        wanted = boards.charuco(board.columns, board.rows, board.square, board.marker)(x, y)
+        expected = boards.charuco(board.columns, board.rows, board.square, board.marker)(x, y)
     assert set(np.unique(painted)) == {0, 255}
-    assert np.mean(painted / 255 != wanted) < 0.02  # on edges
+    assert np.mean(painted / 255 != expected) < 0.02  # on edges
     assert calibrate_lens([("a.png", painted)], board).lens.pixel_size[0] == pytest.approx(0.05, rel=1e-3)
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: Charuco(7, 5, 1.5, 2.0), "is smaller than its square"),
         (lambda: Charuco(4, 4, 2.0, 1.5), "too few corners"),
@@ -179,8 +179,8 @@ def test_a_painted_board_has_its_true_size(board):
         (lambda: Charuco(60, 60, 2.0, 1.5), "fewer squares"),
     ],
 )
-def test_impossible_boards_are_refused(make, said):
-    with pytest.raises(InputError, match=said):
+def test_impossible_boards_are_refused(make, message):
+    with pytest.raises(InputError, match=message):
         make()
 
 
@@ -190,7 +190,7 @@ def painted(board, pixels_per_mm=14):
 
 
 @pytest.mark.parametrize(
-    ("shown", "said"),
+    ("shown", "message"),
     [
         (np.full((99, 99), 255, np.uint8), "100% of its pixels are saturated: expose it less"),
         (np.zeros((99, 99), np.uint8), "brightness is the same everywhere"),
@@ -204,8 +204,8 @@ def painted(board, pixels_per_mm=14):
         (painted(CHARUCO)[:, :90], "only .* of 24 marks|shows no board"),
     ],
 )
-def test_a_picture_of_something_else_is_refused_in_one_line(shown, said):
-    with pytest.raises(InputError, match=f"^a.png .*{said}|^a.png: {said}") as refused:
+def test_a_picture_of_something_else_is_refused_in_one_line(shown, message):
+    with pytest.raises(InputError, match=f"^a.png .*{message}|^a.png: {message}") as refused:
         calibrate_lens([("a.png", shown)], CHARUCO)
     assert "\n" not in str(refused.value)
 

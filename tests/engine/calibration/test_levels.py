@@ -50,10 +50,10 @@ def test_samples_that_are_not_finite_do_not_count():
     frames[0, 0, 0] = frames[3, 0, 0] = np.nan
     frames[:, 1, 1] = np.inf
     taken = moments_of(frames, 2)
-    left = frames[[1, 2, 4, 5], 0, 0].astype(np.float64)
+    remaining = frames[[1, 2, 4, 5], 0, 0].astype(np.float64)
     assert taken.count[0, 0] == 4
-    assert taken.mean[0, 0] == pytest.approx(left.mean(), rel=1e-12)
-    assert taken.variance[0, 0] == pytest.approx(left.var(ddof=1), rel=1e-9)
+    assert taken.mean[0, 0] == pytest.approx(remaining.mean(), rel=1e-12)
+    assert taken.variance[0, 0] == pytest.approx(remaining.var(ddof=1), rel=1e-9)
     level = level_above(taken, None)
     assert np.isfinite(level.sigma[0, 0])
     assert np.isnan(level.value[1, 1])
@@ -64,13 +64,13 @@ def test_the_error_of_rounding_is_the_exact_sum(noise):
     level = np.linspace(0, 1, 201)[:-1, np.newaxis]
     whole = np.arange(-12, 14)
     if noise:
-        share = norm.cdf(whole + 0.5, level, noise) - norm.cdf(whole - 0.5, level, noise)
+        probability = norm.cdf(whole + 0.5, level, noise) - norm.cdf(whole - 0.5, level, noise)
     else:
-        share = (np.floor(level + 0.5) == whole).astype(float)
-    mean = share @ whole
-    variance = float(np.mean(share @ whole**2 - mean**2))
-    left = float(np.mean((mean - level[:, 0]) ** 2))
-    assert float(rounding_error(np.array(variance))) == pytest.approx(left, rel=0.02, abs=1e-6)
+        probability = (np.floor(level + 0.5) == whole).astype(float)
+    mean = probability @ whole
+    variance = float(np.mean(probability @ whole**2 - mean**2))
+    expected = float(np.mean((mean - level[:, 0]) ** 2))
+    assert float(rounding_error(np.array(variance))) == pytest.approx(expected, rel=0.02, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -144,11 +144,11 @@ def test_pixels_share_their_noise_as_far_as_they_are_alike():
     usual, best = pool_variance(np.full(SHAPE, 50.0), variance, np.full(SHAPE, 7))
     np.testing.assert_allclose(usual, variance.mean())
     assert np.std(best) < 0.1 * np.std(variance)
-    own = np.exp(0.8 * generator.standard_normal(SHAPE))
+    gains = np.exp(0.8 * generator.standard_normal(SHAPE))
     _, best = pool_variance(
-        np.full(SHAPE, 50.0), own * generator.chisquare(63, SHAPE) / 63, np.full(SHAPE, 63)
+        np.full(SHAPE, 50.0), gains * generator.chisquare(63, SHAPE) / 63, np.full(SHAPE, 63)
     )
-    assert np.corrcoef(best.ravel(), own.ravel())[0, 1] > 0.95
+    assert np.corrcoef(best.ravel(), gains.ravel())[0, 1] > 0.95
 
 
 # --- full light under a rolled ball -------------------------------------------------------------------------
@@ -162,10 +162,10 @@ def test_full_light_has_no_bias_and_a_true_error(count, full, half, dtype):
     dark = 16 + 3 * generator.standard_normal((1, 4000))
     light = 180 * (1 + 0.05 * generator.standard_normal(dark.shape))
     frames = rolled(dark, light, count, full, half, 2.0, dtype, 2).reshape(count, -1)
-    found = find_plateau(frames.astype(np.float64), dark.ravel(), np.dtype(dtype).kind == "u")
-    known = np.isfinite(found.value)
-    error, sigma = (found.value - (dark + light).ravel())[known], found.sigma[known]
-    assert known.mean() > 0.99
+    plateau = find_plateau(frames.astype(np.float64), dark.ravel(), np.dtype(dtype).kind == "u")
+    valid = np.isfinite(plateau.value)
+    error, sigma = (plateau.value - (dark + light).ravel())[valid], plateau.sigma[valid]
+    assert valid.mean() > 0.99
     assert abs(error.mean()) < 0.1 * np.median(sigma)
     assert np.mean((error / sigma) ** 2) == pytest.approx(1, abs=0.08)
     assert np.median(sigma) < 1.3 * 2.0 / np.sqrt(count * full)
@@ -176,20 +176,20 @@ def test_a_glint_is_no_full_light_and_a_few_samples_are_no_level():
     samples = 200 + 2 * generator.standard_normal((40, 300))
     samples[3, :20] = 250
     samples[9, :20] = 240
-    found = find_plateau(samples, np.full(300, 16.0), False)
-    assert abs(np.mean(found.value[:20]) - 200) < 0.25
-    assert np.all(found.count[:20] <= 38)
+    plateau = find_plateau(samples, np.full(300, 16.0), False)
+    assert abs(np.mean(plateau.value[:20]) - 200) < 0.25
+    assert np.all(plateau.count[:20] <= 38)
     samples = 16 + generator.standard_normal((40, 300))
     samples[:20, :200] += 180
     samples[:3, 200:] += 180
     samples[:, 299] = np.nan
-    found = find_plateau(samples, np.full(300, 16.0), False)
-    assert np.isfinite(found.value[:200]).all()
-    assert np.isnan(found.value[200:]).all()
+    plateau = find_plateau(samples, np.full(300, 16.0), False)
+    assert np.isfinite(plateau.value[:200]).all()
+    assert np.isnan(plateau.value[200:]).all()
 
 
 def test_a_sharp_plateau_of_integers_is_known_within_its_rounding():
     samples = np.where(np.arange(30)[:, np.newaxis] % 3 == 0, 200.0, 16.0) + np.zeros((30, 50))
-    found = find_plateau(samples, np.full(50, 16.0), True)
-    np.testing.assert_array_equal(found.value, 200)
-    np.testing.assert_allclose(found.sigma, 12**-0.5)
+    plateau = find_plateau(samples, np.full(50, 16.0), True)
+    np.testing.assert_array_equal(plateau.value, 200)
+    np.testing.assert_allclose(plateau.sigma, 12**-0.5)

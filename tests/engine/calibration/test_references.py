@@ -46,11 +46,11 @@ def with_defects(dtype, top):
 @pytest.mark.parametrize(("dtype", "top"), [("uint8", 255), ("uint16", 4095), ("float32", None)])
 def test_all_defects_are_found_and_no_sound_pixel_is(dtype, top):
     dark, light, bits = with_defects(dtype, top)
-    found = measure(dark, light, dtype, top=top).references
-    np.testing.assert_array_equal(found.defects, bits)
-    for one in (found.dark, found.bright, found.dark_sigma, found.bright_sigma):
-        assert one.dtype == np.float32
-        np.testing.assert_array_equal(np.isnan(one), bits != 0)
+    references_ = measure(dark, light, dtype, top=top).references
+    np.testing.assert_array_equal(references_.defects, bits)
+    for levels in (references_.dark, references_.bright, references_.dark_sigma, references_.bright_sigma):
+        assert levels.dtype == np.float32
+        np.testing.assert_array_equal(np.isnan(levels), bits != 0)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
@@ -58,10 +58,10 @@ def test_levels_are_right_and_their_errors_true(dtype):
     dark, light = pixels(dtype=dtype)
     light = np.minimum(light, (TOPS[dtype] or 1e9) - 10 * SCALES[dtype] - dark)
     measured = measure(dark, light, dtype)
-    found = measured.references
+    references_ = measured.references
     for value, sigma, truth in (
-        (found.dark, found.dark_sigma, dark),
-        (found.bright, found.bright_sigma, dark + light),
+        (references_.dark, references_.dark_sigma, dark),
+        (references_.bright, references_.bright_sigma, dark + light),
     ):
         assert np.mean(((value - truth) / sigma) ** 2) == pytest.approx(1, abs=0.06)
         assert abs(np.mean(value - truth)) < 0.05 * np.median(sigma)
@@ -76,10 +76,10 @@ def test_several_recordings_count_as_one():
     dark, light = pixels()
     frames = expose(dark, NOISE, 20), expose(dark + light, NOISE, 30)
     whole = references(*frames)
-    parts = ([source(part) for part in np.array_split(one, 3)] for one in frames)
-    cut = measure_references(*parts).references
+    parts = ([source(part) for part in np.array_split(stack, 3)] for stack in frames)
+    from_parts = measure_references(*parts).references
     for name in ("dark", "bright", "dark_sigma", "bright_sigma", "defects"):
-        np.testing.assert_allclose(getattr(cut, name), getattr(whole, name), rtol=1e-5, err_msg=name)
+        np.testing.assert_allclose(getattr(from_parts, name), getattr(whole, name), rtol=1e-5, err_msg=name)
 
 
 def test_a_smooth_glow_and_a_field_that_ends_are_no_hot_pixels():
@@ -88,10 +88,10 @@ def test_a_smooth_glow_and_a_field_that_ends_are_no_hot_pixels():
     dark = 16 + 60 * np.exp(-3 * ((x - 1) ** 2 + (y[:, np.newaxis] - 1) ** 2))
     beyond = np.hypot(x, y[:, np.newaxis]) > 1.05
     light[beyond] = 0
-    found = measure(dark, light).references
-    assert not np.any(found.defects & 1)
-    np.testing.assert_array_equal(found.defects[beyond], 2)
-    assert np.count_nonzero(found.defects[~beyond]) == 0
+    references_ = measure(dark, light).references
+    assert not np.any(references_.defects & 1)
+    np.testing.assert_array_equal(references_.defects[beyond], 2)
+    assert np.count_nonzero(references_.defects[~beyond]) == 0
 
 
 def test_a_pixel_that_flickers_is_hot_and_one_that_never_changes_or_gives_no_numbers_is_dead():
@@ -99,34 +99,34 @@ def test_a_pixel_that_flickers_is_hot_and_one_that_never_changes_or_gives_no_num
     noise = np.full(dark.shape, NOISE)
     noise[5, 6] = 12.0
     frames = expose(dark, noise, 24, "float32"), expose(dark + light, NOISE, 24, "float32")
-    for one in frames:
-        one[:, 9, 9] = 21
-        one[:, :, 20] = 18
+    for stack in frames:
+        stack[:, 9, 9] = 21
+        stack[:, :, 20] = 18
     frames[0][::2, 3, 4] = np.nan
     frames[1][:, 8, 8] = np.nan
-    found = references(*frames)
-    assert found.defects[5, 6] & 1
-    assert found.defects[9, 9] == found.defects[8, 8] == 2
-    assert np.all(found.defects[:, 20] == 2)
-    assert np.count_nonzero(found.defects) == 3 + len(dark)
-    assert found.dark[3, 4] == pytest.approx(dark[3, 4], abs=5 * float(found.dark_sigma[3, 4]))
-    assert found.dark_sigma[3, 4] == pytest.approx(1.41 * np.nanmedian(found.dark_sigma), rel=0.05)
+    measured = references(*frames)
+    assert measured.defects[5, 6] & 1
+    assert measured.defects[9, 9] == measured.defects[8, 8] == 2
+    assert np.all(measured.defects[:, 20] == 2)
+    assert np.count_nonzero(measured.defects) == 3 + len(dark)
+    assert measured.dark[3, 4] == pytest.approx(dark[3, 4], abs=5 * float(measured.dark_sigma[3, 4]))
+    assert measured.dark_sigma[3, 4] == pytest.approx(1.41 * np.nanmedian(measured.dark_sigma), rel=0.05)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
 def test_frames_that_are_all_equal_are_exact_but_for_their_rounding(dtype):
     shape = 4, 5, 7
     measured = measure_references([source(np.full(shape, 16, dtype))], [source(np.full(shape, 200, dtype))])
-    found = measured.references
-    assert np.all(found.dark == 16)
-    assert np.all(found.bright == 200)
-    assert not found.defects.any()
-    np.testing.assert_allclose(found.dark_sigma, 0.0 if dtype == "float32" else 12**-0.5, rtol=1e-6)
+    references_ = measured.references
+    assert np.all(references_.dark == 16)
+    assert np.all(references_.bright == 200)
+    assert not references_.defects.any()
+    np.testing.assert_allclose(references_.dark_sigma, 0.0 if dtype == "float32" else 12**-0.5, rtol=1e-6)
     assert measured.dark.drift == 0
 
 
 @pytest.mark.parametrize(
-    ("dark", "bright", "said"),
+    ("dark", "bright", "message"),
     [
         ((1, 16), (8, 200), "dark contains 1 frame"),
         ((8, 16), (1, 200), "bright contains 1 frame"),
@@ -135,9 +135,9 @@ def test_frames_that_are_all_equal_are_exact_but_for_their_rounding(dtype):
         ((8, 16), (8, 16), "no brighter"),
     ],
 )
-def test_frames_that_contain_no_information_are_refused(dark, bright, said):
+def test_frames_that_contain_no_information_are_refused(dark, bright, message):
     frames = [np.full((count, 5, 7), level, np.uint8) for count, level in (dark, bright)]
-    with pytest.raises(io.InputError, match=said):
+    with pytest.raises(io.InputError, match=message):
         references(*frames)
 
 
@@ -187,11 +187,14 @@ def test_a_rolled_ball_gives_full_light_without_bias():
     light[7, 8] = 260 - dark[7, 8]
     frames = expose(dark, NOISE, 64), rolled(dark, light, 120, 0.35, 0.15)
     measured = measure_references([source(frames[0])], [source(frames[1])], rolled=True)
-    found = measured.references
-    assert found.defects[4, 5] == 2
-    assert found.defects[7, 8] == 4
-    assert np.count_nonzero(found.defects) == 2
-    error, sigma = ((one)[found.defects == 0] for one in (found.bright - dark - light, found.bright_sigma))
+    references_ = measured.references
+    assert references_.defects[4, 5] == 2
+    assert references_.defects[7, 8] == 4
+    assert np.count_nonzero(references_.defects) == 2
+    error, sigma = (
+        (values)[references_.defects == 0]
+        for values in (references_.bright - dark - light, references_.bright_sigma)
+    )
     assert abs(error.mean()) < 0.1 * np.median(sigma)
     assert np.mean((error / sigma) ** 2) == pytest.approx(1, abs=0.08)
     assert measured.bright.frames == 120

@@ -55,8 +55,8 @@ def check(board, view, blur, contrast, noise):
     kind = BOARDS[board][0]
     marks = locate_marks(taken(board, view, blur, contrast, noise), kind, "a.png")
     assert len(marks.board) > 0.9 * len(kind.marks())
-    seen = contrast if VIEWS[view][1] is None else 0.6 * contrast
-    assert worst_error(marks, board, view) < 0.15 + 1.2 * (1 + blur) * noise / seen
+    contrast_seen = contrast if VIEWS[view][1] is None else 0.6 * contrast
+    assert worst_error(marks, board, view) < 0.15 + 1.2 * (1 + blur) * noise / contrast_seen
 
 
 @pytest.mark.parametrize("view", VIEWS)
@@ -71,7 +71,7 @@ def test_marks_of_soft_boards_are_located(board, view, blur, contrast, noise):
 @pytest.mark.parametrize("board", BOARDS)
 @pytest.mark.parametrize(
     ("blur", "contrast", "noise"),
-    [one for one in product(BLURS, CONTRASTS, NOISES) if one not in (*QUICK, TOO_FAINT)],
+    [variant for variant in product(BLURS, CONTRASTS, NOISES) if variant not in (*QUICK, TOO_FAINT)],
 )
 def test_marks_of_all_soft_boards_are_located(board, view, blur, contrast, noise):
     check(board, view, blur, contrast, noise)

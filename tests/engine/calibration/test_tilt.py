@@ -23,10 +23,10 @@ DEGREE = np.radians(1)
 ANGLES = ("tilt", "phase_offset", "major_axis", "centre_x", "centre_y")
 
 
-def precession(**known):
+def precession(**changes):
     """What is to be found; the recordings say a circle of phase 0 at x."""
     usual = Precession(2.53 * DEGREE, 0.05, 1, 0.0, 0.0, (0.0, 0.0), (0.3, -0.2, 12.0))
-    return replace(usual, **known)
+    return replace(usual, **changes)
 
 
 def scale_of(body, shape=SHAPE, camera=None):
@@ -46,10 +46,10 @@ def recording(name, frames, phase=EIGHTHS, press=None, pixel_size=PIXEL):
     return Frames(name, frames, Header("axial", pixel_size=pixel_size, press=press), phase=phase)
 
 
-def ball_turn(truth, x=0.0, y=0.0, *, shape=SHAPE, depth=DEPTH, told=DEPTH, **options):
+def ball_turn(truth, x=0.0, y=0.0, *, shape=SHAPE, depth=DEPTH, stated_depth=DEPTH, **options):
     thing, lean = Ball(RADIUS, x, y), truth.lean(EIGHTHS)
     frames = pictures(thing, lean, depth, truth.pivot, shape=shape, **{"pattern": "linear"} | options)
-    return recording("ball", frames, press=told)
+    return recording("ball", frames, press=stated_depth)
 
 
 def plate_turn(truth, *, thing=None, press=0.5, **options):
@@ -74,17 +74,17 @@ def plate_track(truth, seed=0, phase=EIGHTHS, sigma=5e-5):
     return PlateTrack(phase, lean + sigma * noise, np.full(len(phase), sigma), True)
 
 
-def off(found, truth):
+def off(fitted, truth):
     """Return how far numbers are off, by name."""
     names = ("tilt", "phase_offset", "major_axis", "ellipticity")
-    errors = {name: getattr(found, name) - getattr(truth, name) for name in names}
-    errors |= {f"centre_{a}": found.centre[k] - truth.centre[k] for k, a in enumerate("xy")}
-    return errors | {f"pivot_{a}": found.pivot[k] - truth.pivot[k] for k, a in enumerate("xyz")}
+    errors = {name: getattr(fitted, name) - getattr(truth, name) for name in names}
+    errors |= {f"centre_{a}": fitted.centre[k] - truth.centre[k] for k, a in enumerate("xy")}
+    return errors | {f"pivot_{a}": fitted.pivot[k] - truth.pivot[k] for k, a in enumerate("xyz")}
 
 
-def assert_within_errors(found, truth, *names, most=4.0):
-    errors = off(found, truth)
-    strays = {name: errors[name] for name in names if abs(errors[name]) > most * found.sigma[name]}
+def assert_within_errors(fitted, truth, *names, limit=4.0):
+    errors = off(fitted, truth)
+    strays = {name: errors[name] for name in names if abs(errors[name]) > limit * fitted.sigma[name]}
     assert not strays
 
 
@@ -99,15 +99,15 @@ def test_a_flat_and_a_ball_determine_the_precession(direction):
     assert plate.zenith == pytest.approx(np.hypot(*truth.lean(EIGHTHS).T), abs=0.02 * DEGREE)
     assert (plate.sigma < 0.01 * DEGREE).all()
     fit = fit_precession([ball], [plate])
-    found, errors = fit.precession, off(fit.precession, truth)
-    assert found.direction == direction
+    fitted, errors = fit.precession, off(fit.precession, truth)
+    assert fitted.direction == direction
     assert abs(errors["tilt"]) < 0.02 * DEGREE
     assert abs(errors["phase_offset"]) < 0.1 * DEGREE
     assert abs(errors["pivot_z"]) < 1.0
-    assert found.sigma["ellipticity"] < 0.002
-    assert found.sigma["centre_x"] < 0.01 * DEGREE
+    assert fitted.sigma["ellipticity"] < 0.002
+    assert fitted.sigma["centre_x"] < 0.01 * DEGREE
     names = "tilt", "phase_offset", "centre_x", "centre_y", "pivot_z", "ellipticity", "major_axis"
-    assert_within_errors(found, truth, *names)
+    assert_within_errors(fitted, truth, *names)
     assert fit.residual["zenith"] < 0.01 * DEGREE
     assert fit.residual["place"] < 0.005
 
@@ -115,12 +115,12 @@ def test_a_flat_and_a_ball_determine_the_precession(direction):
 def test_a_wedge_shows_the_half_angle_where_a_flat_is_dark():
     truth, scale = precession(direction=-1, phase_offset=-0.3), scale_of(None)
     wedge = track_plate(plate_turn(truth, thing=Flat(25 * DEGREE, 1.0), press=8.0, seed=7), False, scale)
-    found = fit_precession([track_ball(ball_turn(truth, seed=8), RADIUS, scale)], [wedge]).precession
-    assert found.direction == -1
-    assert abs(off(found, truth)["tilt"]) < 0.02 * DEGREE
-    assert_within_errors(found, truth, "tilt", "phase_offset", "pivot_z")
-    assert found.centre == (0.0, 0.0)
-    assert "centre_x" not in found.sigma
+    fitted = fit_precession([track_ball(ball_turn(truth, seed=8), RADIUS, scale)], [wedge]).precession
+    assert fitted.direction == -1
+    assert abs(off(fitted, truth)["tilt"]) < 0.02 * DEGREE
+    assert_within_errors(fitted, truth, "tilt", "phase_offset", "pivot_z")
+    assert fitted.centre == (0.0, 0.0)
+    assert "centre_x" not in fitted.sigma
 
 
 def test_balls_at_three_places_determine_all_but_the_mean_lean_even_a_lean_to_the_other_side():
@@ -147,8 +147,8 @@ def test_standard_errors_are_those_of_the_errors():
     shares = []
     for seed in range(6):
         balls = [ball_track(truth, (0.5, 0.2, -1.5), seed), ball_track(truth, (-2.0, 3.0, -1.5), seed)]
-        found = fit_precession(balls, [plate_track(truth, seed)]).precession
-        shares += [error / found.sigma[name] for name, error in off(found, truth).items()]
+        fitted = fit_precession(balls, [plate_track(truth, seed)]).precession
+        shares += [error / fitted.sigma[name] for name, error in off(fitted, truth).items()]
     assert np.sqrt(np.mean(np.square(shares))) == pytest.approx(0.95, abs=0.25)
     assert np.max(np.abs(shares)) < 5
 
@@ -166,18 +166,18 @@ def test_a_wrong_frame_hardly_matters():
     ball = ball_track(truth, (0.5, 0.2, -1.5), 2)
     ball.centres[3] += 0.2
     ball.centres[6] = np.nan
-    found = fit_precession([ball], [plate_track(truth)]).precession
-    assert abs(off(found, truth)["phase_offset"]) < 0.5 * DEGREE
-    assert abs(off(found, truth)["pivot_z"]) < 0.1
+    fitted = fit_precession([ball], [plate_track(truth)]).precession
+    assert abs(off(fitted, truth)["phase_offset"]) < 0.5 * DEGREE
+    assert abs(off(fitted, truth)["pivot_z"]) < 0.1
 
 
 def test_phases_may_be_uneven_and_more_than_a_turn():
     truth = precession(direction=-1)
     phase = np.concatenate([np.radians([178.1, 220.8, 280.5, 316.5, 7.6, 48.0, 96.3, 136.4]), EIGHTHS + 6.0])
     ball, plate = ball_track(truth, (0.1, 0.2, -1.5), phase=phase), plate_track(truth, phase=phase)
-    found = fit_precession([ball], [plate]).precession
-    assert found.direction == -1
-    assert_within_errors(found, truth, "tilt", "phase_offset", "pivot_z")
+    fitted = fit_precession([ball], [plate]).precession
+    assert fitted.direction == -1
+    assert_within_errors(fitted, truth, "tilt", "phase_offset", "pivot_z")
 
 
 def test_what_does_not_determine_a_precession_is_refused():
@@ -208,22 +208,22 @@ def test_a_ball_is_placed_within_its_errors_whatever_its_pixels_gains():
     truth = precession()
     camera = Camera(noise=1.5, seed=9, gain_deviation=0.05, offset_deviation=1.0)
     turn = ball_turn(truth, 0.31, -0.17, camera=camera)
-    seen = track_ball(turn, RADIUS, scale_of(None, camera=camera))
-    error = seen.centres - moved((0.31, -0.17, DEPTH - RADIUS), truth.lean(EIGHTHS), truth.pivot)
-    assert (seen.sigma[:, :2] < 2e-3).all()
-    assert np.sqrt(np.mean((error / seen.sigma)[:, :2] ** 2)) < 1.5
+    track = track_ball(turn, RADIUS, scale_of(None, camera=camera))
+    error = track.centres - moved((0.31, -0.17, DEPTH - RADIUS), truth.lean(EIGHTHS), truth.pivot)
+    assert (track.sigma[:, :2] < 2e-3).all()
+    assert np.sqrt(np.mean((error / track.sigma)[:, :2] ** 2)) < 1.5
     assert np.abs(error[:, 2]).max() < 0.03
 
 
 @pytest.mark.parametrize(
     "options",
-    [{"depth": 0.9, "told": 0.9}, {"depth": 0.6, "contact": "elastic", "told": 0.6}],
+    [{"depth": 0.9, "stated_depth": 0.9}, {"depth": 0.6, "contact": "elastic", "stated_depth": 0.6}],
     ids=["the wall ends first", "the gel gives way"],
 )
 def test_an_outline_that_is_not_the_contacts_gives_no_depth(options):
-    seen = track_ball(ball_turn(precession(), **options), RADIUS, scale_of(None))
-    assert (seen.sigma[:, 2] > 0.4).all()
-    assert (seen.sigma[:, :2] < 5e-3).all()
+    track = track_ball(ball_turn(precession(), **options), RADIUS, scale_of(None))
+    assert (track.sigma[:, 2] > 0.4).all()
+    assert (track.sigma[:, :2] < 5e-3).all()
 
 
 def wall(shape, scatter=3 * DEGREE):
@@ -244,11 +244,11 @@ def test_a_real_wall_off_the_axis_is_seen_through():
     truth = precession(pivot=(0.3, -0.2, 5.0))
     light = WallBrightness.of_pixels(wall(shape), 16.0, 224.0, shape, PIXEL)
     turn = ball_turn(truth, *place, shape=shape, optics="cylinder", depth=0.5)
-    seen = track_ball(turn, RADIUS, light)
-    error = seen.centres - moved((*place, 0.5 - RADIUS), truth.lean(EIGHTHS), truth.pivot)
-    assert (seen.sigma[:, :2] < 2e-3).all()
-    assert (seen.sigma[:, 2] < 0.05).all()
-    assert np.sqrt(np.mean((error / seen.sigma) ** 2)) < 1.6
+    track = track_ball(turn, RADIUS, light)
+    error = track.centres - moved((*place, 0.5 - RADIUS), truth.lean(EIGHTHS), truth.pivot)
+    assert (track.sigma[:, :2] < 2e-3).all()
+    assert (track.sigma[:, 2] < 0.05).all()
+    assert np.sqrt(np.mean((error / track.sigma) ** 2)) < 1.6
     with pytest.raises(InputError, match="linear in it: give the zenith gain and offset, or take balls"):
         track_plate(turn, True, light)
 
@@ -258,7 +258,7 @@ def test_turns_that_cannot_be_used_are_refused():
     no_phase = Frames("turn", dark, Header("axial", pixel_size=PIXEL))
     long = recording("turn", np.broadcast_to(dark[:1, :1, :1], (5000, 1000, 1000)))
     vertical = Frames("turn", dark, Header("vertical", pixel_size=PIXEL), travel=EIGHTHS)
-    for source, radius, said in (
+    for source, radius, message in (
         (vertical, 2.0, "turn is of vertical motion"),
         (recording("turn", dark, pixel_size=None), 2.0, "turn has no pixel size: calibrate the scale first"),
         (recording("turn", dark), 0.0, "the ball.s diameter is 0 mm"),
@@ -267,7 +267,7 @@ def test_turns_that_cannot_be_used_are_refused():
         (recording("turn", dark[:3], EIGHTHS[:3]), 2.0, "turn: 3 different phases, at least 4 are needed"),
         (recording("turn", dark), 2.0, "turn: a ball of 4 mm is seen in 0 of 8 frames"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             track_ball(source, radius, scale)
     with pytest.raises(InputError, match=r"turn: no flat plate is seen.* take a wedge"):
         track_plate(recording("turn", dark), True, scale)

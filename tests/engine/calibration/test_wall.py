@@ -34,19 +34,19 @@ def response(presses):
 
 
 def twin_light(zenith, azimuth):
-    """Trace the light of facets all over the field, and tell the lines of sight."""
+    """Trace the light of facets all over the field, and return the lines of sight."""
     view = View((SIDE, SIDE), (2.4, 2.4), BODY, DISTANCE)
     wall = Wall(BODY, make_pattern("linear", BODY), view, open_device(None))
-    one = np.ones((SIDE, SIDE))
+    ones = np.ones((SIDE, SIDE))
     light = [
-        wall.light(Sheet(Z * one, -np.tan(t) * np.cos(a) * one, -np.tan(t) * np.sin(a) * one, one > 0))
+        wall.light(Sheet(Z * ones, -np.tan(t) * np.cos(a) * ones, -np.tan(t) * np.sin(a) * ones, ones > 0))
         for t in zenith
         for a in azimuth
     ]
     return view, np.reshape(light, (len(zenith), len(azimuth), SIDE * SIDE))
 
 
-def told_light(response, view, zenith, azimuth):
+def modelled_light(response, view, zenith, azimuth):
     t, a = (grid.reshape(-1, 1, 1) for grid in np.meshgrid(zenith, azimuth, indexing="ij"))
     normals = np.concatenate([np.sin(t) * np.cos(a), np.sin(t) * np.sin(a), np.cos(t)], axis=2)
     light, within = light_of_response(response, np.stack([view.x.ravel(), view.y.ravel()]), Z, normals)
@@ -56,8 +56,8 @@ def told_light(response, view, zenith, azimuth):
 def bias(response):
     """Return by how many degrees the zenith of noiseless facets would be off, NaN out of range."""
     view, light = twin_light(ZENITH, AZIMUTH)
-    told, within = told_light(response, view, ZENITH, AZIMUTH)
-    off = np.degrees((told - light) / np.gradient(light, ZENITH, axis=0))
+    modelled, within = modelled_light(response, view, ZENITH, AZIMUTH)
+    off = np.degrees((modelled - light) / np.gradient(light, ZENITH, axis=0))
     return np.where(within, off, np.nan)
 
 
@@ -71,8 +71,8 @@ def test_the_light_of_normals_all_over_the_field_is_known(response):
 def test_errors_are_as_large_as_stated(response):
     off = bias(response)
     middle = np.sqrt(np.nanmean(off[10:22] ** 2))
-    told = np.degrees(np.sqrt(np.mean(response.zenith_sigma**2)))
-    assert 0.3 < middle / told < 2.5
+    stated = np.degrees(np.sqrt(np.mean(response.zenith_sigma**2)))
+    assert 0.3 < middle / stated < 2.5
     assert response.zenith_sigma.shape == SHAPE
     assert response.azimuth_sigma.shape == SHAPE
     assert (response.zenith_sigma > 0).all()
@@ -94,11 +94,11 @@ def test_wall_lamps_and_sight_are_found(response):
 
 def test_references_of_a_calibration_go_before_those_of_the_recordings(presses):
     header = presses[0].header
-    told = read_press(presses[0], 2.0, None, None, 500)
+    expected = read_press(presses[0], 2.0, None, None, 500)
     sigma = np.zeros(SHAPE, np.float32)
     references = io.References(header.dark, header.bright, sigma, sigma, np.zeros(SHAPE, np.uint8))
     blind = replaced(presses[0], dark=None, bright=np.ones(SHAPE, np.float32))
-    np.testing.assert_array_equal(read_press(blind, 2.0, references, None, 500).light, told.light)
+    np.testing.assert_array_equal(read_press(blind, 2.0, references, None, 500).light, expected.light)
     small = io.References(*([np.zeros((3, 4), np.float32)] * 4), np.zeros((3, 4), np.uint8))
     with pytest.raises(io.InputError, match="do not fit references"):
         read_press(blind, 2.0, small, None, 500)
@@ -120,7 +120,7 @@ def test_samples_at_the_ends_of_the_camera_and_of_defects_are_left_out(presses):
 
 def test_a_calibrated_rotation_returns_leans_and_how_well_its_pivot_is_known(presses):
     sigma = {"pivot_x": 0.1, "pivot_y": 0.2, "pivot_z": 0.3, "phase_offset": 0.004}
-    known = io.Precession(
+    precession = io.Precession(
         tilt=0.045,
         phase_offset=0.0,
         direction=1,
@@ -130,17 +130,17 @@ def test_a_calibrated_rotation_returns_leans_and_how_well_its_pivot_is_known(pre
         pivot=(1.0, 2.0, 3.0),
         sigma=sigma,
     )
-    pivot = pivot_of(presses[0], known)
+    pivot = pivot_of(presses[0], precession)
     assert pivot.place == (1.0, 2.0, 3.0)
     assert pivot.sigma == pytest.approx((0.1, 0.2, 0.3), rel=0.2)
     assert pivot.phase_sigma == pytest.approx(0.004, rel=0.05)
-    undetermined = pivot_of(presses[0], dataclasses.replace(known, pivot=(math.nan,) * 3, sigma={}))
-    told = pivot_of(presses[0], None)
-    assert (undetermined.place, undetermined.sigma) == (told.place, told.sigma)
-    assert undetermined.phase_sigma < 0.1 < told.phase_sigma  # of a recording, any phase may be meant
+    undetermined = pivot_of(presses[0], dataclasses.replace(precession, pivot=(math.nan,) * 3, sigma={}))
+    expected = pivot_of(presses[0], None)
+    assert (undetermined.place, undetermined.sigma) == (expected.place, expected.sigma)
+    assert undetermined.phase_sigma < 0.1 < expected.phase_sigma  # of a recording, any phase may be meant
     assert undetermined.place == (0.0, 0.0, 0.0)
-    read = read_press(presses[0], 2.0, None, known, 500)
-    np.testing.assert_allclose(read.lean, known.lean(presses[0].series["phase"]), atol=1e-12)
+    read = read_press(presses[0], 2.0, None, precession, 500)
+    np.testing.assert_allclose(read.lean, precession.lean(presses[0].series["phase"]), atol=1e-12)
     assert np.ptp(np.hypot(*read.lean.T)) > 5e-3
 
 
@@ -156,26 +156,26 @@ def test_a_press_without_a_ball_is_named(presses):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"ball": 0.0}, "diameter is 0 mm: give a length above 0"),
         ({"pattern": "striped"}, "take graded or uniform"),
         ({"body": (0.0, 40.0)}, "0.0 mm radius and 40.0 mm height: both must be above 0"),
     ],
 )
-def test_impossible_input_is_refused(presses, options, said):
-    with pytest.raises(io.InputError, match=said):
+def test_impossible_input_is_refused(presses, options, message):
+    with pytest.raises(io.InputError, match=message):
         fit_zenith(presses, **{"ball": 2.0, **options})
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [
         ({"pixel_size": None}, "differ in pixels or their size"),
         ({"tilt": None}, "place-2 has no tilt: give it"),
         ({"dark": None}, "place-2: there are no dark and bright references"),
     ],
 )
-def test_what_a_recording_lacks_is_reported(presses, fields, said):
-    with pytest.raises(io.InputError, match=said):
+def test_what_a_recording_lacks_is_reported(presses, fields, message):
+    with pytest.raises(io.InputError, match=message):
         fit_zenith([presses[0], replaced(presses[1], **fields), *presses[2:]], 2.0)

@@ -16,10 +16,10 @@ from mirrorskin.engine.calibration.wall_model import (
 
 
 def gamma_coefficients(exponent):
-    share = np.linspace(0, 1, 400)
+    fraction = np.linspace(0, 1, 400)
     width = 1e-6
-    basis = curve_means(share - width, share + width)[1:-1]
-    return np.linalg.lstsq(basis, share[1:-1] ** exponent, rcond=None)[0]
+    basis = curve_means(fraction - width, fraction + width)[1:-1]
+    return np.linalg.lstsq(basis, fraction[1:-1] ** exponent, rcond=None)[0]
 
 
 @pytest.mark.parametrize("rising", [True, False])
@@ -40,19 +40,19 @@ def test_means_over_intervals_are_those_of_quadrature(low, high):
         {max(low, 0), *(knot for knot in np.linspace(0, 1, 9) if low < knot < high), min(high, 1)}
     )
     whole = sum(
-        quad(lambda share: float(curve_values(coefficients, share)), first, second)[0]
+        quad(lambda fraction: float(curve_values(coefficients, fraction)), first, second)[0]
         for first, second in itertools.pairwise(inside)
         if second > first
     )
-    found = curve_means([low], [high]) @ coefficients
-    assert found[0] == pytest.approx(whole / (high - low), abs=1e-8)
+    mean = curve_means([low], [high]) @ coefficients
+    assert mean[0] == pytest.approx(whole / (high - low), abs=1e-8)
 
 
 @pytest.mark.parametrize("exponent", [1.0, 2.2, 1 / 2.2])
 def test_a_printed_gamma_is_such_a_curve(exponent):
-    share = np.linspace(0.05, 1, 300)
-    light = curve_values(gamma_coefficients(exponent), share)
-    np.testing.assert_allclose(light, share**exponent, atol=6e-3 if exponent < 1 else 3e-4)
+    fraction = np.linspace(0.05, 1, 300)
+    light = curve_values(gamma_coefficients(exponent), fraction)
+    np.testing.assert_allclose(light, fraction**exponent, atol=6e-3 if exponent < 1 else 3e-4)
 
 
 def test_a_parabola_is_not_rough_and_a_step_is():

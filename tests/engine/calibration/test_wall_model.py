@@ -77,10 +77,10 @@ def test_the_ball_is_met_where_the_shared_geometry_has_it():
     for number in range(200):
         pixel = np.concatenate([samples.place[:, number], lean[:, number]])[:, np.newaxis]
         pose = samples.pose[number]
-        seen = see_ball(pixel, CENTRES[pose // 8], 2.0, LEAN[pose % 8][np.newaxis], pivot)
-        if seen.contact[0, 0]:
-            assert met.z[number] == pytest.approx(seen.z[0, 0], abs=1e-12)
-            np.testing.assert_allclose(met.normal[:, number], seen.normal[0, 0], atol=1e-12)
+        points = see_ball(pixel, CENTRES[pose // 8], 2.0, LEAN[pose % 8][np.newaxis], pivot)
+        if points.contact[0, 0]:
+            assert met.z[number] == pytest.approx(points.z[0, 0], abs=1e-12)
+            np.testing.assert_allclose(met.normal[:, number], points.normal[0, 0], atol=1e-12)
 
 
 def test_without_scatter_the_light_is_that_of_the_kernels_formula():
@@ -92,7 +92,7 @@ def test_without_scatter_the_light_is_that_of_the_kernels_formula():
     zenith, azimuth = np.radians(rng.uniform(15, 42, 500)), rng.uniform(-np.pi, np.pi, 500)
     normal = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
     coefficients = curve_from_steps(True) @ STEEP
-    found = light_of(SheetPoints(*(from_axis + z * lean), z, sight_of(lean), normal), named, coefficients)
+    modelled = light_of(SheetPoints(*(from_axis + z * lean), z, sight_of(lean), normal), named, coefficients)
 
     whole = math.atan2(TRUE["rim"], TRUE["radius"])
     q = np.linspace(0.0, math.tan(whole / 2), 400)
@@ -107,7 +107,7 @@ def test_without_scatter_the_light_is_that_of_the_kernels_formula():
         (q[0], q[-1]),
     )
     assert within[0].sum() > 400
-    np.testing.assert_allclose(found[within[0]], wall[0][within[0]], atol=1e-3)
+    np.testing.assert_allclose(modelled[within[0]], wall[0][within[0]], atol=1e-3)
 
 
 def test_slopes_are_those_of_differences():
@@ -125,7 +125,7 @@ def test_slopes_are_those_of_differences():
         assert np.quantile(off, 0.95) < 2e-3, number
 
 
-def known(sigma_share=1.0):
+def prior_of(sigma_share=1.0):
     mean = true_parameters()
     sigma = np.concatenate(
         [[SCALES[name] for name in SENSOR], np.full(CURVE_COEFFICIENTS, np.inf), np.full(CENTRES.size, 0.5)]
@@ -135,7 +135,7 @@ def known(sigma_share=1.0):
 
 def test_a_fit_finds_the_curve_and_where_the_wall_stands():
     samples = some_samples(1500, 4, noise=2e-3)
-    prior = known()
+    prior = prior_of()
     start = prior.mean.copy()
     start[: len(SENSOR)] += 0.5 * prior.sigma[: len(SENSOR)]
     start[STEPS] = 0
@@ -156,16 +156,18 @@ def test_wild_samples_hardly_matter():
     samples = some_samples(1500, 6, noise=2e-3)
     light = samples.light.copy()
     light[::25] += 0.4
-    wild = LightSamples(light, samples.place, samples.pose, samples.press, samples.lean, 2.0)
-    prior = known()
-    clean, spoilt = (fit_wall(one, prior, prior.mean, 2e-3, 1e-5) for one in (samples, wild))
+    with_outliers = LightSamples(light, samples.place, samples.pose, samples.press, samples.lean, 2.0)
+    prior = prior_of()
+    clean, spoilt = (
+        fit_wall(samples_, prior, prior.mean, 2e-3, 1e-5) for samples_ in (samples, with_outliers)
+    )
     sigma = np.sqrt(np.diag(clean.covariance))
     free = sigma > 0
     assert np.abs((clean.parameters - spoilt.parameters)[free] / sigma[free]).max() < 3
 
 
-def test_errors_are_as_large_as_the_fit_says():
-    prior = known()
+def test_errors_of_the_fit_match_its_covariance():
+    prior = prior_of()
     off = []
     for seed in range(6):
         fit = fit_wall(some_samples(700, 100 + seed, noise=5e-3), prior, prior.mean, 5e-3, 1e-5)

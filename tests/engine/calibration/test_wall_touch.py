@@ -46,10 +46,10 @@ PICTURE = Frames("place-1", np.zeros((1, 12, 12), np.uint8), io.Header("axial", 
 
 
 def coefficients_of(exponent):
-    share = np.linspace(0, 1, 400)
-    basis = curve_means(share - 1e-6, share + 1e-6)[1:-1]
+    fraction = np.linspace(0, 1, 400)
+    basis = curve_means(fraction - 1e-6, fraction + 1e-6)[1:-1]
     return np.maximum.accumulate(
-        np.maximum(np.linalg.lstsq(basis, share[1:-1] ** exponent, rcond=None)[0], 0)
+        np.maximum(np.linalg.lstsq(basis, fraction[1:-1] ** exponent, rcond=None)[0], 0)
     )
 
 
@@ -63,12 +63,12 @@ def some_presses(coefficients, balls=(2.0,) * 5, touched=1.0, each=720):
         offset = away * np.stack([np.cos(turn), np.sin(turn)])
         parts = [TRUE[name] for name in SENSOR], np.diff(coefficients, prepend=0), centre
         # The light of a flatter sheet is that of a place farther in.
-        seen = offset * np.minimum(1, 1.44 * touched / away)
+        apparent = offset * np.minimum(1, 1.44 * touched / away)
         samples, inner = (
             LightSamples(
-                np.zeros(each), centre[:2, np.newaxis] + one, frame, np.zeros(8, np.intp), LEAN, ball
+                np.zeros(each), centre[:2, np.newaxis] + place, frame, np.zeros(8, np.intp), LEAN, ball
             )
-            for one in (offset, seen)
+            for place in (offset, apparent)
         )
         light = predict(inner, np.concatenate(parts), True) + NOISE * rng.normal(size=each)
         start = centre + OFF
@@ -109,8 +109,8 @@ def bias(response, coefficients, highest):
         return light_of(met, TRUE, coefficients), normal
 
     (light, normal), (more, _) = true(zenith), true(zenith + 1e-4)
-    told, within = light_of_response(response, place, 0.5, normal.T[np.newaxis])
-    return np.where(within[0], np.degrees((told[0] - light) * 1e-4 / (more - light)), np.nan)
+    modelled, within = light_of_response(response, place, 0.5, normal.T[np.newaxis])
+    return np.where(within[0], np.degrees((modelled[0] - light) * 1e-4 / (more - light)), np.nan)
 
 
 def test_a_printed_gamma_is_found():
@@ -136,8 +136,8 @@ def test_a_uniform_wall_shows_where_light_begins():
     assert response.curve == pytest.approx([0.95], abs=0.01)
     assert np.isnan(response.azimuth_sigma).all()
     assert np.nanmax(np.degrees(response.zenith_sigma)) < 0.2
-    found = threshold_zenith(response, 0.3, -0.2, 0.0, 0.475 * (1 + 0.03))
-    assert math.degrees(found) == pytest.approx(math.degrees(math.atan2(17.1, 38.5) / 2), abs=0.1)
+    zenith = threshold_zenith(response, 0.3, -0.2, 0.0, 0.475 * (1 + 0.03))
+    assert math.degrees(zenith) == pytest.approx(math.degrees(math.atan2(17.1, 38.5) / 2), abs=0.1)
 
 
 def test_walls_with_and_without_a_print_are_distinguished():

@@ -55,8 +55,8 @@ def least_squares(frames, phase, weights=None):
     return np.stack([*fit, residual]).reshape(4, *frames.shape[1:])
 
 
-def stacked(found):
-    return np.stack([found.mean, found.cosine, found.sine, found.residual])
+def stacked(correlation):
+    return np.stack([correlation.mean, correlation.cosine, correlation.sine, correlation.residual])
 
 
 def push(run, frames, phase, weights=None, cuts=()):
@@ -67,9 +67,9 @@ def push(run, frames, phase, weights=None, cuts=()):
     return run
 
 
-def same(one, other):
-    np.testing.assert_array_equal(stacked(one), stacked(other))
-    assert one.process["frames"] == other.process["frames"]
+def same(first, other):
+    np.testing.assert_array_equal(stacked(first), stacked(other))
+    assert first.process["frames"] == other.process["frames"]
 
 
 @pytest.mark.parametrize(
@@ -85,16 +85,16 @@ def same(one, other):
 def test_it_is_least_squares(device, dtype, phases):
     phase = PHASES[phases]
     frames = swing(dtype, phase)
-    found, expected = correlate(frames, phase, device=device), least_squares(frames, phase)
+    correlation, expected = correlate(frames, phase, device=device), least_squares(frames, phase)
     # Cosines in steps of 2^-17: what noise does to a fit depends on them by that share, times its condition.
     model = np.stack([phase**0, np.cos(phase), np.sin(phase)], axis=1)
-    share = np.linalg.cond(model) * 2.0**-17
+    tolerance = np.linalg.cond(model) * 2.0**-17
     sigma = np.sqrt(np.diag(np.linalg.inv(model.T @ model)))[:, None, None] * np.nan_to_num(expected[3])
-    error = np.abs(stacked(found)[:3] - expected[:3])
-    assert np.all(error <= share * sigma + 3e-7 * np.abs(expected[:3]) + 1e-7 * np.ptp(frames))
-    np.testing.assert_allclose(found.residual, expected[3], rtol=1e-4, atol=1e-5 * np.ptp(frames))
-    assert stacked(found).dtype == np.float32
-    assert found.process["frames"] == len(phase)
+    error = np.abs(stacked(correlation)[:3] - expected[:3])
+    assert np.all(error <= tolerance * sigma + 3e-7 * np.abs(expected[:3]) + 1e-7 * np.ptp(frames))
+    np.testing.assert_allclose(correlation.residual, expected[3], rtol=1e-4, atol=1e-5 * np.ptp(frames))
+    assert stacked(correlation).dtype == np.float32
+    assert correlation.process["frames"] == len(phase)
 
 
 def in_window(frames, weight, device):
@@ -113,9 +113,9 @@ def test_frames_count_by_their_weights(device, dtype, weights):
     frames, weight = swing(dtype, MEASURED), WEIGHTS[weights]
     whole = correlate(frames, MEASURED, frame_weights=weight, device=device)
     expected = least_squares(frames, MEASURED, weight)
-    for found in (whole, in_window(frames, weight, device)):
-        np.testing.assert_allclose(stacked(found), expected, rtol=1e-5, atol=1e-5 * expected[3].max())
-        assert found.process["frames"] == (8 if weight is None else np.count_nonzero(weight))
+    for correlation in (whole, in_window(frames, weight, device)):
+        np.testing.assert_allclose(stacked(correlation), expected, rtol=1e-5, atol=1e-5 * expected[3].max())
+        assert correlation.process["frames"] == (8 if weight is None else np.count_nonzero(weight))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -134,11 +134,11 @@ def test_counts_without_noise_leave_no_residual(device, dtype):
     cosine, sine = np.rint([np.cos(phase), np.sin(phase)])[:, :, None, None]
     light = (mean + cosine * swings - sine * (swings // 2)).astype(dtype)
     for window in (None, 8):
-        found = push(Run(Correlate(window_frames=window, device=device)), light, phase).result()
-        np.testing.assert_allclose(found.mean, mean, rtol=1e-7)
-        np.testing.assert_allclose(found.cosine, swings, rtol=3e-7, atol=1e-6)
-        np.testing.assert_allclose(found.sine, -(swings // 2), rtol=3e-7, atol=1e-6)
-        assert np.all(found.residual <= 1e-6 * np.maximum(swings, 1))
+        result = push(Run(Correlate(window_frames=window, device=device)), light, phase).result()
+        np.testing.assert_allclose(result.mean, mean, rtol=1e-7)
+        np.testing.assert_allclose(result.cosine, swings, rtol=3e-7, atol=1e-6)
+        np.testing.assert_allclose(result.sine, -(swings // 2), rtol=3e-7, atol=1e-6)
+        assert np.all(result.residual <= 1e-6 * np.maximum(swings, 1))
 
 
 @pytest.mark.parametrize("mean", [0.0, 1e6])
@@ -146,10 +146,10 @@ def test_floats_without_noise_leave_but_their_rounding(device, mean):
     phase, azimuth = np.linspace(0, 12.0, 64), np.linspace(-3, 3, 21).reshape(3, 7)
     exact = mean + 50 * np.cos(phase[:, None, None] - azimuth)
     frames = exact.astype(np.float32)
-    rounding, found = np.std(frames - exact), correlate(frames, phase, device=device)
-    assert np.all(found.residual <= 3 * rounding + 50e-7)
-    np.testing.assert_allclose(found.modulation, 50, atol=rounding + 1e-5)
-    np.testing.assert_allclose(found.azimuth, azimuth, atol=0.1 * rounding + 1e-6)
+    rounding, correlation = np.std(frames - exact), correlate(frames, phase, device=device)
+    assert np.all(correlation.residual <= 3 * rounding + 50e-7)
+    np.testing.assert_allclose(correlation.modulation, 50, atol=rounding + 1e-5)
+    np.testing.assert_allclose(correlation.azimuth, azimuth, atol=0.1 * rounding + 1e-6)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
@@ -177,9 +177,9 @@ def test_a_sample_that_is_not_a_number_spoils_its_pixel_while_it_is_in_the_windo
     for start in range(12):
         push(run, frames[start : start + 1], phase[start : start + 1])
         if start >= 4:
-            found = stacked(run.result())
-            assert np.all(np.isfinite(found[:, clean]))
-            assert np.all(np.isnan(found[:, ~clean])) == (start <= 9)
+            maps = stacked(run.result())
+            assert np.all(np.isfinite(maps[:, clean]))
+            assert np.all(np.isnan(maps[:, ~clean])) == (start <= 9)
     whole = correlate(frames, phase, device=device)
     np.testing.assert_array_equal(np.isnan(stacked(whole)), np.broadcast_to(~clean, (4, *SHAPE)))
 
@@ -228,15 +228,15 @@ def test_less_memory_gives_the_same_answer(small_device, dtype, window, weights)
     phase, shape = PHASES["turns"][:10], (9, 48)
     frames = swing(dtype, phase, shape)
     weight = None if WEIGHTS[weights] is None else [1, 1, *WEIGHTS[weights]]
-    found = []
+    answers = []
     for limit in (10**9, 3100):
         small_device.max_allocation = limit
         run = Run(Correlate(window_frames=window, device=small_device))
         push(run, frames[:4], phase[:4], None if weight is None else weight[:4]).result()
         push(run, frames[4:], phase[4:], None if weight is None else weight[4:])
-        found.append(run.result())
+        answers.append(run.result())
     assert len(run.operation._picture.bands) > 1
-    same(*found)
+    same(*answers)
     small_device.max_allocation = 400
     with pytest.raises(DeviceError, match="one row of 800 pixels does not fit"):
         Run(Correlate(device=small_device)).push(np.zeros((1, 4, 800), np.uint8), phase=[0])

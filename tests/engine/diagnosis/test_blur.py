@@ -23,8 +23,8 @@ def pressed(blur, radius=2.5, travel=TRAVEL):
     frames = np.empty((len(travel), *SHAPE), np.float32)
     for number, lowered in enumerate(travel):
         touched = (lowered >= -height).astype(np.float32)
-        seen = gaussian_filter(touched, 4 * blur, mode="nearest") if blur else touched
-        frames[number] = 20 + 200 * seen.reshape(SHAPE[0], 4, SHAPE[1], 4).mean(axis=(1, 3))
+        blurred = gaussian_filter(touched, 4 * blur, mode="nearest") if blur else touched
+        frames[number] = 20 + 200 * blurred.reshape(SHAPE[0], 4, SHAPE[1], 4).mean(axis=(1, 3))
     frames += np.random.default_rng(1).normal(0, NOISE, frames.shape)
     return np.clip(np.rint(frames), 0, 255).astype(np.uint8), bowl(radius).reshape(
         SHAPE[0], 4, SHAPE[1], 4

@@ -49,13 +49,13 @@ def rolled():
 
 @pytest.mark.parametrize("degrees", [-20, 3, 12])
 def test_the_angle_of_slopes_that_are_rotated_is_found(degrees):
-    found = error_of(noisy(rotated(degrees)))
-    assert np.degrees([found.first, found.last]) == pytest.approx([degrees, degrees], abs=0.4)
+    angle = error_of(noisy(rotated(degrees)))
+    assert np.degrees([angle.first, angle.last]) == pytest.approx([degrees, degrees], abs=0.4)
 
 
 def test_a_rotation_that_grows_from_row_to_row_is_found():
-    found = error_of(noisy(rotated(np.linspace(2, 20, SHAPE[0]))))
-    assert np.degrees([found.first, found.last]) == pytest.approx([2, 20], abs=1)
+    angle = error_of(noisy(rotated(np.linspace(2, 20, SHAPE[0]))))
+    assert np.degrees([angle.first, angle.last]) == pytest.approx([2, 20], abs=1)
 
 
 def test_slopes_of_a_surface_are_not_rotated():

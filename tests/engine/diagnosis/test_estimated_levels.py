@@ -15,21 +15,21 @@ def press(gains=0.0, offsets=0.0, low=12.0, high=182.0, seed=0):
     """Return frames of a bowl between these counts, and where pixels are half light, (H, W), mm of travel."""
     generator, (y, x) = np.random.default_rng(seed), np.mgrid[-24:24, -32:32]
     half = 0.05 + 0.3 * (x**2 + y**2) / 32**2
-    share = np.clip((TRAVEL[:, None, None] - half) / WIDTH + 0.5, 0, 1)
+    fraction = np.clip((TRAVEL[:, None, None] - half) / WIDTH + 0.5, 0, 1)
     dark = low + offsets * generator.normal(size=half.shape)
     light = (high - low) * (1 + gains * generator.normal(size=half.shape))
-    frames = dark + light * share + generator.normal(size=share.shape)
+    frames = dark + light * fraction + generator.normal(size=fraction.shape)
     return np.clip(np.rint(frames), 0, 255).astype(np.uint8), half
 
 
-def errors(frames, half, **given):
+def errors(frames, half, **options):
     """Return the errors of heights, mm, and the result."""
-    result = engine.reconstruct(frames, travel=TRAVEL, fill=False, **given)
+    result = engine.reconstruct(frames, travel=TRAVEL, fill=False, **options)
     return (result.height + half)[result.status == 1], result
 
 
 @pytest.mark.parametrize(
-    ("camera", "given"),
+    ("camera", "levels"),
     [
         ({}, {}),
         ({"high": 90}, {}),
@@ -38,8 +38,8 @@ def errors(frames, half, **given):
         ({"low": 40}, {"hold": 1}),
     ],
 )
-def test_heights_are_those_of_the_levels_that_the_frames_have(camera, given):
-    miss, _ = errors(*press(**camera), **given)
+def test_heights_are_those_of_the_levels_that_the_frames_have(camera, levels):
+    miss, _ = errors(*press(**camera), **levels)
     assert abs(np.mean(miss)) < 0.0001  # by the range of uint8: 0.0038
 
 
@@ -57,7 +57,7 @@ def test_of_a_release_the_levels_are_estimated_as_well():
     assert abs(np.mean(miss)) < 0.0001
 
 
-def test_the_result_says_what_was_estimated():
+def test_the_result_lists_what_was_estimated():
     process = errors(*press())[1].process
     assert process["dark"] == "12, estimated from the frames"
     assert process["bright"] == "182, estimated from the frames"
@@ -83,5 +83,5 @@ def test_frames_are_scanned_once(device):
     frames, _ = press(gains=0.05)
     device.profile.clear()
     engine.find_onset(frames, TRAVEL, device=device)
-    scans = {one.name: one.runs for one in device.profile.records() if "scan" in one.name}
+    scans = {record.name: record.runs for record in device.profile.records() if "scan" in record.name}
     assert sum(scans.values()) <= -(-frames.nbytes // 64_000_000)

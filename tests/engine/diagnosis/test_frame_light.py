@@ -36,8 +36,8 @@ def turn(normals, gain, offset, seed, setup=SETUP):
 def errors(result, normals):
     """Return the angular errors and their standard deviations, radians."""
     error = np.linalg.norm(np.cross(result.normals.astype(float), normals), axis=-1)
-    known = np.isfinite(error) & np.isfinite(result.normals_sigma)
-    return error[known], result.normals_sigma[known]
+    valid = np.isfinite(error) & np.isfinite(result.normals_sigma)
+    return error[valid], result.normals_sigma[valid]
 
 
 def reconstruct(normals, gain, offset, seed=1):
@@ -87,8 +87,8 @@ def test_arrays_are_corrected_as_recordings_are():
     source = turn(WAVES, FLICKER, STEADY[1], 1)
     options = {"tilt": SETUP.tilt, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "dark": 20.0}
     frames = source.read(np.empty(source.shape, source.dtype)).frames
-    found = engine.estimate_normals(frames, SETUP.phase, **options)
-    assert np.array_equal(found.normals, engine.reconstruct(source).normals, equal_nan=True)
+    result = engine.estimate_normals(frames, SETUP.phase, **options)
+    assert np.array_equal(result.normals, engine.reconstruct(source).normals, equal_nan=True)
 
 
 def test_an_operation_forgets_the_light_with_the_frames():

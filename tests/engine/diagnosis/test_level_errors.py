@@ -18,10 +18,10 @@ def pressed(dark=0.0, light=0.0, scatter=0.0):
     radius = np.hypot(x, y)
     height = -0.1 - SLOPE * radius / 2
     width = SLOPE / 2 * (np.abs(x) + np.abs(y)) / radius * PIXEL  # of the light's edge, over a pixel
-    share = np.clip((TRAVEL[:, np.newaxis, np.newaxis] + height) / width + 0.5, 0, 1)
+    fraction = np.clip((TRAVEL[:, np.newaxis, np.newaxis] + height) / width + 0.5, 0, 1)
     generator, time = np.random.default_rng(1), np.linspace(0, 1, len(TRAVEL))[:, np.newaxis, np.newaxis]
-    own = 1 + scatter * generator.normal(size=SHAPE)
-    counts = DARK + dark * time + share * own * (BRIGHT - DARK + (light - dark) * time)
+    gain = 1 + scatter * generator.normal(size=SHAPE)
+    counts = DARK + dark * time + fraction * gain * (BRIGHT - DARK + (light - dark) * time)
     counts += generator.normal(0, NOISE, counts.shape)
     return np.clip(np.rint(counts), 0, 255).astype(np.uint8), height
 
@@ -38,7 +38,7 @@ def test_heights_have_true_errors_while_the_dark_level_drifts(method):
     assert np.nanmean(((result.height - height) / result.height_sigma) ** 2) < 1.5
 
 
-def test_the_note_says_by_how_much_levels_differ():
+def test_the_note_states_the_difference_of_levels():
     notes = reconstruct(pressed(light=-8.0)[0]).process["notes"]
     assert notes.startswith("levels differ from their references, light by -3.")
 

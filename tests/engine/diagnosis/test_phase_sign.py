@@ -16,11 +16,11 @@ def warnings_of(shape, sign):
     movement = Axial(phase, np.radians(2.5), 1.0)
     twin = Twin(object=shape, shape=(160, 160), pixel_size=0.04, movement=movement, pattern="linear")
     header = twin.header
-    known = {name: getattr(header, name) for name in ("pixel_size", "tilt", "zenith_gain", "zenith_offset")}
+    options = {name: getattr(header, name) for name in ("pixel_size", "tilt", "zenith_gain", "zenith_offset")}
     frames = twin.read(np.empty(twin.shape, twin.dtype)).frames
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", io.MirrorskinWarning)
-        result = engine.reconstruct(ArrayRecording(frames, {"phase": sign * phase}, known))
+        result = engine.reconstruct(ArrayRecording(frames, {"phase": sign * phase}, options))
     return str(result.process.get("warnings", ""))
 
 

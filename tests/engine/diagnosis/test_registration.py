@@ -48,14 +48,14 @@ def places(header, heights, phase):
 
 def usable(column, row, fine):
     """Whether all 16 samples round a place are there and fine: one by one."""
-    found = np.zeros(column.shape, bool)
+    usable_samples = np.zeros(column.shape, bool)
     rows, columns = fine.shape
     for pixel in np.ndindex(column.shape):
         if np.isfinite(column[pixel]):
             west, north = int(np.floor(column[pixel])), int(np.floor(row[pixel]))
             if 1 <= west < columns - 2 and 1 <= north < rows - 2:
-                found[pixel] = fine[north - 1 : north + 3, west - 1 : west + 3].all()
-    return found
+                usable_samples[pixel] = fine[north - 1 : north + 3, west - 1 : west + 3].all()
+    return usable_samples
 
 
 def register(source, heights, device=None):
@@ -71,14 +71,14 @@ def ramp(shape=SHAPE):
 @pytest.mark.parametrize("pivot", ["40 mm up", "off the axis"])
 def test_each_pixel_sees_where_its_point_has_gone(device, pivot):
     header, heights = replace(HEADER, pivot=PIVOTS[pivot]), some_heights()
-    found = register(made_up(ramp(), header), heights, device)
-    for number, (frame, phase) in enumerate(zip(found, PHASES, strict=True)):
+    registered = register(made_up(ramp(), header), heights, device)
+    for number, (frame, phase) in enumerate(zip(registered, PHASES, strict=True)):
         column, row, _ = places(header, heights, phase)
-        seen = usable(column, row, np.ones(SHAPE, bool))
-        assert seen.sum() > (30 if pivot == "40 mm up" else 300)
-        np.testing.assert_array_equal(np.isfinite(frame), seen)
+        expected_usable = usable(column, row, np.ones(SHAPE, bool))
+        assert expected_usable.sum() > (30 if pivot == "40 mm up" else 300)
+        np.testing.assert_array_equal(np.isfinite(frame), expected_usable)
         expected = 50 + 3 * column + 2 * row + number
-        np.testing.assert_allclose(frame[seen], expected[seen], atol=1e-3)
+        np.testing.assert_allclose(frame[expected_usable], expected[expected_usable], atol=1e-3)
 
 
 @pytest.mark.parametrize(("name", "pivot"), [("sphere", "40 mm up"), ("cone", "off the axis")])
@@ -97,25 +97,25 @@ def test_equation_10_holds_for_the_normal_of_the_mean_pose(name, pivot):
     zenith, azimuth = truth.zenith.astype(float), np.nan_to_num(truth.azimuth.astype(float))
     level = np.sin(zenith)
     facing = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.cos(zenith)], axis=-1)
-    found = register(twin, truth.height)
+    registered = register(twin, truth.height)
     twin.rewind()
     raw = read_all(twin, 6).frames
     checked, away = 0, np.hypot(*np.meshgrid(*io.pixel_axes((61, 71), twin.header.pixel_size)))
-    for phase, frame, before in zip(PHASES, found, raw, strict=True):
+    for phase, frame, before in zip(PHASES, registered, raw, strict=True):
         axis = np.array([-np.sin(TILT) * np.cos(phase), -np.sin(TILT) * np.sin(phase), np.cos(TILT)])
         expected = poses.between(facing, np.broadcast_to(axis, facing.shape))
-        told, untold = (
+        corrected, untold = (
             np.abs((counts - header.zenith_offset) / header.zenith_gain - expected)
             for counts in (frame, before)
         )
         # Not where a kink of the brightness is near: where the sheet faces the camera, and where it ends.
-        smooth = np.isfinite(told) & (truth.zenith > 2 * TILT) & (away > 0.4)
+        smooth = np.isfinite(corrected) & (truth.zenith > 2 * TILT) & (away > 0.4)
         smooth &= places(header, truth.height, phase)[2] > 0.15
         checked += smooth.sum()
-        assert told[smooth].max(initial=0) < np.radians(0.002)
+        assert corrected[smooth].max(initial=0) < np.radians(0.002)
         if pivot == "40 mm up" and name == "sphere":
             assert np.median(untold[smooth]) > np.radians(5)
-    assert checked > 0.2 * found.size
+    assert checked > 0.2 * registered.size
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
@@ -127,13 +127,13 @@ def test_samples_made_of_what_is_clipped_or_missing_are_missing(device, dtype):
     frames[spots < 0.004], frames[spots > 0.996] = ends
     heights = some_heights()
     heights[5:8, 11] = np.nan
-    found = register(made_up(frames), heights, device)
-    for phase, frame, raw in zip(PHASES, found, frames, strict=True):
+    registered = register(made_up(frames), heights, device)
+    for phase, frame, raw in zip(PHASES, registered, frames, strict=True):
         fine = np.isfinite(raw) if kind.kind == "f" else (raw > 0) & (raw < np.iinfo(kind).max)
         assert not fine.all()
-        seen = usable(*places(HEADER, heights, phase)[:2], fine)
-        assert seen.any()
-        np.testing.assert_array_equal(np.isfinite(frame), seen)
+        expected_usable = usable(*places(HEADER, heights, phase)[:2], fine)
+        assert expected_usable.any()
+        np.testing.assert_array_equal(np.isfinite(frame), expected_usable)
 
 
 def test_counts_come_on_the_scale_of_the_pixel_that_they_come_to(device):
@@ -143,11 +143,11 @@ def test_counts_come_on_the_scale_of_the_pixel_that_they_come_to(device):
     header, heights = replace(HEADER, zenith_offset=offset, zenith_gain=gain), some_heights()
     alike = register(made_up(ramp()), heights, device)
     with np.errstate(invalid="ignore"):
-        found = register(made_up((offset + gain * ramp()).astype(np.float32), header), heights, device)
+        registered = register(made_up((offset + gain * ramp()).astype(np.float32), header), heights, device)
         np.testing.assert_allclose(
-            (found - offset) / gain, np.where(np.isnan(found), np.nan, alike), rtol=1e-5
+            (registered - offset) / gain, np.where(np.isnan(registered), np.nan, alike), rtol=1e-5
         )
-    lost = np.isfinite(alike) & np.isnan(found)
+    lost = np.isfinite(alike) & np.isnan(registered)
     assert set(zip(*np.nonzero(lost)[1:], strict=True)) == {(3, 4), (20, 20)}
     constant = replace(HEADER, zenith_offset=np.full(SHAPE, 16.0), zenith_gain=np.full(SHAPE, 250.0))
     np.testing.assert_array_equal(register(made_up(ramp(), constant), heights, device), alike)
@@ -163,10 +163,10 @@ def test_a_pixel_without_a_scale_counts_as_those_on_opposite_sides_of_it(device,
     gain[tuple(np.transpose(places))] = np.nan
     header, heights = replace(HEADER, zenith_offset=np.full(SHAPE, 16.0), zenith_gain=gain), some_heights()
     counts = 16 + np.float32(250) * ramp()
-    found = (register(made_up(counts, header), heights, device) - 16) / 250
+    fractions = (register(made_up(counts, header), heights, device) - 16) / 250
     alike = register(made_up(ramp()), heights, device)
-    np.testing.assert_allclose(found, np.where(np.isnan(found), np.nan, alike), rtol=1e-5)
-    lost = (np.isfinite(alike) & np.isnan(found)).any(axis=0)
+    np.testing.assert_allclose(fractions, np.where(np.isnan(fractions), np.nan, alike), rtol=1e-5)
+    lost = (np.isfinite(alike) & np.isnan(fractions)).any(axis=0)
     assert lost[tuple(np.transpose(places))].all()
     assert lost.sum() == len(places) if mended else lost.sum() > 2 * len(places)
 
@@ -191,8 +191,8 @@ def test_blocks_make_no_difference(device, monkeypatch):
     assert len(small.read(np.empty((6, *SHAPE), np.float32)).frames) == 2
     with pytest.raises(ValueError, match="needed is"):
         small.read(np.empty((2, *SHAPE)))
-    for found, gain in answers:
-        assert found.tobytes() == answers[0][0].tobytes()
+    for registered, gain in answers:
+        assert registered.tobytes() == answers[0][0].tobytes()
         assert gain.tobytes() == answers[0][1].tobytes()
 
 
@@ -202,10 +202,10 @@ def test_the_noise_gain_is_that_of_noise():
     noise = np.random.default_rng(6).normal(0, 2.0, (len(phase), 9, 12)).astype(np.float32)
     header = replace(HEADER, pivot=PIVOTS["centre"])
     source = Registered(made_up(noise + 100, header, phase), some_heights((9, 12)))
-    found = read_all(source, 32).frames - 100
-    known = np.isfinite(found)
-    counted = known.sum(axis=0)
-    measured = np.sqrt(np.nansum(found**2, axis=0) / np.where(counted, counted, np.nan)) / 2.0
+    errors = read_all(source, 32).frames - 100
+    finite = np.isfinite(errors)
+    counted = finite.sum(axis=0)
+    measured = np.sqrt(np.nansum(errors**2, axis=0) / np.where(counted, counted, np.nan)) / 2.0
     gain = source.noise_gain
     np.testing.assert_array_equal(np.isnan(gain), counted == 0)
     some = counted == len(phase)
@@ -218,16 +218,21 @@ def test_the_noise_gain_is_that_of_noise():
 
 
 def test_it_is_a_source_like_its_own():
-    own = made_up(ramp())
-    own.phase = PHASES
-    source = Registered(own, some_heights())
-    assert (source.name, source.shape, source.motion, source.header) == (own.name, own.shape, "axial", HEADER)
+    original = made_up(ramp())
+    original.phase = PHASES
+    source = Registered(original, some_heights())
+    assert (source.name, source.shape, source.motion, source.header) == (
+        original.name,
+        original.shape,
+        "axial",
+        HEADER,
+    )
     assert (source.dtype, source.rewindable) == (np.float32, False)
     assert source.phase is PHASES
     with source as entered:
         block = entered.read()
     assert (block.index, block.phase, block.stays_valid) == (0, [0.0], False)
-    assert own.left
+    assert original.left
 
 
 BAD: dict[str, tuple[dict[str, Any], Any, str]] = {

@@ -33,43 +33,43 @@ def samples_of(read, slope, *, phase=EIGHTHS, weights=None, second=0.0, dtype="f
 @pytest.mark.parametrize("phase", [FOUR, EIGHTHS[:5], UNEVEN, SIXTEEN])
 @pytest.mark.parametrize(("read", "slope"), [(1.5, 0.0), (1.0, 0.05), (0.0, 0.02)])
 def test_read_and_shot_noise_are_separated(read, slope, phase):
-    found = residual_noise(*samples_of(read, slope, phase=phase))
-    np.testing.assert_allclose(found.at(LEVELS), line(read, slope), rtol=0.03)
-    assert found.slope == pytest.approx(slope, rel=0.1, abs=1e-3 * read)
+    noise = residual_noise(*samples_of(read, slope, phase=phase))
+    np.testing.assert_allclose(noise.at(LEVELS), line(read, slope), rtol=0.03)
+    assert noise.slope == pytest.approx(slope, rel=0.1, abs=1e-3 * read)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 def test_rounding_is_noise(dtype):
-    found = residual_noise(*samples_of(1.0, 0.02, dtype=dtype))
-    np.testing.assert_allclose(found.at(LEVELS), np.hypot(line(1.0, 0.02), 1 / np.sqrt(12)), rtol=0.03)
+    noise = residual_noise(*samples_of(1.0, 0.02, dtype=dtype))
+    np.testing.assert_allclose(noise.at(LEVELS), np.hypot(line(1.0, 0.02), 1 / np.sqrt(12)), rtol=0.03)
 
 
 def test_weights_are_inverse_variances_and_the_second_wave_of_a_level_surface_is_no_noise():
-    found = residual_noise(*samples_of(1.0, 0.05, weights=[1, 2, 0.5, 4, 1, 0.1, 1, 3]))
-    np.testing.assert_allclose(found.at(LEVELS), line(1.0, 0.05), rtol=0.03)
-    found = residual_noise(*samples_of(1.0, 0.0, second=5.0))
-    np.testing.assert_allclose(found.at(LEVELS), 1.0, rtol=0.03)
+    noise = residual_noise(*samples_of(1.0, 0.05, weights=[1, 2, 0.5, 4, 1, 0.1, 1, 3]))
+    np.testing.assert_allclose(noise.at(LEVELS), line(1.0, 0.05), rtol=0.03)
+    noise = residual_noise(*samples_of(1.0, 0.0, second=5.0))
+    np.testing.assert_allclose(noise.at(LEVELS), 1.0, rtol=0.03)
 
 
 @pytest.mark.parametrize("phase", [FOUR, EIGHTHS, SIXTEEN])
 @pytest.mark.parametrize(("read", "slope"), [(1.5, 0.0), (1.0, 0.05)])
 def test_pixels_that_lose_contact_are_no_noise(read, slope, phase):
-    samples, *known = samples_of(read, slope, phase=phase)
+    samples, *series = samples_of(read, slope, phase=phase)
     samples[len(phase) // 2, ::10] = 12.0
-    np.testing.assert_allclose(residual_noise(samples, *known).at(LEVELS), line(read, slope), rtol=0.05)
+    np.testing.assert_allclose(residual_noise(samples, *series).at(LEVELS), line(read, slope), rtol=0.05)
 
 
 def test_a_bin_that_is_quite_wrong_does_not_bend_the_line_which_does_not_fall():
-    samples, *known = samples_of(1.0, 0.05)
+    samples, *series = samples_of(1.0, 0.05)
     mean = samples.mean(axis=0)
     dark = mean < 40
     samples[3, dark] += np.random.default_rng(1).uniform(-100, 100, dark.sum()).astype(np.float32)
     assert 0.05 < dark.mean() < 0.1
-    np.testing.assert_allclose(residual_noise(samples, *known).at(LEVELS), line(1.0, 0.05), rtol=0.1)
-    samples, *known = samples_of(1.0, 0.0)
+    np.testing.assert_allclose(residual_noise(samples, *series).at(LEVELS), line(1.0, 0.05), rtol=0.1)
+    samples, *series = samples_of(1.0, 0.0)
     samples[:, mean > 150] *= 0.5
     samples[:, mean > 150] += 0.5 * mean[mean > 150]
-    assert residual_noise(samples, *known).slope == 0.0
+    assert residual_noise(samples, *series).slope == 0.0
 
 
 @pytest.mark.parametrize(
@@ -83,33 +83,33 @@ def test_a_bin_that_is_quite_wrong_does_not_bend_the_line_which_does_not_fall():
     ],
 )
 def test_clipped_and_missing_samples_and_frames_are_left_out(dtype, frames, pixels, values):
-    samples, *known = samples_of(1.0, 0.0, dtype=dtype)
+    samples, *series = samples_of(1.0, 0.0, dtype=dtype)
     samples[frames, pixels] = values
     expected = 1.0 if dtype == "float32" else np.sqrt(13 / 12)
-    np.testing.assert_allclose(residual_noise(samples, *known).at(LEVELS), expected, rtol=0.03)
+    np.testing.assert_allclose(residual_noise(samples, *series).at(LEVELS), expected, rtol=0.03)
 
 
 @pytest.mark.parametrize(("dtype", "floor"), [("uint8", 12**-0.5), ("uint16", 12**-0.5), ("float32", 77e-6)])
 def test_frames_that_are_all_the_same_have_the_least_noise(dtype, floor):
     for pixels in (1, 1000):
-        found = residual_noise(np.full((8, pixels), 77, dtype), np.array(EIGHTHS), np.ones(8))
-        np.testing.assert_allclose(found.at([0, 77, 1e5]), floor, rtol=1e-6)
-        assert found.slope == 0
+        noise = residual_noise(np.full((8, pixels), 77, dtype), np.array(EIGHTHS), np.ones(8))
+        np.testing.assert_allclose(noise.at([0, 77, 1e5]), floor, rtol=1e-6)
+        assert noise.slope == 0
 
 
 @pytest.mark.parametrize(
     "samples", [np.zeros((8, 5), np.uint8), np.full((8, 5), np.nan, np.float32), np.zeros((8, 0), np.uint16)]
 )
 def test_where_nothing_will_be_answered_any_noise_is_accepted(samples):
-    found = residual_noise(samples, np.array(EIGHTHS), np.ones(8))
-    assert found.slope == 0
-    assert 0 < found.at(100.0) < 0.3
+    noise = residual_noise(samples, np.array(EIGHTHS), np.ones(8))
+    assert noise.slope == 0
+    assert 0 < noise.at(100.0) < 0.3
 
 
 @pytest.mark.parametrize("pixels", [1, 300])
 def test_few_pixels_give_rough_estimates(pixels):
-    found = residual_noise(*samples_of(1.0, 0.0, phase=SIXTEEN, pixels=pixels))
-    assert 0.5 < found.at(100.0) < 1.6
+    noise = residual_noise(*samples_of(1.0, 0.0, phase=SIXTEEN, pixels=pixels))
+    assert 0.5 < noise.at(100.0) < 1.6
 
 
 def test_without_a_valid_pixel_or_a_residual_noise_is_not_made_up():

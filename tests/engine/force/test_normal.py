@@ -33,28 +33,28 @@ def distances(count=80):
 )
 def test_a_known_shape_presses_as_the_closed_forms_have_it(theory, profile):
     r = distances()
-    found = find_force(-profile(r), theory.depth, PIXEL, MODULUS)
-    assert found.force == pytest.approx(theory.force, rel=0.003)
-    assert found.pressure.sum() * PIXEL**2 == pytest.approx(found.force, rel=1e-5)
+    force = find_force(-profile(r), theory.depth, PIXEL, MODULUS)
+    assert force.force == pytest.approx(theory.force, rel=0.003)
+    assert force.pressure.sum() * PIXEL**2 == pytest.approx(force.force, rel=1e-5)
     inside = r < 0.9 * theory.radius
-    np.testing.assert_allclose(found.pressure[inside], theory.pressure(r[inside]), rtol=0.03)
-    assert not found.pressure[r > 1.1 * theory.radius].any()
+    np.testing.assert_allclose(force.pressure[inside], theory.pressure(r[inside]), rtol=0.03)
+    assert not force.pressure[r > 1.1 * theory.radius].any()
 
 
-def test_a_weak_stage_lowers_the_force_as_its_compliance_says():
+def test_the_compliance_of_the_stage_lowers_the_force():
     theory, r = paraboloid(3.0, 1.2, MODULUS), distances()
     given_way = 0.05 * theory.force / MODULUS
-    found = find_force(-(r**2) / 6, theory.depth + given_way, PIXEL, MODULUS, compliance=0.05)
-    assert found.force == pytest.approx(theory.force, rel=0.004)
+    force = find_force(-(r**2) / 6, theory.depth + given_way, PIXEL, MODULUS, compliance=0.05)
+    assert force.force == pytest.approx(theory.force, rel=0.004)
 
 
 def test_errors_of_travel_and_modulus_are_propagated():
     ball = -(distances() ** 2) / 6
     whole = [find_force(ball, 0.5 + step, PIXEL, MODULUS).force for step in (-0.002, 0.002)]
-    found = find_force(ball, 0.5, PIXEL, MODULUS, travel_sigma=0.002)
-    assert found.force_sigma == pytest.approx((whole[1] - whole[0]) / 2, rel=0.02)
-    found = find_force(ball, 0.5, PIXEL, MODULUS, modulus_sigma=0.1 * MODULUS)
-    assert found.force_sigma == pytest.approx(0.1 * found.force)
+    force = find_force(ball, 0.5, PIXEL, MODULUS, travel_sigma=0.002)
+    assert force.force_sigma == pytest.approx((whole[1] - whole[0]) / 2, rel=0.02)
+    force = find_force(ball, 0.5, PIXEL, MODULUS, modulus_sigma=0.1 * MODULUS)
+    assert force.force_sigma == pytest.approx(0.1 * force.force)
 
 
 def test_independent_errors_of_heights_give_the_scatter_that_is_expected():
@@ -73,8 +73,8 @@ def test_errors_of_heights_do_not_raise_the_force(noise):
     expected = find_force(ball, 0.4, PIXEL, MODULUS).force
     drawn = []
     for _ in range(12):
-        found = find_force(ball + generator.normal(0, noise, ball.shape), 0.4, PIXEL, MODULUS, sigma=noise)
-        drawn.append((found.force - expected) / found.force_sigma)
+        force = find_force(ball + generator.normal(0, noise, ball.shape), 0.4, PIXEL, MODULUS, sigma=noise)
+        drawn.append((force.force - expected) / force.force_sigma)
     assert np.mean(np.square(drawn)) < 2
 
 
@@ -114,30 +114,30 @@ def test_heights_come_from_wherever_they_are(kind, tmp_path):
         "upwards": dataset.isel(y=slice(None, None, -1)).transpose("x", "y"),
         "file": tmp_path / "worn.h5",
     }[kind]
-    found = find_force(maps, modulus=MODULUS)
-    assert found.force == pytest.approx(expected.force, rel=1e-9)
-    assert found.force_sigma == pytest.approx(expected.force_sigma, rel=1e-9)
-    np.testing.assert_allclose(found.pressure, expected.pressure, rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(found.x, x)
-    assert found.process == {"travel": 0.3, "modulus": MODULUS}
+    force = find_force(maps, modulus=MODULUS)
+    assert force.force == pytest.approx(expected.force, rel=1e-9)
+    assert force.force_sigma == pytest.approx(expected.force_sigma, rel=1e-9)
+    np.testing.assert_allclose(force.pressure, expected.pressure, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(force.x, x)
+    assert force.process == {"travel": 0.3, "modulus": MODULUS}
 
 
 def test_a_result_brings_the_modulus_of_its_calibration():
     ball, x = -(distances(40) ** 2) / 6, PIXEL * (np.arange(40) - 19.5)
     stiffness = io.Stiffness(MODULUS, (0.0, 0.0, 0.0), np.diag([0.01**2, 0, 0, 0]), 0.0, GEL.threshold)
     result = io.Result(height=ball, x=x, y=-x, calibration=calibration(stiffness=stiffness))
-    found, expected = find_force(result, 0.3), find_force(ball, 0.3, PIXEL, MODULUS, modulus_sigma=0.01)
-    assert found.force == pytest.approx(expected.force)
-    assert found.force_sigma == pytest.approx(expected.force_sigma)
+    force, expected = find_force(result, 0.3), find_force(ball, 0.3, PIXEL, MODULUS, modulus_sigma=0.01)
+    assert force.force == pytest.approx(expected.force)
+    assert force.force_sigma == pytest.approx(expected.force_sigma)
 
 
 def test_what_is_lifted_presses_with_nothing():
-    found = find_force(-(distances() ** 2) / 6, -0.1, PIXEL, MODULUS, travel_sigma=0.01)
-    assert (found.force, found.force_sigma, bool(found.contact.any())) == (0.0, 0.0, False)
+    force = find_force(-(distances() ** 2) / 6, -0.1, PIXEL, MODULUS, travel_sigma=0.01)
+    assert (force.force, force.force_sigma, bool(force.contact.any())) == (0.0, 0.0, False)
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"modulus": None}, "modulus is missing"),
         ({"travel": None}, "travel is missing"),
@@ -152,10 +152,10 @@ def test_what_is_lifted_presses_with_nothing():
         ({"sigma": np.zeros((2, 2))}, "sigma has shape"),
     ],
 )
-def test_impossible_input_is_one_line(changes, said):
-    known = {"height": np.zeros((4, 4)), "travel": 0.1, "pixel_size": 0.1, "modulus": 0.1}
-    with pytest.raises(io.InputError, match=said):
-        find_force(**known | changes)
+def test_impossible_input_is_one_line(changes, message):
+    options = {"height": np.zeros((4, 4)), "travel": 0.1, "pixel_size": 0.1, "modulus": 0.1}
+    with pytest.raises(io.InputError, match=message):
+        find_force(**options | changes)
 
 
 @pytest.fixture(scope="module")
@@ -191,17 +191,17 @@ def test_a_press_has_the_twin_s_force(ball):
 def test_the_calibration_s_modulus_and_scatter_are_used(ball):
     twin, _ = ball
     covariance = np.diag([(0.12 * 2 * MODULUS) ** 2, 0, 0, 0])
-    known = io.Stiffness(2 * MODULUS, (0.0, 0.0, 0.0), covariance, 0.05, GEL.threshold)
-    result = engine.reconstruct(twin, calibration(stiffness=known), fill=False)
-    given = engine.reconstruct(twin, calibration(), modulus=MODULUS, fill=False)
-    assert result.force == pytest.approx(2 * given.force)
+    stiffness = io.Stiffness(2 * MODULUS, (0.0, 0.0, 0.0), covariance, 0.05, GEL.threshold)
+    result = engine.reconstruct(twin, calibration(stiffness=stiffness), fill=False)
+    with_modulus = engine.reconstruct(twin, calibration(), modulus=MODULUS, fill=False)
+    assert result.force == pytest.approx(2 * with_modulus.force)
     assert result.force_sigma == pytest.approx(0.13 * result.force, rel=0.01)
     shifted = engine.reconstruct(
-        twin, calibration(stiffness=replace(known, gel_shift=(1.0, 0, 0))), fill=False
+        twin, calibration(stiffness=replace(stiffness, gel_shift=(1.0, 0, 0))), fill=False
     )
     assert 0.001 < abs(shifted.force / result.force - 1) < 0.05
     assert shifted.pressure.sum() / result.pressure.sum() == pytest.approx(shifted.force / result.force)
-    other = replace(known, gel_threshold=0.1)
+    other = replace(stiffness, gel_threshold=0.1)
     lacking = engine.reconstruct(twin, calibration(stiffness=other), fill=False)
     assert lacking.force is None
     assert "calibrate force again" in lacking.process["force"]
@@ -228,8 +228,8 @@ def test_a_load_beyond_the_picture_is_not_a_force():
         camera=Camera(noise=1.0, seed=3),
         optics="cylinder",
     )
-    known = replace(calibration(), camera=io.CameraId("", (64, 40), np.dtype(np.uint8)))
-    result = engine.reconstruct(twin, known, modulus=MODULUS, fill=False)
+    smaller = replace(calibration(), camera=io.CameraId("", (64, 40), np.dtype(np.uint8)))
+    result = engine.reconstruct(twin, smaller, modulus=MODULUS, fill=False)
     assert result.force is None
     assert "none: " in result.process["force"]
 
@@ -237,9 +237,9 @@ def test_a_load_beyond_the_picture_is_not_a_force():
 def test_a_force_comes_back_from_a_file(tmp_path):
     result = io.Result(pressure=np.ones((2, 3), np.float32), force=0.5, force_sigma=0.01)
     io.save_result(result, tmp_path / "a.h5")
-    found = io.open_result(tmp_path / "a.h5")
-    assert (found.force, found.force_sigma) == (0.5, 0.01)
-    np.testing.assert_array_equal(found.pressure, 1)
-    assert "force                         0.5 N" in repr(found)
-    assert float(found.to_xarray().force) == 0.5
-    assert found.to_xarray().force_sigma.units == "N"
+    reopened = io.open_result(tmp_path / "a.h5")
+    assert (reopened.force, reopened.force_sigma) == (0.5, 0.01)
+    np.testing.assert_array_equal(reopened.pressure, 1)
+    assert "force                         0.5 N" in repr(reopened)
+    assert float(reopened.to_xarray().force) == 0.5
+    assert reopened.to_xarray().force_sigma.units == "N"

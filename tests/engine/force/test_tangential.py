@@ -30,27 +30,27 @@ def half_ellipsoid(radius, peak, *grid):
     return inside, traction, moved
 
 
-def force_of(found):
-    return np.array([found.force_x, found.force_y])
+def force_of(force):
+    return np.array([force.force_x, force.force_y])
 
 
 def test_a_disc_that_sticks_is_mindlin_s():
     x, y = places()
     disc = np.hypot(x, y) <= 1
     moved = np.broadcast_to([0.1, -0.05], (61, 61, 2))
-    found = find_tangential_force(moved, PIXEL, MODULUS, contact=disc)
-    np.testing.assert_allclose(force_of(found), 16 / 3 * SHEAR * np.array([0.1, -0.05]), rtol=0.01)
-    assert not found.traction[~disc].any()
+    force = find_tangential_force(moved, PIXEL, MODULUS, contact=disc)
+    np.testing.assert_allclose(force_of(force), 16 / 3 * SHEAR * np.array([0.1, -0.05]), rtol=0.01)
+    assert not force.traction[~disc].any()
 
 
 def test_a_traction_is_found_from_its_displacement_alone():
     inside, traction, moved = half_ellipsoid(1.0, 0.02)
-    found = find_tangential_force(moved, PIXEL, MODULUS, contact=inside)
-    np.testing.assert_allclose(force_of(found), [2 / 3 * np.pi * 0.02, 0], atol=1e-4)
-    assert np.abs(found.traction[..., 0] - traction)[inside].mean() < 0.01 * 0.02
+    force = find_tangential_force(moved, PIXEL, MODULUS, contact=inside)
+    np.testing.assert_allclose(force_of(force), [2 / 3 * np.pi * 0.02, 0], atol=1e-4)
+    assert np.abs(force.traction[..., 0] - traction)[inside].mean() < 0.01 * 0.02
     turned = np.stack([-moved[..., 1].T, moved[..., 0].T], axis=-1)[::-1, ::-1]
     up = find_tangential_force(turned, PIXEL, MODULUS, contact=inside)
-    np.testing.assert_allclose(force_of(up), force_of(found)[::-1], atol=1e-4)
+    np.testing.assert_allclose(force_of(up), force_of(force)[::-1], atol=1e-4)
 
 
 def test_partial_slip_is_cattaneo_s():
@@ -84,10 +84,10 @@ def test_partial_slip_is_cattaneo_s():
             for i in range(count)
         ]
     )
-    found = find_tangential_force(moved, size, MODULUS, contact=r <= 1.0)
+    force = find_tangential_force(moved, size, MODULUS, contact=r <= 1.0)
     # So coarse a grid misses 4 % of the traction itself.
     assert traction.sum() * size**2 == pytest.approx(case.force, rel=0.05)
-    np.testing.assert_allclose(force_of(found), [traction.sum() * size**2, 0], atol=0.01 * case.force)
+    np.testing.assert_allclose(force_of(force), [traction.sum() * size**2, 0], atol=0.01 * case.force)
 
 
 def test_the_error_of_the_force_is_true_for_windows_too():
@@ -100,20 +100,20 @@ def test_the_error_of_the_force_is_true_for_windows_too():
         for _ in range(20):
             noise = generator.normal(0, 0.001 * window, moved.shape)
             noise = ndimage.uniform_filter(noise, (window, window, 0))
-            found = find_tangential_force(
+            force = find_tangential_force(
                 moved + noise, 0.08, MODULUS, contact=inside, sigma=0.001, window_size=window
             )
-            drawn.append(force_of(found))
+            drawn.append(force_of(force))
         assert np.std(drawn, axis=0).mean() == pytest.approx(
-            np.mean([found.force_x_sigma, found.force_y_sigma]), rel=0.25
+            np.mean([force.force_x_sigma, force.force_y_sigma]), rel=0.25
         )
-    assert np.sqrt(np.mean((found.traction[..., 0] - traction)[inside] ** 2)) < 0.15 * 0.02
+    assert np.sqrt(np.mean((force.traction[..., 0] - traction)[inside] ** 2)) < 0.15 * 0.02
 
 
 def test_the_modulus_s_error_counts():
     inside, _, moved = half_ellipsoid(1.0, 0.02)
-    found = find_tangential_force(moved, PIXEL, MODULUS, contact=inside, modulus_sigma=0.05 * MODULUS)
-    assert found.force_x_sigma == pytest.approx(0.05 * found.force_x)
+    force = find_tangential_force(moved, PIXEL, MODULUS, contact=inside, modulus_sigma=0.05 * MODULUS)
+    assert force.force_x_sigma == pytest.approx(0.05 * force.force_x)
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.8])
@@ -133,9 +133,9 @@ def test_the_twin_s_skin_is_pushed_with_the_twin_s_force(friction):
     generator = np.random.default_rng(0)
     for number in (2, 5):
         moved = truth.displacement[number] + generator.normal(0, 5e-4, (64, 64, 2))
-        found = find_tangential_force(moved, 0.09, 0.12, normal_pressure=pressed.pressure, sigma=5e-4)
+        force = find_tangential_force(moved, 0.09, 0.12, normal_pressure=pressed.pressure, sigma=5e-4)
         expected = truth.force[number, :2]
-        assert np.hypot(*(force_of(found) - expected)) < 0.03 * np.hypot(*expected)
+        assert np.hypot(*(force_of(force) - expected)) < 0.03 * np.hypot(*expected)
 
 
 def test_frames_of_a_texture_give_the_force_to_three_percent():
@@ -157,7 +157,7 @@ def test_frames_of_a_texture_give_the_force_to_three_percent():
     moved = find_displacement(frames[0], frames, 0.05, window_size=8, window_step=2)
     pressed = find_force(twin.truth.height, 0.7, 0.05, 0.12)
     for number in (3, 6):
-        found = find_tangential_force(
+        force = find_tangential_force(
             moved.displacement[number],
             0.05,
             0.12,
@@ -166,11 +166,11 @@ def test_frames_of_a_texture_give_the_force_to_three_percent():
             window_size=8,
         )
         expected = twin.truth.force[number, :2]
-        assert np.hypot(*(force_of(found) - expected)) < 0.03 * np.hypot(*expected)
+        assert np.hypot(*(force_of(force) - expected)) < 0.03 * np.hypot(*expected)
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"displacement": np.zeros((9, 9))}, "one map"),
         ({"modulus": None}, "modulus is missing"),
@@ -186,28 +186,28 @@ def test_frames_of_a_texture_give_the_force_to_three_percent():
         ({"displacement": np.full((9, 9, 2), np.nan)}, "0% of the contact has a displacement"),
     ],
 )
-def test_impossible_input_is_one_line(changes, said):
-    known = {"displacement": np.zeros((9, 9, 2)), "modulus": 0.1, "contact": np.ones((9, 9))}
-    with pytest.raises(io.InputError, match=said):
-        find_tangential_force(pixel_size=0.1, **known | changes)
+def test_impossible_input_is_one_line(changes, message):
+    options = {"displacement": np.zeros((9, 9, 2)), "modulus": 0.1, "contact": np.ones((9, 9))}
+    with pytest.raises(io.InputError, match=message):
+        find_tangential_force(pixel_size=0.1, **options | changes)
 
 
 def test_a_few_gaps_are_bridged():
     inside, _, moved = half_ellipsoid(1.0, 0.02)
     moved[28:31, 28:31] = np.nan
-    found = find_tangential_force(moved, PIXEL, MODULUS, contact=inside)
-    assert found.force_x == pytest.approx(2 / 3 * np.pi * 0.02, rel=0.01)
+    force = find_tangential_force(moved, PIXEL, MODULUS, contact=inside)
+    assert force.force_x == pytest.approx(2 / 3 * np.pi * 0.02, rel=0.01)
 
 
 def test_displacements_of_a_result_bring_their_errors_contact_and_pixels():
     inside, _, moved = half_ellipsoid(1.0, 0.02)
-    x, y = (np.ravel(one) for one in places())
+    x, y = (np.ravel(axis) for axis in places())
     sigma = np.full(moved.shape, 5e-4)
     expected = find_tangential_force(moved, PIXEL, MODULUS, contact=inside, sigma=sigma)
     result = io.Result(displacement=moved, displacement_sigma=sigma[..., 0], pressure=1.0 * inside, x=x, y=y)
     several = result.assign(displacement=np.stack([0 * moved, moved]))
     for maps in (result, several, result.to_xarray(), dict(result) | {"x": x, "y": y}):
-        found = find_tangential_force(maps, modulus=MODULUS)
-        np.testing.assert_allclose(force_of(found), force_of(expected), rtol=1e-9)
-        assert found.force_x_sigma == pytest.approx(expected.force_x_sigma)
-        np.testing.assert_allclose(found.traction, expected.traction, atol=1e-9)
+        force = find_tangential_force(maps, modulus=MODULUS)
+        np.testing.assert_allclose(force_of(force), force_of(expected), rtol=1e-9)
+        assert force.force_x_sigma == pytest.approx(expected.force_x_sigma)
+        np.testing.assert_allclose(force.traction, expected.traction, atol=1e-9)

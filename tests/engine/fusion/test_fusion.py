@@ -55,11 +55,11 @@ def ball(size, pixel):
 def by_equation_10(size, pixel, seed=1, setup=Setup(), steepest=55.0):  # noqa: B008 - frozen
     """Return normals of a ball whose frames follow eq. 10: the pivot shifts nothing."""
     x, y, _, zenith = ball(size, pixel)
-    seen = zenith <= steepest
-    true = rotations.direction(np.radians(np.where(seen, zenith, 0)), np.arctan2(y, x))
-    known = {"tilt": setup.tilt, "zenith_gain": setup.slope, "zenith_offset": setup.offset}
-    normals = engine.estimate_normals(rotations.expose(true, setup, seed), setup.phase, **known)
-    return normals.assign(contact=(seen & (normals.contact > 0)).astype(np.uint8))
+    touched = zenith <= steepest
+    true = rotations.direction(np.radians(np.where(touched, zenith, 0)), np.arctan2(y, x))
+    options = {"tilt": setup.tilt, "zenith_gain": setup.slope, "zenith_offset": setup.offset}
+    normals = engine.estimate_normals(rotations.expose(true, setup, seed), setup.phase, **options)
+    return normals.assign(contact=(touched & (normals.contact > 0)).astype(np.uint8))
 
 
 @cache
@@ -198,10 +198,10 @@ def test_components_without_a_height_are_marked():
 
 def test_a_single_pixel_without_a_normal_follows_those_around():
     true, normals = plane()
-    contact, known = np.ones(SHAPE), true.copy()
+    contact, coarse = np.ones(SHAPE), true.copy()
     contact[5, 6] = 0
-    known[5, 6] += 0.03
-    surface = engine.fuse(heights(known, 0.02), directions(normals, contact), 0.1)
+    coarse[5, 6] += 0.03
+    surface = engine.fuse(heights(coarse, 0.02), directions(normals, contact), 0.1)
     assert surface.height[5, 6] == pytest.approx(true[5, 6], abs=0.004)
 
 
@@ -226,8 +226,8 @@ def test_terraces_contain_more_information_than_their_standard_deviations():
     terraces = (np.floor(true / step) + 0.5) * step
     sigma = step / np.sqrt(12)
     some = (true > -1.02) & (true < -0.96)  # of two of them
-    known = heights(np.where(some, terraces, NAN), sigma)
-    surface = engine.fuse(known, directions(normals, sigma=1e-3), 0.1)
+    coarse = heights(np.where(some, terraces, NAN), sigma)
+    surface = engine.fuse(coarse, directions(normals, sigma=1e-3), 0.1)
     error = surface.height - true
     bias = np.mean((terraces - true)[some])
     assert abs(bias) > 0.004
@@ -238,10 +238,10 @@ def test_terraces_contain_more_information_than_their_standard_deviations():
 def test_gross_mistakes_of_the_press_are_left_out():
     true, normals = plane(shape=(40, 40))
     rng = np.random.default_rng(1)
-    known = true + rng.uniform(-0.05, 0.05, true.shape)
+    coarse = true + rng.uniform(-0.05, 0.05, true.shape)
     mistaken = rng.choice(true.size, 20, replace=False)
-    known.flat[mistaken] -= 2.5
-    surface = engine.fuse(heights(known, 0.05 / np.sqrt(3)), directions(normals, sigma=1e-3), 0.1)
+    coarse.flat[mistaken] -= 2.5
+    surface = engine.fuse(heights(coarse, 0.05 / np.sqrt(3)), directions(normals, sigma=1e-3), 0.1)
     assert rms(surface.height - true) < 0.002
 
 
@@ -252,21 +252,21 @@ def terraced(step=0.1):
     return true, normals, terraces, np.full(true.shape, step / np.sqrt(12), np.float32)
 
 
-def test_heights_next_to_the_normals_do_not_say_where_the_surface_is():
+def test_heights_of_the_result_with_the_normals_do_not_place_the_surface():
     true, normals, terraces, sigma = terraced()
     contact = np.ones(true.shape)
     contact[:, 54:] = 0
     terraces[:, 54:] -= 0.06  # what is seen at a rim is seen late
-    known = io.Result(height=terraces, height_sigma=sigma)
-    surface = engine.fuse(known, directions(normals, contact, 1e-3), 0.1)
+    coarse = io.Result(height=terraces, height_sigma=sigma)
+    surface = engine.fuse(coarse, directions(normals, contact, 1e-3), 0.1)
     assert abs(np.mean((surface.height - true)[:, :54])) < 0.001
 
 
 def test_heights_that_fit_no_surface_count_as_little_as_they_deserve():
     true, normals = plane(shape=(40, 40))
     rng = np.random.default_rng(2)
-    known = true + rng.normal(0, 0.2, true.shape)
-    surface = engine.fuse(heights(known, 0.01), directions(normals, sigma=1e-3), 0.1)
+    coarse = true + rng.normal(0, 0.2, true.shape)
+    surface = engine.fuse(heights(coarse, 0.01), directions(normals, sigma=1e-3), 0.1)
     error = surface.height - true
     assert rms(error) < 0.02
     assert 0.2 < rms(error / surface.height_sigma) < 3
@@ -323,14 +323,16 @@ def test_heights_and_normals_may_come_from_anywhere():
     assert set(surface) == {"height", "height_sigma", "filled", "component", "offset_unknown"}
     np.testing.assert_array_equal(surface.x, io.pixel_axes(true.shape, (0.1, 0.1))[0])
     # A user's own height, an xarray dataset, and plain mappings are used in the same way.
-    own = {"depth": io.Map("depth of focus", "mm", quantity="height")}
-    depth = io.Result({name.replace("height", "depth"): heights[name] for name in heights}, declarations=own)
-    for one, other in (
+    declarations = {"depth": io.Map("depth of focus", "mm", quantity="height")}
+    depth = io.Result(
+        {name.replace("height", "depth"): heights[name] for name in heights}, declarations=declarations
+    )
+    for source, other in (
         (depth, normals),
         (io.Result.from_xarray(depth.to_xarray()), io.Result.from_xarray(normals.to_xarray())),
         (dict(heights), dict(normals)),
     ):
-        np.testing.assert_array_equal(engine.fuse(one, other, 0.1).height, surface.height)
+        np.testing.assert_array_equal(engine.fuse(source, other, 0.1).height, surface.height)
 
 
 def test_heights_without_a_known_offset_are_not_used():
@@ -370,14 +372,14 @@ BAD = {
 def test_heights_and_normals_may_be_datasets_or_files(tmp_path, kind):
     size = io.pixel_axes(SHAPE, (0.1, 0.1))
     true, slopes = plane()
-    given = [heights(true).assign(x=size[0], y=size[1]), directions(slopes)]
-    expected = engine.fuse(*given, 0.1)
+    sources = [heights(true).assign(x=size[0], y=size[1]), directions(slopes)]
+    expected = engine.fuse(*sources, 0.1)
     if kind == "dataset":
-        others = [one.to_xarray() for one in given]
+        others = [source.to_xarray() for source in sources]
     else:
         others = [tmp_path / "heights.h5", tmp_path / "normals.h5"]
-        for one, path in zip(given, others, strict=True):
-            io.save_result(one, path)
+        for source, path in zip(sources, others, strict=True):
+            io.save_result(source, path)
     np.testing.assert_array_equal(engine.fuse(*others).height, expected.height)
 
 
@@ -394,8 +396,8 @@ def test_heights_that_light_of_neighbours_moved_within_their_steps_do_not_shift_
     border[:, 1:] = np.diff(terraces, axis=1) > 0.05
     moved = terraces - 0.025 * border * np.random.default_rng(1).uniform(0.2, 1, true.shape)
     surfaces = [
-        engine.fuse(io.Result(height=one, height_sigma=sigma), directions(normals, sigma=1e-3), 0.1)
-        for one in (terraces, moved)
+        engine.fuse(io.Result(height=values, height_sigma=sigma), directions(normals, sigma=1e-3), 0.1)
+        for values in (terraces, moved)
     ]
     assert border.mean() > 0.2
     np.testing.assert_allclose(surfaces[1].height, surfaces[0].height, atol=1e-6)
@@ -404,9 +406,13 @@ def test_heights_that_light_of_neighbours_moved_within_their_steps_do_not_shift_
 @pytest.mark.parametrize("case", BAD)
 def test_what_cannot_be_fused_is_refused_in_one_line(case):
     changes, line = BAD[case]
-    given = {"heights": heights(plane()[0]), "normals": directions(plane()[1]), "pixel_size": 0.1} | changes
+    arguments = {
+        "heights": heights(plane()[0]),
+        "normals": directions(plane()[1]),
+        "pixel_size": 0.1,
+    } | changes
     with pytest.raises(io.InputError, match=line) as caught:
-        engine.fuse(**given)
+        engine.fuse(**arguments)
     assert "\n" not in str(caught.value)
 
 
@@ -439,17 +445,17 @@ def test_a_result_of_both_has_the_maps_of_both():
     assert np.degrees(np.median(away)) < 0.05
 
 
-def test_a_result_of_both_says_how_it_came_about():
-    told = fused().process
-    assert told["method"] == "fusion"
-    assert told["source"] == "twin: sphere, twin: sphere"
-    assert (told["vertical_source"], told["axial_source"]) == ("twin: sphere", "twin: sphere")
-    assert (told["vertical_threshold"], told["axial_tilt"]) == (0.5, TILT)
-    assert told["heights"] == "fused"
-    assert 1 <= told["registrations"] <= 3
-    assert told["last_move_in_pixels"] < 0.02
-    assert told["integration_residual"] < 1e-3
-    assert {"program", "version", "date", "device", "driver"} <= set(told)
+def test_a_result_of_both_stores_its_provenance():
+    process = fused().process
+    assert process["method"] == "fusion"
+    assert process["source"] == "twin: sphere, twin: sphere"
+    assert (process["vertical_source"], process["axial_source"]) == ("twin: sphere", "twin: sphere")
+    assert (process["vertical_threshold"], process["axial_tilt"]) == (0.5, TILT)
+    assert process["heights"] == "fused"
+    assert 1 <= process["registrations"] <= 3
+    assert process["last_move_in_pixels"] < 0.02
+    assert process["integration_residual"] < 1e-3
+    assert {"program", "version", "date", "device", "driver"} <= set(process)
 
 
 def test_recordings_are_named_by_their_hashes(tmp_path):
@@ -466,23 +472,25 @@ def test_recordings_are_named_by_their_hashes(tmp_path):
     ) == hashes
     np.testing.assert_array_equal(result.height, fused().height)
     io.save_result(result, tmp_path / "both.h5")
-    found = io.open_result(tmp_path / "both.h5")
-    np.testing.assert_array_equal(found.offset_unknown, result.offset_unknown)
-    assert found.process == result.process
+    reopened = io.open_result(tmp_path / "both.h5")
+    np.testing.assert_array_equal(reopened.offset_unknown, result.offset_unknown)
+    assert reopened.process == result.process
 
 
 def test_options_reach_the_press_and_the_rotation():
     options = {"threshold": 0.6, "subframe": False}, {"method": "paper", "noise": 1.5}
-    told = fused_anew(press=options[0], rotation=options[1]).process
-    assert (told["vertical_threshold"], told["vertical_subframe"]) == (0.6, False)
-    assert (told["axial_method"], told["axial_noise"]) == ("paper", 1.5)
+    process = fused_anew(press=options[0], rotation=options[1]).process
+    assert (process["vertical_threshold"], process["vertical_subframe"]) == (0.6, False)
+    assert (process["axial_method"], process["axial_noise"]) == ("paper", 1.5)
 
 
 def test_options_may_be_those_of_methods():
     methods = engine.Press(threshold=0.6, subframe=False), engine.Rotation(method="paper", noise=1.5)
-    found = fused_anew(press=methods[0], rotation=methods[1])
+    fused_surface = fused_anew(press=methods[0], rotation=methods[1])
     options = {"threshold": 0.6, "subframe": False}, {"method": "paper", "noise": 1.5}
-    np.testing.assert_array_equal(found.height, fused_anew(press=options[0], rotation=options[1]).height)
+    np.testing.assert_array_equal(
+        fused_surface.height, fused_anew(press=options[0], rotation=options[1]).height
+    )
     with pytest.raises(io.InputError, match="registered with the heights of the press: give no others"):
         fused_anew(rotation={"heights": np.zeros(SMALL)})
 
@@ -500,12 +508,12 @@ def test_frames_may_stay_as_they_were_seen():
 
 
 def test_progress_goes_to_the_last_frame():
-    for register, most in ((True, 30 + 3 * 8), (False, 30 + 8)):
-        done = []
+    for register, frame_count in ((True, 30 + 3 * 8), (False, 30 + 8)):
+        counts = []
         down, turn = press(SMALL, PIXEL), rotation(SMALL, PIXEL)
-        engine.fuse(down, turn, register=register, progress=done.append)
-        assert done == sorted(done)
-        assert done[-1] == frames_to_read(down, turn, register) == most
+        engine.fuse(down, turn, register=register, progress=counts.append)
+        assert counts == sorted(counts)
+        assert counts[-1] == frames_to_read(down, turn, register) == frame_count
 
 
 def test_what_cannot_be_read_twice_is_registered_once():
@@ -554,7 +562,7 @@ UNFIT = {
 
 
 @pytest.mark.parametrize(
-    ("given", "line"),
+    ("options", "line"),
     [
         ((DOWN, ROUND, 0.1), "pixel_size is for results, but recordings are fused. Remove it"),
         (
@@ -564,9 +572,9 @@ UNFIT = {
     ],
     ids=["pixel size", "press"],
 )
-def test_options_of_the_other_kind_are_refused_in_one_line(given, line):
+def test_options_of_the_other_kind_are_refused_in_one_line(options, line):
     with pytest.raises(io.InputError, match=line):
-        engine.fuse(*given, press={})
+        engine.fuse(*options, press={})
 
 
 @pytest.mark.parametrize("case", UNFIT)
@@ -682,16 +690,16 @@ def turned_waves(seed, gain=1.0, offset=0.0, light=lambda counts: counts):
 
 def chi_square(result):
     error = result.height - waves()[0]
-    known = np.isfinite(result.height_sigma) & (result.contact > 0)
-    return float(np.mean((error / result.height_sigma)[known] ** 2))
+    valid = np.isfinite(result.height_sigma) & (result.contact > 0)
+    return float(np.mean((error / result.height_sigma)[valid] ** 2))
 
 
 def test_a_surface_of_results_is_that_of_recordings_that_are_not_registered():
     """Heights only, except for rounding: the sigma of results includes what points may have moved."""
     pressed = engine.reconstruct(pressed_waves(1), fill=False, blur=0)  # as a fusion does it
-    found = engine.fuse(pressed, engine.reconstruct(turned_waves(2)))
+    fused_surface = engine.fuse(pressed, engine.reconstruct(turned_waves(2)))
     expected = engine.fuse(pressed_waves(1), turned_waves(2), register=False)
-    np.testing.assert_allclose(found.height, expected.height, atol=1e-6)
+    np.testing.assert_allclose(fused_surface.height, expected.height, atol=1e-6)
 
 
 def test_light_of_neighbours_does_not_shift_the_fused_surface():

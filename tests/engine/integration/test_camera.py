@@ -20,25 +20,25 @@ def rays(shape=SHAPE, focal=FOCAL, point=POINT):
 
 def plane(normal, distance, **camera):
     """Return depth and normals, of any length, of a plane."""
-    seen = rays(**camera)
-    return -distance / (seen @ np.array(normal)), np.broadcast_to(normal, seen.shape)
+    sight = rays(**camera)
+    return -distance / (sight @ np.array(normal)), np.broadcast_to(normal, sight.shape)
 
 
 def sphere(centre, radius, scale=1):
     """Return depth, normals and where they are of a sphere, of a camera with that many times the pixels."""
     focal, point = np.multiply(FOCAL, scale), scale * (np.array(POINT) + 0.5) - 0.5
-    seen = rays((SHAPE[0] * scale, SHAPE[1] * scale), focal, point)
-    along, square = seen @ np.array(centre), np.sum(seen**2, axis=-1)
+    sight = rays((SHAPE[0] * scale, SHAPE[1] * scale), focal, point)
+    along, square = sight @ np.array(centre), np.sum(sight**2, axis=-1)
     root = along**2 - square * (np.dot(centre, centre) - radius**2)
     depth = (along - np.sqrt(np.where(root > 0, root, np.nan))) / square
-    normals = (seen * depth[..., np.newaxis] - centre) / radius
-    slant = -np.sum(normals * seen, axis=-1) / np.sqrt(square)
+    normals = (sight * depth[..., np.newaxis] - centre) / radius
+    slant = -np.sum(normals * sight, axis=-1) / np.sqrt(square)
     return depth, normals, slant > 0.3, engine.integration.Camera(tuple(focal), tuple(point))
 
 
-def apart(found, depth, mask):
+def apart(surface, depth, mask):
     """Return the largest error of the depth as a share of it, where the scale is free."""
-    error = np.log(found / depth)[mask]
+    error = np.log(surface / depth)[mask]
     return np.abs(error - error.mean()).max()
 
 
@@ -47,18 +47,18 @@ def test_planes_are_exact_at_oblique_rays(device, normal):
     shape, focal = (244, 384), (200.0, 160.0)
     depth, normals = plane(normal, 300.0, shape=shape, focal=focal, point=(204.0, 110.0))
     camera = engine.integration.Camera(focal, (204.0, 110.0))
-    found = engine.integrate(normals=normals, camera=camera, device=device)
-    assert apart(found.height, depth, np.ones(shape, bool)) < 2e-6
-    assert np.mean(np.log(found.height)) == pytest.approx(0, abs=1e-6)
-    assert found.offset_unknown.tolist() == [1]
+    surface = engine.integrate(normals=normals, camera=camera, device=device)
+    assert apart(surface.height, depth, np.ones(shape, bool)) < 2e-6
+    assert np.mean(np.log(surface.height)) == pytest.approx(0, abs=1e-6)
+    assert surface.offset_unknown.tolist() == [1]
 
 
 def test_a_sphere_seen_from_near_converges_with_the_second_order():
     errors = []
     for scale in (1, 2, 4):
         depth, normals, mask, camera = sphere((6.0, -3.0, -55.0), 25.0, scale)
-        found = engine.integrate(normals=normals, camera=camera, mask=mask, sigma=False)
-        errors.append(apart(found.height, depth, mask))
+        surface = engine.integrate(normals=normals, camera=camera, mask=mask, sigma=False)
+        errors.append(apart(surface.height, depth, mask))
     assert errors[0] < 2e-3
     assert (np.divide(errors[:-1], errors[1:]) > 4).all(), errors
 
@@ -69,24 +69,24 @@ def test_known_depths_determine_the_scale_of_the_surface(device, robust):
     upper, middle = mask.copy(), mask.shape[0] // 2
     upper[middle:] = False
     mask[middle : middle + 2] = False
-    known = np.where(upper, depth, np.nan)
+    heights = np.where(upper, depth, np.nan)
     asked = {"normals": normals, "camera": camera, "mask": mask, "device": device, "robust": robust}
-    found = engine.integrate(**asked, known_heights=known, known_height_weights=np.where(upper, 9.0, 0.0))
-    np.testing.assert_allclose(found.height[upper], depth[upper], rtol=2e-4)
-    assert found.offset_unknown.tolist() == [0, 1]
+    surface = engine.integrate(**asked, known_heights=heights, known_height_weights=np.where(upper, 9.0, 0.0))
+    np.testing.assert_allclose(surface.height[upper], depth[upper], rtol=2e-4)
+    assert surface.offset_unknown.tolist() == [0, 1]
     lower = mask & ~upper
-    assert apart(found.height, depth, lower) < 1e-3
-    assert np.mean(np.log(found.height[lower])) == pytest.approx(0, abs=1e-5)
+    assert apart(surface.height, depth, lower) < 1e-3
+    assert np.mean(np.log(surface.height[lower])) == pytest.approx(0, abs=1e-5)
 
 
 def test_sigma_is_that_of_the_depth(device):
     depth, normals, mask, camera = sphere((0.0, 0.0, -40.0), 15.0)
-    known = np.where(mask, depth, np.nan)
-    noisy = [np.random.default_rng(seed).normal(known, 0.5) for seed in range(30)]
+    heights = np.where(mask, depth, np.nan)
+    noisy = [np.random.default_rng(seed).normal(heights, 0.5) for seed in range(30)]
     asked = {"normals": normals, "camera": camera, "mask": mask, "device": device, "slope_weights": 1e6}
-    found = [engine.integrate(**asked, known_heights=one, known_height_weights=4.0) for one in noisy]
-    spread = np.std([one.height[mask] for one in found], axis=0)
-    np.testing.assert_allclose(np.sqrt(np.mean(spread**2)), np.nanmean(found[0].height_sigma), rtol=0.3)
+    surfaces = [engine.integrate(**asked, known_heights=values, known_height_weights=4.0) for values in noisy]
+    spread = np.std([values.height[mask] for values in surfaces], axis=0)
+    np.testing.assert_allclose(np.sqrt(np.mean(spread**2)), np.nanmean(surfaces[0].height_sigma), rtol=0.3)
 
 
 @pytest.mark.filterwarnings("error")
@@ -97,13 +97,15 @@ def test_without_a_camera_lines_of_sight_are_parallel(device):
     normals[20, 20], normals[21, 20], normals[22, 20, 1] = 0, np.nan, np.inf  # there is none
     normals[23, 20] = 1, 0, 0.009  # is seen edge-on
     x[:9] = x[20:24, 20] = np.nan
-    found = engine.integrate(normals=normals, pixel_size=(0.3, 0.5), device=device)
+    surface = engine.integrate(normals=normals, pixel_size=(0.3, 0.5), device=device)
     weights = 1 / (1 + np.nan_to_num(x**2 + y**2))  # n_z^2: normals are as noisy, not slopes
     expected = engine.integrate(x, y, (0.3, 0.5), slope_weights=weights, device=device)
-    np.testing.assert_allclose(found.height, expected.height, atol=1e-5)
-    shares = found.height_sigma / expected.height_sigma
+    np.testing.assert_allclose(surface.height, expected.height, atol=1e-5)
+    shares = surface.height_sigma / expected.height_sigma
     np.testing.assert_allclose(shares[np.isfinite(x)], np.nanmedian(shares), rtol=1e-3)
-    assert found.process["integration_invalid"] == expected.process["integration_invalid"] == 9 * SHAPE[1] + 4
+    assert (
+        surface.process["integration_invalid"] == expected.process["integration_invalid"] == 9 * SHAPE[1] + 4
+    )
 
 
 NORMALS, FLAT = np.broadcast_to([0.0, 0, 1], (4, 5, 3)), np.zeros((4, 5))

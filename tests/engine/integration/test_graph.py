@@ -15,9 +15,9 @@ def walk(flags):
     for first in np.ndindex(flags.shape):
         if labels[first] >= 0 or not flags[first] & (SLOPE | KNOWN):
             continue
-        labels[first], found = count, [first]
-        while found:
-            y, x = found.pop()
+        labels[first], members = count, [first]
+        while members:
+            y, x = members.pop()
             near = []
             near += [(y, x + 1)] * bool(flags[y, x] & RIGHT) + [(y + 1, x)] * bool(flags[y, x] & DOWN)
             near += [(y, x - 1)] * bool(x and flags[y, x - 1] & RIGHT)
@@ -25,32 +25,34 @@ def walk(flags):
             for place in near:
                 if labels[place] < 0:
                     labels[place] = count
-                    found.append(place)
+                    members.append(place)
         count += 1
     return labels, count
 
 
-def picture(shape, seed, cut):
+def picture(shape, seed, with_cuts):
     """Flags of random pixels; all neighbours are linked, or most."""
     random = np.random.default_rng(seed)
     answered = random.random(shape) < 0.7
     flags = np.where(answered, SLOPE, LOST * (random.random(shape) < 0.5))
     flags |= KNOWN * (answered & (random.random(shape) < 0.02))
-    linked = [random.random(shape) < 0.8 if cut else np.ones(shape, bool) for _ in range(2)]
+    linked = [random.random(shape) < 0.8 if with_cuts else np.ones(shape, bool) for _ in range(2)]
     flags[:, :-1] |= RIGHT * (answered[:, :-1] & answered[:, 1:] & linked[0][:, :-1])
     flags[:-1] |= DOWN * (answered[:-1] & answered[1:] & linked[1][:-1])
     return flags.astype(np.uint8)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (17, 1), (40, 61)])
-@pytest.mark.parametrize("cut", [False, True], ids=["whole", "cut"])
-def test_components_are_what_links_hold_together(shape, cut):
+@pytest.mark.parametrize("with_cuts", [False, True], ids=["whole", "cut"])
+def test_components_are_what_links_hold_together(shape, with_cuts):
     for seed in range(3):
-        flags = picture(shape, seed, cut)
+        flags = picture(shape, seed, with_cuts)
         labels, count = walk(flags)
-        found = find_components(flags, cut)
-        np.testing.assert_array_equal(found.labels, labels)
-        assert found.labels.dtype == np.int32
-        known = {labels[place] for place in np.argwhere(flags & KNOWN).tolist() for place in [tuple(place)]}
-        assert [n in known for n in range(count)] == (~found.offset_unknown).tolist()
+        components = find_components(flags, with_cuts)
+        np.testing.assert_array_equal(components.labels, labels)
+        assert components.labels.dtype == np.int32
+        labels_with_height = {
+            labels[place] for place in np.argwhere(flags & KNOWN).tolist() for place in [tuple(place)]
+        }
+        assert [n in labels_with_height for n in range(count)] == (~components.offset_unknown).tolist()
         assert min(shape) == 1 or 10 < count < 400

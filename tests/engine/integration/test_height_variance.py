@@ -28,9 +28,9 @@ def exact_variance(problem):
     ).reshape(-1)
     moves = difference.T @ (graph.weight[:, None] * reading) / np.sqrt(np.where(weights > 0, weights, 1))
     moves = np.hstack([moves, np.diag(np.sqrt(graph.pull))])
-    found = np.sum(centred(graph, np.linalg.solve(matrix, moves)) ** 2, axis=1)
+    variance = np.sum(centred(graph, np.linalg.solve(matrix, moves)) ** 2, axis=1)
     picture = np.full(SHAPE, np.nan)
-    picture[graph.pixel >= 0] = found
+    picture[graph.pixel >= 0] = variance
     return picture
 
 
@@ -73,11 +73,11 @@ def test_sigma_is_that_of_the_noise(options, size, mean, doubtful):
 
 def test_noise_without_weights_is_estimated_from_the_misfit():
     slopes = np.random.default_rng(2).normal(0, 0.07, (2, *SHAPE))
-    given = engine.integrate(*slopes, 1.0, mask=DISTANCE < 15, slope_weights=1 / 0.07**2)
-    found = engine.integrate(*slopes, 1.0, mask=DISTANCE < 15)
-    np.testing.assert_array_equal(np.isnan(given.height_sigma), DISTANCE >= 15)
-    np.testing.assert_array_equal(np.isnan(found.height_sigma), DISTANCE >= 15)
-    ratio = found.height_sigma / given.height_sigma
+    stated = engine.integrate(*slopes, 1.0, mask=DISTANCE < 15, slope_weights=1 / 0.07**2)
+    estimated = engine.integrate(*slopes, 1.0, mask=DISTANCE < 15)
+    np.testing.assert_array_equal(np.isnan(stated.height_sigma), DISTANCE >= 15)
+    np.testing.assert_array_equal(np.isnan(estimated.height_sigma), DISTANCE >= 15)
+    ratio = estimated.height_sigma / stated.height_sigma
     assert np.nanmedian(ratio) == pytest.approx(1, abs=0.05)
     assert np.nanstd(ratio) < 1e-4
 

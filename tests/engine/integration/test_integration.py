@@ -38,9 +38,9 @@ BUMP, WAVES = surfaces.bump(9, 12, 3, -2), surfaces.cosines(17, 2.5)
 
 def problem(surface, noise=0.0, pixel_size=PIXEL, shape=SHAPE, **options):
     """Sample a surface, with noise of the slopes."""
-    seen = surfaces.sample(surface, shape, pixel_size)
+    sampled = surfaces.sample(surface, shape, pixel_size)
     added = np.random.default_rng([0, 11]).normal(0, noise, (2, *shape))
-    return Problem(seen.dz_dx + added[0], seen.dz_dy + added[1], pixel_size, **options)
+    return Problem(sampled.dz_dx + added[0], sampled.dz_dy + added[1], pixel_size, **options)
 
 
 def truth(surface, pixel_size=PIXEL, shape=SHAPE):
@@ -51,13 +51,13 @@ def integrated(asked, device=None, **more):
     return engine.integrate(*asked.arguments, **asked.options, **{"sigma": False, **more}, device=device)
 
 
-def worst(found, expected, mask):
+def worst(actual, expected, mask):
     """Return the largest error as a share of the range, each component about its own mean."""
-    assert np.array_equal(np.isfinite(found.height), mask)
-    assert np.array_equal(found.component >= 0, mask)
-    error = np.where(mask, found.height - expected, np.nan)
-    for label in range(len(found.offset_unknown)):
-        within = found.component == label
+    assert np.array_equal(np.isfinite(actual.height), mask)
+    assert np.array_equal(actual.component >= 0, mask)
+    error = np.where(mask, actual.height - expected, np.nan)
+    for label in range(len(actual.offset_unknown)):
+        within = actual.component == label
         error[within] -= error[within].mean()
     return np.abs(error[mask]).max() / np.ptp(expected[mask])
 
@@ -67,13 +67,13 @@ def _solved(pickled):
     return slope_oracle.solve(pickle.loads(pickled))
 
 
-def apart(found, asked):
+def apart(solved, asked):
     """Return how far heights are from the direct solution's, as a share of their range."""
     expected = _solved(pickle.dumps(asked))  # once for all devices
-    np.testing.assert_array_equal(found.component, expected.component)
-    np.testing.assert_array_equal(found.offset_unknown, expected.offset_unknown)
-    np.testing.assert_array_equal(np.isfinite(found.height), np.isfinite(expected.height))
-    return np.nanmax(np.abs(found.height - expected.height)) / np.ptp(
+    np.testing.assert_array_equal(solved.component, expected.component)
+    np.testing.assert_array_equal(solved.offset_unknown, expected.offset_unknown)
+    np.testing.assert_array_equal(np.isfinite(solved.height), np.isfinite(expected.height))
+    return np.nanmax(np.abs(solved.height - expected.height)) / np.ptp(
         expected.height[expected.component >= 0]
     )
 
@@ -85,19 +85,19 @@ def uneven(shape=SHAPE):
     return smooth * np.exp(np.random.default_rng([0, 12]).normal(0, 0.3, smooth.shape))
 
 
-def some(level=0.0, share=0.05):
+def some(level=0.0, density=0.05):
     """Return known heights of a few pixels."""
-    known = np.random.default_rng(7).random(SHAPE) < share
-    return np.where(known, level + truth(BUMP), np.nan)
+    selected = np.random.default_rng(7).random(SHAPE) < density
+    return np.where(selected, level + truth(BUMP), np.nan)
 
 
 @pytest.mark.parametrize("mask", MASKS)
 def test_planes_and_quadratics_are_exact_on_any_mask(device, mask):
     for surface in (STEEP, BOWL):
-        found = integrated(problem(surface, mask=MASKS[mask]), device)
-        assert found.process["integration_converged"]
-        assert found.process["integration_invalid"] == 0
-        assert worst(found, truth(surface), MASKS[mask]) <= 1e-4
+        solved = integrated(problem(surface, mask=MASKS[mask]), device)
+        assert solved.process["integration_converged"]
+        assert solved.process["integration_invalid"] == 0
+        assert worst(solved, truth(surface), MASKS[mask]) <= 1e-4
 
 
 @pytest.mark.parametrize(("sigma", "region"), [(3, "rectangle"), (40, "disc")])
@@ -105,9 +105,9 @@ def test_a_bump_of_any_size_has_its_height(device, sigma, region):
     shape, square = (240, 320), (0.03, 0.03)
     mask = surfaces.disc(shape) if region == "disc" else np.ones(shape, bool)
     bump = surfaces.bump(sigma, 0.6 * sigma)
-    found = integrated(problem(bump, pixel_size=square, shape=shape, mask=mask), device)
+    solved = integrated(problem(bump, pixel_size=square, shape=shape, mask=mask), device)
     expected = np.ptp(truth(bump, square, shape)[mask])
-    assert np.nanmax(found.height) - np.nanmin(found.height) == pytest.approx(expected, rel=0.002)
+    assert np.nanmax(solved.height) - np.nanmin(solved.height) == pytest.approx(expected, rel=0.002)
 
 
 GIVEN = {
@@ -127,25 +127,25 @@ GIVEN = {
 
 
 @pytest.mark.parametrize(
-    ("mask", "given"),
-    [*(("disc", given) for given in GIVEN), ("rectangle", "noise"), ("20 % holes", "all at once")],
+    ("mask", "inputs"),
+    [*(("disc", inputs) for inputs in GIVEN), ("rectangle", "noise"), ("20 % holes", "all at once")],
 )
-def test_heights_are_those_of_a_direct_solution_in_float64(device, mask, given):
-    asked = problem(WAVES, 0.2, mask=MASKS[mask], **GIVEN[given])
-    found = integrated(asked, device)
-    assert apart(found, asked) <= 1e-4
-    assert found.height.dtype == np.float32
-    assert found.process["integration_residual"] <= 1e-5
-    assert found.process["integration"] == (
-        "direct" if (mask, given) == ("rectangle", "noise") else "multigrid"
+def test_heights_are_those_of_a_direct_solution_in_float64(device, mask, inputs):
+    asked = problem(WAVES, 0.2, mask=MASKS[mask], **GIVEN[inputs])
+    solved = integrated(asked, device)
+    assert apart(solved, asked) <= 1e-4
+    assert solved.height.dtype == np.float32
+    assert solved.process["integration_residual"] <= 1e-5
+    assert solved.process["integration"] == (
+        "direct" if (mask, inputs) == ("rectangle", "noise") else "multigrid"
     )
 
 
 def test_a_full_rectangle_with_heights_known_everywhere_is_solved_directly(device):
     asked = problem(WAVES, 0.2, known_heights=truth(BUMP), known_height_weights=300.0)
-    found = integrated(asked, device)
-    assert found.process["integration"] == "direct"
-    assert apart(found, asked) <= 1e-4
+    solved = integrated(asked, device)
+    assert solved.process["integration"] == "direct"
+    assert apart(solved, asked) <= 1e-4
 
 
 @pytest.mark.parametrize("region", ["rectangle", "disc"])
@@ -155,8 +155,8 @@ def test_refinement_is_of_second_order(region):
         shape = size, size
         mask = surfaces.disc(shape, 0.99) if region == "disc" else np.ones(shape, bool)
         surface, pixel = surfaces.cosines(size / 3.3, size / 12), 3.0 / size
-        found = integrated(problem(surface, pixel_size=(pixel, pixel), shape=shape, mask=mask))
-        errors.append(worst(found, truth(surface, (pixel, pixel), shape), mask))
+        solved = integrated(problem(surface, pixel_size=(pixel, pixel), shape=shape, mask=mask))
+        errors.append(worst(solved, truth(surface, (pixel, pixel), shape), mask))
     orders = np.log2(np.divide(errors[:-1], errors[1:]))
     assert errors[0] < 0.05
     assert (orders >= 1.9).all() or errors[-1] < 1e-5, (errors, orders)
@@ -183,21 +183,21 @@ def test_a_component_is_held_by_its_own_known_heights_and_has_the_mean_0_without
     mask = MASKS["two contacts"]
     right = mask & (surfaces.places(SHAPE)[0] > 0)
     heights = np.where(right, 5 + truth(BOWL), np.nan)
-    found = integrated(problem(BOWL, mask=mask, known_heights=heights), device)
-    assert not found.offset_unknown[found.component[24, 46]]
-    assert found.offset_unknown[found.component[24, 15]]
-    np.testing.assert_allclose(found.height[right], heights[right], atol=1e-4)
-    assert np.nanmean(found.height[mask & ~right]) == pytest.approx(0, abs=1e-5)
+    solved = integrated(problem(BOWL, mask=mask, known_heights=heights), device)
+    assert not solved.offset_unknown[solved.component[24, 46]]
+    assert solved.offset_unknown[solved.component[24, 15]]
+    np.testing.assert_allclose(solved.height[right], heights[right], atol=1e-4)
+    assert np.nanmean(solved.height[mask & ~right]) == pytest.approx(0, abs=1e-5)
 
 
 def test_known_heights_need_no_slope_and_alone_are_taken_as_they_are(device):
     dz_dx, dz_dy, _ = problem(BOWL).arguments
     dz_dx[10, 10], heights = np.nan, np.full(SHAPE, np.nan)
     heights[10, 10] = 7.0
-    found = engine.integrate(dz_dx, dz_dy, PIXEL, known_heights=heights, sigma=False, device=device)
-    assert found.height[10, 10] == pytest.approx(7, abs=1e-5)
-    assert found.offset_unknown.tolist() == [1, 0]
-    assert found.process["integration_invalid"] == 1
+    solution = engine.integrate(dz_dx, dz_dy, PIXEL, known_heights=heights, sigma=False, device=device)
+    assert solution.height[10, 10] == pytest.approx(7, abs=1e-5)
+    assert solution.offset_unknown.tolist() == [1, 0]
+    assert solution.process["integration_invalid"] == 1
     alone = engine.integrate(dz_dx, dz_dy, PIXEL, slope_weights=0, known_heights=some(), sigma=False)
     np.testing.assert_allclose(alone.height, some(), rtol=3e-7, atol=1e-6)
     assert not alone.offset_unknown.any()
@@ -223,26 +223,26 @@ def test_heights_without_weight_or_value_are_as_good_as_none():
 def test_thin_and_tiny_pictures(device, shape, masked):
     mask = np.ones(shape, bool)
     mask.flat[0] = not masked or shape == (1, 1)
-    found = integrated(problem(BOWL, shape=shape, mask=mask), device)
+    solved = integrated(problem(BOWL, shape=shape, mask=mask), device)
     expected = truth(BOWL, shape=shape)
     expected = expected - expected[mask].mean()
     atol = 1e-4 * max(np.ptp(expected[mask]), 1e-3)
-    np.testing.assert_allclose(found.height[mask], expected[mask], atol=atol)
-    np.testing.assert_array_equal(np.isnan(found.height), ~mask)
+    np.testing.assert_allclose(solved.height[mask], expected[mask], atol=atol)
+    np.testing.assert_array_equal(np.isnan(solved.height), ~mask)
 
 
 def test_components_of_one_pixel_have_their_known_height_or_none():
     random = np.random.default_rng(3)
-    specks, known = random.random(SHAPE) < 0.25, random.normal(size=SHAPE)
+    specks, specks_height = random.random(SHAPE) < 0.25, random.normal(size=SHAPE)
     weights = {"slope_weights": 60.0, "known_height_weights": 6.0}
-    found = integrated(problem(WAVES, mask=specks, known_heights=known, **weights))
-    alone = specks & (np.bincount(found.component[specks])[found.component] == 1)
-    np.testing.assert_allclose(found.height[alone], known[alone], atol=1e-5)
+    result = integrated(problem(WAVES, mask=specks, known_heights=specks_height, **weights))
+    alone = specks & (np.bincount(result.component[specks])[result.component] == 1)
+    np.testing.assert_allclose(result.height[alone], specks_height[alone], atol=1e-5)
     assert alone.sum() > 20
     chess = np.indices((9, 12)).sum(axis=0) % 2 == 0
-    found = integrated(problem(BOWL, shape=(9, 12), mask=chess))
-    np.testing.assert_array_equal(found.height[chess], 0)
-    np.testing.assert_array_equal(found.component[chess], np.arange(chess.sum()))
+    result = integrated(problem(BOWL, shape=(9, 12), mask=chess))
+    np.testing.assert_array_equal(result.height[chess], 0)
+    np.testing.assert_array_equal(result.component[chess], np.arange(chess.sum()))
 
 
 @pytest.mark.parametrize("bad", [np.nan, -np.inf])
@@ -250,9 +250,9 @@ def test_slopes_that_are_no_numbers_are_left_out_and_counted(device, bad):
     spots = np.random.default_rng(10).random((2, *SHAPE)) < 0.03
     asked = problem(BUMP, 0.1, mask=DISC)
     asked.dz_dx[spots[0]], asked.dz_dy[spots[1]] = bad, np.nan
-    found = integrated(asked, device)
-    assert found.process["integration_invalid"] == (spots.any(axis=0) & DISC).sum() > 50
-    assert apart(found, asked) <= 1e-4
+    solved = integrated(asked, device)
+    assert solved.process["integration_invalid"] == (spots.any(axis=0) & DISC).sum() > 50
+    assert apart(solved, asked) <= 1e-4
 
 
 def test_any_array_is_accepted_and_stays_as_it_was():
@@ -265,8 +265,8 @@ def test_any_array_is_accepted_and_stays_as_it_was():
         [np.repeat(part, 2, axis=1)[:, ::2] for part in slopes],
         [part.tolist() for part in slopes],
     ):
-        found = engine.integrate(*parts, np.array(PIXEL), mask=7 * DISC.astype(np.int16), sigma=False)
-        np.testing.assert_array_equal(found.height, expected)
+        solution = engine.integrate(*parts, np.array(PIXEL), mask=7 * DISC.astype(np.int16), sigma=False)
+        np.testing.assert_array_equal(solution.height, expected)
     np.testing.assert_array_equal(slopes[0], dz_dx.astype(np.float32))
 
 
@@ -274,14 +274,14 @@ INNER = np.s_[9:40, 21:58]  # what is left of the picture below
 
 
 @pytest.mark.parametrize("robust", [False, True])
-@pytest.mark.parametrize("told", ["by a mask", "by slopes", "by known heights"])
-def test_only_the_box_that_has_an_answer_is_integrated(told, robust):
+@pytest.mark.parametrize("how", ["by a mask", "by slopes", "by known heights"])
+def test_only_the_box_that_has_an_answer_is_integrated(how, robust):
     asked = problem(WAVES, 0.2, edges=surfaces.random_cuts(SHAPE, 8), slope_weights=uneven())
     inside = np.zeros(SHAPE, bool)
     inside[INNER] = surfaces.disc((31, 37), 0.99)
     maps = {"dz_dx": asked.dz_dx, "dz_dy": asked.dz_dy, **asked.options, "known_heights": some()}
     lost = 0
-    if told == "by a mask":
+    if how == "by a mask":
         maps["mask"] = inside.copy()
         maps["mask"][0, :7] = maps["dz_dx"][0, :7] = True
         maps["dz_dx"][0, :7], maps["slope_weights"][:, 0, 0] = np.nan, 0  # wanted, but there is none
@@ -290,12 +290,12 @@ def test_only_the_box_that_has_an_answer_is_integrated(told, robust):
         maps["dz_dy"] = np.where(inside, maps["dz_dy"], np.nan)
         maps["known_heights"] = np.where(inside, maps["known_heights"], np.nan)
         lost = (~inside).sum() - (~inside[INNER]).sum()
-    if told == "by known heights":
+    if how == "by known heights":
         maps["dz_dy"][9:12] = np.nan
         maps["known_heights"][9, 40] = 1.0
-    cut = {name: one[(..., *INNER)] for name, one in maps.items() if one is not None}
+    cropped = {name: values[(..., *INNER)] for name, values in maps.items() if values is not None}
     whole = engine.integrate(pixel_size=PIXEL, robust=robust, **maps)
-    part = engine.integrate(pixel_size=PIXEL, robust=robust, **cut)
+    part = engine.integrate(pixel_size=PIXEL, robust=robust, **cropped)
     assert part.height.shape == (31, 37)
     for name, rest in {
         "height": np.nan,
@@ -304,14 +304,14 @@ def test_only_the_box_that_has_an_answer_is_integrated(told, robust):
         "filled": 0,
         "edges": 0,
     }.items():
-        found, expected = getattr(whole, name), getattr(part, name)
+        actual, expected = getattr(whole, name), getattr(part, name)
         if expected is None:
-            assert found is None
+            assert actual is None
             continue
-        np.testing.assert_array_equal(found[INNER], expected)
-        around = found.copy()
+        np.testing.assert_array_equal(actual[INNER], expected)
+        around = actual.copy()
         around[INNER] = rest
-        np.testing.assert_array_equal(around, np.full(SHAPE, rest, found.dtype))
+        np.testing.assert_array_equal(around, np.full(SHAPE, rest, actual.dtype))
     np.testing.assert_array_equal(whole.offset_unknown, part.offset_unknown)
     assert whole.process["integration_invalid"] == part.process["integration_invalid"] + lost
 
@@ -321,21 +321,21 @@ def test_one_weight_however_odd_changes_little(weight):
     asked = problem(WAVES, mask=DISC)
     plain, weights = integrated(asked).height, np.ones(SHAPE)
     weights[20, 20] = weight
-    found = integrated(problem(WAVES, mask=DISC, slope_weights=weights)).height
-    np.testing.assert_allclose(found, plain, atol=0.02 * np.ptp(plain[DISC]))
+    solved = integrated(problem(WAVES, mask=DISC, slope_weights=weights)).height
+    np.testing.assert_allclose(solved, plain, atol=0.02 * np.ptp(plain[DISC]))
     pinned = np.full(SHAPE, np.nan)
     pinned[20, 20] = 5.0
     heights = {"known_heights": pinned, "known_height_weights": weight}
     if weight > 1:  # it only moves the surface
-        found = integrated(problem(WAVES, mask=DISC, **heights)).height
-        np.testing.assert_allclose(found, plain - plain[20, 20] + 5, atol=1e-4 * np.ptp(plain[DISC]))
+        solved = integrated(problem(WAVES, mask=DISC, **heights)).height
+        np.testing.assert_allclose(solved, plain - plain[20, 20] + 5, atol=1e-4 * np.ptp(plain[DISC]))
 
 
 def test_a_comb_is_solved_by_plain_cycles():
     shape, square = (97, 130), (0.03, 0.03)
     mask, bowl = surfaces.comb(shape), surfaces.quadratic(0.004, 0.001, 0.003, 0.1, -0.2)
-    found = integrated(problem(bowl, pixel_size=square, shape=shape, mask=mask))
-    assert worst(found, truth(bowl, square, shape), mask) <= 1e-4
+    solved = integrated(problem(bowl, pixel_size=square, shape=shape, mask=mask))
+    assert worst(solved, truth(bowl, square, shape), mask) <= 1e-4
 
 
 def test_initial_heights_do_not_change_the_answer():
@@ -353,10 +353,10 @@ def test_without_tolerance_or_with_a_budget_nothing_is_raised():
 
 
 def test_a_surface_that_did_not_converge_is_not_returned(monkeypatch):
-    found = Multigrid.solve
+    solve = Multigrid.solve
 
     def stubborn(self, start=None, **options):
-        return found(self, start, **{**options, "limit": 1})
+        return solve(self, start, **{**options, "limit": 1})
 
     monkeypatch.setattr(Multigrid, "solve", stubborn)
     expected = r"1 iteration.*residual of .*more than 1e-06.*tolerance"
@@ -433,11 +433,11 @@ def heights(case):
 
 @pytest.fixture(scope="module")
 def alone():
-    found = []
+    solved = []
     for case in range(len(CASES)):
         open_device().cache.clear()
-        found.append(heights(case))
-    return found
+        solved.append(heights(case))
+    return solved
 
 
 @pytest.mark.parametrize("order", [range(8), range(7, -1, -1), [2, 3, 2, 4, 2, 5]])
@@ -450,20 +450,20 @@ def test_the_order_of_calls_does_not_matter(alone, order):
 
 
 def test_threads_do_not_meet(alone):
-    found = {}
+    solved = {}
 
     def work(case):
-        found[case] = [heights(case) for _ in range(3)]
+        solved[case] = [heights(case) for _ in range(3)]
 
     threads = [threading.Thread(target=work, args=(case,)) for case in (2, 4, 7)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    for case, answers in found.items():
+    for case, answers in solved.items():
         for answer in answers:
             np.testing.assert_array_equal(answer, alone[case])
-    assert len(found) == 3
+    assert len(solved) == 3
 
 
 def test_a_picture_that_failed_leaves_nothing_behind(alone):
@@ -503,11 +503,11 @@ def test_from_frame_to_frame_everything_may_change(device):
     kept = []
     for number, options in enumerate(FRAMES):
         asked = frame(number, **options)
-        found = surface(integrator, asked, tolerance=1e-5)
-        assert apart(found, asked) <= 1e-4
-        assert found.height_sigma is None
-        assert integrator.result() is found
-        kept.append((found.height, found.height.copy()))
+        solved = surface(integrator, asked, tolerance=1e-5)
+        assert apart(solved, asked) <= 1e-4
+        assert solved.height_sigma is None
+        assert integrator.result() is solved
+        kept.append((solved.height, solved.height.copy()))
     for height, copy in kept:
         np.testing.assert_array_equal(height, copy)
 
@@ -568,8 +568,8 @@ def test_noise_spreads_as_in_the_best_linear_estimate(region):
     generator, beyond = np.random.default_rng(8), []
     for _ in range(6):
         noise = sigma * generator.normal(size=sigma.shape)
-        found = integrated(Problem(*noise.reshape(2, *NOISY), PIXEL, **asked.options))
-        beyond.append(found.height[mask] - best @ noise)
+        solved = integrated(Problem(*noise.reshape(2, *NOISY), PIXEL, **asked.options))
+        beyond.append(solved.height[mask] - best @ noise)
     assert np.any(beyond)
     assert np.sqrt(1 + np.mean(np.square(beyond)) / np.mean(best**2 @ sigma**2)) <= 1.05
 

@@ -22,9 +22,9 @@ def matrix(right, down, diagonal):
     """Return the matrix, of pixels in C order."""
     pixel = np.arange(diagonal.size).reshape(diagonal.shape)
     ends = [(pixel[:, :-1], pixel[:, 1:]), (pixel[:-1], pixel[1:])]
-    one, other = (np.concatenate([pair[k].ravel() for pair in ends]) for k in (0, 1))
+    start, other = (np.concatenate([pair[k].ravel() for pair in ends]) for k in (0, 1))
     weight = np.concatenate([right.ravel(), down.ravel()])
-    links = sparse.coo_array((weight, (one, other)), (diagonal.size,) * 2)
+    links = sparse.coo_array((weight, (start, other)), (diagonal.size,) * 2)
     links = links + links.T
     return sparse.csr_array(sparse.diags_array(links.sum(axis=1) + diagonal.ravel()) - links)
 
@@ -33,24 +33,24 @@ def test_it_solves_what_sparse_elimination_does(device):
     held = HELD + 1e-3 * (RIGHT.mean())
     inverse = engine.integration.invert_laplacian(RIGHT, DOWN, held, device=device)
     exact = algebra.spsolve(matrix(RIGHT, DOWN, held), SOURCE.ravel())
-    found = inverse @ SOURCE.ravel()
+    solution = inverse @ SOURCE.ravel()
     assert inverse.shape == (exact.size, exact.size)
-    np.testing.assert_allclose(found, exact, atol=1e-4 * np.abs(exact).max())
+    np.testing.assert_allclose(solution, exact, atol=1e-4 * np.abs(exact).max())
 
 
 def test_a_singular_one_is_inverted_where_it_can_be():
     held = np.where(np.indices(SHAPE)[1] > 40, HELD, 0.0)  # the left component and lone pixels have none
     inverse = engine.integration.invert_laplacian(RIGHT, DOWN, held)
-    found, a = inverse @ SOURCE.ravel(), matrix(RIGHT, DOWN, held)
+    solution, a = inverse @ SOURCE.ravel(), matrix(RIGHT, DOWN, held)
     count, label = sparse.csgraph.connected_components(a)
     source = SOURCE.ravel().copy()
-    for one in range(count):
-        inside = label == one
+    for column in range(count):
+        inside = label == column
         if not held.ravel()[inside].any():
             source[inside] -= source[inside].mean()
-            assert found[inside].mean() == pytest.approx(0, abs=1e-9 * np.abs(found).max())
+            assert solution[inside].mean() == pytest.approx(0, abs=1e-9 * np.abs(solution).max())
     assert count > 2
-    assert np.linalg.norm(a @ found - source) < 1e-3 * np.linalg.norm(source)
+    assert np.linalg.norm(a @ solution - source) < 1e-3 * np.linalg.norm(source)
 
 
 def test_one_cycle_is_a_preconditioner():
@@ -63,19 +63,19 @@ def test_one_cycle_is_a_preconditioner():
     u, v = np.random.default_rng(5).normal(size=(2, held.size))
     assert u @ (cycle @ v) == pytest.approx(v @ (cycle @ u), rel=1e-4)
     assert u @ (cycle @ u) > 0
-    found, told = algebra.cg(a, SOURCE.ravel(), M=cycle, rtol=1e-10, callback=steps.append)
-    assert told == 0
+    solution, status = algebra.cg(a, SOURCE.ravel(), M=cycle, rtol=1e-10, callback=steps.append)
+    assert status == 0
     assert len(steps) <= 30  # 19; Jacobi's method takes 347
-    assert np.linalg.norm(a @ found - SOURCE.ravel()) < 1e-9 * np.linalg.norm(SOURCE)
+    assert np.linalg.norm(a @ solution - SOURCE.ravel()) < 1e-9 * np.linalg.norm(SOURCE)
 
 
 def test_a_solver_in_float64_needs_few_steps_with_it():
     a, steps = matrix(RIGHT, DOWN, HELD + 1e-2), []
     inverse = engine.integration.invert_laplacian(RIGHT, DOWN, HELD + 1e-2)
-    found, told = algebra.cg(a, SOURCE.ravel(), M=inverse, rtol=1e-12, callback=steps.append)
-    assert told == 0
+    solution, status = algebra.cg(a, SOURCE.ravel(), M=inverse, rtol=1e-12, callback=steps.append)
+    assert status == 0
     assert len(steps) <= 4
-    assert np.linalg.norm(a @ found - SOURCE.ravel()) < 1e-11 * np.linalg.norm(SOURCE)
+    assert np.linalg.norm(a @ solution - SOURCE.ravel()) < 1e-11 * np.linalg.norm(SOURCE)
     pair = np.stack([SOURCE.ravel(), np.zeros(SOURCE.size)], axis=1)
     np.testing.assert_array_equal((inverse.T @ pair)[:, 1], 0)
 

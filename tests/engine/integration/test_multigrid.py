@@ -18,15 +18,15 @@ CYCLES = dict.fromkeys(["rectangle", "disc", "annulus"], 5) | {"holes": 13, "cut
 CYCLES |= {"uneven": 20, "isolated": 16, "comb": 45}
 
 
-def given(device, name, values):
+def upload(device, name, values):
     array = device.array(name, values.shape, np.float32)
     array.write(values)
     return array
 
 
 def links_of(device, graph):
-    arrays = [given(device, name, getattr(graph, name)) for name in ("right", "down", "source")]
-    anchor = None if graph.anchor is None else given(device, "anchor", graph.anchor)
+    arrays = [upload(device, name, getattr(graph, name)) for name in ("right", "down", "source")]
+    anchor = None if graph.anchor is None else upload(device, "anchor", graph.anchor)
     return Links(device, graph.right.shape, arrays[0], arrays[1], anchor, arrays[2])
 
 
@@ -43,11 +43,11 @@ def error_of(graph, heights):
 @pytest.mark.parametrize("kind", graphs.KINDS)
 def test_heights_are_those_of_a_sparse_direct_solver(device, kind, anchored):
     graph = graphs.pixel_graph(kind, (45, 70), anchored)
-    found = Multigrid(links_of(device, graph)).solve(tolerance=1e-6)
-    assert found.converged
-    assert found.residual <= 1e-6
-    assert error_of(graph, heights_of(found)) < 1e-5  # it is the energy that is within 1e-6
-    assert 2 <= found.iterations <= CYCLES[kind]
+    solution = Multigrid(links_of(device, graph)).solve(tolerance=1e-6)
+    assert solution.converged
+    assert solution.residual <= 1e-6
+    assert error_of(graph, heights_of(solution)) < 1e-5  # it is the energy that is within 1e-6
+    assert 2 <= solution.iterations <= CYCLES[kind]
 
 
 @pytest.mark.parametrize("anchored", [False, True], ids=["free", "anchored"])
@@ -66,8 +66,8 @@ def test_a_cycle_is_symmetric_and_positive_definite(device, kind, anchored):
         slow = graph.centred(slow - answer(cycle, image(graph, slow)))
         slow /= np.abs(slow).max()
     right.append(image(graph, slow))
-    answers = [answer(cycle, one) for one in right]
-    products = np.array([[(one * other).sum() for other in answers] for one in right])
+    answers = [answer(cycle, values) for values in right]
+    products = np.array([[(values * other).sum() for other in answers] for values in right])
     scale = np.sqrt(np.outer(products.diagonal(), products.diagonal()))
     assert (products.diagonal() > 0).all()
     np.testing.assert_allclose(products / scale, products.T / scale, atol=1e-4)
@@ -81,11 +81,11 @@ def image(graph, heights):
 def answer(cycle, values):
     """Return what a cycle makes of a right side."""
     hierarchy = cycle._h
-    hierarchy.copy_picture("admit", cycle.b, given(hierarchy.device, "b", values))
+    hierarchy.copy_picture("admit", cycle.b, upload(hierarchy.device, "b", values))
     cycle.run()
-    found = given(hierarchy.device, "found", np.zeros(values.shape))
-    hierarchy.copy_picture("release", cycle.x, found)
-    return found.read().astype(float)
+    solution = upload(hierarchy.device, "found", np.zeros(values.shape))
+    hierarchy.copy_picture("release", cycle.x, solution)
+    return solution.read().astype(float)
 
 
 @pytest.mark.parametrize("kind", ["comb", "spiral"])
@@ -93,9 +93,9 @@ def test_corridors_as_wide_as_a_pixel_are_solved(device, kind):
     shape = 120, 160
     graph = graphs.pixel_graph("comb", shape) if kind == "comb" else spiral(shape)
     solver = Multigrid(links_of(device, graph))
-    found = solver.solve(tolerance=1e-4)
-    assert found.converged
-    assert error_of(graph, heights_of(found)) < 1e-3
+    solution = solver.solve(tolerance=1e-4)
+    assert solution.converged
+    assert error_of(graph, heights_of(solution)) < 1e-3
     if kind == "spiral":
         assert solver._alone.cycle._factors is not None  # of the second level: cycles alone do not do it
 
@@ -104,11 +104,11 @@ def spiral(shape):
     """Return a graph of a corridor that winds to the middle, walls a pixel wide between its turns."""
     graph = graphs.pixel_graph("rectangle", shape)
     valid = np.zeros(shape, bool)
-    (top, left), (bottom, right) = (0, 0), (shape[0] - 1, shape[1] - 1)
-    while bottom - top > 3 and right - left > 3:
-        valid[top, max(left - 2, 0) : right + 1] = valid[top : bottom + 1, right] = True
-        valid[bottom, left : right + 1] = valid[top + 2 : bottom + 1, left] = True
-        top, left, bottom, right = top + 2, left + 2, bottom - 2, right - 2
+    (top, first), (bottom, right) = (0, 0), (shape[0] - 1, shape[1] - 1)
+    while bottom - top > 3 and right - first > 3:
+        valid[top, max(first - 2, 0) : right + 1] = valid[top : bottom + 1, right] = True
+        valid[bottom, first : right + 1] = valid[top + 2 : bottom + 1, first] = True
+        top, first, bottom, right = top + 2, first + 2, bottom - 2, right - 2
     graph.right[:, :-1] *= valid[:, 1:] & valid[:, :-1]
     graph.down[:-1] *= valid[1:] & valid[:-1]
     rise = np.random.default_rng(0).normal(size=(2, *shape)) + 0.5
@@ -131,33 +131,35 @@ def test_the_residual_estimates_the_error_within_a_factor_of_four(device, kind):
     exact, matrix = graph.solve().ravel(), graph.matrix
     solver = Multigrid(links_of(device, graph))
     for tolerance in (1e-2, 1e-3, 1e-4):
-        found = solver.solve(tolerance=tolerance)
-        error = graph.centred(heights_of(found)).ravel() - exact
-        share = np.sqrt(error @ (matrix @ error) / (exact @ (matrix @ exact)))
-        assert found.residual <= tolerance
-        assert share / 4 <= found.residual <= 4 * share
+        solution = solver.solve(tolerance=tolerance)
+        error = graph.centred(heights_of(solution)).ravel() - exact
+        relative_error = np.sqrt(error @ (matrix @ error) / (exact @ (matrix @ exact)))
+        assert solution.residual <= tolerance
+        assert relative_error / 4 <= solution.residual <= 4 * relative_error
 
 
 def test_cuts_cost_few_cycles_more_than_a_mask_does(device):
-    most = {"disc": 4, "cuts": 8, "soft": 15}
-    for kind, cycles in most.items():
+    limits = {"disc": 4, "cuts": 8, "soft": 15}
+    for kind, cycles in limits.items():
         graph = graphs.pixel_graph(kind, (200, 200))
         assert Multigrid(links_of(device, graph)).solve(tolerance=3e-5).iterations <= cycles
 
 
 def test_without_a_tolerance_two_cycles_are_done(device):
     graph = graphs.pixel_graph("disc", (45, 70))
-    found = Multigrid(links_of(device, graph)).solve(tolerance=None)
-    assert found.iterations == 2
-    assert found.converged
-    assert error_of(graph, heights_of(found)) < 2e-3
+    solution = Multigrid(links_of(device, graph)).solve(tolerance=None)
+    assert solution.iterations == 2
+    assert solution.converged
+    assert error_of(graph, heights_of(solution)) < 2e-3
 
 
 def test_a_limit_that_is_too_low_is_reported(device):
-    found = Multigrid(links_of(device, graphs.pixel_graph("holes", (45, 70)))).solve(tolerance=1e-6, limit=2)
-    assert found.iterations == 2
-    assert not found.converged
-    assert found.residual > 1e-6
+    solution = Multigrid(links_of(device, graphs.pixel_graph("holes", (45, 70)))).solve(
+        tolerance=1e-6, limit=2
+    )
+    assert solution.iterations == 2
+    assert not solution.converged
+    assert solution.residual > 1e-6
 
 
 def test_a_deadline_that_is_over_allows_one_cycle(device):
@@ -185,9 +187,9 @@ def test_what_float32_cannot_reach_is_reported_and_the_next_graph_is_solved(devi
     corridor.source[...] = np.random.default_rng(0).normal(size=(1, length))
     corridor.source -= corridor.source.mean()
     solver = Multigrid(links_of(device, corridor))
-    found = solver.solve(tolerance=1e-9)
-    assert not found.converged
-    assert found.iterations < 30
+    solution = solver.solve(tolerance=1e-9)
+    assert not solution.converged
+    assert solution.iterations < 30
     again = graphs.pixel_graph("rectangle", (1, length))
     again.source[...] = 0
     again.source[0, 0], again.source[0, -1] = -1, 1
@@ -204,8 +206,8 @@ def test_lanes_of_a_gpu_answer_as_vectors_do(kind, anchored):
         device.info = dataclasses.replace(device.info, shares_memory=False)
         device.layout = layout
         answers.append(Multigrid(links_of(device, graph)).solve(tolerance=1e-6))
-    one, other = answers  # a GPU's cycles have fewer launches
+    first, other = answers  # a GPU's cycles have fewer launches
     assert other.converged
-    assert other.iterations <= one.iterations + 1
-    heights = [graph.centred(heights_of(one)) for one in answers]
+    assert other.iterations <= first.iterations + 1
+    heights = [graph.centred(heights_of(first)) for first in answers]
     np.testing.assert_allclose(*heights, atol=1e-5 * np.ptp(heights[0]))

@@ -16,8 +16,8 @@ def slopes_at(zenith, azimuth, sigma=0.001, contact=1, tilt=None, **options):
     """Take degrees; return a slope along x and y, and their weights."""
     vectors = rotations.direction(np.radians(zenith), np.radians(azimuth)).astype(np.float32)
     touched = np.full((1, 1), contact, np.uint8)
-    found = find_slopes(vectors[np.newaxis, np.newaxis], np.float32(sigma) * ONE, touched, tilt, **options)
-    return found.dz_dx[0, 0], found.dz_dy[0, 0], *found.weights[:, 0, 0], found.defined[0, 0]
+    slopes = find_slopes(vectors[np.newaxis, np.newaxis], np.float32(sigma) * ONE, touched, tilt, **options)
+    return slopes.dz_dx[0, 0], slopes.dz_dy[0, 0], *slopes.weights[:, 0, 0], slopes.defined[0, 0]
 
 
 @pytest.mark.parametrize(("zenith", "azimuth"), [(0, 0), (1, 30), (30, 135), (60, -90)])
@@ -50,10 +50,10 @@ def test_without_a_tilt_errors_go_both_ways_alike():
     ],
 )
 def test_what_means_nothing_gives_no_slope(change):
-    dz_dx, dz_dy, *weights, known = slopes_at(**{"zenith": 30, "azimuth": 20} | change)
+    dz_dx, dz_dy, *weights, usable = slopes_at(**{"zenith": 30, "azimuth": 20} | change)
     assert np.isnan([dz_dx, dz_dy]).all()
     assert weights == [0, 0]
-    assert not known
+    assert not usable
 
 
 def test_walls_are_steep_but_not_without_bounds():
@@ -73,28 +73,29 @@ STEEP = (10, 30, 50)
 @pytest.mark.parametrize(("phase", "azimuth"), [(EIGHTHS, 20), (EIGHTHS, 130), (UNEVEN, 45)])
 def test_slopes_have_true_errors_and_no_bias(phase, azimuth):
     setup = replace(SETUP, phase=phase)
-    known = {
+    arguments = {
         "phase": setup.phase,
         "tilt": setup.tilt,
         "zenith_gain": setup.slope,
         "zenith_offset": setup.offset,
     }
     # Uneven phases tell azimuths of one direction better than those of another.
-    spare = 0.15 if phase is EIGHTHS else 0.4
+    tolerance = 0.15 if phase is EIGHTHS else 0.4
     toward = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
     for zenith in (0, 1, 4, *STEEP):
         true = np.tile(rotations.direction(np.radians(zenith), np.radians(azimuth)), (100, 100, 1))
         frames = rotations.expose(true, setup, seed=zenith)
-        normals = rotations.estimate(frames, **known, noise=setup.spread)
-        found = find_slopes(normals.normals, normals.normals_sigma, np.ones_like(normals.contact), TILT)
+        normals = rotations.estimate(frames, **arguments, noise=setup.spread)
+        result = find_slopes(normals.normals, normals.normals_sigma, np.ones_like(normals.contact), TILT)
         steepness = np.tan(np.radians(zenith))
-        slopes = found.dz_dx, found.dz_dy
-        for slope, weight, way in zip(slopes, found.weights, toward, strict=True):
-            assert np.mean((slope + steepness * way) ** 2 * weight) == pytest.approx(1, abs=spare)
+        slopes = result.dz_dx, result.dz_dy
+        for slope, weight, component in zip(slopes, result.weights, toward, strict=True):
+            assert np.mean((slope + steepness * component) ** 2 * weight) == pytest.approx(1, abs=tolerance)
         if zenith in STEEP:
             # By the azimuth's noise alone slopes would be flatter by half its variance, 0.5 %.
             means = [
-                np.average(slope, weights=weight) for slope, weight in zip(slopes, found.weights, strict=True)
+                np.average(slope, weights=weight)
+                for slope, weight in zip(slopes, result.weights, strict=True)
             ]
             assert -(means[0] * toward[0] + means[1] * toward[1]) == pytest.approx(steepness, rel=1.5e-3)
 
@@ -103,12 +104,12 @@ def test_on_a_ridge_weights_depend_on_the_axis_across_it():
     vectors = np.tile(rotations.direction(np.radians(30), 0.0), (20, 20, 1))
     vectors[:, 10:, 0] *= -1
     size = vectors.shape[:2]
-    found = find_slopes(
+    result = find_slopes(
         vectors.astype(np.float32), np.full(size, 0.01, np.float32), np.ones(size, np.uint8), TILT
     )
-    for weight in found.weights:
+    for weight in result.weights:
         assert weight == pytest.approx(np.full(size, weight[0, 0]), rel=1e-4)
-    assert found.weights[0, 0, 0] > 50 * found.weights[1, 0, 0]
+    assert result.weights[0, 0, 0] > 50 * result.weights[1, 0, 0]
 
 
 def test_weights_may_depend_on_other_errors():

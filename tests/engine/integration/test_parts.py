@@ -54,12 +54,12 @@ def test_a_fragment_joins_the_part_of_its_most_confident_link():
     np.testing.assert_array_equal(largest_within(parts, joined)[5, 9], parts[5, 10])
 
 
-def placed(confidence, known=None, whole=ALL):
+def placed(confidence, known_weights=None, whole=ALL):
     right, down = halves(confidence)
     parts = np.where(LEFT, 0, 1).astype(np.int32)
     difference = np.where(LEFT, -1.0, 3.0).astype(np.float32)
-    components = Components(np.where(whole, 0, -1).astype(np.int32), np.array([known is None]))
-    weights = np.zeros(SHAPE, np.float32) if known is None else known
+    components = Components(np.where(whole, 0, -1).astype(np.int32), np.array([known_weights is None]))
+    weights = np.zeros(SHAPE, np.float32) if known_weights is None else known_weights
     return place_parts(parts, find_ties(parts, right, down), difference, components, weights)
 
 
@@ -74,7 +74,7 @@ def test_parts_that_links_hold_stay():
 
 
 def test_parts_with_known_heights_stay():
-    lifts = placed(1e-12, known=np.ones(SHAPE, np.float32))
+    lifts = placed(1e-12, known_weights=np.ones(SHAPE, np.float32))
     np.testing.assert_allclose(lifts, 0, atol=1e-3)
 
 

@@ -36,8 +36,8 @@ def test_heights_solve_the_links_of_any_shape(device, shape, screening):
     source = (source - source.mean()).astype(np.float32)
     solver = Rectangle(shape, (0.03, 0.04), device, scale=2.5)
     height = solver.solve(put(device, source), screening * wx).read()
-    told = solve_sparse(source, wx, wy, screening * wx)
-    np.testing.assert_allclose(height, told, atol=1e-6 * np.ptp(told))
+    expected = solve_sparse(source, wx, wy, screening * wx)
+    np.testing.assert_allclose(height, expected, atol=1e-6 * np.ptp(expected))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 3), (40, 30)])
@@ -66,7 +66,7 @@ def test_a_solver_serves_one_picture_and_screening_after_the_other(device):
 
 
 @pytest.mark.parametrize("size", [(1.0, 4.0), (4.0, 1.0), (1e-3, 1e-3), (1e3, 1e3)])
-def test_cosines_are_as_high_as_their_wave_numbers_say(device, size):
+def test_the_height_of_cosines_follows_from_their_wave_numbers(device, size):
     shape, waves = (40, 35), (3, 2)
     y, x = (
         np.cos(np.pi * n * (np.arange(count) + 0.5) / count) for n, count in zip(waves, shape, strict=True)
@@ -79,26 +79,26 @@ def test_cosines_are_as_high_as_their_wave_numbers_say(device, size):
 
 def test_several_pictures_are_solved_at_once(device):
     pictures = np.random.default_rng(0).normal(size=(3, 11, 21))
-    told = [solve_by_cosines(picture) for picture in pictures]
-    found = Rectangle(pictures.shape, (1.0, 1.0), device).solve(put(device, pictures)).read()
-    np.testing.assert_allclose(found, told, atol=5e-6)
+    expected = [solve_by_cosines(picture) for picture in pictures]
+    solution = Rectangle(pictures.shape, (1.0, 1.0), device).solve(put(device, pictures)).read()
+    np.testing.assert_allclose(solution, expected, atol=5e-6)
 
 
 @pytest.mark.parametrize(("shape", "lean"), [((250, 256), 0.0), ((256, 251), 30.0)])
 def test_errors_are_less_than_a_millionth_of_the_range(device, shape, lean):
     source = source_of(scene(shape, lean)).astype(np.float32)
     height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, source)).read()
-    told = solve_by_cosines(source)
-    assert np.abs(height - told).max() < 5e-7 * np.ptp(told)
-    assert abs(height.mean(dtype=np.float64)) < 1e-7 * np.ptp(told)
+    expected = solve_by_cosines(source)
+    assert np.abs(height - expected).max() < 5e-7 * np.ptp(expected)
+    assert abs(height.mean(dtype=np.float64)) < 1e-7 * np.ptp(expected)
 
 
 def test_a_long_slope_stays_straight(device):
     """The slowest modes add up what each line rounds: they carry twice the digits."""
     surface = scene((3000, 48), 1.0)
     height = Rectangle((3000, 48), (1.0, 1.0), device).solve(put(device, source_of(surface))).read()
-    told = solve_by_cosines(source_of(surface).astype(np.float32))
-    assert np.abs(height - told).max() < 5e-7 * np.ptp(told)
+    expected = solve_by_cosines(source_of(surface).astype(np.float32))
+    assert np.abs(height - expected).max() < 5e-7 * np.ptp(expected)
 
 
 @pytest.mark.parametrize("columns", [1531, 4800])
@@ -106,8 +106,8 @@ def test_a_long_strip_is_solved_by_a_convolution_or_outside_of_a_group_s_own_mem
     shape = (37, columns)
     source = source_of(scene(shape, 1.0, noise=0.0)).astype(np.float32)
     height = Rectangle(shape, (1.0, 1.0), device).solve(put(device, source)).read()
-    told = solve_by_cosines(source)
-    assert np.abs(height - told).max() < 1e-6 * np.ptp(told)
+    expected = solve_by_cosines(source)
+    assert np.abs(height - expected).max() < 1e-6 * np.ptp(expected)
 
 
 @pytest.mark.parametrize("mask", [None, True])

@@ -59,17 +59,17 @@ def uneven(size=36, radius=14.0):
     truth, slopes, on = ball(size, radius)
     rng = np.random.default_rng(5)
     weights = rng.uniform(0.3, 3.0, (2, size, size)) * 1000
-    known = np.where(rng.random(truth.shape) < 0.1, truth + rng.normal(0, 0.2, truth.shape), np.nan)
-    return truth, noisy(slopes, 0.02), on, weights, known, rng.uniform(10, 40, truth.shape)
+    heights = np.where(rng.random(truth.shape) < 0.1, truth + rng.normal(0, 0.2, truth.shape), np.nan)
+    return truth, noisy(slopes, 0.02), on, weights, heights, rng.uniform(10, 40, truth.shape)
 
 
 def test_known_heights_lift_a_ball_off_its_plane():
-    truth, slopes, _, weights, known, height_weights = uneven()
+    truth, slopes, _, weights, known_heights, height_weights = uneven()
     surface = engine.integrate(
         *slopes,
         1.0,
         slope_weights=weights,
-        known_heights=known,
+        known_heights=known_heights,
         known_height_weights=height_weights,
         robust=True,
         sigma=False,
@@ -141,7 +141,7 @@ def asked(name):
 
 
 @cache
-def found(name, k=K):
+def robust_surface(name, k=K):
     case, slopes, _ = asked(name)
     options = {"mask": case.mask, "robust": True, "bilateral_sharpness": k, "sigma": False}
     return engine.integrate(*slopes, case.pixel_size, **options)
@@ -150,7 +150,7 @@ def found(name, k=K):
 @pytest.mark.parametrize("name", CASES)
 def test_heights_are_kept_wherever_the_normals_determine_them(name):
     case, _, part = asked(name)
-    surface = found(name)
+    surface = robust_surface(name)
     np.testing.assert_array_equal(np.isfinite(surface.height), case.mask)
     assert np.nanmax(np.abs(steps.errors(surface.height, case, part))) <= 0.02
 
@@ -158,7 +158,7 @@ def test_heights_are_kept_wherever_the_normals_determine_them(name):
 @pytest.mark.parametrize("name", CASES)
 def test_no_edge_is_marked_where_there_is_none(name):
     case, _, _ = asked(name)
-    edges = found(name).edges
+    edges = robust_surface(name).edges
     assert edges.shape == case.mask.shape
     assert edges.dtype == np.uint8
     assert set(np.unique(edges)) <= {0, 1}
@@ -174,6 +174,6 @@ def test_a_tear_is_marked():
     case, _, _ = asked("torn sheet")
     torn = (np.abs(np.diff(case.seen.height, axis=1)) > 3 * case.pixel_size[0]).any(axis=1)
     middle = slice(case.mask.shape[1] // 2 - 3, case.mask.shape[1] // 2 + 3)
-    marked = found("torn sheet").edges[:, middle].any(axis=1)
+    marked = robust_surface("torn sheet").edges[:, middle].any(axis=1)
     assert torn.sum() > 25
     assert marked[torn].mean() >= 0.95

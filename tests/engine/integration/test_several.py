@@ -27,11 +27,11 @@ GRAPHS = {
 
 def slopes(count, seed=0):
     """Return slopes of surfaces with noise, of which the last one is level."""
-    found = np.random.default_rng(seed).normal(0, 0.05, (2, count, *SHAPE))
+    noise = np.random.default_rng(seed).normal(0, 0.05, (2, count, *SHAPE))
     for number in range(count - 1):
-        found[:, number] += surfaces.sample(surfaces.cosines(11.0 + number, 1.5), SHAPE)[:2]
-    found[:, -1] = 0
-    return found.astype(np.float32)
+        noise[:, number] += surfaces.sample(surfaces.cosines(11.0 + number, 1.5), SHAPE)[:2]
+    noise[:, -1] = 0
+    return noise.astype(np.float32)
 
 
 @pytest.mark.parametrize(
@@ -39,34 +39,34 @@ def slopes(count, seed=0):
     [("mask", 18), ("known heights", 3), ("weights", 1), ("rectangle", 18), ("rectangle with heights", 3)],
 )
 def test_each_surface_is_that_found_alone(device, graph, count):
-    given, known = slopes(count), {**GRAPHS[graph], "tolerance": 1e-6, "device": device}
-    found = engine.integrate(*given, 0.5, **known)
-    assert found.height.shape == (count, *SHAPE)
-    assert found.height_sigma.shape == found.component.shape == SHAPE
-    for pair, height in zip(np.moveaxis(given, 1, 0), found.height, strict=True):
-        alone = engine.integrate(*pair, 0.5, sigma=False, **known)
+    gradients, options = slopes(count), {**GRAPHS[graph], "tolerance": 1e-6, "device": device}
+    surface = engine.integrate(*gradients, 0.5, **options)
+    assert surface.height.shape == (count, *SHAPE)
+    assert surface.height_sigma.shape == surface.component.shape == SHAPE
+    for pair, height in zip(np.moveaxis(gradients, 1, 0), surface.height, strict=True):
+        alone = engine.integrate(*pair, 0.5, sigma=False, **options)
         np.testing.assert_allclose(height, alone.height, atol=1e-5 * max(1.0, np.nanmax(alone.height)))
-        assert alone.process["integration"] == found.process["integration"]
-        np.testing.assert_array_equal(alone.component, found.component)
+        assert alone.process["integration"] == surface.process["integration"]
+        np.testing.assert_array_equal(alone.component, surface.component)
 
 
 def test_the_noise_is_that_of_all_surfaces():
-    given = np.random.default_rng(1).normal(0, [[[[0.01]], [[0.03]]]], (2, 2, *SHAPE))
-    both = engine.integrate(*given, 1.0, mask=DISC).height_sigma
-    one, other = (engine.integrate(*given[:, k], 1.0, mask=DISC).height_sigma for k in (0, 1))
-    np.testing.assert_allclose(both[DISC], np.sqrt((one**2 + other**2) / 2)[DISC], rtol=1e-3)
+    gradients = np.random.default_rng(1).normal(0, [[[[0.01]], [[0.03]]]], (2, 2, *SHAPE))
+    both = engine.integrate(*gradients, 1.0, mask=DISC).height_sigma
+    first, other = (engine.integrate(*gradients[:, k], 1.0, mask=DISC).height_sigma for k in (0, 1))
+    np.testing.assert_allclose(both[DISC], np.sqrt((first**2 + other**2) / 2)[DISC], rtol=1e-3)
 
 
 @pytest.mark.parametrize("mask", [DISC, None], ids=["disc", "rectangle"])
 def test_a_pixel_without_a_slope_of_one_surface_is_left_out_of_all(mask):
-    given, lost = slopes(3), np.zeros(SHAPE, bool)
+    gradients, lost = slopes(3), np.zeros(SHAPE, bool)
     lost[30:33, 40:42] = True
-    given[1, 1][lost] = np.nan
-    found = engine.integrate(*given, 0.5, mask=mask)
-    agreed = engine.integrate(*np.where(lost, np.nan, given), 0.5, mask=mask)
-    assert np.isnan(found.height[:, lost]).all()
-    assert found.process["integration_invalid"] == agreed.process["integration_invalid"] == lost.sum()
-    np.testing.assert_array_equal(found.height, agreed.height)
+    gradients[1, 1][lost] = np.nan
+    surface = engine.integrate(*gradients, 0.5, mask=mask)
+    agreed = engine.integrate(*np.where(lost, np.nan, gradients), 0.5, mask=mask)
+    assert np.isnan(surface.height[:, lost]).all()
+    assert surface.process["integration_invalid"] == agreed.process["integration_invalid"] == lost.sum()
+    np.testing.assert_array_equal(surface.height, agreed.height)
 
 
 @pytest.mark.parametrize("kind", ["comb", "cuts", "uneven"])
@@ -74,13 +74,13 @@ def test_a_pixel_without_a_slope_of_one_surface_is_left_out_of_all(mask):
 def test_any_graph_is_solved_for_many_right_sides(device, kind, anchored):
     graph = graphs.pixel_graph(kind, (45, 70), anchored)
     sources = np.random.default_rng(0).normal(size=(6, 45, 70))
-    sources = np.stack([graph.centred(one) for one in sources])
+    sources = np.stack([graph.centred(values) for values in sources])
     maps = [device.from_host("links", getattr(graph, name)) for name in ("right", "down")]
     anchor = device.from_host("anchor", graph.anchor) if anchored else None
     solver = Multigrid(Links(device, (45, 70), *maps, anchor, device.from_host("source", sources[0])))
-    found = solver.solve_many(device.from_host("sources", sources), tolerance=1e-6)
-    assert found.converged
-    for source, height in zip(sources, found.height.read(), strict=True):
+    solution = solver.solve_many(device.from_host("sources", sources), tolerance=1e-6)
+    assert solution.converged
+    for source, height in zip(sources, solution.height.read(), strict=True):
         graph.source[...] = source
         exact = graph.solve()
         np.testing.assert_allclose(graph.centred(height), exact, atol=2e-5 * np.ptp(exact))
@@ -91,8 +91,8 @@ def test_a_product_with_a_matrix_is_one_with_its_columns(device):
     columns = RANDOM.normal(size=(99, 5)) * [1, 1e-6, 1e6, 0, 1]
     for tolerance in (1e-6, None):
         inverse = engine.integration.invert_laplacian(right, down, held, tolerance=tolerance, device=device)
-        found = inverse @ columns
-        for column, answer in zip(columns.T, found.T, strict=True):
+        product = inverse @ columns
+        for column, answer in zip(columns.T, product.T, strict=True):
             np.testing.assert_allclose(answer, inverse @ column, atol=1e-5 * np.abs(answer).max())
 
 

@@ -18,8 +18,8 @@ def scene(shape, seed=0, blobs=True):
     mask = mask if blobs else np.ones(shape, bool)
     dz_dx, dz_dy = np.sin(9 * x) + random.normal(0, 0.1, shape), np.cos(7 * y)
     weights = 10 ** random.uniform(-1, 1, (2, *shape))
-    slopes = [np.where(mask, one, np.nan) for one in (dz_dx, dz_dy)]
-    return [one.astype(np.float32) for one in (*slopes, *np.where(mask, weights, 0))]
+    slopes = [np.where(mask, values, np.nan) for values in (dz_dx, dz_dy)]
+    return [values.astype(np.float32) for values in (*slopes, *np.where(mask, weights, 0))]
 
 
 def follow(follower, maps):
@@ -39,8 +39,8 @@ def best(maps):
 
 def miss(height, exact):
     np.testing.assert_array_equal(np.isnan(height), np.isnan(exact))
-    known = np.isfinite(exact)
-    return np.sqrt(np.mean((height - exact)[known] ** 2)) / np.ptp(exact[known])
+    finite = np.isfinite(exact)
+    return np.sqrt(np.mean((height - exact)[finite] ** 2)) / np.ptp(exact[finite])
 
 
 @pytest.mark.parametrize("shape", [(48, 64), (37, 131), (150, 90)])
@@ -56,10 +56,10 @@ def test_they_come_near_at_once_and_nearer_with_each_step(device, shape):
 def test_what_changes_little_is_followed(device):
     shape = (60, 80)
     follower, start, end = WarmStartIntegrator(device, shape, PIXEL), scene(shape), scene(shape, seed=1)
-    for share in np.linspace(0, 1, 30):
-        maps = [(1 - share) * one + share * other for one, other in zip(start, end, strict=True)]
-        height = follow(follower, [one.astype(np.float32) for one in maps])
-        if share > 0.9:
+    for fraction in np.linspace(0, 1, 30):
+        maps = [(1 - fraction) * before + fraction * other for before, other in zip(start, end, strict=True)]
+        height = follow(follower, [before.astype(np.float32) for before in maps])
+        if fraction > 0.9:
             assert miss(height, best(maps).height) < 2e-2
     assert follower.gap < 0.1
 

@@ -30,12 +30,12 @@ def test_heights_are_bit_by_bit_those_of_the_same_frames_offline(device, dtype):
         live.push(frames[part], travel=TRAVEL[part])
         live.maps()
     dark, bright = references(SHAPE[1:], np.dtype(dtype))
-    found, exact = live.result(), find_onset(frames, TRAVEL, dark=dark, bright=bright, device=device)
+    result, exact = live.result(), find_onset(frames, TRAVEL, dark=dark, bright=bright, device=device)
     assert (exact.status == 1).sum() > 50
-    np.testing.assert_array_equal(found.height, exact.height)
-    np.testing.assert_array_equal(found.height_sigma, exact.height_sigma)
-    np.testing.assert_array_equal(found.status, exact.status)
-    assert found.process["noise"] == exact.process["noise"]
+    np.testing.assert_array_equal(result.height, exact.height)
+    np.testing.assert_array_equal(result.height_sigma, exact.height_sigma)
+    np.testing.assert_array_equal(result.status, exact.status)
+    assert result.process["noise"] == exact.process["noise"]
 
 
 def test_the_map_grows_as_contact_spreads_and_nothing_writes_to_it_later():
@@ -46,8 +46,8 @@ def test_the_map_grows_as_contact_spreads_and_nothing_writes_to_it_later():
         maps = live.maps()
         assert bool(maps) == (number > 0)
         if maps:
-            known = np.isfinite(maps["height"])
-            assert not np.any(known & (maps["contact"] == 0))
+            finite = np.isfinite(maps["height"])
+            assert not np.any(finite & (maps["contact"] == 0))
             assert maps["contact_area"] == pytest.approx(maps["contact"].sum() * PIXEL**2)
             areas.append(maps["contact_area"])
             kept.append((maps["height"], maps["height"].copy()))
@@ -57,7 +57,7 @@ def test_the_map_grows_as_contact_spreads_and_nothing_writes_to_it_later():
         np.testing.assert_array_equal(now, then)
 
 
-def test_holes_are_filled_in_the_result_and_it_says_how_it_came_about():
+def test_holes_are_filled_in_the_result_which_stores_its_provenance():
     frames, live = make()
     live.push(frames, travel=TRAVEL)
     result = live.result()

@@ -39,8 +39,8 @@ def feed(live, frames, cuts):
     return updates
 
 
-def edges_of(found, device=None):
-    return find_edges(found.normals, found.normals_sigma, found.contact, device=device)
+def edges_of(result, device=None):
+    return find_edges(result.normals, result.normals_sigma, result.contact, device=device)
 
 
 def best_heights(normals):
@@ -109,7 +109,7 @@ def test_a_replay_in_other_cuts_is_the_same_bit_by_bit(dtype):
         np.testing.assert_allclose(first.height, other.height, atol=1e-3 * span)
 
 
-def test_the_result_is_whole_and_says_how_it_came_about(tmp_path):
+def test_the_result_is_whole_and_stores_its_provenance(tmp_path):
     frames, live = make()
     feed(live, frames, [SHAPE[0]])
     save_result(live.result(), tmp_path / "live.h5")
@@ -203,8 +203,8 @@ def test_a_window_is_a_turn_of_at_most_64_frames():
     for turn, window, every in ((8, 8, 1), (64, 64, 1), (65, 32, 2), (400.3, 57, 7), (3.2, 3, 1)):
         assert choose_window(turn) == (window, every)
         assert abs(window * every - turn) <= every
-    for turn, wanted, every in ((40, 24, 1), (40, 20, 2), (40, 8, 5), (39.6, 40, 1), (400, 64, 6)):
-        assert choose_window(turn, wanted) == (wanted, every)
+    for turn, frame_count, every in ((40, 24, 1), (40, 20, 2), (40, 8, 5), (39.6, 40, 1), (400, 64, 6)):
+        assert choose_window(turn, frame_count) == (frame_count, every)
     for turn in (2.0, math.nan, math.inf):
         with pytest.raises(InputError, match="frames a turn"):
             choose_window(turn)

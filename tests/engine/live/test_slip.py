@@ -17,8 +17,8 @@ BLOCK = Block(FRAMES, 0, displacement=PLACES)
 
 
 def source(motion="horizontal", **changes):
-    known = {"pixel_size": (PIXEL, PIXEL)} | changes
-    return MadeUp(FRAMES, Header(motion, **known), displacement=PLACES, time=0.01 * np.arange(COUNT))
+    fields = {"pixel_size": (PIXEL, PIXEL)} | changes
+    return MadeUp(FRAMES, Header(motion, **fields), displacement=PLACES, time=0.01 * np.arange(COUNT))
 
 
 class Timed(MadeUp):
@@ -34,11 +34,11 @@ def test_slip_is_bit_by_bit_that_of_the_same_frames_offline():
     for part in np.split(np.arange(COUNT), [1, 2, 5]):
         live.push_block(BLOCK, slice(part[0], part[-1] + 1))
         live.maps()
-    found, offline = live.result(), Sliding(contact=CONTACT).run(source())
+    result, offline = live.result(), Sliding(contact=CONTACT).run(source())
     for name in ("displacement", "slip_onset", "status", "stick_ratio", "slide_distance"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(offline, name), err_msg=name)
-    assert (found.status == 2).mean() > 0.5
-    assert found.process["live"] is True
+        np.testing.assert_array_equal(getattr(result, name), getattr(offline, name), err_msg=name)
+    assert (result.status == 2).mean() > 0.5
+    assert result.process["live"] is True
 
 
 def test_the_displacement_of_the_newest_frame_is_shown_from_the_second_on():
@@ -53,8 +53,8 @@ def test_the_displacement_of_the_newest_frame_is_shown_from_the_second_on():
 
 
 def test_a_whole_run_shows_how_far_the_body_has_come():
-    given = source()
-    timed = Timed(FRAMES, given.header, displacement=PLACES, time=0.01 * np.arange(COUNT))
+    recording = source()
+    timed = Timed(FRAMES, recording.header, displacement=PLACES, time=0.01 * np.arange(COUNT))
     updates = []
     live = LiveRun(timed, Sliding(contact=CONTACT))
     status = Loop(timed, live, updates=1e6, on_update=lambda update, _: updates.append(update)).run()
@@ -64,9 +64,9 @@ def test_a_whole_run_shows_how_far_the_body_has_come():
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("recording", "message"),
     [(source("vertical"), "Sliding needs horizontal or twist"), (source(pixel_size=None), "pixel size")],
 )
-def test_what_shows_no_slip_is_refused(given, told):
-    with pytest.raises(InputError, match=told):
-        LiveRun(given, Sliding())
+def test_what_shows_no_slip_is_refused(recording, message):
+    with pytest.raises(InputError, match=message):
+        LiveRun(recording, Sliding())

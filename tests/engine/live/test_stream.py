@@ -32,29 +32,29 @@ def test_the_result_is_that_of_the_function_on_arrays(frames):
     with stream() as pushed:
         for frame, travel in zip(frames, TRAVEL, strict=True):
             pushed.push(frame, travel=travel)
-        found = pushed.result()
+        result = pushed.result()
     expected = engine.find_onset(frames, TRAVEL, **LEVELS)
-    np.testing.assert_array_equal(found.height, expected.height)
-    np.testing.assert_array_equal(found.height_sigma, expected.height_sigma)
+    np.testing.assert_array_equal(result.height, expected.height)
+    np.testing.assert_array_equal(result.height_sigma, expected.height_sigma)
 
 
 def test_several_frames_are_pushed_at_once(frames):
     with stream() as pushed:
         pushed.push(frames[:25], travel=TRAVEL[:25])
         pushed.push(frames[25:], travel=TRAVEL[25:])
-        found = pushed.result()
-    np.testing.assert_array_equal(found.height, engine.find_onset(frames, TRAVEL, **LEVELS).height)
+        result = pushed.result()
+    np.testing.assert_array_equal(result.height, engine.find_onset(frames, TRAVEL, **LEVELS).height)
 
 
 def test_frames_may_be_overwritten_after_they_were_pushed(frames):
-    room = np.empty(SHAPE, np.uint8)
+    buffer = np.empty(SHAPE, np.uint8)
     with stream() as pushed:
         for frame, travel in zip(frames, TRAVEL, strict=True):
-            room[...] = frame
-            pushed.push(room, travel=travel)
-            room[...] = 0
-        found = pushed.result()
-    np.testing.assert_array_equal(found.height, engine.find_onset(frames, TRAVEL, **LEVELS).height)
+            buffer[...] = frame
+            pushed.push(buffer, travel=travel)
+            buffer[...] = 0
+        result = pushed.result()
+    np.testing.assert_array_equal(result.height, engine.find_onset(frames, TRAVEL, **LEVELS).height)
 
 
 def test_frames_are_pushed_from_any_thread(frames):
@@ -84,7 +84,7 @@ def test_every_frame_is_counted(frames):
     assert (status.used, status.skipped, status.dropped) == (len(frames), 0, 0)
 
 
-def test_a_result_before_there_are_enough_frames_says_how_many_are_missing(frames):
+def test_a_result_before_there_are_enough_frames_names_the_number_missing(frames):
     with stream() as pushed:
         pushed.push(frames[0], travel=0.0)
         with pytest.raises(io.InputError, match="needs at least 2 frames; 1 has been pushed so far"):
@@ -101,10 +101,10 @@ def test_a_result_before_there_are_enough_frames_says_how_many_are_missing(frame
     ],
 )
 def test_what_does_not_fit_is_refused_at_once(frames, change, line):
-    given = {"frames": frames[:1], "travel": [0.0], **change}
-    given = {name: value for name, value in given.items() if value is not None}
+    arguments = {"frames": frames[:1], "travel": [0.0], **change}
+    arguments = {name: value for name, value in arguments.items() if value is not None}
     with stream() as pushed, pytest.raises(io.InputError, match=line):
-        pushed.push(**given)
+        pushed.push(**arguments)
 
 
 @pytest.mark.parametrize(
@@ -138,8 +138,8 @@ def test_what_cannot_be_used_is_refused_where_it_is_pushed_and_changes_nothing(f
             pushed.push(**{"frames": frames[1], "travel": TRAVEL[1], **change})
         assert "\n" not in str(caught.value)
         pushed.push(frames[1:], travel=TRAVEL[1:])
-        found = pushed.result()
-    np.testing.assert_array_equal(found.height, engine.find_onset(frames, TRAVEL, **LEVELS).height)
+        result = pushed.result()
+    np.testing.assert_array_equal(result.height, engine.find_onset(frames, TRAVEL, **LEVELS).height)
 
 
 @pytest.mark.parametrize("place", [0.1, [0.1], [0.1, 0.2, 0.3], [[0.1, 0.2]], [0.1, np.nan]])
@@ -160,8 +160,8 @@ def test_a_rotation_without_tilts_is_processed():
     phase = np.arange(8) * np.pi / 4
     with stream(engine.Correlate(), motion="axial") as pushed:
         pushed.push(counts, phase=phase)
-        found = pushed.result()
-    np.testing.assert_array_equal(found.mean, engine.correlate(counts, phase).mean)
+        result = pushed.result()
+    np.testing.assert_array_equal(result.mean, engine.correlate(counts, phase).mean)
 
 
 def test_times_that_run_backwards_are_refused_and_no_frame_is_lost(frames):
@@ -228,9 +228,9 @@ def test_an_error_inside_with_is_not_hidden_by_that_of_a_frame():
 def reader_of(pushed):
     """Return the thread of a stream."""
     before = set(threading.enumerate())
-    made = pushed()
+    pushed_stream = pushed()
     (thread,) = set(threading.enumerate()) - before
-    return made, thread
+    return pushed_stream, thread
 
 
 @pytest.mark.parametrize("latency", [0.1, math.inf])

@@ -15,8 +15,8 @@ MAPS = "normals", "normals_sigma", "contact", "mean", "cosine", "sine", "residua
 
 def make(dtype="uint8", device=None, **other):
     offset, gain, _ = SCALES[dtype]
-    known = {"window_frames": WINDOW, "tilt": TILT, "zenith_gain": gain, "zenith_offset": offset, **other}
-    return Run(Normals(device=device, **known))
+    options = {"window_frames": WINDOW, "tilt": TILT, "zenith_gain": gain, "zenith_offset": offset, **other}
+    return Run(Normals(device=device, **options))
 
 
 def push(run, frames, cuts, phase=PHASE):
@@ -24,9 +24,9 @@ def push(run, frames, cuts, phase=PHASE):
         run.push(block.frames, phase=block.phase)
 
 
-def same(one, other, maps=MAPS):
+def same(first, other, maps=MAPS):
     for name in maps:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(first, name), getattr(other, name), err_msg=name)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
@@ -70,8 +70,8 @@ def test_the_correlation_is_that_of_correlate(device, dtype):
     frames = turn_frames(SHAPE, dtype)
     run = make(dtype, device, noise=1.0)
     correlate_window = Run(Correlate(window_frames=WINDOW, device=device))
-    for one in (run, correlate_window):
-        push(one, frames, [4, 12, 5])
+    for operation in (run, correlate_window):
+        push(operation, frames, [4, 12, 5])
     run.result()  # which has maps of its own
     same(run.operation.window.correlation(), correlate_window.result(), MAPS[3:])
     if dtype != "float32":
@@ -89,22 +89,22 @@ def test_a_device_with_little_memory_works_in_bands(small_device):
     run = make(device=small_device, noise=1.3)
     push(run, frames, [2, 19])
     assert len(run.operation.window.maps.bands) > 1
-    found = run.result()
-    assert np.mean(np.isclose(found.normals, exact.result().normals, atol=1e-5, equal_nan=True)) > 0.99
-    assert found.normals.shape == (*SHAPE[1:], 3)
+    result = run.result()
+    assert np.mean(np.isclose(result.normals, exact.result().normals, atol=1e-5, equal_nan=True)) > 0.99
+    assert result.normals.shape == (*SHAPE[1:], 3)
 
 
 def test_normals_with_ends_and_a_scale_of_each_pixel_go_round_the_ring_too():
     frames, (offset, gain, noise) = turn_frames(SHAPE), SCALES["uint8"]
     gains = gain * np.linspace(0.9, 1.1, SHAPE[2]) * np.ones(SHAPE[1:])
-    known = {"noise": noise, "dark": offset + 4, "bright": offset + 150}
-    run = make(zenith_gain=gains, **known)
+    options = {"noise": noise, "dark": offset + 4, "bright": offset + 150}
+    run = make(zenith_gain=gains, **options)
     push(run, frames, [11, 10])
     last = slice(-WINDOW, None)
     same(
         run.result(),
         estimate_normals(
-            frames[last], PHASE[last], tilt=TILT, zenith_gain=gains, zenith_offset=offset, **known
+            frames[last], PHASE[last], tilt=TILT, zenith_gain=gains, zenith_offset=offset, **options
         ),
     )
 

@@ -9,11 +9,13 @@ from scipy import ndimage
 from mirrorskin.engine.metrology import PARAMETERS, roughness
 
 SHAPE, SIZE = (240, 300), (0.01, 0.01)
-AREAL = [name for name, one in PARAMETERS.items() if one.standard == "ISO 25178-2"]
+AREAL = [name for name, parameter in PARAMETERS.items() if parameter.standard == "ISO 25178-2"]
 
 
 def values(height, size=SIZE, **options):
-    return {name: one.value for name, one in roughness(height, size, **options).parameters.items()}
+    return {
+        name: parameter.value for name, parameter in roughness(height, size, **options).parameters.items()
+    }
 
 
 def random(spread, seed=1, shape=SHAPE):
@@ -57,33 +59,33 @@ def test_the_aspect_ratio_is_that_of_surfalize(kind):
 
 def test_the_autocorrelation_length_is_that_of_the_surface_before_it_was_drawn():
     # A normal filter of spread s has the autocorrelation exp(-r^2 / 4 s^2), which is 0.2 at 2 s sqrt(ln 5).
-    found = values(random(4, seed=5, shape=(600, 700)))
-    assert found["Sal"] == pytest.approx(0.01 * 8 * np.sqrt(np.log(5)), rel=0.05)
+    parameters = values(random(4, seed=5, shape=(600, 700)))
+    assert parameters["Sal"] == pytest.approx(0.01 * 8 * np.sqrt(np.log(5)), rel=0.05)
 
 
 @pytest.mark.parametrize("angle", [0, 30, 90, 120])
 def test_the_direction_is_that_of_the_waves(angle):
     x, y = places(SHAPE, SIZE)
     wave = np.cos(2 * np.pi * (x * np.cos(np.radians(angle)) + y * np.sin(np.radians(angle))) / 0.13)
-    found = values(0.001 * wave)["Std"]
-    assert abs((found - angle + 90) % 180 - 90) < 1.5
+    direction = values(0.001 * wave)["Std"]
+    assert abs((direction - angle + 90) % 180 - 90) < 1.5
 
 
 def test_a_normal_surface_has_the_material_ratio_of_a_normal_distribution():
-    found = values(random(2, seed=3, shape=(600, 700)))
-    assert (found["Ssk"], found["Sku"]) == pytest.approx((0, 3), abs=0.05)
+    parameters = values(random(2, seed=3, shape=(600, 700)))
+    assert (parameters["Ssk"], parameters["Sku"]) == pytest.approx((0, 3), abs=0.05)
     # Volumes are integrals of its quantiles: with z = 1.2816 at 10 %, Vmp = phi(z) - 0.1 z, and so on.
     for name, value in {"Vmp": 0.0473, "Vmc": 0.9059, "Vvc": 1.2173, "Vvv": 0.1116}.items():
-        assert found[name] == pytest.approx(value, rel=0.05), name
+        assert parameters[name] == pytest.approx(value, rel=0.05), name
 
 
 def test_a_sine_has_the_gradient_and_area_of_its_closed_form():
     x, _ = places((50, 4000), (0.001, 0.01))
-    found = values(0.02 * np.sin(2 * np.pi * x / 0.5), (0.001, 0.01))
+    parameters = values(0.02 * np.sin(2 * np.pi * x / 0.5), (0.001, 0.01))
     gradient = 0.02 * 2 * np.pi / 0.5 / np.sqrt(2)
-    assert found["Sdq"] == pytest.approx(gradient, rel=1e-3)
+    assert parameters["Sdq"] == pytest.approx(gradient, rel=1e-3)
     slope = 0.02 * 2 * np.pi / 0.5 * np.cos(np.linspace(0, 2 * np.pi, 100_001)[:-1])
-    assert found["Sdr"] == pytest.approx(100 * (np.mean(np.sqrt(1 + slope**2)) - 1), rel=2e-3)
+    assert parameters["Sdr"] == pytest.approx(100 * (np.mean(np.sqrt(1 + slope**2)) - 1), rel=2e-3)
 
 
 def test_holes_are_left_out_of_all_parameters():
@@ -106,6 +108,6 @@ def test_all_parameters_are_there():
 
 
 def test_a_surface_of_equal_heights_has_no_shape():
-    found = values(np.ones((20, 30)))
-    assert found["Sq"] == 0
-    assert np.isnan([found[name] for name in ("Ssk", "Sku", "Sal", "Str")]).all()
+    parameters = values(np.ones((20, 30)))
+    assert parameters["Sq"] == 0
+    assert np.isnan([parameters[name] for name in ("Ssk", "Sku", "Sal", "Str")]).all()

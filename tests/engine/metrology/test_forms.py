@@ -40,13 +40,13 @@ def noise(shape, kind, rng):
 
 
 def test_a_plane_is_found_exactly():
-    found = fit_plane(leaning(), *axes())
-    assert found.tilt.value == pytest.approx(np.degrees(np.arctan(0.5)))
-    assert found.azimuth.value == pytest.approx(np.degrees(np.arctan2(0.4, -0.3)))  # downhill
-    assert found.offset.value == pytest.approx(2.0)
-    assert found.rms.value == pytest.approx(0, abs=1e-9)
-    assert max(found.tilt.sigma, found.offset.sigma) < 1e-9
-    assert found.outliers == 0
+    plane = fit_plane(leaning(), *axes())
+    assert plane.tilt.value == pytest.approx(np.degrees(np.arctan(0.5)))
+    assert plane.azimuth.value == pytest.approx(np.degrees(np.arctan2(0.4, -0.3)))  # downhill
+    assert plane.offset.value == pytest.approx(2.0)
+    assert plane.rms.value == pytest.approx(0, abs=1e-9)
+    assert max(plane.tilt.sigma, plane.offset.sigma) < 1e-9
+    assert plane.outliers == 0
     height = np.zeros(SHAPE)
     height[:10] = 1.0
     assert fit_plane(height, *axes()).outliers == 0  # a quarter of the surface
@@ -55,32 +55,32 @@ def test_a_plane_is_found_exactly():
 def test_distances_from_a_plane_are_at_right_angles_to_it():
     height = leaning()
     height[5, 7] += 0.02
-    found = fit_plane(height, *axes())
-    assert found.outliers == 1
-    assert found.residual[5, 7] == pytest.approx(0.02 * np.cos(np.arctan(0.5)))
-    assert np.count_nonzero(abs(found.residual) > 1e-9) == 1
+    plane = fit_plane(height, *axes())
+    assert plane.outliers == 1
+    assert plane.residual[5, 7] == pytest.approx(0.02 * np.cos(np.arctan(0.5)))
+    assert np.count_nonzero(abs(plane.residual) > 1e-9) == 1
 
 
 def test_a_level_plane_falls_nowhere():
-    found = fit_plane(np.full(SHAPE, 3.0), *axes())
-    assert (found.tilt.value, found.offset.value) == pytest.approx((0, 3))
-    assert found.azimuth.sigma > 100
+    plane = fit_plane(np.full(SHAPE, 3.0), *axes())
+    assert (plane.tilt.value, plane.offset.value) == pytest.approx((0, 3))
+    assert plane.azimuth.sigma > 100
 
 
 @pytest.mark.parametrize("zenith", [1, 60])
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_sphere_is_found_exactly(zenith, side):
     width = 5 * np.sin(np.radians(zenith))
-    size = tuple(width * one / 20 for one in (1.3, 0.8))
+    size = tuple(width * extent / 20 for extent in (1.3, 0.8))
     centre = 0.1 * width, -0.05 * width, 0.25
     height = side * cap(SHAPE, size, 5.0, width, centre)
-    found = fit_sphere(height, *axes(SHAPE, size))
-    assert found.hollow == (side < 0)
-    assert found.radius.value == pytest.approx(5.0, rel=1e-7)
-    assert (found.x.value, found.y.value) == pytest.approx(centre[:2])
-    assert found.top.value == pytest.approx(side * 0.25)
-    assert found.z.value == pytest.approx(side * (0.25 - 5), rel=1e-7)
-    assert found.rms.value == pytest.approx(0, abs=1e-6)
+    sphere = fit_sphere(height, *axes(SHAPE, size))
+    assert sphere.hollow == (side < 0)
+    assert sphere.radius.value == pytest.approx(5.0, rel=1e-7)
+    assert (sphere.x.value, sphere.y.value) == pytest.approx(centre[:2])
+    assert sphere.top.value == pytest.approx(side * 0.25)
+    assert sphere.z.value == pytest.approx(side * (0.25 - 5), rel=1e-7)
+    assert sphere.rms.value == pytest.approx(0, abs=1e-6)
 
 
 def test_holes_and_heights_without_a_sigma_do_not_count():
@@ -88,9 +88,9 @@ def test_holes_and_heights_without_a_sigma_do_not_count():
     sigma = np.full(SHAPE, 0.001)
     height[20:25, 30:35] = NAN
     height[10, 10:40], sigma[10, 10:40] = 7.0, NAN
-    found = fit_sphere(height, *axes(), sigma)
-    assert found.radius.value == pytest.approx(5.0)
-    assert np.isnan(found.residual[10, 10:40]).all()
+    sphere = fit_sphere(height, *axes(), sigma)
+    assert sphere.radius.value == pytest.approx(5.0)
+    assert np.isnan(sphere.residual[10, 10:40]).all()
 
 
 def test_late_heights_at_the_rim_of_visibility_do_not_spoil_the_radius():
@@ -99,16 +99,16 @@ def test_late_heights_at_the_rim_of_visibility_do_not_spoil_the_radius():
     assert 0.08 < rim.sum() / np.isfinite(height).sum() < 0.12
     height[rim] -= 0.7
     sigma = np.where(rim, 0.0003, 0.001)  # and they claim to be surer than others
-    found = fit_sphere(height, *axes(), sigma)
-    assert found.outliers == rim.sum()
-    assert abs(found.radius.value - 5) < 3 * found.radius.sigma < 0.02
+    sphere = fit_sphere(height, *axes(), sigma)
+    assert sphere.outliers == rim.sum()
+    assert abs(sphere.radius.value - 5) < 3 * sphere.radius.sigma < 0.02
 
 
-def test_surer_heights_count_more():
+def test_heights_count_by_their_inverse_variance():
     height = np.zeros(SHAPE)
     height[:, 30:] = 0.01 * (places(SHAPE, SIZE)[0] + 5)[:, 30:]
     sigma = np.where(height > 0, 0.1, 0.03)
-    equal, weighted = (fit_plane(height, *axes(), one) for one in (None, sigma))
+    equal, weighted = (fit_plane(height, *axes(), weights) for weights in (None, sigma))
     assert weighted.tilt.value < 0.8 * equal.tilt.value
 
 
@@ -141,8 +141,8 @@ def test_uncertainties_cover_what_went_wrong(kind):
         sphere = fit_sphere(ball + error, *axes(), sigma)
         flat = fit_plane(plane + error, *axes(), sigma)
         tilt = np.degrees(np.arctan(np.hypot(0.1, 0.05)))
-        told = (sphere.radius, 5), (sphere.x, 0), (sphere.top, 0), (flat.tilt, tilt), (flat.offset, 0)
-        pulls.append([(one.value - true) / one.sigma for one, true in told])
+        truths = (sphere.radius, 5), (sphere.x, 0), (sphere.top, 0), (flat.tilt, tilt), (flat.offset, 0)
+        pulls.append([(estimate.value - true) / estimate.sigma for estimate, true in truths])
     assert (np.mean(np.abs(pulls) <= 2, axis=0) >= 0.8).all()
     radius, tilt = np.array(pulls)[:, [0, 3]].T
     # They are not covered by saying nothing, either.
@@ -155,7 +155,7 @@ def test_all_heights_may_be_wrong_together():
     sigma = np.full(SHAPE, 0.02)
     flat = fit_plane(leaning() + error, *axes(), sigma)
     ball = fit_sphere(cap(SHAPE, SIZE, 5.0, 2.5) + error, *axes(), sigma)
-    assert min(one.sigma for one in (flat.offset, ball.top, ball.z)) >= 0.02
+    assert min(estimate.sigma for estimate in (flat.offset, ball.top, ball.z)) >= 0.02
 
 
 @pytest.mark.parametrize("claimed", [0.5, 2.0])
@@ -163,9 +163,9 @@ def test_birges_ratio_is_that_of_errors_to_what_is_claimed(claimed):
     rng = np.random.default_rng(11)
     sigma = np.full(SHAPE, 0.001 * claimed)
     error = 0.001 * rng.standard_normal(SHAPE)
-    for found in (
+    for form in (
         fit_plane(leaning() + error, *axes(), sigma),
         fit_sphere(cap(SHAPE, SIZE, 5.0, 2.5) + error, *axes(), sigma),
     ):
-        assert found.birge == pytest.approx(1 / claimed, rel=0.05)
+        assert form.birge == pytest.approx(1 / claimed, rel=0.05)
     assert np.isnan(fit_plane(leaning() + error, *axes()).birge)

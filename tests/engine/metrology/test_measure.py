@@ -13,7 +13,7 @@ SAG = RADIUS - np.sqrt(RADIUS**2 - WIDTH**2)
 
 
 def values(result, **options):
-    return {name: one.value for name, one in engine.measure(result, **options).quantities.items()}
+    return {name: quantity.value for name, quantity in engine.measure(result, **options).quantities.items()}
 
 
 @pytest.fixture(scope="module")
@@ -23,34 +23,34 @@ def ball():
 
 
 def test_a_cap_has_the_numbers_of_its_closed_form(ball):
-    told = values(ball)
+    measured = values(ball)
     volume = np.pi * SAG**2 * (3 * RADIUS - SAG) / 3
-    assert told["highest point"] == pytest.approx(0, abs=1e-3 * SAG)
-    assert told["lowest point"] == pytest.approx(-SAG, abs=5e-3 * SAG)  # a pixel lies within the rim
-    assert told["height range"] == pytest.approx(SAG, rel=5e-3)
-    assert told["rim height"] == pytest.approx(-SAG, rel=2e-2)
-    assert told["height above rim"] == pytest.approx(SAG, rel=2e-2)
-    assert told["measured area"] == pytest.approx(np.pi * WIDTH**2, rel=1e-3)
-    assert "contact area" not in told
-    assert told["volume above rim"] == pytest.approx(
-        volume - (told["rim height"] + SAG) * np.pi * WIDTH**2, rel=1e-3
+    assert measured["highest point"] == pytest.approx(0, abs=1e-3 * SAG)
+    assert measured["lowest point"] == pytest.approx(-SAG, abs=5e-3 * SAG)  # a pixel lies within the rim
+    assert measured["height range"] == pytest.approx(SAG, rel=5e-3)
+    assert measured["rim height"] == pytest.approx(-SAG, rel=2e-2)
+    assert measured["height above rim"] == pytest.approx(SAG, rel=2e-2)
+    assert measured["measured area"] == pytest.approx(np.pi * WIDTH**2, rel=1e-3)
+    assert "contact area" not in measured
+    assert measured["volume above rim"] == pytest.approx(
+        volume - (measured["rim height"] + SAG) * np.pi * WIDTH**2, rel=1e-3
     )
     # Here the rim counts, whose pixels are in or out as a whole.
-    assert told["volume below rest plane"] == pytest.approx(np.pi * WIDTH**2 * SAG - volume, rel=2e-3)
-    assert told["sphere radius"] == pytest.approx(RADIUS, rel=1e-6)
-    assert told["Sq"] == pytest.approx(0, abs=1e-3)
+    assert measured["volume below rest plane"] == pytest.approx(np.pi * WIDTH**2 * SAG - volume, rel=2e-3)
+    assert measured["sphere radius"] == pytest.approx(RADIUS, rel=1e-6)
+    assert measured["Sq"] == pytest.approx(0, abs=1e-3)
 
 
 def test_a_paraboloid_has_the_volume_of_its_closed_form():
     shape = 90, 121
     size = 3.0 / shape[0], 4.0 / shape[1]  # millimetres up and across
     x, y = places(shape, size[::-1])
-    found = values(result_of(0.5 - (x**2 + y**2) / 40, size[::-1]), form="plane")
-    assert found["highest point"] == pytest.approx(0.5, rel=1e-3)
-    assert found["measured area"] == pytest.approx(12)
+    measured = values(result_of(0.5 - (x**2 + y**2) / 40, size[::-1]), form="plane")
+    assert measured["highest point"] == pytest.approx(0.5, rel=1e-3)
+    assert measured["measured area"] == pytest.approx(12)
     bend = (3**2 + 4**2) / 12 / 40  # the mean of x^2 + y^2 over a rectangle of a x b is (a^2 + b^2) / 12
-    assert found["volume below rest plane"] == pytest.approx(-12 * (0.5 - bend), rel=1e-3)
-    assert "sphere radius" not in found
+    assert measured["volume below rest plane"] == pytest.approx(-12 * (0.5 - bend), rel=1e-3)
+    assert "sphere radius" not in measured
 
 
 def test_the_surface_in_contact_is_that_of_the_normals(ball):
@@ -58,22 +58,22 @@ def test_the_surface_in_contact_is_that_of_the_normals(ball):
     up = np.sqrt(np.maximum(RADIUS**2 - x**2 - y**2, 0.1)) / RADIUS
     normals = np.stack([x / RADIUS, y / RADIUS, up], axis=-1).astype(np.float32)
     normals[np.isnan(ball.height)] = NAN
-    told = engine.measure(
+    measured = engine.measure(
         ball.assign(normals=normals, normals_sigma=np.full(SHAPE, 1e-3, np.float32))
     ).quantities["measured surface area"]
-    assert told.value == pytest.approx(2 * np.pi * RADIUS * SAG, rel=1e-3)
-    assert 0.5e-3 < told.sigma / told.value < 1e-2
+    assert measured.value == pytest.approx(2 * np.pi * RADIUS * SAG, rel=1e-3)
+    assert 0.5e-3 < measured.sigma / measured.value < 1e-2
     assert "measured surface area" not in engine.measure(ball).quantities
 
 
 def test_a_map_of_contact_gives_the_contact_area(ball):
     x, y = places(SHAPE, SIZE)
     contact = (x**2 + y**2 < 4).astype(np.uint8)
-    told = engine.measure(ball.assign(contact=contact)).quantities
-    assert told["contact area"].value == pytest.approx(4 * np.pi, rel=1e-3)
+    quantities = engine.measure(ball.assign(contact=contact)).quantities
+    assert quantities["contact area"].value == pytest.approx(4 * np.pi, rel=1e-3)
     # Half a pixel all around, to one side.
-    assert told["contact area"].sigma == pytest.approx(4 * np.pi * 0.015 / np.sqrt(3), rel=0.15)
-    assert told["measured area"].value == pytest.approx(np.pi * WIDTH**2, rel=1e-3)
+    assert quantities["contact area"].sigma == pytest.approx(4 * np.pi * 0.015 / np.sqrt(3), rel=0.15)
+    assert quantities["measured area"].value == pytest.approx(np.pi * WIDTH**2, rel=1e-3)
 
 
 def test_uncertainties_of_volumes_are_those_of_correlated_errors(ball):
@@ -93,10 +93,10 @@ def test_the_highest_point_is_not_the_one_with_the_largest_error():
     pulls, largest = [], []
     for _ in range(40):
         noisy = clean + rng.normal(0, 0.01, clean.shape)
-        told = engine.measure(result_of(noisy, (0.05, 0.05), sigma=0.01), form="none").quantities[
+        highest = engine.measure(result_of(noisy, (0.05, 0.05), sigma=0.01), form="none").quantities[
             "highest point"
         ]
-        pulls.append(told.value / told.sigma)
+        pulls.append(highest.value / highest.sigma)
         largest.append(np.nanmax(noisy))
     assert np.mean(np.abs(pulls) < 2) >= 0.95
     assert abs(np.mean(pulls)) < 0.6
@@ -105,34 +105,34 @@ def test_the_highest_point_is_not_the_one_with_the_largest_error():
 
 def test_the_lowest_of_many_noisy_pixels_is_known_to_be_too_low():
     noisy = np.random.default_rng(3).normal(0, 0.01, (80, 80))
-    told = engine.measure(result_of(noisy, sigma=0.01)).quantities["lowest point"]
-    assert abs(told.value) < 2 * told.sigma
+    lowest = engine.measure(result_of(noisy, sigma=0.01)).quantities["lowest point"]
+    assert abs(lowest.value) < 2 * lowest.sigma
 
 
 def test_filled_heights_are_measured_separately(ball):
     filled = np.asarray(ball.height > -0.1).astype(np.uint8)
     sigma = np.where(filled, np.float32(NAN), ball.height_sigma)
     part = engine.measure(ball.assign(filled=filled, height_sigma=sigma))
-    whole, told = engine.measure(ball).quantities, part.quantities
+    whole, measured = engine.measure(ball).quantities, part.quantities
     for name in ("measured area", "volume above rim", "volume below rest plane"):
-        assert told[f"{name} with filled"].value == pytest.approx(whole[name].value)
-        assert abs(told[name].value) < abs(whole[name].value)
-        assert np.isfinite(told[name].sigma)
-    assert np.isnan(told["volume above rim with filled"].sigma)
+        assert measured[f"{name} with filled"].value == pytest.approx(whole[name].value)
+        assert abs(measured[name].value) < abs(whole[name].value)
+        assert np.isfinite(measured[name].sigma)
+    assert np.isnan(measured["volume above rim with filled"].sigma)
     # What a press fills it touched, or else surrounded: nobody knows.
     pressed = engine.measure(ball.assign(filled=filled, height_sigma=sigma, fitted=io.Fitted(event="onset")))
     assert pressed.quantities["contact area with filled"] == whole["measured area"]
-    assert not {"contact area", "contact area with filled"} & set(told)
+    assert not {"contact area", "contact area with filled"} & set(measured)
     contact = np.isfinite(ball.height).astype(np.uint8)
     sure = ball.assign(filled=filled, height_sigma=sigma, contact=contact)
     assert engine.measure(sure).quantities["contact area"] == whole["measured area"]
-    assert told["highest point"].value < -0.09
-    assert told["highest point with filled"].value == pytest.approx(0, abs=1e-4)
-    assert told["height above rim with filled"].value == pytest.approx(
+    assert measured["highest point"].value < -0.09
+    assert measured["highest point with filled"].value == pytest.approx(0, abs=1e-4)
+    assert measured["height above rim with filled"].value == pytest.approx(
         whole["height above rim"].value, abs=1e-3
     )
     assert any(note.startswith("the top was filled, not measured") for note in part.notes)
-    assert told["sphere radius"].value == pytest.approx(RADIUS, rel=1e-6)
+    assert measured["sphere radius"].value == pytest.approx(RADIUS, rel=1e-6)
     assert f"pixels filled, not measured, that count only in what says 'filled': {filled.sum()}" in part.notes
 
 
@@ -153,20 +153,20 @@ def test_the_form_is_the_sphere_where_it_leaves_much_less(ball):
 def test_roughness_is_that_from_the_form(ball):
     x, _ = places(SHAPE, SIZE)
     wave = 0.002 * np.cos(2 * np.pi * x / 0.2)
-    told = values(result_of(ball.height + wave, SIZE))
-    assert told["Sq"] == pytest.approx(2 * np.sqrt(0.5 * (1 - WIDTH**2 / (2 * RADIUS**2))), rel=1e-2)
+    measured = values(result_of(ball.height + wave, SIZE))
+    assert measured["Sq"] == pytest.approx(2 * np.sqrt(0.5 * (1 - WIDTH**2 / (2 * RADIUS**2))), rel=1e-2)
     filtered = engine.measure(result_of(ball.height + wave, SIZE), l_filter=0.4)
-    assert filtered.quantities["Sq"].value == pytest.approx(told["Sq"] * (1 - 0.5**4), rel=0.02)
+    assert filtered.quantities["Sq"].value == pytest.approx(measured["Sq"] * (1 - 0.5**4), rel=0.02)
     assert any("L-filter 0.4 mm" in note for note in filtered.notes)
     assert any(note.startswith("pixels left out of texture") for note in filtered.notes)
 
 
 def test_a_region_is_measured_alone(ball):
     region = io.Region((80, 140), (60, 150))
-    told = values(ball, region=region)
-    assert told["measured area"] == pytest.approx(60 * 90 * SIZE[0] * SIZE[1])
-    assert told["sphere radius"] == pytest.approx(RADIUS, rel=1e-5)
-    assert "rim height" not in told
+    measured = values(ball, region=region)
+    assert measured["measured area"] == pytest.approx(60 * 90 * SIZE[0] * SIZE[1])
+    assert measured["sphere radius"] == pytest.approx(RADIUS, rel=1e-5)
+    assert "rim height" not in measured
     assert any("border" in note for note in engine.measure(ball, region=region).notes)
     with pytest.raises(io.InputError, match="--region: a region of rows 0 to 500"):
         engine.measure(ball, region=io.Region((0, 500), (0, 10)))
@@ -204,7 +204,7 @@ def test_what_the_pixel_size_is_known_by_goes_into_all_that_depends_on_it(ball):
         "sphere centre x": 1,
         "highest point": 0,
     }.items():
-        before, after = (one.quantities[name] for one in (plain, with_lens))
+        before, after = (quantities.quantities[name] for quantities in (plain, with_lens))
         assert after.sigma == pytest.approx(np.hypot(before.sigma, power * 0.01 * before.value), rel=1e-3)
     assert any("known within 1 %" in note for note in with_lens.notes)
     assert any("taken as exact" in note for note in plain.notes)
@@ -241,10 +241,10 @@ def test_uncertain_pixels_count_neither_as_lowest_nor_as_rough():
     height = rng.normal(0, 0.001, (40, 50))
     sigma = np.full((40, 50), 0.001, np.float32)
     height[5:7, 30], sigma[5:7, 30] = -0.8, 0.4
-    found = engine.measure(result_of(height, height_sigma=sigma), form="plane")
-    assert found.quantities["lowest point"].value > -0.005
-    assert found.quantities["Sz"].value < 10
-    assert "pixels left out of texture and lowest point, far less certain than others: 2" in found.notes
+    measured = engine.measure(result_of(height, height_sigma=sigma), form="plane")
+    assert measured.quantities["lowest point"].value > -0.005
+    assert measured.quantities["Sz"].value < 10
+    assert "pixels left out of texture and lowest point, far less certain than others: 2" in measured.notes
     sure = engine.measure(result_of(height, sigma=0.001), form="plane").quantities
     assert sure["lowest point"].value == pytest.approx(-0.8)
     assert sure["Sz"].value > 800
@@ -254,27 +254,32 @@ def test_heights_without_a_standard_deviation_are_left_out_and_that_is_reported(
     height = np.zeros((9, 9))
     height[4, 4:6] = 3.0
     sigma = np.where(height > 0, NAN, 0.01).astype(np.float32)
-    found = engine.measure(result_of(height, height_sigma=sigma))
-    assert found.quantities["highest point"].value == 0
-    assert "pixels left out, whose height has no standard deviation: 2" in found.notes
+    measured = engine.measure(result_of(height, height_sigma=sigma))
+    assert measured.quantities["highest point"].value == 0
+    assert "pixels left out, whose height has no standard deviation: 2" in measured.notes
 
 
 @pytest.mark.parametrize(("shape", "sigma"), [((1, 9), None), ((2, 2), 0.0)])
 def test_tiny_pictures_of_all_equal_heights_are_measured(shape, sigma):
-    told = engine.measure(result_of(np.full(shape, -0.5), sigma=sigma)).quantities
-    assert told["highest point"].value == told["lowest point"].value == told["median height"].value == -0.5
-    assert told["Sz"].value == pytest.approx(0, abs=1e-9)
-    assert told["measured area"].value == pytest.approx(np.prod(shape) * 0.01)
-    assert told["volume below rest plane"].value == pytest.approx(np.prod(shape) * 0.005)
+    quantities = engine.measure(result_of(np.full(shape, -0.5), sigma=sigma)).quantities
+    assert (
+        quantities["highest point"].value
+        == quantities["lowest point"].value
+        == quantities["median height"].value
+        == -0.5
+    )
+    assert quantities["Sz"].value == pytest.approx(0, abs=1e-9)
+    assert quantities["measured area"].value == pytest.approx(np.prod(shape) * 0.01)
+    assert quantities["volume below rest plane"].value == pytest.approx(np.prod(shape) * 0.005)
 
 
 def test_without_standard_deviations_uncertainties_of_heights_are_unknown(ball):
     for sigma in (None, NAN):
-        found = engine.measure(result_of(ball.height, SIZE, sigma=sigma))
+        measured = engine.measure(result_of(ball.height, SIZE, sigma=sigma))
         for name in ("highest point", "lowest point", "volume above rim", "Sq"):
-            assert np.isnan(found.quantities[name].sigma)
-        assert np.isfinite(found.quantities["sphere radius"].sigma)
-        assert any("no standard deviations" in note for note in found.notes)
+            assert np.isnan(measured.quantities[name].sigma)
+        assert np.isfinite(measured.quantities["sphere radius"].sigma)
+        assert any("no standard deviations" in note for note in measured.notes)
 
 
 def test_what_cannot_be_measured_is_refused_in_a_line(ball):
@@ -286,8 +291,8 @@ def test_what_cannot_be_measured_is_refused_in_a_line(ball):
         "no height was measured there": result_of(np.zeros((3, 3)), filled=np.ones((3, 3), np.uint8)),
         "a single pixel": result_of(np.zeros((1, 1))),
     }
-    for said, result in refused.items():
-        with pytest.raises(io.InputError, match=said) as caught:
+    for message, result in refused.items():
+        with pytest.raises(io.InputError, match=message) as caught:
             engine.measure(result)
         assert "\n" not in str(caught.value)
     with pytest.raises(io.InputError, match="no sphere fits"):

@@ -15,31 +15,33 @@ def wave(length=0.5, amplitude=0.002, count=1001):
 
 
 def values(heights, **options):
-    return {name: one.value for name, one in profile_parameters(heights, STEP, **options)[0].items()}
+    return {
+        name: parameter.value for name, parameter in profile_parameters(heights, STEP, **options)[0].items()
+    }
 
 
 def test_a_sine_has_its_closed_form():
-    found = values(wave())
-    assert found["Pa"] == pytest.approx(4 / np.pi, rel=2e-3)
-    assert found["Pq"] == pytest.approx(2 / np.sqrt(2), rel=2e-3)
-    assert (found["Pz"], found["Pt"]) == pytest.approx((4, 4), rel=1e-3)
-    assert found["Psk"] == pytest.approx(0, abs=1e-2)
-    assert found["Pku"] == pytest.approx(1.5, rel=2e-3)
-    assert found["PSm"] == pytest.approx(0.5, rel=1e-6)
+    parameters = values(wave())
+    assert parameters["Pa"] == pytest.approx(4 / np.pi, rel=2e-3)
+    assert parameters["Pq"] == pytest.approx(2 / np.sqrt(2), rel=2e-3)
+    assert (parameters["Pz"], parameters["Pt"]) == pytest.approx((4, 4), rel=1e-3)
+    assert parameters["Psk"] == pytest.approx(0, abs=1e-2)
+    assert parameters["Pku"] == pytest.approx(1.5, rel=2e-3)
+    assert parameters["PSm"] == pytest.approx(0.5, rel=1e-6)
 
 
 def test_the_filter_halves_waves_of_its_length():
-    found = values(wave(length=0.8), l_filter=0.8)
-    assert found["Rt"] == pytest.approx(2, rel=0.02)
-    assert found["RSm"] == pytest.approx(0.8, rel=0.01)
+    parameters = values(wave(length=0.8), l_filter=0.8)
+    assert parameters["Rt"] == pytest.approx(2, rel=0.02)
+    assert parameters["RSm"] == pytest.approx(0.8, rel=0.01)
 
 
 def test_the_height_of_section_lengths_is_a_mean_and_the_total_one_is_not():
     heights = wave(length=0.1)
     heights[500:510] *= 5
-    found = values(heights, l_filter=0.8)
-    assert found["Rt"] > 2.5 * 4
-    assert found["Rz"] < 1.5 * 4
+    parameters = values(heights, l_filter=0.8)
+    assert parameters["Rt"] > 2.5 * 4
+    assert parameters["Rz"] < 1.5 * 4
 
 
 def test_small_peaks_do_not_count_in_the_spacing():
@@ -66,10 +68,10 @@ def test_a_section_has_the_parameters_of_its_profile():
     height = 0.002 * np.sin(2 * np.pi * x / 0.5) + 0.3 * x
     result = result_of(height, (0.02, 0.02), sigma=1e-5)
     ends = (-2.5, 0.0), (2.5, 0.0)
-    found = engine.measure(result, form="plane", section=ends)
-    assert found.quantities["Pq"].value == pytest.approx(2 / np.sqrt(2) / np.sqrt(1.09), rel=0.02)
-    assert found.quantities["PSm"].value == pytest.approx(0.5, rel=0.01)
-    assert 0 < found.quantities["Pq"].sigma < 0.01
+    measured = engine.measure(result, form="plane", section=ends)
+    assert measured.quantities["Pq"].value == pytest.approx(2 / np.sqrt(2) / np.sqrt(1.09), rel=0.02)
+    assert measured.quantities["PSm"].value == pytest.approx(0.5, rel=0.01)
+    assert 0 < measured.quantities["Pq"].sigma < 0.01
     rough = engine.measure(result, form="plane", section=ends, l_filter=0.8).quantities
     assert {"Ra", "Rq", "Rz", "Rt", "Rsk", "Rku", "RSm"} <= set(rough)
     assert not any(name.startswith("P") for name in rough)
@@ -77,5 +79,5 @@ def test_a_section_has_the_parameters_of_its_profile():
 
 def test_a_section_that_is_too_short_for_a_profile_is_a_note():
     result = result_of(np.zeros((20, 20)), (0.1, 0.1), sigma=0.001)
-    found = engine.measure(result, form="none", section=((-0.2, 0.0), (0.2, 0.0)))
-    assert any(note.startswith("no profile parameters: a profile needs at least") for note in found.notes)
+    measured = engine.measure(result, form="none", section=((-0.2, 0.0), (0.2, 0.0)))
+    assert any(note.startswith("no profile parameters: a profile needs at least") for note in measured.notes)

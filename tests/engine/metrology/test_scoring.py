@@ -81,9 +81,9 @@ def test_the_error_of_a_normal_is_the_angle_to_the_true_one():
     truth = truth_of_normals(
         [[30, 30, 0], [80, 45, 45]], [[50, -170, np.nan], [10, 45, 45]], [[1, 1, 1], [1, 0, 1]]
     )
-    found = normals([[33, 26, 0], [85, 45, 45]], [[50, 190, 77], [10, 225, np.nan]])
+    actual = normals([[33, 26, 0], [85, 45, 45]], [[50, 190, 77], [10, 225, np.nan]])
     sigma = np.full((2, 3), np.radians(2), np.float32)
-    score = engine.score(io.Result(normals=found, normals_sigma=sigma), truth)
+    score = engine.score(io.Result(normals=actual, normals_sigma=sigma), truth)
     assert score.parts().keys() == {"normal"}
     part = score.normal
     assert (part.answered, part.touched) == (4, 5)
@@ -99,8 +99,8 @@ def test_the_error_of_a_normal_is_the_angle_to_the_true_one():
 def test_small_and_large_angles_are_printed_alike(error):
     across = np.linspace(0, 360, 24, endpoint=False, dtype=np.float32)[np.newaxis]
     truth = truth_of_normals(np.full_like(across, 0.0), across)
-    found = normals(np.full(across.shape, error), across)
-    part = engine.score(io.Result(normals=found), truth).normal
+    actual = normals(np.full(across.shape, error), across)
+    part = engine.score(io.Result(normals=actual), truth).normal
     assert part.largest == pytest.approx(error, rel=1e-5)
     assert part.rms == pytest.approx(error, rel=1e-5)
 
@@ -119,11 +119,11 @@ def test_differences_of_azimuths_are_at_most_half_a_turn():
 
 def test_contact_is_scored_where_there_is_an_answer_and_as_a_whole():
     touched = [[1, 1, 1, 1, 1], [0, 0, 0, 0, 0]]
-    told = [[1, 1, 1, 0, 0], [1, 0, 0, 0, 0]]
+    flagged = [[1, 1, 1, 0, 0], [1, 0, 0, 0, 0]]
     truth = truth_of_normals(np.full((2, 5), 20), np.full((2, 5), 20), touched)
-    found = normals(np.full((2, 5), 20), np.full((2, 5), 20))
-    found[0, 4] = found[1, 4] = np.nan  # without an answer there is nothing to flag
-    part = engine.score(io.Result(normals=found, contact=np.array(told, np.uint8)), truth).contact
+    actual = normals(np.full((2, 5), 20), np.full((2, 5), 20))
+    actual[0, 4] = actual[1, 4] = np.nan  # without an answer there is nothing to flag
+    part = engine.score(io.Result(normals=actual, contact=np.array(flagged, np.uint8)), truth).contact
     assert part.recall == pytest.approx(3 / 5)
     assert part.precision == pytest.approx(3 / 4)
     assert part.lost == 4
@@ -167,10 +167,10 @@ def test_edges_are_found_within_a_pixel(jump, edges, recall, precision):
 
 def test_a_result_for_each_turn_is_scored_over_all_turns():
     truth = truth_of_normals([[30, 40]], [[20, 20]], [[1, 0]])
-    found = np.stack([normals([[30 + error, 40]], [[20, 20]]) for error in (3, 4, 5)])
+    actual = np.stack([normals([[30 + error, 40]], [[20, 20]]) for error in (3, 4, 5)])
     flags = np.array([[[1, 0]], [[1, 1]], [[0, 0]]], np.uint8)
     height = np.array([[[0.1, 0.1]], [[0.1, NAN]], [[0.1, 0.1]]], np.float32)
-    score = engine.score(io.Result(height=height, normals=found, contact=flags, edges=flags), truth)
+    score = engine.score(io.Result(height=height, normals=actual, contact=flags, edges=flags), truth)
     assert (score.normal.answered, score.normal.touched) == (2, 3)  # the third turn claims no contact
     assert score.normal.rms == pytest.approx(np.sqrt(25 / 2), rel=1e-5)
     assert (score.height.answered, score.height.touched) == (5, 3)
@@ -303,7 +303,7 @@ def test_undistorted_maps_are_not_of_the_truth_s_pixels():
 
 
 @pytest.mark.parametrize(
-    ("heights", "said"),
+    ("heights", "message"),
     [
         ([-1.95, 0.0], "from -1.950 to 0.000 mm"),
         ([-0.0019, 0.0123], "from -1.900 to 12.300 \u00b5m"),
@@ -312,6 +312,6 @@ def test_undistorted_maps_are_not_of_the_truth_s_pixels():
         ([-0.25, -0.25], "from -0.250 to -0.250 mm"),
     ],
 )
-def test_the_summary_has_units_and_digits_that_show_the_relief(heights, said):
+def test_the_summary_has_units_and_digits_that_show_the_relief(heights, message):
     text = str(summarise(io.Result(height=np.array([heights], np.float32))))
-    assert text == f"height at 2 of 2 pixels, {said}"
+    assert text == f"height at 2 of 2 pixels, {message}"

@@ -21,27 +21,27 @@ def slope(shape=SHAPE, size=SIZE):
 
 def test_a_plane_is_a_line_between_any_two_points():
     start, end = (-1.43, -2.2), (1.52, 1.9)
-    cut = section(result_of(slope(), SIZE), start, end)
-    assert (cut.x[0], cut.y[0]) == pytest.approx(start)
-    assert (cut.x[-1], cut.y[-1]) == pytest.approx(end)
-    assert cut.distance[-1] == pytest.approx(np.hypot(2.95, 4.1))
-    assert np.diff(cut.distance) == pytest.approx(cut.distance[1])
-    assert cut.height == pytest.approx(0.3 * cut.x - 0.7 * cut.y + 1, abs=1e-6)
-    assert cut.unit == "mm"
+    profile = section(result_of(slope(), SIZE), start, end)
+    assert (profile.x[0], profile.y[0]) == pytest.approx(start)
+    assert (profile.x[-1], profile.y[-1]) == pytest.approx(end)
+    assert profile.distance[-1] == pytest.approx(np.hypot(2.95, 4.1))
+    assert np.diff(profile.distance) == pytest.approx(profile.distance[1])
+    assert profile.height == pytest.approx(0.3 * profile.x - 0.7 * profile.y + 1, abs=1e-6)
+    assert profile.unit == "mm"
     outside = section(result_of(slope(), SIZE), (0.0, 0.0), (3.0, 0.0))
     np.testing.assert_array_equal(np.isnan(outside.height), outside.x > 1.6 + 1e-9)
 
 
 def test_without_ends_it_is_the_row_of_the_highest_point():
     height = cap(SHAPE, SIZE, 5.0, 2.0, (0.31, -0.5, 0.0))
-    cut = section(result_of(height, SIZE, sigma=0.002))
+    profile = section(result_of(height, SIZE, sigma=0.002))
     row = 12  # y = (10 - 12) * 0.25 = -0.5
-    np.testing.assert_array_equal(cut.height, np.float32(height[row]))
-    assert cut.x == pytest.approx((np.arange(33) - 16) * 0.1)
-    assert cut.y == pytest.approx(-0.5)
-    assert cut.distance == pytest.approx(np.arange(33) * 0.1)
-    np.testing.assert_array_equal(np.isfinite(cut.sigma), np.isfinite(cut.height))
-    assert np.nanmax(cut.sigma) == pytest.approx(0.002)
+    np.testing.assert_array_equal(profile.height, np.float32(height[row]))
+    assert profile.x == pytest.approx((np.arange(33) - 16) * 0.1)
+    assert profile.y == pytest.approx(-0.5)
+    assert profile.distance == pytest.approx(np.arange(33) * 0.1)
+    np.testing.assert_array_equal(np.isfinite(profile.sigma), np.isfinite(profile.height))
+    assert np.nanmax(profile.sigma) == pytest.approx(0.002)
 
 
 def test_a_spike_is_not_the_highest_point():
@@ -54,11 +54,11 @@ def test_what_was_filled_may_be_the_highest_point_and_is_reported():
     height = cap(SHAPE, SIZE, 5.0, 2.0)
     filled = np.asarray(height > -0.05)
     result = result_of(height, SIZE, sigma=0.001, filled=filled.astype(np.uint8))
-    cut = section(result)
-    assert cut.y[0] == 0
-    np.testing.assert_array_equal(cut.filled, filled[10])
-    assert np.isnan(cut.sigma[cut.filled]).all()
-    assert np.isfinite(cut.height[cut.filled]).all()
+    profile = section(result)
+    assert profile.y[0] == 0
+    np.testing.assert_array_equal(profile.filled, filled[10])
+    assert np.isnan(profile.sigma[profile.filled]).all()
+    assert np.isfinite(profile.height[profile.filled]).all()
 
 
 def test_next_to_a_hole_nothing_is_reported():
@@ -76,16 +76,16 @@ def test_a_section_has_no_height_between_two_components():
     height[:, 20:] = 5.0
     component = (height > 0).astype(np.int32)
     result = result_of(height, SIZE, component=component, offset_unknown=np.ones(2, np.uint8))
-    cut = section(result, (-1.05, 0.0), (1.05, 0.0))  # midway between pixels
-    assert set(cut.height[np.isfinite(cut.height)]) == {0.0, 5.0}
-    assert np.isnan(cut.height).sum() == 1
+    profile = section(result, (-1.05, 0.0), (1.05, 0.0))  # midway between pixels
+    assert set(profile.height[np.isfinite(profile.height)]) == {0.0, 5.0}
+    assert np.isnan(profile.height).sum() == 1
 
 
 def test_without_a_pixel_size_it_is_in_pixels():
     result = result_of(cap(SHAPE, (1, 1), 50.0, 9.0), x=None, y=None)
-    cut = section(result)
-    assert cut.unit == "px"
-    np.testing.assert_array_equal(cut.distance, np.arange(33))
+    profile = section(result)
+    assert profile.unit == "px"
+    np.testing.assert_array_equal(profile.distance, np.arange(33))
     with pytest.raises(io.InputError, match=r"no pixel size to place a section by: .* --pixel-size"):
         section(result, (0.0, 0.0), (1.0, 0.0))
 
@@ -94,9 +94,9 @@ def test_without_a_pixel_size_it_is_in_pixels():
 @pytest.mark.parametrize("sized", [True, False])
 def test_tiny_pictures_have_sections(shape, sized):
     result = result_of(np.ones(shape), **({} if sized or shape == (1, 1) else {"x": None, "y": None}))
-    cut = section(result)
-    assert len(cut.height) == shape[1]
-    assert (cut.height == 1).all()
+    profile = section(result)
+    assert len(profile.height) == shape[1]
+    assert (profile.height == 1).all()
 
 
 def test_what_cannot_be_cut_is_refused():
@@ -130,10 +130,10 @@ def across(height, **more):
 @pytest.mark.parametrize("ramp", [0.0, 0.3])
 @pytest.mark.parametrize("lean", [0.0, 0.2])
 def test_a_step_has_its_height_at_right_angles_to_its_levels(rise, ramp, lean):
-    found = step_height(across(stair(rise, lean, ramp)))
-    assert found.height.value == pytest.approx(rise, rel=1e-3)
-    assert found.slope.value == pytest.approx(np.degrees(lean), abs=1e-3)
-    assert abs(found.place.value - 2.81) < 0.03 + ramp / 2
+    step = step_height(across(stair(rise, lean, ramp)))
+    assert step.height.value == pytest.approx(rise, rel=1e-3)
+    assert step.slope.value == pytest.approx(np.degrees(lean), abs=1e-3)
+    assert abs(step.place.value - 2.81) < 0.03 + ramp / 2
 
 
 @pytest.mark.parametrize("alike", [False, True])
@@ -143,8 +143,8 @@ def test_the_uncertainty_of_a_step_covers_what_went_wrong(alike):
     for _ in range(60):
         error = rng.standard_normal(LONG[1] + 8)
         error = np.convolve(error, np.ones(9) / 3, "valid") if alike else error[:-8]
-        found = step_height(across(stair() + 0.002 * error)).height
-        pulls.append((found.value - 0.2) / found.sigma)
+        height = step_height(across(stair() + 0.002 * error)).height
+        pulls.append((height.value - 0.2) / height.sigma)
     assert np.mean(np.abs(pulls) < 2) > 0.88
     assert np.sqrt(np.mean(np.square(pulls))) > 0.5
 
@@ -172,25 +172,27 @@ def measured(height, ends, **more):
 
 def test_lengths_and_slope_are_those_between_the_ends():
     x, _ = places(LONG, FINE)
-    told = measured(0.75 * x, ((-1.0, 0.5), (1.0, 0.5)), sigma=0.01).quantities
-    assert told["section length"].value == pytest.approx(2)
-    assert told["height difference"].value == pytest.approx(1.5)
-    assert told["distance in space"].value == pytest.approx(2.5)
-    assert told["slope"].value == pytest.approx(np.degrees(np.arctan(0.75)))
-    assert told["height difference"].sigma == pytest.approx(0.01 * np.sqrt(2), rel=1e-4)
+    quantities = measured(0.75 * x, ((-1.0, 0.5), (1.0, 0.5)), sigma=0.01).quantities
+    assert quantities["section length"].value == pytest.approx(2)
+    assert quantities["height difference"].value == pytest.approx(1.5)
+    assert quantities["distance in space"].value == pytest.approx(2.5)
+    assert quantities["slope"].value == pytest.approx(np.degrees(np.arctan(0.75)))
+    assert quantities["height difference"].sigma == pytest.approx(0.01 * np.sqrt(2), rel=1e-4)
     rise, run = 0.01 * np.sqrt(2), FINE[0] / np.sqrt(6)  # the ends are known within half a pixel
-    assert told["distance in space"].sigma == pytest.approx(np.hypot(0.6 * rise, 0.8 * run), rel=1e-4)
-    assert told["slope"].sigma == pytest.approx(np.degrees(np.hypot(0.8 * rise, 0.6 * run) / 2.5), rel=1e-4)
-    assert "step height" not in told
+    assert quantities["distance in space"].sigma == pytest.approx(np.hypot(0.6 * rise, 0.8 * run), rel=1e-4)
+    assert quantities["slope"].sigma == pytest.approx(
+        np.degrees(np.hypot(0.8 * rise, 0.6 * run) / 2.5), rel=1e-4
+    )
+    assert "step height" not in quantities
 
 
 def test_a_step_is_reported_or_that_there_is_none():
     ends = (-2.5, 0.0), (2.5, 0.0)
     assert measured(stair(), ends).quantities["step height"].value == pytest.approx(0.2)
     flat = 0.001 * np.random.default_rng(9).standard_normal(LONG)
-    found = measured(flat, ends)
-    assert "step height" not in found.quantities
-    assert any(note.startswith("no step along the section") for note in found.notes)
+    measured_ = measured(flat, ends)
+    assert "step height" not in measured_.quantities
+    assert any(note.startswith("no step along the section") for note in measured_.notes)
 
 
 def test_a_section_without_heights_is_refused():

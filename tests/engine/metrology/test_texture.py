@@ -18,8 +18,8 @@ def grating(shape=(120, 161), size=(0.02, 0.03), length=0.4, amplitude=0.005):
 
 def test_a_cosine_grating_has_its_closed_form():
     # 8 whole waves of 20 pixels.
-    found = roughness(grating((31, 160)), (0.02, 0.03))
-    assert found.sa.value == pytest.approx(5 * 2 / np.pi, rel=5e-3)  # 20 samples a wave
+    result = roughness(grating((31, 160)), (0.02, 0.03))
+    assert result.sa.value == pytest.approx(5 * 2 / np.pi, rel=5e-3)  # 20 samples a wave
     fine = roughness(grating((31, 1600), (0.002, 0.03)), (0.002, 0.03))
     assert fine.sa.value == pytest.approx(5 * 2 / np.pi, rel=1e-3)
     assert fine.sq.value == pytest.approx(5 / np.sqrt(2), rel=1e-3)
@@ -30,36 +30,36 @@ def test_a_cosine_grating_has_its_closed_form():
 def test_two_levels_have_their_closed_form():
     height = np.zeros((10, 20))
     height[:, :5] = 0.004  # a quarter of it: 3 um above the mean, the rest 1 below
-    found = roughness(height, (1.0, 1.0))
-    assert (found.sa.value, found.sq.value, found.sz.value) == pytest.approx((1.5, np.sqrt(3), 4))
+    result = roughness(height, (1.0, 1.0))
+    assert (result.sa.value, result.sq.value, result.sz.value) == pytest.approx((1.5, np.sqrt(3), 4))
 
 
-@pytest.mark.parametrize("share", [0.5, 2.0])
+@pytest.mark.parametrize("transmission", [0.5, 2.0])
 @pytest.mark.parametrize("upright", [False, True])
-def test_the_filter_passes_what_the_standard_says(share, upright):
+def test_the_filter_has_the_transmission_of_the_standard(transmission, upright):
     # ISO 16610-61: of a wave of length l, exp(-pi (alpha cutoff / l)^2) goes into the long waves.
     height, size = grating((301, 303), (0.02, 0.02)), (0.02, 0.02)
     if upright:
         height, size = np.ascontiguousarray(height.T), (0.02, 0.02)
-    cutoff = 0.4 / share
-    found = roughness(height, size, l_filter=cutoff)
-    passed = 1 - np.exp(-np.log(2) / share**2)
-    assert found.sz.value == pytest.approx(10 * passed, rel=2e-3)
-    assert 0 < found.left_out < height.size / 2
+    cutoff = 0.4 / transmission
+    result = roughness(height, size, l_filter=cutoff)
+    passed = 1 - np.exp(-np.log(2) / transmission**2)
+    assert result.sz.value == pytest.approx(10 * passed, rel=2e-3)
+    assert 0 < result.left_out < height.size / 2
 
 
 def test_the_filter_takes_sizes_along_x_and_y_for_what_they_are():
     x, y = places((151, 401), (0.01, 0.04))
     for wave in (x, y):
-        found = roughness(0.005 * np.cos(2 * np.pi * wave / 0.8), (0.01, 0.04), l_filter=0.8)
-        assert found.sz.value == pytest.approx(5, rel=5e-3)
+        result = roughness(0.005 * np.cos(2 * np.pi * wave / 0.8), (0.01, 0.04), l_filter=0.8)
+        assert result.sz.value == pytest.approx(5, rel=5e-3)
 
 
 def test_a_hole_is_not_taken_for_a_height():
     height = 7.0 + grating()
     height[60, 80] = NAN
-    found = roughness(height, (0.02, 0.03), l_filter=0.8)
-    assert found.sz.value < 12
+    result = roughness(height, (0.02, 0.03), l_filter=0.8)
+    assert result.sz.value < 12
 
 
 def test_noise_changes_sq_by_no_more_than_its_uncertainty():
@@ -67,22 +67,22 @@ def test_noise_changes_sq_by_no_more_than_its_uncertainty():
     height = grating()
     error = 0.001 * rng.standard_normal(height.shape)
     sigma = np.full(height.shape, np.sqrt(np.mean(error**2)))
-    true, found = (roughness(one, (0.02, 0.03), sigma=sigma) for one in (height, height + error))
+    true, noisy = (roughness(heights, (0.02, 0.03), sigma=sigma) for heights in (height, height + error))
     for name in ("sa", "sq", "sz"):
-        one, other = getattr(found, name), getattr(true, name)
-        assert abs(one.value - other.value) <= 2 * one.sigma
-    assert found.parameters["Sq of noise"].value == pytest.approx(1e3 * sigma[0, 0], rel=0.01)
+        first, other = getattr(noisy, name), getattr(true, name)
+        assert abs(first.value - other.value) <= 2 * first.sigma
+    assert noisy.parameters["Sq of noise"].value == pytest.approx(1e3 * sigma[0, 0], rel=0.01)
 
 
-@pytest.mark.parametrize(("share", "left_out"), [(0.1, True), (0.2, False)])
-def test_pixels_that_are_far_less_certain_are_left_out_if_they_are_few(share, left_out):
+@pytest.mark.parametrize(("fraction", "left_out"), [(0.1, True), (0.2, False)])
+def test_pixels_that_are_far_less_certain_are_left_out_if_they_are_few(fraction, left_out):
     height, sigma = grating((30, 100), (0.02, 0.03)), np.full((30, 100), 1e-4)
-    few = slice(0, round(30 * share))
+    few = slice(0, round(30 * fraction))
     height[few], sigma[few] = height[few] + 0.5, 0.1
-    found = roughness(height, (0.02, 0.03), sigma=sigma)
-    assert (found.sz.value < 11) == left_out
-    assert found.uncertain == (300 if left_out else 0)
-    assert found.pixels == 3000 - found.uncertain
+    result = roughness(height, (0.02, 0.03), sigma=sigma)
+    assert (result.sz.value < 11) == left_out
+    assert result.uncertain == (300 if left_out else 0)
+    assert result.pixels == 3000 - result.uncertain
 
 
 def test_what_has_no_roughness_is_refused():

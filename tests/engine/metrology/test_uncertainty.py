@@ -55,33 +55,36 @@ def noise(length, rng):
 
 def pulls(level, length, l_filter=None, draws=DRAWS):
     """Return (value - truth) / sigma of each parameter, (draws,), at noise of a share of the surface's Sq."""
-    true = {name: one.value for name, one in roughness(surface(), SIZE, l_filter=l_filter).parameters.items()}
+    true = {
+        name: parameter.value
+        for name, parameter in roughness(surface(), SIZE, l_filter=l_filter).parameters.items()
+    }
     true["Sq without noise"] = true["Sq"]
     rng = np.random.default_rng(round(100 * level) + 7)
     sigma = np.full(SHAPE, 0.001 * level)
-    found: dict[str, list[float]] = {}
+    deviations: dict[str, list[float]] = {}
     for _ in range(draws):
         measured = surface() + sigma * noise(length, rng)
         claimed = sigma * (1 + 0.1 * rng.standard_normal())  # the level of the noise is known within a tenth
-        for name, one in roughness(
+        for name, parameter in roughness(
             measured, SIZE, l_filter=l_filter, sigma=claimed, noise_length=length
         ).parameters.items():
             if name in true and name != "Std":
-                found.setdefault(name, []).append((one.value - true[name]) / one.sigma)
-    return {name: np.array(one) for name, one in found.items()}
+                deviations.setdefault(name, []).append((parameter.value - true[name]) / parameter.sigma)
+    return {name: np.array(parameter) for name, parameter in deviations.items()}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("length", [WHITE, CORRELATED, RELATIVE])
 @pytest.mark.parametrize(("level", "l_filter"), [(0.1, None), (0.3, None), (0.3, 1.0), (0.6, None)])
 def test_chi_square_is_about_one(level, length, l_filter):
-    chi2 = {name: float(np.mean(one**2)) for name, one in pulls(level, length, l_filter).items()}
+    chi2 = {name: float(np.mean(pulled**2)) for name, pulled in pulls(level, length, l_filter).items()}
     assert {name: value for name, value in chi2.items() if value > 3} == {}
     assert {name: chi2[name] for name in EXACT if chi2[name] < 0.3} == {}
 
 
 def test_chi_square_of_the_main_parameters_is_about_one():
-    chi2 = {name: float(np.mean(one**2)) for name, one in pulls(0.3, WHITE, draws=16).items()}
+    chi2 = {name: float(np.mean(pulled**2)) for name, pulled in pulls(0.3, WHITE, draws=16).items()}
     assert all(0.4 < chi2[name] < 2.5 for name in ("Sa", "Sq", "Sq without noise", "Sdq", "Sal", "Sk")), chi2
 
 
@@ -90,9 +93,9 @@ def test_sq_without_noise_is_that_of_the_surface_where_noise_is_as_large(length)
     rng, true = np.random.default_rng(3), roughness(surface(), SIZE).sq.value
     sigma = np.full(SHAPE, 0.001)
     measured = surface() + sigma * noise(length, rng)
-    found = roughness(measured, SIZE, sigma=sigma, noise_length=length).parameters
-    assert abs(found["Sq without noise"].value - true) < 3 * found["Sq without noise"].sigma
-    assert found["Sq without noise"].sigma < 0.4 * true
+    parameters = roughness(measured, SIZE, sigma=sigma, noise_length=length).parameters
+    assert abs(parameters["Sq without noise"].value - true) < 3 * parameters["Sq without noise"].sigma
+    assert parameters["Sq without noise"].sigma < 0.4 * true
 
 
 def notes_of(level):
@@ -101,13 +104,13 @@ def notes_of(level):
     return roughness(surface() + sigma * rng.standard_normal(SHAPE), SIZE, sigma=sigma).notes
 
 
-def test_a_note_says_that_noise_determines_the_texture():
+def test_texture_determined_by_noise_is_noted():
     (note,) = notes_of(1.5)
     assert "noise determines the texture parameters; 'Sq without noise' is the surface's own" in note
     assert notes_of(0.3) == []
 
 
-def test_a_note_says_that_sq_is_below_that_of_the_noise():
+def test_sq_below_that_of_the_noise_is_noted():
     error = 0.001 * np.random.default_rng(5).standard_normal(SHAPE)
     (note,) = roughness(error, SIZE, sigma=np.full(SHAPE, 0.002)).notes
     assert note.startswith("Sq is ")
@@ -117,18 +120,18 @@ def test_a_note_says_that_sq_is_below_that_of_the_noise():
 def test_what_noise_hides_is_unknown():
     sigma = np.full(SHAPE, 0.002)
     measured = surface() + sigma * np.random.default_rng(6).standard_normal(SHAPE)
-    found = roughness(measured, SIZE, sigma=sigma).parameters
-    assert np.isnan([found[name].sigma for name in ("Ssk", "Sku", "Smr1", "Smr2")]).all()
+    parameters = roughness(measured, SIZE, sigma=sigma).parameters
+    assert np.isnan([parameters[name].sigma for name in ("Ssk", "Sku", "Smr1", "Smr2")]).all()
 
 
 def test_the_parts_of_the_budget_add_up():
     result = result_of(surface(), SIZE, sigma=1e-4)
-    found = engine.measure(result, l_filter=1.0, section=((-1.5, 0.0), (1.5, 0.0)))
-    for name, parts in found.budget.items():
-        sigma = found.quantities[name].sigma
+    measured = engine.measure(result, l_filter=1.0, section=((-1.5, 0.0), (1.5, 0.0)))
+    for name, parts in measured.budget.items():
+        sigma = measured.quantities[name].sigma
         if np.isfinite(sigma):
-            assert np.sqrt(sum(one**2 for one in parts.values())) == pytest.approx(sigma), name
-    assert {"noise, random", "noise, systematic", "filter edges", "form"} <= set(found.budget["Sq"])
+            assert np.sqrt(sum(value**2 for value in parts.values())) == pytest.approx(sigma), name
+    assert {"noise, random", "noise, systematic", "filter edges", "form"} <= set(measured.budget["Sq"])
 
 
 def test_realisations_are_the_same_in_each_call():
@@ -141,11 +144,13 @@ def test_a_noise_length_is_taken_from_the_result():
     sigma = 3e-5
     fused = result_of(surface(), SIZE, sigma=sigma, fitted=io.Fitted(height_correlation=0.2))
     slopes = result_of(surface(), SIZE, sigma=sigma, fitted=io.Fitted(integration="multigrid"))
-    said = {"correlated over 0.2 mm": fused, "those of integrated slopes": slopes}
-    for words, result in said.items():
+    notes = {"correlated over 0.2 mm": fused, "those of integrated slopes": slopes}
+    for words, result in notes.items():
         assert any(words in note for note in engine.measure(result).notes)
-    plain, given = (engine.measure(fused, noise_length=one).quantities for one in (0.0, 0.2))
-    assert plain["Sdq"].sigma > 1.5 * given["Sdq"].sigma
+    plain, with_length = (
+        engine.measure(fused, noise_length=noise_length).quantities for noise_length in (0.0, 0.2)
+    )
+    assert plain["Sdq"].sigma > 1.5 * with_length["Sdq"].sigma
 
 
 def test_uncertainties_of_a_profile_cover_what_went_wrong():
@@ -155,16 +160,16 @@ def test_uncertainties_of_a_profile_cover_what_went_wrong():
     chi2 = {name: [] for name in true}
     for _ in range(60):
         errors = (0.0004 * rng.standard_normal(400) for _ in range(24))
-        found, _ = profile_parameters(wave + 0.0004 * rng.standard_normal(400), 0.01, errors=errors)
-        for name, one in found.items():
-            chi2[name].append(((one.value - true[name].value) / one.sigma) ** 2)
-    assert all(np.mean(one) < 2.5 for one in chi2.values()), chi2
+        parameters, _ = profile_parameters(wave + 0.0004 * rng.standard_normal(400), 0.01, errors=errors)
+        for name, parameter in parameters.items():
+            chi2[name].append(((parameter.value - true[name].value) / parameter.sigma) ** 2)
+    assert all(np.mean(values) < 2.5 for values in chi2.values()), chi2
     assert np.mean(chi2["Pq"]) > 0.4
 
 
 def test_parameters_scale_with_the_pixel_size_as_declared():
     plain, wide = (roughness(surface(), (f * SIZE[0], f * SIZE[1])).parameters for f in (1.0, 1.01))
-    for name, one in plain.items():
-        if one.value and np.isfinite(one.value):
+    for name, parameter in plain.items():
+        if parameter.value and np.isfinite(parameter.value):
             power = PARAMETERS[name].pixel_power
-            assert wide[name].value / one.value == pytest.approx(1.01**power, rel=1e-3), name
+            assert wide[name].value / parameter.value == pytest.approx(1.01**power, rel=1e-3), name

@@ -43,87 +43,87 @@ def noisy(frames, noise, seed):
 @pytest.mark.parametrize("sharpest", [4.0, 4.1, 4.25])
 def test_waves_of_one_length_are_exact_without_noise(reach, sharpest):
     frames = textured(sharpest=sharpest).astype(np.float32)
-    found = find_focus(frames, TRAVEL, noise=0, reach=reach)
-    np.testing.assert_allclose(found.height, -sharpest, atol=2e-4)
+    result = find_focus(frames, TRAVEL, noise=0, reach=reach)
+    np.testing.assert_allclose(result.height, -sharpest, atol=2e-4)
 
 
 def test_steps_may_be_uneven_and_go_up():
     travel = np.cumsum(np.random.default_rng(1).uniform(0.2, 0.8, 18))[::-1]
-    found = find_focus(textured(travel).astype(np.float32), travel, noise=0)
-    np.testing.assert_allclose(found.height, -4.2, atol=2e-4)
+    result = find_focus(textured(travel).astype(np.float32), travel, noise=0)
+    np.testing.assert_allclose(result.height, -4.2, atol=2e-4)
 
 
 def test_texture_of_all_lengths_is_right_to_a_twentieth_of_a_step():
     frames = textured(waves=lambda generator: np.sqrt(generator.uniform(0.02**2, 0.3**2, 200)))
-    found = find_focus(frames.astype(np.float32), TRAVEL, noise=0)
-    assert abs(np.median(found.height) + 4.2) < 0.5 / 20
+    result = find_focus(frames.astype(np.float32), TRAVEL, noise=0)
+    assert abs(np.median(result.height) + 4.2) < 0.5 / 20
 
 
 def test_the_standard_error_includes_a_curve_that_is_not_a_gaussian():
     frames = textured(waves=lambda generator: np.sqrt(generator.uniform(0.02**2, 0.3**2, 200)))
-    found = find_focus(noisy(frames, 0.1, 0), TRAVEL, noise=0.1)
-    ratio = (found.height + 4.2) / found.height_sigma
+    result = find_focus(noisy(frames, 0.1, 0), TRAVEL, noise=0.1)
+    ratio = (result.height + 4.2) / result.height_sigma
     assert 0.1 < np.mean(ratio**2) < 2  # 100 by noise alone
 
 
 def test_contrast_in_two_frames_has_no_vertex():
     strength = np.array([0, 0, 0, 1, 0.9, 0, 0, 0, 0], np.float32)[:, None, None]
     texture = np.random.default_rng(0).normal(100, 10, SHAPE).astype(np.float32)
-    found = find_focus(strength * texture, np.arange(9.0), noise=0.1)
-    assert (found.status == 2).all()
+    result = find_focus(strength * texture, np.arange(9.0), noise=0.1)
+    assert (result.status == 2).all()
 
 
 def test_a_slope_is_followed():
     slope = 4 + 0.02 * (np.arange(SHAPE[1]) - 23.5)
-    found = find_focus(textured(sharpest=slope).astype(np.float32), TRAVEL, noise=0)
-    error = (found.height + slope)[:, 6:-6]
+    result = find_focus(textured(sharpest=slope).astype(np.float32), TRAVEL, noise=0)
+    error = (result.height + slope)[:, 6:-6]
     assert np.sqrt(np.mean(error**2)) < 0.03
 
 
 def test_three_samples_leave_no_standard_error():
-    found = find_focus(noisy(FRAMES, 0.5, 1), TRAVEL, noise=0.5, reach=1)
-    assert np.isfinite(found.height).any()
-    assert np.isnan(found.height_sigma).all()
+    result = find_focus(noisy(FRAMES, 0.5, 1), TRAVEL, noise=0.5, reach=1)
+    assert np.isfinite(result.height).any()
+    assert np.isnan(result.height_sigma).all()
 
 
 @pytest.mark.parametrize(("noise", "reach"), [(0.5, 2), (3.0, 2)])
 def test_the_standard_error_is_the_scatter(noise, reach):
     frames, square = textured(), []
     for seed in range(40):
-        found = find_focus(noisy(frames, noise, seed), TRAVEL, noise=noise, reach=reach)
-        sound = found.status == 1
+        result = find_focus(noisy(frames, noise, seed), TRAVEL, noise=noise, reach=reach)
+        sound = result.status == 1
         assert sound.mean() > 0.9
-        square.append(np.mean(((found.height + 4.2) / found.height_sigma)[sound] ** 2))
+        square.append(np.mean(((result.height + 4.2) / result.height_sigma)[sound] ** 2))
     # The curvature that noise feigns is a part of the standard deviation.
     assert 0.5 < np.mean(square) < 1.1
 
 
 def test_sharpness_is_the_contrast_without_the_noise():
-    found = find_focus(noisy(textured(sharpest=4.0), 3.0, 0), TRAVEL, noise=3.0)
+    result = find_focus(noisy(textured(sharpest=4.0), 3.0, 0), TRAVEL, noise=3.0)
     clean = find_focus(textured(sharpest=4.0).astype(np.float32), TRAVEL, noise=0)
-    assert np.mean(found.sharpness**2) == pytest.approx(np.mean(clean.sharpness**2), rel=0.01)
+    assert np.mean(result.sharpness**2) == pytest.approx(np.mean(clean.sharpness**2), rel=0.01)
 
 
 def test_a_picture_without_texture_has_no_peak():
-    found = find_focus(noisy(np.full((18, *SHAPE), 100.0), 2.0, 0), TRAVEL, noise=2.0)
-    assert (found.status != 1).mean() > 0.999
-    assert np.isnan(found.height[found.status != 1]).all()
+    result = find_focus(noisy(np.full((18, *SHAPE), 100.0), 2.0, 0), TRAVEL, noise=2.0)
+    assert (result.status != 1).mean() > 0.999
+    assert np.isnan(result.height[result.status != 1]).all()
 
 
 def test_a_peak_at_the_end_of_the_stack_is_reported():
-    found = find_focus(textured(sharpest=9.5).astype(np.float32), TRAVEL, noise=0)
-    assert (found.status == 3).all()
-    assert np.isnan(found.height).all()
+    result = find_focus(textured(sharpest=9.5).astype(np.float32), TRAVEL, noise=0)
+    assert (result.status == 3).all()
+    assert np.isnan(result.height).all()
 
 
 def test_a_missing_sample_is_left_out_and_a_missing_pixel_invalid():
     frames = textured().astype(np.float32)
     frames[6, 9, 9] = np.nan
     frames[:, 30, 30] = np.nan
-    found = find_focus(frames, TRAVEL, noise=0)
-    assert found.height[9, 9] == pytest.approx(-4.2, abs=1e-3)
-    assert found.status[30, 30] == found.status[26, 34] == 0
-    assert found.status[25, 30] == 1
+    result = find_focus(frames, TRAVEL, noise=0)
+    assert result.height[9, 9] == pytest.approx(-4.2, abs=1e-3)
+    assert result.status[30, 30] == result.status[26, 34] == 0
+    assert result.status[25, 30] == 1
 
 
 FRAMES = textured().astype(np.float32)
@@ -151,16 +151,16 @@ def test_texture_that_is_uneven_on_a_slope_is_part_of_the_error():
     slope = 4.2 + 0.05 * (np.arange(SHAPE[1]) - 23.5)
     fading = np.linspace(1, 0.1, SHAPE[1])
     frames = 120 + (textured(sharpest=slope) - 120) * fading
-    found = find_focus(noisy(frames, 0.05, 0), TRAVEL, noise=0.05)
-    ratio = (found.height + slope)[6:-6, 6:-6] / found.height_sigma[6:-6, 6:-6]
+    result = find_focus(noisy(frames, 0.05, 0), TRAVEL, noise=0.05)
+    ratio = (result.height + slope)[6:-6, 6:-6] / result.height_sigma[6:-6, 6:-6]
     assert 0.1 < np.mean(ratio**2) < 1  # 2.0 without
 
 
 def test_errors_grow_where_few_pixels_around_have_a_peak():
     frames = textured()
     frames[:, :, 24:] = 120  # no texture there
-    found = find_focus(noisy(frames, 0.5, 0), TRAVEL, noise=0.5)
-    inside, border = np.nanmedian(found.height_sigma[:, 10]), np.nanmedian(found.height_sigma[:, 24])
+    result = find_focus(noisy(frames, 0.5, 0), TRAVEL, noise=0.5)
+    inside, border = np.nanmedian(result.height_sigma[:, 10]), np.nanmedian(result.height_sigma[:, 24])
     assert border > 2 * inside
 
 
@@ -169,7 +169,7 @@ def jumped(steps):
     return np.where(np.arange(len(TRAVEL)) >= 9, TRAVEL + 0.5 * steps, TRAVEL)
 
 
-def seen(travel, stated):
+def focus_frames(travel, stated):
     """Return the maps of an inclined surface at some travel, from a recording that states another one."""
     slope = 4.2 + 0.04 * (np.arange(SHAPE[1]) - 23.5)
     frames = noisy(textured(travel, sharpest=slope), 0.5, 0)
@@ -185,8 +185,8 @@ def seen(travel, stated):
 )
 def test_a_lost_frame_is_found_by_the_peaks(steps, words):
     with pytest.warns(io.MirrorskinWarning, match=f"from frame 9 on, .* fit a travel {words}"):
-        seen(jumped(steps), TRAVEL)
+        focus_frames(jumped(steps), TRAVEL)
 
 
 def test_travel_that_is_measured_may_jump():
-    assert "peaks" not in seen(jumped(1), jumped(1)).process.get("warnings", "")
+    assert "peaks" not in focus_frames(jumped(1), jumped(1)).process.get("warnings", "")

@@ -40,11 +40,11 @@ def fitted(noise, place=FIELD):
     return [fit_fringes(stack, EVEN, noise=noise) for stack in stacks]
 
 
-def given(phase, sigma):
+def phase_maps(phase, sigma):
     """Maps of phases, (F, H, W), that come from elsewhere."""
     return [
-        {"phase": one, "phase_sigma": other}
-        for one, other in zip(*np.broadcast_arrays(phase, sigma), strict=True)
+        {"phase": phases, "phase_sigma": other}
+        for phases, other in zip(*np.broadcast_arrays(phase, sigma), strict=True)
     ]
 
 
@@ -70,10 +70,10 @@ def test_hot_samples_do_not_change_orders():
         stack = shown(TURN * rate * FIELD, EVEN, 1.0, seed=rate)
         stack[generator.uniform(size=stack.shape) < 1e-3] = 255
         fringes.append(fit_fringes(stack, EVEN, noise=1.0))
-    found = unwrap_frequencies(fringes, RATES)
-    safe = found.risk < 0.01
+    unwrapped = unwrap_frequencies(fringes, RATES)
+    safe = unwrapped.risk < 0.01
     assert np.mean(safe) > 0.97
-    assert np.all(np.abs(found.phase - TURN * RATES[-1] * FIELD)[safe] < np.pi)
+    assert np.all(np.abs(unwrapped.phase - TURN * RATES[-1] * FIELD)[safe] < np.pi)
 
 
 def test_mean_and_modulation_are_those_encoded():
@@ -87,9 +87,9 @@ def test_a_frame_of_weight_0_is_left_out_and_weights_are_inverse_variances():
     expected = fit_fringes(np.delete(frames, 2, 0), np.delete(UNEVEN, 2))
     run = engine.Run(Fringes)
     run.push(frames, phase=UNEVEN, frame_weights=[1, 1, 0, 1, 1, 1])
-    found = run.result()
-    np.testing.assert_allclose(found.phase, expected.phase, atol=1e-5)
-    np.testing.assert_allclose(found.phase_sigma, expected.phase_sigma, rtol=1e-3)
+    result = run.result()
+    np.testing.assert_allclose(result.phase, expected.phase, atol=1e-5)
+    np.testing.assert_allclose(result.phase_sigma, expected.phase_sigma, rtol=1e-3)
     twice = engine.Run(Fringes(noise=2))
     twice.push(frames, phase=UNEVEN, frame_weights=np.full(6, 4.0))
     once = fit_fringes(frames, UNEVEN, noise=2)
@@ -126,38 +126,38 @@ def test_a_pixel_without_fringes_has_no_phase():
 
 
 def test_frequencies_unwrap_exactly_without_noise():
-    found = unwrap_frequencies(fitted(0), RATES)
-    np.testing.assert_allclose(found.phase, TURN * 36 * FIELD, atol=3e-6)
-    assert (found.risk <= 1e-3).all()
+    unwrapped = unwrap_frequencies(fitted(0), RATES)
+    np.testing.assert_allclose(unwrapped.phase, TURN * 36 * FIELD, atol=3e-6)
+    assert (unwrapped.risk <= 1e-3).all()
 
 
 def test_frequencies_unwrap_the_whole_field_in_noise():
-    found = unwrap_frequencies(fitted(1.0), RATES)  # the coarsest to 0.016 rad
-    error = found.phase - TURN * 36 * FIELD
+    unwrapped = unwrap_frequencies(fitted(1.0), RATES)  # the coarsest to 0.016 rad
+    error = unwrapped.phase - TURN * 36 * FIELD
     assert np.abs(error).max() < np.pi
-    assert np.mean((error / found.phase_sigma) ** 2) == pytest.approx(1, abs=0.05)
+    assert np.mean((error / unwrapped.phase_sigma) ** 2) == pytest.approx(1, abs=0.05)
 
 
 def test_the_field_may_have_its_zero_in_the_middle():
     true = np.linspace(-3, 3, 50)[np.newaxis]
-    fringes = given(wrap(np.stack([true, 7 * true])), 0.01)
-    found = unwrap_frequencies(fringes, [1, 7], start=-np.pi)
-    np.testing.assert_allclose(found.phase, 7 * true)
+    fringes = phase_maps(wrap(np.stack([true, 7 * true])), 0.01)
+    unwrapped = unwrap_frequencies(fringes, [1, 7], start=-np.pi)
+    np.testing.assert_allclose(unwrapped.phase, 7 * true)
 
 
 def test_the_risk_is_how_often_the_order_is_wrong():
     place = 0.25 + 0.5 * FIELD  # far from the ends
-    found = unwrap_frequencies(fitted(14.0, place), RATES)
-    wrong = np.abs(found.phase - TURN * 36 * place) > np.pi
+    unwrapped = unwrap_frequencies(fitted(14.0, place), RATES)
+    wrong = np.abs(unwrapped.phase - TURN * 36 * place) > np.pi
     for low, high in [(0.0, 1e-3), (0.01, 0.1), (0.1, 0.3), (0.3, 0.6)]:
-        part = (found.risk >= low) & (found.risk < high)
+        part = (unwrapped.risk >= low) & (unwrapped.risk < high)
         assert part.sum() > 200
-        assert wrong[part].mean() == pytest.approx(found.risk[part].mean(), rel=0.25, abs=1e-3)
+        assert wrong[part].mean() == pytest.approx(unwrapped.risk[part].mean(), rel=0.25, abs=1e-3)
 
 
 def test_the_end_of_the_field_is_at_risk_where_it_may_be_the_other_end():
-    found = unwrap_frequencies(given(np.full((1, 1, 2), [[0.02, 1.0]]), 0.02), [1])
-    assert found.risk[0].tolist() == pytest.approx([0.1587, 0], abs=1e-4)
+    unwrapped = unwrap_frequencies(phase_maps(np.full((1, 1, 2), [[0.02, 1.0]]), 0.02), [1])
+    assert unwrapped.risk[0].tolist() == pytest.approx([0.1587, 0], abs=1e-4)
 
 
 def test_the_gray_code_of_every_stripe_is_read():
@@ -171,9 +171,9 @@ def test_a_gray_code_unwraps_the_whole_field(noise):
     true = TURN * 2 ** (BITS - 1) * FIELD
     fringes = fit_fringes(shown(true, EVEN, noise), EVEN, noise=noise)
     stripes = decode_gray(coded(noise), fringes.mean, noise=fringes.process["noise"])
-    found = unwrap_gray(fringes, stripes)
-    assert np.abs(found.phase - true).max() < np.pi
-    assert (found.risk <= 1e-3).all()
+    unwrapped = unwrap_gray(fringes, stripes)
+    assert np.abs(unwrapped.phase - true).max() < np.pi
+    assert (unwrapped.risk <= 1e-3).all()
 
 
 @pytest.mark.parametrize("width", [0.75 * TURN, TURN])
@@ -182,26 +182,26 @@ def test_stripes_up_to_the_width_of_a_fringe_unwrap_the_whole_field(width, noise
     true = width * 2**BITS * FIELD
     fringes = fit_fringes(shown(true, EVEN, noise), EVEN, noise=noise)
     stripes = decode_gray(coded(noise), fringes.mean, noise=fringes.process["noise"])
-    found = unwrap_gray(fringes, stripes, width=width)
-    right = np.abs(found.phase - true) < np.pi
-    assert right[found.risk <= 1e-3].all()
-    assert (found.risk <= 1e-3).mean() > 0.98
+    unwrapped = unwrap_gray(fringes, stripes, width=width)
+    right = np.abs(unwrapped.phase - true) < np.pi
+    assert right[unwrapped.risk <= 1e-3].all()
+    assert (unwrapped.risk <= 1e-3).mean() > 0.98
 
 
 def test_the_risk_of_a_gray_code_is_a_little_more_than_how_often_the_number_is_off():
-    found = decode_gray(coded(14.0), 100, noise=14)
-    risk, off = found.risk, np.abs(found.stripe - np.floor(2**BITS * FIELD)) > 1
+    code = decode_gray(coded(14.0), 100, noise=14)
+    risk, off = code.risk, np.abs(code.stripe - np.floor(2**BITS * FIELD)) > 1
     assert 0.65 * risk.mean() < off.mean() < risk.mean()
     assert off[risk <= 1e-3].mean() < 1e-3
 
 
 def test_what_is_missing_is_never_safe():
     gone = np.full((1, 1, 1), np.nan)
-    found = unwrap_frequencies(given(gone, gone), [1])
+    unwrapped = unwrap_frequencies(phase_maps(gone, gone), [1])
     stripes = decode_gray(gone, 1, noise=1)
-    grays = unwrap_gray(*given(gone, gone), stripes)
-    assert [one.risk.item() for one in (found, stripes, grays)] == [1, 1, 1]
-    assert np.isnan(found.phase).all()
+    grays = unwrap_gray(*phase_maps(gone, gone), stripes)
+    assert [result.risk.item() for result in (unwrapped, stripes, grays)] == [1, 1, 1]
+    assert np.isnan(unwrapped.phase).all()
 
 
 def test_fringes_of_a_dataset_and_of_a_file_unwrap_as_the_results_do(tmp_path):
@@ -209,10 +209,10 @@ def test_fringes_of_a_dataset_and_of_a_file_unwrap_as_the_results_do(tmp_path):
     expected = unwrap_frequencies(fringes, RATES)
     path = tmp_path / "fine.h5"
     io.save_result(fringes[2], path)
-    found = unwrap_frequencies([fringes[0], fringes[1].to_xarray(), path], RATES)
+    unwrapped = unwrap_frequencies([fringes[0], fringes[1].to_xarray(), path], RATES)
     for name in ("phase", "phase_sigma", "order", "risk"):
-        np.testing.assert_array_equal(found[name], expected[name])
-    assert found.declaration("phase").unit == found.declaration("phase_sigma").unit == "rad"
+        np.testing.assert_array_equal(unwrapped[name], expected[name])
+    assert unwrapped.declaration("phase").unit == unwrapped.declaration("phase_sigma").unit == "rad"
 
 
 @pytest.mark.parametrize("sigma", [0.01, 0.05, 0.3, 3.0])
@@ -220,9 +220,11 @@ def test_fringes_of_a_dataset_and_of_a_file_unwrap_as_the_results_do(tmp_path):
 def test_risk_is_not_below_the_share_of_wrong_orders(rates, sigma):
     place, random = np.linspace(0.02, 0.98, 20_000)[np.newaxis], np.random.default_rng(1)
     true = TURN * np.multiply.outer(np.array(rates), place)
-    found = unwrap_frequencies(given(np.mod(true + random.normal(0, sigma, true.shape), TURN), sigma), rates)
-    wrong, safe = np.abs(found.phase - true[-1]) > np.pi, found.risk < 0.01
-    assert wrong.mean() < 1.05 * found.risk.mean() + 0.002
+    unwrapped = unwrap_frequencies(
+        phase_maps(np.mod(true + random.normal(0, sigma, true.shape), TURN), sigma), rates
+    )
+    wrong, safe = np.abs(unwrapped.phase - true[-1]) > np.pi, unwrapped.risk < 0.01
+    assert wrong.mean() < 1.05 * unwrapped.risk.mean() + 0.002
     assert np.count_nonzero(wrong & safe) <= 0.01 * np.count_nonzero(safe)
 
 
@@ -277,8 +279,8 @@ def test_a_lens_that_blurs_curved_fringes_is_part_of_the_error():
     x, y = np.meshgrid(np.arange(80) * 2 * np.pi / 16, np.arange(60) * 2 * np.pi / 42)
     phase = x + 1.2 * np.sin(y)
     light = 100 + 80 * np.cos(phase - np.arange(8)[:, np.newaxis, np.newaxis] * TURN / 8)
-    seen = np.stack([gaussian_filter(one, 1.5, mode="nearest") for one in light])
-    seen += np.random.default_rng(2).normal(size=seen.shape)
-    found = fit_fringes(seen.astype(np.float32), np.arange(8) * TURN / 8)
-    ratio = (wrap(found.phase - phase) / found.phase_sigma)[5:-5, 5:-5]
+    blurred = np.stack([gaussian_filter(frame, 1.5, mode="nearest") for frame in light])
+    blurred += np.random.default_rng(2).normal(size=blurred.shape)
+    result = fit_fringes(blurred.astype(np.float32), np.arange(8) * TURN / 8)
+    ratio = (wrap(result.phase - phase) / result.phase_sigma)[5:-5, 5:-5]
     assert 0.3 < np.mean(ratio**2) < 2  # 7 without

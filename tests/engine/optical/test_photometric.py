@@ -33,8 +33,8 @@ def lit(lamps, dtype="float32", noise=0.0, seed=0, dark=0.0):
     return light.astype(dtype) if dtype == "float32" else np.rint(light).clip(0, 255).astype(dtype)
 
 
-def angle(found):
-    return np.arccos(np.clip(np.sum(found * BALL, axis=-1), -1, 1))[INSIDE]
+def angle(result):
+    return np.arccos(np.clip(np.sum(result * BALL, axis=-1), -1, 1))[INSIDE]
 
 
 def bound(lamps):
@@ -48,42 +48,42 @@ def bound(lamps):
 
 @pytest.mark.parametrize("lamps", [round_lamps(0.3), LAMPS], ids=["round", "anywhere"])
 def test_a_ball_is_exact_without_noise(lamps):
-    found = photometric_stereo(lit(lamps), light=lamps)
-    np.testing.assert_allclose(found.normals[INSIDE], BALL[INSIDE], atol=2e-6)
-    np.testing.assert_allclose(found.albedo[INSIDE], ALBEDO[INSIDE], rtol=2e-6)
+    result = photometric_stereo(lit(lamps), light=lamps)
+    np.testing.assert_allclose(result.normals[INSIDE], BALL[INSIDE], atol=2e-6)
+    np.testing.assert_allclose(result.albedo[INSIDE], ALBEDO[INSIDE], rtol=2e-6)
 
 
 def test_shadows_and_highlights_are_left_out():
     frames = lit(round_lamps(1.0), "uint8", dark=160.0)  # to 300 counts
-    found = photometric_stereo(frames, light=round_lamps(1.0), dark=160)
-    known = INSIDE & (found.samples > 4)
-    assert known.mean() > 0.5
-    assert (found.samples[known] < 12).mean() > 0.6
-    assert np.degrees(angle(found.normals)[known[INSIDE]]).max() < 1.5
+    result = photometric_stereo(frames, light=round_lamps(1.0), dark=160)
+    usable = INSIDE & (result.samples > 4)
+    assert usable.mean() > 0.5
+    assert (result.samples[usable] < 12).mean() > 0.6
+    assert np.degrees(angle(result.normals)[usable[INSIDE]]).max() < 1.5
 
 
 def test_too_few_lamps_are_no_answer():
-    found = photometric_stereo(lit(LAMPS[:2]), light=LAMPS[:2], noise=1)
+    result = photometric_stereo(lit(LAMPS[:2]), light=LAMPS[:2], noise=1)
     flat = photometric_stereo(lit(LAMPS[[0, 1, 0, 1]]), light=LAMPS[[0, 1, 0, 1]])
-    assert np.isnan([found.normals, flat.normals]).all()
+    assert np.isnan([result.normals, flat.normals]).all()
 
 
 def test_the_standard_error_is_the_cramer_rao_bound():
     lamps = round_lamps(0.3)
     lamps = lamps * np.linspace(0.5, 1.5, 12)[:, None]
     lit_by_all = np.all(np.einsum("hwk,tk->thw", BALL, lamps) > 0, axis=0)[INSIDE]
-    found = photometric_stereo(lit(lamps), light=lamps, noise=2)
+    result = photometric_stereo(lit(lamps), light=lamps, noise=2)
     np.testing.assert_allclose(
-        found.normals_sigma[INSIDE][lit_by_all], 2 * bound(lamps)[lit_by_all], rtol=1e-4
+        result.normals_sigma[INSIDE][lit_by_all], 2 * bound(lamps)[lit_by_all], rtol=1e-4
     )
 
 
 def test_the_standard_errors_are_the_scatter():
     lamps = round_lamps(0.5)
-    found = photometric_stereo(lit(lamps, noise=0.5), light=lamps, shadow=2)
-    assert found.process["noise"] == pytest.approx(0.5, rel=0.03)
-    assert np.mean((angle(found.normals) / found.normals_sigma[INSIDE]) ** 2) == pytest.approx(1, abs=0.07)
-    error = (found.albedo - ALBEDO)[INSIDE] / found.albedo_sigma[INSIDE]
+    result = photometric_stereo(lit(lamps, noise=0.5), light=lamps, shadow=2)
+    assert result.process["noise"] == pytest.approx(0.5, rel=0.03)
+    assert np.mean((angle(result.normals) / result.normals_sigma[INSIDE]) ** 2) == pytest.approx(1, abs=0.07)
+    error = (result.albedo - ALBEDO)[INSIDE] / result.albedo_sigma[INSIDE]
     assert np.mean(error**2) == pytest.approx(1, abs=0.07)
 
 
@@ -91,9 +91,9 @@ def test_a_lamp_that_goes_round_is_the_correlation_of_a_rotation():
     frames = lit(round_lamps(0.3), noise=0.5) + 30  # nowhere dark
     wave = engine.correlate(frames, AZIMUTH)
     vector = np.dstack([wave.cosine / np.sin(0.3), wave.sine / np.sin(0.3), wave.mean / np.cos(0.3)])
-    found = photometric_stereo(frames, AZIMUTH, zenith=0.3)
-    np.testing.assert_allclose(found.normals * found.albedo[..., None], vector, atol=2e-3)
-    np.testing.assert_allclose(found.residual, wave.residual, rtol=1e-3)
+    result = photometric_stereo(frames, AZIMUTH, zenith=0.3)
+    np.testing.assert_allclose(result.normals * result.albedo[..., None], vector, atol=2e-3)
+    np.testing.assert_allclose(result.residual, wave.residual, rtol=1e-3)
 
 
 def test_a_lamp_is_needed_for_each_frame_and_no_more():
@@ -110,9 +110,9 @@ def test_the_dark_level_is_that_of_the_recording():
     frames = lit(round_lamps(0.3), dark=20.0)
     header = io.Header("axial", dark=np.full(ROW.shape, 20, np.float32))
     source = MadeUp(frames, header, phase=AZIMUTH)
-    found = engine.run(source, PhotometricStereo(zenith=0.3))
+    result = engine.run(source, PhotometricStereo(zenith=0.3))
     expected = photometric_stereo(frames, AZIMUTH, zenith=0.3, dark=20.0)
-    np.testing.assert_array_equal(found.normals, expected.normals)
+    np.testing.assert_array_equal(result.normals, expected.normals)
 
 
 FRAMES = lit(LAMPS)
@@ -141,9 +141,9 @@ def test_bad_input_is_one_line(arguments, line):
 
 @pytest.mark.parametrize("azimuth", [[0, np.pi, 0, np.pi], np.pi / 2 * np.array([1, -1, 1, -1])])
 def test_lamps_in_a_plane_determine_no_normal(azimuth):
-    found = photometric_stereo(lit(round_lamps(0.6, np.array(azimuth))), azimuth, zenith=0.6, noise=1)
-    assert np.isnan(found.normals).all()
-    assert np.isnan(found.normals_sigma).all()
+    result = photometric_stereo(lit(round_lamps(0.6, np.array(azimuth))), azimuth, zenith=0.6, noise=1)
+    assert np.isnan(result.normals).all()
+    assert np.isnan(result.normals_sigma).all()
 
 
 def bumps():
@@ -156,20 +156,20 @@ def bumps():
 def shone_on(normals, blur=0.0, power=1.0):
     """Return a recording of a surface under lamps at a zenith of 0.5, seen by a camera."""
     light = 0.8 * np.einsum("hwk,tk->thw", normals, round_lamps(0.5))
-    light = np.stack([gaussian_filter(one, blur, mode="nearest") if blur else one for one in light])
+    light = np.stack([gaussian_filter(frame, blur, mode="nearest") if blur else frame for frame in light])
     counts = 200 * light**power + np.random.default_rng(2).normal(size=light.shape)
     frames = np.rint(counts).clip(0, 255).astype(np.uint8)
     return ArrayRecording(frames, {"phase": AZIMUTH}, {})
 
 
-def chi2(found, normals):
-    error = np.linalg.norm(np.cross(found.normals.astype(float), normals), axis=-1)
-    return np.mean((error / found.normals_sigma)[5:-5, 5:-5] ** 2)
+def chi2(result, normals):
+    error = np.linalg.norm(np.cross(result.normals.astype(float), normals), axis=-1)
+    return np.mean((error / result.normals_sigma)[5:-5, 5:-5] ** 2)
 
 
 def test_a_lens_that_blurs_is_part_of_the_error():
-    found = engine.run(shone_on(bumps(), blur=1.5), PhotometricStereo(zenith=0.5))
-    assert 0.5 < chi2(found, bumps()) < 2  # 33 without
+    result = engine.run(shone_on(bumps(), blur=1.5), PhotometricStereo(zenith=0.5))
+    assert 0.5 < chi2(result, bumps()) < 2  # 33 without
 
 
 def test_brightness_that_is_not_proportional_to_light_is_found():
@@ -178,6 +178,6 @@ def test_brightness_that_is_not_proportional_to_light_is_found():
 
 
 def test_brightness_that_is_proportional_to_light_has_no_finding():
-    found = engine.run(shone_on(bumps()), PhotometricStereo(zenith=0.5))
-    assert "warnings" not in found.process
-    assert 0.9 < chi2(found, bumps()) < 1.1
+    result = engine.run(shone_on(bumps()), PhotometricStereo(zenith=0.5))
+    assert "warnings" not in result.process
+    assert 0.9 < chi2(result, bumps()) < 1.1

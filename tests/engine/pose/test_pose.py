@@ -19,23 +19,23 @@ def draw(rng: np.random.Generator, size: float = 1.0) -> tuple[np.ndarray, np.nd
 
 
 def mean_chi_square(draws: int, shape: tuple[int, int]) -> float:
-    found = []
+    chi_squares = []
     for seed in range(draws):
         rng = np.random.default_rng(seed)
         vector, shift = draw(rng)
-        pair = (sampled(bumpy, *way, rng=rng, shape=shape) for way in ((), (vector, shift)))
+        pair = (sampled(bumpy, *motion, rng=rng, shape=shape) for motion in ((), (vector, shift)))
         pose = engine.pose.estimate_pose(*pair)
         error = error_of(pose, vector, shift)
-        found.append(error @ np.linalg.solve(pose.covariance, error) / 6)
-    return float(np.mean(found))
+        chi_squares.append(error @ np.linalg.solve(pose.covariance, error) / 6)
+    return float(np.mean(chi_squares))
 
 
-def test_errors_are_as_large_as_the_covariance_says() -> None:
+def test_errors_match_the_covariance() -> None:
     assert mean_chi_square(30, (60, 80)) == pytest.approx(1.0, abs=0.3)
 
 
 @pytest.mark.slow
-def test_errors_of_many_draws_are_as_large_as_the_covariance_says() -> None:
+def test_errors_of_many_draws_match_the_covariance() -> None:
     assert mean_chi_square(150, (120, 160)) == pytest.approx(1.0, abs=0.1)
 
 
@@ -52,14 +52,14 @@ def test_what_a_surface_cannot_determine_is_undetermined(form, free: int, size: 
 
 
 def test_a_ball_is_known_by_its_centre_alone() -> None:
-    centre, found = np.array([0, 0, -RADIUS]), []
+    centre, errors = np.array([0, 0, -RADIUS]), []
     for seed in range(30):
         rng = np.random.default_rng(seed)
         vector, shift = draw(rng)
         pose = engine.pose.estimate_pose(sampled(ball, rng=rng), sampled(ball, vector, shift, rng=rng))
-        wanted = engine.pose.Pose(vector, shift, *[None] * 4).apply(centre)
-        found.append(error_at(pose, centre, wanted, np.eye(3)))
-    assert np.mean(found) == pytest.approx(1.0, abs=0.4)
+        expected = engine.pose.Pose(vector, shift, *[None] * 4).apply(centre)
+        errors.append(error_at(pose, centre, expected, np.eye(3)))
+    assert np.mean(errors) == pytest.approx(1.0, abs=0.4)
 
 
 def test_nothing_moves_where_nothing_is_known_to() -> None:
@@ -98,8 +98,8 @@ def test_a_start_leads_to_the_same_motion() -> None:
 def test_heights_alone_are_enough() -> None:
     rng = np.random.default_rng(3)
     vector, shift = draw(rng)
-    pair = [sampled(bumpy, *way, rng=rng) for way in ((), (vector, shift))]
-    pose = engine.pose.estimate_pose(*(one.assign(normals=None, normals_sigma=None) for one in pair))
+    pair = [sampled(bumpy, *motion, rng=rng) for motion in ((), (vector, shift))]
+    pose = engine.pose.estimate_pose(*(surface.assign(normals=None, normals_sigma=None) for surface in pair))
     assert np.abs(error_of(pose, vector, shift)).max() < 0.005
 
 
@@ -108,10 +108,10 @@ def test_maps_without_noise_have_a_pose_and_a_covariance(sigma: float) -> None:
     rng = np.random.default_rng(5)
     vector, shift = draw(rng)
     none = {"height_sigma": 0.0, "normals_sigma": 0.0}
-    pair = [sampled(bumpy, *way, rng=rng, **none) for way in ((), (vector, shift))]
+    pair = [sampled(bumpy, *motion, rng=rng, **none) for motion in ((), (vector, shift))]
     same = {"height_sigma": np.full_like(pair[0].height, sigma)}
     same |= {"normals_sigma": same["height_sigma"]}
-    pose = engine.pose.estimate_pose(*(one.assign(same) for one in pair))
+    pose = engine.pose.estimate_pose(*(surface.assign(same) for surface in pair))
     assert np.abs(error_of(pose, vector, shift)).max() < 1e-3
     assert 0 < pose.sigma.max() < 1e-3
 
@@ -119,10 +119,10 @@ def test_maps_without_noise_have_a_pose_and_a_covariance(sigma: float) -> None:
 def test_integrated_heights_leave_z_open() -> None:
     rng = np.random.default_rng(4)
     pair = []
-    for way in ((), draw(rng)):
-        made = sampled(bumpy, *way, rng=rng)
-        pieces = np.zeros(made.height.shape, np.int32), np.ones(1, np.uint8)
-        pair.append(made.assign(component=pieces[0], offset_unknown=pieces[1]))
+    for motion in ((), draw(rng)):
+        surface = sampled(bumpy, *motion, rng=rng)
+        pieces = np.zeros(surface.height.shape, np.int32), np.ones(1, np.uint8)
+        pair.append(surface.assign(component=pieces[0], offset_unknown=pieces[1]))
     (free,) = engine.pose.estimate_pose(*pair).undetermined
     np.testing.assert_allclose(np.abs(free), [0, 0, 0, 0, 0, 1], atol=1e-6)
 
@@ -131,13 +131,16 @@ def test_the_covariance_is_0_along_undetermined_directions_wherever_the_object_i
     rng = np.random.default_rng(4)
     part = slice(0, 25), slice(30, None)  # whose middle is not the origin
     pair = []
-    for way in ((), draw(rng)):
-        made = sampled(bumpy, *way, rng=rng)
-        apart = {"component": np.zeros(made.height.shape, np.int32), "offset_unknown": np.ones(1, np.uint8)}
-        maps = {name: np.full_like(values, np.nan) for name, values in made.maps().items()}
+    for motion in ((), draw(rng)):
+        surface = sampled(bumpy, *motion, rng=rng)
+        apart = {
+            "component": np.zeros(surface.height.shape, np.int32),
+            "offset_unknown": np.ones(1, np.uint8),
+        }
+        maps = {name: np.full_like(values, np.nan) for name, values in surface.maps().items()}
         for name, values in maps.items():
-            values[part] = made[name][part]
-        pair.append(made.assign(maps | apart))
+            values[part] = surface[name][part]
+        pair.append(surface.assign(maps | apart))
     pose = engine.pose.estimate_pose(*pair)
     assert len(pose.undetermined) == 1
     along = pose.undetermined @ pose.covariance
@@ -148,13 +151,13 @@ def test_pixels_near_the_border_of_contact_do_not_count() -> None:
     rng = np.random.default_rng(5)
     vector, shift = draw(rng)
     pair = []
-    for way in ((), (vector, shift)):
-        made = sampled(bumpy, *way, rng=rng)
-        contact = np.ones(made.height.shape, np.uint8)
+    for motion in ((), (vector, shift)):
+        surface = sampled(bumpy, *motion, rng=rng)
+        contact = np.ones(surface.height.shape, np.uint8)
         contact[:, 30:34] = 0
-        normals = made.normals.copy()
+        normals = surface.normals.copy()
         normals[:, 28:36, 0] += 0.2
-        pair.append(made.assign(contact=contact, normals=normals))
+        pair.append(surface.assign(contact=contact, normals=normals))
     pose = engine.pose.estimate_pose(*pair)
     assert pose.chi_square == pytest.approx(1, abs=0.1)
     assert np.abs(error_of(pose, vector, shift)).max() < 0.005
@@ -163,11 +166,9 @@ def test_pixels_near_the_border_of_contact_do_not_count() -> None:
 @pytest.mark.parametrize(
     ("name", "top", "free"), [("sphere", -RADIUS, 4), ("cone", 0.0, 2), ("cylinder", -RADIUS, 3)]
 )
-def test_errors_on_results_from_frames_are_as_large_as_the_covariance_says(
-    name, top: float, free: int
-) -> None:
+def test_errors_on_results_from_frames_match_the_covariance(name, top: float, free: int) -> None:
     """Of the ball's centre, the cone's tip, or the rod's axis, whether it moved or not."""
-    found = []
+    errors = []
     for seed in range(3):
         for shift, angle in (((0.0, 0.0), 0.0), ((0.3, -0.2), 0.15)):
             thing = make_object(name, (128, 128), (0.07, 0.07))
@@ -175,12 +176,12 @@ def test_errors_on_results_from_frames_are_as_large_as_the_covariance_says(
             after, deep_after = turned(Moved(thing, shift, angle), seed + 100)
             pose = engine.pose.estimate_pose(before, after)
             assert len(pose.undetermined) == free
-            point, wanted = np.array([0, 0, top + deep]), np.array([*shift, top + deep_after])
+            point, expected = np.array([0, 0, top + deep]), np.array([*shift, top + deep_after])
             ways = np.eye(3)[:2]
             if name == "cylinder":
                 ways = np.array([[-math.sin(angle), math.cos(angle), 0]])
-            found.append(error_at(pose, point, wanted, ways))
-    assert 0.2 < np.mean(found) < 1.8
+            errors.append(error_at(pose, point, expected, ways))
+    assert 0.2 < np.mean(errors) < 1.8
 
 
 def refusals() -> dict[str, tuple[io.Result, io.Result, str]]:
@@ -202,6 +203,6 @@ def refusals() -> dict[str, tuple[io.Result, io.Result, str]]:
 
 @pytest.mark.parametrize("name", refusals())
 def test_what_cannot_be_compared_is_refused(name: str) -> None:
-    first, second, said = refusals()[name]
-    with pytest.raises(io.InputError, match=said):
+    first, second, message = refusals()[name]
+    with pytest.raises(io.InputError, match=message):
         engine.pose.estimate_pose(first, second)

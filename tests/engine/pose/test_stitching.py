@@ -15,9 +15,9 @@ MOVES = (
 )
 
 
-def touches(seed=0, moves=MOVES, **known):
+def touches(seed=0, moves=MOVES, **options):
     rng = np.random.default_rng(seed)
-    return [sampled(bumpy, np.array(turn), np.array(shift), rng=rng, **known) for turn, shift in moves]
+    return [sampled(bumpy, np.array(turn), np.array(shift), rng=rng, **options) for turn, shift in moves]
 
 
 @pytest.fixture(scope="module")
@@ -31,19 +31,19 @@ def errors(result):
 
 
 def test_the_surface_is_larger_and_right_to_its_sigma(whole):
-    found = whole.result
-    known = np.isfinite(found.height)
-    assert known.sum() > 1.5 * 60 * 80
-    error = errors(found)[known]
+    result = whole.result
+    finite = np.isfinite(result.height)
+    assert finite.sum() > 1.5 * 60 * 80
+    error = errors(result)[finite]
     assert np.sqrt(np.mean(error**2)) < 1e-3
     # Interpolation takes noise away, of which the standard deviations say nothing.
-    assert 0.5 < np.mean((error / found.height_sigma[known]) ** 2) < 1.2
-    assert (found.status == 2).sum() < 5
+    assert 0.5 < np.mean((error / result.height_sigma[finite]) ** 2) < 1.2
+    assert (result.status == 2).sum() < 5
 
 
 def test_what_several_touches_saw_is_known_better(whole):
-    found = whole.result
-    once, more = np.nanmax(found.height_sigma), np.nanmin(found.height_sigma)
+    result = whole.result
+    once, more = np.nanmax(result.height_sigma), np.nanmin(result.height_sigma)
     assert more < 0.75 * once
 
 
@@ -55,13 +55,13 @@ def test_poses_are_those_that_the_touches_were_moved_by(whole):
 
 
 def test_normals_are_turned_and_merged(whole):
-    found = whole.result
-    x, y = np.meshgrid(found.x, found.y)
+    result = whole.result
+    x, y = np.meshgrid(result.x, result.y)
     _, across, up = bumpy(x, y)
     upright = np.dstack([-across, -up, np.ones_like(x)])
     upright /= np.linalg.norm(upright, axis=-1, keepdims=True)
-    known = np.isfinite(found.normals).all(axis=-1)
-    angle = np.linalg.norm(found.normals - upright, axis=-1)[known]
+    finite = np.isfinite(result.normals).all(axis=-1)
+    angle = np.linalg.norm(result.normals - upright, axis=-1)[finite]
     assert np.sqrt(np.mean(angle**2)) < 0.011
 
 
@@ -78,9 +78,9 @@ def test_a_touch_of_unknown_offset_takes_that_of_the_others():
         y=second.y,
         **relative,
     )
-    found = engine.pose.stitch([first, shifted]).result
-    assert np.sqrt(np.nanmean(errors(found) ** 2)) < 2e-3
-    assert found.offset_unknown is None
+    result = engine.pose.stitch([first, shifted]).result
+    assert np.sqrt(np.nanmean(errors(result) ** 2)) < 2e-3
+    assert result.offset_unknown is None
 
 
 @pytest.mark.parametrize("relative", [0, 1])
@@ -97,9 +97,9 @@ def test_the_offset_and_the_pose_of_a_levelled_touch_are_in_its_sigma(relative):
             component=np.zeros((60, 70), np.int32),
             offset_unknown=np.ones(1, np.uint8),
         )
-        found = engine.pose.stitch(pair).result
-        error = errors(found) - (0.4 if relative == 0 else 0)  # heights are the first touch's
-        squares.append(np.nanmean((error / found.height_sigma) ** 2))
+        result = engine.pose.stitch(pair).result
+        error = errors(result) - (0.4 if relative == 0 else 0)  # heights are the first touch's
+        squares.append(np.nanmean((error / result.height_sigma) ** 2))
     assert 0.5 < np.mean(squares) < 1.5
 
 
@@ -115,10 +115,10 @@ def test_touches_that_differ_are_reported():
         x=second.x,
         y=second.y,
     )
-    found = engine.pose.stitch([first, other]).result
-    assert (found.status[21:29, 31:39] == 2).all()
-    assert (found.height_sigma[21:29, 31:39] > 0.005).all()
-    assert (found.status == 2).sum() < 130
+    result = engine.pose.stitch([first, other]).result
+    assert (result.status[21:29, 31:39] == 2).all()
+    assert (result.height_sigma[21:29, 31:39] > 0.005).all()
+    assert (result.status == 2).sum() < 130
 
 
 def test_what_shares_nothing_is_refused_by_name():

@@ -54,8 +54,8 @@ def first(slopes, travels):
     if not passed.size:
         return np.inf
     k = passed[0]
-    share = (np.tan(THRESHOLD) - slopes[k - 1]) / (slopes[k] - slopes[k - 1])
-    return travels[k - 1] + share * (travels[k] - travels[k - 1])
+    fraction = (np.tan(THRESHOLD) - slopes[k - 1]) / (slopes[k] - slopes[k - 1])
+    return travels[k - 1] + fraction * (travels[k] - travels[k - 1])
 
 
 def pressed_like(theory: Pressed, profile, shape=(72, 80), size=(0.06, 0.05)):
@@ -73,20 +73,20 @@ def pressed_like(theory: Pressed, profile, shape=(72, 80), size=(0.06, 0.05)):
     ids=["paraboloid", "ball", "cone"],
 )
 def test_a_press_is_as_the_closed_forms_have_it(theory, profile):
-    found, r = pressed_like(theory, profile)
-    touch = np.sqrt(np.count_nonzero(found.contact) * 0.06 * 0.05 / np.pi)
+    force, r = pressed_like(theory, profile)
+    touch = np.sqrt(np.count_nonzero(force.contact) * 0.06 * 0.05 / np.pi)
     outside = r > theory.radius + 0.06
     assert touch == pytest.approx(theory.radius, rel=0.02)
-    assert found.load == pytest.approx(theory.force, rel=0.002)
-    np.testing.assert_allclose(found.height[outside], theory.surface(r[outside]), atol=0.002)
+    assert force.load == pytest.approx(theory.force, rel=0.002)
+    np.testing.assert_allclose(force.height[outside], theory.surface(r[outside]), atol=0.002)
 
 
-def test_a_flat_punch_presses_as_boussinesq_says():
+def test_the_force_of_a_flat_punch_is_that_of_boussinesq():
     r = distances((81, 81), (0.05, 0.05))
-    found = press(HalfSpace((81, 81), (0.05, 0.05)), np.where(r <= 1.0, 0.2, np.nan))
-    assert found.load == pytest.approx(8 / 3 * 0.2, rel=0.02)
+    force = press(HalfSpace((81, 81), (0.05, 0.05)), np.where(r <= 1.0, 0.2, np.nan))
+    assert force.load == pytest.approx(8 / 3 * 0.2, rel=0.02)
     far = (r > 1.2) & (r < 1.9)
-    np.testing.assert_allclose(found.height[far], 0.4 / np.pi * np.arcsin(1 / r[far]), rtol=0.02)
+    np.testing.assert_allclose(force.height[far], 0.4 / np.pi * np.arcsin(1 / r[far]), rtol=0.02)
 
 
 def test_pressure_moves_the_surface_as_sums_over_pixels_do():
@@ -101,8 +101,8 @@ def test_a_weak_stage_lets_the_surface_in_less():
     r = distances((48, 48), (0.08, 0.08))
     theory = sphere(3.0, 1.0, 1.0)
     ball = np.sqrt(9 - r**2) - 3
-    found = press(HalfSpace((48, 48), (0.08, 0.08)), ball + theory.depth + 0.05 * theory.force, 0.05)
-    assert found.load == pytest.approx(theory.force, rel=0.003)
+    force = press(HalfSpace((48, 48), (0.08, 0.08)), ball + theory.depth + 0.05 * theory.force, 0.05)
+    assert force.load == pytest.approx(theory.force, rel=0.003)
 
 
 def test_the_threshold_falls_towards_the_wall_as_the_wall_is_seen():
@@ -120,24 +120,24 @@ def test_a_ball_is_corrected_with_pixels_of_two_sizes_and_defects():
     height, sigma, status, truth = ball_press(3.0, shape, size, 1.2, 0.05)
     status[20:23, 30:33], status[10, 50] = 0, 0
     corrected, spread, *_ = fit_press(height, sigma, status, size, GEL, deepest=1.2)
-    known = np.isfinite(corrected)
-    assert not known[status != 1].any()
-    assert np.count_nonzero(known) > 0.5 * np.count_nonzero(status == 1)
-    before, after = (maps[known] - truth[known] for maps in (height, corrected))
+    finite = np.isfinite(corrected)
+    assert not finite[status != 1].any()
+    assert np.count_nonzero(finite) > 0.5 * np.count_nonzero(status == 1)
+    before, after = (maps[finite] - truth[finite] for maps in (height, corrected))
     assert before.mean() < -0.15
     assert abs(after.mean()) < 0.02
     assert np.sqrt(np.mean(after**2)) < 0.04
-    assert np.sqrt(np.mean((after / spread[known]) ** 2)) < 2.5
+    assert np.sqrt(np.mean((after / spread[finite]) ** 2)) < 2.5
 
 
 def test_a_ball_at_the_edge_of_the_picture_is_corrected():
     height, sigma, status, truth = ball_press(5.0, (60, 60), (0.1, 0.1), 1.0, 0.05)
-    cut = np.s_[:, 12:]
+    part = np.s_[:, 12:]
     gel = replace(GEL, axis=(-0.6, 0.0))
-    corrected, *_ = fit_press(height[cut], sigma[cut], status[cut], 0.1, gel, deepest=1.0)
-    known = np.isfinite(corrected)
-    assert np.count_nonzero(known) > 0.5 * np.count_nonzero(status[cut] == 1)
-    before, after = ((maps - truth[cut])[known] for maps in (height[cut], corrected))
+    corrected, *_ = fit_press(height[part], sigma[part], status[part], 0.1, gel, deepest=1.0)
+    finite = np.isfinite(corrected)
+    assert np.count_nonzero(finite) > 0.5 * np.count_nonzero(status[part] == 1)
+    before, after = ((maps - truth[part])[finite] for maps in (height[part], corrected))
     assert abs(after.mean()) < abs(before.mean()) / 5
 
 
@@ -145,10 +145,10 @@ def test_too_little_light_shows_no_surface():
     dark = np.full((20, 20), np.nan)
     with pytest.raises(NotConverged, match="nothing turned light"):
         fit_press(dark, dark, np.full((20, 20), 2), 0.1, GEL)
-    one = dark.copy()
-    one[4, 5:8] = -0.1
+    few = dark.copy()
+    few[4, 5:8] = -0.1
     with pytest.raises(NotConverged, match="too little"):
-        fit_press(one, 0.01, np.where(np.isfinite(one), 1, 2), 0.1, GEL)
+        fit_press(few, 0.01, np.where(np.isfinite(few), 1, 2), 0.1, GEL)
     with pytest.raises(NotConverged, match="too little"):
         fit_press(np.array([[-0.2]]), 0.01, np.array([[1]]), 0.1, GEL)
 
@@ -176,9 +176,9 @@ def test_a_press_that_cannot_be_corrected_stays_and_states_the_reason():
         (GEL, (0.1, 0.1), 0.4, "none: the gel was learned with a threshold of 0.5, not of 0.4"),
         (GEL, (0.1, 0.1), 0.5, "none: nothing turned light"),
     ):
-        same, said, _ = correct_press(result, Pixels(pixel_size), 1.0, threshold, gel)
+        same, reason, _ = correct_press(result, Pixels(pixel_size), 1.0, threshold, gel)
         assert same is result
-        assert said == why
+        assert reason == why
 
 
 def test_flat_tops_belong_to_the_surface_and_what_was_not_reached_does_not():

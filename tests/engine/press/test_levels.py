@@ -40,50 +40,50 @@ def press(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(press):
+def result(press):
     return engine.reconstruct(press, thresholds=SHARES, inclinations=STEPS, fill=False)
 
 
-def test_the_true_inclination_is_within_its_bounds(press, found):
+def test_the_true_inclination_is_within_its_bounds(press, result):
     truth = press.truth
     off = np.min([np.abs(truth.zenith - step) for step in STEPS], axis=0) > math.radians(3.5)
-    seen = (truth.contact == 1) & off & (found.slope_min > 0)
-    assert np.count_nonzero(seen) > 200
-    assert len(np.unique(found.slope_min[seen])) == 3
-    assert (truth.zenith[seen] >= found.slope_min[seen]).all()
-    assert not (truth.zenith[seen] > found.slope_max[seen]).any()
+    selected = (truth.contact == 1) & off & (result.slope_min > 0)
+    assert np.count_nonzero(selected) > 200
+    assert len(np.unique(result.slope_min[selected])) == 3
+    assert (truth.zenith[selected] >= result.slope_min[selected]).all()
+    assert not (truth.zenith[selected] > result.slope_max[selected]).any()
 
 
-def test_bounds_are_neighbouring_steps(found):
+def test_bounds_are_neighbouring_steps(result):
     lower, upper = [0, *STEPS], [*STEPS, np.nan]
     for low, high in zip(lower, upper, strict=True):
-        here = found.slope_min == np.float32(low)
-        np.testing.assert_allclose(found.slope_max[here], high, rtol=1e-6)
+        here = result.slope_min == np.float32(low)
+        np.testing.assert_allclose(result.slope_max[here], high, rtol=1e-6)
 
 
-def test_heights_are_those_of_the_lowest_threshold(press, found):
+def test_heights_are_those_of_the_lowest_threshold(press, result):
     single = engine.reconstruct(press, threshold=SHARES[0], fill=False)
-    np.testing.assert_array_equal(found.height, single.height)
+    np.testing.assert_array_equal(result.height, single.height)
     assert single.slope_min is None
-    assert found.process["threshold"] == SHARES[0]
+    assert result.process["threshold"] == SHARES[0]
 
 
-def test_one_threshold_gives_bounds_too(press, found):
-    one = engine.reconstruct(press, thresholds=SHARES[1:2], inclinations=STEPS[1:2], fill=False)
-    np.testing.assert_array_equal(one.slope_min > 0, found.slope_min >= np.float32(STEPS[1]))
+def test_one_threshold_gives_bounds_too(press, result):
+    single = engine.reconstruct(press, thresholds=SHARES[1:2], inclinations=STEPS[1:2], fill=False)
+    np.testing.assert_array_equal(single.slope_min > 0, result.slope_min >= np.float32(STEPS[1]))
 
 
 def test_invalid_pixels_have_no_bounds():
     frames = np.zeros((6, 1, 4), np.float32)
     frames[3:, 0] = [0, 0.3, 0.9, np.nan]
     options = {"thresholds": [0.2, 0.8], "inclinations": [0.25, 0.5], "dark": 0, "bright": 1, "noise": 0.01}
-    found = bare(Levels(**options), frames, travel=0.1 * np.arange(6))
-    np.testing.assert_array_equal(found.slope_min, np.array([[0, 0.25, 0.5, np.nan]], np.float32))
-    np.testing.assert_array_equal(found.slope_max, np.array([[0.25, 0.5, np.nan, np.nan]], np.float32))
+    result = bare(Levels(**options), frames, travel=0.1 * np.arange(6))
+    np.testing.assert_array_equal(result.slope_min, np.array([[0, 0.25, 0.5, np.nan]], np.float32))
+    np.testing.assert_array_equal(result.slope_max, np.array([[0.25, 0.5, np.nan, np.nan]], np.float32))
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"thresholds": [0.2, 0.8]}, "2 thresholds and 0 inclinations"),
         ({"thresholds": [0.8, 0.2], "inclinations": [0.2, 0.4]}, "from the lowest to the highest"),
@@ -94,27 +94,27 @@ def test_invalid_pixels_have_no_bounds():
         ({"thresholds": [0.5], "inclinations": [0.2], "method": "change-point"}, "method 'threshold'"),
     ],
 )
-def test_impossible_input_is_one_line(press, options, said):
-    with pytest.raises(io.InputError, match=said):
+def test_impossible_input_is_one_line(press, options, message):
+    with pytest.raises(io.InputError, match=message):
         engine.reconstruct(press, **options)
 
 
-def test_the_command_takes_them_repeated_or_with_commas(press, found, tmp_path, monkeypatch):
+def test_the_command_takes_them_repeated_or_with_commas(press, result, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     press.rewind()
     record(press, tmp_path / "press.h5")
     angles = ",".join(f"{step}rad" for step in STEPS)
-    repeated = [word for share in SHARES for word in ("--thresholds", share)]
+    repeated = [word for threshold in SHARES for word in ("--thresholds", threshold)]
     commas = ["--thresholds", ",".join(map(str, SHARES))]
     for words in (repeated, commas):
         words = [*words, "--inclinations", angles, "--no-fill", "-o", "a.h5", "--overwrite"]
         ended = run("reconstruct", "press.h5", *words)
         assert ended.code == 0, ended.said
-        np.testing.assert_array_equal(io.open_result("a.h5").slope_max, found.slope_max)
-    for words, said in (
+        np.testing.assert_array_equal(io.open_result("a.h5").slope_max, result.slope_max)
+    for words, message in (
         (["--thresholds", "0.2,0.8"], "2 thresholds and 0 inclinations"),
         (["--threshold", "half"], "--threshold half: a number is needed"),
     ):
         ended = run("reconstruct", "press.h5", *words, "-o", "b.h5")
         assert (ended.code, ended.said.count("\n")) == (2, 1)
-        assert said in ended.said
+        assert message in ended.said

@@ -46,8 +46,8 @@ def test_a_function_of_arrays_gives_what_a_recording_gives(first):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", io.MirrorskinWarning)
         recorded = engine.reconstruct(source)
-        found = engine.find_onset(frames, TRAVEL, dark=30.0, bright=180.0)
-    np.testing.assert_array_equal(found.height_sigma, recorded.height_sigma)
+        onset = engine.find_onset(frames, TRAVEL, dark=30.0, bright=180.0)
+    np.testing.assert_array_equal(onset.height_sigma, recorded.height_sigma)
 
 
 def test_what_was_given_stays():

@@ -55,9 +55,9 @@ def search_in_blocks(frames, travel, cuts, **options):
 
 def by_reference(frames, travel, dark, bright, **options):
     """Run the references; the plateau that a release begins on is always the pixel's own."""
-    own = options.get("event") == "release" or dark is None
+    estimated = options.get("event") == "release" or dark is None
     with np.errstate(all="ignore"):
-        return numpy_onset(frames, travel, dark, bright, own_dark=own, **options)
+        return numpy_onset(frames, travel, dark, bright, own_dark=estimated, **options)
 
 
 @pytest.mark.parametrize(("dtype", "hold"), [("uint8", 1), ("uint16", 2), ("float32", 7), ("uint8", 300)])
@@ -65,29 +65,31 @@ def by_reference(frames, travel, dark, bright, **options):
 def test_the_reference_finds_the_first_run_that_holds(dtype, hold, event):
     dark, bright = SPEC[dtype]
     frames, travel = stroke(dtype, 25, (9, 11), event, seed=hold, noise=0.2)
-    found = by_reference(frames, travel, dark, bright, noise=1.0, hold=hold, event=event)
+    result = by_reference(frames, travel, dark, bright, noise=1.0, hold=hold, event=event)
     light = frames.astype(float) >= (dark + bright) / 2
     runs = light if event == "onset" else ~light
     expected = np.array([first_run(series, hold) for series in runs.reshape(25, -1).T]).reshape(9, 11)
-    np.testing.assert_array_equal(found.frame, expected)
+    np.testing.assert_array_equal(result.frame, expected)
     never, start = (2, 3) if event == "onset" else (3, 2)
-    np.testing.assert_array_equal(found.status, np.select([expected == -1, expected == 0], [never, start], 1))
+    np.testing.assert_array_equal(
+        result.status, np.select([expected == -1, expected == 0], [never, start], 1)
+    )
 
 
 @BY_KIND
 def test_a_device_agrees_with_the_reference_however_the_stack_is_cut(device, dtype, hold, subframe, event):
     levels, generator = SPEC[dtype], np.random.default_rng(6)
     options = {"threshold": 0.4, "hold": hold, "subframe": subframe, "event": event}
-    for size, own in ((ODD, False), (EVEN, False), ((17, 23), True)):
-        dark, bright = (part * generator.uniform(0.8, 1.2, size) for part in levels) if own else levels
-        frames, travel = stroke(dtype, 60, size, event, seed=3, noise=0.008 if own else 0.1)
+    for size, per_pixel in ((ODD, False), (EVEN, False), ((17, 23), True)):
+        dark, bright = (part * generator.uniform(0.8, 1.2, size) for part in levels) if per_pixel else levels
+        frames, travel = stroke(dtype, 60, size, event, seed=3, noise=0.008 if per_pixel else 0.1)
         options["noise"] = 0.008 * (levels[1] - levels[0])
-        found = find_onset(frames, travel, dark=dark, bright=bright, device=device, **options)
-        assert {1, 2, 3} <= set(found.status.flat)
-        assert_within_an_ulp(found, by_reference(frames, travel, dark, bright, **options), travel)
-        known = {"dark": dark, "bright": bright, "device": device, **options}
+        onset = find_onset(frames, travel, dark=dark, bright=bright, device=device, **options)
+        assert {1, 2, 3} <= set(onset.status.flat)
+        assert_within_an_ulp(onset, by_reference(frames, travel, dark, bright, **options), travel)
+        arguments = {"dark": dark, "bright": bright, "device": device, **options}
         for cuts in (range(1, 60), range(7, 60, 7), [1, 2, 59]):
-            assert_equal(search_in_blocks(frames, travel, list(cuts), **known), found)
+            assert_equal(search_in_blocks(frames, travel, list(cuts), **arguments), onset)
 
 
 @BY_KIND
@@ -116,10 +118,10 @@ def test_tiny_stacks_of_all_kinds(device, dtype, hold, subframe, event):
             "noise": generator.choice([None, 0.0, 0.01, 1.5, 40.0]),
         }
         cuts = np.unique(generator.integers(1, count, generator.integers(0, 6)))
-        known = {"dark": dark, "bright": bright, "device": device, **options}
-        found = search_in_blocks(frames, travel, list(cuts), **known)
-        options["noise"] = found.process["noise"]
-        assert_within_an_ulp(found, by_reference(frames, travel, dark, bright, **options), travel)
+        arguments = {"dark": dark, "bright": bright, "device": device, **options}
+        result = search_in_blocks(frames, travel, list(cuts), **arguments)
+        options["noise"] = result.process["noise"]
+        assert_within_an_ulp(result, by_reference(frames, travel, dark, bright, **options), travel)
 
 
 @pytest.mark.parametrize(
@@ -129,8 +131,8 @@ def test_tiny_stacks_of_all_kinds(device, dtype, hold, subframe, event):
 def test_long_runs_are_counted_over_spans_and_cuts(device, dtype, hold, count):
     """Runs of about as many light frames as it takes, broken now and then by chance."""
     generator, (dark, bright) = np.random.default_rng(33), SPEC[dtype]
-    share = 1 - 1 / generator.uniform(0.5 * hold, 3 * hold, (3, 64))
-    light = generator.random((count, 3, 64)) < share
+    fraction = 1 - 1 / generator.uniform(0.5 * hold, 3 * hold, (3, 64))
+    light = generator.random((count, 3, 64)) < fraction
     light[:: hold - 1, :, ::8] = light[-1, :, ::4] = False  # or else there is a run in every pixel
     frames, travel = np.where(light, bright, dark).astype(dtype), np.arange(count) / 64
     options = {"hold": hold, "noise": 0.01 * (bright - dark)}
@@ -144,16 +146,16 @@ def test_long_runs_are_counted_over_spans_and_cuts(device, dtype, hold, count):
         [32, 64, 96, 128],
         *(np.unique(generator.integers(1, count, n)) for n in (3, 9, 40)),
     ):
-        known = {"dark": dark, "bright": bright, "device": device, **options}
-        assert_within_an_ulp(search_in_blocks(frames, travel, list(cuts), **known), expected, travel)
+        arguments = {"dark": dark, "bright": bright, "device": device, **options}
+        assert_within_an_ulp(search_in_blocks(frames, travel, list(cuts), **arguments), expected, travel)
 
 
 @pytest.mark.parametrize("count", [300, pytest.param(70_000, marks=pytest.mark.slow)])
 def test_long_stacks(device, count):
     onset = np.array([[1, 254, 255, 256], [count - 300, count - 2, count - 1, count + 1]])
     frames = np.where(np.arange(count)[:, None, None] >= onset, 220, 20).astype(np.uint8)
-    found = find_onset(frames, np.arange(count) * 1e-3, **LEVELS["uint8"], device=device)
-    np.testing.assert_array_equal(found.frame, np.where(onset < count, np.maximum(onset, 0), -1))
+    result = find_onset(frames, np.arange(count) * 1e-3, **LEVELS["uint8"], device=device)
+    np.testing.assert_array_equal(result.frame, np.where(onset < count, np.maximum(onset, 0), -1))
 
 
 @pytest.mark.parametrize("event", EVENTS)
@@ -163,9 +165,9 @@ def test_a_sudden_step_is_in_the_middle_of_its_interval(device, event):
     travel = np.array([0.0, 0.1, 0.4, 0.5])
     if event == "release":
         frames, travel = frames[::-1].copy(), travel[::-1]
-    found = find_onset(frames, travel, **LEVELS["uint8"], noise=1.0, event=event, device=device)
-    assert found.height[0, 0] == np.float32(-0.25)
-    assert found.height_sigma[0, 0] == pytest.approx(0.15 / np.sqrt(3))
+    onset = find_onset(frames, travel, **LEVELS["uint8"], noise=1.0, event=event, device=device)
+    assert onset.height[0, 0] == np.float32(-0.25)
+    assert onset.height_sigma[0, 0] == pytest.approx(0.15 / np.sqrt(3))
 
 
 @pytest.mark.parametrize("event", EVENTS)
@@ -174,9 +176,9 @@ def test_a_ramp_is_interpolated_exactly(device, event):
     frames, travel = (np.arange(12) * 16 + 20).astype(np.uint8)[:, None, None], np.arange(12) * 0.1
     if event == "release":
         frames, travel = frames[::-1].copy(), travel[::-1]
-    found = find_onset(frames, travel, **LEVELS["uint8"], noise=1.0, event=event, device=device)
-    assert found.height[0, 0] == pytest.approx(-0.625, abs=1e-7)
-    assert found.height_sigma[0, 0] == pytest.approx(0.1 / 16 * np.hypot(0.25, 0.75), rel=1e-3)
+    onset = find_onset(frames, travel, **LEVELS["uint8"], noise=1.0, event=event, device=device)
+    assert onset.height[0, 0] == pytest.approx(-0.625, abs=1e-7)
+    assert onset.height_sigma[0, 0] == pytest.approx(0.1 / 16 * np.hypot(0.25, 0.75), rel=1e-3)
 
 
 def test_sigma_is_true_on_ramps(device):
@@ -185,10 +187,10 @@ def test_sigma_is_true_on_ramps(device):
     crossing = generator.uniform(10, 14, (200, 250))
     counts = 120 + 24 * (np.arange(24)[:, None, None] - crossing)
     frames = (counts + generator.normal(0, 1.5, counts.shape)).astype(np.float32)
-    found = find_onset(frames, np.arange(24) * 0.1, dark=20, bright=220, noise=1.5, device=device)
-    assert np.all(found.status == 1)
-    error = found.height + 0.1 * crossing
-    assert np.mean((error / found.height_sigma) ** 2) == pytest.approx(1, abs=0.05)
+    onset = find_onset(frames, np.arange(24) * 0.1, dark=20, bright=220, noise=1.5, device=device)
+    assert np.all(onset.status == 1)
+    error = onset.height + 0.1 * crossing
+    assert np.mean((error / onset.height_sigma) ** 2) == pytest.approx(1, abs=0.05)
 
 
 @pytest.mark.parametrize("event", EVENTS)
@@ -201,9 +203,9 @@ def test_sigma_is_true_on_steps(device, event):
     frames, travel = np.rint(counts).astype(np.uint8), np.arange(30) * 0.1
     if event == "release":
         frames, travel = frames[::-1].copy(), travel[::-1]
-    found = find_onset(frames, travel, **LEVELS["uint8"], event=event, device=device)
-    error = found.height + 0.1 * crossing
-    assert np.mean((error / found.height_sigma) ** 2) == pytest.approx(1, abs=0.05)
+    onset = find_onset(frames, travel, **LEVELS["uint8"], event=event, device=device)
+    error = onset.height + 0.1 * crossing
+    assert np.mean((error / onset.height_sigma) ** 2) == pytest.approx(1, abs=0.05)
     assert abs(np.mean(error)) < 0.001
 
 
@@ -212,31 +214,31 @@ def test_a_pixel_that_hovers_about_its_level_does_not_claim_to_know_when(device)
     generator = np.random.default_rng(3)
     counts = np.where(np.arange(40)[:, None, None] >= 3, 119.5, 20) + generator.normal(0, 1.5, (40, 50, 60))
     frames = np.rint(counts).astype(np.uint8)
-    found = find_onset(frames, np.arange(40) * 0.1, **LEVELS["uint8"], noise=1.5, device=device)
-    late = (found.status == 1) & (found.frame > 10)
+    onset = find_onset(frames, np.arange(40) * 0.1, **LEVELS["uint8"], noise=1.5, device=device)
+    late = (onset.status == 1) & (onset.frame > 10)
     assert late.sum() > 100
-    assert np.max(np.abs(((found.height + 0.25) / found.height_sigma)[late])) < 4
+    assert np.max(np.abs(((onset.height + 0.25) / onset.height_sigma)[late])) < 4
 
 
 def test_a_plateau_that_noise_takes_below_its_level_began_in_the_step_that_led_to_it(device):
     """Plateaus at 101 to 104 % of the threshold, with a noise of 2 %: many cross it frames after the step."""
     generator = np.random.default_rng(3)
     depth, plateau = generator.uniform(0.2, 1.0, (2, 40, 50))
-    share, travel = 0.5 * (1.01 + 0.03 * plateau), 0.1 * np.arange(14)
-    light = share * (travel[:, np.newaxis, np.newaxis] > depth)
+    fraction, travel = 0.5 * (1.01 + 0.03 * plateau), 0.1 * np.arange(14)
+    light = fraction * (travel[:, np.newaxis, np.newaxis] > depth)
     frames = (20 + 200 * light + generator.normal(0, 2, light.shape)).astype(np.float32)
-    found = find_onset(frames, travel, dark=20.0, bright=220.0, noise=2.0, device=device)
-    known = found.status == 1
-    error = (found.height + depth)[known]
-    assert known.mean() > 0.9
+    onset = find_onset(frames, travel, dark=20.0, bright=220.0, noise=2.0, device=device)
+    valid = onset.status == 1
+    error = (onset.height + depth)[valid]
+    assert valid.mean() > 0.9
     assert np.mean(np.abs(error) > 0.15) < 1e-3  # a step is 0.1 mm
-    assert np.mean((error / found.height_sigma[known]) ** 2) == pytest.approx(1.0, abs=0.1)
+    assert np.mean((error / onset.height_sigma[valid]) ** 2) == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_sample_that_is_lit_by_its_neighbours_does_not_show_when_the_change_began(device):
     frames = np.array([20.0, 20, 38, 190, 200, 200], np.float32).reshape(-1, 1, 1)
-    found = find_onset(frames, 0.1 * np.arange(6), dark=20.0, bright=220.0, noise=1.0, device=device)
-    assert found.height_sigma.item() == pytest.approx(0.1 / math.sqrt(12), rel=0.05)
+    onset = find_onset(frames, 0.1 * np.arange(6), dark=20.0, bright=220.0, noise=1.0, device=device)
+    assert onset.height_sigma.item() == pytest.approx(0.1 / math.sqrt(12), rel=0.05)
 
 
 @pytest.mark.filterwarnings("ignore:find_onset. no height")
@@ -245,23 +247,23 @@ def test_noise_is_estimated_from_the_first_two_frames():
     for noise in (0.6, 1.5, 6.0):
         frames = np.rint(30 + generator.normal(0, noise, (5, 200, 200))).astype(np.uint8)
         frames[1, :, :40] = 200  # what changes in between is left out
-        found = find_onset(frames, np.arange(5.0), **LEVELS["uint8"])
-        assert found.process["noise"] == pytest.approx(np.hypot(noise, 1 / np.sqrt(12)), rel=0.03)
+        onset = find_onset(frames, np.arange(5.0), **LEVELS["uint8"])
+        assert onset.process["noise"] == pytest.approx(np.hypot(noise, 1 / np.sqrt(12)), rel=0.03)
 
 
 def test_a_spike_is_not_an_onset_unless_the_stack_ends_on_it_and_moves_no_plateau(device):
     frames = np.full((9, 1, 4), 20, np.uint8)
     frames[3, 0, 0] = frames[8, 0, 1] = 255
     frames[[3, 4], 0, 2] = 255
-    found = find_onset(frames, np.arange(9.0), **LEVELS["uint8"], device=device)
-    np.testing.assert_array_equal(found.frame, [[-1, 8, 3, -1]])
+    onset = find_onset(frames, np.arange(9.0), **LEVELS["uint8"], device=device)
+    np.testing.assert_array_equal(onset.frame, [[-1, 8, 3, -1]])
     released = find_onset(255 - frames, -np.arange(9.0), **LEVELS["uint8"], device=device, **RELEASE)
     np.testing.assert_array_equal(released.frame, [[-1, 8, 3, -1]])
     frames = np.full((9, 1, 4), 20, np.uint8)
     frames[4:] = 150
     frames[4, 0, 1] = frames[5, 0, 2] = frames[6, 0, 3] = 255
-    found = find_onset(frames, np.arange(9) * 0.1, **LEVELS["uint8"], noise=1.5, device=device)
-    np.testing.assert_allclose(found.height, np.full((1, 4), -0.35), rtol=1e-6)
+    onset = find_onset(frames, np.arange(9) * 0.1, **LEVELS["uint8"], noise=1.5, device=device)
+    np.testing.assert_allclose(onset.height, np.full((1, 4), -0.35), rtol=1e-6)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -269,11 +271,11 @@ def test_what_never_changes_has_no_height(device, dtype):
     for value, status in ((20, 2), (200, 3)):
         frames = np.full((6, 5, 7), value, dtype)
         with pytest.warns(io.MirrorskinWarning, match="find_onset: no height at any pixel"):
-            found = engine.find_onset(frames, np.arange(6.0), dark=20, bright=220, device=device)
-        assert np.all(found.status == status)
-        assert np.all(found.frame == (0 if status == 3 else -1))
-        assert np.isnan(found.height).all()
-        assert np.isnan(found.height_sigma).all()
+            onset = engine.find_onset(frames, np.arange(6.0), dark=20, bright=220, device=device)
+        assert np.all(onset.status == status)
+        assert np.all(onset.frame == (0 if status == 3 else -1))
+        assert np.isnan(onset.height).all()
+        assert np.isnan(onset.height_sigma).all()
 
 
 def test_a_pixel_that_is_dark_at_start_stays_so_though_it_turns_light(device):
@@ -281,9 +283,9 @@ def test_a_pixel_that_is_dark_at_start_stays_so_though_it_turns_light(device):
     frames[3:6] = 200
     frames[1, 0, 1] = 200  # its dark first frame was a spike
     frames[:, 0, 2] = 200
-    found = find_onset(frames, 9 - np.arange(9.0), **LEVELS["uint8"], device=device, **RELEASE)
-    np.testing.assert_array_equal(found.status, [[2, 1, 3]])
-    np.testing.assert_array_equal(found.frame, [[0, 6, -1]])
+    onset = find_onset(frames, 9 - np.arange(9.0), **LEVELS["uint8"], device=device, **RELEASE)
+    np.testing.assert_array_equal(onset.status, [[2, 1, 3]])
+    np.testing.assert_array_equal(onset.frame, [[0, 6, -1]])
 
 
 @pytest.mark.parametrize("event", EVENTS)
@@ -295,10 +297,10 @@ def test_a_sample_that_is_not_a_number_spoils_a_pixel_until_its_onset(device, ev
         frames[0, 0, 0] = frames[3, 0, 1] = frames[4, 0, 2] = frames[7, 0, 3] = broken
         frames[5, 0, 4] = broken  # the second frame of the run: not decided yet
         travel = np.arange(9) * 0.1 if event == "onset" else 0.8 - np.arange(9) * 0.1
-        found = find_onset(frames, travel, dark=0, bright=1, noise=0.01, event=event, device=device)
-        np.testing.assert_array_equal(found.status, [[0, 0, 0, 1, 0]])
-        assert found.height[0, 3] == pytest.approx(-0.35 if event == "onset" else -0.45)
-        assert np.isnan(found.height[0, [0, 1, 2, 4]]).all()
+        onset = find_onset(frames, travel, dark=0, bright=1, noise=0.01, event=event, device=device)
+        np.testing.assert_array_equal(onset.status, [[0, 0, 0, 1, 0]])
+        assert onset.height[0, 3] == pytest.approx(-0.35 if event == "onset" else -0.45)
+        assert np.isnan(onset.height[0, [0, 1, 2, 4]]).all()
 
 
 @pytest.mark.parametrize("event", EVENTS)
@@ -310,11 +312,11 @@ def test_a_saturated_sample_is_light_though_its_level_is_beyond_the_range(device
     if event == "release":
         frames, travel = frames[::-1].copy(), travel[::-1].copy()
     options = {"threshold": 0.9, "noise": 1.0, "event": event}
-    found = find_onset(frames, travel, dark=20, bright=400, device=device, **options)
-    assert_within_an_ulp(found, by_reference(frames, travel, 20, 400, **options), travel)
-    np.testing.assert_array_equal(found.status[0, [0, 2]], [1, 3])
-    assert 1.9 <= -found.height[0, 0] <= 2.0
-    assert 0 < found.height_sigma[0, 0] < 0.1
+    onset = find_onset(frames, travel, dark=20, bright=400, device=device, **options)
+    assert_within_an_ulp(onset, by_reference(frames, travel, 20, 400, **options), travel)
+    np.testing.assert_array_equal(onset.status[0, [0, 2]], [1, 3])
+    assert 1.9 <= -onset.height[0, 0] <= 2.0
+    assert 0 < onset.height_sigma[0, 0] < 0.1
 
 
 def test_pixels_without_references_are_invalid(device):
@@ -322,11 +324,11 @@ def test_pixels_without_references_are_invalid(device):
     frames[3:] = 200
     dark, bright = np.full((2, 4), 20.0), np.full((2, 4), 220.0)
     bright[0, 0], dark[0, 1], bright[1, 2] = 20, np.nan, np.inf
-    known = {"dark": dark, "bright": bright, "device": device}
-    found = find_onset(frames, np.arange(5.0), **known)
-    np.testing.assert_array_equal(found.frame, [[-1, -1, 3, 3], [3, 3, -1, 3]])
-    released = find_onset(frames[::-1].copy(), -np.arange(5.0), **known, **RELEASE)
-    for status in (found.status, released.status):
+    options = {"dark": dark, "bright": bright, "device": device}
+    onset = find_onset(frames, np.arange(5.0), **options)
+    np.testing.assert_array_equal(onset.frame, [[-1, -1, 3, 3], [3, 3, -1, 3]])
+    released = find_onset(frames[::-1].copy(), -np.arange(5.0), **options, **RELEASE)
+    for status in (onset.status, released.status):
         np.testing.assert_array_equal(status, [[0, 0, 1, 1], [1, 1, 0, 1]])
 
 
@@ -335,18 +337,18 @@ def test_the_level_is_the_smallest_light_sample(device, dtype):
     dark, bright = (10, 21) if dtype != "float32" else map(float, np.float32([0.1, 0.7]))
     for threshold in (0.0, 0.25, 0.5, 1.0):
         exact = dark + threshold * (bright - dark)
-        least = np.ceil(exact) if dtype != "float32" else np.float32(exact)
-        if float(least) < exact:
-            least = np.nextafter(np.float32(least), np.float32(np.inf))
-        below = least - 1 if dtype != "float32" else np.nextafter(least, np.float32(-np.inf))
+        lowest = np.ceil(exact) if dtype != "float32" else np.float32(exact)
+        if float(lowest) < exact:
+            lowest = np.nextafter(np.float32(lowest), np.float32(np.inf))
+        below = lowest - 1 if dtype != "float32" else np.nextafter(lowest, np.float32(-np.inf))
         frames = np.zeros((4, 1, 2), dtype)
-        frames[2:, 0, 0], frames[2:, 0, 1] = least, below
-        known = {"dark": dark, "bright": bright, "threshold": threshold, "noise": 0.1, "device": device}
-        np.testing.assert_array_equal(find_onset(frames, np.arange(4.0), **known).status, [[1, 2]])
+        frames[2:, 0, 0], frames[2:, 0, 1] = lowest, below
+        options = {"dark": dark, "bright": bright, "threshold": threshold, "noise": 0.1, "device": device}
+        np.testing.assert_array_equal(find_onset(frames, np.arange(4.0), **options).status, [[1, 2]])
         if dtype != "uint16":
             frames[:2] = 2 * bright
             np.testing.assert_array_equal(
-                find_onset(frames, -np.arange(4.0), **known, **RELEASE).status, [[3, 1]]
+                find_onset(frames, -np.arange(4.0), **options, **RELEASE).status, [[3, 1]]
             )
 
 
@@ -355,8 +357,8 @@ def test_thresholds_that_binary_cannot_hold_are_met():
     for percent in range(1, 100):
         frames = np.zeros((4, 1, 2), np.uint8)
         frames[2:, 0] = percent, percent - 1
-        found = find_onset(frames, np.arange(4.0), dark=0, bright=100, threshold=percent / 100, noise=0.5)
-        np.testing.assert_array_equal(found.status, [[1, 2]], err_msg=str(percent))
+        onset = find_onset(frames, np.arange(4.0), dark=0, bright=100, threshold=percent / 100, noise=0.5)
+        np.testing.assert_array_equal(onset.status, [[1, 2]], err_msg=str(percent))
 
 
 @pytest.mark.parametrize("event", EVENTS)
@@ -373,9 +375,9 @@ def test_levels_are_those_of_the_reference_to_the_last_bit(device, dtype, event)
     dark = np.select([odd > 0.98, odd > 0.96], [np.nan, -np.inf], dark)
     dark, bright, noise = dark.astype(np.float32), bright.astype(np.float32), 0.01 * top
     for threshold in (0.0, 0.55, 1.0):
-        known = {"dark": dark, "bright": bright, "threshold": threshold, "noise": noise, "event": event}
+        options = {"dark": dark, "bright": bright, "threshold": threshold, "noise": noise, "event": event}
         frames = np.zeros((2, *shape), dtype)
-        search = Onset(device=device, **known)
+        search = Onset(device=device, **options)
         run = Run(Plan(search, checked=False), ArraySource(frames, search, {"travel": [0.0, 1.0]}))
         read = run.operation._picture.read
         levels = read(("levels", 0), ("levels", 1))
@@ -404,8 +406,8 @@ def test_the_whole_range_of_uint16(device):
     for level in (1, 2, 128, 255, 256, 32768, 65535):
         frames = np.random.default_rng(level).choice(edges, (70, 7, 37)).astype(np.uint16)
         options = {"threshold": 1.0, "noise": 0.5}
-        found = find_onset(frames, travel, dark=0, bright=level, device=device, **options)
-        assert_within_an_ulp(found, by_reference(frames, travel, 0, level, **options), travel)
+        onset = find_onset(frames, travel, dark=0, bright=level, device=device, **options)
+        assert_within_an_ulp(onset, by_reference(frames, travel, 0, level, **options), travel)
 
 
 @pytest.mark.parametrize("broken", [False, True])
@@ -419,10 +421,10 @@ def test_the_whole_range_of_float32(device, broken):
             struck = generator.random(frames.shape) < 0.03
             frames[struck] = generator.choice(np.float32([np.nan, np.inf, -np.inf]), np.count_nonzero(struck))
         options = {"threshold": 1.0, "noise": 0.0}
-        found = find_onset(frames, travel, dark=0, bright=level, device=device, **options)
+        onset = find_onset(frames, travel, dark=0, bright=level, device=device, **options)
         expected = by_reference(frames, travel, 0, level, **options)
-        np.testing.assert_array_equal(found.status, expected.status)
-        np.testing.assert_array_equal(found.frame, expected.frame)
+        np.testing.assert_array_equal(onset.status, expected.status)
+        np.testing.assert_array_equal(onset.frame, expected.frame)
     zeros = np.full((4, 1, 2), -1, np.float32)
     zeros[2:] = 0.0, -0.0
     for level in (0.0, -0.0):
@@ -455,21 +457,21 @@ def test_a_hold_longer_than_any_stack_waits_for_the_end(device):
 def test_travel_may_pause(device):
     frames = np.full((5, 1, 1), 20, np.uint8)
     frames[3:] = 200
-    found = find_onset(frames, [0.0, 0.1, 0.1, 0.1, 0.2], **LEVELS["uint8"], noise=1.0, device=device)
-    assert found.height[0, 0] == np.float32(-0.1)
-    assert found.height_sigma[0, 0] == 0
+    onset = find_onset(frames, [0.0, 0.1, 0.1, 0.1, 0.2], **LEVELS["uint8"], noise=1.0, device=device)
+    assert onset.height[0, 0] == np.float32(-0.1)
+    assert onset.height_sigma[0, 0] == 0
 
 
 def test_a_press_played_backwards_has_its_release_where_its_onset_was(device):
     """Steps, and ramps that are under way in both samples: the same interval, so the same answer."""
     generator = np.random.default_rng(2)
     middle, lasts = generator.uniform(8, 32, (20, 30)), generator.choice([1e-6, 6], (20, 30))
-    share = np.clip((np.arange(40)[:, None, None] - middle) / lasts + 0.5, 0, 1)
-    frames = np.rint(20 + 201 * share).astype(np.uint8)  # no sample is at the level, 120.5
+    fraction = np.clip((np.arange(40)[:, None, None] - middle) / lasts + 0.5, 0, 1)
+    frames = np.rint(20 + 201 * fraction).astype(np.uint8)  # no sample is at the level, 120.5
     travel = np.arange(40) / 8  # whose sums are exact
-    known = {"dark": 20, "bright": 221, "noise": 1.0, "device": device}
-    onset = find_onset(frames, travel, **known)
-    release = find_onset(frames[::-1].copy(), travel[::-1].copy(), **known, **RELEASE)
+    options = {"dark": 20, "bright": 221, "noise": 1.0, "device": device}
+    onset = find_onset(frames, travel, **options)
+    release = find_onset(frames[::-1].copy(), travel[::-1].copy(), **options, **RELEASE)
     np.testing.assert_array_equal(release.frame, 40 - onset.frame)
     steps = lasts < 1
     np.testing.assert_array_equal(release.height[steps], onset.height[steps])
@@ -481,9 +483,9 @@ def test_a_release_of_the_complement_is_an_onset(device):
     """All is the same to the last bit where no sample equals the level, which is light in both."""
     frames, travel = stroke("uint8", 40, ODD, "release", seed=11, noise=0.1)
     frames = frames[::-1].copy()
-    known = {"noise": 2.0, "device": device}
-    onset = bare(Onset(bright=221, **known), frames, travel=-travel)  # the level is 110.5
-    release = bare(Onset(dark=255 - 221, **known, **RELEASE), ~frames, travel=travel)
+    options = {"noise": 2.0, "device": device}
+    onset = bare(Onset(bright=221, **options), frames, travel=-travel)  # the level is 110.5
+    release = bare(Onset(dark=255 - 221, **options, **RELEASE), ~frames, travel=travel)
     assert {1, 2, 3} <= set(onset.status.flat)
     np.testing.assert_array_equal(release.frame, onset.frame)
     np.testing.assert_array_equal(release.status, np.array([0, 1, 3, 2])[onset.status])
@@ -547,21 +549,23 @@ def twelve_bits():
 
 def test_levels_that_are_not_given_are_estimated_with_a_note():
     frames, travel = twelve_bits()
-    found = engine.find_onset(frames, travel)
-    said = r"no dark and bright given: estimated as 2\d\d and 32\d\d counts \(give dark and bright, or .*"
-    assert re.fullmatch(said, found.process["notes"])
+    onset = engine.find_onset(frames, travel)
+    message = r"no dark and bright given: estimated as 2\d\d and 32\d\d counts \(give dark and bright, or .*"
+    assert re.fullmatch(message, onset.process["notes"])
     expected = engine.reconstruct(frames, travel=travel)
-    np.testing.assert_array_equal(found.height, expected.height)
-    np.testing.assert_array_equal(found.height_sigma, expected.height_sigma)
+    np.testing.assert_array_equal(onset.height, expected.height)
+    np.testing.assert_array_equal(onset.height_sigma, expected.height_sigma)
     right = np.broadcast_to(-0.15 - 0.1 * (np.arange(19) // 4), (20, 19))
-    np.testing.assert_allclose(found.height[:, :19], right, atol=0.06)
+    np.testing.assert_allclose(onset.height[:, :19], right, atol=0.06)
 
 
 def test_levels_of_other_counts_than_the_frames_are_reported():
     frames, travel = twelve_bits()
     shares = (frames / 4096).astype(np.float32)
-    said = r"samples are 0\.\d+ to 0\.\d+, below the threshold of 1700 between dark 200 and bright 3200: are"
-    with pytest.warns(io.MirrorskinWarning, match=said):
+    message = (
+        r"samples are 0\.\d+ to 0\.\d+, below the threshold of 1700 between dark 200 and bright 3200: are"
+    )
+    with pytest.warns(io.MirrorskinWarning, match=message):
         engine.find_onset(shares, travel, dark=200, bright=3200)
-    with pytest.warns(io.MirrorskinWarning, match=said):
+    with pytest.warns(io.MirrorskinWarning, match=message):
         engine.reconstruct(shares, travel=travel, dark=200, bright=3200)

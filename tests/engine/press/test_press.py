@@ -72,7 +72,7 @@ def test_the_heights_of_a_release_are_as_good_as_those_of_the_press(method):
 
 def test_the_frames_before_a_release_are_read_but_not_looked_at(monkeypatch):
     """Were they, the first one, dark throughout, would be taken for the release."""
-    pushed, done, push = [], [], engine.Onset.push
+    pushed, counts, push = [], [], engine.Onset.push
 
     def note(search, frames, *, travel, **options):
         pushed.append(len(frames))
@@ -80,9 +80,9 @@ def test_the_frames_before_a_release_are_read_but_not_looked_at(monkeypatch):
 
     monkeypatch.setattr(engine.Onset, "push", note)
     limit = 2 * 8 * SHAPE[0] * SHAPE[1]
-    engine.reconstruct(twin(), event="release", memory_limit=limit, progress=done.append)
+    engine.reconstruct(twin(), event="release", memory_limit=limit, progress=counts.append)
     assert pushed == [8, 8, 8, 7]
-    assert done == [8, 16, 24, 29, 37, 45, 53, 60]
+    assert counts == [8, 16, 24, 29, 37, 45, 53, 60]
 
 
 def test_a_recording_can_be_reconstructed_again_and_after_a_look_into_it():
@@ -123,12 +123,12 @@ def test_what_cannot_be_done_is_refused_before_anything_is_read(travel, options,
 
 @pytest.mark.parametrize("missing", [{"dark": None}, {"dark": None, "bright": None}])
 def test_a_change_between_unknown_levels_is_read_twice(missing):
-    done, source, limit = [], twin(DOWN, **missing), 2 * 16 * SHAPE[0] * SHAPE[1]
+    counts, source, limit = [], twin(DOWN, **missing), 2 * 16 * SHAPE[0] * SHAPE[1]
     options = {"method": "change-point", "blur": 0, "fill": False}
-    result = engine.reconstruct(source, **options, memory_limit=limit, progress=done.append)
+    result = engine.reconstruct(source, **options, memory_limit=limit, progress=counts.append)
     source.rewind()
     assert_found(result, engine.find_change_point(frames_of(source), DOWN, blur=0))
-    assert done == [16, 30, 16, 30]
+    assert counts == [16, 30, 16, 30]
     assert result.process["dark"] == result.process["bright"] == "each pixel's own"
     source = twin(**missing)
     result = engine.reconstruct(source, event="release", **options)
@@ -159,12 +159,12 @@ def test_a_source_that_does_not_know_its_travel_beforehand_is_taken_as_a_whole()
         engine.reconstruct(pressed, event="release", dark=20, bright=220)
 
 
-def test_what_is_given_goes_before_what_the_recording_says():
+def test_options_replace_fields_of_the_recording():
     options = {"dark": 40, "bright": np.full(SHAPE, 180.0), "noise": 3.0, "threshold": 0.3, "hold": 2}
     result = engine.reconstruct(twin(DOWN), fill=False, **options)
     assert_found(result, engine.find_onset(frames_of(twin(DOWN)), DOWN, **options))
-    known = {name: result.process[name] for name in options}
-    assert known == {"dark": 40.0, "bright": "map given", "noise": 3.0, "threshold": 0.3, "hold": 2}
+    options_used = {name: result.process[name] for name in options}
+    assert options_used == {"dark": 40.0, "bright": "map given", "noise": 3.0, "threshold": 0.3, "hold": 2}
 
 
 def test_frames_of_all_types_go_the_same_way():
@@ -186,21 +186,21 @@ def test_storage_and_memory_do_not_change_a_result(device, tmp_path, dtype, comp
         io.Header("vertical", dark=dark, bright=bright),
     )
     travel = 0.1 * np.arange(37)
-    wanted = FIND[method](frames, travel, dark=dark, bright=bright, device=device)
+    expected = FIND[method](frames, travel, dark=dark, bright=bright, device=device)
     with io.Recorder(MadeUp(frames, header, travel=travel), tmp_path / "press.h5", compression) as recorder:
-        recorder.drain(lambda done: None)
+        recorder.drain(lambda frame_count: None)
     for limit in (1, 10 * frames[0].nbytes, 10**9):
         with io.open_recording(tmp_path / "press.h5", memory_limit=limit) as recording:
             options = {"method": method, "blur": 0, "device": device, "memory_limit": limit}
             result = engine.reconstruct(recording, **options)
-        assert_found(result, wanted)
+        assert_found(result, expected)
 
 
 def test_a_result_outlives_its_recording(tmp_path):
     frames, travel = random_press("uint8", 20, (64, 64), seed=4), 0.1 * np.arange(20)
     path = tmp_path / "press.h5"
     with io.Recorder(MadeUp(frames, io.Header("vertical"), travel=travel), path) as recorder:
-        recorder.drain(lambda done: None)
+        recorder.drain(lambda frame_count: None)
     with io.open_recording(path) as recording:
         result = engine.run(recording, engine.Onset(noise=5.0, device=open_device()))
     path.unlink()
@@ -211,8 +211,8 @@ def test_a_result_outlives_its_recording(tmp_path):
 class Spiked:
     """A source whose samples are replaced by full white here and there."""
 
-    def __init__(self, source, share):
-        self._source, self._share, self._random = source, share, np.random.default_rng(0)
+    def __init__(self, source, gain):
+        self._source, self._share, self._random = source, gain, np.random.default_rng(0)
 
     def __getattr__(self, name):
         return getattr(self._source, name)

@@ -13,7 +13,7 @@ LEVELS = {name: np.full(SHAPE, value, np.float32) for name, value in (("dark", 3
 DEPTH = 0.3 + 0.4 * np.linspace(0, 1, SHAPE[1]) * np.ones(SHAPE)  # mm at which pixels are touched
 
 
-def press(line_time, known=True, falls=False):
+def press(line_time, with_line_time=True, falls=False):
     """Return a press, or its release, seen through a rolling shutter."""
     time = np.arange(36) / RATE
     late = line_time * (np.arange(SHAPE[0]) - (SHAPE[0] - 1) / 2)[:, np.newaxis]
@@ -21,7 +21,7 @@ def press(line_time, known=True, falls=False):
     travel = SPEED * (time[-1] - when if falls else when)
     light = np.clip((travel - DEPTH) / 0.12 + 0.5, 0, 1)
     frames = np.rint(30 + 200 * light).astype(np.uint8)
-    header = io.Header("vertical", line_time=line_time if known else None, **LEVELS)
+    header = io.Header("vertical", line_time=line_time if with_line_time else None, **LEVELS)
     stated = SPEED * (time[-1] - time if falls else time)
     return MadeUp(frames, header, travel=stated, time=time)
 
@@ -32,7 +32,7 @@ def error_of(tmp_path):
 
     def reconstruct(source, region=None, **options):
         with io.Recorder(source, tmp_path / "press.h5", overwrite=True) as recorder:
-            recorder.drain(lambda done: None)
+            recorder.drain(lambda frame_count: None)
         with io.open_recording(tmp_path / "press.h5", region=region) as recording:
             height = engine.reconstruct(recording, noise=0.5, **options).height
         return height + (DEPTH if region is None else DEPTH[region.slices])
@@ -48,12 +48,12 @@ def test_heights_are_those_of_the_travel_of_their_row(error_of, line_time, event
 
 
 def test_without_the_line_time_heights_are_wrong_by_the_movement_of_the_body(error_of):
-    error = error_of(press(4e-4, known=False))
+    error = error_of(press(4e-4, with_line_time=False))
     assert np.ptp(np.nanmean(error, axis=1)) == pytest.approx(SPEED * 4e-4 * (SHAPE[0] - 1), rel=0.05)
 
 
 def test_the_line_time_can_be_given(error_of):
-    assert np.nanmax(np.abs(error_of(press(4e-4, known=False), line_time=4e-4))) < 0.002
+    assert np.nanmax(np.abs(error_of(press(4e-4, with_line_time=False), line_time=4e-4))) < 0.002
 
 
 def test_a_region_has_the_rows_of_the_whole_picture(error_of):

@@ -8,16 +8,16 @@ from mirrorskin.engine.press.spline import Spline, fit_within
 SHAPE, SPACING, CELLS = (23, 31), (0.1, 0.07), (5, 7)
 
 
-def powers(most):
+def powers(degree):
     """The products of powers of x and y up to a degree, one a plane."""
     row, column = np.indices(SHAPE, dtype=float)
     y, x = row * SPACING[0] - 1, column * SPACING[1] - 1
-    return np.array([x**i * y**j for i in range(most + 1) for j in range(most + 1 - i)])
+    return np.array([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)])
 
 
-def polynomial(most, seed=1):
+def polynomial(degree, seed=1):
     """A polynomial of a degree with random factors."""
-    planes = powers(most)
+    planes = powers(degree)
     return np.tensordot(np.random.default_rng(seed).normal(size=len(planes)), planes, 1)
 
 
@@ -27,9 +27,9 @@ def fit(low, high, stiffness):
 
 def test_a_cubic_is_one_of_its_surfaces():
     exact = polynomial(3)
-    found = fit(exact - 1e-4, exact + 1e-4, 1e-14)
-    assert np.max(np.abs(found.height - exact)) < 2e-6
-    assert found.misfit == 0
+    surface = fit(exact - 1e-4, exact + 1e-4, 1e-14)
+    assert np.max(np.abs(surface.height - exact)) < 2e-6
+    assert surface.misfit == 0
 
 
 def test_a_quadratic_goes_on_where_nothing_is_known():
@@ -46,8 +46,8 @@ def test_the_stiffest_surface_is_the_least_squares_quadratic():
     planes = powers(2)
     factors = np.linalg.lstsq(planes.reshape(len(planes), -1).T, data.ravel(), rcond=None)[0]
     exact = np.tensordot(factors, planes, 1)
-    found = fit(data - 10, data + 10, 1.0)
-    assert np.max(np.abs(found.height - exact)) < 1e-3
+    surface = fit(data - 10, data + 10, 1.0)
+    assert np.max(np.abs(surface.height - exact)) < 1e-3
 
 
 def test_third_derivatives_cost_their_square_in_every_direction():
@@ -68,9 +68,9 @@ def test_third_derivatives_cost_their_square_in_every_direction():
 def test_terraces_are_no_steps():
     exact = polynomial(2)
     low = np.floor(exact / 0.3) * 0.3
-    found = fit(low, low + 0.3, 1e-3)
-    assert found.misfit < 0.05
-    assert np.max(np.abs(found.height - exact)) < 0.03  # a tenth of a step
+    surface = fit(low, low + 0.3, 1e-3)
+    assert surface.misfit < 0.05
+    assert np.max(np.abs(surface.height - exact)) < 0.03  # a tenth of a step
 
 
 def test_a_lower_end_alone_lifts_and_never_lowers():

@@ -54,88 +54,88 @@ EVEN = oscillating_travel(0.0, 1.2, 16, 161)
 
 @pytest.mark.parametrize("travel", [UNEVEN, EVEN], ids=["uneven", "even"])
 @pytest.mark.parametrize("hysteresis", [0.0, 0.07])
-def test_onset_release_and_hysteresis_are_unbiased_and_as_sure_as_they_say(travel, hysteresis):
-    found = strokes_of(made_press(travel, DEPTH, hysteresis), travel)
+def test_onset_release_and_hysteresis_are_unbiased_and_have_true_errors(travel, hysteresis):
+    strokes = strokes_of(made_press(travel, DEPTH, hysteresis), travel)
     lower = DEPTH - hysteresis
-    for onset, truth in ((found.onset, -DEPTH), (found.release, -lower)):
-        known = (onset.status == 1) & (DEPTH > 0.2)
-        error = (onset.height - truth)[known]
-        assert known.sum() > 2500
+    for onset, truth in ((strokes.onset, -DEPTH), (strokes.release, -lower)):
+        valid = (onset.status == 1) & (DEPTH > 0.2)
+        error = (onset.height - truth)[valid]
+        assert valid.sum() > 2500
         # Few of the errors are independent.
-        assert abs(error.mean()) < 4 * np.sqrt(np.mean(onset.height_sigma[known] ** 2) / 50)
-        assert np.mean((error / onset.height_sigma[known]) ** 2) == pytest.approx(1, abs=0.1)
+        assert abs(error.mean()) < 4 * np.sqrt(np.mean(onset.height_sigma[valid] ** 2) / 50)
+        assert np.mean((error / onset.height_sigma[valid]) ** 2) == pytest.approx(1, abs=0.1)
 
 
 def test_onsets_that_noise_hides_at_first_are_joined_by_the_steps_in_which_they_were():
-    found = strokes_of(made_press(UNEVEN, DEPTH, full=122.0), UNEVEN, noise=NOISE)  # the level is 120
-    known = found.onset.status == 1
-    error = (found.onset.height + DEPTH)[known]
-    assert known.mean() > 0.95
+    strokes = strokes_of(made_press(UNEVEN, DEPTH, full=122.0), UNEVEN, noise=NOISE)  # the level is 120
+    valid = strokes.onset.status == 1
+    error = (strokes.onset.height + DEPTH)[valid]
+    assert valid.mean() > 0.95
     assert np.sqrt(np.mean(error**2)) < 0.03
-    assert np.mean((error / found.onset.height_sigma[known]) ** 2) < 1.5
+    assert np.mean((error / strokes.onset.height_sigma[valid]) ** 2) < 1.5
 
 
 def test_hysteresis_is_the_difference_of_both():
-    found = strokes_of(made_press(UNEVEN, DEPTH, 0.07), UNEVEN)
-    miss = (found.onset.hysteresis - 0.07)[DEPTH > 0.2]
+    strokes = strokes_of(made_press(UNEVEN, DEPTH, 0.07), UNEVEN)
+    miss = (strokes.onset.hysteresis - 0.07)[DEPTH > 0.2]
     assert abs(miss.mean()) < 1e-3
-    assert np.mean((miss / found.onset.hysteresis_sigma[DEPTH > 0.2]) ** 2) == pytest.approx(1, abs=0.25)
+    assert np.mean((miss / strokes.onset.hysteresis_sigma[DEPTH > 0.2]) ** 2) == pytest.approx(1, abs=0.25)
 
 
 def test_strokes_that_pass_other_places_contain_more_information_than_their_mean_would():
     """Intervals overlap in ever less: of n strokes the error falls as 1 / n, a mean's as 1 / sqrt(n)."""
-    found = strokes_of(made_press(UNEVEN, DEPTH), UNEVEN)
+    strokes = strokes_of(made_press(UNEVEN, DEPTH), UNEVEN)
     single = find_onset(made_press(UNEVEN, DEPTH)[:9], UNEVEN[:9], dark=DARK, bright=BRIGHT)
-    rms = [np.sqrt(np.nanmean((one.height + DEPTH) ** 2)) for one in (single, found.onset)]
-    assert rms[1] < 0.7 * rms[0] / np.sqrt(np.median(found.onset.strokes))
+    rms = [np.sqrt(np.nanmean((map_.height + DEPTH) ** 2)) for map_ in (single, strokes.onset)]
+    assert rms[1] < 0.7 * rms[0] / np.sqrt(np.median(strokes.onset.strokes))
 
 
 def test_a_scatter_beyond_what_is_predicted_counts():
-    found = strokes_of(made_press(UNEVEN, DEPTH, jitter=0.05), UNEVEN)
+    strokes = strokes_of(made_press(UNEVEN, DEPTH, jitter=0.05), UNEVEN)
     inner = (DEPTH > 0.3) & (DEPTH < 0.9)
     exact = strokes_of(made_press(UNEVEN, DEPTH), UNEVEN)
-    assert np.median(found.onset.height_sigma[inner]) > 2 * np.median(exact.onset.height_sigma[inner])
-    assert np.mean(((found.onset.height + DEPTH) / found.onset.height_sigma)[inner] ** 2) < 1.3
+    assert np.median(strokes.onset.height_sigma[inner]) > 2 * np.median(exact.onset.height_sigma[inner])
+    assert np.mean(((strokes.onset.height + DEPTH) / strokes.onset.height_sigma)[inner] ** 2) < 1.3
 
 
 def test_samples_on_the_way_are_averaged_by_inverse_variance():
-    found = strokes_of(made_press(UNEVEN, DEPTH, rise=0.5), UNEVEN, noise=NOISE)
+    strokes = strokes_of(made_press(UNEVEN, DEPTH, rise=0.5), UNEVEN, noise=NOISE)
     inner = (DEPTH > 0.35) & (DEPTH < 0.85)
-    error = (found.onset.height + DEPTH)[inner]
+    error = (strokes.onset.height + DEPTH)[inner]
     assert np.sqrt(np.mean(error**2)) < 0.003
     # These ramps are straight, and the standard deviation allows for a blur as well.
-    assert 0.65 < np.mean((error / found.onset.height_sigma[inner]) ** 2) < 1.1
+    assert 0.65 < np.mean((error / strokes.onset.height_sigma[inner]) ** 2) < 1.1
 
 
 def test_one_stroke_is_the_press_bit_by_bit():
     travel = np.linspace(0, 1.2, 30)
     frames = made_press(travel, DEPTH)
-    found, press = strokes_of(frames, travel), find_onset(frames, travel, dark=DARK, bright=BRIGHT)
+    strokes, press = strokes_of(frames, travel), find_onset(frames, travel, dark=DARK, bright=BRIGHT)
     for field in ("height", "height_sigma", "status", "frame"):
-        np.testing.assert_array_equal(getattr(found.onset, field), getattr(press, field))
-    assert found.onset.process["noise"] == press.process["noise"]
-    assert np.isnan(found.release.height).all()
+        np.testing.assert_array_equal(getattr(strokes.onset, field), getattr(press, field))
+    assert strokes.onset.process["noise"] == press.process["noise"]
+    assert np.isnan(strokes.release.height).all()
 
 
 def test_a_first_stroke_up_is_one_of_releases():
     travel = 1.2 - oscillating_travel(0.0, 1.2, 3, 46)
-    found = strokes_of(made_press(travel, DEPTH), travel)
-    known = DEPTH > 0.2
-    assert found.onset.process["strokes"] == 3
-    assert np.all(found.release.strokes[known] == 2)
-    assert np.all(found.onset.strokes[known] == 1)
-    assert chi_square(found.onset, -DEPTH) < 1.5
+    strokes = strokes_of(made_press(travel, DEPTH), travel)
+    valid = DEPTH > 0.2
+    assert strokes.onset.process["strokes"] == 3
+    assert np.all(strokes.release.strokes[valid] == 2)
+    assert np.all(strokes.onset.strokes[valid] == 1)
+    assert chi_square(strokes.onset, -DEPTH) < 1.5
 
 
 def test_a_rest_before_a_stroke_up_is_not_a_stroke():
     travel = np.concatenate([np.full(5, 1.2), 1.2 - oscillating_travel(0.0, 1.2, 3, 46)])
-    found = strokes_of(made_press(travel, DEPTH), travel)
+    strokes = strokes_of(made_press(travel, DEPTH), travel)
     same = strokes_of(made_press(travel, DEPTH), travel, blocks=range(1, len(travel)))
-    assert found.onset.process["strokes"] == 3
-    assert np.all(found.onset.strokes[DEPTH > 0.2] == 1)
-    assert chi_square(found.onset, -DEPTH) < 1.5
-    np.testing.assert_array_equal(found.onset.height, same.onset.height)
-    assert np.all(np.diff(travel)[found.onset.frame[DEPTH > 0.2] - 1] > 0)
+    assert strokes.onset.process["strokes"] == 3
+    assert np.all(strokes.onset.strokes[DEPTH > 0.2] == 1)
+    assert chi_square(strokes.onset, -DEPTH) < 1.5
+    np.testing.assert_array_equal(strokes.onset.height, same.onset.height)
+    assert np.all(np.diff(travel)[strokes.onset.frame[DEPTH > 0.2] - 1] > 0)
 
 
 @pytest.fixture(scope="module")
@@ -167,11 +167,11 @@ def test_it_works_live_and_through_a_file(dither, tmp_path):
     while (block := dither.read(live.staging_buffer[:5])) is not None:
         live.push_block(block)
         live.maps()
-    found = live.result()
+    result = live.result()
     io.save_result(exact, tmp_path / "result.h5")
     read = io.open_result(tmp_path / "result.h5")
     for name in ("height", "height_sigma", "status", "hysteresis", "hysteresis_sigma", "strokes"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(exact, name))
+        np.testing.assert_array_equal(getattr(result, name), getattr(exact, name))
         np.testing.assert_array_equal(getattr(read, name), getattr(exact, name))
     assert read.strokes.dtype == np.uint16
 

@@ -22,23 +22,23 @@ def jittered(seed):
     return np.clip(np.rint(counts), 0, 255).astype(np.uint8), travel, onset
 
 
-@pytest.mark.parametrize(("find", "least"), [(find_onset, 0.5), (find_change_point, 0.2)])
-def test_heights_of_a_travel_that_jitters_have_true_errors(find, least):
+@pytest.mark.parametrize(("find", "lowest"), [(find_onset, 0.5), (find_change_point, 0.2)])
+def test_heights_of_a_travel_that_jitters_have_true_errors(find, lowest):
     squares = []
     for seed in range(8):
         frames, travel, onset = jittered(seed)
-        found = find(frames, travel, travel_sigma=SIGMA, **LEVELS)
-        known = found.status == 1
-        squares.append(np.mean(((-found.height - onset) / found.height_sigma)[known] ** 2))
-    assert least < np.mean(squares) < 1.5  # a change-point averages over frames
+        result = find(frames, travel, travel_sigma=SIGMA, **LEVELS)
+        valid = result.status == 1
+        squares.append(np.mean(((-result.height - onset) / result.height_sigma)[valid] ** 2))
+    assert lowest < np.mean(squares) < 1.5  # a change-point averages over frames
 
 
 def test_without_it_the_travel_is_exact():
     frames, travel, _ = jittered(0)
     exact = engine.find_onset(frames, travel, **LEVELS).height_sigma
-    found = engine.find_onset(frames, travel, travel_sigma=SIGMA, **LEVELS).height_sigma
+    sigma = engine.find_onset(frames, travel, travel_sigma=SIGMA, **LEVELS).height_sigma
     expected = np.hypot(exact, np.sqrt(2 / 3) * SIGMA)
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    np.testing.assert_allclose(sigma, expected, rtol=1e-5)
 
 
 def test_a_recording_stores_it(tmp_path):
@@ -47,7 +47,7 @@ def test_a_recording_stores_it(tmp_path):
     levels = {name: np.full((40, 50), value, np.float32) for name, value in LEVELS.items()}
     source = MadeUp(frames, io.Header("vertical", travel_sigma=SIGMA, **levels), travel=travel)
     with io.Recorder(source, tmp_path / "press.h5") as recorder:
-        recorder.drain(lambda done: None)
+        recorder.drain(lambda frame_count: None)
     with io.open_recording(tmp_path / "press.h5") as recording:
         result = engine.reconstruct(recording)
     assert result.process["travel_sigma"] == SIGMA

@@ -76,7 +76,7 @@ class Scene(NamedTuple):
 
 @cache
 def scene():
-    made = Twin(
+    twin = Twin(
         object=Ball(),
         shape=SHAPE,
         pixel_size=PIXEL,
@@ -86,18 +86,18 @@ def scene():
         body=BODY,
         camera=Camera(noise=1.0, seed=5, distance=DISTANCE, gain_deviation=0.05),
     )
-    frames = np.empty(made.shape, np.uint8)
-    made.read(frames)
+    frames = np.empty(twin.shape, np.uint8)
+    twin.read(frames)
     nothing = np.zeros(SHAPE, np.float32)
     levels = (
-        np.broadcast_to(one, SHAPE).astype(np.float32) for one in (made.header.dark, made.header.bright)
+        np.broadcast_to(level, SHAPE).astype(np.float32) for level in (twin.header.dark, twin.header.bright)
     )
     calibration = io.Calibration(
         io.CameraId("", SHAPE, np.dtype(np.uint8)),
         io.References(*levels, nothing, nothing, nothing.astype(np.uint8)),
         zenith=walls.response_of_twin(SHAPE, PIXEL, BODY, DISTANCE),
     )
-    return Scene(frames, made.header, made.truth, calibration)
+    return Scene(frames, twin.header, twin.truth, calibration)
 
 
 @cache
@@ -111,9 +111,9 @@ def rms(values):
 
 def test_normals_are_as_good_as_the_noise_lets_them_be():
     result = plain()
-    zenith, share = scene().errors(result)
+    zenith, ratio = scene().errors(result)
     assert abs(zenith.mean()) < 0.04
-    assert rms(share) == pytest.approx(1, abs=0.08)
+    assert rms(ratio) == pytest.approx(1, abs=0.08)
     assert result.process["zenith"] == "calibrated"
     assert result.process["heights"] == "found in the first turn"
     assert result.process["registered"] is True
@@ -124,9 +124,9 @@ def test_normals_are_as_good_as_the_noise_lets_them_be():
 
 def test_heights_that_are_given_do_as_well():
     result = engine.reconstruct(scene().source(), heights=scene().truth.height)
-    zenith, share = scene().errors(result)
+    zenith, ratio = scene().errors(result)
     assert abs(zenith.mean()) < 0.03
-    assert rms(share) == pytest.approx(1, abs=0.08)
+    assert rms(ratio) == pytest.approx(1, abs=0.08)
     assert result.process["heights"] == "given"
 
 
@@ -147,21 +147,21 @@ def test_without_a_pivot_frames_are_not_registered_but_heights_are_found():
 
 def test_what_the_calibration_is_wrong_by_counts_in_the_errors_that_are_reported():
     wall = walls.response_of_twin(SHAPE, PIXEL, BODY, DISTANCE, sigma=(0.003, 0.004))
-    known = replace(scene().calibration, zenith=wall)
-    doubtful = engine.reconstruct(scene().source(calibration=known)).normals_sigma
+    calibrated = replace(scene().calibration, zenith=wall)
+    doubtful = engine.reconstruct(scene().source(calibration=calibrated)).normals_sigma
     np.testing.assert_allclose(doubtful, np.sqrt(plain().normals_sigma ** 2 + 0.005**2), rtol=1e-5)
 
 
 @pytest.mark.parametrize("missing", ["pixel_size", "press"])
-def test_a_recording_that_does_not_say_where_pixels_look_is_refused(missing):
+def test_a_recording_without_lines_of_sight_is_refused(missing):
     with pytest.raises(io.InputError, match=f"has no {missing.replace('_', ' ')}"):
         engine.reconstruct(scene().source(**{missing: None}))
 
 
 def test_a_uniform_pattern_leaves_the_wave_alone():
     wall = replace(scene().calibration.zenith, pattern="uniform")
-    known = replace(scene().calibration, zenith=wall)
-    result = engine.reconstruct(scene().source(calibration=known))
+    calibrated = replace(scene().calibration, zenith=wall)
+    result = engine.reconstruct(scene().source(calibration=calibrated))
     assert result.normals is None
     assert result.mean is not None
 
@@ -188,8 +188,8 @@ def test_the_first_turn_ends_before_the_second_begins():
         turn.rewind()
         blocks = [turn.read(np.empty((3, *SHAPE), np.uint8)) for _ in range(3)]
         assert turn.read() is None
-        np.testing.assert_array_equal(np.concatenate([one.frames for one in blocks]), scene().frames)
-        assert [one.index for one in blocks] == [0, 3, 6]
+        np.testing.assert_array_equal(np.concatenate([block.frames for block in blocks]), scene().frames)
+        assert [block.index for block in blocks] == [0, 3, 6]
 
 
 def test_registered_frames_follow_points_that_an_oblique_camera_sees():
@@ -205,12 +205,12 @@ def test_registered_frames_follow_points_that_an_oblique_camera_sees():
     turn = walls.about_z(phase) @ walls.about_y(tilt) @ walls.about_z(-phase)
     centre = np.array(pivot)[:, np.newaxis]
     new = centre + turn @ (point - centre)
-    seen = np.array(axis)[:, np.newaxis] + (new[:2] - np.array(axis)[:, np.newaxis]) / (1 - lean * new[2])
-    for frame, expected in ((column, seen[0] / pixel + 30), (row, 20 - seen[1] / pixel)):
+    place = np.array(axis)[:, np.newaxis] + (new[:2] - np.array(axis)[:, np.newaxis]) / (1 - lean * new[2])
+    for frame, expected in ((column, place[0] / pixel + 30), (row, 20 - place[1] / pixel)):
         source = Frames(frame[np.newaxis], np.array([phase]), header)
-        found = Registered(source, height, sight=Sight(lean, axis)).read().frames[0]
-        good = np.isfinite(found)
+        registered = Registered(source, height, sight=Sight(lean, axis)).read().frames[0]
+        good = np.isfinite(registered)
         assert good.mean() > 0.6
-        np.testing.assert_allclose(found[good], expected.reshape(shape)[good], atol=0.01)  # of a pixel
+        np.testing.assert_allclose(registered[good], expected.reshape(shape)[good], atol=0.01)  # of a pixel
         plain = Registered(source := Frames(frame[np.newaxis], source.phase, header), height).read().frames[0]
         assert np.nanmax(np.abs(plain - expected.reshape(shape))) > 0.03

@@ -74,7 +74,7 @@ def turn(name):
 
 
 @pytest.fixture(scope="module", params=CASES)
-def told(request, device):
+def classified(request, device):
     """What the contact flag says: the scene, and where it is down."""
     scene = turn(request.param)
     header, case = scene.header, CASES[request.param]
@@ -91,8 +91,8 @@ def told(request, device):
     return scene, normals
 
 
-def test_lost_contact_is_flagged_and_little_else(told):
-    scene, normals = told
+def test_lost_contact_is_flagged_and_little_else(classified):
+    scene, normals = classified
     lost = ~scene.always & ~scene.never
     assert lost.sum() > 200
     assert scene.always.sum() > 2000

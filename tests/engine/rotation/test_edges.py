@@ -26,7 +26,7 @@ def grid():
 @cache
 def scene(name):
     """Normals, contact and true lines of an upright press, to the bottom unless PRESS tells."""
-    relief = next(one for one in RELIEFS if one.name == name)
+    relief = next(candidate for candidate in RELIEFS if candidate.name == name)
     touch = creases.pressed(relief, PRESS.get(name, 100.0))
     x, y = grid()
     lines = creases.edges_of(relief, touch, SHAPE, PIXEL)
@@ -55,11 +55,11 @@ def find(vectors, sigma, contact, device):
     return edges
 
 
-def assert_follows(edges, lines, least=0.95):
-    found = creases.agreement(edges, lines)
-    assert found.recall >= least, found
-    assert found.precision >= least, found
-    assert found.thickness <= 1.5, found
+def assert_follows(edges, lines, minimum=0.95):
+    agreement = creases.agreement(edges, lines)
+    assert agreement.recall >= minimum, agreement
+    assert agreement.precision >= minimum, agreement
+    assert agreement.thickness <= 1.5, agreement
 
 
 @pytest.mark.parametrize("name", [relief.name for relief in RELIEFS])
@@ -105,13 +105,13 @@ def test_a_jump_counts_from_ten_degrees_on(device, jump, azimuth):
     normals, lines = roof(jump, azimuth)
     edges = find(normals, np.full(SHAPE, 1e-4), np.ones(SHAPE, bool), device)
     assert (len(lines.points) > 0) == (jump > 10)
-    assert_follows(edges, lines, least=0.99)
+    assert_follows(edges, lines, minimum=0.99)
 
 
 @cache
 def rotation(name):
     """Frames of the rotating twin on an object, and the lines that are true all the turn."""
-    relief = next(one for one in RELIEFS if one.name == name)
+    relief = next(candidate for candidate in RELIEFS if candidate.name == name)
     press = {"pyramid": 0.5, "cone on a plate": 0.4, "dome": 0.45}[name]
     twin = Twin(
         object=relief,
@@ -131,10 +131,10 @@ def test_edges_are_found_in_what_the_twin_sees(device, relief):
     frames, header, lines = rotation(relief.name)
     spread = float(np.hypot(1.0, 1 / np.sqrt(12)))
     gain, offset = header.zenith_gain, header.zenith_offset
-    found = engine.estimate_normals(
+    result = engine.estimate_normals(
         frames, EIGHTHS, tilt=TILT, zenith_gain=gain, zenith_offset=offset, noise=spread, device=device
     )
-    edges = engine.find_edges(found.normals, found.normals_sigma, found.contact, device=device)
+    edges = engine.find_edges(result.normals, result.normals_sigma, result.contact, device=device)
     assert len(lines.points) > 400
     assert_follows(edges, lines)
 
@@ -174,10 +174,10 @@ def test_what_has_no_normal_makes_no_edge_of_its_own(device):
 @pytest.mark.parametrize("wrong", ["vectors", "sigma", "empty"])
 def test_maps_that_do_not_fit_are_refused(wrong):
     vectors, sigma, contact = plain_roof()
-    given = {
+    arguments = {
         "vectors": (vectors[1:], sigma, contact),
         "sigma": (vectors, sigma[:, 1:], contact),
         "empty": (vectors[:0], sigma[:0], contact[:0]),
     }
     with pytest.raises(io.InputError, match="do not fit"):
-        engine.find_edges(*given[wrong])
+        engine.find_edges(*arguments[wrong])

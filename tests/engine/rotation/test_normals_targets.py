@@ -23,11 +23,11 @@ def drawn(name):
     return rotations.draw(SETUPS[name], DRAWS, seed=1)
 
 
-def estimate(frames, setup, device, **given):
+def estimate(frames, setup, device, **options):
     """Estimate with what a lab knows: phases, tilt, gain, offset, and the noise of a sample."""
-    known = {"noise": setup.spread, "device": device, **given}
+    arguments = {"noise": setup.spread, "device": device, **options}
     return rotations.estimate(
-        frames, setup.phase, tilt=setup.tilt, zenith_gain=setup.slope, zenith_offset=setup.offset, **known
+        frames, setup.phase, tilt=setup.tilt, zenith_gain=setup.slope, zenith_offset=setup.offset, **arguments
     )
 
 
@@ -40,9 +40,9 @@ def answered(request, device):
 
 
 def test_the_exact_method_reaches_the_bound_in_every_bin_and_sigma_is_true(answered):
-    normals, told, stack = answered
-    np.testing.assert_allclose(told.ratio, 1, rtol=0, atol=0.05)
-    np.testing.assert_allclose(told.chi_square, 1, rtol=0, atol=0.05)
+    normals, scores, stack = answered
+    np.testing.assert_allclose(scores.ratio, 1, rtol=0, atol=0.05)
+    np.testing.assert_allclose(scores.chi_square, 1, rtol=0, atol=0.05)
     assert normals.contact.shape == stack.bound.shape
     assert np.all(np.mean(normals.contact == 0, axis=1) <= 0.01)
 
@@ -53,9 +53,9 @@ def test_frames_without_noise_are_answered_exactly(device, noise):
     normals = rotations.random_normals(300, seed=2)
     normals[0, :8] = rotations.axes(setup.phase, TILT)  # a sample's own axis, where its angle has no slope
     normals[0, 8:16] = rotations.direction(2 * TILT, setup.phase)
-    found = estimate(rotations.expose(normals, setup, seed=2), setup, device, noise=noise)
-    assert np.degrees(rotations.between(found.normals.astype(float), normals)).max() <= 0.01
-    np.testing.assert_allclose(np.linalg.norm(found.normals, axis=-1), 1, atol=1e-6)
+    result = estimate(rotations.expose(normals, setup, seed=2), setup, device, noise=noise)
+    assert np.degrees(rotations.between(result.normals.astype(float), normals)).max() <= 0.01
+    np.testing.assert_allclose(np.linalg.norm(result.normals, axis=-1), 1, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -65,20 +65,22 @@ def test_the_paper_method_is_equations_16_to_22(device, name, phase):
     setup = replace(SETUPS[name], phase=phase)
     stack = rotations.draw(setup, 500, seed=3)
     expected = rotations.paper(stack.frames, setup)
-    found = estimate(stack.frames, setup, device, method="paper")
+    result = estimate(stack.frames, setup, device, method="paper")
     swings = expected.modulation > 1e-5  # without a swing there is no direction to tell
     assert np.mean(swings) > 0.99
-    np.testing.assert_allclose(found.zenith[swings], expected.zenith[swings], rtol=0, atol=1e-5)
-    turned = found.azimuth.astype(float) - expected.azimuth
+    np.testing.assert_allclose(result.zenith[swings], expected.zenith[swings], rtol=0, atol=1e-5)
+    turned = result.azimuth.astype(float) - expected.azimuth
     turned = np.abs(np.arctan2(np.sin(turned), np.cos(turned)))
     assert np.all(turned[swings] <= 1e-5 * TILT / expected.modulation[swings])
 
 
-def test_the_paper_method_is_where_the_errata_say_it_fails(device):
+def test_the_paper_method_fails_as_the_errata_describe(device):
     stack = drawn("float32")
-    told = rotations.scores(estimate(stack.frames, stack.setup, device, method="paper").normals, None, stack)
-    assert np.all(told.ratio[1:6] > 3)  # at and below the tilt
-    assert np.all(told.ratio[-6:] < 1.05)  # far above
+    scores = rotations.scores(
+        estimate(stack.frames, stack.setup, device, method="paper").normals, None, stack
+    )
+    assert np.all(scores.ratio[1:6] > 3)  # at and below the tilt
+    assert np.all(scores.ratio[-6:] < 1.05)  # far above
 
 
 UNUSUAL = {
@@ -95,19 +97,19 @@ def unusual(case):
 
 def without_one(stack, how, device):
     """Estimate without one frame, or one sample of each pixel; return the bound of what is left, too."""
-    frames, setup, given = stack.frames.copy(), stack.setup, {}
-    left = np.ones(frames.shape)
+    frames, setup, options = stack.frames.copy(), stack.setup, {}
+    weight = np.ones(frames.shape)
     if how == "weight":
-        frames[3], left[3] = 0, 0
-        given = {"frame_weights": left[:, 0, 0]}
+        frames[3], weight[3] = 0, 0
+        options = {"frame_weights": weight[:, 0, 0]}
     elif how == "nan":
         lost = np.random.default_rng(0).integers(0, 8, (1, *stack.bound.shape))
         np.put_along_axis(frames, lost, np.nan, axis=0)
-        np.put_along_axis(left, lost, 0, axis=0)
+        np.put_along_axis(weight, lost, 0, axis=0)
     elif how == "left out":
-        frames, left = np.delete(frames, 3, axis=0), np.delete(left, 3, axis=0)
+        frames, weight = np.delete(frames, 3, axis=0), np.delete(weight, 3, axis=0)
         setup = replace(setup, phase=tuple(np.delete(setup.phase, 3)))
-    return estimate(frames, setup, device, **given), rotations.bound(stack.normals, setup, left)
+    return estimate(frames, setup, device, **options), rotations.bound(stack.normals, setup, weight)
 
 
 @pytest.mark.parametrize("case", UNUSUAL)
@@ -115,9 +117,9 @@ def test_uneven_phases_and_missing_frames_cost_what_they_must_and_no_bias(device
     stack = unusual(case)
     normals, best = without_one(stack, UNUSUAL[case][1], device)
     assert np.all(np.abs(rotations.mean_error(normals.normals, stack)) < 4)
-    told = rotations.scores(normals.normals, normals.normals_sigma, stack._replace(bound=best))
-    np.testing.assert_allclose(told.ratio, 1, atol=0.06)
-    np.testing.assert_allclose(told.chi_square, 1, atol=0.12)
+    scores = rotations.scores(normals.normals, normals.normals_sigma, stack._replace(bound=best))
+    np.testing.assert_allclose(scores.ratio, 1, atol=0.06)
+    np.testing.assert_allclose(scores.chi_square, 1, atol=0.12)
 
 
 @cache
@@ -140,9 +142,9 @@ def test_a_clipped_frame_is_no_bias(device, side):
     end = "dark" if side == "low" else "bright"
     normals = estimate(stack.frames, stack.setup, device, **{end: getattr(stack.setup, side)})
     assert np.all(np.abs(rotations.mean_error(normals.normals, stack)) < 4)
-    told = rotations.scores(normals.normals, normals.normals_sigma, stack)
-    np.testing.assert_allclose(told.ratio, 1, atol=0.08)
-    np.testing.assert_allclose(told.chi_square, 1, atol=0.2)
+    scores = rotations.scores(normals.normals, normals.normals_sigma, stack)
+    np.testing.assert_allclose(scores.ratio, 1, atol=0.08)
+    np.testing.assert_allclose(scores.chi_square, 1, atol=0.2)
 
 
 @cache
@@ -157,7 +159,7 @@ def test_an_unknown_tilt_is_reported_within_its_own_error(device, name, tilt):
     stack, error = tilted(name, tilt)
     setup = stack.setup
     assert error < 1e-3 * setup.tilt
-    found = engine.estimate_normals(
+    result = engine.estimate_normals(
         stack.frames,
         setup.phase,
         tilt="estimate",
@@ -166,9 +168,9 @@ def test_an_unknown_tilt_is_reported_within_its_own_error(device, name, tilt):
         noise=setup.spread,
         device=device,
     )
-    assert found.process["tilt"] == pytest.approx(setup.tilt, abs=4 * error)
-    told = rotations.scores(found.normals.reshape(1, -1, 3), None, flat(stack))
-    assert told.ratio[0] <= 1.05
+    assert result.process["tilt"] == pytest.approx(setup.tilt, abs=4 * error)
+    scores = rotations.scores(result.normals.reshape(1, -1, 3), None, flat(stack))
+    assert scores.ratio[0] <= 1.05
 
 
 def flat(stack):
@@ -184,8 +186,8 @@ def test_the_page_about_accuracy_states_what_is_measured(device):
     bins = [BINS.index(tuple(map(float, zenith.split("-")))) for zenith in zeniths]
     stack = drawn("uint8")
     for method, stated in ("exact", exact), ("paper", paper):
-        found = estimate(stack.frames, stack.setup, device, method=method).normals.astype(float)
-        error = rotations.between(found, stack.normals)  # NaN where all samples of a draw are equal
+        result = estimate(stack.frames, stack.setup, device, method=method).normals.astype(float)
+        error = rotations.between(result, stack.normals)  # NaN where all samples of a draw are equal
         rms = np.degrees(np.sqrt(np.nanmean(error**2, axis=-1)))
         np.testing.assert_allclose(rms[bins], np.array(stated, float), rtol=0.03)
     bound = np.degrees(np.sqrt(np.mean(stack.bound, axis=-1)))

@@ -28,34 +28,34 @@ def shown(axes, resting=False, seed=5):
     return (counts + np.random.default_rng(seed).normal(0, NOISE, counts.shape)).astype(np.float32)
 
 
-def information(axes, directions, seen=1.0):
+def information(axes, directions, visible=1.0):
     """Fisher's information of the samples on moves of the normal along directions, (H, W, n, n), 1/rad^2."""
     cosine = np.einsum("ki,hwi->khw", axes, NORMALS)
     growth = np.einsum("ki,nhwi->nkhw", axes, directions) / np.sqrt(1 - cosine**2)
-    return np.einsum("mkhw,nkhw,khw->hwmn", growth, growth, np.broadcast_to(seen, cosine.shape)) * (
+    return np.einsum("mkhw,nkhw,khw->hwmn", growth, growth, np.broadcast_to(visible, cosine.shape)) * (
         (GAIN / NOISE) ** 2
     )
 
 
-def bound(axes, seen=1.0):
+def bound(axes, visible=1.0):
     """The least mean square angle of an unbiased estimate."""
-    covariance = np.linalg.inv(information(axes, np.stack(rotations.tangents(NORMALS)), seen))
+    covariance = np.linalg.inv(information(axes, np.stack(rotations.tangents(NORMALS)), visible))
     return np.trace(covariance, axis1=-2, axis2=-1)
 
 
-def angle(found):
-    return np.arccos(np.clip(np.sum(found.normals * NORMALS, axis=-1, dtype=float), -1, 1))
+def angle(result):
+    return np.arccos(np.clip(np.sum(result.normals * NORMALS, axis=-1, dtype=float), -1, 1))
 
 
-def test_a_growing_precession_reaches_the_bound_and_says_how_sure_it_is():
+def test_a_growing_precession_reaches_the_bound_with_true_errors():
     axes = body_axes(PHASE, GROWING)
-    found = engine.estimate_normals(shown(axes), PHASE, tilt=GROWING, **SCALE)
-    error = angle(found)
+    result = engine.estimate_normals(shown(axes), PHASE, tilt=GROWING, **SCALE)
+    error = angle(result)
     assert np.sqrt(np.sum(error**2) / np.sum(bound(axes))) < 1.05
-    assert np.mean((error / found.normals_sigma) ** 2) == pytest.approx(1, abs=0.06)
-    assert found.process["noise"] == pytest.approx(NOISE, rel=0.02)
-    assert (found.status == 1).all()
-    assert found.contact.mean() > 0.99
+    assert np.mean((error / result.normals_sigma) ** 2) == pytest.approx(1, abs=0.06)
+    assert result.process["noise"] == pytest.approx(NOISE, rel=0.02)
+    assert (result.status == 1).all()
+    assert result.contact.mean() > 0.99
 
 
 def test_a_turn_is_one_case_of_poses():
@@ -73,21 +73,21 @@ def test_a_turn_is_one_case_of_poses():
 def test_rocking_determines_the_slope_along_it_at_the_bound_and_nothing_across(direction, middle):
     phase = np.full(COUNT, direction)
     axes = body_axes(phase, ROCKING + middle)
-    found = engine.estimate_normals(shown(axes), phase, tilt=ROCKING + middle, **SCALE)
+    result = engine.estimate_normals(shown(axes), phase, tilt=ROCKING + middle, **SCALE)
     along = np.array(
-        [np.cos(found.process["slope_direction"]), np.sin(found.process["slope_direction"]), 0.0]
+        [np.cos(result.process["slope_direction"]), np.sin(result.process["slope_direction"]), 0.0]
     )
-    assert np.isclose((found.process["slope_direction"] - direction + 0.1) % np.pi, 0.1)
+    assert np.isclose((result.process["slope_direction"] - direction + 0.1) % np.pi, 0.1)
     p, q = NORMALS @ along, NORMALS[..., 2]
-    error = found.slope + p / q
+    error = result.slope + p / q
     parts = np.broadcast_to(np.stack([along, [0, 0, 1.0]])[:, None, None], (2, *SHAPE, 3))
     growth = np.stack([-1 / q, p / q**2], axis=-1)
     best = np.einsum("hwi,hwij,hwj->hw", growth, np.linalg.inv(information(axes, parts)), growth)
     assert np.sqrt(np.sum(error**2) / np.sum(best)) < 1.05
-    assert np.mean((error / found.slope_sigma) ** 2) == pytest.approx(1, abs=0.06)
-    assert np.sqrt(np.mean((found.zenith - np.arccos(q)) ** 2)) < 4 * NOISE / GAIN / np.sqrt(COUNT)
-    assert (found.status == 4).all()
-    assert found.normals is found.normals_sigma is found.azimuth is None
+    assert np.mean((error / result.slope_sigma) ** 2) == pytest.approx(1, abs=0.06)
+    assert np.sqrt(np.mean((result.zenith - np.arccos(q)) ** 2)) < 4 * NOISE / GAIN / np.sqrt(COUNT)
+    assert (result.status == 4).all()
+    assert result.normals is result.normals_sigma is result.azimuth is None
 
 
 @pytest.mark.parametrize("direction", [0.0, 0.3, 1.0, 3.0, np.pi - 1e-9, -1e-12])
@@ -102,21 +102,21 @@ def test_rocking_of_several_windows_uses_all_frames(direction):
 def test_two_phases_half_a_turn_apart_rock():
     phase = np.pi * (FRAME % 2) + 0.3
     frames = shown(body_axes(phase, np.radians(2.5)))
-    found = engine.estimate_normals(frames, phase, tilt=np.radians(2.5), **SCALE)
-    assert (found.status == 4).all()
-    assert found.process["slope_direction"] == pytest.approx(0.3)
+    result = engine.estimate_normals(frames, phase, tilt=np.radians(2.5), **SCALE)
+    assert (result.status == 4).all()
+    assert result.process["slope_direction"] == pytest.approx(0.3)
 
 
 def test_a_spiral_into_the_object_uses_the_frames_in_contact():
     depth = np.random.default_rng(8).uniform(0.1, 1.2, SHAPE)
     axes, resting = body_axes(PHASE, GROWING), PRESS[:, np.newaxis, np.newaxis] < depth
-    found = engine.estimate_normals(
+    result = engine.estimate_normals(
         shown(axes, resting), PHASE, tilt=GROWING, travel=PRESS, noise=NOISE, **SCALE
     )
-    error, best = angle(found), bound(axes, ~resting)
+    error, best = angle(result), bound(axes, ~resting)
     assert np.sqrt(np.sum(error**2) / np.sum(best)) < 1.05
-    assert np.mean((error / found.normals_sigma) ** 2) == pytest.approx(1, abs=0.1)
-    assert found.contact.mean() > 0.97
+    assert np.mean((error / result.normals_sigma) ** 2) == pytest.approx(1, abs=0.1)
+    assert result.contact.mean() > 0.97
     with pytest.warns(io.MirrorskinWarning, match="the brightness changes at no pixel"):
         never = engine.estimate_normals(
             shown(axes, np.True_), PHASE, tilt=GROWING, travel=PRESS, noise=NOISE, **SCALE
@@ -129,10 +129,10 @@ def test_more_than_a_window_of_frames_is_joined():
     frame = np.arange(130)
     lean = np.radians(2.5) * np.sin(0.385 * frame)
     axes = body_axes(np.zeros(130), lean)
-    found = engine.estimate_normals(shown(axes), axis=axes, noise=NOISE, **SCALE)
-    assert (found.process["turns"], found.process["frames"]) == (3, 130)
+    result = engine.estimate_normals(shown(axes), axis=axes, noise=NOISE, **SCALE)
+    assert (result.process["turns"], result.process["frames"]) == (3, 130)
     slope = -NORMALS[..., 0] / NORMALS[..., 2]
-    assert np.mean(((found.slope - slope) / found.slope_sigma) ** 2) == pytest.approx(1, abs=0.06)
+    assert np.mean(((result.slope - slope) / result.slope_sigma) ** 2) == pytest.approx(1, abs=0.06)
 
 
 @pytest.mark.parametrize(
@@ -184,10 +184,10 @@ def test_a_rocked_recording_gives_its_slope(tmp_path):
         assert recording.header.tilt is None
         result = engine.reconstruct(recording)
     slope = -np.tan(PLANE.zenith) * np.cos(PLANE.azimuth - result.process["slope_direction"])
-    known = result.contact == 1
-    assert known.sum() > 600
-    assert np.mean(((result.slope - slope) / result.slope_sigma)[known] ** 2) == pytest.approx(1, abs=0.15)
-    assert np.all(result.status[known] == 4)
+    answered = result.contact == 1
+    assert answered.sum() > 600
+    assert np.mean(((result.slope - slope) / result.slope_sigma)[answered] ** 2) == pytest.approx(1, abs=0.15)
+    assert np.all(result.status[answered] == 4)
     assert result.normals is None
     assert result.height is None
     live = engine.reconstruct(twin)
@@ -208,8 +208,8 @@ def test_a_recorded_spiral_gives_normals_and_heights(tmp_path):
             engine.reconstruct(recording, method="paper")
     normal = rotations.direction(PLANE.zenith, PLANE.azimuth)
     error = np.arccos(np.clip(result.normals @ normal, -1, 1))
-    known = result.contact == 1
-    assert known.sum() > 900
-    assert np.mean((error / result.normals_sigma)[known] ** 2) == pytest.approx(1, abs=0.2)
-    assert np.isfinite(result.height[known]).all()
+    answered = result.contact == 1
+    assert answered.sum() > 900
+    assert np.mean((error / result.normals_sigma)[answered] ** 2) == pytest.approx(1, abs=0.2)
+    assert np.isfinite(result.height[answered]).all()
     assert set(np.unique(result.status)) <= {1, 2}

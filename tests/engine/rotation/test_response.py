@@ -18,7 +18,7 @@ SHAPE = (8, 31)
 AXES = np.linspace(-6, 6, 31), np.linspace(3, -3, 8)
 
 
-def made(wall=None, dark=10.0, bright=240.0, heights=0.5, **other):
+def make(wall=None, dark=10.0, bright=240.0, heights=0.5, **other):
     return make_response(wall or walls.response(SHAPE), dark, bright, AXES, heights, **other)
 
 
@@ -37,8 +37,8 @@ def frames_of(response, zenith, azimuth, noise=1.0, seed=0):
 def test_each_pixel_has_its_counts_its_place_and_its_shading():
     dark, bright = np.full(SHAPE, 12.0), np.full(SHAPE, 200.0)
     heights = np.random.default_rng(0).uniform(0, 1, SHAPE)
-    found = made(dark=dark, bright=bright, heights=heights, pivot=(1.0, 2.0, 3.0))
-    offset, per_count, x, y, z = found.planes
+    response = make(dark=dark, bright=bright, heights=heights, pivot=(1.0, 2.0, 3.0))
+    offset, per_count, x, y, z = response.planes
     np.testing.assert_array_equal(offset, dark)
     np.testing.assert_array_equal(z, heights.astype(np.float32))
     assert x[0, 0] == pytest.approx(-6 - walls.AXIS[0])
@@ -48,8 +48,8 @@ def test_each_pixel_has_its_counts_its_place_and_its_shading():
     np.testing.assert_allclose(
         1 / per_count, 188 * (1 + a * u + b * v + c * u * u + d * u * v + e * v * v), 1e-6
     )
-    assert found.wall.pivot == pytest.approx((1 - walls.AXIS[0], 2 - walls.AXIS[1], 3))
-    assert found.wall.sense == 1
+    assert response.wall.pivot == pytest.approx((1 - walls.AXIS[0], 2 - walls.AXIS[1], 3))
+    assert response.wall.sense == 1
     np.testing.assert_allclose(shade(replace(walls.response(SHAPE), shade=np.zeros(5)), x, y), 1)
 
 
@@ -59,31 +59,31 @@ def test_a_defect_and_what_is_next_to_the_body_have_no_answer():
     bright = np.full(SHAPE, 240.0)
     bright[5, 6] = 0.0
     wide = np.linspace(-6, 30, 31), AXES[1]
-    found = make_response(walls.response(SHAPE), dark, bright, wide, 0.5)
-    per_count = found.planes[1]
-    beyond = np.hypot(found.planes[2], found.planes[3]) >= walls.RADIUS
+    response = make_response(walls.response(SHAPE), dark, bright, wide, 0.5)
+    per_count = response.planes[1]
+    beyond = np.hypot(response.planes[2], response.planes[3]) >= walls.RADIUS
     assert 0 < beyond.sum() < beyond.size
     expected = ~beyond
     expected[3, 4] = expected[5, 6] = False
     np.testing.assert_array_equal(np.isfinite(per_count), expected)
     with np.errstate(invalid="ignore"):
         frames = np.random.default_rng(0).integers(90, 110, (8, *SHAPE)).astype(np.uint8)
-    normals = rotations.estimate(frames, PHASE, tilt=TILT, response=found, noise=1.0)
+    normals = rotations.estimate(frames, PHASE, tilt=TILT, response=response, noise=1.0)
     assert np.isnan(normals.normals_sigma[~expected]).all()
     assert np.isfinite(normals.normals_sigma[expected]).any()
 
 
 def test_mirrors_that_face_one_way_are_found_to_do_so_all_over_the_picture(device):
-    response = made(pivot=walls.PIVOT)
+    response = make(pivot=walls.PIVOT)
     frames, normal = frames_of(response, 0.5, 2.0)
-    found = rotations.estimate(frames, PHASE, tilt=TILT, response=response, noise=1.0, device=device)
-    error = np.linalg.norm(found.normals - normal, axis=-1) / found.normals_sigma
+    result = rotations.estimate(frames, PHASE, tilt=TILT, response=response, noise=1.0, device=device)
+    error = np.linalg.norm(result.normals - normal, axis=-1) / result.normals_sigma
     assert np.mean(error**2) == pytest.approx(1, abs=0.25)
-    assert found.contact.mean() > 0.98
+    assert result.contact.mean() > 0.98
 
 
 def test_dark_pixels_are_marked_too_level():
-    response = made()
+    response = make()
     light = np.full(SHAPE, 0.5)
     light[2, 3:9] = 0.01
     mean = (response.planes[0] + light / response.planes[1]).astype(np.float32)
@@ -92,7 +92,7 @@ def test_dark_pixels_are_marked_too_level():
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"wall": walls.response(SHAPE, pattern="uniform")}, "uniform pattern"),
         ({"wall": walls.response(SHAPE, curve=np.ones(13))}, "13 coefficients"),
@@ -101,30 +101,31 @@ def test_dark_pixels_are_marked_too_level():
         ({"dark": 240.0, "bright": 10.0}, "swapped"),
     ],
 )
-def test_what_cannot_be_used_is_refused_in_one_line(change, told):
-    with pytest.raises(InputError, match=told) as error:
-        made(**change)
+def test_what_cannot_be_used_is_refused_in_one_line(change, message):
+    with pytest.raises(InputError, match=message) as error:
+        make(**change)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("change", "told"), [({"method": "paper"}, "exact"), ({"tilt": "estimate"}, "tilt cannot be estimated")]
+    ("change", "message"),
+    [({"method": "paper"}, "exact"), ({"tilt": "estimate"}, "tilt cannot be estimated")],
 )
-def test_what_a_response_cannot_do_is_refused(change, told):
+def test_what_a_response_cannot_do_is_refused(change, message):
     frames = np.full((8, *SHAPE), 100, np.uint8)
-    known = {"phase": PHASE, "tilt": TILT, "noise": 1.0, "response": made()}
-    with pytest.raises(InputError, match=told):
-        estimate_normals(frames, **(known | change))
+    options = {"phase": PHASE, "tilt": TILT, "noise": 1.0, "response": make()}
+    with pytest.raises(InputError, match=message):
+        estimate_normals(frames, **(options | change))
 
 
-def known_of(**parts):
+def leaning_response(**parts):
     """Return the response for a source whose calibration has a wall and other parts."""
     camera = CameraId("", SHAPE, np.dtype(np.float32))
     source = MadeUp(np.zeros((8, *SHAPE), np.float32), Header("axial"), phase=PHASE)
     return wall_response_of(Calibrated(source, Calibration(camera, zenith=walls.response(SHAPE), **parts)))
 
 
-def test_an_ellipse_that_is_taken_for_a_circle_makes_azimuths_less_sure():
+def test_an_ellipse_taken_for_a_circle_raises_the_error_of_azimuths():
     """Waves of inclined surfaces, seen linearly: by how much the azimuth of their first harmonic is off."""
     oval, phase = 0.02, np.arange(64) * np.pi / 32
     precession = a_precession(tilt=0.04, ellipticity=oval, centre=(0.0, 0.0))
@@ -136,10 +137,10 @@ def test_an_ellipse_that_is_taken_for_a_circle_makes_azimuths_less_sure():
     off = np.angle(-(cosine + 1j * sine) * np.exp(-1j * towards))
     assert np.max(np.abs(off)) == pytest.approx(oval / 2, rel=0.05)
 
-    plain, told = known_of(), known_of(precession=precession)
+    plain, elliptic = leaning_response(), leaning_response(precession=precession)
     middle = np.pi / 4 - np.arctan(np.mean(plain.reach))
-    added = np.sqrt(told.azimuth_sigma.astype(float) ** 2 - plain.azimuth_sigma.astype(float) ** 2)
+    added = np.sqrt(elliptic.azimuth_sigma.astype(float) ** 2 - plain.azimuth_sigma.astype(float) ** 2)
     np.testing.assert_allclose(added, np.sqrt(np.mean(off**2)) * np.sin(middle), rtol=0.05)
-    np.testing.assert_array_equal(told.zenith_sigma, plain.zenith_sigma)
-    circle = known_of(precession=a_precession(ellipticity=0.0))
+    np.testing.assert_array_equal(elliptic.zenith_sigma, plain.zenith_sigma)
+    circle = leaning_response(precession=a_precession(ellipticity=0.0))
     np.testing.assert_array_equal(circle.azimuth_sigma, plain.azimuth_sigma)

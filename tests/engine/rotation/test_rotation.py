@@ -43,8 +43,8 @@ def frames():
 
 
 def source(header=HEADER, **changes):
-    given = {"phase": PHASE, **changes}
-    return MadeUp(given.pop("frames", frames()), header, **given)
+    fields = {"phase": PHASE, **changes}
+    return MadeUp(fields.pop("frames", frames()), header, **fields)
 
 
 def reconstruct(header=HEADER, **options):
@@ -56,15 +56,15 @@ def errors(result):
     return rotations.between(result.normals.astype(float), DOME)
 
 
-def alike(one, other):
-    assert one.maps().keys() == other.maps().keys()
-    for name, values in one.maps().items():
+def alike(first, other):
+    assert first.maps().keys() == other.maps().keys()
+    for name, values in first.maps().items():
         np.testing.assert_array_equal(values, other.maps()[name], err_msg=name)
 
 
 def test_a_rotation_becomes_normals_and_what_goes_with_them(tmp_path):
-    done = []
-    result = reconstruct(OF_A_SURFACE, progress=done.append)
+    counts = []
+    result = reconstruct(OF_A_SURFACE, progress=counts.append)
     maps = "zenith", "azimuth", "normals_sigma", "mean", "modulation", "residual", "edges", "contact"
     maps = (*maps, "height", "height_sigma", "component")
     shapes = {name: values.shape for name, values in result.maps().items()}
@@ -72,26 +72,26 @@ def test_a_rotation_becomes_normals_and_what_goes_with_them(tmp_path):
     assert np.mean((errors(result) / result.normals_sigma) ** 2) == pytest.approx(1, abs=0.25)
     assert result.contact.all()
     assert (result.x.shape, result.y.shape) == ((SHAPE[1],), (SHAPE[0],))
-    said = {"method": "exact", "tilt_from": "recording", "turns": TURNS, "frames": 8 * TURNS}
-    said |= {"per_turn": False, "tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
-    said |= {"dark": "range of the type", "bright": "range of the type", "heights": "none"}
-    assert {name: result.process[name] for name in said} == said
+    expected = {"method": "exact", "tilt_from": "recording", "turns": TURNS, "frames": 8 * TURNS}
+    expected |= {"per_turn": False, "tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
+    expected |= {"dark": "range of the type", "bright": "range of the type", "heights": "none"}
+    assert {name: result.process[name] for name in expected} == expected
     assert result.process["noise"] == pytest.approx(SETUP.spread, rel=0.1)
-    assert done[-1] == 8 * TURNS
-    assert done == sorted(done)
+    assert counts[-1] == 8 * TURNS
+    assert counts == sorted(counts)
     io.save_result(result, tmp_path / "out.h5")
-    found = io.open_result(tmp_path / "out.h5")
-    assert_same(found, result.assign(process=found.process))
+    stored = io.open_result(tmp_path / "out.h5")
+    assert_same(stored, result.assign(process=stored.process))
 
 
 def test_it_is_the_normals_of_the_frames():
     result = reconstruct(method="paper", noise=20.0)
-    known = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "noise": 20.0}
-    found = engine.estimate_normals(frames(), PHASE, **known, method="paper")
-    np.testing.assert_array_equal(result.normals, found.normals)
-    np.testing.assert_array_equal(result.normals_sigma, found.normals_sigma)
+    options = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "noise": 20.0}
+    normals = engine.estimate_normals(frames(), PHASE, **options, method="paper")
+    np.testing.assert_array_equal(result.normals, normals.normals)
+    np.testing.assert_array_equal(result.normals_sigma, normals.normals_sigma)
     for name in ("zenith", "azimuth", "contact", "mean", "modulation", "residual"):
-        np.testing.assert_array_equal(getattr(result, name), getattr(found, name))
+        np.testing.assert_array_equal(getattr(result, name), getattr(normals, name))
 
 
 @pytest.mark.parametrize("options", [{"per_turn": True}, {"heights": FLAT}, {"tilt": "estimate"}])
@@ -137,20 +137,20 @@ def test_without_a_gain_there_is_the_wave_alone():
             reconstruct(NO_GAIN, **options)
 
 
-def test_what_is_given_goes_before_what_the_source_says():
+def test_options_replace_fields_of_the_source():
     wrong = replace(HEADER, zenith_gain=np.array(1.0), zenith_offset=np.array(9.0), tilt=0.3)
-    given = {"zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "tilt": TILT}
-    result = reconstruct(wrong, **given)
+    options = {"zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "tilt": TILT}
+    result = reconstruct(wrong, **options)
     alike(result, reconstruct())
-    alike(reconstruct(replace(NO_GAIN, tilt=None), **given), result)
-    said = {"zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "tilt": TILT, "tilt_from": "given"}
-    assert {name: result.process[name] for name in said} == said
+    alike(reconstruct(replace(NO_GAIN, tilt=None), **options), result)
+    expected = {"zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "tilt": TILT, "tilt_from": "given"}
+    assert {name: result.process[name] for name in expected} == expected
     unknown = reconstruct(replace(HEADER, zenith_offset=None))
     alike(unknown, reconstruct(replace(HEADER, zenith_offset=np.array(0.0))))
     assert unknown.process["zenith_offset"] == "0"
 
 
-def test_maps_of_the_recording_are_used_and_said_so():
+def test_maps_of_the_recording_are_used_and_named_in_the_process():
     ones, nine = np.ones(SHAPE), tuple(2 * np.pi * np.arange(9) / 9)
     header = replace(
         HEADER,
@@ -159,10 +159,10 @@ def test_maps_of_the_recording_are_used_and_said_so():
         dark=np.full(SHAPE, 1800, np.float32),  # brightness is linear from zenith 27 on
         bright=np.full(SHAPE, 60_000, np.float32),
     )
-    made = rotations.expose(DOME, replace(SETUP, phase=nine), seed=4)
-    result = engine.reconstruct(source(header, frames=made, phase=np.array(nine)))
-    said = {result.process[name] for name in ("zenith_gain", "zenith_offset", "dark", "bright")}
-    assert said == {"map of the recording"}
+    frames_ = rotations.expose(DOME, replace(SETUP, phase=nine), seed=4)
+    result = engine.reconstruct(source(header, frames=frames_, phase=np.array(nine)))
+    sources = {result.process[name] for name in ("zenith_gain", "zenith_offset", "dark", "bright")}
+    assert sources == {"map of the recording"}
     zenith = np.degrees(rotations.angles(DOME)[0])
     assert np.isnan(result.zenith[zenith < 24]).all()
     assert np.isfinite(result.zenith[zenith > 31]).all()
@@ -214,9 +214,9 @@ def test_the_heights_are_those_that_fit_the_normals():
 
 
 def test_separate_contacts_have_separate_heights():
-    made = frames().copy()
-    made[:, :, 10:13] = 150  # level, which no normal that turns is: no contact
-    result = engine.reconstruct(source(OF_A_SURFACE, frames=made))
+    stack = frames().copy()
+    stack[:, :, 10:13] = 150  # level, which no normal that turns is: no contact
+    result = engine.reconstruct(source(OF_A_SURFACE, frames=stack))
     np.testing.assert_array_equal(np.isnan(result.height), result.contact == 0)
     assert result.offset_unknown.tolist() == [1, 1]
     for number, part in enumerate((np.s_[:, :10], np.s_[:, 13:])):
@@ -234,9 +234,9 @@ def test_heights_that_do_not_converge_are_refused(monkeypatch, robust, residual,
 
     def miss(*slopes, **options):
         assert options.pop("robust") == robust
-        found = engine.integrate(*slopes, **options)
-        found = found.with_fitted(integration_converged=False, integration_residual=residual)
-        return found.assign(edges=broken if robust else None)
+        surface = engine.integrate(*slopes, **options)
+        surface = surface.with_fitted(integration_converged=False, integration_residual=residual)
+        return surface.assign(edges=broken if robust else None)
 
     monkeypatch.setattr("mirrorskin.engine.integration.normals_to_height.integrate_arrays", miss)
     if accepted:
@@ -248,7 +248,7 @@ def test_heights_that_do_not_converge_are_refused(monkeypatch, robust, residual,
 
 @pytest.mark.parametrize("camera", [{}, {"electrons": 40.0, "gain_deviation": 0.02, "offset_deviation": 0.5}])
 def test_registered_frames_of_the_twin_have_true_errors(camera):
-    made = Twin(
+    twin = Twin(
         object="sphere",
         shape=(90, 90),
         pixel_size=0.065,
@@ -258,16 +258,16 @@ def test_registered_frames_of_the_twin_have_true_errors(camera):
         camera=Camera(noise=1.0, seed=5, **camera),
     )
     noise = None if camera else float(np.hypot(1, 12**-0.5))
-    truth, found = made.truth, []
+    truth, results = twin.truth, []
     true = rotations.direction(truth.zenith, truth.azimuth)
     for heights in (truth.height, None):
-        made.rewind()
-        result = engine.reconstruct(made, heights=heights, noise=noise)
+        twin.rewind()
+        result = engine.reconstruct(twin, heights=heights, noise=noise)
         error, zenith = rotations.between(result.normals.astype(float), true), np.degrees(truth.zenith)
         # Next to the top and the rim, brightness has kinks.
         smooth = (result.contact > 0) & (truth.contact > 0) & (zenith > 8) & (zenith < 29)
         assert smooth.sum() > 2500
-        found.append(np.sqrt(np.mean(error[smooth] ** 2)))
+        results.append(np.sqrt(np.mean(error[smooth] ** 2)))
         if heights is not None:
             square = np.where(smooth, (error / result.normals_sigma) ** 2, np.nan)
             for low, high in ((8, 15), (15, 22), (22, 29)):
@@ -275,7 +275,7 @@ def test_registered_frames_of_the_twin_have_true_errors(camera):
                 assert mean == pytest.approx(1, abs=0.25 if camera else 0.15)
             if camera:
                 assert result.process["shot_noise"] == pytest.approx(1 / 40, rel=0.15)
-    assert found[0] < 0.8 * found[1]
+    assert results[0] < 0.8 * results[1]
 
 
 REFUSED = {
@@ -297,28 +297,28 @@ def test_what_cannot_be_used_is_refused_in_one_line(case):
     changes, options, message = REFUSED[case]
     part = changes.get("frames", slice(None))
     series = {"phase": PHASE[part]} if "phase" not in changes else {}
-    made = MadeUp(frames()[part], OF_A_SURFACE, **series)
+    recording = MadeUp(frames()[part], OF_A_SURFACE, **series)
     with pytest.raises(io.InputError, match=message) as caught:
-        engine.reconstruct(made, **options)
+        engine.reconstruct(recording, **options)
     assert "\n" not in str(caught.value)
 
 
 def test_operations_run_over_a_source_with_its_properties():
     result = engine.run(source(), engine.Normals)
-    known = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
-    alike(result, engine.estimate_normals(frames(), PHASE, **known))
+    options = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
+    alike(result, engine.estimate_normals(frames(), PHASE, **options))
     assert (result.process["operation"], result.process["tilt"]) == ("Normals", TILT)
     assert (result.process["zenith_gain"], result.process["turns"]) == (SETUP.slope, TURNS)
     wave = engine.run(source(), engine.Correlate(window_frames=8))
     np.testing.assert_array_equal(wave.cosine, engine.correlate(frames()[-8:], PHASE[-8:]).cosine)
     last = engine.run(source(), engine.Normals(window_frames=8, noise=20.0))
-    alike(last, engine.estimate_normals(frames()[-8:], PHASE[-8:], noise=20.0, **known))
+    alike(last, engine.estimate_normals(frames()[-8:], PHASE[-8:], noise=20.0, **options))
     with pytest.raises(io.InputError, match="tilt is missing"):
         engine.run(source(replace(HEADER, tilt=None)), engine.Normals)
     with pytest.raises(io.InputError, match="window have no weights"):
         engine.run(
             frames(),
-            engine.Normals(window_frames=8, **known),
+            engine.Normals(window_frames=8, **options),
             phase=PHASE,
             frame_weights=np.ones(len(PHASE)),
         )
@@ -326,8 +326,8 @@ def test_operations_run_over_a_source_with_its_properties():
 
 @pytest.mark.parametrize("kind", [engine.Normals, engine.Correlate])
 def test_a_stack_that_stays_valid_may_be_followed_by_other_frames(kind):
-    known = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
-    operation = kind(**known) if kind is engine.Normals else kind()
+    options = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
+    operation = kind(**options) if kind is engine.Normals else kind()
     blocks = [
         io.Block(frames()[part], part[0], phase=PHASE[part], stays_valid=True)
         for part in np.split(np.arange(len(PHASE)), [12, 17])
@@ -344,18 +344,18 @@ def test_a_stack_that_stays_valid_may_be_followed_by_other_frames(kind):
 
 
 def test_steps_may_follow_any_operation():
-    made = source(OF_A_SURFACE)
-    operation = engine.Normals(window_frames=24, noise=20.0).configured_for(made)
-    result = engine.Run(Plan(operation, [Edges(), Integration()]), made).complete()
+    recording = source(OF_A_SURFACE)
+    operation = engine.Normals(window_frames=24, noise=20.0).configured_for(recording)
+    result = engine.Run(Plan(operation, [Edges(), Integration()]), recording).complete()
     whole = reconstruct(OF_A_SURFACE, noise=20.0)
     assert np.median(np.abs(result.height - whole.height)) < 0.002
     assert (result.edges.shape, result.offset_unknown.tolist()) == (SHAPE, [1])
 
 
 def test_slopes_may_be_kept_instead_of_heights():
-    made = source(OF_A_SURFACE)
-    plan = engine.Rotation(noise=20.0).slope_plan(made)
-    result, slopes = take_slopes(engine.Run(plan, made).complete())
+    recording = source(OF_A_SURFACE)
+    plan = engine.Rotation(noise=20.0).slope_plan(recording)
+    result, slopes = take_slopes(engine.Run(plan, recording).complete())
     whole = reconstruct(OF_A_SURFACE, noise=20.0)
     assert set(whole) - set(result) == {"height", "height_sigma", "component", "offset_unknown"}
     pixel = OF_A_SURFACE.pixel_size
@@ -367,10 +367,10 @@ def test_slopes_may_be_kept_instead_of_heights():
 
 def test_heights_may_be_a_map_a_result_or_a_file(tmp_path):
     io.save_result(io.Result(height=FLAT), tmp_path / "flat.h5")
-    given = reconstruct(OF_A_SURFACE, heights=FLAT)
-    alike(reconstruct(OF_A_SURFACE, heights=io.Result(height=FLAT)), given)
-    alike(reconstruct(OF_A_SURFACE, heights={"height": FLAT}), given)
-    alike(reconstruct(OF_A_SURFACE, heights=tmp_path / "flat.h5"), given)
+    heights = reconstruct(OF_A_SURFACE, heights=FLAT)
+    alike(reconstruct(OF_A_SURFACE, heights=io.Result(height=FLAT)), heights)
+    alike(reconstruct(OF_A_SURFACE, heights={"height": FLAT}), heights)
+    alike(reconstruct(OF_A_SURFACE, heights=tmp_path / "flat.h5"), heights)
     relative = io.Result(
         height=FLAT, component=np.zeros(SHAPE, np.int32), offset_unknown=np.ones(1, np.uint8)
     )

@@ -13,7 +13,7 @@ SHARP = Setup(gain=5.0, noise=0.0, offset=10.0, dtype="float32")
 
 
 @pytest.mark.parametrize("phase", [EIGHTHS, UNEVEN])
-def test_a_level_is_what_the_matrices_of_a_leaning_body_say(phase):
+def test_a_level_is_that_of_the_matrices_of_a_leaning_body(phase):
     setup = replace(SHARP, phase=phase)
     normals = rotations.random_normals(20, seed=1)
     for level, angle in zip(rotations.levels(normals, setup), phase, strict=True):
@@ -28,13 +28,16 @@ def test_the_bound_is_that_of_differences():
     step = 1e-6
     right, up = rotations.tangents(normals)
     rows = [
-        (rotations.levels(normals + step * way, setup) - rotations.levels(normals - step * way, setup))
-        for way in (right, up)
+        (
+            rotations.levels(normals + step * direction, setup)
+            - rotations.levels(normals - step * direction, setup)
+        )
+        for direction in (right, up)
     ]
     rows = np.stack(rows, axis=-1) / (2 * step * setup.spread)
-    told = np.einsum("k...a,k...b->...ab", rows, rows)
-    np.testing.assert_allclose(rotations.information(normals, setup), told, rtol=1e-5, atol=1e-3)
-    expected = np.trace(np.linalg.inv(told), axis1=-2, axis2=-1)
+    information = np.einsum("k...a,k...b->...ab", rows, rows)
+    np.testing.assert_allclose(rotations.information(normals, setup), information, rtol=1e-5, atol=1e-3)
+    expected = np.trace(np.linalg.inv(information), axis1=-2, axis2=-1)
     np.testing.assert_allclose(rotations.bound(normals, setup), expected, rtol=1e-5)
 
 

@@ -42,12 +42,12 @@ def test_errors_are_at_the_bound_and_sigma_is_true(device, window):
     for seed, (right, down) in enumerate(shifts):
         reference = SPECKLE.frame(SHAPE, 0, 0, NOISE, 50 + seed)
         frames = SPECKLE.frame(SHAPE, right, down, NOISE, seed)[None]
-        found = find_displacement(
+        slip = find_displacement(
             reference, frames, PIXEL, window_size=window, window_step=1, noise=NOISE, device=device
         )
-        error = (found.displacement - in_mm(np.float64(right), np.float64(down)))[INSIDE]
+        error = (slip.displacement - in_mm(np.float64(right), np.float64(down)))[INSIDE]
         squares.append(error**2)
-        bound.append(found.displacement_sigma[INSIDE].astype(float) ** 2)
+        bound.append(slip.displacement_sigma[INSIDE].astype(float) ** 2)
     assert np.sqrt(np.mean(squares) / np.mean(bound)) == pytest.approx(1, abs=0.07)
     assert np.mean(np.array(squares) / np.array(bound)) == pytest.approx(1, abs=0.12)
 
@@ -64,27 +64,27 @@ def test_errors_on_a_sheet_s_own_texture_are_at_the_bound(kind, size):
              + random.normal(0, NOISE, SHAPE)).astype(np.float32)
             for x, y in ((0, 0), (right, down))
         )  # fmt: skip
-        found = find_displacement(reference, frame[None], PIXEL, window_step=1)
-        assert (found.status[INSIDE[:-1]] == 1).mean() > 0.99
-        squares.append((found.displacement - in_mm(np.float64(right), np.float64(down)))[INSIDE] ** 2)
-        bound.append((found.displacement_sigma[INSIDE] * NOISE / found.process["noise"]) ** 2)
+        slip = find_displacement(reference, frame[None], PIXEL, window_step=1)
+        assert (slip.status[INSIDE[:-1]] == 1).mean() > 0.99
+        squares.append((slip.displacement - in_mm(np.float64(right), np.float64(down)))[INSIDE] ** 2)
+        bound.append((slip.displacement_sigma[INSIDE] * NOISE / slip.process["noise"]) ** 2)
     assert np.sqrt(np.nanmean(squares) / np.nanmean(bound)) == pytest.approx(1, abs=0.1)
 
 
 def test_the_noise_is_estimated_from_what_the_fit_leaves():
-    found = find_displacement(REFERENCE, SPECKLE.frame(SHAPE, 0.4, 0.7, NOISE, 1)[None], PIXEL)
-    assert found.process["noise"] == pytest.approx(NOISE, rel=0.03)
+    slip = find_displacement(REFERENCE, SPECKLE.frame(SHAPE, 0.4, 0.7, NOISE, 1)[None], PIXEL)
+    assert slip.process["noise"] == pytest.approx(NOISE, rel=0.03)
 
 
 @pytest.mark.parametrize("angle", [0.05, 0.2])
 def test_a_turn_is_followed_frame_by_frame(angle):
     steps = [turned(angle * k / 5) for k in range(1, 6)]
     frames = np.stack([SPECKLE.frame(SHAPE, *step, NOISE, k) for k, step in enumerate(steps)])
-    found = find_displacement(REFERENCE, frames, PIXEL)
+    slip = find_displacement(REFERENCE, frames, PIXEL)
     part = np.s_[24:-24, 24:-24]
-    error = (found.displacement[-1] - grid(*steps[-1]))[part]
-    assert (found.status[-1][part] == 1).all()
-    assert np.mean((error / found.displacement_sigma[-1][part]) ** 2) == pytest.approx(1, abs=0.15)
+    error = (slip.displacement[-1] - grid(*steps[-1]))[part]
+    assert (slip.status[-1][part] == 1).all()
+    assert np.mean((error / slip.displacement_sigma[-1][part]) ** 2) == pytest.approx(1, abs=0.15)
 
 
 def test_sigma_counts_that_the_movement_bends_inside_windows():
@@ -92,21 +92,21 @@ def test_sigma_counts_that_the_movement_bends_inside_windows():
         return 0.003 * (x - 64) ** 2 + 0 * y
 
     frames = np.stack([SPECKLE.frame(SHAPE, right, 0, NOISE, k) for k in range(4)])
-    found = find_displacement(REFERENCE, frames, PIXEL, window_size=16)
+    slip = find_displacement(REFERENCE, frames, PIXEL, window_size=16)
     part = np.s_[:, 24:-24, 40:88, 0]
-    error = (found.displacement - grid(right, lambda x, y: 0 * x))[part]
-    assert np.mean((error / found.displacement_sigma[part]) ** 2) == pytest.approx(1, abs=0.4)
+    error = (slip.displacement - grid(right, lambda x, y: 0 * x))[part]
+    assert np.mean((error / slip.displacement_sigma[part]) ** 2) == pytest.approx(1, abs=0.4)
 
 
 @pytest.mark.parametrize("far", [6.0, 40.0])
 def test_a_long_displacement_in_one_step_is_found(far):
     frame = SPECKLE.frame(SHAPE, far, 0, NOISE, 1)[None]
-    found = find_displacement(REFERENCE, frame, PIXEL, window_size=16)
-    there = found.displacement[0, 16:-16, 16 : -16 - int(far), 0]
-    assert np.nanmedian(there) == pytest.approx(far * PIXEL[0], abs=1e-3)
-    assert np.mean(np.abs(there - far * PIXEL[0]) < 0.01) > 0.95
-    assert np.isnan(found.displacement[0, :, -int(far) :]).all()
-    assert (found.status[0, :, -int(far) :] == 0).all()
+    slip = find_displacement(REFERENCE, frame, PIXEL, window_size=16)
+    displaced = slip.displacement[0, 16:-16, 16 : -16 - int(far), 0]
+    assert np.nanmedian(displaced) == pytest.approx(far * PIXEL[0], abs=1e-3)
+    assert np.mean(np.abs(displaced - far * PIXEL[0]) < 0.01) > 0.95
+    assert np.isnan(slip.displacement[0, :, -int(far) :]).all()
+    assert (slip.status[0, :, -int(far) :] == 0).all()
 
 
 def test_another_gain_and_offset_of_brightness_change_nothing():
@@ -137,10 +137,10 @@ def test_where_the_sheet_is_clear_there_is_no_answer():
     half = np.s_[:, 64:]
     reference, frame = REFERENCE.copy(), SPECKLE.frame(SHAPE, 0.5, 0, NOISE, 3)
     reference[half], frame[half] = clear[0][half], clear[1][half]
-    found = find_displacement(reference, frame[None], PIXEL)
-    assert (found.status[0, :, 76:] == 3).mean() > 0.99
-    assert np.isnan(found.displacement[0, :, 76:]).mean() > 0.99
-    assert (found.status[0, 16:-16, 16:56] == 1).all()
+    slip = find_displacement(reference, frame[None], PIXEL)
+    assert (slip.status[0, :, 76:] == 3).mean() > 0.99
+    assert np.isnan(slip.displacement[0, :, 76:]).mean() > 0.99
+    assert (slip.status[0, 16:-16, 16:56] == 1).all()
 
 
 def test_a_clear_sheet_is_refused():
@@ -153,9 +153,9 @@ def test_a_clear_sheet_is_refused():
 
 def test_a_texture_that_is_not_found_again_has_no_answer():
     other = Speckle(7).frame(SHAPE, 0, 0, NOISE, 1)
-    found = find_displacement(REFERENCE, other[None], PIXEL, noise=NOISE)
-    assert np.isin(found.status, [0, 2]).mean() > 0.9
-    assert np.isnan(found.displacement).mean() > 0.9
+    slip = find_displacement(REFERENCE, other[None], PIXEL, noise=NOISE)
+    assert np.isin(slip.status, [0, 2]).mean() > 0.9
+    assert np.isnan(slip.displacement).mean() > 0.9
 
 
 @pytest.mark.parametrize(
@@ -172,18 +172,18 @@ def test_a_texture_that_is_not_found_again_has_no_answer():
     ],
 )
 def test_bad_input_is_one_line(change, message):
-    given = {"reference": REFERENCE, "frames": REFERENCE[None], "pixel_size": PIXEL} | change
+    arguments = {"reference": REFERENCE, "frames": REFERENCE[None], "pixel_size": PIXEL} | change
     with pytest.raises(InputError, match=message):
-        find_displacement(**given)
+        find_displacement(**arguments)
 
 
 def test_a_displacement_is_a_result_that_files_and_datasets_keep(tmp_path):
     frames = SPECKLE.frame(SHAPE, 0.4, 0.7, NOISE, 1)[None]
-    found = find_displacement(REFERENCE, frames, PIXEL)
-    io.save_result(found, tmp_path / "moved.h5")
-    for other in (io.open_result(tmp_path / "moved.h5"), io.Result.from_xarray(found.to_xarray())):
+    slip = find_displacement(REFERENCE, frames, PIXEL)
+    io.save_result(slip, tmp_path / "moved.h5")
+    for other in (io.open_result(tmp_path / "moved.h5"), io.Result.from_xarray(slip.to_xarray())):
         for name in ("displacement", "displacement_sigma", "status"):
-            np.testing.assert_array_equal(other[name], found[name], err_msg=name)
+            np.testing.assert_array_equal(other[name], slip[name], err_msg=name)
         assert other.declaration("status").codes[3] == "no texture"
         np.testing.assert_allclose(np.diff(other.x), PIXEL[0])
-    assert found.to_xarray().displacement_sigma.dims == ("frame", "y", "x", "direction")
+    assert slip.to_xarray().displacement_sigma.dims == ("frame", "y", "x", "direction")

@@ -31,13 +31,13 @@ def onset(x, y):
     return FULL * (1 - (radius(x, y) / CONTACT) ** 2)
 
 
-def departure(x, y, way):
+def departure(x, y, distance):
     """The slip of Cattaneo and Mindlin: a shift FULL (1 - r^2 / (2 a^2)) less that of what sticks."""
-    share = np.minimum(radius(x, y) / CONTACT, 1) ** 2
-    q = np.clip((1 - way / FULL) / np.maximum(share, 1e-9), 0, 1)  # of what sticks: (c / r)^2
+    fraction = np.minimum(radius(x, y) / CONTACT, 1) ** 2
+    q = np.clip((1 - distance / FULL) / np.maximum(fraction, 1e-9), 0, 1)  # of what sticks: (c / r)^2
     part = (1 - 2 / np.pi * np.arcsin(np.sqrt(q))) * (1 - 2 * q) + 2 / np.pi * np.sqrt(q * (1 - q))
-    slip = FULL * share / 2 * part
-    return way - (way - slip) * np.minimum(CONTACT / np.maximum(radius(x, y), 1e-9), 1) ** 2
+    slip = FULL * fraction / 2 * part
+    return distance - (distance - slip) * np.minimum(CONTACT / np.maximum(radius(x, y), 1e-9), 1) ** 2
 
 
 @cache
@@ -49,10 +49,10 @@ def slide(direction=(1.0, 0.0), count=20, drawn=0.0):
     right, up = direction
     frames = []
     for k in range(count):
-        way = k * STEP
+        distance = k * STEP
 
-        def lag(x, y, way=way):
-            moved = way - departure(x, y, way)
+        def lag(x, y, distance=distance):
+            moved = distance - departure(x, y, distance)
             return moved + drawn * np.sin(2 * np.pi * moved)
 
         frames.append(
@@ -83,48 +83,50 @@ def slid():
 
 
 def test_slip_and_stick_are_distinguished_within_a_pixel(slid):
-    found, way = slid
-    true = onset(COLUMN, ROW) * PIXEL < way
+    result, distance = slid
+    true = onset(COLUMN, ROW) * PIXEL < distance
     border = binary_dilation(true & INSIDE) & ~binary_erosion(true & INSIDE)
-    part = INSIDE & ~border & np.isin(found.status, [1, 2])
-    slipped = found.status == 1
+    part = INSIDE & ~border & np.isin(result.status, [1, 2])
+    slipped = result.status == 1
     assert part[INSIDE & ~border].mean() > 0.97
     assert (slipped & true & part).sum() >= 0.98 * (true & part).sum()
     assert (slipped & true & part).sum() >= 0.98 * (slipped & part).sum()
-    assert (found.status[~INSIDE] == 3).all()
+    assert (result.status[~INSIDE] == 3).all()
 
 
 def test_texture_that_seems_drawn_to_halves_of_a_pixel_does_not_pass_for_slip():
     frames, places = slide(count=18, drawn=0.06)
     run = engine.Run(search())
     run.push(frames, displacement=places)
-    found, true = run.result(), onset(COLUMN, ROW) * PIXEL
-    assert np.sqrt(np.nanmean((found.slip_onset - true)[INSIDE] ** 2)) < 0.3 * STEP * PIXEL
-    assert (found.status[INSIDE] == 1).sum() == pytest.approx((true[INSIDE] < places[-1, 0]).sum(), rel=0.02)
+    result, true = run.result(), onset(COLUMN, ROW) * PIXEL
+    assert np.sqrt(np.nanmean((result.slip_onset - true)[INSIDE] ** 2)) < 0.3 * STEP * PIXEL
+    assert (result.status[INSIDE] == 1).sum() == pytest.approx((true[INSIDE] < places[-1, 0]).sum(), rel=0.02)
 
 
 def test_the_moment_of_slip_is_known_within_a_frame_and_its_sigma_is_of_that_size(slid):
-    found, _ = slid
-    error = (found.slip_onset - onset(COLUMN, ROW) * PIXEL)[INSIDE]
+    result, _ = slid
+    error = (result.slip_onset - onset(COLUMN, ROW) * PIXEL)[INSIDE]
     assert np.sqrt(np.nanmean(error**2)) < 0.35 * STEP * PIXEL
     assert abs(np.nanmean(error)) < 0.15 * STEP * PIXEL
-    assert 0.2 < np.nanmean((error / found.slip_onset_sigma[INSIDE]) ** 2) < 1.5  # the exponent is right here
-    assert np.isnan(found.slip_onset[found.status == 2]).all()
+    assert (
+        0.2 < np.nanmean((error / result.slip_onset_sigma[INSIDE]) ** 2) < 1.5
+    )  # the exponent is right here
+    assert np.isnan(result.slip_onset[result.status == 2]).all()
 
 
 def test_the_stick_ratio_is_that_of_the_disc_that_sticks(slid):
-    found, _ = slid
+    result, _ = slid
     ways = np.arange(20) * STEP
     expected = np.sqrt(1 - ways / FULL)  # of the radii
-    np.testing.assert_allclose(np.sqrt(found.stick_ratio[3:]), expected[3:], rtol=0.01)
-    assert found.stick_ratio[0] == 1
+    np.testing.assert_allclose(np.sqrt(result.stick_ratio[3:]), expected[3:], rtol=0.01)
+    assert result.stick_ratio[0] == 1
 
 
 def test_the_displacement_is_that_of_the_skin(slid):
-    found, way = slid
-    lag = way / PIXEL - departure(COLUMN, ROW, way / PIXEL)
-    error = found.displacement - np.stack([-lag * PIXEL, 0 * lag], axis=-1)
-    sigma = found.displacement_sigma[..., None]
+    result, distance = slid
+    lag = distance / PIXEL - departure(COLUMN, ROW, distance / PIXEL)
+    error = result.displacement - np.stack([-lag * PIXEL, 0 * lag], axis=-1)
+    sigma = result.displacement_sigma[..., None]
     part = radius(COLUMN, ROW) < CONTACT / 2  # farther out the movement bends within a window
     assert np.nanmean((error / sigma)[part] ** 2) == pytest.approx(1, abs=0.25)
 
@@ -140,10 +142,10 @@ def test_contact_is_estimated_if_it_is_not_given(slid):
     frames, places = slide()
     run = engine.Run(search(contact=None))
     run.push(frames, displacement=places)
-    found = run.result()
-    assert found.contact[INSIDE].mean() > 0.97
-    assert found.contact.sum() < 1.1 * INSIDE.sum()
-    stuck = [np.count_nonzero(one.status == 2) for one in (found, slid[0])]
+    result = run.result()
+    assert result.contact[INSIDE].mean() > 0.97
+    assert result.contact.sum() < 1.1 * INSIDE.sum()
+    stuck = [np.count_nonzero(slip.status == 2) for slip in (result, slid[0])]
     assert stuck[0] == pytest.approx(stuck[1], rel=0.15)
 
 
@@ -151,19 +153,19 @@ def test_skin_that_sticks_does_so_to_the_end():
     frames = np.stack([SPECKLE.frame(SHAPE, -0.4 * k, 0, NOISE, k) for k in range(8)])
     run = engine.Run(search())
     run.push(frames, displacement=0.4 * PIXEL * np.arange(8)[:, None] * [1, 0])
-    found = run.result()
-    assert (found.status[INSIDE] == 1).mean() < 0.01
-    assert (found.stick_ratio > 0.99).all()
+    result = run.result()
+    assert (result.status[INSIDE] == 1).mean() < 0.01
+    assert (result.stick_ratio > 0.99).all()
 
 
 def test_a_body_that_turns_back_is_followed_until_then():
     frames, places = slide()
-    way = np.r_[np.arange(20), np.arange(18, 14, -1)]
+    positions = np.r_[np.arange(20), np.arange(18, 14, -1)]
     run = engine.Run(search())
-    run.push(frames[way], displacement=places[way])
-    found = run.result()
-    assert np.isfinite(found.stick_ratio[:20]).all()
-    assert np.isnan(found.stick_ratio[20:]).all()
+    run.push(frames[positions], displacement=places[positions])
+    result = run.result()
+    assert np.isfinite(result.stick_ratio[:20]).all()
+    assert np.isnan(result.stick_ratio[20:]).all()
 
 
 def test_centre_and_angle_of_a_twist_are_those_of_the_skin_that_sticks():
@@ -178,12 +180,12 @@ def test_centre_and_angle_of_a_twist_are_those_of_the_skin_that_sticks():
     centre = (about[0] * PIXEL, about[1] * PIXEL)
     run = engine.Run(search(motion="twist", centre=centre))
     run.push(frames, twist=steps)
-    found = run.result()
-    assert found.process["angle"] == pytest.approx(-0.12, abs=2e-4)
-    assert (found.process["centre_x"], found.process["centre_y"]) == pytest.approx((0, 0), abs=0.1 * PIXEL)
-    assert found.twist_angle.tolist() == pytest.approx(steps)
-    assert found.declaration("slip_onset").unit == found.declaration("slip_onset_sigma").unit == "rad"
-    assert (found.status[INSIDE] == 1).mean() < 0.01
+    result = run.result()
+    assert result.process["angle"] == pytest.approx(-0.12, abs=2e-4)
+    assert (result.process["centre_x"], result.process["centre_y"]) == pytest.approx((0, 0), abs=0.1 * PIXEL)
+    assert result.twist_angle.tolist() == pytest.approx(steps)
+    assert result.declaration("slip_onset").unit == result.declaration("slip_onset_sigma").unit == "rad"
+    assert (result.status[INSIDE] == 1).mean() < 0.01
 
 
 def test_a_clear_sheet_is_refused():
@@ -225,15 +227,15 @@ def test_bad_input_is_one_line():
 def test_a_source_is_reconstructed_as_the_operation_does(slid):
     frames, places = slide()
     source = MadeUp(frames, io.Header("horizontal", pixel_size=(PIXEL, PIXEL)), displacement=places)
-    found = engine.reconstruct(source, contact=INSIDE)
+    result = engine.reconstruct(source, contact=INSIDE)
     for name in ("displacement", "displacement_sigma", "slip_onset", "slip_onset_sigma", "status", "contact"):
-        np.testing.assert_array_equal(found[name], slid[0][name], err_msg=name)
-    np.testing.assert_array_equal(found.slide_distance, slid[0].slide_distance)
+        np.testing.assert_array_equal(result[name], slid[0][name], err_msg=name)
+    np.testing.assert_array_equal(result.slide_distance, slid[0].slide_distance)
     expected = {"motion": "horizontal", "frames": 20, "window_size": 8, "window_step": 4, "contact": "given"}
-    assert expected.items() <= found.process.items()
-    assert found.process["noise"] == slid[0].process["noise"]
-    assert found.x[0] == pytest.approx(-PIXEL * (SHAPE[1] - 1) / 2)
-    assert found.traction is None
+    assert expected.items() <= result.process.items()
+    assert result.process["noise"] == slid[0].process["noise"]
+    assert result.x[0] == pytest.approx(-PIXEL * (SHAPE[1] - 1) / 2)
+    assert result.traction is None
 
 
 @pytest.mark.parametrize("kind", ["result", "mapping", "dataset", "file", "pressure", "heights"])
@@ -255,29 +257,29 @@ def test_the_contact_comes_from_wherever_there_is_one(kind, slid, tmp_path):
     frames, places = slide()
     run = engine.Run(search(contact=contact))
     run.push(frames, displacement=places)
-    found = run.result()
-    np.testing.assert_array_equal(found.contact, INSIDE)
-    np.testing.assert_array_equal(found.slip_onset, slid[0].slip_onset)
-    assert found.process["contact"] == ("given, by light" if kind == "heights" else "given")
+    slipped = run.result()
+    np.testing.assert_array_equal(slipped.contact, INSIDE)
+    np.testing.assert_array_equal(slipped.slip_onset, slid[0].slip_onset)
+    assert slipped.process["contact"] == ("given, by light" if kind == "heights" else "given")
 
 
 def test_a_modulus_gives_traction_and_force(slid):
     frames, places = slide()
     source = MadeUp(frames, io.Header("horizontal", pixel_size=(PIXEL, PIXEL)), displacement=places)
-    found = engine.reconstruct(source, contact=INSIDE, modulus=0.1)
-    assert found.process["modulus"] == "0.1 MPa, given"
-    assert found.force_x < -3 * found.force_x_sigma
+    result = engine.reconstruct(source, contact=INSIDE, modulus=0.1)
+    assert result.process["modulus"] == "0.1 MPa, given"
+    assert result.force_x < -3 * result.force_x_sigma
     expected = engine.force.find_tangential_force(slid[0], PIXEL, 0.1, window_size=8)
-    np.testing.assert_array_equal(found.traction, expected.traction)
-    assert (found.force_x, found.force_y_sigma) == (expected.force_x, expected.force_y_sigma)
-    assert found.traction[..., 0].sum() * PIXEL**2 == pytest.approx(found.force_x, rel=0.1)
+    np.testing.assert_array_equal(result.traction, expected.traction)
+    assert (result.force_x, result.force_y_sigma) == (expected.force_x, expected.force_y_sigma)
+    assert result.traction[..., 0].sum() * PIXEL**2 == pytest.approx(result.force_x, rel=0.1)
 
 
 def test_free_skin_in_windows_at_the_rim_of_an_estimated_contact_does_not_look_like_early_slip():
     frames, places = slide(count=14)  # to 0.4 of the way at which all slides
     run = engine.Run(search(contact=None))
     run.push(frames, displacement=places)
-    found = run.result()
-    error = (found.slip_onset - onset(COLUMN, ROW) * PIXEL)[INSIDE]
+    result = run.result()
+    error = (result.slip_onset - onset(COLUMN, ROW) * PIXEL)[INSIDE]
     assert abs(np.nanmean(error)) < 0.3 * STEP * PIXEL  # 1.1 frames early with all windows
-    assert 0.2 < np.nanmean((error / found.slip_onset_sigma[INSIDE]) ** 2) < 1.5  # 12 with all windows
+    assert 0.2 < np.nanmean((error / result.slip_onset_sigma[INSIDE]) ** 2) < 1.5  # 12 with all windows

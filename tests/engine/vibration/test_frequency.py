@@ -37,13 +37,13 @@ def test_it_reaches_the_cramer_rao_bound_and_reports_it(case):
     if case == "few of many":
         amplitude[8:] = 0
     phase = random.uniform(0, 2 * np.pi, len(amplitude))
-    found = [estimate_frequency(waves(amplitude, phase, time, seed=seed), time) for seed in range(250)]
-    error = np.array([one.hertz for one in found]) - HERTZ
+    estimates = [estimate_frequency(waves(amplitude, phase, time, seed=seed), time) for seed in range(250)]
+    error = np.array([estimate.hertz for estimate in estimates]) - HERTZ
     assert np.sqrt(np.mean(error**2)) / bound(amplitude, time) == pytest.approx(1, abs=0.12)
-    assert np.mean([(e / one.sigma) ** 2 for e, one in zip(error, found, strict=True)]) == pytest.approx(
-        1, abs=0.22
-    )
-    assert abs(error.mean()) < 4 * bound(amplitude, time) / np.sqrt(len(found))
+    assert np.mean(
+        [(e / estimate.sigma) ** 2 for e, estimate in zip(error, estimates, strict=True)]
+    ) == pytest.approx(1, abs=0.22)
+    assert abs(error.mean()) < 4 * bound(amplitude, time) / np.sqrt(len(estimates))
 
 
 def stack(frames, time):
@@ -64,8 +64,8 @@ def test_a_lock_in_finds_the_waves_of_an_estimated_frequency(harmonic, device):
     expected = {1: phase, 2: np.full(12, 0.4)}[harmonic].reshape(3, 4)
     np.testing.assert_allclose(result.modulation, {1: 20.0, 2: 8.0}[harmonic], atol=1.2)
     np.testing.assert_allclose(result.azimuth, expected, atol=0.2)
-    given = Correlation(harmonic=harmonic, frequency=HERTZ, frame_rate=RATE).run(stack(frames, None))
-    np.testing.assert_allclose(given.modulation, result.modulation, rtol=1e-2)
+    fitted = Correlation(harmonic=harmonic, frequency=HERTZ, frame_rate=RATE).run(stack(frames, None))
+    np.testing.assert_allclose(fitted.modulation, result.modulation, rtol=1e-2)
 
 
 @pytest.mark.parametrize("harmonic", [1, 2, 3])
@@ -73,13 +73,13 @@ def test_a_lock_in_finds_the_waves_of_an_estimated_frequency(harmonic, device):
 def test_a_harmonic_is_the_fit_of_a_multiple_of_the_phase(harmonic, dtype, device):
     frames = np.random.default_rng(2).integers(0, 4096, (16, 5, 7)).astype(dtype)
     phase = np.arange(16) * np.pi / 8 + 0.1
-    found = engine.correlate(frames, phase, harmonic=harmonic, device=device)
+    correlation = engine.correlate(frames, phase, harmonic=harmonic, device=device)
     same = engine.correlate(frames, harmonic * phase, device=device)
     blocks = engine.Run(engine.Correlate(harmonic=harmonic, device=device))
     for part in np.split(np.arange(16), [5, 6]):
         blocks.push(frames[part], phase=phase[part])
     for name in ("mean", "cosine", "sine", "residual"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(same, name))
+        np.testing.assert_array_equal(getattr(correlation, name), getattr(same, name))
         np.testing.assert_allclose(getattr(blocks.result(), name), getattr(same, name), rtol=1e-5, atol=1e-3)
 
 

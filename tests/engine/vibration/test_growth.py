@@ -19,21 +19,21 @@ DITHER = DEPTH + SWING * np.cos(2 * np.pi / 7.3 * np.arange(110))
 SIZE, PIXEL = 96, 0.06
 
 
-def test_a_disc_grows_as_hertz_says():
+def test_a_disc_grows_as_in_hertz_theory():
     """A paraboloid's contact has the radius a = sqrt(R s): dA/ds = pi R, and da/ds = sqrt(R / s) / 2."""
     x, y = io.pixel_axes((SIZE, SIZE), (PIXEL, PIXEL))
     square = x**2 + y[:, np.newaxis] ** 2
     frames = np.where(square <= RADIUS * DITHER[:, np.newaxis, np.newaxis], 220, 20).astype(np.uint8)
-    found = engine.vibration.find_growth(frames, DITHER, dark=20, bright=220, pixel_size=(PIXEL, PIXEL))
-    assert (found.process["travel"], found.process["travel_amplitude"]) == pytest.approx(
+    growth = engine.vibration.find_growth(frames, DITHER, dark=20, bright=220, pixel_size=(PIXEL, PIXEL))
+    assert (growth.process["travel"], growth.process["travel_amplitude"]) == pytest.approx(
         (DEPTH, SWING), rel=1e-3
     )
-    assert found.process["area_growth"] == pytest.approx(np.pi * RADIUS, rel=0.02)
-    border = found.process["area_growth"] / (2 * np.pi * np.sqrt(RADIUS * DEPTH))
+    assert growth.process["area_growth"] == pytest.approx(np.pi * RADIUS, rel=0.02)
+    border = growth.process["area_growth"] / (2 * np.pi * np.sqrt(RADIUS * DEPTH))
     assert border == pytest.approx(np.sqrt(RADIUS / DEPTH) / 2, rel=0.02)
     ring = np.abs(np.sqrt(square) - np.sqrt(RADIUS * DEPTH)) < 0.5 * SWING
-    assert found.growth[ring].mean() > 2
-    assert np.abs(found.growth[square < 4]).max() < 1e-4
+    assert growth.growth[ring].mean() > 2
+    assert np.abs(growth.growth[square < 4]).max() < 1e-4
 
 
 @pytest.fixture(scope="module")
@@ -65,28 +65,28 @@ def test_the_light_of_the_elastic_twin_grows_as_the_surface_around_a_ball(elasti
     frames = elastic.read(np.empty(elastic.shape, elastic.dtype)).frames
     dark, bright = elastic.header.dark, elastic.header.bright
     options = {"dark": dark, "bright": bright, "pixel_size": (PIXEL, PIXEL)}
-    found = engine.vibration.find_growth(frames, DITHER, **options)
+    growth = engine.vibration.find_growth(frames, DITHER, **options)
     light = np.sum((frames.astype(float) - dark) / (bright - dark), axis=(1, 2)) * PIXEL**2
-    assert found.process["area_growth"] == pytest.approx(np.polyfit(DITHER - DEPTH, light, 2)[1], rel=0.01)
+    assert growth.process["area_growth"] == pytest.approx(np.polyfit(DITHER - DEPTH, light, 2)[1], rel=0.01)
     # Half the light is at the slope of the inner border, which lies on the ball itself.
     profile = (frames.mean(axis=0) - dark)[SIZE // 2, SIZE // 2 :] / (bright - dark)[0, 0]
     inner = PIXEL * (np.interp(0.5, profile[10:25], np.arange(10, 25)) + 0.5)
     slope = inner / np.sqrt(RADIUS**2 - inner**2)
     step = 0.01
     areas = [np.pi * light_border(DEPTH + sign * step, slope) ** 2 for sign in (-1, 1)]
-    assert found.process["area_growth"] == pytest.approx((areas[1] - areas[0]) / (2 * step), rel=0.03)
+    assert growth.process["area_growth"] == pytest.approx((areas[1] - areas[0]) / (2 * step), rel=0.03)
 
 
-def test_it_is_as_sure_as_it_says():
+def test_sigma_matches_the_scatter():
     random = np.random.default_rng(3)
     steep = random.uniform(0.2, 3, (60, 70))
     counts = 100 + 200 * steep * (DITHER - DEPTH)[:, np.newaxis, np.newaxis]
     frames = (counts + random.normal(0, 4, counts.shape)).astype(np.float32)
-    found = engine.vibration.find_growth(frames, DITHER, dark=0, bright=200, pixel_size=(0.1, 0.1))
-    error = found.growth - steep
-    assert np.mean((error / found.growth_sigma) ** 2) == pytest.approx(1, abs=0.06)
-    assert abs(found.process["area_growth"] - 0.01 * steep.sum()) < 4 * found.process["area_growth_sigma"]
-    assert abs(error.mean()) < 4 * found.growth_sigma.mean() / np.sqrt(error.size)
+    growth = engine.vibration.find_growth(frames, DITHER, dark=0, bright=200, pixel_size=(0.1, 0.1))
+    error = growth.growth - steep
+    assert np.mean((error / growth.growth_sigma) ** 2) == pytest.approx(1, abs=0.06)
+    assert abs(growth.process["area_growth"] - 0.01 * steep.sum()) < 4 * growth.process["area_growth_sigma"]
+    assert abs(error.mean()) < 4 * growth.growth_sigma.mean() / np.sqrt(error.size)
 
 
 def test_the_command_adds_it_to_the_correlation(elastic, tmp_path):
@@ -99,11 +99,11 @@ def test_the_command_adds_it_to_the_correlation(elastic, tmp_path):
     elastic.rewind()
     frames = elastic.read(np.empty(elastic.shape, elastic.dtype)).frames
     header = elastic.header
-    found = engine.vibration.find_growth(
+    growth = engine.vibration.find_growth(
         frames, DITHER, dark=header.dark, bright=header.bright, pixel_size=(PIXEL, PIXEL)
     )
-    np.testing.assert_allclose(result.growth, found.growth, atol=1e-3)
-    assert result.process["area_growth"] == pytest.approx(found.process["area_growth"], rel=1e-4)
+    np.testing.assert_allclose(result.growth, growth.growth, atol=1e-3)
+    assert result.process["area_growth"] == pytest.approx(growth.process["area_growth"], rel=1e-4)
     refused = run("correlate", tmp_path / "d.h5", "--dither", "--phase-step", "45deg")
     assert refused.code == 2
     assert "--dither takes the phases from the travel" in refused.said
@@ -127,19 +127,21 @@ def test_a_travel_that_is_not_a_dither_is_one_line(travel, line):
 def test_the_frames_are_read_once_if_the_travel_is_known_and_twice_otherwise(elastic):
     elastic.rewind()
     frames = elastic.read(np.empty(elastic.shape, elastic.dtype)).frames.copy()
-    known = {"dark": elastic.header.dark, "bright": elastic.header.bright, "pixel_size": (PIXEL, PIXEL)}
-    found = engine.vibration.find_growth(frames, DITHER, **known)
-    source = ArrayRecording(frames, {"travel": DITHER}, {"dark": known["dark"], "bright": known["bright"]})
+    options = {"dark": elastic.header.dark, "bright": elastic.header.bright, "pixel_size": (PIXEL, PIXEL)}
+    growth = engine.vibration.find_growth(frames, DITHER, **options)
+    source = ArrayRecording(
+        frames, {"travel": DITHER}, {"dark": options["dark"], "bright": options["bright"]}
+    )
     operation = engine.vibration.Growth().configured_for(source)
-    assert (operation.passes, engine.vibration.Growth(**known).passes) == (1, 2)
+    assert (operation.passes, engine.vibration.Growth(**options).passes) == (1, 2)
     once = engine.run(source, engine.vibration.Growth(pixel_size=(PIXEL, PIXEL)))
-    blocks = bare(engine.vibration.Growth(**known), frames, [3, 50], travel=DITHER)
+    blocks = bare(engine.vibration.Growth(**options), frames, [3, 50], travel=DITHER)
     for other in (once, blocks):
         for name in ("growth", "growth_sigma", "azimuth", "residual"):
-            np.testing.assert_array_equal(other[name], found[name])
-        assert other.process["area_growth"] == found.process["area_growth"]
+            np.testing.assert_array_equal(other[name], growth[name])
+        assert other.process["area_growth"] == growth.process["area_growth"]
     with pytest.raises(io.InputError, match="needs all frames twice"):
-        engine.Run(engine.vibration.Growth(**known)).push(frames, travel=DITHER)
+        engine.Run(engine.vibration.Growth(**options)).push(frames, travel=DITHER)
 
 
 def test_a_recording_of_a_dither_has_growth_and_correlation(elastic, tmp_path):
@@ -151,12 +153,12 @@ def test_a_recording_of_a_dither_has_growth_and_correlation(elastic, tmp_path):
         alone = engine.run(recording, engine.vibration.Growth)
         with pytest.raises(io.InputError, match="takes the phase from the travel: leave harmonic out"):
             Correlation(dither=True, harmonic=2).run(recording)
-    said = {
+    message = {
         "method": "correlation",
         "zenith": "none: the recording has no zenith gain",
         "frames": len(DITHER),
     }
-    assert {name: result.process[name] for name in said} == said
+    assert {name: result.process[name] for name in message} == message
     assert result.process["area_growth"] == alone.process["area_growth"]
     assert set(result) == {
         *("growth", "growth_sigma", "azimuth", "mean", "cosine", "sine", "modulation", "residual"),

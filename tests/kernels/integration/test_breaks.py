@@ -17,23 +17,23 @@ def picture(shape):
     links = [np.where(flags & bit, rng.uniform(0.1, 2, shape), 0) for bit in (RIGHT, DOWN)]
     slopes = [rng.normal(0, 0.5, shape) for _ in range(2)]
     maps = [*links, *slopes, rng.uniform(0.05, 1, shape), rng.normal(0, 0.5, shape)]
-    return flags, *(one.astype(np.float32) for one in maps)
+    return flags, *(layer.astype(np.float32) for layer in maps)
 
 
 def test_the_slope_of_a_link_is_without_error_on_a_paraboloid():
     y, x = np.indices((9, 9)) - 4.0
-    z, one = 0.1 * x * x - 0.2 * y * y + 0.05 * x * y, np.ones((9, 9))
+    z, ones = 0.1 * x * x - 0.2 * y * y + 0.05 * x * y, np.ones((9, 9))
     slopes = 0.2 * x + 0.05 * y, 0.05 * x - 0.4 * y
-    *_, rise_x, rise_y = breaks.breaks_trust(one, one, *slopes, one, 0 * one, 1, 0, 0, 0)
+    *_, rise_x, rise_y = breaks.breaks_trust(ones, ones, *slopes, ones, 0 * ones, 1, 0, 0, 0)
     np.testing.assert_allclose(rise_x[:, :-1], np.diff(z, axis=1), atol=1e-12)
     np.testing.assert_allclose(rise_y[:-1], np.diff(z, axis=0), atol=1e-12)
 
 
 def test_solving_its_links_lowers_the_sum():
     _, right, down, slope_x, slope_y, facing, heights = picture((6, 7))
-    one = np.ones(right.shape)
-    known = right, down, slope_x, slope_y, facing, 0 * one
-    trust = breaks.breaks_trust(*known, 0.01, 0.5, 2.0, 1e-5)
+    ones = np.ones(right.shape)
+    links = right, down, slope_x, slope_y, facing, 0 * ones
+    trust = breaks.breaks_trust(*links, 0.01, 0.5, 2.0, 1e-5)
 
     def cost(u):
         total, sizes = 0.0, zip(trust[:2], trust[2:], (1, 0), SIZE, (slope_x, slope_y), strict=True)
@@ -50,8 +50,8 @@ def test_solving_its_links_lowers_the_sum():
         return total
 
     for _ in range(3):
-        known = *trust, slope_x, slope_y, 0 * one, heights
-        x, y, source, _ = breaks.breaks_links(*known, *SIZE, 0.25, 4.0, 1e30)
+        maps = *trust, slope_x, slope_y, 0 * ones, heights
+        x, y, source, _ = breaks.breaks_links(*maps, *SIZE, 0.25, 4.0, 1e30)
         number = np.arange(heights.size).reshape(heights.shape)
         matrix = np.zeros((heights.size, heights.size))
         for weight, axis in ((x, 1), (y, 0)):

@@ -32,7 +32,7 @@ class Scene:
         dz_dx, dz_dy = random.normal(0, 1, (2, *shape)).astype(np.float32)
         dz_dx[random.random(shape) < 0.05] = np.nan
         dz_dy[random.random(shape) < 0.03] = np.inf
-        known = np.where(random.random(shape) < 0.5, random.normal(-300, 1, shape), np.nan)
+        heights = np.where(random.random(shape) < 0.5, random.normal(-300, 1, shape), np.nan)
         some = random.random((3, *shape)) * (random.random((3, *shape)) > 0.1)
         return check_inputs(
             dz_dx,
@@ -41,7 +41,7 @@ class Scene:
             mask=random.random(shape) > 0.1 if self.mask else None,
             slope_weights=[None, some[0], some[:2]][self.weights],
             edges=random.random(shape) < 0.1 if self.edges else None,
-            known_heights=known if self.heights else None,
+            known_heights=heights if self.heights else None,
             known_height_weights=some[2] if self.heights == 2 else None,
         )
 
@@ -57,7 +57,7 @@ SCENES = {
 scenes = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 
 
-def told(inputs):
+def flags_of(inputs):
     """The flags, by the reference."""
     maps = inputs.dz_dx, inputs.dz_dy
     rest = inputs.weight_x, inputs.weight_y, inputs.known_heights, inputs.known_height_weights
@@ -72,9 +72,9 @@ def arguments(inputs, flags, scale):
     return inputs.dz_dx, inputs.dz_dy, flags, *rest, weights, SIZE, PLANE
 
 
-def put(room, values):
+def put(graph, values):
     """An array on the room's device."""
-    array = room.device.array("test", values.shape, np.float32)
+    array = graph.device.array("test", values.shape, np.float32)
     array.write(values)
     return array
 
@@ -86,46 +86,46 @@ def near(device_map, exact):
 @pytest.mark.parametrize("shape", SHAPES)
 @scenes
 def test_kernels_and_reference_build_the_same_graph(device, shape, scene):
-    inputs, room = scene.inputs(shape), PixelGraph(device, shape)
-    flags = told(inputs)
-    np.testing.assert_array_equal(room.upload(inputs), flags)
-    right, down, anchor, source = links.links_join(*arguments(inputs, flags, room.scale))
-    found = room.links(PLANE)
-    near(found.right.read(), right)
-    near(found.down.read(), down)
-    near(found.source.read(), source)
-    assert (found.anchor is None) == (inputs.known_heights is None)
-    if found.anchor is not None:
-        near(found.anchor.read(), anchor)
-    found = put(room, np.zeros((3, *shape)))
-    room.put_source(PLANE, found, 1)
-    near(found.read(), np.stack([0 * source, source, 0 * source]))
+    inputs, graph = scene.inputs(shape), PixelGraph(device, shape)
+    flags = flags_of(inputs)
+    np.testing.assert_array_equal(graph.upload(inputs), flags)
+    right, down, anchor, source = links.links_join(*arguments(inputs, flags, graph.scale))
+    pixel_links = graph.links(PLANE)
+    near(pixel_links.right.read(), right)
+    near(pixel_links.down.read(), down)
+    near(pixel_links.source.read(), source)
+    assert (pixel_links.anchor is None) == (inputs.known_heights is None)
+    if pixel_links.anchor is not None:
+        near(pixel_links.anchor.read(), anchor)
+    pixel_links = put(graph, np.zeros((3, *shape)))
+    graph.put_source(PLANE, pixel_links, 1)
+    near(pixel_links.read(), np.stack([0 * source, source, 0 * source]))
 
 
 @scenes
 def test_kernels_and_reference_find_the_same_misfit(device, scene):
-    inputs, room = scene.inputs((23, 37)), PixelGraph(device, (23, 37))
-    flags = room.upload(inputs).copy()
-    relief = np.random.default_rng(1).normal(0, 1, room.shape).astype(np.float32)
-    exact = links.links_misfit(*arguments(inputs, flags, room.scale), relief)
+    inputs, graph = scene.inputs((23, 37)), PixelGraph(device, (23, 37))
+    flags = graph.upload(inputs).copy()
+    relief = np.random.default_rng(1).normal(0, 1, graph.shape).astype(np.float32)
+    exact = links.links_misfit(*arguments(inputs, flags, graph.scale), relief)
     assert exact > 1
-    assert room.misfit(put(room, relief), PLANE) * room.scale == pytest.approx(exact, rel=1e-5)
+    assert graph.misfit(put(graph, relief), PLANE) * graph.scale == pytest.approx(exact, rel=1e-5)
 
 
 def test_links_may_have_weights_of_their_own(device):
-    inputs, room = SCENES["heights"].inputs((23, 37)), PixelGraph(device, (23, 37))
-    flags = room.upload(inputs).copy()
-    joined = room.links(PLANE)
-    own = [np.random.default_rng(n).random(room.shape).astype(np.float32) for n in (1, 2)]
-    for array, values in zip((joined.right, joined.down), own, strict=True):
+    inputs, graph = SCENES["heights"].inputs((23, 37)), PixelGraph(device, (23, 37))
+    flags = graph.upload(inputs).copy()
+    joined = graph.links(PLANE)
+    slope_weights = [np.random.default_rng(n).random(graph.shape).astype(np.float32) for n in (1, 2)]
+    for array, values in zip((joined.right, joined.down), slope_weights, strict=True):
         array.write(values)
-    maps = (*own, inputs.known_heights, inputs.known_height_weights)
-    numbers = (1.0, 1.0, room.scale), SIZE, PLANE
-    given = inputs.dz_dx, inputs.dz_dy, flags, *maps, *numbers
-    relief = np.random.default_rng(3).normal(0, 1, room.shape).astype(np.float32)
-    exact = links.links_misfit(*given, relief, owned=True)
-    several = put(room, np.stack([0 * relief, relief]))
-    assert room.misfit(several, PLANE, joined, 1) * room.scale == pytest.approx(exact, rel=1e-5)
+    maps = (*slope_weights, inputs.known_heights, inputs.known_height_weights)
+    numbers = (1.0, 1.0, graph.scale), SIZE, PLANE
+    inputs_of_links = inputs.dz_dx, inputs.dz_dy, flags, *maps, *numbers
+    relief = np.random.default_rng(3).normal(0, 1, graph.shape).astype(np.float32)
+    exact = links.links_misfit(*inputs_of_links, relief, owned=True)
+    several = put(graph, np.stack([0 * relief, relief]))
+    assert graph.misfit(several, PLANE, joined, 1) * graph.scale == pytest.approx(exact, rel=1e-5)
 
 
 def grid(shape):
@@ -138,12 +138,12 @@ def test_a_cubic_surface_leaves_no_misfit_where_four_are_in_line():
     dz_dx, dz_dy = (1 + x - 6 * x**2, 2 - y + 3 * y**2)
     inputs = check_inputs(dz_dx.astype(np.float32), dz_dy.astype(np.float32), SIZE)
     height = x + x**2 / 2 - 2 * x**3 + 2 * y - y**2 / 2 + y**3
-    flags = told(inputs)
+    flags = flags_of(inputs)
     inner = flags.copy()
     inner[:, [0, -2]] &= ~np.uint8(RIGHT)
     inner[[0, -2]] &= ~np.uint8(DOWN)
-    given = arguments(inputs, flags, 1.0)
-    steps = links._steps(*given[:5], *given[7:], owned=False)
+    maps = arguments(inputs, flags, 1.0)
+    steps = links._steps(*maps[:5], *maps[7:], owned=False)
     for (_, step), bit, axis in zip(steps, (RIGHT, DOWN), (1, 0), strict=True):
         real = np.roll(height, -1, axis) - height
         level = (PLANE[0] * SIZE[0], -PLANE[1] * SIZE[1])[1 - axis]
@@ -154,12 +154,12 @@ def test_a_cubic_surface_leaves_no_misfit_where_four_are_in_line():
 
 
 def test_a_pixel_is_described_by_its_maps():
-    nan, one = np.nan, 1.0
-    dz = np.array([[one, nan, one, one, nan]], np.float32)
+    nan, unit = np.nan, 1.0
+    dz = np.array([[unit, nan, unit, unit, nan]], np.float32)
     inputs = check_inputs(
         dz, np.ones_like(dz), SIZE, slope_weights=[[1, 1, 0, 1, 0]], known_heights=[[nan, 2, nan, 3, nan]]
     )
-    assert told(inputs).tolist() == [[SLOPE, LOST | KNOWN, 0, SLOPE | KNOWN, 0]]
+    assert flags_of(inputs).tolist() == [[SLOPE, LOST | KNOWN, 0, SLOPE | KNOWN, 0]]
 
 
 def test_a_pixel_on_an_edge_keeps_its_link_to_the_neighbour_most_like_it():
@@ -167,6 +167,6 @@ def test_a_pixel_on_an_edge_keeps_its_link_to_the_neighbour_most_like_it():
     dz_dx[:, 2:], dz_dx[1, 1] = 1.0, 0.9
     marked = np.zeros((3, 4), bool)
     marked[:, 1] = True
-    flags = told(check_inputs(dz_dx, np.zeros_like(dz_dx), SIZE, edges=marked))
+    flags = flags_of(check_inputs(dz_dx, np.zeros_like(dz_dx), SIZE, edges=marked))
     assert (flags & RIGHT).tolist() == [[1, 0, 1, 0], [0, 1, 1, 0], [1, 0, 1, 0]]
     assert (flags[:-1] & DOWN > 0).tolist() == [[1, 0, 1, 1], [1, 0, 1, 1]]

@@ -34,8 +34,8 @@ class Case:
         anchor = self.map(graph.anchor) if anchored else None
         self.h.build(Links(device, SHAPE, right, down, anchor, right), plain=plain)
         Cycle(self.h).prepare()
-        given = [None if one is None else one.read() for one in (right, down, anchor)]
-        self.levels = twin.build(*given, None if plain else STRENGTH)
+        host_maps = [None if values is None else values.read() for values in (right, down, anchor)]
+        self.levels = twin.build(*host_maps, None if plain else STRENGTH)
 
     def map(self, values, dtype=np.float32):
         array = self.device.array("map", values.shape, dtype)
@@ -68,14 +68,14 @@ class Case:
         return array.read().reshape(parts, count).sum(axis=1, dtype=np.float64)
 
 
-def close(found, expected, within=1e-5):
-    np.testing.assert_allclose(found, expected, rtol=within, atol=within * np.abs(expected).max())
+def close(actual, expected, within=1e-5):
+    np.testing.assert_allclose(actual, expected, rtol=within, atol=within * np.abs(expected).max())
 
 
 @pytest.fixture(scope="module")
 def cases(device):
-    made: dict[Any, Case] = {}
-    return lambda kind, anchored: made.setdefault((kind, anchored), Case(device, kind, anchored))
+    opened: dict[Any, Case] = {}
+    return lambda kind, anchored: opened.setdefault((kind, anchored), Case(device, kind, anchored))
 
 
 @pytest.mark.parametrize(("kind", "anchored"), [*GRAPHS, ("isolated", False)])
@@ -94,8 +94,8 @@ def test_levels_are_those_of_the_reference(device, kind, anchored):
             assert moves == len(changed(level))
             if moves:
                 coarse = case.h.levels[number + 1]
-                found = case.h.changed.read()[coarse.base : coarse.base + moves] - coarse.first
-                assert sorted(np.transpose(np.divmod(found, coarse.stride)).tolist()) == changed(level)
+                changes = case.h.changed.read()[coarse.base : coarse.base + moves] - coarse.first
+                assert sorted(np.transpose(np.divmod(changes, coarse.stride)).tolist()) == changed(level)
         assert plain == (not case.h.moves.any()) or kind == "rectangle"
 
 
@@ -111,14 +111,14 @@ def changed(level):
 def test_a_cycle_answers_as_the_reference_wherever_one_group_takes_over(cases, kind, anchored, monkeypatch):
     case = cases(kind, anchored)
     b = case.graph.centred(case.rng.normal(size=SHAPE)).astype(np.float32)
-    given = case.h.array("right side")
-    case.h.copy_picture("admit", given, case.map(b))
+    on_device = case.h.array("right side")
+    case.h.copy_picture("admit", on_device, case.map(b))
     near, usual, last = near_nodes(case.device, 1), case.h.first_of_tail(1), len(case.levels) - 1
     for first in (usual if near else 1, 3, last):
         monkeypatch.setattr(Hierarchy, "first_of_tail", lambda self, lanes, first=first: first)
         cycle = Cycle(case.h)
         cycle.prepare()
-        cycle.b = given
+        cycle.b = on_device
         product = cycle.run()
         order = {"twice_from": first, "large": twin.LARGE_STEPS} if near else {}
         expected = twin.cycle(case.levels, b.astype(np.float64), **order)
@@ -131,10 +131,10 @@ def test_a_cycle_answers_as_the_reference_wherever_one_group_takes_over(cases, k
 def test_the_coarsest_level_is_inverted(cases, kind, anchored):
     case = cases(kind, anchored)
     level, grid = case.levels[-1], case.h.levels[-1]
-    found = case.h.matrix.read().reshape(2 * (grid.rows, grid.stride))
-    inside = found[:, : grid.columns, :, : grid.columns].reshape(2 * (level.to.size,))
+    inverse = case.h.matrix.read().reshape(2 * (grid.rows, grid.stride))
+    inside = inverse[:, : grid.columns, :, : grid.columns].reshape(2 * (level.to.size,))
     close(inside, twin.inverse_matrix(level))
-    assert np.count_nonzero(found) == np.count_nonzero(inside)
+    assert np.count_nonzero(inverse) == np.count_nonzero(inside)
     matrix = np.diag(level.diagonal.ravel())
     for n, unit in enumerate(np.eye(level.to.size)):
         matrix[n] -= twin.around(level, unit.reshape(level.to.shape)).ravel()
@@ -145,10 +145,10 @@ def test_the_coarsest_level_is_inverted(cases, kind, anchored):
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_residual_is_that_of_the_reference(cases, graph, number):
     case = cases(*graph)
-    (b, b_given), (x, x_given), found = case.random(number), case.random(number), case.h.array("found")
-    arrays = {"b": b_given, "x": x_given, "residual": found}
+    (b, b_given), (x, x_given), residual = case.random(number), case.random(number), case.h.array("found")
+    arrays = {"b": b_given, "x": x_given, "residual": residual}
     case.h.over("residual", case.h.levels[number], **case.h.graph, **arrays)
-    close(case.get(found, number), twin.residual(case.levels[number], b, x))
+    close(case.get(residual, number), twin.residual(case.levels[number], b, x))
 
 
 @pytest.mark.parametrize("graph", [STRAIGHT, CROSSED], ids=str)
@@ -160,21 +160,25 @@ def test_steps_of_conjugate_gradients_and_sums(cases, graph):
     if case.h.anchored:
         weighed = case.sums("weigh", anchor=case.h.graph["anchor"], x=x_given)
         assert weighed == pytest.approx((level.anchor * x**2).sum(), rel=1e-5)
-    direction, known = case.h.array("direction"), {**case.h.graph, "inverse": case.h.inverse}
-    given, history = case.device.from_host, case.device.array("history", (3, 3, 1), np.float32)
+    direction, buffers = case.h.array("direction"), {**case.h.graph, "inverse": case.h.inverse}
+    from_host, history = case.device.from_host, case.device.array("history", (3, 3, 1), np.float32)
     history.write(np.array([[[10], [0.2], [1]]]))
-    known |= {"cycle": 1, "history": history}
-    sums = {"products": 2, "product": given("product", [3, 4]), "squares": given("squares", np.ones(99))}
+    buffers |= {"cycle": 1, "history": history}
+    sums = {
+        "products": 2,
+        "product": from_host("product", [3, 4]),
+        "squares": from_host("squares", np.ones(99)),
+    }
     arrays = {"z": z_given, "before": before_given, "direction": direction, "x": x_given}
-    curvature = case.sums("direct", step=2, count=99, **known, **sums, **arrays)
+    curvature = case.sums("direct", step=2, count=99, **buffers, **sums, **arrays)
     p, x = z + 0.7 * before, x + 0.2 * before
     image = -twin.residual(level, zero, p)
     close(case.get(direction), p)
     close(case.get(x_given), x)
     assert curvature == pytest.approx((p * image).sum(), rel=1e-5)
-    products = {"count": 3, "products": given("products", [5, 10, 5])}
-    moving = given("moving", [1])
-    square = case.sums("advance", moving=moving, **known, **products, direction=direction, b=b_given)
+    products = {"count": 3, "products": from_host("products", [5, 10, 5])}
+    moving = from_host("moving", [1])
+    square = case.sums("advance", moving=moving, **buffers, **products, direction=direction, b=b_given)
     b -= 7 / 20 * image
     close(case.get(b_given), b)
     assert square == pytest.approx((case.get(b_given).astype(float) ** 2).sum(), rel=1e-5)
@@ -199,12 +203,12 @@ def test_an_impossible_step_is_not_done(cases, product, curvature, moving):
     endless.fill(np.inf)
     history = case.device.array("history", (2, 3, 1), np.float32)
     history.write(np.array([[[product], [9], [1]]]))
-    known = {**case.h.graph, "inverse": case.h.inverse, "cycle": 0, "history": history}
-    given = {
+    buffers = {**case.h.graph, "inverse": case.h.inverse, "cycle": 0, "history": history}
+    numbers = {
         name: case.device.from_host(name, [value])
         for name, value in (("products", curvature), ("moving", moving))
     }
-    case.sums("advance", count=1, **known, **given, direction=endless, b=b_given)
+    case.sums("advance", count=1, **buffers, **numbers, direction=endless, b=b_given)
     assert history.read()[0, 1, 0] == 0
     np.testing.assert_array_equal(case.get(b_given), b)
     case.h.over("take", case.h.levels[0], cycle=0, step=2, history=history, direction=endless, x=x_given)
@@ -220,17 +224,19 @@ def test_the_best_step_in_a_plane(cases, graph, same):
     if same:
         p, p_given = z, case.h.array("same")
         p_given.write(z_given.read())
-    z_image, p_image = (-twin.residual(level, zero, one) for one in (z, p))
-    expected = [(one * other).sum() for one, other in ((z, z_image), (z, p_image), (p, p_image), (b, p))]
+    z_image, p_image = (-twin.residual(level, zero, vector) for vector in (z, p))
+    expected = [
+        (vector * other).sum() for vector, other in ((z, z_image), (z, p_image), (p, p_image), (b, p))
+    ]
     products = case.sums("curve", 4, **case.h.graph, b=b_given, z=z_given, p=p_given)
     np.testing.assert_allclose(products, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
     halves = np.array([0.25, 0.75]) * (b * z).sum()
     parts = np.repeat(expected, 2) * np.tile([0.5, 0.5], 4)
-    given = {
+    arguments = {
         name: case.device.from_host(name, values) for name, values in (("product", halves), ("parts", parts))
     }
     lengths = case.h.array("lengths", 2)
-    case.h.alone("best", case.h.levels[-1], products=2, count=2, **given, lengths=lengths)
+    case.h.alone("best", case.h.levels[-1], products=2, count=2, **arguments, lengths=lengths)
     case.h.over("follow", case.h.levels[0], lengths=lengths, z=z_given, p=p_given, x=x_given)
     along, again = twin.best_step((b * z).sum(), *expected)
     close(lengths.read(), [along, again], 1e-4)
@@ -244,36 +250,36 @@ def test_the_best_step_in_a_plane(cases, graph, same):
 def test_what_a_level_adds_to_variances(cases, graph, number):
     case = cases(*graph)
     h, fine, level = case.h, case.h.levels[number], case.levels[number]
-    coarse, given = case.random(number + 1)
-    evened, returns, brought, found = (h.array(name) for name in "abcd")
+    coarse, rising = case.random(number + 1)
+    evened, returns, brought, variance = (h.array(name) for name in "abcd")
     links, c = {name: h.graph[name] for name in ("right", "down")}, local_part(number == 0)
     walk = {"evened": evened, "returns": returns, "t": brought}
     above = {**place_of_coarse(h.levels[number + 1]), "moved_nodes": h.moves[number], "to": h.to}
     h.over("even", fine, **h.graph, evened=evened)
-    h.over("returns", fine, **links, **above, **walk, e=given)
-    numbers = {f"c{k}": one for k, one in enumerate(c)}
-    h.over("spread", fine, **h.graph, inverse=h.inverse, **walk, **numbers, x=found)
+    h.over("returns", fine, **links, **above, **walk, e=rising)
+    numbers = {f"c{k}": value for k, value in enumerate(c)}
+    h.over("spread", fine, **h.graph, inverse=h.inverse, **walk, **numbers, x=variance)
     d, r = twin.walk(level)
     close(case.get(evened, number), d)
     close(case.get(returns, number), r)
     close(case.get(brought, number), twin.injected(level, coarse))
-    close(case.get(found, number), twin.spread(level, coarse, twin.local_part(level, c)))
+    close(case.get(variance, number), twin.spread(level, coarse, twin.local_part(level, c)))
 
 
 def test_pictures_come_to_the_finest_level_and_back(cases):
     case = cases(*CROSSED)
     picture = case.rng.normal(size=SHAPE).astype(np.float32)
-    level, back, found = case.h.array("level"), case.map(0 * picture), case.map(0 * picture)
+    level, back, returned = case.h.array("level"), case.map(0 * picture), case.map(0 * picture)
     case.h.copy_picture("admit", level, case.map(picture))
     np.testing.assert_array_equal(case.get(level), picture)
     case.h.copy_picture("release", level, back)
     np.testing.assert_array_equal(back.read(), picture)
     flags = case.rng.choice([1, 4, 6, 8], SHAPE)
-    known = {"least": 0.12, "wanted": 12, "flags": case.map(flags, np.uint8), "inverse": case.h.inverse}
-    case.h.copy_picture("deviation", level, found, **known)
-    least = 0.12 * twin.inverse_of(case.levels[0].diagonal)
-    expected = np.where(flags & 12, np.sqrt(np.maximum(picture, least)), np.nan)
-    np.testing.assert_allclose(found.read(), expected, rtol=1e-5)
+    arguments = {"least": 0.12, "wanted": 12, "flags": case.map(flags, np.uint8), "inverse": case.h.inverse}
+    case.h.copy_picture("deviation", level, returned, **arguments)
+    lowest = 0.12 * twin.inverse_of(case.levels[0].diagonal)
+    expected = np.where(flags & 12, np.sqrt(np.maximum(picture, lowest)), np.nan)
+    np.testing.assert_allclose(returned.read(), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("kind", "anchored"), [*GRAPHS, ("isolated", False), ("isolated", True)])

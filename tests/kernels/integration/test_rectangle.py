@@ -63,8 +63,8 @@ def test_the_reference_solves_the_equations(shape, screening):
     height = refer(source, screening)
     matrix = laplacian(*shape, *WEIGHTS, screening)
     matrix += (screening == 0) / source.size  # in the direction that is not asked for
-    told = np.linalg.solve(matrix, source.ravel()).reshape(shape)
-    np.testing.assert_allclose(height, told, atol=1e-9 * np.ptp(told) + 1e-12)
+    expected = np.linalg.solve(matrix, source.ravel()).reshape(shape)
+    np.testing.assert_allclose(height, expected, atol=1e-9 * np.ptp(expected) + 1e-12)
 
 
 @pytest.mark.parametrize("screening", [0.0, 0.3])
@@ -73,33 +73,33 @@ def test_device_and_reference_find_the_same_heights(device, shape, screening):
     source = random_source(shape).astype(np.float32)
     along, across = WEIGHTS
     for picture, size in ((source, (along, across)), (source.T, (across, along))):
-        given = device.array("source", picture.shape, np.float32)
-        given.write(picture)
+        source_array = device.array("source", picture.shape, np.float32)
+        source_array.write(picture)
         solver = Rectangle(picture.shape, (size[0] ** -0.5, size[1] ** -0.5), device)
-        height = solver.solve(given, screening).read()
-        told = refer(source, screening)
-        told = told if picture is source else told.T
-        np.testing.assert_allclose(height, told, atol=2e-6 * max(1e-3, np.ptp(told)))
+        height = solver.solve(source_array, screening).read()
+        expected = refer(source, screening)
+        expected = expected if picture is source else expected.T
+        np.testing.assert_allclose(height, expected, atol=2e-6 * max(1e-3, np.ptp(expected)))
 
 
-@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("with_heights", [False, True])
 @pytest.mark.parametrize("shape", [(1, 5), (3, 2), (4, 4), (37, 41), (3, 300)])
-def test_device_and_reference_make_the_same_of_slopes(device, shape, known):
+def test_device_and_reference_make_the_same_of_slopes(device, shape, with_heights):
     slopes = np.random.default_rng(1).normal(size=(2, 3, *shape)).astype(np.float32)
     heights = np.random.default_rng(2).normal(size=shape).astype(np.float32)
     size, area, weights = (0.3, 0.4), 0.12, (0.4 / 0.3, 0.3 / 0.4)
-    given = {"known_heights": heights, "known_height_weights": 5.0} if known else {}
-    inputs = check_inputs(*slopes, size, **given, several=True)
+    options = {"known_heights": heights, "known_height_weights": 5.0} if with_heights else {}
+    inputs = check_inputs(*slopes, size, **options, several=True)
     solver = Rectangle(slopes[0].shape, size, device, area)
     height, sigma = solver.integrate(inputs, True)
-    extra = (5.0 * area, inputs.known_heights) if known else (0.0, None)
+    extra = (5.0 * area, inputs.known_heights) if with_heights else (0.0, None)
     links, misfit = shape[0] * (shape[1] - 1) + (shape[0] - 1) * shape[1], 0.0
-    for dz_dx, dz_dy, found in zip(*slopes, height, strict=True):
+    for dz_dx, dz_dy, solved in zip(*slopes, height, strict=True):
         source = np.empty(shape)
         rectangle_source(weights[0] * 0.3 / 24, -weights[1] * 0.4 / 24, dz_dx, dz_dy, source, *extra)
-        told = refer(source, extra[0], weights)
-        np.testing.assert_allclose(found, told + inputs.datum, atol=2e-5 * np.ptp(told))
-        misfit += rectangle_misfit(weights, size, (dz_dx, dz_dy), told, *extra) / len(height)
-    unit = expected_misfit(links, sigma.size, sigma.size * known, 1 - known, weights)
-    told = solver.deviation(extra[0]) * np.sqrt(misfit / unit) if unit > 0 else np.full(shape, np.nan)
-    np.testing.assert_allclose(sigma, told, rtol=1e-4)
+        expected = refer(source, extra[0], weights)
+        np.testing.assert_allclose(solved, expected + inputs.datum, atol=2e-5 * np.ptp(expected))
+        misfit += rectangle_misfit(weights, size, (dz_dx, dz_dy), expected, *extra) / len(height)
+    unit = expected_misfit(links, sigma.size, sigma.size * with_heights, 1 - with_heights, weights)
+    expected = solver.deviation(extra[0]) * np.sqrt(misfit / unit) if unit > 0 else np.full(shape, np.nan)
+    np.testing.assert_allclose(sigma, expected, rtol=1e-4)

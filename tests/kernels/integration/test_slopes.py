@@ -28,28 +28,28 @@ def normals(shape):
 
 def on_device(device, vectors, sigma, contact):
     maps = SlopeKernels(device, contact.shape)
-    given = {"vectors": (vectors, np.float32), "sigma": (sigma, np.float32), "contact": (contact, np.uint8)}
+    options = {"vectors": (vectors, np.float32), "sigma": (sigma, np.float32), "contact": (contact, np.uint8)}
     to = {name: device.from_host(name, np.zeros(contact.shape)) for name in MAPS}
-    maps.find(TILT, {name: device.from_host(name, *one) for name, one in given.items()}, to)
+    maps.find(TILT, {name: device.from_host(name, *array) for name, array in options.items()}, to)
     return maps, {name: to[name].read() for name in MAPS}
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_kernels_do_what_the_reference_does(device, shape):
-    given = normals(shape)
-    maps, found = on_device(device, *given)
-    first = slopes.slopes_find(math.sin(TILT) ** 2, *given)
+    maps_of_normals = normals(shape)
+    maps, typical = on_device(device, *maps_of_normals)
+    first = slopes.slopes_find(math.sin(TILT) ** 2, *maps_of_normals)
     dz_dx, _, *squares = first
     bounds = 1e-4 * maps.typical, 1e3 * maps.typical
-    weights = slopes.slopes_weigh(math.sin(TILT) ** 2, *bounds, given[1], dz_dx, *squares)
+    weights = slopes.slopes_weigh(math.sin(TILT) ** 2, *bounds, maps_of_normals[1], dz_dx, *squares)
     for name, exact in zip(MAPS, (*first[:2], *weights), strict=True):
-        np.testing.assert_allclose(found[name], exact, rtol=2e-5, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(typical[name], exact, rtol=2e-5, atol=1e-6, err_msg=name)
 
 
 def test_the_typical_weight_is_determined_once_and_bounds_the_others(device):
-    given = normals((30, 40))
-    given[1][3, 4] = 1e-9
-    maps, found = on_device(device, *given)
-    weights = find_slopes(*given, TILT).weights
+    maps_of_normals = normals((30, 40))
+    maps_of_normals[1][3, 4] = 1e-9
+    maps, typical = on_device(device, *maps_of_normals)
+    weights = find_slopes(*maps_of_normals, TILT).weights
     assert maps.typical == pytest.approx(float(np.median(weights[weights > 0])), rel=0.05)
-    assert found["weight_x"].max() <= 1e3 * maps.typical * 1.0001
+    assert typical["weight_x"].max() <= 1e3 * maps.typical * 1.0001

@@ -28,19 +28,23 @@ def test_a_system_is_solved_where_unknowns_are_free():
     free = np.arange(COUNT) % 3 > 0
     weights = 1 / np.diag(matrix)
     face = Face.of(free, lambda residual: weights * residual)
-    found = conjugate_gradients(lambda x: matrix @ x, target, face, converged=small, steps=5 * COUNT)
-    assert found.converged
-    assert not found.x[~free].any()
-    np.testing.assert_allclose(found.x[free], np.linalg.solve(matrix[free][:, free], target[free]), atol=1e-9)
-    np.testing.assert_allclose(found.product, matrix @ found.x, atol=1e-9)
-    again = conjugate_gradients(lambda x: matrix @ x, target, face, converged=small, steps=0, start=found.x)
+    solution = conjugate_gradients(lambda x: matrix @ x, target, face, converged=small, steps=5 * COUNT)
+    assert solution.converged
+    assert not solution.x[~free].any()
+    np.testing.assert_allclose(
+        solution.x[free], np.linalg.solve(matrix[free][:, free], target[free]), atol=1e-9
+    )
+    np.testing.assert_allclose(solution.product, matrix @ solution.x, atol=1e-9)
+    again = conjugate_gradients(
+        lambda x: matrix @ x, target, face, converged=small, steps=0, start=solution.x
+    )
     assert (again.steps, again.converged) == (0, True)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_unknowns_of_0_or_more_are_those_of_scipy(seed):
     matrix, target = positive_definite(seed), np.random.default_rng(seed + 10).normal(size=COUNT)
-    found = conjugate_gradients(
+    solution = conjugate_gradients(
         lambda x: matrix @ x,
         target,
         lambda x, residual: Face.of((x > 0) | (residual > 0), same),
@@ -51,13 +55,13 @@ def test_unknowns_of_0_or_more_are_those_of_scipy(seed):
     root = np.linalg.cholesky(matrix).T
     exact = optimize.nnls(root, np.linalg.solve(root.T, target))[0]
     assert 0 < np.count_nonzero(exact) < COUNT
-    np.testing.assert_allclose(found.x, exact, atol=1e-8)
+    np.testing.assert_allclose(solution.x, exact, atol=1e-8)
 
 
 def test_several_systems_are_solved_at_once_each_with_its_own_steps():
     matrix, targets = positive_definite(3), np.random.default_rng(4).normal(size=(3, COUNT))
     targets[1] = 0
-    found = conjugate_gradients(
+    solution = conjugate_gradients(
         lambda x: np.asarray(x @ matrix.astype(np.float32)),
         targets.astype(np.float32),
         Face.of(EVERYWHERE, same),
@@ -65,15 +69,15 @@ def test_several_systems_are_solved_at_once_each_with_its_own_steps():
         steps=5 * COUNT,
         axes=(1,),
     )
-    assert found.converged
-    assert found.x.dtype == np.float32
-    np.testing.assert_allclose(found.x, np.linalg.solve(matrix, targets.T).T, atol=1e-3)
+    assert solution.converged
+    assert solution.x.dtype == np.float32
+    np.testing.assert_allclose(solution.x, np.linalg.solve(matrix, targets.T).T, atol=1e-3)
 
 
 def test_too_few_steps_are_reported_with_the_residual():
     matrix, target = positive_definite(5), np.ones(COUNT)
-    found = conjugate_gradients(
+    solution = conjugate_gradients(
         lambda x: matrix @ x, target, Face.of(EVERYWHERE, same), converged=small, steps=2
     )
-    assert (found.steps, found.converged) == (2, False)
-    np.testing.assert_allclose(found.residual, target - matrix @ found.x, atol=1e-12)
+    assert (solution.steps, solution.converged) == (2, False)
+    np.testing.assert_allclose(solution.residual, target - matrix @ solution.x, atol=1e-12)

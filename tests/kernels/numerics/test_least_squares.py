@@ -41,34 +41,34 @@ def test_minima_are_those_of_scipy(name):
     expected = optimize.least_squares(
         residuals, [1, 1, 0], loss=name, f_scale=limit * NOISE, xtol=1e-14, ftol=1e-14, gtol=1e-14
     )
-    found = fit(residuals, [1.0, 1.0, 0.0], noise=NOISE, loss=LOSSES[name](limit), tolerance=1e-12)
-    assert found.parameters == pytest.approx(expected.x, abs=1e-6)
-    assert found.cost == pytest.approx(2 * expected.cost / NOISE**2)
+    result = fit(residuals, [1.0, 1.0, 0.0], noise=NOISE, loss=LOSSES[name](limit), tolerance=1e-12)
+    assert result.parameters == pytest.approx(expected.x, abs=1e-6)
+    assert result.cost == pytest.approx(2 * expected.cost / NOISE**2)
 
 
 def test_covariance_of_a_convex_loss_is_that_of_scipy():
     residuals = decay(samples())
     expected = optimize.least_squares(residuals, [1, 1, 0], loss="soft_l1", f_scale=3 * NOISE, xtol=1e-14)
-    found = fit(residuals, [1.0, 1.0, 0.0], noise=NOISE, loss=soft_l1(3.0))
+    result = fit(residuals, [1.0, 1.0, 0.0], noise=NOISE, loss=soft_l1(3.0))
     inverted = np.linalg.inv(expected.jac.T @ expected.jac) * NOISE**2
-    np.testing.assert_allclose(found.covariance(), inverted, rtol=1e-4)
-    np.testing.assert_allclose(found.covariance(4.0), 4 * inverted, rtol=1e-4)
+    np.testing.assert_allclose(result.covariance(), inverted, rtol=1e-4)
+    np.testing.assert_allclose(result.covariance(4.0), 4 * inverted, rtol=1e-4)
 
 
 @pytest.mark.parametrize("loss", [soft_l1(3.0), huber(3.0), cauchy(3.0), geman_mcclure(4.0)])
 def test_standard_errors_are_those_of_repeated_fits(loss):
     fits = [fit(decay(samples(seed)), [1.5, 1.0, 0.2], noise=NOISE, loss=loss) for seed in range(150)]
-    scatter = np.std([found.parameters for found in fits], axis=0)
+    scatter = np.std([result.parameters for result in fits], axis=0)
     sigma = np.sqrt(np.diag(fits[0].covariance()))
     assert scatter / sigma == pytest.approx(1, abs=0.2)
 
 
 def test_noise_is_estimated_from_most_residuals():
-    found = fit(
+    result = fit(
         decay(samples(outliers=0.1)), [1.5, 1.0, 0.2], noise=1.0, rescale=mad_sigma, loss=geman_mcclure(4.0)
     )
-    assert found.noise == pytest.approx(NOISE, rel=0.2)
-    assert found.parameters == pytest.approx([2, 1.3, 0.3], abs=0.03)
+    assert result.noise == pytest.approx(NOISE, rel=0.2)
+    assert result.parameters == pytest.approx([2, 1.3, 0.3], abs=0.03)
     normal = np.random.default_rng(1).normal(0, 3, 10**5)
     assert mad_sigma(normal) == pytest.approx(3, rel=0.01)
     assert mad_sigma(np.empty(0)) == 0
@@ -79,19 +79,19 @@ def test_bounds_hold_and_may_be_active():
         assert p[0] <= 0.5
         return np.array([10 * (p[1] - p[0] ** 2), 1 - p[0]])
 
-    found = fit(residuals, [-1.2, 1.0], bounds=(np.array([-5.0, -5.0]), np.array([0.5, 5.0])))
-    assert found.parameters == pytest.approx([0.5, 0.25], abs=1e-5)
+    result = fit(residuals, [-1.2, 1.0], bounds=(np.array([-5.0, -5.0]), np.array([0.5, 5.0])))
+    assert result.parameters == pytest.approx([0.5, 0.25], abs=1e-5)
 
 
 def test_curved_valleys_are_followed():
-    found = fit(lambda p: np.array([10 * (p[1] - p[0] ** 2), 1 - p[0]]), [-1.2, 1.0])
-    assert found.parameters == pytest.approx([1, 1])
+    result = fit(lambda p: np.array([10 * (p[1] - p[0] ** 2), 1 - p[0]]), [-1.2, 1.0])
+    assert result.parameters == pytest.approx([1, 1])
 
 
 def test_a_prior_counts_as_a_measurement_without_outliers():
     prior = Prior(np.array([[1.0]]), np.array([10.0]))  # 10 with a standard deviation of 1
-    found = fit(lambda p: p[0] - np.zeros(4), [0.0], prior=prior, loss=huber(1.0), tolerance=1e-14)
-    assert found.parameters == pytest.approx([6.0])  # of four samples at the limit, against 10 - p
+    result = fit(lambda p: p[0] - np.zeros(4), [0.0], prior=prior, loss=huber(1.0), tolerance=1e-14)
+    assert result.parameters == pytest.approx([6.0])  # of four samples at the limit, against 10 - p
     assert fit(lambda p: p - np.zeros(1), [0.0], prior=prior).parameters == pytest.approx([5.0])
 
 
@@ -102,9 +102,11 @@ def test_a_function_of_derivatives_replaces_differences():
         decayed = np.exp(-p[1] * TIMES)
         return np.stack([decayed, -p[0] * TIMES * decayed, np.ones_like(TIMES)], axis=1)
 
-    given, numerical = (fit(decay(values), [1.0, 1.0, 0.0], jacobian=one) for one in (jacobian, None))
-    assert given.parameters == pytest.approx(numerical.parameters, abs=1e-6)
-    np.testing.assert_allclose(given.covariance(), numerical.covariance(), rtol=1e-5)
+    with_jacobian, numerical = (
+        fit(decay(values), [1.0, 1.0, 0.0], jacobian=function) for function in (jacobian, None)
+    )
+    assert with_jacobian.parameters == pytest.approx(numerical.parameters, abs=1e-6)
+    np.testing.assert_allclose(with_jacobian.covariance(), numerical.covariance(), rtol=1e-5)
 
 
 class Parabola:
@@ -123,13 +125,13 @@ def test_steps_can_be_limited_in_length_and_number():
         lengths.append(float(np.abs(step).max()))
         return step * min(1.0, 0.1 / lengths[-1])
 
-    found = least_squares.descend(Parabola, np.zeros(2), shorten=shorten, steps=3)
-    assert found.parameters == pytest.approx([0.3, 0.3])
+    result = least_squares.descend(Parabola, np.zeros(2), shorten=shorten, steps=3)
+    assert result.parameters == pytest.approx([0.3, 0.3])
 
 
 def test_parameters_without_influence_stay():
-    found = fit(lambda p: p[:1] - 1.0, [0.0, 7.0])
-    assert found.parameters == pytest.approx([1.0, 7.0])
+    result = fit(lambda p: p[:1] - 1.0, [0.0, 7.0])
+    assert result.parameters == pytest.approx([1.0, 7.0])
 
 
 def test_inverse_depends_neither_on_units_nor_on_empty_directions():
@@ -170,18 +172,18 @@ def straight_line(count=400, noise=1.0, seed=0):
 
 def test_a_clipped_fit_without_outliers_is_a_linear_fit():
     columns, values, _ = straight_line(noise=0.0)
-    found = least_squares.fit_clipped(columns, values + 0.1 * np.cos(np.arange(400)))
+    result = least_squares.fit_clipped(columns, values + 0.1 * np.cos(np.arange(400)))
     expected = np.linalg.lstsq(columns, values + 0.1 * np.cos(np.arange(400)), rcond=None)[0]
-    np.testing.assert_allclose(found.parameters, expected, rtol=1e-12)
+    np.testing.assert_allclose(result.parameters, expected, rtol=1e-12)
 
 
 def test_a_clipped_fit_leaves_outliers_out():
     columns, values, random = straight_line()
     stray = random.choice(400, 40, replace=False)
     values[stray] += 50
-    found = least_squares.fit_clipped(columns, values)
-    assert not found.kept[stray].any()
-    assert np.count_nonzero(found.kept) == 360
+    result = least_squares.fit_clipped(columns, values)
+    assert not result.kept[stray].any()
+    assert np.count_nonzero(result.kept) == 360
 
 
 def test_errors_of_a_clipped_fit_are_those_of_repeated_fits():
@@ -190,7 +192,7 @@ def test_errors_of_a_clipped_fit_are_those_of_repeated_fits():
     for seed in range(300):
         columns, line, random = straight_line(noise=0.0, seed=seed)
         fits.append(least_squares.fit_clipped(columns, line + noise * random.normal(size=400), noise))
-    spread = np.std([one.parameters for one in fits], axis=0)
+    spread = np.std([result.parameters for result in fits], axis=0)
     np.testing.assert_allclose(spread, np.sqrt(np.diag(fits[0].inverse)), rtol=0.15)
 
 

@@ -18,7 +18,7 @@ def test_the_triangle_holds_the_normal_equations():
     upper = np.zeros((4, 4))
     upper[np.triu_indices(4)] = triangle[:10, 7]
     upper[3, 3] **= 0.5
-    seen = (FRAMES[:, 7] > 13) & (FRAMES[:, 7] < 255)
-    rows = np.column_stack([LIGHTS, FRAMES[:, 7] - 3.0])[seen]
+    unclipped = (FRAMES[:, 7] > 13) & (FRAMES[:, 7] < 255)
+    rows = np.column_stack([LIGHTS, FRAMES[:, 7] - 3.0])[unclipped]
     np.testing.assert_allclose(upper.T @ upper, rows.T @ rows, atol=1e-8)
-    assert triangle[10, 7] == seen.sum()
+    assert triangle[10, 7] == unclipped.sum()

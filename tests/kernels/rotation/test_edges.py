@@ -34,8 +34,8 @@ def draw(vectors, sigma, contact):
     doubt, lines = np.ones_like(contact), np.zeros_like(contact)
     for chosen in PASSES:
         looked = edges.edges_join(cells, lines) if chosen is COARSE else cells
-        strength, way = edges.edges_jumps(looked, chosen, LIMITS, doubt)
-        lines = edges.edges_thin(strength, way, chosen, lines)
+        strength, direction = edges.edges_jumps(looked, chosen, LIMITS, doubt)
+        lines = edges.edges_thin(strength, direction, chosen, lines)
     return edges.edges_bound(clean, lines)
 
 
@@ -51,9 +51,9 @@ def level(shape=(25, 25), bend=0.0, jump=0.0, at=12):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_kernels_and_reference_draw_the_same(device, shape):
     vectors, sigma, contact = scene(shape, seed=shape[1])
-    drawn, told = find_edges(vectors, sigma, contact, device=device), draw(vectors, sigma, contact)
-    assert np.mean(drawn != told) < 0.002  # float32 decides of what is at a limit
-    assert min(shape) < 9 or told.sum() > 8
+    drawn, expected = find_edges(vectors, sigma, contact, device=device), draw(vectors, sigma, contact)
+    assert np.mean(drawn != expected) < 0.002  # float32 decides of what is at a limit
+    assert min(shape) < 9 or expected.sum() > 8
 
 
 def test_a_drawing_depends_on_nothing_that_was_drawn_before(device):
@@ -83,11 +83,11 @@ def test_flags_that_neighbours_contradict_are_turned_over():
 def test_a_jump_has_its_size_and_its_direction(chosen, jump):
     cells = level(jump=jump)
     looked = edges.edges_join(cells, np.zeros((25, 25), np.uint8)) if chosen is COARSE else cells
-    strength, way = edges.edges_jumps(looked, chosen, LIMITS, np.ones((25, 25), np.uint8))
+    strength, direction = edges.edges_jumps(looked, chosen, LIMITS, np.ones((25, 25), np.uint8))
     chord = 2 * np.sin(np.radians(jump) / 2)
     assert strength[12].max() == pytest.approx(chord / LIMITS.floor, rel=1e-3)
     assert strength[12].argmax() in (12, 13)
-    assert way[12, strength[12].argmax()] == 0
+    assert direction[12, strength[12].argmax()] == 0
 
 
 @pytest.mark.parametrize("bend", [1.0, 2.3])

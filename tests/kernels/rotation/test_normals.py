@@ -52,10 +52,10 @@ class Turn:
 
     def answer(self, method):
         """Answer as the reference does."""
-        known = self.frames, self.table, self.scale
+        arguments = self.frames, self.table, self.scale
         if method == "exact":
-            return normals.normals_exact(*known, self.tilt, self.noise, self.limits)
-        return normals.normals_paper(*known, self.noise, self.limits, self.spread)
+            return normals.normals_exact(*arguments, self.tilt, self.noise, self.limits)
+        return normals.normals_paper(*arguments, self.noise, self.limits, self.spread)
 
 
 class Answers:
@@ -108,56 +108,56 @@ class Answers:
 
     def read(self):
         """Return the answers; nothing behind the last vector of a plane may have been written."""
-        found = {name: array.read() for name, array in self.maps.items()}
+        maps = {name: array.read() for name, array in self.maps.items()}
         lanes = vector_lanes(self.device)
         behind = -(-self.pixels // lanes) * lanes
-        for name, values in found.items():
+        for name, values in maps.items():
             whole = 3 * behind if name == "vectors" else behind
             np.testing.assert_array_equal(values.reshape(-1)[whole:], UNTOUCHED)
-        vectors = found.pop("vectors").reshape(-1, 3)[: self.pixels]
-        return Answer(vectors, **{name: values[0, : self.pixels] for name, values in found.items()})
+        vectors = maps.pop("vectors").reshape(-1, 3)[: self.pixels]
+        return Answer(vectors, **{name: values[0, : self.pixels] for name, values in maps.items()})
 
 
-def compare(found, expected, turn, share=0.0):
+def compare(actual, expected, turn, fraction=0.0):
     """Hold answers against the reference's; they may differ by rounding, and by a share of a standard error.
 
     Zeniths of about 1 radian are good to 5e-7, and what that does to the azimuth grows as sin(zenith) / tilt.
     Next to an axis, the least step turns the direction in which a sample's zenith grows: there, what only the
     steps to come would settle may differ.
     """
-    told = np.isfinite(expected.sigma)
-    np.testing.assert_array_equal(np.isfinite(found.sigma), told)
-    np.testing.assert_array_equal(np.isfinite(found.vectors), np.repeat(told[:, np.newaxis], 3, axis=1))
-    vectors, sigma = expected.vectors[told], expected.sigma[told]
+    finite = np.isfinite(expected.sigma)
+    np.testing.assert_array_equal(np.isfinite(actual.sigma), finite)
+    np.testing.assert_array_equal(np.isfinite(actual.vectors), np.repeat(finite[:, np.newaxis], 3, axis=1))
+    vectors, sigma = expected.vectors[finite], expected.sigma[finite]
     near = np.min(rotations.between(vectors[:, np.newaxis], turn.axes), axis=1) < 5 * sigma
-    error = rotations.between(found.vectors[told].astype(float), vectors)
+    error = rotations.between(actual.vectors[finite].astype(float), vectors)
     slant = np.hypot(vectors[:, 0], vectors[:, 1]) / np.sin(turn.tilt)
-    limit = 2e-6 * (1 + slant) + np.where(near, 0.3, share) * sigma
+    limit = 2e-6 * (1 + slant) + np.where(near, 0.3, fraction) * sigma
     assert np.all(error <= limit), np.max(error / limit)
-    assert np.all(np.abs(found.sigma[told] / sigma - 1) < np.where(near, 0.2, 1e-3 + share))
-    np.testing.assert_allclose(np.linalg.norm(found.vectors[told], axis=1), 1, atol=1e-6)
-    settled = ~told
-    settled[told] = ~near
-    np.testing.assert_array_equal(found.contact[settled].astype(bool), expected.contact[settled])
+    assert np.all(np.abs(actual.sigma[finite] / sigma - 1) < np.where(near, 0.2, 1e-3 + fraction))
+    np.testing.assert_allclose(np.linalg.norm(actual.vectors[finite], axis=1), 1, atol=1e-6)
+    settled = ~finite
+    settled[finite] = ~near
+    np.testing.assert_array_equal(actual.contact[settled].astype(bool), expected.contact[settled])
     counts = 1e-6 * np.nanmax(np.abs(turn.frames.astype(float)), initial=1)
     for name in ("mean", "cosine", "sine", "residual"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), 2e-6, counts, err_msg=name)
+        np.testing.assert_allclose(getattr(actual, name), getattr(expected, name), 2e-6, counts, err_msg=name)
 
 
-def check(device, method, turn, share=0.0, start=0):
+def check(device, method, turn, fraction=0.0, start=0):
     """Answer by both; return the reference's answer."""
     expected = turn.answer(method)
-    compare(Answers(device, turn.frames.shape[1]).take(method, turn, start).read(), expected, turn, share)
+    compare(Answers(device, turn.frames.shape[1]).take(method, turn, start).read(), expected, turn, fraction)
     return expected
 
 
 def facing(pixels, setup, steepest=55.0):
     """Normals of all directions; the first ones are upright, and those of the axes, where u has none."""
-    made = rotations.random_normals(pixels, seed=pixels, bins=[(0, steepest)])[0]
+    directions = rotations.random_normals(pixels, seed=pixels, bins=[(0, steepest)])[0]
     for number, normal in enumerate([*rotations.axes(setup.phase[:3], setup.tilt), np.array([0, 0, 1.0])]):
         if number < pixels // 2:
-            made[number] = normal
-    return made
+            directions[number] = normal
+    return directions
 
 
 def frames_of(setup, pixels, seed=1):
@@ -236,11 +236,11 @@ def test_noise_alone_is_no_loss_of_contact(device):
     setup = replace(UINT16, noise=2000.0)  # of which the wave's amplitude has half; it is 2250 counts
     turn = Turn(rotations.draw(setup, 400, seed=5, bins=[(20, 30)]).frames[:, 0], setup)
     expected = turn.answer("exact")
-    found = Answers(device, 400).take("exact", turn).read()
-    told = np.isfinite(expected.sigma)
-    assert told.mean() > 0.9
-    for contact in (found.contact, expected.contact):
-        assert np.mean(contact[told]) > 0.99
+    result = Answers(device, 400).take("exact", turn).read()
+    finite = np.isfinite(expected.sigma)
+    assert finite.mean() > 0.9
+    for contact in (result.contact, expected.contact):
+        assert np.mean(contact[finite]) > 0.99
 
 
 def test_kernel_and_reference_agree_on_missing_samples(device):
@@ -298,19 +298,23 @@ def misfit(place, samples, setup, turn, frame):
     normal = middle + place[0] * right + place[1] * up
     low, high = np.sort((turn.scale[2:] / turn.scale[1]) + setup.offset)
     level = np.clip(rotations.levels(normal / np.linalg.norm(normal), setup), low, high)
-    told = -((np.nan_to_num(samples) - level) ** 2) / (2 * setup.spread**2)
+    log_likelihood = -((np.nan_to_num(samples) - level) ** 2) / (2 * setup.spread**2)
     if turn.frames.dtype.kind == "u":
         top = np.iinfo(turn.frames.dtype).max
-        told = np.where(samples <= 0, special.log_ndtr((0.5 - level) / setup.spread), told)
-        told = np.where(samples >= top, special.log_ndtr((level - top + 0.5) / setup.spread), told)
-    return -np.sum(turn.weights * np.where(np.isnan(samples), 0, told))
+        log_likelihood = np.where(
+            samples <= 0, special.log_ndtr((0.5 - level) / setup.spread), log_likelihood
+        )
+        log_likelihood = np.where(
+            samples >= top, special.log_ndtr((level - top + 0.5) / setup.spread), log_likelihood
+        )
+    return -np.sum(turn.weights * np.where(np.isnan(samples), 0, log_likelihood))
 
 
 def likeliest(samples, setup, turn, near):
     """Search for the normal of which a pixel's samples are the likeliest, without derivatives."""
     frame, until = (*rotations.tangents(near), near), {"xatol": 1e-6, "fatol": 1e-6}
-    found = optimize.minimize(misfit, [0, 0], (samples, setup, turn, frame), "Nelder-Mead", options=until).x
-    normal = near + found[0] * frame[0] + found[1] * frame[1]
+    angles = optimize.minimize(misfit, [0, 0], (samples, setup, turn, frame), "Nelder-Mead", options=until).x
+    normal = near + angles[0] * frame[0] + angles[1] * frame[1]
     return normal / np.linalg.norm(normal)
 
 
@@ -334,20 +338,20 @@ def test_the_reference_finds_the_likeliest_normal(case):
     if case == "missing":
         frames[range(6), range(6)] = np.nan
     turn = Turn(frames, setup, **options)
-    found = turn.answer("exact")
-    assert np.isfinite(found.sigma).sum() >= 5
-    for pixel in np.flatnonzero(np.isfinite(found.sigma)):
+    result = turn.answer("exact")
+    assert np.isfinite(result.sigma).sum() >= 5
+    for pixel in np.flatnonzero(np.isfinite(result.sigma)):
         expected = likeliest(frames[:, pixel].astype(float), setup, turn, true[pixel])
-        off = rotations.between(found.vectors[pixel], expected)
-        assert off < 0.02 * found.sigma[pixel], (pixel, off / found.sigma[pixel])
+        off = rotations.between(result.vectors[pixel], expected)
+        assert off < 0.02 * result.sigma[pixel], (pixel, off / result.sigma[pixel])
 
 
 @pytest.mark.parametrize("weights", [None, [1, 4, 0.2, 1, 1, 1, 3, 0.1]])
 def test_sigma_is_the_bound_at_the_answer(weights):
     turn = Turn(frames_of(UINT16, 60), UINT16, weights=weights)
-    found = turn.answer("exact")
-    share = turn.weights[:, np.newaxis]
-    expected = np.sqrt(rotations.bound(found.vectors, UINT16, share))
-    away = np.min(rotations.between(found.vectors[:, np.newaxis], turn.axes), axis=1) > 10 * expected
+    result = turn.answer("exact")
+    weight = turn.weights[:, np.newaxis]
+    expected = np.sqrt(rotations.bound(result.vectors, UINT16, weight))
+    away = np.min(rotations.between(result.vectors[:, np.newaxis], turn.axes), axis=1) > 10 * expected
     assert away.sum() > 50
-    np.testing.assert_allclose(found.sigma[away], expected[away], rtol=2e-3)
+    np.testing.assert_allclose(result.sigma[away], expected[away], rtol=2e-3)

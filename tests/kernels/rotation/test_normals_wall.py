@@ -32,16 +32,16 @@ class Scene:
         self.shape, self.phase, self.rng = shape, phase, rng
         self.heights = rng.uniform(0, 1.2, shape)
         wall = walls.response(shape, gamma)
-        known = wall, DARK, BRIGHT, axes, self.heights, walls.PIVOT, follows
-        self.response = make_response(*known)
+        setting = wall, DARK, BRIGHT, axes, self.heights, walls.PIVOT, follows
+        self.response = make_response(*setting)
         self.scale = self.response.planes.reshape(5, -1).astype(np.float64)
         pixels = shape[0] * shape[1]
         angles = np.radians(rng.uniform(*zenith, pixels)), rng.uniform(-np.pi, np.pi, pixels)
         self.normals = facing(*angles)
         turning, _ = _rotations(turn_of(phase), TILT)
-        seen = np.einsum("kij,nj->kni", turning, self.normals)
+        turned = np.einsum("kij,nj->kni", turning, self.normals)
         place, wall = _places(self.scale, turning, self.response.wall), self.response.wall
-        self.light, within = wall_light(place, seen, wall.geometry, wall.lamps, wall.curve, wall.reach)
+        self.light, within = wall_light(place, turned, wall.geometry, wall.lamps, wall.curve, wall.reach)
         self.within = within.all(axis=0)
 
     def frames(self, noise, dtype="float32"):
@@ -56,49 +56,49 @@ class Scene:
         return normals_wall(frames, turn, self.scale, self.response.wall, TILT, noise, limits)
 
 
-def off(found, true):
-    return np.linalg.norm(found - true, axis=1)
+def off(actual, true):
+    return np.linalg.norm(actual - true, axis=1)
 
 
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 @pytest.mark.parametrize("follows", [False, True])
 def test_without_noise_the_normal_is_the_true_one(gamma, follows):
     scene = Scene(follows=follows, gamma=gamma)
-    found = scene.answer(scene.frames(0.0).astype(np.float64), 1e-4)
+    result = scene.answer(scene.frames(0.0).astype(np.float64), 1e-4)
     assert scene.within.mean() > 0.8
-    assert np.max(off(found.vectors, scene.normals)[scene.within]) < 1e-4
-    assert np.median(off(found.vectors, scene.normals)[scene.within]) < 1e-6
-    assert found.contact[scene.within].all()
+    assert np.max(off(result.vectors, scene.normals)[scene.within]) < 1e-4
+    assert np.median(off(result.vectors, scene.normals)[scene.within]) < 1e-6
+    assert result.contact[scene.within].all()
 
 
 def test_the_reference_finds_the_likeliest_normal():
     scene = Scene((1, 6))
     noise = 2.0
     frames = scene.frames(noise)
-    found = scene.answer(frames, noise)
+    result = scene.answer(frames, noise)
     samples = (frames - scene.scale[0]) * scene.scale[1]
     for pixel in np.flatnonzero(scene.within)[:2]:
 
         def misfit(angles, pixel=pixel):
-            known = scene.response.wall.curve, *scene.scale[2:, [pixel]], facing(*np.array(angles))
+            setting = scene.response.wall.curve, *scene.scale[2:, [pixel]], facing(*np.array(angles))
             return [
-                one - light_of(*known, at, follows=False)[0]
-                for one, at in zip(samples[:, pixel], PHASE, strict=True)
+                sample - light_of(*setting, at, follows=False)[0]
+                for sample, at in zip(samples[:, pixel], PHASE, strict=True)
             ]
 
         vector = scene.normals[pixel]
         start = math.acos(vector[2]), math.atan2(vector[1], vector[0])
         best = optimize.least_squares(misfit, start, x_scale=(0.01, 0.1), diff_step=1e-5).x
-        assert off(found.vectors[[pixel]], facing(*best)[np.newaxis])[0] < 0.02 * found.sigma[pixel]
+        assert off(result.vectors[[pixel]], facing(*best)[np.newaxis])[0] < 0.02 * result.sigma[pixel]
 
 
 def test_samples_beyond_the_ends_of_the_wall_contain_no_information_and_do_no_harm():
     scene = Scene((40, 61), zenith=(14, 43))
     noise = 0.5
-    found = scene.answer(scene.frames(noise), noise)
-    some = ~scene.within & np.isfinite(found.sigma)
+    result = scene.answer(scene.frames(noise), noise)
+    some = ~scene.within & np.isfinite(result.sigma)
     assert some.sum() > 100
-    error = off(found.vectors, scene.normals)[some] / found.sigma[some]
+    error = off(result.vectors, scene.normals)[some] / result.sigma[some]
     assert np.median(error) < 1.5
 
 
@@ -108,10 +108,10 @@ def test_a_pixel_that_does_not_follow_the_object_is_not_a_contact():
     frames[:, :40] = frames[:1, :40]  # still
     frames[:, 40:60] = DARK
     frames += 0.5 * scene.rng.normal(size=frames.shape).astype(np.float32)
-    found = scene.answer(frames, 0.5)
-    assert not found.contact[:60].any()
-    assert np.isnan(found.sigma[40:60]).all()
-    assert found.contact[60:][scene.within[60:]].all()
+    result = scene.answer(frames, 0.5)
+    assert not result.contact[:60].any()
+    assert np.isnan(result.sigma[40:60]).all()
+    assert result.contact[60:][scene.within[60:]].all()
 
 
 # Each is a kernel of its own, and takes its time to be built.
@@ -142,17 +142,17 @@ def test_kernel_and_reference_agree(device, case):
         frames[scene.rng.random(frames.shape) < 0.02] = np.nan
     expected = scene.answer(frames, noise, weights)
     stack = frames.reshape(-1, *shape)
-    known = {"response": scene.response, "noise": noise, "frame_weights": weights, "device": device}
-    found = rotations.estimate(stack, scene.phase, tilt=TILT, **known)
-    told = np.isfinite(found.normals_sigma.ravel())
+    arguments = {"response": scene.response, "noise": noise, "frame_weights": weights, "device": device}
+    result = rotations.estimate(stack, scene.phase, tilt=TILT, **arguments)
+    finite = np.isfinite(result.normals_sigma.ravel())
     # A sample at the very end of the wall may fall on either side.
-    assert np.mean(told != np.isfinite(expected.sigma)) <= 0.01
-    assert told.any()
-    both = told & np.isfinite(expected.sigma)
-    error = off(found.normals.reshape(-1, 3)[both], expected.vectors[both])
+    assert np.mean(finite != np.isfinite(expected.sigma)) <= 0.01
+    assert finite.any()
+    both = finite & np.isfinite(expected.sigma)
+    error = off(result.normals.reshape(-1, 3)[both], expected.vectors[both])
     assert np.quantile(error / expected.sigma[both], 0.98) < 1e-2
-    close = np.abs(found.normals_sigma.ravel()[both] / expected.sigma[both] - 1) < 1e-3
+    close = np.abs(result.normals_sigma.ravel()[both] / expected.sigma[both] - 1) < 1e-3
     assert close.mean() > 0.98
-    assert np.mean(found.contact.ravel()[both] == expected.contact[both]) > 0.98
+    assert np.mean(result.contact.ravel()[both] == expected.contact[both]) > 0.98
     for name in ("mean", "cosine", "sine", "residual"):
-        np.testing.assert_allclose(getattr(found, name).ravel(), getattr(expected, name), 2e-5, 2e-4)
+        np.testing.assert_allclose(getattr(result, name).ravel(), getattr(expected, name), 2e-5, 2e-4)

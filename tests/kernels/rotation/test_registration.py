@@ -49,12 +49,12 @@ def test_the_reference_finds_a_cubic_surface_where_it_has_moved_to() -> None:
     shape = 12, 14
     row, column = np.indices(shape)
     height = np.random.default_rng(0).uniform(-1, 0, shape).astype(np.float32)
-    found = registered_frame(polynomial(column, row).astype(np.float32), height, SHIFT)[0]
+    registered = registered_frame(polynomial(column, row).astype(np.float32), height, SHIFT)[0]
     x, y = moved(SHIFT.astype(float), height.astype(float))
     inside = (x >= 1) & (x < 12) & (y >= 1) & (y < 10)
     assert inside.sum() > 60
-    np.testing.assert_allclose(found[inside], polynomial(x, y)[inside], rtol=1e-5, atol=1e-3)
-    assert np.isnan(found[~inside]).all()
+    np.testing.assert_allclose(registered[inside], polynomial(x, y)[inside], rtol=1e-5, atol=1e-3)
+    assert np.isnan(registered[~inside]).all()
 
 
 def test_a_shift_of_whole_pixels_moves_samples_and_noise_as_they_are() -> None:

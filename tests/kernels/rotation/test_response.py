@@ -50,7 +50,7 @@ def test_the_point_met_is_on_the_wall_and_on_the_ray():
 
 def test_slopes_are_those_of_small_differences():
     place, normals = mirrors()
-    told = light_slopes(place, normals, GEOMETRY, LAMPS, CURVE)
+    slopes = light_slopes(place, normals, GEOMETRY, LAMPS, CURVE)
     rng = np.random.default_rng(2)
     across = np.cross(normals, rng.normal(size=normals.shape))
     step = 1e-5
@@ -59,7 +59,7 @@ def test_slopes_are_those_of_small_differences():
         moved = normals + sign * step * across
         moved /= np.linalg.norm(moved, axis=-1, keepdims=True)
         ends.append(wall_light(place, moved, GEOMETRY, LAMPS, CURVE, ALL)[0])
-    np.testing.assert_allclose((told * across).sum(axis=-1), (ends[1] - ends[0]) / (2 * step), atol=2e-9)
+    np.testing.assert_allclose((slopes * across).sum(axis=-1), (ends[1] - ends[0]) / (2 * step), atol=2e-9)
 
 
 def test_within_are_rays_all_of_whose_scattered_ones_meet_the_wall():
@@ -79,5 +79,5 @@ def test_out_of_reach_the_curve_goes_on_straight():
     light, _ = wall_light(place, normals, GEOMETRY, (0, 0), CURVE, reach)
     np.testing.assert_allclose(light, polynomial(held) + polynomial.deriv()(held) * (q - held), atol=1e-14)
     along = facing(zenith + np.pi / 2, 1.0)
-    told = (light_slopes(place, normals, GEOMETRY, (0, 0), CURVE, reach) * along).sum(axis=-1)
-    np.testing.assert_allclose(told, -polynomial.deriv()(held) * (1 + q**2), atol=1e-12)
+    slopes = (light_slopes(place, normals, GEOMETRY, (0, 0), CURVE, reach) * along).sum(axis=-1)
+    np.testing.assert_allclose(slopes, -polynomial.deriv()(held) * (1 + q**2), atol=1e-12)

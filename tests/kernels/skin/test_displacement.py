@@ -36,10 +36,10 @@ def spline(frame):
     """Coefficients of a frame, as the reference makes them."""
     padded = np.empty((frame.shape[0] + 2 * MARGIN, frame.shape[1] + 2 * MARGIN), np.float32)
     displacement_pad(frame, padded)
-    half, found = padded.copy(), padded.copy()
+    half, coefficients = padded.copy(), padded.copy()
     displacement_filter(1, padded, half)
-    displacement_filter(padded.shape[1], half, found)
-    return padded, half, found
+    displacement_filter(padded.shape[1], half, coefficients)
+    return padded, half, coefficients
 
 
 def planes_of(reference):
@@ -69,9 +69,9 @@ def test_a_sample_keeps_its_noise_and_one_between_two_has_less(part):
 def test_nodes_are_joined_by_straight_lines():
     y, x = np.mgrid[: GRID[0], : GRID[1]] * STEP + START
     inside = np.s_[:, 2:33, 2:44]
-    found = interpolate_nodes(np.stack([x + 2 * y, y]), START, STEP, SHAPE)
+    interpolated = interpolate_nodes(np.stack([x + 2 * y, y]), START, STEP, SHAPE)
     row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    np.testing.assert_allclose(found[inside], np.stack([column + 2 * row, row])[inside])
+    np.testing.assert_allclose(interpolated[inside], np.stack([column + 2 * row, row])[inside])
 
 
 def test_a_displacement_is_found_from_the_columns_of_its_window():
@@ -85,11 +85,11 @@ def test_a_displacement_is_found_from_the_columns_of_its_window():
     difference[0] = 0.7 * planes[1] - 0.2 * planes[2] + np.where(np.isnan(planes[0]), 0, 3) + 0.1 * planes[3]
     field = np.zeros((2, *GRID))
     displacement_solve(STEP, FIRST + HALO, WINDOW, planes, difference, field, inverse, answer)
-    found = answer.reshape(9, *GRID)[:, 4, 2:-2]
-    np.testing.assert_allclose(found[0], 0.7, atol=1e-5)
-    np.testing.assert_allclose(found[1], -0.2, atol=1e-5)
-    np.testing.assert_allclose(found[2:6], 0, atol=1e-5)
-    np.testing.assert_allclose(found[6], 0.9, atol=1e-5)
+    displacement = answer.reshape(9, *GRID)[:, 4, 2:-2]
+    np.testing.assert_allclose(displacement[0], 0.7, atol=1e-5)
+    np.testing.assert_allclose(displacement[1], -0.2, atol=1e-5)
+    np.testing.assert_allclose(displacement[2:6], 0, atol=1e-5)
+    np.testing.assert_allclose(displacement[6], 0.9, atol=1e-5)
 
 
 def test_cubics_through_nodes_keep_parabolas():

@@ -13,12 +13,12 @@ PIXEL = 0.05, 0.06
 
 
 def pose_of(
-    vector: tuple[float, ...], shape: tuple[int, int], shift: tuple[float, ...], least: float
+    vector: tuple[float, ...], shape: tuple[int, int], shift: tuple[float, ...], least_facing: float
 ) -> np.ndarray:
     rows, columns = shape
     grid = -(columns - 1) / 2 * PIXEL[0], (rows - 1) / 2 * PIXEL[1], *PIXEL
     turn = Rotation.from_rotvec(vector).as_matrix().ravel()
-    return np.array([*turn, *shift, 0.1, -0.2, 0.05, *grid, *grid, least, least], np.float32)
+    return np.array([*turn, *shift, 0.1, -0.2, 0.05, *grid, *grid, least_facing, least_facing], np.float32)
 
 
 def blocks_of(shape: tuple[int, int], step: int) -> int:
@@ -31,8 +31,8 @@ def test_the_gradient_of_a_plane_is_its_slope_up_to_the_border() -> None:
     values[4, 5] = np.nan
     gradient = np.zeros((9, 11, 2))
     pose_gradient(*PIXEL, values, gradient)
-    known = np.isfinite(values)
-    np.testing.assert_allclose(gradient[known], np.broadcast_to([0.2, -0.5], (known.sum(), 2)), atol=1e-9)
+    finite = np.isfinite(values)
+    np.testing.assert_allclose(gradient[finite], np.broadcast_to([0.2, -0.5], (finite.sum(), 2)), atol=1e-9)
     assert np.isnan(gradient[4, 5]).all()
 
 

@@ -33,17 +33,17 @@ def moments(signal: float, read: float, grain: float) -> list[float]:
 def test_random_words_are_those_that_the_generators_authors_published(
     counter: list[int], key: tuple[int, int], words: list[int]
 ) -> None:
-    found = exposure.philox(np.array(counter, np.uint32)[:, None], key)
-    assert found[:, 0].tolist() == words
+    drawn = exposure.philox(np.array(counter, np.uint32)[:, None], key)
+    assert drawn[:, 0].tolist() == words
 
 
 def test_numbers_are_normal() -> None:
-    found = exposure.normals(2**18, 7, 11)
-    assert stats.kstest(found, "norm").pvalue > 0.01
+    numbers = exposure.normals(2**18, 7, 11)
+    assert stats.kstest(numbers, "norm").pvalue > 0.01
     for limit in (2, 3, 4):
-        beyond = int((np.abs(found) > limit).sum())
-        assert stats.binomtest(beyond, found.size, 2 * stats.norm.sf(limit)).pvalue > 0.01
-    assert (np.abs(found) > 4).any()
+        beyond = int((np.abs(numbers) > limit).sum())
+        assert stats.binomtest(beyond, numbers.size, 2 * stats.norm.sf(limit)).pvalue > 0.01
+    assert (np.abs(numbers) > 4).any()
 
 
 def test_numbers_do_not_depend_on_each_other() -> None:
@@ -52,24 +52,24 @@ def test_numbers_do_not_depend_on_each_other() -> None:
     def field(frame: int, seed: int) -> NDArray[np.float64]:
         return exposure.normals(shape[0] * shape[1] // 4, frame, seed).reshape(shape)
 
-    one = field(0, 0)
+    base = field(0, 0)
     pairs = {
-        "beside": (one[:, 1:], one[:, :-1]),
-        "two beside": (one[:, 2:], one[:, :-2]),
-        "below": (one[1:], one[:-1]),
-        "a quarter": (one[128:256], one[:128]),
-        "two quarters": (one[256:], one[:256]),
-        "three quarters": (one[384:], one[:128]),
-        "frame": (field(1, 0), one),
-        "frame far on": (field(2**32, 0), one),
-        "seed": (field(0, 1), one),
-        "seed far on": (field(0, 2**32), one),
+        "beside": (base[:, 1:], base[:, :-1]),
+        "two beside": (base[:, 2:], base[:, :-2]),
+        "below": (base[1:], base[:-1]),
+        "a quarter": (base[128:256], base[:128]),
+        "two quarters": (base[256:], base[:256]),
+        "three quarters": (base[384:], base[:128]),
+        "frame": (field(1, 0), base),
+        "frame far on": (field(2**32, 0), base),
+        "seed": (field(0, 1), base),
+        "seed far on": (field(0, 2**32), base),
         "frame for seed": (field(0, 1), field(1, 0)),
     }
-    for name, (left, right) in pairs.items():
+    for name, (first, right) in pairs.items():
         for power in (1, 2):  # squares: two numbers from one radius must not be large together
-            correlation = np.corrcoef(left.ravel() ** power, right.ravel() ** power)[0, 1]
-            assert abs(correlation) < 4 / np.sqrt(left.size), name
+            correlation = np.corrcoef(first.ravel() ** power, right.ravel() ** power)[0, 1]
+            assert abs(correlation) < 4 / np.sqrt(first.size), name
 
 
 @pytest.mark.parametrize("read", [0.0, 0.7, 5.0])

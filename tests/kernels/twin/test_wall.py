@@ -39,8 +39,8 @@ def by_azimuth(columns=4000):
 @pytest.mark.parametrize("zenith", [13.0, 20.0, 30.0, 44.0])
 @pytest.mark.parametrize("height", [0.0, 2.5])
 def test_a_mirror_at_the_centre_shows_the_wall_twice_its_zenith_off_the_axis(zenith, height):
-    seen = look(mirror(zenith, 70, height), (0, 0), by_height())
-    assert seen * RIM == pytest.approx(height + RADIUS / np.tan(np.radians(2 * zenith)), abs=2e-5)
+    light = look(mirror(zenith, 70, height), (0, 0), by_height())
+    assert light * RIM == pytest.approx(height + RADIUS / np.tan(np.radians(2 * zenith)), abs=2e-5)
 
 
 def test_a_mirror_off_the_centre_shows_where_its_ray_meets_the_circle():
@@ -55,11 +55,11 @@ def test_a_mirror_off_the_centre_shows_where_its_ray_meets_the_circle():
 def test_a_line_of_sight_is_mirrored_as_a_vector():
     # Looking down at 10 degrees towards +x, a mirror of 15 degrees towards +x sends the ray 40 degrees off.
     tilt = np.tan(np.radians(10))
-    seen = look(mirror(15), (0, 0, -tilt, 0), by_height())
-    assert seen * RIM == pytest.approx(RADIUS / np.tan(np.radians(40)), abs=2e-5)
+    light = look(mirror(15), (0, 0, -tilt, 0), by_height())
+    assert light * RIM == pytest.approx(RADIUS / np.tan(np.radians(40)), abs=2e-5)
     # Raised by 2 mm, it is seen further back along that line.
-    seen = look(mirror(15, height=2), (0, 0, -tilt, 0), by_height())
-    assert seen * RIM == pytest.approx(2 + (RADIUS + 2 * tilt) / np.tan(np.radians(40)), abs=2e-5)
+    light = look(mirror(15, height=2), (0, 0, -tilt, 0), by_height())
+    assert light * RIM == pytest.approx(2 + (RADIUS + 2 * tilt) / np.tan(np.radians(40)), abs=2e-5)
 
 
 @pytest.mark.parametrize(
@@ -86,10 +86,10 @@ def test_across_a_gap_light_is_refracted():
     for zenith in (25.0, 35.0, 43.0):
         inside = np.radians(90 - 2 * zenith)  # to the side's normal
         outside = np.arcsin(INDEX * np.sin(inside))
-        seen = look(mirror(zenith, 30), (0, 0), by_height(), gap) / look(
+        ratio = look(mirror(zenith, 30), (0, 0), by_height(), gap) / look(
             mirror(zenith, 30), (0, 0), CLEAR, gap
         )
-        assert seen * RIM == pytest.approx(RADIUS * np.tan(inside) + gap * np.tan(outside), abs=2e-5)
+        assert ratio * RIM == pytest.approx(RADIUS * np.tan(inside) + gap * np.tan(outside), abs=2e-5)
 
 
 def test_the_bodys_side_reflects_part_of_the_light():
@@ -114,7 +114,7 @@ def test_lamps_light_one_side_more(gap):
     lamps = 0.4 * np.cos(np.radians(50)), 0.4 * np.sin(np.radians(50))
     plain = look(mirror(30, 50), (0, 0), gap=gap)
     for azimuth in (50, 110, 230):
-        share = (1 + 0.4 * np.cos(np.radians(azimuth - 50))) / 1.4
+        expected = (1 + 0.4 * np.cos(np.radians(azimuth - 50))) / 1.4
         assert look(mirror(30, azimuth), (0, 0), gap=gap, lamps=lamps) == pytest.approx(
-            plain * share, abs=1e-6
+            plain * expected, abs=1e-6
         )
