@@ -43,7 +43,7 @@ from .model.positions import Steps
 from .model.result import Result, select_turn
 from .storage.atomic import check_output
 from .storage.calibration_file import open_calibration, save_calibration, update_calibration
-from .watch.watch import Check
+from .watch.watch import CheckReport
 
 __all__ = [
     "ArrayRecording",
@@ -51,7 +51,7 @@ __all__ = [
     "Calibrated",
     "Calibration",
     "CameraId",
-    "Check",
+    "CheckReport",
     "Finding",
     "Fitted",
     "Format",

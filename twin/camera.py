@@ -143,11 +143,11 @@ class Sensor:
         self.offset.flags.writeable = self.full.flags.writeable = False
         self._shape, self._pixels = shape, shape[0] * shape[1]
         self._quarter = -(-self._pixels // 4)  # the generator produces four numbers at a time
-        room = (4 * self._quarter,)
-        self._light = self.device.array("light", room, np.float32)
-        self._offset = self.device.array("offset", room, np.float32)
-        self._span = self.device.array("span", room, np.float32)
-        self._counts = self.device.array("counts", room, self.dtype)
+        size = (4 * self._quarter,)
+        self._light = self.device.array("light", size, np.float32)
+        self._offset = self.device.array("offset", size, np.float32)
+        self._span = self.device.array("span", size, np.float32)
+        self._counts = self.device.array("counts", size, self.dtype)
         for array, values in ((self._offset, self.offset), (self._span, span)):
             array.write(values.ravel())
 
@@ -202,7 +202,9 @@ def frame_dtype(dtype: DTypeLike) -> np.dtype[Any]:
     except TypeError:
         kind = np.dtype(object)
     if kind not in FRAME_DTYPES:
-        raise InputError(f"frames cannot be {dtype}: take {', '.join(known.name for known in FRAME_DTYPES)}")
+        raise InputError(
+            f"frames cannot be {dtype}: take {', '.join(allowed.name for allowed in FRAME_DTYPES)}"
+        )
     return kind
 
 

@@ -20,7 +20,7 @@ from mirrorskin.twin.objects import PLATE_RADIUS, Cone, Cylinder, Object, Plane,
 OBJECT_NAMES = ("sphere", "coin", "plane", "cone", "cylinder", "step", "texture")
 
 _MADE_ALREADY: dict[str, Object] = {
-    made.name: made for made in (Sphere(), Coin(), Cone(), Cylinder(), Step(), Texture())
+    thing.name: thing for thing in (Sphere(), Coin(), Cone(), Cylinder(), Step(), Texture())
 }
 
 

@@ -221,9 +221,9 @@ def press(
     start : (H, W), a pressure to start from, as of the step before
     compliance : how far a force lifts the body, mm/N: the stage's flexure
     """
-    for given in (obstacle, start):
-        if given is not None and given.shape != space.shape:
-            raise ValueError(f"a map of {given.shape} does not fit a half-space of {space.shape}")
+    for argument in (obstacle, start):
+        if argument is not None and argument.shape != space.shape:
+            raise ValueError(f"a map of {argument.shape} does not fit a half-space of {space.shape}")
     pressure = np.zeros(space.shape)
     iterations = 0
     reach = obstacle > 0
@@ -251,7 +251,7 @@ def _minimise(
 
     steps = 0
     while True:
-        found = conjugate_gradients(
+        solution = conjugate_gradients(
             lambda change: opened(change.astype(np.float32)),
             np.where(reach, obstacle, 0.0),
             lambda pressure, overlap: Face.of(reach & ((pressure > 0) | (overlap > 0)), precondition),
@@ -261,15 +261,15 @@ def _minimise(
             moved=opened(start),
             limit=lambda pressure: pressure if pressure.min() >= 0 else np.maximum(pressure, 0.0),
         )
-        steps, start = steps + found.steps, found.x
-        if not found.converged:
+        steps, start = steps + solution.steps, solution.x
+        if not solution.converged:
             raise RuntimeError(
                 f"the contact did not converge in {ITERATIONS} iterations: the error of the gap "
-                f"is {float(np.abs(found.residual).max()):.2g} mm, the tolerance {tolerance:.2g} "
+                f"is {float(np.abs(solution.residual).max()):.2g} mm, the tolerance {tolerance:.2g} "
                 "mm"
             )
-        if not found.steps:  # converged in double precision as well
-            return found.x, steps
+        if not solution.steps:  # converged in double precision as well
+            return solution.x, steps
 
 
 def _inverse(space: HalfSpace) -> Callable[[Floats], Floats]:

@@ -110,7 +110,7 @@ class Friction:
             factors = _shrink(traction, self._limit)
             return traction if (factors == 1).all() else traction * factors
 
-        found = conjugate_gradients(
+        solution = conjugate_gradients(
             self._shifted,
             target,
             lambda traction, lag: self._face(self._limited(traction, lag)),
@@ -120,13 +120,13 @@ class Friction:
             moved=shift,
             limit=within,
         )
-        if not found.converged:
+        if not solution.converged:
             raise RuntimeError(
                 f"stick and slip did not converge in {ITERATIONS} iterations: the error of the "
-                f"displacement is {float(_length(found.residual).max()):.2g} mm, the tolerance "
+                f"displacement is {float(_length(solution.residual).max()):.2g} mm, the tolerance "
                 f"{tolerance:.2g} mm"
             )
-        return found.x, found.product, self._limited(found.x, target - found.product)
+        return solution.x, solution.product, self._limited(solution.x, target - solution.product)
 
     def _limited(self, traction: Floats, lag: Floats) -> _Limited:
         return _limited(traction, np.where(self._touches, lag, 0.0), self._limit)

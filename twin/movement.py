@@ -173,8 +173,8 @@ def oscillating_travel(start: float, stop: float, strokes: int, frames: int) -> 
     >>> oscillating_travel(0.0, 1.0, 2, 5).round(3).tolist()
     [0.0, 0.5, 1.0, 0.5, 0.0]
     """
-    swing = np.cos(np.pi * strokes * np.arange(frames) / max(1, frames - 1))
-    return np.asarray(start + (stop - start) * (1 - swing) / 2)
+    oscillation = np.cos(np.pi * strokes * np.arange(frames) / max(1, frames - 1))
+    return np.asarray(start + (stop - start) * (1 - oscillation) / 2)
 
 
 class Axial(Movement):

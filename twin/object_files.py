@@ -56,10 +56,10 @@ class HeightMap:
         """Return z in mm, bilinear between the samples; NaN outside the map and next to its NaN samples."""
         rows, columns = self.heights.shape
         # Rounded, so that a position on a sample uses only that sample and no neighbour that may be NaN.
-        left, share_x = _cell(np.round(x / self.pixel_size[0] + (columns - 1) / 2, 9), columns)
+        column, share_x = _cell(np.round(x / self.pixel_size[0] + (columns - 1) / 2, 9), columns)
         top, share_y = _cell(np.round((rows - 1) / 2 - y / self.pixel_size[1], 9), rows)
         # One flat index is faster than two. A neighbour with weight 0 may be NaN and is excluded.
-        samples, corner = self.heights.ravel(), top * columns + left
+        samples, corner = self.heights.ravel(), top * columns + column
         to_right, down = (share_x > 0).astype(np.intp), columns * (share_y > 0)
         upper, lower = (
             (1 - share_x) * samples[start] + share_x * samples[start + to_right]
@@ -290,24 +290,24 @@ def _cut(x: Floats, y: Floats, z: Floats, row: _Indices) -> tuple[Floats, Floats
         low, high = np.minimum(y[:, a], y[:, b]), np.maximum(y[:, a], y[:, b])
         crosses = (low < high) & (row >= low - _MARGIN) & (row <= high + _MARGIN)
         rise = np.where(crosses, y[:, b] - y[:, a], 1.0)
-        share = np.where(crosses, np.clip((row - y[:, a]) / rise, 0.0, 1.0), np.nan)
-        ends[0, edge] = x[:, a] + share * (x[:, b] - x[:, a])
-        ends[1, edge] = z[:, a] + share * (z[:, b] - z[:, a])
+        fraction = np.where(crosses, np.clip((row - y[:, a]) / rise, 0.0, 1.0), np.nan)
+        ends[0, edge] = x[:, a] + fraction * (x[:, b] - x[:, a])
+        ends[1, edge] = z[:, a] + fraction * (z[:, b] - z[:, a])
     # At a corner three edges are cut, elsewhere two.
     every = np.arange(len(row))
-    left, right = np.nanargmin(ends[0], axis=0), np.nanargmax(ends[0], axis=0)
-    return ends[:, left, every], ends[:, right, every]
+    first, right = np.nanargmin(ends[0], axis=0), np.nanargmax(ends[0], axis=0)
+    return ends[:, first, every], ends[:, right, every]
 
 
 def _fill(top: Floats, rows: _Indices, start: Floats, end: Floats) -> None:
     """Raise the samples between the ends of each cut to it."""
     first, count = _samples_between(start[0], end[0], top.shape[1])
     for part in _parts(count):
-        cut, column = _expand(first[part], count[part])
-        (x0, z0), (x1, z1) = start[:, part][:, cut], end[:, part][:, cut]
+        triangle, column = _expand(first[part], count[part])
+        (x0, z0), (x1, z1) = start[:, part][:, triangle], end[:, part][:, triangle]
         length = np.where(x1 > x0, x1 - x0, 1.0)
         z = z0 + np.clip((column - x0) / length, 0.0, 1.0) * (z1 - z0)
-        np.maximum.at(top, (rows[part][cut], column), z)
+        np.maximum.at(top, (rows[part][triangle], column), z)
 
 
 def _samples_between(start: Floats, end: Floats, samples: int) -> tuple[_Indices, _Indices]:
@@ -322,8 +322,8 @@ def _parts(count: _Indices) -> Iterator[slice]:
     sums = np.cumsum(count)
     start = 0
     while start < len(count):
-        done = sums[start - 1] if start else 0
-        stop = max(start + 1, int(np.searchsorted(sums, done + _PART, side="right")))
+        before = sums[start - 1] if start else 0
+        stop = max(start + 1, int(np.searchsorted(sums, before + _PART, side="right")))
         yield slice(start, stop)
         start = stop
 

@@ -15,7 +15,7 @@ from mirrorskin.twin.view import View
 
 STEEP = 1e6  # slope at the very edge of an object, where it is undefined; no mirror shows it
 
-_NOWHERE = 1e3  # "far below", mm, where there is no object
+_FAR_BELOW = 1e3  # "far below", mm, where there is no object
 _PRECISION = 1e-9  # tolerance of a height, mm
 _RAYS = 32768  # rays processed at a time, so that their data fit into the processor's cache
 _SECANTS = 5  # secant steps that reduce an error of a millimetre to the tolerance on a smooth surface
@@ -68,9 +68,9 @@ def meet(thing: Object, pose: Pose, view: View) -> Obstacle:
     inside, sideways = np.zeros(view.shape, bool), 0.0
     for first in range(0, inside.size, _RAYS):
         some = slice(first, first + _RAYS)
-        foot, lean = _rays(pose, view, some)
-        inside.ravel()[some] = _gap(thing, foot, lean, np.zeros(1)) <= 0
-        sideways = max(sideways, float(np.max(-foot.z / lean.z * np.sqrt(lean.x**2 + lean.y**2))))
+        origin, lean = _rays(pose, view, some)
+        inside.ravel()[some] = _gap(thing, origin, lean, np.zeros(1)) <= 0
+        sideways = max(sideways, float(np.max(-origin.z / lean.z * np.sqrt(lean.x**2 + lean.y**2))))
     maps = np.full((3, *view.shape), np.nan)
     reach = math.ceil(sideways / min(view.pixel_size)) if sideways > 0 else 0
     near = np.flatnonzero(_spread(inside, reach) if reach else inside)
@@ -82,13 +82,13 @@ def meet(thing: Object, pose: Pose, view: View) -> Obstacle:
 
 def _rays(pose: Pose, view: View, pixels: NDArray[np.intp] | slice) -> tuple[_Vectors, _Vectors]:
     """Return start and direction of the rays of some pixels in the object's frame."""
-    left, down = view.x.ravel()[pixels] - pose.shift[0], view.y.ravel()[pixels] - pose.shift[1]
+    right, down = view.x.ravel()[pixels] - pose.shift[0], view.y.ravel()[pixels] - pose.shift[1]
     # Row vectors times the rotation are vectors in the inverse rotation.
-    foot = (left * to[0] + down * to[1] - pose.shift[2] * to[2] for to in pose.rotation.T)
+    origin = (right * to[0] + down * to[1] - pose.shift[2] * to[2] for to in pose.rotation.T)
     if view.orthographic:
-        return _Vectors(*foot), _Vectors(*pose.rotation[2])
+        return _Vectors(*origin), _Vectors(*pose.rotation[2])
     away, up = view.slope_x.ravel()[pixels], view.slope_y.ravel()[pixels]
-    return _Vectors(*foot), _Vectors(*(away * to[0] + up * to[1] + to[2] for to in pose.rotation.T))
+    return _Vectors(*origin), _Vectors(*(away * to[0] + up * to[1] + to[2] for to in pose.rotation.T))
 
 
 def _spread(inside: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
@@ -108,7 +108,7 @@ def _spread(inside: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
 def _meet(
     thing: Object,
     pose: Pose,
-    foot: _Vectors,
+    origin: _Vectors,
     lean: _Vectors,
     steps: int,
     pixels: NDArray[np.intp],
@@ -116,15 +116,15 @@ def _meet(
 ) -> None:
     """Write height and slopes of some pixels, where defined, to maps of (3, H x W)."""
     if steps:
-        height, side = _search(thing, foot, lean, steps)
+        height, side = _search(thing, origin, lean, steps)
     else:
-        height = (thing.height(foot.x, foot.y) - foot.z) / lean.z
+        height = (thing.height(origin.x, origin.y) - origin.z) / lean.z
         side = np.zeros(height.shape, bool)
     here = np.flatnonzero(height >= 0)
     height, side, pixels = height[here], side[here], pixels[here]
-    foot, lean = foot.of(here), lean.of(here)
+    origin, lean = origin.of(here), lean.of(here)
     maps[0, pixels] = height
-    slopes = _slopes(thing, pose, foot.x + height * lean.x, foot.y + height * lean.y)
+    slopes = _slopes(thing, pose, origin.x + height * lean.x, origin.y + height * lean.y)
     for slope, values in zip(maps[1:], slopes, strict=True):
         slope[pixels] = np.where(side, STEEP, values)
 
@@ -132,38 +132,40 @@ def _meet(
 def _above(thing: Object, x: Floats, y: Floats, z: Floats) -> Floats:
     """Return the height of a point above the surface, mm; a large value where there is no object."""
     distance = z - thing.height(x, y)
-    distance[np.isnan(distance)] = _NOWHERE
+    distance[np.isnan(distance)] = _FAR_BELOW
     return distance
 
 
-def _search(thing: Object, foot: _Vectors, lean: _Vectors, steps: int) -> tuple[Floats, NDArray[np.bool_]]:
+def _search(thing: Object, origin: _Vectors, lean: _Vectors, steps: int) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the uppermost height above 0 of the object on each ray, and whether it is a vertical side.
 
     The height is NaN where a ray does not meet it.
     """
-    top = -foot.z / lean.z  # the object's highest point is at z = 0 of its own frame
-    found, side = np.full(top.shape, np.nan), np.zeros(top.shape, bool)
+    top = -origin.z / lean.z  # the object's highest point is at z = 0 of its own frame
+    heights, side = np.full(top.shape, np.nan), np.zeros(top.shape, bool)
     rays = np.flatnonzero(top > 0)
     upper = top[rays]
-    over = _gap(thing, foot.of(rays), lean.of(rays), upper)
+    over = _gap(thing, origin.of(rays), lean.of(rays), upper)
     for step in range(1, steps + 1):
         lower = top[rays] * (1 - step / steps)
-        under = _gap(thing, foot.of(rays), lean.of(rays), lower)
-        met, left = np.flatnonzero(under <= 0), np.flatnonzero(under > 0)
+        under = _gap(thing, origin.of(rays), lean.of(rays), lower)
+        met, missed = np.flatnonzero(under <= 0), np.flatnonzero(under > 0)
         if met.size:
             ends = _End(lower[met], under[met]), _End(upper[met], over[met])
-            found[rays[met]], side[rays[met]] = _narrow(thing, foot.of(rays[met]), lean.of(rays[met]), *ends)
-        rays, upper, over = rays[left], lower[left], under[left]
-    return found, side
+            heights[rays[met]], side[rays[met]] = _narrow(
+                thing, origin.of(rays[met]), lean.of(rays[met]), *ends
+            )
+        rays, upper, over = rays[missed], lower[missed], under[missed]
+    return heights, side
 
 
-def _gap(thing: Object, foot: _Vectors, lean: _Vectors, height: Floats) -> Floats:
+def _gap(thing: Object, origin: _Vectors, lean: _Vectors, height: Floats) -> Floats:
     """Return G at a height on each ray."""
-    return _above(thing, foot.x + height * lean.x, foot.y + height * lean.y, foot.z + height * lean.z)
+    return _above(thing, origin.x + height * lean.x, origin.y + height * lean.y, origin.z + height * lean.z)
 
 
 def _narrow(
-    thing: Object, foot: _Vectors, lean: _Vectors, lower: _End, upper: _End
+    thing: Object, origin: _Vectors, lean: _Vectors, lower: _End, upper: _End
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the height between two at which G changes its sign, and whether it jumps there."""
     then, now = lower, upper
@@ -171,25 +173,25 @@ def _narrow(
         rise = now.gap - then.gap
         step = np.divide(now.gap * (now.height - then.height), rise, out=np.zeros_like(rise), where=rise != 0)
         height = np.clip(now.height - step, lower.height, upper.height)
-        then, now = now, _End(height, _gap(thing, foot, lean, height))
+        then, now = now, _End(height, _gap(thing, origin, lean, height))
         if np.abs(now.height - then.height).max() <= _PRECISION:
             break
     at = now.height
-    below, above = (_gap(thing, foot, lean, at + part * _PRECISION) for part in (-0.5, 0.5))
-    left = np.flatnonzero((below > 0) | (above <= 0) | (above - below > _JUMP))
+    below, above = (_gap(thing, origin, lean, at + part * _PRECISION) for part in (-0.5, 0.5))
+    unclear = np.flatnonzero((below > 0) | (above <= 0) | (above - below > _JUMP))
     side = np.zeros(at.shape, bool)
-    if left.size:
+    if unclear.size:
         from scipy.optimize import elementwise
 
-        foot, lean = foot.of(left), lean.of(left)
+        origin, lean = origin.of(unclear), lean.of(unclear)
         hit = elementwise.find_root(
-            lambda height, number: _gap(thing, foot.of(number), lean.of(number), height),
-            (lower.height[left], upper.height[left]),
-            args=(np.arange(left.size),),
+            lambda height, number: _gap(thing, origin.of(number), lean.of(number), height),
+            (lower.height[unclear], upper.height[unclear]),
+            args=(np.arange(unclear.size),),
             tolerances={"xatol": _PRECISION, "fatol": 0.0},
         )
-        at[left] = np.where(hit.success, hit.x, at[left])
-        side[left] = np.abs(hit.f_x) > _JUMP
+        at[unclear] = np.where(hit.success, hit.x, at[unclear])
+        side[unclear] = np.abs(hit.f_x) > _JUMP
     return at, side
 
 

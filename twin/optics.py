@@ -157,42 +157,42 @@ def visible_zenith(body: Body, x: ArrayLike, y: ArrayLike, azimuth: ArrayLike) -
     x, y, azimuth = np.broadcast_arrays(
         np.asarray(x, float), np.asarray(y, float), np.asarray(azimuth, float)
     )
-    room = body.radius**2 - x * x - y * y
+    half_chord_squared = body.radius**2 - x * x - y * y
     along = x * np.cos(azimuth) + y * np.sin(azimuth)
     # The distance is undefined outside the body: NaN from here on.
-    cosine = np.sqrt(along * along + np.where(room > 0, room, np.nan))
-    way = room / (cosine + along)
-    lower = np.arctan2(way, body.height) / 2
+    cosine = np.sqrt(along * along + np.where(half_chord_squared > 0, half_chord_squared, np.nan))
+    length = half_chord_squared / (cosine + along)
+    lower = np.arctan2(length, body.height) / 2
     if body.air_gap > 0:
-        lower = _leaves(body, way, cosine / body.radius, lower)
+        lower = _leaves(body, length, cosine / body.radius, lower)
     return lower, np.where(np.isnan(lower), np.nan, math.pi / 4)
 
 
-def _leaves(body: Body, way: Floats, cosine: Floats, lower: Floats) -> Floats:
+def _leaves(body: Body, length: Floats, cosine: Floats, lower: Floats) -> Floats:
     """Return the least zenith at which a ray leaves the body below the rim and also meets the wall below it.
 
     ``cosine`` is that of a horizontal ray and the side's normal. A larger zenith makes the ray meet the wall
     lower.
     """
-    least = math.sqrt(1 - 1 / body.index**2) / cosine
-    dark = np.maximum(lower, np.arcsin(np.minimum(least, 1)) / 2)
+    lowest = math.sqrt(1 - 1 / body.index**2) / cosine
+    dark = np.maximum(lower, np.arcsin(np.minimum(lowest, 1)) / 2)
     light = np.full_like(dark, math.pi / 4)
     for _ in range(_HALVINGS):
         middle = (dark + light) / 2
-        below = _height_at_wall(body, way, cosine, middle) <= body.height
+        below = _height_at_wall(body, length, cosine, middle) <= body.height
         dark, light = np.where(below, dark, middle), np.where(below, middle, light)
-    return np.where(least < 1, light, np.nan)
+    return np.where(lowest < 1, light, np.nan)
 
 
-def _height_at_wall(body: Body, way: Floats, cosine: Floats, zenith: Floats) -> Floats:
+def _height_at_wall(body: Body, length: Floats, cosine: Floats, zenith: Floats) -> Floats:
     """Return the height at which a ray meets the wall across the gap."""
     level, rise = np.sin(2 * zenith), np.cos(2 * zenith)
     out = np.sqrt(np.maximum(1 - body.index**2 * (1 - (level * cosine) ** 2), 0))
     spread = np.maximum(1 - (body.index * rise) ** 2, 0)  # squared horizontal component of the refracted ray
-    room = (body.radius + body.air_gap) ** 2 - body.radius**2
+    gap_squared = (body.radius + body.air_gap) ** 2 - body.radius**2
     towards = body.radius * out
-    across = room / (towards + np.sqrt(towards**2 + spread * room + _TINY))
-    return np.asarray(rise * (way / level + body.index * across))
+    across = gap_squared / (towards + np.sqrt(towards**2 + spread * gap_squared + _TINY))
+    return np.asarray(rise * (length / level + body.index * across))
 
 
 _RAYS = 128  # rays per pixel

@@ -129,8 +129,8 @@ def make_pattern(name: str | Path, body: Body) -> Pattern:
         return linear_pattern(body)
     path = Path(name)
     if path.suffix.lower() not in PICTURE_SUFFIXES:
-        known, kinds = ", ".join(PATTERN_NAMES), ", ".join(PICTURE_SUFFIXES)
-        raise InputError(f"pattern {str(name)!r} is unknown: take {known} or the path of a picture ({kinds})")
+        names, kinds = ", ".join(PATTERN_NAMES), ", ".join(PICTURE_SUFFIXES)
+        raise InputError(f"pattern {str(name)!r} is unknown: take {names} or the path of a picture ({kinds})")
     try:
         return Picture(read_picture(path))
     except InputError as error:

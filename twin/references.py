@@ -22,7 +22,7 @@ _Counts = NDArray[np.float32]
 
 _DARK_FRAMES = 16
 _BRIGHTEST = 3  # rank of a pixel's sample that is its reference, to exclude single glints
-_LEAST = 0.1  # minimum light of a pixel with references, relative to the others
+_LIGHT_MIN = 0.1  # minimum light of a pixel with references, relative to the others
 _STEP = 0.4  # distance between positions of the ball, as a share of its radius
 _STEEPEST = math.radians(46.0)  # zenith at the rim of the ball's contact, which is all that a wall can show
 
@@ -67,13 +67,13 @@ def ball_references(optics: Ideal | Wall | Coat, sensor: Sensor, view: View) -> 
     for number, (x, y) in enumerate(_places(view, reach), _DARK_FRAMES):
         light = optics.light(ball.drape(Pose(np.eye(3), np.array([x, y, depth]))))
         sensor.expose(light, -1 - number, counts)
-        left = counts.astype(np.float32)
+        remainder = counts.astype(np.float32)
         for kept in brightest:
-            left, kept[...] = np.minimum(kept, left), np.maximum(kept, left)
+            remainder, kept[...] = np.minimum(kept, remainder), np.maximum(kept, remainder)
     bright = brightest[-1]
     span = bright - dark
-    seen = span >= _LEAST * np.median(span[view.on_body])
-    return np.where(seen, dark, np.nan).astype(np.float32), np.where(seen, bright, np.float32(np.nan))
+    lit = span >= _LIGHT_MIN * np.median(span[view.on_body])
+    return np.where(lit, dark, np.nan).astype(np.float32), np.where(lit, bright, np.float32(np.nan))
 
 
 def _places(view: View, radius: float) -> list[tuple[float, float]]:

@@ -47,7 +47,7 @@ class Scene:
         Models of the sheet's shape and of its light.
     exposure : float
         Exposure, in the unit of the moments.
-    room : int
+    kept_poses : int
         Number of poses whose light is cached, at least 1.
     imprint : Imprint, optional
     shade : callable, optional
@@ -65,7 +65,7 @@ class Scene:
         skin: Skin,
         optics: Optics,
         exposure: float = 0.0,
-        room: int = _BLUR_POSES,
+        kept_poses: int = _BLUR_POSES,
         imprint: Imprint | None = None,
         shade: Shade | None = None,
     ) -> None:
@@ -75,7 +75,7 @@ class Scene:
         if exposure > 0:
             self._ends = [-exposure / 2, 0.0, exposure / 2]
             self.moments = (exposure * _BLUR).tolist()
-        self._room = max(1, room)
+        self._room = max(1, kept_poses)
         self._kept: dict[bytes, tuple[Light, Floats | None]] = {}
 
     def light(self, pose_at: Callable[[float], Pose], middle: float = 0.0) -> Light:

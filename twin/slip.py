@@ -153,10 +153,10 @@ class SkinHistory:
 
         The number may be fractional, from half a frame before the first to half a frame after the last.
         """
-        before, after, share = self._between(frame)
+        before, after, fraction = self._between(frame)
         window, loads, *_ = self._course
-        load = (1 - share) * loads[before] + share * loads[after]
-        place = self._path[before] + share * (self._path[after] - self._path[before])
+        load = (1 - fraction) * loads[before] + fraction * loads[after]
+        place = self._path[before] + fraction * (self._path[after] - self._path[before])
         return Drag.by(self._skin.space, window, load, self._margin, place)
 
     def displacements(self) -> NDArray[np.float32]:

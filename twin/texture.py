@@ -94,8 +94,8 @@ class SheetTexture:
         across, up = (size / 4 for size in pixel_size)
         x, y = places
         quarters = [np.stack([x + i * across, y + j * up]) for j in (-1, 1) for i in (-1, 1)]
-        share: Floats = np.mean([self._dots(part) for part in quarters], axis=0)
-        return 1 - self.contrast * share
+        fraction: Floats = np.mean([self._dots(part) for part in quarters], axis=0)
+        return 1 - self.contrast * fraction
 
     def shown(self, reflectance: NDArray[Any], light: Light) -> Light:
         """Return the share of full light of pixels that get a light from the mirror."""
@@ -178,12 +178,12 @@ class Coat:
             return self.texture.shown(self.rest, light)
         off = np.stack([height * view.slope_x, height * view.slope_y])
         if history is not None and self.texture.kind == "flakes":
-            share = self._flakes.share(history.drag(frame), off)
-            return self.texture.shown(1 - self.texture.contrast * share, light)
-        seen = np.stack([view.x, view.y]) + off
+            fraction = self._flakes.share(history.drag(frame), off)
+            return self.texture.shown(1 - self.texture.contrast * fraction, light)
+        points = np.stack([view.x, view.y]) + off
         if history is not None:
-            seen = history.drag(frame).material(seen)
-        return self.texture.shown(self.texture.reflectance(seen, view.pixel_size), light)
+            points = history.drag(frame).material(points)
+        return self.texture.shown(self.texture.reflectance(points, view.pixel_size), light)
 
     @functools.cached_property
     def _flakes(self) -> _DraggedFlakes:
@@ -235,12 +235,12 @@ class DraggedCoat:
         place = np.array([x, y, math.atan2(rotation[0, 1], rotation[0, 0])])
         if abs(travel - self._travel) > _STILL or rotation[2, 2] < 1 - _STILL:
             self._travel, self._pressed_at, self._state = travel, place, None
-        way = place - self._pressed_at
-        twists = bool(abs(way[2]) > _STILL)
+        delta = place - self._pressed_at
+        twists = bool(abs(delta[2]) > _STILL)
         if twists != self._twists:
             self._twists, self._state = twists, None
-        if self._state is None and abs(way).max() > _STILL:
+        if self._state is None and abs(delta).max() > _STILL:
             self._state = SkinState(self._skin, travel, self._coefficient)
         if self._state is not None:
-            self._state.go(way[2:] if twists else way[:2])
+            self._state.go(delta[2:] if twists else delta[:2])
         return self._coat.shade(light, height, history=self._state)

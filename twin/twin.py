@@ -360,15 +360,15 @@ class Twin(Closing):
         )
 
     def _make_scene(self) -> Scene:
-        share = self._camera.exposure * self._camera.frame_rate
+        fraction = self._camera.exposure * self._camera.frame_rate
         coat, history, optics = self._optics, self._history, self._optics
         shade: Shade | None = None
         if isinstance(coat, Coat) and history is not None:
             optics, shade = coat.optics, lambda light, z, _, frame: coat.shade(light, z, frame, history)
         each = (np.dtype(np.float64).itemsize if shade else 0) + np.dtype(np.float32).itemsize
-        room = _MEMORY // (each * self._view.x.size)
+        count = _MEMORY // (each * self._view.x.size)
         imprint = self._imprint if isinstance(self.movement, Vertical) else None
-        return Scene(self._witness, optics, share, room, imprint, shade)
+        return Scene(self._witness, optics, fraction, count, imprint, shade)
 
     def _zenith_scale(self) -> tuple[Floats, Floats] | None:
         """Return counts per radian of zenith and at zenith 0, where brightness is linear in it."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.base.types import Floats, InputError, pixel_axes
 from mirrorskin.twin.body import Body
 
-_ROUNDS = 100
+_ITERATIONS_MAX = 100
 
 
 class View:
@@ -69,7 +69,7 @@ def _tangent_inside(away: Floats, body: Body, above: float) -> Floats:
     """
     index = body.index
     tangent = np.zeros_like(away)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS_MAX):
         under = 1 / np.sqrt(index**2 + (index**2 - 1) * tangent**2)
         missing = away - above * tangent - body.height * tangent * under
         step = missing / (above + body.height * index**2 * under**3)

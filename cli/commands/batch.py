@@ -163,17 +163,17 @@ def _is_result(path: Path, folder: Path) -> bool:
 def _prepare(folder: Path, jobs: Sequence[Job]) -> None:
     """Create the folder, check that it can be written to, and remove temporary files of a killed batch."""
     from mirrorskin import io
-    from mirrorskin.io.base.system import as_input_error
+    from mirrorskin.io.base.system import translate_os_errors
     from mirrorskin.io.storage.atomic import remove_leftovers
 
-    with as_input_error(f"{folder} cannot be created", "choose another folder with -o"):
+    with translate_os_errors(f"{folder} cannot be created", "choose another folder with -o"):
         if folder.exists() and not folder.is_dir():
             raise io.InputError(f"{folder} is not a folder: name one with -o")
         if not folder.parent.is_dir():
             raise io.InputError(f"{folder}: there is no folder {folder.parent}: make it first")
         folder.mkdir(exist_ok=True)
     with (
-        as_input_error(f"{folder} cannot be written to", "choose another with -o"),
+        translate_os_errors(f"{folder} cannot be written to", "choose another with -o"),
         TemporaryFile(dir=folder),
     ):
         pass

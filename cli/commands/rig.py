@@ -98,7 +98,7 @@ def home(rig: RigFile) -> None:
 def lift(rig: RigFile) -> None:
     """Set the body upright, lift it to the end of its travel, and bring it to the middle."""
     with _opened(rig) as stage:
-        for place in stage.limits.way_up(stage.report().position):
+        for place in stage.limits.retreat_path(stage.report().position):
             stage.move(place)
             stage.wait()
 

@@ -116,10 +116,13 @@ def _start_in_background() -> None:
 
 def _detach(log: Path, ready: int) -> None:
     """Send further output to a log, and report to the waiting parent that the rig is ready."""
-    from mirrorskin.io.base.system import as_input_error
+    from mirrorskin.io.base.system import translate_os_errors
 
     sys.stdout.flush()
-    with as_input_error(f"{log} cannot be written", "choose another folder with -o"), log.open("ab") as file:
+    with (
+        translate_os_errors(f"{log} cannot be written", "choose another folder with -o"),
+        log.open("ab") as file,
+    ):
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     os.write(ready, b"1")

@@ -32,7 +32,7 @@ from mirrorskin.io.base.types import exclusive_use
 from mirrorskin.io.model.maps import SIGMA, UNDECLARED, declaration_of
 from mirrorskin.io.model.result import result_of
 from mirrorskin.io.storage.layout import as_series
-from mirrorskin.io.watch.watch import Watch
+from mirrorskin.io.watch.watch import FrameChecker
 from mirrorskin.kernels.array import Array
 
 if TYPE_CHECKING:
@@ -106,9 +106,9 @@ class Run(ThreadSafe):
         if on_device is not None:
             self._use_device_of(on_device)
         self.operation._begin(shape[1:], dtype)
-        self._watch: Watch | None = None
+        self._watch: FrameChecker | None = None
         if self._plan.checked and source is not None:
-            self._watch = Watch(
+            self._watch = FrameChecker(
                 source,
                 moved=bool(self.operation.motions),
                 phased="phase" in self.operation.positions,
@@ -242,7 +242,7 @@ class Run(ThreadSafe):
         with naming(cast("Source", self._source)):
             self._take(block, self._watch)
 
-    def _take(self, block: Block, watch: Watch | None) -> None:
+    def _take(self, block: Block, watch: FrameChecker | None) -> None:
         operation = self.operation
         if self._final is not None:
             raise InputError(f"the run of {type(operation).__name__} has ended: push frames into a new one")

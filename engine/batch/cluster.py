@@ -24,7 +24,7 @@ from mirrorskin.engine.base.provenance import program_version
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.batch.work import Outcome
 from mirrorskin.io import InputError
-from mirrorskin.io.base.system import as_input_error, lock
+from mirrorskin.io.base.system import lock, translate_os_errors
 from mirrorskin.io.storage.atomic import remove_leftovers
 
 PATIENCE = 30.0
@@ -281,7 +281,7 @@ async def _greet(distributed: ModuleType, address: str) -> None:
 def _trace(folder: Path) -> Iterator[Path]:
     """Create a temporary empty file in a folder: a worker that sees it sees the folder itself."""
     with ExitStack() as stack:
-        with as_input_error(f"{folder} cannot be written to", "choose another folder with -o"):
+        with translate_os_errors(f"{folder} cannot be written to", "choose another folder with -o"):
             file = stack.enter_context(
                 tempfile.NamedTemporaryFile(prefix=".mirrorskin-", suffix=".part", dir=folder)
             )

@@ -17,7 +17,7 @@ from mirrorskin.engine.base.running import Progress
 from mirrorskin.engine.base.summary import summarise
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.io import InputError, Recording
-from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.system import translate_os_errors
 from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.io.base.url import Url
 from mirrorskin.io.files.result_file import open_process
@@ -92,7 +92,7 @@ def _compute(
     target, digest = outcome.job.target, plan.digest(source.motion)
     if _has_result(outcome.job, source, digest):
         return replace(outcome, state="kept", message=_KEPT)
-    with as_input_error(f"{target.parent} cannot be created", "choose another folder for results"):
+    with translate_os_errors(f"{target.parent} cannot be created", "choose another folder for results"):
         target.parent.mkdir(parents=True, exist_ok=True)
     io.check_output(target, outcome.job.source)
     opened = open_device(device)

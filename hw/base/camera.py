@@ -69,11 +69,11 @@ class Camera(Protocol):
     def error(self) -> HardwareError | None:
         """Reason why no more frames will arrive; None while the camera works."""
 
-    def take(self, most: int, timeout: float) -> Frames:
+    def take(self, limit: int, timeout: float) -> Frames:
         """Take the oldest waiting frames, or wait for one.
 
-        At least one and at most `most` frames are returned, without a gap between them. HardwareError if none
-        arrives within `timeout` seconds, or none will arrive any more.
+        At least one and at most `limit` frames are returned, without a gap between them. HardwareError if
+        none arrives within `timeout` seconds, or none will arrive any more.
         """
 
     def flush(self) -> None:

@@ -12,7 +12,7 @@ from typing import Self
 from mirrorskin.io.base.system import open_regular
 
 _HEADING = re.compile(r"# Emulated rig: port (\S+), process (\d+), started at (\d+)\.")
-_LONGEST = 1 << 20  # maximum size of a rig file, bytes
+_FILE_SIZE_MAX = 1 << 20  # maximum size of a rig file, bytes
 _STARTED = 18  # index, after state, of the start time in /proc/PID/stat; see proc(5)
 
 
@@ -48,11 +48,11 @@ class Emulator:
         user.
         """
         with open_regular(path) as file:
-            text = file.read(_LONGEST).decode("utf-8-sig", errors="replace")
-        found = _HEADING.match(text)
-        if found is None or f'\nport = "{found[1]}"\n' not in text:
+            text = file.read(_FILE_SIZE_MAX).decode("utf-8-sig", errors="replace")
+        match = _HEADING.match(text)
+        if match is None or f'\nport = "{match[1]}"\n' not in text:
             return None
-        return cls(found[1], int(found[2]), int(found[3]))
+        return cls(match[1], int(match[2]), int(match[3]))
 
     @property
     def heading(self) -> str:

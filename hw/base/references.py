@@ -26,24 +26,28 @@ def read_reference(
     camera: CameraSettings, name: Literal["dark", "bright"], rig_file: str | Path
 ) -> NDArray[np.float32] | None:
     """Return a reference, (H, W), NaN at pixels without one; None if the rig file has none."""
-    given = camera.dark if name == "dark" else camera.bright
-    if given is None:
+    reference = camera.dark if name == "dark" else camera.bright
+    if reference is None:
         return None
     where, dtype = f"{rig_file}: camera.{name}", np.dtype(camera.dtype)
-    if isinstance(given, str):
-        counts = _read(Path(given), where)
-        _check_fits(counts, given, camera, where)
+    if isinstance(reference, str):
+        counts = _read(Path(reference), where)
+        _check_fits(counts, reference, camera, where)
     else:
-        counts = np.full(camera.shape, given, np.float64)
-    known = counts[~np.isnan(counts)]
-    if not known.size:
-        raise InputError(f"{where}: {given} contains only NaN; take the reference again")
-    least, most = (0, np.iinfo(dtype).max) if dtype.kind == "u" else (-_LARGEST, _LARGEST)
-    low, high = known.min(), known.max()
-    if not least <= low <= high <= most:
-        found = f"{given} contains {low:.6g} to {high:.6g}" if isinstance(given, str) else f"it is {low:.6g}"
+        counts = np.full(camera.shape, reference, np.float64)
+    finite = counts[~np.isnan(counts)]
+    if not finite.size:
+        raise InputError(f"{where}: {reference} contains only NaN; take the reference again")
+    lowest, highest = (0, np.iinfo(dtype).max) if dtype.kind == "u" else (-_LARGEST, _LARGEST)
+    low, high = finite.min(), finite.max()
+    if not lowest <= low <= high <= highest:
+        content = (
+            f"{reference} contains {low:.6g} to {high:.6g}"
+            if isinstance(reference, str)
+            else f"it is {low:.6g}"
+        )
         raise InputError(
-            f"{where}: {found}, but counts of {dtype.name} are {least:g} to {most:g}; take the "
+            f"{where}: {content}, but counts of {dtype.name} are {lowest:g} to {highest:g}; take the "
             "reference with this camera"
         )
     return counts.astype(np.float32)
@@ -76,9 +80,9 @@ def _check_fits(counts: NDArray[Any], path: str, camera: CameraSettings, where: 
             f"{camera.dtype}; take the reference with this camera, or correct camera.dtype"
         )
     if counts.shape != camera.shape:
-        found = " x ".join(map(str, reversed(counts.shape))) or "a single number"
+        size = " x ".join(map(str, reversed(counts.shape))) or "a single number"
         rows, columns = camera.shape
         raise InputError(
-            f"{where}: {path} is {found}, but the camera's pictures are {columns} x {rows} "
+            f"{where}: {path} is {size}, but the camera's pictures are {columns} x {rows} "
             "(columns x rows); take the reference with this camera, or correct camera.size"
         )

@@ -418,9 +418,9 @@ def load_rig(path: Path | str) -> RigSettings:
     _check_emulator(path)
     camera = file.camera
     resolved: dict[str, Any] = {
-        name: str(path.parent / given)
+        name: str(path.parent / file_name)
         for name in ("dark", "bright")
-        if isinstance(given := getattr(camera, name), str)
+        if isinstance(file_name := getattr(camera, name), str)
     }
     if isinstance(camera.source, str) and not camera.streamed:
         driver = camera_driver(camera.source)

@@ -126,8 +126,8 @@ class Limits:
         lean = math.degrees(position.tilt - self.tilt)
         beyond = [low - position.travel, position.travel - min(high, self.press), lean]
         for motion, _, scale in _SIDEWAYS:
-            (least, greatest), value = getattr(self, motion), getattr(position, motion)
-            beyond += [(least - value) * scale, (value - greatest) * scale]
+            (lowest, greatest), value = getattr(self, motion), getattr(position, motion)
+            beyond += [(lowest - value) * scale, (value - greatest) * scale]
         return max(0.0, *beyond)
 
     def nearest(self, position: Position) -> Position:
@@ -136,12 +136,12 @@ class Limits:
         bounds = {"travel": (low, min(high, self.press)), "x": self.x, "y": self.y, "twist": self.twist}
         return Position(
             **{
-                motion: min(max(getattr(position, motion), least), greatest)
-                for motion, (least, greatest) in bounds.items()
+                motion: min(max(getattr(position, motion), lowest), greatest)
+                for motion, (lowest, greatest) in bounds.items()
             }
         )
 
-    def way_up(self, position: Position) -> list[Position]:
+    def retreat_path(self, position: Position) -> list[Position]:
         """Return the path of a retreat: upright, straight up to the least travel, and to the centre."""
         upright, high = self.nearest(position), self.travel[0]
         first = [upright] if position.tilt > _UPRIGHT else []
@@ -192,10 +192,10 @@ class Stage(Protocol):
     def home(self) -> None:
         """Home the axes; called only if the rig file states that there are switches."""
 
-    def check_way(self, start: Position, place: Position, speed: float | None) -> None:
+    def check_move(self, start: Position, place: Position, speed: float | None) -> None:
         """Refuse a sweep that is impossible at a speed, mm/s or rad/s."""
 
-    def check_turns(self, tilt: float, turns: float, rate: float) -> None:
+    def check_precession(self, tilt: float, turns: float, rate: float) -> None:
         """Refuse a precession of a half-angle, radians, at a rate, turns per second."""
 
     def move(self, place: Position, speed: float | None = None) -> None:

@@ -79,9 +79,9 @@ class ThreadedCamera(Closing):
         """Reason why no more frames will arrive; None while the camera works."""
         return self._ring.error
 
-    def take(self, most: int, timeout: float) -> Frames:
+    def take(self, limit: int, timeout: float) -> Frames:
         """Take the oldest waiting frames, or wait for one; see ``Camera.take``."""
-        return self._ring.take(most, timeout)
+        return self._ring.take(limit, timeout)
 
     def flush(self) -> None:
         """Discard the waiting frames; they do not count as dropped."""

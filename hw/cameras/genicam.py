@@ -66,7 +66,7 @@ class GenicamCamera(ReopenedCamera):
     Examples
     --------
     >>> with GenicamCamera(CameraSettings(source="genicam:", size=(640, 480))) as camera:  # doctest: +SKIP
-    ...     camera.take(most=8, timeout=1.0).pixels.shape
+    ...     camera.take(limit=8, timeout=1.0).pixels.shape
     (1, 480, 640)
     """
 
@@ -113,22 +113,22 @@ class GenicamCamera(ReopenedCamera):
             stream.push_buffer(buffer)
 
     def _open(self) -> Any:
-        wanted = str(self._settings.source).partition(":")[2]
+        camera_name = str(self._settings.source).partition(":")[2]
         aravis = self._aravis
         aravis.update_device_list()
-        there: dict[str, set[str]] = {}
+        devices: dict[str, set[str]] = {}
         for n in range(aravis.get_n_devices()):
             names = (aravis.get_device_serial_nbr, aravis.get_device_physical_id, aravis.get_device_address)
             device = aravis.get_device_id(n)
-            there[device] = {device, *(name(n) for name in names)}
-        found = [device for device, names in there.items() if not wanted or wanted in names]
-        if not wanted and not found:
+            devices[device] = {device, *(name(n) for name in names)}
+        matching = [device for device, names in devices.items() if not camera_name or camera_name in names]
+        if not camera_name and not matching:
             raise InputError(f"{self.name}: no camera found; check its cable, power supply and network")
         try:
-            opened = aravis.Camera.new(found[0] if found else wanted)
+            opened = aravis.Camera.new(matching[0] if matching else camera_name)
         except self._failure as error:
-            known = f"; available: {', '.join(sorted(there))}" if there else "; none was found"
-            raise InputError(f"{self.name} cannot be opened: {error.message}{known}") from error
+            available = f"; available: {', '.join(sorted(devices))}" if devices else "; none was found"
+            raise InputError(f"{self.name} cannot be opened: {error.message}{available}") from error
         if opened.is_gv_device() and not opened.get_device().is_controller():
             raise InputError(
                 f"{self.name} is used by another program: close that program, and wait some seconds"
@@ -148,14 +148,14 @@ class GenicamCamera(ReopenedCamera):
                 f"{self.name} delivers {width} x {height} pixels, not {asked.size[0]} x "
                 f"{asked.size[1]}: set camera.size in the rig file accordingly"
             )
-        there = device.dup_available_pixel_formats_as_strings()
+        available = device.dup_available_pixel_formats_as_strings()
         formats = _FORMATS.get(asked.dtype, ())
-        chosen = [one for one in formats if one in there and asked.fourcc in (None, one)]
+        chosen = [name for name in formats if name in available and asked.fourcc in (None, name)]
         if not chosen:
-            wanted = asked.fourcc or " or ".join(formats) or "none"
+            needed = asked.fourcc or " or ".join(formats) or "none"
             raise InputError(
-                f"{self.name} has no format for dtype {asked.dtype} (needed: {wanted}; available: "
-                f"{', '.join(there)}): set camera.dtype and camera.fourcc in the rig file "
+                f"{self.name} has no format for dtype {asked.dtype} (needed: {needed}; available: "
+                f"{', '.join(available)}): set camera.dtype and camera.fourcc in the rig file "
                 "accordingly"
             )
         device.set_pixel_format_from_string(chosen[0])

@@ -88,10 +88,10 @@ class ReopenedCamera(ThreadedCamera):
         self._put(time, lost if self._lost is None else self._came_back(time))
         self._ready.set()
 
-    def take(self, most: int, timeout: float) -> Frames:
+    def take(self, limit: int, timeout: float) -> Frames:
         """Take the oldest waiting frames, or wait for one; see ``Camera.take``."""
         try:
-            return super().take(most, timeout)
+            return super().take(limit, timeout)
         except HardwareError as error:
             lost = self._lost
             if lost is None or self.error is not None:
@@ -138,16 +138,16 @@ class ReopenedCamera(ThreadedCamera):
 
     def _wait_for_return(self, why: str) -> float:
         """Wait before the next attempt, or give up; return the remaining seconds for attempts."""
-        left = self._was_lost(why) + PATIENCE - self.clock.now()
-        if left <= 0:
+        remaining = self._was_lost(why) + PATIENCE - self.clock.now()
+        if remaining <= 0:
             self._fail(
                 f"{why}: it was lost and did not come back within {PATIENCE:.3g} s; check its cable "
                 "and power supply"
             )
             self._stop.set()
-        self._stop.wait(min(self._pause, max(left, 0.0)))
+        self._stop.wait(min(self._pause, max(remaining, 0.0)))
         self._pause = min(2 * self._pause, _PAUSES[1])
-        return min(OPEN_TIMEOUT, max(left, 0.1))
+        return min(OPEN_TIMEOUT, max(remaining, 0.1))
 
     def _was_lost(self, why: str) -> float:
         """Log a new loss of the camera, and return the time of the loss."""
@@ -170,5 +170,5 @@ class ReopenedCamera(ThreadedCamera):
 
 def warn_of_other(name: str, what: str, asked: float | str, got: float | str, unit: str = "") -> None:
     """Log that a camera uses another value than requested."""
-    said = [f"{value}{unit}" if isinstance(value, str) else f"{value:g}{unit}" for value in (asked, got)]
-    _log.warning("%s: %s %s was requested, but the camera set %s", name, what, *said)
+    texts = [f"{value}{unit}" if isinstance(value, str) else f"{value:g}{unit}" for value in (asked, got)]
+    _log.warning("%s: %s %s was requested, but the camera set %s", name, what, *texts)

@@ -16,14 +16,14 @@ from mirrorskin.hw.base.errors import HardwareError
 
 MEMORY = 64_000_000  # default size of a ring, bytes
 _SECONDS = 0.5
-_LEAST, _MOST = 4, 1024  # frames
+_SLOTS_MIN, _SLOTS_MAX = 4, 1024  # frames
 _BEYOND = 64  # readable bytes after the frames, so that a kernel may load its last word as a whole
 
 
 def usual_slots(shape: tuple[int, int], dtype: DTypeLike, rate: float | None = None) -> int:
     """Return the number of frames in a ring: 64 MB or 0.5 s, whichever is more, from 4 to 1024."""
-    room = MEMORY // max(1, math.prod(shape) * np.dtype(dtype).itemsize)
-    return max(_LEAST, min(room, _MOST), math.ceil(_SECONDS * (rate or 0.0)))
+    count = MEMORY // max(1, math.prod(shape) * np.dtype(dtype).itemsize)
+    return max(_SLOTS_MIN, min(count, _SLOTS_MAX), math.ceil(_SECONDS * (rate or 0.0)))
 
 
 class Ring:
@@ -54,7 +54,7 @@ class Ring:
         # One more for writing; and while one is shared and one copied, one can wait.
         places = max(slots + 2, 4)
         self._slots = slots
-        self._most_lent = max(1, slots // 2)
+        self._shared_max = max(1, slots // 2)
         self._places = _pages((places, *shape), np.dtype(dtype))
         self._time = np.zeros(places)
         self._number = np.zeros(places, np.int64)
@@ -62,7 +62,7 @@ class Ring:
         self._free = [True] * places
         self._waiting: deque[int] = deque()
         self._missed = 0  # frames lost since the last one taken
-        self._lent = 0
+        self._shared = 0
         self._returned: deque[range] = deque()
         self._writing = 0
         self._free[0] = False
@@ -82,7 +82,7 @@ class Ring:
             self.dropped += lost
             self._waiting.append(here)
             self._reclaim()
-            while len(self._waiting) > max(1, self._slots - self._lent):
+            while len(self._waiting) > max(1, self._slots - self._shared):
                 self._forget_oldest()
             self._writing = self._next(here)
             self._came.notify()
@@ -94,7 +94,7 @@ class Ring:
                 self.error = error
             self._came.notify_all()
 
-    def take(self, most: int, timeout: float) -> Frames:
+    def take(self, limit: int, timeout: float) -> Frames:
         """Take the oldest waiting frames, or wait for one; see ``mirrorskin.hw.Camera.take``.
 
         The result ends before lost frames, at the last slot, and at half of the ring.
@@ -102,14 +102,14 @@ class Ring:
         with self._came:
             self._wait(timeout)
             self._reclaim()
-            room = self._most_lent - self._lent
-            run = self._run(min(max(1, most), room if room > 0 else len(self._free) - 2 - self._lent))
-            self._lent += len(run)
+            free = self._shared_max - self._shared
+            run = self._run(min(max(1, limit), free if free > 0 else len(self._free) - 2 - self._shared))
+            self._shared += len(run)
             missed, self._missed = self._missed + self._lost[run.start], 0
             part = slice(run.start, run.stop)
             number, time = self._number[part].copy(), self._time[part].copy()
         pixels = np.asarray(_Loan(self._places[part], self._returned, run))
-        if room <= 0:
+        if free <= 0:
             copy = _pages(pixels.shape, pixels.dtype)
             copy[:] = pixels
             pixels = copy
@@ -123,11 +123,11 @@ class Ring:
             self._waiting.clear()
             self._missed = 0
 
-    def _run(self, most: int) -> range:
+    def _run(self, limit: int) -> range:
         """Remove contiguous waiting slots without a loss between them from the queue."""
         first = self._waiting.popleft()
         stop = first + 1
-        while self._waiting and stop - first < most and self._waiting[0] == stop and not self._lost[stop]:
+        while self._waiting and stop - first < limit and self._waiting[0] == stop and not self._lost[stop]:
             self._waiting.popleft()
             stop += 1
         return range(first, stop)
@@ -138,19 +138,19 @@ class Ring:
             if self.error is not None:
                 # a traceback would keep arrays of earlier callers alive
                 raise self.error.with_traceback(None)
-            left = deadline - self._clock.now()
-            if left <= 0:
+            remaining = deadline - self._clock.now()
+            if remaining <= 0:
                 raise HardwareError(
                     f"{self.name} delivered no frame for {timeout:.3g} s: check whether it runs, "
                     "and its cable"
                 )
-            self._came.wait(left)
+            self._came.wait(remaining)
 
     def _reclaim(self) -> None:
         """Recover the slots that are no longer referenced."""
         while self._returned:
             run = self._returned.popleft()
-            self._lent -= len(run)
+            self._shared -= len(run)
             self._free[run.start : run.stop] = [True] * len(run)
 
     def _forget_oldest(self) -> None:

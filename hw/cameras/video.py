@@ -81,7 +81,7 @@ class VideoCamera(ReopenedCamera):
     Examples
     --------
     >>> with VideoCamera(CameraSettings(source=0, size=(640, 480))) as camera:  # doctest: +SKIP
-    ...     camera.take(most=8, timeout=1.0).pixels.shape
+    ...     camera.take(limit=8, timeout=1.0).pixels.shape
     (1, 480, 640)
     """
 
@@ -212,12 +212,12 @@ class Capture:
     def retrieve(self, out: NDArray[Any]) -> None:
         """Write the picture that was grabbed to a frame, (H, W)."""
         try:
-            done, picture = self._video.retrieve(out if self._raw else self._picture)
+            success, picture = self._video.retrieve(out if self._raw else self._picture)
             if self._jpeg:
-                picture = _decode(picture) if done else None
+                picture = _decode(picture) if success else None
         except cv2.error as error:
             raise InputError(f"{self._source.name}: a picture cannot be decoded: {error.err}") from error
-        if not done or picture is None:
+        if not success or picture is None:
             raise InputError(f"{self._source.name}: a picture cannot be decoded: check camera.fourcc")
         if picture is not out:
             self._picture = picture
@@ -383,10 +383,10 @@ def find_source(source: int | str) -> VideoSource:
 
 def _check_device(path: Path) -> None:
     if not path.exists():
-        there = sorted(str(found) for found in _DEVICES.glob("video*"))
+        devices = sorted(str(path) for path in _DEVICES.glob("video*"))
         raise InputError(
             f"camera {path}: there is no such device; "
-            + (f"available: {', '.join(there)}" if there else "Linux reports no camera")
+            + (f"available: {', '.join(devices)}" if devices else "Linux reports no camera")
         )
     if not os.access(path, os.R_OK | os.W_OK):
         raise InputError(f"no permission to use camera {path}: add yourself to the group 'video'")

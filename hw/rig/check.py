@@ -142,9 +142,9 @@ def _controller(stage: Any, settings: StageSettings) -> Iterator[CheckResult]:
     yield _wait("stage", "longest round trip", stage.longest_trip, stage.longest_silence, "stage.silence")
 
 
-def _rated(part: str, what: str, found: str, remedy: str = "", verdict: Verdict = "warning") -> CheckResult:
+def _rated(part: str, what: str, value: str, remedy: str = "", verdict: Verdict = "warning") -> CheckResult:
     """Return a finding that is ok unless there is a remedy."""
-    return CheckResult(part, what, found, verdict if remedy else "ok", remedy)
+    return CheckResult(part, what, value, verdict if remedy else "ok", remedy)
 
 
 def in_words(position: Position, settings: StageSettings) -> str:
@@ -167,23 +167,23 @@ def _state(report: Report, settings: StageSettings) -> CheckResult:
 
 
 def _position(report: Report, stage: Stage, settings: StageSettings) -> CheckResult:
-    found = in_words(report.position, settings)
+    value = in_words(report.position, settings)
     if settings.home:
-        return CheckResult("stage", "position", f"{found} (before homing)")
+        return CheckResult("stage", "position", f"{value} (before homing)")
     try:
         stage.limits.check(report.position, "it")
     except InputError:
         remedy = "outside the file's limits; move it inside by hand, or correct zero"
-        return CheckResult("stage", "position", found, "warning", remedy)
-    return CheckResult("stage", "position", found)
+        return CheckResult("stage", "position", value, "warning", remedy)
+    return CheckResult("stage", "position", value)
 
 
 def _homing(parameters: Mapping[int, float], settings: StageSettings) -> CheckResult:
     on = bool(int(parameters.get(_HOMING, 0)) & 1)
-    found = ("on" if on else "off") if _HOMING in parameters else "not told"
+    value = ("on" if on else "off") if _HOMING in parameters else "not told"
     wrong = settings.home and not on
     remedy = "the file requires homing; set stage.home = false, or enable it ($22=1)" if wrong else ""
-    return _rated("stage", "homing ($22)", found, remedy, "failed")
+    return _rated("stage", "homing ($22)", value, remedy, "failed")
 
 
 def _length(name: str, axis: Axis, parameters: Mapping[int, float]) -> CheckResult:
@@ -192,13 +192,13 @@ def _length(name: str, axis: Axis, parameters: Mapping[int, float]) -> CheckResu
     number = _LENGTHS + _LETTERS.index(axis.letter)
     length = parameters.get(number)
     what = f"{name}: limits against ${number}"
-    found = f"{low:g} to {high:g} {unit}, {_of_controller(length, unit)}"
+    value = f"{low:g} to {high:g} {unit}, {_of_controller(length, unit)}"
     if length is None:
-        return CheckResult("stage", what, found)
+        return CheckResult("stage", what, value)
     ends = sorted(axis.zero + axis.direction * value for value in (low, high))
-    most, remedy = length * (1 + _ROUNDING), ""
-    within = -most <= ends[0] <= ends[1] <= 0 or 0 <= ends[0] <= ends[1] <= most
-    if high - low > most:
+    bound, remedy = length * (1 + _ROUNDING), ""
+    within = -bound <= ends[0] <= ends[1] <= 0 or 0 <= ends[0] <= ends[1] <= bound
+    if high - low > bound:
         remedy = (
             f"the limits are {high - low:g} {unit} apart, but the axis is shorter; correct "
             f"stage.{name}.limits"
@@ -208,18 +208,18 @@ def _length(name: str, axis: Axis, parameters: Mapping[int, float]) -> CheckResu
             f"the limits are {ends[0]:g} to {ends[1]:g} in machine coordinates, partly outside "
             f"its soft limits ($20); correct stage.{name}.limits or its zero"
         )
-    return _rated("stage", what, found, remedy)
+    return _rated("stage", what, value, remedy)
 
 
 def _speed(name: str, axis: Axis, parameters: Mapping[int, float]) -> CheckResult:
     """Compare the speed of an axis; GRBL's settings are per minute."""
     unit, number = axis.unit, _RATES + _LETTERS.index(axis.letter)
     theirs = parameters[number] / 60 if number in parameters else None
-    found = f"{axis.speed:g} {unit}/s, {_of_controller(theirs, f'{unit}/s')}"
+    value = f"{axis.speed:g} {unit}/s, {_of_controller(theirs, f'{unit}/s')}"
     remedy = ""
     if theirs is not None and axis.speed > theirs * (1 + _ROUNDING):
         remedy = f"the controller is slower than the file; set stage.{name}.speed = {theirs:g}"
-    return _rated("stage", f"{name}: speed against ${number}", found, remedy)
+    return _rated("stage", f"{name}: speed against ${number}", value, remedy)
 
 
 def _of_controller(value: float | None, unit: str) -> str:
@@ -309,49 +309,49 @@ def check_trigger(
     trigger = Trigger(stage, camera, settings, lambda: None, clock)
     frames = [trigger.expose() for _ in range(_TRIGGERED)]
     trigger.check(wait=True)
-    found = (
+    value = (
         f"{_TRIGGERED} frames, at most {1e3 * trigger.longest:.0f} ms after '{settings.trigger}' was "
         "switched on"
     )
-    yield CheckResult("camera", "trigger", found)
+    yield CheckResult("camera", "trigger", value)
     yield _brightness(frames[-1].pixels[-1].copy())
 
 
 def _rate(counts: Counts, settings: CameraSettings) -> CheckResult:
-    found, remedy = f"{counts.rate:.2f} Hz", ""
+    value, remedy = f"{counts.rate:.2f} Hz", ""
     if settings.rate is not None:
-        found += f", requested {settings.rate:g} Hz"
+        value += f", requested {settings.rate:g} Hz"
         if not abs(counts.rate - settings.rate) <= _RATE_TOLERANCE * settings.rate:
             remedy = (
                 f"the exposure or the transfer may be too slow for it; set camera.rate = {counts.rate:.3g}"
             )
-    return _rated("camera", "rate", found, remedy)
+    return _rated("camera", "rate", value, remedy)
 
 
 def _losses(dropped: int, after: Counts, before: Counts) -> CheckResult:
     total, late = after.frames - before.frames, after.late - before.late
-    found = f"{total} frames, {dropped} lost, {late} late, {after.reconnects} reconnections"
+    value = f"{total} frames, {dropped} lost, {late} late, {after.reconnects} reconnections"
     lost = dropped or after.reconnects
     remedy = "frames are lost; reduce the rate, or use a faster connection" if lost else ""
-    return _rated("camera", "frames", found, remedy)
+    return _rated("camera", "frames", value, remedy)
 
 
 def _brightness(picture: NDArray[Any]) -> CheckResult:
-    known = picture[~np.isnan(picture)]
-    if not known.size:
+    finite = picture[~np.isnan(picture)]
+    if not finite.size:
         return CheckResult(
             "camera", "brightness", "NaN", "warning", "no pixel has a value; check camera.dtype"
         )
-    low, middle, high = (float(value) for value in np.percentile(known, (0, 50, 100)))
+    low, middle, high = (float(value) for value in np.percentile(finite, (0, 50, 100)))
     top = np.iinfo(picture.dtype).max if picture.dtype.kind == "u" else np.inf
     saturated, dark = float(np.mean(picture >= top)), float(np.mean(picture <= 0))
-    found = f"{low:g} to {high:g}, median {middle:g}; {saturated:.2%} saturated, {dark:.2%} black"
+    value = f"{low:g} to {high:g}, median {middle:g}; {saturated:.2%} saturated, {dark:.2%} black"
     remedy = ""
     if saturated > _SATURATED_MAX:
         remedy = "too much light; shorten the exposure"
     elif high <= low:
         remedy = "all pixels are equal; check the light and the lens cap"
-    return _rated("camera", "brightness", found, remedy)
+    return _rated("camera", "brightness", value, remedy)
 
 
 # Checks of the axes: each moves back and forth a little
@@ -392,7 +392,7 @@ def _there_and_back(stage: Stage, settings: StageSettings, name: str, home: Posi
         stage.move(replace(home, **{name: place}))
         off = max(off, abs(getattr(stage.wait().position, name) - place))
     unit, scale = axis.unit, axis.scale
-    found = f"{step * scale:+.3g} {unit} and back, off by {off * scale:.4f} {unit}"
+    text = f"{step * scale:+.3g} {unit} and back, off by {off * scale:.4f} {unit}"
     lost = off > _POSITION_TOLERANCE[unit]
     remedy = f"the axis does not reach its target; check {axis.letter} and its steps per unit" if lost else ""
-    return _rated("move", f"{name} ({axis.letter})", found, remedy, "failed")
+    return _rated("move", f"{name} ({axis.letter})", text, remedy, "failed")

@@ -80,13 +80,13 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     every = max(1, math.floor(seconds * rig.rate / _MOST_FRAMES))
     _FrameLog(rig, every).until(rests + _LONGEST_DELAY)  # earlier frames may show the approach
     log = _FrameLog(rig, every)
-    there = log.follow(rig.begin(lambda: rig.stage.move(stroke.end, speed), timed=True))
+    outward = log.follow(rig.begin(lambda: rig.stage.move(stroke.end, speed), timed=True))
     back = log.follow(rig.begin(lambda: rig.stage.move(stroke.begin, speed), timed=True))
     log.until(back.ended + _LONGEST_DELAY)
 
     path = Trapezoid.planned(stroke.length, speed)
-    turned = (there.ended + back.began) / 2
-    down = _track(rig, stroke.along, path, there.began, turned)
+    turned = (outward.ended + back.began) / 2
+    down = _track(rig, stroke.along, path, outward.began, turned)
     up = _track(rig, lambda place: stroke.length - stroke.along(place), path, back.began, back.ended)
 
     def place(times: Floats) -> Floats:
@@ -95,7 +95,7 @@ def measure_delay(rig: Rig, plan: Plan) -> Delay:
     clock, clock_error = frame_times(*log.arrivals())
     delay = estimate_delay(clock, np.concatenate(log.pictures), place, rig.camera.name)
     rig.go(plan.first)
-    report_errors = [one.spread / one.path.speed / math.sqrt(one.reports) / 2 for one in (down, up)]
+    report_errors = [track.spread / track.path.speed / math.sqrt(track.reports) / 2 for track in (down, up)]
     return replace(delay, error=math.hypot(delay.error, clock_error, *report_errors))
 
 
@@ -221,21 +221,21 @@ def estimate_delay(
             f"position: press deeper, or {_REMEDY}"
         )
     around = tuple(trials[[best - 1, best + 1]])
-    found = minimize_scalar(cost, bounds=around, method="bounded", options={"xatol": 1e-5})
-    error = _error(float(found.x), time, change, place)
+    minimum = minimize_scalar(cost, bounds=around, method="bounded", options={"xatol": 1e-5})
+    error = _error(float(minimum.x), time, change, place)
     if not error < _ERROR_MAX:
         raise HardwareError(
-            f"{name}: the delay is {found.x:.3f} ± {error:.3f} s, which is too uncertain: press "
+            f"{name}: the delay is {minimum.x:.3f} ± {error:.3f} s, which is too uncertain: press "
             f"deeper, or {_REMEDY}"
         )
-    return Delay(float(found.x), error)
+    return Delay(float(minimum.x), error)
 
 
 def _principal_components(pictures: Floats) -> Floats:
     """Return the largest principal components of the pictures' change, (n, c)."""
     change = pictures - pictures.mean(axis=0)
-    left, size, _ = np.linalg.svd(change, full_matrices=False)
-    return np.asarray((left * size)[:, :_COMPONENTS])
+    modes, size, _ = np.linalg.svd(change, full_matrices=False)
+    return np.asarray((modes * size)[:, :_COMPONENTS])
 
 
 def _fit(place: Floats, time: Floats, change: Floats) -> tuple[Floats, Floats, int]:
@@ -262,8 +262,8 @@ def _fit(place: Floats, time: Floats, change: Floats) -> tuple[Floats, Floats, i
 class _LinearSpline:
     """Least squares of linear splines; each frame has the index of its knot and its share of the next."""
 
-    def __init__(self, knot: NDArray[np.intp], share: Floats, count: int) -> None:
-        self._knot, self._near, self._next, self._count = knot, 1 - share, share, count
+    def __init__(self, knot: NDArray[np.intp], fraction: Floats, count: int) -> None:
+        self._knot, self._near, self._next, self._count = knot, 1 - fraction, fraction, count
         diagonal = np.bincount(knot, self._near**2, count) + np.bincount(knot + 1, self._next**2, count)
         above = np.bincount(knot + 1, self._near * self._next, count)
         # A weak regularisation determines knots without frames.
@@ -274,16 +274,18 @@ class _LinearSpline:
         from scipy.linalg import solveh_banded
 
         sums = [
-            np.bincount(self._knot, self._near * one, self._count)
-            + np.bincount(self._knot + 1, self._next * one, self._count)
-            for one in values.T
+            np.bincount(self._knot, self._near * value, self._count)
+            + np.bincount(self._knot + 1, self._next * value, self._count)
+            for value in values.T
         ]
         return np.asarray(solveh_banded(self._bands, np.stack(sums, axis=1)))
 
     def at(self, line: Floats) -> Floats:
         """Return the splines' values at the frames, (n, c)."""
-        found: Floats = self._near[:, None] * line[self._knot] + self._next[:, None] * line[self._knot + 1]
-        return found
+        interpolated: Floats = (
+            self._near[:, None] * line[self._knot] + self._next[:, None] * line[self._knot + 1]
+        )
+        return interpolated
 
 
 def _error(delay: float, time: Floats, change: Floats, place: Callable[[Floats], Floats]) -> float:

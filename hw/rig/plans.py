@@ -523,18 +523,18 @@ def _check_wait(seconds: float) -> None:
 
 
 def _check_one_of(*both: tuple[str, float | None, str]) -> None:
-    given = [(name, value, unit) for name, value, unit in both if value is not None]
-    if len(given) != 1:
+    choices = [(name, value, unit) for name, value, unit in both if value is not None]
+    if len(choices) != 1:
         (step, _, _), (speed, _, _) = both
         raise InputError(f"give either a {step}, for a scan in steps, or a {speed}, for a continuous one")
-    name, value, unit = given[0]
+    name, value, unit = choices[0]
     _check_above_zero(value, name, unit)
 
 
-def _check_steps(count: float, least: int) -> None:
-    if not least - _ROUNDING <= count <= _STEPS_MAX:
+def _check_steps(count: float, minimum: int) -> None:
+    if not minimum - _ROUNDING <= count <= _STEPS_MAX:
         raise InputError(
-            f"{count:.3g} steps are not possible: {least} to {_STEPS_MAX} are; change the step or "
+            f"{count:.3g} steps are not possible: {minimum} to {_STEPS_MAX} are; change the step or "
             "the distance"
         )
 
@@ -560,6 +560,6 @@ def check_plan(plan: Plan, settings: StageSettings, name: str, stage: Stage | No
         return
     able = Axes(settings, name) if stage is None else stage
     if isinstance(plan, AxialPlan):  # one turn suffices for the check
-        able.check_turns(plan.tilt, min(plan.turns, 1.0), plan.rate or 0.0)
+        able.check_precession(plan.tilt, min(plan.turns, 1.0), plan.rate or 0.0)
     else:
-        able.check_way(plan.first, plan.ends[0], plan.speed)
+        able.check_move(plan.first, plan.ends[0], plan.speed)

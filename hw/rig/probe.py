@@ -16,7 +16,7 @@ from mirrorskin.io.base.types import Floats, InputError
 
 _FRAMES, _PLACES = 4, 4  # frames at a position, and number of preceding positions to compare with
 _SIGMAS = 8.0  # change of a block's mean on contact, in standard deviations
-_LEAST = 1e-4  # minimum standard deviation, as a share of the greatest block mean
+_SIGMA_MIN = 1e-4  # minimum standard deviation, as a share of the greatest block mean
 
 
 def find_contact(rig: Rig, start: float, step: float) -> float:
@@ -51,12 +51,12 @@ def find_contact(rig: Rig, start: float, step: float) -> float:
     plan = contact_plan(rig.stage.limits, start, step)
     before: list[Floats] = []
     with StepScan(rig, plan, frames=_FRAMES) as scan:
-        room = np.empty((_FRAMES, *scan.shape[1:]), scan.dtype)
-        while (block := scan.read(room)) is not None and block.travel is not None:
-            seen = [block_means(block.frames)]
-            while sum(map(len, seen)) < _FRAMES and (more := scan.read(room)) is not None:
-                seen.append(block_means(more.frames))
-            here = np.concatenate(seen)
+        buffer = np.empty((_FRAMES, *scan.shape[1:]), scan.dtype)
+        while (block := scan.read(buffer)) is not None and block.travel is not None:
+            means = [block_means(block.frames)]
+            while sum(map(len, means)) < _FRAMES and (more := scan.read(buffer)) is not None:
+                means.append(block_means(more.frames))
+            here = np.concatenate(means)
             if len(before) == _PLACES and _differ(np.concatenate(before), here):
                 return float(block.travel[0]) - step / 2
             before = [*before[1 - _PLACES :], here]
@@ -79,6 +79,6 @@ def contact_plan(limits: Limits, start: float, step: float) -> VerticalPlan:
 
 def _differ(before: Floats, here: Floats) -> bool:
     """Return whether any of the block means, (n, k), differ from those of other positions."""
-    noise = max(float(np.median(before.std(axis=0, ddof=1))), _LEAST * float(np.abs(before).max()))
+    noise = max(float(np.median(before.std(axis=0, ddof=1))), _SIGMA_MIN * float(np.abs(before).max()))
     sigma = noise * math.sqrt(1 / len(before) + 1 / len(here))
     return bool(np.abs(here.mean(axis=0) - before.mean(axis=0)).max() > _SIGMAS * sigma)

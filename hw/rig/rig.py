@@ -108,8 +108,8 @@ class Rig(Closing):
     def rate(self) -> float:
         """Frames per second: measured, or from the rig file."""
         measured = self.camera.counts.rate
-        said = self.settings.camera.rate
-        return measured if math.isfinite(measured) and measured > 0 else said or math.nan
+        nominal = self.settings.camera.rate
+        return measured if math.isfinite(measured) and measured > 0 else nominal or math.nan
 
     @property
     def period(self) -> float:
@@ -157,7 +157,7 @@ class Rig(Closing):
         """Move the body to a place and wait until it rests there; see ``end``."""
         return self.end(self.begin(lambda: self.stage.move(place, speed)))
 
-    def take(self, most: int) -> Frames:
+    def take(self, limit: int) -> Frames:
         """Take waiting frames, or wait for one, as ``Camera.take``; HardwareError if the rig failed.
 
         With a trigger, one frame is triggered.
@@ -168,7 +168,7 @@ class Rig(Closing):
         while True:
             self.check()
             try:
-                return self.camera.take(most, _SLICE + 2 * self.period)
+                return self.camera.take(limit, _SLICE + 2 * self.period)
             except HardwareError:
                 self.check()
                 if self.camera.error is not None or self.clock.now() > until:
@@ -199,7 +199,7 @@ class Rig(Closing):
 
     def _watch(self) -> None:
         """Guard: stop the stage on a fault during a move."""
-        looked, seen, silence, last = self._move, -math.inf, 0.0, self.clock.now()
+        looked, newest, silence, last = self._move, -math.inf, 0.0, self.clock.now()
         while not self._closing.wait(_TICK):
             # If the guard is late, the computer is busy, and the camera's thread may be late as well.
             passed, last = self.clock.now() - last, self.clock.now()
@@ -208,8 +208,8 @@ class Rig(Closing):
             if move is None or (move.over and not paused):
                 self._looked = last
                 continue
-            if move is not looked or latest != seen:
-                looked, seen, silence = move, latest, 0.0
+            if move is not looked or latest != newest:
+                looked, newest, silence = move, latest, 0.0
             else:
                 silence += _TICK if passed < 2 * _TICK else _TICK / 2
             fault = _paused(passed) if paused else self._fault_after(move, silence)
@@ -260,7 +260,7 @@ def open_stage(settings: StageSettings, unlock: bool = False, clock: Clock = SYS
     """
     driver = stage_driver(settings.firmware)
     if unlock and "unlock" not in driver.takes:
-        titles = " or ".join(known.title for known in built_in(STAGES) if "unlock" in known.takes)
+        titles = " or ".join(driver.title for driver in built_in(STAGES) if "unlock" in driver.takes)
         raise InputError(
             f"stage {settings.port}: only {titles} can be unlocked; switch this controller off and on"
         )

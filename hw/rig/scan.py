@@ -163,7 +163,7 @@ class Scan(Closing):
     def lift(self) -> Report:
         """Set the body upright, lift it straight up to the end of its travel, and move it to the centre."""
         stage = self.rig.stage
-        return self._visit(*stage.limits.way_up(stage.report().position))
+        return self._visit(*stage.limits.retreat_path(stage.report().position))
 
     def close(self) -> None:
         """Lift the body; stop the stage if it is moving."""
@@ -188,17 +188,19 @@ class Scan(Closing):
         """Move to some positions in sequence, and return the final report of rest."""
         return [self.rig.go(place) for place in dict.fromkeys(places)][-1]
 
-    def _next(self, most: int, origin: float) -> Block | None:
+    def _next(self, limit: int, origin: float) -> Block | None:
         """Return the next frames, after waiting for the first if necessary."""
         raise NotImplementedError
 
     def _block(
         self, frames: NDArray[Any], arrival: Floats, place: Floats, dropped: int, origin: float
     ) -> Block:
-        known: dict[str, Any] = {self.plan.series: place}
-        known |= {name: np.full(len(frames), value) for name, value in self.plan.constants.items()}
+        properties: dict[str, Any] = {self.plan.series: place}
+        properties |= {name: np.full(len(frames), value) for name, value in self.plan.constants.items()}
         stays_valid = frames.flags.c_contiguous
-        return Block(frames, self.count, arrival - origin, dropped=dropped, stays_valid=stays_valid, **known)
+        return Block(
+            frames, self.count, arrival - origin, dropped=dropped, stays_valid=stays_valid, **properties
+        )
 
     def _prepare(self) -> None:
         """Move to the start of the scan, and wait there; the body leans only when it is pressed."""
@@ -290,14 +292,14 @@ class StepScan(Scan):
         """Number of frames."""
         return len(self._values) * self.frames
 
-    def _next(self, most: int, origin: float) -> Block | None:
+    def _next(self, limit: int, origin: float) -> Block | None:
         if self._left == 0:
             if self._step + 1 == len(self._values):
                 if self.rig.trigger is not None:
                     self.rig.trigger.check(wait=True)
                 return None
             self._go_on()
-        frames, arrival, dropped = self._take(min(most, self._left))
+        frames, arrival, dropped = self._take(min(limit, self._left))
         self._left -= len(frames)
         place = np.repeat(self._values[self._step : self._step + 1], len(frames), axis=0)
         return self._block(frames, arrival, place, dropped, origin)
@@ -321,10 +323,10 @@ class StepScan(Scan):
         self._since = rest.time + self.settle + delay + exposure / 2
         self.rig.camera.flush()
 
-    def _take(self, most: int) -> tuple[NDArray[Any], Floats, int]:
+    def _take(self, limit: int) -> tuple[NDArray[Any], Floats, int]:
         """Take frames that are new enough; losses before the first frame of a position are ignored."""
         while True:
-            taken = self.rig.take(most)
+            taken = self.rig.take(limit)
             new = int(np.searchsorted(taken.time, self._since, side="right"))
             if new < len(taken.time):
                 first = self._left == self.frames
@@ -347,13 +349,13 @@ def check_there(rest: Report, place: Position, name: str) -> None:
 def take_dark(rig: Rig, since: float, count: int = _DARK_FRAMES) -> NDArray[np.float32]:
     """Return the mean of some frames that arrived after a time, (H, W); there must be no contact."""
     total = np.zeros(rig.camera.shape)
-    left = count
+    remaining = count
     if rig.trigger is not None:
         since = -math.inf
     rig.camera.flush()
-    while left:
-        frames = rig.take(left)
+    while remaining:
+        frames = rig.take(remaining)
         new = frames.pixels[frames.time > since]
         total += new.sum(axis=0, dtype=np.float64)
-        left -= len(new)
+        remaining -= len(new)
     return (total / count).astype(np.float32)

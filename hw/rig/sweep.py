@@ -79,7 +79,7 @@ class SweepScan(Scan):
         """Measured frames per second of the camera during the scan."""
         if not self._frames:
             return super().rate
-        number, time = (np.concatenate(one) for one in zip(*self._frames, strict=True))
+        number, time = (np.concatenate(parts) for parts in zip(*self._frames, strict=True))
         return float(np.ptp(number) / np.ptp(time)) if len(time) > 1 else super().rate
 
     @property
@@ -102,7 +102,7 @@ class SweepScan(Scan):
         """Return the positions of all frames, computed from all reports once the motion has ended."""
         if not (self._complete and self._frames):  # all frames may have been before or after the motion
             return super().positions()
-        number, arrival = (np.concatenate(one) for one in zip(*self._frames, strict=True))
+        number, arrival = (np.concatenate(parts) for parts in zip(*self._frames, strict=True))
         times, reported = zip(*self._reports, strict=True)
         track = Track(times, reported, self._path)
         distances = track.at(even_times(number, arrival) - self.delay.seconds)
@@ -112,16 +112,16 @@ class SweepScan(Scan):
         super()._prepare()
         _ = self.delay
 
-    def _next(self, most: int, origin: float) -> Block | None:
+    def _next(self, limit: int, origin: float) -> Block | None:
         if self._move is None:
-            taken, rest = self._begin(most)
+            taken, rest = self._begin(limit)
             if not isinstance(self.plan, AxialPlan):
                 return self._give(taken, rest, np.zeros(rest.stop - rest.start), taken.dropped, origin)
         move = self._move
         assert move is not None  # set by _begin
         dropped = 0  # frames lost since the last block
         while True:
-            taken = self.rig.take(most)
+            taken = self.rig.take(limit)
             self._add_reports()
             exposed = taken.time - self.delay.seconds
             distance = self._live_track.at(exposed)
@@ -142,13 +142,13 @@ class SweepScan(Scan):
         self._frames.append((taken.number[part], time))
         return self._block(taken.pixels[part], time, self.plan.recorded(distance), dropped, origin)
 
-    def _begin(self, most: int) -> tuple[Frames, slice]:
+    def _begin(self, limit: int) -> tuple[Frames, slice]:
         """Wait until frames show the body at rest, and start the motion; return these frames."""
         plan, stage = self.plan, self.rig.stage
         self._every = self.every  # at the current rate
         self.rig.camera.flush()
         rests = stage.report().time + self.delay.seconds
-        while (taken := self.rig.take(most)).time[-1] <= rests:
+        while (taken := self.rig.take(limit)).time[-1] <= rests:
             pass
         self._move = self.rig.begin(lambda: plan.begin(stage), timed=True)
         self._live_track = LiveTrack(self._path, self._move.began)

@@ -23,7 +23,7 @@ _REPORTS_MIN = 4  # minimum number of reports in motion to estimate more than th
 _SYSTEMATIC = 1.5  # excess of the deviations over chance, as a ratio, above which they are systematic
 _SMOOTH = 5  # reports on each side
 _LOST_FRAME_GAP = 0.6  # periods in excess of one that may indicate a lost frame
-_NEAR = 9  # frames on each side of a gap
+_GAP_NEIGHBOURS = 9  # frames on each side of a gap
 
 
 class Progress:
@@ -196,11 +196,11 @@ def even_times(number: ArrayLike, arrival: ArrayLike, window: int = 25) -> Float
 
 def _with_lost_frames(number: Floats, arrival: Floats) -> Floats:
     """Return numbers that include undetected lost frames: later frames are late by whole periods."""
-    step = min(_NEAR, len(number) // 2)  # averaging over some frames suppresses jitter
+    step = min(_GAP_NEIGHBOURS, len(number) // 2)  # averaging over some frames suppresses jitter
     period = float(np.median((arrival[step:] - arrival[:-step]) / (number[step:] - number[:-step])))
     late = arrival - period * (number - number[0])
     counted = number.copy()
     for gap in np.flatnonzero(np.diff(late) > _LOST_FRAME_GAP * period) + 1:
-        before, after = late[max(0, gap - _NEAR) : gap], late[gap : gap + _NEAR]
+        before, after = late[max(0, gap - _GAP_NEIGHBOURS) : gap], late[gap : gap + _GAP_NEIGHBOURS]
         counted[gap:] += max(0, round((np.median(after) - np.median(before)) / period))
     return counted

@@ -170,13 +170,13 @@ class GrblStage(Closing):
         """Maximum time without an answer during a move, seconds."""
         return self._link.longest_silence
 
-    def check_way(self, start: Position, place: Position, speed: float | None) -> None:
+    def check_move(self, start: Position, place: Position, speed: float | None) -> None:
         """Refuse a straight move that is too fast, or too slow for the controller."""
-        self.axes.check_way(start, place, speed)
+        self.axes.check_move(start, place, speed)
 
-    def check_turns(self, tilt: float, turns: float, rate: float) -> None:
+    def check_precession(self, tilt: float, turns: float, rate: float) -> None:
         """Refuse a precession that is too fast, too slow, or in axes without arcs."""
-        self.axes.check_turns(tilt, turns, rate)
+        self.axes.check_precession(tilt, turns, rate)
 
     def home(self) -> None:
         """Home the axes; returns when homing is complete."""
@@ -216,7 +216,7 @@ class GrblStage(Closing):
         moves = itertools.pairwise([self._destination(), *places])
         legs = [pieces for move in moves if (pieces := self.axes.pieces(*move, speed))]
         if legs:
-            self._send([one for pieces in legs for one in pieces], places[-1], ramps=len(legs))
+            self._send([piece for pieces in legs for piece in pieces], places[-1], ramps=len(legs))
         else:
             self._target = places[-1]
 
@@ -271,13 +271,13 @@ class GrblStage(Closing):
 
     def history(self, since: float = -math.inf) -> list[Report]:
         """Return the reports later than `since`, oldest first; about an hour of them is kept."""
-        found = []
+        replies = []
         with self._link.lock:
             for report in reversed(self._reports):
                 if report.time <= since:
                     break
-                found.append(report)
-        return found[::-1]
+                replies.append(report)
+        return replies[::-1]
 
     def stop(self) -> None:
         """Stop the body at once. Thread-safe; may be called repeatedly, and raises nothing."""
@@ -340,9 +340,9 @@ class GrblStage(Closing):
     def _check(self, controller: Controller) -> None:
         """Refuse a controller that lacks an axis; adopt its limits of speed and travel."""
         status = self._link.seen.status if self._link.seen else None
-        known = controller.axes or (status and (status.machine or status.work))
+        letters = controller.axes or (status and (status.machine or status.work))
         for motion, letter in self.axes.letters.items():
-            if known and letter not in known:
+            if letters and letter not in letters:
                 raise InputError(f"{self.name}: the controller has no axis {letter}; correct the rig file")
             steps, rate, acceleration = (
                 controller.settings.get(number + _LETTERS.index(letter), 0.0) for number in (100, 110, 120)
@@ -368,18 +368,18 @@ class GrblStage(Closing):
         if controller.on(20):
             self.limits = _within_soft_limits(self._settings, controller, self.name).limits
 
-    def _on_report(self, seen: TimedStatus) -> None:
+    def _on_report(self, timed: TimedStatus) -> None:
         """Process a report; the link's lock is held."""
-        if seen.status.offset is not None:
-            self._take_offset(seen.status.offset, seen.working)
+        if timed.status.offset is not None:
+            self._take_offset(timed.status.offset, timed.working)
         elif self._offset is None:
             self._lacking += 1
-        place = self._place(seen.status)
+        place = self._place(timed.status)
         if place is None:
             return
-        self._check_limits(place, seen.working)
-        self._latest = Report(seen.answer.time, place, seen.status.state)
-        if seen.answer.sure:
+        self._check_limits(place, timed.working)
+        self._latest = Report(timed.answer.time, place, timed.status.state)
+        if timed.answer.sure:
             self._reports.append(self._latest)
 
     def _take_offset(self, offset: Mapping[str, float], working: bool) -> None:
@@ -424,10 +424,10 @@ class GrblStage(Closing):
                 number = self._link.enqueue(*commands) + int(not commands[0].duration)
                 self._target = target
             self._due = max(self._due, self._link.clock.now()) + duration
-            left = self._due - self._link.clock.now()
+            remaining = self._due - self._link.clock.now()
             self._link.until(
                 lambda: self._link.window.done >= number or None,
-                1.25 * left + self._settings.timeout,
+                1.25 * remaining + self._settings.timeout,
                 "take a move",
             )
 
@@ -484,11 +484,11 @@ def _within_soft_limits(settings: StageSettings, controller: Controller, name: s
 
 def _greet(link: Link, name: str, timeout: float, unlock: bool) -> Controller:
     """Check that GRBL 1.1 answers and is at rest, and read its settings."""
-    seen = _first(link, name, timeout, unlock)
-    if seen.status.state not in ("idle", "alarm"):  # left in this state by a previous user
+    first = _first(link, name, timeout, unlock)
+    if first.status.state not in ("idle", "alarm"):  # left in this state by a previous user
         if not unlock:
             raise InputError(
-                f"{name}: it is in the state {seen.status.state}, caused by another program or by "
+                f"{name}: it is in the state {first.status.state}, caused by another program or by "
                 f"hand: wait until it ends, or {_UNLOCK}, which stops it"
             )
         link.restart(timeout)
@@ -534,9 +534,9 @@ def _identity(link: Link, name: str, timeout: float) -> Controller:
     if size:
         link.window.size = min(BUFFER, int(size[1]))  # a query waits behind all lines that were sent
     settings = {}
-    for said in link.ask("$$", timeout):
-        if isinstance(said, Setting) and re.fullmatch(r"-?\d+(\.\d*)?", said.value):
-            settings[said.number] = float(said.value)
+    for reply in link.ask("$$", timeout):
+        if isinstance(reply, Setting) and re.fullmatch(r"-?\d+(\.\d*)?", reply.value):
+            settings[reply.number] = float(reply.value)
     kind = "grblHAL" if {"FIRMWARE", "NEWOPT"} & answers.keys() else "Grbl"
     firmware = link.banner.text.partition(" [")[0] if link.banner else f"{kind} {version}"
     axes = re.match(r"AXS:\d+:([A-Z]+)", answers.get("AXS", ""))

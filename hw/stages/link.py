@@ -54,8 +54,10 @@ def open_port(url: str, baud: int, name: str) -> serial.Serial:
             port.write_timeout = _WRITE
         port.open()
     except (OSError, ValueError) as error:
-        known = _REMEDIES.get(getattr(error, "errno", None) or 0)
-        raise InputError(f"{name}: {known or f'cannot be opened ({error}); correct the rig file'}") from error
+        remedy = _REMEDIES.get(getattr(error, "errno", None) or 0)
+        raise InputError(
+            f"{name}: {remedy or f'cannot be opened ({error}); correct the rig file'}"
+        ) from error
     return port
 
 
@@ -224,7 +226,7 @@ class Link:
         """
         with self.lock:
             self._check()
-            numbers = [self.window.add(one.line, one.duration, one.ramp) for one in commands]
+            numbers = [self.window.add(command.line, command.duration, command.ramp) for command in commands]
             self.rests = 0
             self._pump()
         return numbers[0]
@@ -249,10 +251,10 @@ class Link:
                 result = ready()
                 if result is not None:
                     return result
-                left = end - self.clock.now()
-                if left <= 0:
+                remaining = end - self.clock.now()
+                if remaining <= 0:
                     raise HardwareError(f"{self._name}: did not {what} within {timeout:.3g} s")
-                self.lock.wait(min(left, _SLICE))
+                self.lock.wait(min(remaining, _SLICE))
 
     def restart(self, timeout: float) -> None:
         """Put the machine on hold, reset it, and discard earlier replies."""

@@ -119,17 +119,17 @@ class MarlinStage(Closing):
         self._thread = clock.thread(self._watch, f"{self.name}: watch")
         self._thread.start()
 
-    def check_way(self, start: Position, place: Position, speed: float | None) -> NoReturn:
+    def check_move(self, start: Position, place: Position, speed: float | None) -> NoReturn:
         """Refuse a sweep: the position in each frame would be unknown."""
         raise InputError(f"{self.name}: Marlin does not report its position while it moves; use steps")
 
-    def check_turns(self, tilt: float, turns: float, rate: float) -> NoReturn:
+    def check_precession(self, tilt: float, turns: float, rate: float) -> NoReturn:
         """Refuse a precession, for the same reason."""
         raise InputError(f"{self.name}: Marlin does not report its position while it moves; use steps")
 
     def precess(self, tilt: float, turns: float, rate: float, start: float = 0.0) -> NoReturn:
         """Refuse a precession, for the same reason."""
-        self.check_turns(tilt, turns, rate)
+        self.check_precession(tilt, turns, rate)
 
     def home(self) -> None:
         """Home the axes of the rig; returns when homing is complete."""
@@ -165,11 +165,13 @@ class MarlinStage(Closing):
         due = max(began, self._due or began)
         limit = 0.25 * (due - began) + self._settings.timeout if timeout is None else began + timeout - due
         with self._guarded():
-            while (left := due - self.clock.now()) > 0:  # no line is pending, so a stop takes effect at once
+            while (
+                remaining := due - self.clock.now()
+            ) > 0:  # no line is pending, so a stop takes effect at once
                 self._check()
                 if timeout is not None and self.clock.now() - began > timeout:
                     self._fail(f"did not come to rest within {timeout:g} s")
-                self.clock.sleep(min(left, _TICK))
+                self.clock.sleep(min(remaining, _TICK))
             with self._lock:
                 self._ask("M400", limit)
                 self._due = None
@@ -229,8 +231,8 @@ class MarlinStage(Closing):
             self._write("M115")
             for line in self._listen(_KNOCK, lambda line: "FIRMWARE_NAME:" in line):
                 heard = True
-                _, found, name = line.partition("FIRMWARE_NAME:")
-                if not found:
+                _, mark, name = line.partition("FIRMWARE_NAME:")
+                if not mark:
                     continue
                 name = re.split(r" [A-Z_]+:", name)[0].strip()
                 if "marlin" not in name.lower():
@@ -254,18 +256,18 @@ class MarlinStage(Closing):
 
     def _learn(self, settings: list[str]) -> None:
         """Adopt the speeds (``M203``) and accelerations (``M201``, ``M204``) of the controller as limits."""
-        told: dict[str, dict[str, float]] = {}
+        values: dict[str, dict[str, float]] = {}
         for line in settings:
             code, _, words = line.removeprefix("echo:").strip().partition(" ")
-            told.setdefault(code, {letter: float(number) for letter, number in _WORD.findall(words)})
+            values.setdefault(code, {letter: float(number) for letter, number in _WORD.findall(words)})
         for motion, letter in self.axes.letters.items():
-            rate, acceleration = (told.get(code, {}).get(letter, 0.0) for code in ("M203", "M201"))
-            acceleration = min(acceleration, told.get("M204", {}).get("T", acceleration))
+            rate, acceleration = (values.get(code, {}).get(letter, 0.0) for code in ("M203", "M201"))
+            acceleration = min(acceleration, values.get("M204", {}).get("T", acceleration))
             if rate > 0:
                 self.axes.limit(motion, rate)
             if acceleration > 0:
                 self._acceleration = min(self._acceleration, acceleration)
-            steps, expected = told.get("M92", {}).get(letter), self._settings.axes[motion].steps
+            steps, expected = values.get("M92", {}).get(letter), self._settings.axes[motion].steps
             if steps and expected and abs(steps / expected - 1) > _SAME_STEPS:
                 raise InputError(
                     f"{self.name}: M92 {letter} is {steps:g} steps, but {expected:g} in the rig "
@@ -282,8 +284,8 @@ class MarlinStage(Closing):
     def _locate(self) -> Report:
         """Query the position at rest, and store the report."""
         asked = self.clock.now()
-        said = next((line for line in self._ask("M114") if line.startswith("X:")), "")
-        places = {letter: float(value) for letter, value in _PLACE.findall(said.partition("Count")[0])}
+        answer = next((line for line in self._ask("M114") if line.startswith("X:")), "")
+        places = {letter: float(value) for letter, value in _PLACE.findall(answer.partition("Count")[0])}
         missing = sorted(set(self.axes.letters.values()) - set(places))
         if missing:
             raise HardwareError(f"{self.name}: the controller has no axis {missing[0]}; correct the rig file")
@@ -321,20 +323,20 @@ class MarlinStage(Closing):
                     )
             self._write(self._numbered(line))
             asked = heard = self.clock.now()
-            limit, said = self._settings.timeout if timeout is None else timeout, list[str]()
+            limit, lines = self._settings.timeout if timeout is None else timeout, list[str]()
             while True:
                 late = self.clock.now() - heard > limit  # before new replies are read
                 for text in self._read():
                     if re.match(r"ok\b", text):
                         self._trips.append(self.clock.now() - asked)
-                        return [*said, text[2:].strip()]  # some replies are in the same line
+                        return [*lines, text[2:].strip()]  # some replies are in the same line
                     if not lenient:
                         self._judge(text, line)
                     if lenient or "busy:" in text:  # other messages may come without end
                         heard, late = self.clock.now(), False
                     if "busy:" in text:
                         limit = _BUSY
-                    said.append(text)
+                    lines.append(text)
                 self._check()
                 if late or self.clock.now() - asked > max(limit, _HOMING):
                     self._fail(

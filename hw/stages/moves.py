@@ -85,9 +85,9 @@ class Axes:
         """Set the acceleration of a motion, machine units/s^2; the default is infinite."""
         self._accelerations[self._axes[motion].letter] = acceleration
 
-    def distance(self, one: Position, other: Position) -> float:
+    def distance(self, start: Position, other: Position) -> float:
         """Return the largest difference of two positions over the axes, machine units."""
-        a, b = self.machine(one), self.machine(other)
+        a, b = self.machine(start), self.machine(other)
         return max(abs(a[letter] - b[letter]) for letter in a)
 
     def straight(self, start: Position, place: Position, speed: float | None) -> Command | None:
@@ -115,23 +115,23 @@ class Axes:
             return []
         duration = self._duration(start, place, speed)
         feed = self._feed(length / duration)
-        way = {letter: after[letter] - before[letter] for letter in after}
-        steps = max(self._steps[letter] * abs(way[letter]) for letter in way)
+        delta = {letter: after[letter] - before[letter] for letter in after}
+        steps = max(self._steps[letter] * abs(delta[letter]) for letter in delta)
         self._check_steps(steps / duration, length / duration)
         count = _count(duration, longest)
         ends = [
-            {letter: after[letter] - way[letter] * (1 - number / count) for letter in way}
+            {letter: after[letter] - delta[letter] * (1 - number / count) for letter in delta}
             for number in range(1, count + 1)
         ]
-        ramp = max(abs(way[letter]) / duration / self._accelerations[letter] for letter in way)
+        ramp = max(abs(delta[letter]) / duration / self._accelerations[letter] for letter in delta)
         lines = [f"{self._straight}{_words(end)}{feed}" for end in ends]
         return _timed(lines, duration, ramp)
 
-    def check_way(self, start: Position, place: Position, speed: float | None) -> None:
+    def check_move(self, start: Position, place: Position, speed: float | None) -> None:
         """Refuse a straight move that is too fast, or too slow for the controller; see ``straight``."""
         self.straight(start, place, speed)
 
-    def check_turns(self, tilt: float, turns: float, rate: float) -> None:
+    def check_precession(self, tilt: float, turns: float, rate: float) -> None:
         """Refuse a precession that is impossible for any origin of the work coordinates; see ``arcs``."""
         self.arcs(tilt, turns, rate, 0.0, self.machine(Position()))
 
@@ -188,9 +188,9 @@ class Axes:
         if pitch.unit != roll.unit:
             raise InputError(f"{self._name}: arcs need pitch and roll in the same unit; use steps instead")
         sense = pitch.direction * roll.direction
-        for letters, way in (((pitch.letter, roll.letter), sense), ((roll.letter, pitch.letter), -sense)):
+        for letters, sign in (((pitch.letter, roll.letter), sense), ((roll.letter, pitch.letter), -sense)):
             if letters in _PLANES:
-                return _PLANES[letters], way
+                return _PLANES[letters], sign
         raise InputError(
             f"{self._name}: GRBL does not support arcs in the axes {pitch.letter} and "
             f"{roll.letter}; put pitch and roll on two of X, Y and Z, or use steps"
@@ -244,10 +244,10 @@ class Axes:
     def _check_steps(self, steps: float, speed: float) -> None:
         """Refuse a move that the controller would make too fast: steps and machine units per second."""
         if steps < SLOWEST_STEPS:
-            least = speed * SLOWEST_STEPS / steps
+            slowest = speed * SLOWEST_STEPS / steps
             raise InputError(
                 f"{self._name}: {speed:.4g} mm/s (or degrees/s) are {steps:.3g} steps per second, "
-                f"but the controller's minimum is {SLOWEST_STEPS:g}; use {least:.3g} or more, or "
+                f"but the controller's minimum is {SLOWEST_STEPS:g}; use {slowest:.3g} or more, or "
                 "steps"
             )
 

@@ -215,19 +215,19 @@ class Splitter:
 
     def feed(self, data: bytes, now: float) -> list[tuple[bytes, float]]:
         """Return the lines that `data` completes, and the times of their first bytes."""
-        found: list[tuple[bytes, float]] = []
+        lines: list[tuple[bytes, float]] = []
         *whole, rest = data.replace(b"\r", b"\n").split(b"\n")
         for part in whole:
             began = self._began if self._rest else now
-            found.append((bytes(self._rest + part), began))
+            lines.append((bytes(self._rest + part), began))
             self._rest.clear()
         if rest and not self._rest:
             self._began = now
         self._rest += rest
         if len(self._rest) > LONGEST:
-            found.append((bytes(self._rest), self._began))
+            lines.append((bytes(self._rest), self._began))
             self._rest.clear()
-        return [(line, began) for line, began in found if line]
+        return [(line, began) for line, began in lines if line]
 
 
 class Noise:

@@ -12,10 +12,10 @@ SLICE = 0.02
 
 _DELAYED = 2 * SLICE  # own delay, seconds, after which a silence may be due to a busy computer
 _PART = 0.5  # share of a slice that counts as silence after such a delay
-_SURELY = 0.4  # seconds after which a silence is real, however busy the computer is
+_REAL_SILENCE = 0.4  # seconds after which a silence is real, however busy the computer is
 _MEDIAN_OF = 15  # number of round trips of which the median is the usual one
 _TIMES, _LATE = 3.0, 0.004  # factor and seconds by which a trusted round trip may exceed the usual one
-_AGAIN = 0.04  # seconds, and at least two usual round trips, after which a query is repeated
+_REPEAT_AFTER = 0.04  # seconds, and at least two usual round trips, after which a query is repeated
 _FIRST = 0.2  # the same before the first answer
 # the repeat interval after an ambiguous answer, in times of that answer, until an answer is trusted
 _WIDER = 2.0
@@ -66,7 +66,7 @@ class ReportTimes:
 
     def silence(self, now: float) -> float:
         """Return how long a query has been open while somebody was reading."""
-        if self._open and now - self._out > _SURELY:
+        if self._open and now - self._out > _REAL_SILENCE:
             return now - self._out
         return self._silence
 
@@ -74,7 +74,7 @@ class ReportTimes:
         """Return whether to send a query now."""
         if not self._open:
             return now - self._quiet >= self.period and now >= self._resume
-        wait = max(_AGAIN, 2 * self.usual) if self._trips else _FIRST
+        wait = max(_REPEAT_AFTER, 2 * self.usual) if self._trips else _FIRST
         return now - self._open[-1] >= max(wait, self._wider)
 
     def ask(self, now: float) -> None:
@@ -101,7 +101,7 @@ class ReportTimes:
             self._quiet = now
             if asked:
                 # homing answers nothing for a long time
-                self._wider = min(_WIDER * (now - asked[0]), _SURELY)
+                self._wider = min(_WIDER * (now - asked[0]), _REAL_SILENCE)
                 self._resume = asked[-1] + self._wider
             return Answer(-math.inf, now, False)
         trip = now - asked[0]

@@ -54,21 +54,23 @@ class Trapezoid:
         t = np.clip(np.asarray(time, np.float64), 0, self.duration)
         number = np.clip(t // self._leg_duration, 0, self.legs - 1)
         t = t - number * self._leg_duration
-        left = self._leg_duration - t
-        up, down = np.minimum(t, self.ramp), np.minimum(left, self.ramp)
+        remaining = self._leg_duration - t
+        up, down = np.minimum(t, self.ramp), np.minimum(remaining, self.ramp)
         cruise = self.acceleration * self.ramp * (t - self.ramp / 2)
         early, late = self.acceleration / 2 * up**2, self.leg - self.acceleration / 2 * down**2
-        return number * self.leg + np.where(t < self.ramp, early, np.where(left < self.ramp, late, cruise))
+        return number * self.leg + np.where(
+            t < self.ramp, early, np.where(remaining < self.ramp, late, cruise)
+        )
 
     def time(self, place: ArrayLike) -> Floats:
         """Return the time at which a distance is reached, seconds; the inverse of ``place``."""
         s = np.clip(np.asarray(place, np.float64), 0, self.length)
         number = np.clip(s // self.leg, 0, self.legs - 1)
         s = s - number * self.leg
-        left = np.maximum(self.leg - s, 0)
+        remaining = np.maximum(self.leg - s, 0)
         ramp_end = self.acceleration / 2 * self.ramp**2
         early = np.sqrt(2 * s / self.acceleration)
-        late = self._leg_duration - np.sqrt(2 * left / self.acceleration)
+        late = self._leg_duration - np.sqrt(2 * remaining / self.acceleration)
         cruise = s / (self.acceleration * self.ramp) + self.ramp / 2
-        within = np.where(s < ramp_end, early, np.where(left < ramp_end, late, cruise))
+        within = np.where(s < ramp_end, early, np.where(remaining < ramp_end, late, cruise))
         return number * self._leg_duration + within

@@ -44,7 +44,7 @@ _ELSEWHERE = {
 """Functions to which an argument belongs, for arguments that are often given to others."""
 
 
-def unknown_argument(owner: str, name: str, known: Collection[str], what: str = "argument") -> str:
+def unknown_argument(owner: str, name: str, valid: Collection[str], what: str = "argument") -> str:
     """Return a message about an argument or option that a function or a class does not have.
 
     Examples
@@ -52,17 +52,17 @@ def unknown_argument(owner: str, name: str, known: Collection[str], what: str = 
     >>> unknown_argument("find_onset()", "treshold", ["threshold", "hold"])
     'find_onset() has no argument treshold: did you mean threshold?'
     """
-    remedy = f"it has {', '.join(known) or 'none'}"
-    if close := nearest(name, known):
+    remedy = f"it has {', '.join(valid) or 'none'}"
+    if close := nearest(name, valid):
         remedy = f"did you mean {close}?"
     elif what in ("argument", "option") and name in _ELSEWHERE:
         remedy = f"it is {_ELSEWHERE[name]}"
     return f"{owner} has no {what} {name}: {remedy}"
 
 
-def nearest(name: str, known: Iterable[str], similarity: float = 0.75) -> str:
+def nearest(name: str, candidates: Iterable[str], similarity: float = 0.75) -> str:
     """Return the name that a misspelt one is likely to mean; empty if none is as similar, from 0 to 1."""
-    return next(iter(difflib.get_close_matches(name, list(known), n=1, cutoff=similarity)), "")
+    return next(iter(difflib.get_close_matches(name, list(candidates), n=1, cutoff=similarity)), "")
 
 
 def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -83,28 +83,28 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         parameters = list(inspect.signature(function).parameters.values())
-        places = {one.name: index for index, one in enumerate(parameters)}
-        optional = {one.name for one in parameters if one.default is None}
-        known = [(places[name], name, check) for name, check in checks.items()]
-        takes_any = any(one.kind is one.VAR_KEYWORD for one in parameters)
+        places = {parameter.name: index for index, parameter in enumerate(parameters)}
+        optional = {parameter.name for parameter in parameters if parameter.default is None}
+        argument_checks = [(places[name], name, check) for name, check in checks.items()]
+        takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
 
         @functools.wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            given: list[Any] = list(args)
-            for index, name, check in known:
-                if index < len(given):
-                    if given[index] is not None or name not in optional:
-                        given[index] = check(name, given[index])
+            values: list[Any] = list(args)
+            for index, name, check in argument_checks:
+                if index < len(values):
+                    if values[index] is not None or name not in optional:
+                        values[index] = check(name, values[index])
                 elif name in kwargs and (kwargs[name] is not None or name not in optional):
                     kwargs[name] = check(name, kwargs[name])
             if (
                 kwargs
                 and not takes_any
-                and (unknown := next((one for one in kwargs if one not in places), ""))
+                and (unknown := next((keyword for keyword in kwargs if keyword not in places), ""))
             ):
                 raise TypeError(unknown_argument(f"{function.__name__}()", unknown, [*places]))
             with computation():
-                return function(*given, **kwargs)
+                return function(*values, **kwargs)
 
         return call
 
@@ -129,7 +129,7 @@ def as_array(name: str, value: Any, unit: str = "", components: bool = False) ->
     if isinstance(numbers, np.ma.MaskedArray) and np.any(numbers.mask):
         array = _without_masked(array, np.ma.getmaskarray(numbers), as_nan=name in _COUNTS or bool(unit))
     attributes = _attributes(value)
-    stored = {one: attributes[one] for one in _PACKING if one in attributes}
+    stored = {key: attributes[key] for key in _PACKING if key in attributes}
     if stored and (packing := packing_of(stored, array.dtype, name)) is not None:
         array = packing.unpack(array, np.float32 if name in _COUNTS else np.float64)
     if _is_labelled(value):
@@ -168,7 +168,7 @@ def _is_labelled(value: Any) -> bool:
 
 def _order(name: str, value: Any, components: bool) -> tuple[int, ...]:
     """Return the order of the dimensions of an array of xarray that the argument needs."""
-    names = [str(one) for one in value.dims]
+    names = [str(dim) for dim in value.dims]
     if name in ("frames", "samples") and len(names) == 3:
         return order_of(names, name)
     return order_of_map(names, name, components)
@@ -179,7 +179,7 @@ def _numbers_and_unit(value: Any) -> tuple[Any, str]:
     if isinstance(value, Real | str | list | tuple) or not callable(getattr(value, "to", None)):
         return value, ""
     unit, numbers = (
-        next((part for one in names if (part := getattr(value, one, None)) is not None), None)
+        next((part for name in names if (part := getattr(value, name, None)) is not None), None)
         for names in (("units", "unit"), ("magnitude", "value"))
     )
     if unit is None or numbers is None:
@@ -209,7 +209,7 @@ def _is_simple(value: Any) -> bool:
 
 
 def _has_dlpack_only(value: Any) -> bool:
-    return hasattr(value, "__dlpack__") and not any(hasattr(value, one) for one in _PROTOCOLS)
+    return hasattr(value, "__dlpack__") and not any(hasattr(value, protocol) for protocol in _PROTOCOLS)
 
 
 def _without_masked(array: NDArray[Any], mask: NDArray[np.bool_], as_nan: bool) -> NDArray[Any]:
@@ -223,7 +223,7 @@ def _without_masked(array: NDArray[Any], mask: NDArray[np.bool_], as_nan: bool) 
 def is_array(value: Any) -> bool:
     """Return whether an argument is a whole array, or a list of its parts, and not an iterator over them."""
     whole = isinstance(value, list | tuple | memoryview | bytes | bytearray)
-    return whole or any(hasattr(value, one) for one in (*_PROTOCOLS, "__dlpack__"))
+    return whole or any(hasattr(value, protocol) for protocol in (*_PROTOCOLS, "__dlpack__"))
 
 
 def as_array_or_number(name: str, value: Any, unit: str = "") -> Any:

@@ -30,7 +30,7 @@ UNVERIFIED_PARTS = Finding(
 )
 """Finding for parts of frames."""
 
-_PIECE = 32_000_000  # bytes of frames that are read while earlier ones are compared
+_READ_BYTES = 32_000_000  # bytes of frames that are read while earlier ones are compared
 
 
 def checksums(frames: NDArray[Any]) -> NDArray[np.uint32]:
@@ -72,22 +72,22 @@ class Verifier:
             Frames differ from their checksums.
         """
         (first, stop), *part = spans
-        left = self._left[first:stop]
-        if not left.any():
+        expected = self._left[first:stop]
+        if not expected.any():
             reader.fetch(spans, out)
             return
         cores, length, size = usable_cores(), reader.length, out[:1].nbytes
         # Chunks of a piece are decoded in parallel, so there are several for each core.
-        step = max(2 * cores, _PIECE // (length * size)) * length
-        found: list[Future[NDArray[np.uint32]]] = []
+        step = max(2 * cores, _READ_BYTES // (length * size)) * length
+        futures: list[Future[NDArray[np.uint32]]] = []
         with ThreadPoolExecutor(cores, "mirrorskin-checksums") as pool:
             for place in range(first // step * step, stop, step):
                 start, end = max(place, first), min(place + step, stop)
                 piece = out[start - first : end - first]
                 reader.fetch([(start, end), *part], piece)
-                found += [pool.submit(checksums, one) for one in np.array_split(piece, cores)]
-        values = np.concatenate([one.result() for one in found])
-        damaged = first + np.flatnonzero(left & (values[: len(left)] != self._expected[first:stop]))
+                futures += [pool.submit(checksums, part) for part in np.array_split(piece, cores)]
+        values = np.concatenate([future.result() for future in futures])
+        damaged = first + np.flatnonzero(expected & (values[: len(expected)] != self._expected[first:stop]))
         if damaged.size:
             raise InputError(f"{self._name}: {describe_damage(damaged)}: {REMEDY}")
-        left[...] = False
+        expected[...] = False

@@ -49,16 +49,16 @@ def in_process(findings: Sequence[Finding], process: Mapping[str, Any]) -> dict[
     >>> in_process([Finding("flicker", "the light flickers by 3 %")], {})
     {'warnings': 'the light flickers by 3 %'}
     """
-    known = {}
-    for name, wanted in zip(_KINDS, (True, False), strict=True):
+    texts = {}
+    for name, is_warning in zip(_KINDS, (True, False), strict=True):
         text = str(process.get(name, ""))
-        for one in findings:
-            repeated = f"{_BETWEEN}{one.text}{_BETWEEN}" in f"{_BETWEEN}{text}{_BETWEEN}"
-            if one.warning is wanted and not repeated:
-                text = f"{text}{_BETWEEN}{one.text}" if text else one.text
+        for finding in findings:
+            repeated = f"{_BETWEEN}{finding.text}{_BETWEEN}" in f"{_BETWEEN}{text}{_BETWEEN}"
+            if finding.warning is is_warning and not repeated:
+                text = f"{text}{_BETWEEN}{finding.text}" if text else finding.text
         if text:
-            known[name] = text
-    return known
+            texts[name] = text
+    return texts
 
 
 def carried(process: Mapping[str, Any], /, **inputs: Mapping[str, Any]) -> dict[str, str]:
@@ -78,7 +78,7 @@ def carried(process: Mapping[str, Any], /, **inputs: Mapping[str, Any]) -> dict[
     >>> carried({"noise": 1.2}, heights={"warnings": "frame 3: lost"}, normals={"tilt": 0.04})
     {'warnings': 'heights: frame 3: lost'}
     """
-    findings = [one for name, own in inputs.items() for one in findings_of(name, own)]
+    findings = [finding for name, source in inputs.items() for finding in findings_of(name, source)]
     return in_process(findings, process)
 
 
@@ -92,8 +92,10 @@ def merged(*processes: Mapping[str, Any]) -> dict[str, Any]:
     """
     values: dict[str, Any] = {}
     for process in processes:
-        own = [Finding(_CARRIED, str(process[kind]), kind == _KINDS[0]) for kind in _KINDS if kind in process]
-        values = {**values, **process, **in_process(own, values)}
+        carried = [
+            Finding(_CARRIED, str(process[kind]), kind == _KINDS[0]) for kind in _KINDS if kind in process
+        ]
+        values = {**values, **process, **in_process(carried, values)}
     return values
 
 
@@ -133,17 +135,17 @@ def with_findings(result: Result, *findings: Finding) -> Result:
     return result.assign(process={**result.process, **in_process(findings, result.process)})
 
 
-def named(name: str, said: str) -> str:
+def named(name: str, text: str) -> str:
     """Return a message with the name of its source as a prefix."""
-    return said if said.startswith(name) else f"{name}: {said}"
+    return text if text.startswith(name) else f"{name}: {text}"
 
 
 def warn(name: str, process: Mapping[str, Any]) -> None:
     """Issue a `MirrorskinWarning` with the ``warnings`` of a process, and the name of the source."""
-    said = str(process.get("warnings", ""))
-    if not said:
+    text = str(process.get("warnings", ""))
+    if not text:
         return
     level, frame = 1, sys._getframe()  # the line of the first caller outside of mirrorskin is shown
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("mirrorskin."):
         level, frame = level + 1, frame.f_back
-    warnings.warn(named(name, said), MirrorskinWarning, stacklevel=level)
+    warnings.warn(named(name, text), MirrorskinWarning, stacklevel=level)

@@ -49,8 +49,8 @@ def decode(data: bytes | NDArray[np.uint8], name: str, *, upright: bool = False)
 def encode(suffix: str, picture: NDArray[Any], parameters: Sequence[int] = ()) -> bytes:
     """Encode a picture; ValueError if OpenCV, which only returns a flag, fails."""
     with quiet_opencv() as cv2:
-        done, data = cv2.imencode(suffix, picture, list(parameters))
-    if not done:
+        success, data = cv2.imencode(suffix, picture, list(parameters))
+    if not success:
         raise ValueError(f"OpenCV cannot encode {picture.shape} {picture.dtype} as {suffix}")
     return bytes(data)
 
@@ -88,9 +88,9 @@ def is_coloured(picture: NDArray[Any]) -> bool:
     if picture.ndim == 2:
         return False
     return not all(
-        np.array_equal(picture[rows, :, 0], picture[rows, :, one], equal_nan=True)
+        np.array_equal(picture[rows, :, 0], picture[rows, :, k], equal_nan=True)
         for rows in rows_of(picture)
-        for one in (1, 2)
+        for k in (1, 2)
     )
 
 
@@ -103,9 +103,9 @@ def to_grey(picture: NDArray[Any], name: str, channel: int | None = None) -> NDA
     if channel is not None:
         order = [2, 1, 0, 3][: 1 if picture.ndim == 2 else picture.shape[2]]
         if picture.ndim == 2 or not 0 <= channel < len(order):
-            names = ", ".join(f"{k} {one}" for k, one in enumerate(_COLOURS[: len(order)]))
-            there = "is grey: leave --channel out" if picture.ndim == 2 else f"has the channels {names}"
-            raise InputError(f"{name} has no channel {channel}: it {there}")
+            names = ", ".join(f"{k} {colour}" for k, colour in enumerate(_COLOURS[: len(order)]))
+            problem = "is grey: leave --channel out" if picture.ndim == 2 else f"has the channels {names}"
+            raise InputError(f"{name} has no channel {channel}: it {problem}")
         return picture[..., order[channel]]
     if not is_coloured(picture):
         return picture if picture.ndim == 2 else picture[..., 0]

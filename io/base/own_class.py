@@ -50,33 +50,39 @@ def load_class(name: str | type, group: str = "") -> Callable[..., Any]:
         raise InputError(f"{name}: there is no {file.name} in {folder.resolve()}")
     try:
         if place.partition(".")[0] == "mirrorskin":
-            found = importlib.import_module(module)
+            loaded = importlib.import_module(module)
         else:
             with _importable(str(folder.resolve())):
-                found = importlib.import_module(module) if file is None else _run(file)
+                loaded = importlib.import_module(module) if file is None else _run(file)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # an import of the module itself failed
         raise InputError(f"{name}: there is no {place} in {folder.resolve()}, nor installed") from error
-    made: Any = found
+    value: Any = loaded
     for part in kind.split("."):
-        made = getattr(made, part, None)
-    if not callable(made):
-        exported = getattr(found, "__all__", ())
-        classes = {one: it for one in exported or vars(found) if isinstance(it := getattr(found, one), type)}
-        own = [one for one, it in classes.items() if exported or it.__module__ == found.__name__]
-        raise InputError(f"{name}: {unknown_argument(place, kind, own, 'class')}")
-    return made  # type: ignore[no-any-return]
+        value = getattr(value, part, None)
+    if not callable(value):
+        exported = getattr(loaded, "__all__", ())
+        classes = {
+            attribute: it
+            for attribute in exported or vars(loaded)
+            if isinstance(it := getattr(loaded, attribute), type)
+        }
+        names = [
+            attribute for attribute, it in classes.items() if exported or it.__module__ == loaded.__name__
+        ]
+        raise InputError(f"{name}: {unknown_argument(place, kind, names, 'class')}")
+    return value  # type: ignore[no-any-return]
 
 
 def installed_names(group: str) -> list[str]:
     """Return the names of the entry points in a group, which installed packages declare."""
-    return sorted({one.name for one in entry_points(group=group)})
+    return sorted({point.name for point in entry_points(group=group)})
 
 
 def installed_class(name: str, group: str) -> str | None:
     """Return MODULE:CLASS of the entry point with a name in a group; None if there is no such one."""
-    return next((f"{one.module}:{one.attr}" for one in entry_points(group=group, name=name)), None)
+    return next((f"{point.module}:{point.attr}" for point in entry_points(group=group, name=name)), None)
 
 
 def _class_of(name: str, group: str) -> str:
@@ -113,11 +119,11 @@ def importable_name(kind: type) -> str:
         It is defined in the program itself, or in a function.
     """
     where = kind.__module__
-    found: Any = sys.modules.get(where)
+    value: Any = sys.modules.get(where)
     for part in kind.__qualname__.split("."):
-        found = getattr(found, part, None)
-    if where in ("__main__", "__mp_main__") or found is not kind:
-        if found is not kind:
+        value = getattr(value, part, None)
+    if where in ("__main__", "__mp_main__") or value is not kind:
+        if value is not kind:
             where = "a function" if "<locals>" in kind.__qualname__ else f"no place of {where}"
         name = kind.__qualname__.rpartition(".")[2]
         raise InputError(

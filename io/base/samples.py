@@ -27,7 +27,7 @@ ATTRIBUTES = (
 """Attributes of the CF conventions, sections 2.5.1 and 8.1, that define the meaning of stored values."""
 
 _EXACT = 1 << 24  # float32 is exact to half a count up to this number
-_PIECE = 8_000_000  # bytes of stored samples that are decoded at once
+_DECODED_BYTES = 8_000_000  # bytes of stored samples that are decoded at once
 _MOST_NUMBERS = 100  # maximum number of values in an attribute
 _TARGETS = {"b": np.uint8, "i": np.uint16, "u": np.uint16, "f": np.float32}  # by kind; int8 becomes uint8
 
@@ -115,7 +115,7 @@ def packing_of(attributes: Mapping[str, Any], dtype: np.dtype[Any], where: str) 
         limits = np.iinfo(stored)
         missing = {value for value in missing if limits.min <= value <= limits.max}
     low, high = numbers("valid_range", -math.inf, math.inf)[:2]
-    found = Packing(
+    packing = Packing(
         numbers("scale_factor", 1.0)[0],
         numbers("add_offset", 0.0)[0],
         tuple(sorted(value for value in missing if not math.isnan(value))),
@@ -125,11 +125,11 @@ def packing_of(attributes: Mapping[str, Any], dtype: np.dtype[Any], where: str) 
         ),
         unsigned,
     )
-    if not (math.isfinite(found.scale) and found.scale != 0 and math.isfinite(found.offset)):
+    if not (math.isfinite(packing.scale) and packing.scale != 0 and math.isfinite(packing.offset)):
         raise InputError(
-            f"{where}: scale_factor {found.scale:g} and add_offset {found.offset:g}: correct them"
+            f"{where}: scale_factor {packing.scale:g} and add_offset {packing.offset:g}: correct them"
         )
-    return None if found == Packing() else found
+    return None if packing == Packing() else packing
 
 
 def frame_dtype(dtype: DTypeLike, where: str) -> np.dtype[Any]:
@@ -255,23 +255,23 @@ class Decoding:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """The conversions."""
-        found = []
+        problems = []
         if self.order != (0, 1, 2):
             shown = "the order of MATLAB" if self.matlab else f"the dimensions ({', '.join(self.names)})"
             axes = (
                 "third, first, second" if self.matlab else ", ".join(self.names[axis] for axis in self.order)
             )
-            found.append(
+            problems.append(
                 Finding("order of axes", f"{self.where} has {shown}: frames, rows, columns are {axes}", False)
             )
         if self.packing is not None:
             unknown = ", NaN where unknown" if self.dtype.kind == "f" else ""
             text = f"{self.where}: {self.packing.names} applied; samples are {self.dtype}{unknown}"
-            found.append(Finding("packed samples", text, False))
+            problems.append(Finding("packed samples", text, False))
         elif self.dtype != self.stored:
             text = f"{self.where} is of type {self.stored}; samples are converted to {self.dtype}"
-            found.append(Finding("converted samples", text, False))
-        return tuple(found)
+            problems.append(Finding("converted samples", text, False))
+        return tuple(problems)
 
     def decode(self, values: NDArray[Any], first: int = 0, out: NDArray[Any] | None = None) -> NDArray[Any]:
         """Return frames, (n, H, W), from stored samples in this order of axes; see `convert_samples`."""
@@ -290,7 +290,7 @@ class DecodedFrames(Closing):
         self.chunk = decoding.shape(reader.chunk)
         self.length = self.chunk[0]
         row, rows = math.prod(shape[1:]) * decoding.stored.itemsize, int(reader.chunk[0])
-        self._rows = max(1, _PIECE // (row * rows)) * rows
+        self._rows = max(1, _DECODED_BYTES // (row * rows)) * rows
         self.scratch_bytes: int = reader.scratch_bytes + self._rows * row
 
     def fetch(self, spans: Sequence[Span], out: NDArray[Any]) -> None:
@@ -299,7 +299,7 @@ class DecodedFrames(Closing):
         stored: list[Span] = [(0, 0)] * 3
         for axis, span in zip(order, spans, strict=True):
             stored[axis] = span
-        cut, (start, stop) = order.index(0), stored[0]
+        first_axis, (start, stop) = order.index(0), stored[0]
         at = start
         while at < stop:
             end = min(stop, (at // self._rows + 1) * self._rows)
@@ -307,8 +307,8 @@ class DecodedFrames(Closing):
             values = np.empty([last - first for first, last in spans_here], self._decoding.stored)
             self._reader.fetch(spans_here, values)
             part = [slice(None)] * 3
-            part[cut] = slice(at - start, end - start)
-            first = at if cut == 0 else spans[0][0]
+            part[first_axis] = slice(at - start, end - start)
+            first = at if first_axis == 0 else spans[0][0]
             self._decoding.decode(values.transpose(order), first, out[*part])
             at = end
 
@@ -345,15 +345,15 @@ def order_of(names: Sequence[str], where: str) -> tuple[int, int, int]:
     shown = f"{where} has the dimensions ({', '.join(names)})"
     if "colours" in kinds:
         raise InputError(f"{shown}: give one channel, as a stack (t, y, x)")
-    known = [kind for kind in kinds if kind]
-    if len({*known}) != len(known):
+    stated = [kind for kind in kinds if kind]
+    if len({*stated}) != len(stated):
         raise InputError(f"{shown}: name frames, rows and columns differently, such as (t, y, x)")
-    if len(known) == 2:
-        kinds[kinds.index("")] = next(iter({"frames", "rows", "columns"} - {*known}))
-    elif len(known) == 1 and known[0] == "frames":
+    if len(stated) == 2:
+        kinds[kinds.index("")] = next(iter({"frames", "rows", "columns"} - {*stated}))
+    elif len(stated) == 1 and stated[0] == "frames":
         rest = iter(("rows", "columns"))
         kinds = [kind or next(rest) for kind in kinds]
-    elif len(known) == 1 and kinds.index(known[0]) != ("frames", "rows", "columns").index(known[0]):
+    elif len(stated) == 1 and kinds.index(stated[0]) != ("frames", "rows", "columns").index(stated[0]):
         raise InputError(f"{shown}, not (t, y, x), and the others are not known: name them t, y and x")
     if "" in kinds:
         return 0, 1, 2
@@ -377,8 +377,8 @@ def order_of_map(names: Sequence[str], where: str, components: bool = False) -> 
     """
     kinds = [_kind_of(name) for name in names]
     frames, rows, columns, others = (
-        [axis for axis, kind in enumerate(kinds) if kind in wanted]
-        for wanted in (("frames",), ("rows",), ("columns",), ("", "colours"))
+        [axis for axis, kind in enumerate(kinds) if kind in names]
+        for names in (("frames",), ("rows",), ("columns",), ("", "colours"))
     )
     if len(rows) == len(columns) == 1:
         last = others[-1:] if components else []

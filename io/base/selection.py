@@ -39,10 +39,10 @@ class Region:
     @classmethod
     def read(cls, text: str) -> Self | None:
         """Return the region written by the property ``text``; None for any other text."""
-        found = _TEXT.fullmatch(text)
-        if found is None:
+        match = _TEXT.fullmatch(text)
+        if match is None:
             return None
-        column, row, columns, rows = map(int, found.groups())
+        column, row, columns, rows = map(int, match.groups())
         return cls((row, row + rows), (column, column + columns))
 
     @property
@@ -78,8 +78,8 @@ class Region:
 
     def within(self, outer: Region) -> tuple[slice, slice]:
         """Return the slices that crop a map of another region to this one."""
-        (top, left), (rows, columns) = outer.origin, self.slices
-        return slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
+        (top, column), (rows, columns) = outer.origin, self.slices
+        return slice(rows.start - top, rows.stop - top), slice(columns.start - column, columns.stop - column)
 
     def centre(self, picture: tuple[int, int], pixel_size: tuple[float, float]) -> tuple[float, float]:
         """Return the position of its centre relative to the centre of a picture, mm to the right and up."""
@@ -108,7 +108,7 @@ class Selection(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class FrameLabel:
     """Source of frames, for messages: the file, as the user named it, and the dataset."""
 
     path: str

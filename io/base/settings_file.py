@@ -78,19 +78,19 @@ def _table(values: Any, model: type[_Model], where: str, name: str) -> _Model:
     for key in values:
         if key not in fields:
             raise InputError(f"{where}: {_dotted(name, key)} is not known: {_suggest(key, list(fields))}")
-    found: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     for key, field in fields.items():
         kind, dotted = field.type, _dotted(name, key)
-        table = next((one for one in _within(kind) if _is_model(one)), None)
+        table = next((member for member in _within(kind) if _is_model(member)), None)
         if key not in values and field.required:
             missing = f"table [{dotted}]" if table else f"{key} = {_example(kind)} in [{name}]"
             raise InputError(f"{where}: {dotted} is missing: add {missing}")
         if key in values and table:
-            found[field.name] = _table(values[key], table, where, dotted)
+            arguments[field.name] = _table(values[key], table, where, dotted)
         elif key in values:
-            found[field.name] = _value(values[key], kind, f"{where}: {dotted}", key)
+            arguments[field.name] = _value(values[key], kind, f"{where}: {dotted}", key)
     try:
-        return model(**found)
+        return model(**arguments)
     except ValueError as error:
         raise InputError(f"{where}: {f'[{name}] ' if name else ''}{error}") from error
 
@@ -111,9 +111,9 @@ def _convert(value: Any, kind: Any) -> Any:
     if get_origin(inner) not in (Union, UnionType):
         return msgspec.convert(value, kind)
     problems = []
-    for one in get_args(inner):
+    for member in get_args(inner):
         try:
-            return _convert(value, one)
+            return _convert(value, member)
         except msgspec.ValidationError as error:
             problems.append(error)
     raise problems[0]
@@ -131,8 +131,8 @@ def _within(kind: Any) -> Iterator[Any]:
         kind = get_args(kind)[0]
     yield kind
     if get_origin(kind) is not Literal and not _is_model(kind):
-        for one in get_args(kind):
-            yield from _within(one)
+        for member in get_args(kind):
+            yield from _within(member)
 
 
 def _is_model(kind: Any) -> bool:
@@ -142,16 +142,16 @@ def _is_model(kind: Any) -> bool:
 def _meta(kind: Any) -> msgspec.Meta | None:
     """Return the outermost annotation with a description."""
     if get_origin(kind) is Annotated:
-        for one in kind.__metadata__:
-            if isinstance(one, msgspec.Meta) and one.description:
-                return one
+        for annotation in kind.__metadata__:
+            if isinstance(annotation, msgspec.Meta) and annotation.description:
+                return annotation
     inner = () if get_origin(kind) is Literal else get_args(kind)
-    return next((found for one in inner if (found := _meta(one)) is not None), None)
+    return next((meta for member in inner if (meta := _meta(member)) is not None), None)
 
 
 def _choices(kind: Any) -> tuple[Any, ...]:
-    found = next((one for one in _within(kind) if get_origin(one) is Literal), None)
-    return (True, False) if found is None else get_args(found)
+    literal = next((member for member in _within(kind) if get_origin(member) is Literal), None)
+    return (True, False) if literal is None else get_args(literal)
 
 
 def _needed(kind: Any) -> str:
@@ -171,6 +171,6 @@ def _dotted(table: str, key: str) -> str:
     return f"{table}.{shown}" if table else shown
 
 
-def _suggest(key: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(key.lower(), known, n=1, cutoff=0.5)
-    return f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+def _suggest(key: str, names: list[str]) -> str:
+    close = difflib.get_close_matches(key.lower(), names, n=1, cutoff=0.5)
+    return f"did you mean {close[0]}?" if close else f"there are {', '.join(names)}"

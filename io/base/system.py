@@ -17,7 +17,7 @@ from mirrorskin.io.base.types import InputError
 
 # h5py raises any of these for damaged files.
 _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
-_LONGEST = 100
+_QUOTED_MAX = 100
 
 MAX_UNPACKED_BYTES = 1 << 30
 """Limit of the memory that one file may require by the sizes it states: a picture, a compressed array.
@@ -29,7 +29,7 @@ MAX_TEXT_BYTES = 64 << 20
 """Limit of the size of a text or a table that is read as a whole: settings, positions, readings."""
 
 
-class as_input_error(AbstractContextManager[None]):  # noqa: N801  # named like contextlib's functions
+class translate_os_errors(AbstractContextManager[None]):  # noqa: N801  # named like contextlib's functions
     """Convert errors of a file to an InputError of one line.
 
     It is a class, because opening a file uses many of them, and a generator takes several times as long.
@@ -56,12 +56,12 @@ def reason(error: Exception) -> str:
     if "truncated" in text:
         return "it is truncated: copy it again"
     inner = text.partition("(")[2].removesuffix(")") or text
-    return f"it is damaged ({' '.join(inner.split())[:_LONGEST]}): copy it again"
+    return f"it is damaged ({' '.join(inner.split())[:_QUOTED_MAX]}): copy it again"
 
 
 def is_flagged(error: Exception) -> bool:
     """Return whether HDF5 refused a file because it is marked as being written, or this process writes it."""
-    return any(said in str(error) for said in ("already open for write", "locking flag values don't match"))
+    return any(text in str(error) for text in ("already open for write", "locking flag values don't match"))
 
 
 def check_regular(path: Path, remedy: str = "") -> None:

@@ -30,7 +30,7 @@ def one_line(value: object) -> str:
     return printable(" ".join(str(value).split()))
 
 
-def shortened(text: str, most: int = 40) -> str:
+def shortened(text: str, length: int = 40) -> str:
     """Return a text, shortened for quoting in a message.
 
     Examples
@@ -38,4 +38,4 @@ def shortened(text: str, most: int = 40) -> str:
     >>> shortened("a line without end", 6)
     'a line...'
     """
-    return text if len(text) <= most else f"{text[:most]}..."
+    return text if len(text) <= length else f"{text[:length]}..."

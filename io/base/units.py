@@ -170,7 +170,7 @@ PLAIN = {"", "1", "dimensionless", "share", "count", "counts", "frame", "frames"
 _PER_SECOND = {"mHz": "1/ks", "Hz": "1/s", "hertz": "1/s", "kHz": "1/ms", "MHz": "1/us", "GHz": "1/ns"}
 _OTHER_PLURALS = {"px": "pixels", "pixel": "pixels", "pixels": "pixels", "Hz": "hertz", "hertz": "hertz"}
 _MOST_DECIMALS = 9
-_LONGEST = 40  # maximum number of quoted characters of a unit
+_QUOTED_MAX = 40  # maximum number of quoted characters of a unit
 
 
 @functools.cache
@@ -223,22 +223,22 @@ def _refusal(symbol: str, kind: Kind) -> str:
         return f"{plural} are not {_NOUN[kind]}"
     if unit:
         return f"{symbol} is not {_NOUN[kind]}"
-    end = "..." if len(symbol) > _LONGEST else ""
-    return f"{symbol[:_LONGEST]}{end} is not a known unit ({_EXAMPLES[kind]})"
+    end = "..." if len(symbol) > _QUOTED_MAX else ""
+    return f"{symbol[:_QUOTED_MAX]}{end} is not a known unit ({_EXAMPLES[kind]})"
 
 
 def is_common(symbol: str, kind: Kind | None = None) -> bool:
     """Return whether a text is the symbol of a common unit, of some kind or of any."""
-    return any(symbol in units.split() for own, units in _HEADINGS.items() if kind in (None, own))
+    return any(symbol in units.split() for quantity, units in _HEADINGS.items() if kind in (None, quantity))
 
 
-def conversion_factor(unit: str, wanted: str, where: str) -> float:
+def conversion_factor(unit: str, target: str, where: str) -> float:
     """Return the factor that converts a value in a file from its unit to another."""
     try:
-        return ratio(unit, wanted)
+        return ratio(unit, target)
     except InputError as error:
         raise InputError(
-            f"{where} is in {unit[:_LONGEST]!r}, which cannot be converted to {wanted}: "
+            f"{where} is in {unit[:_QUOTED_MAX]!r}, which cannot be converted to {target}: "
             "correct its attribute units"
         ) from error
 
@@ -260,15 +260,15 @@ def ratio(unit: str, other: str) -> float:
         return 1.0
     for kind in BASE:
         units = units_of(kind)
-        one, base = units.get(_spelling(unit)), units.get(_spelling(other))
-        if one and base:
-            return one.factor / base.factor
-    parts, others = (_PER_SECOND.get(one, one).split("/") for one in (unit, other))
+        factors, base = units.get(_spelling(unit)), units.get(_spelling(other))
+        if factors and base:
+            return factors.factor / base.factor
+    parts, others = (_PER_SECOND.get(symbol, symbol).split("/") for symbol in (unit, other))
     if len(parts) == len(others) == 2:
-        over, under = (ratio(one.strip(), base.strip()) for one, base in zip(parts, others, strict=True))
+        over, under = (ratio(part.strip(), base.strip()) for part, base in zip(parts, others, strict=True))
         return over / under
-    wanted = repr(other[:_LONGEST]) if other else "a number without a unit"
-    raise InputError(f"{unit[:_LONGEST]!r} cannot be converted to {wanted}. Use units of one quantity")
+    needed = repr(other[:_QUOTED_MAX]) if other else "a number without a unit"
+    raise InputError(f"{unit[:_QUOTED_MAX]!r} cannot be converted to {needed}. Use units of one quantity")
 
 
 def numbers_with_unit(values: Sequence[float], unit: str) -> tuple[list[str], str]:

@@ -41,14 +41,14 @@ def path_of(text: str | os.PathLike[str]) -> Path:
     >>> type(path_of("memory://press.zarr")).__name__, str(path_of("file:///data/press.zarr"))
     ('Url', '/data/press.zarr')
     """
-    said = os.fspath(text)
-    found = _SCHEME.match(said)
-    if found is None:
-        return Path(said)
-    return Path("/", said[found.end() :]) if found[1] == "file" else Url(said)
+    address = os.fspath(text)
+    match = _SCHEME.match(address)
+    if match is None:
+        return Path(address)
+    return Path("/", address[match.end() :]) if match[1] == "file" else Url(address)
 
 
 def is_zarr(path: str | Path) -> bool:
     """Return whether a path is a Zarr store: an address, ``NAME.zarr``, or a zipped ``NAME.zarr.zip``."""
-    known = path_of(path)
-    return isinstance(known, Url) or known.name.lower().endswith((ZARR_SUFFIX, f"{ZARR_SUFFIX}.zip"))
+    local = path_of(path)
+    return isinstance(local, Url) or local.name.lower().endswith((ZARR_SUFFIX, f"{ZARR_SUFFIX}.zip"))

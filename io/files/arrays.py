@@ -22,10 +22,10 @@ from mirrorskin.io.base.samples import DecodedFrames, Decoding
 from mirrorskin.io.base.selection import Region
 from mirrorskin.io.base.system import (
     MAX_UNPACKED_BYTES,
-    as_input_error,
     check_regular,
     check_unpacked,
     open_regular,
+    translate_os_errors,
 )
 from mirrorskin.io.base.types import FRAME_DTYPES, MOTIONS, Block, Header, InputError, Motion, block_memory
 from mirrorskin.io.files.recording import Recording, cut_out
@@ -40,7 +40,7 @@ _KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that ar
 _NEEDED = "travel (--travel-step or --travel), phase (--phase-step or --phases)"
 _HASH_INTERVAL, _HASH_LENGTH = 4 << 20, 4 << 10  # bytes: of each 4 MiB of frames, the first 4 KiB are hashed
 _HEAD_BYTES = 1 << 14  # bytes read for the header of a member: NumPy accepts at most 10 000 characters
-_PIECE = 1 << 20  # bytes unpacked at a time
+_UNPACKED_BYTES = 1 << 20  # bytes unpacked at a time
 
 
 class ArrayRecording(Recording):
@@ -84,7 +84,7 @@ class ArrayRecording(Recording):
         header: Mapping[str, Any],
         motion: Motion | None = None,
         region: Region | None = None,
-        wanted: tuple[int, int | None] | None = None,
+        frame_range: tuple[int, int | None] | None = None,
         name: str = "the array of frames",
         origins: Mapping[Path, State] | None = None,
     ) -> None:
@@ -92,7 +92,7 @@ class ArrayRecording(Recording):
         frames = frames if isinstance(frames, FrameReader) else as_array("frames", frames)
         reader = frames if isinstance(frames, FrameReader) else None
         if reader is not None and reader.shape[0] < 2:
-            hints = "".join(f". {found.text}" for found in reader.findings if found.warning)
+            hints = "".join(f". {finding.text}" for finding in reader.findings if finding.warning)
             raise InputError(f"{name} contains {reader.shape[0]} frame: a stack has at least 2{hints}")
         if len(frames.shape) != 3 or frames.shape[0] < 2 or 0 in frames.shape:
             raise InputError(f"{name} has shape {frames.shape}: frames, (T, H, W), at least 2, are needed")
@@ -106,32 +106,45 @@ class ArrayRecording(Recording):
         self.path, self.name, self.dataset, self._files = Path(name), name, "", dict(origins or {})
         self.motion, series = _motion(name, positions, motion)
         self.full_shape: tuple[int, int, int] = frames.shape[0], frames.shape[1], frames.shape[2]
-        cut = cut_out(name, self.full_shape, wanted, region)
-        self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
-        self.which: str = f"{cut.frames[0]}:{cut.frames[1]}"
-        self.shape: tuple[int, int, int] = (cut.frames[1] - cut.frames[0], *cut.region.shape)
+        selection = cut_out(name, self.full_shape, frame_range, region)
+        self.region, self.origin, self.first_frame = (
+            selection.region,
+            selection.region.origin,
+            selection.frames[0],
+        )
+        self.which: str = f"{selection.frames[0]}:{selection.frames[1]}"
+        self.shape: tuple[int, int, int] = (
+            selection.frames[1] - selection.frames[0],
+            *selection.region.shape,
+        )
         self.dtype: np.dtype[Any] = decoding.dtype
         self.time = self.travel = self.phase = self.displacement = self.twist = self.tilt = None
         lost = None if reader is None else reader.lost
-        given = along(as_series(series, positions[series]), self.full_shape[0], lost)
-        assert given is not None
+        series_of_frames = along(as_series(series, positions[series]), self.full_shape[0], lost)
+        assert series_of_frames is not None
         width = ROW_SHAPES.get(series, ())
         where = f"{name}: the {series} given"
-        if np.shape(given)[:1] == (self.full_shape[2],) != (self.full_shape[0],):
+        if np.shape(series_of_frames)[:1] == (self.full_shape[2],) != (self.full_shape[0],):
             count, _, columns = self.full_shape
-            problem = f"{where} has shape {np.shape(given)} for {count} frames of {columns} columns"
+            problem = (
+                f"{where} has shape {np.shape(series_of_frames)} for {count} frames of {columns} columns"
+            )
             raise InputError(f"{problem}: if the frames are the last axis, use numpy.moveaxis(frames, -1, 0)")
-        setattr(self, series, check_finite(given, self.full_shape[0], where, cut.frames, width))
-        levels = {one: _map(name, one, header.get(one), self.full_shape[1:]) for one in ("dark", "bright")}
-        known: dict[str, Any] = {
-            one: level[cut.region.slices] for one, level in levels.items() if level is not None
+        setattr(
+            self, series, check_finite(series_of_frames, self.full_shape[0], where, selection.frames, width)
+        )
+        levels = {
+            level: _map(name, level, header.get(level), self.full_shape[1:]) for level in ("dark", "bright")
         }
-        known["pixel_size"] = _pixel_size(name, header.get("pixel_size"))
-        self.header: Header = Header(self.motion, **{"title": self.path.stem, **header, **known})
+        properties: dict[str, Any] = {
+            key: level[selection.region.slices] for key, level in levels.items() if level is not None
+        }
+        properties["pixel_size"] = _pixel_size(name, header.get("pixel_size"))
+        self.header: Header = Header(self.motion, **{"title": self.path.stem, **header, **properties})
         self.used, self.dropped, self.state = None, None, COMPLETE
         if reader is not None:
-            self.time = None if reader.time is None else reader.time[slice(*cut.frames)]
-            self.dropped = None if lost is None else lost[slice(*cut.frames)]
+            self.time = None if reader.time is None else reader.time[slice(*selection.frames)]
+            self.dropped = None if lost is None else lost[slice(*selection.frames)]
             self.left_out, self.findings = reader.left_out, (*reader.findings, *decoding.findings)
         self.storage = reader.how if isinstance(reader, WholeFrames) else "one piece"
         self._next, self._hash = 0, ""
@@ -153,12 +166,12 @@ class ArrayRecording(Recording):
         block = self._block(self._part(start, out[: stop - start]))
         return block if lost is None else replace(block, dropped=int(lost[start]))
 
-    def read_in_place(self, most: int) -> Block | None:
-        """Return the next frames, at most ``most``, as a view of the array; None at the end or for a file."""
+    def read_in_place(self, limit: int) -> Block | None:
+        """Return at most ``limit`` next frames as a view of the array; None at the end or for a file."""
         if not isinstance(self._frames, np.ndarray):
             return None
         start = self.first_frame + self._next
-        stop = min(start + most, self.first_frame + self.shape[0])
+        stop = min(start + limit, self.first_frame + self.shape[0])
         frames = self._frames[start:stop, *self.region.slices]
         return self._block(frames) if len(frames) else None
 
@@ -173,7 +186,7 @@ class ArrayRecording(Recording):
         if isinstance(self._frames, np.ndarray):
             return self._frames[start : start + len(out), *self.region.slices]
         span = start, start + len(out)
-        with as_input_error(f"{self.name}: frames {start} to {span[1] - 1} cannot be read"):
+        with translate_os_errors(f"{self.name}: frames {start} to {span[1] - 1} cannot be read"):
             self._frames.fetch((span, self.region.rows, self.region.columns), out)
         return out
 
@@ -224,16 +237,16 @@ class ArrayRecording(Recording):
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def _errors_named(path: Path) -> Iterator[None]:
     """Convert NumPy's errors for a damaged file to a one-line error that names the file."""
     try:
         yield
     except (InputError, MemoryError):
         raise
     except Exception as error:  # a damaged header is parsed as Python, which raises errors of many types
-        said = " ".join(str(error).split())
+        text = " ".join(str(error).split())
         raise InputError(
-            f"{path} is not a NumPy array of numbers ({said}): write it with numpy.save"
+            f"{path} is not a NumPy array of numbers ({text}): write it with numpy.save"
         ) from error
 
 
@@ -264,7 +277,7 @@ def _read_head(file: IO[bytes]) -> _Head:
 
 def list_arrays(path: Path) -> dict[str, str]:
     """Return the names of the arrays in a file, with the shape and type of each."""
-    with _naming(path), open_regular(path) as file:
+    with _errors_named(path), open_regular(path) as file:
         if path.suffix.lower() == ".npy":
             return {"array": _describe(_read_head(file))}
         with zipfile.ZipFile(file) as archive:
@@ -277,7 +290,9 @@ def _describe(head: _Head) -> str:
 
 def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     """Return the members of an archive by the names of their arrays."""
-    return {one.filename.removesuffix(".npy"): one for one in archive.infolist() if not one.is_dir()}
+    return {
+        member.filename.removesuffix(".npy"): member for member in archive.infolist() if not member.is_dir()
+    }
 
 
 def _head_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> _Head:
@@ -289,7 +304,7 @@ def _head_of(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> _Head:
 
 def read_array(path: Path) -> NDArray[Any]:
     """Read an array of numbers written by ``numpy.save``."""
-    with _naming(path), open_regular(path) as file:
+    with _errors_named(path), open_regular(path) as file:
         head = _number_head(file)
         check_unpacked(head.nbytes, str(path), "give a smaller array")
         return _read_values(file, head)
@@ -338,7 +353,7 @@ def _read_values(file: IO[bytes], head: _Head) -> NDArray[Any]:
     read: Any = file  # IO lacks readinto
     rest = values.view(np.uint8).data if values.size else memoryview(b"")
     while rest:
-        count = read.readinto(rest[:_PIECE])
+        count = read.readinto(rest[:_UNPACKED_BYTES])
         if not count:
             raise ValueError("it was cut off")
         rest = rest[count:]
@@ -384,7 +399,7 @@ def open_stack(
     header: Mapping[str, Any],
     motion: Motion | None,
     region: Region | None,
-    wanted: tuple[int, int | None] | None,
+    frame_range: tuple[int, int | None] | None,
     memory_limit: int | None = None,
     override_motion: bool = False,
     verify: bool = True,
@@ -396,7 +411,7 @@ def open_stack(
     """
     with ExitStack() as opening:
         if form is None:
-            with _naming(path):
+            with _errors_named(path):
                 check_regular(path)
                 files = {path: state_of(path.stat())}
                 frames, arrays = _open_array(path, dataset, memory_limit)
@@ -406,21 +421,21 @@ def open_stack(
                 _motion(str(path), positions, motion)
             options = {"dataset": dataset, "channel": channel, "memory_limit": memory_limit, "verify": verify}
             frames = opening.enter_context(open_reader(path, form, **options))
-            with as_input_error(str(path)):
+            with translate_os_errors(str(path)):
                 files = {file: state_of(file.stat()) for file in frames.files}
             held = {**frames.positions, **frames.header}
-        given = {one: value for one, value in positions.items() if value is not None}
-        known = given or {one: value for one, value in held.items() if one in POSITIONS.values()}
+        kept = {name: value for name, value in positions.items() if value is not None}
+        series = kept or {name: value for name, value in held.items() if name in POSITIONS.values()}
         stated = held.pop("motion", motion)
         if motion not in (None, stated) and not override_motion:
             raise InputError(
                 f"{path} states the motion {stated}, but --motion is {motion}: leave --motion out, or correct"
                 " the file"
             )
-        motion = motion or (None if given else stated)
-        own = {name: value for name, value in held.items() if name not in POSITIONS.values()}
-        header = own | {name: value for name, value in header.items() if value is not None}
-        recording = ArrayRecording(frames, known, header, motion, region, wanted, str(path), files)
+        motion = motion or (None if kept else stated)
+        properties = {name: value for name, value in held.items() if name not in POSITIONS.values()}
+        header = properties | {name: value for name, value in header.items() if value is not None}
+        recording = ArrayRecording(frames, series, header, motion, region, frame_range, str(path), files)
         opening.pop_all()  # the recording closes the file from now on
     return recording
 
@@ -440,14 +455,14 @@ def _open_array(
         if chosen not in members:
             raise InputError(f"{path} contains no array {chosen!r}: choose from {', '.join(members)}")
         limit = max(MAX_UNPACKED_BYTES, memory_limit or 0)
-        needed = {name: one for name, one in members.items() if name in _KNOWN or name == chosen}
+        needed = {name: member for name, member in members.items() if name in _KNOWN or name == chosen}
         held = _read_members(path, archive, needed, limit)
         return held.pop(chosen), held
 
 
 def _stack_of(path: Path, names: Iterable[str]) -> str:
     """Return the name of the array of frames in an archive."""
-    others = [one for one in names if one not in _KNOWN]
+    others = [name for name in names if name not in _KNOWN]
     if "frames" in others or len(others) == 1:
         return "frames" if "frames" in others else others[0]
     raise InputError(f"{path} contains the arrays {', '.join(names)}: choose the frames with --dataset")
@@ -456,9 +471,9 @@ def _stack_of(path: Path, names: Iterable[str]) -> str:
 def _check_names(name: str, positions: Iterable[str], header: Iterable[str]) -> None:
     """Raise InputError if a position or a property does not exist."""
     properties = [field.name for field in fields(Header) if field.name != "motion"]
-    for given, known in ((positions, [*POSITIONS.values()]), (header, properties)):
-        if unknown := next((one for one in given if one not in known), ""):
-            raise InputError(unknown_argument(name, unknown, known, "property"))
+    for stated, allowed in ((positions, [*POSITIONS.values()]), (header, properties)):
+        if unknown := next((name for name in stated if name not in allowed), ""):
+            raise InputError(unknown_argument(name, unknown, allowed, "property"))
 
 
 def _pixel_size(name: str, size: Any) -> tuple[float, float] | None:
@@ -477,14 +492,16 @@ def _motion(
     """Return the motion, and the name of its position."""
     if motion is not None and motion not in MOTIONS:
         raise InputError(f"{name}: unknown motion {motion!r}: give one of {', '.join(MOTIONS)}")
-    given = [one for one, values in positions.items() if values is not None]
-    fitting = [one for one in MOTIONS if POSITIONS[one] in given and motion in (None, one)]
+    stated = [name for name, values in positions.items() if values is not None]
+    fitting = [
+        candidate for candidate in MOTIONS if POSITIONS[candidate] in stated and motion in (None, candidate)
+    ]
     if motion is not None and not fitting:
         remedy = REMEDIES.get(POSITIONS[motion], "give it")
         raise InputError(f"{name}: {motion} motion needs the {POSITIONS[motion]} of each frame: {remedy}")
     if len(fitting) != 1:
         where = "does not state the position of the body in each frame"
-        problem = f"has {' and '.join(given)}" if given else where
+        problem = f"has {' and '.join(stated)}" if stated else where
         remedy = ", or --motion" if fitting else ""
         raise InputError(f"{name} {problem}: give one of {_NEEDED}{remedy}")
     return fitting[0], POSITIONS[fitting[0]]

@@ -85,7 +85,7 @@ def _frames(kind: str, frames: FrameReader) -> dict[str, str]:
 
 
 def _findings(findings: Iterable[Finding]) -> dict[str, str]:
-    return {f"finding: {found.kind}": found.text for found in findings}
+    return {f"finding: {finding.kind}": finding.text for finding in findings}
 
 
 def _recording(recording: Recording) -> dict[str, str]:
@@ -134,10 +134,10 @@ def _counts(values: NDArray[np.floating] | None, unit: str) -> str:
     """Return a number, or the median of a map, as text."""
     if values is None:
         return "none"
-    known = values[np.isfinite(values)]
-    if not known.size:
+    finite = values[np.isfinite(values)]
+    if not finite.size:
         return "no valid pixel"
-    return f"{np.median(known):g} {unit}{' (median)' if np.ndim(values) else ''}"
+    return f"{np.median(finite):g} {unit}{' (median)' if np.ndim(values) else ''}"
 
 
 def _range(name: str, values: NDArray[np.float64] | None, unit: str) -> dict[str, str]:

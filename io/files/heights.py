@@ -71,13 +71,13 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
 
 
 def _cut_heights(
-    height: NDArray[np.float32], own: Region, source: Recording, name: str
+    height: NDArray[np.float32], region: Region, source: Recording, name: str
 ) -> NDArray[np.float32]:
     """Crop heights to the pixels of a recording."""
-    wanted = source.region
-    if not (own.holds(wanted) and Region.whole(source.full_shape[1:]).holds(own)):
+    target = source.region
+    if not (region.holds(target) and Region.whole(source.full_shape[1:]).holds(region)):
         raise InputError(
-            f"{name} contains the heights of {own}, where {source.name} needs those of {wanted}: "
+            f"{name} contains the heights of {region}, where {source.name} needs those of {target}: "
             "give some of all these pixels"
         )
-    return np.ascontiguousarray(height[wanted.within(own)])
+    return np.ascontiguousarray(height[target.within(region)])

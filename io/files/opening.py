@@ -22,7 +22,7 @@ from mirrorskin.io.base.checksums import UNVERIFIED, UNVERIFIED_PARTS
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.samples import Decoding, frame_dtype, order_of
 from mirrorskin.io.base.selection import Region
-from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.system import translate_os_errors
 from mirrorskin.io.base.types import (
     InputError,
     Motion,
@@ -137,11 +137,21 @@ def open_recording(
 
         if live:
             raise InputError(f"{path} is not a recording of a live run: leave --live out")
-        known = {"tilt": tilt, "pixel_size": pixel_size}
+        properties = {"tilt": tilt, "pixel_size": pixel_size}
         where = {"travel": travel, "phase": phase}
         part = region, frames
         return open_stack(
-            path, form, dataset, channel, where, known, motion, *part, memory_limit, override_motion, verify
+            path,
+            form,
+            dataset,
+            channel,
+            where,
+            properties,
+            motion,
+            *part,
+            memory_limit,
+            override_motion,
+            verify,
         )
     with ExitStack() as opening:
         file = opening.enter_context(open_file(path, memory_limit))
@@ -149,24 +159,35 @@ def open_recording(
         file.check_layout(MARK)
         stack, state, decoding = _find_stack(file, dataset, ours)
         shape = (state.count, *decoding.shape(stack.shape)[1:])
-        cut = cut_out(str(path), shape, frames, region)
+        selection = cut_out(str(path), shape, frames, region)
         coordinates = Coordinates() if ours else read_coordinates(file, stack, decoding)
-        layout = Layout(file, ours, shape, cut, coordinates)
+        layout = Layout(file, ours, shape, selection, coordinates)
         header = layout.header(motion, tilt, pixel_size, override_motion)
-        state, numbers = state.of(slice(*cut.frames)), np.arange(*cut.frames)
+        state, numbers = state.of(slice(*selection.frames)), np.arange(*selection.frames)
         if live:
             chosen = _used(str(path), state, travel, phase)
             state, positions = state.of(chosen), layout.live(header.motion, chosen)
             numbers = numbers[chosen]
         else:
-            given = {"vertical": travel, "axial": phase}.get(header.motion)
-            positions = layout.positions(header.motion, along(given, shape[0]))
+            series = {"vertical": travel, "axial": phase}.get(header.motion)
+            positions = layout.positions(header.motion, along(series, shape[0]))
         opened = file.frames(stack) if isinstance(file, ZarrFile) else None
-        expected, notes = _expected(file, stack, state, cut.region, verify)
+        expected, notes = _expected(file, stack, state, selection.region, verify)
         frames_of = Stack(
-            stack, str(path), shape[0], numbers, cut.region, memory_limit, threads, decoding, opened, expected
+            stack,
+            str(path),
+            shape[0],
+            numbers,
+            selection.region,
+            memory_limit,
+            threads,
+            decoding,
+            opened,
+            expected,
         )
-        recording = Recording(file, stack, frames_of, cut, header, positions, layout, state, shape, live)
+        recording = Recording(
+            file, stack, frames_of, selection, header, positions, layout, state, shape, live
+        )
         recording.findings += (*decoding.findings, *coordinates.findings, *notes)
         opening.pop_all()  # the recording closes the file from now on
     return recording
@@ -215,7 +236,7 @@ def _find_stack(
     where = file.where(stack)
     if not isinstance(stack, h5py.Dataset):
         raise InputError(f"{where} is not a dataset: name one with --dataset")
-    with as_input_error(where):
+    with translate_os_errors(where):
         shape = stack.shape
     if shape is None or len(shape) != 3:
         raise InputError(f"{where} has shape {shape}: a stack of frames, (T, H, W), is needed")
@@ -234,7 +255,7 @@ def _find_stack(
 
 def _decoding(file: Hdf5File, stack: h5py.Dataset, ours: bool, where: str) -> Decoding:
     """Return how frames are decoded from the stored values, according to attributes and axes of the stack."""
-    with as_input_error(where):
+    with translate_os_errors(where):
         dtype = stack.dtype.newbyteorder("=")
     frame_dtype(dtype, where)
     packing = file.packing(stack)

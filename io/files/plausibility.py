@@ -11,7 +11,7 @@ import numpy as np
 
 from mirrorskin.io.base.types import InputError, Source, exclusive_use
 from mirrorskin.io.files.opening import open_recording
-from mirrorskin.io.watch.watch import FIELD, TRAVEL, Check, Limits, Watch
+from mirrorskin.io.watch.watch import FIELD, TRAVEL, CheckReport, FrameChecker, Limits
 
 _BLOCK = 32_000_000  # bytes of frames read at a time
 
@@ -23,7 +23,7 @@ def check(
     travel_limits: Limits = TRAVEL,
     progress: Callable[[int], None] | None = None,
     **opening: Any,
-) -> Check:
+) -> CheckReport:
     """Read all frames of a source, and report whether they and their positions are plausible.
 
     Parameters
@@ -41,7 +41,7 @@ def check(
 
     Returns
     -------
-    Check
+    CheckReport
         Facts and findings.
 
     Raises
@@ -64,19 +64,19 @@ def check(
         return _watched(source, progress).check(field_limits, travel_limits)
 
 
-def _watched(source: Source, progress: Callable[[int], None] | None) -> Watch:
+def _watched(source: Source, progress: Callable[[int], None] | None) -> FrameChecker:
     """Return what all frames of a source show, and rewind it before and after, if possible."""
-    seen = Watch(source)
+    checker = FrameChecker(source)
     if source.rewindable:
         source.rewind()
     size = math.prod(source.shape[1:]) * source.dtype.itemsize
-    room = np.empty((max(1, min(_BLOCK // size, source.shape[0])), *source.shape[1:]), source.dtype)
-    done = 0
-    while (block := source.read(room)) is not None:
-        seen.push(block)
-        done += len(block.frames)
+    buffer = np.empty((max(1, min(_BLOCK // size, source.shape[0])), *source.shape[1:]), source.dtype)
+    frames = 0
+    while (block := source.read(buffer)) is not None:
+        checker.push(block)
+        frames += len(block.frames)
         if progress:
-            progress(done)
+            progress(frames)
     if source.rewindable:
         source.rewind()
-    return seen
+    return checker

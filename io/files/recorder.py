@@ -32,7 +32,7 @@ from mirrorskin.io.storage.layout import (
     TRUTH,
     TRUTH_MAPS,
 )
-from mirrorskin.io.watch.watch import Check, Watch
+from mirrorskin.io.watch.watch import CheckReport, FrameChecker
 
 Compression = Literal["raw", "bitshuffle", "blosc", "gzip", "lzf"]
 COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
@@ -95,11 +95,11 @@ def new_stack(file: h5py.File, shape: tuple[int, int, int], dtype: Any, **storag
     return stack
 
 
-def write_plot(file: h5py.File, motion: Motion, known: set[str]) -> None:
+def write_plot(file: h5py.File, motion: Motion, names: set[str]) -> None:
     """Write the default plot: the frames against their positions, or against their time if unknown."""
     data = new_group(file["entry"], "data", "NXdata", signal="frames")
     data["frames"] = h5py.SoftLink(STACK)
-    axes = known - {"displacement"}  # it has two numbers per frame
+    axes = names - {"displacement"}  # it has two numbers per frame
     along = next((name for name in ("tilt", POSITIONS[motion], "time") if name in axes), None)
     if along is not None:
         target = SERIES[along][0]
@@ -220,8 +220,8 @@ class Recorder(TeeSource[Source]):
             opening.push(self._finish)
             opening.enter_context(self.source)
             write_header(self._new.root, self.header, self._calibration)
-            found = getattr(self.source, "findings", ())
-            put(self._new.root, FINDINGS, None, msgspec.json.encode(found).decode() if found else None)
+            findings = getattr(self.source, "findings", ())
+            put(self._new.root, FINDINGS, None, msgspec.json.encode(findings).decode() if findings else None)
             chunks = None if self._compression == "raw" else (1, *self.shape[1:])
             storage = {"chunks": chunks, **packing(self._compression)}
             self._frames = new_stack(self._new.root, self.shape, self.dtype, **storage)
@@ -241,17 +241,17 @@ class Recorder(TeeSource[Source]):
             for name in SERIES:
                 values = getattr(block, name)
                 if values is not None:
-                    room = np.full((self.shape[0], *values.shape[1:]), np.nan)
-                    self._series.setdefault(name, room)[part] = values
+                    buffer = np.full((self.shape[0], *values.shape[1:]), np.nan)
+                    self._series.setdefault(name, buffer)[part] = values
             self._new.check()
         return block
 
-    def drain(self, progress: Callable[[int], None] | None = None) -> Check:
+    def drain(self, progress: Callable[[int], None] | None = None) -> CheckReport:
         """Write all frames, and return their check; ``progress`` is called with the number so far."""
-        watch = Watch(self.source)
+        watch = FrameChecker(self.source)
         length = max(1, _BLOCK // (self.shape[1] * self.shape[2] * self.dtype.itemsize))
-        room = np.empty((min(length, self.shape[0]), *self.shape[1:]), self.dtype)
-        while (block := self.read(room)) is not None:
+        buffer = np.empty((min(length, self.shape[0]), *self.shape[1:]), self.dtype)
+        while (block := self.read(buffer)) is not None:
             watch.push(block)
             if progress is not None:
                 progress(self._count)

@@ -108,7 +108,7 @@ class Recording(Closing):
         file: Hdf5File,
         dataset: h5py.Dataset,
         stack: Stack,
-        cut: Selection,
+        selection: Selection,
         header: Header,
         positions: Mapping[str, Floats | None],
         layout: Layout,
@@ -119,13 +119,17 @@ class Recording(Closing):
         self.path, self.name, self.dataset = file.path, str(file.path), str(dataset.name)
         self.header, self.motion, self._layout = header, header.motion, layout
         self.shape, self.dtype = stack.shape, stack.dtype
-        self.region, self.origin, self.first_frame = cut.region, cut.region.origin, cut.frames[0]
+        self.region, self.origin, self.first_frame = (
+            selection.region,
+            selection.region.origin,
+            selection.frames[0],
+        )
         self.full_shape = full_shape
         self.state, self.used, self.dropped = state.state, state.used, state.dropped
         self.time, self.travel, self.phase = (positions.get(name) for name in ("time", "travel", "phase"))
         self.displacement, self.twist = positions.get("displacement"), positions.get("twist")
         self.tilt: Floats | None = positions.get("tilt")
-        self.which: str = f"{cut.frames[0]}:{cut.frames[1]}{', used live' if live else ''}"
+        self.which: str = f"{selection.frames[0]}:{selection.frames[1]}{', used live' if live else ''}"
         self.used_live = live
         self.storage, self._file, self._dataset = file.storage(dataset), file, dataset
         self._origins = file.origins() if isinstance(file, ZarrFile) else origins(file, dataset)
@@ -158,8 +162,8 @@ class Recording(Closing):
         here = slice(self._next, self._next + len(frames))
         self._next = here.stop
         series = {name: getattr(self, name) for name in SERIES}
-        known = {name: values[here] for name, values in series.items() if values is not None}
-        return Block(frames, here.start, **known, origin=self.origin)
+        positions = {name: values[here] for name, values in series.items() if values is not None}
+        return Block(frames, here.start, **positions, origin=self.origin)
 
     def frame(self, number: int) -> NDArray[Any]:
         """Return one frame, (H, W); the position of reading does not change."""
@@ -196,11 +200,11 @@ class Recording(Closing):
             return None
         expected = read_checksums(self._file, node, RecordingState(self.full_shape[0]))
         self._stack.verifier = None
-        room = np.empty((1, *self.shape[1:]), self.dtype)
+        buffer = np.empty((1, *self.shape[1:]), self.dtype)
         self.rewind()
-        found = [checksums(block.frames) for block in iter(lambda: self.read(room), None)]
+        sums = [checksums(block.frames) for block in iter(lambda: self.read(buffer), None)]
         self.rewind()
-        return np.flatnonzero(np.concatenate(found) != expected)
+        return np.flatnonzero(np.concatenate(sums) != expected)
 
     @functools.cached_property
     def truth(self) -> Truth | None:

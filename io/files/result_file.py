@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.base.arguments import check_flag, check_kind, check_path, checked
-from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.system import translate_os_errors
 from mirrorskin.io.base.types import InputError, ProcessValue
 from mirrorskin.io.base.url import ZARR_SUFFIX, is_zarr, path_of
 from mirrorskin.io.formats.registry import Format, export_format
@@ -68,7 +68,7 @@ ZARR = Format(
 )
 _RESULT, _PROCESS, _FITTED, _OWN = "/entry/result", "/entry/process", "/entry/fitted", "own_maps"
 _DECLARATION = "declaration"  # attribute of a map that is not declared in the table
-_AGAIN = "reconstruct it again"
+_REMEDY = "reconstruct it again"
 _AXES = dict.fromkeys("xy", Map(unit="mm", dtype="float64"))
 _LAYOUT = 2  # version of the layout; in layout 1 maps were not declared, and some had other names
 
@@ -132,9 +132,9 @@ def _map_items(result: Result) -> Iterator[Item]:
         if name in result.declarations:
             attributes[_DECLARATION] = fixed_text(declared.encode())
         yield Item(f"{_RESULT}/{name}", np.asarray(values), attributes)
-    own = [name for name in result if not is_builtin(name)]
-    if own:
-        yield Item(f"{_RESULT}/{_OWN}", fixed_text(own), {})
+    names = [name for name in result if not is_builtin(name)]
+    if names:
+        yield Item(f"{_RESULT}/{_OWN}", fixed_text(names), {})
     for name, positions in _axes(result).items():
         yield Item(f"{_RESULT}/{name}", positions, {"units": "mm"} if name in _AXES else {})
 
@@ -181,19 +181,19 @@ def open_result(path: str | Path) -> Result:
             declared = _AXES.get(name) or declaration_of(name, declarations)
             if declared.axes == "pieces" and "component" in stored:
                 shape = (int(maps["component"].max(initial=-1)) + 1,)
-            values = file.read(node, shape, unit=declared.unit or None, remedy=_AGAIN)
+            values = file.read(node, shape, unit=declared.unit or None, remedy=_REMEDY)
             dtype = values.dtype if declared is UNDECLARED else declared.dtype
             maps[name] = values.astype(dtype, copy=False) if declared.axes != "none" else float(values)
             if name == "component" and maps[name].min(initial=-1) < -1:
-                raise InputError(f"{file.where(node)} has numbers below -1: {_AGAIN}")
+                raise InputError(f"{file.where(node)} has numbers below -1: {_REMEDY}")
         for name, direction in (("x", 1), ("y", -1)):
             if name in maps and not np.all(direction * np.diff(maps[name]) > 0):
-                raise InputError(f"{path}: {_RESULT}/{name} is not in the order of the pixels: {_AGAIN}")
+                raise InputError(f"{path}: {_RESULT}/{name} is not in the order of the pixels: {_REMEDY}")
         process = read_process(file, _PROCESS)
         if _layout(file) < _LAYOUT and "status" in maps:
             declarations |= _status_of_layout_1(maps, process)
         others: dict[str, Any] = {name: maps.pop(name, None) for name in _AXES}
-        others |= {"process": process, "fitted": read_record(file, _FITTED, Fitted, _AGAIN)}
+        others |= {"process": process, "fitted": read_record(file, _FITTED, Fitted, _REMEDY)}
         return Result(maps, **others, calibration=carried_by(file), declarations=declarations)
 
 
@@ -205,7 +205,7 @@ def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
     with _opened(path_of(path)) as file:
         for node, shape in _find_maps(file)[0].values():
             if getattr(node, "shape", None) != shape:
-                raise InputError(f"{file.where(node)} is not of shape {shape}: {_AGAIN}")
+                raise InputError(f"{file.where(node)} is not of shape {shape}: {_REMEDY}")
         return read_process(file, _PROCESS, names or None)
 
 
@@ -232,9 +232,9 @@ def _find_maps(file: Hdf5File) -> tuple[Found, dict[str, Map]]:
     """Find the maps and axes in a file, with their required shapes and their declarations."""
     group = file.find(_RESULT)
     listed = file.find(f"{_RESULT}/{_OWN}")
-    own = () if listed is None else filter(may_name_a_map, file.texts(listed, _AGAIN))
-    builtin = (one for name in TABLE for one in (name, f"{name}{SIGMA}"))
-    names = {name: name for name in dict.fromkeys((*builtin, *own, *_AXES))}
+    listed_names = () if listed is None else filter(may_name_a_map, file.texts(listed, _REMEDY))
+    builtin = (builtin_name for name in TABLE for builtin_name in (name, f"{name}{SIGMA}"))
+    names = {name: name for name in dict.fromkeys((*builtin, *listed_names, *_AXES))}
     declarations: dict[str, Map] = {}
     if _layout(file) < _LAYOUT:
         motion = file.find(f"{_PROCESS}/motion")
@@ -261,31 +261,36 @@ def _shaped(file: Hdf5File, nodes: Mapping[str, Node], declarations: Mapping[str
     shapes: dict[str, Shape] = {name: getattr(node, "shape", None) or () for name, node in nodes.items()}
     declared = {name: declaration_of(name, declarations) for name in nodes if name not in _AXES}
     size = next(
-        (size_of_maps(one, shapes[name]) for name, one in declared.items() if one.axes == "pixels"), ()
+        (
+            size_of_maps(declaration, shapes[name])
+            for name, declaration in declared.items()
+            if declaration.axes == "pixels"
+        ),
+        (),
     )
     if len(size) not in (2, 3):
-        raise InputError(f"{file.path}: {_RESULT} contains no maps: {_AGAIN}")
+        raise InputError(f"{file.path}: {_RESULT} contains no maps: {_REMEDY}")
     needed: dict[str, Shape] = {"x": size[-1:], "y": size[-2:-1]}
-    for name, one in declared.items():
-        if one.axes == "pixels":
-            needed[name] = (*size, len(one.components)) if one.components else size
-            if one.per_frame and len(shapes[name]) > len(needed[name]):
+    for name, declaration in declared.items():
+        if declaration.axes == "pixels":
+            needed[name] = (*size, len(declaration.components)) if declaration.components else size
+            if declaration.per_frame and len(shapes[name]) > len(needed[name]):
                 needed[name] = (shapes[name][0], *needed[name])
         else:
-            needed[name] = () if one.axes == "none" else shapes[name][:1] or (0,)
+            needed[name] = () if declaration.axes == "none" else shapes[name][:1] or (0,)
     return {name: (node, needed[name]) for name, node in nodes.items()}
 
 
-def _check_frames(path: str | Path, found: Found, declarations: Mapping[str, Map]) -> None:
+def _check_frames(path: str | Path, nodes: Found, declarations: Mapping[str, Map]) -> None:
     """Refuse series with different numbers of frames."""
     counts = {}
-    for name, (_node, shape) in found.items():
+    for name, (_node, shape) in nodes.items():
         declared = _AXES.get(name) or declaration_of(name, declarations)
         if declared.axes == "frames" or (declared.per_frame and len(shape) == 4):
             counts[name] = shape[0] if shape else 0
     if len(set(counts.values())) > 1:
         each = ", ".join(f"{name} of {count}" for name, count in counts.items())
-        raise InputError(f"{path}: {_RESULT} has values of different numbers of frames ({each}): {_AGAIN}")
+        raise InputError(f"{path}: {_RESULT} has values of different numbers of frames ({each}): {_REMEDY}")
 
 
 def _status_of_layout_1(maps: Mapping[str, Any], process: Mapping[str, ProcessValue]) -> dict[str, Map]:
@@ -335,7 +340,7 @@ def check_result_output(path: Path, *keep: Path | None, overwrite: bool = False)
     if is_zarr(path) and path.suffix.lower() == ZARR_SUFFIX:
         from mirrorskin.io.files.zarr_export import check_store
 
-        with as_input_error(f"{path} cannot be written", "choose another place with -o"):
+        with translate_os_errors(f"{path} cannot be written", "choose another place with -o"):
             check_store(path)
         return
     _check_format(path)

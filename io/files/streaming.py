@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.base.checksums import checksums
-from mirrorskin.io.base.system import as_input_error, lock, reserve_space
+from mirrorskin.io.base.system import lock, reserve_space, translate_os_errors
 from mirrorskin.io.base.types import Block, Closing, Floats, Header, InputError, LiveSource
 from mirrorskin.io.files.recorder import (
     Compression,
@@ -349,9 +349,9 @@ class StreamRecorder(TeeSource[LiveSource]):
     def _open(self, descriptor: int, block: Block) -> GrowingRecording | GrowingMessages:
         if self._messages is not None:
             return self._messages(self.path, descriptor, self.header)
-        known = self.header, self.shape, self.dtype, self._compression, self._calibration
+        layout = self.header, self.shape, self.dtype, self._compression, self._calibration
         series = [name for name in SERIES if getattr(block, name) is not None]
-        return GrowingRecording(self.path, descriptor, *known, series)
+        return GrowingRecording(self.path, descriptor, *layout, series)
 
     def _follow(self, file: GrowingRecording | GrowingMessages) -> _End:
         """Append queued items until the end; after an error, wait for the end."""
@@ -398,7 +398,7 @@ class StreamRecorder(TeeSource[LiveSource]):
             self._backlog -= size
 
     def _write_errors(self) -> AbstractContextManager[None]:
-        return as_input_error(f"{self.path} could not be written", MAKE_ROOM)
+        return translate_os_errors(f"{self.path} could not be written", MAKE_ROOM)
 
 
 _Identity = tuple[int, int]
@@ -407,10 +407,10 @@ _Identity = tuple[int, int]
 def _identity(path: Path) -> _Identity | None:
     """Return the identity of a file, which differs for another file of the same name; None without a file."""
     try:
-        found = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 def _cut_short(error: BaseException) -> str:
@@ -497,14 +497,14 @@ class GrowingRecording(Closing):
         meta = min((1 << 16) + 24 * shape[0], _MOST_META)
         self._spare = _SPARE + 2 * meta
         self._path, self._step = path, min(_STEP, shape[0] * self._frame)
-        self._reserved, self._believed = 0, False
+        self._reserved, self._cannot_preallocate = 0, False
         with ExitStack() as opening:
             self._descriptor = os.dup(descriptor)
             opening.callback(os.close, self._descriptor)
             opening.callback(synchronise, self._descriptor)
-            room = self._spare + 32 * math.prod(shape[1:])  # includes the maps of the header
-            room += 0 if calibration is None else size_of(calibration)
-            self._reserve(room)
+            needed = self._spare + 32 * math.prod(shape[1:])  # includes the maps of the header
+            needed += 0 if calibration is None else size_of(calibration)
+            self._reserve(needed)
             file = h5py.File(
                 f"/proc/self/fd/{self._descriptor}",
                 "w",
@@ -515,11 +515,11 @@ class GrowingRecording(Closing):
                 alignment_interval=math.gcd(self._frame, _PAGE),
             )
             self._file = opening.enter_context(file)
-            self._reserve(room)  # again, because HDF5 has truncated the file
+            self._reserve(needed)  # again, because HDF5 has truncated the file
             write_header(self._file, header, calibration)
-            known = {"time", POSITIONS[header.motion], *series}
-            self._make(shape, dtype, compression, known)
-            write_plot(self._file, header.motion, known)
+            names = {"time", POSITIONS[header.motion], *series}
+            self._make(shape, dtype, compression, names)
+            write_plot(self._file, header.motion, names)
             self._file.flush()  # everything but the frames is allocated now
             self._exit = opening.pop_all()
 
@@ -579,12 +579,12 @@ class GrowingRecording(Closing):
         self._exit.close()
 
     def _make(
-        self, shape: tuple[int, int, int], dtype: np.dtype[Any], compression: Compression, known: set[str]
+        self, shape: tuple[int, int, int], dtype: np.dtype[Any], compression: Compression, names: set[str]
     ) -> None:
         """Create the datasets that grow: no others can be created afterwards."""
         file, (expected, rows, columns) = self._file, shape
-        chunks, most = (1, rows, columns), (None, rows, columns)
-        storage = {"chunks": chunks, "maxshape": most, **packing(compression)}
+        chunks, maximum = (1, rows, columns), (None, rows, columns)
+        storage = {"chunks": chunks, "maxshape": maximum, **packing(compression)}
         # Without a cache, each chunk is compressed immediately.
         self._frames = new_stack(file, (0, rows, columns), dtype, rdcc_nbytes=0, **storage)
         self._state = file.create_dataset(STATE, (), h5py.string_dtype("utf-8", _STATE_LENGTH))
@@ -596,7 +596,7 @@ class GrowingRecording(Closing):
                 if place is not None
             ]
             for name in SERIES
-            if name in known
+            if name in names
         }
         self._dropped = Column(file, DROPPED, None, np.int32(0), expected)
         self._checksums = Column(file, CHECKSUM, None, np.uint32(0), expected)
@@ -619,7 +619,7 @@ class GrowingRecording(Closing):
     def _reserve(self, end: int) -> None:
         """Preallocate the file up to ``end``, if the file system supports it."""
         start = min(self._reserved, os.fstat(self._descriptor).st_size)  # HDF5 may have truncated it
-        if self._believed or end <= start:
+        if self._cannot_preallocate or end <= start:
             return
         for reach in (end + self._step, end):
             try:
@@ -627,8 +627,8 @@ class GrowingRecording(Closing):
                 self._reserved = reach
                 return
             except OSError as error:
-                self._believed = error.errno in _UNABLE
-                if self._believed:
+                self._cannot_preallocate = error.errno in _UNABLE
+                if self._cannot_preallocate:
                     return
                 if error.errno not in _FULL:
                     raise

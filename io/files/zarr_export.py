@@ -14,14 +14,14 @@ from typing import Any
 import h5py
 import numpy as np
 
-from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.system import translate_os_errors
 from mirrorskin.io.base.types import InputError, Source
 from mirrorskin.io.base.url import ZARR_SUFFIX, Url, path_of
 from mirrorskin.io.files.opening import is_recording, open_recording
 from mirrorskin.io.storage.atomic import new_folder
 from mirrorskin.io.storage.hdf5 import Hdf5File, Node, first_value
 from mirrorskin.io.storage.layout import STACK
-from mirrorskin.io.storage.zarr import AT_ONCE, ZarrFile, naming, open_file
+from mirrorskin.io.storage.zarr import AT_ONCE, ZarrFile, errors_named, open_file
 from mirrorskin.io.storage.zarr_metadata import names_in
 
 _WHOLE: Any = {"write_empty_chunks": True}
@@ -89,7 +89,7 @@ def check_store(target: Path) -> None:
         raise InputError(f"{target}: Zarr is written as NAME{ZARR_SUFFIX}: name it so with -o")
     taken = f"{target} exists: remove it, or name another output with -o"
     if isinstance(target, Url):
-        with naming(f"{target} cannot be written"):
+        with errors_named(f"{target} cannot be written"):
             from zarr.core.sync import sync
 
             from mirrorskin.io.storage.zarr_store import opened_store
@@ -102,7 +102,7 @@ def check_store(target: Path) -> None:
         raise InputError(taken)
     if not target.parent.is_dir():
         raise InputError(f"{target}: there is no folder {target.parent}: make it first")
-    with naming(f"{target} cannot be written"):
+    with errors_named(f"{target} cannot be written"):
         import zarr  # noqa: F401
 
 
@@ -110,7 +110,7 @@ def check_store(target: Path) -> None:
 def _new_store(target: Path) -> Iterator[Any]:
     """Create a store; after an error, everything written is removed."""
     check_store(target)
-    with naming(f"{target} cannot be written"):
+    with errors_named(f"{target} cannot be written"):
         from zarr.core.sync import sync
 
         from mirrorskin.io.storage.zarr_store import opened_store
@@ -160,8 +160,8 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
             zarr.create_array(store, data=values, chunks=chunks, **about)
         else:
             texts = file.texts(node, "copy it again") if node.ndim else file.value(node)
-            made = zarr.create_array(store, shape=node.shape, dtype=str, **about)
-            made[...] = np.array(texts, np.dtypes.StringDType())
+            array = zarr.create_array(store, shape=node.shape, dtype=str, **about)
+            array[...] = np.array(texts, np.dtypes.StringDType())
 
     with ThreadPoolExecutor(AT_ONCE, "mirrorskin-zarr") as pool:
         list(pool.map(write, nodes))
@@ -169,17 +169,17 @@ def _write_nodes(file: Hdf5File, store: Any) -> None:
 
 def _attributes(file: Hdf5File, node: Node) -> dict[str, Any]:
     """Return the attributes of an object that are numbers or texts."""
-    with as_input_error(f"{file.path}: {node.name}"):
+    with translate_os_errors(f"{file.path}: {node.name}"):
         # By index: to find names, h5py opens the object again, which fails if its values are in raw files.
         opened = [h5py.h5a.open(node.id, index=index) for index in range(h5py.h5a.get_num_attrs(node.id))]
-    found: dict[str, Any] = {}
+    attributes: dict[str, Any] = {}
     for attribute in opened:
         if attribute.dtype.kind in "biuf" or h5py.check_string_dtype(attribute.dtype) is not None:
             name = attribute.name.decode(errors="replace")
             values = np.asarray(file.attribute_values(node, name))
-            plain = np.array([first_value(one) for one in values.reshape(-1)], object)
-            found[name] = plain.reshape(values.shape).tolist()
-    return found
+            plain = np.array([first_value(value) for value in values.reshape(-1)], object)
+            attributes[name] = plain.reshape(values.shape).tolist()
+    return attributes
 
 
 def _write_frames(recording: Source, store: Any, progress: Callable[[int], None]) -> None:
@@ -198,8 +198,8 @@ def _write_frames(recording: Source, store: Any, progress: Callable[[int], None]
         attributes={"interpretation": "image", "units": "counts"},
         config=_WHOLE,
     )
-    room = np.empty((length * max(1, _BLOCK // (length * frame)), *recording.shape[1:]), recording.dtype)
-    while (block := recording.read(room)) is not None:
+    buffer = np.empty((length * max(1, _BLOCK // (length * frame)), *recording.shape[1:]), recording.dtype)
+    while (block := recording.read(buffer)) is not None:
         array[block.index : block.index + len(block.frames)] = block.frames
         progress(block.index + len(block.frames))
 

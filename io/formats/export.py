@@ -83,8 +83,8 @@ def export_result(
     if map_name and section is not None:
         raise InputError(f"{path}: a cross-section is of the heights. Leave out the section or the map")
     form = _format_of(path)
-    given = {"map_name": map_name, "section": section, "points": points, "float32": float32}
-    options = {name: value for name, value in given.items() if value and name in form.options}
+    choices = {"map_name": map_name, "section": section, "points": points, "float32": float32}
+    options = {name: value for name, value in choices.items() if value and name in form.options}
     encode = form.load(form.encoder)
     if form.writes_itself:
         holds: str = encode(result, path) or "everything"

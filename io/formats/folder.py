@@ -56,8 +56,8 @@ class FolderFrames(WholeFrames):
         self.lost, numbering = _lost(numbers)
         first_of_each = {file.suffix.lower(): file for file in reversed(self.files)}
         files = sorted(first_of_each.values())
-        seen = dict.fromkeys(found for file in files for found in self._look(file))
-        kept = [found for found in seen if channel is None or found.kind != "colour"]
+        findings = dict.fromkeys(finding for file in files for finding in self._look(file))
+        kept = [finding for finding in findings if channel is None or finding.kind != "colour"]
         self.findings = (*numbering, *lost_frames(self.lost), *kept)
 
     def _look(self, file: Path) -> tuple[Finding, ...]:
@@ -104,8 +104,8 @@ def _find_sequence(folder: Path) -> tuple[NDArray[np.int64], tuple[Path, ...], t
 
 def _longest(families: _Families) -> _Families:
     """Return the largest family of files, and all others of the same size."""
-    most = max(map(len, families.values()), default=0)
-    return {key: family for key, family in families.items() if len(family) >= min(most, 2)}
+    largest = max(map(len, families.values()), default=0)
+    return {key: family for key, family in families.items() if len(family) >= min(largest, 2)}
 
 
 def _families(files: list[Path], pattern: str) -> _Families:
@@ -120,16 +120,16 @@ def _families(files: list[Path], pattern: str) -> _Families:
     keys = {
         file: [
             ((before, len(text.partition(".")[2]), after), int(text.replace(".", "")))
-            for before, text, after in found
+            for before, text, after in place
         ]
-        for file, found in places.items()
+        for file, place in places.items()
     }
-    alike = Counter(key for found in keys.values() for key, _ in found)
+    alike = Counter(key for items in keys.values() for key, _ in items)
     families = defaultdict(list)
-    for file, found in keys.items():
-        if found:
-            differing = [place for place in found if alike[place[0]] > 1]
-            key, number = (differing or found)[-1]
+    for file, items in keys.items():
+        if items:
+            differing = [place for place in items if alike[place[0]] > 1]
+            key, number = (differing or items)[-1]
             families[key].append((number, file))
     return families
 

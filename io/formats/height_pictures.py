@@ -69,7 +69,7 @@ TIFF = Format(
 )
 
 
-_MOST = np.iinfo(np.uint16).max
+_COUNT_MAX = np.iinfo(np.uint16).max
 _FLAT = 1e-6  # mm per count, if all heights are equal
 _PNG_KEYWORDS = {SOURCE: "Title", DATE: "Creation Time", SOFTWARE: "Software"}
 _CENTIMETRE = 10.0  # mm
@@ -132,12 +132,12 @@ class _Counts(NamedTuple):
 def _counts(result: Result) -> _Counts:
     """Scale the heights of a result to 16 bits."""
     height, x, y = grid_of(result)
-    known = np.isfinite(height)
-    heights = np.where(known, height, np.nan).astype(np.float64)
+    finite = np.isfinite(height)
+    heights = np.where(finite, height, np.nan).astype(np.float64)
     lowest, highest = float(np.nanmin(heights)), float(np.nanmax(heights))
-    step = (highest - lowest) / (_MOST - 1) or _FLAT
-    values = np.rint((np.where(known, heights, lowest) - lowest) / step) + 1
-    counts = np.where(known, values, 0).astype(np.uint16)
+    step = (highest - lowest) / (_COUNT_MAX - 1) or _FLAT
+    values = np.rint((np.where(finite, heights, lowest) - lowest) / step) + 1
+    counts = np.where(finite, values, 0).astype(np.uint16)
     return _Counts(counts, lowest - step, step, pixel_size_of(x, y), (float(x[0]), float(y[0])))
 
 
@@ -157,7 +157,7 @@ def _texts(counts: _Counts, notes: Mapping[str, str]) -> Iterator[tuple[str, str
         "XOffset": x - width / 2,
         "YOffset": -y - height / 2,
         "ZMin": counts.offset,
-        "ZMax": counts.offset + counts.step * _MOST,
+        "ZMax": counts.offset + counts.step * _COUNT_MAX,
     }
     for name, length in lengths.items():
         yield f"Gwy::{name}", repr(length * _METRE)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.base.arguments import check_path, checked
 from mirrorskin.io.base.checksums import REMEDY, crc32
 from mirrorskin.io.base.opencv import is_coloured, to_grey
-from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, as_input_error, check_unpacked, open_regular
+from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, check_unpacked, open_regular, translate_os_errors
 from mirrorskin.io.base.text import one_line
 from mirrorskin.io.base.types import MOTIONS, Block, Closing, Floats, Header, InputError
 from mirrorskin.io.formats.pictures import Picture, decode_bytes
@@ -81,7 +81,7 @@ _INSTALL = "MCAP needs packages that are not installed: pip install 'mirrorskin[
 _PROPERTIES = ("tilt", "press", "line_time", "travel_sigma")  # numbers of a recording, in the metadata
 _NOTES, _MOST_NOTES = "mirrorskin", 8  # name of the metadata; maximum number of its records to read
 _NUMERAL = re.compile(r"[-+]?[0-9]+\.?[0-9]*(?:[eE][-+]?[0-9]+)?")
-_LONGEST = 100  # characters quoted of an error message of a package
+_QUOTED_MAX = 100  # characters quoted of an error message of a package
 _COPIES = 6  # of a chunk with one image that exist at the same time: packed, unpacked, message, image, frame
 _MOST_PACKED = 255  # largest compression ratio accepted for all chunks of a file, the limit of LZ4
 
@@ -160,7 +160,7 @@ class _File:
 
 
 @checked(path=check_path)
-def save_messages(given: Result | Recording, path: str | Path) -> str:
+def save_messages(source: Result | Recording, path: str | Path) -> str:
     """Write a result or a recording as ROS 2 messages to an MCAP file, which appears complete or not at all.
 
     For a recording, the frames are ``sensor_msgs/Image`` on ``/camera/image``, ``dark`` and ``bright`` are on
@@ -172,7 +172,7 @@ def save_messages(given: Result | Recording, path: str | Path) -> str:
 
     Parameters
     ----------
-    given : Result or Recording
+    source : Result or Recording
         Frames without times are stamped one second apart.
     path : str or Path
 
@@ -195,11 +195,13 @@ def save_messages(given: Result | Recording, path: str | Path) -> str:
     """
     with (
         new_file(Path(path)) as descriptor,
-        as_input_error(f"{path} could not be written", MAKE_ROOM, OSError),
+        translate_os_errors(f"{path} could not be written", MAKE_ROOM, OSError),
         os.fdopen(descriptor, "wb", closefd=False) as stream,
     ):
         file = _File(stream)
-        holds = _put_result(file, given, path) if isinstance(given, Result) else _put_recording(file, given)
+        holds = (
+            _put_result(file, source, path) if isinstance(source, Result) else _put_recording(file, source)
+        )
         file.finish()
     return holds
 
@@ -234,8 +236,8 @@ def _put_recording(file: _File, recording: Recording) -> str:
     time = np.arange(count, dtype=np.float64) if recording.time is None else recording.time
     _put_header(file, header)
     recording.rewind()
-    room = np.empty((1, *recording.shape[1:]), recording.dtype)
-    while (block := recording.read(room)) is not None:
+    buffer = np.empty((1, *recording.shape[1:]), recording.dtype)
+    while (block := recording.read(buffer)) is not None:
         stamps = _stamps(begun, time[block.index : block.index + len(block.frames)])
         _put_frames(file, block, stamps)
         for name in _SERIES:
@@ -352,7 +354,7 @@ def _picture(values: NDArray[Any]) -> dict[str, Any]:
 
 def _stamps(begun: int, time: Floats) -> list[int]:
     """Return the time stamps of times in seconds since the start."""
-    return [begun + round(float(one) * _SECOND) for one in time]
+    return [begun + round(float(seconds) * _SECOND) for seconds in time]
 
 
 def _stamp(text: str) -> int:
@@ -411,15 +413,15 @@ class MessageFrames(WholeFrames):
         self.lost = _lost(stamps.numbers[order])
         self.positions = dict(self._numbers(count))
         self.header = dict(self._properties(frame.shape))
-        seen = [one for one in first.findings if channel is None or one.kind != "colour"]
-        self.findings = (*lost_frames(self.lost), *seen)
+        findings = [finding for finding in first.findings if channel is None or finding.kind != "colour"]
+        self.findings = (*lost_frames(self.lost), *findings)
 
     def frames(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
         """Decode images, from the current one on or from the first."""
         if start < self._next:
             self._left, self._next = self._messages(self._topic), 0
         while self._next < start:
-            with self._naming():
+            with self._errors_named():
                 next(self._left)
             self._next += 1
         while self._next < stop:
@@ -429,32 +431,32 @@ class MessageFrames(WholeFrames):
     def _picture(self) -> Picture:
         """Decode the next image."""
         number, self._next = self._next, self._next + 1
-        with self._naming():
+        with self._errors_named():
             return _decode(next(self._left), f"{self._path}: {self._topic}, message {number}")
 
     def _choose(self, topic: str | None) -> str:
         """Return the topic of the images: the requested one, or the only one."""
-        found = {
+        topics = {
             channel.topic
             for channel in self._summary.channels.values()
             if channel.kind in (_IMAGE, _COMPRESSED)
         }
-        if topic is None and IMAGES in found:
+        if topic is None and IMAGES in topics:
             return IMAGES
-        if topic is None and len(found) == 1:
-            return next(iter(found))
-        if topic in found:
+        if topic is None and len(topics) == 1:
+            return next(iter(topics))
+        if topic in topics:
             return str(topic)
-        there = ", ".join(sorted(found)) or "none"
+        names = ", ".join(sorted(topics)) or "none"
         wrong = "name one with --dataset" if topic is None else f"{topic} is not one of them"
-        raise InputError(f"{self._path}: its topics of images are {there}: {wrong}")
+        raise InputError(f"{self._path}: its topics of images are {names}: {wrong}")
 
     def _numbers(self, count: int) -> Iterator[tuple[str, Floats]]:
         """Yield the positions that the file contains for each image."""
-        topics = {one.topic for one in self._summary.channels.values() if one.kind == _NUMBER}
+        topics = {channel.topic for channel in self._summary.channels.values() if channel.kind == _NUMBER}
         for name in ("travel", "phase", "twist"):
             if f"/{name}" in topics and len(self._stamps_of(f"/{name}").times) == count:
-                with self._naming():
+                with self._errors_named():
                     values = [float(message.data) for message in self._messages(f"/{name}")]
                 yield name, np.asarray(values) / _SERIES[name]
 
@@ -469,28 +471,33 @@ class MessageFrames(WholeFrames):
             values = _NUMERAL.findall(self._summary.notes.get(name, ""))
             if len(values) == count:
                 yield name, tuple(map(float, values)) if count > 1 else float(values[0])
-        images = {one.topic for one in self._summary.channels.values() if one.kind == _IMAGE}
+        images = {channel.topic for channel in self._summary.channels.values() if channel.kind == _IMAGE}
         for name in ("dark", "bright"):
             topic = f"/camera/{name}"
             if topic in images and self._topic == IMAGES:
-                with self._naming():
-                    found = [to_grey(_decode(one, topic).samples, topic) for one in self._messages(topic)]
-                if len(found) == 1 and found[0].shape in (shape, (1, 1)):
-                    yield name, found[0] if found[0].shape == shape else found[0][0, 0]
+                with self._errors_named():
+                    frames = [
+                        to_grey(_decode(message, topic).samples, topic) for message in self._messages(topic)
+                    ]
+                if len(frames) == 1 and frames[0].shape in (shape, (1, 1)):
+                    yield name, frames[0] if frames[0].shape == shape else frames[0][0, 0]
 
     def _stamps_of(self, topic: str) -> _Stamps:
         """Return the times and sequence numbers of the messages of a topic, in the order of storage."""
         if topic not in self._known:
-            with self._naming():
-                found = [(one.log_time, one.sequence, _stamp_in(one.data)) for one in self._stored(topic)]
-            self._known[topic] = _Stamps(*np.array(found, np.uint64).reshape(-1, 3).T)
+            with self._errors_named():
+                stamps = [
+                    (record.log_time, record.sequence, _stamp_in(record.data))
+                    for record in self._stored(topic)
+                ]
+            self._known[topic] = _Stamps(*np.array(stamps, np.uint64).reshape(-1, 3).T)
         return self._known[topic]
 
     def _messages(self, topic: str) -> Iterator[Any]:
         """Yield the messages of a topic in the order of their times, decoded."""
         times, stored = self._stamps_of(topic).times, self._stored(topic)
         if np.any(times[1:] < times[:-1]):
-            stored = iter(sorted(self._hold(topic), key=lambda one: one.log_time))
+            stored = iter(sorted(self._hold(topic), key=lambda record: record.log_time))
         decoders = {name: _decoder(name) for name in _MESSAGES}
         for message in stored:
             yield decoders[self._summary.channels[message.channel_id].kind](message.data)
@@ -508,35 +515,39 @@ class MessageFrames(WholeFrames):
         """Yield the messages of a topic in the order of storage."""
         from mcap.records import Chunk, Message
 
-        wanted = {number for number, one in self._summary.channels.items() if one.topic == topic and one.kind}
+        channels = {
+            number
+            for number, channel in self._summary.channels.items()
+            if channel.topic == topic and channel.kind
+        }
         total = count = 0
         with open_regular(self._path) as file:
-            most = max(MAX_UNPACKED_BYTES, _MOST_PACKED * os.fstat(file.fileno()).st_size)
-            for record in self._records(file, wanted):
-                if isinstance(record, Message) and record.channel_id in wanted:
+            limit = max(MAX_UNPACKED_BYTES, _MOST_PACKED * os.fstat(file.fileno()).st_size)
+            for record in self._records(file, channels):
+                if isinstance(record, Message) and record.channel_id in channels:
                     yield record
                     count += 1
                 if isinstance(record, Chunk):
                     data, crc = _unpack(record), record.uncompressed_crc
                     del record  # before messages are copied
                     total += len(data)
-                    check_unpacked(total, f"{self._path}, unpacked,", "repack it with 'mcap compress'", most)
+                    check_unpacked(total, f"{self._path}, unpacked,", "repack it with 'mcap compress'", limit)
                     if self._verify and crc not in (0, crc32(data)):  # 0: unknown
                         what = f"the chunk that begins with message {count} of {topic}"
                         raise InputError(f"{self._path}: {what} differs from what was recorded: {REMEDY}")
-                    for message in _messages_in(data, wanted):
+                    for message in _messages_in(data, channels):
                         yield message
                         count += 1
 
-    def _records(self, file: BufferedReader, wanted: set[int]) -> Iterator[Any]:
+    def _records(self, file: BufferedReader, channels: set[int]) -> Iterator[Any]:
         """Yield the chunks that contain messages of some channels; without an index, all records."""
         from mcap.stream_reader import StreamReader
 
-        most = MAX_UNPACKED_BYTES // _COPIES
+        limit = MAX_UNPACKED_BYTES // _COPIES
         if not self._summary.chunks:
-            yield from StreamReader(file, emit_chunks=True, record_size_limit=most).records
-        for chunk in sorted(self._summary.chunks, key=lambda one: one.chunk_start_offset):
-            if not chunk.message_index_offsets or wanted & chunk.message_index_offsets.keys():
+            yield from StreamReader(file, emit_chunks=True, record_size_limit=limit).records
+        for chunk in sorted(self._summary.chunks, key=lambda part: part.chunk_start_offset):
+            if not chunk.message_index_offsets or channels & chunk.message_index_offsets.keys():
                 file.seek(chunk.chunk_start_offset)
                 yield next(iter(StreamReader(file, skip_magic=True, emit_chunks=True).records))
 
@@ -549,7 +560,7 @@ class MessageFrames(WholeFrames):
             raise InputError(_INSTALL) from error
         schemas: dict[int, str] = {}
         summary, notes = _Summary({}, [], {}), list[int]()
-        with self._naming(), open_regular(self._path) as file:
+        with self._errors_named(), open_regular(self._path) as file:
             file.seek(-_FOOTER.size, os.SEEK_END)
             code, _, start, *_ = _FOOTER.unpack(file.read(_FOOTER.size))
             if code != _FOOTER_CODE or not start:
@@ -573,16 +584,16 @@ class MessageFrames(WholeFrames):
         return summary
 
     @contextlib.contextmanager
-    def _naming(self) -> Iterator[None]:
+    def _errors_named(self) -> Iterator[None]:
         """Convert the packages' errors for damaged bytes to a one-line error that names the file."""
         try:
             yield
         except (InputError, ImportError):
             raise
         except Exception as error:  # of many types
-            said = one_line(error) or type(error).__name__
+            text = one_line(error) or type(error).__name__
             raise InputError(
-                f"{self._path} is damaged, or not an MCAP file of ROS 2 ({said[:_LONGEST]}): copy it again"
+                f"{self._path} is damaged, or not an MCAP file of ROS 2 ({text[:_QUOTED_MAX]}): copy it again"
             ) from error
 
 
@@ -626,7 +637,7 @@ def _unpack(chunk: Chunk) -> bytes:
     return data
 
 
-def _messages_in(records: bytes, wanted: set[int]) -> Iterator[Message]:
+def _messages_in(records: bytes, channels: set[int]) -> Iterator[Message]:
     """Yield the messages of some channels in a chunk."""
     from mcap.opcode import Opcode
     from mcap.records import Message
@@ -640,7 +651,7 @@ def _messages_in(records: bytes, wanted: set[int]) -> Iterator[Message]:
         if code == Opcode.MESSAGE and size >= _MESSAGE.size:
             number, sequence, logged, published = _MESSAGE.unpack_from(records, start)
             data = records[start + _MESSAGE.size : at]
-            if number in wanted:
+            if number in channels:
                 yield Message(number, logged, data, published, sequence)
 
 

@@ -38,7 +38,7 @@ _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 _PNG_PALETTE = 3  # colour type
 _PNG_COMPRESSION = 16  # cv2.IMWRITE_PNG_COMPRESSION
 _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
-_PIECE = 1 << 20  # bytes unpacked at a time
+_UNPACKED_BYTES = 1 << 20  # bytes unpacked at a time
 _INCH = 0.0254  # m
 _JPEG_MARK, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _SEQUENTIAL = (0xC0, 0xC1)  # markers of JPEGs that are decoded block by block
@@ -127,13 +127,13 @@ def _decode_bmp(data: bytes, name: str) -> Picture:
 
 
 def _decode_pgm(data: bytes, name: str) -> NDArray[Any]:
-    found = _PGM_HEAD.match(data)
-    columns, rows, most = map(int, found.groups()) if found else (0, 0, 0)
-    kind = np.dtype(">u2" if most > 255 else "u1")
-    if found is None or not 0 < most < 65536 or len(data) - found.end() < rows * columns * kind.itemsize:
+    match = _PGM_HEAD.match(data)
+    columns, rows, highest = map(int, match.groups()) if match else (0, 0, 0)
+    kind = np.dtype(">u2" if highest > 255 else "u1")
+    if match is None or not 0 < highest < 65536 or len(data) - match.end() < rows * columns * kind.itemsize:
         raise InputError(f"{name} is damaged or cut off: copy it again")
     check_picture(name, columns, rows, kind.itemsize, packed=len(data))
-    samples = np.frombuffer(data, kind, rows * columns, found.end()).reshape(rows, columns)
+    samples = np.frombuffer(data, kind, rows * columns, match.end()).reshape(rows, columns)
     return samples.astype(kind.newbyteorder("="))
 
 
@@ -163,7 +163,7 @@ def _decode_png(data: bytes, name: str) -> Picture:
 def _png_bytes(width: int, height: int, bits: int, interlaced: bool) -> int:
     """Return the unpacked size of the pixels of a PNG in bytes (PNG, section 7)."""
     passes = _ADAM7 if interlaced else ((0, 0, 1, 1),)
-    sizes = ((-((left - width) // across), -((top - height) // down)) for left, top, across, down in passes)
+    sizes = ((-((first - width) // across), -((top - height) // down)) for first, top, across, down in passes)
     return sum(rows * (1 + -(-columns * bits // 8)) for columns, rows in sizes if columns > 0)
 
 
@@ -173,7 +173,7 @@ def _unpack_to(pieces: Iterable[bytes | memoryview], size: int) -> bool:
     try:
         for packed in pieces:
             while packed and size > 0:
-                size -= len(unpacker.decompress(packed, _PIECE))
+                size -= len(unpacker.decompress(packed, _UNPACKED_BYTES))
                 packed = unpacker.unconsumed_tail
     except zlib.error:
         return False

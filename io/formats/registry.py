@@ -126,7 +126,7 @@ def _named(suffix: str, use: str) -> Format | None:
     """Return the format of a suffix that has a reader or an encoder; packages are only asked if none has."""
 
     def found(candidates: Iterable[Format]) -> Format | None:
-        return next((one for one in candidates if suffix in one.suffixes and getattr(one, use)), None)
+        return next((form for form in candidates if suffix in form.suffixes and getattr(form, use)), None)
 
     return found(_built_in()) or (None if suffix in _OURS else found(_installed()))
 
@@ -165,7 +165,7 @@ def open_reader(path: Path, form: Format, **options: Any) -> FrameReader:
 
 def sources() -> str:
     """Return the sources of frames for help texts: "HDF5, ..., TIFF, MCAP, or a folder of pictures"."""
-    others = sorted((one.source for one in formats(installed=False) if one.source), key=len)
+    others = sorted((form.source for form in formats(installed=False) if form.source), key=len)
     listed = ["HDF5", "Zarr", "NPY", "NPZ", *others]
     return ", ".join([*listed[:-1], f"or {listed[-1]}"])
 
@@ -177,7 +177,7 @@ def export_format(suffix: str) -> Format | None:
 
 def exports(installed: bool = True) -> dict[str, Format]:
     """Return the formats that results are exported to, by suffix; all, or the built-in ones."""
-    return {suffix: one for one in formats(installed) if one.encoder for suffix in one.suffixes}
+    return {suffix: form for form in formats(installed) if form.encoder for suffix in form.suffixes}
 
 
 def export_suffixes(option: str = "") -> tuple[str, ...]:
@@ -188,14 +188,14 @@ def export_suffixes(option: str = "") -> tuple[str, ...]:
     >>> export_suffixes("points")
     ('.ply',)
     """
-    return tuple(suffix for suffix, one in exports().items() if not option or option in one.options)
+    return tuple(suffix for suffix, form in exports().items() if not option or option in form.options)
 
 
 def contents() -> str:
     """Return the contents and suffixes of exports: "a mesh .ply .stl, points .xyz"."""
     kinds: dict[str, list[str]] = {}
-    for suffix, one in exports(installed=False).items():
-        kinds.setdefault(one.content, []).append(suffix)
+    for suffix, form in exports(installed=False).items():
+        kinds.setdefault(form.content, []).append(suffix)
     return ", ".join(f"{kind} {' '.join(suffixes)}" for kind, suffixes in kinds.items())
 
 

@@ -58,8 +58,8 @@ def notes_of(result: Result) -> dict[str, str]:
     if result.height is not None:
         notes["heights"] = height_datum(result)
     if result.height is not None and result.filled is not None and result.filled.any():
-        known = np.isfinite(result.height)
-        filled, of = np.count_nonzero(known & (result.filled > 0)), np.count_nonzero(known)
+        finite = np.isfinite(result.height)
+        filled, of = np.count_nonzero(finite & (result.filled > 0)), np.count_nonzero(finite)
         notes["filled"] = f"{filled} of {of} heights were not measured but filled"
     return notes
 

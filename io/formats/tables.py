@@ -191,8 +191,9 @@ def encode_npz(result: Result, map_name: str = "") -> Encoded:
     kept: dict[str, Any] = {map_name: result[map_name]} if map_name else {**result}
     arrays, declared = {**kept, **axes}, {name: result.declaration(name) for name in kept}
     texts = {
-        "units": {name: one.unit for name, one in declared.items() if one.unit} | dict.fromkeys(axes, "mm"),
-        "legends": {name: one.codes for name, one in declared.items() if one.codes},
+        "units": {name: declaration.unit for name, declaration in declared.items() if declaration.unit}
+        | dict.fromkeys(axes, "mm"),
+        "legends": {name: declaration.codes for name, declaration in declared.items() if declaration.codes},
         "process": dict(result.process),
         "fitted": result.fitted.values(),
     }

@@ -83,20 +83,20 @@ class TiffFrames(WholeFrames):
         with _quiet_tifffile(), ExitStack() as opening:
             try:
                 self._file = opening.enter_context(_open(path))
-                found = list(self._file.series)
-                shaped = bool(found) and all(one.kind == "shaped" for one in found)
-                if shaped and len(found) > 1 and dataset is None:
+                series = list(self._file.series)
+                shaped = bool(series) and all(part.kind == "shaped" for part in series)
+                if shaped and len(series) > 1 and dataset is None:
                     plain = opening.enter_context(_open(path, "shaped"))
-                    if sum(map(_frames_in, found)) == sum(map(_frames_in, plain.series)):  # were appended
-                        self._file, found = plain, list(plain.series)
-                elif shaped and sum(len(one.pages) for one in found) < len(self._file.pages):
+                    if sum(map(_frames_in, series)) == sum(map(_frames_in, plain.series)):  # were appended
+                        self._file, series = plain, list(plain.series)
+                elif shaped and sum(len(part.pages) for part in series) < len(self._file.pages):
                     raise InputError(f"{path} has pages that its metadata do not describe: save it again")
-                complete = bool(found) and self._ends()
+                complete = bool(series) and self._ends()
                 if self._file.is_imagej:  # without the samples that its metadata state, it is a plain TIFF
-                    complete = complete and found[0].kind == "imagej"
+                    complete = complete and series[0].kind == "imagej"
                 if not complete:
                     raise self._damaged()
-                self._take(_chosen(path, found, dataset), dtypes)
+                self._take(_chosen(path, series, dataset), dtypes)
             except InputError:
                 raise
             except OSError as error:
@@ -133,8 +133,8 @@ class TiffFrames(WholeFrames):
 
     def _damaged(self) -> InputError:
         with open_regular(self._path) as unread:
-            known = unread.read(4) in _MARKS
-        wrong = "is damaged or cut off" if known else "is not a TIFF"
+            is_tiff = unread.read(4) in _MARKS
+        wrong = "is damaged or cut off" if is_tiff else "is not a TIFF"
         return InputError(f"{self._path} {wrong}: {_REMEDY}")
 
     def _ends(self) -> bool:
@@ -275,7 +275,7 @@ class TiffFrames(WholeFrames):
         if samples == 4:
             tags[338] = "H", [1]  # otherwise colours are multiplied by the opacity
         tiled = page.is_tiled
-        tags[325 if tiled else 279] = "I", [len(one) for one in segments]
+        tags[325 if tiled else 279] = "I", [len(segment) for segment in segments]
         tags[324 if tiled else 273] = "I", [0] * len(segments)
         return _write(tags, 324 if tiled else 273, segments, order)
 
@@ -306,9 +306,9 @@ def _write(
         if size > 4:
             places[code], start = start, start + size + size % 2
     at = []
-    for one in segments:
+    for segment in segments:
         at.append(start)
-        start += len(one)
+        start += len(segment)
     tags[offsets] = "I", at
     entries, extra = b"", b""
     for code in sorted(tags):
@@ -324,16 +324,16 @@ def _write(
     return b"".join([head, struct.pack(f"{order}H", len(tags)), entries, bytes(4), extra, *segments])
 
 
-def _chosen(path: Path, found: list[Any], wanted: str | None) -> Any:
+def _chosen(path: Path, series: list[Any], name: str | None) -> Any:
     """Return a series of a file: the requested one, or the only one."""
-    if wanted is None and len(found) == 1:
-        return found[0]
-    if wanted is not None and wanted.isdecimal() and int(wanted) < len(found):
-        return found[int(wanted)]
-    sizes = ", ".join(f"{number}: {_describe(one)}" for number, one in enumerate(found[:5]))
-    if wanted is not None:
-        raise InputError(f"{path} has no series {wanted!r}: choose from {sizes}")
-    raise InputError(f"{path} contains {len(found)} series of pictures, {sizes}: choose one with --dataset")
+    if name is None and len(series) == 1:
+        return series[0]
+    if name is not None and name.isdecimal() and int(name) < len(series):
+        return series[int(name)]
+    sizes = ", ".join(f"{number}: {_describe(part)}" for number, part in enumerate(series[:5]))
+    if name is not None:
+        raise InputError(f"{path} has no series {name!r}: choose from {sizes}")
+    raise InputError(f"{path} contains {len(series)} series of pictures, {sizes}: choose one with --dataset")
 
 
 def _describe(series: Any) -> str:
@@ -391,8 +391,8 @@ def _table(name: str, page: Any) -> ColourTable:
 def _pixel_size(file: Any) -> str:
     """Return the pixel size in the metadata of ImageJ or OME, as text."""
     if file.is_ome and file.ome_metadata:
-        found = re.findall('PhysicalSize([XY])="([0-9.eE+-]{1,20})"', file.ome_metadata)
-        sizes, unit = dict(found), re.search('PhysicalSizeXUnit="([^"]{1,9})"', file.ome_metadata)
+        pixel_sizes = re.findall('PhysicalSize([XY])="([0-9.eE+-]{1,20})"', file.ome_metadata)
+        sizes, unit = dict(pixel_sizes), re.search('PhysicalSizeXUnit="([^"]{1,9})"', file.ome_metadata)
         if {"X", "Y"} <= sizes.keys():
             return f"{sizes['X']} x {sizes['Y']} {unit[1] if unit else 'µm'}"
     if file.is_imagej and file.imagej_metadata:

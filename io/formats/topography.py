@@ -77,7 +77,7 @@ GSF = Format(
 
 
 _METRE, _MICROMETRE = 1e-3, 1e3  # of a millimetre
-_LONGEST = 32_000  # bytes of a comment in a SUR file, whose length has 16 bits
+_COMMENT_MAX = 32_000  # bytes of a comment in a SUR file, whose length has 16 bits
 _CENTIMETRE = 10.0  # mm
 
 
@@ -115,7 +115,7 @@ def encode_sur(result: Result) -> Encoded:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The surface has different pixel size in x and y")
         surface = Surface(height * np.float64(_MICROMETRE), width * _MICROMETRE, step * _MICROMETRE)
-    comment = _comment(result).encode("ascii", "backslashreplace")[:_LONGEST].decode()
+    comment = _comment(result).encode("ascii", "backslashreplace")[:_COMMENT_MAX].decode()
     file = BytesIO()
     surface.save(file, format=".sur", comment=comment)
     return Encoded([file.getvalue()], _holds(result))

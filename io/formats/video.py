@@ -69,7 +69,7 @@ _LIMIT = {"max_pixels": str(MAX_UNPACKED_BYTES // (_DECODER_FRAMES + _CONVERTED_
 _ALL_FRAMES = {"ignore_editlist": "1"}
 _INSTALL = "videos need mirrorskin[video]: pip install 'mirrorskin[video]'"
 _KEPT = 256_000_000  # bytes of decoded frames that are kept in memory, by default
-_LONGEST = 100  # characters quoted of an error message
+_QUOTED_MAX = 100  # characters quoted of an error message
 _DEEP = re.compile(r"(gray|yuva?4\d\dp)(9|10|12|14|16)(le|be)")  # formats whose first plane is the luma
 _FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 _MOST_LOST = 1 << 30  # maximum number of frames lost between two frames
@@ -168,8 +168,8 @@ class VideoFrames(WholeFrames):
         av = load_av(self._path)
         try:
             place = str(self._path.absolute())
-            given = _OPTIONS | options | _LIMIT
-            container = av.open(place, "r", options=given, metadata_errors="replace")
+            arguments = _OPTIONS | options | _LIMIT
+            container = av.open(place, "r", options=arguments, metadata_errors="replace")
         except Exception as error:  # of many types
             raise self._not_a_video() from error
         try:
@@ -191,21 +191,25 @@ class VideoFrames(WholeFrames):
 
     def _choose(self, container: InputContainer) -> VideoStream:
         """Return the requested stream of frames, or the only one."""
-        found = [one for one in container.streams.video if not one.disposition & one.disposition.attached_pic]
-        if not found:
+        streams = [
+            stream
+            for stream in container.streams.video
+            if not stream.disposition & stream.disposition.attached_pic
+        ]
+        if not streams:
             raise self._not_a_video()
         number = self._wanted
-        if number is None and len(found) == 1:
-            return found[0]
-        if number is not None and number.isdecimal() and int(number) < len(found):
-            return found[int(number)]
+        if number is None and len(streams) == 1:
+            return streams[0]
+        if number is not None and number.isdecimal() and int(number) < len(streams):
+            return streams[int(number)]
         wrong = "choose one with --dataset" if number is None else f"{number!r} is not one of them"
-        raise InputError(f"{self._path} contains {len(found)} streams of frames, numbered from 0: {wrong}")
+        raise InputError(f"{self._path} contains {len(streams)} streams of frames, numbered from 0: {wrong}")
 
     def _decode(self, container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
         """Yield the frames; InputError where one cannot be decoded."""
         number = 0
-        with self._naming(lambda: number):
+        with self._errors_named(lambda: number):
             for packet in container.demux(stream):
                 if packet.is_corrupt:
                     raise ValueError("it is incomplete")
@@ -216,16 +220,16 @@ class VideoFrames(WholeFrames):
                     number += 1
 
     @contextmanager
-    def _naming(self, number: Any) -> Iterator[None]:
+    def _errors_named(self, number: Any) -> Iterator[None]:
         """Convert errors of the decoder to a one-line error that names the frame."""
         try:
             yield
         except (InputError, MemoryError):
             raise
         except Exception as error:  # of many types
-            said = one_line(getattr(error, "strerror", None) or error)[:_LONGEST]
+            text = one_line(getattr(error, "strerror", None) or error)[:_QUOTED_MAX]
             raise InputError(
-                f"{self._path}: frame {number()} cannot be decoded ({said}): the video is damaged or cut off;"
+                f"{self._path}: frame {number()} cannot be decoded ({text}): the video is damaged or cut off;"
                 " copy it again, or encode anew what there is"
             ) from error
 
@@ -306,10 +310,10 @@ class VideoFrames(WholeFrames):
         if not self._container.format.name.startswith("mov"):
             return 0
         container, stream = self._open({})
-        with container, self._naming(lambda: count):
+        with container, self._errors_named(lambda: count):
             shown = sum(1 for packet in container.demux(stream) if packet.size and not packet.is_discard)
         container, stream = self._open(_ALL_FRAMES)
-        with container, self._naming(lambda: count):
+        with container, self._errors_named(lambda: count):
             return max(0, sum(1 for packet in container.demux(stream) if packet.size) - shown)
 
     def _find(self, stream: VideoStream, frame: VideoFrame) -> Iterator[Finding]:

@@ -30,20 +30,20 @@ def size_facts(pixel_size: Size) -> dict[str, float]:
     return {f"pixel_size_{axis}": float(size) for axis, size in zip("xy", pixel_size, strict=True)}
 
 
-def differ(one: Size, other: Size) -> bool:
+def differ(size: Size, other: Size) -> bool:
     """Return whether two pixel sizes differ too much for lengths based on both."""
-    return not all(abs(left - right) <= _SAME_SIZE * right for left, right in zip(one, other, strict=True))
+    return not all(abs(value - right) <= _SAME_SIZE * right for value, right in zip(size, other, strict=True))
 
 
 def outdated(
     calibration: Calibration, pixel_size: Size, parts: Iterable[str] = SIZED
 ) -> Iterator[tuple[str, Size]]:
     """Yield the parts that were made with another pixel size, if it was stored, and that size."""
-    there = calibration.parts()
+    present = calibration.parts()
     for part in parts:
         facts = [calibration.process.get(f"{PARTS[part].command}.{fact}") for fact in size_facts(pixel_size)]
         sizes = [float(fact) for fact in facts if isinstance(fact, float | int)]
-        if part in there and len(sizes) == 2 and differ((sizes[0], sizes[1]), pixel_size):
+        if part in present and len(sizes) == 2 and differ((sizes[0], sizes[1]), pixel_size):
             yield part, (sizes[0], sizes[1])
 
 
@@ -77,7 +77,7 @@ def check_camera(
     if mine.name and camera.name and mine.name != camera.name:
         differences.append((f"the camera {mine.name!r}", f"{camera.name!r}"))
     if tuple(mine.shape) != tuple(camera.shape):
-        sizes = (f"{one.shape[1]} x {one.shape[0]}" for one in (mine, camera))
+        sizes = (f"{size.shape[1]} x {size.shape[0]}" for size in (mine, camera))
         differences.append((f"{next(sizes)} pixels", next(sizes)))
     if np.dtype(mine.dtype) != np.dtype(camera.dtype):
         differences.append((f"{np.dtype(mine.dtype).name} samples", np.dtype(camera.dtype).name))
@@ -162,17 +162,17 @@ class Calibrated:
     @functools.cached_property
     def header(self) -> Header:
         """The header of the source, with references, pixel size, tilt and pivot of the calibration."""
-        own = self.source.header
-        self._check(own.camera)
+        stored = self.source.header
+        self._check(stored.camera)
         calibration = self.calibration
-        known: dict[str, Any] = {}
+        properties: dict[str, Any] = {}
         if calibration.references is not None:
-            known |= {"dark": calibration.references.dark, "bright": calibration.references.bright}
+            properties |= {"dark": calibration.references.dark, "bright": calibration.references.bright}
         if calibration.lens is not None:
-            known["pixel_size"] = calibration.lens.pixel_size
+            properties["pixel_size"] = calibration.lens.pixel_size
         if self.motion == "axial" and calibration.precession is not None:
-            known |= self._movement(own, calibration.precession)
-        header = replace(own, **known)
+            properties |= self._movement(stored, calibration.precession)
+        header = replace(stored, **properties)
         self._check_sizes(header.pixel_size)
         return header
 
@@ -185,10 +185,10 @@ class Calibrated:
         """Read the source's next frames, with corrected phases; see ``Source.read``."""
         return self._corrected(self.source.read(out))
 
-    def read_in_place(self, most: int) -> Block | None:
+    def read_in_place(self, limit: int) -> Block | None:
         """Return the next frames of an array without a copy, or None; see ``ArrayRecording``."""
         read_in_place: Callable[[int], Block | None] | None = getattr(self.source, "read_in_place", None)
-        return None if read_in_place is None else self._corrected(read_in_place(most))
+        return None if read_in_place is None else self._corrected(read_in_place(limit))
 
     def rewind(self) -> None:
         """Go back to the first frame."""
@@ -225,21 +225,21 @@ class Calibrated:
         shape: tuple[int, ...] = getattr(self.source, "full_shape", self.source.shape)
         check_camera(self.whole, CameraId(camera, (shape[1], shape[2]), self.source.dtype), self.name)
 
-    def _check_sizes(self, known: Size | None) -> None:
-        size = known if self.whole.lens is None else self.whole.lens.pixel_size
+    def _check_sizes(self, stated: Size | None) -> None:
+        size = stated if self.whole.lens is None else self.whole.lens.pixel_size
         used = [name for name in SIZED if PARTS[name].motion == self.motion]
         check_sizes(self.whole, size, self.name, used)
 
-    def _movement(self, own: Header, precession: Precession) -> dict[str, Any]:
+    def _movement(self, header: Header, precession: Precession) -> dict[str, Any]:
         """Return tilt and pivot of the precession, or of the source if undetermined."""
         tilt = precession.tilt
-        unknown = own.pivot or (np.nan,) * 3
+        unknown = header.pivot or (np.nan,) * 3
         places = zip(precession.pivot, unknown, strict=True)
-        pivot = tuple(there if np.isfinite(there) else otherwise for there, otherwise in places)
-        if own.tilt and not 1 / _SAME_TILT < tilt / own.tilt < _SAME_TILT:
-            learned, said = np.degrees([tilt, own.tilt])
+        pivot = tuple(value if np.isfinite(value) else otherwise for value, otherwise in places)
+        if header.tilt and not 1 / _SAME_TILT < tilt / header.tilt < _SAME_TILT:
+            learned, stated = np.degrees([tilt, header.tilt])
             raise InputError(
                 f"{self.whole.name or 'the calibration'} is for a tilt of {learned:.2f} deg, but that of "
-                f"{self.name} is {said:.2f} deg: calibrate the tilt again"
+                f"{self.name} is {stated:.2f} deg: calibrate the tilt again"
             )
         return {"tilt": tilt, "pivot": pivot if np.isfinite(pivot).all() else None}

@@ -405,8 +405,8 @@ class Calibration:
 
     def parts(self) -> dict[str, Part]:
         """Return the existing parts, by the names of the attributes."""
-        found = {name: getattr(self, name) for name in PARTS}
-        return {name: part for name, part in found.items() if part is not None}
+        parts = {name: getattr(self, name) for name in PARTS}
+        return {name: part for name, part in parts.items() if part is not None}
 
     def rows(self) -> Iterator[Row]:
         """Yield its numbers in the units of tables; for maps, the medians."""
@@ -414,13 +414,13 @@ class Calibration:
         for what, size in zip(("rows", "columns"), self.camera.shape, strict=True):
             yield Row("camera", f"{what} of a frame", size)
         yield Row("camera", "type of a sample", np.dtype(self.camera.dtype).name)
-        for one in self.parts().values():
-            yield from one.rows()
+        for record in self.parts().values():
+            yield from record.rows()
 
     @property
     def contents(self) -> str:
         """The existing parts in one line, by the names of the commands that calibrate them."""
-        return ", ".join(one.command for one in self.parts().values()) or "nothing"
+        return ", ".join(part.command for part in self.parts().values()) or "nothing"
 
 
 PARTS: dict[str, type[Part]] = {

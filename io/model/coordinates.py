@@ -48,7 +48,7 @@ class Coordinates:
 
 def read_coordinates(file: Hdf5File, stack: h5py.Dataset, decoding: Decoding) -> Coordinates:
     """Read the coordinates of a stack of another program; coordinates without units are ignored."""
-    found = Coordinates()
+    coordinates = Coordinates()
     if decoding.names:
         group = str(stack.name).rpartition("/")[0]
         shape = decoding.shape(stack.shape)
@@ -58,19 +58,24 @@ def read_coordinates(file: Hdf5File, stack: h5py.Dataset, decoding: Decoding) ->
             for name, count in zip(names, shape, strict=True)
         ]
         if axes[0] is not None:
-            _take_series(found, names[0], *axes[0], decoding.where)
+            _take_series(coordinates, names[0], *axes[0], decoding.where)
         steps = [
-            _step(found, name, direction, axis, decoding.where)
+            _step(coordinates, name, direction, axis, decoding.where)
             for name, direction, axis in zip(names[1:], (-1, 1), axes[1:], strict=True)
         ]
         if steps[0] and steps[1]:
-            found.pixel_size = steps[1], steps[0]
-            _note(found, decoding.where, "the pixel size", f"{names[2]} and {names[1]}")
+            coordinates.pixel_size = steps[1], steps[0]
+            _note(coordinates, decoding.where, "the pixel size", f"{names[2]} and {names[1]}")
     size = file.attribute_values(stack, _FIJI)
-    if found.pixel_size is None and size is not None and size.shape == (3,) and size.dtype.kind in "iuf":
-        found.pixel_size = float(size[2]) / 1000, float(size[1]) / 1000
-        _note(found, decoding.where, "the pixel size", _FIJI)
-    return found
+    if (
+        coordinates.pixel_size is None
+        and size is not None
+        and size.shape == (3,)
+        and size.dtype.kind in "iuf"
+    ):
+        coordinates.pixel_size = float(size[2]) / 1000, float(size[1]) / 1000
+        _note(coordinates, decoding.where, "the pixel size", _FIJI)
+    return coordinates
 
 
 def _axis(file: Hdf5File, name: str, count: int) -> tuple[Kind, Floats] | None:
@@ -92,15 +97,15 @@ def _axis(file: Hdf5File, name: str, count: int) -> tuple[Kind, Floats] | None:
     return None
 
 
-def _take_series(found: Coordinates, name: str, kind: Kind, values: Floats, where: str) -> None:
+def _take_series(coordinates: Coordinates, name: str, kind: Kind, values: Floats, where: str) -> None:
     series = _SERIES[kind]
-    found.series[series] = values
-    found.motion = _MOTIONS.get(series) if name.lower() == series else None
-    _note(found, where, f"the {series} of each frame", name)
+    coordinates.series[series] = values
+    coordinates.motion = _MOTIONS.get(series) if name.lower() == series else None
+    _note(coordinates, where, f"the {series} of each frame", name)
 
 
 def _step(
-    found: Coordinates, name: str, direction: int, axis: tuple[Kind, NDArray[Any]] | None, where: str
+    coordinates: Coordinates, name: str, direction: int, axis: tuple[Kind, NDArray[Any]] | None, where: str
 ) -> float | None:
     """Return the distance of rows or columns, mm, if they are evenly spaced along a length."""
     if axis is None or axis[0] != "length" or len(axis[1]) < 2:
@@ -110,7 +115,7 @@ def _step(
     even = np.abs(places - places[0] - step * np.arange(len(places)))
     if not step or not np.all(even <= _EVEN * abs(step)):
         text = f"{where}: its coordinate {name} is not evenly spaced, and states no pixel size"
-        found.findings.append(Finding("uneven pixels", text))
+        coordinates.findings.append(Finding("uneven pixels", text))
         return None
     if step * direction < 0:
         change, first = ("rises with the row", "top") if direction < 0 else ("falls with the column", "left")
@@ -118,9 +123,9 @@ def _step(
             f"{where}: its coordinate {name} {change}, and the first one is taken as the {first} of the "
             "picture; reverse the axis if that is wrong"
         )
-        found.findings.append(Finding("mirrored picture", text))
+        coordinates.findings.append(Finding("mirrored picture", text))
     return abs(step)
 
 
-def _note(found: Coordinates, where: str, what: str, source: str) -> None:
-    found.findings.append(Finding("coordinates", f"{where}: {what} is read from {source}", False))
+def _note(coordinates: Coordinates, where: str, what: str, source: str) -> None:
+    coordinates.findings.append(Finding("coordinates", f"{where}: {what} is read from {source}", False))

@@ -139,7 +139,9 @@ def taken_from(values: Mapping[str, Any]) -> Fitted:
     >>> taken_from({"noise": 1.5, "turns": "all", "program": "mirrorskin"}).values()
     {'noise': 1.5}
     """
-    return Fitted(**{name: _as_declared(values.get(name), one) for name, one in parameters(Fitted).items()})
+    return Fitted(
+        **{name: _as_declared(values.get(name), parameter) for name, parameter in parameters(Fitted).items()}
+    )
 
 
 def _as_declared(value: Any, declared: Parameter) -> Any:
@@ -157,7 +159,7 @@ def _as_declared(value: Any, declared: Parameter) -> Any:
 def _as_declared_tuple(values: Sequence[Any], declared: Parameter) -> tuple[Any, ...] | None:
     """Return several values in their declared type, or None if they have another one."""
     numbers = declared.kind == "numbers"
-    fits = all(type(one) in ((int, float) if numbers else (int,)) for one in values)
+    fits = all(type(item) in ((int, float) if numbers else (int,)) for item in values)
     fits &= declared.kind.endswith("s") and declared.shape[0] in (len(values), "T")
     if not fits or (declared.valid is not None and not declared.valid(values)):
         return None

@@ -156,10 +156,10 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
 
     def has_answer(self, values: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which pixels are defined: none of their components is NaN or the undefined value."""
-        known: NDArray[np.bool_] = np.isfinite(values)
+        defined: NDArray[np.bool_] = np.isfinite(values)
         if self.undefined is not None:
-            known &= values != self.undefined
-        return np.asarray(known.all(axis=-1)) if self.components else known
+            defined &= values != self.undefined
+        return np.asarray(defined.all(axis=-1)) if self.components else defined
 
     def title_of(self, name: str) -> str:
         """Return the title of the figure of a map of this name."""
@@ -209,9 +209,9 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
                 raise ValueError(f"it has {len(text)} characters")
             return msgspec.json.decode(text.encode(), type=cls)
         except (msgspec.MsgspecError, ValueError) as error:
-            said = " ".join(str(error).split())
+            message = " ".join(str(error).split())
             raise InputError(
-                f"{where}: the declaration of the map is invalid ({said}). Reconstruct it again"
+                f"{where}: the declaration of the map is invalid ({message}). Reconstruct it again"
             ) from error
 
 
@@ -229,74 +229,79 @@ def _type_problem(name: str, kind: Any, value: Any, error: Exception) -> str:
     return f"{name} of a map is invalid: {error}"
 
 
-def _subject(one: Map) -> str:
+def _subject(declaration: Map) -> str:
     """Return the title or caption of a map, for messages about a map whose name is unknown."""
-    words = one.title or one.caption
+    words = declaration.title or declaration.caption
     return f"the map {words[:60]!r}" if words else "a map"
 
 
-def _text_problems(one: Map) -> Iterator[str]:
+def _text_problems(declaration: Map) -> Iterator[str]:
     for name in ("caption", "unit", "title", "displayed", "within", "included_in", "summary"):
-        if not getattr(one, name).isprintable():
+        if not getattr(declaration, name).isprintable():
             yield f"the {name} of a map has a line break or another control character. Use one line"
-    if not all(text.isprintable() for text in one.codes.values()):
+    if not all(text.isprintable() for text in declaration.codes.values()):
         yield "a legend has a line break or another control character. Use one line for each code"
-    if len(msgspec.json.encode(one)) > LONGEST_DECLARATION:
+    if len(msgspec.json.encode(declaration)) > LONGEST_DECLARATION:
         yield f"the declaration of a map is longer than {LONGEST_DECLARATION} bytes. Shorten its texts"
 
 
-def _type_problems(one: Map) -> Iterator[str]:
-    if one.dtype not in _DTYPES:
-        yield f"the dtype of a map is {one.dtype[:40]!r}. Use one of {', '.join(_DTYPES)}"
+def _type_problems(declaration: Map) -> Iterator[str]:
+    if declaration.dtype not in _DTYPES:
+        yield f"the dtype of a map is {declaration.dtype[:40]!r}. Use one of {', '.join(_DTYPES)}"
         return
-    numbers = [*one.codes] if one.undefined is None else [*one.codes, one.undefined]
-    if one.is_integer:
-        limits = np.iinfo(one.dtype)
+    numbers = (
+        [*declaration.codes] if declaration.undefined is None else [*declaration.codes, declaration.undefined]
+    )
+    if declaration.is_integer:
+        limits = np.iinfo(declaration.dtype)
         wrong = [n for n in numbers if n != int(n) or not limits.min <= n <= limits.max]
         if wrong:
-            yield f"{wrong[0]:g} is not a value of {one.dtype}. Declare another dtype"
-    elif one.codes:
-        yield f"a map of {one.dtype} has codes. Declare a dtype of integers"
-    if len(one.codes) > _MOST_CODES:
-        yield f"a legend has {len(one.codes)} codes; at most {_MOST_CODES} are supported"
+            yield f"{wrong[0]:g} is not a value of {declaration.dtype}. Declare another dtype"
+    elif declaration.codes:
+        yield f"a map of {declaration.dtype} has codes. Declare a dtype of integers"
+    if len(declaration.codes) > _MOST_CODES:
+        yield f"a legend has {len(declaration.codes)} codes; at most {_MOST_CODES} are supported"
 
 
-def _shape_problems(one: Map) -> Iterator[str]:
-    names = one.components
-    if names and (one.axes != "pixels" or one.codes):
+def _shape_problems(declaration: Map) -> Iterator[str]:
+    names = declaration.components
+    if names and (declaration.axes != "pixels" or declaration.codes):
         yield "a map has components, but is not a map of vectors: leave axes and codes out"
     if names and not (
         2 <= len(set(names)) == len(names) <= 16 and all(name.isidentifier() for name in names)
     ):
         yield "the components of a map are not 2 to 16 different names"
-    if one.sampling == "direction" and len(names) != 3:
+    if declaration.sampling == "direction" and len(names) != 3:
         yield "a map sampled as a direction needs three components"
-    if one.sampling == "angle" and (names or one.unit != "rad"):
-        yield f"a map sampled as an angle is in {one.unit or 'no unit'}. Use radians, without components"
+    if declaration.sampling == "angle" and (names or declaration.unit != "rad"):
+        unit = declaration.unit or "no unit"
+        yield f"a map sampled as an angle is in {unit}. Use radians, without components"
 
 
-def _unit_problems(one: Map) -> Iterator[str]:
-    subject = _subject(one)
-    if one.displayed and not one.unit:
-        yield f"{subject} has no unit, but is displayed in {one.displayed[:40]}. Declare its unit"
-    elif one.displayed:
+def _unit_problems(declaration: Map) -> Iterator[str]:
+    subject = _subject(declaration)
+    if declaration.displayed and not declaration.unit:
+        yield f"{subject} has no unit, but is displayed in {declaration.displayed[:40]}. Declare its unit"
+    elif declaration.displayed:
         try:
-            ratio(one.unit, one.displayed)
+            ratio(declaration.unit, declaration.displayed)
         except InputError as error:
             yield f"{subject} cannot be displayed: {error}"
-    if one.quantity and one.quantity not in TABLE:
-        yield f"the quantity of {subject} is {one.quantity[:40]!r}. Use one of {', '.join(TABLE)}"
-    elif one.quantity:
-        yield from conflicts(one, TABLE[one.quantity], f"{subject} of quantity {one.quantity}")
+    if declaration.quantity and declaration.quantity not in TABLE:
+        yield f"the quantity of {subject} is {declaration.quantity[:40]!r}. Use one of {', '.join(TABLE)}"
+    elif declaration.quantity:
+        yield from conflicts(
+            declaration, TABLE[declaration.quantity], f"{subject} of quantity {declaration.quantity}"
+        )
 
 
 _CHECKS = (_text_problems, _type_problems, _shape_problems, _unit_problems)
 
 
-def conflicts(one: Map, other: Map, what: str) -> Iterator[str]:
+def conflicts(declaration: Map, other: Map, what: str) -> Iterator[str]:
     """Yield why a declaration cannot replace another, whose unit, axes and components are used by code."""
     for name in ("unit", "axes", "components"):
-        wrong, right = getattr(one, name), getattr(other, name)
+        wrong, right = getattr(declaration, name), getattr(other, name)
         if wrong != right:
             yield f"{what} has the {name} {wrong or 'none'}. Declare {right or 'none'}"
 
@@ -526,7 +531,7 @@ TABLE: Mapping[str, Map] = {
 """The maps, series and numbers that built-in operations return, in the order of files and figures."""
 
 _PLACES = {name: place for place, name in enumerate(TABLE)}
-_DEVIATIONS = {f"{name}{SIGMA}": one.deviation(name) for name, one in TABLE.items()}
+_DEVIATIONS = {f"{name}{SIGMA}": declaration.deviation(name) for name, declaration in TABLE.items()}
 
 TWIST: Mapping[str, Map] = {
     "slip_onset": Map(
@@ -572,10 +577,10 @@ def declaration_of(name: str, declared: Mapping[str, Map] | None = None) -> Map:
             return table[name]
     base = name.removesuffix(SIGMA)
     builtin = TABLE.get(base)
-    own = (declared or {}).get(base, builtin)
-    if own is None:
+    declaration = (declared or {}).get(base, builtin)
+    if declaration is None:
         return UNDECLARED
-    return _DEVIATIONS[name] if own is builtin else own.deviation(base)
+    return _DEVIATIONS[name] if declaration is builtin else declaration.deviation(base)
 
 
 UNDECLARED = Map()
@@ -589,18 +594,18 @@ def check_declarations(declarations: Mapping[str, Map]) -> None:
     become angles in a twist.
     """
     stands_for: dict[str, str] = {}
-    for name, one in declarations.items():
-        if not isinstance(one, Map):
-            raise InputError(f"the declaration of {name} is {one!r:.40}. Use mirrorskin.io.Map(...)")
-        table = TWIST if name in TWIST and one.unit == TWIST[name].unit else TABLE
+    for name, declaration in declarations.items():
+        if not isinstance(declaration, Map):
+            raise InputError(f"the declaration of {name} is {declaration!r:.40}. Use mirrorskin.io.Map(...)")
+        table = TWIST if name in TWIST and declaration.unit == TWIST[name].unit else TABLE
         if name in table:
-            for problem in conflicts(one, table[name], f"the map {name}"):
+            for problem in conflicts(declaration, table[name], f"the map {name}"):
                 raise InputError(f"{problem}, as the built-in map has, or choose another name")
-        if one.quantity and one.quantity != name:
-            other = stands_for.setdefault(one.quantity, name)
+        if declaration.quantity and declaration.quantity != name:
+            other = stands_for.setdefault(declaration.quantity, name)
             if other != name:
                 raise InputError(
-                    f"both {other} and {name} have the quantity {one.quantity}. Leave it out of one"
+                    f"both {other} and {name} have the quantity {declaration.quantity}. Leave it out of one"
                 )
 
 
@@ -610,21 +615,21 @@ def check_new(declarations: Mapping[str, Map], others: Container[str] = ()) -> N
     This is for declarations in programs; declarations in files are read without these checks.
     """
     check_declarations(declarations)
-    for name, one in declarations.items():
-        base, undefined = name.removesuffix(SIGMA), one.undefined
+    for name, declaration in declarations.items():
+        base, undefined = name.removesuffix(SIGMA), declaration.undefined
         if is_deviation(name) and name not in TABLE and (base in declarations or is_builtin(base)):
             unit = declaration_of(base, declarations).unit
-            if one.unit != unit:
+            if declaration.unit != unit:
                 raise InputError(
-                    f"the map {name} has the unit {one.unit or 'none'}, but {base} has the unit "
+                    f"the map {name} has the unit {declaration.unit or 'none'}, but {base} has the unit "
                     f"{unit or 'none'}. Declare {unit or 'none'}"
                 )
-        if one.codes and undefined is not None and undefined not in one.codes:
-            codes = ", ".join(map(str, one.codes))
+        if declaration.codes and undefined is not None and undefined not in declaration.codes:
+            codes = ", ".join(map(str, declaration.codes))
             raise InputError(
                 f"the map {name} is undefined at {undefined:g}, which is not in its codes ({codes:.100})"
             )
-        quantity = one.quantity
+        quantity = declaration.quantity
         if quantity and quantity != name and (quantity in declarations or quantity in others):
             raise InputError(
                 f"both {quantity} and {name} have the quantity {quantity}. Leave one of them out"

@@ -102,7 +102,7 @@ def _faces(pieces: NDArray[np.integer]) -> NDArray[np.int64]:
         (without_c, (at_a, at_d, at_b)),
     )
     return np.concatenate(
-        [np.stack([corner[there] for corner in corners], axis=1) for there, corners in triangles]
+        [np.stack([corner[inside] for corner in corners], axis=1) for inside, corners in triangles]
     )
 
 

@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from mirrorskin.io.files.recording import Recording
-    from mirrorskin.io.model.result import Result, Shown
+    from mirrorskin.io.model.result import MapContainer, Result
 
 _PICTURE = 480  # maximum length of the longer side of a picture, pixels
 
 
-def as_text(result: Shown) -> str:
+def as_text(result: MapContainer) -> str:
     """Return the maps of a result with shape, unit and range, one per line."""
     lines = [f"{name:<14}{shape:<16}{values}" for name, shape, values in _rows(result)]
     lines += [f"warning: {text}" for text in warnings_in(getattr(result, "process", {}))]
     return "\n".join([f"{type(result).__name__}{_origin(result)}", *(f"  {line}" for line in lines)])
 
 
-def as_html(result: Shown) -> str:
+def as_html(result: MapContainer) -> str:
     """Return a table of the maps, and a picture of the height, or of the first other map."""
     rows = "".join(
         "<tr>" + "".join(f"<td style='text-align:left'>{escape(cell)}</td>" for cell in row) + "</tr>"
@@ -65,19 +65,19 @@ def recording_as_html(recording: Recording) -> str:
     return f"<p>{escape(recording_as_text(recording))}</p>{picture}"
 
 
-def plot(result: Shown, name: str | None, axes: Axes | None) -> Axes:
-    """Draw a map; see `Shown.plot`."""
+def plot(result: MapContainer, name: str | None, axes: Axes | None) -> Axes:
+    """Draw a map; see `MapContainer.plot`."""
     import matplotlib.pyplot as plt
 
     maps = result.maps()
     chosen = _first(result) if name is None else name
     if chosen not in maps or maps[chosen].ndim != 2:
-        pictures = [one for one, values in maps.items() if values.ndim == 2]
+        pictures = [map_name for map_name, values in maps.items() if values.ndim == 2]
         raise InputError(unknown_argument("the result", str(chosen), pictures, "picture"))
-    x, y = (getattr(result, one, None) for one in "xy")
+    x, y = (getattr(result, axis, None) for axis in "xy")
     extent = None
     if x is not None and y is not None:
-        a, b = ((one[1] - one[0]) / 2 if len(one) > 1 else 0.5 for one in (x, y))
+        a, b = ((axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5 for axis in (x, y))
         extent = (x[0] - a, x[-1] + a, y[-1] + b, y[0] - b)
     axes = plt.subplots()[1] if axes is None else axes
     image = axes.imshow(maps[chosen], extent=extent, interpolation="nearest")
@@ -119,8 +119,8 @@ def as_xarray(result: Result, shape: tuple[int, ...]) -> xarray.Dataset:
             attributes[_DECLARATION] = declared.encode()
         data[name] = (dimensions, values, attributes)
         coordinates |= components
-    known = {_FITTED: result.fitted.encode()} if result.fitted.values() else {}
-    return xarray.Dataset(data, coordinates, attrs={**result.process, **known})
+    extra = {_FITTED: result.fitted.encode()} if result.fitted.values() else {}
+    return xarray.Dataset(data, coordinates, attrs={**result.process, **extra})
 
 
 def _dimensions(
@@ -161,7 +161,7 @@ def from_xarray(dataset: xarray.Dataset) -> tuple[dict[str, Any], dict[str, Any]
         for name in ("x", "y")
         if name in dataset.variables
     }
-    process = {str(name): one for name, one in dataset.attrs.items()}
+    process = {str(name): value for name, value in dataset.attrs.items()}
     stored = process.pop(_FITTED, None)
     try:
         fitted = taken_from(process) if stored is None else Fitted.decode(str(stored))
@@ -179,41 +179,41 @@ def _as_picture(dataset: xarray.Dataset) -> xarray.Dataset:
             dataset = dataset.isel({name: slice(None, None, -1)})
     swapped = {"x": "y", "y": "x"}
     for label, variable in dataset.data_vars.items():
-        names = [str(one) for one in variable.dims]
+        names = [str(dim) for dim in variable.dims]
         if {"x", "y"} <= {*names} and names.index("x") < names.index("y"):
-            dataset = dataset.assign({label: variable.transpose(*(swapped.get(one, one) for one in names))})
+            dataset = dataset.assign({label: variable.transpose(*(swapped.get(dim, dim) for dim in names))})
     return dataset
 
 
-def _first(result: Shown) -> str | None:
+def _first(result: MapContainer) -> str | None:
     """Return the most informative map."""
     pictures = [name for name, values in result.maps().items() if values.ndim == 2 or values.shape[-1] > 3]
     summarised = [name for name in pictures if result.declaration(name).summary]
     return next(iter([*summarised, *pictures]), None)
 
 
-def _unit(name: str, result: Shown) -> str:
+def _unit(name: str, result: MapContainer) -> str:
     return result.declaration(name).unit
 
 
-def _rows(result: Shown) -> list[tuple[str, str, str]]:
+def _rows(result: MapContainer) -> list[tuple[str, str, str]]:
     """Return name, shape, and unit with range of each map."""
     rows = []
     for name, values in result.maps().items():
         shape = " x ".join(map(str, values.shape))
         declared = result.declaration(name)
-        known = values.ravel() if declared.codes else values[declared.has_answer(values)]
-        span = f"{known.min():.4g} to {known.max():.4g}" if known.size else "nothing known"
-        share = f", {known.size / values.size:.0%} known" if 0 < known.size < values.size else ""
+        defined = values.ravel() if declared.codes else values[declared.has_answer(values)]
+        span = f"{defined.min():.4g} to {defined.max():.4g}" if defined.size else "nothing known"
+        notes = f", {defined.size / values.size:.0%} known" if 0 < defined.size < values.size else ""
         filled = _filled(result, name)
-        share += "" if filled is None else f", {np.mean(filled):.2g} filled"
-        unit = f" {declared.unit}".rstrip() if known.size else ""
-        rows.append((name, shape, f"{span}{unit}{share}"))
+        notes += "" if filled is None else f", {np.mean(filled):.2g} filled"
+        unit = f" {declared.unit}".rstrip() if defined.size else ""
+        rows.append((name, shape, f"{span}{unit}{notes}"))
     numbers = result.numbers().items()
     return rows + [(name, "", f"{value:.4g} {_unit(name, result)}".rstrip()) for name, value in numbers]
 
 
-def _filled(result: Shown, name: str) -> NDArray[np.bool_] | None:
+def _filled(result: MapContainer, name: str) -> NDArray[np.bool_] | None:
     """Return which heights of a map were filled, (H, W); None if none were, or for other maps."""
     filled = result.maps().get("filled")
     name_of = getattr(result, "name_of", None)
@@ -226,7 +226,7 @@ def _filled_note(filled: NDArray[np.bool_]) -> str:
     return f"orange: filled, not measured ({np.mean(filled):.2g} of the pixels)"
 
 
-def _origin(result: Shown) -> str:
+def _origin(result: MapContainer) -> str:
     source = getattr(result, "process", {}).get("source")
     return f" of {source}" if source else ""
 
@@ -241,11 +241,11 @@ def _picture(name: str, values: NDArray[Any], unit: str, filled: NDArray[np.bool
     flat = values.reshape(-1, *values.shape[-2:])[-1].astype(np.float64)
     step = max(1, -(-max(flat.shape) // _PICTURE))
     flat = flat[::step, ::step]
-    known = np.isfinite(flat)
-    if not known.any():
+    finite = np.isfinite(flat)
+    if not finite.any():
         return ""
-    low, high = np.percentile(flat[known], (1, 99))
-    grey = np.clip((np.where(known, flat, low) - low) / (high - low or 1.0), 0, 1)
+    low, high = np.percentile(flat[finite], (1, 99))
+    grey = np.clip((np.where(finite, flat, low) - low) / (high - low or 1.0), 0, 1)
     colours = cv2.applyColorMap((255 * grey).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     note = ""
     if filled is not None:
@@ -254,7 +254,7 @@ def _picture(name: str, values: NDArray[Any], unit: str, filled: NDArray[np.bool
         shades = ends[0] + grey[..., np.newaxis] * (ends[1] - ends[0])  # blue, green, red
         colours = np.where(marks[..., np.newaxis], shades, colours).astype(np.uint8)
         note = f"; {_filled_note(filled)}"
-    picture = np.dstack([colours, 255 * known.astype(np.uint8)])
+    picture = np.dstack([colours, 255 * finite.astype(np.uint8)])
     data = base64.b64encode(encode(".png", picture)).decode()
     caption = escape(f"{name}, {low:.4g} to {high:.4g} {unit}".rstrip() + note)
     image = f"<img alt='{caption}' src='data:image/png;base64,{data}'>"

@@ -144,10 +144,10 @@ def parameter(text: str, unit: str = "", *, default: Any = MISSING, **options: A
 
     Files must contain parameters without a default: declare one if older files are to be read.
     """
-    one = Parameter(text, unit, optional=default is not MISSING, **options)
+    declaration = Parameter(text, unit, optional=default is not MISSING, **options)
     if callable(default):
-        return field(default_factory=default, metadata={"parameter": one})
-    return field(default=default, metadata={"parameter": one})
+        return field(default_factory=default, metadata={"parameter": declaration})
+    return field(default=default, metadata={"parameter": declaration})
 
 
 class Row(NamedTuple):
@@ -200,31 +200,31 @@ class Part:
     def rows(self) -> Iterator[Row]:
         """Yield the numbers shown in tables; for maps, the medians."""
         errors = self.standard_errors()
-        for name, one in parameters(self).items():
-            title = name.replace("_", " ") if one.title is None else one.title
+        for name, parameter in parameters(self).items():
+            title = name.replace("_", " ") if parameter.title is None else parameter.title
             value = getattr(self, name)
             if not title or value is None:
                 continue
-            if one.flags:
-                for flag, bit in one.flags.items():
+            if parameter.flags:
+                for flag, bit in parameter.flags.items():
                     yield Row(
                         self.command, flag, int(np.count_nonzero(value & bit)), math.nan, "pixels", flag
                     )
                 continue
-            if one.convert is not None:
-                value = one.convert(value)
-            elif one.kind == "map":
+            if parameter.convert is not None:
+                value = parameter.convert(value)
+            elif parameter.kind == "map":
                 value = median(value)
-            named = one.components or ("",)
-            for component, number in zip(named, value if one.components else (value,), strict=True):
+            named = parameter.components or ("",)
+            for component, number in zip(named, value if parameter.components else (value,), strict=True):
                 what = title.format(component) if "{}" in title else f"{title} {component}".rstrip()
                 key = f"{name}_{component}" if component else name
                 if isinstance(number, str | int):
                     yield Row(self.command, what, number, name=key)
                     continue
-                factor = 1.0 if one.convert is not None else one.factor
+                factor = 1.0 if parameter.convert is not None else parameter.factor
                 sigma = errors.get(key, math.nan) * factor
-                yield Row(self.command, what, float(number) * factor, sigma, one.shown_unit, key)
+                yield Row(self.command, what, float(number) * factor, sigma, parameter.shown_unit, key)
 
 
 K = TypeVar("K")
@@ -233,8 +233,8 @@ T = TypeVar("T", bound=Part)
 
 def median(values: Any) -> float:
     """Return the median of the pixels that have a value; NaN if there are none."""
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else math.nan
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else math.nan
 
 
 @dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(parameter,))
@@ -246,9 +246,9 @@ def part(cls: type[T]) -> type[T]:
 def documented(cls: type[K]) -> type[K]:
     """Add the attributes declared by `parameter` to the docstring of a dataclass."""
     lines = ["Attributes", "----------"]
-    for name, one in parameters(cls).items():
-        text = f"{one.text[:1].upper()}{one.text[1:]}."
-        lines += [f"{name} : {one.described()}", textwrap.indent(textwrap.fill(text, _COLUMNS), "    ")]
+    for name, parameter in parameters(cls).items():
+        text = f"{parameter.text[:1].upper()}{parameter.text[1:]}."
+        lines += [f"{name} : {parameter.described()}", textwrap.indent(textwrap.fill(text, _COLUMNS), "    ")]
     cls.__doc__ = "\n\n".join([inspect.cleandoc(cls.__doc__ or ""), "\n".join(lines)])
     return cls
 
@@ -260,10 +260,10 @@ def parameters(of: Any) -> dict[str, Parameter]:
 
 @functools.cache
 def _parameters(kind: Any) -> dict[str, Parameter]:
-    return {one.name: one.metadata["parameter"].settled(str(one.type)) for one in fields(kind)}
+    return {field.name: field.metadata["parameter"].settled(str(field.type)) for field in fields(kind)}
 
 
 def unit_of(name: str, declared: Mapping[str, Parameter]) -> str:
     """Return the unit of a parameter by its name, with or without the name of a component."""
-    one = declared.get(name) or declared.get(name.rpartition("_")[0])
-    return "" if one is None else one.unit
+    parameter = declared.get(name) or declared.get(name.rpartition("_")[0])
+    return "" if parameter is None else parameter.unit

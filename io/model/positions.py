@@ -13,7 +13,7 @@ from mirrorskin.io.base.arguments import check_number
 from mirrorskin.io.base.types import Floats, InputError
 
 _ROUNDING = 1e-6  # radians
-_GREATEST = 1e12  # largest value accepted, in mm, rad or s
+_VALUE_MAX = 1e12  # largest value accepted, in mm, rad or s
 
 
 @runtime_checkable
@@ -25,15 +25,15 @@ class Positions(Protocol):
 
 
 def along(
-    given: ArrayLike | Positions | None, count: int, lost: NDArray[np.int32] | None = None
+    positions: ArrayLike | Positions | None, count: int, lost: NDArray[np.int32] | None = None
 ) -> ArrayLike | None:
     """Return positions for ``count`` frames, from an array or an object that computes them.
 
     Even steps include the frames ``lost`` before each frame.
     """
-    if isinstance(given, Steps) and lost is not None and lost.any():
-        return np.asarray(given.start + given.step * (np.arange(count) + np.cumsum(lost)))
-    return given.positions(count) if isinstance(given, Positions) else given
+    if isinstance(positions, Steps) and lost is not None and lost.any():
+        return np.asarray(positions.start + positions.step * (np.arange(count) + np.cumsum(lost)))
+    return positions.positions(count) if isinstance(positions, Positions) else positions
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,9 +163,9 @@ def check_finite(
         raise InputError(f"{name} has shape {array.shape} for {count} frames: {needed} needed")
     start, stop = within or (0, count)
     checked = array[start:stop].astype(np.float64)
-    known = (np.abs(checked) <= _GREATEST).all(axis=tuple(range(1, array.ndim)))
-    if not np.all(known):
-        frame = start + int(np.argmin(known))
-        needed = f"every frame needs a finite number, at most {_GREATEST:g}"
+    defined = (np.abs(checked) <= _VALUE_MAX).all(axis=tuple(range(1, array.ndim)))
+    if not np.all(defined):
+        frame = start + int(np.argmin(defined))
+        needed = f"every frame needs a finite number, at most {_VALUE_MAX:g}"
         raise InputError(f"{name} is {array[frame]} at frame {frame}: {needed}")
     return checked

@@ -39,15 +39,17 @@ _UNKNOWN = Fitted()
 _FEW_GAPS = 16  # maximum number of gaps between codes that are searched one by one
 
 
-class Shown:
+class MapContainer:
     """Base class of maps that are displayed: as text, in a notebook, and as figures."""
 
     __slots__ = ()
 
     def maps(self) -> dict[str, NDArray[Any]]:
         """Return the existing maps, by name."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}  # type: ignore[arg-type]
-        return {name: one for name, one in values.items() if isinstance(one, np.ndarray) and one.ndim > 1}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        return {
+            name: value for name, value in values.items() if isinstance(value, np.ndarray) and value.ndim > 1
+        }
 
     def numbers(self) -> dict[str, float]:
         """Return the existing single numbers, by name."""
@@ -95,7 +97,7 @@ class Shown:
         return as_html(self)
 
 
-class Result(Shown, Mapping[str, Any]):
+class Result(MapContainer, Mapping[str, Any]):
     """The maps of a reconstruction: a read-only mapping from names to arrays, with attribute access.
 
     The table in `mirrorskin.io.model.maps` declares the maps of built-in operations: ``result.height`` is
@@ -166,8 +168,8 @@ class Result(Shown, Mapping[str, Any]):
     ) -> None:
         values = {**(maps or {}), **named}
         kept = {name: values[name] for name in sorted(values, key=place_of) if values[name] is not None}
-        known = {name: one for name, one in (declarations or {}).items() if name in kept}
-        check_declarations(known)
+        declared = {name: declaration for name, declaration in (declarations or {}).items() if name in kept}
+        check_declarations(declared)
         for name, value in {
             "_maps": {name: getattr(value, "read", value) for name, value in kept.items()},
             "_on_device": {name: value for name, value in kept.items() if hasattr(value, "read")},
@@ -176,7 +178,7 @@ class Result(Shown, Mapping[str, Any]):
             "process": process or {},
             "fitted": fitted,
             "calibration": calibration,
-            "declarations": known,
+            "declarations": declared,
         }.items():
             object.__setattr__(self, name, value)
 
@@ -195,9 +197,9 @@ class Result(Shown, Mapping[str, Any]):
     def __getattr__(self, name: str) -> Any:
         if name in Result.__slots__:  # the constructor failed
             raise AttributeError(name)
-        own = self.name_of(name)
-        if own is not None:
-            return self[own]
+        own_name = self.name_of(name)
+        if own_name is not None:
+            return self[own_name]
         if is_builtin(name):
             return None
         raise AttributeError(unknown_argument("the result", name, [*self._maps], "map"))
@@ -229,8 +231,8 @@ class Result(Shown, Mapping[str, Any]):
         if quantity in self._maps:
             return quantity
         base = quantity.removesuffix(SIGMA) if is_deviation(quantity) else quantity
-        own = (name for name, one in self.declarations.items() if one.quantity == base)
-        return next(own, base) + quantity.removeprefix(base)
+        names = (name for name, declaration in self.declarations.items() if declaration.quantity == base)
+        return next(names, base) + quantity.removeprefix(base)
 
     def declaration(self, name: str) -> Map:
         """Return the declaration of a map: its unit, meaning, legend and more."""
@@ -255,14 +257,14 @@ class Result(Shown, Mapping[str, Any]):
         ['slope']
         """
         if isinstance(maps, Result) and "process" not in changes:
-            own = {name: maps.process[name] for name in ("warnings", "notes") if name in maps.process}
-            changes["process"] = merged(self.process, own)
+            findings = {name: maps.process[name] for name in ("warnings", "notes") if name in maps.process}
+            changes["process"] = merged(self.process, findings)
         values = {**(maps or {}), **changes}
         fields = {name: values.pop(name, getattr(self, name)) for name in FIELDS}
         fields["declarations"] = {**self.declarations, **(fields["declarations"] or {})}
         replaced = {self._own_name(name): value for name, value in values.items()}
         changed = Result({**self._maps, **replaced}, **fields)
-        kept = {name: one for name, one in self._on_device.items() if name not in replaced}
+        kept = {name: value for name, value in self._on_device.items() if name not in replaced}
         changed._on_device.update(kept)
         return changed
 
@@ -296,10 +298,10 @@ class Result(Shown, Mapping[str, Any]):
         >>> fit.on_device("mean").shape, fit.mean[0, 0]
         ((2, 3), np.float32(1.0))
         """
-        own = self._own_name(name)
-        if own not in self._maps and not is_builtin(name):
+        own_name = self._own_name(name)
+        if own_name not in self._maps and not is_builtin(name):
             raise InputError(unknown_argument("the result", name, [*self._maps], "map"))
-        return self._on_device.get(own)
+        return self._on_device.get(own_name)
 
     def maps(self) -> dict[str, NDArray[Any]]:
         """Return the maps, by name: built-in ones in the order of the table, then others."""
@@ -422,8 +424,8 @@ def _checked_map(name: str, values: Any, declared: Map, shape: tuple[int, int]) 
     values = np.asarray(values)
     if declared.axes != "pixels":
         size = () if declared.axes == "none" else (*values.shape[:1],) or (1,)
-    own = values.shape[1:] if declared.per_frame and values.ndim > len(size) else values.shape
-    if values.dtype.kind not in "buif" or own != size:
+    size_of_values = values.shape[1:] if declared.per_frame and values.ndim > len(size) else values.shape
+    if values.dtype.kind not in "buif" or size_of_values != size:
         raise InputError(f"map {name} is {values.dtype} {values.shape}: numbers {size} are needed")
     if declared is UNDECLARED:
         return values.astype(np.uint8) if values.dtype.kind == "b" else values
@@ -480,12 +482,12 @@ def display_order(result: Result) -> list[str]:
     >>> display_order(Result(maps, declarations=declared))
     ['wear', 'gloss', 'kind']
     """
-    height, own = result.name_of("height"), [*result.declarations]
+    height, names = result.name_of("height"), [*result.declarations]
 
     def place(name: str) -> tuple[bool, bool, bool, int]:
-        one, builtin = result.declaration(name), is_builtin(name)
-        aside = bool(one.codes) or is_deviation(name) or not one.overview
-        return name != height, aside, not builtin, own.index(name) if name in own and not builtin else 0
+        declaration, builtin = result.declaration(name), is_builtin(name)
+        aside = bool(declaration.codes) or is_deviation(name) or not declaration.overview
+        return name != height, aside, not builtin, names.index(name) if name in names and not builtin else 0
 
     return sorted(result.maps(), key=place)
 
@@ -500,8 +502,8 @@ def map_shape(result: Result) -> tuple[int, ...]:
 
 def shape_of(result: Result, name: str) -> tuple[int, ...]:
     """Return the shape of a map, without copying it from a device."""
-    there = result.on_device(name)
-    return np.shape(result[name]) if there is None else tuple(there.shape)
+    on_device = result.on_device(name)
+    return np.shape(result[name]) if on_device is None else tuple(on_device.shape)
 
 
 def size_of_maps(declared: Map, shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -542,8 +544,8 @@ def select_turn(result: Result, turn: int | None) -> Result:
         return result
     if turn is None or not 0 <= turn < size[0]:
         wrong = "" if turn is None else f", and none of turn {turn}"
-        count, most = ("1 turn", "") if size[0] == 1 else (f"{size[0]} turns", f" to {size[0] - 1}")
-        raise InputError(f"this result has maps of {count}{wrong}: choose one with --turn 0{most}")
+        count, last = ("1 turn", "") if size[0] == 1 else (f"{size[0]} turns", f" to {size[0] - 1}")
+        raise InputError(f"this result has maps of {count}{wrong}: choose one with --turn 0{last}")
     chosen: dict[str, Any] = {name: values[turn] for name, values in maps.items()}
     if result.component is not None:
         chosen |= _renumbered(result.component[turn], result.offset_unknown)
@@ -554,8 +556,8 @@ def _renumbered(
     component: NDArray[np.int32], offset_unknown: NDArray[np.uint8] | None
 ) -> dict[str, NDArray[Any]]:
     """Renumber the components of one turn from 0."""
-    own = np.unique(component[component >= 0])
-    numbered = np.where(component >= 0, np.searchsorted(own, component), -1).astype(np.int32)
+    components = np.unique(component[component >= 0])
+    numbered = np.where(component >= 0, np.searchsorted(components, component), -1).astype(np.int32)
     if offset_unknown is None:
         return {"component": numbered}
-    return {"component": numbered, "offset_unknown": offset_unknown[own]}
+    return {"component": numbered, "offset_unknown": offset_unknown[components]}

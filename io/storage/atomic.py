@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.base.system import as_input_error, check_writable_system, lock
+from mirrorskin.io.base.system import check_writable_system, lock, translate_os_errors
 from mirrorskin.io.base.text import legible
 from mirrorskin.io.base.types import Closing, InputError, ProcessValue
 from mirrorskin.io.base.url import is_zarr
@@ -65,7 +65,7 @@ def check_output(path: Path, *keep: Path | None, replaces: Replaces = "derived")
     >>> check_output(Path("result.h5"), Path("press.h5"))  # doctest: +SKIP
     """
     check_writable_system()
-    with as_input_error(f"{path} cannot be written", "choose another place with -o"):
+    with translate_os_errors(f"{path} cannot be written", "choose another place with -o"):
         if is_zarr(path):
             raise InputError(f"{path}: this is written as HDF5: name a local file, .h5, with -o")
         if path.is_dir():
@@ -75,8 +75,8 @@ def check_output(path: Path, *keep: Path | None, replaces: Replaces = "derived")
         if path.exists():
             if not path.is_file():
                 raise InputError(f"{path} is not a regular file: choose another place with -o")
-            inputs = [one for one in keep if one is not None and one.exists()]
-            if any(path.samefile(one) or path.parent.samefile(one) for one in inputs):
+            inputs = [file for file in keep if file is not None and file.exists()]
+            if any(path.samefile(file) or path.parent.samefile(file) for file in inputs):
                 raise InputError(f"{path} is the input, or part of it: name another output with -o")
             _check_existing(path, replaces)
         with tempfile.TemporaryFile(dir=path.parent):
@@ -111,7 +111,7 @@ class NewHdf5(Closing):
     def check(self) -> None:
         """Raise InputError if the disk did not accept everything written so far."""
         if self._disk.error is not None:
-            with as_input_error(f"{self._path} could not be written", MAKE_ROOM):
+            with translate_os_errors(f"{self._path} could not be written", MAKE_ROOM):
                 raise self._disk.error
 
     def close(self) -> None:
@@ -132,7 +132,7 @@ def new_file(path: Path, replaces: Replaces = "derived") -> Iterator[int]:
     check_output(path, replaces=replaces)
     with new_part(path) as (part, descriptor):
         yield descriptor
-        with as_input_error(f"{path} could not be written", MAKE_ROOM):
+        with translate_os_errors(f"{path} could not be written", MAKE_ROOM):
             synchronise(descriptor)
             _rename(part, path, replaces)
 
@@ -141,11 +141,11 @@ def new_file(path: Path, replaces: Replaces = "derived") -> Iterator[int]:
 def new_part(path: Path) -> Iterator[tuple[Path, int]]:
     """Create a locked file in the folder of ``path``, under a temporary name that is removed at the end."""
     folder = Path(os.path.realpath(path)).parent
-    _tidy(folder)
+    _remove_leftovers_once(folder)
     # The name is chosen before the file exists, so that it is removed even if the program ends now.
     part, descriptor = folder / f"{_PREFIX}{os.urandom(8).hex()}{_SUFFIX}", -1
     try:
-        with as_input_error(f"{path} could not be written"):
+        with translate_os_errors(f"{path} could not be written"):
             descriptor = _make(part)
         yield part, descriptor
     finally:
@@ -214,13 +214,13 @@ def new_folder(path: Path) -> Iterator[Path]:
     Leftovers of killed programs in that folder are removed, as in `new_file`. If several programs create the
     same folder, the first one keeps the name; the others raise InputError.
     """
-    _tidy(path.parent)
+    _remove_leftovers_once(path.parent)
     part, descriptor = path.parent / f"{_PREFIX}{os.urandom(8).hex()}{_SUFFIX}", -1
     try:
-        with as_input_error(f"{path} could not be written"):
+        with translate_os_errors(f"{path} could not be written"):
             descriptor = _make_folder(part)
         yield part
-        with as_input_error(f"{path} could not be written", "choose another place with -o"):
+        with translate_os_errors(f"{path} could not be written", "choose another place with -o"):
             for written in (*part.rglob("*"), part):
                 _synchronise_path(written)
             if path.exists() or not _renamed(part, path):
@@ -235,7 +235,7 @@ def new_folder(path: Path) -> Iterator[Path]:
 def new_hdf5(path: Path, replaces: Replaces = "derived") -> Iterator[NewHdf5]:
     """Write an HDF5 file like ``new_file``."""
     with new_file(path, replaces) as descriptor:
-        with as_input_error(f"{path} could not be written", MAKE_ROOM):
+        with translate_os_errors(f"{path} could not be written", MAKE_ROOM):
             new = NewHdf5(path, descriptor)
         with new:
             yield new
@@ -262,7 +262,7 @@ def remove_leftovers(folder: Path) -> list[Path]:
     return removed
 
 
-_tidy = functools.cache(remove_leftovers)
+_remove_leftovers_once = functools.cache(remove_leftovers)
 
 
 def _make(part: Path) -> int:
@@ -337,7 +337,7 @@ def write_new(path: Path, parts: Sequence[bytes], replaces: Replaces = "derived"
     """Write the parts of a file, which appears complete or not at all."""
     with (
         new_file(path, replaces) as descriptor,
-        as_input_error(f"{path} could not be written", MAKE_ROOM),
+        translate_os_errors(f"{path} could not be written", MAKE_ROOM),
         os.fdopen(descriptor, "wb", closefd=False) as file,
     ):
         file.writelines(parts)
@@ -376,7 +376,10 @@ def write_item(root: h5py.Group, item: Item) -> None:
 
 def write_file(path: Path, items: Iterable[Item], replaces: Replaces = "derived") -> None:
     """Write a file with these objects, which appears complete or not at all."""
-    with new_hdf5(path, replaces) as new, as_input_error(f"{path} could not be written", MAKE_ROOM, OSError):
+    with (
+        new_hdf5(path, replaces) as new,
+        translate_os_errors(f"{path} could not be written", MAKE_ROOM, OSError),
+    ):
         for item in items:
             write_item(new.root, item)
 
@@ -389,7 +392,7 @@ def fixed_text(text: str | Sequence[str]) -> NDArray[Any]:
     if isinstance(text, str):
         encoded = legible(text).encode() or b"\0"
         return np.array(encoded, h5py.string_dtype("utf-8", len(encoded)))
-    texts = [legible(one).encode() for one in text]
+    texts = [legible(part).encode() for part in text]
     return np.array(texts, h5py.string_dtype("utf-8", max(map(len, texts), default=0) or 1))
 
 

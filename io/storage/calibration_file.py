@@ -32,7 +32,7 @@ MARK, VERSION = "mirrorskin_calibration", 1
 ENTRY, CARRIED = "/entry", "/entry/calibration"
 """Group of the calibration in a calibration file, and of the copy in recordings and results."""
 
-_AGAIN = "calibrate again"
+_REMEDY = "calibrate again"
 T = TypeVar("T")
 
 
@@ -174,38 +174,40 @@ def _part_items(part: Part, place: str, camera: CameraId) -> Iterator[Item]:
     """Yield the objects of a part; ValueError if it does not fit the camera or is inconsistent."""
     sizes = _sizes_of(camera)
     how = parameters(part)
-    for name, one in how.items():
+    for name, parameter in how.items():
         value = getattr(part, name)
         if value is None:
             continue
-        if one.kind == "mapping":
+        if parameter.kind == "mapping":
             for key, number in value.items():
                 values = np.asarray(number, np.float64)
                 yield Item(f"{place}/{name}/{key}", values, _units(unit_of(key, how)))
             continue
-        values = _values_of(value, one)
-        if values.shape != _shape_of(one, values.shape, sizes):
-            raise ValueError(f"{place}/{name} is of shape {values.shape}: {one.shape} is needed")
-        image = {"interpretation": "image"} if one.kind == "map" else {}
-        yield Item(f"{place}/{name}", values, image | _units(one.unit))
+        values = _values_of(value, parameter)
+        if values.shape != _shape_of(parameter, values.shape, sizes):
+            raise ValueError(f"{place}/{name} is of shape {values.shape}: {parameter.shape} is needed")
+        image = {"interpretation": "image"} if parameter.kind == "map" else {}
+        yield Item(f"{place}/{name}", values, image | _units(parameter.unit))
 
 
 def record_items(record: Any, place: str) -> Iterator[Item]:
     """Yield the known values of a record that `parameter` declares, in a group if there are any."""
-    known = {name: one for name, one in parameters(record).items() if getattr(record, name) is not None}
-    if known:
+    present = {
+        name: parameter for name, parameter in parameters(record).items() if getattr(record, name) is not None
+    }
+    if present:
         yield Item(place, None, {"NX_class": "NXcollection"})
-    for name, one in known.items():
-        yield Item(f"{place}/{name}", _values_of(getattr(record, name), one), _units(one.unit))
+    for name, parameter in present.items():
+        yield Item(f"{place}/{name}", _values_of(getattr(record, name), parameter), _units(parameter.unit))
 
 
 def read_record(file: Hdf5File, place: str, kind: type[T], remedy: str) -> T:
     """Read what `record_items` writes; InputError with a remedy if a value is damaged."""
     values: dict[str, Any] = {}
-    for name, one in parameters(kind).items():
+    for name, parameter in parameters(kind).items():
         node = file.find(f"{place}/{name}")
         if node is not None:
-            values[name] = _read_field(file, node, one, {}, remedy)
+            values[name] = _read_field(file, node, parameter, {}, remedy)
     return kind(**values)
 
 
@@ -228,9 +230,9 @@ def _sizes_of(camera: CameraId) -> dict[str, int]:
 
 def _shape_of(how: Parameter, shape: tuple[int, ...], sizes: dict[str, int]) -> tuple[int, ...]:
     """Return the required shape of an array; sizes that occur for the first time are taken from its shape."""
-    there = (*shape, *[0] * len(how.shape))
+    expected = (*shape, *[0] * len(how.shape))
     return tuple(
-        size if isinstance(size, int) else sizes.setdefault(size, there[axis])
+        size if isinstance(size, int) else sizes.setdefault(size, expected[axis])
         for axis, size in enumerate(how.shape)
     )
 
@@ -243,44 +245,46 @@ def _read(file: Hdf5File, place: str, name: str) -> Calibration:
     version = file.attribute(place, MARK)
     if version != VERSION:
         newer = isinstance(version, int) and version > VERSION
-        kind, remedy = ("a newer", f"update the program, or {_AGAIN}") if newer else ("an older", _AGAIN)
+        kind, remedy = ("a newer", f"update the program, or {_REMEDY}") if newer else ("an older", _REMEDY)
         raise InputError(
             f"{file.path} contains a calibration of {kind} layout, {version}, where {VERSION} is read: "
             f"{remedy}"
         )
     camera = _read_camera(file, f"{place}/camera")
-    found = {one: file.find(f"{place}/{kind.command}") for one, kind in PARTS.items()}
+    nodes = {name: file.find(f"{place}/{kind.command}") for name, kind in PARTS.items()}
     parts: dict[str, Any] = {
-        one: _read_part(file, node, PARTS[one], camera) for one, node in found.items() if node is not None
+        name: _read_part(file, node, PARTS[name], camera) for name, node in nodes.items() if node is not None
     }
     return Calibration(camera, **parts, process=read_process(file, f"{place}/process"), name=name)
 
 
 def _read_camera(file: Hdf5File, place: str) -> CameraId:
-    name, shape, dtype = (file.follow(f"{place}/{one}", _AGAIN) for one in ("name", "shape", "dtype"))
-    rows, columns = file.read(shape, (2,), remedy=_AGAIN).tolist()
+    name, shape, dtype = (file.follow(f"{place}/{key}", _REMEDY) for key in ("name", "shape", "dtype"))
+    rows, columns = file.read(shape, (2,), remedy=_REMEDY).tolist()
     kind = str(file.value(dtype))
     if not (isinstance(rows, int) and isinstance(columns, int) and rows > 0 and columns > 0):
-        raise InputError(f"{file.where(shape)} is ({rows}, {columns}), which is not a picture size: {_AGAIN}")
-    if kind not in [one.name for one in FRAME_DTYPES]:
-        raise InputError(f"{file.where(dtype)} is {kind!r}, which is not a supported data type: {_AGAIN}")
+        raise InputError(
+            f"{file.where(shape)} is ({rows}, {columns}), which is not a picture size: {_REMEDY}"
+        )
+    if kind not in [allowed.name for allowed in FRAME_DTYPES]:
+        raise InputError(f"{file.where(dtype)} is {kind!r}, which is not a supported data type: {_REMEDY}")
     return CameraId(str(file.value(name)), (rows, columns), np.dtype(kind))
 
 
 def _read_part(file: Hdf5File, group: Node, kind: type[Part], camera: CameraId) -> Part:
     """Read one part; parameters with a default may be missing."""
     sizes, how, values = _sizes_of(camera), parameters(kind), dict[str, Any]()
-    for name, one in how.items():
+    for name, parameter in how.items():
         node = file.walk(group, name)
         if node is not None:
-            values[name] = _read_field(file, node, one, sizes)
-        elif not one.optional:
-            raise InputError(f"{file.where(group)} has no {name}: {_AGAIN}")
+            values[name] = _read_field(file, node, parameter, sizes)
+        elif not parameter.optional:
+            raise InputError(f"{file.where(group)} has no {name}: {_REMEDY}")
     return kind(**values)
 
 
 def _read_field(
-    file: Hdf5File, node: Node, how: Parameter, sizes: dict[str, int], remedy: str = _AGAIN
+    file: Hdf5File, node: Node, how: Parameter, sizes: dict[str, int], remedy: str = _REMEDY
 ) -> Any:
     value: Any
     if how.kind == "text":
@@ -302,8 +306,8 @@ def _read_field(
         if how.kind == "array" and not np.isfinite(value).all():
             raise InputError(f"{file.where(node)} has numbers that are not finite: {remedy}")
         if how.kind in ("integer", "integers") and not np.isfinite(value).all():
-            found = tuple(np.ravel(value).tolist())
-            raise InputError(f"{file.where(node)} is {found}, where whole numbers are needed: {remedy}")
+            values = tuple(np.ravel(value).tolist())
+            raise InputError(f"{file.where(node)} is {values}, where whole numbers are needed: {remedy}")
         if how.kind == "flag":
             value = bool(value)
         elif how.kind in ("number", "numbers", "integer", "integers"):

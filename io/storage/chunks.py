@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.base.selection import Span
-from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.system import translate_os_errors
 
 Bytes = NDArray[np.uint8]
 Codec = Callable[[Bytes, Bytes], None]
@@ -95,15 +95,19 @@ class Chunks:
             first, last = max(p * c, start), min((p + 1) * c, stop)
             source.append(slice(first - p * c, last - p * c))
             target.append(slice(first - start, last - start))
-        wanted = out[*target]
+        target_part = out[*target]
         first = position[0] * self.length
-        with as_input_error(lambda: self._name(first, min(first + self.length, spans[0][1]))):
-            if wanted.shape == self.shape and wanted.flags.c_contiguous and wanted.dtype == self._dtype:
-                self._decode(position, wanted.reshape(-1).view(np.uint8))
+        with translate_os_errors(lambda: self._name(first, min(first + self.length, spans[0][1]))):
+            if (
+                target_part.shape == self.shape
+                and target_part.flags.c_contiguous
+                and target_part.dtype == self._dtype
+            ):
+                self._decode(position, target_part.reshape(-1).view(np.uint8))
                 return
             buffer = self._buffers.pop() if self._buffers else np.empty(self._size, np.uint8)
             self._decode(position, buffer)
-            wanted[...] = buffer.view(self._dtype).reshape(self.shape)[*source]
+            target_part[...] = buffer.view(self._dtype).reshape(self.shape)[*source]
             self._buffers.append(buffer)
 
     def _decode(self, position: tuple[int, ...], out: Bytes) -> None:
@@ -136,8 +140,8 @@ def find_codecs(dataset: h5py.h5d.DatasetID) -> list[Codec] | str:
         codes.pop()
     if any(code != h5py.h5z.FILTER_SHUFFLE for code in codes[:-1]):
         return "packed twice"  # the size between the two is unknown
-    cut = plist.get_layout() == h5py.h5d.CHUNKED and np.any(np.mod(dataset.shape, plist.get_chunk()))
-    if cut and len(codecs) == 1 and codes == [h5py.h5z.FILTER_SHUFFLE]:
+    is_partial = plist.get_layout() == h5py.h5d.CHUNKED and np.any(np.mod(dataset.shape, plist.get_chunk()))
+    if is_partial and len(codecs) == 1 and codes == [h5py.h5z.FILTER_SHUFFLE]:
         return "perhaps raw at the edge"  # nothing in such a chunk shows whether it was shuffled
     return codecs
 
@@ -161,7 +165,7 @@ def _check_sum(packed: Bytes, stored: Bytes) -> None:
     """Raise ValueError if data differ from the checksum stored by HDF5, Fletcher's of 32 bits."""
     words = np.append(packed, np.zeros(packed.size % 2, np.uint8)).view(">u2").astype(np.int64)
     sums = words.sum(), (np.arange(words.size, 0, -1) % 65535 * words).sum()
-    low, high = (int(one - 1) % 65535 + 1 if one else 0 for one in sums)
+    low, high = (int(value - 1) % 65535 + 1 if value else 0 for value in sums)
     if stored.tobytes() != (high << 16 | low).to_bytes(4, "little"):
         raise ValueError("(the checksum of a chunk is wrong)")
 
@@ -266,9 +270,9 @@ _MAKERS: dict[int, Callable[[tuple[int, ...]], Codec]] = {
 }
 
 
-def _check(found: int, needed: int) -> None:
-    if found != needed:
-        raise ValueError(f"(a chunk gives {found} bytes where {needed} are needed)")
+def _check(status: int, needed: int) -> None:
+    if status != needed:
+        raise ValueError(f"(a chunk gives {status} bytes where {needed} are needed)")
 
 
 def _plugin(name: str) -> str:

@@ -52,9 +52,9 @@ def check_replaced(path: Path, replaces: Replaces) -> None:
         return
     kind = protected_kind(path)
     if replaces == "nothing" or (replaces == "unused" and not kind):
-        known = f" and is {kind}" if kind else ""
+        description = f" and is {kind}" if kind else ""
         raise InputError(
-            f"{path} exists{known}: add --overwrite to replace it, or choose another name with -o"
+            f"{path} exists{description}: add --overwrite to replace it, or choose another name with -o"
         )
     if kind and not (kind == _CALIBRATION and replaces == "calibration"):
         raise InputError(f"{path} is {kind}, which this command never replaces: choose another name with -o")

@@ -12,14 +12,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.system import translate_os_errors
 from mirrorskin.io.base.types import InputError
 from mirrorskin.io.storage.hdf5 import Hdf5File, chunks_of, virtual_source
 
 Spans = NDArray[np.int64]
 
 _HASH_INTERVAL, _HASH_LENGTH = 4 << 20, 4 << 10
-_PIECE = 1 << 20
+_READ_BYTES = 1 << 20
 
 
 State = tuple[int, int, int, int]
@@ -28,13 +28,13 @@ State = tuple[int, int, int, int]
 
 def origins(file: Hdf5File, dataset: h5py.Dataset) -> dict[Path, State]:
     """Return the files that contain frames, starting with the recording, and their state when opened."""
-    with as_input_error(f"{file.path}: {dataset.name}"):
+    with translate_os_errors(f"{file.path}: {dataset.name}"):
         root = os.fstat(file.root.id.get_vfd_handle())
-        found = {Path(file.root.filename): state_of(root)}
+        states = {Path(file.root.filename): state_of(root)}
         for path, part, _ in _parts(file, dataset):
             opened = path.stat() if part is None else os.fstat(part.file.id.get_vfd_handle())
-            found.setdefault(path, state_of(opened))
-    return found
+            states.setdefault(path, state_of(opened))
+    return states
 
 
 def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, State], frames: int) -> str:
@@ -47,28 +47,28 @@ def fingerprint(file: Hdf5File, dataset: h5py.Dataset, origins: Mapping[Path, St
     in their order, and the values of all other datasets.
     """
     if file.root.swmr_mode:
-        with as_input_error(f"{file.path}: {dataset.name}"):
+        with translate_os_errors(f"{file.path}: {dataset.name}"):
             return _of_growing(file, dataset, frames)
     spans: dict[Path, list[Spans]] = {path: [] for path in origins}
-    with as_input_error(f"{file.path}: {dataset.name}"):
+    with translate_os_errors(f"{file.path}: {dataset.name}"):
         for path, part, span in _parts(file, dataset):
             spans[path].append(span if part is None else _stored(part))
     digest = hashlib.sha256()
     for path, parts in spans.items():
-        with as_input_error(str(path)), path.open("rb", buffering=0) as opened:
+        with translate_os_errors(str(path)), path.open("rb", buffering=0) as opened:
             state = os.fstat(opened.fileno())
             _compare(path, state, origins[path])
             digest.update(state.st_size.to_bytes(8, "little"))
             for start, stop in _chosen(_joined(parts), state.st_size):
-                for place in range(start, stop, _PIECE):
-                    digest.update(os.pread(opened.fileno(), min(_PIECE, stop - place), place))
+                for place in range(start, stop, _READ_BYTES):
+                    digest.update(os.pread(opened.fileno(), min(_READ_BYTES, stop - place), place))
     return digest.hexdigest()
 
 
 def fingerprint_of_files(origins: Mapping[Path, State], digest: hashlib._Hash) -> str:
     """Add the size and the first 4 KiB of each 4 MiB of files to a hash; return it in hexadecimal."""
     for path in origins:
-        with as_input_error(str(path)), path.open("rb", buffering=0) as opened:
+        with translate_os_errors(str(path)), path.open("rb", buffering=0) as opened:
             size = os.fstat(opened.fileno()).st_size
             digest.update(size.to_bytes(8, "little"))
             for place in range(0, size, _HASH_INTERVAL):
@@ -79,12 +79,12 @@ def fingerprint_of_files(origins: Mapping[Path, State], digest: hashlib._Hash) -
 def check_unchanged(origins: Mapping[Path, State]) -> None:
     """Raise InputError if a file has changed since it was opened."""
     for path, state in origins.items():
-        with as_input_error(str(path)):
+        with translate_os_errors(str(path)):
             _compare(path, path.stat(), state)
 
 
-def _compare(path: Path, found: os.stat_result, state: State) -> None:
-    if state_of(found) != state:
+def _compare(path: Path, status: os.stat_result, state: State) -> None:
+    if state_of(status) != state:
         raise InputError(f"{path} was changed while it was open: start again")
 
 
@@ -98,7 +98,7 @@ def _of_growing(file: Hdf5File, dataset: h5py.Dataset, frames: int) -> str:
             digest.update(str(node.name).encode())
             digest.update(value.tobytes() if value.dtype.kind != "O" else str(value).encode())
     before = 0
-    for chunk in sorted(chunks_of(dataset), key=lambda one: one.chunk_offset):
+    for chunk in sorted(chunks_of(dataset), key=lambda place: place.chunk_offset):
         if chunk.chunk_offset[0] < frames:
             stop = chunk.byte_offset + chunk.size
             for taken in range(chunk.byte_offset + -before % _HASH_INTERVAL, stop, _HASH_INTERVAL):
@@ -114,9 +114,9 @@ def modified(origins: Mapping[Path, State]) -> str:
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}Z"
 
 
-def state_of(found: os.stat_result) -> State:
+def state_of(status: os.stat_result) -> State:
     """Return the state of a file, which differs after a change."""
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _parts(file: Hdf5File, dataset: h5py.Dataset) -> Iterator[tuple[Path, h5py.Dataset | None, Spans]]:

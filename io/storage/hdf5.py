@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.base.samples import ATTRIBUTES, Packing, packing_of
-from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, as_input_error, is_flagged, open_regular
+from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, is_flagged, open_regular, translate_os_errors
 from mirrorskin.io.base.types import Closing, InputError, ProcessValue
 from mirrorskin.io.base.units import conversion_factor
 from mirrorskin.io.storage.chunks import Chunks, find_codecs
@@ -49,7 +49,7 @@ class Hdf5File(Closing):
         self.memory_limit = memory_limit
         real = os.path.realpath(path)
         self._home = Path(real).parent
-        with as_input_error(str(path)):
+        with translate_os_errors(str(path)):
             self.root: Any = _open_file(path, real) if root is None else root
         self._files: dict[str, h5py.File] = {real: self.root}
         self._groups: dict[str, Node | None] = {"": self.root}
@@ -87,7 +87,7 @@ class Hdf5File(Closing):
     def names(self, group: str) -> list[str]:
         """Return the names in a group; none if the group does not exist."""
         node = self.find(group)
-        with as_input_error(f"{self.path}: {group}"):
+        with translate_os_errors(f"{self.path}: {group}"):
             if not isinstance(node, h5py.Group):
                 return []
             if len(node) > _MOST_NAMES:
@@ -101,11 +101,11 @@ class Hdf5File(Closing):
         """Return whether the group has the attribute ``mark``, which shows that mirrorskin wrote the file."""
         return self.attribute(group, mark) is not None
 
-    def check_layout(self, mark: str, known: int = 1) -> None:
-        """Raise InputError if the layout of a file is newer than ``known``, the latest that can be read."""
+    def check_layout(self, mark: str, newest: int = 1) -> None:
+        """Raise InputError if the layout of a file is newer than ``newest``, the latest that can be read."""
         layout = self.attribute("/entry", mark)
-        if isinstance(layout, int) and layout > known:
-            raise InputError(f"{self.path} is of layout {layout}, where {known} is read: update the program")
+        if isinstance(layout, int) and layout > newest:
+            raise InputError(f"{self.path} is of layout {layout}, where {newest} is read: update the program")
 
     def attribute(self, name: str, attribute: str) -> Any:
         """Return an attribute of an object, a text or a number; None if it is missing."""
@@ -114,12 +114,12 @@ class Hdf5File(Closing):
 
     def _attribute_of(self, node: Node, attribute: str) -> Any:
         values = self.attribute_values(node, attribute)
-        with as_input_error(lambda: self.where(node)):
+        with translate_os_errors(lambda: self.where(node)):
             return None if values is None else first_value(values)
 
     def attribute_values(self, node: Node, attribute: str) -> NDArray[Any] | None:
         """Return all values of an attribute of an object; None if it is missing."""
-        with as_input_error(lambda: self.where(node)):
+        with translate_os_errors(lambda: self.where(node)):
             if not h5py.h5a.exists(node.id, attribute.encode()):
                 return None
             return self._values(h5py.h5a.open(node.id, attribute.encode()))
@@ -129,18 +129,18 @@ class Hdf5File(Closing):
 
         Each object is yielded once. Soft and external links are not followed.
         """
-        with as_input_error(str(self.path)):
+        with translate_os_errors(str(self.path)):
             yield from walk_objects(self.root, str(self.path))
 
     def stacks(self) -> dict[str, str]:
         """Return the three-dimensional datasets of the file itself, with their sizes and types."""
-        with as_input_error(str(self.path)):
-            found = {
+        with translate_os_errors(str(self.path)):
+            names = {
                 name: f"{' x '.join(map(str, node.shape))} {node.dtype}"
                 for name, node in self.objects()
                 if isinstance(node, h5py.Dataset) and node.ndim == 3
             }
-        return dict(sorted(found.items()))
+        return dict(sorted(names.items()))
 
     def check_frames(self, stack: h5py.Dataset, count: int) -> None:
         """Raise InputError for frames that HDF5 cannot read, or would replace by fill values."""
@@ -165,7 +165,7 @@ class Hdf5File(Closing):
     ) -> NDArray[Any]:
         """Read numbers, unpacked and converted to a unit, after checking that they are stored."""
         remedy = remedy and f": {remedy}"
-        with as_input_error(lambda: self.where(node)):
+        with translate_os_errors(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.id.dtype.kind not in "iufb":
                 raise InputError(f"{self.where(node)} contains no numbers{remedy}")
             shape = node.id.shape
@@ -179,14 +179,14 @@ class Hdf5File(Closing):
         if packing is not None:
             values = packing.unpack(values, np.float64)
         stated = None if unit is None else self._attribute_of(node, "units")
-        given = unit if stated is None else str(stated or unit)
-        if given is None or unit is None or given == unit:
+        unit_of_file = unit if stated is None else str(stated or unit)
+        if unit_of_file is None or unit is None or unit_of_file == unit:
             return values
-        return values * conversion_factor(given, unit, self.where(node))
+        return values * conversion_factor(unit_of_file, unit, self.where(node))
 
     def packing(self, node: h5py.Dataset) -> Packing | None:
         """Return the packing of a dataset from its attributes; None if values are stored unpacked."""
-        with as_input_error(lambda: self.where(node)):
+        with translate_os_errors(lambda: self.where(node)):
             if not h5py.h5a.get_num_attrs(node.id):
                 return None
         values = {name: self.attribute_values(node, name) for name in ATTRIBUTES}
@@ -200,7 +200,7 @@ class Hdf5File(Closing):
 
         They are read from dimension scales (netCDF), labels, or NeXus attributes.
         """
-        with as_input_error(lambda: self.where(node)):
+        with translate_os_errors(lambda: self.where(node)):
             if (scales := self._scales(node)) is not None:
                 return scales
         group = str(node.name).rpartition("/")[0]
@@ -229,8 +229,8 @@ class Hdf5File(Closing):
         self._check_heaps_of(attribute)
         lists: NDArray[Any] = np.empty(attribute.shape, attribute.dtype)
         attribute.read(lists)
-        references = [one[0] if len(one) else None for one in lists]
-        names = [h5py.h5r.get_name(one, node.id) if one else None for one in references]
+        references = [entries[0] if len(entries) else None for entries in lists]
+        names = [h5py.h5r.get_name(reference, node.id) if reference else None for reference in references]
         return tuple((name or b"").decode(errors="replace").rpartition("/")[2] for name in names)
 
     def load(self, node: h5py.Dataset, rows: int | None = None) -> NDArray[Any]:
@@ -239,7 +239,7 @@ class Hdf5File(Closing):
         All datasets except frames are read by this method, including single texts.
         """
         check_storage(self, node, frames=rows, values=True)
-        with as_input_error(lambda: self.where(node)):
+        with translate_os_errors(lambda: self.where(node)):
             packed = node.id.get_offset() is None and node.id.get_create_plist().get_nfilters()
             return self._unpack(node.id, rows) if packed else self._values(node.id, rows)
 
@@ -258,7 +258,7 @@ class Hdf5File(Closing):
 
     def value(self, node: Node) -> Any:
         """Read a single text or number, alone or in an array of one."""
-        with as_input_error(lambda: self.where(node)):
+        with translate_os_errors(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.id.shape not in ((), (1,)):
                 raise InputError(
                     f"{self.where(node)} does not hold one value: write one text or number there"
@@ -267,7 +267,7 @@ class Hdf5File(Closing):
 
     def texts(self, node: Node, remedy: str) -> tuple[str, ...]:
         """Read a list of texts."""
-        with as_input_error(lambda: self.where(node)):
+        with translate_os_errors(lambda: self.where(node)):
             if not isinstance(node, h5py.Dataset) or node.ndim != 1 or node.dtype.kind not in "SO":
                 raise InputError(f"{self.where(node)} is not a list of texts: {remedy}")
         return tuple(str(first_value(text)) for text in self.load(node))
@@ -289,14 +289,14 @@ class Hdf5File(Closing):
         path = self.sibling(node, filename, what)
         real = os.path.realpath(path)
         if real not in self._files:
-            with as_input_error(str(path)):
+            with translate_os_errors(str(path)):
                 self._files[real] = _open_file(path, real)
         return self._files[real]
 
     def sibling(self, node: Node, filename: str, what: str) -> Path:
         """Return the file that an object refers to, which must be in the recording's own folder."""
         what = f"{self.path}: {what}"
-        with as_input_error(what):
+        with translate_os_errors(what):
             target = Path(os.path.realpath(Path(node.file.filename).parent / filename))
             if not target.is_relative_to(self._home):
                 raise InputError(
@@ -358,11 +358,11 @@ class Hdf5File(Closing):
         needed = self._spent + scratch
         if needed <= VALUES_LIMIT:  # the usual case
             return
-        most = max(self.memory_limit or 0, self.root.id.get_filesize(), VALUES_LIMIT)
-        if needed > most:
+        limit = max(self.memory_limit or 0, self.root.id.get_filesize(), VALUES_LIMIT)
+        if needed > limit:
             raise InputError(
                 f"{self.path}: values other than frames take at least {needed / 1e6:.4g} MB in memory; "
-                f"at most {most / 1e6:.4g} MB are read. Copy only what is needed, or raise --memory"
+                f"at most {limit / 1e6:.4g} MB are read. Copy only what is needed, or raise --memory"
             )
 
     def count_step(self, node: Node) -> None:
@@ -375,7 +375,7 @@ class Hdf5File(Closing):
 
     def _step(self, node: Node, part: str, depth: int) -> Node | None:
         self.count_step(node)
-        with as_input_error(lambda: f"{self.where(node)}: {part}"):
+        with translate_os_errors(lambda: f"{self.where(node)}: {part}"):
             name = part.encode(errors="surrogateescape")
             if not isinstance(node, h5py.Group) or not node.id.links.exists(name):
                 return None
@@ -462,7 +462,7 @@ def _open_file(path: Path, real: str) -> h5py.File:
 _HEAP = re.compile(rb"GCOL\x01\0\0\0")  # signature, version and reserved bytes of a heap
 _HEAD, _OBJECT = struct.Struct("<8sQ"), struct.Struct("<H6xQ")  # headers of a heap, and of its objects
 _BULK = 1 << 16  # bytes; larger datasets are not searched for heaps
-_PIECE = 1 << 20  # bytes searched at once; smaller files are searched completely
+_SEARCHED_BYTES = 1 << 20  # bytes searched at once; smaller files are searched completely
 
 
 def _check_heaps(file: h5py.File) -> int:
@@ -474,13 +474,13 @@ def _check_heaps(file: h5py.File) -> int:
     longest, at = 0, 0
     with Path(file.filename).open("rb") as opened:
         size = os.fstat(opened.fileno()).st_size
-        bulk = sorted(_bulk(file)) if size > _PIECE else ()
+        bulk = sorted(_bulk(file)) if size > _SEARCHED_BYTES else ()
         for stop, after in (*bulk, (size, size)):
             while at < stop:
-                piece = os.pread(opened.fileno(), min(_PIECE, stop - at) + _HEAD.size, at)
+                piece = os.pread(opened.fileno(), min(_SEARCHED_BYTES, stop - at) + _HEAD.size, at)
                 for heap in _HEAP.finditer(piece):
                     longest = max(longest, _check_heap(opened, at + heap.start(), size))
-                at += _PIECE
+                at += _SEARCHED_BYTES
             at = after
     return longest
 
@@ -514,7 +514,9 @@ def _bulk(file: h5py.File) -> list[tuple[int, int]]:
         if start is not None:
             places.append((start, start + node.id.get_storage_size()))
         elif node.id.get_create_plist().get_layout() == h5py.h5d.CHUNKED:
-            node.id.chunk_iter(lambda one: places.append((one.byte_offset, one.byte_offset + one.size)))
+            node.id.chunk_iter(
+                lambda chunk: places.append((chunk.byte_offset, chunk.byte_offset + chunk.size))
+            )
     return places
 
 
@@ -524,10 +526,10 @@ def walk_objects(file: h5py.File, path: str) -> Iterator[tuple[str, Node]]:
     Each object is opened from its group. Opening it from the root, as h5py does, is quadratic in the depth.
     """
     waiting: list[tuple[str, int, h5py.Group, bytes]] = []
-    seen = {_address(file["/"])}
+    addresses = {_address(file["/"])}
 
     def put_members(name: str, depth: int, group: h5py.Group) -> None:
-        count = len(seen) + len(waiting) + group.id.get_num_objs()
+        count = len(addresses) + len(waiting) + group.id.get_num_objs()
         if depth >= _GROUPS_DEEP or count > _MOST_OBJECTS:
             problem = (
                 f"groups nested more than {_GROUPS_DEEP} deep"
@@ -545,9 +547,9 @@ def walk_objects(file: h5py.File, path: str) -> Iterator[tuple[str, Node]]:
         if group.id.links.get_info(member).type != h5py.h5l.TYPE_HARD:
             continue
         node, name = _open(group, member), f"{parent}/{member.decode(errors='surrogateescape')}"
-        if (address := _address(node)) in seen:
+        if (address := _address(node)) in addresses:
             continue
-        seen.add(address)
+        addresses.add(address)
         yield name, node
         if isinstance(node, h5py.Group):
             put_members(name, depth + 1, node)
@@ -567,7 +569,7 @@ def check_storage(
     if depth > _VIRTUAL_DEEP:
         where = file.where(dataset)
         raise InputError(f"{where}: virtual datasets are nested too deeply; copy the frames into one dataset")
-    with as_input_error(lambda: file.where(dataset)):
+    with translate_os_errors(lambda: file.where(dataset)):
         shape, offset = dataset.id.shape, dataset.id.get_offset()
         if frames is not None:
             shape = (frames, *shape[1:])
@@ -591,9 +593,9 @@ def check_storage(
 
 def chunks_of(dataset: h5py.Dataset) -> list[h5py.h5d.StoreInfo]:
     """Return the stored chunks of a dataset: the position of each in the stack and in the file."""
-    found: list[h5py.h5d.StoreInfo] = []
-    dataset.id.chunk_iter(found.append)
-    return found
+    chunks: list[h5py.h5d.StoreInfo] = []
+    dataset.id.chunk_iter(chunks.append)
+    return chunks
 
 
 def _filters(dataset: h5py.Dataset) -> list[tuple[int, str]]:
@@ -673,6 +675,6 @@ def _mapped(file: Hdf5File, dataset: h5py.Dataset, part: Any, depth: int, values
 def read_process(file: Hdf5File, place: str, names: Iterable[str] | None = None) -> dict[str, ProcessValue]:
     """Read the process values of a file, or only some of them; missing ones are left out."""
     group = file.find(place)
-    wanted = file.names(place) if names is None else names
-    found = {} if group is None else {name: file.walk(group, name) for name in wanted}
-    return {name: file.value(node) for name, node in found.items() if node is not None}
+    selected = file.names(place) if names is None else names
+    nodes = {} if group is None else {name: file.walk(group, name) for name in selected}
+    return {name: file.value(node) for name, node in nodes.items() if node is not None}

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.io.base.arguments import as_array
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.selection import Selection
-from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.system import translate_os_errors
 from mirrorskin.io.base.types import MOTIONS, Floats, Header, InputError, Motion, Truth
 from mirrorskin.io.model.coordinates import Coordinates
 from mirrorskin.io.model.maps import TWIST, declaration_of
@@ -94,9 +94,9 @@ def read_state(file: Hdf5File, ours: bool, stack: h5py.Dataset, count: int) -> R
     if state == UNDER_WAY and not (file.root.swmr_mode and is_locked(file.path)):
         state = f"{CUT_SHORT}its writer was killed"
     places = [place for place, _ in (*SERIES.values(), *LIVE.values())]
-    with as_input_error(str(file.path)):
-        found = {place: file.find(place) for place in (*places, USED, DROPPED)}
-        grown = {place: node for place, node in found.items() if _grows(node)}
+    with translate_os_errors(str(file.path)):
+        nodes = {place: file.find(place) for place in (*places, USED, DROPPED)}
+        grown = {place: node for place, node in nodes.items() if _grows(node)}
         count = min(int(node.shape[0]) for node in (stack, *grown.values()))
     used, dropped = (
         file.read(grown[place], (count,), rows=count) if place in grown else None for place in (USED, DROPPED)
@@ -143,20 +143,20 @@ class Layout:
         override_motion: bool = False,
     ) -> Header:
         """Read the properties of the whole stack; given properties may be missing in the file."""
-        own = self._text(f"{STAGE}/motion")
-        if motion and own in MOTIONS and own != motion and not override_motion:
+        stored = self._text(f"{STAGE}/motion")
+        if motion and stored in MOTIONS and stored != motion and not override_motion:
             raise InputError(
-                f"{self._file.path} states the motion {own}, but --motion is {motion}: leave --motion out,"
+                f"{self._file.path} states the motion {stored}, but --motion is {motion}: leave --motion out,"
                 " or correct the file"
             )
-        motion = motion or cast(Motion, own) or self._coordinates.motion
+        motion = motion or cast(Motion, stored) or self._coordinates.motion
         if motion not in MOTIONS:
             problem = (
                 f"states the unknown motion {motion!r}" if motion else "does not state how the sensor moved"
             )
             raise InputError(f"{self._file.path} {problem}: give --motion, one of {', '.join(MOTIONS)}")
         # In a vertical press the dataset "travel" contains the positions, not the press.
-        pressed = "vertical" not in (own, motion)
+        pressed = "vertical" not in (stored, motion)
         pixel_size = self._pixel_size() if pixel_size is None else self._above_zero(pixel_size)
         return Header(
             motion,
@@ -175,36 +175,36 @@ class Layout:
             camera=self._text(f"{DETECTOR}/local_name"),
         )
 
-    def positions(self, motion: Motion, given: ArrayLike | None) -> dict[str, Floats | None]:
+    def positions(self, motion: Motion, positions: ArrayLike | None) -> dict[str, Floats | None]:
         """Read and check the times and positions of the frames; travel or phase may be given."""
         name, time = POSITIONS[motion], self._cut(self._series("time"))
         if name not in REMEDIES:
             return {"time": time, name: self._cut(self._series(name))}
-        where = f"{self._file.path}: {SERIES[name][0] if given is None else f'the {name} given'}"
-        given = self._series(name, remedy=REMEDIES[name]) if given is None else given
-        if given is None:
+        where = f"{self._file.path}: {SERIES[name][0] if positions is None else f'the {name} given'}"
+        positions = self._series(name, remedy=REMEDIES[name]) if positions is None else positions
+        if positions is None:
             remedy = REMEDIES[name]
             raise InputError(
                 f"{self._file.path} does not state the position of the body in each frame: {remedy}"
             )
-        found = {"time": time, name: check_finite(given, self._count, where, self._part.frames)}
+        series = {"time": time, name: check_finite(positions, self._count, where, self._part.frames)}
         pressed = self._text(f"{STAGE}/motion") != "vertical"
         also = ("tilt", "travel") if motion == "axial" and pressed else ()
-        return found | {one: self._each(one) for one in also}
+        return series | {other: self._each(other) for other in also}
 
     def live(self, motion: Motion, chosen: NDArray[np.intp]) -> dict[str, Floats | None]:
         """Read the times of some frames of the part, and the positions that a live run used."""
         name = POSITIONS[motion]
-        known = [name, "tilt"] if motion == "axial" and self._is_of_each("tilt") else [name]
+        names = [name, "tilt"] if motion == "axial" and self._is_of_each("tilt") else [name]
         time = self._cut(self._series("time"))
-        found = {"time": None if time is None else time[chosen]}
-        for one in known:
-            values = self._cut(self._series(one, LIVE))
+        series = {"time": None if time is None else time[chosen]}
+        for other in names:
+            values = self._cut(self._series(other, LIVE))
             if values is None:
                 raise InputError(f"{self._file.path} contains no positions of a live run: leave --live out")
-            where = f"{self._file.path}: {LIVE[one][0]} of the frames that were used"
-            found[one] = check_finite(values[chosen], len(chosen), where, width=ROW_SHAPES.get(one, ()))
-        return found
+            where = f"{self._file.path}: {LIVE[other][0]} of the frames that were used"
+            series[other] = check_finite(values[chosen], len(chosen), where, width=ROW_SHAPES.get(other, ()))
+        return series
 
     def findings(self) -> tuple[Finding, ...]:
         """Read the findings that were stored when the frames were imported."""
@@ -223,8 +223,8 @@ class Layout:
         """Return the contents of the truth, by name; InputError if it is incomplete."""
         if self._find(TRUTH) is None:
             return {}
-        found = {name: self._find(f"{TRUTH}/{name}") for name in TRUTH_MAPS}
-        present = {name: node for name, node in found.items() if node is not None}
+        maps = {name: self._find(f"{TRUTH}/{name}") for name in TRUTH_MAPS}
+        present = {name: node for name, node in maps.items() if node is not None}
         missing = [f.name for f in fields(Truth) if f.default is MISSING and f.name not in present]
         if present and missing:
             raise InputError(f"{self._file.path}: {TRUTH} has no {', '.join(missing)}: simulate it again")

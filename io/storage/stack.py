@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.base.checksums import Verifier
 from mirrorskin.io.base.samples import DecodedFrames, Decoding, Reader
-from mirrorskin.io.base.selection import Place, Region, Span
-from mirrorskin.io.base.system import as_input_error, reserve_space, usable_cores
+from mirrorskin.io.base.selection import FrameLabel, Region, Span
+from mirrorskin.io.base.system import reserve_space, translate_os_errors, usable_cores
 from mirrorskin.io.base.types import Closing, InputError
 from mirrorskin.io.model.frames import FrameReader
 from mirrorskin.io.storage.chunks import Chunks, find_codecs
@@ -136,10 +136,10 @@ class Stack:
         checksums: NDArray[np.uint32] | None = None,
     ) -> None:
         self.shape, self.dtype = (len(numbers), *region.shape), decoding.dtype
-        self._place, self._limit = Place(path, str(dataset.name)), memory_limit or _LIMIT
+        self._place, self._limit = FrameLabel(path, str(dataset.name)), memory_limit or _LIMIT
         self._numbers, self._region = numbers, region
         self._first, self._end = int(numbers[0]), int(numbers[-1]) + 1
-        with as_input_error(f"{path}: {dataset.name}"):
+        with translate_os_errors(f"{path}: {dataset.name}"):
             first = count if decoding.order[0] == 0 else int(dataset.shape[0])
             reader: Reader = frames or _open(dataset, self._place, first, self._limit, threads)
             self._frames = reader if decoding.plain else DecodedFrames(reader, decoding, dataset.shape)
@@ -178,7 +178,7 @@ class Stack:
         self._unpacked, self._kept = None, (0, 0)
 
     def _fetch(self, frames: Span, out: NDArray[Any]) -> None:
-        with as_input_error(self._place.name(*frames)):
+        with translate_os_errors(self._place.name(*frames)):
             # HDF5 returns zeros beyond the end of a truncated file.
             if self._file is not None and os.fstat(self._file.id.get_vfd_handle()).st_size < self._size:
                 raise OSError("truncated: the file became shorter")
@@ -188,9 +188,9 @@ class Stack:
             else:
                 self.verifier.fetch(self._frames, spans, out)
 
-    def _run(self, start: int, most: int) -> Span:
+    def _run(self, start: int, limit: int) -> Span:
         """Return the consecutive frames of the dataset that begin with a selected one: first and end."""
-        numbers = self._numbers[start : start + most]
+        numbers = self._numbers[start : start + limit]
         gaps = np.flatnonzero(np.diff(numbers) != 1)
         return int(numbers[0]), int(numbers[gaps[0] if gaps.size else -1]) + 1
 
@@ -219,24 +219,24 @@ class Stack:
             self._unpacked = np.ndarray((length, *self.shape[1:]), self.dtype, memory)
             self._how = "unpacked into memory" if fits else "unpacked to disk"
         assert self._unpacked is not None
-        self._kept, done = (0, 0), start
-        while done < stop:
-            span = self._chunk_span(done)
+        self._kept, last = (0, 0), start
+        while last < stop:
+            span = self._chunk_span(last)
             self._fetch(span, self._unpacked[span[0] - start : span[1] - start])
-            done = span[1]
+            last = span[1]
         self._kept = start, stop
 
     def _disk_memory(self, size: int) -> mmap.mmap:
         """Return the memory of a mapped unnamed file, which no other program can truncate."""
         what = f"{self._place.path}: {self._place.dataset} is unpacked to disk, {size / 1e9:.3g} GB"
         remedy = "name a folder with more room in TMPDIR, raise --memory, or repack it in chunks of one frame"
-        with as_input_error(what, remedy), tempfile.TemporaryFile(buffering=0) as file:
+        with translate_os_errors(what, remedy), tempfile.TemporaryFile(buffering=0) as file:
             reserve_space(file.fileno(), 0, size)
             return mmap.mmap(file.fileno(), size)
 
 
 def _open(
-    dataset: h5py.Dataset, place: Place, count: int, limit: int, threads: int | None
+    dataset: h5py.Dataset, place: FrameLabel, count: int, limit: int, threads: int | None
 ) -> RawFrames | Chunks | Hdf5Frames:
     """Open the frames: directly if they are contiguous, otherwise by chunks, otherwise through HDF5."""
     if why := _why_only_hdf5(dataset):
@@ -246,8 +246,8 @@ def _open(
         if isinstance(codecs, str):
             return Hdf5Frames(dataset, codecs)
         # The number of threads is limited so that a quarter of the memory suffices for them.
-        most = max(1, limit // (4 * math.prod(dataset.chunks) * dataset.dtype.itemsize))
-        return Chunks(dataset.id, codecs, place.name, min(threads or usable_cores(), most))
+        count = max(1, limit // (4 * math.prod(dataset.chunks) * dataset.dtype.itemsize))
+        return Chunks(dataset.id, codecs, place.name, min(threads or usable_cores(), count))
     offset = dataset.id.get_offset()
     if offset is None:
         return Hdf5Frames(dataset, "in its header")

@@ -23,7 +23,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.base.selection import Place, Span
+from mirrorskin.io.base.selection import FrameLabel, Span
 from mirrorskin.io.base.system import reason
 from mirrorskin.io.base.text import one_line
 from mirrorskin.io.base.types import Closing, InputError
@@ -53,7 +53,7 @@ _UNREACHABLE = {"ConnectionError", "TimeoutError", "ClientError", "BotoCoreError
 
 
 @contextmanager
-def naming(what: str) -> Iterator[None]:
+def errors_named(what: str) -> Iterator[None]:
     """Convert errors of Zarr and of store libraries, of many classes, to one line with a remedy."""
     try:
         # Zarr adds the offsets of a damaged shard without checking for overflow.
@@ -89,29 +89,29 @@ def _reason(error: Exception) -> str:
 
 def open_file(path: str | Path, memory_limit: int | None = None) -> Hdf5File:
     """Open an HDF5 file or a Zarr store."""
-    known = path_of(path)
-    return (ZarrFile if is_zarr(known) else Hdf5File)(known, memory_limit)
+    local = path_of(path)
+    return (ZarrFile if is_zarr(local) else Hdf5File)(local, memory_limit)
 
 
 def find_stores(pattern: Url) -> list[Path]:
     """Return the addresses that match a pattern such as ``s3://bucket/*.zarr``."""
-    with naming(str(pattern)):
+    with errors_named(str(pattern)):
         from fsspec.core import url_to_fs
 
         from mirrorskin.io.storage.zarr_store import options_of
 
         system, place = url_to_fs(str(pattern), **options_of(pattern))
-        found = [path_of(system.unstrip_protocol(one)) for one in sorted(system.glob(place))]
-    if not found:
+        stores = [path_of(system.unstrip_protocol(store)) for store in sorted(system.glob(place))]
+    if not stores:
         raise InputError(f"{pattern}: no store matches: name recordings")
-    return found
+    return stores
 
 
 class ZarrFile(Hdf5File):
     """A Zarr group, or a single array as ``/data``."""
 
     def __init__(self, path: Path, memory_limit: int | None = None) -> None:
-        with naming(str(path)), ExitStack() as opening:
+        with errors_named(str(path)), ExitStack() as opening:
             from zarr.core.sync import sync
 
             from mirrorskin.io.storage.zarr_store import CompleteStore, opened_store
@@ -120,7 +120,7 @@ class ZarrFile(Hdf5File):
             nodes = sync(read_nodes(self._store, path))
             groups = {f"/{name}": attributes for name, attributes in nodes.groups.items()}
             self.arrays: dict[str, ArrayMetadata] = {
-                f"/{name or 'data'}": one for name, one in nodes.arrays.items()
+                f"/{name or 'data'}": array for name, array in nodes.arrays.items()
             }
             self._known: dict[str, Array] = {}
             self._early: dict[str, Future[NDArray[Any]]] = {}
@@ -142,19 +142,22 @@ class ZarrFile(Hdf5File):
         grows = "/entry/state" in self.arrays
         for name, attributes in groups.items():
             _set_attributes(self.root.require_group(name), attributes)
-        for name, one in self.arrays.items():
-            if one.dtype is not None:
-                most = (None, *one.shape[1:]) if grows and one.shape and name != STACK else None
-                dtype = "S1" if one.is_text else one.dtype
-                made = self.root.create_dataset(name, one.shape, dtype, maxshape=most)
-                _set_attributes(made, {**one.attributes, **_fill_value(one)})
+        for name, array in self.arrays.items():
+            if array.dtype is not None:
+                maximum = (None, *array.shape[1:]) if grows and array.shape and name != STACK else None
+                dtype = "S1" if array.is_text else array.dtype
+                node = self.root.create_dataset(name, array.shape, dtype, maxshape=maximum)
+                _set_attributes(node, {**array.attributes, **_fill_value(array)})
 
     def _read_early(self) -> None:
         """Read small arrays concurrently, because each is a request; errors are stored until they matter."""
         small = [
             name
-            for name, one in self.arrays.items()
-            if one.dtype is not None and one.nbytes <= _SMALL and one.shape == one.chunks and name != STACK
+            for name, array in self.arrays.items()
+            if array.dtype is not None
+            and array.nbytes <= _SMALL
+            and array.shape == array.chunks
+            and name != STACK
         ]
         with ThreadPoolExecutor(AT_ONCE, "mirrorskin-zarr") as pool:
             self._early = {name: pool.submit(self._decode, name) for name in small}
@@ -170,7 +173,7 @@ class ZarrFile(Hdf5File):
     def _decode(self, name: str, rows: int | None = None) -> NDArray[Any]:
         """Read an array, or its first rows."""
         where = f"{self.path}: {name}"
-        with naming(where):
+        with errors_named(where):
             array = self._array(name)
             try:
                 return np.asarray(array[...] if rows is None else array[:rows])
@@ -189,8 +192,8 @@ class ZarrFile(Hdf5File):
     def check_frames(self, stack: h5py.Dataset, count: int) -> None:
         """Raise InputError for missing frames, and for chunks that are too large for memory."""
         name = str(stack.name)
-        one, where = self.arrays[name], self.where(stack)
-        with naming(where):
+        stored, where = self.arrays[name], self.where(stack)
+        with errors_named(where):
             from zarr.core.sync import sync
 
             array = self._array(name)
@@ -199,8 +202,8 @@ class ZarrFile(Hdf5File):
                 raise InputError(
                     f"{where} is in chunks of {size / 1e6:.3g} MB: raise --memory, or write smaller ones"
                 )
-            last = ((n - 1) // piece for n, piece in zip(one.shape, one.chunks, strict=True))
-            key = f"{one.path}/{array.metadata.encode_chunk_key(tuple(last))}".lstrip("/")
+            last = ((n - 1) // piece for n, piece in zip(stored.shape, stored.chunks, strict=True))
+            key = f"{stored.path}/{array.metadata.encode_chunk_key(tuple(last))}".lstrip("/")
             if not sync(self._store.exists(key)):
                 raise MissingChunkError(
                     f"its last chunk, {key}, is missing: copy it again, or write empty ones, too"
@@ -208,15 +211,15 @@ class ZarrFile(Hdf5File):
 
     def dimensions(self, node: h5py.Dataset) -> tuple[str, ...]:
         """Return the names of the axes of an array, "" for an axis without; empty if there are none."""
-        one = self.arrays[str(node.name)]
-        names = one.document.get("dimension_names", one.attributes.get("_ARRAY_DIMENSIONS"))
+        array = self.arrays[str(node.name)]
+        names = array.document.get("dimension_names", array.attributes.get("_ARRAY_DIMENSIONS"))
         if not isinstance(names, list) or len(names) != node.ndim:
             return ()
         return tuple(name if isinstance(name, str) else "" for name in names)
 
     def frames(self, stack: h5py.Dataset) -> ZarrFrames:
         """Return the object that reads the frames."""
-        return ZarrFrames(self._array(str(stack.name)), Place(str(self.path), str(stack.name)))
+        return ZarrFrames(self._array(str(stack.name)), FrameLabel(str(self.path), str(stack.name)))
 
     def storage(self, stack: h5py.Dataset) -> str:
         """Return a description of how a stack is stored."""
@@ -234,14 +237,14 @@ class ZarrFile(Hdf5File):
     def fingerprint(self, stack: h5py.Dataset) -> str:
         """Return a SHA-256 of everything but the frames, and of some frames if they have no checksums."""
         digest = hashlib.sha256()
-        for name, one in sorted(self.arrays.items()):
-            digest.update(f"{name} {one.shape} {one.dtype} {json.dumps(one.attributes)}".encode())
-            if self._ours and name != STACK and one.dtype is not None and not one.is_text:
+        for name, member in sorted(self.arrays.items()):
+            digest.update(f"{name} {member.shape} {member.dtype} {json.dumps(member.attributes)}".encode())
+            if self._ours and name != STACK and member.dtype is not None and not member.is_text:
                 digest.update(self._decode(name).tobytes())
         if self.find(CHECKSUM) is None:
             array = self._array(str(stack.name))
             for number in range(0, array.shape[0], -(-array.shape[0] // _SAMPLE)):
-                with naming(self.where(stack)):
+                with errors_named(self.where(stack)):
                     digest.update(np.asarray(array[number]).tobytes())
         return digest.hexdigest()
 
@@ -253,9 +256,9 @@ def _set_attributes(node: h5py.Group | h5py.Dataset, attributes: Mapping[str, An
             node.attrs.create(name, fixed_text(value))
         elif isinstance(value, bool | int | float):
             node.attrs.create(name, value)
-        elif isinstance(value, list) and all(isinstance(one, str) for one in value):
+        elif isinstance(value, list) and all(isinstance(item, str) for item in value):
             node.attrs.create(name, fixed_text(value))
-        elif isinstance(value, list) and all(isinstance(one, int | float) for one in value):
+        elif isinstance(value, list) and all(isinstance(item, int | float) for item in value):
             node.attrs.create(name, np.array(value, np.float64))
 
 
@@ -280,7 +283,7 @@ class ZarrFrames(Closing):
 
     how = "chunks of Zarr, several at once"
 
-    def __init__(self, array: Array, place: Place) -> None:
+    def __init__(self, array: Array, place: FrameLabel) -> None:
         self.chunk: Shape = array.chunks
         self.length = array.chunks[0]
         self.scratch_bytes = AT_ONCE * math.prod(array.chunks) * array.dtype.itemsize
@@ -290,5 +293,5 @@ class ZarrFrames(Closing):
         """Write a part into ``out``, a C-contiguous array."""
         from zarr.core.buffer.cpu import NDBuffer
 
-        with naming(self._place.name(*spans[0])):
+        with errors_named(self._place.name(*spans[0])):
             self._array.get_basic_selection(tuple(slice(*span) for span in spans), out=NDBuffer(out))

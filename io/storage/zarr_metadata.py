@@ -72,8 +72,10 @@ async def read_nodes(store: Any, path: Path) -> Nodes:
     if not _is_array(root):
         listed = await _consolidated(store, root, version)
         documents |= await _members(store, version) if listed is None else listed
-    groups = {name: _attributes(one) for name, one in documents.items() if not _is_array(one)}
-    arrays = {name: _array(name, one, version) for name, one in documents.items() if _is_array(one)}
+    groups = {name: _attributes(document) for name, document in documents.items() if not _is_array(document)}
+    arrays = {
+        name: _array(name, document, version) for name, document in documents.items() if _is_array(document)
+    }
     return Nodes(groups, arrays)
 
 
@@ -94,10 +96,12 @@ async def _members(store: Any, version: int) -> dict[str, dict[str, Any]]:
             for group, members in zip(groups, names, strict=True)
             for name in members
         ]
-        found = await _all_of(_read_document(store, place, version) for place in places)
-        present = {place: one for place, one in zip(places, found, strict=True) if one is not None}
+        contents = await _all_of(_read_document(store, place, version) for place in places)
+        present = {
+            place: document for place, document in zip(places, contents, strict=True) if document is not None
+        }
         documents |= present
-        groups = [place for place, one in present.items() if not _is_array(one)]
+        groups = [place for place, document in present.items() if not _is_array(document)]
     return documents
 
 
@@ -126,16 +130,16 @@ async def _read_document(store: Any, place: str, version: int) -> dict[str, Any]
     array, group, attributes = await _all_of(
         _read_json(store, place, name) for name in (".zarray", ".zgroup", ".zattrs")
     )
-    found = group if array is None else array
-    return None if found is None else found | {"attributes": attributes or {}}
+    node = group if array is None else array
+    return None if node is None else node | {"attributes": attributes or {}}
 
 
 async def _read_json(store: Any, place: str, name: str) -> dict[str, Any] | None:
     from zarr.core.buffer import default_buffer_prototype
 
     key = f"{place}/{name}".lstrip("/")
-    found = await store.get(key, default_buffer_prototype())
-    return None if found is None else _mapping(json.loads(found.to_bytes()), key)
+    content = await store.get(key, default_buffer_prototype())
+    return None if content is None else _mapping(json.loads(content.to_bytes()), key)
 
 
 async def _consolidated(store: Any, root: dict[str, Any], version: int) -> dict[str, dict[str, Any]] | None:
@@ -146,21 +150,21 @@ async def _consolidated(store: Any, root: dict[str, Any], version: int) -> dict[
             return None
         members = _mapping(_mapping(copies, "consolidated_metadata").get("metadata"), "metadata")
         return {
-            _checked_name(name): _mapping(one, name)
-            for name, one in members.items()
+            _checked_name(name): _mapping(member, name)
+            for name, member in members.items()
             if name.count("/") <= _DEEP
         }
     copies = await _read_json(store, "", ".zmetadata")
     if copies is None:
         return None
-    found: dict[str, dict[str, Any]] = {}
+    documents: dict[str, dict[str, Any]] = {}
     for key, value in _mapping(copies.get("metadata"), ".zmetadata").items():
         name, _, kind = key.rpartition("/")
         if name and name.count("/") <= _DEEP:
-            one = found.setdefault(_checked_name(name), {"zarr_format": 2, "attributes": {}})
+            document_of_node = documents.setdefault(_checked_name(name), {"zarr_format": 2, "attributes": {}})
             document = _mapping(value, key)
-            one |= {"attributes": document} if kind == ".zattrs" else document
-    return found
+            document_of_node |= {"attributes": document} if kind == ".zattrs" else document
+    return documents
 
 
 def _checked_name(name: str) -> str:
@@ -210,8 +214,8 @@ def _array(path: str, document: dict[str, Any], version: int) -> ArrayMetadata:
     return ArrayMetadata(path, shape, chunks, _dtype(kind, version), _attributes(document), document)
 
 
-def _sizes(value: Any, least: int, what: str) -> tuple[int, ...]:
-    if not isinstance(value, list) or not all(type(one) is int and one >= least for one in value):
+def _sizes(value: Any, lowest: int, what: str) -> tuple[int, ...]:
+    if not isinstance(value, list) or not all(type(size) is int and size >= lowest for size in value):
         raise ValueError(f"{what} is {str(value)[:80]}")
     return tuple(value)
 
@@ -233,7 +237,7 @@ def check_codecs(array: ArrayMetadata, where: str) -> None:
     version = _version(array.document)
     if version == 2:
         compressor, filters = array.document.get("compressor"), array.document.get("filters") or []
-        names = [_identifier(one, "id", _FILTERS_2, where) for one in _sequence(filters, where)]
+        names = [_identifier(entry, "id", _FILTERS_2, where) for entry in _sequence(filters, where)]
         if compressor is not None:
             _identifier(compressor, "id", _COMPRESSORS_2, where)
         good = names == ["vlen-utf8"] if array.is_text else "vlen-utf8" not in names
@@ -253,11 +257,11 @@ def check_codecs(array: ArrayMetadata, where: str) -> None:
 
 def _codec_names(codecs: Any, allowed: set[str], where: str) -> Iterator[str]:
     """Yield the names of codecs, including those inside shards, if all are allowed."""
-    for one in _sequence(codecs, where):
-        name = _identifier(one, "name", allowed, where)
+    for codec in _sequence(codecs, where):
+        name = _identifier(codec, "name", allowed, where)
         yield name
         if name == _SHARDS:
-            inside = _mapping(_mapping(one, where).get("configuration"), f"the shards of {where}")
+            inside = _mapping(_mapping(codec, where).get("configuration"), f"the shards of {where}")
             yield from _codec_names(inside.get("codecs"), allowed, where)
             list(_codec_names(inside.get("index_codecs", []), _INDEX_CODECS, where))
 

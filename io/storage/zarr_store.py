@@ -27,8 +27,8 @@ def opened_store(path: Path, read_only: bool = True) -> Iterator[Any]:
     """Open a Zarr store; on exit its connections are closed, which fsspec does not do itself."""
     if isinstance(path, Url):
         if path.parts[0].rstrip(":") not in SCHEMES or "::" in str(path):
-            known = ", ".join(SCHEMES)
-            raise InputError(f"{path} cannot be opened: addresses of stores begin with one of {known}")
+            names = ", ".join(SCHEMES)
+            raise InputError(f"{path} cannot be opened: addresses of stores begin with one of {names}")
         store = FsspecStore.from_url(str(path), options_of(path), read_only)
     elif read_only and not path.exists():
         raise InputError(f"{path}: no such file")
@@ -70,10 +70,10 @@ class CompleteStore(WrapperStore[Any]):  # type: ignore[misc]  # where it is not
         """Read a document (None if it is missing), or a chunk or a part of one, which must exist."""
         if isinstance(self._store, LocalStore):
             self._check_place(key)
-        found = await super().get(key, prototype, byte_range)
-        if found is None and key.rpartition("/")[2] not in METADATA:
+        content = await super().get(key, prototype, byte_range)
+        if content is None and key.rpartition("/")[2] not in METADATA:
             raise MissingChunkError(f"its chunk {key} is missing: copy it again, or write empty ones, too")
-        return found
+        return content
 
     def _check_place(self, key: str) -> None:
         """Raise InputError for what is not a regular file inside of the folder."""

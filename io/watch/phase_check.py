@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.base.types import Floats
 
-_FEWEST, _FEWEST_FRAMES, _MOST_FRAMES = 64, 6, 128  # minimum number of pixels; limits of the number of frames
+_PIXELS_MIN, _FRAMES_MIN, _FRAMES_MAX = 64, 6, 128  # minimum number of pixels; limits of the number of frames
 _SHIFTS = -1, 1, 2, 3  # tested errors of the phase of later frames, steps
 _BETTER = 0.85  # maximum ratio of the sums of squares with and without a jump
 _STEADY = 0.7  # minimum share of a linear rise in the sum of squares of the mean residual of all pixels
@@ -25,18 +25,18 @@ class PhaseCheck:
 
     def __init__(self, counts: NDArray[np.float32], phase: Floats) -> None:
         self._phase = phase
-        self.possible = _FEWEST_FRAMES <= len(phase) <= _MOST_FRAMES and counts.shape[1] >= _FEWEST
+        self.possible = _FRAMES_MIN <= len(phase) <= _FRAMES_MAX and counts.shape[1] >= _PIXELS_MIN
         if not self.possible:
             return
         waves = np.linalg.qr(_waves(phase))[0].astype(np.float32)
-        swing = swing_of(counts, phase)[:, np.newaxis]
-        size = np.abs(swing)
+        modulation = swing_of(counts, phase)[:, np.newaxis]
+        size = np.abs(modulation)
         swings = size > max(_SWINGS * float(np.median(size)), 1e-6)
-        self.possible = bool(swings.any()) and abs(np.mean(swing[swings] / size[swings])) < _AS_ONE
-        left = counts - waves @ (waves.T @ counts)
-        square = np.sum(left**2, axis=0)
+        self.possible = bool(swings.any()) and abs(np.mean(modulation[swings] / size[swings])) < _AS_ONE
+        residual = counts - waves @ (waves.T @ counts)
+        square = np.sum(residual**2, axis=0)
         used = square <= _OUTLYING**2 * np.median(square)
-        self._counts, self._left = counts[:, used], left[:, used]
+        self._counts, self._left = counts[:, used], residual[:, used]
 
     def jump(self) -> tuple[int, int, float] | None:
         """Return the first frame with a wrong phase, the error in steps, and the step; None if all fit."""
@@ -52,8 +52,8 @@ class PhaseCheck:
         turned = np.swapaxes(waves, 1, 2)
         explained = np.trace(np.linalg.pinv(turned @ waves) @ (turned @ (products @ waves)), axis1=1, axis2=2)
         best = int(np.argmax(explained))
-        least = float(np.trace(products) - explained[best])
-        if not least < _BETTER * float(np.sum(self._left**2)):
+        cost = float(np.trace(products) - explained[best])
+        if not cost < _BETTER * float(np.sum(self._left**2)):
             return None
         return int(frames[best]), int(shifts[best]), step
 

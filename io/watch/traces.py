@@ -15,11 +15,11 @@ from mirrorskin.io.base.types import Floats, Motion
 from mirrorskin.io.watch.phase_check import PhaseCheck, swing_of
 
 _SIDE = 24  # pixels of the grid along each side
-_MOST = 1 << 22  # number of samples above which the grid becomes coarser
-_FEWEST = 64  # minimum number of pixels for findings
+_SAMPLES_MAX = 1 << 22  # number of samples above which the grid becomes coarser
+_PIXELS_MIN = 64  # minimum number of pixels for findings
 _QUANTUM = 1 / math.sqrt(12)  # standard deviation of rounding, counts
 _MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
-_CLEAR = 10.0  # minimum change of a pixel that is a response, standard deviations of the noise
+_RESPONSE_MIN = 10.0  # minimum change of a pixel that is a response, standard deviations of the noise
 _FEW = 0.05  # share of pixels below which their common behaviour is ignored
 _MOST_OF = 0.8  # share of pixels that must agree
 _CLIPPED = 0.1  # tolerated share of responding pixels that reach the end of the scale
@@ -66,7 +66,7 @@ class FrameSamples:
         steps = [-(-length // _SIDE) for length in shape[1:]]
         cuts = [slice((n - 1) % step // 2, None, step) for n, step in zip(shape[1:], steps, strict=True)]
         self._grid = (slice(None), *cuts)
-        self.rows, self.columns = (np.arange(n)[cut] for n, cut in zip(shape[1:], cuts, strict=True))
+        self.rows, self.columns = (np.arange(n)[part] for n, part in zip(shape[1:], cuts, strict=True))
         self._parts: list[NDArray[Any]] = []
         self.count = 0
 
@@ -91,14 +91,15 @@ class FrameSamples:
         self.count += len(values)
         # The grid depends on the number of frames only, which live runs do not know in advance.
         while (
-            self.count * len(self.rows) * len(self.columns) > _MOST and len(self.rows) + len(self.columns) > 4
+            self.count * len(self.rows) * len(self.columns) > _SAMPLES_MAX
+            and len(self.rows) + len(self.columns) > 4
         ):
             down, across = (2, 1) if len(self.rows) >= len(self.columns) else (1, 2)
             self._parts = [part[:, ::down, ::across].copy() for part in self._parts]
             self.rows, self.columns = self.rows[::down], self.columns[::across]
             cuts = (
-                slice(int(one[0]), None, int(one[1] - one[0]) if len(one) > 1 else None)
-                for one in (self.rows, self.columns)
+                slice(int(axis[0]), None, int(axis[1] - axis[0]) if len(axis) > 1 else None)
+                for axis in (self.rows, self.columns)
             )
             self._grid = (slice(None), *cuts)
 
@@ -131,14 +132,14 @@ class Traces:
         if not (finite := np.isfinite(self._counts).all(axis=0)).all():
             self._counts = self._counts.compress(finite, axis=1)
         self._motion, self._series = motion, series
-        self._known = self._counts.shape[1] >= _FEWEST and len(self._counts) > 2
+        self._known = self._counts.shape[1] >= _PIXELS_MIN and len(self._counts) > 2
         if self._known:
             self._lowest, self._highest = self._counts.min(axis=0), self._counts.max(axis=0)
             self._range = self._highest - self._lowest
             self.span = float(self._highest.max() - self._lowest.min())
             self._fit = self._harmonics()
             self.noise = self._noise()
-            self._response = max(_CLEAR * self.noise, 0.02 * self.span)  # minimum change of a response
+            self._response = max(_RESPONSE_MIN * self.noise, 0.02 * self.span)  # minimum change of a response
             self._responding = self._range > self._response
             self._share = float(self._responding.mean())
 
@@ -234,20 +235,20 @@ class Traces:
     def _noise(self) -> float:
         """Return an estimate of the standard deviation of a sample, from the smallest changes."""
         steps = np.diff(self._counts, axis=0)
-        found = [_MAD * float(np.median(_medians(np.abs(steps)))) / math.sqrt(2)]
+        estimates = [_MAD * float(np.median(_medians(np.abs(steps)))) / math.sqrt(2)]
         if self._fit is not None:
-            left = np.abs(self._counts - self._fit)
-            found.append(_MAD * float(np.median(left)))
+            residual = np.abs(self._counts - self._fit)
+            estimates.append(_MAD * float(np.median(residual)))
             if len(steps) > 1:
-                found.append(_MAD * float(np.median(np.abs(np.diff(steps, axis=0)))) / math.sqrt(6))
-        return max(min(found), _QUANTUM if self._integer else 0.0)
+                estimates.append(_MAD * float(np.median(np.abs(np.diff(steps, axis=0)))) / math.sqrt(6))
+        return max(min(estimates), _QUANTUM if self._integer else 0.0)
 
     def _repeated(self) -> Iterator[Finding]:
         """Yield a finding for frames identical to the preceding one, if other frames differ everywhere."""
         counts = self._counts
         inside = (counts[1:] > 0) & (counts[1:] < self._end())  # where noise is not clipped
         differ = np.count_nonzero((counts[1:] != counts[:-1]) & inside, axis=1)
-        again = np.flatnonzero((differ == 0) & (inside.sum(axis=1) >= _FEWEST)) + 1
+        again = np.flatnonzero((differ == 0) & (inside.sum(axis=1) >= _PIXELS_MIN)) + 1
         if len(again) and np.median(differ) > _NOISY * counts.shape[1]:
             yield Finding(
                 "repeated frames",
@@ -327,7 +328,7 @@ class Traces:
     def _outliers(self) -> float:
         """Return the share of samples of a press that differ from those before and after."""
         steps = np.diff(self._counts, axis=0)
-        limit = max(_CLEAR * self.noise, _OUTLYING * self.span)
+        limit = max(_RESPONSE_MIN * self.noise, _OUTLYING * self.span)
         apart = (np.minimum(steps[:-1], -steps[1:]) > limit) | (np.maximum(steps[:-1], -steps[1:]) < -limit)
         of_frame = apart.mean(axis=1)
         return float(np.mean(np.where(of_frame < _FLASH, of_frame, 0)))
@@ -356,7 +357,7 @@ class Traces:
         for axis, name in ((2, "rows"), (1, "columns")):
             series = np.moveaxis(samples, axis, 0).reshape(samples.shape[axis], -1)
             series = series[:, np.ptp(series, axis=0) > self._response]
-            if series.shape[1] >= _FEWEST and max(self._changes(series)) > _MOST_OF:
+            if series.shape[1] >= _PIXELS_MIN and max(self._changes(series)) > _MOST_OF:
                 return name
         return ""
 
@@ -381,7 +382,7 @@ class Traces:
     def _common(self, counts: Samples, used: NDArray[np.bool_]) -> tuple[Floats, Floats, float] | None:
         """Return the common deviation of used pixels in each frame, its error, and their level."""
         counted = np.count_nonzero(used, axis=1)
-        enough = counted >= _FEWEST // 2
+        enough = counted >= _PIXELS_MIN // 2
         if np.count_nonzero(enough) < 5:
             return None
         counts, used, counted = counts[enough], used[enough], counted[enough]
@@ -395,13 +396,13 @@ class Traces:
     def _flicker(self) -> tuple[float, float] | None:
         """Return the standard deviations of the common light, and of its noise, as shares."""
         if self._fit is not None and len(self._counts) >= 2 * (2 * _HARMONICS + 1):
-            left = self._counts - self._fit
-            if float(np.mean(left**2)) > 0.02 * float(np.var(self._counts)):
+            residual = self._counts - self._fit
+            if float(np.mean(residual**2)) > 0.02 * float(np.var(self._counts)):
                 return None  # harmonics do not describe the brightness
             wave = swing_of(self._of_responding, self._series["phase"])
             if wave.size and abs(np.mean(wave / np.abs(wave))) > _AS_ONE:
                 return None  # on a flat object, light that is not a cosine would look the same
-            gain = np.median(left / np.maximum(self._fit, 1e-3 * self._highest.max()), axis=1)
+            gain = np.median(residual / np.maximum(self._fit, 1e-3 * self._highest.max()), axis=1)
             error = 1.25 * self.noise / math.sqrt(self._fit.shape[1]) / float(np.mean(self._fit))
             return float(np.std(gain)), error
         if not self._goes_down() or self._share < _FEW:
@@ -411,10 +412,10 @@ class Traces:
         lit[2:] &= lit[:-2]  # for two frames
         lit[:2] = False
         lit &= np.count_nonzero(lit, axis=0) >= 5
-        found = self._common(counts, lit)
-        if found is None or found[2] <= 0:
+        common = self._common(counts, lit)
+        if common is None or common[2] <= 0:
             return None
-        offset, errors, level = found
+        offset, errors, level = common
         return float(np.std(np.diff(offset)) / math.sqrt(2) / level), float(np.mean(errors) / level)
 
     @functools.cached_property
@@ -435,14 +436,14 @@ class Traces:
         change = np.maximum.accumulate([np.abs(part - means[0]).max(axis=0) for part in parts])
         dark = (change < self._response) & (means[0] < self._lowest.min() + _DARK * self.span)
         start = counts[: len(parts[0]) + len(parts[1])].compress(dark[2], axis=1)
-        if start.shape[1] < _FEWEST:
+        if start.shape[1] < _PIXELS_MIN:
             return None
         noise = _MAD / math.sqrt(2) * float(np.median(np.abs(np.diff(start, axis=0))))
         noise = max(noise, _QUANTUM if self._integer else 0.0)
         levels, error = [0.0], 0.0
         for part, mean, used in zip(parts[1:-1], means[1:-1], dark[2:], strict=True):
             pixels = np.count_nonzero(used)
-            if pixels < max(_FEWEST, _DARK_PIXELS * used.size):
+            if pixels < max(_PIXELS_MIN, _DARK_PIXELS * used.size):
                 break
             rise = (mean - means[0])[used]
             common = float(np.median(rise))
@@ -457,8 +458,8 @@ class Traces:
         travel = self._series.get("travel")
         if self._motion != "vertical" or travel is None:
             return False
-        way = float(travel[-1] - travel[0])
-        return way != 0 and bool(np.all(np.diff(travel) * way >= 0))
+        delta = float(travel[-1] - travel[0])
+        return delta != 0 and bool(np.all(np.diff(travel) * delta >= 0))
 
 
 def _medians(values: NDArray[Any], count: NDArray[np.intp] | None = None) -> NDArray[Any]:
@@ -469,5 +470,5 @@ def _medians(values: NDArray[Any], count: NDArray[np.intp] | None = None) -> NDA
     return np.asarray((ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2)
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.2g} %" if fraction < 0.995 else f"{100 * fraction:.0f} %"

@@ -27,7 +27,7 @@ Limits = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckReport:
     """Facts and findings about frames; ``print`` shows them.
 
     Attributes
@@ -47,16 +47,16 @@ class Check:
     @property
     def warnings(self) -> tuple[Finding, ...]:
         """The findings that are warnings: results may be wrong."""
-        return tuple(one for one in self.findings if one.warning)
+        return tuple(finding for finding in self.findings if finding.warning)
 
     def __str__(self) -> str:
         width = max(map(len, self.facts), default=0)
         lines = [f"{name:<{width}}  {value}" for name, value in self.facts.items()]
-        lines += [f"{'warning' if one.warning else 'note'}: {one.text}" for one in self.findings]
+        lines += [f"{'warning' if finding.warning else 'note'}: {finding.text}" for finding in self.findings]
         return "\n".join([self.name, *lines] if lines else [self.name, "nothing is known"])
 
 
-class Watch:
+class FrameChecker:
     """Collects samples and positions of the frames of a source while they are read.
 
     ``moved``: whether the brightness must respond to the motion. ``phased``: whether it must fit the phases.
@@ -80,18 +80,18 @@ class Watch:
             if values is not None:
                 parts.append(values)
 
-    def check(self, field_limits: Limits = FIELD, travel_limits: Limits = TRAVEL) -> Check:
+    def check(self, field_limits: Limits = FIELD, travel_limits: Limits = TRAVEL) -> CheckReport:
         """Return the check of the frames so far."""
         series, traces = self._look()
         source = self._source
         facts = {"frames": f"{self.samples.count} of {source.shape[2]} x {source.shape[1]}, {source.dtype}"}
         facts |= _facts(source, series, traces)
-        return Check(source.name, facts, self._findings(series, traces, field_limits, travel_limits))
+        return CheckReport(source.name, facts, self._findings(series, traces, field_limits, travel_limits))
 
     def findings(self) -> tuple[Finding, ...]:
         """Return the findings about the frames so far, for a result, which states their region itself."""
-        found = self._findings(*self._look(), FIELD, TRAVEL)
-        return tuple(one for one in found if one != UNVERIFIED_PARTS)
+        findings = self._findings(*self._look(), FIELD, TRAVEL)
+        return tuple(finding for finding in findings if finding != UNVERIFIED_PARTS)
 
     def _look(self) -> tuple[dict[str, Floats], Traces]:
         """Return the positions and times of the frames so far, and their brightness."""
@@ -137,7 +137,7 @@ def _facts(source: Source, series: Mapping[str, Floats], traces: Traces) -> dict
     if "time" in series and len(series["time"]) > 1:
         facts["time"] = f"{series['time'][-1] - series['time'][0]:.4g} s"
     levels = [
-        "given" if getattr(source.header, one) is not None else "not given" for one in ("dark", "bright")
+        "given" if getattr(source.header, level) is not None else "not given" for level in ("dark", "bright")
     ]
     return {**facts, **traces.facts(), "levels": f"dark {levels[0]}, bright {levels[1]}"}
 
@@ -187,8 +187,8 @@ def _from_to(limits: Limits) -> str:
 
 def _order(source: Source, series: Mapping[str, Floats], lost: int) -> Iterator[Finding]:
     """Yield findings about missing frames."""
-    known = {one.kind for one in getattr(source, "findings", ())}
-    if lost and "lost frames" not in known:
+    kinds = {finding.kind for finding in getattr(source, "findings", ())}
+    if lost and "lost frames" not in kinds:
         yield Finding("lost frames", f"{lost} frame{'s were' if lost > 1 else ' was'} lost", False)
     time = series.get("time")
     position = series.get({"vertical": "travel", "axial": "phase"}.get(source.motion, ""))

@@ -55,7 +55,7 @@ class FakeStage:
 
     name = "fake stage"
     axes = Axes(settings().stage, name)
-    check_way, check_turns = axes.check_way, axes.check_turns
+    check_move, check_precession = axes.check_move, axes.check_precession
 
     def __init__(self, clock, limits=LIMITS, acceleration=100.0, late=0.0, seed=0):
         self.clock, self.limits = clock, limits

@@ -145,10 +145,10 @@ class TwinCamera(ThreadedCamera):
             start = self.clock.now()
             yield from (start + number * period for number in itertools.count())
             return
-        seen = 0
+        frames = 0
         while not self._ended.wait(_LOOK):
-            for went_on in self._trigger()[::2][seen:]:
-                seen += 1
+            for went_on in self._trigger()[::2][frames:]:
+                frames += 1
                 yield went_on + self._twin.exposure / 2
 
     def _render(self, middle: float, number: int) -> NDArray[Any]:

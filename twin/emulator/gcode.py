@@ -71,7 +71,7 @@ class Interpreter:
             if word is None or word[2] is None:
                 raise GrblError(1 if word is None else 2)
             at, letter, value = word.end(), word[1], float(word[2])
-            known = codes if letter in "GM" else values
+            allowed = codes if letter in "GM" else values
             if letter in "GM":
                 code = f"{letter}{value:g}"
                 if code not in _GROUP_OF:
@@ -81,7 +81,7 @@ class Interpreter:
                 codes[_GROUP_OF[code]] = code
             elif letter not in self.axes and letter not in "FIJK":
                 raise GrblError(20)
-            elif letter in known:
+            elif letter in allowed:
                 raise GrblError(25)
             else:
                 values[letter] = value

@@ -22,7 +22,7 @@ Place = tuple[float, ...]
 
 BLOCKS = 15  # moves that the firmware's planner can hold
 _ARC_STEP = math.radians(1.0)  # resolution at which an arc is tested for leaving a box
-_SAME = 1e-9  # axis units; closer positions count as on the face of the box
+_FACE_TOLERANCE = 1e-9  # axis units; closer positions count as on the face of the box
 _STRAIGHT = 1e-6  # 1 - cos(angle); below it two moves count as collinear
 _TINY = 1e-12  # shorter distances and times count as 0
 _FORGET = 1024  # number of spans that are dropped at a time
@@ -150,7 +150,9 @@ def stays_inside(path: Path, low: Place, high: Place) -> bool:
     was_inside = False
     for number in range(path.samples + 1):
         place = path.end if number == path.samples else path.point(path.length * number / path.samples)
-        is_inside = all(a - _SAME <= p <= b + _SAME for p, a, b in zip(place, low, high, strict=True))
+        is_inside = all(
+            a - _FACE_TOLERANCE <= p <= b + _FACE_TOLERANCE for p, a, b in zip(place, low, high, strict=True)
+        )
         if was_inside and not is_inside:
             return False
         was_inside = is_inside
@@ -280,12 +282,12 @@ class Planner:
         for move in self._moves:
             if speed <= 0:
                 break
-            slowing, left = -move.acceleration, move.path.length - distance
-            if speed * speed <= 2 * move.acceleration * left:
+            slowing, remaining = -move.acceleration, move.path.length - distance
+            if speed * speed <= 2 * move.acceleration * remaining:
                 time = self._append(time, speed / move.acceleration, move, distance, speed, slowing)
                 break
-            slower = math.sqrt(speed * speed - 2 * move.acceleration * left)
-            time = self._append(time, 2 * left / (speed + slower), move, distance, speed, slowing)
+            slower = math.sqrt(speed * speed - 2 * move.acceleration * remaining)
+            time = self._append(time, 2 * remaining / (speed + slower), move, distance, speed, slowing)
             self._ends.append(time)
             distance, speed = 0.0, slower
         self._stop = time
@@ -333,29 +335,29 @@ class Planner:
             squares[index] = min(squares[index], reached)
         time = now
         for move, leaves in zip(self._moves, squares[1:], strict=True):
-            left = move.path.length - distance
-            leaves = min(leaves, speed * speed + 2 * move.acceleration * left)
+            remaining = move.path.length - distance
+            leaves = min(leaves, speed * speed + 2 * move.acceleration * remaining)
             time = self._ramp(time, move, distance, speed, math.sqrt(leaves))
             self._ends.append(time)
             distance, speed = 0.0, math.sqrt(leaves)
 
     def _ramp(self, time: float, move: Move, distance: float, enters: float, leaves: float) -> float:
         """Append a trapezoid of acceleration, constant speed and deceleration; return the time of its end."""
-        left = move.path.length - distance
-        peak = math.sqrt(move.acceleration * left + (enters * enters + leaves * leaves) / 2)
+        remaining = move.path.length - distance
+        peak = math.sqrt(move.acceleration * remaining + (enters * enters + leaves * leaves) / 2)
         # Rounding may leave slightly less than the braking distance: deceleration is then slightly higher.
         peak = max(min(peak, move.speed), enters, leaves)
         faster = (peak * peak - enters * enters) / (2 * move.acceleration)
-        slower = min((peak * peak - leaves * leaves) / (2 * move.acceleration), left - faster)
-        for way, begin, end in (
+        slower = min((peak * peak - leaves * leaves) / (2 * move.acceleration), remaining - faster)
+        for sense, begin, end in (
             (faster, enters, peak),
-            (left - faster - slower, peak, peak),
+            (remaining - faster - slower, peak, peak),
             (slower, peak, leaves),
         ):
-            if way > _TINY:
-                duration = 2 * way / (begin + end)
+            if sense > _TINY:
+                duration = 2 * sense / (begin + end)
                 time = self._append(time, duration, move, distance, begin, (end - begin) / duration)
-                distance += way
+                distance += sense
         return time
 
     def _append(

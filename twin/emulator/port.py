@@ -148,8 +148,8 @@ class GrblLine(Closing):
         """Wait for bytes, at most for the timeout, and return the available ones."""
         end = self._clock.now() + (math.inf if self.timeout is None else self.timeout)
         with self._change:
-            while not self.in_waiting and (left := end - self._clock.now()) > 0:
-                self._change.wait(min(left, max(0.0, self.machine.next_event() - self._clock.now())))
+            while not self.in_waiting and (remaining := end - self._clock.now()) > 0:
+                self._change.wait(min(remaining, max(0.0, self.machine.next_event() - self._clock.now())))
             data = bytes(self._coming[:size])
             del self._coming[:size]
         return data
@@ -259,9 +259,9 @@ class GrblPort(GrblLine):
                     self.write(os.read(self._master, _CHUNK))
 
     def _say(self) -> None:
-        said = b""
+        pending = b""
         while not self._closing:
             with contextlib.suppress(OSError):
-                said = said or self.read(_CHUNK)
-                if said and select.select([], [self._master], [], _LOOK)[1]:
-                    said = said[os.write(self._master, said) :]
+                pending = pending or self.read(_CHUNK)
+                if pending and select.select([], [self._master], [], _LOOK)[1]:
+                    pending = pending[os.write(self._master, pending) :]

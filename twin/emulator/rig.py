@@ -33,7 +33,7 @@ from mirrorskin.hw.base.rig_file import (
 )
 from mirrorskin.hw.base.stage import Position
 from mirrorskin.hw.stages.grbl import GrblStage
-from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.system import translate_os_errors
 from mirrorskin.io.base.types import Floats, InputError
 from mirrorskin.io.storage.atomic import write_new
 from mirrorskin.twin import Axial, Camera, Object, Twin, Vertical
@@ -229,7 +229,7 @@ class EmulatedRig:
             still running uses it.
         """
         path, picture = folder / _FILE, folder / _REFERENCE
-        with as_input_error(f"{path} cannot be read", "choose another folder with -o"):
+        with translate_os_errors(f"{path} cannot be read", "choose another folder with -o"):
             if not path.exists():
                 if picture.exists():
                     raise InputError(f"{picture} exists. Delete it, or choose another folder with -o")
@@ -273,7 +273,7 @@ class EmulatedRig:
         file = RigFile(name=settings.name, stage=stage, camera=camera)
         text = "\n".join(_toml(msgspec.to_builtins(file)))
         emulator = Emulator.here(stage.port)
-        with as_input_error(f"{folder} cannot be written to", "choose another folder with -o"):
+        with translate_os_errors(f"{folder} cannot be written to", "choose another folder with -o"):
             folder.mkdir(parents=True, exist_ok=True)
             self._leaving.callback(_remove, folder, emulator)
             array = BytesIO()

@@ -218,9 +218,9 @@ class SimulatedCondition(threading.Condition):
     def wait_for(self, predicate: Callable[[], T], timeout: float | None = None) -> T:
         """Wait until a predicate is true, at most for the timeout; return its value."""
         end = math.inf if timeout is None else self._clock.now() + timeout
-        while not (found := predicate()) and (left := end - self._clock.now()) > 0:
-            self.wait(left)
-        return found
+        while not (satisfied := predicate()) and (remaining := end - self._clock.now()) > 0:
+            self.wait(remaining)
+        return satisfied
 
     def notify(self, n: int = 1) -> None:
         """Wake some of the waiting threads."""

@@ -143,7 +143,7 @@ class RigControl:
         """Set the body upright, lift it, and bring it to the middle."""
 
         def task(rig: Rig) -> None:
-            for place in rig.stage.limits.way_up(rig.stage.report().position):
+            for place in rig.stage.limits.retreat_path(rig.stage.report().position):
                 self._go(rig, place, None)
 
         self._give(task)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mirrorskin.io import InputError, Result, select_turn
-from mirrorskin.io.base.system import as_input_error
+from mirrorskin.io.base.system import translate_os_errors
 from mirrorskin.io.storage.atomic import MAKE_ROOM, new_file
 from mirrorskin.view.drawing.canvas import check_drawing
 from mirrorskin.view.report.contents import Ends, contents_of, surface_of
@@ -63,7 +63,7 @@ def write_report(
     path = Path(path)
     with (
         new_file(path) as descriptor,
-        as_input_error(f"{path} could not be written", MAKE_ROOM),
+        translate_os_errors(f"{path} could not be written", MAKE_ROOM),
         os.fdopen(os.dup(descriptor), "w", encoding="utf-8", errors="replace", newline="\n") as file,
     ):
         file.write(page)
