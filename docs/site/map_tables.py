@@ -18,6 +18,7 @@ import numpy as np
 from mirrorskin.hw.base.drivers import CAMERAS, STAGES, Driver, built_in
 from mirrorskin.hw.base.rig_file import StageSettings
 from mirrorskin.io import Fitted, Map
+from mirrorskin.io.base.types import PROPERTIES
 from mirrorskin.io.formats.registry import exports
 from mirrorskin.io.model.calibration import PARTS
 from mirrorskin.io.model.maps import (
@@ -140,6 +141,28 @@ def as_table(head: list[str], rows: Iterable[list[str]]) -> str:
     return "".join(f"| {' | '.join(cells)} |\n".replace("  ", " ").replace("  ", " ") for cells in lines)
 
 
+def rows() -> dict[str, list[str]]:
+    """Return the rows of declared properties of recordings, by page."""
+    layout, keys = [], []
+    for table, group in (("camera", "detector"), ("stage", "stage")):
+        declared = {name: prop for name, prop in PROPERTIES.items() if prop.of == table}
+        for name, prop in declared.items():
+            layout.append(f"| `.../{group}/{name}` * | number | {prop.unit} | {prop.text} |\n")
+            limits = f"{prop.unit}, {prop.within[0]:g} to {prop.within[1]:g}"
+            keys.append(f"| `{name}` | {limits} | {prop.text}; {prop.use} | unknown |\n")
+    return {"formats.md": layout, "rig.md": keys}
+
+
+def with_rows(page: str, current: list[str]) -> str:
+    """Return a page with the current rows in place of those with the same first cell, or below the last."""
+    for row, before in zip(current, ["", *current], strict=False):
+        first = row.partition(" | ")[0]
+        old = re.search(rf"^{re.escape(first)} \|.*\n", page, flags=re.MULTILINE)
+        page = page.replace(old[0], row) if old else page.replace(before, before + row)
+        assert row in page
+    return page
+
+
 def pages() -> dict[str, str]:
     """Return the pages with their current tables, by name."""
     made = {}
@@ -150,6 +173,8 @@ def pages() -> dict[str, str]:
             assert len(found) == 1, f"{name} has {len(found)} tables whose first cell is {first}"
             page = page.replace(found[0], table)
         made[name] = page
+    for name, current_rows in rows().items():
+        made[name] = with_rows(made.get(name) or (DOCS / name).read_text(encoding="utf-8"), current_rows)
     return made
 
 

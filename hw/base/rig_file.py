@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 import re
 import shlex
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 import msgspec
 from msgspec import Meta
@@ -22,6 +23,7 @@ from mirrorskin.hw.base.references import SUFFIXES, check_references
 from mirrorskin.hw.base.stage import Limits
 from mirrorskin.io import InputError
 from mirrorskin.io.base.settings_file import load_toml
+from mirrorskin.io.base.types import PROPERTIES
 
 _USER = re.compile("//[^/]*@")
 _STEEPEST = 90.0  # degrees
@@ -40,11 +42,16 @@ _FOURCC_HELP = ", or ".join(driver.formats_help for driver in _FORMATS)
 _OTHER_STAGES = ", ".join(_STAGES[1:])
 _SERIALS = "".join(f"{name}SERIAL, " for name in _CAMERAS)
 _TRIGGERED = " or ".join(_CAMERAS)
+_STAGE_LINES, _CAMERA_LINES = (
+    "".join(prop.line(name) for name, prop in PROPERTIES.items() if prop.of == table)
+    for table in ("stage", "camera")
+)
 
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*\Z")]
 Line = Literal["coolant", "spindle"]
 """An output of the controller that can be switched on and off."""
 
+_Model = TypeVar("_Model", bound=msgspec.Struct)
 Letter = Literal["X", "Y", "Z", "A", "B", "C"]
 _Side = Annotated[float, Meta(gt=0)]
 _Pixels = Annotated[int, Meta(ge=1, le=_CELL)]
@@ -186,6 +193,29 @@ class TiltAxis(AngleAxis, frozen=True, kw_only=True):
     ]
 
 
+def _with_properties(table: str) -> Callable[[type[_Model]], type[_Model]]:
+    """Add the declared properties of recordings to the keys of a table."""
+    keys = []
+    for name, prop in PROPERTIES.items():
+        low, high = prop.within
+        number = Annotated[float, Meta(ge=low, le=high)]
+        meta = Meta(description=prop.needed, examples=[float(prop.example)])
+        if prop.of == table:
+            keys.append((name, Annotated[number | None, meta], None))
+
+    def add(model: type[_Model]) -> type[_Model]:
+        about: dict[str, Any] = {
+            "bases": (model,),
+            "module": model.__module__,
+            "namespace": {"__doc__": model.__doc__},
+        }
+        whole = msgspec.defstruct(model.__name__, keys, frozen=True, kw_only=True, **about)
+        return cast("type[_Model]", whole)
+
+    return add
+
+
+@_with_properties("stage")
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
     """The connection and the limits of the stage: the table ``[stage]``.
 
@@ -221,9 +251,6 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
         0.07
     )
     press: Annotated[float, Meta(description="a finite number of mm", examples=[2.0])]
-    travel_sigma: Annotated[
-        float | None, Meta(ge=0, le=1, description="a standard deviation from 0 to 1 mm", examples=[0.002])
-    ] = None
     pivot: Annotated[
         tuple[float, float, float] | None,
         Meta(description="a list of x, y and z, in mm,", examples=[[0.0, 0.0, 0.0]]),
@@ -274,6 +301,7 @@ class StageSettings(msgspec.Struct, frozen=True, kw_only=True):
         return Limits(travel, max(0.0, min(reaches, default=0.0)), press, **sideways)
 
 
+@_with_properties("camera")
 class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
     """The settings of the camera and the meaning of its counts: the table ``[camera]``."""
 
@@ -314,9 +342,6 @@ class CameraSettings(msgspec.Struct, frozen=True, kw_only=True):
         Meta(description="a time from 0 to 10 s", examples=[0.03]),
     ] = None
     stall: Annotated[float, Meta(ge=0.02, le=5, description="a time from 0.02 to 5 s", examples=[0.1])] = 0.1
-    line_time: Annotated[
-        float | None, Meta(ge=-0.01, le=0.01, description="a time from -0.01 to 0.01 s", examples=[1.5e-5])
-    ] = None
     pixel_size: Annotated[
         _Side | tuple[_Side, _Side] | None,
         Meta(description="a length above 0, in mm, or a list of a width and a height", examples=[0.03]),
@@ -428,11 +453,13 @@ def load_rig(path: Path | str) -> RigSettings:
     camera = msgspec.structs.replace(camera, **resolved)
     check_references(camera, str(path))
     firmware = file.stage.firmware
-    if firmware.isidentifier() and firmware not in (names := driver_names(STAGES)):
-        raise InputError(
-            f"{path}: stage.firmware is {firmware}, and there are {', '.join(names)}; or name a class, as in"
-            ' "my_stage.py:MyStage"'
-        )
+    if firmware.isidentifier() and all(firmware != driver.name for driver in built_in(STAGES)):
+        names = driver_names(STAGES)  # packages are only asked if none is built in
+        if firmware not in names:
+            raise InputError(
+                f"{path}: stage.firmware is {firmware}, and there are {', '.join(names)}; or name a class, as"
+                ' in "my_stage.py:MyStage"'
+            )
     stage = msgspec.structs.replace(file.stage, firmware=_next_to(path, firmware))
     return RigSettings(path, file.name or path.stem, stage, camera)
 
@@ -477,8 +504,7 @@ home = true                     # the stage has limit switches, and must be home
 # report_rate = 20.0            # Hz: rate of position queries at rest
 # silence = 0.07                # s without an answer, in motion, after which the stage is stopped
 press = 2.0                     # mm: maximum travel, even if the axis allows more
-# travel_sigma = 0.002          # mm: standard deviation of the travel of a frame
-# pivot = [0.0, 0.0, 0.0]       # mm from the centre of the sheet: pivot of the body's rotation
+{_STAGE_LINES}# pivot = [0.0, 0.0, 0.0]       # mm from the centre of the sheet: pivot of the body's rotation
 
 [stage.travel]                  # mm, positive down, 0 where the skin is just above the object
 letter = "Z"
@@ -548,8 +574,7 @@ size = [640, 480]               # columns, rows
 # trigger_input = "Line0"       # the input of a {_TRIGGERED} camera to which this output is connected
 # stall = 0.1                   # s without a frame, in motion, after which the stage is stopped
 # delay = 0.03                  # s from the middle of the exposure to the arrival; measured for a stream
-# line_time = 15e-6             # s from row to row of a rolling shutter; negative if the last is first
-pixel_size = 0.03               # mm at the sheet
+{_CAMERA_LINES}pixel_size = 0.03               # mm at the sheet
 # dark = 12                     # counts without light, or a picture file
 # bright = "bright.tif"         # counts in full light, or a picture file
 # zenith_gain = 5.7             # counts per degree of zenith

@@ -19,7 +19,7 @@ from mirrorskin.hw.base.rig_file import RigSettings
 from mirrorskin.hw.base.stage import Position, Report
 from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, RockPlan, TwistPlan, check_plan
 from mirrorskin.hw.rig.rig import Rig
-from mirrorskin.io.base.types import Block, Closing, Floats, Header, InputError
+from mirrorskin.io.base.types import PROPERTIES, Block, Closing, Floats, Header, InputError
 
 SETTLE = 0.1
 """Seconds from rest to the first exposure, of a motion with stops, by default."""
@@ -228,8 +228,11 @@ def _header(settings: RigSettings, plan: Plan) -> Header:
         zenith_gain=_scalar(camera.counts_per_radian),
         zenith_offset=_scalar(camera.zenith_offset),
         camera=camera.name,
-        travel_sigma=stage.travel_sigma,
-        line_time=None if plan.in_steps else camera.line_time,
+        **{
+            name: getattr(getattr(settings, prop.of), name)
+            for name, prop in PROPERTIES.items()
+            if prop.in_steps or not plan.in_steps
+        },
     )
     if isinstance(plan, AxialPlan):
         return replace(header, press=plan.press, tilt=plan.tilt, pivot=stage.pivot)

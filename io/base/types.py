@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -12,6 +13,8 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.io.base.properties import attributes_of, declared_in, stated
 
 Motion = Literal["vertical", "axial", "horizontal", "twist"]
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
@@ -104,8 +107,6 @@ class Header:
         Millimetres at the sheet along x and y.
     dark, bright : ndarray, (H, W), float32, or None
         Counts of each pixel without light and with full light.
-    travel_sigma : float or None
-        Standard deviation of the travel of each frame, mm, independent from frame to frame.
     press : float or None
         Travel of the press during other motions, mm.
     tilt : float or None
@@ -114,9 +115,6 @@ class Header:
         Pivot of the body, mm, from the centre of the sheet at rest, with the body pressed and upright.
     zenith_gain, zenith_offset : ndarray, scalar or (H, W), float64, or None
         Counts per radian of zenith, and counts at zenith zero.
-    line_time : float or None
-        For a rolling shutter: seconds between the exposures of consecutive rows; negative if the last row is
-        exposed first. The time and position of a frame refer to its middle row.
     camera : str
         Name of the camera; empty if unknown.
     """
@@ -127,14 +125,40 @@ class Header:
     pixel_size: tuple[float, float] | None = None
     dark: NDArray[np.float32] | None = None
     bright: NDArray[np.float32] | None = None
-    travel_sigma: float | None = None
     press: float | None = None
     tilt: float | None = None
     pivot: tuple[float, float, float] | None = None
     zenith_gain: Floats | None = None
     zenith_offset: Floats | None = None
-    line_time: float | None = None
     camera: str = ""
+    travel_sigma: float | None = stated(
+        of="stage",
+        unit="mm",
+        text="standard deviation of the travel of each frame, independent from frame to frame",
+        use="it is added to the standard deviation of heights",
+        short="mm: standard deviation of the travel of a frame",
+        kind="standard deviation",
+        within=(0.0, 1.0),
+        example="0.002",
+    )
+    line_time: float | None = stated(
+        of="camera",
+        unit="s",
+        text="from the exposure of a row to that of the next one, of a rolling shutter; negative if the last"
+        " row is the first",
+        use="heights of a press that moves are corrected for it",
+        short="s from row to row of a rolling shutter; negative if the last is first",
+        kind="time",
+        within=(-0.01, 0.01),
+        example="15e-6",
+        in_steps=False,
+    )
+
+
+PROPERTIES = declared_in(Header.__dataclass_fields__)
+"""The declared numbers of a header; time and position of a frame refer to its middle row."""
+
+Header.__doc__ = inspect.cleandoc(Header.__doc__ or "") + "\n" + attributes_of(PROPERTIES)
 
 
 class Closing:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.base.findings import Finding
-from mirrorskin.io.base.types import InputError
+from mirrorskin.io.base.types import PROPERTIES, InputError
 from mirrorskin.io.base.url import is_zarr, path_of
 from mirrorskin.io.files.arrays import list_arrays
 from mirrorskin.io.files.opening import open_recording
@@ -118,6 +118,11 @@ def _recording(recording: Recording) -> dict[str, str]:
     if header.tilt is not None:
         facts["tilt"] = f"{np.degrees(header.tilt):g} deg"
     facts |= _range("tilt", None if recording.tilt is None else np.degrees(recording.tilt), "deg")
+    facts |= {
+        name.replace("_", " "): f"{value:g} {prop.unit}"
+        for name, prop in PROPERTIES.items()
+        if (value := getattr(header, name)) is not None
+    }
     if recording.motion == "axial":
         facts["zenith gain"] = _counts(header.zenith_gain, "counts/rad")
         facts["zenith offset"] = _counts(header.zenith_offset, "counts")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.base.checksums import checksums
-from mirrorskin.io.base.types import Block, Floats, Header, InputError, Motion, Source, Truth
+from mirrorskin.io.base.types import PROPERTIES, Block, Floats, Header, InputError, Motion, Source, Truth
 from mirrorskin.io.model.calibration import Calibration
 from mirrorskin.io.model.maps import TWIST, declaration_of
 from mirrorskin.io.storage.atomic import fixed_text, new_hdf5
@@ -25,6 +25,7 @@ from mirrorskin.io.storage.layout import (
     CHECKSUM,
     DROPPED,
     FINDINGS,
+    GROUPS,
     MARK,
     POSITIONS,
     SERIES,
@@ -78,8 +79,8 @@ def write_header(file: h5py.File, header: Header, calibration: Calibration | Non
     put(detector, "bright", "counts", header.bright)
     put(detector, "zenith_gain", "1/rad", header.zenith_gain)
     put(detector, "zenith_offset", "counts", header.zenith_offset)
-    put(detector, "line_time", "s", header.line_time)
-    put(stage, "travel_sigma", "mm", header.travel_sigma)
+    for name, prop in PROPERTIES.items():
+        put(file[GROUPS[prop.of]], name, prop.unit, getattr(header, name))
     put(stage, "tilt", "rad", header.tilt)
     put(stage, "pivot", "mm", header.pivot)
     if header.motion != "vertical":

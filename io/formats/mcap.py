@@ -21,7 +21,7 @@ from mirrorskin.io.base.checksums import REMEDY, crc32
 from mirrorskin.io.base.opencv import is_coloured, to_grey
 from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, check_unpacked, open_regular, translate_os_errors
 from mirrorskin.io.base.text import one_line
-from mirrorskin.io.base.types import MOTIONS, Block, Closing, Floats, Header, InputError
+from mirrorskin.io.base.types import MOTIONS, PROPERTIES, Block, Closing, Floats, Header, InputError
 from mirrorskin.io.formats.pictures import Picture, decode_bytes
 from mirrorskin.io.formats.registry import Format
 from mirrorskin.io.formats.surface import check_heights, points_of
@@ -78,7 +78,7 @@ _CLOUD, _NUMBER, _WRENCH = (
 )
 _INSTALL = "MCAP needs packages that are not installed: pip install 'mirrorskin[mcap]'"
 
-_PROPERTIES = ("tilt", "press", "line_time", "travel_sigma")  # numbers of a recording, in the metadata
+_NUMBERS = ("tilt", "press", *PROPERTIES)  # numbers of a recording, in the metadata
 _NOTES, _MOST_NOTES = "mirrorskin", 8  # name of the metadata; maximum number of its records to read
 _NUMERAL = re.compile(r"[-+]?[0-9]+\.?[0-9]*(?:[eE][-+]?[0-9]+)?")
 _QUOTED_MAX = 100  # characters quoted of an error message of a package
@@ -253,7 +253,7 @@ def _put_header(file: _File, header: Header) -> None:
         if picture is not None:
             image = _picture(np.atleast_2d(np.asarray(picture, np.float32)))
             file.put(f"/camera/{name}", _IMAGE, image, _stamp(header.start_time))
-    names = ("motion", "title", "pixel_size", "camera", *_PROPERTIES)
+    names = ("motion", "title", "pixel_size", "camera", *_NUMBERS)
     notes = {name: getattr(header, name) for name in names}
     file.note({name: value for name, value in notes.items() if value not in (None, "")})
 
@@ -467,7 +467,7 @@ class MessageFrames(WholeFrames):
                 yield name, self._summary.notes[name]
         if self._summary.notes.get("motion") in MOTIONS:
             yield "motion", self._summary.notes["motion"]
-        for name, count in {**dict.fromkeys(_PROPERTIES, 1), "pixel_size": 2}.items():
+        for name, count in {**dict.fromkeys(_NUMBERS, 1), "pixel_size": 2}.items():
             values = _NUMERAL.findall(self._summary.notes.get(name, ""))
             if len(values) == count:
                 yield name, tuple(map(float, values)) if count > 1 else float(values[0])

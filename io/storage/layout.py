@@ -15,7 +15,7 @@ from mirrorskin.io.base.arguments import as_array
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.selection import Selection
 from mirrorskin.io.base.system import translate_os_errors
-from mirrorskin.io.base.types import MOTIONS, Floats, Header, InputError, Motion, Truth
+from mirrorskin.io.base.types import MOTIONS, PROPERTIES, Floats, Header, InputError, Motion, Truth
 from mirrorskin.io.model.coordinates import Coordinates
 from mirrorskin.io.model.maps import TWIST, declaration_of
 from mirrorskin.io.model.positions import Positions, check_finite
@@ -25,6 +25,8 @@ from mirrorskin.io.storage.hdf5 import Hdf5File, Node, Shape
 MARK, RESULT_MARK = "mirrorskin_recording", "mirrorskin_result"
 STACK = "/entry/instrument/detector/data"
 DETECTOR, STAGE, TRUTH = "/entry/instrument/detector", "/entry/instrument/stage", "/entry/truth"
+GROUPS = {"camera": DETECTOR, "stage": STAGE}
+"""The group of a declared property, by the table of the rig file that contains it."""
 TRUTH_MAPS = tuple(field.name for field in fields(Truth))
 """Contents of the truth of a simulation."""
 
@@ -165,14 +167,16 @@ class Layout:
             pixel_size=pixel_size,
             dark=self._reference("dark"),
             bright=self._reference("bright"),
-            travel_sigma=self._scalar(f"{STAGE}/travel_sigma", "mm", "correct it"),
             press=self._one("travel", "correct it") if pressed else None,
             tilt=self._one("tilt", "give --tilt") if tilt is None else tilt,
             pivot=self._pivot(pixel_size),
             zenith_gain=self._map(f"{DETECTOR}/zenith_gain", "1/rad"),
             zenith_offset=self._map(f"{DETECTOR}/zenith_offset"),
-            line_time=self._scalar(f"{DETECTOR}/line_time", "s", "correct it"),
             camera=self._text(f"{DETECTOR}/local_name"),
+            **{
+                name: self._scalar(f"{GROUPS[prop.of]}/{name}", prop.unit, "correct it")
+                for name, prop in PROPERTIES.items()
+            },
         )
 
     def positions(self, motion: Motion, positions: ArrayLike | None) -> dict[str, Floats | None]:
