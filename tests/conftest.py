@@ -6,6 +6,9 @@ import dataclasses
 import os
 import signal
 
+# Threads of BLAS that wait for each other take much processor time. It is read when NumPy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pytest
 from gpu_check import taken_for_gpu
 
