@@ -74,46 +74,43 @@ def test_a_program_is_compiled_once_and_works_without_pocls_cache(change, tmp_pa
 
 
 def test_kernels_of_one_name_in_several_programs_stay_apart(change, tmp_path):
-    for _ in range(2):
-        assert change("2*values[item]")[0] == [0, 2, 4]
-        assert change("7-values[item]")[0] == [7, 6, 5]
+    assert change("2*values[item]")[0] == [0, 2, 4]
+    assert change("7-values[item]")[0] == [7, 6, 5]
+    assert change("2*values[item]")[0] == [0, 2, 4]
     assert len(records(tmp_path)) == 2
 
 
 def test_programs_of_one_processor_are_not_used_for_another(change, tmp_path):
-    for compiled in (1, 0):
-        for processor in ("x86-64", "core2"):
-            assert change("exp(values[item])", MIRRORSKIN_PROCESSOR=processor) == [EXP, compiled]
+    for processor, compiled in (("x86-64", 1), ("core2", 1), ("x86-64", 0)):
+        assert change("exp(values[item])", MIRRORSKIN_PROCESSOR=processor) == [EXP, compiled]
     assert len(records(tmp_path)) == 2
 
 
-@pytest.mark.parametrize("damage", [lambda kept: b"", lambda kept: kept[:-9], lambda kept: kept[:-1] + b"x"])
-def test_a_damaged_record_is_made_again(damage, change, tmp_path):
-    change("2*values[item]")
-    (record,) = records(tmp_path)
-    record.write_bytes(damage(record.read_bytes()))
-    assert change("2*values[item]") == [[0, 2, 4], 1]
-    assert change("2*values[item]") == [[0, 2, 4], 0]
-
-
-def test_bitcode_that_pocl_refuses_is_made_again(change, tmp_path):
-    change("2*values[item]")
-    (record,) = records(tmp_path)
-    head, _, _ = record.read_bytes()[32:].partition(b"\n")
+def not_bitcode(record):
+    """Replace the bitcode of a record, and seal it anew."""
+    head, _, _ = record[32:].partition(b"\n")
     sealed = head + b"\nBC\xc0\xde no bitcode"
-    record.write_bytes(hashlib.sha256(sealed).digest() + sealed)
-    assert change("2*values[item]") == [[0, 2, 4], 1]
+    return hashlib.sha256(sealed).digest() + sealed
+
+
+def test_a_record_that_is_damaged_or_refused_by_pocl_is_made_again(change, tmp_path):
+    change("2*values[item]")
+    (record,) = records(tmp_path)
+    sound = record.read_bytes()
+    for damaged in (b"", sound[:-9], sound[:-1] + b"x", not_bitcode(sound)):
+        record.write_bytes(damaged)
+        assert change("2*values[item]") == [[0, 2, 4], 1]
+    assert change("2*values[item]") == [[0, 2, 4], 0]
 
 
 def test_a_folder_that_cannot_be_written_costs_only_time(change, tmp_path):
     (tmp_path / "mirrorskin").write_text("a file where the folder should be")
-    for _ in range(2):
-        assert change("2*values[item]") == [[0, 2, 4], 1]
+    assert change("2*values[item]") == [[0, 2, 4], 1]
 
 
 def test_processes_that_start_at_once_get_along(start, change, tmp_path):
-    processes = [start(f"{factor}*values[item]") for factor in (2, 2, 3, 3)]
-    for process, factor in zip(processes, (2, 2, 3, 3), strict=True):
+    processes = [start(f"{factor}*values[item]") for factor in (2, 2, 3)]
+    for process, factor in zip(processes, (2, 2, 3), strict=True):
         with process:
             assert json.load(process.stdout)[0] == [0, factor, 2 * factor]
     assert len(records(tmp_path)) == 2

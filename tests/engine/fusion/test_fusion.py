@@ -627,10 +627,15 @@ def test_other_regions_of_one_size_are_refused(tmp_path):
 SEEDS = 11, 12, 13
 
 
+@cache
+def fused_sample(inputs, seed):
+    return sample_fusion.INPUTS[inputs](seed)
+
+
 @pytest.mark.parametrize("inputs", sample_fusion.INPUTS)
 def test_sigma_of_the_fused_sample_is_the_scatter_of_its_errors(inputs):
     scores = [
-        sample_fusion.error_of(sample_fusion.INPUTS[inputs](seed), sample_fusion.sources_of(seed)[0].truth)
+        sample_fusion.error_of(fused_sample(inputs, seed), sample_fusion.sources_of(seed)[0].truth)
         for seed in SEEDS
     ]
     rms, _, chi_square, _ = np.mean(scores, axis=0)
@@ -639,9 +644,9 @@ def test_sigma_of_the_fused_sample_is_the_scatter_of_its_errors(inputs):
 
 
 def test_results_fused_note_that_recordings_are_more_accurate():
-    notes = sample_fusion.of_results(SEEDS[0]).process["notes"]
+    notes = fused_sample("results", SEEDS[0]).process["notes"]
     assert "engine.fuse of both recordings" in notes
-    assert "notes" not in sample_fusion.of_recordings(SEEDS[0]).process
+    assert "notes" not in fused_sample("recordings", SEEDS[0]).process
 
 
 # Analytic recordings: a wavy surface that a lens shows to a camera with noise.

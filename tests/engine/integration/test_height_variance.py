@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import sparse
 from slope_oracle import Problem, build, centred
 
 from mirrorskin import engine
@@ -18,17 +19,17 @@ LEFT = np.where(COLUMN < 9, 0.0, np.nan)
 def exact_variance(problem):
     """The heights' variance by dense algebra, where the weights are inverse variances."""
     graph = build(problem)
-    difference, reading = graph.difference.toarray(), graph.reading.toarray()
-    matrix = difference.T @ (graph.weight[:, None] * difference) + np.diag(graph.pull)
+    weighted = graph.difference.T @ sparse.diags(graph.weight)
+    matrix = (weighted @ graph.difference).toarray() + np.diag(graph.pull)
     for label in np.flatnonzero(graph.free):
         member = (graph.label == label).astype(float)
         matrix += np.outer(member, member)
     weights = np.broadcast_to(
         1.0 if problem.slope_weights is None else problem.slope_weights, (2, *SHAPE)
     ).reshape(-1)
-    moves = difference.T @ (graph.weight[:, None] * reading) / np.sqrt(np.where(weights > 0, weights, 1))
-    moves = np.hstack([moves, np.diag(np.sqrt(graph.pull))])
-    variance = np.sum(centred(graph, np.linalg.solve(matrix, moves)) ** 2, axis=1)
+    moves = weighted @ graph.reading @ sparse.diags(1 / np.sqrt(np.where(weights > 0, weights, 1)))
+    moves = sparse.hstack([moves, sparse.diags(np.sqrt(graph.pull))])
+    variance = np.sum(centred(graph, np.linalg.inv(matrix) @ moves) ** 2, axis=1)
     picture = np.full(SHAPE, np.nan)
     picture[graph.pixel >= 0] = variance
     return picture

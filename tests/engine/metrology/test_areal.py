@@ -1,5 +1,7 @@
 """Areal parameters against closed forms and against surfalize, and with holes."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import surfalize
@@ -40,21 +42,27 @@ CURVE = {"Sk", "Spk", "Svk", "Smr1", "Smr2", "Vmp", "Vmc", "Vvc", "Vvv"}
 CASES = [(kind, name) for kind in SURFACES for name in AREAL if name not in ("Str", "Std")]
 
 
+@cache
+def of_surface(kind):
+    """Return the parameters of a surface, and what surfalize makes its own from."""
+    surface = surfalize.Surface(1e3 * SURFACES[kind], 1e3 * SIZE[0], 1e3 * SIZE[1])
+    return values(SURFACES[kind]), surface, surface.get_abbott_firestone_curve()
+
+
 # The curve of waves has its least slope at both ends, so its core is either.
 @pytest.mark.parametrize(("kind", "name"), [(k, n) for k, n in CASES if k != "waves" or n not in CURVE])
 def test_parameters_are_those_of_surfalize(kind, name):
-    surface = surfalize.Surface(1e3 * SURFACES[kind], 1e3 * SIZE[0], 1e3 * SIZE[1])
-    curve = surface.get_abbott_firestone_curve()
+    parameters, surface, curve = of_surface(kind)
     other = getattr(curve, name.lower())() if name.startswith("V") else getattr(surface, name)()
     other = 1e-3 * other if name == "Sal" else other
     tolerance = {"Ssk": 1e-9, "Smr1": 0.05, "Smr2": 0.05, "Spk": 0.01, "Svk": 0.01}.get(name, 0.0)
-    assert values(SURFACES[kind])[name] == pytest.approx(other, rel=3e-3, abs=tolerance)
+    assert parameters[name] == pytest.approx(other, rel=3e-3, abs=tolerance)
 
 
 @pytest.mark.parametrize("kind", ["isotropic", "with a lay", "hills"])
 def test_the_aspect_ratio_is_that_of_surfalize(kind):
-    surface = surfalize.Surface(1e3 * SURFACES[kind], 1e3 * SIZE[0], 1e3 * SIZE[1])
-    assert values(SURFACES[kind])["Str"] == pytest.approx(surface.Str(), rel=0.01)
+    parameters, surface, _ = of_surface(kind)
+    assert parameters["Str"] == pytest.approx(surface.Str(), rel=0.01)
 
 
 def test_the_autocorrelation_length_is_that_of_the_surface_before_it_was_drawn():

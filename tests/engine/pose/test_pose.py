@@ -169,10 +169,10 @@ def test_pixels_near_the_border_of_contact_do_not_count() -> None:
 def test_errors_on_results_from_frames_match_the_covariance(name, top: float, free: int) -> None:
     """Of the ball's centre, the cone's tip, or the rod's axis, whether it moved or not."""
     errors = []
+    thing = make_object(name, (128, 128), (0.07, 0.07))
     for seed in range(3):
+        before, deep = turned(thing, seed)
         for shift, angle in (((0.0, 0.0), 0.0), ((0.3, -0.2), 0.15)):
-            thing = make_object(name, (128, 128), (0.07, 0.07))
-            before, deep = turned(thing, seed)
             after, deep_after = turned(Moved(thing, shift, angle), seed + 100)
             pose = engine.pose.estimate_pose(before, after)
             assert len(pose.undetermined) == free
