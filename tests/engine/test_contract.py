@@ -11,11 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bare import Parts
 from operations import CASES, CUTS, LEVELS, assert_same, engine_classes
 
 from mirrorskin import engine, io
+from mirrorskin.engine.base.options import Configured
 from mirrorskin.engine.live import LiveRun
 from mirrorskin.kernels import memory
+from mirrorskin.kernels.errors import DeviceError
 
 pytestmark = pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 EACH = pytest.mark.parametrize("name", CASES)
@@ -176,6 +179,25 @@ def test_what_memory_held_before_and_what_comes_after_changes_nothing(device, na
         np.asarray(values)[...] = 1  # it is the caller's
 
 
+@pytest.mark.parametrize(
+    "name", [name for name in CASES if not name.startswith(("LastTurn", "MovingNormals", "Slip"))]
+)
+def test_a_picture_in_bands_has_the_maps_of_the_whole(small_device, name):
+    case, limit, bands = CASES[name], 1 << 17, set()
+    expected = whole(name, small_device)
+    while len(bands) < 3:
+        small_device.max_allocation = limit = limit * 2 // 3
+        operation = case.make(device=small_device)
+        source = Parts(case.frames, operation, case.given, [5])
+        run = engine.Run(operation.plan(source), source)
+        assert_same(run.complete(), expected)
+        assert_same(run.result(), expected)
+        bands.add(len(run.operation._picture.bands))
+    small_device.max_allocation = 64
+    with pytest.raises(DeviceError, match=r"one row of 31 pixels does not fit|has no memory for"):
+        case.whole(device=small_device)
+
+
 @EACH
 def test_running_it_over_a_recording_gives_the_same(name):
     case = replace(CASES[name], weights={})
@@ -233,6 +255,28 @@ def uneven_options():
             value = option.stored(operation)
             if option.kind in ("number", "numbers", "map") and option.name not in ABOUT_FRAMES:
                 yield pytest.param(name, option.name, uneven(option, value), id=f"{name}, {option.name}")
+
+
+def impossible_values():
+    """Yield each option of the engine's classes with values outside of its range, and what is needed."""
+    for kind in engine_classes():
+        for option in kind.options.values() if issubclass(kind, Configured) else ():
+            low, high = option.within
+            wrong = [None if low is None else low - 1, None if high is None else high + 1, option.above]
+            wrong += [np.nan] if option.kind == "number" else []
+            if option.kind == "choice":
+                yield pytest.param(kind, option, "nonsense", id=f"{kind.__name__}, {option.name}")
+            elif option.kind in ("number", "integer", "numbers", "integers"):
+                for number in (number for number in wrong if number is not None):
+                    yield pytest.param(kind, option, number, id=f"{kind.__name__}, {option.name} {number:g}")
+
+
+@pytest.mark.parametrize(("kind", "option", "value"), list(impossible_values()))
+def test_a_value_outside_of_the_declared_range_is_refused_in_a_line(kind, option, value):
+    several = option.kind in ("numbers", "integers")
+    with pytest.raises(io.InputError, match=f"{option.name} .*{value}.*(is needed|Use )") as caught:
+        kind(**{option.name: [value] * (option.count or 1) if several else value})
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("name", "option", "value"), list(uneven_options()))

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import pytest
 from live_frames import PIXEL, paced, press_header
-from stacks import TRAVEL, MadeUp, random_stack, record, sphere
+from stacks import TRAVEL, MadeUp, random_stack, record
 
 from mirrorskin import engine, io
 from mirrorskin.engine.base.options import Option
@@ -74,18 +74,6 @@ def test_a_recording_gives_the_same_bits_however_it_is_cut(tmp_path, whole, comp
     same(result, whole)
 
 
-def test_frames_that_come_one_by_one_give_the_same_bits(whole):
-    same(engine.run((frame for frame in FRAMES), Moments, travel=TRAVEL), whole)
-
-
-def test_a_second_run_begins_anew_and_leaves_the_first_result_alone(whole):
-    moments = Moments()
-    first = engine.run(FRAMES, moments, travel=TRAVEL)
-    engine.run(FRAMES[:3], moments, travel=TRAVEL[:3])
-    same(first, whole)
-    same(engine.run(stack(), moments), whole)
-
-
 def test_maps_numbers_and_provenance_are_kept_in_a_file(tmp_path):
     class Mixed(Moments):
         def result(self):
@@ -125,17 +113,6 @@ def test_maps_that_are_not_built_in_are_exported_and_displayed(tmp_path):
 def test_select_turn_includes_maps_that_are_not_built_in():
     turns = io.Result(zenith=np.zeros((2, 5, 7), np.float32), total=FRAMES[:2])
     np.testing.assert_array_equal(io.select_turn(turns, 1)["total"], FRAMES[1])
-
-
-def test_built_in_operations_are_run_as_well(device):
-    press = sphere()
-    frames = press.read(np.empty(press.shape, press.dtype)).frames.copy()
-    onset = engine.find_onset(frames, TRAVEL, device=device)
-    result = engine.run(press, engine.Onset(device=device, memory_limit=1))
-    for name in ("height", "height_sigma", "status", "frame"):
-        np.testing.assert_array_equal(result[name], onset[name])
-    assert result.process["noise"] == onset.process["noise"]
-    assert result.process["device"] == device.info.title
 
 
 def test_levels_that_are_not_given_are_those_of_the_recording(tmp_path):
@@ -412,15 +389,6 @@ def test_a_map_declared_in_the_class_is_written_with_its_unit_and_legend(tmp_pat
     np.testing.assert_array_equal(read.height_sigma, result.wear_sigma)
     assert read.declaration("wear_sigma").unit == "mm"
     assert read.declaration("material").codes == {0: "unknown", 1: "steel"}
-
-
-def test_what_result_returns_does_not_change_afterwards():
-    moments = engine.Run(Moments())
-    moments.push(FRAMES[:3], travel=TRAVEL[:3])
-    first = moments.result()
-    kept = {name: values.copy() for name, values in first.items()}
-    moments.push(FRAMES[3:], travel=TRAVEL[3:])
-    same(first, kept)
 
 
 def declared(**attributes):

@@ -12,7 +12,6 @@ from mirrorskin.engine.base.picture import PerFrame, Picture
 from mirrorskin.engine.base.tiling import Planes
 from mirrorskin.engine.optical.focus import Focus
 from mirrorskin.engine.optical.photometric import PhotometricStereo
-from mirrorskin.kernels.device import Device
 
 SHAPE, COUNT = (23, 31), 9
 FRAMES = np.random.default_rng(3).integers(20, 200, (COUNT, *SHAPE)).astype(np.uint8)
@@ -69,31 +68,6 @@ def same(actual, expected):
     assert list(actual) == list(expected)
     for name in expected:
         np.testing.assert_array_equal(actual[name], expected[name], err_msg=name)
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_bands_have_the_maps_of_the_whole(small_device, name):
-    operation, positions, smallest = CASES[name]
-    operation = operation.with_options(device=small_device)
-    whole = bare(operation, FRAMES, **positions)
-    small_device.max_allocation = smallest
-    run = bare_run(operation)
-    for start in range(0, COUNT, 4):
-        part = slice(start, start + 4)
-        run.push(FRAMES[part], **{name: values[part] for name, values in positions.items()})
-    assert len(run.operation._picture.bands) > 2
-    for _ in range(2):
-        same(run.result(), whole)
-    same(bare(operation, FRAMES, [2, 3], **positions), whole)
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_several_devices_have_the_maps_of_one(device, name):
-    operation, positions, _ = CASES[name]
-    other = Device(device.context.devices[0])
-    other.info, other.layout = device.info, device.layout
-    expected = bare(operation.with_options(device=device), FRAMES, **positions)
-    same(bare(operation.with_options(device=[device, other]), FRAMES, **positions), expected)
 
 
 @pytest.mark.parametrize("name", CASES)

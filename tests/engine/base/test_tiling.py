@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from bare import bare, find_onset, ready
-from presses import LEVELS, SPEC, assert_equal, random_press
+from bare import find_onset, ready
+from presses import assert_equal, random_press
 
 from mirrorskin.engine import Onset
 from mirrorskin.io import Block
@@ -13,21 +13,7 @@ from mirrorskin.kernels.errors import DeviceError
 
 FRAMES = random_press("uint8", 30, (23, 31), seed=5)
 TRAVEL = np.arange(30) * 0.1
-LARGEST = 3 * 768 * 4  # three planes of frame numbers, 23 x 31 pixels in whole words
 SMALLEST = 3 * 64 * 4  # those of one row
-
-
-@pytest.mark.parametrize("limit", [LARGEST, LARGEST - 1, SMALLEST])
-def test_less_room_gives_the_same_answer(small_device, limit):
-    whole = find_onset(FRAMES, TRAVEL, **LEVELS["uint8"], device=small_device)
-    small_device.max_allocation = limit
-    search = ready(Onset(dark=20, bright=220, device=small_device), FRAMES, TRAVEL)
-    for start in range(0, 30, 4):
-        part = slice(start, start + 4)
-        search.push(FRAMES[part], travel=TRAVEL[part])
-    assert_equal(search.result(), whole)
-    assert_equal(search.result(), whole)
-    assert (len(search.operation._picture.bands) > 1) == (limit < LARGEST)
 
 
 def test_the_room_shrinks_before_the_picture_is_cut_and_one_row_must_fit(small_device):
@@ -81,20 +67,6 @@ def lent(frames, offset):
     placed[:] = frames
     placed.flags.writeable = False
     return placed
-
-
-@pytest.mark.parametrize(
-    ("dtype", "size", "offset"),
-    [("uint8", (23, 31), 8), ("uint8", (16, 64), 64), ("uint16", (16, 64), 1448), ("float32", (23, 31), 0)],
-)
-def test_lent_frames_give_the_same_answer_wherever_they_lie(device, dtype, size, offset):
-    frames = random_press(dtype, 40, size, seed=6)
-    travel = np.arange(40) * 0.1
-    placed = lent(frames, offset)
-    dark, bright = SPEC[dtype]
-    search = Onset(dark=dark, bright=bright, device=device, memory_limit=2 * frames.nbytes)
-    result = bare(search, placed, [33, 34], travel=travel)
-    assert_equal(result, find_onset(frames, travel, **LEVELS[dtype], device=device))
 
 
 def test_lent_frames_are_worked_on_where_they_lie(device):

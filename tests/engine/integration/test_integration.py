@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import pickle
-import threading
 from functools import cache
 
 import numpy as np
@@ -447,23 +446,6 @@ def test_the_order_of_calls_does_not_matter(alone, order):
     first = heights(2)
     heights(3)
     np.testing.assert_array_equal(first, alone[2])
-
-
-def test_threads_do_not_meet(alone):
-    solved = {}
-
-    def work(case):
-        solved[case] = [heights(case) for _ in range(3)]
-
-    threads = [threading.Thread(target=work, args=(case,)) for case in (2, 4, 7)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for case, answers in solved.items():
-        for answer in answers:
-            np.testing.assert_array_equal(answer, alone[case])
-    assert len(solved) == 3
 
 
 def test_a_picture_that_failed_leaves_nothing_behind(alone):

@@ -178,17 +178,6 @@ def test_without_a_pixel_size_there_are_no_heights():
     assert live.result().height is None
 
 
-def test_compiling_in_advance_changes_nothing():
-    frames, live = make(noise=None)
-    live.precompile()
-    with pytest.raises(InputError):
-        live.result()
-    feed(live, frames, [SHAPE[0]])
-    _, fresh = make(noise=None)
-    feed(fresh, frames, [SHAPE[0]])
-    np.testing.assert_array_equal(live.result().normals, fresh.result().normals)
-
-
 def test_a_whole_run_uses_each_frame():
     frames = turn_frames(SHAPE)
     source = paced(frames, turn_header(), PHASE, 100.0, SimulatedClock())

@@ -28,19 +28,6 @@ class Timed(MadeUp):
         return 0.01 * self.frames_read
 
 
-def test_slip_is_bit_by_bit_that_of_the_same_frames_offline():
-    live = LiveRun(source(), Sliding(contact=CONTACT))
-    live.precompile()
-    for part in np.split(np.arange(COUNT), [1, 2, 5]):
-        live.push_block(BLOCK, slice(part[0], part[-1] + 1))
-        live.maps()
-    result, offline = live.result(), Sliding(contact=CONTACT).run(source())
-    for name in ("displacement", "slip_onset", "status", "stick_ratio", "slide_distance"):
-        np.testing.assert_array_equal(getattr(result, name), getattr(offline, name), err_msg=name)
-    assert (result.status == 2).mean() > 0.5
-    assert result.process["live"] is True
-
-
 def test_the_displacement_of_the_newest_frame_is_shown_from_the_second_on():
     live = LiveRun(source(), Sliding(contact=CONTACT))
     for number in range(COUNT):

@@ -7,7 +7,7 @@ from typing import get_args
 import geometry
 import numpy as np
 import pytest
-from presses import SPEC, random_press
+from presses import random_press
 from stacks import MadeUp, ball, record
 
 from mirrorskin import engine, io
@@ -165,35 +165,6 @@ def test_options_replace_fields_of_the_recording():
     assert_found(result, engine.find_onset(frames_of(twin(DOWN)), DOWN, **options))
     options_used = {name: result.process[name] for name in options}
     assert options_used == {"dark": 40.0, "bright": "map given", "noise": 3.0, "threshold": 0.3, "hold": 2}
-
-
-def test_frames_of_all_types_go_the_same_way():
-    heights = [
-        engine.reconstruct(ball((40, 50), 0.2, DOWN[:20], dtype=dtype, noise=0)).height for dtype in SPEC
-    ]
-    np.testing.assert_allclose(heights[0], heights[1], atol=1e-6)
-    np.testing.assert_allclose(heights[0], heights[2], atol=1e-6)
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize(
-    ("dtype", "compression"), [("uint8", "raw"), ("uint16", "bitshuffle"), ("float32", "gzip")]
-)
-def test_storage_and_memory_do_not_change_a_result(device, tmp_path, dtype, compression, method):
-    dark, bright = (np.full((21, 34), level, np.float32) for level in SPEC[dtype])
-    frames, header = (
-        random_press(dtype, 37, (21, 34), seed=3),
-        io.Header("vertical", dark=dark, bright=bright),
-    )
-    travel = 0.1 * np.arange(37)
-    expected = FIND[method](frames, travel, dark=dark, bright=bright, device=device)
-    with io.Recorder(MadeUp(frames, header, travel=travel), tmp_path / "press.h5", compression) as recorder:
-        recorder.drain(lambda frame_count: None)
-    for limit in (1, 10 * frames[0].nbytes, 10**9):
-        with io.open_recording(tmp_path / "press.h5", memory_limit=limit) as recording:
-            options = {"method": method, "blur": 0, "device": device, "memory_limit": limit}
-            result = engine.reconstruct(recording, **options)
-        assert_found(result, expected)
 
 
 def test_a_result_outlives_its_recording(tmp_path):

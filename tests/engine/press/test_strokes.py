@@ -9,7 +9,6 @@ import pytest
 from bare import bare, find_onset
 
 from mirrorskin import engine, io
-from mirrorskin.engine.live import LiveRun
 from mirrorskin.twin import Camera, Twin, Vertical, oscillating_travel
 
 DARK, BRIGHT, NOISE = 20.0, 220.0, 2.0
@@ -157,23 +156,6 @@ def test_a_source_that_oscillates_is_reconstructed_from_all_its_strokes(dither):
     up = engine.reconstruct(dither, fill=False, event="release")
     np.testing.assert_array_equal(up.hysteresis, result.hysteresis)
     np.testing.assert_allclose((up.height - result.height)[inner], result.hysteresis[inner], atol=1e-6)
-
-
-def test_it_works_live_and_through_a_file(dither, tmp_path):
-    exact = engine.reconstruct(dither, fill=False)
-    live = LiveRun(dither, engine.Press(fill=False))
-    live.precompile()
-    dither.rewind()
-    while (block := dither.read(live.staging_buffer[:5])) is not None:
-        live.push_block(block)
-        live.maps()
-    result = live.result()
-    io.save_result(exact, tmp_path / "result.h5")
-    read = io.open_result(tmp_path / "result.h5")
-    for name in ("height", "height_sigma", "status", "hysteresis", "hysteresis_sigma", "strokes"):
-        np.testing.assert_array_equal(getattr(result, name), getattr(exact, name))
-        np.testing.assert_array_equal(getattr(read, name), getattr(exact, name))
-    assert read.strokes.dtype == np.uint16
 
 
 def test_what_needs_one_press_is_refused():

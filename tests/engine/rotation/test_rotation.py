@@ -84,29 +84,6 @@ def test_a_rotation_becomes_normals_and_what_goes_with_them(tmp_path):
     assert_same(stored, result.assign(process=stored.process))
 
 
-def test_it_is_the_normals_of_the_frames():
-    result = reconstruct(method="paper", noise=20.0)
-    options = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "noise": 20.0}
-    normals = engine.estimate_normals(frames(), PHASE, **options, method="paper")
-    np.testing.assert_array_equal(result.normals, normals.normals)
-    np.testing.assert_array_equal(result.normals_sigma, normals.normals_sigma)
-    for name in ("zenith", "azimuth", "contact", "mean", "modulation", "residual"):
-        np.testing.assert_array_equal(getattr(result, name), getattr(normals, name))
-
-
-@pytest.mark.parametrize("options", [{"per_turn": True}, {"heights": FLAT}, {"tilt": "estimate"}])
-def test_it_is_the_same_however_a_source_is_read(options):
-    header = replace(OF_A_SURFACE, pixel_size=None) if "heights" not in options else OF_A_SURFACE
-    whole = reconstruct(header, **options)
-    frame = 2 * SHAPE[0] * SHAPE[1]
-    for limit in (1, 6 * frame):
-        alike(reconstruct(header, memory_limit=limit, **options), whole)
-    again = source(header)
-    again.rewindable, again.rewind = True, lambda: setattr(again, "frames_read", 0)
-    again.read(np.empty((5, *SHAPE), np.uint16))
-    alike(engine.reconstruct(again, **options), whole)
-
-
 def test_each_turn_may_be_returned_alone():
     result, mean = reconstruct(OF_A_SURFACE, per_turn=True), reconstruct(OF_A_SURFACE)
     for name, values in result.maps().items():
