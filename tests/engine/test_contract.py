@@ -263,10 +263,10 @@ def impossible_values():
         for option in kind.options.values() if issubclass(kind, Configured) else ():
             low, high = option.within
             wrong = [None if low is None else low - 1, None if high is None else high + 1, option.above]
-            wrong += [np.nan] if option.kind == "number" else []
+            wrong += [np.nan] if option.kind in ("number", "map") else []
             if option.kind == "choice":
                 yield pytest.param(kind, option, "nonsense", id=f"{kind.__name__}, {option.name}")
-            elif option.kind in ("number", "integer", "numbers", "integers"):
+            elif option.kind in ("number", "integer", "numbers", "integers", "map"):
                 for number in (number for number in wrong if number is not None):
                     yield pytest.param(kind, option, number, id=f"{kind.__name__}, {option.name} {number:g}")
 

@@ -282,6 +282,8 @@ def test_a_saturated_sample_is_light_and_pixels_without_references_are_invalid(d
     [
         ({"frames": np.zeros((1, 3, 3), np.uint8), "travel": [0.0]}, "at least 2 frames"),
         ({"event": "release"}, "runs back at frame 1: a release only goes up"),
+        ({"threshold": 0.0}, "threshold 0.0"),
+        ({"hold": 13}, "hold 13"),
     ],
 )
 def test_bad_input_is_refused(change, words):
