@@ -19,7 +19,7 @@ from mirrorskin.hw.base.drivers import CAMERAS, STAGES, Driver, built_in
 from mirrorskin.hw.base.rig_file import StageSettings
 from mirrorskin.io import Fitted, Map
 from mirrorskin.io.base.types import PROPERTIES
-from mirrorskin.io.formats.registry import exports
+from mirrorskin.io.formats.registry import FOLDER, Format, exports, formats
 from mirrorskin.io.model.calibration import PARTS
 from mirrorskin.io.model.maps import (
     TABLE,
@@ -77,6 +77,10 @@ def tables() -> dict[str, dict[str, str]]:
             "map": as_table(["map", "shape, type", "unit", "undefined", "content"], rows),
             "fitted": as_table(["fitted", "shape, type", "unit", "content"], facts),
             "code": as_table(["code", *_STATUS], meanings),
+            "frames of other programs": as_table(
+                ["frames of other programs", "suffixes", "options", "extra"],
+                (_reader(form) for form in formats(installed=False) if form.source),
+            ),
             "suffix": as_table(
                 ["suffix", "content", "unit, and where it is stated", "holes", "filled heights", "opens in"],
                 _rows_of_exports(),
@@ -95,6 +99,12 @@ def tables() -> dict[str, dict[str, str]]:
             "dataset": as_table(["dataset", "shape, type", "unit", "content"], [*_CAMERA, *stored, _PROCESS])
         },
     }
+
+
+def _reader(form: Format) -> list[str]:
+    suffixes = ", ".join(f"`{suffix}`" for suffix in form.suffixes if suffix != FOLDER)
+    options = ", ".join(f"`--{name}`" for name in form.takes if name in ("dataset", "channel"))
+    return [form.source, suffixes, options, f"`mirrorskin[{form.extra}]`" if form.extra else ""]
 
 
 def _rows_of_exports() -> list[list[str]]:

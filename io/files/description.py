@@ -70,7 +70,7 @@ def describe(path: str | Path, *, dataset: str | None = None, channel: int | Non
 
 
 def _frames(kind: str, frames: FrameReader) -> dict[str, str]:
-    """Describe the frames of a folder, TIFF, video or MCAP file."""
+    """Describe the frames of a file or folder of another program."""
     count, rows, columns = frames.shape
     facts = {"kind": kind}
     facts |= {"frames": f"{count} of {columns} x {rows}, {frames.dtype.name}", "storage": frames.how}

@@ -78,7 +78,7 @@ def open_recording(
     override_motion: bool = False,
     verify: bool = True,
 ) -> Recording:
-    """Open a stack of frames: HDF5, Zarr, NPY, NPZ, TIFF, MCAP, a video, or a folder of numbered pictures.
+    """Open a stack of frames: a recording, or frames of any format that is read.
 
     Parameters
     ----------

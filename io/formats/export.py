@@ -44,12 +44,8 @@ def export_result(
     result : Result
         Maps of one turn; see ``select_turn``.
     path : str or Path
-        The suffix selects the format: ``.ply``, ``.stl`` and ``.obj``, a surface of triangles; ``.xyz``,
-        points as text; ``.x3p`` (ISO 25178-72), ``.sur`` (Digital Surf) and ``.gsf`` (Gwyddion), heights for
-        programs of metrology; ``.png``, ``.tif`` and ``.tiff``, heights as counts of 16 bits with their
-        scale, 0 for undefined; ``.csv``, heights as a matrix in mm, or a cross-section; ``.npz``, all maps as
-        plain arrays; ``.mcap``, ROS 2 messages, as written by ``save_messages``; ``.zarr``, everything in a
-        result file, as written by ``save_zarr``.
+        The suffix selects the format, such as ``.ply``, ``.tif``, ``.csv`` or ``.npz``;
+        ``mirrorskin export --help`` lists all.
     map_name : str, optional
         Name of a map, built-in or declared, which a ``.csv``, a ``.tif`` (float32) or an ``.npz`` contains
         instead, in its unit.

@@ -47,6 +47,7 @@ MCAP = Format(
     writes_itself=True,
     of_recordings=True,
     recorder="GrowingMessages",
+    extra="mcap",
     exported=(
         (
             "`.mcap`",
@@ -88,6 +89,7 @@ _MOST_PACKED = 255  # largest compression ratio accepted for all chunks of a fil
 # From the file format (https://mcap.dev/spec): opcode and length, then the fields.
 _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _HEADER_BYTES = 12  # bytes of a header in CDR: encapsulation, seconds and nanoseconds
+_MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _FOOTER_CODE = struct.Struct("<BQQQI8s"), 2
 
 # The fields of standard ROS 2 messages.
@@ -551,6 +553,16 @@ class MessageFrames(WholeFrames):
                 file.seek(chunk.chunk_start_offset)
                 yield next(iter(StreamReader(file, skip_magic=True, emit_chunks=True).records))
 
+    def _index_start(self, file: BufferedReader) -> int:
+        """Return where the index starts, from the end of a file with the first bytes of MCAP."""
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise ValueError("its first bytes are not those of MCAP")
+        file.seek(-_FOOTER.size, os.SEEK_END)
+        code, _, start, *_ = _FOOTER.unpack(file.read(_FOOTER.size))
+        if code != _FOOTER_CODE or not start:
+            raise InputError(f"{self._path} has no index: it is cut off; 'mcap recover' makes one")
+        return int(start)
+
     def _read_summary(self) -> _Summary:
         """Read the channels and chunks from the file's index."""
         try:
@@ -561,11 +573,7 @@ class MessageFrames(WholeFrames):
         schemas: dict[int, str] = {}
         summary, notes = _Summary({}, [], {}), list[int]()
         with self._errors_named(), open_regular(self._path) as file:
-            file.seek(-_FOOTER.size, os.SEEK_END)
-            code, _, start, *_ = _FOOTER.unpack(file.read(_FOOTER.size))
-            if code != _FOOTER_CODE or not start:
-                raise InputError(f"{self._path} has no index: it is cut off; 'mcap recover' makes one")
-            file.seek(start)
+            file.seek(self._index_start(file))
             for record in StreamReader(file, skip_magic=True, emit_chunks=True).records:
                 if isinstance(record, Schema):
                     schemas[record.id] = record.name

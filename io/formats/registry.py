@@ -69,7 +69,7 @@ class Format:
         Name of the class that writes frames while they come, in the module of the declaration; "" if none
         does. See `mirrorskin.io.formats.mcap.GrowingMessages`.
     package, extra : str
-        Package that exporting it needs, and the extra of mirrorskin that installs it.
+        Package that exporting it needs, and the extra of mirrorskin that installs what it needs.
     exported : tuple of tuples of str
         Rows of the table of exports in the documentation: suffix and option, content, unit and where it is
         stated, holes, filled heights, programs that open it.

@@ -53,6 +53,7 @@ VIDEO = Format(
     reader="VideoFrames",
     has_positions=False,
     takes=("dataset", "channel", "memory_limit"),
+    extra="video",
 )
 
 

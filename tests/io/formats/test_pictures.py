@@ -31,6 +31,14 @@ def save(folder, names, dtype=np.uint8):
         assert cv2.imwrite(str(folder / name), frame(number, dtype))
 
 
+def write_sample(folder):
+    folder.mkdir()
+    save(folder, [f"frame{number}.png" for number in range(4)])
+
+
+SAMPLES = {"pictures": write_sample}
+
+
 def drain(source, size=None):
     """Read to the end, ``size`` frames at a time; return copies of the frames, and the blocks."""
     room = None if size is None else np.empty((size, *source.shape[1:]), source.dtype)

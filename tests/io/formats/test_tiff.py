@@ -36,6 +36,8 @@ def write(path, frames, **options):
 
 PLAIN = {"metadata": None}
 
+SAMPLES = {"stack.tif": lambda path: write(path, stack(6), **PLAIN)}
+
 
 @pytest.mark.parametrize(
     "options",
