@@ -82,6 +82,18 @@ def _words(components: int = 1, offset_unknown: int = 0) -> Iterator[str]:
         yield f"absolute height unknown{of}"
 
 
+def make_folder(folder: Path, parents: bool = False) -> None:
+    """Create a folder for output, unless it exists; with ``parents``, also those above it."""
+    from mirrorskin.io import InputError
+
+    try:
+        folder.mkdir(parents=parents, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: the folder cannot be created: {error.strerror}. Choose another with -o"
+        ) from error
+
+
 def printable(value: object) -> str:
     """Return a text in the encoding of standard output, without characters that control terminals.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -14,13 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from mirrorskin.cli import options
+from mirrorskin.cli.commands.simulate import make_twin, preset, record
 from mirrorskin.cli.groups import Option
-from mirrorskin.cli.output import print_json, print_table, progress
+from mirrorskin.cli.output import make_folder, print_json, print_table, progress
 
 if TYPE_CHECKING:
     from mirrorskin import io
     from mirrorskin.engine.metrology.scoring import Score
-    from mirrorskin.twin import Movement, Twin
 
 Results = dict[str, "io.Result"]
 Scores = dict[str, "Score"]
@@ -28,55 +27,36 @@ Draw = Callable[..., None]
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """An object of the twin under a square picture; `frames`: of the press or of the turn."""
+class Press:
+    """A press of the paper's section 3.2, and how it is drawn."""
 
-    object: str
     title: str
-    size: int  # pixels
-    pixel_size: float  # mm
-    frames: int
-
-
-@dataclass(frozen=True)
-class Press(Experiment):
-    """A press of the paper's section 3.2."""
-
-    step: float  # mm
+    line: str  # motion and options of 'simulate'
     surface: bool = False  # drawn in space as well
     detail: tuple[float, float] | None = None  # heights, mm, that have a colour scale of their own
 
-    def movement(self) -> Movement:
-        """Return the steps of the press."""
-        from mirrorskin import io
-        from mirrorskin.twin import Vertical
 
-        return Vertical(io.Steps(self.step, self.step).positions(self.frames))
-
-
-@dataclass(frozen=True)
-class Turn(Experiment):
-    """The axial rotation of the paper's section 4.2, about a point of the pressed sheet."""
-
-    press: float  # mm
-    tilt: float  # degrees
-
-    def movement(self) -> Movement:
-        """Return one turn of even steps."""
-        from mirrorskin import io
-        from mirrorskin.twin import Axial
-
-        phase = io.Steps(2 * math.pi / self.frames).positions(self.frames)
-        return Axial(phase, math.radians(self.tilt), self.press)
-
-
+# The paper's ideal sensor; its camera has noise, uneven pixels and a lens.
+_CAMERA = "--noise 1 --electrons 40 --gain-deviation 0.02 --offset-deviation 0.5 --point-spread 0.5"
 PRESSES = {
-    "fig5": Press("sphere", "Fig. 5: sphere, 10 mm, 30 x 0.1 mm", 240, 0.05, 30, 0.1, surface=True),
+    "fig5": Press(
+        "Fig. 5: sphere, 10 mm, 30 x 0.1 mm",
+        f"vertical {_CAMERA} --size 240x240 --pixel-size 0.05mm --frames 30 --travel-step 0.1mm"
+        " --travel-start 0.1mm",
+        surface=True,
+    ),
     "fig6": Press(
-        "coin", "Fig. 6: 5 yen coin, 22 mm, 90 x 0.02 mm", 640, 0.041, 90, 0.02, detail=(-0.3, 0.02)
+        "Fig. 6: 5 yen coin, 22 mm, 90 x 0.02 mm",
+        f"vertical {_CAMERA} --object coin --size 640x640 --pixel-size 0.041mm --frames 90"
+        " --travel-step 0.02mm --travel-start 0.02mm",
+        detail=(-0.3, 0.02),
     ),
 }
-TURN = Turn("sphere", "Fig. 10 (a): sphere, 10 mm, 8 x 45 deg", 240, 0.05, 8, 1.5, 2.5)
+_TURN_TITLE = "Fig. 10 (a): sphere, 10 mm, 8 x 45 deg"
+TURN = (
+    f"axial {_CAMERA} --size 240x240 --pixel-size 0.05mm --pattern linear --references exact"
+    " --frames 8 --press 1.5mm --tilt 2.5deg"
+)
 _TURN, _FUSED_PRESS = "fig10a", "fig5"
 # The method of the normals, and whether the frames are registered with the true heights.
 _METHODS = {"paper": ("paper", False), "exact": ("exact", False), "exact, registered": ("exact", True)}
@@ -117,21 +97,16 @@ def command(
     as_json: options.Json = False,
 ) -> None:
     """Draw the figures of the paper from experiments on the twin."""
-    from mirrorskin import io, view
+    from mirrorskin import view
 
     view.check_drawing()
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise io.InputError(
-            f"{output}: the folder cannot be created: {error.strerror}. Choose another with -o"
-        ) from error
+    make_folder(output, parents=True)
     scores: dict[str, Scores] = {}
     with _drawing() as draw:
         for number, (name, press) in enumerate(PRESSES.items(), 1):
             _announce(number, press.title)
             scores[name] = _press(name, press, output, device, overwrite, draw)
-        _announce(_STEPS - 1, TURN.title)
+        _announce(_STEPS - 1, _TURN_TITLE)
         truth, results = _turn(output, device, overwrite, draw)
         scores[_TURN] = _judge(results, truth)
         _announce(_STEPS, "a press and a rotation, fused")
@@ -139,7 +114,7 @@ def command(
     if as_json:
         print_json(scores)
         return
-    _print_heights({name: found for name, found in scores.items() if name != _TURN})
+    _print_heights({figure: by_method for figure, by_method in scores.items() if figure != _TURN})
     click.echo()
     _print_normals(scores[_TURN])
     click.echo(f"recordings, results and figures are in {output}: look at {output / 'fig5.png'}")
@@ -170,7 +145,7 @@ def _press(name: str, press: Press, folder: Path, device: str | None, overwrite:
     from mirrorskin import engine, io, view
 
     path = folder / f"{name}.h5"
-    truth = _record(press, path, device, overwrite, references="ball")
+    truth = _record(press.line, path, device, overwrite)
     results: Results = {}
     with io.open_recording(path) as recording:
         for method, subframe in (("sub-frame", True), ("eq. 4", False)):
@@ -194,7 +169,7 @@ def _turn(folder: Path, device: str | None, overwrite: bool, draw: Draw) -> tupl
     from mirrorskin import engine, io, view
 
     path = folder / f"{_TURN}.h5"
-    truth = _record(TURN, path, device, overwrite, pattern="linear")
+    truth = _record(TURN, path, device, overwrite)
     results: Results = {}
     with io.open_recording(path) as recording:
         for name, (method, registered) in _METHODS.items():
@@ -202,7 +177,7 @@ def _turn(folder: Path, device: str | None, overwrite: bool, draw: Draw) -> tupl
             results[name] = engine.reconstruct(recording, method=method, heights=heights, device=device)
             target = folder / f"{_TURN}-{name.replace(', ', '-')}-result.h5"
             io.save_result(results[name], target, overwrite=overwrite)
-    draw(view.normal_figure, results, truth, TURN.title, path.with_suffix(".png"))
+    draw(view.normal_figure, results, truth, _TURN_TITLE, path.with_suffix(".png"))
     return truth, results
 
 
@@ -241,35 +216,12 @@ def _fuse(folder: Path, device: str | None, overwrite: bool) -> io.Result:
     return result
 
 
-def _record(
-    experiment: Press | Turn, path: Path, device: str | None, overwrite: bool, **sensor: str
-) -> io.Truth:
-    """Record an experiment with the camera of a laboratory; return the truth."""
-    from mirrorskin import io
-
-    twin = _twin(experiment, device, **sensor)
-    with (
-        io.Recorder(twin, path, truth=lambda: twin.truth, overwrite=overwrite) as recorder,
-        progress("simulating", twin.shape[0]) as show,
-    ):
-        recorder.drain(show)
+def _record(line: str, path: Path, device: str | None, overwrite: bool) -> io.Truth:
+    """Record a preset; return the truth."""
+    motion, values = preset(line)
+    twin = make_twin(motion, values, device=device)
+    record(twin, path, overwrite)
     return twin.truth
-
-
-def _twin(experiment: Press | Turn, device: str | None, **sensor: str) -> Twin:
-    """Return the paper's ideal sensor; its camera has noise, uneven pixels and a lens."""
-    from mirrorskin.twin import Camera, Twin
-
-    options: dict[str, Any] = sensor
-    return Twin(
-        object=experiment.object,
-        shape=(experiment.size, experiment.size),
-        pixel_size=experiment.pixel_size,
-        movement=experiment.movement(),
-        camera=Camera(noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.5, point_spread=0.5),
-        device=device,
-        **options,
-    )
 
 
 def _judge(results: Results, truth: io.Truth) -> Scores:

@@ -15,7 +15,7 @@ from mirrorskin.cli.declared import Terms, term
 from mirrorskin.cli.groups import Argument, refuse_foreign
 
 if TYPE_CHECKING:
-    from mirrorskin.twin import Movement
+    from mirrorskin.twin import Body, Movement, Twin
 
 FRAMES_MAX = 10**7
 _FRAMES = 30
@@ -124,28 +124,42 @@ def command(
     compression: options.Compression = options.CompressionName.raw,
     overwrite: options.Overwrite = False,
     device: options.Device = None,
-    **given: Annotated[Any, TWIN],
+    **chosen: Annotated[Any, TWIN],
 ) -> None:
     """Record what the twin sees, with the truth."""
-    import numpy as np
-
     from mirrorskin import io
-    from mirrorskin.cli.output import printable, progress
-    from mirrorskin.cli.quantity import vector
-    from mirrorskin.twin import Body, Camera, Twin
+    from mirrorskin.cli.output import printable
 
-    values = TWIN.filled(given)
+    values = TWIN.filled(chosen)
     # A name without a suffix is a shape, and not a file to keep.
     files = [source for name in ("object", "pattern") if (source := Path(values[name])).suffix]
     io.check_output(output, *files, replaces="anything" if overwrite else "nothing")
     refuse_foreign(context, motion)
+    twin = make_twin(motion, values, device=device)
+    for name in ("friction", "modulus"):
+        if name in chosen and values["contact"] != "elastic":
+            raise io.InputError(f"--{name} needs --contact elastic: a sheet that only conforms has no forces")
+    record(twin, output, overwrite, compression)
+    count, rows, columns = twin.shape
+    click.echo(printable(f"{output}: {count} frames of {columns} x {rows}: {twin.header.title}"))
+
+
+def make_twin(
+    motion: str, values: Mapping[str, Any], body: Body | None = None, device: str | None = None
+) -> Twin:
+    """Return the twin that values of all options describe, or with another body than that."""
+    import numpy as np
+
+    from mirrorskin.cli.quantity import vector
+    from mirrorskin.twin import Body, Camera, Twin
+
     right, up = vector(values["object_shift"], 2, "--object-shift")
-    twin = Twin(
+    return Twin(
         object=values["object"],
         object_shift=(right, up),
         **sensor_options(values),
-        movement=make_movement(motion, values),
-        body=Body(**{name: values[name] for name in _BODY}),
+        movement=_make_movement(motion, values),
+        body=body or Body(**{name: values[name] for name in _BODY}),
         camera=Camera(
             np.dtype(values["dtype"]),
             **{name: values[name] for name in _CAMERA},
@@ -155,21 +169,37 @@ def command(
         references=values["references"],
         device=device,
     )
-    for name in ("friction", "modulus"):
-        if name in given and values["contact"] != "elastic":
-            raise io.InputError(f"--{name} needs --contact elastic: a sheet that only conforms has no forces")
-    count, rows, columns = twin.shape
+
+
+def preset(line: str) -> tuple[str, dict[str, Any]]:
+    """Return the motion and the values of all options of a command line."""
+    motion, *words = line.split()
+    context = click.Command("simulate", params=[*TWIN.parameters()]).make_context("simulate", words)
+    values = {name: value for name, value in context.params.items() if value is not None}
+    return motion, TWIN.filled(values)
+
+
+def record(
+    twin: Twin,
+    output: Path,
+    overwrite: bool,
+    compression: options.CompressionName = options.CompressionName.raw,
+    label: str = "simulating",
+) -> None:
+    """Write the recording of a twin and the truth; the label is that of the progress bar."""
+    from mirrorskin import io
+    from mirrorskin.cli.output import progress
+
     with (
         io.Recorder(
             twin, output, compression.value, truth=lambda: twin.truth, overwrite=overwrite
         ) as recorder,
-        progress("simulating", count) as show,
+        progress(label, twin.shape[0]) as show,
     ):
         recorder.drain(show)
-    click.echo(printable(f"{output}: {count} frames of {columns} x {rows}: {twin.header.title}"))
 
 
-def make_movement(motion: str, values: Mapping[str, Any]) -> Movement:
+def _make_movement(motion: str, values: Mapping[str, Any]) -> Movement:
     """Return the twin's movement that options describe."""
     import numpy as np
 
@@ -200,7 +230,7 @@ def make_movement(motion: str, values: Mapping[str, Any]) -> Movement:
         return twin.Axial(phase, tilt, press, (x, y, z))
     if motion == "horizontal":
         along = vector(values["displacement_step"], 2, "--displacement-step")
-        return twin.Horizontal(np.stack([io.Steps(one).positions(count) for one in along], axis=1), press)
+        return twin.Horizontal(np.stack([io.Steps(step).positions(count) for step in along], axis=1), press)
     return twin.Twist(io.Steps(values["twist_step"]).positions(count), press)
 
 

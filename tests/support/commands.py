@@ -97,22 +97,14 @@ def _files() -> dict[Path, tuple[int, int]]:
 
 def small_presses() -> dict[str, demo.Press]:
     """Return the demo's presses over the same fields and travels, with few pixels and frames."""
-    frames = 8
+    fewer = {"fig5": f"--size {_SPHERE}x{_SPHERE} --pixel-size 0.25mm --travel-step 0.375mm"}
+    fewer["fig6"] = f"--size {_SIZE}x{_SIZE} --pixel-size {0.041 * 640 / _SIZE}mm --travel-step 0.225mm"
     return {
-        name: dataclasses.replace(
-            press,
-            size=size,
-            pixel_size=press.pixel_size * press.size / size,
-            frames=frames,
-            step=press.step * press.frames / frames,
-        )
+        name: dataclasses.replace(press, line=f"{press.line} {fewer[name]} --frames 8")
         for name, press in demo.PRESSES.items()
-        for size in [_SPHERE if press.object == "sphere" else _SIZE]
     }
 
 
-def small_turn() -> demo.Turn:
+def small_turn() -> str:
     """Return the demo's rotation over the same field, with few pixels."""
-    return dataclasses.replace(
-        demo.TURN, size=_SPHERE, pixel_size=demo.TURN.pixel_size * demo.TURN.size / _SPHERE
-    )
+    return f"{demo.TURN} --size {_SPHERE}x{_SPHERE} --pixel-size 0.25mm"

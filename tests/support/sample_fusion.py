@@ -9,20 +9,20 @@ from __future__ import annotations
 import sys
 import warnings
 from functools import cache
-from unittest import mock
 
 import numpy as np
 
 from mirrorskin import engine, io
 from mirrorskin.cli.commands import sample
+from mirrorskin.cli.commands.simulate import make_twin, preset
 from mirrorskin.twin import Twin
 
 
 @cache
 def sources_of(seed: int) -> tuple[Twin, Twin]:
     """Return the press and the turn of the sample, with another seed."""
-    with mock.patch.object(sample, "_SEED", seed):
-        return sample._pressed(), sample._twin(10.0, sample._turn(1.5), pattern="linear")
+    press, turn = (make_twin(*preset(f"{line} --seed {seed}")) for line in (sample.PRESS, sample.TURN))
+    return press, turn
 
 
 def of_recordings(seed: int) -> io.Result:
