@@ -104,10 +104,10 @@ class Term:
         try:
             value = getattr(quantity, _UNITS.get(self.unit, ("", plain))[1])(text, where)
         except InputError as error:
-            told = str(error)
+            message = str(error)
             if self.unit and self.unit not in _UNITS and re.fullmatch(r"[-+.\de]+\s*[A-Za-zµ/]+", text):
-                told = f"{where} {text}: a number of {self.unit} is needed, without a unit"
-            raise InputError(", or ".join([told, *self.words])) from error
+                message = f"{where} {text}: a number of {self.unit} is needed, without a unit"
+            raise InputError(", or ".join([message, *self.words])) from error
         if self.least is not None and value < self.least:
             raise InputError(f"{where} {text}: a number of at least {self.least} is needed")
         if self.most is not None and value > self.most:
@@ -123,37 +123,45 @@ class Term:
 class DeclaredOption(MotionOption):
     """The option of click for a term; its value is in the term's unit. ``of_engine``: see `ClassCommand`."""
 
-    def __init__(self, one: Term, of_engine: bool = True) -> None:
-        self._term, self.of_engine, self.unit = one, of_engine, one.unit
-        names = [f"{one.flag}/--no-{one.flag[2:]}" if one.kind == "flag" else one.flag, one.name]
+    def __init__(self, declaration: Term, of_engine: bool = True) -> None:
+        self._term, self.of_engine, self.unit = declaration, of_engine, declaration.unit
+        names = [
+            f"{declaration.flag}/--no-{declaration.flag[2:]}"
+            if declaration.kind == "flag"
+            else declaration.flag,
+            declaration.name,
+        ]
         settings: dict[str, Any] = {}
-        if one.kind == "choice":
-            settings = {"type": click.Choice([*one.choices])}
-        elif one.kind == "file":
-            settings = {"type": ExistingPath(), "metavar": one.file or one.unit}
-        elif one.kind == "path":
-            settings = {"type": AnyPath(), "metavar": one.unit}
-        elif one.kind == "name":
-            settings = {"type": NameOrFile(), "metavar": one.unit}
-        elif one.kind == "switch":
+        if declaration.kind == "choice":
+            settings = {"type": click.Choice([*declaration.choices])}
+        elif declaration.kind == "file":
+            settings = {"type": ExistingPath(), "metavar": declaration.file or declaration.unit}
+        elif declaration.kind == "path":
+            settings = {"type": AnyPath(), "metavar": declaration.unit}
+        elif declaration.kind == "name":
+            settings = {"type": NameOrFile(), "metavar": declaration.unit}
+        elif declaration.kind == "switch":
             settings = {"is_flag": True}
-        elif one.kind != "flag":
-            settings = {"metavar": one.metavar, "multiple": one.kind in ("numbers", "integers")}
+        elif declaration.kind != "flag":
+            settings = {
+                "metavar": declaration.metavar,
+                "multiple": declaration.kind in ("numbers", "integers"),
+            }
         super().__init__(
             names,
-            help=f"{one.help[:1].upper()}{one.help[1:].rstrip('.')}.",
+            help=f"{declaration.help[:1].upper()}{declaration.help[1:].rstrip('.')}.",
             default=None,
-            show_default=one.shown_default or one.default or False,
-            motions=one.motions,
+            show_default=declaration.shown_default or declaration.default or False,
+            motions=declaration.motions,
             **settings,
         )
 
     def process_value(self, ctx: click.Context, value: Any) -> Any:
         """Read the text, or the texts of an option that is repeated."""
-        found = super().process_value(ctx, value)
+        text = super().process_value(ctx, value)
         if self.multiple:
-            found = ",".join(found or ()) or None
-        return self._term.read(found, self._term.flag) if isinstance(found, str) else found
+            text = ",".join(text or ()) or None
+        return self._term.read(text, self._term.flag) if isinstance(text, str) else text
 
 
 @dataclass(frozen=True)
@@ -165,22 +173,22 @@ class Terms:
 
     def parameters(self) -> list[DeclaredOption]:
         """Return the options of click."""
-        return [DeclaredOption(one, self.of_engine) for one in self.terms]
+        return [DeclaredOption(term, self.of_engine) for term in self.terms]
 
     def only(self, *names: str) -> Terms:
         """Return some of the options."""
-        return replace(self, terms=[one for one in self.terms if one.name in names])
+        return replace(self, terms=[term for term in self.terms if term.name in names])
 
     def without(self, *names: str) -> Terms:
         """Return all options but some."""
-        return replace(self, terms=[one for one in self.terms if one.name not in names])
+        return replace(self, terms=[term for term in self.terms if term.name not in names])
 
-    def filled(self, given: Mapping[str, Any]) -> dict[str, Any]:
+    def filled(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values of all options: given ones, defaults, or None."""
         return {
-            one.name: given[one.name] if one.name in given else one.read(one.default, one.flag)
-            if one.default else None
-            for one in self.terms
+            term.name: values[term.name] if term.name in values else term.read(term.default, term.flag)
+            if term.default else None
+            for term in self.terms
         }  # fmt: skip
 
 
@@ -223,8 +231,8 @@ class ClassCommand(Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Load the class, and parse the arguments with its options."""
-        name = next((found[1] for word in args if (found := _CLASS.fullmatch(word))), None)
-        name = name or _installed(args, any(one.name == "class_name" for one in self.params))
+        name = next((match[1] for word in args if (match := _CLASS.fullmatch(word))), None)
+        name = name or _installed(args, any(parameter.name == "class_name" for parameter in self.params))
         if name is None:
             return super().parse_args(ctx, args)
         ctx.meta[_LOADED] = self._load(name)
@@ -233,7 +241,7 @@ class ClassCommand(Command):
         try:
             return super().parse_args(ctx, args)
         except click.NoSuchOption as error:
-            flags = [one.opts[0] for one in ctx.meta[_LOADED][1]]
+            flags = [option.opts[0] for option in ctx.meta[_LOADED][1]]
             message = unknown_argument(name, error.option_name, flags, "option")
             raise click.UsageError(message, ctx) from None
 
@@ -246,27 +254,27 @@ class ClassCommand(Command):
         taken: dict[str, click.Parameter | None] = dict.fromkeys(
             self.get_help_option_names(click.Context(self))
         )
-        for one in self.params:
-            if not getattr(one, "of_engine", False):
-                taken |= dict.fromkeys((*one.opts, *one.secondary_opts), one)
+        for parameter in self.params:
+            if not getattr(parameter, "of_engine", False):
+                taken |= dict.fromkeys((*parameter.opts, *parameter.secondary_opts), parameter)
         terms = []
-        for wanted in terms_of({"": kind}):
-            if wanted.flag not in taken:
-                terms.append(wanted)
-            elif wanted.name not in _SHARED or getattr(taken[wanted.flag], "unit", None) != wanted.unit:
+        for term in terms_of({"": kind}):
+            if term.flag not in taken:
+                terms.append(term)
+            elif term.name not in _SHARED or getattr(taken[term.flag], "unit", None) != term.unit:
                 raise InputError(
-                    f"{name} has an option {wanted.name}, and so has 'mirrorskin {self.name}' for something"
+                    f"{name} has an option {term.name}, and so has 'mirrorskin {self.name}' for something"
                     " else. Rename that of the class"
                 )
-        return kind, [DeclaredOption(one) for one in terms]
+        return kind, [DeclaredOption(term) for term in terms]
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """Return the command's parameters, with the class's options if there is a class."""
         parameters = super().get_params(ctx)
         if _LOADED not in ctx.meta:
             return parameters
-        rest = [one for one in parameters if not getattr(one, "of_engine", False)]
-        count = sum(isinstance(one, click.Argument) for one in rest)
+        rest = [parameter for parameter in parameters if not getattr(parameter, "of_engine", False)]
+        count = sum(isinstance(parameter, click.Argument) for parameter in rest)
         return [*rest[:count], *ctx.meta[_LOADED][1], *rest[count:]]
 
     def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -298,46 +306,48 @@ def terms_of(kinds: Mapping[str, type[Any]]) -> list[Term]:
 
     A class with the motion ``""`` is for any motion.
     """
-    found: dict[str, list[Term]] = {}
+    by_name: dict[str, list[Term]] = {}
     for motion, kind in kinds.items():
-        for one in kind.options.values():
-            if not one.python_only:
-                term = replace(term_of(one), motions=(motion,) if motion else ())
-                found.setdefault(one.name, []).append(term)
-    return [_merged(variants) for variants in found.values()]
+        for option in kind.options.values():
+            if not option.python_only:
+                term = replace(term_of(option), motions=(motion,) if motion else ())
+                by_name.setdefault(option.name, []).append(term)
+    return [_merged(variants) for variants in by_name.values()]
 
 
-def term_of(one: Option) -> Term:
+def term_of(option: Option) -> Term:
     """Return the term of a declaration."""
     from mirrorskin.engine.base.options import plain
 
-    shown, default = one.shown_default, plain(one.default)
+    shown, default = option.shown_default, plain(option.default)
     if not shown and default is not None:
         several = default if isinstance(default, tuple) else (default,)
         shown = ",".join(f"{value:g}" if isinstance(value, float) else str(value) for value in several)
-        if one.kind == "flag":
-            shown = one.name.replace("_", "-") if one.default else f"no-{one.name.replace('_', '-')}"
-        elif one.unit == "rad":
+        if option.kind == "flag":
+            shown = option.name.replace("_", "-") if option.default else f"no-{option.name.replace('_', '-')}"
+        elif option.unit == "rad":
             shown = ",".join(f"{math.degrees(value):g}deg" for value in several)
-        elif one.unit in ("mm", "MPa", "N", "s"):
-            shown += one.unit
-    unit = one.unit or {"text": "TEXT", "path": "FILE"}.get(str(one.kind), "")
-    return Term(one.name, str(one.kind), one.help, unit, shown, one.choices, one.words, one.file)
+        elif option.unit in ("mm", "MPa", "N", "s"):
+            shown += option.unit
+    unit = option.unit or {"text": "TEXT", "path": "FILE"}.get(str(option.kind), "")
+    return Term(
+        option.name, str(option.kind), option.help, unit, shown, option.choices, option.words, option.file
+    )
 
 
 def _merged(variants: list[Term]) -> Term:
     """Join options of one name; where they differ, help and default mention the motions."""
     first = variants[0]
-    if any((one.kind, one.unit) != (first.kind, first.unit) for one in variants):
+    if any((variant.kind, variant.unit) != (first.kind, first.unit) for variant in variants):
         raise TypeError(f"{first.name} is declared with different kinds or units")
-    motions = tuple(motion for one in variants for motion in one.motions)
+    motions = tuple(motion for variant in variants for motion in variant.motions)
     helps, defaults = (_by_motion(variants, name) for name in ("help", "shown_default"))
     return replace(
         first,
-        help=helps if len({one.help for one in variants}) > 1 else for_motions(motions, helps),
+        help=helps if len({variant.help for variant in variants}) > 1 else for_motions(motions, helps),
         shown_default=defaults,
-        choices=tuple(dict.fromkeys(choice for one in variants for choice in one.choices)),
-        words=tuple(dict.fromkeys(word for one in variants for word in one.words)),
+        choices=tuple(dict.fromkeys(choice for variant in variants for choice in variant.choices)),
+        words=tuple(dict.fromkeys(word for variant in variants for word in variant.words)),
         motions=motions,
     )
 
@@ -345,8 +355,8 @@ def _merged(variants: list[Term]) -> Term:
 def _by_motion(variants: list[Term], name: str) -> str:
     """Return the text of all variants, or each with its motions."""
     motions: dict[str, list[str]] = {}
-    for one in variants:
-        motions.setdefault(getattr(one, name), []).extend(one.motions)
+    for variant in variants:
+        motions.setdefault(getattr(variant, name), []).extend(variant.motions)
     if len(motions) == 1:
         return next(iter(motions))
     return "; ".join(for_motions(their, text) for text, their in motions.items() if text)
@@ -357,15 +367,15 @@ def declarations() -> dict[str, list[dict[str, Any]]]:
     from mirrorskin.engine.base.reconstruction import method_for
     from mirrorskin.engine.vibration.lock_in import Correlation
 
-    methods: dict[str, type[Any]] = {one: method_for(one) for one in MOTIONS}
+    methods: dict[str, type[Any]] = {motion: method_for(motion) for motion in MOTIONS}
     fused = ("tilt", "zenith_gain", "zenith_offset", "robust")
     terms = {
         "reconstruct": terms_of(methods),
         "correlate": terms_of({"": Correlation}),
-        "fuse": [one for one in terms_of({"": methods["axial"]}) if one.name in fused],
+        "fuse": [term for term in terms_of({"": methods["axial"]}) if term.name in fused],
     }
     return {
-        command: [{name: value for name, value in asdict(one).items() if value} for one in options]
+        command: [{name: value for name, value in asdict(term).items() if value} for term in options]
         for command, options in terms.items()
     }
 

@@ -49,8 +49,8 @@ def _read(path: Path) -> Mapping[str, str]:
     for key, example in examples.items():
         meta = Meta(min_length=1, description="a text in quotes", examples=[example])
         keys.append((key, Annotated[str, meta] | None, None))
-    found = structs.asdict(load_toml(path, defstruct("Defaults", keys, rename="kebab"), _REMEDY))
-    return {key.replace("_", "-"): value for key, value in found.items() if value is not None}
+    values = structs.asdict(load_toml(path, defstruct("Defaults", keys, rename="kebab"), _REMEDY))
+    return {key.replace("_", "-"): value for key, value in values.items() if value is not None}
 
 
 def option_defaults() -> dict[str, str]:
@@ -72,11 +72,11 @@ def with_pixel_size(recording: Recording) -> Recording:
     return recording
 
 
-def calibration_of(recording: Recording, given: Path | None) -> Path | None:
+def calibration_of(recording: Recording, path_given: Path | None) -> Path | None:
     """Return the given calibration, or the user's own if there is none with the recording either."""
     path = defaults().get("calibration")
-    if given is not None or path is None or recording.carried is not None:
-        return given
+    if path_given is not None or path is None or recording.carried is not None:
+        return path_given
     _note(recording, f"calibration {path}")
     return Path(path).expanduser()
 

@@ -54,7 +54,7 @@ class MotionOption(click.Option):
 
 def for_motions(motions: Sequence[str], text: str) -> str:
     """Return a text after the motions to which it applies, unless these are all."""
-    nouns = ", ".join(_NOUNS.get(one, one) for one in motions)
+    nouns = ", ".join(_NOUNS.get(motion, motion) for motion in motions)
     return text if not motions or {*MOTIONS} <= {*motions} else f"{nouns}: {text}"
 
 
@@ -62,16 +62,16 @@ def refuse_foreign(context: click.Context, motion: str, name: str = "this") -> N
     """Raise InputError if an option on the command line does not apply to the motion of ``name``."""
     from mirrorskin.io import InputError
 
-    for one in context.command.get_params(context):
-        source = context.get_parameter_source(one.name or "")
-        if not isinstance(one, MotionOption) or not one.motions or motion in one.motions:
+    for parameter in context.command.get_params(context):
+        source = context.get_parameter_source(parameter.name or "")
+        if not isinstance(parameter, MotionOption) or not parameter.motions or motion in parameter.motions:
             continue
         if source is not None and source.name == "COMMANDLINE":
-            nouns = [_NOUNS.get(other, other) for other in one.motions]
+            nouns = [_NOUNS.get(other, other) for other in parameter.motions]
             *others, last = [f"{noun}es" if noun.endswith("s") else f"{noun}s" for noun in nouns]
             plurals = f"{', '.join(others)} and {last}" if others else last
             noun = _NOUNS.get(motion, motion)
-            raise InputError(f"{one.opts[0]} applies to {plurals} only; {name} is a {noun}. Remove it")
+            raise InputError(f"{parameter.opts[0]} applies to {plurals} only; {name} is a {noun}. Remove it")
 
 
 class Group(click.Group):
@@ -141,17 +141,19 @@ def make_command(
         else:
             parameters.append(_parameter(parameter, hints[parameter.name]))
     if len(named) < len(parameters):
-        parameters.sort(key=lambda one: one.name in _COMMON)
+        parameters.sort(key=lambda parameter: parameter.name in _COMMON)
 
     def call(**values: Any) -> Any:
         for name, parameter in named.items():
             if isinstance(values[name], tuple):
                 values[name] = list(values[name]) or parameter.default
-        given = {name: value for name, value in values.items() if name in named or value is not None}
-        return function(**given, **({context: click.get_current_context()} if context else {}))
+        arguments = {name: value for name, value in values.items() if name in named or value is not None}
+        return function(**arguments, **({context: click.get_current_context()} if context else {}))
 
-    made = Command if kind is None else kind
-    return made(name=name, params=parameters, callback=call, help=inspect.getdoc(function) or "", **settings)
+    command_class = Command if kind is None else kind
+    return command_class(
+        name=name, params=parameters, callback=call, help=inspect.getdoc(function) or "", **settings
+    )
 
 
 class Command(click.Command):
@@ -237,7 +239,7 @@ class _Words(click.Choice[Any]):
     """The values of an enumeration."""
 
     def __init__(self, kind: type[StrEnum]) -> None:
-        super().__init__([one.value for one in kind])
+        super().__init__([word.value for word in kind])
         self._kind = kind
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -270,21 +272,23 @@ class _Commands(Mapping[str, Any]):
 
 def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
     """Return the parameter of click for a parameter of a function."""
-    kind, said = get_args(hint)[:2]
-    kind = next((one for one in get_args(kind) if NoneType in get_args(kind) and one is not NoneType), kind)
+    kind, declaration = get_args(hint)[:2]
+    kind = next(
+        (member for member in get_args(kind) if NoneType in get_args(kind) and member is not NoneType), kind
+    )
     many = get_origin(kind) is list
     kind = get_args(kind)[0] if many else kind
-    settings = dict(said.settings)
+    settings = dict(declaration.settings)
     bounds = {name: settings.pop(name) for name in ("min", "max") if name in settings}
-    or_file, written = settings.pop("or_file", False), not _WRITTEN.isdisjoint(said.names)
+    or_file, written = settings.pop("or_file", False), not _WRITTEN.isdisjoint(declaration.names)
     settings["type"] = NameOrFile() if or_file else _type(kind, bounds, written)
     settings["required"] = parameter.default is parameter.empty
     if parameter.default is not parameter.empty and not many:
         default = parameter.default
         settings["default"] = default.value if isinstance(default, StrEnum) else default
-    if isinstance(said, Argument):
+    if isinstance(declaration, Argument):
         return _Argument(parameter.name, {**settings, "nargs": -1 if many else 1})
-    names = said.names
+    names = declaration.names
     if kind is bool:
         settings = {**settings, "is_flag": True, "type": None}
     if not names:
@@ -306,7 +310,11 @@ def _type(kind: Any, bounds: dict[str, Any], written: bool) -> Any:
 
 def _list_parameters(command: click.Command, ctx: click.Context, formatter: click.HelpFormatter) -> None:
     for title, kind in (("Arguments", click.Argument), ("Options", click.Option)):
-        records = [one.get_help_record(ctx) for one in command.get_params(ctx) if isinstance(one, kind)]
+        records = [
+            parameter.get_help_record(ctx)
+            for parameter in command.get_params(ctx)
+            if isinstance(parameter, kind)
+        ]
         if any(records):
             with formatter.section(title):
                 formatter.write_dl([record for record in records if record is not None])

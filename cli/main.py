@@ -168,7 +168,7 @@ def _lacking(error: BaseException | None) -> str:
     if not isinstance(error, ImportError | OSError | RuntimeError) or getattr(error, "exit_code", None):
         return ""
     lines = str(error).splitlines()
-    return next((line.strip() for line in lines if any(said in line for said in _REFUSED)), "")
+    return next((line.strip() for line in lines if any(reason in line for reason in _REFUSED)), "")
 
 
 def _end(number: int, frame: FrameType | None) -> None:
@@ -220,17 +220,17 @@ def _ended_by_signals(is_program: bool) -> Iterator[None]:
     are waited for, because OpenCL aborts a program that ends while it works.
     """
     _OneLine.signalled = _OneLine.insisted = 0
-    told = sys.unraisablehook
+    previous_hook = sys.unraisablehook
 
     def insist(lost: sys.UnraisableHookArgs) -> None:
         """Raise the exception again if it was lost, as in destructors and callbacks."""
         if not isinstance(lost.exc_value, KeyboardInterrupt | SystemExit) or not hasattr(signal, "setitimer"):
-            told(lost)
+            previous_hook(lost)
             return
-        kind, given = type(lost.exc_value), lost.exc_value.args
+        kind, arguments = type(lost.exc_value), lost.exc_value.args
 
         def again(number: int, frame: object) -> None:
-            raise kind(*given)
+            raise kind(*arguments)
 
         install(signal.SIGALRM, again)
         signal.setitimer(signal.ITIMER_REAL, _SOON)
@@ -245,7 +245,7 @@ def _ended_by_signals(is_program: bool) -> Iterator[None]:
         try:
             yield
         finally:
-            sys.unraisablehook = told
+            sys.unraisablehook = previous_hook
 
 
 def _complete(instruction: str) -> None:

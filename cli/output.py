@@ -53,7 +53,7 @@ def report_saved(
     summary, pieces = summarise(result), _pieces(result)
     if as_json:
         devices = open_devices(device) if "device" in result.process else []
-        profile = [record for one in devices for record in one.profile.records()]
+        profile = [record for opened in devices for record in opened.profile.records()]
         facts = {"summary": summary.as_dict() | pieces, "process": result.process}
         print_json({"output": str(path), **facts, "profile": profile})
     else:
@@ -100,14 +100,14 @@ def printable(value: object) -> str:
     Texts in files, and names of files, may hold any characters. What the encoding lacks is written in ASCII
     where that is usual, as in "+-" and "um", and as "?" otherwise.
     """
-    encoding, said = getattr(sys.stdout, "encoding", None) or "utf-8", str(value)
+    encoding, words = getattr(sys.stdout, "encoding", None) or "utf-8", str(value)
     try:
-        said.encode(encoding)
+        words.encode(encoding)
     except UnicodeEncodeError:
         for letter, ascii_text in _ASCII.items():
-            said = said.replace(letter, ascii_text)
-        said = said.encode(encoding, "replace").decode(encoding)
-    return text.printable(said)
+            words = words.replace(letter, ascii_text)
+        words = words.encode(encoding, "replace").decode(encoding)
+    return text.printable(words)
 
 
 def print_json(value: Any) -> None:
@@ -145,10 +145,10 @@ def _plain(value: Any) -> Any:
 def report_missing_maps(name: str, process: Mapping[str, object], remedies: Mapping[str, str]) -> None:
     """Print which maps and forces are missing, why, and the remedy; and what was done about a gel."""
     for what, remedy in remedies.items():
-        said = str(process.get(what))
-        if said.startswith(_UNTOLD):
-            said = said.removeprefix(_UNTOLD)
-            click.echo(printable(f"{name}: no {what}: {said}; give {remedy}"), err=True)
+        reason = str(process.get(what))
+        if reason.startswith(_UNTOLD):
+            reason = reason.removeprefix(_UNTOLD)
+            click.echo(printable(f"{name}: no {what}: {reason}; give {remedy}"), err=True)
     gel = str(process.get("gel", ""))
     force = str(process.get("force", ""))
     if force.startswith(_UNTOLD):
@@ -190,9 +190,9 @@ def report_contact(name: str, process: Mapping[str, object]) -> None:
         "given, by light": "the contact given is where a press saw light, which runs ahead of the skin;"
         " reconstruct that press with the calibration of a gel and --modulus",
     }
-    said = widened.get(str(process.get("contact")))
-    if said is not None:
-        click.echo(printable(f"{name}: {said}"), err=True)
+    warning = widened.get(str(process.get("contact")))
+    if warning is not None:
+        click.echo(printable(f"{name}: {warning}"), err=True)
 
 
 @contextmanager
@@ -202,11 +202,11 @@ def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
     How much there is may be unknown.
     """
     if not sys.stderr.isatty():
-        yield lambda done: None
+        yield lambda count: None
         return
     from rich.console import Console
     from rich.progress import Progress
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=total)
-        yield lambda done: bar.update(task, completed=done)
+        yield lambda count: bar.update(task, completed=count)

@@ -140,17 +140,17 @@ def frame_size(text: str, option: str = "") -> tuple[int, int]:
 
 def region(text: str, option: str = "") -> Region:
     """Return a rectangle of the picture, as in ``100,50,640x480``: first column and row, columns and rows."""
-    found = Region.read("".join(text.split()))
-    if found is None:
+    parsed = Region.read("".join(text.split()))
+    if parsed is None:
         needed = "the first column and row, and how many of each, are needed"
         raise _error(text, option, needed, "100,50,640x480")
-    return found
+    return parsed
 
 
 def frame_range(text: str, option: str = "") -> tuple[int, int | None]:
     """Return a range of frames, as in ``10:200``: the first and the one after the last, None for the end."""
     match = re.fullmatch(r"([0-9]{0,9}):([0-9]{0,9})", "".join(text.split()))
-    start, stop = (int(one) if one else None for one in match.groups()) if match else (None, 0)
+    start, stop = (int(bound) if bound else None for bound in match.groups()) if match else (None, 0)
     if stop is not None and stop <= (start or 0):
         needed = "the first frame, from 0, and a later one that is left out are needed"
         raise _error(text, option, needed, "10:200, or 10: for all from 10 on")
@@ -189,8 +189,8 @@ def decimal_comma(text: str) -> str:
     >>> decimal_comma("0,05mm"), decimal_comma("0.05mm,0.04mm")
     ('0.05mm', '')
     """
-    found = _DECIMAL_COMMA.fullmatch(text)
-    return f"{found[1]}.{found[2]}{found[3]}" if found else ""
+    match = _DECIMAL_COMMA.fullmatch(text)
+    return f"{match[1]}.{match[2]}{match[3]}" if match else ""
 
 
 def refuse_decimal_comma(text: str, option: str, several: bool = False) -> None:
@@ -198,12 +198,12 @@ def refuse_decimal_comma(text: str, option: str, several: bool = False) -> None:
     for part in text.split(":") if several else [text]:
         numbers = part.split(",")
         pairs = [",".join(numbers[first : first + 2]) for first in range(0, len(numbers), 2)]
-        found = next(filter(None, map(decimal_comma, pairs if several else [part])), "")
-        if found and not (several and found[-1].isdigit()):
-            given = " ".join(f"{option} {shortened(text)}".split())
-            raise InputError(f"{given}: write the number with a decimal point, {found}")
+        corrected = next(filter(None, map(decimal_comma, pairs if several else [part])), "")
+        if corrected and not (several and corrected[-1].isdigit()):
+            written = " ".join(f"{option} {shortened(text)}".split())
+            raise InputError(f"{written}: write the number with a decimal point, {corrected}")
 
 
 def _error(text: str, option: str, wrong: str, example: str) -> InputError:
-    given = " ".join(f"{option} {shortened(text)}".split())
-    return InputError(f"{given}: {wrong}; write e.g. {example}")
+    written = " ".join(f"{option} {shortened(text)}".split())
+    return InputError(f"{written}: {wrong}; write e.g. {example}")

@@ -74,27 +74,27 @@ PLAN = Terms(
 """The options of a plan."""
 
 
-def make_plan(context: click.Context, given: Mapping[str, Any], settings: RigSettings) -> Plan:
+def make_plan(context: click.Context, chosen: Mapping[str, Any], settings: RigSettings) -> Plan:
     """Return the plan described by a command's options; the rig can follow it."""
     from mirrorskin.hw.rig.plans import check_plan
 
     motion = str(context.params["motion"])
-    kind = "rock" if given.get("rock") and motion == "axial" else motion
+    kind = "rock" if chosen.get("rock") and motion == "axial" else motion
     refuse_foreign(context, kind)
-    plan = _plan(kind, PLAN.filled(given), given)
-    check_steps(plan, given)
+    plan = _plan(kind, PLAN.filled(chosen), chosen)
+    check_steps(plan, chosen)
     check_plan(plan, settings.stage, settings.name)
     return plan
 
 
-def check_steps(plan: Plan, given: Mapping[str, Any]) -> None:
+def check_steps(plan: Plan, chosen: Mapping[str, Any]) -> None:
     """Raise InputError for options of motions with stops if the motion has none."""
     from mirrorskin.io import InputError
 
-    if given.get("settle", 0) < 0:
-        raise InputError(f"--settle {given['settle']:g}s: a time of at least 0 is needed")
+    if chosen.get("settle", 0) < 0:
+        raise InputError(f"--settle {chosen['settle']:g}s: a time of at least 0 is needed")
     for name in ("settle", "frames"):
-        if name in given and not plan.in_steps:
+        if name in chosen and not plan.in_steps:
             raise InputError(f"--{name} needs a motion with stops. Remove it, or give a step")
 
 
@@ -108,8 +108,8 @@ def open_calibration(path: Path | None, settings: RigSettings) -> Calibration | 
     if path is None:
         return None
     calibration, camera = io.open_calibration(path), settings.camera
-    known = io.CameraId(camera.name, camera.shape, np.dtype(camera.dtype))
-    check_camera(calibration, known, settings.name)
+    camera_id = io.CameraId(camera.name, camera.shape, np.dtype(camera.dtype))
+    check_camera(calibration, camera_id, settings.name)
     return calibration
 
 
@@ -117,14 +117,14 @@ def check_recording(
     planned: PlannedScan,
     path: Path,
     *inputs: Path | None,
-    known: Calibration | None = None,
+    calibration: Calibration | None = None,
     overwrite: bool = False,
 ) -> None:
     """Raise InputError for a recording of a scan that could not be written, before the rig is opened."""
     from mirrorskin import io
 
     io.check_output(path, *inputs, replaces="anything" if overwrite else "nothing")
-    io.StreamRecorder(planned, path, calibration=known)
+    io.StreamRecorder(planned, path, calibration=calibration)
 
 
 @contextmanager
@@ -153,52 +153,52 @@ def _remains(recorder: StreamRecorder) -> str:
     return f"{recorder.file} was cut short and holds {recorder.written} frames{older}"
 
 
-def _plan(kind: str, values: Mapping[str, Any], given: Mapping[str, Any]) -> Plan:
+def _plan(kind: str, values: Mapping[str, Any], chosen: Mapping[str, Any]) -> Plan:
     from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan, VerticalPlan
     from mirrorskin.io import InputError
 
     if kind == "vertical":
-        start, stop = values["start"], _needed(given, "stop", "2mm")
-        if "stroke_depth" in given:
-            if "strokes" not in given or "start" in given:
+        start, stop = values["start"], _needed(chosen, "stop", "2mm")
+        if "stroke_depth" in chosen:
+            if "strokes" not in chosen or "start" in chosen:
                 raise InputError("--stroke-depth needs --strokes, and takes the place of --start")
-            start = stop - given["stroke_depth"]
-        return VerticalPlan(start, stop, strokes=given.get("strokes", 1), **_pace(given, "mm", "0.5mm/s"))
-    press = _needed(given, "press", "1mm")
+            start = stop - chosen["stroke_depth"]
+        return VerticalPlan(start, stop, strokes=chosen.get("strokes", 1), **_pace(chosen, "mm", "0.5mm/s"))
+    press = _needed(chosen, "press", "1mm")
     if kind == "axial":
         return AxialPlan(press, *(values[name] for name in ("tilt", "turns", "phase_step", "rate")))
     if kind == "rock":
-        return RockPlan(press, values["tilt"], values["phase"], **_pace(given, "rad", "2deg/s"))
+        return RockPlan(press, values["tilt"], values["phase"], **_pace(chosen, "rad", "2deg/s"))
     if kind == "horizontal":
-        distance, pace = _needed(given, "distance", "0.5mm"), _pace(given, "mm", "0.5mm/s")
+        distance, pace = _needed(chosen, "distance", "0.5mm"), _pace(chosen, "mm", "0.5mm/s")
         return HorizontalPlan(press, distance, values["direction"], wait=values["wait"], **pace)
-    angle, pace = _needed(given, "angle", "10deg"), _pace(given, "rad", "2deg/s")
+    angle, pace = _needed(chosen, "angle", "10deg"), _pace(chosen, "rad", "2deg/s")
     return TwistPlan(press, angle, wait=values["wait"], **pace)
 
 
-def _pace(given: Mapping[str, Any], unit: str, example: str) -> dict[str, Any]:
+def _pace(chosen: Mapping[str, Any], unit: str, example: str) -> dict[str, Any]:
     """Return the step or the speed, such as ``0.5mm/s``, in mm or rad."""
     from mirrorskin.cli import quantity
     from mirrorskin.io import InputError
 
     read = quantity.length if unit == "mm" else quantity.angle
-    found: dict[str, Any] = {
-        "step": read(given["step"], "--step") if "step" in given else None,
+    pace: dict[str, Any] = {
+        "step": read(chosen["step"], "--step") if "step" in chosen else None,
         "speed": None,
     }
-    if "speed" in given:
-        distance, slash, second = given["speed"].strip().rpartition("/")
+    if "speed" in chosen:
+        distance, slash, second = chosen["speed"].strip().rpartition("/")
         if not slash or second.strip() != "s":
             raise InputError(
-                f"--speed {given['speed']}: a distance or angle per second is needed; write e.g. {example}"
+                f"--speed {chosen['speed']}: a distance or angle per second is needed; write e.g. {example}"
             )
-        found["speed"] = read(distance, "--speed")
-    return found
+        pace["speed"] = read(distance, "--speed")
+    return pace
 
 
-def _needed(given: Mapping[str, Any], name: str, example: str) -> float:
+def _needed(chosen: Mapping[str, Any], name: str, example: str) -> float:
     from mirrorskin.io import InputError
 
-    if name not in given:
+    if name not in chosen:
         raise InputError(f"--{name} is missing: write e.g. --{name} {example}")
-    return float(given[name])
+    return float(chosen[name])

@@ -36,15 +36,15 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
             kinds = {"operation": load_operation(operation)}
         except InputError as error:
             raise InputError(f"{path}: operation.class: {error}") from error
-    stack = [(one.name, _stack_type(one) | None, None) for one in STACK.without("phases").terms]
+    stack = [(term.name, _stack_type(term) | None, None) for term in STACK.without("phases").terms]
     tables: dict[str, type[Struct]] = {"stack": defstruct("stack", stack, frozen=True, rename="kebab")}
     tables |= {name: _table(name, kind) for name, kind in kinds.items()}
     fields: Any = [(name, model, field(default_factory=model)) for name, model in tables.items()]
     settings = load_toml(path, defstruct("Settings", fields, frozen=True), _REMEDY)
-    given = {name: _given(getattr(settings, name)) for name in tables}
-    opening = _opening(given["stack"], f"{path}: stack.")
+    stored = {name: _given(getattr(settings, name)) for name in tables}
+    opening = _opening(stored["stack"], f"{path}: stack.")
     chosen: dict[str, Any] = {
-        name: _options(given[name], kind, f"{path}: {name}") for name, kind in kinds.items()
+        name: _options(stored[name], kind, f"{path}: {name}") for name, kind in kinds.items()
     }
     if operation:
         chosen = {"operation": operation, "operation_options": chosen["operation"]}
@@ -73,34 +73,40 @@ def _operation_of(path: Path) -> str:
 
 def _table(name: str, kind: type[Any]) -> type[Struct]:
     """Return the model of a table with the options of a class."""
-    fields = [(one.name, _type(one) | None, None) for one in kind.options.values() if not one.python_only]
+    fields = [
+        (option.name, _type(option) | None, None)
+        for option in kind.options.values()
+        if not option.python_only
+    ]
     if name == "operation":
         fields = [("class_", Annotated[str, _text("mine.py:Wear")], field(name="class")), *fields]
     return defstruct(name, fields, frozen=True, rename="kebab", kw_only=True)
 
 
-def _stack_type(one: Term) -> Any:
+def _stack_type(term: Term) -> Any:
     """Return the type in TOML of an option of a stack."""
-    if one.kind == "flag":
+    if term.kind == "flag":
         return bool
-    return Literal[one.choices] if one.choices else Annotated[str, _text(one.example or one.unit)]
+    return Literal[term.choices] if term.choices else Annotated[str, _text(term.example or term.unit)]
 
 
-def _type(one: Option) -> Any:
+def _type(option: Option) -> Any:
     """Return the type of an option's value in TOML."""
-    term = term_of(one)
-    if one.kind == "flag":
+    term = term_of(option)
+    if option.kind == "flag":
         return bool
-    if one.kind == "choice":
-        return Literal[one.choices]
-    if one.kind in ("file", "path", "text") or one.words or term.example:
-        kind: Any = Annotated[str, _text(one.file or term.example or term.unit)]
+    if option.kind == "choice":
+        return Literal[option.choices]
+    if option.kind in ("file", "path", "text") or option.words or term.example:
+        kind: Any = Annotated[str, _text(option.file or term.example or term.unit)]
     else:
-        number = int if one.kind in ("integer", "integers") else float
-        bounds = zip(("ge", "le", "gt"), (*one.within, one.above), strict=True)
+        number = int if option.kind in ("integer", "integers") else float
+        bounds = zip(("ge", "le", "gt"), (*option.within, option.above), strict=True)
         limits: dict[str, Any] = {name: bound for name, bound in bounds if bound is not None}
-        kind = Annotated[number, Meta(description=one.needed, examples=[number(one.example or 1)], **limits)]
-    return list[kind] if one.kind in ("numbers", "integers") else kind
+        kind = Annotated[
+            number, Meta(description=option.needed, examples=[number(option.example or 1)], **limits)
+        ]
+    return list[kind] if option.kind in ("numbers", "integers") else kind
 
 
 def _given(table: Struct) -> dict[str, Any]:
@@ -109,25 +115,25 @@ def _given(table: Struct) -> dict[str, Any]:
 
 def _options(values: Mapping[str, Any], kind: type[Any], where: str) -> dict[str, Any]:
     """Return options in their units, with which the class can be constructed."""
-    found = {}
+    values_read = {}
     for name, value in values.items():
         if name == "class_":
             continue
-        one, term = kind.options[name], term_of(kind.options[name])
+        option, term = kind.options[name], term_of(kind.options[name])
         place = f"{where}.{name.replace('_', '-')}"
-        if one.kind in ("file", "path"):
-            found[name] = Path(value)
+        if option.kind in ("file", "path"):
+            values_read[name] = Path(value)
             continue
         if isinstance(value, list):
             value = [term.read_one(part, place) if isinstance(part, str) else part for part in value]
         elif isinstance(value, str):
             value = term.read_one(value, place)
-        found[name] = value
+        values_read[name] = value
     try:
-        chosen: dict[str, Any] = kind(**found).written()
+        chosen: dict[str, Any] = kind(**values_read).written()
     except InputError as error:
         raise InputError(f"{where}{_with_key(str(error), kind)}") from error
-    return {name: chosen[name] for name in found}
+    return {name: chosen[name] for name in values_read}
 
 
 def _with_key(message: str, kind: type[Any]) -> str:
@@ -139,12 +145,12 @@ def _with_key(message: str, kind: type[Any]) -> str:
 def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
     """Convert [stack] to keywords of ``open_recording``; InputError for those that no stack can have."""
     read = {}
-    for one in STACK.terms:
-        if one.name in values:
-            value, place = values[one.name], f"{where}{one.flag[2:]}"
-            if one.kind == "file":
+    for term in STACK.terms:
+        if term.name in values:
+            value, place = values[term.name], f"{where}{term.flag[2:]}"
+            if term.kind == "file":
                 value = Path(value)
-            read[one.name] = one.read(value, place) if isinstance(value, str) else value
+            read[term.name] = term.read(value, place) if isinstance(value, str) else value
     options = stack_options(read, where)
     if "tilt" in options:
         try:

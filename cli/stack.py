@@ -76,23 +76,23 @@ FORMATS = sources()
 """Source of the frames."""
 
 
-def stack_options(given: dict[str, Any], where: str = "--") -> StackOptions:
+def stack_options(chosen: dict[str, Any], where: str = "--") -> StackOptions:
     """Remove the options of a stack, except the tilt, and return keywords of `io.open_recording`.
 
     Messages put ``where`` before an option's name.
     """
-    names = [one.name for one in STACK.terms if one.name != "tilt"]
-    values = {name: given.pop(name) for name in names if name in given}
+    names = [term.name for term in STACK.terms if term.name != "tilt"]
+    values = {name: chosen.pop(name) for name in names if name in chosen}
     options = StackOptions()
     for name in ("dataset", "channel", "motion", "pixel_size", "region", "frames", "verify"):
         if name in values:
             options[name] = values[name]
-    if isinstance(given.get("tilt"), float):
-        options["tilt"] = given["tilt"]
+    if isinstance(chosen.get("tilt"), float):
+        options["tilt"] = chosen["tilt"]
     return options | _travel(values, where) | _phase(values)
 
 
-def stack_words(given: Mapping[str, Any]) -> list[str]:
+def stack_words(chosen: Mapping[str, Any]) -> list[str]:
     """Return the words of a command for the options of a stack that are given, except for region and frames.
 
     Examples
@@ -103,16 +103,16 @@ def stack_words(given: Mapping[str, Any]) -> list[str]:
     ['--no-verify']
     """
     words = []
-    for one in STACK.terms:
-        if one.name not in given or one.name in ("region", "frames"):
+    for option in STACK.terms:
+        if option.name not in chosen or option.name in ("region", "frames"):
             continue
-        value = given[one.name]
-        if one.kind == "flag":
-            words.append(one.flag if value else f"--no-{one.flag[2:]}")
+        value = chosen[option.name]
+        if option.kind == "flag":
+            words.append(option.flag if value else f"--no-{option.flag[2:]}")
             continue
         values = value if isinstance(value, tuple) else (value,)
-        unit = one.unit.partition(",")[0] if one.unit in ("mm", "rad", "mm,mm") else ""
-        words.append(f"{one.flag}={','.join(f'{part}{unit}' for part in values)}")
+        unit = option.unit.partition(",")[0] if option.unit in ("mm", "rad", "mm,mm") else ""
+        words.append(f"{option.flag}={','.join(f'{part}{unit}' for part in values)}")
     return words
 
 

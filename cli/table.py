@@ -60,7 +60,9 @@ def read_table(path: Path, remedy: str, lists: bool = False) -> Table:
     if len(contents) > 1 and not any(map(_VALUE.match, re.split(r"[;,\t]|\s+", contents[0][1]))):
         heading = contents.pop(0)[1]
     body = "\n".join(text for _, text in contents)
-    delimiter = separator[1] if separator else next((one for one in ";\t," if one in body), "")
+    delimiter = (
+        separator[1] if separator else next((character for character in ";\t," if character in body), "")
+    )
     rows = tuple(Row(f"{path}, line {number}:", _cells(text, delimiter)) for number, text in contents)
     columns = max((len(row.cells) for row in rows), default=0) if len(rows) > 1 or not lists else 1
     names = _heading(heading, delimiter, columns)
@@ -124,9 +126,9 @@ def unit_of(heading: str, kind: Kind, where: str) -> str:
         It is unknown, or measures something else.
     """
     words = re.split(r"[\s_,.:]+", heading.strip())
-    found = _BRACKETS.search(heading) or _SLASH.search(heading)
+    match = _BRACKETS.search(heading) or _SLASH.search(heading)
     last = words[-1] if is_common(words[-1], None if len(words) > 1 else kind) else ""
-    unit = found[1] if found else last
+    unit = match[1] if match else last
     if unit:
         try:
             in_base(unit, kind)
@@ -170,12 +172,12 @@ def _column_of(path: Path, table: Table, what: str, names: Sequence[Sequence[str
     if table.columns == 1:
         return 0
     words = [re.findall(r"[^\W\d_]+", name.lower()) for name in table.heading]
-    for wanted in names:
-        found = [index for index, own in enumerate(words) if {*own} & {*wanted}]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            several = " and ".join(repr(shortened(table.heading[index])) for index in found)
+    for name_words in names:
+        matches = [index for index, heading_words in enumerate(words) if {*heading_words} & {*name_words}]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            several = " and ".join(repr(shortened(table.heading[index])) for index in matches)
             raise InputError(f"{path} has several columns of {what}, {several}: remove all but one")
     shown = shortened(", ".join(table.heading), 80)
     raise InputError(f"{path} has the columns {shown}, and none of {what}: name one {names[0][0]}")
@@ -201,9 +203,9 @@ def _refuse_decimal_commas(path: Path, contents: Sequence[tuple[int, str]]) -> N
     words = contents
     if len(contents) == 1:
         words = [(number, word) for number, text in contents for word in text.split()]
-    found = [quantity.decimal_comma(word) for _, word in words]
-    several = len(found) > 1 and all(found)
-    with_unit = next((n for n, one in enumerate(found) if one and one[-1].isalpha()), None)
+    corrected = [quantity.decimal_comma(word) for _, word in words]
+    several = len(corrected) > 1 and all(corrected)
+    with_unit = next((n for n, number in enumerate(corrected) if number and number[-1].isalpha()), None)
     if several or with_unit is not None:
         number, word = words[with_unit or 0]
         quantity.refuse_decimal_comma(word, f"{path}, line {number}:")

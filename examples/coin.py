@@ -28,8 +28,11 @@ print(
     f"RMS error {error.rms:.4f} mm on the slopes; standard deviation of a step: {0.02 / np.sqrt(12):.4f} mm"
 )
 
-cut = section(result, (-11.5, 0.0), (11.5, 0.0))
-print(f"along {cut.distance[-1]:.1f} mm: from {np.nanmin(cut.height):.3f} to {np.nanmax(cut.height):.3f} mm")
+profile = section(result, (-11.5, 0.0), (11.5, 0.0))
+print(
+    f"along {profile.distance[-1]:.1f} mm: from {np.nanmin(profile.height):.3f}"
+    f" to {np.nanmax(profile.height):.3f} mm"
+)
 
 figures = figures_of(result, name="a 5 yen coin", section=((-11.5, 0.0), (11.5, 0.0)))
 for what in ("height", "section"):

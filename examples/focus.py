@@ -26,31 +26,31 @@ blurred = np.stack([texture, *(cv2.GaussianBlur(texture, (0, 0), width) for widt
 frames = []
 for position in travel:
     where = np.minimum(1.5 * np.abs(position + height) / DEPTH / 0.25, len(widths) - 1.001)
-    low, share = where.astype(int), where % 1
+    low, fraction = where.astype(int), where % 1
     rows = np.indices((ROWS, COLUMNS))
-    frame = (1 - share) * blurred[low, *rows] + share * blurred[low + 1, *rows]
+    frame = (1 - fraction) * blurred[low, *rows] + fraction * blurred[low + 1, *rows]
     frames.append(frame + rng.normal(0, 1, frame.shape))
 stack = np.rint(frames).clip(0, 255).astype(np.uint8)
 
-found = engine.optical.find_focus(stack, travel, noise=1.0, radius=5)
-error = 1e3 * (found.height - height)
+surface = engine.optical.find_focus(stack, travel, noise=1.0, radius=5)
+error = 1e3 * (surface.height - height)
 inside = np.isfinite(error)
 print(f"heights at {100 * inside.mean():.0f} % of the pixels, RMS error {np.std(error[inside]):.1f} µm")
-print(f"median standard error {1e3 * np.nanmedian(found.height_sigma):.1f} µm, steps {1e3 * 0.02:.0f} µm")
+print(f"median standard error {1e3 * np.nanmedian(surface.height_sigma):.1f} µm, steps {1e3 * 0.02:.0f} µm")
 
 extent = (0, COLUMNS * PIXEL, 0, ROWS * PIXEL)
 figure, axes = plt.subplots(2, 2, figsize=(11, 7), layout="constrained")
 for panel, number in zip(axes[0], (13, 20), strict=True):
     panel.imshow(stack[number], cmap="gray", extent=extent)
     panel.set(title=f"frame at {1e3 * travel[number]:.0f} µm", xlabel="x (mm)", ylabel="y (mm)")
-picture = axes[1, 0].imshow(1e3 * found.height, extent=extent)
+picture = axes[1, 0].imshow(1e3 * surface.height, extent=extent)
 figure.colorbar(picture, ax=axes[1, 0], label="height (µm)")
 axes[1, 0].set(title="height", xlabel="x (mm)", ylabel="y (mm)")
 row = ROWS // 2
 place = PIXEL * np.arange(COLUMNS)
 axes[1, 1].plot(place, 1e3 * height[row], color="0.6", linewidth=3, label="true")
 axes[1, 1].errorbar(
-    place[::4], 1e3 * found.height[row, ::4], 1e3 * found.height_sigma[row, ::4], fmt=".", label="found"
+    place[::4], 1e3 * surface.height[row, ::4], 1e3 * surface.height_sigma[row, ::4], fmt=".", label="found"
 )
 axes[1, 1].set(title="along the middle row", xlabel="x (mm)", ylabel="height (µm)")
 axes[1, 1].legend()

@@ -46,21 +46,21 @@ def true_force(twin):
 balls = {4: press(4, 1.2, 0), 8: press(8, 1.2, 1)}
 gel = fit_gel([ball_onset(Press(fill=False).run(twin), twin, size / 2) for size, twin in balls.items()]).gel
 camera = io.CameraId("", (SIZE, SIZE), np.dtype(balls[4].dtype))
-known = io.Calibration(camera, gel=gel)
+calibration = io.Calibration(camera, gel=gel)
 
 # The modulus: four presses on a scale whose readings have a standard deviation of 1 mN.
 generator = np.random.default_rng(1)
 weighed = [
-    known_press(twin, known, true_force(twin) + SCALE_ERROR * generator.normal(), SCALE_ERROR)
+    known_press(twin, calibration, true_force(twin) + SCALE_ERROR * generator.normal(), SCALE_ERROR)
     for twin in (*balls.values(), press(6, 0.6, 20), press(10, 0.9, 21))
 ]
 for part in (gel, fit_stiffness(weighed, gel).stiffness):
-    known = io.update_calibration(Path("force-cal.h5"), part, camera)
+    calibration = io.update_calibration(Path("force-cal.h5"), part, camera)
 
 forces, sigmas, truths = [], [], []
 for number, (diameter, depth) in enumerate([(3, 0.81), (5, 0.51), (5, 1.02), (7, 0.75), (9, 1.05)]):
     twin = press(diameter, depth, 40 + number)
-    result, true = engine.reconstruct(twin, known, fill=False), true_force(twin)
+    result, true = engine.reconstruct(twin, calibration, fill=False), true_force(twin)
     name = f"ball {diameter} mm, {depth:g} mm deep"
     print(f"{name}: {result.force:.4f} ± {result.force_sigma:.4f} N, true {true:.4f} N")
     forces.append(result.force)

@@ -35,11 +35,11 @@ def measured(axis):
         phase = 2 * np.pi * rate * (seen(axis) / SCREEN + 0.5)
         light = 110 + 80 * np.cos(phase - SHIFTS[:, None, None]) + rng.normal(0, 1.5, (8, SIZE, SIZE))
         fits.append(engine.optical.fit_fringes(np.rint(light).astype(np.uint8), SHIFTS))
-    found = engine.optical.unwrap_frequencies(fits, RATES)
+    unwrapped = engine.optical.unwrap_frequencies(fits, RATES)
     turns = 2 * np.pi * RATES[-1]
-    place = np.where(found.risk <= 1e-3, SCREEN * (found.phase / turns - 0.5), np.nan)
+    place = np.where(unwrapped.risk <= 1e-3, SCREEN * (unwrapped.phase / turns - 0.5), np.nan)
     slope = np.tan(0.5 * np.arctan((place - places[axis]) / DISTANCE))
-    return slope, found.phase_sigma * SCREEN / turns / (2 * DISTANCE), found
+    return slope, unwrapped.phase_sigma * SCREEN / turns / (2 * DISTANCE), unwrapped
 
 
 along_x, sigma_x, fringes = measured("x")

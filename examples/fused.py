@@ -22,9 +22,9 @@ result = engine.fuse(press, turn)
 
 error = engine.score(result, press.truth).height
 print(f"RMS error {1000 * error.rms:.1f} µm at {error.answered} pixels")
-found = engine.measure(result, form="sphere").quantities
+quantities = engine.measure(result, form="sphere").quantities
 for name in ("sphere radius", "sphere top", "sphere residual RMS"):
-    print(f"{name}: {found[name]}")
+    print(f"{name}: {quantities[name]}")
 
 io.export_result(result, "ball.ply")  # triangles in mm, for any program that shows meshes
 figures = figures_of(result, name="a ball of 10 mm, fused")

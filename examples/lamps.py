@@ -30,20 +30,22 @@ lamps = np.column_stack(
 light = print_pattern * np.maximum(np.einsum("hwk,tk->thw", normals, lamps), 0)
 frames = np.rint(light + rng.normal(0, 1, light.shape)).clip(0, 255).astype(np.uint8)
 
-found = engine.optical.photometric_stereo(frames, azimuth, zenith=ZENITH, shadow=4)
-angle = np.degrees(np.arccos(np.clip(np.sum(found.normals * normals, axis=-1), -1, 1)))
-slopes = -found.normals[..., :2] / found.normals[..., 2:]
+estimate = engine.optical.photometric_stereo(frames, azimuth, zenith=ZENITH, shadow=4)
+angle = np.degrees(np.arccos(np.clip(np.sum(estimate.normals * normals, axis=-1), -1, 1)))
+slopes = -estimate.normals[..., :2] / estimate.normals[..., 2:]
 surface = engine.integrate(slopes[..., 0], slopes[..., 1], PIXEL)
 error = surface.height - surface.height.mean() - true + true.mean()
-print(f"normals: median error {np.nanmedian(angle):.2f} degrees, albedo {np.median(found.albedo):.0f} counts")
+print(
+    f"normals: median error {np.nanmedian(angle):.2f} degrees, albedo {np.median(estimate.albedo):.0f} counts"
+)
 print(f"heights: RMS error {1e3 * np.nanstd(error):.1f} µm of {1e3 * np.ptp(true):.0f} µm")
 
 side = SIZE * PIXEL / 2
 figure, axes = plt.subplots(1, 4, figsize=(17, 4.2), layout="constrained")
 for panel, values, label, title, colours in (
     (axes[0], frames[0], "counts", "first frame", "gray"),
-    (axes[1], found.albedo, "counts", "albedo: the print", "gray"),
-    (axes[2], 0.5 + 0.5 * found.normals, "", "normals as colours", None),
+    (axes[1], estimate.albedo, "counts", "albedo: the print", "gray"),
+    (axes[2], 0.5 + 0.5 * estimate.normals, "", "normals as colours", None),
     (axes[3], surface.height - surface.height.mean(), "height (mm)", "height", "viridis"),
 ):
     picture = panel.imshow(values, extent=(-side, side, -side, side), cmap=colours)

@@ -30,8 +30,8 @@ def moved(turn, shift):
     x, y = io.pixel_axes((SAMPLES, SAMPLES), pixel)
     place = np.stack([*np.meshgrid(x, y), np.zeros((SAMPLES, SAMPLES))], axis=-1)
     for _ in range(20):  # fixed-point iteration for the height of the moved object
-        own = (place - shift) @ turn
-        place[..., 2] += pebble(own[..., 0], own[..., 1]) - own[..., 2]
+        local = (place - shift) @ turn
+        place[..., 2] += pebble(local[..., 0], local[..., 1]) - local[..., 2]
     return HeightMap(place[..., 2], pixel, "pebble")
 
 
@@ -60,9 +60,9 @@ def touch(thing, depth, seed):
     return engine.fuse(press, rotation)
 
 
-share = np.linspace(0, 1, TOUCHES)
-shifts = np.stack([share, 0.6 * np.sin(math.pi * share), -0.05 * share], axis=1)  # mm
-turns = np.radians(np.stack([8 * np.sin(math.tau * share), 10 * share, 40 * share], axis=1))
+progress = np.linspace(0, 1, TOUCHES)
+shifts = np.stack([progress, 0.6 * np.sin(math.pi * progress), -0.05 * progress], axis=1)  # mm
+turns = np.radians(np.stack([8 * np.sin(math.tau * progress), 10 * progress, 40 * progress], axis=1))
 
 tracker, results, poses = engine.pose.PoseTracker(), [], []
 for number, (turn, shift) in enumerate(zip(turns, shifts, strict=True)):
@@ -71,10 +71,10 @@ for number, (turn, shift) in enumerate(zip(turns, shifts, strict=True)):
     poses.append(tracker.push(results[-1]))
 
 last = poses[-1]
-for axis, found, true in zip("xyz", last.translation, shifts[-1], strict=True):
-    print(f"translation along {axis}: {found:+.4f} mm, true {true:+.4f} mm")
-for axis, found, true in zip("xyz", np.degrees(last.rotation), np.degrees(turns[-1]), strict=True):
-    print(f"rotation about {axis}: {found:+.3f} degrees, true {true:+.3f} degrees")
+for axis, value, true in zip("xyz", last.translation, shifts[-1], strict=True):
+    print(f"translation along {axis}: {value:+.4f} mm, true {true:+.4f} mm")
+for axis, value, true in zip("xyz", np.degrees(last.rotation), np.degrees(turns[-1]), strict=True):
+    print(f"rotation about {axis}: {value:+.3f} degrees, true {true:+.3f} degrees")
 
 # Errors are the small motions from the true to the estimated poses.
 rotations = np.array([pose.rotation for pose in poses])
@@ -96,11 +96,11 @@ rows = [
     ("translation (mm)", translations, shifts, "µm", 1000 * (translations - small.apply(shifts)), 1000, 3),
     ("rotation (°)", *np.degrees([rotations, turns]), "°", np.degrees(small.as_rotvec()), 180 / math.pi, 0),
 ]
-for (_, path, wrong), (label, found, true, unit, error, scale, first) in zip(axes, rows, strict=True):
+for (_, path, wrong), (label, value, true, unit, error, scale, first) in zip(axes, rows, strict=True):
     for part, axis in enumerate("xyz"):
         colour, sigma = f"C{part}", scale * sigmas[:, first + part]
         path.plot(true[:, part], color=colour, linewidth=1)
-        path.plot(found[:, part], "o", color=colour, markersize=4, label=axis)
+        path.plot(value[:, part], "o", color=colour, markersize=4, label=axis)
         wrong.fill_between(range(TOUCHES), -sigma, sigma, color=colour, alpha=0.2, linewidth=0)
         wrong.plot(error[:, part], "o-", color=colour, markersize=4, linewidth=1)
     path.set(xlabel="touch", ylabel=label, title="estimated (dots) and true (lines)")

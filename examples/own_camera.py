@@ -17,11 +17,11 @@ STEP, SPEED = 0.1, 0.5  # mm from frame to frame of the video; mm/s of the stage
 live = len(sys.argv) == 1
 video = cv2.VideoCapture(0 if live else sys.argv[1])
 size = int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH))
-known = io.Header("vertical", pixel_size=(0.0375, 0.0375))
+header = io.Header("vertical", pixel_size=(0.0375, 0.0375))
 press = engine.Press(dark=16, bright=223)  # counts
 start, number = time.monotonic(), 0
 
-with engine.live.Stream(press, size, header=known, latency=0.1 if live else math.inf) as stream:
+with engine.live.Stream(press, size, header=header, latency=0.1 if live else math.inf) as stream:
     while video.grab():
         grey = cv2.cvtColor(video.retrieve()[1], cv2.COLOR_BGR2GRAY)
         stream.push(grey, travel=SPEED * (time.monotonic() - start) if live else STEP * number)

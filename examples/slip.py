@@ -53,8 +53,8 @@ def draw_map(panel, values, contact, sticks, label, title, **colours):
 
 
 # A slide to 0.9 of the distance at which the whole contact slips.
-share = np.linspace(0, 0.9, FRAMES)
-slide = Horizontal(np.outer(1.5 * FRICTION * PRESS * share, [1.0, 0.0]), PRESS)
+force_ratio = np.linspace(0, 0.9, FRAMES)
+slide = Horizontal(np.outer(1.5 * FRICTION * PRESS * force_ratio, [1.0, 0.0]), PRESS)
 # A twist after which half of the radius of the contact sticks (Lubkin, 1951).
 stuck = np.linspace(1, 0.5, FRAMES)
 largest = 4 * FRICTION * math.sqrt(PRESS / RADIUS) / math.pi
@@ -63,13 +63,13 @@ twist = Twist(largest * (special.ellipk(1 - stuck**2) - special.ellipe(1 - stuck
 figure, axes = plt.subplots(2, 4, figsize=(18, 8), layout="constrained")
 figure.suptitle("black: border of the contact; red: border of the part that sticks at the end")
 for row, name, movement, theory, closed, unit, scale in (
-    (axes[0], "slide", slide, "Cattaneo and Mindlin", 1 - share, "mm", 1.0),
+    (axes[0], "slide", slide, "Cattaneo and Mindlin", 1 - force_ratio, "mm", 1.0),
     (axes[1], "twist", twist, "Lubkin", stuck**2, "°", 180 / math.pi),
 ):
     result, truth, contact = find_slip(movement)
     distance = result.slide_distance if name == "slide" else result.twist_angle
     onset = np.where(contact, truth.slip_onset, np.nan)
-    true = np.array([1 - np.mean(onset[contact] <= way) for way in distance])
+    true = np.array([1 - np.mean(onset[contact] <= distance_slid) for distance_slid in distance])
     error = 1000 * np.linalg.norm(result.displacement - truth.displacement[-1], axis=-1)
     ratios = (result.stick_ratio[-1], true[-1], closed[-1])
     radii = "found {:.3f}, true {:.3f}, closed form {:.3f}".format(*map(math.sqrt, ratios))

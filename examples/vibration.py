@@ -22,8 +22,8 @@ LAB = Camera(noise=1.0, electrons=40.0, gain_deviation=0.02, offset_deviation=0.
 
 def simulate(thing, movement, *, camera=LAB, **sensor):
     """Return a twin, and its frames."""
-    known = {"shape": (SIZE, SIZE), "pixel_size": FIELD / SIZE, "camera": camera, **sensor}
-    twin = Twin(object=thing, movement=movement, **known)
+    options = {"shape": (SIZE, SIZE), "pixel_size": FIELD / SIZE, "camera": camera, **sensor}
+    twin = Twin(object=thing, movement=movement, **options)
     frames = np.empty(twin.shape, twin.dtype)
     twin.read(frames)
     twin.rewind()
@@ -59,8 +59,8 @@ run.push(frames[ends[-1] :], travel=travel[ends[-1] :])
 x, y = io.pixel_axes(twin.shape[1:], twin.header.pixel_size)
 pressed = run.result().assign(x=x, y=y)
 lag = 1000 * float(np.nanmean(pressed.hysteresis[np.isfinite(truth)]))
-count, found, expected = (round(curve[-1][0]), 1000 * curve[-1][1], 1000 * curve[-1][2])
-print(f"height after {count} strokes: RMS error {found:.1f} µm, expected {expected:.1f} µm")
+count, rms_error, expected = (round(curve[-1][0]), 1000 * curve[-1][1], 1000 * curve[-1][2])
+print(f"height after {count} strokes: RMS error {rms_error:.1f} µm, expected {expected:.1f} µm")
 print(f"hysteresis: {lag:.1f} µm, true {1000 * BACKLASH:.0f} µm")
 
 # A body that rocks by 2.5 degrees about the tip of a pyramid with five sides.
@@ -87,10 +87,10 @@ twin, _ = simulate("sphere", Vertical(1.0 + SWING * np.cos(math.tau / 7.3 * np.a
 dithered = Correlation(dither=True).run(twin)
 noiseless = Camera(np.dtype(np.uint16), noise=0.0)
 twin, frames = simulate("sphere", Vertical(1.0 + SWING * np.array([-0.5, 0.5])), camera=noiseless, **contact)
-share = (frames - twin.header.dark.astype(float)) / (twin.header.bright - twin.header.dark)
-growth = float(np.sum(share[1] - share[0])) * (FIELD / SIZE) ** 2 / SWING
-found = (dithered.process["area_growth"], dithered.process["area_growth_sigma"])
-print(f"lit area: grows by {found[0]:.3f} ± {found[1]:.3f} mm² for each mm of travel, true {growth:.3f}")
+lit = (frames - twin.header.dark.astype(float)) / (twin.header.bright - twin.header.dark)
+growth = float(np.sum(lit[1] - lit[0])) * (FIELD / SIZE) ** 2 / SWING
+error = (dithered.process["area_growth"], dithered.process["area_growth_sigma"])
+print(f"lit area: grows by {error[0]:.3f} ± {error[1]:.3f} mm² for each mm of travel, true {growth:.3f}")
 
 # The strokes: height after each, hysteresis, and errors divided by their standard deviations.
 figure, axes = plt.subplots(2, 3, figsize=(15, 8), layout="constrained")
@@ -127,7 +127,7 @@ panel.legend()
 # The maps of rocking and dither.
 measured = np.where(rocked.contact == 1, rocked.slope, np.nan)
 largest = np.nanpercentile(dithered.growth, 99.5)
-area = f"dither: {found[0]:.2f} mm²/mm, true {growth:.2f}"
+area = f"dither: {error[0]:.2f} mm²/mm, true {growth:.2f}"
 for panel, values, label, title, limit in (
     (axes[1, 0], measured, "slope", "rocking: slope along one direction", np.nanmax(np.abs(slope))),
     (axes[1, 1], error, "error of the slope", f"its error: RMS {rms(error):.3f}", 4 * rms(error)),

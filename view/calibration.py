@@ -99,8 +99,8 @@ def draw_lens(lens: Lens) -> Figure:
         DIVERGING,
         even=True,
     )
-    for one in axes[1:]:
-        one.images[0].set_extent(extent)
+    for panel in axes[1:]:
+        panel.images[0].set_extent(extent)
     each = slice(None, None, max(1, len(rows) // 10))
     axes[1].quiver(
         columns[each, each],
@@ -164,9 +164,9 @@ def _draw_grid(axes: Axes, lens: Lens) -> None:
             )
             ideal = np.stack(_project(to_picture, line), axis=-1)
             far = np.abs(ideal / (columns, rows) - 0.5).max(axis=-1) > _BEYOND
-            seen = np.where(far[:, np.newaxis], np.nan, _distort(ideal, lens))
+            distorted = np.where(far[:, np.newaxis], np.nan, _distort(ideal, lens))
             colour = "tab:red" if abs(value) < step / 2 else "tab:blue"
-            axes.plot(*seen.T, color=colour, lw=1.4 if colour == "tab:red" else 0.8)
+            axes.plot(*distorted.T, color=colour, lw=1.4 if colour == "tab:red" else 0.8)
     axes.set(
         xlim=(-0.5, columns - 0.5),
         ylim=(rows - 0.5, -0.5),
@@ -269,8 +269,8 @@ def check_figure(check: Check, title: str, path: Path) -> None:
     axes = figure.subplots(len(check.after), len(columns), squeeze=False)
     for row, name in zip(axes, check.after, strict=True):
         shown = [parts[name] for _, parts in columns if name in parts]
-        known = np.concatenate([np.abs(part.error[np.isfinite(part.error)]) for part in shown])
-        worst = float(np.percentile(known, _WORST)) if known.size else 1.0
+        errors = np.concatenate([np.abs(part.error[np.isfinite(part.error)]) for part in shown])
+        worst = float(np.percentile(errors, _WORST)) if errors.size else 1.0
         for place, (when, parts) in zip(row, columns, strict=True):
             _draw(place, f"{name}, {when}", parts[name], check, worst)
     save_figure(figure, title, path)

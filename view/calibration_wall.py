@@ -168,8 +168,8 @@ def _draw_correlation(axes: Axes, response: WallResponse) -> None:
     correlation = covariance / np.outer(sigma, sigma)
     picture = axes.imshow(correlation, cmap=DIVERGING, vmin=-1, vmax=1, interpolation="nearest")
     explain_colours(axes, picture, "correlation")
-    left = math.degrees(response.error)
-    axes.set_title(f"errors of the {len(sigma)} parameters\nleft on the balls: {left:.3f}° RMS")
+    residual = math.degrees(response.error)
+    axes.set_title(f"errors of the {len(sigma)} parameters\nleft on the balls: {residual:.3f}° RMS")
     names = [response.parameters[number] for number in free] if len(free) <= _NAMED else []
     size = 7 if len(names) > 12 else 9
     axes.set_xticks(range(len(names)), names, rotation=90, fontsize=size)
@@ -204,10 +204,10 @@ def _draw_threshold(axes: Axes, gel: Gel) -> None:
     axes.plot(x, np.where(lit, np.nan, z), color="0.25", lw=4, label="too flat: dark")
     for side in (-1, 1):
         across, up = side * math.sin(gel.threshold), math.cos(gel.threshold)
-        foot = _BALL * across, _BALL * (up - 1)
-        tip = foot[0] + 0.5 * across, foot[1] + 0.5 * up
-        axes.annotate("", tip, foot, arrowprops={"arrowstyle": "-|>", "color": "tab:blue", "lw": 1.5})
-        axes.plot([foot[0]] * 2, [foot[1], foot[1] + 0.5], color="0.6", lw=1, ls=":")
+        start = _BALL * across, _BALL * (up - 1)
+        tip = start[0] + 0.5 * across, start[1] + 0.5 * up
+        axes.annotate("", tip, start, arrowprops={"arrowstyle": "-|>", "color": "tab:blue", "lw": 1.5})
+        axes.plot([start[0]] * 2, [start[1], start[1] + 0.5], color="0.6", lw=1, ls=":")
     words = _with_error(math.degrees(gel.threshold), math.degrees(gel.sigma.get("threshold", math.nan)), "°")
     axes.set(
         xlabel="x (mm)",
@@ -243,11 +243,11 @@ def draw_stiffness(stiffness: Stiffness) -> Figure:
     figure = new_sheet(8, 5.2)
     axes = figure.add_subplot()
     depth = np.linspace(0, _DEEPEST, _FINE)
-    share = math.hypot(stiffness.scatter, stiffness.modulus_sigma / stiffness.modulus)
+    relative_sigma = math.hypot(stiffness.scatter, stiffness.modulus_sigma / stiffness.modulus)
     for radius in _RADII:
         force = 16 / 9 * math.sqrt(radius) * stiffness.modulus * depth**1.5
         axes.plot(depth, force, lw=2, label=f"ball of {2 * radius:g} mm")
-        axes.fill_between(depth, force * (1 - share), force * (1 + share), alpha=0.3)
+        axes.fill_between(depth, force * (1 - relative_sigma), force * (1 + relative_sigma), alpha=0.3)
     words = _with_error(1000 * stiffness.modulus, 1000 * stiffness.modulus_sigma, " kPa")
     axes.set(
         xlabel="depth in the gel (mm)",

@@ -123,15 +123,19 @@ def shown_maps(maps: Result) -> list[str]:
 
     Edges are drawn over normals.
     """
-    known = {name: maps.declaration(name) for name in display_order(maps) if not is_deviation(name)}
-    return [name for name, one in known.items() if one.overview and not one.included_in and name != "edges"]
+    declarations = {name: maps.declaration(name) for name in display_order(maps) if not is_deviation(name)}
+    return [
+        name
+        for name, declaration in declarations.items()
+        if declaration.overview and not declaration.included_in and name != "edges"
+    ]
 
 
 def section(height: NDArray[np.float32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return the cross-section along the middle row, one line for each piece without a gap."""
     row = height[height.shape[0] // 2].astype(np.float64)
-    known = np.flatnonzero(np.isfinite(row))
-    pieces = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1)
+    columns = np.flatnonzero(np.isfinite(row))
+    pieces = np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1)
     return [np.stack([x[piece], -row[piece]], axis=1) for piece in pieces if len(piece) > 1]
 
 
@@ -154,9 +158,9 @@ class _Range:
         return grey(values, *self.ends)
 
     def _widen(self, values: NDArray[Any]) -> None:
-        known = values[np.isfinite(values)]
-        if known.size:
-            self.ends = min(self.ends[0], float(known.min())), max(self.ends[1], float(known.max()))
+        finite = values[np.isfinite(values)]
+        if finite.size:
+            self.ends = min(self.ends[0], float(finite.min())), max(self.ends[1], float(finite.max()))
 
 
 def _blueprint(titles: Mapping[str, str], scaled: bool) -> Any:

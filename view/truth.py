@@ -58,8 +58,8 @@ class Relief:
 
     def notes(self, missing: str) -> str:
         """Return notes on the colours, the share of filled heights, and the level."""
-        share = 100 * float(self.filled.sum()) / max(1.0, float(np.isfinite(self.height).sum()))
-        filled = [f"orange: filled, {share:.0f} % of the heights"] if self.filled.any() else []
+        percentage = 100 * float(self.filled.sum()) / max(1.0, float(np.isfinite(self.height).sum()))
+        filled = [f"orange: filled, {percentage:.0f} % of the heights"] if self.filled.any() else []
         return "\n".join([*filled, missing, *(["truth's level"] if self.levelled else [])])
 
     @property
@@ -71,8 +71,8 @@ class Relief:
     @property
     def ends(self) -> Range:
         """The lowest and the highest height."""
-        known = self.height[np.isfinite(self.height)]
-        return (float(known.min()), float(known.max())) if known.size else (-1.0, 0.0)
+        finite = self.height[np.isfinite(self.height)]
+        return (float(finite.min()), float(finite.max())) if finite.size else (-1.0, 0.0)
 
 
 def relief_of(result: Result, truth: Truth) -> Relief:
@@ -283,8 +283,8 @@ def normal_figure(results: Mapping[str, Result], truth: Truth, title: str, path:
         _check(result, truth)
     errors = {name: _errors(result, truth) for name, result in results.items()}
     shared = np.logical_and.reduce([np.isfinite(error) for error in errors.values()])
-    known = np.concatenate([error[shared] for error in errors.values()])
-    worst = float(np.percentile(known, _WORST)) if known.size else 1.0
+    errors_shared = np.concatenate([error[shared] for error in errors.values()])
+    worst = float(np.percentile(errors_shared, _WORST)) if errors_shared.size else 1.0
     figure = new_figure(14, 4.4 * len(results))
     axes = figure.subplots(len(results), 3, squeeze=False)
     _draw_key(axes[0, 0].inset_axes((1.05, 0.3, 0.4, 0.4)))
@@ -321,13 +321,13 @@ def _errors(result: Result, truth: Truth) -> Floats:
 
 def _draw_normals(axes: Axes, name: str, result: Result) -> None:
     normals, x, y = _maps(result)
-    known = np.asarray(np.isfinite(normals).all(axis=-1))
-    colours = np.ones((*known.shape, 4))
-    colours[..., :3] = np.where(known[..., np.newaxis], (np.nan_to_num(normals) + 1) / 2, 0)
+    finite = np.asarray(np.isfinite(normals).all(axis=-1))
+    colours = np.ones((*finite.shape, 4))
+    colours[..., :3] = np.where(finite[..., np.newaxis], (np.nan_to_num(normals) + 1) / 2, 0)
     if result.edges is not None:
         colours[result.edges.astype(bool)] = 0, 0, 0, 1
-        known = known | result.edges.astype(bool)
-    colours[~known, 3] = 0
+        finite = finite | result.edges.astype(bool)
+    colours[~finite, 3] = 0
     draw_image(axes, colours, extent(x, y))
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{name}; black: edges, blue: no answer")
 
@@ -375,9 +375,11 @@ def _draw_needles(axes: Axes, result: Result) -> None:
 
 def _draw_angles(axes: Axes, result: Result, error: Floats, shared: NDArray[np.bool_], worst: float) -> None:
     _, x, y = _maps(result)
-    known, common = error[np.isfinite(error)], error[shared]
+    finite, common = error[np.isfinite(error)], error[shared]
     note = (
-        f"median {np.median(known):.2f} deg of all {known.size} px" if known.size else "no pixel in contact"
+        f"median {np.median(finite):.2f} deg of all {finite.size} px"
+        if finite.size
+        else "no pixel in contact"
     )
     if common.size:
         note = f"median {np.median(common):.2f} deg of the {common.size} px that all answer\n{note}"
@@ -433,9 +435,9 @@ def _draw_surfaces(results: Mapping[str, Result], truth: Truth) -> Figure:
 
 def _draw_height_errors(axes: Axes, relief: Relief, truth: Truth) -> None:
     error = _MICROMETRES * (relief.height - truth.height)
-    known = error[np.isfinite(error)]
-    worst = float(np.percentile(np.abs(known), _WORST)) if known.size else 1.0
-    note = f"RMS {np.sqrt(np.mean(known**2)):.1f} \N{MICRO SIGN}m" if known.size else "no pixel answered"
+    finite = error[np.isfinite(error)]
+    worst = float(np.percentile(np.abs(finite), _WORST)) if finite.size else 1.0
+    note = f"RMS {np.sqrt(np.mean(finite**2)):.1f} \N{MICRO SIGN}m" if finite.size else "no pixel answered"
     place, label = extent(relief.x, relief.y), "height - truth (\N{MICRO SIGN}m)"
     draw_image(axes, error, place, label, cmap=DIVERGING, vmin=-worst, vmax=worst)
     if relief.filled.any():

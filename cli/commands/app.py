@@ -123,13 +123,13 @@ def _opening(
     if holds_result(path):
         io.open_result(path)
         return Opening()
-    given = dict(chosen)
+    values = dict(chosen)
     stack: dict[str, Any] = {**stack_options(chosen)}
     part = {name: stack.pop(name, None) for name in ("region", "frames")}
     with io.open_recording(path, **stack, **part) as recording:
         if recording.header.pixel_size is None:
             size = with_pixel_size(recording).header.pixel_size
             if size is not None:
-                stack["pixel_size"] = given["pixel_size"] = size
+                stack["pixel_size"] = values["pixel_size"] = size
         calibration = calibration_of(recording, calibration)
-    return Opening(stack, stack_words(given), calibration, device, operation or "", **part)
+    return Opening(stack, stack_words(values), calibration, device, operation or "", **part)

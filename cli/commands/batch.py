@@ -84,7 +84,7 @@ def command(
     part, parts = map(int, match.groups()) if (match := _SHARD.fullmatch(shard or "1/1")) else (0, 0)
     if not 1 <= part <= parts:
         raise InputError(f"--shard {shard}: a part and the number of parts is needed; write e.g. 1/4")
-    found = _find(recordings, output)
+    sources = _find(recordings, output)
 
     from mirrorskin.cli.quantity import memory as bytes_of
     from mirrorskin.cli.settings import read_settings
@@ -93,7 +93,7 @@ def command(
     plan = dataclasses.replace(read_settings(settings, bytes_of(memory, "--memory")), strict=strict)
     warnings.simplefilter("ignore", MirrorskinWarning)  # outcomes contain them
     # All are named before they are divided, so that a result has the same name on every machine.
-    jobs = make_jobs(found, output)
+    jobs = make_jobs(sources, output)
     if parts > 1:
         jobs = sorted(jobs, key=lambda job: job.target)[part - 1 :: parts]
     _prepare(output, jobs)
@@ -117,14 +117,14 @@ def _find(words: Sequence[str], folder: Path) -> list[Path]:
     from mirrorskin.io.base.url import Url, is_zarr, path_of
     from mirrorskin.io.storage.zarr import find_stores
 
-    found: list[Path] = []
+    paths: list[Path] = []
     for word in words:
         path = path_of(word)
         if os.path.lexists(path) or not glob.has_magic(word):
-            found.append(path)
+            paths.append(path)
             continue
         if isinstance(path, Url):
-            found += find_stores(path)
+            paths += find_stores(path)
             continue
         every = map(Path, sorted(glob.glob(word, recursive=True)))  # noqa: PTH207  # paths may be absolute
         answers = [
@@ -134,14 +134,14 @@ def _find(words: Sequence[str], folder: Path) -> list[Path]:
         ]
         if not answers:
             raise InputError(f"{word}: no file matches. Name recordings")
-        found += answers
-    if not any(isinstance(path, Url) or os.path.lexists(path) for path in found):
-        raise InputError(f"{found[0]}: no such file")
-    recordings = [path for path in found if not _is_result(path, folder)]
+        paths += answers
+    if not any(isinstance(path, Url) or os.path.lexists(path) for path in paths):
+        raise InputError(f"{paths[0]}: no such file")
+    recordings = [path for path in paths if not _is_result(path, folder)]
     if not recordings:
         raise InputError(f"{words[0]}: results only. Name recordings")
-    if len(recordings) < len(found):
-        click.echo(f"left out, as results: {len(found) - len(recordings)} files", err=True)
+    if len(recordings) < len(paths):
+        click.echo(f"left out, as results: {len(paths) - len(recordings)} files", err=True)
     return recordings
 
 
@@ -275,8 +275,8 @@ def _problem(outcome: Outcome) -> str:
 class _Show:
     """Display of the progress of a batch: a line for each file, if wanted."""
 
-    def __init__(self, wanted: bool) -> None:
-        self._wanted = wanted
+    def __init__(self, enabled: bool) -> None:
+        self._wanted = enabled
 
     def under_way(self, job: Job, frames: int, /) -> None:
         """Receive, from any thread, the number of frames of a job that were read."""
@@ -333,10 +333,10 @@ class _Table(_Show):
             table.add_column(head, justify="right")
         with self._lock:
             last, running = list(self._last), list(self._running.items())
-        for one in last:
-            state = _problem(one) if one.state == "failed" else one.state
-            speed = _speed(one) if one.bytes else ""
-            cells = printable(str(one.job.source)), one.motion, state, f"{one.seconds:.2f}", speed
+        for outcome in last:
+            state = _problem(outcome) if outcome.state == "failed" else outcome.state
+            speed = _speed(outcome) if outcome.bytes else ""
+            cells = printable(str(outcome.job.source)), outcome.motion, state, f"{outcome.seconds:.2f}", speed
             table.add_row(*map(Text, cells))
         for job, (start, frames) in running:
             state = f"{frames} frames" if frames else "begun"

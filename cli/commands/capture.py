@@ -24,7 +24,7 @@ def command(
     calibration: options.Calibration = None,
     compression: options.Compression = options.CompressionName.raw,
     overwrite: options.Overwrite = False,
-    **given: Annotated[Any, scans.PLAN],
+    **chosen: Annotated[Any, scans.PLAN],
 ) -> None:
     """Move the stage, and record what the camera sees; what was taken is kept whatever happens."""
     from mirrorskin import io
@@ -35,14 +35,16 @@ def command(
     from mirrorskin.kernels.rotation.correlation import WINDOW
 
     settings = load_rig(rig_file)
-    plan = scans.make_plan(context, given, settings)
-    known = scans.open_calibration(calibration, settings)
+    plan = scans.make_plan(context, chosen, settings)
+    calibrated = scans.open_calibration(calibration, settings)
     planned = PlannedScan(settings, plan)
-    scans.check_recording(planned, output, rig_file, calibration, known=known, overwrite=overwrite)
+    scans.check_recording(planned, output, rig_file, calibration, calibration=calibrated, overwrite=overwrite)
     with open_rig(settings, plan.in_steps) as rig:
         # Normals are computed from this number of frames of a turn; more would be of no use.
-        scan = make_scan(rig, plan, given.get("settle"), given.get("frames"), turn_frames=WINDOW)
-        recorder = io.StreamRecorder(scan, output, compression.value, calibration=known, overwrite=overwrite)
+        scan = make_scan(rig, plan, chosen.get("settle"), chosen.get("frames"), turn_frames=WINDOW)
+        recorder = io.StreamRecorder(
+            scan, output, compression.value, calibration=calibrated, overwrite=overwrite
+        )
         with scans.kept(recorder):
             _drain(recorder)
         click.echo(f"{output}: {_summary(scan)}")
@@ -54,8 +56,8 @@ def _drain(recorder: StreamRecorder) -> None:
     from mirrorskin.cli.output import progress
 
     with recorder, progress("capturing", recorder.shape[0]) as show:
-        room = np.empty((_TOGETHER, *recorder.shape[1:]), recorder.dtype)
-        while recorder.read(room) is not None:
+        buffer = np.empty((_TOGETHER, *recorder.shape[1:]), recorder.dtype)
+        while recorder.read(buffer) is not None:
             show(recorder.count)
 
 

@@ -44,12 +44,12 @@ def command(
         io.open_recording(recording, memory_limit=bytes_of(memory, "--memory"), **stack) as source,
         progress("checking", source.shape[0]) as show,
     ):
-        found = io.check(with_pixel_size(source), field_limits=sides, travel_limits=travels, progress=show)
+        report = io.check(with_pixel_size(source), field_limits=sides, travel_limits=travels, progress=show)
     if as_json:
-        print_json(found)
+        print_json(report)
     else:
-        for line in str(found).splitlines():
+        for line in str(report).splitlines():
             click.echo(printable(line))
     if strict:
         make_strict(strict)
-        warn(found.name, in_process(found.warnings, {}))
+        warn(report.name, in_process(report.warnings, {}))

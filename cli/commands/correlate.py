@@ -29,19 +29,19 @@ def command(
     from mirrorskin.engine.vibration.lock_in import Correlation
 
     phases = chosen.get("phases")
-    known = stack_options(chosen)
+    opening = stack_options(chosen)
     if chosen.get("dither"):
-        if "frequency" in chosen or "phase" in known:
+        if "frequency" in chosen or "phase" in opening:
             raise io.InputError("--dither takes the phases from the travel. Remove those given")
     else:
-        known["motion"] = "axial"
+        opening["motion"] = "axial"
     if "frequency" in chosen:
-        if "phase" in known:
+        if "phase" in opening:
             raise io.InputError("--frequency gives the phases. Remove --phase-step and --phases")
-        known["phase"] = io.Steps(0.0)
+        opening["phase"] = io.Steps(0.0)
     limit = bytes_of(memory, "--memory")
     override = not chosen.get("dither", False)
-    with io.open_recording(stack, memory_limit=limit, override_motion=override, **known) as source:
+    with io.open_recording(stack, memory_limit=limit, override_motion=override, **opening) as source:
         target = output or stack.with_name(f"{stack.stem}-correlation.h5")
         io.check_result_output(target, stack, phases, overwrite=overwrite)
         method = Correlation(**{**chosen, "memory_limit": limit, "device": device})

@@ -36,7 +36,7 @@ def command(as_json: options.Json = False) -> None:
             [str(config_file() or "none"), *(f"{key} {value}" for key, value in defaults().items())]
         ),
         **{f"package {name}": _version(name) or "missing" for name in _PACKAGES},
-        **{f"extra {name}": found for name, found in _extras().items()},
+        **{f"extra {name}": state for name, state in _extras().items()},
         **{name: value for name, value in sorted(os.environ.items()) if _VARIABLES.match(name)},
     }
     if as_json:

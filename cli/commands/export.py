@@ -63,8 +63,8 @@ def command(
 
     suffixes = {path.suffix.lower() for path in output}
     chosen = {"map_name": map_name, "section": section, "points": points, "float32": float32}
-    for option, given in chosen.items():
-        if given and not suffixes & {*(taken := export_suffixes(option))}:
+    for option, value in chosen.items():
+        if value and not suffixes & {*(taken := export_suffixes(option))}:
             name = option.removesuffix("_name")
             raise io.InputError(f"--{name} is for a {taken[0]} file: name one with -o, or leave --{name} out")
     ends = None if section in (None, _APEX) else segment(section, "--section")
@@ -75,13 +75,13 @@ def command(
             for path, form in forms.items():
                 click.echo(printable(f"{path}: {form.load(form.encoder)(recording, path)}"))
     elif output:
-        found = io.select_turn(io.open_result(result), turn)
+        saved = io.select_turn(io.open_result(result), turn)
         for path in output:
-            check_export(found, path, map_name)
-        columns = None if section is None else section_columns(found, ends)
+            check_export(saved, path, map_name)
+        columns = None if section is None else section_columns(saved, ends)
         for path in output:
             holds = io.export_result(
-                found, path, map_name=map_name, section=columns, points=points, float32=float32
+                saved, path, map_name=map_name, section=columns, points=points, float32=float32
             )
             click.echo(printable(f"{path}: {holds}"))
     for path in stores:

@@ -47,13 +47,13 @@ def command(
 
     make_strict(strict)
     files = [value for value in chosen.values() if isinstance(value, Path)]
-    known = stack_options(chosen)
+    stack = stack_options(chosen)
     robust = chosen.pop("robust", False)
     limit = bytes_of(memory, "--memory")
     target = output or vertical.with_name(f"{vertical.stem}-fused.h5")
     with (
-        _open(vertical, "vertical", known, limit) as pressed,
-        _open(axial, "axial", known, limit) as turned,
+        _open(vertical, "vertical", stack, limit) as pressed,
+        _open(axial, "axial", stack, limit) as turned,
     ):
         io.check_result_output(target, vertical, axial, calibration, *files, overwrite=overwrite)
         calibration = calibration_of(pressed, calibration)
@@ -72,11 +72,11 @@ def command(
     save_and_report(result, target, device, as_json, overwrite=overwrite)
     for path, opened, prefix in ((vertical, pressed, "vertical_"), (axial, turned, "axial_")):
         report_unverified(opened)
-        process = {name.removeprefix(prefix): said for name, said in result.process.items()}
+        process = {name.removeprefix(prefix): value for name, value in result.process.items()}
         report_notes(str(path), process)
 
 
-def _open(path: Path, place: Motion, known: StackOptions, limit: int) -> Recording:
+def _open(path: Path, place: Motion, stack: StackOptions, limit: int) -> Recording:
     """Open a recording; the command line determines the motion of a file in another layout."""
     from mirrorskin import io
     from mirrorskin.io.formats.registry import is_of_others
@@ -87,5 +87,5 @@ def _open(path: Path, place: Motion, known: StackOptions, limit: int) -> Recordi
     if not is_of_others(path):
         with open_file(path) as file:
             ours = file.marked(MARK)
-    mine: Any = {**known, "dataset": None, "channel": None} if ours else {**known, "motion": place}
+    mine: Any = {**stack, "dataset": None, "channel": None} if ours else {**stack, "motion": place}
     return with_pixel_size(io.open_recording(path, memory_limit=limit, **mine))

@@ -21,7 +21,7 @@ def command(
     compression: options.Compression = options.CompressionName.raw,
     overwrite: options.Overwrite = False,
     strict: options.Strict = False,
-    **given: Annotated[Any, IMPORTED],
+    **chosen: Annotated[Any, IMPORTED],
 ) -> None:
     """Convert frames of another program to a recording."""
     from mirrorskin import io
@@ -31,17 +31,17 @@ def command(
     make_strict(strict)
 
     refuse_foreign(context, motion.value, str(frames))
-    files = [value for value in given.values() if isinstance(value, Path)]
+    files = [value for value in chosen.values() if isinstance(value, Path)]
     io.check_output(output, frames, *files, replaces="anything" if overwrite else "nothing")
-    known = stack_options(given)
-    known["motion"] = motion.value
-    source = with_pixel_size(io.open_recording(frames, **known))
+    stack = stack_options(chosen)
+    stack["motion"] = motion.value
+    source = with_pixel_size(io.open_recording(frames, **stack))
     with (
         io.Recorder(source, output, compression.value, overwrite=overwrite) as recorder,
         progress("importing", source.shape[0]) as show,
     ):
-        found = recorder.drain(show)
-        process = in_process(found.findings, {})
+        report = recorder.drain(show)
+        process = in_process(report.findings, {})
         warn(str(frames), process)
     report_notes(str(frames), process)
     if source.header.pixel_size is None:

@@ -74,7 +74,7 @@ def command(
     ] = None,
     calibration: options.Calibration = None,
     device: options.Devices = None,
-    **given: Annotated[Any, scans.PLAN, declared("reconstruct").only(*_OPTIONS)],
+    **chosen: Annotated[Any, scans.PLAN, declared("reconstruct").only(*_OPTIONS)],
 ) -> None:
     """Reconstruct while the stage moves. Ctrl-C stops it, and keeps what was computed and recorded."""
     from mirrorskin import io
@@ -84,41 +84,41 @@ def command(
     from mirrorskin.hw.rig.scan import PlannedScan
 
     rig = load_rig(rig_file)
-    planned = {one.name for one in scans.PLAN.terms}
-    plan = scans.make_plan(context, {name: one for name, one in given.items() if name in planned}, rig)
+    planned = {term.name for term in scans.PLAN.terms}
+    plan = scans.make_plan(context, {name: value for name, value in chosen.items() if name in planned}, rig)
     kind = method_for(plan.motion) if operation is None else load_operation(operation)
     shared = () if operation is None else kind.options
-    chosen = {name: one for name, one in given.items() if name in shared or name not in planned}
-    computed = kind(device=device, **chosen)
+    of_kind = {name: value for name, value in chosen.items() if name in shared or name not in planned}
+    computed = kind(device=device, **of_kind)
     if overwrite and record is None and output is None:
         raise io.InputError("--overwrite is for --record and -o: leave it out")
-    inputs = rig_file, calibration, *(one for one in chosen.values() if isinstance(one, Path))
+    inputs = rig_file, calibration, *(value for value in of_kind.values() if isinstance(value, Path))
     if output is not None:
         io.check_result_output(output, *inputs, record, overwrite=overwrite)
         if record is not None and record.resolve() == output.resolve():
             raise io.InputError(f"--record and -o are both {output}: name two files")
-    known = scans.open_calibration(calibration, rig)
+    calibrated = scans.open_calibration(calibration, rig)
     scan = PlannedScan(rig, plan)
     if record is not None:
-        scans.check_recording(scan, record, *inputs, known=known, overwrite=overwrite)
-    values = {**context.params, **given, "latency": duration(latency, "--latency")}
-    live = _Live(rig, plan, computed, values, known)
+        scans.check_recording(scan, record, *inputs, calibration=calibrated, overwrite=overwrite)
+    values = {**context.params, **chosen, "latency": duration(latency, "--latency")}
+    live = _Live(rig, plan, computed, values, calibrated)
     live.check(scan)
     live.run()
 
 
 class _Live:
-    """A run whose result is kept however it ends; `given`: the command's options."""
+    """A run whose result is kept however it ends; `values`: those of the command's options."""
 
     def __init__(
         self,
         settings: RigSettings,
         plan: Plan,
         computed: Operation | Method,
-        given: Mapping[str, Any],
+        values: Mapping[str, Any],
         calibration: Calibration | None,
     ) -> None:
-        self._settings, self._plan, self._computed, self._given = settings, plan, computed, given
+        self._settings, self._plan, self._computed, self._values = settings, plan, computed, values
         self._calibration = calibration
         self._loop: Loop | None = None
         self._run: LiveRun | None = None
@@ -130,11 +130,11 @@ class _Live:
         source = self._calibrated(planned)
         run = self._prepare(source, self._settings.camera.rate)
         run.precompile()
-        Loop(source, run, latency=self._given["latency"])
-        if self._given["view"]:
+        Loop(source, run, latency=self._values["latency"])
+        if self._values["view"]:
             from mirrorskin.view.viewer import check_place
 
-            check_place(self._given["view"], "--view")
+            check_place(self._values["view"], "--view")
 
     def run(self) -> None:
         """Reconstruct while the stage moves, and save the result."""
@@ -165,17 +165,19 @@ class _Live:
         from mirrorskin.hw.rig.sweep import make_scan
         from mirrorskin.io import StreamRecorder
 
-        given, settings, known = self._given, self._settings, self._calibration
+        values, settings, calibration = self._values, self._settings, self._calibration
         with ExitStack() as stack:
             rig = stack.enter_context(open_rig(settings))
-            scan = make_scan(rig, self._plan, given.get("settle"), given.get("frames"))
-            view = given["view"]
+            scan = make_scan(rig, self._plan, values.get("settle"), values.get("frames"))
+            view = values["view"]
             shown = stack.enter_context(_viewer(view, scan.shape[1:], settings)) if view else None
             tell = stack.enter_context(show_status())
-            record = given["record"]
+            record = values["record"]
             recorder = None
             if record is not None:
-                recorder = StreamRecorder(scan, record, calibration=known, overwrite=given["overwrite"])
+                recorder = StreamRecorder(
+                    scan, record, calibration=calibration, overwrite=values["overwrite"]
+                )
             source = self._calibrated(scan if recorder is None else recorder)
             stack.enter_context(scans.kept(recorder))
             stack.enter_context(source)
@@ -192,7 +194,7 @@ class _Live:
             mark = None if recorder is None else recorder.mark
             guard = _Guard()
             self._loop = Loop(
-                source, run, latency=given["latency"], on_update=on_update, mark=mark, guard=guard
+                source, run, latency=values["latency"], on_update=on_update, mark=mark, guard=guard
             )
             gc.freeze()  # a collector that looks through all that was there before would hold up frames
             try:
@@ -221,13 +223,13 @@ class _Live:
             return LiveRun(source, computed)
         if rate is None and not plan.in_steps:
             return LiveRun(source, computed)
-        per_turn = plan.frames_a_turn(rate or math.nan, self._given.get("frames") or 1)
+        per_turn = plan.frames_a_turn(rate or math.nan, self._values.get("frames") or 1)
         window, every = choose_window(per_turn, computed.window_frames)
         return LiveRun(source, computed.with_options(window_frames=window), every=every)
 
     def _save(self) -> None:
         """Write the result, if requested, and print which maps are missing."""
-        output = self._given["output"]
+        output = self._values["output"]
         if output is None:
             return
         from mirrorskin.cli.output import report_contact, report_missing_maps, report_notes, save_and_report
@@ -239,10 +241,10 @@ class _Live:
         save_and_report(
             result,
             output,
-            self._given["device"],
+            self._values["device"],
             as_json=False,
             must_answer=False,
-            overwrite=self._given["overwrite"],
+            overwrite=self._values["overwrite"],
         )
         report_notes(self._settings.name, result.process)
 

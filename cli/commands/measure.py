@@ -65,7 +65,7 @@ def command(
         bool, Option("--budget", help="Print the contributions to each standard uncertainty.")
     ] = False,
     as_json: options.Json = False,
-    **given: Annotated[Any, STACK.only("region")],
+    **chosen: Annotated[Any, STACK.only("region")],
 ) -> None:
     """Measure a height map: heights, areas, volumes, plane or sphere, texture, profiles, steps."""
     from mirrorskin import engine, io
@@ -73,7 +73,7 @@ def command(
 
     measures = engine.measure(
         io.select_turn(io.open_result(result), turn),
-        region=given.get("region"),
+        region=chosen.get("region"),
         form=None if form is None else form.value,
         s_filter=None if s_filter is None else quantity.length(s_filter, "--s-filter"),
         l_filter=None if l_filter is None else quantity.length(l_filter, "--l-filter"),
@@ -100,8 +100,8 @@ def _print_groups(measures: Measures, expanded: bool) -> None:
 
     width = max(map(len, measures.quantities))
     texts = {
-        name: str(replace(one, sigma=(2 if expanded else 1) * one.sigma))
-        for name, one in measures.quantities.items()
+        name: str(replace(quantity, sigma=(2 if expanded else 1) * quantity.sigma))
+        for name, quantity in measures.quantities.items()
     }
     wide = max(len(texts[name]) for name in texts)
     heading = ""

@@ -74,8 +74,8 @@ def check(
     findings: list[CheckResult] = []
     complete = False
     try:
-        with closing(check_rig(settings, move=move)) as found:
-            findings.extend(found)  # keeps what was found before an error
+        with closing(check_rig(settings, move=move)) as report:
+            findings.extend(report)  # keeps what was found before an error
         complete = True
     finally:
         if findings:
@@ -116,14 +116,14 @@ def jog(
     from mirrorskin.hw.base.rig_file import load_rig
     from mirrorskin.io import InputError
 
-    known = load_rig(rig).stage.axes.get(axis.value)
-    if known is None:
+    spec = load_rig(rig).stage.axes.get(axis.value)
+    if spec is None:
         raise InputError(f"{rig} has no [stage.{axis.value}]: add it, or move another axis")
-    way = (length if known.unit == "mm" else angle)(by, "--by")
+    delta = (length if spec.unit == "mm" else angle)(by, "--by")
     with _opened(rig) as stage:
         here = stage.report().position
-        place = replace(here, **{axis.value: getattr(here, axis.value) + way})
-        stage.move(place, _SLOW * known.top_speed)
+        place = replace(here, **{axis.value: getattr(here, axis.value) + delta})
+        stage.move(place, _SLOW * spec.top_speed)
         stage.wait()
 
 
@@ -187,7 +187,9 @@ def _print(settings: RigSettings, findings: Sequence[CheckResult], complete: boo
         sound = complete and all(finding.verdict != "failed" for finding in findings)
         print_json({"rig": settings.name, "sound": sound, "findings": findings})
         return
-    rows = [[one.verdict, one.part, one.what, one.found, one.remedy] for one in findings]
+    rows = [
+        [finding.verdict, finding.part, finding.what, finding.found, finding.remedy] for finding in findings
+    ]
     if not sys.stdout.isatty():
         print_table(["", "part", "what", "found", "remedy"], rows)
         return

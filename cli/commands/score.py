@@ -21,15 +21,15 @@ def command(
     from mirrorskin import engine, io
     from mirrorskin.cli.output import printable
 
-    found = io.open_result(result)
-    part = found.fitted.region
+    saved = io.open_result(result)
+    part = saved.fitted.region
     with io.open_recording(truth) as whole:
         if part is not None and not io.Region.whole(whole.shape[1:]).holds(part):
             part = None  # of another stack
     with io.open_recording(truth, region=part) as recording:
         if recording.truth is None:
             raise io.InputError(f"{truth} holds no truth: only 'mirrorskin simulate' writes one")
-        score = engine.score(found, recording.truth)
+        score = engine.score(saved, recording.truth)
     for note in score.notes:
         click.echo(printable(f"{result}: {note.removeprefix('result: ')}"), err=True)
     if score.slip_left_out is not None:

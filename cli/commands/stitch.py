@@ -21,7 +21,7 @@ def command(
     overwrite: options.Overwrite = False,
     device: options.Device = None,
     as_json: options.Json = False,
-    **given: Annotated[Any, STACK.only("pixel_size")],
+    **chosen: Annotated[Any, STACK.only("pixel_size")],
 ) -> None:
     """Join several touches to one larger surface."""
     from mirrorskin import engine, io
@@ -30,6 +30,6 @@ def command(
     io.check_result_output(output, *results, overwrite=overwrite)
     touches = [io.open_result(path) for path in results]
     whole = engine.pose.stitch(
-        touches, given.get("pixel_size"), names=[str(path) for path in results], device=device
+        touches, chosen.get("pixel_size"), names=[str(path) for path in results], device=device
     )
     save_and_report(whole.result, output, device, as_json, overwrite=overwrite)

@@ -51,7 +51,7 @@ def serve(
         ),
     ] = False,
     ready: Annotated[int | None, Option("--ready-fd", hidden=True)] = None,
-    **given: Annotated[Any, RIG],
+    **chosen: Annotated[Any, RIG],
 ) -> None:
     """Run an emulated rig: a stage behind a serial port, with the twin as its camera.
 
@@ -63,7 +63,7 @@ def serve(
         return
     from mirrorskin.twin.emulator.rig import EmulatedRig
 
-    values = RIG.filled(given)
+    values = RIG.filled(chosen)
     EmulatedRig.check_folder(output)
     times = {name: values[name] for name in ("rate", "delay", "jitter", "seed")}
     rig = EmulatedRig(values["object"], **sensor_options(values), **times, home=True, device=device)
@@ -92,11 +92,11 @@ def _start_in_background() -> None:
     from mirrorskin.hw.base.errors import HardwareError
 
     reading, writing = os.pipe()
-    own = [sys.executable, "-P", "-m", "mirrorskin.cli.main", *sys.argv[1:], "--ready-fd", str(writing)]
+    words = [sys.executable, "-P", "-m", "mirrorskin.cli.main", *sys.argv[1:], "--ready-fd", str(writing)]
     with os.fdopen(reading, "rb") as pipe:
         try:
             child = subprocess.Popen(
-                own, stdin=subprocess.DEVNULL, pass_fds=(writing,), start_new_session=True
+                words, stdin=subprocess.DEVNULL, pass_fds=(writing,), start_new_session=True
             )
         finally:
             os.close(writing)

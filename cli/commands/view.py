@@ -67,7 +67,7 @@ def _check(output: Path, result: Path) -> None:
         suffixes = " or ".join(FIGURE_SUFFIXES)
         raise io.InputError(f"-o {output}: name a picture that ends in {suffixes}, or a folder")
     else:
-        nearest = next(one for one in (output, *output.absolute().parents) if one.exists())
+        nearest = next(folder for folder in (output, *output.absolute().parents) if folder.exists())
         if not nearest.is_dir():
             raise io.InputError(f"{output} cannot be created: {nearest} is not a folder. Use another -o")
 

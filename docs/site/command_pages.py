@@ -70,8 +70,8 @@ def _page(command: Any, above: Any, name: str, level: int) -> Iterator[str]:
     if command.params or not is_group:  # some groups do something by themselves
         yield from _options(command, context)
     if is_group:
-        for one in command.list_commands(context):
-            yield from _page(command.get_command(context, one), context, one, level + 1)
+        for below in command.list_commands(context):
+            yield from _page(command.get_command(context, below), context, below, level + 1)
 
 
 def _options(command: Any, context: Any) -> Iterator[str]:

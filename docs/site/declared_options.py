@@ -42,17 +42,17 @@ class _Docstring(griffe.Docstring):
     def parsed(self) -> list[griffe.DocstringSection]:
         sections: list[griffe.DocstringSection] = self.parse()
         for section in sections:
-            for one in section.value if isinstance(section.value, list) else ():
-                if isinstance(getattr(one, "annotation", None), griffe.ExprTuple):
-                    one.annotation = ", ".join(map(str, one.annotation.elements))
+            for field in section.value if isinstance(section.value, list) else ():
+                if isinstance(getattr(field, "annotation", None), griffe.ExprTuple):
+                    field.annotation = ", ".join(map(str, field.annotation.elements))
         return sections
 
 
 def _modules_of(module: griffe.Module) -> Iterator[griffe.Module]:
     yield module
-    for one in module.modules.values():
-        if not one.is_alias:
-            yield from _modules_of(one)
+    for submodule in module.modules.values():
+        if not submodule.is_alias:
+            yield from _modules_of(submodule)
 
 
 def _add_options(module: griffe.Module, loader: griffe.GriffeLoader) -> None:
@@ -84,12 +84,12 @@ def _docstring(value: Any, parent: Any, loader: griffe.GriffeLoader) -> griffe.D
 def _parameters(value: Any) -> griffe.Parameters:
     """Return the parameters of a generated signature."""
     parameters = inspect.signature(value).parameters.values()
-    return griffe.Parameters(*[_parameter(one) for one in parameters])
+    return griffe.Parameters(*[_parameter(parameter) for parameter in parameters])
 
 
-def _parameter(one: inspect.Parameter) -> griffe.Parameter:
-    default = None if one.default is one.empty else repr(one.default)
-    return griffe.Parameter(one.name, kind=_KINDS[one.kind], default=default)
+def _parameter(parameter: inspect.Parameter) -> griffe.Parameter:
+    default = None if parameter.default is parameter.empty else repr(parameter.default)
+    return griffe.Parameter(parameter.name, kind=_KINDS[parameter.kind], default=default)
 
 
 def _replace_docstrings(parent: Any) -> None:

@@ -52,13 +52,13 @@ def pages() -> dict[str, str | bytes]:
         raise PluginError("examples: the scripts differ from those that docs/site/gallery_pages.py lists")
     texts = [script.read_text(encoding="utf-8") for script in scripts]
     with ThreadPoolExecutor(2) as pool:  # much of the time is starting Python, on one core
-        done = list(pool.map(_run, scripts, texts))
-    firsts = [next(iter(drawn)) for _, drawn in done]
-    made: dict[str, str | bytes] = {"gallery/index.md": _index(texts, firsts)}
-    for name, text, (printed, drawn) in zip(_ORDER, texts, done, strict=True):
-        made[f"gallery/{name}.md"] = _page(name, text, printed, list(drawn))
-        made |= {f"gallery/{picture}": content for picture, content in drawn.items()}
-    return made
+        results = list(pool.map(_run, scripts, texts))
+    firsts = [next(iter(drawn)) for _, drawn in results]
+    contents: dict[str, str | bytes] = {"gallery/index.md": _index(texts, firsts)}
+    for name, text, (printed, drawn) in zip(_ORDER, texts, results, strict=True):
+        contents[f"gallery/{name}.md"] = _page(name, text, printed, list(drawn))
+        contents |= {f"gallery/{picture}": content for picture, content in drawn.items()}
+    return contents
 
 
 @functools.cache
@@ -66,7 +66,7 @@ def _run(script: Path, text: str) -> tuple[str, dict[str, bytes]]:
     """Run a script as it is now; return what it prints, and its pictures in the order of drawing."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "MPLBACKEND": "agg"}
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-P", str(script)],
             cwd=folder,
             env=environment,
@@ -75,10 +75,12 @@ def _run(script: Path, text: str) -> tuple[str, dict[str, bytes]]:
             timeout=_LONGEST,
         )
         pictures = sorted(Path(folder).glob("*.png"), key=lambda path: path.stat().st_mtime_ns)
-        if done.returncode or not pictures:
+        if process.returncode or not pictures:
             drawn = f"{len(pictures)} pictures"
-            raise PluginError(f"{script} ended with status {done.returncode} and {drawn}:\n{done.stderr}")
-        return done.stdout, {f"{script.stem}-{path.name}": path.read_bytes() for path in pictures}
+            raise PluginError(
+                f"{script} ended with status {process.returncode} and {drawn}:\n{process.stderr}"
+            )
+        return process.stdout, {f"{script.stem}-{path.name}": path.read_bytes() for path in pictures}
 
 
 def _parts(text: str) -> tuple[str, str, str]:

@@ -116,8 +116,8 @@ def _api_page(package: str) -> str:
     """Return the page of a package; members with the name of their module are requested explicitly."""
     module = importlib.import_module(package)
     named = [getattr(module, name) for name in getattr(module, "__all__", []) if _is_module(package, name)]
-    members = [one for one in named if not isinstance(one, ModuleType)]
-    sections = "".join(f"\n::: {one.__module__}.{one.__name__}\n{_AS_MEMBER}" for one in members)
+    members = [member for member in named if not isinstance(member, ModuleType)]
+    sections = "".join(f"\n::: {member.__module__}.{member.__name__}\n{_AS_MEMBER}" for member in members)
     return f"# {package}\n\n::: {package}\n{sections}"
 
 

@@ -62,16 +62,18 @@ _STATUS: dict[str, type[IntEnum]] = {
 
 def tables() -> dict[str, dict[str, str]]:
     """Return the tables by page and first cell."""
-    rows = [_row(name, one) for name, one in TABLE.items()]
+    rows = [_row(name, declaration) for name, declaration in TABLE.items()]
     legends = [status_of(codes).codes for codes in _STATUS.values()]
     codes = sorted({code for legend in legends for code in legend})
     meanings = ([str(code), *(legend.get(code, "") for legend in legends)] for code in codes)
     stored = [
-        _stored(f"{kind.command}/{name}", one)
+        _stored(f"{kind.command}/{name}", parameter)
         for kind in PARTS.values()
-        for name, one in parameters(kind).items()
+        for name, parameter in parameters(kind).items()
     ]
-    facts = (_stored(name, replace(one, optional=False)) for name, one in parameters(Fitted).items())
+    facts = (
+        _stored(name, replace(parameter, optional=False)) for name, parameter in parameters(Fitted).items()
+    )
     return {
         "formats.md": {
             "map": as_table(["map", "shape, type", "unit", "undefined", "content"], rows),
@@ -125,23 +127,30 @@ def _camera(driver: Driver) -> list[str]:
     return [f"`{driver.name}:`" if driver.name else "anything else", driver.help, extra]
 
 
-def _stored(name: str, one: Parameter) -> list[str]:
+def _stored(name: str, parameter: Parameter) -> list[str]:
     """Return the row of a parameter of a calibration."""
-    dtype = _STORED.get(one.kind, one.dtype.str[1:])
-    place = f"`{name}/NAME`" if one.kind == "mapping" else f"`{name}`"
-    return [f"{place} *" if one.optional else place, f"{one.size} {dtype}".strip(), one.unit, one.text]
+    dtype = _STORED.get(parameter.kind, parameter.dtype.str[1:])
+    place = f"`{name}/NAME`" if parameter.kind == "mapping" else f"`{name}`"
+    return [
+        f"{place} *" if parameter.optional else place,
+        f"{parameter.size} {dtype}".strip(),
+        parameter.unit,
+        parameter.text,
+    ]
 
 
-def _row(name: str, one: Map) -> list[str]:
-    size = _LEADING[one.axes] + (f", {len(one.components)}" if one.components else "")
+def _row(name: str, declaration: Map) -> list[str]:
+    size = _LEADING[declaration.axes] + (f", {len(declaration.components)}" if declaration.components else "")
     shapes = [f"({size})"] if size else []
-    shapes += [f"(T, {size})"] if one.per_frame else []
-    dtype = np.dtype(one.dtype)
-    unit = f"{one.unit}; of a twist {TWIST[name].unit}" if name in TWIST else one.unit
-    undefined = "" if dtype.kind != "f" and one.undefined is None else f"{one.undefined_value:g}"
-    undefined = undefined.replace("nan", "NaN") if one.axes != "none" else ""
-    legend = ", ".join(f"{code} {text}" for code, text in one.codes.items())
-    content = "; ".join(part for part in (one.caption, legend) if part)
+    shapes += [f"(T, {size})"] if declaration.per_frame else []
+    dtype = np.dtype(declaration.dtype)
+    unit = f"{declaration.unit}; of a twist {TWIST[name].unit}" if name in TWIST else declaration.unit
+    undefined = (
+        "" if dtype.kind != "f" and declaration.undefined is None else f"{declaration.undefined_value:g}"
+    )
+    undefined = undefined.replace("nan", "NaN") if declaration.axes != "none" else ""
+    legend = ", ".join(f"{code} {text}" for code, text in declaration.codes.items())
+    content = "; ".join(part for part in (declaration.caption, legend) if part)
     return [f"`{name}`", f"{' or '.join(shapes)} {dtype.str[1:]}".strip(), unit, undefined, content]
 
 
@@ -175,17 +184,20 @@ def with_rows(page: str, current: list[str]) -> str:
 
 def pages() -> dict[str, str]:
     """Return the pages with their current tables, by name."""
-    made = {}
+    contents = {}
     for name, current in tables().items():
         page = (DOCS / name).read_text(encoding="utf-8")
         for first, table in current.items():
-            found = re.findall(rf"^\| {first} \|.*\n(?:\|.*\n)+", page, flags=re.MULTILINE)
-            assert len(found) == 1, f"{name} has {len(found)} tables whose first cell is {first}"
-            page = page.replace(found[0], table)
-        made[name] = page
+            tables_found = re.findall(rf"^\| {first} \|.*\n(?:\|.*\n)+", page, flags=re.MULTILINE)
+            assert len(tables_found) == 1, (
+                f"{name} has {len(tables_found)} tables whose first cell is {first}"
+            )
+            page = page.replace(tables_found[0], table)
+        contents[name] = page
     for name, current_rows in rows().items():
-        made[name] = with_rows(made.get(name) or (DOCS / name).read_text(encoding="utf-8"), current_rows)
-    return made
+        page = contents.get(name) or (DOCS / name).read_text(encoding="utf-8")
+        contents[name] = with_rows(page, current_rows)
+    return contents
 
 
 if __name__ == "__main__":

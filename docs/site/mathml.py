@@ -60,11 +60,11 @@ def _mathml(quoted: str, display: str, name: str) -> str:
         _lower_prime(part)
         _bind_signs(part)
         _set_apart(part)
-    found = tostring(formula, encoding="unicode")
-    unknown = _UNKNOWN.search(found)
+    markup = tostring(formula, encoding="unicode")
+    unknown = _UNKNOWN.search(markup)
     if unknown:
         raise PluginError(f"{name}: {latex}: {unknown[1]} cannot be translated")
-    return found
+    return markup
 
 
 def _draw_bar(part: Element) -> None:
@@ -83,9 +83,9 @@ def _lower_prime(part: Element) -> None:
 
 def _bind_signs(part: Element) -> None:
     """Leave out spaces that TeX does not have: round bars, and behind a sign that belongs to what follows."""
-    for one in part:
-        if one.tag == "mo" and one.text in _TIGHT:
-            one.attrib |= {"lspace": "0", "rspace": "0"}
+    for element in part:
+        if element.tag == "mo" and element.text in _TIGHT:
+            element.attrib |= {"lspace": "0", "rspace": "0"}
     for left, right in pairwise(part):
         if left.tag == right.tag == "mo" and right.text in _SIGNS and left.text not in _CLOSING:
             right.set("form", "prefix")

@@ -28,7 +28,7 @@ def pages() -> dict[str, str | bytes]:
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / _NOTEBOOK.name).write_bytes(_NOTEBOOK.read_bytes())
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-m", "nbconvert", "--execute", "--to", "markdown", _NOTEBOOK.name],
             cwd=folder,
             env={**os.environ, "PATH": path},
@@ -36,9 +36,9 @@ def pages() -> dict[str, str | bytes]:
             text=True,
             timeout=_LONGEST,
         )
-        if done.returncode:
-            raise PluginError(f"{_NOTEBOOK.name} ended with status {done.returncode}:\n{done.stderr}")
+        if process.returncode:
+            raise PluginError(f"{_NOTEBOOK.name} ended with status {process.returncode}:\n{process.stderr}")
         text = (Path(folder) / "notebook.md").read_text(encoding="utf-8")
         pictures = sorted(Path(folder).glob("notebook_files/*"))
-        found = {f"notebook_files/{picture.name}": picture.read_bytes() for picture in pictures}
-    return {"notebook.md": text.replace("![png]", "![what the cell draws]"), **found}
+        images = {f"notebook_files/{picture.name}": picture.read_bytes() for picture in pictures}
+    return {"notebook.md": text.replace("![png]", "![what the cell draws]"), **images}

@@ -53,15 +53,15 @@ def function_of(name: str) -> str:
         kind = getattr(module, operation, None)
         if kind is None:
             continue
-        options = [one for one in kind.options if one != "memory_limit"]
-        for one in _public(module):
-            function = getattr(module, one)
-            if one == _FUNCTIONS.get(operation) or (
+        options = [option for option in kind.options if option != "memory_limit"]
+        for public in _public(module):
+            function = getattr(module, public)
+            if public == _FUNCTIONS.get(operation) or (
                 "__signature__" in getattr(function, "__dict__", {})
                 and not isinstance(function, type)
                 and _keywords(function.__signature__) == options
             ):
-                return f"engine{place}.{one}"
+                return f"engine{place}.{public}"
     return ""
 
 
@@ -82,8 +82,8 @@ def operations_table() -> str:
 
 
 def _operation(name: str, kind: type[Operation]) -> list[str]:
-    needed = " or ".join(f"`{one}`" for one in kind.positions)
-    maps = ", ".join(f"`{one}`" for one in kind.maps)
+    needed = " or ".join(f"`{position}`" for position in kind.positions)
+    maps = ", ".join(f"`{name}`" for name in kind.maps)
     function = function_of(name)
     return [
         _linked(name),
@@ -96,36 +96,36 @@ def _operation(name: str, kind: type[Operation]) -> list[str]:
 
 def options_section(name: str, kind: Any) -> str:
     """Return heading, summary and table of the options of a class."""
-    options = {one: declared for one, declared in kind.options.items() if one not in _COMMON}
+    options = {name: declared for name, declared in kind.options.items() if name not in _COMMON}
     table = as_table(["option", "value", "default", "meaning"], map(_option, options.values()))
     about = textwrap.fill(f"`{name}`. {_summary(kind)}.", 100, break_on_hyphens=False)
     return f"### `{name.rpartition('.')[2]}`\n\n{about}\n\n{table}"
 
 
-def _option(one: Option) -> list[str]:
-    help_text = f"{one.help[:1].upper()}{one.help[1:]}".rstrip(".")
-    only = ". Python only" if one.python_only else ""
-    return [f"`{one.name}`", _value(one), _default(one), f"{help_text}{only}"]
+def _option(option: Option) -> list[str]:
+    help_text = f"{option.help[:1].upper()}{option.help[1:]}".rstrip(".")
+    only = ". Python only" if option.python_only else ""
+    return [f"`{option.name}`", _value(option), _default(option), f"{help_text}{only}"]
 
 
-def _value(one: Option) -> str:
+def _value(option: Option) -> str:
     """Return type, unit and limits of an option."""
-    if one.choices:
-        return ", ".join(f'`"{choice}"`' for choice in one.choices)
-    if one.kind == "map":
-        return f"number or map, {one.unit}" if one.unit else "number or array"
-    value = _KINDS.get(str(one.kind)) or one.needed.removeprefix("a ")
-    if one.kind == "integer" and value.startswith("number of at"):
+    if option.choices:
+        return ", ".join(f'`"{choice}"`' for choice in option.choices)
+    if option.kind == "map":
+        return f"number or map, {option.unit}" if option.unit else "number or array"
+    value = _KINDS.get(str(option.kind)) or option.needed.removeprefix("a ")
+    if option.kind == "integer" and value.startswith("number of at"):
         value = f"integer {value.removeprefix('number ')}"
-    if one.kind in ("numbers", "integers"):
+    if option.kind in ("numbers", "integers"):
         value = f"list, each a {value}"
-    return " or ".join([value, *(f'`"{word}"`' for word in one.words)])
+    return " or ".join([value, *(f'`"{word}"`' for word in option.words)])
 
 
-def _default(one: Option) -> str:
-    if one.shown_default or one.default is None:
-        return one.shown_default or "none"
-    return f"`{plain(one.default)!r}`".replace("'", '"')
+def _default(option: Option) -> str:
+    if option.shown_default or option.default is None:
+        return option.shown_default or "none"
+    return f"`{plain(option.default)!r}`".replace("'", '"')
 
 
 def _linked(name: str) -> str:
@@ -139,7 +139,7 @@ def _summary(kind: type) -> str:
 
 def _keywords(signature: inspect.Signature) -> list[str]:
     parameters = signature.parameters.values()
-    return [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
+    return [parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
 
 
 def _module(package: str) -> ModuleType:
@@ -147,12 +147,12 @@ def _module(package: str) -> ModuleType:
 
 
 def _public(module: ModuleType) -> Iterable[str]:
-    own = [
+    public = [
         name
         for name, value in vars(module).items()
         if not name.startswith("_") and getattr(value, "__module__", None) == module.__name__
     ]
-    names: list[str] = getattr(module, "__all__", own)
+    names: list[str] = getattr(module, "__all__", public)
     return sorted(names, key=str.lower)
 
 
@@ -160,8 +160,11 @@ def pages() -> Mapping[str, str]:
     """Return the pages with their current tables, by name."""
     options = (DOCS / OPTIONS).read_text(encoding="utf-8")
     assert options.count(MARK) == 1, f"{OPTIONS} needs one line {MARK}"
-    sections = ["## Methods\n", *(options_section(*one) for one in classes(Method).items())]
-    sections += ["## Operations\n", *(options_section(*one) for one in classes(Operation).items())]
+    sections = ["## Methods\n", *(options_section(*documented) for documented in classes(Method).items())]
+    sections += [
+        "## Operations\n",
+        *(options_section(*documented) for documented in classes(Operation).items()),
+    ]
     operations = (DOCS / OPERATIONS).read_text(encoding="utf-8")
     for table in (methods_table(), operations_table()):
         head = re.escape(table.partition("\n")[0])

@@ -61,16 +61,16 @@ def reachable(pages: Iterable[Path]) -> list[Path]:
     pages : iterable of Path
         Those outside the documentation are among what is returned.
     """
-    found: dict[Path, None] = {}
+    reached: dict[Path, None] = {}
     waiting = list(pages)
     while waiting:
         page = waiting.pop()
-        if page in found or not page.is_file():
+        if page in reached or not page.is_file():
             continue
-        found[page] = None
+        reached[page] = None
         if page.suffix == ".md":
             waiting += [target for target in _targets(page) if _is_page(target)]
-    return [page for page in found if not page.is_relative_to(DOCS)]
+    return [page for page in reached if not page.is_relative_to(DOCS)]
 
 
 def relink(markdown: str, uri: str) -> str:
@@ -83,8 +83,8 @@ def relink(markdown: str, uri: str) -> str:
             return match[0]
         if not (_is_page(target) or target.is_relative_to(DOCS)):
             return words
-        way = os.path.relpath(uri_of(target), PurePosixPath(uri).parent)
-        return f"[{words}]({way}{match[3] or ''})"
+        link = os.path.relpath(uri_of(target), PurePosixPath(uri).parent)
+        return f"[{words}]({link}{match[3] or ''})"
 
     return _LINK.sub(changed, markdown)
 

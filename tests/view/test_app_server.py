@@ -62,7 +62,7 @@ def serving(page, **settings):
 @pytest.fixture(scope="module")
 def served():
     """The parts of the address of a server, which runs in a thread."""
-    with serving(_page, most=1000) as address:
+    with serving(_page, page_limit=1000) as address:
         yield address
 
 
@@ -243,7 +243,7 @@ def test_more_pages_than_the_limit_are_refused_until_one_is_closed():
         await _close_socket(sockets[1])
         return answer
 
-    with serving(page, most=2, lifetime=10) as address:
+    with serving(page, page_limit=2, lifetime=10) as address:
         assert asyncio.run(open_and_close(address)) == 200
 
 

@@ -65,11 +65,11 @@ class OptionsPane:
         """Make the widgets of the operation: those with a value first, then those that may be left out."""
         self.widgets = {}
         parts: dict[bool, list[Any]] = {True: [], False: []}
-        for name, one in self._session.options().items():
-            field, shown = widget_of(one, self._session.value(name))
+        for name, option in self._session.options().items():
+            field, shown = widget_of(option, self._session.value(name))
             field.param.watch(lambda event, name=name: self._changed(name, event.new), "value")
             self.widgets[name] = field
-            parts[one.default is not None].append(shown)
+            parts[option.default is not None].append(shown)
         self._first[:], self._more[:] = parts[True], parts[False]
 
     def _changed(self, name: str, value: Any) -> None:
@@ -88,24 +88,24 @@ def widget_of(option: Option, value: Any) -> tuple[Any, Any]:
     unit = _DEGREES.get(option.unit, option.unit)
     titled = f"{label} ({unit})" if unit else label
     about = described(option)
-    widgets, given = pn.widgets, {"width": _WIDTH, "description": about}
+    widgets, settings = pn.widgets, {"width": _WIDTH, "description": about}
     if option.kind == "flag" and not option.optional:
         box = widgets.Checkbox(label=label, value=value, margin=(8, 0, 8, 10))
         return box, pn.Row(box, widgets.TooltipIcon(value=about, margin=(6, 5)))
     if option.kind in ("choice", "flag"):
-        chosen: dict[str, Any] = {one: one for one in option.choices} or {"yes": True, "no": False}
+        chosen: dict[str, Any] = {choice: choice for choice in option.choices} or {"yes": True, "no": False}
         if option.optional:
             chosen = {option.shown_default or "none": None, **chosen}
-        field = widgets.Select(label=label, options=chosen, value=plain(value), **given)
+        field = widgets.Select(label=label, options=chosen, value=plain(value), **settings)
         return field, field
     low, high = option.within
     if option.kind == "integer" and option.default is not None:
         end = high if high is not None and high < _ANY else None
-        field = widgets.IntInput(label=titled, value=value, start=low, end=end, **given)
+        field = widgets.IntInput(label=titled, value=value, start=low, end=end, **settings)
         return field, field
     if option.kind == "number" and option.default is not None and low is not None and high is not None:
         step = (high - low) / _STEPS
-        field = widgets.FloatInput(label=titled, value=value, start=low, end=high, step=step, **given)
+        field = widgets.FloatInput(label=titled, value=value, start=low, end=high, step=step, **settings)
         slider = widgets.FloatSlider(
             label="",
             start=low,
@@ -120,7 +120,7 @@ def widget_of(option: Option, value: Any) -> tuple[Any, Any]:
         field.param.watch(lambda event: slider.param.update(value=event.new), "value")
         return field, pn.Column(field, slider, margin=0)
     field = widgets.TextInput(
-        label=titled, value=written(option, value), placeholder=option.shown_default or "none", **given
+        label=titled, value=written(option, value), placeholder=option.shown_default or "none", **settings
     )
     return field, field
 
@@ -143,7 +143,7 @@ def written(option: Option, value: Any) -> str:
     if value is None:
         return ""
     if isinstance(value, list | tuple):
-        return ", ".join(written(option, one) for one in value)
+        return ", ".join(written(option, item) for item in value)
     value = plain(value)
     return str(value) if isinstance(value, str) else f"{value / _factor(option):.10g}"
 
@@ -163,7 +163,7 @@ def read(option: Option, value: Any) -> Any:
         return text
     numbers = [_number(option, part) for part in text.split(",")]
     if option.kind in ("numbers", "integers"):
-        return numbers if option.kind == "numbers" else [_whole(one) for one in numbers]
+        return numbers if option.kind == "numbers" else [_whole(number) for number in numbers]
     if len(numbers) > 1:
         raise InputError(f"{option.name} {text}: write the number with a decimal point")
     return _whole(numbers[0]) if option.kind == "integer" else numbers[0]

@@ -72,8 +72,8 @@ class App:
         if not sources and rig is None:
             raise io.InputError("the application needs a recording, a result or a rig: name a file")
         pn.extension(inline=True)  # in a notebook, no other machine is asked for scripts
-        one = opening or Opening()
-        openings = [one] * len(sources) if isinstance(one, Opening) else [*one]
+        opened = opening or Opening()
+        openings = [opened] * len(sources) if isinstance(opened, Opening) else [*opened]
         self._worker = ThreadPoolExecutor(1, "mirrorskin-page") if _is_served() else None
         self._run = run_now if self._worker is None else _in_thread(self._worker, pn.state.curdoc)
         self._sources = [*zip(sources, openings, strict=True)]
@@ -81,7 +81,7 @@ class App:
         self.rig: RigPane | None = None
         self.recording: RecordingPane | None = None
         self.options: OptionsPane | None = None
-        names = {_name_of(one, number): number for number, one in enumerate(sources)}
+        names = {_name_of(source, number): number for number, source in enumerate(sources)}
         stop: list[Any] = []
         if rig is not None:
             from mirrorskin.view.app.rig import REFRESH, RigPane
@@ -161,14 +161,14 @@ class App:
             parts.append(f"{session.whole.motion} motion, {count} frames of {columns} x {rows}")
         if session.computing:
             parts.append("the result is being computed")
-        told: Sequence[str] = ()
+        messages: Sequence[str] = ()
         if session.now is not None:
-            told = warnings_in(session.now.result.process)
+            messages = warnings_in(session.now.result.process)
             parts.append(str(summarise(session.now.result)))
             if session.now.seconds:
                 parts.append(f"computed in {session.now.seconds:.2f} s")
         lines = [f'<p class="about">{escape("; ".join(parts))}</p>']
-        lines += [f'<p class="warning">{escape(one)}</p>' for one in told]
+        lines += [f'<p class="warning">{escape(message)}</p>' for message in messages]
         self._about.object = "".join(lines)
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> Any:

@@ -142,7 +142,7 @@ def show_map(sheet: Sheet, name: str, like: Shown | None = None) -> Shown:
         )  # fmt: skip
     scale = scale_of(sheet, name)
     low, high = (scale.low, scale.high) if like is None or not like.palette else (like.low, like.high)
-    note = "; ".join(one for one in scale.note.split("; ") if one not in ("", UNDEFINED_NOTE))
+    note = "; ".join(part for part in scale.note.split("; ") if part not in ("", UNDEFINED_NOTE))
     return Shown(
         scale.values.astype(np.float32),
         title,
@@ -159,8 +159,8 @@ def show_map(sheet: Sheet, name: str, like: Shown | None = None) -> Shown:
 def show_change(now: Shown, before: Shown) -> Shown:
     """Return how the change from one map of numbers to another is drawn: in diverging colours."""
     change = now.values - before.values
-    known = np.abs(change[np.isfinite(change)])
-    side = float(np.percentile(known, _CHANGE_SHOWN)) if known.any() else 0.0
+    changes = np.abs(change[np.isfinite(change)])
+    side = float(np.percentile(changes, _CHANGE_SHOWN)) if changes.any() else 0.0
     _, side = apart(-side, side)
     tooltips = [("x, y", "$x{0.000}, $y{0.000}"), ("Change", _READ)]
     readings = Readings({"value0": _to_read(change)}, tooltips, units=now.readings.units)
@@ -223,11 +223,11 @@ def _to_read(values: NDArray[Any]) -> NDArray[np.float32]:
 def _classes(sheet: Sheet, name: str) -> tuple[NDArray[np.uint8], list[str], list[tuple[str, str]]]:
     """Return the places of the codes of a map in its legend, their colours, and the legend with shares."""
     declared, values = sheet.result.declaration(name), sheet.result[name]
-    codes, colours = sorted(declared.codes), [hex_of(one) for one in code_colours(declared)]
+    codes, colours = sorted(declared.codes), [hex_of(colour) for colour in code_colours(declared)]
     places = np.clip(np.searchsorted(codes, values), 0, len(codes) - 1)
     classes = np.where(np.asarray(codes)[places] == values, places, len(codes)).astype(np.uint8)
     counts = np.bincount(classes.ravel(), minlength=len(codes) + 1)
-    names = [*(declared.codes[one] for one in codes), "unknown number"]
+    names = [*(declared.codes[code] for code in codes), "unknown number"]
     legend = [
         (colours[place], f"{names[place]} {percent(int(count), classes.size)}")
         for place, count in enumerate(counts)
@@ -299,10 +299,10 @@ class Picture:
             for mapper in (self.mapper, self.logarithmic)
         ]
         if bar:
-            for one in self._bars:
-                self.figure.add_layout(one, "right")
-        for one in (self._log, self._rgba, *self._bars):  # until a map is shown
-            one.visible = False
+            for item in self._bars:
+                self.figure.add_layout(item, "right")
+        for item in (self._log, self._rgba, *self._bars):  # until a map is shown
+            item.visible = False
         self.hover = HoverTool(renderers=[self._plain], tooltips=[])
         self.figure.add_tools(self.hover)
 
@@ -317,8 +317,8 @@ class Picture:
         if not colours:
             mapper = self.logarithmic if shown.logarithmic else self.mapper
             mapper.update(palette=[*shown.palette], low=shown.low, high=shown.high)
-        for one, renderer in zip(self._bars, (self._plain, self._log), strict=True):
-            one.visible = renderer.visible and not shown.legend
+        for bar, renderer in zip(self._bars, (self._plain, self._log), strict=True):
+            bar.visible = renderer.visible and not shown.legend
         self.source.data = {
             "image": [shown.values],
             **{name: [v] for name, v in shown.readings.columns.items()},
@@ -443,9 +443,9 @@ def pixel_at(place: Edges, shape: tuple[int, int], x: float, y: float) -> tuple[
     return (top - y) / (top - bottom) * shape[0], (x - left) / (right - left) * shape[1]
 
 
-def region_between(place: Edges, shape: tuple[int, int], one: Point, other: Point) -> Region | None:
+def region_between(place: Edges, shape: tuple[int, int], first: Point, other: Point) -> Region | None:
     """Return the pixels of a rectangle between two corners; None if it has less than two rows or columns."""
-    corners = np.array([pixel_at(place, shape, *one), pixel_at(place, shape, *other)])
+    corners = np.array([pixel_at(place, shape, *first), pixel_at(place, shape, *other)])
     (top, left), (bottom, right) = corners.min(axis=0), corners.max(axis=0)
     rows = max(0, round(top)), min(shape[0], round(bottom))
     columns = max(0, round(left)), min(shape[1], round(right))

@@ -188,8 +188,8 @@ class _Graph:
             )  # fmt: skip
         self.event = Span(dimension="height", line_color="#009e73", line_width=2, visible=False)
         self.band = BoxAnnotation(fill_color="#009e73", fill_alpha=0.2, line_alpha=0, visible=False)
-        for one in (*self.spans.values(), *self.labels.values(), self.event, self.band):
-            self.figure.add_layout(one)
+        for item in (*self.spans.values(), *self.labels.values(), self.event, self.band):
+            self.figure.add_layout(item)
 
     def show(self, trace: Trace, title: str) -> None:
         """Draw the brightness of a pixel."""
@@ -204,16 +204,16 @@ class _Graph:
             if level is not None:
                 self.spans[name].location = self.labels[name].y = level
         shown = np.array([*trace.brightness, *trace.levels.values()])
-        room = 0.06 * (float(np.ptp(shown)) or 1.0)
-        self.figure.y_range.update(start=float(shown.min()) - room, end=float(shown.max()) + room)
+        margin = 0.06 * (float(np.ptp(shown)) or 1.0)
+        self.figure.y_range.update(start=float(shown.min()) - margin, end=float(shown.max()) + margin)
         aside = 0.03 * (float(np.ptp(trace.position)) or 1.0)
         self.figure.x_range.update(
             start=float(trace.position.min()) - aside, end=float(trace.position.max()) + aside
         )
-        known = math.isfinite(trace.event)
-        self.event.visible = known
-        self.band.visible = known and math.isfinite(trace.event_sigma)
-        if known:
+        has_event = math.isfinite(trace.event)
+        self.event.visible = has_event
+        self.band.visible = has_event and math.isfinite(trace.event_sigma)
+        if has_event:
             self.event.location = trace.event
         if self.band.visible:
             self.band.left, self.band.right = (

@@ -133,7 +133,7 @@ class ResultPane:
         self._pictures = {"now": now, "before": Picture(sheet.place, sheet.unit, _PICTURE, like=now)}
         self._dragging = Dragging(now, self._drawn, self.drag.value)
         now.figure.on_event(Tap, self._tapped)
-        self._panes = {name: pn.pane.Bokeh(one.figure) for name, one in self._pictures.items()}
+        self._panes = {name: pn.pane.Bokeh(picture.figure) for name, picture in self._pictures.items()}
 
     def _draw_next(self, before: Sheet, shown: Shown, now: Shown) -> None:
         """Draw the previous map, or the change since then, which codes and directions do not have."""
@@ -174,18 +174,18 @@ class ResultPane:
             self.where.object = ""
             return
         try:
-            cut = section(sheet.result, *(self._session.ends or ()))
+            profile = section(sheet.result, *(self._session.ends or ()))
         except InputError:
             self._session.ends = None
             return
         if self._dragging is not None:
-            self._dragging.line.data = {"x": cut.x[[0, -1]], "y": cut.y[[0, -1]]}
+            self._dragging.line.data = {"x": profile.x[[0, -1]], "y": profile.y[[0, -1]]}
         before = self._session.sheet(self._session.before)
         other = None
         if before is not None and before.result.height is not None and before.place == sheet.place:
-            other = section(before.result, (cut.x[0], cut.y[0]), (cut.x[-1], cut.y[-1]))
-        self.section.show(sheet, cut, other)
-        ends = [f"({cut.x[end]:.3g}, {cut.y[end]:.3g})" for end in (0, -1)]
+            other = section(before.result, (profile.x[0], profile.y[0]), (profile.x[-1], profile.y[-1]))
+        self.section.show(sheet, profile, other)
+        ends = [f"({profile.x[end]:.3g}, {profile.y[end]:.3g})" for end in (0, -1)]
         self.where.object = f"<p>Section from {ends[0]} to {ends[1]} {sheet.unit}</p>"
 
     def _show_measures(self) -> None:
@@ -277,23 +277,25 @@ class _SectionGraph:
         self.hover = HoverTool(renderers=[lines["now"]], mode="vline")
         self.figure.add_tools(self.hover)
 
-    def show(self, sheet: Sheet, cut: Section, before: Section | None) -> None:
+    def show(self, sheet: Sheet, profile: Section, before: Section | None) -> None:
         """Draw a section, and that of the previous result."""
         factor, unit = sheet.of_height.figure_scale, sheet.of_height.figure_unit
-        measured = np.where(cut.filled, np.nan, factor * cut.height)
-        band = _BAND * factor * cut.sigma
-        self._band.glyph.width = float(np.ptp(cut.distance)) / max(len(cut.distance) - 1, 1)
+        measured = np.where(profile.filled, np.nan, factor * profile.height)
+        band = _BAND * factor * profile.sigma
+        self._band.glyph.width = float(np.ptp(profile.distance)) / max(len(profile.distance) - 1, 1)
         self.sources["now"].data = {
-            "x": cut.distance,
+            "x": profile.distance,
             "y": measured,
             "low": measured - band,
             "high": measured + band,
-            "sigma": 1e3 * cut.sigma,
+            "sigma": 1e3 * profile.sigma,
         }
-        self.sources["filled"].data = _line(cut, np.where(cut.filled, factor * cut.height, np.nan))
-        self.sources["before"].data = _line(before or cut, factor * before.height if before else None)
+        self.sources["filled"].data = _line(
+            profile, np.where(profile.filled, factor * profile.height, np.nan)
+        )
+        self.sources["before"].data = _line(before or profile, factor * before.height if before else None)
         self._legend["previous"].visible = before is not None
-        self._legend["filled"].visible = bool(cut.filled.any())
+        self._legend["filled"].visible = bool(profile.filled.any())
         title = title_of_height(sheet)
         self.figure.xaxis.axis_label = f"distance along the section ({sheet.unit})"
         self.figure.yaxis.axis_label = labelled(title, sheet.of_height)
@@ -304,7 +306,7 @@ class _SectionGraph:
         ]
 
 
-def _line(cut: Section, height: Any) -> dict[str, Any]:
-    x: Any = [] if height is None else cut.distance
+def _line(profile: Section, height: Any) -> dict[str, Any]:
+    x: Any = [] if height is None else profile.distance
     none = np.full(len(x), np.nan)
     return {"x": x, "y": [] if height is None else height, "low": none, "high": none, "sigma": none}

@@ -119,7 +119,7 @@ class RigPane:
             rows.append(pn.Row(name_of, *buttons, self._places[name], margin=(0, 0)))
         self.lift = pn.widgets.Button(label="Lift", width=90)
         self.lift.on_click(lambda _: self._ask(self.control.lift))
-        return [heading("Move by hand"), pn.Row(*(self.steps[one] for one in units), self.lift), *rows]
+        return [heading("Move by hand"), pn.Row(*(self.steps[unit] for unit in units), self.lift), *rows]
 
     def _running(self) -> list[Any]:
         """Return the fields of a run."""
@@ -182,9 +182,9 @@ class RigPane:
     def _start(self) -> None:
         try:
             if self.motion.value == "press":
-                plan = vertical_plan(**{name: one.value for name, one in self.press.items()})
+                plan = vertical_plan(**{name: field.value for name, field in self.press.items()})
             else:
-                values = {name: one.value for name, one in self.turn.items()}
+                values = {name: field.value for name, field in self.turn.items()}
                 plan = axial_plan(**{**values, "tilt": math.radians(values["tilt"])})
         except InputError as error:
             self.control.problem = str(error)
@@ -195,7 +195,7 @@ class RigPane:
 
     def refresh(self) -> None:
         """Show what the rig shows now."""
-        control, seen = self.control, self.control.seen
+        control, state = self.control, self.control.seen
         self.connect.disabled = control.state != "disconnected"
         self.start.disabled = self.lift.disabled = control.state != "ready"
         self.open.visible = control.result is not None and control.state != "moving"
@@ -207,23 +207,23 @@ class RigPane:
             axis = control.settings.stage.axes[name]
             value = "unknown" if here is None else f"{getattr(here, name) * axis.scale:.3f} {axis.unit}"
             _set(place, f"<p>{value}</p>")
-        if seen.frame is not None and seen.frame is not self._drawn:
-            self._drawn = seen.frame
-            self._show_frame(seen.frame)
-        if seen.update is not self._shown:
-            self._shown = seen.update
+        if state.frame is not None and state.frame is not self._drawn:
+            self._drawn = state.frame
+            self._show_frame(state.frame)
+        if state.update is not self._shown:
+            self._shown = state.update
             self._show_run()
 
     def _show_frame(self, frame: Any) -> None:
         self.camera.show(show_frame(frame, "", automatic=False), about="live")
-        found = judge(frame)
-        share = found.counts / max(1, int(found.counts.max()))
-        self.histogram.data = {"left": found.edges[:-1], "right": found.edges[1:], "top": np.sqrt(share)}
-        self._brightness.end = float(found.edges[-1])
-        advice = ": shorten the exposure" if found.saturated > _SATURATED else ""
+        judged = judge(frame)
+        heights = judged.counts / max(1, int(judged.counts.max()))
+        self.histogram.data = {"left": judged.edges[:-1], "right": judged.edges[1:], "top": np.sqrt(heights)}
+        self._brightness.end = float(judged.edges[-1])
+        advice = ": shorten the exposure" if judged.saturated > _SATURATED else ""
         facts = {
-            "Saturated": f"{100 * found.saturated:.2f} %{advice}",
-            "Sharpness": f"{found.sharpness:.2f}, larger is sharper",
+            "Saturated": f"{100 * judged.saturated:.2f} %{advice}",
+            "Sharpness": f"{judged.sharpness:.2f}, larger is sharper",
             "Frames": f"{self.control.seen.frames}, {self.control.seen.rate:.1f} per second",
         }
         _set(self.facts, table(facts))

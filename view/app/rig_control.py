@@ -305,8 +305,8 @@ def judge(frame: NDArray[Any], bins: int = 64) -> Judged:
     """
     import cv2
 
-    most = float(np.iinfo(frame.dtype).max) if frame.dtype.kind == "u" else float(np.nanmax(frame))
+    full_scale = float(np.iinfo(frame.dtype).max) if frame.dtype.kind == "u" else float(np.nanmax(frame))
     values = np.nan_to_num(frame.astype(np.float32))
-    counts, edges = np.histogram(values, bins, (0.0, max(most, 1e-9)))
-    saturated = float(np.mean(values >= most)) if frame.dtype.kind == "u" else 0.0
+    counts, edges = np.histogram(values, bins, (0.0, max(full_scale, 1e-9)))
+    saturated = float(np.mean(values >= full_scale)) if frame.dtype.kind == "u" else 0.0
     return Judged(saturated, float(cv2.Laplacian(values, cv2.CV_32F).std()), counts, edges)

@@ -66,7 +66,7 @@ class AppServer:
     """
 
     def __init__(
-        self, page: Callable[[], Any], port: int = 0, lifetime: int = 15_000, most: int = _PAGES
+        self, page: Callable[[], Any], port: int = 0, lifetime: int = 15_000, page_limit: int = _PAGES
     ) -> None:
         from panel.io.resources import DIST_DIR
         from panel.io.server import get_server
@@ -93,7 +93,7 @@ class AppServer:
             check_unused_sessions_milliseconds=min(lifetime, 17_000),
         )
         _restore(interrupt)
-        _refuse_others(self._server, hosts, f"/{token}", most)
+        _refuse_others(self._server, hosts, f"/{token}", page_limit)
         self.address = f"http://{HERE}:{port}/{token}/"
 
     def run(self, browser: bool) -> None:
@@ -143,11 +143,11 @@ class StopServer:
 
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
-                known = secrets.compare_digest(self.path.encode(), path.encode())
+                is_path = secrets.compare_digest(self.path.encode(), path.encode())
                 here = self.headers.get("Host", "").lower() in hosts
-                if known and here:
+                if is_path and here:
                     stop()
-                self.send_response(204 if known and here else 404 if here else 421)
+                self.send_response(204 if is_path and here else 404 if here else 421)
                 self.end_headers()
 
             def log_message(self, format: str, *args: Any) -> None:  # noqa: A002  # overrides
@@ -171,7 +171,7 @@ def _hosts(port: int) -> list[str]:
     return [f"{name}:{port}" for name in _NAMES] + ([*_NAMES] if port == _HTTP_PORT else [])
 
 
-def _refuse_others(server: Any, hosts: Sequence[str], prefix: str, most: int) -> None:
+def _refuse_others(server: Any, hosts: Sequence[str], prefix: str, page_limit: int) -> None:
     """Refuse requests for other hosts, from other pages, and for more pages than are allowed."""
     from tornado.httputil import HTTPServerRequest
     from tornado.routing import Matcher, Rule
@@ -189,7 +189,7 @@ def _refuse_others(server: Any, hosts: Sequence[str], prefix: str, most: int) ->
     class Unwanted(Matcher):
         def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
             refusal = _why_foreign(request, hosts) or _why_no_page(
-                request, prefix, server.get_sessions(), most
+                request, prefix, server.get_sessions(), page_limit
             )
             return refusal and {"target_kwargs": {"status": refusal[0], "text": refusal[1]}}
 
@@ -207,17 +207,19 @@ def _why_foreign(request: Any, hosts: Sequence[str]) -> tuple[int, str] | None:
     return None
 
 
-def _why_no_page(request: Any, prefix: str, sessions: Sequence[Any], most: int) -> tuple[int, str] | None:
+def _why_no_page(
+    request: Any, prefix: str, sessions: Sequence[Any], page_limit: int
+) -> tuple[int, str] | None:
     """Return status and text of the answer to a request for a page that cannot be opened."""
     place = request.path.removeprefix(prefix)
     if place == request.path or place not in ("", "/", "/ws", "/autoload.js"):
         return None
     if request.query or place == "/autoload.js":  # which Bokeh answers, and the application does not use
         return 404, "There is no such page."
-    if len(sessions) < most or _is_open(request, sessions):
+    if len(sessions) < page_limit or _is_open(request, sessions):
         return None
     remedy = "Close one, and load this page again after half a minute"
-    return 503, f"{most} pages are open, which is the limit. {remedy}."
+    return 503, f"{page_limit} pages are open, which is the limit. {remedy}."
 
 
 def _is_open(request: Any, sessions: Sequence[Any]) -> bool:

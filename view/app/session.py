@@ -139,8 +139,8 @@ class Session:
             self.name = Path(source).name
             self.whole = io.open_recording(source, **opening.keywords)
         if self.whole is not None:
-            own = load_operation(opening.operation) if opening.operation else method_for(self.whole.motion)
-            self.kind: type[Any] = own
+            kind = load_operation(opening.operation) if opening.operation else method_for(self.whole.motion)
+            self.kind: type[Any] = kind
             self.compute()
 
     @property
@@ -162,25 +162,25 @@ class Session:
         """Return the operations that apply to the motion: names as in `load_operation`, by label."""
         if self.whole is None:
             return {}
-        motion, found = self.whole.motion, {}
+        motion, names = self.whole.motion, {}
         for name in engine.__all__:
             kind = getattr(engine, name)
             if not isinstance(kind, type) or not issubclass(kind, engine.Operation | engine.Method):
                 continue
             where = getattr(kind, "motions", ())
-            needed = [one for one, must in getattr(kind, "positions", {}).items() if must]
-            has = all(getattr(self.whole, one, None) is not None for one in needed)
+            needed = [position for position, must in getattr(kind, "positions", {}).items() if must]
+            has = all(getattr(self.whole, position, None) is not None for position in needed)
             if kind not in (engine.Operation, engine.Method) and has and (not where or motion in where):
                 method = kind is method_for(motion)
-                found[f"{name} (all steps)" if method else name] = f"{_MODULE}:{name}"
+                names[f"{name} (all steps)" if method else name] = f"{_MODULE}:{name}"
         if self.opening.operation:
-            found[self.opening.operation.rpartition(":")[2]] = self.opening.operation
-        return dict(sorted(found.items(), key=lambda one: not one[0].endswith("(all steps)")))
+            names[self.opening.operation.rpartition(":")[2]] = self.opening.operation
+        return dict(sorted(names.items(), key=lambda item: not item[0].endswith("(all steps)")))
 
     def options(self) -> dict[str, Option]:
         """Return the options that can be chosen, by name."""
-        found = getattr(self, "kind", None)
-        return {} if found is None else {n: o for n, o in found.options.items() if not o.python_only}
+        kind = getattr(self, "kind", None)
+        return {} if kind is None else {n: o for n, o in kind.options.items() if not o.python_only}
 
     def value(self, name: str) -> Any:
         """Return the value of an option."""
@@ -192,7 +192,9 @@ class Session:
             self._watchers.setdefault(name, []).append(callback)
 
     def _tell(self, *names: str) -> None:
-        for callback in dict.fromkeys(one for name in names for one in self._watchers.get(name, [])):
+        for callback in dict.fromkeys(
+            callback for name in names for callback in self._watchers.get(name, [])
+        ):
             callback()
 
     def choose_operation(self, name: str) -> None:
@@ -374,9 +376,9 @@ def _ignore(_: object) -> None:
     """Do nothing with what a function returned."""
 
 
-def _same(one: Any, other: Any) -> bool:
-    one, other = plain(one), plain(other)
-    return type(one) is type(other) and bool(one == other)
+def _same(first: Any, other: Any) -> bool:
+    first, other = plain(first), plain(other)
+    return type(first) is type(other) and bool(first == other)
 
 
 def _name_of(kind: type[Any]) -> str:

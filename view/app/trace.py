@@ -121,18 +121,18 @@ def levels_at(session: Session, row: int, column: int) -> dict[str, float]:
     estimated = {"dark": fitted.dark_level, "bright": fitted.bright_level}
     for name in ("dark", "bright"):
         option = session.options().get(name)
-        given = None if option is None else option.check(session.value(name))
-        level = given if given is not None else getattr(source.header, name)
+        chosen = None if option is None else option.check(session.value(name))
+        level = chosen if chosen is not None else getattr(source.header, name)
         if level is None:
             level = estimated[name]
         if level is None:
             level = _end_of_type(part.dtype, name)
         values = np.asarray(level, np.float64)
         levels[name.capitalize()] = float(values if values.ndim == 0 else values[row, column])
-    share = fitted.threshold
-    if share is not None:
+    threshold = fitted.threshold
+    if threshold is not None:
         low, high = levels.values()
-        levels = {"Dark": low, "Threshold": low + share * (high - low), "Bright": high}
+        levels = {"Dark": low, "Threshold": low + threshold * (high - low), "Bright": high}
     return levels
 
 
@@ -154,13 +154,15 @@ def _turn(
     curve = None
     if len(frames) >= 3:
         fit = engine.correlate(frames[:, np.newaxis, np.newaxis], phase, device=session.opening.device)
-        mean, cosine, sine, left = (float(fit[name][0, 0]) for name in ("mean", "cosine", "sine", "residual"))
+        mean, cosine, sine, residual = (
+            float(fit[name][0, 0]) for name in ("mean", "cosine", "sine", "residual")
+        )
         along = np.linspace(float(phase.min()), float(phase.max()), _CURVE)
         curve = np.degrees(along), mean + cosine * np.cos(along) + sine * np.sin(along)
         facts = {
             "Mean": f"{mean:.2f} counts",
             "Amplitude": f"{math.hypot(cosine, sine):.2f} counts",
             "Phase of the maximum": f"{math.degrees(math.atan2(sine, cosine)):.1f} deg",
-            "Standard deviation of the residual": f"{left:.2f} counts",
+            "Standard deviation of the residual": f"{residual:.2f} counts",
         }
     return Trace(degrees, frames.astype(np.float64), axis, unit, curve=curve, facts=facts)

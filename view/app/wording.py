@@ -37,7 +37,7 @@ def _flag(option: Option, value: Any) -> list[str]:
     if option.kind == "flag":
         return [f"--{name}" if value else f"--no-{name}"]
     values = [*value] if isinstance(value, list | tuple) else [value]
-    return [f"--{name}={','.join(_number(option.unit, one) for one in values)}"]
+    return [f"--{name}={','.join(_number(option.unit, item) for item in values)}"]
 
 
 def _number(unit: str, value: Any) -> str:
@@ -54,13 +54,13 @@ def as_python(session: Session) -> str:
     options = dict(session.changed)
     if opening.device is not None:
         options["device"] = opening.device
-    given = [f"{name}={plain(value)!r}" for name, value in options.items()]
+    words = [f"{name}={plain(value)!r}" for name, value in options.items()]
     calibration = [] if opening.calibration is None else [repr(str(opening.calibration))]
     lines = ["from mirrorskin import engine, io"]
     if session.is_method:
-        call = f"engine.reconstruct({', '.join(['recording', *calibration, *given])})"
+        call = f"engine.reconstruct({', '.join(['recording', *calibration, *words])})"
     elif session.kind_name.startswith("mirrorskin.engine:") and not calibration:
-        call = f"engine.run(recording, engine.{session.kind.__name__}({', '.join(given)}))"
+        call = f"engine.run(recording, engine.{session.kind.__name__}({', '.join(words)}))"
     else:
         lines = [
             "from mirrorskin import io",
@@ -68,7 +68,7 @@ def as_python(session: Session) -> str:
         ]
         where = f"load_operation({session.kind_name!r})"
         places = ["None", *calibration] if calibration else []
-        call = f"run_class({', '.join([where, 'recording', *places, *given])})"
+        call = f"run_class({', '.join([where, 'recording', *places, *words])})"
     lines += [
         "",
         f"with io.open_recording({', '.join(_opening(session))}) as recording:",

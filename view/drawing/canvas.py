@@ -258,22 +258,22 @@ def draw_pixels(
 ) -> None:
     """Draw a map of all pixels, with a colour bar."""
     shown = np.asarray(values, np.float64)
-    known = shown[np.isfinite(shown)]
-    low, high = (float(v) for v in np.percentile(known, _SHOWN)) if known.size else (0.0, 1.0)
+    finite = shown[np.isfinite(shown)]
+    low, high = (float(v) for v in np.percentile(finite, _SHOWN)) if finite.size else (0.0, 1.0)
     if even:
         high = max(abs(low), abs(high))
         low = -high
     if high - low <= 1e-6 * max(abs(low), abs(high)):  # a single value has no range
         low, high = low - 0.5, high + 0.5
-    beyond = exceeded(known, low, high)
+    beyond = exceeded(finite, low, high)
     draw_image(axes, shown, label=label, extend=beyond, cmap=colours, vmin=low, vmax=high)
-    summary = f"median {np.median(known):.4g} {label.split()[0]}" if known.size else "no answer"
-    blue = "; blue: no answer" if 0 < known.size < shown.size else ""
+    summary = f"median {np.median(finite):.4g} {label.split()[0]}" if finite.size else "no answer"
+    blue = "; blue: no answer" if 0 < finite.size < shown.size else ""
     axes.set(title=f"{title}\n{summary}{blue}", xlabel="column (px)", ylabel="row (px)")
 
 
 def draw_parameter(axes: Axes, part: Part, name: str, colours: str = SEQUENTIAL) -> None:
     """Draw a map of a calibration, with the text and in the unit that are declared."""
-    one = parameters(part)[name]
-    values = getattr(part, name) * one.factor
-    draw_pixels(axes, values, one.text.partition(";")[0], one.shown_unit, colours)
+    declaration = parameters(part)[name]
+    values = getattr(part, name) * declaration.factor
+    draw_pixels(axes, values, declaration.text.partition(";")[0], declaration.shown_unit, colours)

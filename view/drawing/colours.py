@@ -37,8 +37,8 @@ _HALF = 0.01  # half the width of a scale of equal values, relative to them, so 
 
 def span(values: NDArray[Any]) -> tuple[float, float]:
     """Return the lowest and highest value, except for a few outliers."""
-    known = values[np.isfinite(values)]
-    low, high = np.percentile(known, _SHOWN) if known.size else (-1.0, 0.0)
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, _SHOWN) if finite.size else (-1.0, 0.0)
     return float(low), float(high)
 
 

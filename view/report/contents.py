@@ -164,7 +164,7 @@ def numbers_of(result: Result, section: Ends | None) -> Numbers:
     except InputError as error:
         return Numbers([], [sentence(str(error))])
     written = [_written(quantity) for quantity in measures.quantities.values()]
-    values, sigmas = (align([one[part] for one in written]) for part in (0, 1))
+    values, sigmas = (align([pair[part] for pair in written]) for part in (0, 1))
     units = [_UNITS.get(quantity.unit, quantity.unit) for quantity in measures.quantities.values()]
     names = list(measures.quantities)
     groups = [sentence(group_of(name)).removesuffix(".") for name in names]

@@ -77,8 +77,8 @@ def surface_page(result: Result, name: str) -> str:
 def _render(contents: Mapping[str, Any], template: str = "page.html") -> str:
     import jinja2
 
-    own = resources.files("mirrorskin.view.report")
-    texts = {name: own.joinpath(name).read_text("utf-8") for name in (*_TEMPLATES, "page.css", *_SCRIPTS)}
+    folder = resources.files("mirrorskin.view.report")
+    texts = {name: folder.joinpath(name).read_text("utf-8") for name in (*_TEMPLATES, "page.css", *_SCRIPTS)}
     environment = jinja2.Environment(
         autoescape=True,
         undefined=jinja2.StrictUndefined,
@@ -103,8 +103,8 @@ def _unescaped(text: str) -> Any:
 
 def _policy(script: str, style: str) -> str:
     """Return a policy that allows the page's own script, style and pictures, and nothing else."""
-    own = {"script-src": script, "style-src": style}
-    hashes = [f"{kind} 'sha256-{_hash(text)}'" for kind, text in own.items()]
+    sources = {"script-src": script, "style-src": style}
+    hashes = [f"{kind} 'sha256-{_hash(text)}'" for kind, text in sources.items()]
     return "; ".join(
         ["default-src 'none'", "img-src data:", *hashes, "base-uri 'none'", "form-action 'none'"]
     )

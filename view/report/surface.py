@@ -28,18 +28,18 @@ def surface_data(result: Result) -> dict[str, Any] | None:
     if result.height is None or not np.isfinite(result.height).any():
         return None
     grid = sample(result)
-    known = grid.height[grid.piece >= 0]
-    if min(grid.height.shape) < 2 or not known.size:
+    heights = grid.height[grid.piece >= 0]
+    if min(grid.height.shape) < 2 or not heights.size:
         return None
     scaled = result.x is not None and result.y is not None
-    shown = span(known)
+    shown = span(heights)
     ideal = _RELIEF * max(np.ptp(grid.x), np.ptp(grid.y)) / max(shown[1] - shown[0], 1e-9)
     stretch, factor = (1.0, ideal) if scaled else (ideal, 1.0)
     return {
         "unit": "mm" if scaled else "px",
         "x": np.round(grid.x, 6).tolist(),
         "y": np.round(grid.y, 6).tolist(),
-        **_encoded(grid, known),
+        **_encoded(grid, heights),
         "shown": shown,
         "stretch": stretch,
         "factor": round(min(max(factor, 1.0), MOST_EXAGGERATED)),
@@ -49,15 +49,15 @@ def surface_data(result: Result) -> dict[str, Any] | None:
     }
 
 
-def _encoded(grid: Grid, known: Floats) -> dict[str, Any]:
-    lowest, highest = float(known.min()), float(known.max())
+def _encoded(grid: Grid, heights: Floats) -> dict[str, Any]:
+    lowest, highest = float(heights.min()), float(heights.max())
     hole = grid.piece < 0
-    share = (np.where(hole, lowest, grid.height) - lowest) / ((highest - lowest) or 1.0)
+    fraction = (np.where(hole, lowest, grid.height) - lowest) / ((highest - lowest) or 1.0)
     marks = np.where(hole, 0, 1 + grid.piece % _PIECES + _FILLED_BIT * grid.filled)
     return {
         "lowest": lowest,
         "highest": highest,
-        "heights": _text(np.round(_CODES * share)),
+        "heights": _text(np.round(_CODES * fraction)),
         "marks": _text(marks),
     }
 
@@ -104,7 +104,7 @@ class Grid:
     filled: NDArray[np.bool_]
 
 
-def sample(result: Result, most: int = MOST) -> Grid:
+def sample(result: Result, limit: int = MOST) -> Grid:
     """Average over blocks of pixels, so that each side has at most ``most`` samples.
 
     Only the rectangle that contains all heights is used. A block with heights at less than half of its pixels
@@ -117,7 +117,7 @@ def sample(result: Result, most: int = MOST) -> Grid:
     rows, columns = (_reach(np.asarray(answered.any(axis=axis))) for axis in (1, 0))
     y, x = _places(result)
     kind_of, height = _kinds(result)[rows, columns], result.height[rows, columns].astype(np.float64)
-    block = -(-height.shape[0] // most), -(-height.shape[1] // most)
+    block = -(-height.shape[0] // limit), -(-height.shape[1] // limit)
     kind, mean = _averaged(_blocks(kind_of, block, _HOLE), _blocks(height, block, np.nan))
     kind[2 * _count(kind_of != _HOLE, block) < _count(np.ones_like(kind_of, bool), block)] = _HOLE
     hole = kind == _HOLE
@@ -160,8 +160,8 @@ def _kinds(result: Result) -> NDArray[np.int64]:
 def _averaged(kinds: NDArray[np.int64], heights: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Return the median kind of each block, and the mean height of its pixels; a block of holes is a hole."""
     ordered = np.sort(kinds, axis=-1)  # holes come first
-    size, known = kinds.shape[-1], np.count_nonzero(kinds != _HOLE, axis=-1)
-    middle = np.minimum(size - known + known // 2, size - 1)[..., np.newaxis]
+    size, answered = kinds.shape[-1], np.count_nonzero(kinds != _HOLE, axis=-1)
+    middle = np.minimum(size - answered + answered // 2, size - 1)[..., np.newaxis]
     kind = np.take_along_axis(ordered, middle, axis=-1)
     chosen = (kinds == kind) & (kinds != _HOLE)
     count = np.maximum(np.count_nonzero(chosen, axis=-1), 1)

@@ -101,17 +101,17 @@ def split_process(process: Mapping[str, object]) -> tuple[dict[str, Rows], dict[
     parameters: dict[str, Rows] = {}
     provenance: dict[str, Rows] = {}
     for name, value in process.items():
-        motion, own = _motion_of(name) if process.get("method") == _FUSED else ("", name)
-        place = provenance if own in _FIRST else parameters
-        place.setdefault(motion, []).append((own.replace("_", " "), _text(own, value)))
+        motion, field = _motion_of(name) if process.get("method") == _FUSED else ("", name)
+        place = provenance if field in _FIRST else parameters
+        place.setdefault(motion, []).append((field.replace("_", " "), _text(field, value)))
     for rows in provenance.values():
         rows.sort(key=lambda row: _FIRST.index(row[0].replace(" ", "_")))
     return parameters, provenance
 
 
 def _motion_of(name: str) -> tuple[str, str]:
-    motion, _, own = name.partition("_")
-    return (_MOTIONS[motion], own) if motion in _MOTIONS else ("", name)
+    motion, _, field = name.partition("_")
+    return (_MOTIONS[motion], field) if motion in _MOTIONS else ("", name)
 
 
 def _text(name: str, value: object) -> str:

@@ -99,7 +99,7 @@ def _chosen(sheet: Sheet, name: str, section: Ends | None, maps: Sequence[str] |
     """Return the requested panels, by default those of the overview; InputError if one does not exist."""
     panels = list(_panels_of(sheet, section))
     has = list(dict.fromkeys(panel.name for panel in panels))
-    lacking = [one for one in maps or () if one not in has]
+    lacking = [name for name in maps or () if name not in has]
     if not has:
         raise InputError(f"{name} has no map to draw: 'mirrorskin export' writes all it has into an .npz")
     if lacking:
@@ -112,11 +112,11 @@ def _chosen(sheet: Sheet, name: str, section: Ends | None, maps: Sequence[str] |
 def _panels_of(sheet: Sheet, section: Ends | None) -> Iterator[_Panel]:
     """Yield the panels of a result: heights, their section and histogram, and all other maps."""
     result = sheet.result
-    height, cut = result.name_of("height"), _cut(sheet, section)
+    height, profile = result.name_of("height"), _cut(sheet, section)
     if height is not None:
-        yield _Panel(height, partial(draw_height, sheet=sheet, cut=cut))
-    if cut is not None:
-        yield _Panel("section", partial(draw_section, sheet=sheet, cut=cut))
+        yield _Panel(height, partial(draw_height, sheet=sheet, profile=profile))
+    if profile is not None:
+        yield _Panel("section", partial(draw_section, sheet=sheet, profile=profile))
     if height is not None:
         yield _Panel("histogram", partial(draw_histogram, sheet=sheet))
     for name in result.maps():
@@ -133,10 +133,10 @@ def _cut(sheet: Sheet, ends: Ends | None) -> Section | None:
     height = sheet.result.height
     if height is None or not np.isfinite(height).any():
         return None
-    cut = section(sheet.result, *(ends or ()))
-    if not np.isfinite(cut.height).any():
+    profile = section(sheet.result, *(ends or ()))
+    if not np.isfinite(profile.height).any():
         raise InputError("no height is known along the section: choose other points, or leave it out")
-    return cut if len(cut.distance) > 1 else None
+    return profile if len(profile.distance) > 1 else None
 
 
 def _figure(sheet: Sheet, panels: Sequence[_Panel], name: str) -> Figure:

@@ -32,7 +32,7 @@ _MARGIN = 0.05
 _EDGE = 0.1  # space for a letter, relative to the picture's width
 
 
-def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
+def draw_height(axes: Axes, sheet: Sheet, profile: Section | None = None) -> None:
     """Draw heights by colour, with a scale bar, and the line of the section."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -46,8 +46,8 @@ def draw_height(axes: Axes, sheet: Sheet, cut: Section | None = None) -> None:
     explain_colours(axes, colours, scale.label, scale.beyond)
     if sheet.true_to_scale and sheet.unit == "mm" and height.size > 1:
         _draw_scale(axes, sheet)
-    if cut is not None:
-        _draw_line(axes, sheet, cut)
+    if profile is not None:
+        _draw_line(axes, sheet, profile)
     lay_out(axes, sheet)
     title = title_of_height(sheet)
     entitle(axes, f"{title[:1].upper()}{title[1:]}", "; ".join(_notes(sheet)))
@@ -95,20 +95,20 @@ def _draw_scale(axes: Axes, sheet: Sheet) -> None:
     )
 
 
-def _draw_line(axes: Axes, sheet: Sheet, cut: Section) -> None:
+def _draw_line(axes: Axes, sheet: Sheet, profile: Section) -> None:
     """Draw the line of a section, with A and B beyond its ends, or inside where an end is near the edge."""
-    (line,) = axes.plot(cut.x[[0, -1]], cut.y[[0, -1]], color="black", lw=1, ls=(0, (6, 3)))
+    (line,) = axes.plot(profile.x[[0, -1]], profile.y[[0, -1]], color="black", lw=1, ls=(0, (6, 3)))
     line.set_path_effects(outlined(2.5))
     left, right, _, top = sheet.place
     edge = _EDGE * (right - left)
-    to_left = cut.x[0] <= cut.x[-1]
+    to_left = profile.x[0] <= profile.x[-1]
     for name, place, beyond in (("A", 0, to_left), ("B", -1, not to_left)):
-        room = (cut.x[place] - left if beyond else right - cut.x[place]) > edge
-        align = "right" if beyond == room else "left"
-        above = top - cut.y[place] > edge
+        fits = (profile.x[place] - left if beyond else right - profile.x[place]) > edge
+        align = "right" if beyond == fits else "left"
+        above = top - profile.y[place] > edge
         axes.annotate(
             name,
-            (float(cut.x[place]), float(cut.y[place])),
+            (float(profile.x[place]), float(profile.y[place])),
             (3 if align == "left" else -3, 3 if above else -3),
             textcoords="offset points",
             ha=align,
@@ -126,14 +126,14 @@ def height_picture(
     from matplotlib import colormaps
     from matplotlib.colors import Normalize
 
-    known = np.isfinite(height)
-    level = Normalize(*span, clip=True)(np.where(known, height, span[0]))
+    finite = np.isfinite(height)
+    level = Normalize(*span, clip=True)(np.where(finite, height, span[0]))
     colours = np.where(
         filled[..., np.newaxis],
         filled_colours()(level, bytes=True)[..., :3],
         colormaps[SEQUENTIAL](level, bytes=True)[..., :3],
     )
-    return np.asarray(np.where(known[..., np.newaxis], colours, MISSING_RGB), np.uint8)
+    return np.asarray(np.where(finite[..., np.newaxis], colours, MISSING_RGB), np.uint8)
 
 
 _KEY = 129  # pixels of the key along a side
@@ -228,7 +228,7 @@ def _draw_codes(axes: Axes, sheet: Sheet, name: str) -> None:
     codes = sorted(declared.codes)
     places = np.clip(np.searchsorted(codes, values), 0, len(codes) - 1)
     classes = np.where(np.asarray(codes)[places] == values, places, len(codes)).astype(np.uint8)
-    _draw_shares(axes, sheet, classes, code_colours(declared), (*(declared.codes[one] for one in codes),))
+    _draw_shares(axes, sheet, classes, code_colours(declared), (*(declared.codes[code] for code in codes),))
     entitle(axes, declared.title_of(name))
 
 

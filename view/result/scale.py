@@ -71,8 +71,8 @@ def displayed_values(sheet: Sheet, name: str) -> Floats:
     """Return the values of a map in the unit of figures, NaN where undefined; of frames, the last ones."""
     declared, values = sheet.result.declaration(name), sheet.result[name]
     last = values[-1] if declared.per_frame and values.ndim > 2 + bool(declared.components) else values
-    known = declared.has_answer(last).reshape(*last.shape[:2], *[1] * (last.ndim - 2))
-    return np.where(known, declared.figure_scale * last.astype(np.float64), np.nan)
+    answered = declared.has_answer(last).reshape(*last.shape[:2], *[1] * (last.ndim - 2))
+    return np.where(answered, declared.figure_scale * last.astype(np.float64), np.nan)
 
 
 def labelled(text: str, declared: Map) -> str:
@@ -109,8 +109,8 @@ def _of_heights(sheet: Sheet, values: Floats, name: str) -> Scale:
 
 def _of_lengths(vectors: Floats, declared: Map) -> Scale:
     length = np.sqrt(np.sum(vectors**2, axis=-1))
-    known = length[np.isfinite(length)]
-    low, high = apart(float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    finite = length[np.isfinite(length)]
+    low, high = apart(float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     return Scale(length, SEQUENTIAL, low, high, labelled("length", declared), missing_note(length))
 
 
@@ -121,8 +121,8 @@ def _of_angles(values: Floats, name: str, declared: Map) -> Scale:
 
 
 def _of_signed(values: Floats, name: str, declared: Map) -> Scale:
-    known = np.abs(values[np.isfinite(values)])
-    side = float(np.percentile(known, _SIGNED_SHOWN)) if known.any() else 1.0
+    sizes = np.abs(values[np.isfinite(values)])
+    side = float(np.percentile(sizes, _SIGNED_SHOWN)) if sizes.any() else 1.0
     label = labelled(name.replace("_", " "), declared)
     ends = exceeded(values, -side, side)
     return Scale(values, DIVERGING, -side, side, label, missing_note(values), beyond=ends)
@@ -130,10 +130,10 @@ def _of_signed(values: Floats, name: str, declared: Map) -> Scale:
 
 def _of_numbers(values: Floats, name: str, declared: Map) -> Scale:
     """Return a scale that is logarithmic for positive numbers that span decades."""
-    known = values[np.isfinite(values)]
-    low, high = (float(v) for v in np.percentile(known, _SHOWN)) if known.size else (0.0, 1.0)
+    finite = values[np.isfinite(values)]
+    low, high = (float(v) for v in np.percentile(finite, _SHOWN)) if finite.size else (0.0, 1.0)
     error = declared.colours == "error"
-    notes = [f"median {np.median(known):.3g} {declared.figure_unit}".rstrip()] if known.size else []
+    notes = [f"median {np.median(finite):.3g} {declared.figure_unit}".rstrip()] if finite.size else []
     return Scale(
         values,
         ERROR if error else SEQUENTIAL,
@@ -141,5 +141,5 @@ def _of_numbers(values: Floats, name: str, declared: Map) -> Scale:
         labelled("standard deviation" if error else name.replace("_", " "), declared),
         "; ".join(filter(None, [*notes, missing_note(values)])),
         logarithmic=declared.colours != "sequential" and low > 0 and high > _DECADES * low,
-        beyond=exceeded(known, low, high),
+        beyond=exceeded(finite, low, high),
     )

@@ -26,27 +26,32 @@ _TAIL = 0.1  # excess of the histogram's range over the range of the colours
 _NEAR = 0.1  # of the width: labels closer to a side are aligned inwards
 
 
-def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
+def draw_section(axes: Axes, sheet: Sheet, profile: Section) -> None:
     """Draw heights along a section, with a band of two standard deviations, whose width the legend states.
 
     Filled heights are dashed; a hole is a gap; the highest point is marked.
     """
     scale = sheet.of_height.figure_scale
-    height, sigma = scale * cut.height, scale * cut.sigma
-    measured = np.where(cut.filled, np.nan, height)
+    height, sigma = scale * profile.height, scale * profile.sigma
+    measured = np.where(profile.filled, np.nan, height)
     if np.isfinite(measured).any():
-        axes.plot(cut.distance, measured, color="tab:blue", lw=1.5, label="measured")
-        _draw_apex(axes, sheet, cut)
-    if cut.filled.any():
+        axes.plot(profile.distance, measured, color="tab:blue", lw=1.5, label="measured")
+        _draw_apex(axes, sheet, profile)
+    if profile.filled.any():
         axes.plot(
-            cut.distance, _joined(height, cut.filled), color=FILLED, ls=(0, (2, 1)), lw=1.5, label="filled"
+            profile.distance,
+            _joined(height, profile.filled),
+            color=FILLED,
+            ls=(0, (2, 1)),
+            lw=1.5,
+            label="filled",
         )
-    if np.isfinite(cut.sigma).any():
+    if np.isfinite(profile.sigma).any():
         band = measured - _TIMES * sigma, measured + _TIMES * sigma
-        width, unit = sheet.height_text(_TIMES * float(np.nanmedian(cut.sigma))).split(" ", 1)
+        width, unit = sheet.height_text(_TIMES * float(np.nanmedian(profile.sigma))).split(" ", 1)
         label = f"± {_TIMES} sigma: {float(width):.2g} {unit}"
-        axes.fill_between(cut.distance, *band, color="tab:blue", alpha=0.25, lw=0, label=label)
-    stretched = _stretch(axes, sheet, cut)
+        axes.fill_between(profile.distance, *band, color="tab:blue", alpha=0.25, lw=0, label=label)
+    stretched = _stretch(axes, sheet, profile)
     for name, end in (("A", 0), ("B", 1)):
         axes.annotate(
             name,
@@ -63,9 +68,9 @@ def draw_section(axes: Axes, sheet: Sheet, cut: Section) -> None:
     axes.set_ylabel(f"{title_of_height(sheet)} ({sheet.of_height.figure_unit})", fontsize=TEXT)
     axes.tick_params(labelsize=SMALL)
     axes.grid(alpha=0.3)
-    if np.isfinite(cut.height).any():
+    if np.isfinite(profile.height).any():
         axes.legend(fontsize=SMALL, **BESIDE)
-    entitle(axes, "Section", f"{_ends(cut, sheet.unit)}{stretched}")
+    entitle(axes, "Section", f"{_ends(profile, sheet.unit)}{stretched}")
 
 
 def _joined(height: Floats, filled: NDArray[np.bool_]) -> Floats:
@@ -76,51 +81,51 @@ def _joined(height: Floats, filled: NDArray[np.bool_]) -> Floats:
     return np.where(near, height, np.nan)
 
 
-def _draw_apex(axes: Axes, sheet: Sheet, cut: Section) -> None:
+def _draw_apex(axes: Axes, sheet: Sheet, profile: Section) -> None:
     """Mark the highest point of the surface, if the section has it, or that of the section."""
-    distance = cut.distance
-    top, height, label = _highest_point(sheet, cut)
+    distance = profile.distance
+    top, height, label = _highest_point(sheet, profile)
     drawn = sheet.of_height.figure_scale * height
     axes.plot(distance[top], drawn, "v", color="tab:red", ms=5, label=label)
-    share = (distance[top] - distance[0]) / (distance[-1] - distance[0] or 1.0)
+    position = (distance[top] - distance[0]) / (distance[-1] - distance[0] or 1.0)
     axes.annotate(
         sheet.height_text(height),
         (float(distance[top]), drawn),
         (0, 6),
         textcoords="offset points",
-        ha="left" if share < _NEAR else "right" if share > 1 - _NEAR else "center",
+        ha="left" if position < _NEAR else "right" if position > 1 - _NEAR else "center",
         fontsize=SMALL,
         color="tab:red",
         path_effects=outlined(2.5),
     )
 
 
-def _highest_point(sheet: Sheet, cut: Section) -> tuple[int, float, str]:
+def _highest_point(sheet: Sheet, profile: Section) -> tuple[int, float, str]:
     """Return the sample, the height in mm and the name of the point to mark."""
     from mirrorskin.engine.metrology import highest_point
 
-    top = int(np.nanargmax(np.where(cut.filled, np.nan, cut.height)))
-    if cut.unit == "mm":
+    top = int(np.nanargmax(np.where(profile.filled, np.nan, profile.height)))
+    if profile.unit == "mm":
         point = highest_point(sheet.result)
-        near = np.hypot(cut.x - point.x, cut.y - point.y)
-        if np.min(near) <= _AT_APEX * float(cut.distance[1] - cut.distance[0]):
+        near = np.hypot(profile.x - point.x, profile.y - point.y)
+        if np.min(near) <= _AT_APEX * float(profile.distance[1] - profile.distance[0]):
             return int(np.argmin(near)), point.height.value, "highest point"
-    return top, float(cut.height[top]), "highest on A-B"
+    return top, float(profile.height[top]), "highest on A-B"
 
 
-def _stretch(axes: Axes, sheet: Sheet, cut: Section) -> str:
+def _stretch(axes: Axes, sheet: Sheet, profile: Section) -> str:
     """Set the limits of the panel so that the vertical exaggeration is a round number; return it as text.
 
     Equal heights are drawn to scale.
     """
     axes.set_box_aspect(BOX)
-    length = float(cut.distance[-1] - cut.distance[0]) or 1.0
-    axes.set_xlim(float(cut.distance[0]), float(cut.distance[0]) + length)
-    known = cut.height[np.isfinite(cut.height)]
+    length = float(profile.distance[-1] - profile.distance[0]) or 1.0
+    axes.set_xlim(float(profile.distance[0]), float(profile.distance[0]) + length)
+    finite = profile.height[np.isfinite(profile.height)]
     scale = sheet.of_height.figure_scale
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     equal = apart(low, high) != (low, high)
-    if sheet.unit != "mm" or not known.size:
+    if sheet.unit != "mm" or not finite.size:
         axes.margins(y=0.2)
         if equal:
             axes.set_ylim(*(scale * end for end in apart(low, high)))
@@ -134,9 +139,9 @@ def _stretch(axes: Axes, sheet: Sheet, cut: Section) -> str:
     return f"; heights stretched {times:g} times" if times > 1 else f"; heights shrunk {1 / times:g} times"
 
 
-def _ends(cut: Section, unit: str) -> str:
+def _ends(profile: Section, unit: str) -> str:
     """Return the ends of the section as text."""
-    a, b = (f"({cut.x[place]:.3g}, {cut.y[place]:.3g})" for place in (0, -1))
+    a, b = (f"({profile.x[place]:.3g}, {profile.y[place]:.3g})" for place in (0, -1))
     return f"A {a} to B {b} {unit}"
 
 
@@ -149,10 +154,10 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
     assert height is not None
     scale = sheet.of_height.figure_scale
     parts = [height[np.isfinite(height) & (sheet.filled == filled)] for filled in (False, True)]
-    known = np.concatenate(parts)
-    low, high = _shown(known)
-    beyond = int(np.count_nonzero((known < low) | (known > high)))
-    shown = known[(known >= low) & (known <= high)]
+    finite = np.concatenate(parts)
+    low, high = _shown(finite)
+    beyond = int(np.count_nonzero((finite < low) | (finite > high)))
+    shown = finite[(finite >= low) & (finite <= high)]
     ends = (float(shown.min()), float(shown.max())) if shown.size else (0.0, 1.0)
     bins = np.histogram_bin_edges(shown, _BINS, apart(*ends))
     counts = [np.histogram(part, bins)[0] for part in parts]
@@ -168,10 +173,10 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
     axes.grid(alpha=0.3)
     axes.set_axisbelow(True)
     axes.set_box_aspect(BOX)
-    if known.size:
+    if finite.size:
         axes.legend(fontsize=SMALL, **BESIDE)
     sigma = sheet.result.height_sigma
-    notes = [f"median {sheet.height_text(float(np.median(known)))}"] if known.size else ["no answer"]
+    notes = [f"median {sheet.height_text(float(np.median(finite)))}"] if finite.size else ["no answer"]
     if sigma is not None and np.isfinite(sigma).any():
         declared = sheet.result.declaration(sheet.result.name_of("height_sigma") or "height_sigma")
         error = declared.figure_scale * np.nanmedian(sigma)
@@ -181,8 +186,8 @@ def draw_histogram(axes: Axes, sheet: Sheet) -> None:
     entitle(axes, "Distribution of heights", "; ".join(notes))
 
 
-def _shown(known: Floats) -> tuple[float, float]:
+def _shown(finite: Floats) -> tuple[float, float]:
     """Return the range of heights, except for a few pixels far from all others."""
-    low, high = apart(*span(known))
-    room = _TAIL * (high - low)
-    return low - room, high + room
+    low, high = apart(*span(finite))
+    margin = _TAIL * (high - low)
+    return low - margin, high + margin

@@ -65,8 +65,8 @@ class Sheet:
     def filled(self) -> NDArray[np.bool_]:
         """Where the height was filled, not measured, (H, W)."""
         assert self.result.height is not None
-        known: NDArray[np.bool_] = np.isfinite(self.result.height)
-        return np.zeros_like(known) if self.result.filled is None else known & (self.result.filled > 0)
+        finite: NDArray[np.bool_] = np.isfinite(self.result.height)
+        return np.zeros_like(finite) if self.result.filled is None else finite & (self.result.filled > 0)
 
     @property
     def of_height(self) -> Map:
@@ -108,9 +108,9 @@ def lay_out(axes: Axes, sheet: Sheet) -> None:
         if len(along) == 1:
             axis.set_ticks([])
             axis.set_label_text(f"{name} = {along[0]:.3g} {sheet.unit}")
-    for one in (axes, *axes.child_axes):
-        one.tick_params(labelsize=SMALL)
-        one.yaxis.label.set_fontsize(TEXT)
+    for scales in (axes, *axes.child_axes):
+        scales.tick_params(labelsize=SMALL)
+        scales.yaxis.label.set_fontsize(TEXT)
 
 
 def entitle(axes: Axes, title: str, note: str = "") -> None:
@@ -131,5 +131,5 @@ def entitle(axes: Axes, title: str, note: str = "") -> None:
 
 def percent(part: int, whole: int) -> str:
     """Return a share as text, as in "12.3 %"; a share above 0 is never printed as 0."""
-    share = 100 * part / whole
-    return "< 0.1 %" if 0 < share < 0.05 else f"{share:.1f} %"
+    percentage = 100 * part / whole
+    return "< 0.1 %" if 0 < percentage < 0.05 else f"{percentage:.1f} %"

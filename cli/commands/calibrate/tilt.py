@@ -81,9 +81,9 @@ def command(
                 else:
                     plates.append(track_plate(source, number <= len(paths) + len(flats), light))
                 show(number)
-        found = fit_precession(tracks, plates, depth_sigma=light.depth_sigma)
+        precession = fit_precession(tracks, plates, depth_sigma=light.depth_sigma)
         named = {"sources": paths, "flats": flats, "wedges": wedges}
-        return _learned(found, {"ball": ball, **{name: files for name, files in named.items() if files}})
+        return _learned(precession, {"ball": ball, **{name: files for name, files in named.items() if files}})
 
     capture = inputs.Capture(rig, turns, settle, overwrite, check)
     plates = [*flats, *wedges]

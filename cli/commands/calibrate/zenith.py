@@ -112,11 +112,11 @@ def _learned(response: WallResponse, facts: dict[str, Any]) -> inputs.Learned:
     errors = dict(zip(response.parameters, np.sqrt(np.diag(response.covariance)).tolist(), strict=True))
     sigma = np.degrees(response.zenith_sigma[np.isfinite(response.zenith_sigma)])
     middle, worst = (float(np.median(sigma)), float(sigma.max())) if sigma.size else (np.nan, np.nan)
-    most = float(np.degrees(response.error))
+    residual = float(np.degrees(response.error))
     place = *response.axis, response.sight[0], *response.lamps
     values = zip(_PRINTED, (response.radius, response.rim, *place, response.scatter), strict=True)
-    found = {name: {"value": value, "sigma": errors[name]} for name, value in values}
-    degrees = {"zenith_sigma_median": middle, "zenith_sigma_worst": worst, "residual_on_balls": most}
+    fitted = {name: {"value": value, "sigma": errors[name]} for name, value in values}
+    degrees = {"zenith_sigma_median": middle, "zenith_sigma_worst": worst, "residual_on_balls": residual}
     doubt = (
         f"depth not determined, standard deviation of zenith {middle:.2g} deg: press less, so that the"
         " contact ends within the part that shows the wall"
@@ -124,10 +124,10 @@ def _learned(response: WallResponse, facts: dict[str, Any]) -> inputs.Learned:
     return inputs.Learned(
         response,
         facts,
-        {"pattern": response.pattern, "found": found, "degrees": degrees},
+        {"pattern": response.pattern, "found": fitted, "degrees": degrees},
         f"wall {response.radius:.2f} ± {errors['radius']:.2g} mm from the axis and"
         f" {response.rim:.1f} ± {errors['rim']:.2g} mm high (noise alone), axis at {response.axis[0]:.2f},"
         f" {response.axis[1]:.2f} mm; standard deviation of zenith {middle:.2g} deg ({worst:.2g} at most),"
-        f" residual on the balls at most {most:.2g} deg",
+        f" residual on the balls at most {residual:.2g} deg",
         [doubt] if middle > _DOUBTFUL else [],
     )
