@@ -125,10 +125,10 @@ def dragged():
 
 def arrays():
     """Return frames of a press and of a rotation, with what is known of them."""
-    known = {"dark": 16.0, "bright": 216.0, "gain": 150.0, "offset": 0.0, "tilt": 0.05}
+    levels = {"dark": 16.0, "bright": 216.0, "gain": 150.0, "offset": 0.0, "tilt": 0.05}
     positions = {"travel": 0.1 * np.arange(12), "phase": np.pi / 4 * np.arange(8)}
     press, turn = np.zeros((12, 40, 48), np.uint8), np.zeros((8, 40, 48), np.uint8)
-    return {**known, **positions, "press_frames": press, "turn_frames": turn}
+    return {**levels, **positions, "press_frames": press, "turn_frames": turn}
 
 
 NAMES = {  # what the Python of a page takes for granted

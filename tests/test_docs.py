@@ -63,15 +63,15 @@ def test_a_command_of_the_documentation_is_understood(page, words, monkeypatch, 
     understood(words)
 
 
-def test_messages_that_troubleshooting_tells_of_are_those_of_the_program():
+def test_messages_in_troubleshooting_are_those_of_the_program():
     folders = ("cli", "engine", "hw", "io", "kernels", "twin", "view")
     files = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
     source = "".join(file.read_text(encoding="utf-8") for file in files)
     joined = re.sub(r"""["']\s*\n\s*f?["']""", "", source)
     page = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
-    told = re.findall(r"^ *> (.*)$", page, re.MULTILINE)
-    assert len(told) > 60
-    parts = [part.strip() for line in told for part in FILLED_IN.split(line)]
+    messages = re.findall(r"^ *> (.*)$", page, re.MULTILINE)
+    assert len(messages) > 60
+    parts = [part.strip() for line in messages for part in FILLED_IN.split(line)]
     assert [part for part in parts if len(part) > 8 and part not in joined] == []
 
 
@@ -145,7 +145,11 @@ def named_in(page):
 def options_of(command, above=None):
     """Return the options of a command and of all commands in it."""
     context = click.Context(command, parent=above)
-    names = {name for one in command.get_params(context) for name in (*one.opts, *one.secondary_opts)}
+    names = {
+        name
+        for parameter in command.get_params(context)
+        for name in (*parameter.opts, *parameter.secondary_opts)
+    }
     inner = command.list_commands(context) if hasattr(command, "list_commands") else ()
     return names.union(*(options_of(command.get_command(context, name), context) for name in inner))
 
@@ -196,6 +200,6 @@ def test_phrases_that_contributing_asks_to_avoid_are_not_used():
     paths = [ROOT / "README.md", *(path for name in folders for path in (ROOT / name).rglob("*.*"))]
     names = [path.relative_to(ROOT).as_posix() for path in paths]
     checked = [name for name in names if files.search(name) and not without.search(name)]
-    found = [name for name in checked if phrase.search((ROOT / name).read_text(encoding="utf-8"))]
+    offenders = [name for name in checked if phrase.search((ROOT / name).read_text(encoding="utf-8"))]
     assert len(checked) > 100
-    assert found == []
+    assert offenders == []

@@ -24,11 +24,11 @@ MODULES = [".".join(("mirrorskin", *file.relative_to(ROOT).with_suffix("").parts
 @pytest.mark.parametrize("name", [name.removesuffix(".__init__") for name in MODULES])
 def test_examples_run(name, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    told = []
+    printed = []
     runner = doctest.DocTestRunner(verbose=False)
     for example in doctest.DocTestFinder(exclude_empty=True).find(importlib.import_module(name)):
-        runner.run(example, out=told.append)
-    assert runner.summarize(verbose=False).failed == 0, "".join(told)
+        runner.run(example, out=printed.append)
+    assert runner.summarize(verbose=False).failed == 0, "".join(printed)
 
 
 @pytest.mark.parametrize("package", [engine, io], ids=["engine", "io"])
@@ -39,41 +39,41 @@ def test_every_public_function_has_an_example(package):
 
 
 def forces(printed):
-    for found, sigma, true in numbers(printed, r": (\S+) ± (\S+) N, true (\S+) N"):
-        assert found == pytest.approx(true, rel=0.02)
+    for values, sigma, true in numbers(printed, r": (\S+) ± (\S+) N, true (\S+) N"):
+        assert values == pytest.approx(true, rel=0.02)
         assert 0 < sigma < 0.02 * true
 
 
 def moved(printed):
-    for found, true in numbers(printed, r"translation .*: (\S+) mm, true (\S+) mm"):
-        assert found == pytest.approx(true, abs=0.015)  # a quarter of a pixel
-    for found, true in numbers(printed, r"rotation .*: (\S+) degrees, true (\S+) degrees"):
-        assert found == pytest.approx(true, abs=0.25)
+    for values, true in numbers(printed, r"translation .*: (\S+) mm, true (\S+) mm"):
+        assert values == pytest.approx(true, abs=0.015)  # a quarter of a pixel
+    for values, true in numbers(printed, r"rotation .*: (\S+) degrees, true (\S+) degrees"):
+        assert values == pytest.approx(true, abs=0.25)
 
 
 def slipped(printed):
-    for found, true, closed in numbers(printed, r"found (\S+), true (\S+), closed form (\S+)"):
+    for values, true, closed in numbers(printed, r"found (\S+), true (\S+), closed form (\S+)"):
         assert true == pytest.approx(closed, abs=0.02)
-        assert found == pytest.approx(true, abs=0.05)
+        assert values == pytest.approx(true, abs=0.05)
     for (error,) in numbers(printed, r"within (\S+) µm"):
         assert error < 5
-    ((found, true),) = numbers(printed, r"(\S+) degrees, true (\S+)")
-    assert found == pytest.approx(true, rel=0.02)
+    ((values, true),) = numbers(printed, r"(\S+) degrees, true (\S+)")
+    assert values == pytest.approx(true, rel=0.02)
 
 
 def vibrated(printed):
-    for found, expected in numbers(printed, r"RMS error (\S+?)(?: µm)?, expected (\S+)"):
-        assert 0.2 * expected < found < 1.5 * expected  # the twin has no lens, whose blur is in the sigma
-    ((found, true),) = numbers(printed, r"hysteresis: (\S+) µm, true (\S+) µm")
-    assert found == pytest.approx(true, abs=2)
-    ((found, true),) = numbers(printed, r"grows by (\S+) .* true (\S+)")
-    assert found == pytest.approx(true, rel=0.01)
+    for values, expected in numbers(printed, r"RMS error (\S+?)(?: µm)?, expected (\S+)"):
+        assert 0.2 * expected < values < 1.5 * expected  # the twin has no lens, whose blur is in the sigma
+    ((values, true),) = numbers(printed, r"hysteresis: (\S+) µm, true (\S+) µm")
+    assert values == pytest.approx(true, abs=2)
+    ((values, true),) = numbers(printed, r"grows by (\S+) .* true (\S+)")
+    assert values == pytest.approx(true, rel=0.01)
 
 
 def compared(printed):
-    found = numbers(printed, r"RMS error (\S+) mm.* at (\d+) pixels; (\d+) pixels")
-    assert len(found) == 8
-    for number, (error, answered, untouched) in enumerate(found):
+    values = numbers(printed, r"RMS error (\S+) mm.* at (\d+) pixels; (\d+) pixels")
+    assert len(values) == 8
+    for number, (error, answered, untouched) in enumerate(values):
         elastic = number % 4 >= 2
         assert untouched > 0.3 * answered if elastic else untouched < 0.02 * answered
         assert error > 0.4 if elastic else error < 0.3
@@ -95,9 +95,9 @@ def measured(printed):
 
 def numbers(printed, pattern):
     """Return the numbers of all matches of a pattern; there is at least one."""
-    found = [tuple(map(float, match.groups())) for match in re.finditer(pattern, printed)]
-    assert found, printed
-    return found
+    values = [tuple(map(float, match.groups())) for match in re.finditer(pattern, printed)]
+    assert values, printed
+    return values
 
 
 SLOW = {
@@ -122,8 +122,8 @@ def unwrapped(printed):
 
 
 def focused(printed):
-    ((share, error),) = numbers(printed, r"(\d+) % of the pixels, RMS error (\S+) µm")
-    assert share > 95
+    ((fraction, error),) = numbers(printed, r"(\d+) % of the pixels, RMS error (\S+) µm")
+    assert fraction > 95
     assert error < 3
 
 
@@ -140,8 +140,8 @@ def grown(printed):
 
 
 def clicked(printed):
-    found = numbers(printed, r"onset at (\S+) ± (\S+) mm, true (\S+) mm")
-    ((onset, sigma, true),) = found
+    values = numbers(printed, r"onset at (\S+) ± (\S+) mm, true (\S+) mm")
+    ((onset, sigma, true),) = values
     assert abs(onset - true) < 3 * sigma
 
 

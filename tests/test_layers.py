@@ -17,9 +17,9 @@ ROOT = Path(__file__).parent.parent
 def test_imports_follow_the_layers():
     # In a process of its own: within this one it would disable the loggers of all tests that follow.
     command = Path(sys.executable).with_name("lint-imports"), "--no-cache"
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "Contracts: 2 kept, 0 broken" in done.stdout
+    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert process.returncode == 0, process.stdout + process.stderr
+    assert "Contracts: 2 kept, 0 broken" in process.stdout
 
 
 def test_every_folder_is_under_the_rule():
@@ -35,7 +35,7 @@ def test_no_modules_import_each_other():
 
 def test_no_packages_import_each_other():
     pairs = {(folder_of(module), folder_of(other)) for module, other in imports()}
-    assert knots((one, other) for one, other in pairs if one != other) == []
+    assert knots((name, other) for name, other in pairs if name != other) == []
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ BASES = {"Operation", "Step"}
 def modules() -> dict[str, ast.Module]:
     packages = [path.parent for path in ROOT.glob("*/__init__.py")]
     files = [file for package in packages for file in package.rglob("*.py")]
-    return {str(one.relative_to(ROOT)): ast.parse(one.read_text(encoding="utf-8")) for one in files}
+    return {str(path.relative_to(ROOT)): ast.parse(path.read_text(encoding="utf-8")) for path in files}
 
 
 def last_name(node: ast.expr) -> str:
@@ -30,11 +30,11 @@ def last_name(node: ast.expr) -> str:
 
 def classes_of(trees: list[ast.Module]) -> set[str]:
     """Return the names of all classes that are derived from operations or steps."""
-    found = set(BASES)
+    names = set(BASES)
     defined = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
-    while more := {node.name for node in defined if found & {*map(last_name, node.bases)}} - found:
-        found |= more
-    return {name.lstrip("_") for name in found}
+    while more := {node.name for node in defined if names & {*map(last_name, node.bases)}} - names:
+        names |= more
+    return {name.lstrip("_") for name in names}
 
 
 class Calls(ast.NodeVisitor):
@@ -123,5 +123,5 @@ def test_only_the_run_loop_calls_operations_and_steps():
     trees = modules()
     classes = classes_of([*trees.values()])
     assert LOOP in trees
-    found = {name: Calls(tree, classes).lines for name, tree in trees.items() if name != LOOP}
-    assert {name: lines for name, lines in found.items() if lines} == {}
+    lines_by_file = {name: Calls(tree, classes).lines for name, tree in trees.items() if name != LOOP}
+    assert {name: lines for name, lines in lines_by_file.items() if lines} == {}

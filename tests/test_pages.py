@@ -34,10 +34,10 @@ def named(page):
 
 def datasets(path):
     """Return the names of a file's datasets, but for what a process tells."""
-    found = []
+    names = []
     with h5py.File(path) as file:
-        file.visititems(lambda name, node: found.append(name) if isinstance(node, h5py.Dataset) else None)
-    return {name.rsplit("/", 1)[-1] for name in found if "/process/" not in name}
+        file.visititems(lambda name, node: names.append(name) if isinstance(node, h5py.Dataset) else None)
+    return {name.rsplit("/", 1)[-1] for name in names if "/process/" not in name}
 
 
 def turn(phases=8):
@@ -50,7 +50,7 @@ def turn(phases=8):
     )
 
 
-def test_a_recording_of_another_program_needs_no_more_than_the_page_says(tmp_path, monkeypatch):
+def test_a_recording_of_another_program_needs_no_more_than_the_page_lists(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     source = ball((20, 24), 0.3, TRAVEL)
     frames = source.read(np.empty(source.shape, source.dtype)).frames
@@ -67,7 +67,7 @@ def test_a_result_is_read_without_the_program(tmp_path, monkeypatch, capsys):
     result = engine.reconstruct(ball((40, 44), 0.15, TRAVEL))
     io.save_result(result, "res.h5")
     names = {}
-    (example,) = (one for one in examples("formats.md") if "known" in one and "h5py" in one)
+    (example,) = (block for block in examples("formats.md") if "known" in block and "h5py" in block)
     exec(example, names)
     np.testing.assert_array_equal(names["height"], result.height)
     np.testing.assert_array_equal(names["y"], result.y)
@@ -79,9 +79,9 @@ def test_a_result_is_read_without_the_program(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("per_turn", [False, True])
 def test_all_that_is_in_a_result_is_described(tmp_path, per_turn):
     io.save_result(engine.reconstruct(turn(), per_turn=per_turn), tmp_path / "turn.h5")
-    found = datasets(tmp_path / "turn.h5")
-    assert {"height", "normals", "contact", "offset_unknown", "x"} < found
-    assert found <= named("formats.md")
+    names = datasets(tmp_path / "turn.h5")
+    assert {"height", "normals", "contact", "offset_unknown", "x"} < names
+    assert names <= named("formats.md")
 
 
 @pytest.mark.parametrize("script", ["map_tables", "option_tables"])
@@ -89,8 +89,8 @@ def test_the_tables_of_maps_parameters_operations_and_options_are_those_of_the_d
     script, monkeypatch
 ):
     monkeypatch.syspath_prepend(DOCS / "site")
-    made = runpy.run_path(str(DOCS / f"site/{script}.py"))
-    for page, text in made["pages"]().items():
+    script_names = runpy.run_path(str(DOCS / f"site/{script}.py"))
+    for page, text in script_names["pages"]().items():
         assert (DOCS / page).read_text(encoding="utf-8") == text, f"python docs/site/{script}.py writes them"
 
 
@@ -107,9 +107,9 @@ def test_all_that_is_in_a_recording_is_described(tmp_path):
     source = turn()
     with io.Recorder(source, tmp_path / "turn.h5", truth=source.truth) as recorder:
         recorder.drain(lambda count: None)
-    found = datasets(tmp_path / "turn.h5")
-    assert {"data", "phase", "pivot", "zenith_gain"} < found
-    assert found <= named("formats.md")
+    names = datasets(tmp_path / "turn.h5")
+    assert {"data", "phase", "pivot", "zenith_gain"} < names
+    assert names <= named("formats.md")
 
 
 @pytest.mark.parametrize("name", ["dimensions", "gap", "distance", "skin"])

@@ -59,10 +59,10 @@ def test_a_command_runs(desk, line, monkeypatch):
         words += FEWER
     monkeypatch.chdir(desk)
     if words[0] in OF_THEIR_OWN:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-P", "-m", "mirrorskin.cli.main", *words], capture_output=True, text=True
         )
-        assert done.returncode == 0, done.stderr
+        assert process.returncode == 0, process.stderr
         return
     ended = run(*words)
     assert ended.code == 0, ended.said
@@ -85,18 +85,18 @@ def test_the_block_of_the_emulated_rig_runs_as_it_is_pasted(tmp_path):
         folder = tmp_path / str(attempt)
         folder.mkdir()
         shell = ["bash", "-ec", RIG]
-        done = subprocess.run(shell, cwd=folder, env=environment, capture_output=True, text=True)
-        if "end it with" in done.stdout:
-            end(process_of(done.stdout))
+        process = subprocess.run(shell, cwd=folder, env=environment, capture_output=True, text=True)
+        if "end it with" in process.stdout:
+            end(process_of(process.stdout))
             assert not (folder / "rig" / "rig.toml").exists()
-        if done.returncode == 0 or not starved(done.stderr):
+        if process.returncode == 0 or not starved(process.stderr):
             break
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr
     with contextlib.chdir(folder):
-        found = json.loads(run("measure", "steps-result.h5", "--json").out)["quantities"]
+        quantities = json.loads(run("measure", "steps-result.h5", "--json").out)["quantities"]
         live, again = io.open_result("live-result.h5"), io.open_result("again.h5")
     for name, true in (("sphere radius", 5.0), ("sphere top", 0.0)):
-        assert found[name]["value"] == pytest.approx(true, abs=0.03), name
+        assert quantities[name]["value"] == pytest.approx(true, abs=0.03), name
     np.testing.assert_array_equal(again.height, live.height)
 
 
@@ -105,14 +105,14 @@ def test_the_python_runs(tmp_path, monkeypatch):
     for name in ("press", "turn"):
         assert run("sample", name, "-o", f"{name}.h5").code == 0
     assert len(PYTHON) == 2
-    known = arrays()
+    namespace = arrays()
     for block in PYTHON:
-        exec(block, known)
-    assert np.isfinite(known["onset"].height).any()
-    assert np.isfinite(known["surface"].height).all()
+        exec(block, namespace)
+    assert np.isfinite(namespace["onset"].height).any()
+    assert np.isfinite(namespace["surface"].height).all()
     with io.open_recording("press.h5") as recording:
-        assert engine.score(known["both"], recording.truth).height.rms < 0.001  # mm
-    assert known["twin"].shape == (4, 480, 640)
+        assert engine.score(namespace["both"], recording.truth).height.rms < 0.001  # mm
+    assert namespace["twin"].shape == (4, 480, 640)
 
 
 def arrays():

@@ -31,10 +31,10 @@ def message_class(kind):
     class Message:
         __slots__ = tuple(defaults)
 
-        def __init__(self, **given):
+        def __init__(self, **options):
             for name, default in defaults.items():
-                setattr(self, name, given.pop(name, None) or default())
-            assert not given
+                setattr(self, name, options.pop(name, None) or default())
+            assert not options
 
         def typed(self):
             """Return the message as rosbags has it."""
@@ -58,7 +58,7 @@ def _typed(value):
     if isinstance(value, bytes):
         return np.frombuffer(value, np.uint8)
     if isinstance(value, list):
-        return [one.typed() for one in value]
+        return [item.typed() for item in value]
     return value.typed() if hasattr(value, "typed") else value
 
 
@@ -76,7 +76,7 @@ def bag(monkeypatch, tmp_path):
             self.writer.open()
 
         def create_publisher(self, kind, topic, depth):
-            name = next(kinds[name] for name, one in classes.items() if one is kind)
+            name = next(kinds[name] for name, message_class in classes.items() if message_class is kind)
             connection = self.writer.add_connection(f"/{topic}", name, typestore=STORE)
 
             def publish(message):
@@ -109,15 +109,15 @@ def published(bag, clock, monkeypatch):
     """Run the node; return what another program reads in the bag, by topic."""
     rig = fake_rig(spreading(SHAPE), clock, rate=60.0, told={"pixel_size": (0.05, 0.05), "rate": 60.0})
     monkeypatch.setattr(hw, "load_rig", lambda _path: rig.settings)
-    monkeypatch.setattr(hw, "open_rig", lambda told: rig)
+    monkeypatch.setattr(hw, "open_rig", lambda settings: rig)
     runpy.run_path(str(NODE))["main"]("rig.toml", 1.0)
     assert bag.ended == ["node", "rclpy"]
     assert rig.stage.closed
     with AnyReader([bag.path]) as reader:
-        found = {}
+        received = {}
         for connection, _, data in reader.messages():
-            found.setdefault(connection.topic, []).append(reader.deserialize(data, connection.msgtype))
-    return found
+            received.setdefault(connection.topic, []).append(reader.deserialize(data, connection.msgtype))
+    return received
 
 
 def points_of(cloud):
@@ -126,7 +126,7 @@ def points_of(cloud):
 
 def test_pictures_are_published(published):
     pictures = published["/camera/image"]
-    assert {(one.height, one.width, one.encoding) for one in pictures} == {(*SHAPE, "mono8")}
+    assert {(picture.height, picture.width, picture.encoding) for picture in pictures} == {(*SHAPE, "mono8")}
     assert np.ptp(pictures[-1].data) > 100
 
 

@@ -61,8 +61,8 @@ def test_the_tutorial_leads_to_a_surface(photographs, capsys):
     maps = re.findall(r"`([a-z_]+)`", BLOCK.sub("", section))
     assert maps
     assert set(maps) <= set(io.open_result("facing.h5"))
-    found = re.findall(r"they differ by (\S+) degrees, expected (\S+)", printed)
-    (before, expected_before), (after, expected_after) = (map(float, pair) for pair in found)
+    angles = re.findall(r"they differ by (\S+) degrees, expected (\S+)", printed)
+    (before, expected_before), (after, expected_after) = (map(float, pair) for pair in angles)
     assert before > 1.5 * expected_before
     assert after == pytest.approx(expected_after, rel=0.2)
     assert Path("butterfly.stl").stat().st_size > 1000

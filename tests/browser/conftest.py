@@ -88,8 +88,8 @@ class Opened:
     def box(self):
         """Where the surface is on the screen: left, top, width and height, CSS pixels."""
         self.page.locator("#surface-canvas").scroll_into_view_if_needed()
-        found = self.page.locator("#surface-canvas").bounding_box()
-        return found["x"], found["y"], found["width"], found["height"]
+        canvas = self.page.locator("#surface-canvas").bounding_box()
+        return canvas["x"], canvas["y"], canvas["width"], canvas["height"]
 
     def point(self, across, down):
         """Point at a place on the surface, as shares of its width and height; return what is read."""

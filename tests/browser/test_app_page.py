@@ -117,10 +117,10 @@ def test_a_new_threshold_is_saved_as_the_command_line_saves_it(opened, press, tm
         opened.page.get_by_text("Save press-result.h5").click()
     saved = tmp_path / "saved.h5"
     download.value.save_as(saved)
-    found, expected = io.open_result(saved), by_command(press, tmp_path, "--threshold", "0.37")
-    assert {*found} == {*expected}
+    result, expected = io.open_result(saved), by_command(press, tmp_path, "--threshold", "0.37")
+    assert {*result} == {*expected}
     for name in expected:
-        np.testing.assert_array_equal(found[name], expected[name])
+        np.testing.assert_array_equal(result[name], expected[name])
 
 
 def test_the_command_is_copied(opened):
@@ -144,7 +144,9 @@ def test_a_section_is_drawn_by_dragging(opened):
     opened.show("Result")
     opened.page.get_by_text("highest point", exact=True).wait_for()
     box = opened.page.locator(".bk-Canvas").first.bounding_box()
-    places = [(box["x"] + share * box["width"], box["y"] + 0.4 * box["height"]) for share in (0.3, 0.5, 0.6)]
+    places = [
+        (box["x"] + fraction * box["width"], box["y"] + 0.4 * box["height"]) for fraction in (0.3, 0.5, 0.6)
+    ]
     opened.page.mouse.move(*places[0])
     opened.page.mouse.down()
     for place in places[1:]:
@@ -188,6 +190,6 @@ def test_it_asks_no_other_machine_and_complains_of_nothing(opened, address):
     for tab in ("Result", "Surface", "Save and copy"):
         opened.show(tab)
     opened.page.wait_for_load_state("networkidle")
-    own = address.rpartition("/")[0]
-    assert [url for url in opened.requests if not url.startswith((own, "data:", "about:", "blob:"))] == []
+    origin = address.rpartition("/")[0]
+    assert [url for url in opened.requests if not url.startswith((origin, "data:", "about:", "blob:"))] == []
     assert opened.complaints == []

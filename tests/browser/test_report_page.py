@@ -30,23 +30,23 @@ def a_result(shape=SHAPE, pixel=PIXEL):
     grid = np.meshgrid(x, y)
     height = height_at(*grid)
     height[np.hypot(grid[0] - HOLE[0], grid[1] - HOLE[1]) < 0.5] = np.nan
-    known = np.isfinite(height)
+    finite = np.isfinite(height)
     slopes = np.gradient(height, y, x)
     normals = np.stack([-slopes[1], -slopes[0], np.ones(shape)], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     filled = np.hypot(grid[0] - 2, grid[1] + 2) < 0.6
     maps = {
         "height": height.astype(np.float32),
-        "height_sigma": np.where(known & ~filled, 0.002, np.nan).astype(np.float32),
+        "height_sigma": np.where(finite & ~filled, 0.002, np.nan).astype(np.float32),
         "normals": normals.astype(np.float32),
         "zenith": np.arccos(normals[..., 2]).astype(np.float32),
         "azimuth": np.arctan2(normals[..., 1], normals[..., 0]).astype(np.float32),
         "normals_sigma": np.full(shape, 0.01, np.float32),
-        "status": np.where(known, 1, 2).astype(np.uint8),
+        "status": np.where(finite, 1, 2).astype(np.uint8),
         "edges": (np.abs(np.hypot(grid[0] - HOLE[0], grid[1] - HOLE[1]) - 0.6) < 0.05).astype(np.uint8),
-        "contact": known.astype(np.uint8),
+        "contact": finite.astype(np.uint8),
         "filled": filled.astype(np.uint8),
-        "component": np.where(known, 0, -1).astype(np.int32),
+        "component": np.where(finite, 0, -1).astype(np.int32),
         "offset_unknown": np.zeros(1, np.uint8),
     }
     process = {
@@ -80,9 +80,9 @@ def upright(opened):
 
 def read(text):
     """The numbers of a readout: x, y and z."""
-    found = re.match(r"x (\S+) mm\s+y (\S+) mm\s+z (\S+) mm", text)
-    assert found, text
-    return [float(number.replace("\N{MINUS SIGN}", "-")) for number in found.groups()]
+    match = re.match(r"x (\S+) mm\s+y (\S+) mm\s+z (\S+) mm", text)
+    assert match, text
+    return [float(number.replace("\N{MINUS SIGN}", "-")) for number in match.groups()]
 
 
 def drawn(surface):
@@ -118,10 +118,10 @@ def test_a_page_fits_every_screen(opening, path, scheme):
     opened = opening(path, color_scheme=scheme)
     for width in (320, 390, 800, 1280):
         opened.page.set_viewport_size({"width": width, "height": 850})
-        wide, seen = opened.page.evaluate(
+        wide, content_width = opened.page.evaluate(
             "() => ['scrollWidth', 'clientWidth'].map((name) => document.documentElement[name])"
         )
-        assert (wide, seen) == (width, width)
+        assert (wide, content_width) == (width, width)
         _, _, across, down = opened.box()
         assert across > 0.6 * width
         assert down < 850
@@ -134,7 +134,9 @@ def test_letters_have_contrast_in_light_and_dark_themes(opening, path):
         ink, paper = page.evaluate(
             "() => ['color', 'backgroundColor'].map((name) => getComputedStyle(document.body)[name])"
         )
-        lightness = [np.mean([int(part) for part in re.findall(r"\d+", one)[:3]]) for one in (ink, paper)]
+        lightness = [
+            np.mean([int(part) for part in re.findall(r"\d+", colour)[:3]]) for colour in (ink, paper)
+        ]
         assert (lightness[0] > lightness[1]) == dark
         assert abs(lightness[0] - lightness[1]) > 150
 
@@ -142,9 +144,9 @@ def test_letters_have_contrast_in_light_and_dark_themes(opening, path):
 def test_the_surface_is_drawn_right_side_up(opening, path):
     opened = opening(path)
     surface = upright(opened)
-    seen = drawn(surface)
-    rows, columns = np.nonzero(seen)
-    assert seen.mean() > 0.1
+    pixels = drawn(surface)
+    rows, columns = np.nonzero(pixels)
+    assert pixels.mean() > 0.1
     # From above: x to the right, y up, and a millimetre as long along both.
     scale = (np.ptp(columns) + 1) / ((SHAPE[1] - 1) * PIXEL)
     assert (np.ptp(rows) + 1) / ((SHAPE[0] - 1) * PIXEL) == pytest.approx(scale, rel=0.02)
@@ -170,8 +172,8 @@ def test_what_one_points_at_is_read(opening, path):
     scale = (np.ptp(columns) + 1) / ((SHAPE[1] - 1) * PIXEL)
     high, wide = surface.shape[:2]
     for x, y in ((0.0, 0.0), PEAK, (-3.0, 2.0)):
-        found = read(opened.point((middle[0] + x * scale) / wide, (middle[1] - y * scale) / high))
-        np.testing.assert_allclose(found, [x, y, height_at(x, y)], atol=0.03)
+        position = read(opened.point((middle[0] + x * scale) / wide, (middle[1] - y * scale) / high))
+        np.testing.assert_allclose(position, [x, y, height_at(x, y)], atol=0.03)
     hole = opened.point((middle[0] + HOLE[0] * scale) / wide, (middle[1] - HOLE[1] * scale) / high)
     assert hole == ""
     filled = opened.point((middle[0] + 2 * scale) / wide, (middle[1] + 2 * scale) / high)
@@ -181,14 +183,14 @@ def test_what_one_points_at_is_read(opening, path):
 
 def test_what_one_points_at_from_the_side_is_on_the_surface(opening, path):
     opened = opening(path)
-    found = []
+    positions = []
     for across in np.linspace(0.35, 0.65, 4):
         for down in (0.45, 0.6):
-            said = opened.point(across, down)
-            if said:
-                found.append(read(said))
-    assert len(found) > 4
-    for x, y, z in found:
+            text = opened.point(across, down)
+            if text:
+                positions.append(read(text))
+    assert len(positions) > 4
+    for x, y, z in positions:
         assert z == pytest.approx(height_at(x, y), abs=0.02)
 
 
@@ -238,9 +240,9 @@ def test_drag_keys_wheel_and_slider_change_the_view_and_a_double_click_brings_it
 
 def test_what_is_under_the_pointer_stays_there_when_one_zooms(opening, path):
     opened = opening(path)
-    before, seen = read(opened.point(0.55, 0.5)), opened.surface()
+    before, shown = read(opened.point(0.55, 0.5)), opened.surface()
     opened.page.mouse.wheel(0, -700)
-    opened.until(lambda surface: drawn(surface).sum() > 1.5 * drawn(seen).sum(), "the wheel does not zoom")
+    opened.until(lambda surface: drawn(surface).sum() > 1.5 * drawn(shown).sum(), "the wheel does not zoom")
     assert opened.point(0.1, 0.1) != opened.point(0.9, 0.9)
     np.testing.assert_allclose(read(opened.point(0.55, 0.5)), before, atol=0.02)
 

@@ -75,27 +75,27 @@ def test_a_batch_keeps_what_was_made_of_an_array_until_the_array_changes():
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("t.txt", "\n".join(f"{one:.1f}" for one in TRAVEL)),
-        ("t.txt", "# stage\n" + " ".join(f"{1000 * one:.0f}um" for one in TRAVEL)),
-        ("t.csv", "travel (mm),\r\n" + "\r\n".join(f"{one:.1f}," for one in TRAVEL)),
+        ("t.txt", "\n".join(f"{travel:.1f}" for travel in TRAVEL)),
+        ("t.txt", "# stage\n" + " ".join(f"{1000 * travel:.0f}um" for travel in TRAVEL)),
+        ("t.csv", "travel (mm),\r\n" + "\r\n".join(f"{travel:.1f}," for travel in TRAVEL)),
     ],
 )
 def test_the_travel_of_each_frame_is_read_from_a_text(stack, name, text):
     Path(name).write_bytes(text.encode())
-    found = heights("ball.npy", "--travel", name, *SIZE, "--dark", 0, "--bright", 255)
-    np.testing.assert_allclose(found, stack[1].height, atol=1e-6)
+    height = heights("ball.npy", "--travel", name, *SIZE, "--dark", 0, "--bright", 255)
+    np.testing.assert_allclose(height, stack[1].height, atol=1e-6)
 
 
 def test_the_travel_of_a_real_stage_places_heights():
     uneven = TRAVEL**2
     np.save("t.npy", uneven)
     even = heights("ball.npy", *STEPS, "--no-fill", "--no-subframe")
-    found = heights("ball.npy", "--travel", "t.npy", "--no-fill", "--no-subframe")
-    np.testing.assert_allclose(found, -(even**2), rtol=1e-6)
+    height = heights("ball.npy", "--travel", "t.npy", "--no-fill", "--no-subframe")
+    np.testing.assert_allclose(height, -(even**2), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["ball.npy"], "ball.npy does not state the position of the body in each frame: give one of travel"),
         (["ball.npy", "--motion", "axial"], "ball.npy: axial motion needs the phase of each frame"),
@@ -119,7 +119,7 @@ def test_the_travel_of_a_real_stage_places_heights():
         (["two.npz", *STEPS], "two.npz contains the arrays a, b: choose the frames with --dataset"),
     ],
 )
-def test_an_array_that_cannot_be_used_is_refused_in_a_line(words, said):
+def test_an_array_that_cannot_be_used_is_refused_in_a_line(words, message):
     Path("t.txt").write_text("0.1 0.2")
     for name in ("cut.npy", "cut.npz"):
         Path(name).write_bytes(Path(f"ball{Path(name).suffix}").read_bytes()[:700])
@@ -127,18 +127,18 @@ def test_an_array_that_cannot_be_used_is_refused_in_a_line(words, said):
     np.save("negative.npy", np.full((4, 5, 6), -1, np.int16))
     np.save("flat.npy", np.zeros((4, 5), np.uint8))
     np.savez("two.npz", a=np.zeros((4, 5, 6), np.uint8), b=np.zeros((4, 5, 6), np.uint8))
-    refused(said, "reconstruct", *words, "-o", "out.h5")
+    refused(message, "reconstruct", *words, "-o", "out.h5")
 
 
 def test_what_an_array_or_an_archive_holds_is_reported():
     assert run("info ball.npy").out.split("\n")[1].split(maxsplit=1)[1] == "12 x 12 x 16, uint8"
-    told = json.loads(run("info ball.npz --json").out)
-    assert (told["travel"], told["dark"]) == ("12, float64", "one number, float64")
+    report = json.loads(run("info ball.npz --json").out)
+    assert (report["travel"], report["dark"]) == ("12, float64", "one number, float64")
     Path("cut.npz").write_bytes(Path("ball.npz").read_bytes()[:700])
     assert run("info cut.npz").said.startswith("mirrorskin: cut.npz is not a NumPy array")
 
 
-def test_an_import_without_the_pixel_size_says_what_needs_it():
+def test_an_import_without_the_pixel_size_names_the_commands_that_need_it():
     words = ("import", "ball.npy", "--motion", "vertical", *STEPS, "-o", "rec.h5")
     assert "no pixel size" in run(*words).said
     assert run(*words, *SIZE, "--overwrite").said == ""
@@ -149,25 +149,25 @@ def test_an_import_without_the_pixel_size_says_what_needs_it():
 
 def test_frames_in_memory_have_a_result_that_can_be_saved(stack):
     frames, expected = stack
-    found = engine.reconstruct(frames, travel=TRAVEL, pixel_size=0.4, dark=0, bright=255)
-    np.testing.assert_array_equal(found.height, expected.height)
-    np.testing.assert_array_equal(found.x, expected.x)
-    io.save_result(found, "saved.h5")
+    result = engine.reconstruct(frames, travel=TRAVEL, pixel_size=0.4, dark=0, bright=255)
+    np.testing.assert_array_equal(result.height, expected.height)
+    np.testing.assert_array_equal(result.x, expected.x)
+    io.save_result(result, "saved.h5")
     np.testing.assert_array_equal(io.open_result("saved.h5").height, expected.height)
 
 
 def test_frames_with_phases_are_a_rotation():
     phase = np.arange(8) * np.pi / 4
     frames = np.broadcast_to((100 + 20 * np.cos(phase))[:, None, None], (8, 6, 7)).astype(np.float32)
-    found = engine.reconstruct(
+    result = engine.reconstruct(
         frames, phase=phase, tilt=0.05, pixel_size=(0.1, 0.1), zenith_gain=400.0, zenith_offset=0.0, noise=0.5
     )
-    assert found.normals.shape == (6, 7, 3)
-    assert found.process["source"] == "the array of frames"
+    assert result.normals.shape == (6, 7, 3)
+    assert result.process["source"] == "the array of frames"
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("options", "message"),
     [
         ({}, "does not state the position of the body"),
         ({"travel": TRAVEL, "phase": TRAVEL}, "has travel and phase: give one of"),
@@ -176,9 +176,9 @@ def test_frames_with_phases_are_a_rotation():
         ({"travel": TRAVEL, "pixel_size": "0.1mm"}, "pixel_size is '0.1mm'"),
     ],
 )
-def test_frames_in_memory_that_do_not_fit_are_refused(stack, given, said):
-    with pytest.raises(io.InputError, match=said):
-        engine.reconstruct(stack[0], **given)
+def test_frames_in_memory_that_do_not_fit_are_refused(stack, options, message):
+    with pytest.raises(io.InputError, match=message):
+        engine.reconstruct(stack[0], **options)
 
 
 def test_a_recording_has_its_own_travel(folder):
@@ -188,9 +188,9 @@ def test_a_recording_has_its_own_travel(folder):
 
 def test_levels_that_were_not_given_are_named():
     words = ("reconstruct", "ball.npy", *STEPS, *SIZE, "-o", "out.h5", "--overwrite")
-    said = run(*words).said
-    assert "ball.npy: no dark and bright given: estimated as " in said
-    assert said.count("\n") == 1
+    text = run(*words).said
+    assert "ball.npy: no dark and bright given: estimated as " in text
+    assert text.count("\n") == 1
     assert "no bright given: estimated as " in run(*words, "--dark", 0).said
     assert "no dark" not in run(*words, "--dark", 0, "--bright", 255).said
 
@@ -213,8 +213,8 @@ def test_a_batch_takes_the_travel_of_a_file():
 
 def test_levels_that_the_frames_do_not_show_are_warned_of():
     np.save("dark.npy", np.full((4, 5, 6), 12, np.uint8))
-    said = run("reconstruct dark.npy", *STEPS, *SIZE, "-o", "out.h5").said
-    assert "the range of the frames' type is taken, and heights may be wrong" in said
+    text = run("reconstruct dark.npy", *STEPS, *SIZE, "-o", "out.h5").said
+    assert "the range of the frames' type is taken, and heights may be wrong" in text
 
 
 def test_a_result_without_an_answer_ends_with_the_reason():
@@ -242,6 +242,6 @@ def test_a_twist_in_degrees_is_reported():
     frames = np.random.default_rng(1).integers(80, 120, (6, 40, 40)).astype(np.uint8)
     np.savez("twist.npz", frames=frames, twist=2.0 * np.arange(6))
     with io.open_recording("twist.npz") as recording:
-        assert [one.text for one in recording.findings] == [
+        assert [finding.text for finding in recording.findings] == [
             "the twist spans 10 rad, more than half a turn: is it in degrees?"
         ]

@@ -34,8 +34,10 @@ def folder(tmp_path, monkeypatch):
 def process(*words, command=("-m", "mirrorskin.cli.main"), **settings):
     """Run the command line as a user does."""
     command = [sys.executable, *command, *words]
-    done = subprocess.run(command, capture_output=True, check=False, **settings)
-    return Ended(done.returncode, done.stdout.decode(errors="replace"), done.stderr.decode(errors="replace"))
+    process = subprocess.run(command, capture_output=True, check=False, **settings)
+    return Ended(
+        process.returncode, process.stdout.decode(errors="replace"), process.stderr.decode(errors="replace")
+    )
 
 
 def change(name, value=None):
@@ -167,14 +169,14 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_reconstruct_refuses_in_one_line(case):
-    make, options, said = CASES[case]
+    make, options, message = CASES[case]
     make()
     name = [] if case == "an input with a long name" else ["bad.h5"]
-    refused(said, "reconstruct", *name, *options)
+    refused(message, "reconstruct", *name, *options)
 
 
 @pytest.mark.parametrize(
-    ("make", "words", "said"),
+    ("make", "words", "message"),
     [
         (cut_to(30), ["reconstruct", "bad.h5"], "bad.h5: it is "),
         (
@@ -184,13 +186,13 @@ def test_reconstruct_refuses_in_one_line(case):
         ),
     ],
 )
-def test_a_process_ends_with_one_line(make, words, said):
+def test_a_process_ends_with_one_line(make, words, message):
     make()
-    refused(said, *words, run=process)
+    refused(message, *words, run=process)
 
 
 @pytest.mark.parametrize(
-    ("make", "words", "said"),
+    ("make", "words", "message"),
     [
         (a_result, ["score", "bad.h5", "--truth", "bad.h5"], "bad.h5 is a result: give the recording"),
         (
@@ -210,9 +212,9 @@ def test_a_process_ends_with_one_line(make, words, said):
         (stack(), ["simulate", "vertical", "--object", "bad.h5", "-o", "bad.h5"], "bad.h5 is the input"),
     ],
 )
-def test_other_commands_refuse_in_one_line(make, words, said):
+def test_other_commands_refuse_in_one_line(make, words, message):
     make()
-    refused(said, *words)
+    refused(message, *words)
 
 
 def test_a_result_of_another_size_is_not_scored():

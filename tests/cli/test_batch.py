@@ -38,9 +38,9 @@ def test_bad_recordings_of_every_kind_are_reported_and_the_rest_is_done():
     for name, make in SOUND.items():
         make(Path(name))
     bad = [make(Path(f"{make.__name__}.h5")).name for make in BAD]
-    code, out, said = run("batch", *bad, *SOUND, "-o", "out")
+    code, out, errors = run("batch", *bad, *SOUND, "-o", "out")
     lines = out.splitlines()
-    assert (code, said) == (1, "")
+    assert (code, errors) == (1, "")
     assert results() == ["press-result.h5", "turn-result.h5"]
     for name, words in zip(bad, BAD.values(), strict=True):
         assert sum(line.startswith("failed: ") and name in line and words in line for line in lines) == 2
@@ -99,15 +99,15 @@ def test_remedies_are_those_of_a_batch():
         file.update(foreign)
     assert "choose with dataset in [stack] of --settings" in run("batch a.h5 -o out").out
     Path("batch.toml").write_text('[stack]\ndataset = "x"\n')
-    said = run("batch a.h5 -o out --settings batch.toml").out
-    assert "give motion in [stack] of --settings, one of vertical" in said
+    text = run("batch a.h5 -o out --settings batch.toml").out
+    assert "give motion in [stack] of --settings, one of vertical" in text
 
 
 def test_a_motion_that_contradicts_a_file_fails_it():
     presses("a.h5")
     Path("batch.toml").write_text('[stack]\nmotion = "axial"\n')
-    said = run("batch a.h5 -o out --settings batch.toml").out
-    assert "a.h5 states the motion vertical, but motion in [stack] of --settings is axial" in said
+    text = run("batch a.h5 -o out --settings batch.toml").out
+    assert "a.h5 states the motion vertical, but motion in [stack] of --settings is axial" in text
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
@@ -133,17 +133,17 @@ def test_a_name_that_is_not_text_is_shown_as_well_as_can_be(monkeypatch, encodin
 def test_json_lists_every_file():
     presses("a.h5")
     missing(Path("b.h5"))
-    code, out, said = run("batch a.h5 b.h5 -o out --json")
-    told = json.loads(out)
-    assert (code, said) == (1, "")
-    assert {name: told[name] for name in ("output", "done", "kept", "failed", "bytes")} == {
+    code, out, errors = run("batch a.h5 b.h5 -o out --json")
+    report = json.loads(out)
+    assert (code, errors) == (1, "")
+    assert {name: report[name] for name in ("output", "done", "kept", "failed", "bytes")} == {
         "output": "out",
         "done": 1,
         "kept": 0,
         "failed": 1,
         "bytes": 8 * 5 * 7,
     }
-    second, first = told["files"]
+    second, first = report["files"]
     assert (first["source"], first["result"], first["state"]) == ("a.h5", "out/a-result.h5", "done")
     assert (first["motion"], first["bytes"]) == ("vertical", 8 * 5 * 7)
     assert (second["state"], second["message"]) == ("failed", "b.h5: no such file")
@@ -182,7 +182,7 @@ def test_a_terminal_shows_a_table(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ("x*.h5 -o out", "x*.h5: no file matches"),
         ("a.h5 -o no/out", "there is no folder no: make it first"),
@@ -200,13 +200,13 @@ def test_a_terminal_shows_a_table(monkeypatch):
         ("a.h5 out-result.h5 out-result.nxs out-result.h5.h5 -o out", "would be the result of two"),
     ],
 )
-def test_a_wrong_call_is_one_line_and_makes_nothing(tmp_path, words, said):
+def test_a_wrong_call_is_one_line_and_makes_nothing(tmp_path, words, message):
     presses("a.h5")
-    refused(said, f"batch {words}")
+    refused(message, f"batch {words}")
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
-def test_ctrl_c_leaves_whole_results_and_says_how_to_go_on(tmp_path):
+def test_ctrl_c_leaves_whole_results_and_prints_how_to_resume(tmp_path):
     presses("a.h5")
     for number in range(300):
         Path(f"{number:03}.h5").symlink_to("a.h5")
@@ -216,20 +216,20 @@ def test_ctrl_c_leaves_whole_results_and_says_how_to_go_on(tmp_path):
         for _ in range(3):  # who is in a hurry
             child.send_signal(signal.SIGINT)
             time.sleep(0.01)
-        rest, said = child.communicate(timeout=60)
+        rest, errors = child.communicate(timeout=60)
     assert child.returncode in (130, -signal.SIGINT)  # the last may come when the program has ended already
     assert first.split(" in ")[0] == "done: 000.h5"
     assert not half_written(tmp_path)
-    found = results()
-    assert 1 <= len(found) < 300
-    assert all(io.open_result(f"out/{name}").height is not None for name in found)
-    said = said.replace("mirrorskin: it is being stopped; two more Ctrl-C end it at once\n", "")
-    told = int(said.split()[2])
-    assert said == f"ended after {told} of 300: the same command resumes it\n"
+    written = results()
+    assert 1 <= len(written) < 300
+    assert all(io.open_result(f"out/{name}").height is not None for name in written)
+    errors = errors.replace("mirrorskin: it is being stopped; two more Ctrl-C end it at once\n", "")
+    count = int(errors.split()[2])
+    assert errors == f"ended after {count} of 300: the same command resumes it\n"
     # It may end between the count and the line, and a line whose writing is interrupted may come twice.
     lines = {line for line in [first.rstrip(), *rest.splitlines()] if line.startswith("done: ")}
-    assert told - len(lines) in (0, 1)
-    assert len(found) - told in (0, 1)
+    assert count - len(lines) in (0, 1)
+    assert len(written) - count in (0, 1)
 
 
 @pytest.mark.parametrize(
@@ -240,10 +240,10 @@ def test_ctrl_c_leaves_whole_results_and_says_how_to_go_on(tmp_path):
     ],
 )
 def test_a_cluster_is_given_the_same_jobs(monkeypatch, words, expected):
-    given = []
+    submitted = []
 
     def run_cluster(jobs, plan, **where):
-        given.append((jobs, plan.memory_limit, where))
+        submitted.append((jobs, plan.memory_limit, where))
         for job in jobs:
             yield Outcome(job, "done", "well", 0.5, 1000, "a device", "axial")
 
@@ -251,7 +251,7 @@ def test_a_cluster_is_given_the_same_jobs(monkeypatch, words, expected):
     presses("a.h5", "b.h5")
     code, out, _ = run(f"batch a.h5 b.h5 -o out --memory 1MB {words}")
     assert (code, out.splitlines()[0]) == (0, "done: a.h5 in 0.5 s, 0 MB/s: well")
-    assert given == [(make_jobs([Path("a.h5"), Path("b.h5")], Path("out")), 10**6, expected)]
+    assert submitted == [(make_jobs([Path("a.h5"), Path("b.h5")], Path("out")), 10**6, expected)]
 
 
 WEAR = """
@@ -292,15 +292,15 @@ def test_a_user_s_operation_runs_in_a_batch_and_is_resumed(workers):
     ]
     first, again = run(*words, "--json"), run(*words, "--json")
     states = [
-        {Path(one["source"]).name: one["state"] for one in json.loads(ended.out)["files"]}
+        {Path(file["source"]).name: file["state"] for file in json.loads(ended.out)["files"]}
         for ended in (first, again)
     ]
     assert states == [{"press.h5": "done", "turn.h5": "failed"}, {"press.h5": "kept", "turn.h5": "failed"}]
-    message = next(one["message"] for one in json.loads(first.out)["files"] if one["state"] == "failed")
+    message = next(file["message"] for file in json.loads(first.out)["files"] if file["state"] == "failed")
     assert "travel is missing: Wear needs it of each frame" in message
-    found = io.open_result("out/press-result.h5")
-    assert found.declaration("wear").quantity == "height"
-    assert (found.process["operation"], found.process["travel_offset"]) == ("Wear", pytest.approx(0.1))
+    result = io.open_result("out/press-result.h5")
+    assert result.declaration("wear").quantity == "height"
+    assert (result.process["operation"], result.process["travel_offset"]) == ("Wear", pytest.approx(0.1))
     Path("batch.toml").write_text(SETTINGS.replace("100um", "0.2mm"))
     changed = json.loads(run(*words, "--json").out)["files"]
-    assert [one["state"] for one in changed if "press" in one["source"]] == ["done"]
+    assert [file["state"] for file in changed if "press" in file["source"]] == ["done"]

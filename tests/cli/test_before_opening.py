@@ -69,8 +69,8 @@ def prepared(tmp_path_factory):
         (folder / "own.py").write_text(OWN)
         io.save_result(io.Result(contact=np.ones((5, 5), np.uint8)), folder / "small.h5")
         for name, camera in (("other.h5", "other"), ("same.h5", rig.settings.camera.name)):
-            known = io.CameraId(camera, (24, 32), np.dtype(np.uint8))
-            io.save_calibration(io.Calibration(known), folder / name)
+            camera_id = io.CameraId(camera, (24, 32), np.dtype(np.uint8))
+            io.save_calibration(io.Calibration(camera_id), folder / name)
 
         def opening(*_, **__):
             opened.append("opened")
@@ -90,7 +90,7 @@ def opened(prepared, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (f"{PRESS} --operation own.py:Twice", "needs all frames twice, so it cannot run live"),
         (f"{PRESS} --operation own.py:Posed", "Posed needs pose"),
@@ -148,9 +148,9 @@ def opened(prepared, monkeypatch):
         ("calibrate scale none.png --board chessboard:8x6:1mm -o cal.h5", "none.png"),
     ],
 )
-def test_a_call_that_cannot_be_opens_nothing(opened, words, said):
+def test_a_call_that_cannot_be_opens_nothing(opened, words, message):
     line = words if "rigs/" in words else f"{words} --rig rigs/{'dim' if words == ZENITH else 'rig'}.toml"
-    refused(said, line)
+    refused(message, line)
     assert opened == []
 
 

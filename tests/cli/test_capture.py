@@ -238,14 +238,14 @@ def test_a_capture_that_fails_at_its_first_frame_leaves_a_recording(emulated, ol
 def test_a_capture_that_is_cut_short_leaves_a_recording_and_names_its_own(emulated, older, monkeypatch):
     fail_at(monkeypatch, 2)
     ended = capture(emulated, "vertical", "-o", older[0], *STEPS, "--overwrite")
-    own = older[0].with_name("older-partial.h5")
+    partial = older[0].with_name("older-partial.h5")
     assert ended.code == 1
     assert ended.said == (
-        f"mirrorskin: the camera is lost: plug it in; {own} was cut short and holds 2 frames;"
+        f"mirrorskin: the camera is lost: plug it in; {partial} was cut short and holds 2 frames;"
         f" the older {older[0]} is unchanged\n"
     )
     assert older[0].read_bytes() == older[1]
-    with io.open_recording(own) as recording:
+    with io.open_recording(partial) as recording:
         assert recording.state == "cut short: the camera is lost: plug it in"
 
 
@@ -267,7 +267,7 @@ def test_a_file_that_fails_ends_a_capture_in_a_line(emulated, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["vertical", "--stop", "9mm", "--step", "1mm"], "beyond the axis"),
         (["axial", "--press", "1mm", "--tilt", "20deg", "--rate", "1"], "exceeds the maximum"),
@@ -324,10 +324,10 @@ def test_a_file_that_fails_ends_a_capture_in_a_line(emulated, tmp_path):
         ),
     ],
 )
-def test_a_call_that_cannot_be_opens_nothing(emulated, tmp_path, monkeypatch, words, said):
+def test_a_call_that_cannot_be_opens_nothing(emulated, tmp_path, monkeypatch, words, message):
     monkeypatch.setattr(rigs, "open_rig", None)
     path = tmp_path / "none.h5"
-    refused(said, emulated, *words, "-o", path, run=capture)
+    refused(message, emulated, *words, "-o", path, run=capture)
     assert not path.exists()
 
 
@@ -343,7 +343,7 @@ def test_a_port_that_is_missing_is_one_line(emulated, tmp_path):
     refused("none", "capture vertical --rig", file, "-o", tmp_path / "a.h5", "--stop", "1mm", "--step", "1mm")
 
 
-def test_a_stage_that_is_said_to_home_and_does_not_is_refused(emulated, tmp_path):
+def test_a_stage_that_does_not_home_as_its_file_states_is_refused(emulated, tmp_path):
     rig, file = emulated
     other = file.with_name("home.toml")
     other.write_text(file.read_text().replace("home = false", "home = true"))
@@ -354,11 +354,11 @@ def test_a_stage_that_is_said_to_home_and_does_not_is_refused(emulated, tmp_path
 
 def test_contact_is_found_and_the_zero_printed(emulated):
     ended = done("rig probe", emulated[1], "--from", "-1mm", "--step", "0.2mm")
-    found = re.search(r"first contact at a travel of (\S+) ± 0.1 mm; .* set zero = (\S+) in", ended.out)
+    match = re.search(r"first contact at a travel of (\S+) ± 0.1 mm; .* set zero = (\S+) in", ended.out)
     assert (
-        -0.11 <= float(found[1]) <= 0.31
+        -0.11 <= float(match[1]) <= 0.31
     )  # the sphere's top lies at 0, and its light needs a pixel of contact
-    assert float(found[2]) == pytest.approx(emulated[0].settings.stage.travel.coordinate(float(found[1])))
+    assert float(match[2]) == pytest.approx(emulated[0].settings.stage.travel.coordinate(float(match[1])))
 
 
 def test_contact_from_the_start_is_refused(emulated):

@@ -34,9 +34,9 @@ GIVEN = [
 
 @pytest.mark.parametrize("levels", [["--dark", 20, "--bright", 200], ["--dark", 20], []])
 def test_the_method_reaches_the_engine(folder, levels):
-    told = json.loads(done(*GIVEN, *levels, "--json").out)
-    assert told["process"]["method"] == "change-point"
-    kernels = {record["name"] for record in told["profile"]}
+    report = json.loads(done(*GIVEN, *levels, "--json").out)
+    assert report["process"]["method"] == "change-point"
+    kernels = {record["name"] for record in report["profile"]}
     passes = {"changepoint_scan"} if len(levels) == 4 else {"changepoint_sum", "changepoint_split"}
     assert kernels >= passes | {"changepoint_heights"}
     height = io.open_result(folder / "press-result.h5").height
@@ -45,7 +45,7 @@ def test_the_method_reaches_the_engine(folder, levels):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["--no-subframe"], "needs method 'threshold'"),
         (["--hold", "13"], "hold 13"),
@@ -53,6 +53,6 @@ def test_the_method_reaches_the_engine(folder, levels):
         (["--method", "guess"], "guess"),
     ],
 )
-def test_impossible_input_is_refused_in_one_line(folder, words, said):
-    refused(said, *GIVEN, *words)
+def test_impossible_input_is_refused_in_one_line(folder, words, message):
+    refused(message, *GIVEN, *words)
     assert not (folder / "press-result.h5").exists()

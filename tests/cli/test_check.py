@@ -44,8 +44,8 @@ def test_limits_are_options():
 
 
 def test_the_report_is_json():
-    found = json.loads(done("check simulated.npy --travel-step 100mm --json").out)
-    assert [one["kind"] for one in found["findings"]] == ["travel"]
+    report = json.loads(done("check simulated.npy --travel-step 100mm --json").out)
+    assert [finding["kind"] for finding in report["findings"]] == ["travel"]
 
 
 @pytest.mark.parametrize(

@@ -72,5 +72,5 @@ def test_a_batch_uses_damaged_frames_with_a_setting():
 def test_a_crop_reports_that_it_is_not_verified(line):
     press(Path("press.h5"))
     rotation(Path("turn.h5"))
-    said = run(line, "--region", "1,1,4x3").said
-    assert said.count("the frames were not verified") == line.count(".h5")
+    text = run(line, "--region", "1,1,4x3").said
+    assert text.count("the frames were not verified") == line.count(".h5")

@@ -48,16 +48,16 @@ def help_of(*words):
         f"heavy = {HEAVY} & set(sys.modules)\n"
         "sys.exit(str(heavy) if heavy else 0)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+    return process.stdout
 
 
 def test_help_imports_nothing_heavy():
-    said = help_of()
+    text = help_of()
     commands = ("reconstruct", "correlate", "simulate", "score", "import", "demo", "devices", "info", "bench")
     for command in commands:
-        assert f"\n  {command} " in said
+        assert f"\n  {command} " in text
 
 
 @pytest.mark.parametrize(
@@ -97,11 +97,11 @@ def test_options_reach_the_engine(folder):
         "0",
         "--no-fill",
     ]
-    told = json.loads(mirrorskin("reconstruct", "sphere.h5", "-o", "o.h5", *words, "--json", cwd=folder))
-    process = told["process"]
+    report = json.loads(mirrorskin("reconstruct", "sphere.h5", "-o", "o.h5", *words, "--json", cwd=folder))
+    process = report["process"]
     assert (process["threshold"], process["hold"], process["subframe"]) == (0.3, 1, False)
-    assert told["summary"]["answered"] > 1000
-    assert {record["name"] for record in told["profile"]} >= {"onset_scan"}
+    assert report["summary"]["answered"] > 1000
+    assert {record["name"] for record in report["profile"]} >= {"onset_scan"}
     result = io.open_result(folder / "o.h5")
     heights = result.height[np.isfinite(result.height)]
     assert set(np.unique(heights)) <= set((-0.1 * np.arange(1, 31)).astype(np.float32))
@@ -145,15 +145,15 @@ def test_devices_lists_what_there_is():
 )
 def test_what_is_given_is_used(folder, words, name, value):
     words = ["-o", "g.h5", "--overwrite", *words, "--json"]
-    told = json.loads(mirrorskin("reconstruct", "sphere.h5", *words, cwd=folder))
+    report = json.loads(mirrorskin("reconstruct", "sphere.h5", *words, cwd=folder))
     if value is None:
-        assert told["summary"]["highest"] < -5
+        assert report["summary"]["highest"] < -5
     else:
-        assert told["process"][name] == value
+        assert report["process"][name] == value
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ("--bogus", "--bogus"),
         ("simulate sideways -o a.h5", "sideways"),
@@ -163,10 +163,10 @@ def test_what_is_given_is_used(folder, words, name, value):
         ("import . -o a.h5 --motion axial --phase-step 45deg --travel-step 1mm", "travel"),
     ],
 )
-def test_a_wrong_call_is_one_line(tmp_path, words, said):
+def test_a_wrong_call_is_one_line(tmp_path, words, message):
     ended = run(words)
     assert ended.code == 2
-    assert said in ended.said
+    assert message in ended.said
     assert ended.said.count("\n") == 1
 
 

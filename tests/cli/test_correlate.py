@@ -33,9 +33,9 @@ def fitted(frames, phase):
     """Fit by NumPy's least squares: mean, cosine, sine, and what is left."""
     table = np.stack([np.ones_like(phase), np.cos(phase), np.sin(phase)], axis=1)
     counts = frames.reshape(len(frames), -1).astype(float)
-    found = np.linalg.lstsq(table, counts, rcond=None)[0]
-    left = np.sqrt(np.sum((counts - table @ found) ** 2, axis=0) / (len(frames) - 3))
-    return [values.reshape(frames.shape[1:]) for values in (*found, left)]
+    coefficients = np.linalg.lstsq(table, counts, rcond=None)[0]
+    left = np.sqrt(np.sum((counts - table @ coefficients) ** 2, axis=0) / (len(frames) - 3))
+    return [values.reshape(frames.shape[1:]) for values in (*coefficients, left)]
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
@@ -72,12 +72,12 @@ def test_the_output_is_printed_in_a_line_and_plotted():
 
 def test_the_process_is_stored():
     ended = run("correlate", theirs(), "--phases", "phases.txt", "--pixel-size", "0.5mm", "--json")
-    told = json.loads(ended.out)
-    assert told["output"] == "theirs-correlation.h5"
-    assert told["summary"]["answered"] == 35
-    assert told["profile"]
+    report = json.loads(ended.out)
+    assert report["output"] == "theirs-correlation.h5"
+    assert report["summary"]["answered"] == 35
+    assert report["profile"]
     process = io.open_result("theirs-correlation.h5").process
-    assert told["process"] == process
+    assert report["process"] == process
     assert (process["source"], process["dataset"], process["frames"]) == ("theirs.h5", "/some/stack", 8)
     assert {"program", "version", "date", "device", "driver", "source_fingerprint"} <= set(process)
     assert io.open_result("theirs-correlation.h5").x[1] == -1.0
@@ -87,8 +87,8 @@ def test_a_rotation_has_its_own_phases_and_a_press_needs_them():
     record(MadeUp(random_stack(), io.Header("axial"), phase=np.array(UNEVEN)), Path("turn.h5"))
     assert run("correlate turn.h5").code == 0
     assert run("correlate", theirs(), "--phases", "phases.txt").code == 0
-    own, given = (io.open_result(f"{name}-correlation.h5").cosine for name in ("turn", "theirs"))
-    np.testing.assert_array_equal(own, given)
+    recorded, replaced = (io.open_result(f"{name}-correlation.h5").cosine for name in ("turn", "theirs"))
+    np.testing.assert_array_equal(recorded, replaced)
     record(sphere(), Path("press.h5"))
     assert run("correlate press.h5 --phase-step 45deg").code == 0
     assert "--phase-step" in run("correlate press.h5").said
@@ -135,12 +135,12 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_bad_input_is_one_line(case):
-    make, words, said_of = CASES[case]
+    make, words, message = CASES[case]
     make()
     Path("seven.txt").write_text(PHASES.rpartition(" ")[0])
     Path("number.txt").write_text("0deg\n45\n90deg")
     before = set(Path().iterdir())
-    refused(said_of, "correlate theirs.h5", *words)
+    refused(message, "correlate theirs.h5", *words)
     assert set(Path().iterdir()) == before
 
 

@@ -37,7 +37,7 @@ class Turns(Configured):
     robust: bool = option(default=False, help="keep breaks")
 
 
-TERMS = {one.name: one for one in terms_of({"vertical": Onsets, "axial": Turns})}
+TERMS = {term.name: term for term in terms_of({"vertical": Onsets, "axial": Turns})}
 
 
 def test_options_of_one_name_become_one_that_names_the_motions_where_they_differ():
@@ -60,7 +60,7 @@ def test_options_of_one_name_but_different_units_are_refused():
 
 
 def test_defaults_and_placeholders_are_written_as_on_the_command_line():
-    shown = {name: (one.metavar, one.shown_default) for name, one in TERMS.items()}
+    shown = {name: (term.metavar, term.shown_default) for name, term in TERMS.items()}
     assert shown["threshold"] == ("SHARE", "0.5")
     assert shown["length"] == ("LENGTH", "0.1mm")
     assert shown["tilt"] == ("ANGLE|estimate", "2.5deg")

@@ -52,7 +52,7 @@ EACH = pytest.mark.parametrize("name", [*DECLARED, "wear_sigma"])
 
 def of(name):
     """Return a result with one declared map, and its standard deviation if it has one."""
-    maps = {one: MAPS[one] for one in MAPS if one.removesuffix("_sigma") == name.removesuffix("_sigma")}
+    maps = {key: MAPS[key] for key in MAPS if key.removesuffix("_sigma") == name.removesuffix("_sigma")}
     process = {"program": "mirrorskin", "source": "own.h5"}
     return io.Result(maps, x=X, y=Y, process=process, declarations=DECLARED)
 
@@ -61,9 +61,9 @@ def of(name):
 @pytest.mark.parametrize("suffix", ["h5", "zarr"])
 def test_a_declared_map_is_read_as_it_was_written(name, suffix, tmp_path):
     io.save_result(of(name), tmp_path / f"own.{suffix}")
-    found = io.open_result(tmp_path / f"own.{suffix}")
-    assert_same(found, of(name))
-    assert found.declaration(name) == of(name).declaration(name)
+    result = io.open_result(tmp_path / f"own.{suffix}")
+    assert_same(result, of(name))
+    assert result.declaration(name) == of(name).declaration(name)
 
 
 @EACH
@@ -82,7 +82,7 @@ def test_an_npz_has_units_and_legends(name, tmp_path):
     assert run("export", saved(name, tmp_path), "-o", tmp_path / "own.npz").code == 0
     with np.load(tmp_path / "own.npz") as arrays:
         np.testing.assert_array_equal(arrays[name], MAPS[name], strict=True)
-        units, legends = (json.loads(str(arrays[one])) for one in ("units", "legends"))
+        units, legends = (json.loads(str(arrays[key])) for key in ("units", "legends"))
     declared = of(name).declaration(name)
     assert units.get(name, "") == declared.unit
     assert legends.get(name, {}) == {str(code): text for code, text in declared.codes.items()}
@@ -159,8 +159,8 @@ def test_values_are_drawn_in_the_displayed_unit_and_without_undefined_ones():
 
 def test_the_overview_has_the_legend_of_the_codes():
     axes = panel(overview(of("material"), name="own.h5"), "Materials")
-    said = [text.get_text().splitlines()[0] for text in axes.get_legend().get_texts()]
-    assert said == ["unknown", "steel & tin", "glass"]
+    text = [text.get_text().splitlines()[0] for text in axes.get_legend().get_texts()]
+    assert text == ["unknown", "steel & tin", "glass"]
 
 
 def test_texts_with_dollar_signs_are_not_read_as_formulas(tmp_path):
@@ -216,12 +216,12 @@ def test_a_declared_map_is_undistorted_like_a_built_in_one(name):
         "flow": "displacement",
         "stress": "growth",
     }
-    found, expected = undistort(of(name), bent_lens())[name], undistort(built_in, bent_lens())[twin[name]]
-    assert not np.array_equal(found, MAPS[name])
+    corrected, expected = undistort(of(name), bent_lens())[name], undistort(built_in, bent_lens())[twin[name]]
+    assert not np.array_equal(corrected, MAPS[name])
     if name == "stress":
         expected = np.where(np.isnan(expected), np.float32(-1), expected)
-    np.testing.assert_array_equal(found, expected)
-    assert found.dtype == MAPS[name].dtype
+    np.testing.assert_array_equal(corrected, expected)
+    assert corrected.dtype == MAPS[name].dtype
 
 
 def test_measure_takes_the_map_that_is_a_height():
@@ -243,8 +243,8 @@ def test_poses_are_estimated_from_the_map_that_is_a_height():
     worn = of("wear").assign(height=bumps)
     assert list(worn) == ["wear", "wear_sigma"]
     built_in = io.Result(height=bumps, height_sigma=SIGMA, x=X, y=Y)
-    found, expected = (engine.pose.estimate_pose(one, one) for one in (worn, built_in))
-    np.testing.assert_array_equal(found.translation, expected.translation)
+    pose, expected = (engine.pose.estimate_pose(height, height) for height in (worn, built_in))
+    np.testing.assert_array_equal(pose.translation, expected.translation)
 
 
 def test_the_heights_of_a_fusion_may_be_the_map_that_is_a_height(tmp_path):
@@ -285,18 +285,18 @@ class Worn(engine.Operation):
         pass
 
     def result(self):
-        own = {"wear": BALL.astype(float), "wear_sigma": SIGMA.astype(float), "ratio": 12.5, "note": "new"}
-        return own | {"material": MATERIAL.astype(int), "flow": FLOW, "stress": STRESS, "status": MATERIAL}
+        maps = {"wear": BALL.astype(float), "wear_sigma": SIGMA.astype(float), "ratio": 12.5, "note": "new"}
+        return maps | {"material": MATERIAL.astype(int), "flow": FLOW, "stress": STRESS, "status": MATERIAL}
 
 
 def test_an_operation_declares_its_maps(tmp_path):
-    found = engine.run(np.zeros((2, *SHAPE), np.uint8), Worn)
+    result = engine.run(np.zeros((2, *SHAPE), np.uint8), Worn)
     for name, values in MAPS.items():
-        np.testing.assert_array_equal(found[name], values, strict=True)
-    assert (found.numbers(), found.process["note"]) == ({"ratio": 12.5}, "new")
-    io.save_result(found, tmp_path / "own.h5")
-    assert_same(io.open_result(tmp_path / "own.h5"), found)
-    assert found.declaration("status").codes == {}, "a legend is not guessed from the name"
+        np.testing.assert_array_equal(result[name], values, strict=True)
+    assert (result.numbers(), result.process["note"]) == ({"ratio": 12.5}, "new")
+    io.save_result(result, tmp_path / "own.h5")
+    assert_same(io.open_result(tmp_path / "own.h5"), result)
+    assert result.declaration("status").codes == {}, "a legend is not guessed from the name"
     assert io.open_result(tmp_path / "own.h5").declaration("status").codes == {}
 
 

@@ -85,19 +85,19 @@ def test_a_rig_of_the_user_is_used(config):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ('pixelsize = "0.3mm"', "pixelsize is not known: did you mean pixel-size?"),
         ("device = 3", 'device is 3: a text in quotes is needed; write e.g. device = "gpu"'),
         ('device = "gpu', "is not TOML"),
     ],
 )
-def test_a_wrong_file_is_refused_in_one_line(config, text, said):
+def test_a_wrong_file_is_refused_in_one_line(config, text, message):
     path = config(text)
     ended = run("devices")
     assert ended.code == 2
     assert str(path) in ended.said
-    assert said in ended.said
+    assert message in ended.said
     assert ended.said.count("\n") == 1
 
 

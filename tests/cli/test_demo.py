@@ -64,23 +64,23 @@ def test_the_table_of_heights_has_each_figure_and_method(shown):
     head, *rows = (cells(line) for line in lines[: 1 + len(HEIGHTS)])
     assert head == ["figure", "method", "answered", "RMS", "mean", "99 %", "filled", "RMS of filled"]
     assert [row[:2] for row in rows] == HEIGHTS
-    found = {
-        tuple(row[:2]): dict(zip(head[2:7], (float(one.split()[0]) for one in row[2:7]), strict=True))
+    by_figure = {
+        tuple(row[:2]): dict(zip(head[2:7], (float(cell.split()[0]) for cell in row[2:7]), strict=True))
         for row in rows
     }
-    for values in found.values():
+    for values in by_figure.values():
         assert values["answered"] > 50
         assert abs(values["mean"]) <= values["RMS"] < 1000
         assert values["99 %"] > 0
     for figure, step in (("fig5", 0.375), ("fig6", 0.225)):
-        assert found[figure, "sub-frame"]["answered"] == found[figure, "eq. 4"]["answered"]
-        assert found[figure, "sub-frame"]["RMS"] < found[figure, "eq. 4"]["RMS"]
-        assert found[figure, "eq. 4"]["mean"] < -0.3e3 * step
-    assert found["fig10b", "rotation, registered"]["filled"] == 0
-    both = found["fused", "press and rotation"]
+        assert by_figure[figure, "sub-frame"]["answered"] == by_figure[figure, "eq. 4"]["answered"]
+        assert by_figure[figure, "sub-frame"]["RMS"] < by_figure[figure, "eq. 4"]["RMS"]
+        assert by_figure[figure, "eq. 4"]["mean"] < -0.3e3 * step
+    assert by_figure["fig10b", "rotation, registered"]["filled"] == 0
+    both = by_figure["fused", "press and rotation"]
     result = io.open_result(folder / "fused-result.h5")
     assert both["filled"] == np.count_nonzero(result.filled) > 0
-    assert both["RMS"] < found["fused", "press"]["RMS"]
+    assert both["RMS"] < by_figure["fused", "press"]["RMS"]
     legend = " ".join(lines[1 + len(HEIGHTS) : lines.index("")])
     for word in ("answered", "filled", "registered"):
         assert f"{word}: " in legend
@@ -91,14 +91,15 @@ def test_the_table_of_normals_has_both_methods_and_registration(shown):
     start = next(number for number, line in enumerate(lines) if "lost and flagged" in line)
     head, rows = cells(lines[start]), [cells(line) for line in lines[start + 1 : start + 4]]
     assert [row[:2] for row in rows] == [["fig10a", method] for method in TURNED]
-    found = {
-        row[1]: dict(zip(head[2:7], (float(one.split()[0]) for one in row[2:7]), strict=True)) for row in rows
+    by_method = {
+        row[1]: dict(zip(head[2:7], (float(cell.split()[0]) for cell in row[2:7]), strict=True))
+        for row in rows
     }
     assert [row[7:] == ["-", "-"] for row in rows] == ["registered" in method for method in TURNED]
-    for values in found.values():
+    for values in by_method.values():
         assert 20 < values["answered"] <= 100
         assert 0 < values["median"] <= values["RMS"] <= values["99 %"] < 120
-    assert found["exact, registered"]["median"] < found["exact"]["median"]
+    assert by_method["exact, registered"]["median"] < by_method["exact"]["median"]
     legend = " ".join(lines[start + 4 : -1])
     for word in ("answered", "chi2"):
         assert f"{word}: " in legend
@@ -113,7 +114,7 @@ def cells(row):
 @pytest.mark.slow
 def test_json_has_the_scores_of_each_figure_and_method(small, tmp_path, monkeypatch):
     for figure in ("height", "normal", "surface"):
-        monkeypatch.setattr(view, f"{figure}_figure", lambda *given, **style: None)
+        monkeypatch.setattr(view, f"{figure}_figure", lambda *arguments, **style: None)
     scores = json.loads(run("demo -o", tmp_path, "--json").out)
     assert list(scores) == list(FIGURES)
     assert list(scores["fig6"]) == list(PRESSED)
@@ -126,8 +127,8 @@ def test_json_has_the_scores_of_each_figure_and_method(small, tmp_path, monkeypa
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
     (tmp_path / "file").touch()
-    said = refused("the folder cannot be created", "demo -o", tmp_path / "file" / "demo")
-    assert "Choose another with -o" in said
+    message = refused("the folder cannot be created", "demo -o", tmp_path / "file" / "demo")
+    assert "Choose another with -o" in message
 
 
 def test_without_matplotlib_nothing_is_computed(tmp_path, monkeypatch):

@@ -44,8 +44,8 @@ def test_a_missing_package_of_an_extra_is_named(facts, monkeypatch):
         return "1.0"
 
     monkeypatch.setattr(doctor.metadata, "version", installed)
-    found = facts()
-    assert (found["extra mesh"], found["extra view"]) == ("missing: trimesh", "installed")
+    state = facts()
+    assert (state["extra mesh"], state["extra view"]) == ("missing: trimesh", "installed")
 
 
 def test_environment_variables_of_opencl_are_shown(facts, monkeypatch):

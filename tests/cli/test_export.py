@@ -89,14 +89,14 @@ def test_a_turn_is_chosen():
 
 def test_a_cross_section_runs_across_the_apex():
     assert run("export ball-result.h5 -o cut.csv --section apex").code == 0
-    told = columns_of("cut.csv")
-    assert list(told) == ["distance [mm]", "x [mm]", "y [mm]", "height [mm]", "sigma [mm]"]
-    np.testing.assert_allclose(told["y [mm]"], -0.2)
-    np.testing.assert_allclose(told["x [mm]"], X, atol=1e-9)
-    np.testing.assert_allclose(told["distance [mm]"], X - X[0], atol=1e-9)
+    columns = columns_of("cut.csv")
+    assert list(columns) == ["distance [mm]", "x [mm]", "y [mm]", "height [mm]", "sigma [mm]"]
+    np.testing.assert_allclose(columns["y [mm]"], -0.2)
+    np.testing.assert_allclose(columns["x [mm]"], X, atol=1e-9)
+    np.testing.assert_allclose(columns["distance [mm]"], X - X[0], atol=1e-9)
     expected = cap()[np.argmin(np.abs(Y + 0.2))]
-    np.testing.assert_allclose(told["height [mm]"], expected, atol=1e-6)
-    np.testing.assert_allclose(told["sigma [mm]"], 0.002, rtol=1e-6)
+    np.testing.assert_allclose(columns["height [mm]"], expected, atol=1e-6)
+    np.testing.assert_allclose(columns["sigma [mm]"], 0.002, rtol=1e-6)
     assert "# source: ball.h5" in Path("cut.csv").read_text(encoding="utf-8")
 
 
@@ -104,10 +104,10 @@ def test_a_cross_section_runs_between_two_points_and_a_hole_is_empty():
     x, y = X[HOLE[1]], Y[HOLE[0]]
     ends = f"--section={x:.3f}mm,0mm:{x:.3f}mm,{y + 0.2:.3f}mm"
     assert run("export ball-result.h5 -o cut.csv", ends).code == 0
-    told = columns_of("cut.csv")
-    np.testing.assert_allclose(told["x [mm]"], x, atol=1e-9)
-    assert told["y [mm]"][[0, -1]] == pytest.approx([0, y + 0.2], abs=1e-9)
-    missing = told["y [mm]"][np.isnan(told["height [mm]"])]
+    columns = columns_of("cut.csv")
+    np.testing.assert_allclose(columns["x [mm]"], x, atol=1e-9)
+    assert columns["y [mm]"][[0, -1]] == pytest.approx([0, y + 0.2], abs=1e-9)
+    missing = columns["y [mm]"][np.isnan(columns["height [mm]"])]
     np.testing.assert_allclose(missing, y, atol=1e-9)
     assert len(missing) == 1
 
@@ -117,9 +117,9 @@ def test_a_filled_height_is_marked_in_a_cross_section():
     filled[:, 20] = 1
     io.save_result(io.Result(height=cap(), filled=filled, x=X, y=Y), "filled-result.h5")
     assert run("export filled-result.h5 -o cut.csv --section apex").code == 0
-    told = columns_of("cut.csv")
-    assert list(told) == ["distance [mm]", "x [mm]", "y [mm]", "height [mm]", "filled"]
-    assert np.flatnonzero(told["filled"]).tolist() == [20]
+    columns = columns_of("cut.csv")
+    assert list(columns) == ["distance [mm]", "x [mm]", "y [mm]", "height [mm]", "filled"]
+    assert np.flatnonzero(columns["filled"]).tolist() == [20]
 
 
 @pytest.mark.parametrize(
@@ -151,8 +151,8 @@ def test_impossible_input_is_one_line_and_writes_nothing(words, line):
 def test_a_result_without_a_pixel_size_is_refused_but_for_its_arrays():
     io.save_result(io.Result(height=cap()), "bare-result.h5")
     for suffix in ("ply", "stl", "xyz", "png", "tif", "tiff", "csv"):
-        said = refused(f"bare.{suffix} needs millimetres", "export bare-result.h5 -o", f"bare.{suffix}")
-        assert "--pixel-size" in said
+        message = refused(f"bare.{suffix} needs millimetres", "export bare-result.h5 -o", f"bare.{suffix}")
+        assert "--pixel-size" in message
     assert run("export bare-result.h5 -o bare.npz").code == 0
 
 

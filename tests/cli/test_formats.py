@@ -32,9 +32,9 @@ def write_video(path, frames, stamps=None):
         stream = container.add_stream("ffv1", rate=25)
         stream.height, stream.width, stream.pix_fmt = *frames.shape[1:], "gray"
         for number, picture in enumerate(frames):
-            one = av.VideoFrame.from_ndarray(picture, "gray")
-            one.pts = number if stamps is None else int(stamps[number])
-            container.mux(stream.encode(one))
+            video_frame = av.VideoFrame.from_ndarray(picture, "gray")
+            video_frame.pts = number if stamps is None else int(stamps[number])
+            container.mux(stream.encode(video_frame))
         container.mux(stream.encode(None))
 
 
@@ -85,21 +85,21 @@ def test_a_batch_takes_it(path):
         "[press]\ndark = 0\nbright = 255\n"
     )
     done("batch", path, "-o", "results", "--settings", "batch.toml")
-    found = io.open_result(Path("results", f"{path.stem}-result.h5")).height
-    np.testing.assert_array_equal(found, heights("ball.npy"))
+    height = io.open_result(Path("results", f"{path.stem}-result.h5")).height
+    np.testing.assert_array_equal(height, heights("ball.npy"))
 
 
 def test_a_correlation_is_that_of_the_array(path):
-    found = []
+    means = []
     for name in (path, "ball.npy"):
         done("correlate", name, "--phase-step", "30deg", "-o", "out.h5", "--overwrite")
-        found.append(io.open_result("out.h5").mean)
-    np.testing.assert_array_equal(*found)
+        means.append(io.open_result("out.h5").mean)
+    np.testing.assert_array_equal(*means)
 
 
 def test_it_is_described(path):
-    said = done("info", path).out
-    assert "12 of 16 x 12, uint8" in said
+    text = done("info", path).out
+    assert "12 of 16 x 12, uint8" in text
 
 
 def test_the_name_of_the_result_follows_from_its_own(path):
@@ -127,8 +127,8 @@ def test_a_fingerprint_changes_with_the_file(path):
 
 @pytest.mark.parametrize("command", ["reconstruct", "info", "check", "correlate", "import"])
 def test_help_lists_the_formats(command):
-    said = " ".join(run(command, "--help").out.split())
-    assert "MCAP, TIFF, a video (AVI, MP4, MOV, MKV)" in said
+    text = " ".join(run(command, "--help").out.split())
+    assert "MCAP, TIFF, a video (AVI, MP4, MOV, MKV)" in text
 
 
 def test_a_channel_is_chosen_on_the_command_line(tmp_path, monkeypatch, frames):

@@ -77,8 +77,8 @@ def zenith_scale():
 
 def without(name, *lost):
     with h5py.File(name, "a") as file:
-        for one in lost:
-            del file[one]
+        for dataset in lost:
+            del file[dataset]
 
 
 def test_a_press_and_a_rotation_become_one_surface():
@@ -96,29 +96,29 @@ def test_a_press_and_a_rotation_become_one_surface():
     assert np.sqrt(np.nanmean(error**2)) < 0.05
     assert abs(error[SHAPE[0] // 2, SHAPE[1] // 2]) < 0.05  # at the top, which neither saw
     assert result.filled[SHAPE[0] // 2, SHAPE[1] // 2] == 1
-    told = run("info press-fused.h5").out
-    assert "map height" in told
-    assert "map filled" in told
+    text = run("info press-fused.h5").out
+    assert "map height" in text
+    assert "map filled" in text
     assert "height RMS error" in run("score press-fused.h5 --truth press.h5").out
 
 
 def test_json_contains_the_engine_s_surface_and_where_it_came_from():
     result, ended = fuse("--json")
-    told = json.loads(ended.out)
-    assert told["output"] == "out.h5"
-    assert told["summary"]["what"] == "height"
-    assert told["summary"]["filled"] == np.count_nonzero(result.filled)
-    assert told["summary"]["components"] == result.component.max() + 1
-    assert told["summary"]["offset_unknown"] == np.count_nonzero(result.offset_unknown)
-    assert told["process"]["vertical_source"].endswith("press.h5")
-    assert told["process"]["axial_source"].endswith("turn.h5")
+    report = json.loads(ended.out)
+    assert report["output"] == "out.h5"
+    assert report["summary"]["what"] == "height"
+    assert report["summary"]["filled"] == np.count_nonzero(result.filled)
+    assert report["summary"]["components"] == result.component.max() + 1
+    assert report["summary"]["offset_unknown"] == np.count_nonzero(result.offset_unknown)
+    assert report["process"]["vertical_source"].endswith("press.h5")
+    assert report["process"]["axial_source"].endswith("turn.h5")
     with io.open_recording("press.h5") as vertical, io.open_recording("turn.h5") as axial:
         expected = engine.fuse(vertical, axial)
     np.testing.assert_array_equal(result.height, expected.height)
     np.testing.assert_array_equal(result.filled, expected.filled)
 
 
-def test_what_other_people_s_files_do_not_say_is_given():
+def test_options_replace_properties_missing_in_files_of_others():
     ours, _ = fuse("--no-register")
     scale = zenith_scale()
     foreign("press.h5", "raw/images")
@@ -148,16 +148,20 @@ def test_a_rotation_without_a_gain_is_refused_and_it_can_be_given():
     fuse(*scale)
 
 
-def test_both_are_read_as_a_calibration_says():
+def test_both_are_read_with_a_calibration():
     with io.open_recording("turn.h5") as recording:
         shape, dark, bright = recording.shape[1:], recording.header.dark, recording.header.bright
     little = np.full(shape, 0.1, np.float32)
     references = io.References(dark, bright, little, little, np.zeros(shape, np.uint8))
     io.save_calibration(io.Calibration(io.CameraId("", shape, np.dtype("uint8")), references), "cal.h5")
-    plain, told = fuse()[0], fuse("--calibration", "cal.h5")[0]
-    assert told.process["vertical_bright"] == told.process["axial_bright"] == "map of the calibration"
-    np.testing.assert_array_equal(told.calibration.references.bright, bright)
-    np.testing.assert_allclose(told.height, plain.height, atol=1e-4)
+    plain, calibrated = fuse()[0], fuse("--calibration", "cal.h5")[0]
+    assert (
+        calibrated.process["vertical_bright"]
+        == calibrated.process["axial_bright"]
+        == "map of the calibration"
+    )
+    np.testing.assert_array_equal(calibrated.calibration.references.bright, bright)
+    np.testing.assert_allclose(calibrated.height, plain.height, atol=1e-4)
     io.save_calibration(io.Calibration(io.CameraId("other", shape, np.dtype("uint8"))), "cal.h5")
     refused("other", "fuse press.h5 turn.h5", "--calibration", "cal.h5")
 
@@ -208,9 +212,9 @@ REFUSED = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_bad_input_is_one_line(case):
-    words, names, said_of = REFUSED[case]
+    words, names, message = REFUSED[case]
     line = refused("", "fuse", *(names or ("press.h5", "turn.h5")), *words)
-    assert said_of in line
+    assert message in line
 
 
 def test_pixels_of_unknown_size_are_refused_and_can_be_given():

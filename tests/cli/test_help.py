@@ -37,8 +37,8 @@ print(len(made), *[name for name in {HEAVY} if name in sys.modules])
 
 
 def test_no_command_needs_anything_heavy_before_it_runs():
-    done = subprocess.run([sys.executable, "-c", MADE], capture_output=True, text=True, check=True)
-    count, *heavy = done.stdout.split()
+    process = subprocess.run([sys.executable, "-c", MADE], capture_output=True, text=True, check=True)
+    count, *heavy = process.stdout.split()
     assert int(count) > len(PURPOSES)
     assert not heavy
 
@@ -80,7 +80,7 @@ def test_a_command_s_help_needs_no_other():
     assert not loaded("reconstruct", "--help") & others
 
 
-def test_help_says_of_each_command_what_its_own_help_begins_with(commands):
+def test_help_lists_the_purpose_of_each_command(commands):
     assert list(commands) == list(PURPOSES)
     for name, purpose in PURPOSES.items():
         assert commands[name].name == name
@@ -90,13 +90,13 @@ def test_help_says_of_each_command_what_its_own_help_begins_with(commands):
 
 @pytest.mark.parametrize("group", [(), ("calibrate",), ("rig",), ("twin",)])
 def test_the_help_of_a_group_cuts_nothing_short(group, commands):
-    said = " ".join(run(*group, "--help").out.partition("\nCommands:\n")[2].split())
-    own = (
-        {name: one.help.split("\n\n")[0] for name, one in commands[group[0]].commands.items()}
+    text = " ".join(run(*group, "--help").out.partition("\nCommands:\n")[2].split())
+    purposes = (
+        {name: command.help.split("\n\n")[0] for name, command in commands[group[0]].commands.items()}
         if group
         else PURPOSES
     )
-    assert said == " ".join(f"{name} {purpose}" for name, purpose in own.items())
+    assert text == " ".join(f"{name} {purpose}" for name, purpose in purposes.items())
 
 
 @pytest.mark.parametrize("name", PURPOSES)
@@ -152,8 +152,8 @@ def complete(ask):
     """Complete a command line as bash does, and return the answers, each as "type,value"."""
 
     def answers(line):
-        code, out, said = ask("bash_complete", COMP_WORDS=line, COMP_CWORD=str(line.count(" ")))
-        assert (code, said) == (0, "")
+        code, out, errors = ask("bash_complete", COMP_WORDS=line, COMP_CWORD=str(line.count(" ")))
+        assert (code, errors) == (0, "")
         return out.split()
 
     return answers
@@ -200,14 +200,14 @@ def test_the_script_of_bash_completes_in_bash(tmp_path):
         f'eval "$(_MIRRORSKIN_COMPLETE=bash_source {program})"; COMP_WORDS=(mirrorskin sco) COMP_CWORD=1;'
         f' $(complete -p mirrorskin | sed "s/.*-F \\([^ ]*\\) .*/\\1/") {program}; echo "${{COMPREPLY[@]}}"'
     )
-    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
-    assert done.stdout == "score\n"
+    process = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
+    assert process.stdout == "score\n"
 
 
 def test_another_instruction_is_refused(ask):
-    code, _, said = ask("bash")
-    assert (code, said.count("\n")) == (2, 1)
-    assert "bash_source" in said
+    code, _, errors = ask("bash")
+    assert (code, errors.count("\n")) == (2, 1)
+    assert "bash_source" in errors
 
 
 def test_completion_of_a_command_imports_no_command():
@@ -228,11 +228,11 @@ def test_completion_of_an_option_imports_nothing_heavy(name):
 
 def test_no_text_of_the_product_names_a_file_of_the_documentation():
     root = Path(__file__).parents[2]
-    found = [
+    names = [
         f"{path.relative_to(root)}:{node.lineno}"
         for package in ("cli", "engine", "hw", "io", "kernels", "view")
         for path in (root / package).rglob("*.py")
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and "docs/" in node.value
     ]
-    assert found == []  # an installed wheel has no docs
+    assert names == []  # an installed wheel has no docs

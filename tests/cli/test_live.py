@@ -61,34 +61,36 @@ def fake(clock, monkeypatch, tmp_path):
             self.camera_settings = {"pixel_size": (0.05, 0.05), "delay": 0.0, "rate": 60.0}
             self.path = tmp_path / "rig.toml"
 
-        def open(self, told):
+        def open(self, message):
             opened = fake_rig(self.picture, clock, rate=60.0)
-            opened.settings, self.stage, self.camera = told, opened.stage, opened.camera
+            opened.settings, self.stage, self.camera = message, opened.stage, opened.camera
             return opened
 
         def run(self, *words):
             return CliRunner().invoke(app, [*words, "--rig", str(self.path)])
 
-    made = Fake()
-    made.path.touch()
+    prepared = Fake()
+    prepared.path.touch()
     monkeypatch.setattr(
-        file, "load_rig", lambda path: settings(made.picture(Position()).shape, **made.camera_settings)
+        file,
+        "load_rig",
+        lambda path: settings(prepared.picture(Position()).shape, **prepared.camera_settings),
     )
-    monkeypatch.setattr(rig, "open_rig", made.open)
-    return made
+    monkeypatch.setattr(rig, "open_rig", prepared.open)
+    return prepared
 
 
 def counted(text):
-    found = re.search(r"(\d+) frames at .* (\d+) used, (\d+) skipped, (\d+) dropped; (\d+) updates", text)
-    assert found is not None, text
-    return [int(number) for number in found.groups()]
+    match = re.search(r"(\d+) frames at .* (\d+) used, (\d+) skipped, (\d+) dropped; (\d+) updates", text)
+    assert match is not None, text
+    return [int(number) for number in match.groups()]
 
 
 def test_a_press_is_reported_recorded_and_kept(fake, tmp_path):
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
-    done = fake.run(*PRESS, "--record", str(record), "-o", str(output))
-    assert done.exit_code == 0, done.output
-    frames, used, skipped, _, updates = counted(done.output)
+    ended = fake.run(*PRESS, "--record", str(record), "-o", str(output))
+    assert ended.exit_code == 0, ended.output
+    frames, used, skipped, _, updates = counted(ended.output)
     assert used + skipped == frames > 10
     assert updates > 1
     result = io.open_result(output)
@@ -102,20 +104,20 @@ def test_a_press_is_reported_recorded_and_kept(fake, tmp_path):
 
 def test_frames_and_heights_go_into_an_mcap_file(fake, tmp_path):
     record = tmp_path / "rec.mcap"
-    done = fake.run(*PRESS, "--record", str(record))
-    assert done.exit_code == 0, done.output
-    _, used, skipped, _, updates = counted(done.output)
+    ended = fake.run(*PRESS, "--record", str(record))
+    assert ended.exit_code == 0, ended.output
+    _, used, skipped, _, updates = counted(ended.output)
     with record.open("rb") as file:
-        found = [one[1].topic for one in make_reader(file).iter_messages()]
-    assert found.count("/camera/image") == used + skipped
-    assert 1 <= found.count("/height") <= updates  # while one is written, others may be missed
+        topics = [message[1].topic for message in make_reader(file).iter_messages()]
+    assert topics.count("/camera/image") == used + skipped
+    assert 1 <= topics.count("/height") <= updates  # while one is written, others may be missed
 
 
 def test_strokes_are_joined_and_their_hysteresis_is_reported(fake, tmp_path):
     output = tmp_path / "res.h5"
     words = ["--stop", "1mm", "--stroke-depth", "0.8mm", "--strokes", "4", "--speed", "2.5mm/s", *ALL]
-    done = fake.run("vertical", *words, "-o", str(output))
-    assert done.exit_code == 0, done.output
+    ended = fake.run("vertical", *words, "-o", str(output))
+    assert ended.exit_code == 0, ended.output
     result = io.open_result(output)
     assert result.process["strokes"] == 4
     assert np.isfinite(result.hysteresis).sum() > 20
@@ -144,8 +146,8 @@ def test_a_rotation_is_reported_and_kept(fake, tmp_path):
     fake.picture = slanted()
     fake.camera_settings |= {"zenith_gain": math.radians(GAIN), "zenith_offset": OFFSET}
     output = tmp_path / "res.h5"
-    done = fake.run(*TURN, "-o", str(output))
-    assert done.exit_code == 0, done.output
+    ended = fake.run(*TURN, "-o", str(output))
+    assert ended.exit_code == 0, ended.output
     result = io.open_result(output)
     assert result.process["window_frames"] == 24
     assert np.degrees(np.median(result.zenith)) == pytest.approx(math.degrees(0.3), abs=1.0)
@@ -157,9 +159,9 @@ def test_rocking_is_reported_recorded_and_kept_and_repeated(fake, tmp_path):
     fake.camera_settings |= {"zenith_gain": math.radians(GAIN), "zenith_offset": OFFSET}
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
     words = ["axial", "--rock", "--press", "1mm", "--tilt", "3deg", "--speed", "10deg/s", *ALL]
-    done = fake.run(*words, "--record", str(record), "-o", str(output))
-    assert done.exit_code == 0, done.output
-    assert counted(done.output)[1] > 20
+    ended = fake.run(*words, "--record", str(record), "-o", str(output))
+    assert ended.exit_code == 0, ended.output
+    assert counted(ended.output)[1] > 20
     result = io.open_result(output)
     assert set(np.unique(result.status)) == {4}
     assert result.height is None
@@ -181,12 +183,12 @@ def test_ctrl_c_stops_the_stage_and_keeps_what_there_is(fake, clock, tmp_path):
     thread = clock.thread(interrupt, "interrupts")
     thread.start()
     words = ["vertical", "--stop", "1.5mm", "--speed", "0.1mm/s", "--record", str(record), "-o", str(output)]
-    done = fake.run(*words)
+    ended = fake.run(*words)
     thread.join()
-    assert done.exit_code != 0
-    assert "cut short" in done.output
+    assert ended.exit_code != 0
+    assert "cut short" in ended.output
     assert 0.1 <= fake.stage.position().travel < 0.11, "it was stopped on its way"
-    assert 0 < io.open_result(output).process["frames"] == counted(done.output)[1]
+    assert 0 < io.open_result(output).process["frames"] == counted(ended.output)[1]
     with io.open_recording(record) as recording:
         assert recording.state.startswith("cut short")
 
@@ -206,11 +208,11 @@ def test_a_run_that_is_cut_short_leaves_an_older_recording(fake, tmp_path):
     assert isinstance(refused.exception, io.InputError)
     assert not hasattr(fake, "stage")
     fake.picture = lost
-    done = fake.run(*PRESS, "--record", str(record), "--overwrite")
-    assert isinstance(done.exception, HardwareError)
+    ended = fake.run(*PRESS, "--record", str(record), "--overwrite")
+    assert isinstance(ended.exception, HardwareError)
     assert re.search(
         r"rec-partial\.h5 was cut short and holds \d+ frames; the older .*rec\.h5 is unchanged$",
-        str(done.exception),
+        str(ended.exception),
     )
     assert record.read_bytes() == before
     with io.open_recording(tmp_path / "rec-partial.h5") as recording:
@@ -231,10 +233,10 @@ def test_a_camera_that_is_lost_ends_it_with_its_own_complaint(fake, tmp_path):
         return picture(place)
 
     fake.picture = lost
-    done = fake.run(*PRESS, "-o", str(output))
-    assert isinstance(done.exception, HardwareError)
+    ended = fake.run(*PRESS, "-o", str(output))
+    assert isinstance(ended.exception, HardwareError)
     assert fake.stage.stops
-    assert "cut short" in done.output
+    assert "cut short" in ended.output
     assert output.exists()
 
 
@@ -244,13 +246,13 @@ def test_a_call_that_fails_stops_the_stage_and_keeps_what_there_is(fake, tmp_pat
     words = [*PRESS, "--record"]
     with failing(kind) as calls:
         assert fake.run(*words, str(tmp_path / "rec.h5"), "-o", str(tmp_path / "res.h5")).exit_code == 0
-    for share in (0.1, 0.3, 0.5, 0.7, 0.9):
-        record, output = tmp_path / f"rec-{share}.h5", tmp_path / f"res-{share}.h5"
-        with failing(kind, int(share * calls.count)):
-            done = fake.run(*words, str(record), "-o", str(output))
-        if done.exit_code:
-            known = (DeviceError, MemoryError, io.InputError, HardwareError)
-            assert isinstance(done.exception, known), (share, done.exception)
+    for fraction in (0.1, 0.3, 0.5, 0.7, 0.9):
+        record, output = tmp_path / f"rec-{fraction}.h5", tmp_path / f"res-{fraction}.h5"
+        with failing(kind, int(fraction * calls.count)):
+            ended = fake.run(*words, str(record), "-o", str(output))
+        if ended.exit_code:
+            expected_errors = (DeviceError, MemoryError, io.InputError, HardwareError)
+            assert isinstance(ended.exception, expected_errors), (fraction, ended.exception)
         assert fake.stage.closed
         assert not fake.stage.moving()
         if output.exists():
@@ -270,14 +272,14 @@ def test_a_turn_that_is_cut_short_reports_that_there_is_no_result(fake, tmp_path
         return picture(place)
 
     fake.picture = lost
-    done = fake.run(*TURN, "-o", str(tmp_path / "res.h5"))
-    assert isinstance(done.exception, HardwareError)
-    assert "no result: " in done.output
+    ended = fake.run(*TURN, "-o", str(tmp_path / "res.h5"))
+    assert isinstance(ended.exception, HardwareError)
+    assert "no result: " in ended.output
     assert not (tmp_path / "res.h5").exists()
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ([*PRESS, "--latency", "5mm"], "--latency"),
         ([*TURN, "--window-frames", "60"], "window_frames 60"),
@@ -287,11 +289,11 @@ def test_a_turn_that_is_cut_short_reports_that_there_is_no_result(fake, tmp_path
         (["axial", "--rock", "--press", "1mm", "--speed", "5deg/s"], "zenith_gain"),
     ],
 )
-def test_impossible_input_is_one_clear_line(fake, words, told):
-    done = fake.run(*words)
-    assert isinstance(done.exception, io.InputError)
-    assert told in str(done.exception)
-    assert "\n" not in str(done.exception)
+def test_impossible_input_is_one_clear_line(fake, words, message):
+    ended = fake.run(*words)
+    assert isinstance(ended.exception, io.InputError)
+    assert message in str(ended.exception)
+    assert "\n" not in str(ended.exception)
 
 
 class Slow:
@@ -378,10 +380,10 @@ def test_a_slide_is_reported_recorded_and_kept_and_repeated(fake, tmp_path):
     io.save_result(io.Result(contact=np.ones(SHAPED, np.uint8)), press)
     words = ["horizontal", "--press", "1mm", "--distance", "0.3mm", "--speed", "0.3mm/s", "--wait", "0s"]
     words += ["--contact", str(press), *ALL]
-    done = fake.run(*words, "--record", str(record), "-o", str(output))
-    assert done.exit_code == 0, done.output
+    ended = fake.run(*words, "--record", str(record), "-o", str(output))
+    assert ended.exit_code == 0, ended.output
     result = io.open_result(output)
-    assert result.process["frames"] == counted(done.output)[1] > 10
+    assert result.process["frames"] == counted(ended.output)[1] > 10
     assert np.nanmedian(result.displacement[..., 0]) == pytest.approx(-0.3, abs=0.02)
     with io.open_recording(record, live=True) as recording:
         again = engine.reconstruct(recording, contact=np.ones(SHAPED, np.uint8))
@@ -422,21 +424,21 @@ def test_a_built_in_operation_gives_the_same_live_as_over_the_recording(
         fake.camera_settings |= {"zenith_gain": math.radians(GAIN), "zenith_offset": OFFSET}
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
     chosen = "--operation", f"mirrorskin.{where}", *flags.split()
-    done = fake.run(*words, *chosen, "--record", str(record), "-o", str(output))
-    assert done.exit_code == 0, done.stderr
+    ended = fake.run(*words, *chosen, "--record", str(record), "-o", str(output))
+    assert ended.exit_code == 0, ended.stderr
     with io.open_recording(record, live=True) as recording:
         again = engine.run(recording, load_operation(f"mirrorskin.{where}")(**options))
-    found = io.open_result(output)
-    assert [*found] == [*again]
+    result = io.open_result(output)
+    assert [*result] == [*again]
     for name in again:
-        np.testing.assert_array_equal(found[name], again[name], err_msg=name)
+        np.testing.assert_array_equal(result[name], again[name], err_msg=name)
 
 
 def test_an_operation_of_the_user_s_gives_the_same_live_as_over_the_recording(fake, tmp_path):
     record, output = tmp_path / "rec.h5", tmp_path / "res.h5"
-    done = fake.run(*PRESS, "--operation", OWN, "--least", "1", "--record", str(record), "-o", str(output))
-    assert done.exit_code == 0, done.output
-    assert counted(done.output)[4] > 1
+    ended = fake.run(*PRESS, "--operation", OWN, "--least", "1", "--record", str(record), "-o", str(output))
+    assert ended.exit_code == 0, ended.output
+    assert counted(ended.output)[4] > 1
     with io.open_recording(record, live=True) as recording:
         operation = load_operation(OWN)(least=1.0, memory_limit=2 * 7 * int(np.prod(SHAPE)))
         again = engine.run(recording, operation)
@@ -456,26 +458,26 @@ def test_an_operation_of_the_user_s_is_calibrated_and_its_maps_are_pictures(fake
     io.save_calibration(
         io.Calibration(io.CameraId("", dark.shape, np.dtype("uint8")), references=references), calibration
     )
-    done = fake.run(
+    ended = fake.run(
         *PRESS, "--operation", OWN, "--calibration", calibration, "--view", view, "-o", str(output)
     )
-    assert done.exit_code == 0, done.output
+    assert ended.exit_code == 0, ended.output
     assert io.open_result(output).process["calibration_parts"] == "references"
     command = [sys.executable, "-m", "rerun_cli", "rrd", "print", str(view)]
-    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    assert "/maps/rise" in told
-    assert "/maps/height" in told
+    text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert "/maps/rise" in text
+    assert "/maps/height" in text
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ([*PRESS, "--operation", OWN, "--hold", "3"], "has no option --hold: it has --least"),
         ([*PRESS, "--operation", f"{OWN}r"], "has no class SteepestRiser: did you mean SteepestRise?"),
         ([*TURN, "--operation", OWN], "but SteepestRise needs vertical motion"),
     ],
 )
-def test_an_impossible_operation_is_one_clear_line(fake, words, told):
-    done = fake.run(*words)
-    assert told in f"{done.exception} {done.output}"
-    assert done.exit_code != 0
+def test_an_impossible_operation_is_one_clear_line(fake, words, message):
+    ended = fake.run(*words)
+    assert message in f"{ended.exception} {ended.output}"
+    assert ended.exit_code != 0

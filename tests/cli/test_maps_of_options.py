@@ -28,13 +28,13 @@ def heights(dark, name):
 def test_a_map_in_a_file_is_used(name):
     values = np.full((20, 24), 20, np.uint8)
     np.save(name, values) if name.endswith("npy") else cv2.imwrite(name, values)
-    found, same = heights(name, "map.h5"), heights("20", "number.h5")
-    np.testing.assert_array_equal(found.height, same.height)
-    assert found.process["dark"] == "map given"
+    result, same = heights(name, "map.h5"), heights("20", "number.h5")
+    np.testing.assert_array_equal(result.height, same.height)
+    assert result.process["dark"] == "map given"
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("none.png", "none.png: no such file"),
         ("press.npy", "press.npy has shape (13, 20, 24): a map (H, W) is needed"),
@@ -42,9 +42,9 @@ def test_a_map_in_a_file_is_used(name):
         ("20x", "a number of counts is needed"),
     ],
 )
-def test_another_file_is_refused_in_one_line(name, said):
+def test_another_file_is_refused_in_one_line(name, message):
     np.save("small.npy", np.zeros((2, 3)))
     ended = run(f"reconstruct press.h5 --dark {name} --bright 200")
     assert ended.code == 2
-    assert said in ended.said
+    assert message in ended.said
     assert ended.said.count("\n") == 1

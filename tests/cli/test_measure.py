@@ -49,7 +49,7 @@ def test_programs_get_value_sigma_and_unit(ball):
     assert measures["quantities"]["Sq"]["unit"] == "µm"
 
 
-def test_options_say_where_and_from_what(ball):
+def test_options_choose_the_place_and_the_form(ball):
     part = told(ball, "--region", "20,20,10x15")["quantities"]
     assert part["measured area"]["value"] == pytest.approx(1.5)
     assert "plane tilt" in told(ball, "--form", "plane")["quantities"]
@@ -72,8 +72,8 @@ def test_a_step_is_measured_along_a_section(tmp_path):
 def test_one_turn_of_several_is_measured(tmp_path):
     path = tmp_path / "turns.h5"
     height = cap(SHAPE, SIZE, 5.0, 2.5).astype(np.float32)
-    one = result_of(height, SIZE)
-    io.save_result(one.assign(height=np.stack([height, height - 1])), path)
+    turn = result_of(height, SIZE)
+    io.save_result(turn.assign(height=np.stack([height, height - 1])), path)
     first, second = (told(path, "--turn", n)["quantities"]["highest point"]["value"] for n in (0, 1))
     assert first - second == pytest.approx(1)
     refused("choose one with --turn", "measure", path)

@@ -15,7 +15,7 @@ from mirrorskin.cli.output import print_fields, printable, report_missing_maps
 
 
 @pytest.mark.parametrize(
-    ("process", "said"),
+    ("process", "message"),
     [
         (
             {"height": "none: the recording has no pixel size"},
@@ -33,9 +33,9 @@ from mirrorskin.cli.output import print_fields, printable, report_missing_maps
         ),
     ],
 )
-def test_what_is_missing_and_what_a_gel_did_is_printed_in_a_line(process, said, capsys):
+def test_what_is_missing_and_what_a_gel_did_is_printed_in_a_line(process, message, capsys):
     report_missing_maps("a.h5", process, {"height": "it"})
-    assert capsys.readouterr() == ("", f"{said}\n" if said else "")
+    assert capsys.readouterr() == ("", f"{message}\n" if message else "")
 
 
 def test_no_text_of_a_file_steers_the_terminal_or_forges_a_line(capsys):
@@ -88,8 +88,8 @@ def test_what_is_logged_does_not_control_the_terminal():
         "import logging, sys; from mirrorskin.cli import main; sys.argv = ['mirrorskin', 'info', 'no.h5'];"
         "import atexit; atexit.register(lambda: logging.getLogger('x').warning('a\\x1b[2Jb')); main.program()"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
-    assert done.stderr.splitlines()[-1] == "a?[2Jb"
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert process.stderr.splitlines()[-1] == "a?[2Jb"
 
 
 def test_what_the_encoding_of_a_terminal_lacks_is_written_in_ascii(monkeypatch):

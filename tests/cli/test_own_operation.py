@@ -144,9 +144,9 @@ def test_an_impossible_option_is_one_line(folder, option, line):
 
 
 def test_json_has_units_and_counts(folder):
-    said = json.loads((folder / "said.json").read_text(encoding="utf-8"))
-    assert said["process"]["travel_offset"] == OFFSET
-    assert said["summary"]["what"] == "depth"
+    text = json.loads((folder / "said.json").read_text(encoding="utf-8"))
+    assert text["process"]["travel_offset"] == OFFSET
+    assert text["summary"]["what"] == "depth"
 
 
 @pytest.mark.parametrize("suffix", ["h5", "zarr"])
@@ -188,17 +188,17 @@ def test_a_map_that_cannot_be_exported_is_one_line(folder, options, line):
 
 
 def test_its_function_on_arrays_gives_the_same(folder, result):
-    own = load_operation(f"{folder / 'mine.py'}:Bright")
-    height_of = engine.function_of(own)
+    operation = load_operation(f"{folder / 'mine.py'}:Bright")
+    height_of = engine.function_of(operation)
     assert [*inspect.signature(height_of).parameters][:2] == ["frames", "travel"]
     assert "Added to all travels" in height_of.__doc__
     same(height_of(FRAMES, TRAVEL, travel_offset=OFFSET), result)
 
 
-def same(one, other):
-    assert one.maps().keys() == other.maps().keys()
+def same(first, other):
+    assert first.maps().keys() == other.maps().keys()
     for name in other.maps():
-        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+        np.testing.assert_array_equal(first[name], other[name], err_msg=name)
 
 
 def test_a_calibration_is_used_by_the_command_the_application_and_if_the_recording_carries_it(
@@ -211,31 +211,31 @@ def test_a_calibration_is_used_by_the_command_the_application_and_if_the_recordi
     calibration = io.Calibration(io.CameraId("", SHAPE, FRAMES.dtype), references=references)
     io.save_calibration(calibration, tmp_path / "cal.h5")
     done(*words(folder), "--calibration", tmp_path / "cal.h5", "-o", tmp_path / "res.h5")
-    found = io.open_result(tmp_path / "res.h5")
-    assert found.process["calibration_parts"] == "references"
-    np.testing.assert_array_equal(np.isfinite(found.height[:, :3]), False)
-    assert np.isfinite(found.height[:, 3:]).any()
+    result = io.open_result(tmp_path / "res.h5")
+    assert result.process["calibration_parts"] == "references"
+    np.testing.assert_array_equal(np.isfinite(result.height[:, :3]), False)
+    assert np.isfinite(result.height[:, 3:]).any()
     opening = Opening(calibration=tmp_path / "cal.h5", operation=f"{folder / 'mine.py'}:Bright")
     session = Session(folder / "one.h5", opening)
-    same(session.now.result, found)
+    same(session.now.result, result)
     texts = as_command(session), as_python(session)
     session.close()
     monkeypatch.chdir(tmp_path)
     for work in (lambda: done(*shlex.split(texts[0])[1:], "--overwrite"), lambda: exec(texts[1], {})):
         Path("result.h5").unlink(missing_ok=True)
         work()
-        same(io.open_result("result.h5"), found)
+        same(io.open_result("result.h5"), result)
     header = io.Header("vertical", pixel_size=(PIXEL, PIXEL))
     record(io.Calibrated(MadeUp(FRAMES, header, travel=TRAVEL), calibration), tmp_path / "carried.h5")
     with io.open_recording(tmp_path / "carried.h5") as recording:
         again = engine.run(recording, load_operation(f"{folder / 'mine.py'}:Bright"))
-    same(again, found)
+    same(again, result)
 
 
 def test_its_maps_are_shown_while_it_runs(folder, result):
-    own = load_operation(f"{folder / 'mine.py'}:Bright")(travel_offset=OFFSET)
+    operation = load_operation(f"{folder / 'mine.py'}:Bright")(travel_offset=OFFSET)
     header = io.Header("vertical", pixel_size=(PIXEL, PIXEL))
-    with engine.live.Stream(own, SHAPE, header=header, latency=math.inf) as stream:
+    with engine.live.Stream(operation, SHAPE, header=header, latency=math.inf) as stream:
         stream.push(FRAMES, travel=TRAVEL)
         stream.result()
     shown = stream.latest()
@@ -293,10 +293,10 @@ def test_a_batch_runs_it_and_resumes(folder, tmp_path):
     )
     command = "batch", folder / "one.h5", folder / "two.h5", "-o", tmp_path / "out", "--settings"
     done(*command, tmp_path / "batch.toml")
-    found = io.open_result(next((tmp_path / "out").glob("one*.h5")))
-    np.testing.assert_array_equal(found.height, io.open_result(folder / "res.h5").height)
+    result = io.open_result(next((tmp_path / "out").glob("one*.h5")))
+    np.testing.assert_array_equal(result.height, io.open_result(folder / "res.h5").height)
     again = run(*command, tmp_path / "batch.toml", "--json")
-    assert {one["state"] for one in json.loads(again.out)["files"]} == {"kept"}
+    assert {file["state"] for file in json.loads(again.out)["files"]} == {"kept"}
 
 
 def test_the_documentation_names_all_that_it_needs():

@@ -27,9 +27,9 @@ MEASURED = [178.1, 220.8, 280.5, 316.5, 7.6, 48.0, 96.3, 136.4]
 def test_angles_are_separated_by_blanks_in_any_unit(tmp_path, text, degrees):
     path = tmp_path / "phases.txt"
     path.write_bytes(text.encode())
-    found = read_phases(path)
-    assert isinstance(found, Positions)
-    phases = found.positions(len(degrees))
+    phases_read = read_phases(path)
+    assert isinstance(phases_read, Positions)
+    phases = phases_read.positions(len(degrees))
     assert phases.dtype == np.float64
     np.testing.assert_allclose(np.degrees(phases), degrees, rtol=1e-14, atol=1e-12)
 

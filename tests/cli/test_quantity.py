@@ -138,9 +138,9 @@ def test_one_or_two_lengths(text, sizes):
     ],
 )
 def test_vectors_have_as_many_lengths_as_are_needed(read, text, millimetres):
-    found = read(text, "--o")
-    assert isinstance(found, tuple)
-    assert found == pytest.approx(millimetres, rel=1e-12)
+    vector_read = read(text, "--o")
+    assert isinstance(vector_read, tuple)
+    assert vector_read == pytest.approx(millimetres, rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -323,7 +323,7 @@ WORDS = st.text("abcdefghiklmnoprstuvxyzABCDEGKMNPRTW\u00b5\u03bc", max_size=5) 
 ONE = st.builds("{}{}".format, NUMBERS, WORDS | st.sampled_from(["mm", "deg", "s", "MB"]))
 
 
-@settings(deadline=None, max_examples=400)
+@settings(deadline=None, max_examples=150)
 @given(
     st.text(max_size=12)
     | ONE

@@ -184,7 +184,7 @@ def test_a_claim_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "said_of"),
+    ("words", "message"),
     [
         ("simulate vertical --object teapot -o a.h5", "sphere"),
         ("simulate vertical --size 0x4 -o a.h5", "--size"),
@@ -201,8 +201,8 @@ def test_a_claim_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
         ("bench -o no/such/run.json", "no folder"),
     ],
 )
-def test_other_commands_refuse_too(tmp_path, words, said_of):
-    refused(said_of, words)
+def test_other_commands_refuse_too(tmp_path, words, message):
+    refused(message, words)
     assert not list(tmp_path.iterdir())
 
 

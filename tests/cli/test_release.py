@@ -22,17 +22,17 @@ def mirrorskin(*words, cwd):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("release")
-    said = mirrorskin("simulate", "vertical", *SMALL, "--release", "-o", "both.h5", cwd=place)
-    assert said.startswith("both.h5: 59 frames of 70 x 60")
+    text = mirrorskin("simulate", "vertical", *SMALL, "--release", "-o", "both.h5", cwd=place)
+    assert text.startswith("both.h5: 59 frames of 70 x 60")
     return place
 
 
 def scored(folder, recording, *words):
-    told = json.loads(
+    report = json.loads(
         mirrorskin("reconstruct", recording, "-o", "r.h5", "--overwrite", *words, "--json", cwd=folder)
     )
     score = json.loads(mirrorskin("score", "r.h5", "--truth", recording, "--json", cwd=folder))
-    return told["process"], score["height"]
+    return report["process"], score["height"]
 
 
 def test_press_and_release_are_scored_alike(folder):

@@ -34,7 +34,7 @@ def test_a_page_is_next_to_its_result_unless_a_place_is_given(folder, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ("res.h5 -o res.h5", "is the input"),
         ("nothing.h5", "nothing.h5"),
@@ -44,6 +44,6 @@ def test_a_page_is_next_to_its_result_unless_a_place_is_given(folder, monkeypatc
         ("no-size.h5 --section 0mm,0mm:1mm,0mm", "--pixel-size"),
     ],
 )
-def test_what_cannot_be_done_is_one_line_and_leaves_nothing(folder, words, said):
-    refused(said, f"report {words}")
+def test_what_cannot_be_done_is_one_line_and_leaves_nothing(folder, words, message):
+    refused(message, f"report {words}")
     assert {path.name for path in folder.iterdir()} == {"res.h5", "no-size.h5"}

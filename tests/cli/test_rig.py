@@ -50,8 +50,10 @@ def controller(folder, simulated, monkeypatch):
     """Plug in a controller with these settings, and write its rig file."""
 
     def plug_in(home=False, **settings):
-        told = MACHINE | {22: float(home)} | {int(name[1:]): value for name, value in settings.items()}
-        line = GrblLine(GrblMachine(told, start=dict.fromkeys("XYZ", -1.0), clock=simulated))
+        settings_set = (
+            MACHINE | {22: float(home)} | {int(name[1:]): value for name, value in settings.items()}
+        )
+        line = GrblLine(GrblMachine(settings_set, start=dict.fromkeys("XYZ", -1.0), clock=simulated))
         monkeypatch.setattr("mirrorskin.hw.stages.grbl.open_port", lambda *_: line.open())
         write_film_rig(folder, RIG.format(port=line.url, home=str(home).lower()))
         return line
@@ -66,21 +68,21 @@ def test_a_sound_rig_is_printed_in_a_table_and_nothing_moves(controller):
     assert (ended.code, ended.said) == (0, "")
     assert machine.position() == before
     assert ended.out.split("\n")[0].split() == ["part", "what", "found", "remedy"]
-    for said in (
+    for text in (
         "stage +firmware +.*1[.]1",
         "stage +state +idle",
         "roll -?0.000 deg",
         "camera +pictures +8 x 6 uint8",
     ):
-        assert re.search(f"^ok +.*{said}", ended.out, re.MULTILINE), ended.out
+        assert re.search(f"^ok +.*{text}", ended.out, re.MULTILINE), ended.out
 
 
 def test_a_rig_that_homes_and_moves_is_printed_in_json_and_ends_where_it_homed(controller):
     machine = controller(home=True).machine
     ended = run("rig check rig.toml --move --json")
-    told = json.loads(ended.out)
-    assert (ended.code, ended.said, told["sound"], told["rig"]) == (0, "", True, "rig")
-    moves = {one["what"]: one["found"] for one in told["findings"] if one["part"] == "move"}
+    report = json.loads(ended.out)
+    assert (ended.code, ended.said, report["sound"], report["rig"]) == (0, "", True, "rig")
+    moves = {finding["what"]: finding["found"] for finding in report["findings"] if finding["part"] == "move"}
     assert list(moves) == ["homing", "travel (Z)", "pitch (X)", "roll (Y)"]
     assert moves["travel (Z)"] == "+0.5 mm and back, off by 0.0000 mm"
     assert machine.position()["Z"] == pytest.approx(-0.3, abs=0.01)
@@ -103,8 +105,8 @@ def test_a_failure_is_printed_in_a_line_and_nothing_is_moved(controller):
 def test_what_soft_limits_do_not_allow_is_refused_before_anything_moves(controller):
     port = controller(home=True, s20=1.0)
     before = port.machine.position()
-    said = refused("", "rig check rig.toml --move")
-    assert re.fullmatch(r"stage .*: stage.pitch.limits are -5 to 5 .* allow -\d+ to 0: .*", said)
+    message = refused("", "rig check rig.toml --move")
+    assert re.fullmatch(r"stage .*: stage.pitch.limits are -5 to 5 .* allow -\d+ to 0: .*", message)
     assert port.machine.position() == before
 
 
@@ -133,8 +135,8 @@ def test_a_leaning_stage_is_lifted_upright(controller, clock):
 def test_an_alarm_is_ended_only_by_unlocking(controller):
     port = controller()
     port.alarm(9)
-    said = refused("locked", "rig lift rig.toml")
-    assert "'mirrorskin rig unlock'" in said
+    message = refused("locked", "rig lift rig.toml")
+    assert "'mirrorskin rig unlock'" in message
     assert port.machine.state == "Alarm"
     assert run("rig unlock rig.toml").code == 0
     assert port.machine.state == "Idle"
@@ -191,10 +193,10 @@ def test_on_a_terminal_the_table_has_colours(folder, monkeypatch):
         CheckResult("camera", "rate", "1 Hz", "failed", "mend it"),
     ]
     command._print(load_rig("rig.toml"), findings, True, False)
-    said = sys.stdout.getvalue()
-    assert "[b]idle" in said
-    assert "\x1b[31mfailed\x1b[0m" in said
-    assert "mend it" in said
+    text = sys.stdout.getvalue()
+    assert "[b]idle" in text
+    assert "\x1b[31mfailed\x1b[0m" in text
+    assert "mend it" in text
 
 
 def test_a_new_rig_file_can_be_loaded_and_is_never_written_over_another(folder):
@@ -217,9 +219,9 @@ def test_a_full_disk_leaves_no_half_a_rig_file(tmp_path):
         "from mirrorskin.cli.main import main; main()"
     )
     words = [sys.executable, "-B", "-c", code, "rig", "new", "-o", "mine.toml"]  # half a module would stay
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == (
+    process = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stdout) == (2, "")
+    assert process.stderr == (
         "mirrorskin: mine.toml could not be written: File too large; make room, or choose another place with"
         " -o\n"
     )

@@ -61,8 +61,10 @@ def test_a_rotation_becomes_normals_that_are_scored():
     result = io.open_result("turn-result.h5")
     assert ended.out.startswith("turn-result.h5: normals at 99 of 99 pixels, zenith from ")
     lowest, highest = result.height.min(), result.height.max()
-    told = f"in contact at 99, relative height from {lowest:.3f} to {highest:.3f} mm, absolute height unknown"
-    assert ended.out.endswith(f", {told}\n")
+    ending = (
+        f"in contact at 99, relative height from {lowest:.3f} to {highest:.3f} mm, absolute height unknown"
+    )
+    assert ended.out.endswith(f", {ending}\n")
     assert ended.out.count("\n") == 1
     assert np.max(errors(result)) < 2
     assert result.x is not None
@@ -101,9 +103,9 @@ def test_without_a_pixel_size_there_are_no_heights_and_a_line_states_the_reason(
     assert ended.said == "turn.h5: no height: the recording has no pixel size; give --pixel-size\n"
     assert ended.out.startswith("out.h5: normals at 99 of 99 pixels, zenith from ")
     assert not {"height", "height_sigma", "component"} & set(result.maps())
-    given, ended = reconstruct("--pixel-size", "0.1mm")
+    without_file, ended = reconstruct("--pixel-size", "0.1mm")
     assert ended.said == ""
-    assert np.isfinite(given.height).all()
+    assert np.isfinite(without_file.height).all()
 
 
 def test_a_surface_that_was_not_found_is_one_line_and_no_file(monkeypatch):
@@ -133,21 +135,21 @@ def test_each_turn_has_maps_of_its_own():
 def test_phases_from_a_file_replace_the_recording_s():
     turn("right.h5", phase=np.array(SETUP.phase) ** 1.1)
     with io.open_recording("right.h5") as recording:
-        found = read_all(recording, 8)
-    record(MadeUp(found.frames, HEADER, phase=np.zeros(8)), Path("wrong.h5"))
-    Path("phases.txt").write_text(" ".join(f"{phase!r}rad" for phase in found.phase.tolist()))
-    given, _ = reconstruct("--phases", "phases.txt", name="wrong.h5")
-    own, _ = reconstruct(name="right.h5")
-    np.testing.assert_array_equal(given.normals, own.normals)
+        recorded = read_all(recording, 8)
+    record(MadeUp(recorded.frames, HEADER, phase=np.zeros(8)), Path("wrong.h5"))
+    Path("phases.txt").write_text(" ".join(f"{phase!r}rad" for phase in recorded.phase.tolist()))
+    replaced, _ = reconstruct("--phases", "phases.txt", name="wrong.h5")
+    expected, _ = reconstruct(name="right.h5")
+    np.testing.assert_array_equal(replaced.normals, expected.normals)
 
 
 def test_gain_offset_and_tilt_on_the_command_line_replace_the_recording_s():
     turn("right.h5")
     turn("wrong.h5", zenith_gain=np.array(7.0), zenith_offset=np.array(700.0), tilt=0.2)
     words = ["--zenith-gain", "400/deg", "--zenith-offset", "2000", "--tilt", "2.5deg"]
-    given, _ = reconstruct(*words, name="wrong.h5")
-    own, _ = reconstruct(name="right.h5")
-    np.testing.assert_allclose(given.normals, own.normals, atol=1e-5)
+    replaced, _ = reconstruct(*words, name="wrong.h5")
+    expected, _ = reconstruct(name="right.h5")
+    np.testing.assert_allclose(replaced.normals, expected.normals, atol=1e-5)
 
 
 def test_an_unknown_tilt_is_estimated():
@@ -212,10 +214,10 @@ FOR = {"--modulus": "presses, slides and twists"}
 @pytest.mark.parametrize("option", PRESS)
 def test_options_of_a_press_are_refused_for_a_rotation(option):
     turn()
-    told = refused("", "reconstruct turn.h5", option, *PRESS[option])
+    message = refused("", "reconstruct turn.h5", option, *PRESS[option])
     # Of a pair of opposites the first is named.
     name = option.replace("--no-", "--")
-    assert told == f"{name} applies to {FOR.get(name, 'presses')} only; turn.h5 is a rotation. Remove it"
+    assert message == f"{name} applies to {FOR.get(name, 'presses')} only; turn.h5 is a rotation. Remove it"
 
 
 @pytest.mark.parametrize("option", ROTATION)
@@ -223,8 +225,8 @@ def test_options_of_a_rotation_are_refused_for_a_press(option):
     record(sphere(), Path("press.h5"))
     Path("phases.txt").write_text("1deg")
     Path("turn.h5").touch()
-    told = refused("", "reconstruct press.h5", option, *ROTATION[option])
-    assert told == f"{option} applies to rotations only; press.h5 is a press. Remove it"
+    message = refused("", "reconstruct press.h5", option, *ROTATION[option])
+    assert message == f"{option} applies to rotations only; press.h5 is a press. Remove it"
 
 
 @pytest.mark.parametrize("motion", ["horizontal", "twist"])
@@ -260,13 +262,13 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_bad_input_is_one_line(case):
-    changes, words, said_of = CASES[case]
+    changes, words, message = CASES[case]
     turn(**changes)
     Path("two.txt").write_text("0deg 90deg " * 4)
     Path("seven.txt").write_text("0deg 45deg 90deg 135deg 180deg 225deg 270deg")
     io.save_result(io.Result(zenith=np.zeros(SHAPE, np.float32)), "flat.h5")
     io.save_result(io.Result(height=np.zeros((2, 3), np.float32)), "small.h5")
-    refused(said_of, "reconstruct turn.h5", *words)
+    refused(message, "reconstruct turn.h5", *words)
 
 
 def test_two_phases_half_a_turn_apart_are_a_body_that_rocks():

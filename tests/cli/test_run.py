@@ -104,10 +104,10 @@ def test_region_frames_and_travel_are_those_of_reconstruct():
     chosen = ("--region", "1,1,4x3", "--frames", "1:7", "--travel-step", "0.2mm")
     ended = done("run", f"{example}:SteepestRise", "press.h5", *chosen, "-o", "out.h5", "--json")
     assert json.loads(ended.out)["process"]["source_frames"] == "1:7"
-    own = runpy.run_path(str(example))["SteepestRise"]
+    operation = runpy.run_path(str(example))["SteepestRise"]
     region = io.Region.read("1,1,4x3")
     with io.open_recording("press.h5", region=region, frames=(1, 7), travel=io.Steps(0.2)) as source:
-        expected = engine.run(source, own)
+        expected = engine.run(source, operation)
     np.testing.assert_array_equal(io.open_result("out.h5").height, expected.height)
 
 
@@ -207,8 +207,8 @@ def recordings(tmp_path_factory):
         "turn": ["axial", "--pattern", "linear"],
         "slide": ["horizontal", "--frames", "6", "--texture", "dots", "--texture-size", "0.5mm"],
     }
-    for name, one in words.items():
-        done("simulate", *one, *small, "-o", folder / f"{name}.h5")
+    for name, words_of in words.items():
+        done("simulate", *words_of, *small, "-o", folder / f"{name}.h5")
     return folder
 
 
@@ -231,7 +231,7 @@ def test_built_in_operations_and_methods_run_as_in_python(name, recordings):
     place, _, kind = name.rpartition(":")
     module = f"mirrorskin.engine.{place}" if place else "mirrorskin.engine"
     words = [
-        f"{'--no-' if value is False else '--'}{one.replace('_', '-')}" for one, value in options.items()
+        f"{'--no-' if value is False else '--'}{name.replace('_', '-')}" for name, value in options.items()
     ]
     words += [str(value) for value in options.values() if not isinstance(value, bool)]
     path = recordings / f"{motion}.h5"
@@ -241,10 +241,10 @@ def test_built_in_operations_and_methods_run_as_in_python(name, recordings):
         expected = (
             operation.run(source) if isinstance(operation, engine.Method) else engine.run(source, operation)
         )
-    found = io.open_result("out.h5")
+    result = io.open_result("out.h5")
     for option, value in options.items():
-        assert found.process.get(option, value) == value
-    assert_same(found.assign(process={}), expected.assign(process={}))
+        assert result.process.get(option, value) == value
+    assert_same(result.assign(process={}), expected.assign(process={}))
 
 
 def test_what_a_module_itself_lacks_is_not_hidden():
@@ -252,27 +252,27 @@ def test_what_a_module_itself_lacks_is_not_hidden():
         run("run lost_of_a_test:Light press.h5")
 
 
-def test_what_the_page_says_runs():
+def test_the_code_of_the_page_runs():
     page = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
-    own, code, configured, loop, steps, declared, with_units, on_a_device, with_kernel = blocks
-    Path("light.py").write_text(own)
+    first, code, configured, loop, steps, declared, with_units, on_a_device, with_kernel = blocks
+    Path("light.py").write_text(first)
     Path("first_light.py").write_text(with_kernel)
     for line in "".join(re.findall(r"^```sh\n(.*?)^```", page, re.DOTALL | re.MULTILINE)).splitlines():
         words = line.partition(" #")[0].replace("device=gpu", "device=cpu").split()[1:]
         if not {"live", "--live"} & {*words}:  # tests/cli/test_live.py
             done(*words)
-    known = {}
-    exec(own + code + configured + loop + steps + declared + with_units + on_a_device, known)
-    assert known["result"]["light"].any()
-    np.testing.assert_array_equal(known["again"].height, known["onset"].height)
-    assert known["edges"].shape == known["surface"].height.shape
-    assert known["Wear"].maps["wear"].quantity == "height"
-    assert known["run"].result()["light"].tolist() == np.full((48, 64), 2).tolist()
-    in_percent = engine.run(np.full((4, 2, 3), 120, np.uint8), known["LightInPercent"])
+    namespace = {}
+    exec(first + code + configured + loop + steps + declared + with_units + on_a_device, namespace)
+    assert namespace["result"]["light"].any()
+    np.testing.assert_array_equal(namespace["again"].height, namespace["onset"].height)
+    assert namespace["edges"].shape == namespace["surface"].height.shape
+    assert namespace["Wear"].maps["wear"].quantity == "height"
+    assert namespace["run"].result()["light"].tolist() == np.full((48, 64), 2).tolist()
+    in_percent = engine.run(np.full((4, 2, 3), 120, np.uint8), namespace["LightInPercent"])
     assert in_percent["share"].tolist() == [[100.0] * 3] * 2
     header = io.Header("vertical", dark=np.full((2, 3), 60, np.float32))
     frames = 10 * np.arange(24, dtype=np.uint8).reshape(4, 2, 3)
     for chosen, level in ({}, 60), ({"dark": 10}, 10):
-        above = engine.run(MadeUp(frames, header), known["LightAboveDark"](level=50, **chosen))
+        above = engine.run(MadeUp(frames, header), namespace["LightAboveDark"](level=50, **chosen))
         np.testing.assert_array_equal(above["light"], (frames > 50 + level).sum(axis=0))

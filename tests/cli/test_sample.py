@@ -65,25 +65,20 @@ def test_a_name_that_is_not_a_video_is_refused_in_one_line(tmp_path, capfd):
     assert capfd.readouterr().err == ""  # nor does OpenCV print anything
 
 
-KNOWN = ("--motion", "vertical", "--travel-step", "0.1mm", "--pixel-size", "0.0375mm")  # of a user's frames
+VERTICAL = (
+    "--motion",
+    "vertical",
+    "--travel-step",
+    "0.1mm",
+    "--pixel-size",
+    "0.0375mm",
+)  # of a user's frames
 
 
-@pytest.fixture
-def score(sample):
-    """Compare a result with the truth that `sample press` has."""
+def test_heights_of_a_video_are_right_without_more_options(sample):
+    """tests/test_blocks.py has the stack and the pictures, by docs/start.md."""
     sample("press", "truth.h5")
-    return lambda result: check_score(["score", result, "--truth", "truth.h5"])
-
-
-def test_the_stack_s_heights_are_right_without_more_options(sample, score):
-    sample("stack", "theirs.h5")
-    assert run("reconstruct theirs.h5 --dataset /raw/images", *KNOWN, "-o", "heights.h5").code == 0
-    score("heights.h5")
-
-
-@pytest.mark.parametrize(("name", "file"), [("pictures", "frames"), ("video", "press.avi")])
-def test_heights_of_imported_frames_are_right_without_more_options(name, file, sample, score):
-    sample(name, file)
-    assert run("import", file, "-o", "press.h5", *KNOWN).code == 0
+    sample("video", "press.avi")
+    assert run("import press.avi -o press.h5", *VERTICAL).code == 0
     assert run("reconstruct press.h5").code == 0
-    score("press-result.h5")
+    check_score(["score", "press-result.h5", "--truth", "truth.h5"])

@@ -122,11 +122,15 @@ def test_every_key_is_an_option_of_reconstruct_too(settings):
     from mirrorskin.cli.main import app
 
     command = app.commands["reconstruct"]
-    options = {name.removeprefix("--") for one in command.params for name in (*one.opts, *one.secondary_opts)}
+    options = {
+        name.removeprefix("--")
+        for parameter in command.params
+        for name in (*parameter.opts, *parameter.secondary_opts)
+    }
     assert set(re.findall(r"^([a-z-]+) =", EVERYTHING, re.MULTILINE)) <= options
 
 
-def test_what_is_not_said_is_left_to_the_recordings(settings):
+def test_missing_settings_are_left_to_the_recordings(settings):
     assert settings("") == read_settings(None, 1000) == Plan(memory_limit=1000)
     assert settings("[press]\n[stack]\n") == Plan(memory_limit=1000)
 
@@ -163,7 +167,7 @@ def test_a_tilt_may_be_estimated(settings):
 
 
 @pytest.mark.parametrize(
-    ("table", "line", "said"),
+    ("table", "line", "message"),
     [
         (
             "stack",
@@ -229,10 +233,10 @@ def test_a_tilt_may_be_estimated(settings):
         ("stack", "travel_step = '1mm'", "travel_step is not known: did you mean travel-step?"),
     ],
 )
-def test_what_cannot_be_used_is_reported_with_file_table_and_key(settings, table, line, said):
+def test_what_cannot_be_used_is_reported_with_file_table_and_key(settings, table, line, message):
     with pytest.raises(io.InputError) as refused:
         settings(f"[{table}]\n{line}\n")
-    assert str(refused.value).startswith(f"b.toml: {table}.{said}")
+    assert str(refused.value).startswith(f"b.toml: {table}.{message}")
     assert "\n" not in str(refused.value)
 
 
@@ -250,7 +254,7 @@ class Band(engine.Operation):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("[presses]\n", "b.toml: presses is not known: did you mean press?"),
         ("press = 2\n", "b.toml: press is 2: write [press] alone in a line"),
@@ -275,11 +279,11 @@ class Band(engine.Operation):
         ),
     ],
 )
-def test_a_file_that_makes_no_sense_is_reported(settings, text, said):
+def test_a_file_that_makes_no_sense_is_reported(settings, text, message):
     Path("mine.py").write_text(BAND)
     with pytest.raises(io.InputError) as refused:
         settings(text)
-    assert str(refused.value).startswith(said)
+    assert str(refused.value).startswith(message)
 
 
 def test_the_page_lists_the_keys_of_a_stack(settings):

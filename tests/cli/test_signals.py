@@ -20,19 +20,19 @@ def press(tmp_path):
 
 @pytest.mark.parametrize("second", ["SIGINT", "SIGTERM"])
 def test_a_second_signal_does_not_interrupt_what_the_first_one_began(press, monkeypatch, capfd, second):
-    done = []
+    events = []
 
     def describe(path):
         try:
             signal.raise_signal(signal.SIGINT)
         finally:
             signal.raise_signal(getattr(signal, second))
-            done.append("cleaned up")
+            events.append("cleaned up")
 
     monkeypatch.setattr(io, "describe", describe)
     ended = run("info", press)
     assert (ended.code, ended.out, ended.said) == (130, "", "")
-    assert done == ["cleaned up"]
+    assert events == ["cleaned up"]
     assert capfd.readouterr().err == "mirrorskin: it is being stopped; two more Ctrl-C end it at once\n"
 
 
@@ -59,9 +59,11 @@ program()
 
 def test_a_repeated_signal_ends_a_hanging_program_at_once_and_without_an_abort(press):
     command = [sys.executable, "-c", INSISTING]
-    done = subprocess.run(command, cwd=press.parent, capture_output=True, text=True, timeout=120, check=False)
-    assert (done.returncode, done.stdout) == (130, "")
-    assert done.stderr == "mirrorskin: it is being stopped; two more Ctrl-C end it at once\n"
+    process = subprocess.run(
+        command, cwd=press.parent, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (process.returncode, process.stdout) == (130, "")
+    assert process.stderr == "mirrorskin: it is being stopped; two more Ctrl-C end it at once\n"
 
 
 HANDLED = [signal.SIGTERM, signal.SIGHUP, signal.SIGALRM, signal.SIGINT]
@@ -71,8 +73,8 @@ def handlers():
     return [signal.getsignal(number) for number in HANDLED]
 
 
-@pytest.mark.parametrize("own", [False, True])
-def test_handlers_of_the_caller_are_restored(press, monkeypatch, own):
+@pytest.mark.parametrize("own_handler", [False, True])
+def test_handlers_of_the_caller_are_restored(press, monkeypatch, own_handler):
     before = handlers()
 
     class Careless:
@@ -84,7 +86,7 @@ def test_handlers_of_the_caller_are_restored(press, monkeypatch, own):
         signal.pause()
 
     try:
-        if own:
+        if own_handler:
             for number in HANDLED:
                 signal.signal(number, lambda *_: None)
         installed = handlers()
@@ -114,19 +116,21 @@ print([names[signal.getsignal(getattr(signal, name))] for name in ("SIGTERM", "S
 
 
 @pytest.mark.parametrize(
-    ("own", "expected"),
-    [("SIGTERM", ["own", "default", "default"]), ("SIGHUP,SIGINT", ["default", "own", "own"])],
+    ("handler", "expected"),
+    [("SIGTERM", ["handler", "default", "default"]), ("SIGHUP,SIGINT", ["default", "handler", "handler"])],
 )
-def test_handlers_after_a_program(own, expected):
-    command = [sys.executable, "-c", RETURNED, "--version", own]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    assert done.stdout.splitlines()[1:] == [str(expected)]
+def test_handlers_after_a_program(handler, expected):
+    command = [sys.executable, "-c", RETURNED, "--version", handler]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert process.stdout.splitlines()[1:] == [str(expected)]
 
 
-@pytest.mark.parametrize(("limit", "said"), [(400_000 << 10, "512 MB are needed"), (900 << 20, "PoCL needs")])
-def test_too_little_address_space_is_one_line(press, limit, said):
+@pytest.mark.parametrize(
+    ("limit", "message"), [(400_000 << 10, "512 MB are needed"), (900 << 20, "PoCL needs")]
+)
+def test_too_little_address_space_is_one_line(press, limit, message):
     # 400 000 KB is 'ulimit -v 400000', with which PoCL's threads aborted; LLVM crashed with 900 MB.
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "mirrorskin.cli.main", "reconstruct", press, "-o", press.with_name("r.h5")],
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
@@ -135,10 +139,10 @@ def test_too_little_address_space_is_one_line(press, limit, said):
         timeout=300,
         check=False,
     )
-    assert done.returncode == 1
-    assert done.stderr.count("\n") == 1
-    assert f"the address space is limited to {limit >> 20} MB, and" in done.stderr
-    assert said in done.stderr
+    assert process.returncode == 1
+    assert process.stderr.count("\n") == 1
+    assert f"the address space is limited to {limit >> 20} MB, and" in process.stderr
+    assert message in process.stderr
 
 
 @pytest.mark.parametrize(

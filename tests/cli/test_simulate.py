@@ -27,17 +27,17 @@ EXACT = ["--references", "exact"]
 def simulate(motion, *words, size=SMALL):
     """Simulate, and return the recording's frames and positions, and the recording, which is closed."""
     path = f"{next(_NUMBER)}.h5"
-    code, out, said = run("simulate", motion, *size, *words, "-o", path)
-    assert (code, said) == (0, ""), said
+    code, out, errors = run("simulate", motion, *size, *words, "-o", path)
+    assert (code, errors) == (0, ""), errors
     with io.open_recording(path) as recording:
-        found = read_all(recording, 7)
+        block = read_all(recording, 7)
         assert recording.truth is not None  # it is kept
     columns, rows = recording.shape[:0:-1]
     start = f"{path}: {recording.shape[0]} frames of {columns} x {rows}: Digital twin, "
     assert out.startswith(start)
     assert f", {motion} motion" in out
     assert out.count("\n") == 1
-    return found, recording
+    return block, recording
 
 
 _NUMBER = itertools.count()
@@ -60,10 +60,10 @@ RECORDED = {
 
 
 def test_strokes_go_up_and_down_as_far_as_the_steps_would():
-    found, _ = simulate(
+    block, _ = simulate(
         "vertical", "--travel-start", "0.5mm", "--travel-step", "0.2mm", "--strokes", "2", "--frames", "5"
     )
-    np.testing.assert_allclose(found.travel, 0.5 + 0.8 * np.array([0, 0.5, 1, 0.5, 0]), atol=1e-12)
+    np.testing.assert_allclose(block.travel, 0.5 + 0.8 * np.array([0, 0.5, 1, 0.5, 0]), atol=1e-12)
     refused("--strokes applies to presses only; this is a rotation", "simulate axial --strokes 3 -o a.h5")
     refused("leave --release out", "simulate vertical --strokes 3 --release -o a.h5")
 
@@ -108,17 +108,17 @@ def test_an_object_is_where_it_is_shifted_to(contact):
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_each_motion_is_recorded_as_it_is_given(motion, contact):
     words = [*GIVEN[motion], "--frames", "5", "--contact", contact, *EXACT]
-    found, recording = simulate(motion, *words)
-    assert found.frames.shape == (5, *SHAPE)
-    assert found.frames.dtype == np.uint8
+    block, recording = simulate(motion, *words)
+    assert block.frames.shape == (5, *SHAPE)
+    assert block.frames.dtype == np.uint8
     name, positions = RECORDED[motion]
     for series, values in dict.fromkeys(("travel", "phase", "displacement", "twist")).items():
         expected = positions if series == name else values
         if expected is None:
-            assert getattr(found, series) is None
+            assert getattr(block, series) is None
         else:
-            np.testing.assert_allclose(getattr(found, series), expected, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.time, STEPS / 30)
+            np.testing.assert_allclose(getattr(block, series), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(block.time, STEPS / 30)
     header = recording.header
     assert recording.motion == header.motion == motion
     assert header.pixel_size == (PIXEL, PIXEL)
@@ -144,13 +144,13 @@ def documented():
     code, out, _ = run("simulate --help")
     assert code == 0
     entries = re.split(r"\n\s+(?=--|-o)", out)
-    found = {}
+    defaults = {}
     for entry in entries:
         name = re.match(r"(--[a-z-]+)", entry)
         default = re.search(r"\[default:\s+([^\]]*)\]", entry)
         if name and default:
-            found[name[1]] = " ".join(default[1].strip("()").split())
-    return found
+            defaults[name[1]] = " ".join(default[1].strip("()").split())
+    return defaults
 
 
 @pytest.fixture
@@ -159,33 +159,33 @@ def asked(monkeypatch):
     calls = []
     twin = Twin
 
-    def spy(**given):
-        calls.append(given)
-        return twin(**given)
+    def spy(**options):
+        calls.append(options)
+        return twin(**options)
 
     monkeypatch.setattr(mirrorskin.twin, "Twin", spy)
     return calls
 
 
 def test_without_options_a_press_is_the_documented_one():
-    told = documented()
-    found, _ = simulate("vertical", *EXACT)
-    assert len(found.travel) == 30
-    assert told["--frames"].startswith("30; of a rotation one turn")
-    assert told["--travel-start"] == told["--travel-step"] == "0.1mm"
-    np.testing.assert_allclose(found.travel, 0.1 * np.arange(1, 31))
-    assert told["--frame-rate"] == "30"
-    np.testing.assert_allclose(found.time, np.arange(30) / 30)
+    defaults = documented()
+    block, _ = simulate("vertical", *EXACT)
+    assert len(block.travel) == 30
+    assert defaults["--frames"].startswith("30; of a rotation one turn")
+    assert defaults["--travel-start"] == defaults["--travel-step"] == "0.1mm"
+    np.testing.assert_allclose(block.travel, 0.1 * np.arange(1, 31))
+    assert defaults["--frame-rate"] == "30"
+    np.testing.assert_allclose(block.time, np.arange(30) / 30)
 
 
 def test_without_options_a_rotation_is_one_turn_of_the_documented_one():
-    told = documented()
-    found, recording = simulate("axial", *EXACT)
-    assert (told["--phase-step"], told["--tilt"], told["--press"]) == ("45deg", "2.5deg", "1mm")
-    np.testing.assert_allclose(found.phase, np.arange(8) * np.pi / 4)
+    defaults = documented()
+    block, recording = simulate("axial", *EXACT)
+    assert (defaults["--phase-step"], defaults["--tilt"], defaults["--press"]) == ("45deg", "2.5deg", "1mm")
+    np.testing.assert_allclose(block.phase, np.arange(8) * np.pi / 4)
     assert recording.header.tilt == pytest.approx(math.radians(2.5))
     assert recording.header.press == 1
-    assert told["--pivot"] == "0mm,0mm,0mm"
+    assert defaults["--pivot"] == "0mm,0mm,0mm"
     assert recording.header.pivot == (0, 0, 0)
 
 
@@ -195,37 +195,37 @@ def test_a_turn_has_as_many_frames_as_steps_fit_in_it(step, count):
 
 
 def test_without_options_the_field_is_the_documented_one(asked, monkeypatch):
-    told = documented()
+    defaults = documented()
 
-    def refuse(**given):
-        asked.append(given)
+    def refuse(**options):
+        asked.append(options)
         raise io.InputError("enough is known")
 
     monkeypatch.setattr(mirrorskin.twin, "Twin", refuse)
     refused("enough is known", "simulate vertical -o a.h5")
     rows, columns = asked[0]["shape"]
-    assert f"{columns}x{rows}" == told["--size"] == "480x480"
+    assert f"{columns}x{rows}" == defaults["--size"] == "480x480"
     assert asked[0]["pixel_size"] == (0.025, 0.025)
-    assert told["--pixel-size"] == "0.025mm"
+    assert defaults["--pixel-size"] == "0.025mm"
 
 
 def test_without_options_body_and_camera_are_the_twin_s_own(asked):
-    told = documented()
+    defaults = documented()
     simulate("vertical", "--frames", "2")
-    (given,) = asked
-    assert given["body"] == Body()
-    assert given["camera"] == Camera()
-    chosen = {name: given[name] for name in ("object", "contact", "optics", "pattern", "references")}
-    assert chosen == {name: told[f"--{name}"] for name in chosen}
+    (arguments,) = asked
+    assert arguments["body"] == Body()
+    assert arguments["camera"] == Camera()
+    chosen = {name: arguments[name] for name in ("object", "contact", "optics", "pattern", "references")}
+    assert chosen == {name: defaults[f"--{name}"] for name in chosen}
     assert chosen["references"] == "ball"
-    assert given["texture"] is None
+    assert arguments["texture"] is None
     size, contrast = SheetTexture().size, SheetTexture().contrast
-    assert (told["--texture-size"], told["--texture-contrast"]) == (f"{size:g}mm", str(contrast))
+    assert (defaults["--texture-size"], defaults["--texture-contrast"]) == (f"{size:g}mm", str(contrast))
     for option, value in (("--friction", Body().friction), ("--noise", Camera().noise)):
-        assert float(told[option]) == value
-    assert told["--scatter"] == f"{math.degrees(Body().scatter):g}deg"
-    assert told["--bits"] == str(Camera(np.dtype(np.uint16)).bits)
-    assert told["--dtype"] == Camera().dtype.name
+        assert float(defaults[option]) == value
+    assert defaults["--scatter"] == f"{math.degrees(Body().scatter):g}deg"
+    assert defaults["--bits"] == str(Camera(np.dtype(np.uint16)).bits)
+    assert defaults["--dtype"] == Camera().dtype.name
 
 
 WALL = ["--optics", "cylinder"]
@@ -290,11 +290,11 @@ OWN = {
 
 
 @pytest.mark.parametrize(
-    ("motion", "option"), [(m, o) for o, (_, own) in OWN.items() for m in MOTIONS if m not in own]
+    ("motion", "option"), [(m, o) for o, (_, motions) in OWN.items() for m in MOTIONS if m not in motions]
 )
 def test_an_option_of_another_motion_is_refused(motion, option):
     words = [motion, *SMALL, f"--{option}", OWN[option][0], "-o", "a.h5"]
-    *others, last = [PLURALS[one] for one in OWN[option][1]]
+    *others, last = [PLURALS[motion] for motion in OWN[option][1]]
     named = f"{', '.join(others)} and {last}" if others else last
     refused(f"--{option} applies to {named} only; this is a {NOUNS[motion]}. Remove it", "simulate", *words)
 
@@ -426,9 +426,9 @@ def test_impossible_input_is_refused_in_one_line(case):
     wide("wide.npy")
     picture("picture.png")
     Path("picture.png").with_suffix(".ply").write_bytes(Path("picture.png").read_bytes())
-    words, said_of = BAD[case]
+    words, message = BAD[case]
     size = [] if "--size" in words else SMALL
-    refused(said_of, "simulate", *words, *size, "-o", "a.h5")
+    refused(message, "simulate", *words, *size, "-o", "a.h5")
 
 
 def test_a_refusal_leaves_the_recording_that_was_there():
@@ -442,8 +442,8 @@ def test_an_input_is_not_overwritten_but_a_name_is_not_an_input():
     Path("sphere").mkdir()
     for again in ([], ["--overwrite"]):
         words = ("simulate", "vertical", *SMALL, "--frames", "2", *EXACT, "-o", "sphere/a.h5")
-        code, _, said = run(*words, *again)
-        assert (code, said) == (0, "")
+        code, _, errors = run(*words, *again)
+        assert (code, errors) == (0, "")
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
@@ -451,8 +451,8 @@ def test_the_same_seed_gives_the_same_frames(motion):
     words = [*GIVEN[motion], "--frames", "3", *WALL, "--contact", "elastic", "--electrons", "40"]
     deviations = ["--gain-deviation", "0.02", "--offset-deviation", "0.5"]
     first, again, other = (simulate(motion, *words, *deviations, "--seed", seed) for seed in "778")
-    for found, expected in zip(again[0], first[0], strict=True):
-        np.testing.assert_array_equal(found, expected)
+    for repeated, expected in zip(again[0], first[0], strict=True):
+        np.testing.assert_array_equal(repeated, expected)
     for name in ("dark", "bright"):
         reference = getattr(first[1].header, name)
         np.testing.assert_array_equal(getattr(again[1].header, name), reference)
@@ -462,9 +462,9 @@ def test_the_same_seed_gives_the_same_frames(motion):
 
 def test_a_release_goes_back_by_the_same_steps():
     words = ["--frames", "5", "--travel-start", "0.5mm", "--travel-step", "0.5mm"]
-    found, recording = simulate("vertical", *words, "--release", "--noise", "0", *EXACT)
-    np.testing.assert_allclose(found.travel, [0.5, 1, 1.5, 2, 2.5, 2, 1.5, 1, 0.5])
-    np.testing.assert_array_equal(found.frames, found.frames[::-1])
+    block, recording = simulate("vertical", *words, "--release", "--noise", "0", *EXACT)
+    np.testing.assert_allclose(block.travel, [0.5, 1, 1.5, 2, 2.5, 2, 1.5, 1, 0.5])
+    np.testing.assert_array_equal(block.frames, block.frames[::-1])
     assert recording.truth.contact.sum() == np.count_nonzero(geometry.sphere(SHAPE, PIXEL).height >= -2.5)
 
 
@@ -474,9 +474,9 @@ CLEAR = ["--noise", "0", *EXACT]
 @pytest.mark.parametrize(("bits", "scale"), [("10", 4), ("12", 16), ("16", 256), (None, 16)])
 def test_bits_set_the_camera_s_levels(bits, scale):
     words = ["--frames", "2", "--travel-start", "3mm", "--travel-step", "0mm", "--dtype", "uint16", *CLEAR]
-    found, recording = simulate("vertical", *words, *([] if bits is None else ["--bits", bits]))
-    assert found.frames.dtype == np.uint16
-    assert (found.frames.min(), found.frames.max()) == (16 * scale, 224 * scale)
+    block, recording = simulate("vertical", *words, *([] if bits is None else ["--bits", bits]))
+    assert block.frames.dtype == np.uint16
+    assert (block.frames.min(), block.frames.max()) == (16 * scale, 224 * scale)
     assert recording.header.bright[0, 0] == 224 * scale
 
 
@@ -497,13 +497,13 @@ def test_a_picture_can_surround_the_body():
 
 
 def test_a_linear_pattern_writes_the_zenith_to_the_header():
-    found, recording = simulate("axial", "--pattern", "linear", "--frames", "2", "--dtype", "float32", *CLEAR)
+    block, recording = simulate("axial", "--pattern", "linear", "--frames", "2", "--dtype", "float32", *CLEAR)
     header, truth = recording.header, recording.truth
     # Between the zeniths that show the wall's rim and the horizon, counts go from dark to bright.
     rim = math.atan2(17.5, 40) / 2
     np.testing.assert_allclose(header.zenith_gain, 208 / (math.pi / 4 - rim))
     np.testing.assert_allclose(header.zenith_offset + header.zenith_gain * rim, 16, rtol=1e-6)
-    zenith = (found.frames.mean(axis=0) - header.zenith_offset) / header.zenith_gain
+    zenith = (block.frames.mean(axis=0) - header.zenith_offset) / header.zenith_gain
     inside = (truth.contact == 1) & (truth.zenith > math.radians(17)) & (truth.zenith < math.radians(40))
     assert inside.sum() > 10
     # Of a body that is tilted by 2.5 degrees.
@@ -531,8 +531,8 @@ def test_objects_come_from_files():
 @pytest.mark.parametrize("packing", ["raw", "bitshuffle"])
 def test_frames_are_packed_as_asked(packing):
     plain, _ = simulate("vertical", "--frames", "3", *EXACT)
-    found, recording = simulate("vertical", "--frames", "3", *EXACT, "--compression", packing)
-    np.testing.assert_array_equal(found.frames, plain.frames)
+    block, recording = simulate("vertical", "--frames", "3", *EXACT, "--compression", packing)
+    np.testing.assert_array_equal(block.frames, plain.frames)
     assert (recording.storage == "in one piece") == (packing == "raw")
 
 

@@ -38,7 +38,7 @@ def contact(slide):
 
 
 @pytest.fixture(scope="module")
-def found(slide, contact):
+def slide_result(slide, contact):
     ended = run("reconstruct", slide, "--contact", contact, "--per-frame", "-o", slide.with_name("found.h5"))
     assert (ended.code, ended.said) == (0, "")
     assert "slip onset at " in ended.out
@@ -46,19 +46,19 @@ def found(slide, contact):
     return io.open_result(slide.with_name("found.h5"))
 
 
-def test_a_slide_is_reported_as_found_in_its_frames(slide, contact, found):
+def test_a_slide_is_reported_as_found_in_its_frames(slide, contact, slide_result):
     touched = io.open_result(contact).contact
     with io.open_recording(slide) as recording:
-        told = engine.run(recording, engine.slip.Slip(contact=touched, per_frame=True))
+        expected = engine.run(recording, engine.slip.Slip(contact=touched, per_frame=True))
     for name in ("displacement", "displacement_sigma", "slip_onset", "slip_onset_sigma", "status", "contact"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(told, name), err_msg=name)
-    np.testing.assert_allclose(found.slide_distance, np.arange(12) * 0.02, atol=1e-12)
-    np.testing.assert_array_equal(found.stick_ratio, told.stick_ratio)
+        np.testing.assert_array_equal(getattr(slide_result, name), getattr(expected, name), err_msg=name)
+    np.testing.assert_allclose(slide_result.slide_distance, np.arange(12) * 0.02, atol=1e-12)
+    np.testing.assert_array_equal(slide_result.stick_ratio, expected.stick_ratio)
 
 
-def test_a_slide_agrees_with_the_truth(slide, found):
+def test_a_slide_agrees_with_the_truth(slide, slide_result):
     with io.open_recording(slide) as recording:
-        score = engine.score(found, recording.truth).slip
+        score = engine.score(slide_result, recording.truth).slip
     assert score.coverage > 0.9
     assert score.recall > 0.9
     assert score.precision > 0.9
@@ -75,16 +75,16 @@ def test_skin_at_coarse_pixels_is_not_reported_to_slip_too_early(motion, words, 
     assert run("simulate", motion, *scene, "-o", path).code == 0
     with io.open_recording(path) as recording:
         truth = recording.truth
-        found = engine.reconstruct(recording, contact=truth.contact)
+        coarse = engine.reconstruct(recording, contact=truth.contact)
     slipped = np.isfinite(truth.slip_onset).astype(np.uint8)
     around = np.ones((3, 3), np.uint8)
     inside = cv2.dilate(slipped, around) == cv2.erode(slipped, around)
-    told, known = (found.status == 1) & inside, np.isin(found.status, (1, 2)) & inside
-    assert np.mean(slipped[told]) > 0.98
-    assert np.mean(told[known & (slipped != 0)]) > 0.98
+    slipping, decided = (coarse.status == 1) & inside, np.isin(coarse.status, (1, 2)) & inside
+    assert np.mean(slipped[slipping]) > 0.98
+    assert np.mean(slipping[decided & (slipped != 0)]) > 0.98
 
 
-def test_slip_in_the_first_frames_is_scored_by_the_truth_of_these(slide, contact, found, tmp_path):
+def test_slip_in_the_first_frames_is_scored_by_the_truth_of_these(slide, contact, slide_result, tmp_path):
     target = tmp_path / "part.h5"
     assert run("reconstruct", slide, "--frames", "0:10", "--contact", contact, "-o", target).code == 0
     ended = run("score", target, "--truth", slide, "--json")
@@ -95,7 +95,7 @@ def test_slip_in_the_first_frames_is_scored_by_the_truth_of_these(slide, contact
     assert slip["displacement_rms"] < 0.01
     # Cattaneo and Mindlin: less sticks at the end of the slide than on the way.
     with io.open_recording(slide) as recording:
-        whole = engine.score(found, recording.truth).slip
+        whole = engine.score(slide_result, recording.truth).slip
     assert slip["true_stick_radius"] > whole.true_stick_radius + 0.03
 
 
@@ -133,21 +133,21 @@ def test_a_score_prints_the_true_and_found_radius_of_sticking(slide):
     assert score.table()["slip stick radius"].endswith(f"({error:+.1f} %)")
 
 
-def test_slip_without_a_truth_of_it_is_left_out_or_refused_where_there_is_nothing_else(slide, found):
+def test_slip_without_a_truth_of_it_is_left_out_or_refused_where_there_is_nothing_else(slide, slide_result):
     with io.open_recording(slide) as recording:
         truth = recording.truth
     bare = io.Truth(truth.height, truth.zenith, truth.azimuth, truth.contact)
-    score = engine.score(found, bare)
+    score = engine.score(slide_result, bare)
     assert score.slip is None
     assert "the truth has none" in score.slip_left_out
     with pytest.raises(io.InputError, match="the truth has none"):
         engine.score(stuck_within(0.5, truth), bare)
 
 
-def test_only_the_last_displacement_is_reported_unless_all_are_wanted(slide, contact, found):
+def test_only_the_last_displacement_is_reported_unless_all_are_wanted(slide, contact, slide_result):
     target = slide.with_name("last.h5")
     assert run("reconstruct", slide, "--contact", contact, "-o", target).code == 0
-    np.testing.assert_array_equal(io.open_result(target).displacement, found.displacement[-1])
+    np.testing.assert_array_equal(io.open_result(target).displacement, slide_result.displacement[-1])
 
 
 def test_a_part_of_a_twist_turns_about_the_whole_pictures_centre(tmp_path):
@@ -156,14 +156,14 @@ def test_a_part_of_a_twist_turns_about_the_whole_pictures_centre(tmp_path):
         io.save_result(io.Result(contact=recording.truth.contact), tmp_path / "press.h5")
     words = "--region", "8,4,52x56", "--contact", tmp_path / "press.h5", "-o", tmp_path / "found.h5"
     assert run("reconstruct", path, *words).code == 0
-    found = io.open_result(tmp_path / "found.h5")
-    assert found.process["angle"] == pytest.approx(-math.radians(2.5), rel=0.05)
-    assert (found.process["centre_x"], found.process["centre_y"]) == pytest.approx((0, 0), abs=0.06)
-    assert found.to_xarray()["twist_angle"].attrs["units"] == "rad"
-    assert found.twist_angle[-1] == pytest.approx(math.radians(2.5))
+    result = io.open_result(tmp_path / "found.h5")
+    assert result.process["angle"] == pytest.approx(-math.radians(2.5), rel=0.05)
+    assert (result.process["centre_x"], result.process["centre_y"]) == pytest.approx((0, 0), abs=0.06)
+    assert result.to_xarray()["twist_angle"].attrs["units"] == "rad"
+    assert result.twist_angle[-1] == pytest.approx(math.radians(2.5))
 
 
-def test_pictures_and_tables_know_slip(slide, found, tmp_path):
+def test_pictures_and_tables_know_slip(slide, slide_result, tmp_path):
     result = slide.with_name("found.h5")
     assert run("view", result, "-o", tmp_path / "pictures").code == 0
     assert {path.stem for path in (tmp_path / "pictures").iterdir()} == {
@@ -175,8 +175,8 @@ def test_pictures_and_tables_know_slip(slide, found, tmp_path):
     assert run("export", result, "-o", tmp_path / "maps.npz").code == 0
     with np.load(tmp_path / "maps.npz") as arrays:
         assert json.loads(str(arrays["units"]))["slip_onset"] == "mm"
-        np.testing.assert_array_equal(arrays["stick_ratio"], found.stick_ratio)
-    described = found.to_xarray()
+        np.testing.assert_array_equal(arrays["stick_ratio"], slide_result.stick_ratio)
+    described = slide_result.to_xarray()
     assert described["displacement"].dims == ("frame", "y", "x", "direction")
 
 
@@ -187,7 +187,7 @@ def test_a_batch_takes_slides(slide, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["--hold", 3], "--hold applies to presses only; "),
         (["--method", "paper"], "--method applies to presses and rotations only; "),
@@ -195,8 +195,8 @@ def test_a_batch_takes_slides(slide, tmp_path):
         (["--frames", "0:2"], "at least 3"),
     ],
 )
-def test_what_contains_nothing_about_a_slide_is_refused_in_a_line(slide, words, told):
-    refused(told, "reconstruct", slide, *words)
+def test_what_contains_nothing_about_a_slide_is_refused_in_a_line(slide, words, message):
+    refused(message, "reconstruct", slide, *words)
 
 
 def test_a_contact_that_is_only_estimated_is_reported(slide, tmp_path):
@@ -218,30 +218,30 @@ def test_a_contact_by_the_light_of_a_press_is_reported(slide, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("maps", "told"),
+    ("maps", "message"),
     [
         ({"contact": np.ones((3, 4), np.uint8)}, "(3, 4), the frames are 64 x 64: give that of the same"),
         ({"contact": np.zeros((64, 64), np.uint8)}, "contact is nowhere: give"),
         ({"mean": np.zeros((64, 64), np.float32)}, "neither contact nor heights: give"),
     ],
 )
-def test_a_contact_of_no_use_is_refused_by_the_name_of_its_file(slide, tmp_path, maps, told):
+def test_a_contact_of_no_use_is_refused_by_the_name_of_its_file(slide, tmp_path, maps, message):
     io.save_result(io.Result(**maps), tmp_path / "other.h5")
-    said = refused("other.h5", "reconstruct", slide, "--contact", tmp_path / "other.h5")
-    assert told in said
+    line = refused("other.h5", "reconstruct", slide, "--contact", tmp_path / "other.h5")
+    assert message in line
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["--texture", "none", "--press", "0.05mm"], "speckled or printed sheet"),
         (["--displacement-step", "0mm,0mm"], "the body does not move in these frames: take some"),
     ],
 )
-def test_frames_that_show_no_slip_are_refused_by_the_name_of_their_file(tmp_path, words, told):
+def test_frames_that_show_no_slip_are_refused_by_the_name_of_their_file(tmp_path, words, message):
     path = simulate("horizontal", tmp_path, "--frames", 4, *words)
-    said = refused(f"{path}: ", "reconstruct", path)
-    assert told in said
+    line = refused(f"{path}: ", "reconstruct", path)
+    assert message in line
 
 
 def test_contact_is_determined_from_the_pressure_of_a_press(slide):
@@ -249,18 +249,18 @@ def test_contact_is_determined_from_the_pressure_of_a_press(slide):
     touched[20:40, 20:40] = True
     press = io.Result(height=np.zeros((64, 64), np.float32), pressure=touched.astype(np.float32))
     with io.open_recording(slide) as recording:
-        found = engine.reconstruct(recording, contact=press)
-    np.testing.assert_array_equal(found.contact, touched)
+        from_press = engine.reconstruct(recording, contact=press)
+    np.testing.assert_array_equal(from_press.contact, touched)
 
 
 def test_a_modulus_gives_the_force_along_the_sheet(slide, contact, tmp_path):
     target = tmp_path / "force.h5"
     assert run("reconstruct", slide, "--contact", contact, "--modulus", "1MPa", "-o", target).code == 0
-    found = io.open_result(target)
+    result = io.open_result(target)
     with io.open_recording(slide) as recording:
         true = recording.truth.force[-1]
     # The simulation's modulus is 1 MPa, too.
-    assert found.force_x == pytest.approx(true[0], rel=0.06)
-    assert found.force_y == pytest.approx(true[1], abs=4 * found.force_y_sigma + 0.01 * abs(true[0]))
-    assert found.traction.shape == (64, 64, 2)
-    assert found.traction[..., 0].sum() * 0.05**2 == pytest.approx(found.force_x, rel=0.05)
+    assert result.force_x == pytest.approx(true[0], rel=0.06)
+    assert result.force_y == pytest.approx(true[1], abs=4 * result.force_y_sigma + 0.01 * abs(true[0]))
+    assert result.traction.shape == (64, 64, 2)
+    assert result.traction[..., 0].sum() * 0.05**2 == pytest.approx(result.force_x, rel=0.05)

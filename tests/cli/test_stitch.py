@@ -44,12 +44,12 @@ def test_presses_of_an_object_wider_than_the_field_become_all_of_it():
     whole = io.open_result("whole.h5")
     # The first press has the object's middle at y 0.07 mm; its highest point is at height 0.
     error = whole.height - (hills(*np.meshgrid(whole.x, whole.y - 0.07)) - hills(x, y).max())
-    known = np.isfinite(error)
-    across = whole.x[known.any(axis=0)]
+    finite = np.isfinite(error)
+    across = whole.x[finite.any(axis=0)]
     assert across[-1] - across[0] > 1.5 * 64 * 0.05
     measured = io.open_result("0-result.h5").filled == 0
-    assert known.sum() > 1.4 * measured.sum()
-    assert np.median(np.abs(error[known])) < 0.01  # steps of 0.03 mm
+    assert finite.sum() > 1.4 * measured.sum()
+    assert np.median(np.abs(error[finite])) < 0.01  # steps of 0.03 mm
     agree = whole.status == 1
     assert 0.8 < np.mean((error[agree] / whole.height_sigma[agree]) ** 2) < 1.4
 

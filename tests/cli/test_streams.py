@@ -31,10 +31,10 @@ def recording(tmp_path_factory):
 def shell(line, unbuffered=""):
     """Run a line of shell, in which $M is the program; return its exit code and what standard error got."""
     environment = {**os.environ, "M": PROGRAM, "PYTHONUNBUFFERED": unbuffered}
-    done = subprocess.run(
+    process = subprocess.run(
         ["bash", "-c", line], env=environment, capture_output=True, text=True, timeout=LIMIT
     )
-    return done.returncode, done.stderr
+    return process.returncode, process.stderr
 
 
 @UNBUFFERED
@@ -56,8 +56,8 @@ def test_a_reader_that_ends_early_is_not_an_error_to_report(recording, unbuffere
 @pytest.mark.parametrize("closed", [">&-", "<&- >&-", "<&-", ">&- 2>&-", "<&- >&- 2>&-"])
 def test_closed_streams_are_nothing_to_stumble_over(recording, tmp_path, closed, unbuffered):
     result = tmp_path / "result.h5"
-    code, said = shell(f"$M reconstruct {recording} -o {result} {closed}", unbuffered)
-    assert code == 0, said
+    code, errors = shell(f"$M reconstruct {recording} -o {result} {closed}", unbuffered)
+    assert code == 0, errors
     assert run("info", result).code == 0  # nothing was printed into the file in place of a closed stream
 
 
@@ -100,7 +100,7 @@ def test_an_interrupted_read_from_a_network_is_quiet(begun, number, code):
             ) as process:
                 assert asked.wait(LIMIT)
                 process.send_signal(number)
-                out, said = process.communicate(timeout=LIMIT)
+                out, errors = process.communicate(timeout=LIMIT)
         finally:
             server.shutdown()
-    assert (process.returncode, out, said) == (code, "", "")
+    assert (process.returncode, out, errors) == (code, "", "")

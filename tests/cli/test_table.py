@@ -55,7 +55,7 @@ def test_the_heading_states_the_unit_and_the_column(tmp_path, text):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("travel [s]\n0\n1", "the heading 'travel [s]' states the unit 's': seconds are not a length"),
         (
@@ -82,10 +82,10 @@ def test_the_heading_states_the_unit_and_the_column(tmp_path, text):
         ("frame,travel\n0,0.05\n1", "line 3:: a number and a unit are needed"),
     ],
 )
-def test_what_does_not_state_one_travel_of_each_frame_is_refused(tmp_path, text, said):
+def test_what_does_not_state_one_travel_of_each_frame_is_refused(tmp_path, text, message):
     with pytest.raises(InputError) as caught:
         read(tmp_path, text)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_a_heading_without_unit_has_none():

@@ -40,13 +40,13 @@ def serving(folder: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], 
     ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as child:
         assert child.stdout is not None
-        said = ""
+        text = ""
         try:
             for line in child.stdout:
-                said += line
+                text += line
                 if "Ctrl-C" in line:
                     break
-            yield child, said
+            yield child, text
         finally:
             child.kill()
 
@@ -54,11 +54,11 @@ def serving(folder: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], 
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 0), ("SIGTERM", 128 + signal.SIGTERM)])
 def test_a_rig_is_served_until_it_is_stopped(name: str, code: int, tmp_path: Path) -> None:
     folder = tmp_path / "rig"
-    with serving(folder, "--pattern", "linear", "--rate", "60") as (child, said):
+    with serving(folder, "--pattern", "linear", "--rate", "60") as (child, text):
         path = folder / "rig.toml"
         settings = load_rig(path)
-        assert f"{path}: sphere under 42 x 31 pixels at 60 frames a second" in said
-        assert f"mirrorskin rig check {path}" in said
+        assert f"{path}: sphere under 42 x 31 pixels at 60 frames a second" in text
+        assert f"mirrorskin rig check {path}" in text
         assert (settings.camera.shape, settings.camera.rate) == ((31, 42), 60.0)
         assert settings.camera.zenith_gain is not None
         assert np.nanmean(np.load(folder / "bright.npy")) > 200
@@ -82,7 +82,7 @@ def connected(settings: RigSettings) -> socket.socket:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("--size", "42"), "--size"),
         (("--rate", "0"), "frame rate"),
@@ -92,8 +92,8 @@ def connected(settings: RigSettings) -> socket.socket:
         (("--pattern", "dots"), "dots"),
     ],
 )
-def test_what_cannot_be_served_is_refused(words: tuple[str, ...], told: str, tmp_path: Path) -> None:
-    refused(told, "twin serve -o", tmp_path / "rig", *SMALL, *words)
+def test_what_cannot_be_served_is_refused(words: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    refused(message, "twin serve -o", tmp_path / "rig", *SMALL, *words)
     assert not (tmp_path / "rig").exists()
 
 
@@ -192,22 +192,22 @@ def test_a_rig_that_runs_is_not_replaced(terminal: Terminal) -> None:
 
 def test_a_copy_with_a_port_of_its_own_is_a_rig_file_like_any_other(terminal: Terminal) -> None:
     process, path = terminal.serve(), terminal.folder / "rig" / "rig.toml"
-    own = re.sub('port = ".*"', 'port = "/dev/ttyUSB0"', path.read_text())
+    text = re.sub('port = ".*"', 'port = "/dev/ttyUSB0"', path.read_text())
     terminal.end(process, signal.SIGKILL)
-    path.write_text(own)
+    path.write_text(text)
     assert load_rig(path).stage.port == "/dev/ttyUSB0"
     assert terminal("twin", "serve", "-o", "rig", "--background", *SMALL).returncode == 2
-    assert path.read_text() == own
+    assert path.read_text() == text
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [(("--size", "42"), "--size"), (("--object", "cube"), "cube"), (("-o", "/proc/rig"), "-o")],
 )
 def test_what_cannot_be_served_in_the_background_is_refused(
-    words: tuple[str, ...], told: str, terminal: Terminal
+    words: tuple[str, ...], message: str, terminal: Terminal
 ) -> None:
     ended = terminal("twin", "serve", "-o", "rig", "--background", *SMALL, *words)
     assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
-    assert told in ended.stderr
+    assert message in ended.stderr
     assert not (terminal.folder / "rig").exists()

@@ -30,14 +30,14 @@ def view(*words):
 
 def made(result):
     """Return what lies beside a result now."""
-    return sorted(str(one.relative_to(result.parent)) for one in result.parent.rglob("*.png"))
+    return sorted(str(path.relative_to(result.parent)) for path in result.parent.rglob("*.png"))
 
 
 def test_without_a_screen_a_picture_is_next_to_the_result(result):
-    done = view(result, "--map", "status")
-    assert done.exit_code == 0, done.output
-    assert "no screen" in done.stderr
-    assert done.stdout == f"written to {result.with_name('ball-view.png')}\n"
+    ended = view(result, "--map", "status")
+    assert ended.exit_code == 0, ended.output
+    assert "no screen" in ended.stderr
+    assert ended.stdout == f"written to {result.with_name('ball-view.png')}\n"
     assert made(result) == ["ball-view.png"]
     assert cv2.imread(str(result.with_name("ball-view.png"))).shape[0] > 300
 
@@ -58,26 +58,22 @@ def test_a_picture_of_lines_is_the_same_each_time(result, suffix, head):
     path = result.with_name(f"a.{suffix}")
     drawn = []
     for _ in range(2):
-        assert view(result, "-o", path).exit_code == 0
+        assert view(result, "--map", "height", "-o", path).exit_code == 0
         drawn.append(path.read_bytes())
     assert drawn[0].startswith(head)
     assert drawn[0] == drawn[1]
-
-
-def test_a_picture_of_lines_has_texts_that_can_be_searched(result):
-    path = result.with_name("a.svg")
-    assert view(result, "-o", path).exit_code == 0
-    assert ">height</text>" in path.read_text(encoding="utf-8").lower()
+    if suffix == "SVG":  # texts can be searched
+        assert b">height</text>" in drawn[0].lower()
 
 
 def test_a_folder_gets_a_picture_of_each_map(result):
     folder = result.parent / "new" / "pictures"
-    done = view(
+    ended = view(
         result, "-o", folder, "--map", "section", "--map", "status", "--section", "-1mm,0mm:1mm,0.1mm"
     )
-    assert done.exit_code == 0, done.output
+    assert ended.exit_code == 0, ended.output
     assert made(result) == ["new/pictures/section.png", "new/pictures/status.png"]
-    assert done.stdout.count("written to") == 2
+    assert ended.stdout.count("written to") == 2
 
 
 def test_of_turns_one_is_chosen_and_a_picture_s_ending_may_be_in_capitals(result):
@@ -85,14 +81,14 @@ def test_of_turns_one_is_chosen_and_a_picture_s_ending_may_be_in_capitals(result
     io.save_result(io.Result(azimuth=azimuth), result, overwrite=True)
     assert "--turn 0 to 1" in str(view(result).exception)
     path = result.with_name("TURN.PNG")
-    done = view(result, "--turn", 1, "-o", path)
-    assert done.exit_code == 0, done.output
+    ended = view(result, "--turn", 1, "-o", path)
+    assert ended.exit_code == 0, ended.output
     assert cv2.imread(str(path)).shape[0] > 300
     assert sorted(result.parent.iterdir()) == [path, result]
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["--map", "heigt"], "ball.h5 has no picture heigt: did you mean height?"),
         (["-o", "{}"], "name a picture that ends in .png or .pdf or .svg, or a folder"),
@@ -108,13 +104,13 @@ def test_of_turns_one_is_chosen_and_a_picture_s_ending_may_be_in_capitals(result
         (["--turn", "0"], "leave --turn out"),
     ],
 )
-def test_impossible_input_is_one_clear_line(result, monkeypatch, words, told):
+def test_impossible_input_is_one_clear_line(result, monkeypatch, words, message):
     monkeypatch.chdir(result.parent)
     before = result.read_bytes()
-    done = view(result, *(word.format(result) for word in words))
-    assert isinstance(done.exception, io.InputError), done.output
-    assert told in str(done.exception)
-    assert "\n" not in str(done.exception)
+    ended = view(result, *(word.format(result) for word in words))
+    assert isinstance(ended.exception, io.InputError), ended.output
+    assert message in str(ended.exception)
+    assert "\n" not in str(ended.exception)
     assert result.read_bytes() == before
     assert made(result) == []
 
@@ -130,20 +126,14 @@ def test_without_matplotlib_the_remedy_is_named(result, monkeypatch):
     assert "pip install 'mirrorskin[view]'" in str(view(result).exception)
 
 
-def test_the_help_says_where_the_names_of_maps_are_listed():
-    told = " ".join(view("--help").output.split())
-    assert all(text in told for text in ("mirrorskin info", "section", "histogram"))
+def test_the_help_names_the_lists_of_maps():
+    help_text = " ".join(view("--help").output.split())
+    assert all(text in help_text for text in ("mirrorskin info", "section", "histogram"))
 
 
 @pytest.mark.parametrize("name", [r"$\frac{$", "$x$ $", "\x1b[2J\x07", "\u5de5\u5177"])
 def test_a_name_that_is_a_formula_or_a_control_code_is_a_title_like_any_other(tmp_path, name):
-    recording, result = tmp_path / "press.h5", tmp_path / f"{name}.h5"
-    assert (
-        run(
-            "simulate vertical --size 16x16 --pixel-size 0.4mm --frames 6 --travel-step 0.5mm -o", recording
-        ).code
-        == 0
-    )
-    assert run("reconstruct", recording, "-o", result).code == 0
-    ended = run("view", result, "-o", tmp_path / "a.png")
+    result = tmp_path / f"{name}.h5"
+    io.save_result(ball(), result)
+    ended = run("view", result, "--map", "status", "-o", tmp_path / "a.png")
     assert (ended.code, ended.said) == (0, "")

@@ -32,8 +32,8 @@ def bucket(tmp_path):
 def test_a_command_reads_an_address_as_a_file(bucket):
     assert run("reconstruct", ADDRESS, "-o", "zarr.h5").code == 0
     assert run("reconstruct press.h5 -o hdf5.h5").code == 0
-    found = [io.open_result(name).height for name in ("zarr.h5", "hdf5.h5")]
-    assert found[0].tobytes() == found[1].tobytes()
+    heights = [io.open_result(name).height for name in ("zarr.h5", "hdf5.h5")]
+    assert heights[0].tobytes() == heights[1].tobytes()
 
 
 @pytest.mark.parametrize("output", ["result.zarr", "memory://bucket/result.zarr"])
@@ -42,8 +42,8 @@ def test_a_result_is_written_as_zarr_and_read_as_a_file(bucket, output):
     ended = run("reconstruct press.h5 -o", output)
     assert (ended.code, ended.out.split(":")[0]) == (0, output.split(":")[0])
     first, second = io.open_result("press-result.h5"), io.open_result(output)
-    assert {name: one.tobytes() for name, one in first.maps().items()} == {
-        name: one.tobytes() for name, one in second.maps().items()
+    assert {name: values.tobytes() for name, values in first.maps().items()} == {
+        name: values.tobytes() for name, values in second.maps().items()
     }
     assert {**first.process, "date": ""} == {**second.process, "date": ""}  # they may be a second apart
     scores = [run("score", name, "--truth", "press.h5").out for name in ("press-result.h5", output)]
@@ -94,7 +94,7 @@ def test_import_makes_hdf5_of_an_address(bucket):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("reconstruct", "memory://bucket/nothing.zarr"), "memory://bucket/nothing.zarr: there is no Zarr"),
         (
@@ -114,8 +114,8 @@ def test_import_makes_hdf5_of_an_address(bucket):
         (("batch", "memory://bucket/x*", "-o", "r"), "memory://bucket/x*: no store matches"),
     ],
 )
-def test_impossible_input_is_one_line_with_its_address(bucket, words, said):
-    refused(said, *words)
+def test_impossible_input_is_one_line_with_its_address(bucket, words, message):
+    refused(message, *words)
 
 
 def test_a_chunk_that_is_lost_in_the_middle_leaves_nothing(bucket, tmp_path):
@@ -141,5 +141,5 @@ def test_a_folder_behind_a_web_server_is_read_as_a_file(bucket, tmp_path):
         assert "no Zarr" in run("info", f"{address[:-5]}s.zarr").said
         server.shutdown()
     assert run("reconstruct press.h5").code == 0
-    found = [io.open_result(name).height for name in ("web.h5", "press-result.h5")]
-    assert found[0].tobytes() == found[1].tobytes()
+    heights = [io.open_result(name).height for name in ("web.h5", "press-result.h5")]
+    assert heights[0].tobytes() == heights[1].tobytes()

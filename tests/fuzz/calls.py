@@ -63,7 +63,7 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
     turned = {"normals": normals, "normals_sigma": sure, "contact": contact}
     disc = _FAR < 5
     fringes = {"phase": 0.3 * _COLUMN, "phase_sigma": np.full(SHAPE, 0.05)}
-    made: dict[str, dict[str, Any]] = {
+    arguments: dict[str, dict[str, Any]] = {
         "find_onset": {"frames": _press(), "travel": np.linspace(0, 1, 8), "noise": 1.0},
         "find_change_point": {"frames": _press(), "travel": np.linspace(0, 1, 8)},
         "estimate_normals": {
@@ -103,7 +103,7 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
         "score": {"result": result, "truth": io.Truth(height, flat, flat, contact)},
         "fuse": {"heights": heights, "normals": turned, "pixel_size": 0.1},
     }  # fmt: skip
-    return {name: (_functions()[name], arguments) for name, arguments in made.items()}
+    return {name: (_functions()[name], arguments) for name, arguments in arguments.items()}
 
 
 @cache
@@ -120,14 +120,14 @@ def _functions() -> dict[str, Callable[..., Any]]:
         "slip",
         "vibration",
     )
-    found = {}
+    functions = {}
     for package in [engine, *(getattr(engine, name) for name in packages)]:
         names = getattr(package, "__all__", None) or [name for name in vars(package) if name[0] != "_"]
         for name in names:
             function = getattr(package, name)
             if inspect.isfunction(function) and function.__module__.startswith(package.__name__):
-                found[name] = function
-    return found
+                functions[name] = function
+    return functions
 
 
 def public_functions() -> set[str]:
@@ -155,11 +155,11 @@ def odd_values(sound: Any) -> Iterator[tuple[str, Any]]:
         part = array.copy()
         part.flat[-1] = value
         yield f"{name} in part", part.astype(np.float32)
-    most = np.finfo(sound.dtype).max / 4 if sound.dtype.kind == "f" else np.iinfo(np.int64).max
+    extreme = np.finfo(sound.dtype).max / 4 if sound.dtype.kind == "f" else np.iinfo(np.int64).max
     part = array.copy()
-    part.flat[-1] = most
+    part.flat[-1] = extreme
     yield "huge in part", part.astype(sound.dtype if sound.dtype.kind == "f" else np.float64)
-    yield "all huge", np.full_like(part, most)
+    yield "all huge", np.full_like(part, extreme)
     yield "transposed", np.asarray(sound).T
     yield "one too few", np.asarray(sound)[:-1]
     yield "complex array", array * 1j
@@ -207,7 +207,7 @@ def call_with(name: str, data: bytes) -> None:
 
 
 def _given_arrays(name: str) -> dict[str, np.ndarray]:
-    return {one: sound for one, sound in calls()[name][1].items() if isinstance(sound, np.ndarray)}
+    return {key: sound for key, sound in calls()[name][1].items() if isinstance(sound, np.ndarray)}
 
 
 def _arrays(answer: Any) -> Iterator[tuple[str, np.ndarray]]:

@@ -198,11 +198,11 @@ def _make_containers(folder: Path, frames: np.ndarray[Any, Any], travel: np.ndar
     places = {"travel": ("travel", 1000 * travel, {"units": "um"})}
     for name, count, unit in (("y", frames.shape[1], "mm"), ("x", frames.shape[2], "um")):
         places[name] = (name, np.arange(count) * 0.4, {"units": unit})
-    known = xarray.Dataset({"frames": (("travel", "y", "x"), frames)}, places)
+    dataset = xarray.Dataset({"frames": (("travel", "y", "x"), frames)}, places)
     packed = {"frames": {"dtype": "i2", "scale_factor": 0.5, "add_offset": -3.0, "_FillValue": -1}}
-    known.astype("f8").to_netcdf(folder / "packed-netcdf.h5", engine="h5netcdf", encoding=packed)
-    known.transpose("y", "x", "travel").to_netcdf(folder / "named-netcdf.h5", engine="h5netcdf")
-    known.to_zarr(folder / "xarray.zarr", encoding={"frames": {"_FillValue": 255}}, consolidated=False)
+    dataset.astype("f8").to_netcdf(folder / "packed-netcdf.h5", engine="h5netcdf", encoding=packed)
+    dataset.transpose("y", "x", "travel").to_netcdf(folder / "named-netcdf.h5", engine="h5netcdf")
+    dataset.to_zarr(folder / "xarray.zarr", encoding={"frames": {"_FillValue": 255}}, consolidated=False)
     with h5py.File(folder / "matlab.h5", "w", userblock_size=512) as file:
         file["frames"] = frames.transpose(0, 2, 1).astype(np.float64)
         file["frames"].attrs["MATLAB_class"] = np.bytes_("double")
@@ -327,19 +327,19 @@ def _of_frames(path: Path, sound: Path, out: Path) -> list[Line]:
 def _of_objects(path: Path, sound: Path, out: Path) -> list[Line]:
     """Return the commands that read meshes, height maps and pictures."""
     small = ("--size", "24x20", "--pixel-size", "0.4mm", "--frames", 3, "-o", out / "a.h5")
-    given = [("simulate", "vertical", "--object", path, *small)]
+    commands = [("simulate", "vertical", "--object", path, *small)]
     if path.suffix in (".png", ".tif", ".jpg", ".bmp", ".pgm"):
         folder = out / "frames"
         folder.mkdir()
         shutil.copy(sound / "picture.png", folder / "frame1.png")
         shutil.copy(path, folder / f"frame2{path.suffix}")
         board = ("--board", "dots:5x4:1mm", "-o", out / "cal.h5")
-        given += [
+        commands += [
             ("import", folder, "--motion", "vertical", "--travel-step", "0.1mm", "-o", out / "b.h5"),
             ("simulate", "axial", "--pattern", path, *small),
             ("calibrate", "scale", path, *board),
         ]
-    return given
+    return commands
 
 
 def _of_tables(path: Path, sound: Path, out: Path) -> list[Line]:
@@ -409,9 +409,9 @@ def read(path: str, sound: Path | None = None) -> bool:
             reader(path)
             good = True
         except (io.InputError, engine.NotConverged, DeviceError) as error:
-            said = str(error)
-            if "\n" in said or len(said) > 1000:
-                raise AssertionError(f"no line: {said[:200]}") from error
+            text = str(error)
+            if "\n" in text or len(text) > 1000:
+                raise AssertionError(f"no line: {text[:200]}") from error
     if sound is not None:
         good |= _command(Path(path), sound)
     return good
@@ -449,7 +449,9 @@ def _command(path: Path, sound: Path) -> bool:
     for _ in range(AT_ONCE):
         with tempfile.TemporaryDirectory() as folder:
             choices = [
-                one for make in COMMANDS.get(path.suffix, []) for one in make(path, sound, Path(folder))
+                command
+                for make in COMMANDS.get(path.suffix, [])
+                for command in make(path, sound, Path(folder))
             ]
             if not choices:
                 return good
@@ -458,9 +460,9 @@ def _command(path: Path, sound: Path) -> bool:
                 ended = run(*words)
             except BaseException as error:
                 raise AssertionError(f"mirrorskin {' '.join(map(str, words))[:200]}") from error
-        said = ended.out + ended.said
-        if ended.code not in (0, 1, 2) or not said.replace("\n", "").isprintable():
-            raise AssertionError(f"mirrorskin {' '.join(map(str, words))[:200]}: {ended.code} {said[:200]!r}")
+        text = ended.out + ended.said
+        if ended.code not in (0, 1, 2) or not text.replace("\n", "").isprintable():
+            raise AssertionError(f"mirrorskin {' '.join(map(str, words))[:200]}: {ended.code} {text[:200]!r}")
         lines = ended.said.splitlines()
         stated = bool(lines) and lines[-1].startswith("mirrorskin: ")
         if ended.code == 1:  # a result without an answer
@@ -515,7 +517,9 @@ def serve(sound: Path | None) -> None:
         except BaseException as error:
             cause = error.__cause__ if isinstance(error, AssertionError) and error.__cause__ else error
             lines = "".join(traceback.format_exception(cause, chain=False)).splitlines()[-16:]
-            outcome = f"traceback {error} | " + " | ".join(one.strip() for one in lines if one.strip("^~ "))
+            outcome = f"traceback {error} | " + " | ".join(
+                line.strip() for line in lines if line.strip("^~ ")
+            )
             outcome = " ".join(outcome.split())
         print(outcome, file=answers, flush=True)
 
@@ -541,13 +545,13 @@ class Reader:
             process.stdin.write(f"{path}\n")
             process.stdin.flush()
         ready = self._wait(process)
-        said = process.stdout.readline().rstrip("\n") if ready else "hang"
-        if said and ready:
-            return said
+        text = process.stdout.readline().rstrip("\n") if ready else "hang"
+        if text and ready:
+            return text
         if ready:
-            said = f"crash {process.wait()}"
+            text = f"crash {process.wait()}"
         self.close()
-        return said
+        return text
 
     def _wait(self, process: subprocess.Popen[str]) -> bool:
         """Wait for an answer; return whether it came."""
@@ -624,30 +628,30 @@ def main() -> int:
     parser.add_argument("--serve", action="store_true")
     parser.add_argument("--sound", type=Path)
     parser.add_argument("--kinds", nargs="*", help="suffixes of the files to damage, instead of all")
-    given = parser.parse_args()
-    if given.serve:
-        serve(given.sound)
+    options = parser.parse_args()
+    if options.serve:
+        serve(options.sound)
         return 0
-    end = time.monotonic() + 60 * given.minutes
-    found: dict[str, Counter[str]] = {}
+    end = time.monotonic() + 60 * options.minutes
+    counts_by_kind: dict[str, Counter[str]] = {}
 
     def go_on(number: int) -> bool:
-        return number < given.count if given.count is not None else time.monotonic() < end
+        return number < options.count if options.count is not None else time.monotonic() < end
 
     with tempfile.TemporaryDirectory() as folder:
         samples = make_samples(Path(folder))
-        if given.kinds:
-            samples = [path for path in samples if path.suffix in given.kinds]
-        for kind, outcome in attack(samples, given.seed, go_on, given.keep):
+        if options.kinds:
+            samples = [path for path in samples if path.suffix in options.kinds]
+        for kind, outcome in attack(samples, options.seed, go_on, options.keep):
             word = outcome.split()[0]
-            found.setdefault(kind, Counter())[word] += 1
+            counts_by_kind.setdefault(kind, Counter())[word] += 1
             if word not in ("read", "refused"):
                 print(kind, outcome, flush=True)
     words = ("read", "refused", "traceback", "hang", "crash")
     print(f"| file | damaged | {' | '.join(words)} |\n|---|{'---|' * (len(words) + 1)}")
-    for kind, counts in sorted(found.items()):
+    for kind, counts in sorted(counts_by_kind.items()):
         print(f"| {kind} | {counts.total()} | {' | '.join(str(counts[word]) for word in words)} |")
-    return int(any(counts.total() > counts["read"] + counts["refused"] for counts in found.values()))
+    return int(any(counts.total() > counts["read"] + counts["refused"] for counts in counts_by_kind.values()))
 
 
 if __name__ == "__main__":

@@ -330,7 +330,7 @@ def _mutated(path: Path, whole: dict[Path, bytes], chance: random.Random) -> byt
         changed = semantic(data, chance)
         return damage(changed, chance) if chance.random() < 0.1 else changed
     if kind in ("splice", "other"):
-        alike = [one for one in whole if (one.suffix == path.suffix) == (kind == "splice")]
+        alike = [other for other in whole if (other.suffix == path.suffix) == (kind == "splice")]
         other = whole[chance.choice(alike)] if alike else data
         return splice(data, other, chance) if kind == "splice" else other
     return damage(data, chance) if kind == "bytes" else b""

@@ -20,50 +20,50 @@ def test_an_odd_argument_is_answered_or_refused_in_a_line(name):
     function, arguments = calls()[name]
     function(**arguments)
     wrong = {
-        f"{argument} {kind}": said
+        f"{argument} {kind}": text
         for argument, sound in arguments.items()
         for kind, value in odd_values(sound)
-        if (said := trial(name, argument, value)) is not None
+        if (text := trial(name, argument, value)) is not None
     }
     assert wrong == {}
 
 
 def test_lists_are_taken_as_arrays():
-    function, known = calls()["find_onset"]
-    known |= {"dark": 0.0, "bright": 255.0}
-    listed = {name: value.tolist() for name, value in known.items() if isinstance(value, np.ndarray)}
-    listed["frames"] = known["frames"]
-    np.testing.assert_array_equal(function(**known).height, function(**{**known, **listed}).height)
+    function, arguments = calls()["find_onset"]
+    arguments |= {"dark": 0.0, "bright": 255.0}
+    listed = {name: value.tolist() for name, value in arguments.items() if isinstance(value, np.ndarray)}
+    listed["frames"] = arguments["frames"]
+    np.testing.assert_array_equal(function(**arguments).height, function(**{**arguments, **listed}).height)
 
 
 def test_a_masked_sample_is_not_known():
-    function, known = calls()["find_onset"]
-    mask = np.zeros(known["frames"].shape, bool)
+    function, arguments = calls()["find_onset"]
+    mask = np.zeros(arguments["frames"].shape, bool)
     mask[:, 3, 4] = True
-    frames = np.ma.masked_array(known["frames"], mask)
-    found = function(**{**known, "frames": frames, "dark": 0.0, "bright": 255.0})
-    whole = function(**{**known, "dark": 0.0, "bright": 255.0})
-    assert math.isnan(found.height[3, 4])
-    there = ~mask[0]
-    np.testing.assert_allclose(found.height[there], whole.height[there], equal_nan=True)
+    frames = np.ma.masked_array(arguments["frames"], mask)
+    result = function(**{**arguments, "frames": frames, "dark": 0.0, "bright": 255.0})
+    whole = function(**{**arguments, "dark": 0.0, "bright": 255.0})
+    assert math.isnan(result.height[3, 4])
+    valid = ~mask[0]
+    np.testing.assert_allclose(result.height[valid], whole.height[valid], equal_nan=True)
 
 
 def test_a_masked_height_is_a_hole():
-    function, known = calls()["fill_holes"]
+    function, arguments = calls()["fill_holes"]
     mask = np.zeros(SHAPE, bool)
     mask[7:9, 9:11] = True
-    height, filled = function(**{**known, "height": np.ma.masked_array(known["height"], mask)})
+    height, filled = function(**{**arguments, "height": np.ma.masked_array(arguments["height"], mask)})
     np.testing.assert_array_equal(filled, mask)
-    np.testing.assert_allclose(height[mask], known["height"][mask], atol=5e-3)
+    np.testing.assert_allclose(height[mask], arguments["height"][mask], atol=5e-3)
 
 
 def test_masked_contact_is_none():
-    function, known = calls()["find_tangential_force"]
-    touches = known["contact"]
+    function, arguments = calls()["find_tangential_force"]
+    touches = arguments["contact"]
     mask = np.zeros(SHAPE, bool)
     mask[:7] = True
-    masked = function(**{**known, "contact": np.ma.masked_array(touches, mask)})
-    expected = function(**{**known, "contact": touches & ~mask})
+    masked = function(**{**arguments, "contact": np.ma.masked_array(touches, mask)})
+    expected = function(**{**arguments, "contact": touches & ~mask})
     assert (masked.force_x, masked.force_y) == (expected.force_x, expected.force_y)
 
 

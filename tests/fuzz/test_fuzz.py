@@ -50,7 +50,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(tmp_path):
     samples = fuzz.make_samples(tmp_path / "samples")
     outcomes = list(fuzz.attack(samples, 1, lambda number: number < COUNT, tmp_path / "findings"))
     assert len(outcomes) == COUNT
-    assert [one for one in outcomes if one[1] not in ("read", "refused")] == []
+    assert [outcome for outcome in outcomes if outcome[1] not in ("read", "refused")] == []
 
 
 @pytest.mark.parametrize(

@@ -48,21 +48,21 @@ def measure_references_of_flat_fields() -> Answer:
     random = np.random.default_rng(3)
     dark, light = random.normal(15, 1, (21, 33)), random.normal(180, 6, (21, 33))
     dark[3, 4], light[8, 9], light[12, 2] = 90, 0, 280
-    found = measure_references([still(dark, 24, 1, "dark")], [still(dark + light, 24, 2, "bright")])
+    flat = measure_references([still(dark, 24, 1, "dark")], [still(dark + light, 24, 2, "bright")])
     ball = np.where(random.random((60, 21, 33)) < 0.4, dark + light, dark + 0.3 * light)
     rolled = measure_references([still(dark, 24, 1, "dark")], [still(ball, 60, 4, "ball")], rolled=True)
-    told = {}
-    for name, one in ("flat", found), ("rolled", rolled):
-        maps = one.references
-        told[name] = {
+    answers = {}
+    for name, measured in ("flat", flat), ("rolled", rolled):
+        maps = measured.references
+        answers[name] = {
             "dark": maps.dark,
             "bright": maps.bright,
             "dark_sigma": maps.dark_sigma,
             "bright_sigma": maps.bright_sigma,
             "defects": maps.defects,
-            "noise": np.array([one.dark.noise, one.bright.noise]),
+            "noise": np.array([measured.dark.noise, measured.bright.noise]),
         }
-    return named(**told)
+    return named(**answers)
 
 
 @case(FITTED, numbers=Tolerance(1e-4, 1e-6))
@@ -75,14 +75,14 @@ def calibrate_a_lens() -> Answer:
     light = np.clip((away - 0.25) / 0.06 + 0.5, 0, 1)
     beyond = (np.abs(x) > 3.4) | (np.abs(y) > 3.0)
     picture = np.rint(40 + 160 * np.where(beyond, 1.0, light)).astype(np.uint8)
-    found = calibrate_lens([("board", picture)], Dots(7, 6, 1.0))
-    lens = found.lens
-    numbers = [*lens.pixel_size, lens.error, lens.scale_sigma, found.worst]
+    result = calibrate_lens([("board", picture)], Dots(7, 6, 1.0))
+    lens = result.lens
+    numbers = [*lens.pixel_size, lens.error, lens.scale_sigma, result.worst]
     return {
         "camera": lens.camera,
         "distortion": lens.distortion,
         "numbers": np.array(numbers),
-        "marks": found.marks,
+        "marks": result.marks,
     }
 
 
@@ -94,14 +94,20 @@ def fit_a_precession() -> Answer:
         BallTrack(EIGHTHS, *followed(place, tilt, alpha, pivot)) for place in ((-2, 1, -1.5), (3, 2, -1.5))
     ]
     zenith = tilt + np.random.default_rng(9).normal(0, 5e-5, 8)
-    found = fit_precession(tracks, [PlateTrack(EIGHTHS, zenith, np.full(8, 5e-5), True)])
-    known = found.precession
-    numbers = [known.tilt, known.phase_offset, known.ellipticity, *known.centre, *known.pivot]
+    fitted = fit_precession(tracks, [PlateTrack(EIGHTHS, zenith, np.full(8, 5e-5), True)])
+    precession = fitted.precession
+    numbers = [
+        precession.tilt,
+        precession.phase_offset,
+        precession.ellipticity,
+        *precession.centre,
+        *precession.pivot,
+    ]
     return {
         "numbers": np.array(numbers),
-        "direction": known.direction,
-        "sigma": np.array([known.sigma[name] for name in sorted(known.sigma)]),
-        "notes": list(found.notes),
+        "direction": precession.direction,
+        "sigma": np.array([precession.sigma[name] for name in sorted(precession.sigma)]),
+        "notes": list(fitted.notes),
     }
 
 
@@ -110,9 +116,11 @@ def followed(place: Any, tilt: float, alpha: Any, pivot: Any) -> tuple[Any, Any]
     axis = np.stack([-np.sin(alpha), np.cos(alpha), 0 * alpha], axis=1)
     arm = np.asarray(place, float) - pivot
     along = axis * (axis @ arm)[:, None]
-    seen = along + (arm - along) * np.cos(tilt) + np.cross(axis, arm) * np.sin(tilt) + pivot
-    sigma = np.broadcast_to([1e-3, 1e-3, 3e-3], seen.shape).copy()
-    return seen + sigma * np.random.default_rng(int(10 * place[0]) + 50).normal(size=seen.shape), sigma
+    position = along + (arm - along) * np.cos(tilt) + np.cross(axis, arm) * np.sin(tilt) + pivot
+    sigma = np.broadcast_to([1e-3, 1e-3, 3e-3], position.shape).copy()
+    return position + sigma * np.random.default_rng(int(10 * place[0]) + 50).normal(
+        size=position.shape
+    ), sigma
 
 
 @dataclass(frozen=True)
@@ -153,14 +161,22 @@ def fit_a_wall() -> Answer:
         frames = np.empty(twin.shape, twin.dtype)
         twin.read(frames)
         presses.append(Source(frames, twin.header, phase=EIGHTHS))
-    found = fit_zenith(presses, 2.0, body=(16.6, 42.0))
-    numbers = [found.radius, found.rim, *found.axis, *found.sight, *found.lamps, *found.reach, found.error]
+    fitted = fit_zenith(presses, 2.0, body=(16.6, 42.0))
+    numbers = [
+        fitted.radius,
+        fitted.rim,
+        *fitted.axis,
+        *fitted.sight,
+        *fitted.lamps,
+        *fitted.reach,
+        fitted.error,
+    ]
     return {
         "frames": np.stack([press.frames for press in presses]),
         "numbers": np.array(numbers),
-        "curve": found.curve,
-        "zenith.map": found.zenith_sigma,
-        "azimuth.map": found.azimuth_sigma,
+        "curve": fitted.curve,
+        "zenith.map": fitted.zenith_sigma,
+        "azimuth.map": fitted.azimuth_sigma,
     }
 
 
@@ -215,17 +231,17 @@ def live_rotation() -> Answer:
             "contact": update.get("contact"),
         }
         live.idle_work(0.0)
-    known = {"result": result_maps(live.result())}
-    return named(**{name: updates[name] for name in ("update_1", "update_5")}, **known)
+    final = {"result": result_maps(live.result())}
+    return named(**{name: updates[name] for name in ("update_1", "update_5")}, **final)
 
 
 @case(FITTED, **RECONSTRUCTED)
 def reconstruct_with_a_calibration() -> Answer:
     shape = (40, 52)
-    known = turn_source(pivot=(0.4, -0.3, 5.0))
+    source = turn_source(pivot=(0.4, -0.3, 5.0))
     alpha = 0.4 - EIGHTHS  # as a stage says that goes round the other way
     frames = turn("uint16", shape)[0]
     precession = io.Precession(TILT, 0.4, -1, 0.0, 0.0, (0.0, 0.0), (0.4, -0.3, 5.0))
     camera = io.CameraId("lab", shape, np.dtype("uint16"))
     calibration = io.Calibration(camera, precession=precession)
-    return result_maps(engine.reconstruct(Source(frames, known.header, phase=alpha), calibration))
+    return result_maps(engine.reconstruct(Source(frames, source.header, phase=alpha), calibration))

@@ -75,7 +75,7 @@ def make(name: str) -> str:
     return name
 
 
-def told(*words: object) -> Any:
+def json_of(*words: object) -> Any:
     """Run a command that prints JSON, and return that."""
     return json.loads(command(*words, "--json"))
 
@@ -87,17 +87,17 @@ def recording(name: str) -> Answer:
         while (block := source.read(np.empty(source.shape, source.dtype))) is not None:
             read.append((block.frames.copy(), block))
         header, truth = source.header, source.truth
-    frames = np.concatenate([one for one, _ in read])
+    frames = np.concatenate([block_frames for block_frames, _ in read])
     places = {}
     for name in ("travel", "phase", "displacement", "twist"):
         parts = [getattr(block, name) for _, block in read]
         places[name] = None if parts[0] is None else np.concatenate(parts)
-    known = {"dark": header.dark, "bright": header.bright, "gain": header.zenith_gain}
+    levels = {"dark": header.dark, "bright": header.bright, "gain": header.zenith_gain}
     maps = {}
     if truth is not None:
         maps = {"truth_height": truth.height, "truth_zenith": truth.zenith, "truth_contact": truth.contact}
         maps["truth_slip"] = truth.slip
-    return {"frames": frames, **places, **known, **maps}
+    return {"frames": frames, **places, **levels, **maps}
 
 
 def result(*words: object) -> Answer:
@@ -205,8 +205,8 @@ def reconstruct_recorded_turns() -> Answer:
 @case(**RESULT)
 def reconstruct_and_say_so() -> Answer:
     return {
-        "press": told("reconstruct", "press.h5", "-o", "some-result.h5", "--overwrite")["summary"],
-        "turn": told("reconstruct", "turn.h5", "-o", "some-result.h5", "--overwrite")["summary"],
+        "press": json_of("reconstruct", "press.h5", "-o", "some-result.h5", "--overwrite")["summary"],
+        "turn": json_of("reconstruct", "turn.h5", "-o", "some-result.h5", "--overwrite")["summary"],
     }
 
 
@@ -229,26 +229,26 @@ def fuse_recordings() -> Answer:
 @case(PROCESS, fragile=True)
 def score_results() -> Answer:
     return {
-        "press": told("score", "press-result.h5", "--truth", "press.h5"),
-        "turn": told("score", "turn-result.h5", "--truth", "turn.h5"),
-        "turns": told("score", "turns-result.h5", "--truth", "turns.h5"),
-        "fused": told("score", "fused.h5", "--truth", "press.h5"),
+        "press": json_of("score", "press-result.h5", "--truth", "press.h5"),
+        "turn": json_of("score", "turn-result.h5", "--truth", "turn.h5"),
+        "turns": json_of("score", "turns-result.h5", "--truth", "turns.h5"),
+        "fused": json_of("score", "fused.h5", "--truth", "press.h5"),
     }
 
 
 @case(PROCESS, fragile=True)
 def info_of_files() -> Answer:
     names = ("press.h5", "turn.h5", "press-result.h5", "turn-result.h5", "fused.h5", "gel-cal.h5")
-    return {name: told("info", name) for name in names}
+    return {name: json_of("info", name) for name in names}
 
 
 @case(PROCESS, fragile=True)
 def measure_results() -> Answer:
     return {
-        "fused": told("measure", "fused.h5"),
-        "section": told("measure", "fused.h5", "--section=-3mm,0mm:3mm,1mm", "--form", "plane"),
-        "part": told("measure", "turn-result.h5", "--region", "10,10,25x20", "--form", "sphere"),
-        "turn": told("measure", "turns-result.h5", "--turn", "1"),
+        "fused": json_of("measure", "fused.h5"),
+        "section": json_of("measure", "fused.h5", "--section=-3mm,0mm:3mm,1mm", "--form", "plane"),
+        "part": json_of("measure", "turn-result.h5", "--region", "10,10,25x20", "--form", "sphere"),
+        "turn": json_of("measure", "turns-result.h5", "--turn", "1"),
     }
 
 
@@ -292,12 +292,12 @@ def table(path: str) -> Any:
 @case(**RESULT)
 def batch_of_recordings() -> Answer:
     make("press.h5"), make("turn.h5")
-    done = told("batch", "press.h5", "turn.h5", "-o", "results")
-    counts = {name: done[name] for name in ("failed", "files")} if Path("results").exists() else {}
+    report = json_of("batch", "press.h5", "turn.h5", "-o", "results")
+    counts = {name: report[name] for name in ("failed", "files")} if Path("results").exists() else {}
     kept = {name: io.open_result(f"results/{name}-result.h5") for name in ("press", "turn")}
     alone = {name: io.open_result(make(f"{name}-result.h5")) for name in kept}
-    for name, one in kept.items():
-        for key, values in one.maps().items():
+    for name, batch_result in kept.items():
+        for key, values in batch_result.maps().items():
             np.testing.assert_array_equal(values, alone[name].maps()[key])
     files = [[Path(file["result"]).name, file["message"]] for file in counts["files"]]
     return {
@@ -310,12 +310,12 @@ def batch_of_recordings() -> Answer:
 @case(Tolerance(1e-3, 1e-5))
 def calibrate_a_gel() -> Answer:
     make("gel-cal.h5")
-    learned = told("calibrate", "elastic", "gel.h5", "--ball", "10mm", "-o", "again-cal.h5")
-    check = told("calibrate", "check", "gel.h5", "--ball", "10mm", "--calibration", "gel-cal.h5")
+    learned = json_of("calibrate", "elastic", "gel.h5", "--ball", "10mm", "-o", "again-cal.h5")
+    check = json_of("calibrate", "check", "gel.h5", "--ball", "10mm", "--calibration", "gel-cal.h5")
     return {
         "gel": learned["gel"],
         "check": {when: check[when]["height"]["rms"] for when in ("before", "after")},
-        "shown": told("calibrate", "show", "gel-cal.h5")["numbers"],
+        "shown": json_of("calibrate", "show", "gel-cal.h5")["numbers"],
     }
 
 
@@ -335,4 +335,4 @@ def paint_a_board() -> Answer:
 
 @case()
 def devices_are_told() -> Answer:
-    return {"found": bool(told("devices")["devices"])}
+    return {"found": bool(json_of("devices")["devices"])}

@@ -26,11 +26,13 @@ def main() -> int:
     )
     parser.add_argument("--freeze", action="store_true", help="keep what they answer now")
     words = parser.parse_args()
-    wanted = [n for n in CASES if not words.cases or any(fnmatch.fnmatch(n, one) for one in words.cases)]
+    selected = [
+        n for n in CASES if not words.cases or any(fnmatch.fnmatch(n, pattern) for pattern in words.cases)
+    ]
     warnings.simplefilter("error")
     frozen, wrong = golden.load(), 0
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        for name in wanted:
+        for name in selected:
             wrong += not report(name, frozen, words.freeze)
     if words.freeze:
         golden.save({name: frozen[name] for name in CASES if name in frozen})
@@ -41,20 +43,20 @@ def report(name: str, frozen: dict[str, dict[str, golden.NDArray]], freeze: bool
     """Print how a case's arrays differ, and tell whether they are the same; take them over if asked."""
     begin = time.perf_counter()
     try:
-        found, known = golden.answers(name), frozen.get(name, {})
+        answers, expected = golden.answers(name), frozen.get(name, {})
     except Exception as error:
         print(f"{name}: FAILS with {type(error).__name__}: {error}")
         return False
-    wrong = golden.differences(name, found, known)
+    wrong = golden.differences(name, answers, expected)
     print(f"{name}: {'DIFFERS' if wrong else 'same'} ({time.perf_counter() - begin:.2f} s)")
-    for key in sorted(found.keys() | known.keys()):
-        if key in found and key in known:
-            same, said = golden.compare(found[key], known[key], CASES[name].within(key, known))
+    for key in sorted(answers.keys() | expected.keys()):
+        if key in answers and key in expected:
+            same, text = golden.compare(answers[key], expected[key], CASES[name].within(key, expected))
         else:
-            same, said = False, "is new" if key in found else "is missing"
-        print(f"    {'  ' if same else '! '}{key}: {said}")
+            same, text = False, "is new" if key in answers else "is missing"
+        print(f"    {'  ' if same else '! '}{key}: {text}")
     if freeze:
-        frozen[name] = found
+        frozen[name] = answers
     return not wrong
 
 

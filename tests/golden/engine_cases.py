@@ -54,10 +54,10 @@ ONSET = {"height": HEIGHT, "height_sigma": HEIGHT, "process": FITTED}
 SMALL = (19, 26)
 
 
-def result_maps(found: io.Result) -> Answer:
+def result_maps(result: io.Result) -> Answer:
     """Return all maps of a result, its axes, and how it was made."""
-    known = {"process": dict(found.process), "offset_unknown": found.offset_unknown}
-    return {**found.maps(), "x": found.x, "y": found.y, **known}
+    facts = {"process": dict(result.process), "offset_unknown": result.offset_unknown}
+    return {**result.maps(), "x": result.x, "y": result.y, **facts}
 
 
 def named(**parts: Answer) -> dict[str, Any]:
@@ -192,10 +192,10 @@ def change_of(dtype: str, **options: Any) -> Answer:
 
 @case(**ONSET)
 def find_change_point_of_known_levels() -> Answer:
-    known = {
+    levels_by_type = {
         dtype: dict(zip(("dark", "bright"), level_maps(dtype, (37, 53)), strict=True)) for dtype in LEVELS
     }
-    return named(**{dtype: change_of(dtype, **levels) for dtype, levels in known.items()})
+    return named(**{dtype: change_of(dtype, **levels) for dtype, levels in levels_by_type.items()})
 
 
 @case(**ONSET)
@@ -219,8 +219,8 @@ def find_change_point_block_by_block() -> Answer:
     frames, travel = press("uint16", seed=8)
     source = Source(frames, io.Header("vertical"), travel=travel)
     search = engine.ChangePoint(memory_limit=8 * frames[0].nbytes)  # of four frames
-    found = engine.Run(Plan(search, checked=False), source).complete()
-    return result_maps(found.assign(process={"noise": found.process["noise"]}))
+    result = engine.Run(Plan(search, checked=False), source).complete()
+    return result_maps(result.assign(process={"noise": result.process["noise"]}))
 
 
 @case(HEIGHT)
@@ -229,17 +229,17 @@ def fill_holes() -> Answer:
     x, y = places((41, 56))
     holes = (np.hypot(x - 0.3, y) < 0.25) | (np.hypot(x + 0.6, y + 0.4) < 0.12)
     sigma = np.where(holes, np.nan, 0.003)
-    known = np.where(holes, np.nan, height)
-    filled, where = engine.fill_holes(known, sigma, PIXEL)
-    deep, there = engine.fill_holes(known, sigma, PIXEL, deepest=-0.6, steepest=0.1)
-    return {"filled": filled, "where": where, "deep": deep, "deep_where": there}
+    open_height = np.where(holes, np.nan, height)
+    filled, where = engine.fill_holes(open_height, sigma, PIXEL)
+    deep, deep_where = engine.fill_holes(open_height, sigma, PIXEL, deepest=-0.6, steepest=0.1)
+    return {"filled": filled, "where": where, "deep": deep, "deep_where": deep_where}
 
 
-def press_source(dtype: str = "uint8", **known: Any) -> Source:
+def press_source(dtype: str = "uint8", **options: Any) -> Source:
     """Return a press as a source with all that a header knows."""
     frames, travel = press(dtype, (48, 64), 24)
     dark, bright = (np.full((48, 64), level, np.float32) for level in LEVELS[dtype])
-    header = io.Header("vertical", pixel_size=PIXEL, dark=dark, bright=bright, camera="lab", **known)
+    header = io.Header("vertical", pixel_size=PIXEL, dark=dark, bright=bright, camera="lab", **options)
     return Source(frames, header, travel=travel)
 
 
@@ -328,8 +328,8 @@ def find_focus() -> Answer:
     sharp = np.exp(-((travel[:, None, None] + 2 * dome(SMALL)[0] - 0.6) ** 2))
     answers = {}
     for dtype in LEVELS:
-        found = engine.optical.find_focus(counted(texture * sharp, dtype), travel, noise=0.01)
-        answers[dtype] = result_maps(found)
+        result = engine.optical.find_focus(counted(texture * sharp, dtype), travel, noise=0.01)
+        answers[dtype] = result_maps(result)
     return named(**answers)
 
 
@@ -345,22 +345,22 @@ def photometric_stereo() -> Answer:
     _, along_x, along_y = dome(SMALL)
     normal = np.stack([-along_x, -along_y, np.ones(SMALL)]) / np.sqrt(1 + along_x**2 + along_y**2)
     light = np.stack([0.7 * np.cos(EIGHTHS), 0.7 * np.sin(EIGHTHS), np.full(8, 0.714)], axis=1)
-    share = 0.8 * np.clip(np.einsum("ki,ihw->khw", light, normal), 0, 1)
-    share += np.random.default_rng(4).normal(0, 0.01, share.shape)
+    fraction = 0.8 * np.clip(np.einsum("ki,ihw->khw", light, normal), 0, 1)
+    fraction += np.random.default_rng(4).normal(0, 0.01, fraction.shape)
     answers = {}
     for dtype, (dark, _) in LEVELS.items():
-        found = engine.optical.photometric_stereo(counted(share, dtype), light=light, dark=dark)
-        answers[dtype] = result_maps(found)
+        result = engine.optical.photometric_stereo(counted(fraction, dtype), light=light, dark=dark)
+        answers[dtype] = result_maps(result)
     return named(**answers)
 
 
 def normals_of(dtype: str = "uint16", phase: Any = EIGHTHS, **options: Any) -> Answer:
     """Estimate the dome's normals."""
-    made = {name: options.pop(name) for name in ("noise_of", "lost", "shape") if name in options}
-    made = {"noise": made.pop("noise_of", 1.0), **made}
-    frames, gain, offset = turn(dtype, phase=phase, **made)
-    known = {"tilt": TILT, "zenith_gain": gain, "zenith_offset": offset}
-    return result_maps(engine.estimate_normals(frames, phase, **known, **options))
+    own_options = {name: options.pop(name) for name in ("noise_of", "lost", "shape") if name in options}
+    own_options = {"noise": own_options.pop("noise_of", 1.0), **own_options}
+    frames, gain, offset = turn(dtype, phase=phase, **own_options)
+    calibration = {"tilt": TILT, "zenith_gain": gain, "zenith_offset": offset}
+    return result_maps(engine.estimate_normals(frames, phase, **calibration, **options))
 
 
 ROTATION = {
@@ -408,8 +408,8 @@ def estimate_normals_where_contact_is_lost() -> Answer:
 @case(FITTED, **ROTATION, process=Tolerance(1e-4, 1e-7))
 def estimate_normals_and_the_tilt() -> Answer:
     frames, gain, offset = turn("uint16")
-    known = {"tilt": "estimate", "zenith_gain": gain, "zenith_offset": offset}
-    return result_maps(engine.estimate_normals(frames, EIGHTHS, **known))
+    calibration = {"tilt": "estimate", "zenith_gain": gain, "zenith_offset": offset}
+    return result_maps(engine.estimate_normals(frames, EIGHTHS, **calibration))
 
 
 @case(FITTED, **ROTATION)
@@ -443,12 +443,12 @@ def find_edges() -> Answer:
     return {f"edges_{h}x{w}": engine.find_edges(*facets((h, w))) for h, w in ((48, 64), (71, 53))}
 
 
-def turn_source(turns: int = 1, dtype: str = "uint16", **known: Any) -> Source:
+def turn_source(turns: int = 1, dtype: str = "uint16", **options: Any) -> Source:
     """Return a rotation as a source with all that a header knows."""
     phase = np.arange(8 * turns) * np.pi / 4
     frames, gain, offset = turn(dtype, (40, 52), phase, lost=True)
     scale = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset)}
-    header = io.Header("axial", pixel_size=PIXEL, tilt=TILT, press=1.0, camera="lab", **scale, **known)
+    header = io.Header("axial", pixel_size=PIXEL, tilt=TILT, press=1.0, camera="lab", **scale, **options)
     return Source(frames, header, phase=phase)
 
 
@@ -671,7 +671,10 @@ def cap(shape: tuple[int, int] = (48, 64), radius: float = 4.0) -> io.Result:
 
 def numbers(quantities: dict[str, Quantity]) -> dict[str, list[Any]]:
     """Return measured quantities as JSON."""
-    return {name: [float(one.value), float(one.sigma), one.unit] for name, one in quantities.items()}
+    return {
+        name: [float(quantity.value), float(quantity.sigma), quantity.unit]
+        for name, quantity in quantities.items()
+    }
 
 
 @case(FITTED)
@@ -680,27 +683,27 @@ def fit_plane() -> Answer:
     height = 0.1 * x - 0.05 * y + 0.3 + np.random.default_rng(2).normal(0, 0.003, x.shape)
     height[pick(x.shape, 0.02, 5)] += 0.5
     axis_x, axis_y = io.pixel_axes(x.shape, PIXEL)
-    found = engine_fit_plane(height, axis_x, axis_y, np.full(x.shape, 0.003))
+    fitted = engine_fit_plane(height, axis_x, axis_y, np.full(x.shape, 0.003))
     bare = engine_fit_plane(height, axis_x, axis_y)
     return {
-        "numbers": numbers(found.quantities()),
-        "residual": found.residual,
-        "outliers": found.outliers,
-        "birge": found.birge,
+        "numbers": numbers(fitted.quantities()),
+        "residual": fitted.residual,
+        "outliers": fitted.outliers,
+        "birge": fitted.birge,
         "bare": numbers(bare.quantities()),
     }
 
 
 @case(FITTED)
 def fit_sphere() -> Answer:
-    known = cap()
-    found = engine_fit_sphere(known.height, known.x, known.y, known.height_sigma)
+    surface = cap()
+    fitted = engine_fit_sphere(surface.height, surface.x, surface.y, surface.height_sigma)
     return {
-        "numbers": numbers(found.quantities()),
-        "residual": found.residual,
-        "outliers": found.outliers,
-        "hollow": found.hollow,
-        "birge": found.birge,
+        "numbers": numbers(fitted.quantities()),
+        "residual": fitted.residual,
+        "outliers": fitted.outliers,
+        "hollow": fitted.hollow,
+        "birge": fitted.birge,
     }
 
 
@@ -713,7 +716,7 @@ def roughness() -> Answer:
     residual[10:13, 20:23] = np.nan
     plain = engine_roughness(residual, PIXEL)
     fine = engine_roughness(residual, PIXEL, l_filter=0.8, sigma=np.full(x.shape, 1e-3))
-    counts = [[one.pixels, one.left_out, one.uncertain] for one in (plain, fine)]
+    counts = [[area.pixels, area.left_out, area.uncertain] for area in (plain, fine)]
     return {
         "plain": numbers(plain.parameters),
         "fine": numbers(fine.parameters),
@@ -746,12 +749,15 @@ def section_and_step() -> Answer:
 
 @case(FITTED)
 def measure() -> Answer:
-    found = {
+    measured = {
         "all": engine.measure(cap()),
         "sphere": engine.measure(cap(), form="sphere", l_filter=0.5, section=((-1.0, 0.0), (1.0, 0.3))),
         "part": engine.measure(cap(), region=io.Region((10, 40), (5, 50)), form="plane"),
     }
-    return {name: {**numbers(one.quantities), "notes": one.notes} for name, one in found.items()}
+    return {
+        name: {**numbers(measured_part.quantities), "notes": measured_part.notes}
+        for name, measured_part in measured.items()
+    }
 
 
 @case(FITTED)
@@ -768,10 +774,10 @@ def score() -> Answer:
 
 @case()
 def summarise() -> Answer:
-    told = engine_summarise(engine.reconstruct(press_source()))
+    summary = engine_summarise(engine.reconstruct(press_source()))
     return {
-        "what": told.what,
-        "counts": np.array([told.pixels, told.answered, told.filled]),
-        "range": np.array([told.lowest, told.highest]),
-        "unit": told.unit,
+        "what": summary.what,
+        "counts": np.array([summary.pixels, summary.answered, summary.filled]),
+        "range": np.array([summary.lowest, summary.highest]),
+        "unit": summary.unit,
     }

@@ -93,21 +93,21 @@ def case(
     return keep
 
 
-def as_array(found: Any) -> NDArray[Any]:
+def as_array(result: Any) -> NDArray[Any]:
     """Return an answer as an array; what is neither array nor number becomes JSON."""
-    if isinstance(found, dict | list | str):
-        return np.array(json.dumps(without_volatile(found), sort_keys=True))
-    return np.asarray(found)
+    if isinstance(result, dict | list | str):
+        return np.array(json.dumps(without_volatile(result), sort_keys=True))
+    return np.asarray(result)
 
 
-def without_volatile(found: Any) -> Any:
+def without_volatile(result: Any) -> Any:
     """Return JSON without what differs from run to run."""
-    if isinstance(found, dict):
-        kept = {k: v for k, v in found.items() if not any(word in k.lower() for word in VOLATILE)}
+    if isinstance(result, dict):
+        kept = {k: v for k, v in result.items() if not any(word in k.lower() for word in VOLATILE)}
         return {name: without_volatile(value) for name, value in kept.items()}
-    if isinstance(found, str):
-        return found.replace("-0.0000 ", "+0.0000 ")  # the sign of nothing
-    return [without_volatile(one) for one in found] if isinstance(found, list) else found
+    if isinstance(result, str):
+        return result.replace("-0.0000 ", "+0.0000 ")  # the sign of nothing
+    return [without_volatile(item) for item in result] if isinstance(result, list) else result
 
 
 def answers(name: str) -> dict[str, NDArray[Any]]:
@@ -132,94 +132,96 @@ def save(kept: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
     np.savez_compressed(ANSWERS, **arrays)
 
 
-def differences(name: str, found: Arrays, frozen: Arrays) -> dict[str, str]:
+def differences(name: str, result: Arrays, frozen: Arrays) -> dict[str, str]:
     """Return what differs beyond the tolerance, in words, by array."""
-    wrong = dict.fromkeys(frozen.keys() - found.keys(), "is missing")
-    wrong |= dict.fromkeys(found.keys() - frozen.keys(), "is new")
-    for key in sorted(found.keys() & frozen.keys()):
-        one, other, within = found[key], frozen[key], CASES[name].within(key, frozen)
+    wrong = dict.fromkeys(frozen.keys() - result.keys(), "is missing")
+    wrong |= dict.fromkeys(result.keys() - frozen.keys(), "is new")
+    for key in sorted(result.keys() & frozen.keys()):
+        answer, other, within = result[key], frozen[key], CASES[name].within(key, frozen)
         if CASES[name].fragile:
-            same, words = _compare_usual(one, other)
+            same, words = _compare_usual(answer, other)
         else:
             contact = frozen.get(".".join([*key.split(".")[:-1], "contact"]))
-            alike = other.dtype.kind == "f" and one.shape == other.shape
+            alike = other.dtype.kind == "f" and answer.shape == other.shape
             if contact is not None and alike and other.shape[: contact.ndim] == contact.shape:
-                one, other = one[contact > 0], other[contact > 0]
-            same, words = compare(one, other, within)
+                answer, other = answer[contact > 0], other[contact > 0]
+            same, words = compare(answer, other, within)
         if not same:
             wrong[key] = words
     return wrong
 
 
-def _compare_usual(found: NDArray[Any], frozen: NDArray[Any]) -> tuple[bool, str]:
+def _compare_usual(result: NDArray[Any], frozen: NDArray[Any]) -> tuple[bool, str]:
     """Tell whether two arrays of one kind are usually alike, and texts tell of the same."""
-    if (found.dtype, found.ndim) != (frozen.dtype, frozen.ndim) and frozen.dtype.kind != "U":
-        return False, f"{frozen.dtype} {frozen.shape} became {found.dtype} {found.shape}"
+    if (result.dtype, result.ndim) != (frozen.dtype, frozen.ndim) and frozen.dtype.kind != "U":
+        return False, f"{frozen.dtype} {frozen.shape} became {result.dtype} {result.shape}"
     if frozen.dtype.kind == "U":
-        one, other = (
-            sorted(place for place, _ in _leaves(json.loads(str(text)))) for text in (found, frozen)
+        text, other = (
+            sorted(place for place, _ in _leaves(json.loads(str(text)))) for text in (result, frozen)
         )
-        return one == other, "tells of other things" if one != other else "tells of the same"
-    if found.shape != frozen.shape:
-        return True, f"{frozen.shape} became {found.shape}"
-    one, other = found.astype(float), frozen.astype(float)
-    known = np.isfinite(one) & np.isfinite(other)
-    if not known.any():
+        return text == other, "tells of other things" if text != other else "tells of the same"
+    if result.shape != frozen.shape:
+        return True, f"{frozen.shape} became {result.shape}"
+    text, other = result.astype(float), frozen.astype(float)
+    finite = np.isfinite(text) & np.isfinite(other)
+    if not finite.any():
         return True, "nothing is known in both"
-    error, size = np.median(np.abs(one - other)[known]), np.median(np.abs(other[known]))
+    error, size = np.median(np.abs(text - other)[finite]), np.median(np.abs(other[finite]))
     return bool(error <= 0.05 * size), f"differ by {error:.2g} in the median, of {size:.2g}"
 
 
-def compare(found: NDArray[Any], frozen: NDArray[Any], within: Limits) -> tuple[bool, str]:
+def compare(result: NDArray[Any], frozen: NDArray[Any], within: Limits) -> tuple[bool, str]:
     """Tell whether two arrays are the same within a tolerance, and how they differ."""
-    if (found.dtype.kind, found.shape) != (frozen.dtype.kind, frozen.shape):
-        return False, f"{frozen.dtype} {frozen.shape} became {found.dtype} {found.shape}"
+    if (result.dtype.kind, result.shape) != (frozen.dtype.kind, frozen.shape):
+        return False, f"{frozen.dtype} {frozen.shape} became {result.dtype} {result.shape}"
     if frozen.dtype.kind == "U":
-        return _compare_texts(str(found), str(frozen), within)
-    if found.dtype != frozen.dtype:
-        return False, f"{frozen.dtype} became {found.dtype}"
+        return _compare_texts(str(result), str(frozen), within)
+    if result.dtype != frozen.dtype:
+        return False, f"{frozen.dtype} became {result.dtype}"
     if frozen.dtype.kind != "f":
-        count = int(np.count_nonzero(found != frozen))
+        count = int(np.count_nonzero(result != frozen))
         return count == 0, f"{count} of {frozen.size} differ" if count else "equal"
-    return _compare_floats(found.astype(float), frozen.astype(float), within)
+    return _compare_floats(result.astype(float), frozen.astype(float), within)
 
 
-def _compare_floats(found: NDArray[Any], frozen: NDArray[Any], within: Limits) -> tuple[bool, str]:
-    there = np.isfinite(frozen)
-    elsewhere = np.where(there, 0.0, frozen)
+def _compare_floats(result: NDArray[Any], frozen: NDArray[Any], within: Limits) -> tuple[bool, str]:
+    finite = np.isfinite(frozen)
+    elsewhere = np.where(finite, 0.0, frozen)
     odd = int(
-        np.count_nonzero((there != np.isfinite(found)) | _differ(np.where(there, 0.0, found), elsewhere))
+        np.count_nonzero((finite != np.isfinite(result)) | _differ(np.where(finite, 0.0, result), elsewhere))
     )
     if odd:
         return False, f"{odd} of {frozen.size} are no numbers in one of them only"
-    error = np.abs(found[there] - frozen[there])
+    error = np.abs(result[finite] - frozen[finite])
     if not error.any():
         return True, "equal"
-    size = np.abs(frozen[there])
+    size = np.abs(frozen[finite])
     same = bool(np.all(error <= within[1] + within[0] * size))
-    known = size > np.finfo(np.float32).tiny
-    relative = np.max(error[known] / size[known], initial=0.0)
+    significant = size > np.finfo(np.float32).tiny
+    relative = np.max(error[significant] / size[significant], initial=0.0)
     return same, f"{np.count_nonzero(error)} differ by up to {error.max():.2g}, relative {relative:.2g}"
 
 
-def _differ(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
-    return ~((one == other) | (np.isnan(one) & np.isnan(other)))
+def _differ(first: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
+    return ~((first == other) | (np.isnan(first) & np.isnan(other)))
 
 
-def _compare_texts(found: str, frozen: str, within: Limits) -> tuple[bool, str]:
-    if found == frozen:
+def _compare_texts(result: str, frozen: str, within: Limits) -> tuple[bool, str]:
+    if result == frozen:
         return True, "equal"
-    one = dict(_leaves(json.loads(found)))
+    answer = dict(_leaves(json.loads(result)))
     other = dict(_leaves(json.loads(frozen)))
-    wrong = [place for place in sorted(one.keys() | other.keys()) if not _alike(place, one, other, within)]
-    told = "; ".join(f"{place}: {other.get(place)!r} became {one.get(place)!r}" for place in wrong[:5])
-    return not wrong, told or "equal but for rounding"
+    wrong = [
+        place for place in sorted(answer.keys() | other.keys()) if not _alike(place, answer, other, within)
+    ]
+    text = "; ".join(f"{place}: {other.get(place)!r} became {answer.get(place)!r}" for place in wrong[:5])
+    return not wrong, text or "equal but for rounding"
 
 
-def _alike(place: str, one: dict[str, Any], other: dict[str, Any], within: Limits) -> bool:
-    if place not in one or place not in other:
+def _alike(place: str, answer: dict[str, Any], other: dict[str, Any], within: Limits) -> bool:
+    if place not in answer or place not in other:
         return False
-    left, right = _number(one[place]), _number(other[place])
+    left, right = _number(answer[place]), _number(other[place])
     if isinstance(left, float) and isinstance(right, float):
         return abs(left - right) <= within[1] + within[0] * abs(right) or (left != left and right != right)
     return bool(left == right and type(left) is type(right))
@@ -233,9 +235,9 @@ def _number(value: Any) -> Any:
         return value
 
 
-def _leaves(found: Any, place: str = "") -> list[tuple[str, Any]]:
+def _leaves(result: Any, place: str = "") -> list[tuple[str, Any]]:
     """Return every value of some JSON, and where it stands."""
-    if not isinstance(found, dict | list):
-        return [(place, found)]
-    parts = found.items() if isinstance(found, dict) else enumerate(found)
+    if not isinstance(result, dict | list):
+        return [(place, result)]
+    parts = result.items() if isinstance(result, dict) else enumerate(result)
     return [leaf for name, part in parts for leaf in _leaves(part, f"{place}.{name}" if place else str(name))]

@@ -28,8 +28,8 @@ def strokes(dtype: str) -> tuple[Any, Any]:
     travel = 0.5 * (1 - np.cos(0.41 * np.arange(48)))
     lag = travel + 0.02 * (np.gradient(travel) < 0)
     starts = np.clip(-dome((37, 53))[0] + 0.05, 0.01, 1.2)
-    share = np.clip((lag[:, None, None] - starts) / 0.05, 0, 1)
-    return counted(share + random.normal(0, 0.01, share.shape), dtype), travel
+    fraction = np.clip((lag[:, None, None] - starts) / 0.05, 0, 1)
+    return counted(fraction + random.normal(0, 0.01, fraction.shape), dtype), travel
 
 
 @case(HEIGHT, sigma=HEIGHT)
@@ -38,13 +38,13 @@ def stroke_search() -> Answer:
     for dtype in ("uint8", "float32"):
         frames, travel = strokes(dtype)
         dark, bright = LEVELS[dtype]
-        found = {}
+        results = {}
         for event in ("onset", "release"):
             run = engine.Run(press.Strokes(event=event, dark=dark, bright=bright))
             for part in np.split(np.arange(len(frames)), [1, 17, 30]):
                 run.push(frames[part], travel=travel[part])
-            found[event] = run.result()
-        onset, release = found["onset"], found["release"]
+            results[event] = run.result()
+        onset, release = results["onset"], results["release"]
         answers[dtype] = {
             "onset": onset.height,
             "onset_sigma": onset.height_sigma,
@@ -60,12 +60,12 @@ def stroke_search() -> Answer:
 @case(FORCE)
 def find_force() -> Answer:
     height = np.where(np.hypot(*places((40, 52))) < 1.1, dome((40, 52), 0.4)[0], np.nan)
-    found = force.find_force(height, 0.2, PIXEL, 0.1, sigma=0.002, travel_sigma=0.005, modulus_sigma=0.001)
+    result = force.find_force(height, 0.2, PIXEL, 0.1, sigma=0.002, travel_sigma=0.005, modulus_sigma=0.001)
     soft = force.find_force(height, 0.2, PIXEL, 0.1, compliance=0.02)
     return {
-        "pressure": found.pressure,
-        "contact": found.contact != 0,
-        "numbers": np.array([found.force, found.force_sigma, soft.force]),
+        "pressure": result.pressure,
+        "contact": result.contact != 0,
+        "numbers": np.array([result.force, result.force_sigma, soft.force]),
     }
 
 
@@ -75,13 +75,13 @@ def find_tangential_force() -> Answer:
     contact = np.hypot(x - 0.1, y) < 0.7
     shift = np.stack([0.05 - 0.02 * np.hypot(x, y) ** 2, 0.01 * x * y], axis=-1)
     shift += np.random.default_rng(3).normal(0, 5e-4, shift.shape)
-    found = force.find_tangential_force(
+    result = force.find_tangential_force(
         shift, PIXEL, 0.1, contact=contact, sigma=5e-4, window_size=4, modulus_sigma=0.001
     )
     return {
-        "traction": found.traction,
-        "force": np.array([found.force_x, found.force_y]),
-        "sigma": np.array([found.force_x_sigma, found.force_y_sigma]),
+        "traction": result.traction,
+        "force": np.array([result.force_x, result.force_y]),
+        "sigma": np.array([result.force_x_sigma, result.force_y_sigma]),
     }
 
 
@@ -115,12 +115,12 @@ def normals_of_poses() -> Answer:
             run = engine.Run(rotation.MovingNormals(**options))
             for part in np.split(np.arange(20), [3, 11]):
                 run.push(frames[part], pose=axis[part])
-            found = run.result()
-            whole = {"vectors": found.normals, "sigma": found.normals_sigma} if name == "whole" else {}
-            direction = found.process.get("slope_direction")
-            rocked = {"slope": found.slope, "slope_sigma": found.slope_sigma, "direction": direction}
-            told = {"status": found.status, **whole, **rocked}
-            answers |= {f"{dtype}.{name}.{key}": value for key, value in told.items()}
+            result = run.result()
+            whole = {"vectors": result.normals, "sigma": result.normals_sigma} if name == "whole" else {}
+            direction = result.process.get("slope_direction")
+            rocked = {"slope": result.slope, "slope_sigma": result.slope_sigma, "direction": direction}
+            values = {"status": result.status, **whole, **rocked}
+            answers |= {f"{dtype}.{name}.{key}": value for key, value in values.items()}
     return answers
 
 
@@ -128,8 +128,8 @@ def normals_of_poses() -> Answer:
 def estimate_frequency() -> Answer:
     time = np.arange(120) / 30
     wave = 100 + 20 * np.cos(math.tau * 3.21 * time)[:, None, None] * np.linspace(0.5, 1, 12).reshape(3, 4)
-    found = vibration.estimate_frequency(wave + np.random.default_rng(1).normal(0, 1, wave.shape), time)
-    return {"numbers": np.array([found.hertz, found.sigma])}
+    result = vibration.estimate_frequency(wave + np.random.default_rng(1).normal(0, 1, wave.shape), time)
+    return {"numbers": np.array([result.hertz, result.sigma])}
 
 
 def drift(k: int, noise: float = 1.0) -> Any:
@@ -150,12 +150,12 @@ def find_displacement() -> Answer:
     for dtype in ("uint8", "float32"):
         frames = np.stack([drift(k) for k in range(4)])
         frames = frames if dtype == "float32" else np.clip(frames.round(), 0, 255).astype(dtype)
-        found = slip.find_displacement(frames[0], frames[1:], PIXEL, window_size=12, window_step=4)
+        result = slip.find_displacement(frames[0], frames[1:], PIXEL, window_size=12, window_step=4)
         answers |= {
-            f"{dtype}.displacement": found.displacement[:, ::3, ::3],
-            f"{dtype}.sigma": found.displacement_sigma[0, ::3, ::3],
-            f"{dtype}.status": found.status,
-            f"{dtype}.noise": found.process["noise"],
+            f"{dtype}.displacement": result.displacement[:, ::3, ::3],
+            f"{dtype}.sigma": result.displacement_sigma[0, ::3, ::3],
+            f"{dtype}.status": result.status,
+            f"{dtype}.noise": result.process["noise"],
         }
     return answers
 
@@ -174,16 +174,16 @@ def slip_search() -> Answer:
         run = engine.Run(slip.Slip(pixel_size=PIXEL, motion=motion, contact=contact))
         for k in range(12):
             run.push(slipping(motion, k)[None], **{position: places_of(motion, k)})
-        found = run.result()
-        told = {
-            "displacement": found.displacement[::3, ::3],
-            "sigma": found.displacement_sigma[::3, ::3],
-            "stick_ratio": found.stick_ratio,
+        result = run.result()
+        values = {
+            "displacement": result.displacement[::3, ::3],
+            "sigma": result.displacement_sigma[::3, ::3],
+            "stick_ratio": result.stick_ratio,
             # Not each pixel: whether one that is about to slip has slipped, last bits decide.
-            "slip_onset": np.nanpercentile(found.slip_onset, (10, 30, 50, 70)),
-            "slip_onset_sigma": np.nanpercentile(found.slip_onset_sigma, (10, 30, 50, 70)),
+            "slip_onset": np.nanpercentile(result.slip_onset, (10, 30, 50, 70)),
+            "slip_onset_sigma": np.nanpercentile(result.slip_onset_sigma, (10, 30, 50, 70)),
         }
-        answers |= {f"{motion}.{name}": value for name, value in told.items()}
+        answers |= {f"{motion}.{name}": value for name, value in values.items()}
     return answers
 
 
@@ -217,8 +217,8 @@ def estimate_pose() -> Answer:
     for form in (bumpy, rod):
         random = np.random.default_rng(1)
         pair = [
-            sampled(form, *way, rng=random)
-            for way in (((0, 0, 0), (0, 0, 0)), ((0.02, -0.03, 0.1), (0.1, -0.05, 0.02)))
+            sampled(form, *pose, rng=random)
+            for pose in (((0, 0, 0), (0, 0, 0)), ((0.02, -0.03, 0.1), (0.1, -0.05, 0.02)))
         ]
         moved = pose.estimate_pose(*pair)
         answers |= {
@@ -234,12 +234,12 @@ def estimate_pose() -> Answer:
 @case(POSE)
 def pose_tracker() -> Answer:
     random, tracker = np.random.default_rng(2), pose.PoseTracker()
-    found = [
+    poses = [
         tracker.push(sampled(bumpy, (0, 0, 0.03 * k), (0.15 * k, 0.03 * k, 0), rng=random)) for k in range(12)
     ]
     return {
-        "rotation": np.stack([pose.rotation for pose in found]),
-        "translation": np.stack([pose.translation for pose in found]),
-        "sigma": np.stack([pose.sigma for pose in found]),
+        "rotation": np.stack([pose.rotation for pose in poses]),
+        "translation": np.stack([pose.translation for pose in poses]),
+        "sigma": np.stack([pose.sigma for pose in poses]),
         "keys": tracker.keys,
     }

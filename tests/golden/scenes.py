@@ -46,14 +46,14 @@ def press(
     starts = -dome(shape)[0] * 2 + random.uniform(-0.03, 0.03, shape)
     ramp = random.choice([1e-3, 0.05, 0.2], shape)
     plateau = random.uniform(0.4, 1.1, shape)
-    share = plateau * np.clip((travel[:, None, None] - starts) / ramp, 0, 1)
-    return counted(share + random.normal(0, noise, share.shape), dtype), travel
+    fraction = plateau * np.clip((travel[:, None, None] - starts) / ramp, 0, 1)
+    return counted(fraction + random.normal(0, noise, fraction.shape), dtype), travel
 
 
-def counted(share: Map, dtype: str) -> NDArray[Any]:
+def counted(fraction: Map, dtype: str) -> NDArray[Any]:
     """Return counts of shares of the way from dark to bright."""
     dark, bright = LEVELS[dtype]
-    counts = dark + (bright - dark) * share
+    counts = dark + (bright - dark) * fraction
     if dtype == "float32":
         return counts.astype(dtype)
     return np.clip(np.rint(counts), 0, np.iinfo(dtype).max).astype(dtype)
@@ -78,7 +78,9 @@ def turn(
     lost: bool = False,
 ) -> tuple[NDArray[Any], float, float]:
     """Return frames of a rotation over the dome, counts per radian of zenith, and counts at zenith 0."""
-    gain, offset, share = {"uint8": (220, 8, 1), "uint16": (3400, 150, 20), "float32": (5, 0.5, 0.02)}[dtype]
+    gain, offset, fraction = {"uint8": (220, 8, 1), "uint16": (3400, 150, 20), "float32": (5, 0.5, 0.02)}[
+        dtype
+    ]
     _, along_x, along_y = dome(shape)
     normal = np.stack([-along_x, -along_y, np.ones(shape)]) / np.sqrt(1 + along_x**2 + along_y**2)
     alpha = np.asarray(phase, float)
@@ -90,9 +92,9 @@ def turn(
     counts = offset + gain * zenith
     if lost:  # light is gone in some frames where the sheet hangs free
         x, y = places(shape)
-        swing = np.cos(alpha)[:, None, None] * x + np.sin(alpha)[:, None, None] * y
-        counts = np.where(np.hypot(x, y) + 0.2 * swing > 1.1, 0.0, counts)
-    counts = counts + noise * share * np.random.default_rng(seed).normal(0, 1, counts.shape)
+        along = np.cos(alpha)[:, None, None] * x + np.sin(alpha)[:, None, None] * y
+        counts = np.where(np.hypot(x, y) + 0.2 * along > 1.1, 0.0, counts)
+    counts = counts + noise * fraction * np.random.default_rng(seed).normal(0, 1, counts.shape)
     if dtype == "float32":
         return counts.astype(dtype), float(gain), float(offset)
     ends = 0, np.iinfo(dtype).max
@@ -106,6 +108,6 @@ def ridge(shape: tuple[int, int]) -> tuple[Map, Map]:
     return 0.4 * side, 0.12 * side + 0.05 * y
 
 
-def pick(shape: tuple[int, int], share: float, seed: int) -> NDArray[np.bool_]:
+def pick(shape: tuple[int, int], fraction: float, seed: int) -> NDArray[np.bool_]:
     """Return random pixels, so large a share of all."""
-    return np.random.default_rng(seed).random(shape) < share
+    return np.random.default_rng(seed).random(shape) < fraction

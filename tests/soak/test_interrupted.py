@@ -16,7 +16,7 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 def test_a_batch_goes_on_where_it_was_ended(number, seed, recordings, undisturbed, tmp_path):
     chance, start, folder = random.Random(seed), time.monotonic(), tmp_path / "results"
     batch = soak.Batch(recordings, folder)
-    said = batch.end(number, chance.randrange(len(recordings) - 2), chance.uniform(0, 0.1))
+    text = batch.end(number, chance.randrange(len(recordings) - 2), chance.uniform(0, 0.1))
 
     before = soak.results(folder)
     assert soak.all_data(folder).items() <= undisturbed.items()
@@ -26,8 +26,8 @@ def test_a_batch_goes_on_where_it_was_ended(number, seed, recordings, undisturbe
         assert batch.code == -number
     else:
         assert batch.code == 128 + number
-        assert "the same command resumes it" in said
-        assert "Traceback" not in said
+        assert "the same command resumes it" in text
+        assert "Traceback" not in text
         assert soak.leftovers(folder) == []
 
     again = run("batch", *recordings, "-o", folder)

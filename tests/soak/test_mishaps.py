@@ -50,8 +50,8 @@ def test_a_capture_that_ends_leaves_a_recording_that_opens(what, seed, served, t
             folder, file, mishaps.words(chance), mishaps.FULL if what == "disk full" else None
         )
         sent = end(child, what, chance)
-        said = child.wait()
-        if not mishaps.starved(said):
+        text = child.wait()
+        if not mishaps.starved(text):
             break
 
     state = mishaps.state_of(child.recording)
@@ -59,14 +59,14 @@ def test_a_capture_that_ends_leaves_a_recording_that_opens(what, seed, served, t
         assert child.process.returncode == -signal.SIGKILL
         assert state == "cut short: its writer was killed"
     elif what == "SIGTERM":
-        assert child.process.returncode == 128 + signal.SIGTERM, said
+        assert child.process.returncode == 128 + signal.SIGTERM, text
         assert state == "cut short: the program was ended"
         assert not rig.machine.moving(sent + mishaps.SOON)
     else:
         assert not rig.machine.moving()
-        assert child.process.returncode == 1, said
-        assert "disk is full" in said
-        assert "Traceback" not in said
+        assert child.process.returncode == 1, text
+        assert "disk is full" in text
+        assert "Traceback" not in text
         assert state.startswith("cut short: ")
     mishaps.rest(rig)
     frames = len(mishaps.frames_of(child.recording))

@@ -44,15 +44,19 @@ def test_a_job_whose_worker_is_killed_is_done_by_another(
     workers.run(soak.die_with, victim.name, delay, tmp_path / "died")
     outcomes = list(run_cluster(make_jobs(recordings, tmp_path), Plan(), workers.scheduler.address))
 
-    there = int((tmp_path / "died").read_text())
+    count_done = int((tmp_path / "died").read_text())
     assert caplog.text.count("was lost") <= 1, outcomes  # it may be back before anyone looks
     states = [outcome.state for outcome in outcomes]
     assert states.count("done") + states.count("kept") == len(recordings)
     assert states.count("kept") <= 2  # saved, and nobody was told yet
     assert soak.all_data(tmp_path) == undisturbed
-    share = len(os.sched_getaffinity(0)) // WORKERS
+    fraction = len(os.sched_getaffinity(0)) // WORKERS
     threads = set(workers.run(os.getenv, "POCL_MAX_PTHREAD_COUNT").values())
-    assert threads <= {str(max(1, share)), str(share + 1), None}  # None: it came back, and did nothing yet
+    assert threads <= {
+        str(max(1, fraction)),
+        str(fraction + 1),
+        None,
+    }  # None: it came back, and did nothing yet
     assert threads != {None}
-    rest = len(recordings) - there
-    soak.ROUNDS.append(soak.Round("worker", seed, there, rest, time.monotonic() - start))
+    rest = len(recordings) - count_done
+    soak.ROUNDS.append(soak.Round("worker", seed, count_done, rest, time.monotonic() - start))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,7 @@ def _imported(file: Path) -> Iterator[str]:
                 yield _defining(package, node.attr)
 
 
+@cache
 def imports() -> set[tuple[str, str]]:
     """Return the pairs of a module and another one that it imports."""
     pairs = {(module, other) for module, file in FILES.items() for other in _imported(file)}

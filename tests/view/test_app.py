@@ -46,16 +46,16 @@ def turn(tmp_path_factory):
 
 @pytest.fixture
 def app(press):
-    made = App(press)
-    yield made
-    made.close()
+    opened = App(press)
+    yield opened
+    opened.close()
 
 
 @pytest.fixture
 def session(press):
-    made = Session(press)
-    yield made
-    made.close()
+    opened = Session(press)
+    yield opened
+    opened.close()
 
 
 def test_a_recording_is_reconstructed_as_on_the_command_line(session, press):
@@ -65,7 +65,7 @@ def test_a_recording_is_reconstructed_as_on_the_command_line(session, press):
 
 
 def test_every_option_of_the_operation_has_a_widget(app):
-    declared = [name for name, one in engine.Press.options.items() if not one.python_only]
+    declared = [name for name, option in engine.Press.options.items() if not option.python_only]
     assert list(app.options.widgets) == declared
 
 
@@ -91,7 +91,7 @@ def test_the_change_since_the_previous_result_is_shown(app):
     np.testing.assert_allclose(shown, now - before, atol=1e-6)
 
 
-def test_an_option_that_is_refused_says_why_and_keeps_the_result(app):
+def test_a_refused_option_shows_the_reason_and_keeps_the_result(app):
     first = app.session.now
     app.options.widgets["noise"].value = "-1"
     assert app.session.now is first
@@ -223,10 +223,12 @@ def test_the_pointer_reads_a_height_with_its_standard_deviation_in_the_units_of_
         "Status",
         "Origin",
     ]
-    known = np.isfinite(result.height)
-    np.testing.assert_allclose(shown.readings.columns["value0"][known], result.height[known])
-    known = np.isfinite(result.height_sigma)
-    np.testing.assert_allclose(shown.readings.columns["sigma"][known], 1e3 * result.height_sigma[known], 1e-6)
+    finite = np.isfinite(result.height)
+    np.testing.assert_allclose(shown.readings.columns["value0"][finite], result.height[finite])
+    finite = np.isfinite(result.height_sigma)
+    np.testing.assert_allclose(
+        shown.readings.columns["sigma"][finite], 1e3 * result.height_sigma[finite], 1e-6
+    )
 
 
 def test_in_a_notebook_scripts_come_with_the_page(app):
@@ -266,7 +268,7 @@ def test_an_open_recording_and_a_result_can_be_shown_in_a_notebook(press):
         assert app.session.now.result.height.shape == (24, 32)
 
 
-def test_a_recording_is_opened_as_the_command_line_says(press):
+def test_a_recording_is_opened_with_the_options_of_the_command_line(press):
     session = Session(press, Opening(keywords={"pixel_size": (0.4, 0.4)}))
     assert session.now.result.x[1] - session.now.result.x[0] == pytest.approx(0.4)
     session.close()

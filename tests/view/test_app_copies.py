@@ -41,11 +41,11 @@ def turn(tmp_path, monkeypatch):
     return record(twin, tmp_path / "turn.h5")
 
 
-def same(one, other):
+def same(first, other):
     """Whether all maps of two results are equal."""
-    assert {*one} == {*other}
-    for name in one:
-        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+    assert {*first} == {*other}
+    for name in first:
+        np.testing.assert_array_equal(first[name], other[name], err_msg=name)
 
 
 def by_command(text):
@@ -102,10 +102,10 @@ def test_a_part_of_a_press_is_computed_again(press, again):
     same(session.now.result, again(session))
 
 
-def test_what_the_command_line_said_of_a_stack_is_repeated(press, again):
-    given = {"travel_step": 0.2, "travel_start": 0.1, "pixel_size": (0.1, 0.2)}
+def test_options_of_a_stack_are_repeated_in_the_command(press, again):
+    stack = {"travel_step": 0.2, "travel_start": 0.1, "pixel_size": (0.1, 0.2)}
     keywords = {"travel": io.Steps(0.2, 0.1), "pixel_size": (0.1, 0.2)}
-    session = Session(press, Opening(keywords, stack_words(given), device="0"))
+    session = Session(press, Opening(keywords, stack_words(stack), device="0"))
     same(session.now.result, again(session))
 
 
@@ -177,7 +177,7 @@ def test_nothing_is_saved_for_options_without_a_result(press):
     assert "no result has been computed with these options" in pane.problem.object
 
 
-def test_a_file_that_cannot_be_written_says_why(press):
+def test_a_file_that_cannot_be_written_shows_the_reason(press):
     session = Session(press, Opening(operation="mirrorskin.engine:Onset"))
     session.now = type(session.now)(session.now.result.assign(height=None), "no heights")
     pane = SavePane(session)

@@ -146,14 +146,23 @@ def slow_stop(emulated, monkeypatch):
     return delay
 
 
+STOPS = [(0.15, 0, 0.3), (0, 0.15, 1.499), (1, 1, 1.499)]
+
+
 def press_to(ready, path, end):
     """Start a recorded press to a travel of 1.5 mm, and wait until another travel is reached, mm."""
     ready.control.run(vertical_plan(0.0, 1.5, 0.5), path)
     ready.until(lambda: ready.control.seen.update is not None and travel(ready) >= end)
 
 
-@pytest.mark.parametrize("end", [0.3, 1.2, 1.499])
-@pytest.mark.parametrize(("before", "after"), [(0, 0), (0.15, 0), (0, 0.15), (0.15, 0.15), (1, 1)])
+@pytest.mark.parametrize(
+    ("before", "after", "end"),
+    [
+        pytest.param(before, after, end, marks=[] if (before, after, end) in STOPS else [pytest.mark.slow])
+        for end in (0.3, 1.2, 1.499)
+        for before, after in ((0, 0), (0.15, 0), (0, 0.15), (0.15, 0.15), (1, 1))
+    ],
+)
 def test_a_stopped_recording_is_complete_only_at_its_last_travel(
     ready, slow_stop, tmp_path, before, after, end
 ):
@@ -167,7 +176,7 @@ def test_a_stopped_recording_is_complete_only_at_its_last_travel(
         assert reached or recording.state.startswith("cut short: "), recording.state
 
 
-@pytest.mark.parametrize("seconds", [0, 0.15, 1])
+@pytest.mark.parametrize("seconds", [*[pytest.param(time, marks=pytest.mark.slow) for time in (0, 0.15)], 1])
 def test_a_body_that_is_stopped_at_the_end_of_a_press_is_not_lifted(ready, slow_stop, tmp_path, seconds):
     slow_stop(seconds, seconds)
     press_to(ready, tmp_path / "run.h5", 1.4999)
@@ -200,7 +209,7 @@ def test_closing_stops_what_moves(ready):
 
 
 @pytest.mark.parametrize("fault", ["stall", "silence", "alarm", "bug"])
-def test_a_fault_stops_the_stage_and_says_why(ready, fault):
+def test_a_fault_stops_the_stage_and_shows_the_reason(ready, fault):
     before = travel(ready)
     ready.control.jog("travel", 3.0)
     ready.until(lambda: travel(ready) > before + 0.1)
@@ -329,7 +338,9 @@ def test_the_recording_of_a_run_is_opened(ready, tmp_path):
 
 def test_closing_the_last_page_stops_the_rig(ready, monkeypatch):
     closed = []
-    monkeypatch.setattr(type(pn.state), "on_session_destroyed", lambda state, done: closed.append(done))
+    monkeypatch.setattr(
+        type(pn.state), "on_session_destroyed", lambda state, callback: closed.append(callback)
+    )
     page = pages([], [], ready.control)
     page()
     page()
@@ -345,7 +356,7 @@ def test_closing_the_last_page_stops_the_rig(ready, monkeypatch):
 def test_saturation_and_sharpness_are_judged():
     frame = np.zeros((10, 10), np.uint8)
     frame[:5] = 255
-    found = judge(frame)
-    assert found.saturated == 0.5
-    assert found.counts.sum() == 100
-    assert found.sharpness > judge(np.full((10, 10), 9, np.uint8)).sharpness == 0
+    judged = judge(frame)
+    assert judged.saturated == 0.5
+    assert judged.counts.sum() == 100
+    assert judged.sharpness > judge(np.full((10, 10), 9, np.uint8)).sharpness == 0

@@ -14,9 +14,9 @@ from mirrorskin.view.calibration_wall import draw_gel, draw_response
 
 
 def titled(axes, start):
-    found = [one for one in axes if one.get_title().startswith(start)]
-    assert len(found) == 1, [one.get_title() for one in axes]
-    return found[0]
+    matching = [panel for panel in axes if panel.get_title().startswith(start)]
+    assert len(matching) == 1, [panel.get_title() for panel in axes]
+    return matching[0]
 
 
 def references(shape=(9, 11)):
@@ -30,8 +30,8 @@ def references(shape=(9, 11)):
 
 
 def test_a_part_becomes_a_picture(tmp_path):
-    known = a_calibration(only=("lens",))
-    written = calibration_figures(known, tmp_path / "new" / "folder")
+    calibration = a_calibration(only=("lens",))
+    written = calibration_figures(calibration, tmp_path / "new" / "folder")
     assert [path.name for path in written] == ["scale.png"]
     for path in written:
         picture = cv2.imread(str(path))
@@ -50,20 +50,20 @@ def test_an_impossible_folder_is_reported(tmp_path):
 
 
 def test_all_maps_of_references_are_drawn_with_their_units():
-    known = references()
-    axes = draw_references(known).axes
+    maps = references()
+    axes = draw_references(maps).axes
     for start, values in (
-        ("dark", known.dark),
-        ("bright", known.bright),
-        ("light", known.bright - known.dark),
-        ("standard error of dark", known.dark_sigma),
-        ("standard error of bright", known.bright_sigma),
+        ("dark", maps.dark),
+        ("bright", maps.bright),
+        ("light", maps.bright - maps.dark),
+        ("standard error of dark", maps.dark_sigma),
+        ("standard error of bright", maps.bright_sigma),
     ):
-        one = titled(axes, start)
-        np.testing.assert_allclose(np.ma.filled(one.images[0].get_array(), np.nan), values, rtol=1e-6)
-        assert f"{np.nanmedian(values):.4g} counts" in one.get_title()
-    told = [text.get_text() for text in titled(axes, "defects").get_legend().get_texts()]
-    assert told == ["sound: 95", "hot: 1", "dead: 1", "saturated: 1", "several: 1"]
+        panel = titled(axes, start)
+        np.testing.assert_allclose(np.ma.filled(panel.images[0].get_array(), np.nan), values, rtol=1e-6)
+        assert f"{np.nanmedian(values):.4g} counts" in panel.get_title()
+    legend = [text.get_text() for text in titled(axes, "defects").get_legend().get_texts()]
+    assert legend == ["sound: 95", "hot: 1", "dead: 1", "saturated: 1", "several: 1"]
 
 
 def test_lines_of_whole_millimetres_are_where_opencv_has_them():
@@ -76,8 +76,8 @@ def test_lines_of_whole_millimetres_are_where_opencv_has_them():
     on_sheet = np.stack([np.zeros(5), np.linspace(-4, 1, 5), np.ones(5)])
     pixels = np.linalg.inv(lens.camera) @ on_sheet
     rays = (np.linalg.inv(lens.matrix) @ (pixels / pixels[2])).T
-    seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)
-    for place in seen.reshape(-1, 2):
+    projected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)
+    for place in projected.reshape(-1, 2):
         along = np.interp(place[1], x0[::-1, 1], x0[::-1, 0])
         assert along == pytest.approx(place[0], abs=0.02)
 
@@ -108,10 +108,10 @@ def test_the_threshold_of_a_uniform_wall_is_drawn_by_azimuth():
 
 
 def test_a_precession_is_drawn_through_its_phases():
-    known = a_precession()
-    path = titled(draw_precession(known).axes, "lean of the body")
+    precession = a_precession()
+    path = titled(draw_precession(precession).axes, "lean of the body")
     marks = next(line for line in path.lines if line.get_marker() == "o").get_xydata()
-    np.testing.assert_allclose(marks, np.degrees(known.lean(np.arange(8) * math.pi / 4)))
+    np.testing.assert_allclose(marks, np.degrees(precession.lean(np.arange(8) * math.pi / 4)))
     assert {text.get_text() for text in path.texts} >= {f"{45 * k}°" for k in range(8)}
 
 
@@ -142,7 +142,7 @@ def test_numbers_are_in_the_units_people_speak_of():
 
 
 @pytest.mark.parametrize(
-    ("value", "sigma", "told"),
+    ("value", "sigma", "message"),
     [
         (1.23456, 0.012, ("1.235", "0.012")),
         (123.456, 40.0, ("123", "40")),
@@ -150,5 +150,5 @@ def test_numbers_are_in_the_units_people_speak_of():
         (math.nan, math.nan, ("unknown", "")),
     ],
 )
-def test_no_more_digits_are_written_than_are_known(value, sigma, told):
-    assert Row("tilt", "angle", value, sigma, "deg").cells()[2:4] == told
+def test_no_more_digits_are_written_than_are_known(value, sigma, message):
+    assert Row("tilt", "angle", value, sigma, "deg").cells()[2:4] == message

@@ -15,8 +15,8 @@ def test_normals_have_the_customary_colours():
 
 @pytest.mark.parametrize("name", ["MISSING", "FILLED"])
 def test_a_colour_is_the_same_by_name_and_by_numbers(name):
-    told = np.multiply(255, to_rgb(getattr(colours, name))).round()
-    assert tuple(told) == getattr(colours, f"{name}_RGB")
+    colour = np.multiply(255, to_rgb(getattr(colours, name))).round()
+    assert tuple(colour) == getattr(colours, f"{name}_RGB")
 
 
 def test_heights_go_from_violet_to_yellow_and_holes_have_their_own_colour():

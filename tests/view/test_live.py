@@ -67,21 +67,21 @@ def test_a_file_keeps_all_that_was_shown(tmp_path):
     view.show(known(), STATUS)
     view.close()
     command = [sys.executable, "-m", "rerun_cli", "rrd", "print", str(path)]
-    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     for name in ("/camera", "/maps/height", "/maps/normals", "/maps/wear", "/section/surface", "/status"):
-        assert name in told
+        assert name in text
 
 
 def test_the_display_is_described_in_words(tmp_path):
     view = live.LiveView(tmp_path / "run.rrd", SHAPE)
     view.show(known(), STATUS)
-    told = view._status_text(known(), STATUS)
+    text = view._status_text(known(), STATUS)
     view.close()
-    assert "30.0 frames/s" in told
-    assert "10.0 ms, 99 % below 20.0 ms" in told
-    assert "Height from -1.000 (violet) to -1.000 mm (yellow)" in told
-    assert "Worn from 2.000 (violet) to 2.000 µm (yellow)" in told
-    assert "Contact area 3.5 mm²" in told
+    assert "30.0 frames/s" in text
+    assert "10.0 ms, 99 % below 20.0 ms" in text
+    assert "Height from -1.000 (violet) to -1.000 mm (yellow)" in text
+    assert "Worn from 2.000 (violet) to 2.000 µm (yellow)" in text
+    assert "Contact area 3.5 mm²" in text
 
 
 def test_a_viewer_in_the_browser_listens_on_this_machine_only(monkeypatch):

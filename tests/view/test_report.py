@@ -87,8 +87,8 @@ class Page(HTMLParser):
     @property
     def surface(self):
         """What the script is told, if there is a surface."""
-        found = [text for text in self.texts.get("script", []) if text.startswith("{")]
-        return json.loads(found[0]) if found else None
+        scripts = [text for text in self.texts.get("script", []) if text.startswith("{")]
+        return json.loads(scripts[0]) if scripts else None
 
 
 def written(folder, result, name="a.h5", **asked):
@@ -115,7 +115,10 @@ def quick(monkeypatch):
 
 def test_everything_the_page_needs_is_in_it(page):
     addresses = [
-        one[key] for _, one in page.elements for key in ("src", "href", "srcset", "data") if key in one
+        element[key]
+        for _, element in page.elements
+        for key in ("src", "href", "srcset", "data")
+        if key in element
     ]
     assert len(addresses) > 5
     assert {address[:5] if address[0] == "d" else address[0] for address in addresses} == {"data:", "#"}
@@ -125,39 +128,43 @@ def test_everything_the_page_needs_is_in_it(page):
 
 
 def test_the_policy_allows_the_page_s_own_script_and_style_alone(page):
-    (policy,) = [one["content"] for one in page.all("meta") if "http-equiv" in one]
+    (policy,) = [element["content"] for element in page.all("meta") if "http-equiv" in element]
     rules = dict(rule.split(" ", 1) for rule in policy.split("; "))
     assert rules["default-src"] == "'none'"
     assert rules["img-src"] == "data:"
     for tag, rule in (("script", "script-src"), ("style", "style-src")):
-        own = page.texts[tag][-1].encode()
-        assert rules[rule] == f"'sha256-{base64.b64encode(hashlib.sha256(own).digest()).decode()}'"
+        content = page.texts[tag][-1].encode()
+        assert rules[rule] == f"'sha256-{base64.b64encode(hashlib.sha256(content).digest()).decode()}'"
     # These would need leave of their own.
-    assert not [key for _, one in page.elements for key in one if key == "style" or key.startswith("on")]
+    assert not [
+        key for _, element in page.elements for key in element if key == "style" or key.startswith("on")
+    ]
 
 
 def test_a_page_is_well_made(page):
-    names = [one["id"] for _, one in page.elements if "id" in one]
+    names = [element["id"] for _, element in page.elements if "id" in element]
     assert len(names) == len(set(names))
-    wanted = [one["href"][1:] for one in page.all("a")]
-    wanted += [one[key] for _, one in page.elements for key in ("for", "aria-describedby") if key in one]
-    assert len(wanted) > 8
-    assert set(wanted) <= set(names)
+    targets = [element["href"][1:] for element in page.all("a")]
+    targets += [
+        element[key] for _, element in page.elements for key in ("for", "aria-describedby") if key in element
+    ]
+    assert len(targets) > 8
+    assert set(targets) <= set(names)
     headings = [tag for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)]
     assert headings == ["h1", *["h2"] * (len(headings) - 1)]
     assert page.all("html") == [{"lang": "en"}]
-    assert all(one["scope"] for one in page.all("th"))
+    assert all(element["scope"] for element in page.all("th"))
 
 
 def test_each_picture_is_there_in_words_too(page):
-    seen = page.all("img")
-    assert len(seen) >= 4
-    assert len({one["alt"] for one in seen} - {""}) == len(seen)
-    for one in seen:
-        head, _, data = one["src"].partition(",")
+    pictures = page.all("img")
+    assert len(pictures) >= 4
+    assert len({picture["alt"] for picture in pictures} - {""}) == len(pictures)
+    for element in pictures:
+        head, _, data = element["src"].partition(",")
         assert head in ("data:image/png;base64", "data:image/webp;base64")
         picture = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
-        assert picture.shape[:2] == (int(one["height"]), int(one["width"]))
+        assert picture.shape[:2] == (int(element["height"]), int(element["width"]))
         assert picture.std() > 1
 
 
@@ -173,15 +180,15 @@ def test_a_caption_mentions_filled_heights_only_if_there_are_some(filled):
 
 
 def test_names_are_shown_and_never_run(page):
-    assert [one.get("type") for one in page.all("script")] == ["application/json", "module"]
+    assert [element.get("type") for element in page.all("script")] == ["application/json", "module"]
     assert page.texts["h1"] == [f"{HOSTILE}.h5"]
     assert HOSTILE in "".join(page.texts["td"])
     assert HOSTILE in "".join(page.texts["q"])
 
 
 def test_a_page_contains_numbers_parameters_and_their_origin(page):
-    told = engine.measure(cap())
-    for name in told.quantities:
+    measured = engine.measure(cap())
+    for name in measured.quantities:
         assert name in page.texts["th"]
     assert "yes" in page.texts["td"]
     assert "0.5" in page.texts["td"]
@@ -268,22 +275,24 @@ def test_without_a_pixel_size_places_are_pixels(tmp_path, quick):
     assert "--pixel-size" in page.words  # what measuring would take
 
 
-@pytest.mark.parametrize(("unknown", "said"), [([1], "The height is relative"), ([1, 0, 1], "2 of 3 pieces")])
-def test_what_is_relative_is_reported(tmp_path, quick, unknown, said):
+@pytest.mark.parametrize(
+    ("unknown", "message"), [([1], "The height is relative"), ([1, 0, 1], "2 of 3 pieces")]
+)
+def test_what_is_relative_is_reported(tmp_path, quick, unknown, message):
     result = cap().assign(offset_unknown=np.array(unknown, np.uint8))
-    assert said in written(tmp_path, result).words
+    assert message in written(tmp_path, result).words
     assert "relative" not in written(tmp_path, cap()).texts["p"]
 
 
 def test_one_turn_of_several_is_shown(tmp_path, quick):
-    one = cap()
-    each = {name: np.stack([values, values]) for name, values in one.maps().items()}
+    turn = cap()
+    each = {name: np.stack([values, values]) for name, values in turn.maps().items()}
     each["height"][1] += np.float32(0.25)
     each["component"][1][each["component"][1] >= 0] += 1
-    turns = one.assign(each, offset_unknown=np.array([0, 1], np.uint8))
+    turns = turn.assign(each, offset_unknown=np.array([0, 1], np.uint8))
     page = written(tmp_path, turns, turn=1)
     assert page.texts["h1"] == ["a.h5, turn 1"]
-    assert page.surface["highest"] == pytest.approx(float(np.nanmax(one.height)) + 0.25)
+    assert page.surface["highest"] == pytest.approx(float(np.nanmax(turn.height)) + 0.25)
     assert "The height is relative" in page.words
     with pytest.raises(io.InputError, match="--turn"):
         written(tmp_path, turns)
@@ -291,8 +300,8 @@ def test_one_turn_of_several_is_shown(tmp_path, quick):
 
 def test_a_calibration_is_described_if_there_is_one(tmp_path, quick, page):
     assert "half-angle" in page.texts["th"]
-    assert "calibration" in [one.get("id") for one in page.all("section")]
-    assert "calibration" not in [one.get("id") for one in written(tmp_path, cap()).all("section")]
+    assert "calibration" in [element.get("id") for element in page.all("section")]
+    assert "calibration" not in [element.get("id") for element in written(tmp_path, cap()).all("section")]
 
 
 def test_a_fused_process_is_listed_by_movement():
@@ -324,9 +333,9 @@ def test_points_are_listed_below_each_other():
     assert align([]) == []
 
 
-def blocks_of(shape, most):
+def blocks_of(shape, limit):
     """Yield each sample's place, and the pixels that it is of."""
-    steps = [-(-size // most) for size in shape]
+    steps = [-(-size // limit) for size in shape]
     for row in range(-(-shape[0] // steps[0])):
         for column in range(-(-shape[1] // steps[1])):
             yield (
@@ -338,18 +347,18 @@ def blocks_of(shape, most):
             )
 
 
-@pytest.mark.parametrize(("shape", "most"), [((7, 9), 9), ((7, 9), 4), ((11, 3), 5), ((13, 17), 2)])
-def test_a_sample_is_the_mean_of_its_pixels(shape, most):
+@pytest.mark.parametrize(("shape", "limit"), [((7, 9), 9), ((7, 9), 4), ((11, 3), 5), ((13, 17), 2)])
+def test_a_sample_is_the_mean_of_its_pixels(shape, limit):
     height = np.random.default_rng(1).normal(size=shape).astype(np.float32)
     x, y = io.pixel_axes(shape, (0.1, 0.3))
-    grid = sample(io.Result(height=height, x=x, y=y), most)
-    assert max(grid.height.shape) <= most
-    seen = 0
-    for (row, column), (rows, columns) in blocks_of(shape, most):
+    grid = sample(io.Result(height=height, x=x, y=y), limit)
+    assert max(grid.height.shape) <= limit
+    pixels = 0
+    for (row, column), (rows, columns) in blocks_of(shape, limit):
         assert grid.height[row, column] == pytest.approx(float(height[rows, columns].astype(float).mean()))
         assert (grid.x[column], grid.y[row]) == pytest.approx((x[columns].mean(), y[rows].mean()))
-        seen += 1
-    assert seen == grid.height.size
+        pixels += 1
+    assert pixels == grid.height.size
     assert not grid.filled.any()
     assert not grid.piece.any()
 
@@ -384,14 +393,14 @@ def test_only_the_part_that_holds_heights_is_reported():
 
 def test_pictures_of_noise_stay_small(monkeypatch):
     noise = np.random.default_rng(3).integers(0, 255, (200, 160, 3), np.uint8)
-    for most, kind, size in ((100_000, "png", 160), (50_000, "webp", 160), (9_000, "webp", 80)):
-        monkeypatch.setattr(contents, "MOST_BYTES", most)
+    for limit, kind, size in ((100_000, "png", 160), (50_000, "webp", 160), (9_000, "webp", 80)):
+        monkeypatch.setattr(contents, "MOST_BYTES", limit)
         packed, data = contents.packed(noise)
-        seen = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        assert (packed, seen.shape[1]) == (kind, size)
-        assert len(data) <= most
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert (packed, picture.shape[1]) == (kind, size)
+        assert len(data) <= limit
         if kind == "png":
-            np.testing.assert_array_equal(seen, noise)
+            np.testing.assert_array_equal(picture, noise)
 
 
 def test_a_surface_of_a_million_pixels_stays_small():
@@ -414,9 +423,9 @@ def test_the_same_result_makes_the_same_page(tmp_path, monkeypatch):
 
 
 def test_what_is_missing_is_reported_before_any_work(tmp_path, monkeypatch):
-    found = importlib.util.find_spec
+    find_spec = importlib.util.find_spec
     monkeypatch.setattr(
-        "mirrorskin.view.report.page.find_spec", lambda name: None if name == "jinja2" else found(name)
+        "mirrorskin.view.report.page.find_spec", lambda name: None if name == "jinja2" else find_spec(name)
     )
     with pytest.raises(io.InputError, match=r"Jinja2: pip install 'mirrorskin\[view\]'"):
         written(tmp_path, cap())

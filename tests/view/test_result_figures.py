@@ -72,7 +72,7 @@ def test_a_standard_deviation_is_a_figure_with_the_title_of_its_map(alone):
 
 
 def test_the_page_has_all_pictures_under_a_title_with_a_summary(alone, page):
-    titles = [axes.get_title("left") for one in alone.values() for axes in one.axes]
+    titles = [axes.get_title("left") for panel in alone.values() for axes in panel.axes]
     assert [axes.get_title("left") for axes in page.axes] == titles
     name, line = (text.get_text() for text in page.texts)
     assert name == "ball.h5"
@@ -85,7 +85,7 @@ def test_only_what_is_asked_for_is_drawn_in_the_usual_order():
     assert list(figures_of(ball(), name="it", maps=["modulation"])) == ["modulation"]
 
 
-def test_what_a_result_does_not_have_is_said_and_what_it_has():
+def test_a_missing_map_is_named_and_so_are_those_present():
     with pytest.raises(io.InputError, match=r"^it has no picture normals: it has status$"):
         overview(only("status"), name="it", maps=["status", "normals"])
     with pytest.raises(io.InputError, match=r"^it has no map to draw: 'mirrorskin export' writes all"):
@@ -140,8 +140,8 @@ def test_no_panel_is_on_another_or_beyond_the_page(result):
     for box in boxes:
         assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
         assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
-    for one, other in itertools.combinations(boxes, 2):
-        assert not one.overlaps(other)
+    for first, other in itertools.combinations(boxes, 2):
+        assert not first.overlaps(other)
 
 
 @pytest.mark.parametrize(("shape", "panels"), [((1, 1), 7), ((9, 1), 7), ((7, 200), 8)])

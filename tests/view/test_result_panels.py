@@ -78,12 +78,12 @@ def test_a_millimetre_is_as_long_up_as_it_is_across(name):
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (mm)", "y (mm)")
 
 
-def test_the_scale_bar_is_as_long_as_it_says():
+def test_the_scale_bar_is_as_long_as_its_label():
     axes = panel_of(draw_height, ball())
     (bar,) = axes.lines
-    told = next(text.get_text() for text in axes.texts if text.get_text().endswith("mm"))
-    assert np.ptp(bar.get_xdata()) == pytest.approx(float(told.removesuffix(" mm")))
-    assert told == "0.5 mm"  # the longest round length below 0.3 of 3.2 mm
+    label = next(text.get_text() for text in axes.texts if text.get_text().endswith("mm"))
+    assert np.ptp(bar.get_xdata()) == pytest.approx(float(label.removesuffix(" mm")))
+    assert label == "0.5 mm"  # the longest round length below 0.3 of 3.2 mm
 
 
 def test_a_single_pixel_of_unknown_size_has_no_scale_bar():
@@ -143,8 +143,8 @@ def test_a_and_b_are_beyond_the_ends_but_within_the_picture(ends, sides):
 
 
 def test_a_section_has_gaps_at_holes_and_what_was_filled_is_dashed():
-    sheet, cut = cut_of(along())
-    axes = panel_of(draw_section, sheet.result, cut)
+    sheet, profile = cut_of(along())
+    axes = panel_of(draw_section, sheet.result, profile)
     lines = {line.get_label(): line for line in axes.lines}
     measured, filled = lines["measured"], lines["filled"]
     expected = along().height[10].astype(float)
@@ -159,8 +159,8 @@ def test_a_section_has_gaps_at_holes_and_what_was_filled_is_dashed():
 
 
 def test_a_section_has_a_band_of_two_standard_deviations():
-    sheet, cut = cut_of(along())
-    axes = panel_of(draw_section, sheet.result, cut)
+    sheet, profile = cut_of(along())
+    axes = panel_of(draw_section, sheet.result, profile)
     corners = np.concatenate([path.vertices for path in axes.collections[0].get_paths()])
     at_start = corners[np.isclose(corners[:, 0], 0), 1]
     np.testing.assert_allclose([at_start.min(), at_start.max()], -1 + 0.01 * np.array([-2, 2]), atol=1e-6)
@@ -170,46 +170,46 @@ def test_a_section_has_a_band_of_two_standard_deviations():
 
 def test_the_highest_point_of_the_surface_is_marked_with_its_measured_height():
     result = ball(filled=None)
-    sheet, cut = sheet_of(result), section(result)
-    axes = panel_of(draw_section, sheet.result, cut)
-    told = engine.measure(result).quantities["highest point"].value
+    sheet, profile = sheet_of(result), section(result)
+    axes = panel_of(draw_section, sheet.result, profile)
+    highest = engine.measure(result).quantities["highest point"].value
     assert "highest point" in named(axes)
-    assert sheet.height_text(told) in [text.get_text() for text in axes.texts]
+    assert sheet.height_text(highest) in [text.get_text() for text in axes.texts]
 
 
 def test_the_highest_measured_point_is_marked():
-    sheet, cut = cut_of(along())
-    axes = panel_of(draw_section, sheet.result, cut)
+    sheet, profile = cut_of(along())
+    axes = panel_of(draw_section, sheet.result, profile)
     mark = next(line for line in axes.lines if line.get_marker() == "v")
-    assert mark.get_xydata()[0] == pytest.approx((1.9, cut.height[19]))
-    assert f"{cut.height[19]:.3f} mm" in [text.get_text() for text in axes.texts]
+    assert mark.get_xydata()[0] == pytest.approx((1.9, profile.height[19]))
+    assert f"{profile.height[19]:.3f} mm" in [text.get_text() for text in axes.texts]
 
 
-@pytest.mark.parametrize(("span", "told"), [(2.5, 1), (1.0, 2), (0.3, 10), (0.001, 2000), (50, 1 / 20)])
-def test_a_section_is_stretched_as_it_says(span, told):
-    sheet, cut = cut_of(along(span=span))
-    axes = panel_of(draw_section, sheet.result, cut)
+@pytest.mark.parametrize(("span", "message"), [(2.5, 1), (1.0, 2), (0.3, 10), (0.001, 2000), (50, 1 / 20)])
+def test_a_section_is_stretched_as_its_title_states(span, message):
+    sheet, profile = cut_of(along(span=span))
+    axes = panel_of(draw_section, sheet.result, profile)
     axes.apply_aspect()
     (x0, y0), (x1, y1) = axes.transData.transform([(0, 0), (1, 1)])
-    assert (y1 - y0) / (x1 - x0) == pytest.approx(told)
-    words = f"stretched {told} times" if told > 1 else "shrunk 20 times"
-    assert note(axes).endswith("true to scale" if told == 1 else words)
+    assert (y1 - y0) / (x1 - x0) == pytest.approx(message)
+    words = f"stretched {message} times" if message > 1 else "shrunk 20 times"
+    assert note(axes).endswith("true to scale" if message == 1 else words)
     low, high = axes.get_ylim()
     assert low < -span < 0 < high
 
 
 def test_a_section_without_errors_or_holes_mentions_neither():
     level = io.Result(height=np.zeros((3, 9), np.float32), x=np.arange(9.0), y=np.arange(3.0)[::-1])
-    sheet, cut = cut_of(level)
-    axes = panel_of(draw_section, sheet.result, cut)
+    sheet, profile = cut_of(level)
+    axes = panel_of(draw_section, sheet.result, profile)
     assert named(axes) == {"measured", "highest point"}
     assert note(axes).startswith("A (0, 1) to B (8, 1) mm")
 
 
 def test_a_section_across_nothing_but_a_hole_is_empty():
-    cut = section(ball(), (1.0, 1.3), (1.5, 1.3))
-    assert not np.isfinite(cut.height).any()
-    axes = panel_of(draw_section, ball(), cut)
+    profile = section(ball(), (1.0, 1.3), (1.5, 1.3))
+    assert not np.isfinite(profile.height).any()
+    axes = panel_of(draw_section, ball(), profile)
     assert not axes.lines
     assert axes.get_legend() is None
 
@@ -255,7 +255,7 @@ def test_codes_have_the_legend_of_their_declaration(codes, texts):
     status = np.repeat(np.array([*codes], np.uint8), counts)[np.newaxis]
     axes = map_of("status", io.Result(status=status, declarations={"status": status_of(codes)}))
     shares = (percent(count, status.size) for count in counts)
-    assert named(axes) == {f"{text}\n{share}" for text, share in zip(texts, shares, strict=True)}
+    assert named(axes) == {f"{text}\n{fraction}" for text, fraction in zip(texts, shares, strict=True)}
     colours = [tuple(colour) for colour in axes.images[0].get_array()[0]]
     assert len(set(colours)) == len(codes)
     assert colours[0] == MISSING_RGB
@@ -334,8 +334,11 @@ def test_the_distribution_counts_every_height_once():
     result = ball()
     axes = panel_of(draw_histogram, result)
     areas = {patch.get_label(): patch.get_data() for patch in axes.patches}
-    known = np.isfinite(result.height)
-    for name, part in (("measured", known & (result.filled == 0)), ("filled", known & (result.filled == 1))):
+    finite = np.isfinite(result.height)
+    for name, part in (
+        ("measured", finite & (result.filled == 0)),
+        ("filled", finite & (result.filled == 1)),
+    ):
         counts = areas[name].values - areas[name].baseline
         assert counts.sum() == np.count_nonzero(part)
     assert note(axes).endswith("median expected error 2 µm")
@@ -368,7 +371,7 @@ def test_vectors_are_shown_by_their_length_and_arrows(shape):
     assert np.isnan(length[0, 0])
     np.testing.assert_allclose(length[1:], 5, rtol=1e-6)
     assert axes.child_axes[0].get_ylabel() == "length (µm)"
-    (arrows,) = (one for one in axes.collections if hasattr(one, "U"))
+    (arrows,) = (panel for panel in axes.collections if hasattr(panel, "U"))
     np.testing.assert_allclose([arrows.U[-1], arrows.V[-1]], [3, -4], rtol=1e-6)
 
 
@@ -394,19 +397,19 @@ def test_declared_heights_have_the_displayed_unit_in_the_map():
 
 
 def test_declared_heights_have_the_displayed_unit_in_the_section():
-    sheet, cut = cut_of(in_micrometres(along()))
-    axes = panel_of(draw_section, sheet.result, cut)
+    sheet, profile = cut_of(in_micrometres(along()))
+    axes = panel_of(draw_section, sheet.result, profile)
     assert axes.get_ylabel() == "rise (µm)"
     lines = {line.get_label(): line for line in axes.lines}
     np.testing.assert_allclose(np.nanmin(lines["measured"].get_ydata()), -1000)
     band = np.concatenate([path.vertices for path in axes.collections[0].get_paths()])
     assert -1100 < band[:, 1].min() < -1010
-    assert f"{1000 * cut.height[19]:.4g} µm" in [text.get_text() for text in axes.texts]
+    assert f"{1000 * profile.height[19]:.4g} µm" in [text.get_text() for text in axes.texts]
 
 
-def test_a_section_in_micrometres_is_stretched_as_it_says():
-    sheet, cut = cut_of(in_micrometres(along(span=0.3)))
-    axes = panel_of(draw_section, sheet.result, cut)
+def test_a_section_in_micrometres_is_stretched_as_its_title_states():
+    sheet, profile = cut_of(in_micrometres(along(span=0.3)))
+    axes = panel_of(draw_section, sheet.result, profile)
     axes.apply_aspect()
     (x0, y0), (x1, y1) = axes.transData.transform([(0, 0), (1, 1000)])
     assert (y1 - y0) / (x1 - x0) == pytest.approx(10)
@@ -431,7 +434,7 @@ def rounded(value, shape=(6, 10)):
 def assert_plain(axes):
     """Assert that no scale of a panel has an offset, such as 1e-5+2.8867e1."""
     FigureCanvasAgg(axes.figure).draw()
-    scales = [axis for one in (axes, *axes.child_axes) for axis in (one.xaxis, one.yaxis)]
+    scales = [axis for panel in (axes, *axes.child_axes) for axis in (panel.xaxis, panel.yaxis)]
     assert [axis.get_offset_text().get_text() for axis in scales] == [""] * len(scales)
 
 
@@ -448,8 +451,8 @@ def test_a_map_that_is_constant_up_to_rounding_has_one_colour():
 def test_heights_that_are_constant_up_to_rounding_have_a_plain_scale(draw, value, scaled):
     places = {"x": np.arange(10.0), "y": np.arange(6.0)[::-1]} if scaled else {}
     result = in_micrometres(io.Result(height=rounded(value), **places))
-    cut = (section(result),) if draw is draw_section else ()
-    assert_plain(panel_of(draw, result, *cut))
+    profile = (section(result),) if draw is draw_section else ()
+    assert_plain(panel_of(draw, result, *profile))
 
 
 def test_a_section_of_equal_heights_is_not_stretched():

@@ -51,10 +51,10 @@ def surfaces(monkeypatch, styles):
     drawn = []
     plot = Axes3D.plot_surface
 
-    def plot_surface(axes, *given, **style):
-        drawn.append(given)
+    def plot_surface(axes, *options, **style):
+        drawn.append(options)
         styles.append(style)
-        return plot(axes, *given, **style)
+        return plot(axes, *options, **style)
 
     monkeypatch.setattr(Axes3D, "plot_surface", plot_surface)
     return drawn
@@ -66,10 +66,10 @@ def surfaces(monkeypatch, styles):
 )
 def test_height_maps_become_a_picture(tmp_path, kinds, surface):
     pixel = np.arange(600).reshape(20, 30) == 44
-    known = {"slope": True, "nothing": False, "pixel": pixel, "filled": filled_in() == 1}
+    masks = {"slope": True, "nothing": False, "pixel": pixel, "filled": filled_in() == 1}
     results = {
         kind: result_of(
-            np.where(known[kind], slope(), np.float32(np.nan)),
+            np.where(masks[kind], slope(), np.float32(np.nan)),
             filled=filled_in() if kind == "filled" else None,
         )
         for kind in kinds
@@ -226,20 +226,20 @@ def test_surfaces_share_a_vertical_scale_that_holds_all_of_them():
     deep = slope().copy()
     deep[3, 4] = -7
     figure = heights._draw_heights({"a": result_of(slope()), "b": result_of(deep)}, truth_of(slope()), True)
-    one, other = (axes.get_zlim() for axes in figure.axes if isinstance(axes, Axes3D))
-    assert one == other
-    assert one[0] <= -7
-    assert one[1] >= 0
+    panel, other = (axes.get_zlim() for axes in figure.axes if isinstance(axes, Axes3D))
+    assert panel == other
+    assert panel[0] <= -7
+    assert panel[1] >= 0
 
 
 def test_a_detail_has_a_scale_of_its_own():
     height = slope()
     figure = heights._draw_heights({"a": result_of(height)}, truth_of(height), False, (-0.1, 0.02))
     panels = [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
-    whole, _, part, cut = panels
+    whole, _, part, profile = panels
     assert whole.get_images()[0].norm.vmin < -0.25
     assert (part.get_images()[0].norm.vmin, part.get_images()[0].norm.vmax) == (-0.1, 0.02)
-    assert cut.get_ylim() == (-0.1, 0.02)
+    assert profile.get_ylim() == (-0.1, 0.02)
 
 
 @KINDS
@@ -274,7 +274,7 @@ def test_components_that_know_no_height_are_moved_to_the_truth_and_the_others_ar
     np.testing.assert_allclose(shown, expected, atol=1e-6)
     np.testing.assert_array_equal(result.height, kept)
     assert "truth's level" in axes.get_title()
-    known = result_of(kept, component=component, offset_unknown=np.zeros(3, np.uint8))
-    axes, _ = draw({"a": known}, truth_of(truth))
+    moved = result_of(kept, component=component, offset_unknown=np.zeros(3, np.uint8))
+    axes, _ = draw({"a": moved}, truth_of(truth))
     np.testing.assert_array_equal(np.ma.filled(axes.get_images()[0].get_array(), np.nan), kept)
     assert "level" not in axes.get_title()

@@ -32,7 +32,7 @@ def drawn(results, truth, tmp_path, monkeypatch):
     kept = []
     monkeypatch.setattr(normals, "save_figure", lambda figure, title, path: kept.append(figure))
     view.normal_figure(results, truth, "title", tmp_path / "x.png")
-    axes = [one for one in kept[0].axes if one.get_label() != "<colorbar>"]
+    axes = [panel for panel in kept[0].axes if panel.get_label() != "<colorbar>"]
     return np.array(axes).reshape(-1, 3)
 
 
@@ -70,9 +70,9 @@ def test_needles_point_where_the_surface_faces_and_only_in_contact(tmp_path, mon
 
 
 def test_errors_are_angles_where_contact_is_found_and_true(tmp_path, monkeypatch):
-    touched, told = np.ones((2, *SHAPE), np.uint8)
-    touched[0], told[1] = 0, 0
-    results = {"right": result_of(contact=told), "turned": result_of(0.5, ZENITH + np.radians(2))}
+    touched, true = np.ones((2, *SHAPE), np.uint8)
+    touched[0], true[1] = 0, 0
+    results = {"right": result_of(contact=true), "turned": result_of(0.5, ZENITH + np.radians(2))}
     rows = drawn(results, truth_of(contact=touched), tmp_path, monkeypatch)
     right, turned = (row[2].images[0].get_array() for row in rows)
     np.testing.assert_allclose(right[2:], 0, atol=1e-4)

@@ -40,10 +40,10 @@ def test_a_surface_becomes_a_picture(tmp_path):
 
 
 def test_the_last_is_drawn_as_a_whole_and_all_are_cut():
-    whole, seen, errors, cuts, below = drawn({"first": result_of(5), "last": result_of(2)})
+    whole, last_whole, errors, cuts, below = drawn({"first": result_of(5), "last": result_of(2)})
     assert whole.get_title().startswith("last")
-    assert seen.get_title().startswith("last")
-    np.testing.assert_array_equal(shown(seen), result_of(2).height)
+    assert last_whole.get_title().startswith("last")
+    np.testing.assert_array_equal(shown(last_whole), result_of(2).height)
     np.testing.assert_allclose(shown(errors), 2, atol=1e-3)
     assert [line.get_label() for line in cuts.get_lines()] == ["truth", "first", "last"]
     first, last = below.get_lines()[1:]

@@ -43,10 +43,10 @@ def test_the_errors_left_are_printed_in_a_table(folder):
 
 
 def test_json_contains_the_cells_too(folder):
-    told = json.loads(check(folder, "--ball", "10mm", "--cells", "4", "--json").out)
-    assert np.shape(told["after"]["height"]["cells"]["rms"]) == (4, 4)
-    assert abs(told["after"]["height"]["bias"]) < 0.02
-    assert told["before"] == {}
+    report = json.loads(check(folder, "--ball", "10mm", "--cells", "4", "--json").out)
+    assert np.shape(report["after"]["height"]["cells"]["rms"]) == (4, 4)
+    assert abs(report["after"]["height"]["bias"]) < 0.02
+    assert report["before"] == {}
 
 
 def test_a_picture_is_drawn(folder, tmp_path):

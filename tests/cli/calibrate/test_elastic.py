@@ -70,9 +70,9 @@ def test_a_ball_becomes_a_gel_in_the_file_and_is_printed_in_a_line():
         calibration.process["elastic.pixel_size_y"]
     )
     again = run("calibrate elastic ball.h5 --ball 4mm -o cal.h5 --json")
-    told = json.loads(again.out)
-    assert told["gel"]["threshold"] == pytest.approx(calibration.gel.threshold)
-    assert told["balls"][0]["pixels"] > 200
+    report = json.loads(again.out)
+    assert report["gel"]["threshold"] == pytest.approx(calibration.gel.threshold)
+    assert report["balls"][0]["pixels"] > 200
 
 
 @pytest.mark.parametrize(

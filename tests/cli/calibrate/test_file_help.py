@@ -18,6 +18,6 @@ def help_of(*words):
 
 
 def test_calibrate_names_its_commands_and_is_quick():
-    said = help_of("calibrate")
-    assert all(f"\n  {command} " in said for command in COMMANDS)
-    assert said.endswith("heavy:\n")
+    text = help_of("calibrate")
+    assert all(f"\n  {command} " in text for command in COMMANDS)
+    assert text.endswith("heavy:\n")

@@ -44,15 +44,15 @@ def flat_references(dark=20.0, bright=220.0):
     return io.References(dark * full, bright * full, full, full, np.zeros(SHAPE, np.uint8))
 
 
-def press(name="press.h5", **known):
+def press(name="press.h5", **options):
     """Record pixels that turn light one after the other, by a recording whose own references are wrong."""
     steps = np.linspace(0.15, 0.55, SHAPE[0] * SHAPE[1]).reshape(SHAPE)
-    share = np.clip((TRAVEL[:, None, None] - steps) / 0.2 + 0.5, 0, 1)
-    frames = np.rint(20 + 200 * share).astype(np.uint8)
+    fraction = np.clip((TRAVEL[:, None, None] - steps) / 0.2 + 0.5, 0, 1)
+    frames = np.rint(20 + 200 * fraction).astype(np.uint8)
     wrong = {"dark": np.zeros(SHAPE, np.float32), "bright": np.full(SHAPE, 60, np.float32)}
     header = io.Header("vertical", pixel_size=(0.1, 0.1), camera="left", **wrong)
     source = MadeUp(frames, header, travel=TRAVEL)
-    with io.Recorder(source, name, **known) as recorder:
+    with io.Recorder(source, name, **options) as recorder:
         recorder.drain(lambda count: None)
     return steps
 
@@ -74,32 +74,32 @@ def bias(result, steps):
 
 def test_a_press_is_reconstructed_with_the_references_of_the_calibration():
     steps, calibration = press(), save(references=flat_references())
-    without, found = reconstruct("press.h5"), reconstruct("press.h5", "--calibration", "cal.h5")
-    assert bias(found, steps) < 0.005
+    without, result = reconstruct("press.h5"), reconstruct("press.h5", "--calibration", "cal.h5")
+    assert bias(result, steps) < 0.005
     assert bias(without, steps) > 0.02
-    assert_same(found.calibration, calibration)
-    assert (found.process["calibration"], found.process["calibration_parts"]) == ("cal.h5", "references")
-    assert found.process["source_region"] == "0,0,11x9"
+    assert_same(result.calibration, calibration)
+    assert (result.process["calibration"], result.process["calibration_parts"]) == ("cal.h5", "references")
+    assert result.process["source_region"] == "0,0,11x9"
     assert without.calibration is None
     assert "calibration" not in without.process
     by_hand = reconstruct("press.h5", "--dark", "20", "--bright", "220")
-    np.testing.assert_array_equal(found.height, by_hand.height)
+    np.testing.assert_array_equal(result.height, by_hand.height)
 
 
 def test_a_calibration_that_is_carried_is_used_unless_another_is_given():
     carried = replace(a_calibration(SHAPE, only=[]), references=flat_references())
     steps = press(calibration=carried)
     other = save(references=flat_references(dark=100.0))
-    found = reconstruct("press.h5")
-    assert bias(found, steps) < 0.005
-    assert found.process["calibration"] == "the calibration in press.h5"
-    assert_same(found.calibration, carried)
-    given = reconstruct("press.h5", "--calibration", "cal.h5")
-    assert bias(given, steps) > 0.02
-    assert_same(given.calibration, other)
+    result = reconstruct("press.h5")
+    assert bias(result, steps) < 0.005
+    assert result.process["calibration"] == "the calibration in press.h5"
+    assert_same(result.calibration, carried)
+    replaced = reconstruct("press.h5", "--calibration", "cal.h5")
+    assert bias(replaced, steps) > 0.02
+    assert_same(replaced.calibration, other)
     press("plain.h5")
     from_a_result = reconstruct("plain.h5", "--calibration", "press.h5")
-    np.testing.assert_array_equal(from_a_result.height, found.height)
+    np.testing.assert_array_equal(from_a_result.height, result.height)
 
 
 def test_normals_of_a_stage_that_goes_round_otherwise_are_right_with_its_precession():
@@ -107,10 +107,10 @@ def test_normals_of_a_stage_that_goes_round_otherwise_are_right_with_its_precess
     precession = io.Precession(TILT, 0.4, -1, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0, 5.0))
     save(dtype="uint16", precession=precession)
     true = direction(ZENITH, AZIMUTH)
-    without, found = reconstruct("turn.h5"), reconstruct("turn.h5", "--calibration", "cal.h5")
+    without, result = reconstruct("turn.h5"), reconstruct("turn.h5", "--calibration", "cal.h5")
     assert np.degrees(np.median(between(without.normals, true))) > 5
-    assert np.degrees(np.median(between(found.normals, true))) < 1
-    assert found.process["calibration_parts"] == "tilt"
+    assert np.degrees(np.median(between(result.normals, true))) < 1
+    assert result.process["calibration_parts"] == "tilt"
 
 
 # What is refused, in one line and with exit code 2, before anything is written.
@@ -130,27 +130,29 @@ REFUSALS = [
 ]
 
 
-@pytest.mark.parametrize(("known", "change", "said"), REFUSALS)
-def test_a_wrong_calibration_is_refused_by_reconstruct(known, change, said):
+@pytest.mark.parametrize(("options", "change", "message"), REFUSALS)
+def test_a_wrong_calibration_is_refused_by_reconstruct(options, change, message):
     press()
-    save(**known)
+    save(**options)
     if change is not None:
         change(Path("cal.h5"))
-    refused(said.format("press.h5"), "reconstruct press.h5 -o out.h5 --calibration cal.h5")
+    refused(message.format("press.h5"), "reconstruct press.h5 -o out.h5 --calibration cal.h5")
     assert not Path("out.h5").exists()
 
 
-@pytest.mark.parametrize(("known", "change", "said"), REFUSALS[1:])
+@pytest.mark.parametrize(("options", "change", "message"), REFUSALS[1:])
 @pytest.mark.parametrize("command", ["capture", "live"])
-def test_a_wrong_calibration_is_refused_before_the_stage_is_opened(monkeypatch, command, known, change, said):
+def test_a_wrong_calibration_is_refused_before_the_stage_is_opened(
+    monkeypatch, command, options, change, message
+):
     monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, name="left"))
     monkeypatch.setattr(rig, "open_rig", None)
     Path("rig.toml").touch()
-    save(**known)
+    save(**options)
     if change is not None:
         change(Path("cal.h5"))
     words = ["vertical", "--rig", "rig.toml", "--stop", "1mm", "--step", "1mm", "--calibration", "cal.h5"]
-    refused(said.format("fake"), command, *words, *(["-o", "rec.h5"] if command == "capture" else []))
+    refused(message.format("fake"), command, *words, *(["-o", "rec.h5"] if command == "capture" else []))
 
 
 def test_the_calibration_is_not_overwritten():
@@ -167,10 +169,12 @@ def test_the_calibration_is_not_overwritten():
 @pytest.fixture
 def fake(clock, monkeypatch):
     """A rig whose file is read and which is opened without hardware; its own references are wrong."""
-    known = {"pixel_size": (0.05, 0.05), "delay": 0.0, "rate": 60.0, "name": "left", "bright": 255.0}
+    rig_options = {"pixel_size": (0.05, 0.05), "delay": 0.0, "rate": 60.0, "name": "left", "bright": 255.0}
 
-    monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, **known))
-    monkeypatch.setattr(rig, "open_rig", lambda *_: fake_rig(spreading(SHAPE), clock, rate=60.0, told=known))
+    monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, **rig_options))
+    monkeypatch.setattr(
+        rig, "open_rig", lambda *_: fake_rig(spreading(SHAPE), clock, rate=60.0, told=rig_options)
+    )
     Path("rig.toml").touch()
 
 

@@ -50,21 +50,21 @@ def test_presses_and_a_scale_become_a_modulus_that_reconstruct_uses(folder):
     ended = done("calibrate force", *presses, "--readings", "scale.csv", "-o", "cal.h5")
     assert ended.out.startswith("cal.h5: modulus ")
     assert "held-out forces wrong by" in ended.out
-    known = io.open_calibration("cal.h5")
-    assert known.stiffness.modulus == pytest.approx(MODULUS, rel=0.03)
-    assert known.process["force.sources"] == ", ".join(presses)
+    calibration = io.open_calibration("cal.h5")
+    assert calibration.stiffness.modulus == pytest.approx(MODULUS, rel=0.03)
+    assert calibration.process["force.sources"] == ", ".join(presses)
     ended = run("reconstruct press-1.h5 --calibration cal.h5 -o a.h5")
     result = io.open_result("a.h5")
     assert "force 0." in ended.out
-    told = run("info a.h5").out
-    assert "force_sigma" in told
-    assert "MPa of the calibration" in told
+    text = run("info a.h5").out
+    assert "force_sigma" in text
+    assert "MPa of the calibration" in text
     assert result.force == pytest.approx(folder[1][1], rel=0.03)
     words = [word for force in folder[1] for word in ("--force", f"{1000 * force}mN")]
     again = run("calibrate force", *presses, *words, "--force-sigma", "1mN", "-o", "cal.h5", "--json")
-    told = json.loads(again.out)
-    assert told["stiffness"]["modulus"] == pytest.approx(known.stiffness.modulus, rel=0.01)
-    assert [one["recording"] for one in told["presses"]] == presses
+    report = json.loads(again.out)
+    assert report["stiffness"]["modulus"] == pytest.approx(calibration.stiffness.modulus, rel=0.01)
+    assert [entry["recording"] for entry in report["presses"]] == presses
     shown = run("calibrate show cal.h5").out
     assert "modulus" in shown
     assert "kPa" in shown
@@ -78,7 +78,7 @@ def test_a_modulus_can_be_given(folder):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ("", "either as --force, one per recording, or as --readings"),
         ("--force 1N --readings scale.csv", "either as --force"),
@@ -92,8 +92,8 @@ def test_a_modulus_can_be_given(folder):
         ("--force 1N -o new.h5", "new.h5 has no gel"),
     ],
 )
-def test_a_wrong_call_is_one_line(words, said):
+def test_a_wrong_call_is_one_line(words, message):
     Path("other.csv").write_text("press-9.h5,1.0\n")
     Path("bad.csv").write_text("name,newtons\npress-0.h5,much\n")
     Path("comma.csv").write_text("name,newtons\npress-0.h5,1,5\n")
-    refused(said, f"calibrate force press-0.h5 -o cal.h5 {words}")
+    refused(message, f"calibrate force press-0.h5 -o cal.h5 {words}")

@@ -43,14 +43,14 @@ def test_a_dark_and_a_bright_recording_become_references(scene, tmp_path):
     assert ended.out.startswith(f"{path}: dark 15.")
     assert "24 frames" in ended.out
     assert ended.out.endswith("; 1 hot, 1 dead, 0 saturated\n")
-    known = io.open_calibration(path)
-    assert known.camera.name == "lab"
-    assert known.camera.shape == SHAPE
-    assert known.camera.dtype == np.uint8
-    assert known.references.defects[3, 4] == 1
-    assert known.references.defects[8, 9] == 2
-    assert known.process["references.dark_frames"] == 24
-    assert known.process["references.bright_sources"] == str(scene / "bright.h5")
+    calibration = io.open_calibration(path)
+    assert calibration.camera.name == "lab"
+    assert calibration.camera.shape == SHAPE
+    assert calibration.camera.dtype == np.uint8
+    assert calibration.references.defects[3, 4] == 1
+    assert calibration.references.defects[8, 9] == 2
+    assert calibration.process["references.dark_frames"] == 24
+    assert calibration.process["references.bright_sources"] == str(scene / "bright.h5")
 
 
 def test_a_folder_of_pictures_is_accepted(scene, tmp_path):
@@ -77,8 +77,8 @@ def test_frames_without_positions_are_accepted(scene, tmp_path, name):
 
 def test_too_few_frames_for_a_stated_noise_are_counted(scene, tmp_path):
     path = tmp_path / "cal.h5"
-    said = refused("--noise 0.1", scene, path, "--noise", "0.1", run=references)
-    needed = int(said.split(" more frames")[0].split()[-1])
+    message = refused("--noise 0.1", scene, path, "--noise", "0.1", run=references)
+    needed = int(message.split(" more frames")[0].split()[-1])
     assert needed == pytest.approx((NOISE**2 + 1 / 12) / 0.1**2 - 24, rel=0.1)
     assert not path.exists()
     assert references(scene, path, "--noise", "0.5").code == 0
@@ -91,7 +91,7 @@ def test_a_camera_whose_dark_level_is_cut_off_is_reported(scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--dark", "dark.h5"), "--bright missing"),
         ((), "--dark and --bright missing"),
@@ -103,10 +103,10 @@ def test_a_camera_whose_dark_level_is_cut_off_is_reported(scene, tmp_path):
         (("--rig", "rig.toml", "--rolled"), "--press is missing"),
     ],
 )
-def test_an_impossible_call_is_one_line(scene, tmp_path, monkeypatch, words, said):
+def test_an_impossible_call_is_one_line(scene, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(scene)
     Path("rig.toml").touch()
-    refused(said, "calibrate references -o", tmp_path / "cal.h5", *words)
+    refused(message, "calibrate references -o", tmp_path / "cal.h5", *words)
     assert not (tmp_path / "cal.h5").exists()
 
 

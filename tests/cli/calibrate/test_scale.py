@@ -44,35 +44,35 @@ def test_a_picture_becomes_a_lens_in_a_file():
     assert ended.said == ""
     assert ended.out.startswith("cal.h5: 71.4")
     assert "24 marks in 1 picture " in ended.out
-    known = io.open_calibration("cal.h5")
-    assert known.camera.shape == known.lens.shape == SHOWN.shape
-    assert known.camera.dtype == np.uint8
-    assert known.lens.pixel_size == pytest.approx((1 / PER_MM,) * 2, rel=1e-3)
-    assert 0 < known.lens.scale_sigma < 1e-3
-    assert known.process["scale.board"] == CHARUCO
-    assert known.process["scale.sources"] == "a.png"
+    calibration = io.open_calibration("cal.h5")
+    assert calibration.camera.shape == calibration.lens.shape == SHOWN.shape
+    assert calibration.camera.dtype == np.uint8
+    assert calibration.lens.pixel_size == pytest.approx((1 / PER_MM,) * 2, rel=1e-3)
+    assert 0 < calibration.lens.scale_sigma < 1e-3
+    assert calibration.process["scale.board"] == CHARUCO
+    assert calibration.process["scale.sources"] == "a.png"
 
 
 def test_dots_do_as_well_and_json_contains_it():
     cv2.imwrite("dots.png", DOTTED)
     ended = calibrate("dots.png", "dots.png", "--board", "dots:7x6:1mm", "-o", "cal.h5", "--json")
     assert ended.code == 0, ended.said
-    told = json.loads(ended.out)
-    assert told["pixel_size"] == pytest.approx(1 / PER_MM, rel=1e-3)
-    assert [one["marks"] for one in told["pictures"]] == [42, 42]
-    assert told["pixel_size_sigma"] < 1e-4
+    report = json.loads(ended.out)
+    assert report["pixel_size"] == pytest.approx(1 / PER_MM, rel=1e-3)
+    assert [entry["marks"] for entry in report["pictures"]] == [42, 42]
+    assert report["pixel_size_sigma"] < 1e-4
 
 
-def test_a_recording_is_averaged_and_says_its_camera():
+def test_a_recording_is_averaged_and_names_its_camera():
     random = np.random.default_rng(0)
     frames = SHOWN.astype(float) + 20 * random.standard_normal((12, *SHOWN.shape))
     recorded(np.clip(np.rint(frames), 0, 255).astype(np.uint8))
     ended = calibrate("rec.h5", *TO)
     assert ended.code == 0, ended.said
-    known = io.open_calibration("cal.h5")
-    assert known.camera.name == "lab"
+    calibration = io.open_calibration("cal.h5")
+    assert calibration.camera.name == "lab"
     alone = calibrate_lens([("one", frames[0].astype(np.float32))], Charuco(7, 5, 2.0, 1.5))
-    assert known.lens.error < alone.lens.error
+    assert calibration.lens.error < alone.lens.error
 
 
 def test_pictures_may_have_fewer_bits_than_the_camera():
@@ -80,12 +80,12 @@ def test_pictures_may_have_fewer_bits_than_the_camera():
     assert calibrate("rec.h5", *TO).code == 0
     ended = calibrate("a.png", *TO)
     assert ended.code == 0, ended.said
-    known = io.open_calibration("cal.h5")
-    assert (known.camera.name, known.camera.dtype) == ("lab", np.uint16)
+    calibration = io.open_calibration("cal.h5")
+    assert (calibration.camera.name, calibration.camera.dtype) == ("lab", np.uint16)
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ([], "no picture of a board is given"),
         (["."], "sequence: name pictures"),
@@ -96,7 +96,7 @@ def test_pictures_may_have_fewer_bits_than_the_camera():
         (["moving.h5"], "moving.h5 is a sequence in which the picture changes"),
     ],
 )
-def test_what_is_not_a_picture_of_the_board_is_refused(words, said, tmp_path):
+def test_what_is_not_a_picture_of_the_board_is_refused(words, message, tmp_path):
     cv2.imwrite("dots.png", DOTTED)
     cv2.imwrite("white.png", np.full_like(SHOWN, 255))
     cv2.imwrite("small.png", SHOWN[1:])
@@ -104,7 +104,7 @@ def test_what_is_not_a_picture_of_the_board_is_refused(words, said, tmp_path):
     recorded(np.stack([np.roll(SHOWN, k, 0) for k in range(5)]), "moving.h5")
     # The folder that is given must not be that of the file.
     (tmp_path / "to").mkdir()
-    with pytest.raises(io.InputError, match=re.escape(said)):
+    with pytest.raises(io.InputError, match=re.escape(message)):
         command(Path("to/cal.h5"), CHARUCO, [Path(word) for word in words])
     assert not (tmp_path / "to" / "cal.h5").exists()
 
@@ -120,7 +120,7 @@ def test_a_board_is_painted_in_its_true_size():
 
 
 @pytest.mark.parametrize(
-    ("path", "dpi", "said"),
+    ("path", "dpi", "message"),
     [
         ("board.jpg", 2540, "name it board.png"),
         ("b.png", 0, "pixels per inch of a printer"),
@@ -128,8 +128,8 @@ def test_a_board_is_painted_in_its_true_size():
         ("b.png", 90_000, "fewer dots per inch"),
     ],
 )
-def test_a_board_that_cannot_be_painted_is_refused(path, dpi, said):
-    with pytest.raises(io.InputError, match=said):
+def test_a_board_that_cannot_be_painted_is_refused(path, dpi, message):
+    with pytest.raises(io.InputError, match=message):
         board_command(Path(path), CHARUCO, dpi)
     assert not Path(path).exists()
 
@@ -144,5 +144,5 @@ def test_what_was_made_with_other_pixels_is_named(before, again):
     )
     ended = calibrate("a.png", *TO)
     assert ended.code == 0, ended.said
-    said = f"learn {', '.join(again)} again: made with another pixel size\n" if again else ""
-    assert ended.said == said
+    text = f"learn {', '.join(again)} again: made with another pixel size\n" if again else ""
+    assert ended.said == text

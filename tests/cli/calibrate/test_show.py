@@ -58,8 +58,8 @@ def test_a_terminal_gets_a_table_without_repeated_words(saved, monkeypatch):
 
 
 def test_machines_get_numbers_and_how_they_came_about(saved):
-    told = json.loads(run("calibrate show", saved, "--json").out)
-    by_name = {(one["part"], one["what"]): one for one in told["numbers"]}
+    report = json.loads(run("calibrate show", saved, "--json").out)
+    by_name = {(row["part"], row["what"]): row for row in report["numbers"]}
     assert by_name["tilt", "pivot z"] == {
         "part": "tilt",
         "what": "pivot z",
@@ -69,8 +69,8 @@ def test_machines_get_numbers_and_how_they_came_about(saved):
         "name": "pivot_z",
     }
     assert by_name["scale", "distortion k1"]["sigma"] is None
-    assert told["process"]["tilt.frames"] == 8
-    assert told["pictures"] == []
+    assert report["process"]["tilt.frames"] == 8
+    assert report["pictures"] == []
 
 
 def test_pictures_go_into_a_folder(tmp_path):
@@ -78,4 +78,4 @@ def test_pictures_go_into_a_folder(tmp_path):
     io.save_calibration(a_calibration(only=("precession",)), path)
     ended = done("calibrate show", path, "-o", folder)
     assert ended.out.endswith(f"{folder}: tilt.png\n")
-    assert [one.name for one in folder.iterdir()] == ["tilt.png"]
+    assert [path.name for path in folder.iterdir()] == ["tilt.png"]

@@ -41,8 +41,8 @@ def test_each_place_is_asked_for_and_becomes_a_recording_next_to_the_calibration
         inputs.Place("ball-1", "put the ball at place 1 of 1", AxialPlan(0.5, 0.04, 1.0, np.pi / 2)),
     ]
     dark, ball = inputs.take(rig_file, tmp_path / "cal.h5", places, settle="0s")
-    said = capsys.readouterr().err
-    assert said.splitlines() == [
+    text = capsys.readouterr().err
+    assert text.splitlines() == [
         "take everything off, then press Enter",
         "put the ball at place 1 of 1, then press Enter",
     ]
@@ -89,12 +89,12 @@ def test_references_are_taken_until_their_noise_is_as_stated(rig_file, tmp_path,
     path = tmp_path / "cal.h5"
     words = ("--rig", rig_file, "--bright", bright, "-o", path, "--noise", "0.45", "--frames", "4", "--json")
     ended = done("calibrate references", *words)
-    told = json.loads(ended.out)
-    assert told["dark"]["frames"] > 4
-    assert told["dark"]["sigma"] <= 0.45
+    report = json.loads(ended.out)
+    assert report["dark"]["frames"] > 4
+    assert report["dark"]["sigma"] <= 0.45
     assert ended.said.count("press Enter") >= 2
-    known = io.open_calibration(path)
-    np.testing.assert_allclose(np.nanmedian(known.references.dark), 16, atol=0.3)
+    calibration = io.open_calibration(path)
+    np.testing.assert_allclose(np.nanmedian(calibration.references.dark), 16, atol=0.3)
     assert (tmp_path / "cal-dark.h5").exists()
     assert (tmp_path / "cal-dark-2.h5").exists()
 

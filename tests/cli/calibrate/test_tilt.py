@@ -36,28 +36,28 @@ def here(turns, tmp_path):
         (tmp_path / path.name).symlink_to(path)
 
 
-def turn(path, thing, press, seed, **known):
+def turn(path, thing, press, seed, **options):
     frames = pictures(
         thing, TRUTH.lean(EIGHTHS), press, TRUTH.pivot, shape=SHAPE, body=TALL, pattern="linear", seed=seed
     )
-    record(MadeUp(frames, header(press, **known), phase=EIGHTHS), path)
+    record(MadeUp(frames, header(press, **options), phase=EIGHTHS), path)
 
 
-def header(press, **known):
+def header(press, **options):
     movement = Axial([0.0], np.radians(2.5), press)
     twin = Twin(object=Ball(1.0), shape=SHAPE, pixel_size=0.1, movement=movement, pattern="linear", body=TALL)
-    told = twin.header
+    original = twin.header
     usual = {
         "pixel_size": (0.1, 0.1),
         "press": press,
-        "tilt": told.tilt,
-        "dark": told.dark,
-        "bright": told.bright,
-        "zenith_gain": told.zenith_gain,
-        "zenith_offset": told.zenith_offset,
+        "tilt": original.tilt,
+        "dark": original.dark,
+        "bright": original.bright,
+        "zenith_gain": original.zenith_gain,
+        "zenith_offset": original.zenith_offset,
         "camera": "left",
     }
-    return io.Header("axial", **usual | known)
+    return io.Header("axial", **usual | options)
 
 
 def tilt(*words):
@@ -76,25 +76,25 @@ def test_a_flat_and_a_ball_become_a_precession_in_a_file():
     assert line is not None, ended.out
     assert [float(number) for number in line.groups()] == pytest.approx([2.53, 2.865, 12], abs=0.1)
     assert ended.said.startswith("note: the phase offset is assumed to be within 90 deg of 0")
-    known = io.open_calibration("cal.h5")
-    assert known.camera.name == "left"
-    assert known.camera.shape == SHAPE
-    found = known.precession
-    assert found.direction == -1
-    assert found.tilt == pytest.approx(TRUTH.tilt, abs=np.radians(0.02))
-    assert found.lean(EIGHTHS) == pytest.approx(TRUTH.lean(EIGHTHS), abs=1e-4)
-    assert found.sigma["tilt"] < np.radians(0.02)
-    assert known.process["tilt.sources"] == "ball.h5"
-    assert known.process["tilt.flats"] == "flat.h5"
-    assert known.process["tilt.ball"] == "4mm"
-    assert (known.process["tilt.pixel_size_x"], known.process["tilt.pixel_size_y"]) == (0.1, 0.1)
-    assert known.process["tilt.residual_place"] < 0.005
-    assert "within 90 deg" in known.process["tilt.assumptions"]
+    calibration = io.open_calibration("cal.h5")
+    assert calibration.camera.name == "left"
+    assert calibration.camera.shape == SHAPE
+    precession = calibration.precession
+    assert precession.direction == -1
+    assert precession.tilt == pytest.approx(TRUTH.tilt, abs=np.radians(0.02))
+    assert precession.lean(EIGHTHS) == pytest.approx(TRUTH.lean(EIGHTHS), abs=1e-4)
+    assert precession.sigma["tilt"] < np.radians(0.02)
+    assert calibration.process["tilt.sources"] == "ball.h5"
+    assert calibration.process["tilt.flats"] == "flat.h5"
+    assert calibration.process["tilt.ball"] == "4mm"
+    assert (calibration.process["tilt.pixel_size_x"], calibration.process["tilt.pixel_size_y"]) == (0.1, 0.1)
+    assert calibration.process["tilt.residual_place"] < 0.005
+    assert "within 90 deg" in calibration.process["tilt.assumptions"]
 
 
-def test_what_the_file_knew_before_is_kept_and_what_the_user_says_of_the_scale_is_believed():
-    one = np.ones(SHAPE, np.float32)
-    references = io.References(16 * one, 224 * one, one, one, np.zeros(SHAPE, np.uint8))
+def test_earlier_parts_are_kept_and_the_given_scale_is_used():
+    ones = np.ones(SHAPE, np.float32)
+    references = io.References(16 * ones, 224 * ones, ones, ones, np.zeros(SHAPE, np.uint8))
     camera = io.CameraId("left", SHAPE, np.dtype(np.uint8))
     io.save_calibration(io.Calibration(camera, references), "cal.h5")
     gain = f"{208 / 45 * 1.02}/deg"  # 2 per cent too much
@@ -102,13 +102,13 @@ def test_what_the_file_knew_before_is_kept_and_what_the_user_says_of_the_scale_i
     ended = tilt("ball.h5", "--flat", "flat.h5", "--zenith-gain", gain, "--zenith-offset", "16")
 
     assert ended.code == 0, ended.said
-    known = io.open_calibration("cal.h5")
-    assert known.references is not None
-    assert known.precession.tilt == pytest.approx(TRUTH.tilt / 1.02, abs=np.radians(0.02))
+    calibration = io.open_calibration("cal.h5")
+    assert calibration.references is not None
+    assert calibration.precession.tilt == pytest.approx(TRUTH.tilt / 1.02, abs=np.radians(0.02))
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ([], "no recordings"),
         (["ball.h5"], "half-angle is not determined"),
@@ -119,7 +119,7 @@ def test_what_the_file_knew_before_is_kept_and_what_the_user_says_of_the_scale_i
         (["bare.h5"], "bare.h5: the recording has no zenith gain and offset"),
     ],
 )
-def test_impossible_input_is_one_line_and_writes_nothing(words, said):
+def test_impossible_input_is_one_line_and_writes_nothing(words, message):
     if "other.h5" in words:
         record(
             MadeUp(np.zeros((8, 5, 5), np.uint8), io.Header("axial", camera="right"), phase=EIGHTHS),
@@ -130,7 +130,7 @@ def test_impossible_input_is_one_line_and_writes_nothing(words, said):
         record(MadeUp(np.zeros((8, 5, 5), np.uint8), bare, phase=EIGHTHS), "bare.h5")
     Path("rig.toml").touch()
 
-    refused(said, *words, run=tilt)
+    refused(message, *words, run=tilt)
     assert not Path("cal.h5").exists()
 
 
@@ -168,14 +168,14 @@ def test_a_wall_that_was_measured_with_other_pixels_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("known", "said"),
+    ("options", "message"),
     [
         ({"ellipticity": 0.002, "sigma": {"ellipticity": 0.0005}}, ["azimuths are off by up to 0.057 deg"]),
         ({"centre": (0.003, 0.004), "sigma": {}}, ["to the mean pose, which leans by 0.29 deg"]),
         ({"centre": (1e-4, 0.0), "sigma": {"centre_x": 1e-4, "centre_y": 1e-4}}, []),
     ],
 )
-def test_an_oval_and_a_mean_lean_are_named_with_what_they_spoil_where_they_matter(known, said):
-    found = list(warnings(a_precession(**{"ellipticity": 0.0, "centre": (0.0, 0.0)} | known)))
-    assert len(found) == len(said)
-    assert all(one in note for one, note in zip(said, found, strict=True))
+def test_an_oval_and_a_mean_lean_are_named_with_what_they_spoil_where_they_matter(options, message):
+    notes = list(warnings(a_precession(**{"ellipticity": 0.0, "centre": (0.0, 0.0)} | options)))
+    assert len(notes) == len(message)
+    assert all(part in note for part, note in zip(message, notes, strict=True))

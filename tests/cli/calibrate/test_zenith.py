@@ -31,17 +31,17 @@ def folder(tmp_path):
 @pytest.fixture
 def fitted(monkeypatch):
     """Take down what the fit is given; it answers with a response that is made up."""
-    told = {}
+    arguments = {}
 
     def fit_zenith(presses, ball, **options):
-        told.update(options, ball=ball, names=[press.name for press in presses])
-        told.update(tilts=[press.header.tilt for press in presses])
-        told.update(sizes={press.header.pixel_size for press in presses})
+        arguments.update(options, ball=ball, names=[press.name for press in presses])
+        arguments.update(tilts=[press.header.tilt for press in presses])
+        arguments.update(sizes={press.header.pixel_size for press in presses})
         options["progress"](len(presses))
         return response()
 
     monkeypatch.setattr(wall, "fit_zenith", fit_zenith)
-    return told
+    return arguments
 
 
 def response():
@@ -70,20 +70,20 @@ def test_a_response_is_added_to_a_calibration(folder, fitted):
     assert len(fitted["names"]) == 5
     np.testing.assert_array_equal(fitted["references"].dark, references.dark)
     assert fitted["precession"].pivot == precession.pivot
-    known = io.open_calibration("cal.h5")
-    assert known.references is not None
-    assert known.zenith is not None
-    np.testing.assert_array_equal(known.zenith.curve, a_response().curve)
-    assert any("place-3.h5" in str(value) for value in known.process.values())
+    calibration = io.open_calibration("cal.h5")
+    assert calibration.references is not None
+    assert calibration.zenith is not None
+    np.testing.assert_array_equal(calibration.zenith.curve, a_response().curve)
+    assert any("place-3.h5" in str(value) for value in calibration.process.values())
 
 
 def test_without_a_calibration_one_is_made_and_printed_as_json(folder, fitted):
     ended = calibrate("--pattern", "uniform", "--tilt", "3deg", "--json")
     assert ended.code == 0, ended.said
-    told = json.loads(ended.out)
-    assert told["output"] == "cal.h5"
-    assert told["found"]["rim"] == {"value": 40.0, "sigma": 2.0}
-    assert told["degrees"]["residual_on_balls"] == pytest.approx(np.degrees(0.003))
+    report = json.loads(ended.out)
+    assert report["output"] == "cal.h5"
+    assert report["found"]["rim"] == {"value": 40.0, "sigma": 2.0}
+    assert report["degrees"]["residual_on_balls"] == pytest.approx(np.degrees(0.003))
     assert fitted["references"] is None
     assert fitted["precession"] is None
     assert fitted["pattern"] == "uniform"
@@ -92,15 +92,15 @@ def test_without_a_calibration_one_is_made_and_printed_as_json(folder, fitted):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--press", "1mm"), "--press applies to presses on a rig"),
         (("--rig", "rig.toml", "--press", "1mm"), "both give the presses"),
     ],
 )
-def test_an_impossible_call_is_refused(folder, fitted, words, said):
+def test_an_impossible_call_is_refused(folder, fitted, words, message):
     Path("rig.toml").touch()
-    refused(said, *words, run=calibrate)
+    refused(message, *words, run=calibrate)
     assert not (folder / "cal.h5").exists()
 
 
