@@ -98,15 +98,18 @@ def _type(option: Option) -> Any:
     if option.kind == "choice":
         return Literal[option.choices]
     if option.kind in ("file", "path", "text") or option.words or term.example:
-        kind: Any = Annotated[str, _text(option.file or term.example or term.unit)]
+        meta = _text(option.file or term.example or term.unit)
+        kind: Any = Annotated[str, meta]
     else:
         number = int if option.kind in ("integer", "integers") else float
         bounds = zip(("ge", "le", "gt"), (*option.within, option.above), strict=True)
         limits: dict[str, Any] = {name: bound for name, bound in bounds if bound is not None}
-        kind = Annotated[
-            number, Meta(description=option.needed, examples=[number(option.example or 1)], **limits)
-        ]
-    return list[kind] if option.kind in ("numbers", "integers") else kind
+        meta = Meta(description=option.needed, examples=[number(option.example or 1)], **limits)
+        kind = Annotated[number, meta]
+    if option.kind not in ("numbers", "integers"):
+        return kind
+    item, examples = str(meta.description), [meta.examples]
+    return Annotated[list[kind], Meta(description=f"a list, with each item {item},", examples=examples)]
 
 
 def _given(table: Struct) -> dict[str, Any]:

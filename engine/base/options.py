@@ -219,7 +219,8 @@ class Option:
     @property
     def example(self) -> str:
         """A value in the option's unit."""
-        return _EXAMPLES.get(self.unit, "")
+        example, low = _EXAMPLES.get(self.unit, ""), self.within[0]
+        return f"{low:g}" if low is not None and example and float(example) < low else example
 
     @property
     def needed(self) -> str:

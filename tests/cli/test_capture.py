@@ -286,42 +286,25 @@ def test_a_file_that_fails_ends_a_capture_in_a_line(emulated, tmp_path):
             ["vertical", "--stop", "1mm", "--step", "1mm", "--press", "1mm"],
             "--press applies to rotations, rocking motions, slides and twists only; this is a press",
         ),
-        (
-            ["axial", "--press", "1mm", "--phase-step", "45deg", "--stop", "1mm"],
-            "--stop applies to presses only; this is a rotation. Remove it",
-        ),
         (["vertical", "--stop", "1mm", "--step", "1mm", "--stroke-depth", "1mm"], "needs --strokes"),
         (
             ["vertical", "--stop", "1mm", "--step", "1mm", "--strokes", "2", "--stroke-depth", "9mm"],
             "beyond the axis",
         ),
         (["vertical", "--stop", "1mm", "--step", "1mm", "--strokes", "99999"], "strokes are not possible"),
-        (["horizontal", "--stop", "1mm"], "--stop applies to presses only; this is a slide. Remove it"),
         (["horizontal", "--press", "1mm", "--step", "1mm"], "--distance is missing"),
         (["horizontal", "--press", "1mm", "--distance", "5mm", "--step", "1mm"], "5 mm of x is beyond"),
         (["horizontal", "--press", "1mm", "--distance", "1mm", "--speed", "9mm/s"], "too fast"),
         (["twist", "--press", "1mm", "--step", "1deg"], "--angle is missing"),
         (
-            ["vertical", "--stop", "1mm", "--step", "1mm", "--rock"],
-            "--rock applies to rotations and rocking motions only; this is a press",
-        ),
-        (
             ["axial", "--press", "1mm", "--rock", "--rate", "1"],
             "--rate applies to rotations only; this is a rocking motion. Remove it",
-        ),
-        (
-            ["axial", "--press", "1mm", "--step", "1deg"],
-            "--step applies to presses, slides, twists and rocking motions only; this is a rotation",
         ),
         (["axial", "--press", "1mm", "--rock", "--tilt", "20deg", "--step", "1deg"], "exceeds the maximum"),
         (["twist", "--press", "1mm", "--angle", "60deg", "--step", "1deg"], "60 degrees of twist is beyond"),
         (["twist", "--press", "1mm", "--angle", "9deg", "--speed", "1deg"], "write e.g. 2deg/s"),
         (["twist", "--press", "1mm", "--angle", "9deg", "--step", "1mm"], "--step 1mm"),
         (["twist", "--press", "1mm", "--angle", "9deg", "--step", "1deg", "--wait", "-1s"], "a wait of -1 s"),
-        (
-            ["vertical", "--stop", "1mm", "--step", "1mm", "--wait", "1s"],
-            "--wait applies to slides and twists only; this is a press",
-        ),
     ],
 )
 def test_a_call_that_cannot_be_opens_nothing(emulated, tmp_path, monkeypatch, words, message):

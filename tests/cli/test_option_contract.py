@@ -15,6 +15,7 @@ from mirrorskin.cli.declared import DeclaredOption
 from mirrorskin.cli.groups import MOTIONS, MotionOption, refuse_foreign
 from mirrorskin.cli.main import app
 from mirrorskin.cli.settings import read_settings
+from mirrorskin.cli.stack import STACK
 from mirrorskin.engine.base.reconstruction import method_for
 from mirrorskin.engine.batch.jobs import TABLES
 from mirrorskin.io import InputError
@@ -96,6 +97,20 @@ def test_an_option_of_another_motion_is_refused(name, motion):
                 refuse_foreign(context, motion, "a.h5")
 
 
+STACK_KEYS = [term for term in STACK.without("dataset", "channel", "phases", "travel").terms if term.unit]
+
+
+@pytest.mark.parametrize("term", STACK_KEYS, ids=lambda term: term.name)
+def test_a_wrong_setting_of_a_stack_is_refused_with_file_table_and_key(tmp_path, term):
+    path = tmp_path / "b.toml"
+    for value in ["5", "true", *(f'"{text}"' for text in wrong_texts(term))]:
+        path.write_text(f"[stack]\n{term.flag[2:]} = {value}\n")
+        with pytest.raises(InputError) as refused:
+            read_settings(path, 1000)
+        assert str(refused.value).startswith(f"{path}: stack.{term.flag[2:]}"), value
+        assert "\n" not in str(refused.value)
+
+
 METHODS = {table: method_for(motion) for motion, table in TABLES.items()}
 KEYS = [
     pytest.param(table, option, id=f"{table}.{option.name}")
@@ -103,6 +118,9 @@ KEYS = [
     for option in method.options.values()
     if not option.python_only
 ]
+
+
+TOGETHER = {"thresholds": 'inclinations = ["5deg"]', "inclinations": "thresholds = [0.3]"}  # both are needed
 
 
 def wrong_values(option):
@@ -123,7 +141,11 @@ def wrong_values(option):
         return [*values, "5", f'"{OTHER_UNIT.get(option.unit, "5deg")}"']
     low, high = option.within
     values += [str(bound) for bound in (None if low is None else low - 1, option.above) if bound is not None]
-    return [*values, *([] if high is None else [str(high + 1)]), *(["nan"] if option.kind == "number" else [])]
+    return [
+        *values,
+        *([] if high is None else [str(high + 1)]),
+        *(["nan"] if option.kind == "number" else []),
+    ]
 
 
 @pytest.mark.parametrize(("table", "option"), KEYS)
@@ -137,5 +159,5 @@ def test_a_wrong_setting_is_refused_with_file_table_key_and_an_example_that_work
         assert message.startswith(f"{path}: {table}.{key}"), value
         assert "\n" not in message
         for example in re.findall(rf"; write e\.g\. {key} = (\S+)$", message):
-            path.write_text(f"[{table}]\n{key} = {example}\n")
+            path.write_text(f"[{table}]\n{key} = {example}\n{TOGETHER.get(key, '')}\n")
             assert option.name in getattr(read_settings(path, 1000), table)
