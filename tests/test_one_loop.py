@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,10 +17,15 @@ COPIES = {"with_options", "configured_for", "copy_for_run"}  # methods that retu
 BASES = {"Operation", "Step"}
 
 
+RELEVANT = re.compile(rf"^class \w+\(|\.({'|'.join(CALLS)})\(", re.MULTILINE)  # others need no parsing
+
+
 def modules() -> dict[str, ast.Module]:
+    """Return the modules that derive a class, or call a method that may be that of an operation or a step."""
     packages = [path.parent for path in ROOT.glob("*/__init__.py")]
     files = [file for package in packages for file in package.rglob("*.py")]
-    return {str(path.relative_to(ROOT)): ast.parse(path.read_text(encoding="utf-8")) for path in files}
+    texts = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in files}
+    return {name: ast.parse(text) for name, text in texts.items() if RELEVANT.search(text)}
 
 
 def last_name(node: ast.expr) -> str:

@@ -52,7 +52,11 @@ def test_the_delay_of_the_camera_is_measured(rig_file, tmp_path):
 
 
 @pytest.mark.parametrize("words", [TURN, SLIDE], ids=["turn", "slide"])
-@pytest.mark.parametrize("rig_file", RIGS, indirect=True)
+@pytest.mark.parametrize(
+    "rig_file",
+    [pytest.param(rate, marks=[pytest.mark.slow] if rate > min(RATES) else []) for rate in RATES],
+    indirect=True,
+)
 def test_a_rotation_and_a_slide_are_recorded(rig_file, words, tmp_path):
     done("capture", *words, "--rig", rig_file, "-o", tmp_path / "rec.h5")
     end = recorded(tmp_path / "rec.h5", "phase" if words is TURN else "displacement")[-1]

@@ -158,6 +158,8 @@ def test_a_wrong_setting_is_refused_with_file_table_key_and_an_example_that_work
         message = str(refused.value)
         assert message.startswith(f"{path}: {table}.{key}"), value
         assert "\n" not in message
+        if option.unit not in UNITS and not option.words and option.kind in NUMBERS and option.kind != "map":
+            assert f"{key} is " in message, "refused by the table, before the class"
         for example in re.findall(rf"; write e\.g\. {key} = (\S+)$", message):
             path.write_text(f"[{table}]\n{key} = {example}\n{TOGETHER.get(key, '')}\n")
             assert option.name in getattr(read_settings(path, 1000), table)

@@ -1,5 +1,6 @@
 import contextlib
 import math
+import re
 
 import numpy as np
 import pytest
@@ -365,5 +366,7 @@ def test_what_is_not_a_segment_is_refused(text):
     ],
 )
 def test_a_decimal_comma_is_named(read, text, written):
-    with pytest.raises(InputError, match=rf"^--o .*: write the number with a decimal point, {written}$"):
+    with pytest.raises(
+        InputError, match=rf"^--o .*: write the number with a decimal point, {re.escape(written)}$"
+    ):
         read(text, "--o")

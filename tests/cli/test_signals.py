@@ -117,7 +117,7 @@ print([names[signal.getsignal(getattr(signal, name))] for name in ("SIGTERM", "S
 
 @pytest.mark.parametrize(
     ("handler", "expected"),
-    [("SIGTERM", ["handler", "default", "default"]), ("SIGHUP,SIGINT", ["default", "handler", "handler"])],
+    [("SIGTERM", ["own", "default", "default"]), ("SIGHUP,SIGINT", ["default", "own", "own"])],
 )
 def test_handlers_after_a_program(handler, expected):
     command = [sys.executable, "-c", RETURNED, "--version", handler]

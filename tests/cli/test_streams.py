@@ -12,10 +12,12 @@ from pathlib import Path
 import pytest
 from commands import run
 
+CLOSED = [">&-", ">&- 2>&-", "<&- >&- 2>&-"]
 LIMIT = 120  # seconds
 PROGRAM = str(Path(sys.executable).with_name("mirrorskin"))
+BEGUN = b"HTTP/1.1 200 OK\r\nContent-Length: 1000\r\n\r\n{"
 FULL = "mirrorskin: standard output could not be written: No space left on device\n"
-UNBUFFERED = pytest.mark.parametrize("unbuffered", ["", "1"])
+UNBUFFERED = pytest.mark.parametrize("unbuffered", ["", pytest.param("1", marks=pytest.mark.slow)])
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,10 @@ def test_a_reader_that_ends_early_is_not_an_error_to_report(recording, unbuffere
 
 
 @UNBUFFERED
-@pytest.mark.parametrize("closed", [">&-", "<&- >&-", "<&-", ">&- 2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(
+    "closed",
+    [*[pytest.param(ends, marks=pytest.mark.slow) for ends in ("<&- >&-", "<&-")], *CLOSED],
+)
 def test_closed_streams_are_nothing_to_stumble_over(recording, tmp_path, closed, unbuffered):
     result = tmp_path / "result.h5"
     code, errors = shell(f"$M reconstruct {recording} -o {result} {closed}", unbuffered)
@@ -74,9 +79,15 @@ def test_notes_that_cannot_be_printed_do_not_end_a_command(recording, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "begun", [b"", b"HTTP/1.1 200 OK\r\nContent-Length: 1000\r\n\r\n{"], ids=["silent", "begun"]
+    ("begun", "number", "code"),
+    [
+        (b"", signal.SIGINT, 130),
+        (BEGUN, signal.SIGTERM, 143),
+        pytest.param(BEGUN, signal.SIGINT, 130, marks=pytest.mark.slow),
+        pytest.param(b"", signal.SIGTERM, 143, marks=pytest.mark.slow),
+    ],
+    ids=["silent, interrupted", "begun, ended", "begun, interrupted", "silent, ended"],
 )
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupted_read_from_a_network_is_quiet(begun, number, code):
     asked = threading.Event()
 

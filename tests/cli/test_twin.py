@@ -151,7 +151,7 @@ def terminal(tmp_path: Path) -> Iterator[Terminal]:
         yield opened
 
 
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", pytest.param("SIGINT", marks=pytest.mark.slow)])
 def test_a_rig_in_the_background_is_ready_at_once_and_removes_its_file(name: str, terminal: Terminal) -> None:
     process, folder = terminal.serve(), terminal.folder / "rig"
     settings = load_rig(folder / "rig.toml")
@@ -202,7 +202,7 @@ def test_a_copy_with_a_port_of_its_own_is_a_rig_file_like_any_other(terminal: Te
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [(("--size", "42"), "--size"), (("--object", "cube"), "cube"), (("-o", "/proc/rig"), "-o")],
+    [(("--object", "cube"), "cube"), (("-o", "/proc/rig"), "-o")],
 )
 def test_what_cannot_be_served_in_the_background_is_refused(
     words: tuple[str, ...], message: str, terminal: Terminal
