@@ -1,10 +1,10 @@
-# make [demo|test|test-all|test-older|test-lowest|test-browser|test-cameras|test-hardware|docs|package|lint|types|fuzz|bench|portability|gpu-check|gpu|gpu-wheels|clean]; each installs what it needs in .venv first.
+# make [demo|test|test-all|test-older|test-lowest|test-browser|test-cameras|test-hardware|docs|package|lint|types|fuzz|bench|accuracy|portability|gpu-check|gpu|gpu-wheels|clean]; each installs what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test test-all test-older test-lowest test-browser test-cameras test-hardware docs package lint types fuzz bench portability gpu-check gpu gpu-wheels clean
+.PHONY: demo test test-all test-older test-lowest test-browser test-cameras test-hardware docs package lint types fuzz bench accuracy portability gpu-check gpu gpu-wheels clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -41,7 +41,7 @@ test-all: $(READY)
 PROCESSOR ?= haswell sandybridge
 test-older: $(READY)
 	@for processor in $(PROCESSOR); do
-		$(BIN)/python tests/portability/older_processor.py $$processor $(TESTS) -m 'not slow' \
+		$(BIN)/python evaluation/portability/older_processor.py $$processor $(TESTS) -m 'not slow' \
 		    tests/golden tests/engine/test_contract.py tests/kernels/test_references.py
 	done
 
@@ -99,7 +99,6 @@ lint: $(READY)
 types: $(READY)
 	@cd tests
 	../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml $(PACKAGES:%=-p mirrorskin.%)
-	MYPYPATH=../bench ../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml -p suite -m run
 
 # Damaged files and replies, MINUTES of them; what is neither read nor refused in one line is kept.
 MINUTES ?= 60
@@ -111,21 +110,25 @@ fuzz: $(READY)
 bench: $(READY)
 	@$(BIN)/python bench/run.py run
 
+# The tables of docs/accuracy.md, from stored results; MEASURE='normals ramps' measures these first.
+accuracy: $(READY)
+	@$(BIN)/python evaluation/accuracy.py $(MEASURE)
+
 portability: $(READY)
-	@$(BIN)/python tests/portability/portability.py
+	@$(BIN)/python evaluation/portability/portability.py
 
 # What calls and kernels would have a GPU do that is not here: launches, waits and copies; then registers, for which
 # clang and libclc come from the system, ptxas from the package index.
 gpu-check: .venv/.ptxas
-	@PYTHONPATH=bench $(BIN)/python tests/portability/gpu_counts.py
-	$(BIN)/python tests/portability/gpu_check.py
+	@$(BIN)/python evaluation/portability/gpu_counts.py
+	$(BIN)/python evaluation/portability/gpu_check.py
 
 # With a GPU: copies, whole calls, answers and device tests, in gpu.json and gpu.md.
 gpu: $(READY)
-	@PYTHONPATH=bench $(BIN)/python tests/portability/gpu.py
+	@$(BIN)/python evaluation/portability/gpu.py
 
 # Wheels for a machine with a GPU and without network: carry the checkout there, and run
-# 'tests/portability/gpu.sh build/gpu-wheels'. VERSION is that machine's Python.
+# 'evaluation/portability/gpu.sh build/gpu-wheels'. VERSION is that machine's Python.
 VERSION ?= 3.12
 gpu-wheels: $(READY)
 	@rm -rf build/gpu-wheels build/lib build/bdist.*  # what lies there would be part of the wheel

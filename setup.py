@@ -8,6 +8,7 @@ from setuptools import find_packages, setup
 from setuptools.command.build_py import build_py
 
 _HERE = Path(__file__).parent
+_DEVELOPMENT = {"bench", "evaluation"}  # packages of a checkout, which are not installed
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!\w+:|#)([^)]+)\)")
 
 
@@ -32,7 +33,7 @@ def long_description() -> str:
     return _LINK.sub(absolute, (_HERE / "README.md").read_text(encoding="utf-8"))
 
 
-folders = [path.parent.name for path in _HERE.glob("*/__init__.py")]
+folders = {path.parent.name for path in _HERE.glob("*/__init__.py")} - _DEVELOPMENT
 packages = find_packages(include=[*folders, *(f"{folder}.*" for folder in folders)])
 setup(
     long_description=long_description(),

@@ -12,8 +12,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 import click
-from suite import (
-    accuracy,
+
+from mirrorskin.bench.suite import (
     batch,
     calls,
     compare,
@@ -28,14 +28,13 @@ from suite import (
     robust,
     twin,
 )
-from suite.harness import Cases, DisagreementError, InaccurateError
-
+from mirrorskin.bench.suite.harness import Cases, DisagreementError
 from mirrorskin.cli.commands.bench.records import Case, describe_run, open_run
 from mirrorskin.io import InputError, check_output
 from mirrorskin.io.storage.atomic import write_new
 from mirrorskin.kernels.device import open_device
 
-_MODULES = calls, onset, normals, correlation, integration, robust, twin, paths, batch, live, pose, accuracy
+_MODULES = calls, onset, normals, correlation, integration, robust, twin, paths, batch, live, pose
 CASES: Cases = {name: run for module in _MODULES for name, run in module.CASES.items()}
 _FILE = click.Path(path_type=Path)
 
@@ -84,7 +83,6 @@ def run_cases(
             if output is not None:
                 write_new(output, [run.as_json()])
                 write_new(output.with_suffix(".md"), [report.as_markdown(run).encode()])
-    check_accuracy(cases)
 
 
 @main.command("compare")
@@ -127,20 +125,6 @@ def choose(patterns: Iterable[str]) -> list[str]:
     return [name for name in CASES if any(fnmatchcase(name, pattern) for pattern in patterns)]
 
 
-def check_accuracy(cases: Iterable[Case]) -> None:
-    """Raise InaccurateError if a bound of accuracy was missed: a device must not be fast but wrong."""
-    missed = [
-        f"{case.name}, {target.what}: {target.measured}, must be {target.bound}"
-        for case in cases
-        if case.name in accuracy.CASES
-        for target in case.targets
-        if not target.met
-    ]
-    if missed:
-        more = f" (and {len(missed) - 1} more)" if len(missed) > 1 else ""
-        raise InaccurateError(f"the device is not accurate: {missed[0]}{more}")
-
-
 @contextmanager
 def _temporary_files(folder: Path | None) -> Iterator[None]:
     """Place temporary files, also of child processes, in a folder."""
@@ -156,5 +140,5 @@ def _temporary_files(folder: Path | None) -> Iterator[None]:
 if __name__ == "__main__":
     try:
         main()
-    except (InputError, DisagreementError, InaccurateError) as error:
+    except (InputError, DisagreementError) as error:
         sys.exit(f"bench: {error}")

@@ -10,8 +10,8 @@ import signal
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
-from gpu_check import taken_for_gpu
 
+from mirrorskin.evaluation.portability.gpu_check import taken_for_gpu
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels import embedded
 from mirrorskin.kernels.device import Device, list_devices

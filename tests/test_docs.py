@@ -37,7 +37,20 @@ FILLED_IN = re.compile(
 )
 COMMAND = app
 NAMING = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
-FOLDERS = "bench", "cli", "docs", "engine", "examples", "hw", "io", "kernels", "tests", "twin", "view"
+FOLDERS = (
+    "bench",
+    "cli",
+    "docs",
+    "engine",
+    "evaluation",
+    "examples",
+    "hw",
+    "io",
+    "kernels",
+    "tests",
+    "twin",
+    "view",
+)
 SOURCES = [
     "/setup.py",
     *(f"/{path.relative_to(ROOT)}" for name in FOLDERS for path in (ROOT / name).rglob("*.*")),

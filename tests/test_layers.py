@@ -72,6 +72,7 @@ def test_no_folder_has_more_than_20_modules():
 
 SMALL = {
     "engine/base/errors.py": "other packages import it alone",
+    "evaluation/base/object_store.py": "tests and benchmarks start the same server",
     "hw/base/errors.py": "other packages import it alone",
     "kernels/array_types.py": "all references import it alone",
     "kernels/bitcode.py": "the one place that knows how PoCL keeps programs",
@@ -88,11 +89,26 @@ def test_small_modules_have_a_reason():
     assert {name for name, count in lines.items() if count < 40} == SMALL.keys()
 
 
-def test_the_package_imports_no_development_tool():
-    packages = [path.parent for path in ROOT.glob("*/__init__.py")]
-    tools = re.compile(r"^\s*(from|import) (bench|suite|examples|tests)\b", re.MULTILINE)
-    files = [file for package in packages for file in package.rglob("*.py")]
-    assert [file for file in files if tools.search(file.read_text(encoding="utf-8"))] == []
+IMPORT = re.compile(r"^\s*(?:from|import) (?:mirrorskin\.)?(bench|evaluation|examples|tests)\b", re.MULTILINE)
+
+
+def development_imports(folder):
+    """Return which of the folders for developers each file of a folder imports."""
+    files = {file.relative_to(ROOT): file.read_text(encoding="utf-8") for file in folder.rglob("*.py")}
+    return {file.as_posix(): set(IMPORT.findall(text)) for file, text in files.items() if IMPORT.search(text)}
+
+
+def test_the_product_imports_no_development_tool():
+    packages = {path.parent.name for path in ROOT.glob("*/__init__.py")} - {"bench", "evaluation"}
+    assert [development_imports(ROOT / package) for package in packages] == [{}] * len(packages)
+
+
+def test_only_tests_of_the_benchmark_import_it():
+    modules = development_imports(ROOT / "tests")
+    assert [
+        file for file in modules if "bench" in modules[file] and not file.startswith("tests/bench/")
+    ] == []
+    assert set().union(*modules.values()) == {"bench", "evaluation"}
 
 
 def test_the_package_has_its_parts_and_its_version():

@@ -10,10 +10,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import sensor_report
 from stacks import ball
 
 from mirrorskin import engine, io
+from mirrorskin.evaluation.sensor import report as sensor_report
 from mirrorskin.twin import Axial, Twin
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -17,9 +17,9 @@ from background import end, install, process_of
 from commands import run
 from mishaps import starved
 from right_scores import check_score
-from rotations import Setup, direction, expose
 
 from mirrorskin import engine, io
+from mirrorskin.evaluation.scenes.rotations import Setup, direction, expose
 
 ROOT = Path(__file__).parent.parent
 TEXT = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in ("README.md", "docs/twin.md"))

@@ -16,15 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import io
+from mirrorskin.bench.suite.files import MAPS, make_press, new_folder, record, sync, to_result
+from mirrorskin.bench.suite.harness import Cases, DisagreementError, agree, check_memory
 from mirrorskin.cli.commands.bench.limits import time_works
 from mirrorskin.cli.commands.bench.records import Case, Target
 from mirrorskin.cli.commands.bench.timing import OURS, Work
 from mirrorskin.engine import find_onset
 from mirrorskin.engine.batch.jobs import Job, Plan, make_jobs
 from mirrorskin.engine.batch.local import run_local
+from mirrorskin.evaluation.base.sources import Frames
 from mirrorskin.kernels.device import Device
-from suite.files import MAPS, Frames, make_press, new_folder, record, sync, to_result
-from suite.harness import Cases, DisagreementError, agree, check_memory
 
 BATCH, LOOP = f"{OURS}, batch", f"{OURS}, open, reconstruct and save in a loop"
 LEAST = "kernels and plain reads and writes alone"

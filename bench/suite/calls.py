@@ -16,16 +16,11 @@ from typing import Any
 import numpy as np
 
 from mirrorskin import engine
+from mirrorskin.bench.suite.files import new_folder
+from mirrorskin.bench.suite.harness import Cases, check_memory, time_call
 from mirrorskin.cli.commands.bench.records import Case, Row, Target, Timing
 from mirrorskin.cli.commands.bench.timing import OURS, ROUNDS, Work, take_turns
-from mirrorskin.io import MirrorskinWarning, Recorder
-from mirrorskin.io.files.arrays import ArrayRecording
-from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.errors import DeviceError
-from mirrorskin.twin import Axial, Twin, Vertical
-from suite.files import new_folder
-from suite.harness import Cases, check_memory, time_call
-from suite.scenes import (
+from mirrorskin.evaluation.scenes.inputs import (
     LEVELS,
     PIXEL,
     SCALES,
@@ -40,6 +35,11 @@ from suite.scenes import (
     travel_of,
     turn_noise,
 )
+from mirrorskin.io import MirrorskinWarning, Recorder
+from mirrorskin.io.files.arrays import ArrayRecording
+from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.errors import DeviceError
+from mirrorskin.twin import Axial, Twin, Vertical
 
 _HD, _QUICK = (1080, 1920), (48, 64)
 _PRESS = 16  # frames

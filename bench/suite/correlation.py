@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.bench.suite.harness import Cases, agree, check_memory, missing, time_call
 from mirrorskin.cli.commands.bench.records import THREADS, Case
 from mirrorskin.cli.commands.bench.timing import OURS
 from mirrorskin.engine import correlate
 from mirrorskin.engine.correlation.design_matrix import basis, fit_matrix
+from mirrorskin.evaluation.scenes.inputs import STEPS, fill_turns, phases
 from mirrorskin.kernels.device import Device
-from suite.harness import Cases, agree, check_memory, missing, time_call
-from suite.scenes import STEPS, fill_turns, phases
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]

@@ -12,69 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mirrorskin import io
 from mirrorskin.cli.commands.bench.timing import OURS
 from mirrorskin.engine import reconstruct
-from mirrorskin.io.base.types import Closing, Floats
+from mirrorskin.evaluation.base.sources import Frames, shared_memory
+from mirrorskin.evaluation.scenes.inputs import STEPS, TILT, fill_press, fill_turns, phases, references
 from mirrorskin.io.files.recorder import Compression
 from mirrorskin.kernels.device import Device
-from suite.scenes import STEPS, TILT, fill_press, fill_turns, phases, references
 
 PATH = f"{OURS}, file to result"
 ROUNDS = 7
 MAPS = 128  # bytes per pixel for all maps, in memory or in files
 
-_PAGE, _PADDING = 4096, 64  # frames start on a page, and a kernel may load the last word as a whole
 _LEANS = 7.0  # distance from the centre of the picture at which the pressed ball has a zenith of 45°, mm
 _DIFFERENT = 64  # number of turns after which the frames repeat
-
-
-class Frames(Closing):
-    """Frames in memory, (T, H, W), as a source; positions, (T,), are travel in mm or phase in radians."""
-
-    name, rewindable = "frames in memory", True
-
-    def __init__(self, frames: NDArray[Any], header: io.Header, positions: Floats) -> None:
-        self.header, self.motion = header, header.motion
-        self.shape = (len(frames), frames.shape[1], frames.shape[2])
-        self.dtype = frames.dtype
-        self._frames, self._positions = frames, positions
-        self._next = 0
-
-    @property
-    def block(self) -> io.Block:
-        """All frames as one block, which a device can use in place."""
-        return self._part(0, len(self._frames))
-
-    def first(self, count: int) -> Frames:
-        """Return a source of the first frames."""
-        return Frames(self._frames[:count], self.header, self._positions[:count])
-
-    def rewind(self) -> None:
-        """Go back to the first frame."""
-        self._next = 0
-
-    def read(self, out: NDArray[Any] | None = None, /) -> io.Block | None:
-        """Return the next frames in place; see ``Source.read``."""
-        start = self._next
-        self._next = min(start + (1 if out is None else len(out)), len(self._frames))
-        return self._part(start, self._next) if start < self._next else None
-
-    def _part(self, start: int, stop: int) -> io.Block:
-        axis = "travel" if self.motion == "vertical" else "phase"
-        positions: dict[str, Any] = {axis: self._positions[start:stop]}
-        return io.Block(self._frames[start:stop], start, stays_valid=True, **positions)
-
-
-def shared_memory(shape: tuple[int, ...], dtype: Any = np.uint8) -> NDArray[Any]:
-    """Allocate memory that a device can use in place; its pages are mapped before anything is timed."""
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    raw = np.full(size + _PAGE + _PADDING, 1, np.uint8)
-    start = -raw.ctypes.data % _PAGE
-    frames: NDArray[Any] = raw[start : start + size].view(dtype).reshape(shape)
-    return frames
 
 
 def make_press(shape: tuple[int, int, int]) -> Frames:
@@ -84,7 +36,7 @@ def make_press(shape: tuple[int, int, int]) -> Frames:
     dark, bright = references(shape[1:], frames.dtype)
     step = _LEANS * (2**0.5 - 1) / (0.9 * shape[0])
     header = io.Header("vertical", dark=dark, bright=bright)
-    return Frames(frames, header, np.arange(shape[0], dtype=np.float64) * step)
+    return Frames(frames, header, travel=np.arange(shape[0], dtype=np.float64) * step)
 
 
 def make_turns(shape: tuple[int, int, int]) -> Frames:
@@ -95,7 +47,7 @@ def make_turns(shape: tuple[int, int, int]) -> Frames:
     for start in range(different, shape[0], different):
         part = frames[start : start + different]
         part[:] = frames[: len(part)]
-    return Frames(frames, io.Header("axial", tilt=TILT), phases(shape[0]))
+    return Frames(frames, io.Header("axial", tilt=TILT), phase=phases(shape[0]))
 
 
 @contextmanager

@@ -32,12 +32,6 @@ class DisagreementError(Exception):
     exit_code = 1
 
 
-class InaccurateError(Exception):
-    """The results of a device differ from the truth by more than the bound; the message states the number."""
-
-    exit_code = 1
-
-
 def time_call(
     name: str,
     title: str,
@@ -58,16 +52,6 @@ def time_call(
     rows = time_works(works, moved, device, quick, check, first=first)
     targets = () if quick else call_targets(rows)
     return Case(name, title, list(rows.values()), dict(absent or {}), targets=targets)
-
-
-def at_most(what: str, value: float, bound: float) -> Target:
-    """Return a target with an upper bound; NaN does not meet it."""
-    return Target(what, f"at most {bound:.3g}", f"{value:.3g}", bool(value <= bound))
-
-
-def within(what: str, value: float, low: float, high: float) -> Target:
-    """Return a target with two bounds; NaN does not meet it."""
-    return Target(what, f"{low:.4g} to {high:.4g}", f"{value:.4g}", bool(low <= value <= high))
 
 
 def ratio_target(what: str, bound: float, ours: Row, theirs: Row, than: str, *, faster: bool) -> Target:

@@ -19,13 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import engine
+from mirrorskin.bench.suite.harness import Cases, agree, call_targets, check_memory, missing, ratio_target
 from mirrorskin.cli.commands.bench.limits import time_works
 from mirrorskin.cli.commands.bench.records import THREADS, Case, Row, Target
 from mirrorskin.cli.commands.bench.timing import FIRST, OURS, Work
 from mirrorskin.engine import Integrator
+from mirrorskin.evaluation.scenes.inputs import (
+    PIXEL,
+    Shape,
+    blob_mask,
+    drifting_slopes,
+    noisy_slopes,
+    random_cuts,
+)
 from mirrorskin.kernels.device import Device
-from suite.harness import Cases, agree, call_targets, check_memory, missing, ratio_target
-from suite.scenes import PIXEL, Shape, blob_mask, drifting_slopes, noisy_slopes, random_cuts
 
 Floats = NDArray[Any]  # float32, or float64 for exact results
 Doubles = NDArray[np.float64]

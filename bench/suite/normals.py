@@ -7,11 +7,11 @@ from functools import partial
 
 import numpy as np
 
+from mirrorskin.bench.suite.harness import Cases, check_memory, time_call
 from mirrorskin.cli.commands.bench.records import Case
 from mirrorskin.engine import estimate_normals
+from mirrorskin.evaluation.scenes.inputs import SCALES, STEPS, TILT, fill_turns, phases, turn_noise
 from mirrorskin.kernels.device import Device
-from suite.harness import Cases, check_memory, time_call
-from suite.scenes import SCALES, STEPS, TILT, fill_turns, phases, turn_noise
 
 _QUICK = (48, 64)
 _MAPS = 3 * 4 + 4 + 1 + 4  # bytes per pixel: normal, sigma, contact and mean

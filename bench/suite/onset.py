@@ -11,14 +11,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.bench.suite.harness import Cases, agree, check_memory, missing, time_call
 from mirrorskin.cli.commands.bench.records import THREADS, Case
 from mirrorskin.cli.commands.bench.timing import OURS
 from mirrorskin.engine import find_onset
 from mirrorskin.engine.base.frames import estimate_noise, reference_maps, thin_out
+from mirrorskin.evaluation.scenes.inputs import (
+    LEVELS,
+    StackName,
+    fill_press,
+    press_noise,
+    references,
+    travel_of,
+)
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.press.onset import BENT, DARK, onset_heights, onset_levels, onset_near, onset_sure
-from suite.harness import Cases, agree, check_memory, missing, time_call
-from suite.scenes import LEVELS, StackName, fill_press, press_noise, references, travel_of
 
 Maps = dict[str, NDArray[Any]]
 Flags = NDArray[np.uint8]

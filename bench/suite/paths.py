@@ -23,30 +23,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import io
+from mirrorskin.bench.suite.files import (
+    MAPS,
+    PATH,
+    ROUNDS,
+    make_press,
+    make_turns,
+    new_folder,
+    record,
+    sync,
+    to_new_results,
+    to_result,
+)
+from mirrorskin.bench.suite.harness import (
+    Cases,
+    DisagreementError,
+    agree,
+    check_memory,
+    missing,
+    ratio_target,
+)
 from mirrorskin.cli.commands.bench.limits import time_works
 from mirrorskin.cli.commands.bench.records import Case, Target
 from mirrorskin.cli.commands.bench.timing import OURS, Work
 from mirrorskin.engine import reconstruct
 from mirrorskin.engine.base.tiling import MEMORY_LIMIT
+from mirrorskin.evaluation.base.object_store import object_store
+from mirrorskin.evaluation.base.sources import Frames, shared_memory
+from mirrorskin.evaluation.scenes.inputs import SCALES, STEPS, Floats, references
 from mirrorskin.io.base.url import path_of
 from mirrorskin.kernels.device import Device, list_devices, open_device
-from suite.files import (
-    MAPS,
-    PATH,
-    ROUNDS,
-    Frames,
-    make_press,
-    make_turns,
-    new_folder,
-    record,
-    shared_memory,
-    sync,
-    to_new_results,
-    to_result,
-)
-from suite.harness import Cases, DisagreementError, agree, check_memory, missing, ratio_target
-from suite.object_store import object_store
-from suite.scenes import SCALES, STEPS, Floats, references
 
 Shape = tuple[int, int, int]
 

@@ -7,19 +7,17 @@ import time
 
 import numpy as np
 
+from mirrorskin.bench.suite.harness import Cases
 from mirrorskin.cli.commands.bench.limits import time_works
 from mirrorskin.cli.commands.bench.records import Case, Target
 from mirrorskin.cli.commands.bench.timing import OURS, Work
 from mirrorskin.engine.pose import Pose, PoseTracker
-from mirrorskin.io import Result, pixel_axes
+from mirrorskin.evaluation.scenes.inputs import wavy_dome
 from mirrorskin.kernels.device import Device
-from suite.harness import Cases
 
 _SHAPE, _QUICK = (240, 320), (60, 80)
-_FIELD = 8.0  # mm across
 _FRAMES = 24  # number of frames along a circle that ends at its start
 _REACH, _TURN = 0.4, 0.2  # amplitudes of position and angle, mm and rad
-_SIGMA, _NORMAL_SIGMA = 1e-3, 0.01  # mm and rad
 _BYTES = 32  # bytes of the record of a pixel
 _RATE = 200.0  # target, results per second
 
@@ -32,7 +30,7 @@ def run_track(device: Device, quick: bool) -> Case:
     shape = _QUICK if quick else _SHAPE
     angles = 2 * math.pi * np.arange(_FRAMES + 1) / _FRAMES
     path = [(_REACH * math.sin(a), _REACH * (1 - math.cos(a)), _TURN * math.sin(a)) for a in angles]
-    results = [surface(shape, *place, seed) for seed, place in enumerate(path)]
+    results = [wavy_dome(shape, *place, seed) for seed, place in enumerate(path)]
     seconds: list[float] = []
 
     def follow() -> Pose:
@@ -60,30 +58,6 @@ def run_track(device: Device, quick: bool) -> Case:
     title = f"motion along results of {' x '.join(map(str, shape))}: heights, normals and their sigmas"
     absent = {"NormalFlow": "not available as a package"}
     return Case("pose-track", title, list(rows.values()), absent, notes, () if quick else (target,))
-
-
-def surface(shape: tuple[int, int], right: float, up: float, turn: float, seed: int) -> Result:
-    """Return waves on a dome, rotated about z and translated, with noise of the stated deviations."""
-    rng = np.random.default_rng(seed)
-    x, y = pixel_axes(shape, (_FIELD / shape[1], _FIELD / shape[1]))
-    across, high = np.meshgrid(x - right, y - up)
-    cosine, sine = math.cos(turn), math.sin(turn)
-    u, v = cosine * across + sine * high, cosine * high - sine * across
-    height = -0.03 * (u * u + 0.7 * v * v) + 0.05 * np.sin(1.5 * u + 0.3) * np.cos(1.2 * v)
-    p = -0.06 * u + 0.075 * np.cos(1.5 * u + 0.3) * np.cos(1.2 * v)
-    q = -0.042 * v - 0.06 * np.sin(1.5 * u + 0.3) * np.sin(1.2 * v)
-    slopes = np.stack([cosine * p - sine * q, sine * p + cosine * q], axis=-1)
-    slopes += rng.normal(0, _NORMAL_SIGMA / math.sqrt(2), slopes.shape)
-    normals = np.dstack([-slopes, np.ones(shape)])
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return Result(
-        height=(height + rng.normal(0, _SIGMA, shape)).astype(np.float32),
-        height_sigma=np.full(shape, _SIGMA, np.float32),
-        normals=normals.astype(np.float32),
-        normals_sigma=np.full(shape, _NORMAL_SIGMA, np.float32),
-        x=x,
-        y=y,
-    )
 
 
 CASES: Cases = {"pose-track": run_track}

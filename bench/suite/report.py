@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mirrorskin.bench.suite import glance
 from mirrorskin.cli.commands.bench.records import Case, Row, Run, as_ms, as_percent
 from mirrorskin.cli.commands.bench.timing import FIRST, OURS
-from suite import glance
 
 HEAD = ("work", "ms", "quartiles", "kernels", "copies", "GB/s", "frames/s", "of limit", "kernels")
 TARGET_HEAD = ("target", "bound", "measured", "met")
@@ -58,7 +58,6 @@ _PEERS = (
     "Each work of the engine next to the fastest peer with the same result. of limit: bandwidth divided by "
     "that of memory; where this is small, arithmetic or the overhead of calls is the limit."
 )
-_ACCURACY = "Results of this device compared with the known truth: the measured value and its bound."
 
 Machine = Mapping[str, Case]  # cases by name
 
@@ -110,7 +109,6 @@ def as_page(runs: Mapping[Path, Run], chart: str) -> str:
         ("At a glance", _GLANCE, _glance),
         ("Calls", _CALLS, _calls),
         ("Works and peers", _PEERS, _peers),
-        ("Accuracy", _ACCURACY, _accuracy),
         ("Targets", _TARGETS, _targets),
     ):
         parts += _topic(title, about, machines, describe)
@@ -185,8 +183,7 @@ def _glance(machine: Machine) -> list[str]:
 
 
 def _targets(machine: Machine) -> list[str]:
-    cases = [case for case in machine.values() if not case.name.startswith("accuracy-")]
-    cells = [[case.name, *row] for case in cases for row in as_targets(case)]
+    cells = [[case.name, *row] for case in machine.values() for row in as_targets(case)]
     return [as_table(("case", *TARGET_HEAD), cells, numbers=False)] if cells else []
 
 
@@ -218,7 +215,7 @@ def _peers(machine: Machine) -> list[str]:
     """Return each work of the engine that has a peer or a target, with the fastest peer."""
     cells = []
     for case in machine.values():
-        if case.name.startswith(("accuracy-", "call-")):
+        if case.name.startswith("call-"):
             continue
         works = [row for row in case.rows if not row.is_limit]
         rivals = {row.name: _fastest(row, works) for row in works if _is_ours(row)}
@@ -256,18 +253,6 @@ def _pair(case: Case, row: Row, rival: Row | None) -> list[str]:
     if rival is None:
         return [*cells, "", "", ""]
     return [*cells, _who(rival), as_ms(rival.wall.median), f"{rival.wall.median / mine:.1f}"]
-
-
-def _accuracy(machine: Machine) -> list[str]:
-    """Return a table of the accuracy cases: number of bounds met, and those missed."""
-    cells = []
-    for case in machine.values():
-        if case.name.startswith("accuracy-"):
-            missed = [f"{one.what}: {one.measured}" for one in case.targets if not one.met]
-            met = f"{len(case.targets) - len(missed)} of {len(case.targets)}"
-            cells.append([case.name, case.title, met, "; ".join(missed) or "none"])
-    head = ("case", "about", "bounds met", "missed")
-    return [as_table(head, cells, numbers=False)] if cells else []
 
 
 def _who(row: Row) -> str:

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.bench.suite.harness import Cases
 from mirrorskin.cli.commands.bench.limits import time_works
 from mirrorskin.cli.commands.bench.records import Case
 from mirrorskin.cli.commands.bench.timing import OURS, Work
 from mirrorskin.kernels.device import Device
 from mirrorskin.twin import Axial, Camera, Movement, Twin, Vertical
-from suite.harness import Cases
 
 _SHAPE, _QUICK = (128, 480, 640), (12, 48, 64)
 _FIELD = 12.0  # width of the picture, mm

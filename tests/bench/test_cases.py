@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
-import run as program
 from bench_runs import row
 from click.testing import CliRunner
-from suite import integration
-from suite.harness import DisagreementError, InaccurateError, agree, call_targets
-from suite.scenes import blob_mask, noisy_slopes, random_cuts
 
-from mirrorskin.cli.commands.bench.records import Case, Target, describe_run, open_run
+from mirrorskin.bench import run as program
+from mirrorskin.bench.suite import integration
+from mirrorskin.bench.suite.harness import DisagreementError, agree, call_targets
+from mirrorskin.cli.commands.bench.records import Case, describe_run, open_run
 from mirrorskin.cli.commands.bench.timing import FIRST, OURS
+from mirrorskin.evaluation.scenes.inputs import blob_mask, noisy_slopes, random_cuts
 from mirrorskin.io import InputError
 from mirrorskin.kernels.device import open_device
 
@@ -32,7 +32,6 @@ QUICK = (
     "file-s3",
     "batch-small",
     "live-vertical-vga",
-    "accuracy-surfaces",
 )
 
 
@@ -43,7 +42,7 @@ def check_case(name, path):
     run = describe_run(device, [case], quick=True)
     path.write_bytes(run.as_json())
     assert open_run(path) == run
-    assert name.startswith("accuracy-") == bool(case.targets)
+    assert not case.targets
     if case.rows and case.rows[0].is_limit:
         assert all(row.bytes for row in case.rows)
 
@@ -84,13 +83,6 @@ def test_patterns_choose_cases_in_their_order():
         program.choose(["onset"])
 
 
-def test_an_inaccurate_device_fails():
-    cases = [Case("accuracy-press", "", targets=(Target("height", "at most 1", "3", False),))]
-    with pytest.raises(InaccurateError, match="accuracy-press, height: 3, must be at most 1"):
-        program.check_accuracy(cases)
-    program.check_accuracy([Case("file-press", "", targets=cases[0].targets)])
-
-
 def test_maps_that_differ_are_named_with_a_pixel():
     ours = {"height": np.array([[1.0, np.nan], [2.0, 3.0]])}
     agree("peer", {"height": ours["height"] + 0.1}, ours, {"height": 0.2})
@@ -123,17 +115,10 @@ def test_a_direct_solution_solves_its_own_equations():
 
 @pytest.fixture
 def cases(monkeypatch):
-    """Cases that take no time instead of those of the suite: one, two, accuracy-press, bad and stopped."""
+    """Cases that take no time instead of those of the suite: one, bad and stopped."""
 
     def measured(device, quick):
         return Case("one", f"quick: {quick}", [row("read limit", 1.0, moved=10), row(OURS, 1.0, moved=10)])
-
-    def inaccurate(device, quick):
-        targets = (
-            Target("height", "at most 0.1 um", "0.3 um", False),
-            Target("sigma", "at most 2", "9", False),
-        )
-        return Case("accuracy-press", "", targets=targets)
 
     def refuse(device, quick):
         raise InputError("case bad needs more than there is")
@@ -141,7 +126,7 @@ def cases(monkeypatch):
     def interrupt(device, quick):
         raise KeyboardInterrupt
 
-    runs = {"one": measured, "accuracy-press": inaccurate, "bad": refuse, "stopped": interrupt}
+    runs = {"one": measured, "bad": refuse, "stopped": interrupt}
     monkeypatch.setattr(program, "CASES", runs)
 
 
@@ -149,14 +134,10 @@ def call(*words):
     return CliRunner().invoke(program.main, [str(word) for word in words])
 
 
-@pytest.mark.parametrize(
-    ("name", "error", "left"),
-    [("bad", InputError, ["one"]), ("accuracy-press", InaccurateError, ["one", "accuracy-press"])],
-)
-def test_what_was_measured_before_an_error_is_written(cases, tmp_path, name, error, left):
-    ended = call("run", "one", name, "-o", tmp_path / "run.json")
-    assert isinstance(ended.exception, error)
-    assert [case.name for case in open_run(tmp_path / "run.json").cases] == left
+def test_what_was_measured_before_an_error_is_written(cases, tmp_path):
+    ended = call("run", "one", "bad", "-o", tmp_path / "run.json")
+    assert isinstance(ended.exception, InputError)
+    assert [case.name for case in open_run(tmp_path / "run.json").cases] == ["one"]
     assert "## one: quick: False" in (tmp_path / "run.md").read_text(encoding="utf-8")
 
 
@@ -173,7 +154,7 @@ def test_runs_are_compared_and_become_a_page(cases, tmp_path):
     made = call("report", tmp_path / "a.json", "-o", tmp_path / "page.md")
     assert made.exit_code == 0
     assert "a.json: " in (tmp_path / "page.md").read_text(encoding="utf-8")
-    assert call("run", "--list").output.split() == ["one", "accuracy-press", "bad", "stopped"]
+    assert call("run", "--list").output.split() == ["one", "bad", "stopped"]
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ import re
 import pytest
 from bench_runs import case, row, target
 from bench_runs import run as made
-from suite.compare import HEAD, as_rows, as_text, compare
 
+from mirrorskin.bench.suite.compare import HEAD, as_rows, as_text, compare
 from mirrorskin.cli.commands.bench.records import Machine
 from mirrorskin.io import InputError
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from live_frames import paced, phases, turn_frames, turn_header
-from suite.live import Ran, judge_press, judge_rotation
 
+from mirrorskin.bench.suite.live import Ran, judge_press, judge_rotation
 from mirrorskin.engine.live import RAISED, Latency, Status, Update
 from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 

@@ -10,10 +10,10 @@ import h5py
 import numpy as np
 import pytest
 from commands import done, refused, run
-from rotations import UNEVEN
 from stacks import MadeUp, plot_of, random_stack, record, sphere
 
 from mirrorskin import io
+from mirrorskin.evaluation.scenes.rotations import UNEVEN
 
 PHASES = " ".join(f"{np.degrees(phase)}deg" for phase in UNEVEN)
 

@@ -10,10 +10,10 @@ import h5py
 import numpy as np
 import pytest
 from commands import done, refused, run
-from rotations import TILT, Setup, between, direction, expose
 from stacks import MadeUp, read_all, record, sphere
 
 from mirrorskin import engine, io
+from mirrorskin.evaluation.scenes.rotations import TILT, Setup, between, direction, expose
 
 SHAPE = (9, 11)
 X, Y = np.meshgrid(np.linspace(-1, 1, 11), np.linspace(1, -1, 9))

@@ -4,11 +4,11 @@ import zipfile
 
 import numpy as np
 import pytest
-import rotations
-from rotations import EIGHTHS, TILT
 
 from mirrorskin import engine, io
 from mirrorskin.engine.base.undistort import undistort
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, TILT
 from mirrorskin.io.formats.registry import export_suffixes
 from mirrorskin.view.report import write_report
 

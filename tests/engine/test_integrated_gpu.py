@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 from operations import CASES, assert_same
-from suite.scenes import blob_mask, noisy_slopes, random_cuts, roof
 
 from mirrorskin import engine
+from mirrorskin.evaluation.scenes.inputs import blob_mask, noisy_slopes, random_cuts, roof
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.layout import GPU_LAYOUT

@@ -14,8 +14,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from poses import Pose, leaning
-from rotations import between
 from scipy.spatial import cKDTree
+
+from mirrorskin.evaluation.scenes.rotations import between
 
 Map = NDArray[np.float64]
 Mask = NDArray[np.bool_]

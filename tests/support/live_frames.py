@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from suite import scenes
-from suite.live import Paced
 
+from mirrorskin.evaluation.base.sources import Paced
+from mirrorskin.evaluation.scenes import inputs as scenes
 from mirrorskin.io import Block, Header
 from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 

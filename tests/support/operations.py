@@ -17,7 +17,6 @@ from live_frames import phases, press_frames, turn_frames
 from numpy.typing import NDArray
 from speckle import Speckle
 from stacks import MadeUp
-from suite.scenes import SCALES, TILT
 
 from mirrorskin import engine
 from mirrorskin.engine.optical.fringes import Fringes, fit_fringes
@@ -25,6 +24,7 @@ from mirrorskin.engine.optical.photometric import PhotometricStereo, photometric
 from mirrorskin.engine.press.levels import Levels
 from mirrorskin.engine.rotation.last_turn import LastTurn
 from mirrorskin.engine.vibration.growth import Growth
+from mirrorskin.evaluation.scenes.inputs import SCALES, TILT
 from mirrorskin.io import Header, Result
 from mirrorskin.io.base.types import body_axes
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from calibration_scenes import Frames
 
 from mirrorskin import io
+from mirrorskin.evaluation.calibration.scenes import Frames
 
 TOPS = {"uint8": 255, "uint16": 4095, "float32": None}
 SCALES = {"uint8": 1.0, "uint16": 16.0, "float32": 1.0}
@@ -14,7 +14,7 @@ SCALES = {"uint8": 1.0, "uint16": 16.0, "float32": 1.0}
 def source(frames, name="made up", again=False):
     """Return a source of given frames, (T, H, W)."""
     travel = 0.01 * np.arange(len(frames))
-    made = Frames(name, frames, io.Header("vertical", camera="lab"), travel=travel)
+    made = Frames(frames, io.Header("vertical", camera="lab"), name, travel=travel)
     made.rewindable = again
     return made
 

@@ -17,9 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 import slope_oracle
-import surfaces
 from numpy.typing import NDArray
 from scipy import ndimage
+
+from mirrorskin.evaluation.scenes import surfaces
 
 Map = NDArray[np.float64]
 Mask = NDArray[np.bool_]

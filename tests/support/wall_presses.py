@@ -6,10 +6,10 @@ import math
 from typing import Any
 
 import numpy as np
-from calibration_scenes import Frames, Thing
-from calibration_scorer import ball
 from numpy.typing import NDArray
 
+from mirrorskin.evaluation.calibration.scenes import Frames, Thing
+from mirrorskin.evaluation.calibration.scorer import ball
 from mirrorskin.io import WallResponse
 from mirrorskin.kernels.rotation.response import shade_terms, sight_slopes, wall_light
 from mirrorskin.twin import Axial, Body, Camera, Twin
@@ -51,4 +51,4 @@ def _press(place: tuple[float, float], number: int) -> Frames:
     )
     frames: NDArray[Any] = np.empty(twin.shape, twin.dtype)
     twin.read(frames)
-    return Frames(f"place-{number}", frames, twin.header, phase=phase)
+    return Frames(frames, twin.header, f"place-{number}", phase=phase)

@@ -10,10 +10,10 @@ import pytest
 from calibrations import a_calibration, assert_same
 from commands import done, refused
 from rig_fakes import fake_rig, settings, spreading
-from rotations import TILT, Setup, between, direction, expose
 from stacks import MadeUp, record
 
 from mirrorskin import engine, io
+from mirrorskin.evaluation.scenes.rotations import TILT, Setup, between, direction, expose
 from mirrorskin.hw.base import rig_file as file
 from mirrorskin.hw.rig import rig
 

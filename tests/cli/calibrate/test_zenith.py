@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from calibrations import a_lens, a_precession, a_response, some_references
 from commands import refused, run
-from rotations import TILT
 from stacks import MadeUp, record
 
 from mirrorskin import io
 from mirrorskin.engine.calibration import wall
+from mirrorskin.evaluation.scenes.rotations import TILT
 from mirrorskin.io.model.calibrated import size_facts
 
 SHAPE = (5, 7)

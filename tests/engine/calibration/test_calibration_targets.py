@@ -1,18 +1,17 @@
 """A small complete calibration: flat fields and nine balls, then scores on other objects.
 
-``tests/support/calibration_report.py`` goes it with all pixels, and prints what the issue asks for.
+``evaluation/calibration/report.py`` goes it with all pixels, and prints what the issue asks for.
 """
 
 import math
 
-import calibration_report as report
-import calibration_scorer as scorer
 import numpy as np
 import pytest
-from calibration_scenes import Lab, press_for
 
 from mirrorskin.engine.calibration import wall
 from mirrorskin.engine.calibration.check import check_ball
+from mirrorskin.evaluation.calibration import report, scorer
+from mirrorskin.evaluation.calibration.scenes import Lab, press_for
 
 pytestmark = pytest.mark.slow  # nine balls and three objects are traced
 

@@ -1,15 +1,15 @@
 import math
 from dataclasses import replace
 
-import calibration_scorer as scorer
 import numpy as np
 import pytest
-from calibration_scenes import Frames, Thing
 from stacks import ball
 from walls import response_of_twin
 
 from mirrorskin import io
 from mirrorskin.engine.calibration.check import check_ball
+from mirrorskin.evaluation.calibration import scorer
+from mirrorskin.evaluation.calibration.scenes import Frames, Thing
 from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE, PIXEL = (71, 80), 0.08
@@ -48,7 +48,7 @@ def test_a_ball_is_found_next_to_the_middle(press):
     press.rewind()
     frames = np.empty(press.shape, press.dtype)
     press.read(frames)
-    aside = Frames("aside", np.roll(frames, 5, axis=2), press.header, travel=press.travel)
+    aside = Frames(np.roll(frames, 5, axis=2), press.header, "aside", travel=press.travel)
     assert check_ball(aside, calibration(), 10.0).place == pytest.approx((5 * PIXEL, 0), abs=0.03)
 
 
@@ -82,7 +82,7 @@ def test_what_the_table_has_no_number_for_is_explained(press):
     [({"rewindable": False}, "cannot be read twice"), ({"motion": "twist"}, "twist motion")],
 )
 def test_what_cannot_be_checked_is_refused(press, change, message):
-    source = Frames("press", np.zeros((3, *SHAPE), np.uint8), press.header, travel=np.arange(3.0))
+    source = Frames(np.zeros((3, *SHAPE), np.uint8), press.header, "press", travel=np.arange(3.0))
     for name, value in change.items():
         setattr(source, name, value)
     with pytest.raises(io.InputError, match=message):
@@ -100,14 +100,14 @@ def test_numbers_out_of_range_are_refused(press, ball_size, cells, message):
 
 @pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 def test_a_press_on_nothing_is_reported(press):
-    source = Frames("nothing", np.full((len(TRAVEL), *SHAPE), 16, np.uint8), press.header, travel=TRAVEL)
+    source = Frames(np.full((len(TRAVEL), *SHAPE), 16, np.uint8), press.header, "nothing", travel=TRAVEL)
     with pytest.raises(io.InputError, match="too little of a ball"):
         check_ball(source, calibration(), 10.0)
 
 
 def test_a_rotation_needs_a_zenith(press):
     header = replace(press.header, motion="axial")
-    source = Frames("turn", np.zeros((8, *SHAPE), np.uint8), header, phase=np.arange(8.0))
+    source = Frames(np.zeros((8, *SHAPE), np.uint8), header, "turn", phase=np.arange(8.0))
     with pytest.raises(io.InputError, match="calibrate zenith first"):
         check_ball(source, calibration(), 10.0)
 
@@ -132,7 +132,7 @@ def test_a_rotation_about_a_ball_is_judged_with_the_wall_and_as_it_was_designed(
     references = io.References(header.dark, header.bright, little, little, np.zeros(shape, np.uint8))
     zenith = response_of_twin(shape, pixel, body, distance)
     calibrated = io.Calibration(io.CameraId("", shape, np.dtype("uint8")), references, zenith=zenith)
-    check = check_ball(Frames("turn", frames, header, phase=phase), calibrated, 6.0, cells=4)
+    check = check_ball(Frames(frames, header, "turn", phase=phase), calibrated, 6.0, cells=4)
     assert check.place == pytest.approx((0.5, -0.4), abs=0.03)
     before, after = check.before, check.after
     assert abs(float(after["zenith"].whole.bias)) < 0.2

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import Frames
 from leaning_turns import EIGHTHS, Ball, Flat, pictures
 from poses import leaning
 
@@ -12,6 +11,7 @@ from mirrorskin.engine.calibration.ball import moved
 from mirrorskin.engine.calibration.brightness import LinearBrightness, WallBrightness
 from mirrorskin.engine.calibration.tilt import fit_precession
 from mirrorskin.engine.calibration.tilt_tracks import BallTrack, PlateTrack, track_ball, track_plate
+from mirrorskin.evaluation.calibration.scenes import Frames
 from mirrorskin.io import Header, InputError, Precession, WallResponse
 from mirrorskin.twin import Axial, Body, Camera, Twin
 
@@ -43,7 +43,7 @@ def scale_of(body, shape=SHAPE, camera=None):
 
 
 def recording(name, frames, phase=EIGHTHS, press=None, pixel_size=PIXEL):
-    return Frames(name, frames, Header("axial", pixel_size=pixel_size, press=press), phase=phase)
+    return Frames(frames, Header("axial", pixel_size=pixel_size, press=press), name, phase=phase)
 
 
 def ball_turn(truth, x=0.0, y=0.0, *, shape=SHAPE, depth=DEPTH, stated_depth=DEPTH, **options):
@@ -255,9 +255,9 @@ def test_a_real_wall_off_the_axis_is_seen_through():
 
 def test_turns_that_cannot_be_used_are_refused():
     scale, dark = scale_of(None, (30, 30)), np.full((8, 30, 30), 16, np.uint8)
-    no_phase = Frames("turn", dark, Header("axial", pixel_size=PIXEL))
+    no_phase = Frames(dark, Header("axial", pixel_size=PIXEL), "turn")
     long = recording("turn", np.broadcast_to(dark[:1, :1, :1], (5000, 1000, 1000)))
-    vertical = Frames("turn", dark, Header("vertical", pixel_size=PIXEL), travel=EIGHTHS)
+    vertical = Frames(dark, Header("vertical", pixel_size=PIXEL), "turn", travel=EIGHTHS)
     for source, radius, message in (
         (vertical, 2.0, "turn is of vertical motion"),
         (recording("turn", dark, pixel_size=None), 2.0, "turn has no pixel size: calibrate the scale first"),

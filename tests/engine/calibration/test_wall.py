@@ -5,12 +5,12 @@ import math
 
 import numpy as np
 import pytest
-from calibration_scenes import Frames
 from wall_presses import BODY, DISTANCE, SHAPE, light_of_response, wall_presses
 
 from mirrorskin import io
 from mirrorskin.engine.calibration.wall import fit_zenith
 from mirrorskin.engine.calibration.wall_fit import pivot_of, read_press
+from mirrorskin.evaluation.calibration.scenes import Frames
 from mirrorskin.io import pixel_axes
 from mirrorskin.kernels.device import open_device
 from mirrorskin.twin.optics import Wall
@@ -109,7 +109,7 @@ def test_samples_at_the_ends_of_the_camera_and_of_defects_are_left_out(presses):
     frames[:, 24, 20:28] = 255
     dark = presses[0].header.dark.copy()
     dark[22] = np.nan
-    spoilt = Frames("place-1", frames, dataclasses.replace(presses[0].header, dark=dark), **presses[0].series)
+    spoilt = Frames(frames, dataclasses.replace(presses[0].header, dark=dark), "place-1", **presses[0].series)
     read = read_press(spoilt, 2.0, None, None, 10**6)
     y = pixel_axes(SHAPE, presses[0].header.pixel_size)[1]
     assert np.isfinite(read.light).all()
@@ -146,11 +146,11 @@ def test_a_calibrated_rotation_returns_leans_and_how_well_its_pivot_is_known(pre
 
 def replaced(press, **fields):
     header = dataclasses.replace(press.header, **fields)
-    return Frames(press.name, press.frames, header, **press.series)
+    return Frames(press.frames, header, press.name, **press.series)
 
 
 def test_a_press_without_a_ball_is_named(presses):
-    empty = Frames("place-2", np.full_like(presses[1].frames, 16), presses[1].header, **presses[1].series)
+    empty = Frames(np.full_like(presses[1].frames, 16), presses[1].header, "place-2", **presses[1].series)
     with pytest.raises(io.InputError, match="place-2: a ball of 4 mm is seen in 0 of 8 frames"):
         fit_zenith([presses[0], empty, *presses[2:]], 2.0)
 

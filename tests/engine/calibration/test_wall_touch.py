@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from calibration_scenes import Frames
 from wall_presses import light_of_response
 
 from mirrorskin import io
@@ -21,6 +20,7 @@ from mirrorskin.engine.calibration.wall_model import (
     predict,
 )
 from mirrorskin.engine.calibration.wall_response import make_response, threshold_zenith
+from mirrorskin.evaluation.calibration.scenes import Frames
 from mirrorskin.kernels.rotation.response import sight_of
 
 NOMINAL = dict.fromkeys(SENSOR, (0.0, 3.0)) | dict.fromkeys(SENSOR[-5:], (0.0, 0.02))
@@ -42,7 +42,7 @@ PHASE = np.arange(8) * np.pi / 4
 LEAN = math.radians(2.5) * np.stack([np.cos(PHASE), np.sin(PHASE)], axis=1)
 OFF = np.array([0.03, -0.04, 0.1])
 NOISE = 4e-3
-PICTURE = Frames("place-1", np.zeros((1, 12, 12), np.uint8), io.Header("axial", pixel_size=(1.0, 1.0)))
+PICTURE = Frames(np.zeros((1, 12, 12), np.uint8), io.Header("axial", pixel_size=(1.0, 1.0)), "place-1")
 
 
 def coefficients_of(exponent):

@@ -4,11 +4,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-import rotations
-from rotations import Setup
 
 from mirrorskin import engine, io
 from mirrorskin.engine.diagnosis.curl import find_azimuth_error
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import Setup
 from mirrorskin.io.files.arrays import ArrayRecording
 
 SHAPE, PIXEL = (60, 80), (0.05, 0.06)

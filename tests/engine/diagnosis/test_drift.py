@@ -4,9 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
-from independent_camera import Fault, points, record
 
 from mirrorskin import engine
+from mirrorskin.evaluation.faults.camera import Fault, points, record
 from mirrorskin.io import MirrorskinWarning
 
 SHAPE, PIXEL = (36, 48), 0.05

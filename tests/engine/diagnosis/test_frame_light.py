@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-import rotations
-from rotations import Setup
 
 from mirrorskin import engine
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import Setup
 from mirrorskin.io.files.arrays import ArrayRecording
 
 SIZE, PIXEL, COUNT = 72, 0.05, 16

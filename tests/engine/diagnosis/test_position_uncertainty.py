@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from independent_camera import DARK, SPAN, Fault, centres, points, record
 
 from mirrorskin import engine
+from mirrorskin.evaluation.faults.camera import DARK, SPAN, Fault, centres, points, record
 
 SHAPE, PIXEL, STEP = (48, 64), 0.05, 0.02
 TRAVEL = np.arange(0.2, 1.1, STEP)

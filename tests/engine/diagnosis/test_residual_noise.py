@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from rotations import EIGHTHS, UNEVEN
 
 from mirrorskin.engine.diagnosis.residual_noise import residual_noise
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, UNEVEN
 from mirrorskin.io import InputError
 
 PIXELS = 10_000

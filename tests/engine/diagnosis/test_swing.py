@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-import rotations
-from rotations import Setup
 from scipy.ndimage import gaussian_filter
 
 from mirrorskin import engine, io
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import Setup
 from mirrorskin.io.files.arrays import ArrayRecording
 
 SIZE, PIXEL, COUNT = 72, 0.05, 16

@@ -5,14 +5,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-import rotations
-import sample_fusion
-from rotations import EIGHTHS, TILT, Setup
 from scipy.stats import norm
 from stacks import MadeUp, record
 
 from mirrorskin import engine, io
 from mirrorskin.engine.fusion.fusion import frames_to_read
+from mirrorskin.evaluation import sample_fusion
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, TILT, Setup
 from mirrorskin.io.files.arrays import ArrayRecording
 from mirrorskin.twin import Axial, Body, Camera, Twin, Vertical
 

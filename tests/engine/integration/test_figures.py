@@ -4,9 +4,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from suite.figure_scenes import HELD_OUT, doll, random_figure
 
 from mirrorskin import engine
+from mirrorskin.evaluation.scenes.figures import HELD_OUT, doll, random_figure
 
 SHAPE = 64, 64
 NAMES = "figure 100", "figure 106", "figure 115", "figure 124", "figure 127"

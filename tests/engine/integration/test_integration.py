@@ -10,11 +10,11 @@ from functools import cache
 import numpy as np
 import pytest
 import slope_oracle
-import surfaces
 from slope_oracle import Problem
 
 from mirrorskin import engine, io
 from mirrorskin.engine.integration.multigrid import Multigrid
+from mirrorskin.evaluation.scenes import surfaces
 from mirrorskin.kernels.device import open_device
 
 SHAPE, PIXEL = (49, 62), (0.03, 0.05)

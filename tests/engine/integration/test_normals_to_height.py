@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import rotations
-from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
 from mirrorskin.engine.integration.normals_to_height import find_slopes
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, TILT, UNEVEN, Setup
 
 ONE = np.ones((1, 1), np.float32)
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import graphs
 import numpy as np
 import pytest
-import surfaces
 
 from mirrorskin import engine, io
 from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.hierarchy import choose_lanes
 from mirrorskin.engine.integration.multigrid import Multigrid
+from mirrorskin.evaluation.scenes import surfaces
 
 SHAPE = 61, 83
 DISC = surfaces.disc(SHAPE)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from live_frames import PIXEL, paced, press_frames, press_header, turn_header
-from suite.scenes import references
 
 from mirrorskin.engine import Press
 from mirrorskin.engine.live import LiveRun
+from mirrorskin.evaluation.scenes.inputs import references
 from mirrorskin.io import InputError
 
 SHAPE = (30, 17, 23)

@@ -6,13 +6,13 @@ import threading
 import numpy as np
 import pytest
 from live_frames import PIXEL, paced, phases, press_header, turn_frames, turn_header
-from suite.scenes import SCALES, TILT
 
 from mirrorskin.engine import Correlate, Rotation, Run, estimate_normals, find_edges, integrate
 from mirrorskin.engine.integration.normals_to_height import find_slopes
 from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
 from mirrorskin.engine.live import LiveRun, Loop
 from mirrorskin.engine.rotation.last_turn import choose_window
+from mirrorskin.evaluation.scenes.inputs import SCALES, TILT
 from mirrorskin.io import InputError, open_result, save_result
 from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from live_frames import blocks, phases, turn_frames
-from suite.scenes import SCALES, TILT
 
 from mirrorskin.engine import Correlate, Normals, Run, correlate, estimate_normals
+from mirrorskin.evaluation.scenes.inputs import SCALES, TILT
 from mirrorskin.io import InputError
 
 SHAPE, WINDOW = (21, 13, 29), 8

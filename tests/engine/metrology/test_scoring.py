@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from rotations import direction
 
 from mirrorskin import engine, io
 from mirrorskin.engine.base.summary import summarise
+from mirrorskin.evaluation.scenes.rotations import direction
 from mirrorskin.io.model.maps import SlipStatus, status_of
 
 NAN = np.float32(np.nan)

@@ -5,9 +5,9 @@ import pytest
 from bare import bare, find_change_point
 from changes import assert_near, numpy_change, numpy_split
 from presses import LEVELS, SPEC, assert_equal, random_press
-from ramps import NOISES, WIDTHS, compare, errors, ramps, rms
 
 from mirrorskin.engine import ChangePoint, Run
+from mirrorskin.evaluation.ramps import NOISES, WIDTHS, compare, errors, ramps, rms
 from mirrorskin.io import InputError
 
 DTYPES = sorted(SPEC)
@@ -54,7 +54,7 @@ def test_sigma_is_true_unknown_levels_cost_little_and_a_release_is_as_good(devic
     travel = np.arange(64.0)
     options = {"noise": float(np.hypot(noise, 1 / np.sqrt(12))), "device": device}
     result = find_change_point(frames, travel, **LEVELS["uint8"], **options)
-    error = errors(result.height, result.status, middle)
+    error = errors(result, middle)
     square = (error / result.height_sigma) ** 2
     assert 0.65 < np.mean(square) < 1.1  # ramps are straight, and sigma allows for a blur where noise is low
     each = np.mean(square, axis=1)
@@ -63,7 +63,7 @@ def test_sigma_is_true_unknown_levels_cost_little_and_a_release_is_as_good(devic
     assert np.all(each[np.array(WIDTHS) >= 4] > 0.7)
 
     split = find_change_point(frames, travel, **options)
-    assert rms(errors(split.height, split.status, middle)) < 1.35 * rms(error)
+    assert rms(errors(split, middle)) < 1.35 * rms(error)
     back, up = frames[::-1].copy(), travel[::-1].copy()
     for levels, press in ((LEVELS["uint8"], result), ({}, split)):
         release = find_change_point(back, up, **levels, **options, **RELEASE)

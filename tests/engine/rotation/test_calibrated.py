@@ -7,15 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-import rotations
 import walls
-from rotations import EIGHTHS, TILT
 from stacks import MadeUp
 
 from mirrorskin import engine, io
 from mirrorskin.engine.diagnosis.registration import Registered, Sight
 from mirrorskin.engine.live import LiveRun
 from mirrorskin.engine.rotation.rotation import first_turn
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, TILT
 from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE, PIXEL, PRESS = (68, 71), 0.085, 0.7

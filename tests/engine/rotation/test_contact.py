@@ -8,10 +8,10 @@ import poses
 import pytest
 from geometry import pixel_centres
 from numpy.typing import NDArray
-from rotations import EIGHTHS, TILT, UNEVEN
 from stacks import read_all
 
 from mirrorskin import engine
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, TILT, UNEVEN
 from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE = (111, 110)

@@ -5,13 +5,13 @@ from functools import cache
 import creases
 import numpy as np
 import pytest
-import rotations
 from creases import CONE, DOME, PYRAMID, RELIEFS, SMOOTH
 from geometry import pixel_centres
-from rotations import EIGHTHS, TILT, Setup
 from stacks import read_all
 
 from mirrorskin import engine, io
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, TILT, Setup
 from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE, PIXEL = (93, 98), 0.05

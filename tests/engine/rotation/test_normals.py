@@ -5,11 +5,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import rotations
-from rotations import EIGHTHS, TILT, Setup
 
 from mirrorskin import engine
 from mirrorskin.engine import Normals, estimate_normals
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, TILT, Setup
 from mirrorskin.io import InputError
 
 SETUP = Setup(gain=60.0, noise=20.0, offset=150.0, dtype="uint16")

@@ -1,16 +1,14 @@
-"""Normals from axial rotations, against the statistical limit (tests/support/rotations.py)."""
+"""Normals from axial rotations, against the statistical limit (evaluation/scenes/rotations.py)."""
 
-import re
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-import rotations
-from rotations import BINS, SETUPS, TILT, UNEVEN, Setup
 
 from mirrorskin import engine
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import BINS, SETUPS, TILT, UNEVEN, Setup
 
 DRAWS = 10_000
 # So little noise that an estimate's own curvature, of second order in it, is no bias that one could see.
@@ -175,20 +173,3 @@ def test_an_unknown_tilt_is_reported_within_its_own_error(device, name, tilt):
 
 def flat(stack):
     return stack._replace(normals=stack.normals.reshape(1, -1, 3), bound=stack.bound.reshape(1, -1))
-
-
-def test_the_page_about_accuracy_states_what_is_measured(device):
-    page = (Path(__file__).parents[3] / "docs" / "accuracy.md").read_text(encoding="utf-8")
-    zeniths, bounds, exact, paper = (
-        re.search(rf"^\| {name} \| (.*) \|$", page, re.MULTILINE)[1].split(" | ")
-        for name in ("zenith", "Cramér.Rao bound", "`exact`", "`paper`")
-    )
-    bins = [BINS.index(tuple(map(float, zenith.split("-")))) for zenith in zeniths]
-    stack = drawn("uint8")
-    for method, stated in ("exact", exact), ("paper", paper):
-        result = estimate(stack.frames, stack.setup, device, method=method).normals.astype(float)
-        error = rotations.between(result, stack.normals)  # NaN where all samples of a draw are equal
-        rms = np.degrees(np.sqrt(np.nanmean(error**2, axis=-1)))
-        np.testing.assert_allclose(rms[bins], np.array(stated, float), rtol=0.03)
-    bound = np.degrees(np.sqrt(np.mean(stack.bound, axis=-1)))
-    np.testing.assert_allclose(bound[bins], np.array(bounds, float), rtol=0.01)

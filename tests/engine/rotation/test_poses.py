@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import rotations
 
 from mirrorskin import engine, io
+from mirrorskin.evaluation.scenes import rotations
 from mirrorskin.io.base.types import body_axes
 from mirrorskin.twin import Camera, Leaning, Plane, Twin
 

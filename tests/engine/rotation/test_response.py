@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import rotations
 import walls
 from calibrations import a_precession
 from stacks import MadeUp
@@ -12,6 +11,7 @@ from walls import PHASE, TILT
 
 from mirrorskin.engine import estimate_normals
 from mirrorskin.engine.rotation.response import make_response, shade, wall_response_of
+from mirrorskin.evaluation.scenes import rotations
 from mirrorskin.io import Calibrated, Calibration, CameraId, Header, InputError
 
 SHAPE = (8, 31)

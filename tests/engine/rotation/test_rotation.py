@@ -5,13 +5,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-import rotations
-from rotations import EIGHTHS, TILT, Setup
 from stacks import MadeUp, assert_same
 
 from mirrorskin import engine, io
 from mirrorskin.engine.base.operation import Plan
 from mirrorskin.engine.rotation.steps import Edges, Integration, take_slopes
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, TILT, Setup
 from mirrorskin.twin import Axial, Body, Camera, Twin
 
 SHAPE = (20, 24)

@@ -1,13 +1,14 @@
-"""The tests' own formulas of axial rotations (tests/support/rotations.py), compared with simpler ones."""
+"""The tests' own formulas of axial rotations (evaluation/scenes/rotations.py), compared with simpler ones."""
 
 from dataclasses import replace
 
 import numpy as np
 import poses
 import pytest
-import rotations
-from rotations import EIGHTHS, SETUPS, TILT, UNEVEN, Setup
 from scipy import integrate, stats
+
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, SETUPS, TILT, UNEVEN, Setup
 
 SHARP = Setup(gain=5.0, noise=0.0, offset=10.0, dtype="float32")
 

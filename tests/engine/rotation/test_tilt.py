@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import rotations
-from rotations import EIGHTHS, TILT, UNEVEN, Setup
 
 from mirrorskin.engine.correlation.design_matrix import turn_fit
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.engine.rotation.tilt import estimate_tilt, zenith_seen
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, TILT, UNEVEN, Setup
 from mirrorskin.io import InputError
 
 SETUP = Setup(gain=60.0, noise=20.0, offset=150.0, dtype="uint16")

@@ -7,9 +7,9 @@ import shutil
 import pytest
 from commands import run
 from stacks import record, sphere
-from suite.object_store import object_store
 
 from mirrorskin import io
+from mirrorskin.evaluation.base.object_store import object_store
 
 pytest.importorskip("s3fs", reason="needs 'mirrorskin[s3]'")
 pytest.importorskip("moto.server", reason="needs 'moto[server]'")

@@ -4,12 +4,12 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-import rotations
-from rotations import EIGHTHS, UNEVEN, Setup
 from scipy import optimize, special
 
 from mirrorskin.engine.base.picture import vector_lanes
 from mirrorskin.engine.correlation.design_matrix import fit_matrix
+from mirrorskin.evaluation.scenes import rotations
+from mirrorskin.evaluation.scenes.rotations import EIGHTHS, UNEVEN, Setup
 from mirrorskin.kernels.device import C_TYPES
 from mirrorskin.kernels.rotation import normals
 from mirrorskin.kernels.rotation.normals import Answer, Variance, contact_limits

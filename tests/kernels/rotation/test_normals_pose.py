@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-import rotations
 
 from mirrorskin import engine
 from mirrorskin.engine.rotation.poses import check_poses, pose_fit
+from mirrorskin.evaluation.scenes import rotations
 from mirrorskin.io.base.types import body_axes
 from mirrorskin.kernels.rotation import normals_pose
 from mirrorskin.kernels.rotation.normals import Variance, contact_limits

@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 import pytest
-import rotations
 import walls
 from scipy import optimize
 from walls import PHASE, TILT, facing, light_of
 
 from mirrorskin.engine.correlation.design_matrix import fit_matrix
 from mirrorskin.engine.rotation.response import make_response
+from mirrorskin.evaluation.scenes import rotations
 from mirrorskin.kernels.rotation.normals import Variance, contact_limits
 from mirrorskin.kernels.rotation.normals_wall import _places, _rotations, normals_wall
 from mirrorskin.kernels.rotation.response import wall_light

@@ -1,0 +1,1 @@
+"""Sources of frames, tables of results, and a server that reports, tests and benchmarks share."""

@@ -1,0 +1,1 @@
+"""Standard deviations when a camera, a lamp or a stage fails."""

@@ -1,0 +1,237 @@
+"""A camera independent of the twin: its frames of a scene, and all its possible faults.
+
+The light of a scene is computed at 4 x 4 points of each pixel, blurred by a lens, averaged over the pixel,
+and turned into counts by a sensor with shot noise and read noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+Floats = NDArray[np.float64]
+Light = Callable[[Floats], Floats]
+"""The light of a scene at positions (T, rows of points or 1, 1): shares from 0 to 1, (T, points, points)."""
+
+POINTS = 4  # along each side of a pixel
+DARK, SPAN = 20.0, 200.0  # counts of 8 bits: without light, and from there to full light
+ELECTRONS = 200.0  # a count of 8 bits
+READ_NOISE = 1.2  # counts of 8 bits
+_CAMERA = 7  # seed of what stays the same from recording to recording
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What goes wrong in a recording; the defaults are a camera without a fault.
+
+    Attributes
+    ----------
+    name : str
+    blur : float
+        Standard deviation of the lens's point spread, pixels.
+    gamma : float
+        Exponent of the response.
+    exposure : float
+        Times the light that just fits into 8 bits.
+    flicker : float
+        Standard deviation of the lamp from frame to frame, as a share.
+    drift : float
+        Rise of the dark level over the recording, counts of 8 bits.
+    jitter : float
+        Standard deviation of the position, steps from frame to frame.
+    stated : bool
+        Whether the user states the jitter, or the shutter.
+    dropped, duplicated : bool
+        Whether the frame in the middle is missing, or is there twice; nobody noticed.
+    hot : float
+        Share of the samples that are at the end of the scale.
+    outliers : float
+        Share of the samples that are any number.
+    gain : float
+        Standard deviation of each pixel's gain.
+    vignetting : float
+        Loss of light in the corners.
+    bits : int
+        Of a sample.
+    stray : float
+        Share of the light of a frame that is spread over the whole frame.
+    codec : str
+        "jpeg" (quality 90) or "mpeg" (MPEG-4) if frames are compressed.
+    shutter : float
+        Steps from the first row's exposure to the last row's.
+    """
+
+    name: str
+    blur: float = 0.0
+    gamma: float = 1.0
+    exposure: float = 1.0
+    flicker: float = 0.0
+    drift: float = 0.0
+    jitter: float = 0.0
+    stated: bool = False
+    dropped: bool = False
+    duplicated: bool = False
+    hot: float = 0.0
+    outliers: float = 0.0
+    gain: float = 0.0
+    vignetting: float = 0.0
+    bits: int = 8
+    stray: float = 0.0
+    codec: str = ""
+    shutter: float = 0.0
+
+    @property
+    def scale(self) -> float:
+        """Counts for a count of 8 bits."""
+        return float(2**self.bits - 1) / 255
+
+
+FAULTS = (
+    Fault("none"),
+    Fault("blur 0.5 px", blur=0.5),
+    Fault("blur 1.5 px", blur=1.5),
+    Fault("saturation", exposure=1.4),
+    Fault("gamma 0.9", gamma=0.9),
+    Fault("flicker 2 %", flicker=0.02),
+    Fault("drift 4 counts", drift=4.0),
+    Fault("jitter 0.1 steps", jitter=0.1),
+    Fault("the same, stated", jitter=0.1, stated=True),
+    Fault("dropped frame", dropped=True),
+    Fault("repeated frame", duplicated=True),
+    Fault("rolling shutter", shutter=1.0),
+    Fault("rolling shutter, stated", shutter=1.0, stated=True),
+    Fault("hot 0.1 %", hot=0.001),
+    Fault("outliers 1 %", outliers=0.01),
+    Fault("gain 3 %", gain=0.03),
+    Fault("vignetting 10 %", vignetting=0.1),
+    Fault("12 bits", bits=12),
+    Fault("stray light 1 %", stray=0.01),
+    Fault("JPEG 90", codec="jpeg"),
+    Fault("MPEG-4", codec="mpeg"),
+)
+
+
+def points(shape: tuple[int, int], pixel_size: float) -> tuple[Floats, Floats]:
+    """Return x, to the right, and y, up, of all points at which light is computed, mm from the centre."""
+    rows, columns = (POINTS * size for size in shape)
+    x = (np.arange(columns) - (columns - 1) / 2) * pixel_size / POINTS
+    y = ((rows - 1) / 2 - np.arange(rows)) * pixel_size / POINTS
+    return x[np.newaxis, :], y[:, np.newaxis]
+
+
+def centres(shape: tuple[int, int], pixel_size: float) -> tuple[Floats, Floats]:
+    """Return x and y of the centres of all pixels, mm from the centre of the picture."""
+    rows, columns = shape
+    x = (np.arange(columns, dtype=np.float64) - (columns - 1) / 2) * pixel_size
+    y = ((rows - 1) / 2 - np.arange(rows, dtype=np.float64)) * pixel_size
+    return x[np.newaxis, :], y[:, np.newaxis]
+
+
+def record(light: Light, positions: Floats, fault: Fault, seed: int) -> NDArray[np.unsignedinteger]:
+    """Return the frames of a scene, (T, H, W), at positions, (T,), that are what the user believes."""
+    generator = np.random.default_rng(seed)
+    middle, step = len(positions) // 2, float(np.median(np.diff(positions)))
+    true = positions.copy()
+    if fault.dropped:
+        true[middle:] = np.append(positions[middle + 1 :], positions[-1] + step)
+    if fault.duplicated:
+        true[middle:] = positions[middle - 1 : -1]
+    true = true + fault.jitter * step * generator.normal(size=len(true))
+    frames = [_share(light, position, step, fault) for position in true]
+    shares = np.stack(frames)
+    flicker = 1 + fault.flicker * generator.normal(size=len(true))
+    drift = fault.drift * np.linspace(0, 1, len(true))
+    pixels = 1 + fault.gain * np.random.default_rng(_CAMERA).normal(size=shares.shape[1:])
+    light_counts = _expose(shares * pixels * flicker[:, np.newaxis, np.newaxis], fault, generator)
+    counts = _sample(light_counts + drift[:, np.newaxis, np.newaxis], fault, generator)
+    if fault.duplicated:
+        counts[middle] = counts[middle - 1]
+    return _compress(counts, fault)
+
+
+def references(shape: tuple[int, int], fault: Fault, seed: int) -> tuple[Floats, Floats]:
+    """Return the levels without and with full light, counts: means of 16 frames of the same camera."""
+    steady = replace(fault, flicker=0.0, drift=0.0, jitter=0.0, dropped=False, duplicated=False, hot=0.0)
+    steady = replace(steady, outliers=0.0, codec="")
+    rows, columns = (POINTS * size for size in shape)
+    dark, bright = (
+        record(lambda _: np.full((1, rows, columns), level), np.arange(16.0), steady, seed).mean(axis=0)  # noqa: B023
+        for level in (0.0, 1.0)
+    )
+    return dark, bright
+
+
+def _share(light: Light, position: float, step: float, fault: Fault) -> Floats:
+    """Return the share of full light of each pixel in one frame, behind the lens."""
+    shown = np.full((1, 1, 1), position)
+    if fault.shutter:
+        rows = light(shown).shape[1]
+        shown = position + fault.shutter * step * np.linspace(0, 1, rows)[np.newaxis, :, np.newaxis]
+    fine = light(shown)[0]
+    for axis in (0, 1):
+        if fault.blur:
+            fine = gaussian_filter1d(fine, fault.blur * POINTS, axis=axis, mode="nearest")
+    rows, columns = (size // POINTS for size in fine.shape)
+    share: Floats = fine.reshape(rows, POINTS, columns, POINTS).mean(axis=(1, 3))
+    share = (1 - fault.stray) * share + fault.stray * share.mean()
+    x, y = np.linspace(-1, 1, columns)[np.newaxis], np.linspace(-1, 1, rows)[:, np.newaxis]
+    return share * (1 - fault.vignetting * (x**2 + y**2) / 2)
+
+
+def _expose(shares: Floats, fault: Fault, generator: np.random.Generator) -> Floats:
+    """Return counts of 8 bits, without limits."""
+    full = fault.exposure * SPAN
+    light = np.maximum(shares, 0) ** fault.gamma
+    electrons = generator.poisson(light * full * ELECTRONS)
+    return DARK + electrons / ELECTRONS + generator.normal(0, READ_NOISE, shares.shape)
+
+
+def _sample(counts: Floats, fault: Fault, generator: np.random.Generator) -> NDArray[np.unsignedinteger]:
+    top = 2**fault.bits - 1
+    stored = np.rint(counts * fault.scale)
+    hot = generator.random(stored.shape) < fault.hot
+    any_number = generator.random(stored.shape) < fault.outliers
+    stored[hot] = top
+    stored[any_number] = generator.integers(0, top + 1, np.count_nonzero(any_number))
+    return np.clip(stored, 0, top).astype(np.uint8 if fault.bits == 8 else np.uint16)
+
+
+def _compress(frames: NDArray[np.unsignedinteger], fault: Fault) -> NDArray[np.unsignedinteger]:
+    if fault.codec == "jpeg":
+        quality = [cv2.IMWRITE_JPEG_QUALITY, 90]
+        stored = [cv2.imencode(".jpg", frame, quality)[1] for frame in frames]
+        return np.stack([np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE), np.uint8) for jpeg in stored])
+    if fault.codec == "mpeg":
+        return _filmed(frames)
+    return frames
+
+
+def _filmed(frames: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
+    """Return frames as an MPEG-4 video of 4 bits a pixel holds them."""
+    encoder = av.CodecContext.create("mpeg4", "w")
+    encoder.height, encoder.width = frames.shape[1:]
+    encoder.pix_fmt, encoder.time_base, encoder.framerate = "yuv420p", Fraction(1, 25), Fraction(25)
+    encoder.bit_rate = 4 * frames[0].size * 25
+    decoder = av.CodecContext.create("mpeg4", "r")
+    packets = []
+    for number, frame in enumerate(frames):
+        picture = av.VideoFrame.from_ndarray(_as_yuv(frame), format="yuv420p")
+        picture.pts = number
+        packets += encoder.encode(picture)
+    packets += encoder.encode(None)
+    decoded = [picture for packet in packets for picture in decoder.decode(packet)] + decoder.decode(None)
+    rows = frames.shape[1]
+    return np.stack([picture.to_ndarray()[:rows] for picture in decoded])
+
+
+def _as_yuv(frame: NDArray[np.unsignedinteger]) -> NDArray[np.uint8]:
+    rows, columns = frame.shape
+    grey = np.full((rows // 2, columns), 128, np.uint8)
+    return np.concatenate([frame, grey]).astype(np.uint8)

@@ -1,0 +1,1 @@
+"""Other OpenCL implementations, other processors, and GPUs; see README.md."""

@@ -1,0 +1,50 @@
+"""No call may do more on a GPU than in the table; ``gpu_counts.py --freeze`` updates the table."""
+
+import warnings
+
+import pytest
+
+from mirrorskin.evaluation.portability import gpu_counts
+from mirrorskin.io import MirrorskinWarning
+from mirrorskin.kernels.device import open_device
+
+KNOWN = gpu_counts.load()
+
+
+@pytest.fixture(scope="module")
+def found():
+    device = open_device()
+    as_it_is = device.info, device.layout
+    with warnings.catch_warnings(action="ignore", category=MirrorskinWarning):  # its press is not its turn
+        try:
+            return dict(gpu_counts.count_all())
+        finally:
+            device.info, device.layout = as_it_is  # other tests use this device, too
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KNOWN)
+def test_a_call_has_a_gpu_do_no_more_than_before(found, name):
+    assert list(gpu_counts.complaints(name, found[name], KNOWN[name])) == []
+
+
+@pytest.mark.slow
+def test_every_call_is_in_the_table(found):
+    assert found.keys() == KNOWN.keys()
+
+
+def test_what_rises_is_printed_in_a_line():
+    row = KNOWN["integrate"]
+    more = {**row, "launches": row["launches"] + 1, "waits": row["waits"] - 1}
+    assert list(gpu_counts.complaints("integrate", more, row)) == [
+        f"integrate: launches {row['launches'] + 1}, and the table has {row['launches']}"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("items", "moved", "seconds"),
+    [(1 << 20, 4 << 20, 4 * 2**20 / 2.4e12), (64, 64 * 16384 * 4, 16384 * 0.5e-6)],
+    ids=["as long as the memory takes", "as long as one work-item reads"],
+)
+def test_a_kernel_takes_as_long_as_what_limits_it(items, moved, seconds):
+    assert gpu_counts.seconds_of(items, moved) == pytest.approx(seconds)
