@@ -141,7 +141,6 @@ CASES = {
     ),
     "a negative pixel given": (stack(), [*GIVEN, "--pixel-size=-1mm"], "above zero"),
     "a named group": (change(f"{STAGE}/travel"), ["--dataset", "/entry"], "/entry is not a dataset"),
-    "complex": (typed("c8"), GIVEN, "complex64: frames are uint8, uint16 or float32"),
     "compound": (typed([("r", "u1"), ("g", "u1")]), GIVEN, "frames are uint8, uint16 or float32"),
     "a damaged chunk": (damaged_chunk, GIVEN, "frames 2 to 3 of /x cannot be read"),
     "a large chunk": (

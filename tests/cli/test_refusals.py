@@ -35,15 +35,6 @@ def foreign(path, **datasets):
             file[name] = value
 
 
-def cut(path, length):
-    path.write_bytes(path.read_bytes()[:length])
-
-
-def truncated(path):
-    ours(path)
-    cut(path, path.stat().st_size - 300)
-
-
 def claims_too_much(path):
     with h5py.File(path, "w") as file:
         file.create_dataset("frames", (10**6, 1000, 1000), "u1")
@@ -82,7 +73,6 @@ CASES = {
     "a folder": (lambda path: path.mkdir(), [], "folder"),
     "an empty file": (lambda path: path.touch(), [], "not an HDF5 file"),
     "not HDF5": (lambda path: path.write_text("hello\n" * 999), [], "not an HDF5 file"),
-    "truncated": (truncated, [], "truncated"),
     "no stack": (lambda path: foreign(path, flat=FRAMES[0]), GIVEN, "no stack"),
     "several stacks": (lambda path: foreign(path, **TWO), GIVEN, "--dataset"),
     "a wrong name": (lambda path: foreign(path, **TWO), [*GIVEN, "--dataset", "three"], "three"),
@@ -131,7 +121,6 @@ CASES = {
     "a missing filter": (unknown_filter, GIVEN, "32099"),
     "an unknown device": (ours, ["--device", "abacus"], "abacus"),
     "a folder as output": (ours, ["-o", "."], "folder"),
-    "no folder for the output": (ours, ["-o", "no/such/folder.h5"], "no folder"),
     "a link to nothing": (external_link("nothing.h5"), [*GIVEN, "--dataset", "frames"], "nothing.h5"),
     "a link out of the folder": (external_link("/etc/passwd"), [*GIVEN, "--dataset", "frames"], "out of"),
     "a claim beyond the file": (claims_too_much, GIVEN, "claims"),
@@ -182,10 +171,7 @@ def test_a_claim_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
     ("words", "message"),
     [
         ("simulate vertical -o no/such/a.h5", "no folder"),
-        ("import nothing.avi --motion vertical --travel-step 1mm -o a.h5", "nothing.avi"),
-        ("import . --motion vertical -o a.h5", "without numbered pictures"),
         ("score nothing.h5 --truth nothing.h5", "no such file"),
-        ("info nothing.h5", "no such file"),
         ("bench --against what.json", "no such file"),
         ("bench -o run.txt", "must end in .json"),
         ("bench -o no/such/run.json", "no folder"),
