@@ -196,10 +196,8 @@ EACH_DOOR = pytest.mark.parametrize("door", DOORS)
 
 def answer(door, frames, travel, dtype=np.uint8):
     """Return the maps of an entry point, as bytes by name; ``dtype`` is the type of a stream's samples."""
-    result = DOORS[door](frames, travel, dtype)
-    return {
-        name: (result[name].dtype, result[name].tobytes()) for name in ("height", "height_sigma", "status")
-    }
+    onset = DOORS[door](frames, travel, dtype)
+    return {name: (onset[name].dtype, onset[name].tobytes()) for name in ("height", "height_sigma", "status")}
 
 
 @pytest.mark.parametrize("kind", FRAMES_OF_KIND)
@@ -379,10 +377,7 @@ SIZED = {"x": 0.1 * (np.arange(8) - 3.5), "y": 0.1 * (2.5 - np.arange(6))}
 def in_micrometres(*names):
     """Return maps of a surface, some of them in micrometres: with pint, or in a dataset of xarray."""
     plain = {"height": FLAT, "height_sigma": FLAT_SIGMA, **SIZED}
-    return {
-        name: UNITS.Quantity(1e3 * number, "um") if name in names else number
-        for name, number in plain.items()
-    }
+    return {name: UNITS.Quantity(1e3 * mm, "um") if name in names else mm for name, mm in plain.items()}
 
 
 def area(maps, **options):
@@ -490,9 +485,7 @@ CHANGES = {
 def test_arrays_and_recordings_give_what_the_function_gives(name, change):
     case = CASES[name]
     is_estimated = case.kind is not engine.optical.Focus
-    options = {
-        option: value for option, value in case.options.items() if option != "noise" or not is_estimated
-    }
+    options = {key: value for key, value in case.options.items() if key != "noise" or not is_estimated}
     frames = np.rint(CHANGES[change](case.frames.astype(float))).clip(0, 255).astype(case.frames.dtype)
     expected = case.function(frames, **case.given, **options)
     result = engine.run(frames, case.kind(**options), **case.given)

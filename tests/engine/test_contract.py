@@ -59,17 +59,15 @@ def content(result):
 @EACH
 def test_maps_are_as_declared_and_each_has_its_standard_deviation_by_name(name):
     case, result = CASES[name], whole(name)
-    for map_name, values in result.items():
-        declared = result.declaration(map_name)
-        assert declared is not io.model.maps.UNDECLARED, map_name
-        assert np.asarray(values).dtype == declared.dtype, map_name
+    for label, values in result.items():
+        declared = result.declaration(label)
+        assert declared is not io.model.maps.UNDECLARED, label
+        assert np.asarray(values).dtype == declared.dtype, label
         if declared.axes == "pixels":
             shape = case.frames.shape[1:] + (len(declared.components),) * bool(declared.components)
-            assert np.shape(values)[-len(shape) :] == shape, map_name
-            assert np.ndim(values) - len(shape) in (0, 1), map_name  # 1: of each frame or turn
-    assert {map_name.removesuffix("_sigma") for map_name in result if map_name.endswith("_sigma")} <= set(
-        result
-    )
+            assert np.shape(values)[-len(shape) :] == shape, label
+            assert np.ndim(values) - len(shape) in (0, 1), label  # 1: of each frame or turn
+    assert {label.removesuffix("_sigma") for label in result if label.endswith("_sigma")} <= set(result)
 
 
 @EACH
@@ -204,13 +202,9 @@ def test_running_it_over_a_recording_gives_the_same(name):
     result = engine.run(case.source(), case.make())
     assert_same(result, case.whole())
     assert result.process["operation"] == case.kind.__name__
-    numbers = {
-        option: value for option, value in case.options.items() if isinstance(value, bool | int | float)
-    }
-    chosen = {
-        option: value for option, value in numbers.items() if option not in ("tilt", "noise")
-    }  # estimated
-    assert {option: result.process[option] for option in chosen} == chosen
+    numbers = {key: value for key, value in case.options.items() if isinstance(value, bool | int | float)}
+    chosen = {key: value for key, value in numbers.items() if key not in ("tilt", "noise")}  # estimated
+    assert {key: result.process[key] for key in chosen} == chosen
 
 
 @EACH
@@ -376,11 +370,7 @@ def test_each_answer_next_to_pushes_is_that_of_a_single_thread(name):
 
 
 def test_every_operation_has_a_case():
-    operations = (
-        candidate
-        for candidate in engine_classes()
-        if issubclass(candidate, engine.Operation) and candidate.maps
-    )
-    kinds = {candidate for candidate in operations if candidate.push is not engine.Operation.push}
+    operations = (entry for entry in engine_classes() if issubclass(entry, engine.Operation) and entry.maps)
+    kinds = {entry for entry in operations if entry.push is not engine.Operation.push}
     bases = {base for kind in kinds for base in kind.__mro__[1:]}
     assert kinds - bases <= {case.kind for case in CASES.values()}

@@ -307,9 +307,7 @@ def words_of(kind: Any, options: Any) -> list[str]:
 def application(task: Task) -> io.Result:
     operation = "" if task.is_method else name_of(task.case.kind)
     computations: list[Any] = []
-    session = Session(
-        task.recording(), Opening(operation=operation), lambda *computation: computations.append(computation)
-    )
+    session = Session(task.recording(), Opening(operation=operation), lambda *work: computations.append(work))
     for name, value in task.case.options.items():
         session.choose(name, value)
     session.run = run_now
@@ -446,11 +444,7 @@ OTHER_PLAN = {  # while frames come, another operation computes
 def pairs() -> list[Any]:
     """Return all operations and methods with all doors."""
     combinations = ((name, door) for name in EVERYTHING for door in doors_of(name))
-    return [
-        pytest.param(*combination, id=", ".join(combination))
-        for combination in combinations
-        if combination not in OTHER_PLAN
-    ]
+    return [pytest.param(*both, id=", ".join(both)) for both in combinations if both not in OTHER_PLAN]
 
 
 def assert_same(actual: io.Result, expected: io.Result) -> None:

@@ -86,10 +86,7 @@ CONSUMERS = {
         f"fringes: {LOST}; stripes: {FLICKER}",
     ),
     "assign": (lambda: touch().assign(zenith=X).process["warnings"], LOST),
-    "assign a result": (
-        lambda: touch().assign(touch(FLICKER)).process["warnings"],
-        f"{LOST}; {FLICKER}",
-    ),
+    "assign a result": (lambda: touch().assign(touch(FLICKER)).process["warnings"], f"{LOST}; {FLICKER}"),
     "assign the same result": (lambda: touch().assign(touch()).process["warnings"], LOST),
     "to_xarray": (lambda: io.Result.from_xarray(touch().to_xarray()).process["warnings"], LOST),
 }

@@ -259,11 +259,7 @@ def test_hidden_drivers_and_broken_libraries_are_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        (
-            "POCL_DEVICES",
-            "bogus",
-            "no OpenCL device found: POCL_DEVICES is 'bogus', which makes PoCL show",
-        ),
+        ("POCL_DEVICES", "bogus", "no OpenCL device found: POCL_DEVICES is 'bogus', which makes PoCL show"),
         ("POCL_DEVICES", "", "no OpenCL device found: POCL_DEVICES is '', which makes PoCL show"),
         ("POCL_MAX_PTHREAD_COUNT", "-3", "POCL_MAX_PTHREAD_COUNT is '-3': a whole number above 0 is needed"),
         ("MIRRORSKIN_PROCESSOR", "i999", "kernels here: MIRRORSKIN_PROCESSOR is 'i999'; unset it"),

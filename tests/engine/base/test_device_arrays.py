@@ -90,9 +90,7 @@ def copies(device, call):
     device.profile.clear()
     result = call()
     records = device.profile.records()
-    up, down = (
-        sum(record.bytes for record in records if record.kind == kind) for kind in ("upload", "download")
-    )
+    up, down = (sum(item.bytes for item in records if item.kind == kind) for kind in ("upload", "download"))
     return up / 288_000, down / 288_000, result
 
 

@@ -253,10 +253,7 @@ def test_defaults_are_written_as_on_the_command_line():
         light: Light = option(default=Light.BLUE, help="light")
         angles: Sequence[float] = option(default=[np.pi], unit="rad", help="angles")
 
-    assert [term_of(declared_option).shown_default for declared_option in Own.options.values()] == [
-        "blue",
-        "180deg",
-    ]
+    assert [term_of(declared).shown_default for declared in Own.options.values()] == ["blue", "180deg"]
 
 
 def test_equal_options_make_equal_operations(kinds):

@@ -141,12 +141,10 @@ def test_the_lens_is_that_of_opencv():
     x, y = np.meshgrid(*pixel_axes((41, 57), (0.02, 0.02)))
     # Any plane before the camera will do that is seen as the sheet is.
     rays = np.linalg.solve(lens.camera @ lens.matrix, np.stack([x, y, np.ones_like(x)]).reshape(3, -1)).T
-    expected = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)[0].reshape(
-        -1, 2
-    )
+    truth = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)[0].reshape(-1, 2)
     column, row = picture_places(lens, x, y)
-    np.testing.assert_allclose(column.ravel(), expected[:, 0], atol=1e-9)
-    np.testing.assert_allclose(row.ravel(), expected[:, 1], atol=1e-9)
+    np.testing.assert_allclose(column.ravel(), truth[:, 0], atol=1e-9)
+    np.testing.assert_allclose(row.ravel(), truth[:, 1], atol=1e-9)
 
 
 def test_no_answer_does_not_creep():
@@ -206,11 +204,9 @@ def test_a_part_of_the_picture_is_that_part_of_the_map(stated):
     result = maps_of(shape).assign(component=None, contact=None)
     part = slice(top, 30), slice(first_column, 49)
     fitted = Fitted(source_region=(top, top + 21, first_column, first_column + 34) if stated else None)
-    part_of_result = result.assign(
-        {name: values[part] for name, values in result.maps().items()}, fitted=fitted
-    )
+    cropped = result.assign({name: values[part] for name, values in result.maps().items()}, fitted=fitted)
     whole = undistort(result, bent(shape))
-    undistorted = undistort(part_of_result, bent(shape), None if stated else (top, first_column))
+    undistorted = undistort(cropped, bent(shape), None if stated else (top, first_column))
     np.testing.assert_array_equal(undistorted.x, whole.x[part[1]])
     np.testing.assert_array_equal(undistorted.y, whole.y[part[0]])
     inside = slice(4, -4), slice(4, -4)

@@ -30,11 +30,7 @@ def test_recordings_of_one_name_keep_their_folders_below_the_common_one():
 
 def test_recordings_that_differ_in_their_ending_keep_it():
     assert named("x.h5", "x.nxs") == ["x.h5-result.h5", "x.nxs-result.h5"]
-    assert named("a/x.h5", "a/x.nxs", "b/x.h5") == [
-        "a/x.h5-result.h5",
-        "a/x.nxs-result.h5",
-        "b/x-result.h5",
-    ]
+    assert named("a/x.h5", "a/x.nxs", "b/x.h5") == ["a/x.h5-result.h5", "a/x.nxs-result.h5", "b/x-result.h5"]
 
 
 def test_a_result_that_is_a_recording_of_the_batch_is_refused(tmp_path, monkeypatch):

@@ -79,10 +79,7 @@ def turn(x, y, depth, pivot=(0.0, 0.0, 10.0), phase=EIGHTHS, **options):
 
 @pytest.mark.parametrize(
     ("optics", "pattern", "x", "y", "depth"),
-    [
-        ("ideal", "uniform", 3, 2, 0.6),
-        ("cylinder", "linear", -5.2, 4, 0.7),
-    ],
+    [("ideal", "uniform", 3, 2, 0.6), ("cylinder", "linear", -5.2, 4, 0.7)],
 )
 def test_a_ball_is_found(optics, pattern, x, y, depth):
     centre = find_ball(turn(x, y, depth, optics=optics, pattern=pattern), EIGHTHS, PIXEL, RADIUS)

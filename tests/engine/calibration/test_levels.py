@@ -74,8 +74,7 @@ def test_the_error_of_rounding_is_the_exact_sum(noise):
 
 
 @pytest.mark.parametrize(
-    ("dtype", "noise", "count"),
-    [("uint8", 1.5, 2), ("uint8", 0.2, 16), ("float32", 1.5, 8)],
+    ("dtype", "noise", "count"), [("uint8", 1.5, 2), ("uint8", 0.2, 16), ("float32", 1.5, 8)]
 )
 def test_standard_errors_are_true(dtype, noise, count):
     truth = levels_about(40, 3)
@@ -101,10 +100,7 @@ def test_a_pixel_that_flickers_has_an_error_of_its_own():
     assert np.median(level.sigma) == pytest.approx(1.53 / 8, rel=0.03)
 
 
-@pytest.mark.parametrize(
-    ("dtype", "middle", "noise"),
-    [("uint8", 0.0, 1.5), ("float32", 1.0, 1.5)],
-)
+@pytest.mark.parametrize(("dtype", "middle", "noise"), [("uint8", 0.0, 1.5), ("float32", 1.0, 1.5)])
 def test_a_dark_level_near_zero_is_that_of_the_samples_before_clipping(dtype, middle, noise):
     truth = levels_about(middle, 0.3 * noise)
     frames = np.maximum(expose(truth, noise, 64, dtype), 0)

@@ -158,9 +158,7 @@ def test_wild_samples_hardly_matter():
     light[::25] += 0.4
     with_outliers = LightSamples(light, samples.place, samples.pose, samples.press, samples.lean, 2.0)
     prior = prior_of()
-    clean, spoilt = (
-        fit_wall(samples_, prior, prior.mean, 2e-3, 1e-5) for samples_ in (samples, with_outliers)
-    )
+    clean, spoilt = (fit_wall(each, prior, prior.mean, 2e-3, 1e-5) for each in (samples, with_outliers))
     sigma = np.sqrt(np.diag(clean.covariance))
     free = sigma > 0
     assert np.abs((clean.parameters - spoilt.parameters)[free] / sigma[free]).max() < 3

@@ -30,13 +30,7 @@ def errors(frames, half, **options):
 
 @pytest.mark.parametrize(
     ("camera", "levels"),
-    [
-        ({}, {}),
-        ({"high": 90}, {}),
-        ({}, {"dark": 12}),
-        ({}, {"bright": 182}),
-        ({"low": 40}, {"hold": 1}),
-    ],
+    [({}, {}), ({"high": 90}, {}), ({}, {"dark": 12}), ({}, {"bright": 182}), ({"low": 40}, {"hold": 1})],
 )
 def test_heights_are_those_of_the_levels_that_the_frames_have(camera, levels):
     miss, _ = errors(*press(**camera), **levels)

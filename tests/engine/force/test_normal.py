@@ -102,13 +102,7 @@ def test_heights_come_from_wherever_they_are(kind, tmp_path):
         metres[name].attrs["units"] = "m"
     maps = {
         "declared": declared,
-        "mapping": {
-            "height": ball.tolist(),
-            "height_sigma": sigma,
-            "x": x,
-            "y": -x,
-            "travel": 0.3,
-        },
+        "mapping": {"height": ball.tolist(), "height_sigma": sigma, "x": x, "y": -x, "travel": 0.3},
         "dataset": dataset,
         "metres": metres,
         "upwards": dataset.isel(y=slice(None, None, -1)).transpose("x", "y"),

@@ -406,13 +406,9 @@ def test_heights_that_light_of_neighbours_moved_within_their_steps_do_not_shift_
 @pytest.mark.parametrize("case", BAD)
 def test_what_cannot_be_fused_is_refused_in_one_line(case):
     changes, line = BAD[case]
-    arguments = {
-        "heights": heights(plane()[0]),
-        "normals": directions(plane()[1]),
-        "pixel_size": 0.1,
-    } | changes
+    call = {"heights": heights(plane()[0]), "normals": directions(plane()[1]), "pixel_size": 0.1} | changes
     with pytest.raises(io.InputError, match=line) as caught:
-        engine.fuse(**arguments)
+        engine.fuse(**call)
     assert "\n" not in str(caught.value)
 
 
@@ -486,11 +482,9 @@ def test_options_reach_the_press_and_the_rotation():
 
 def test_options_may_be_those_of_methods():
     methods = engine.Press(threshold=0.6, subframe=False), engine.Rotation(method="paper", noise=1.5)
-    fused_surface = fused_anew(press=methods[0], rotation=methods[1])
+    surface = fused_anew(press=methods[0], rotation=methods[1])
     options = {"threshold": 0.6, "subframe": False}, {"method": "paper", "noise": 1.5}
-    np.testing.assert_array_equal(
-        fused_surface.height, fused_anew(press=options[0], rotation=options[1]).height
-    )
+    np.testing.assert_array_equal(surface.height, fused_anew(press=options[0], rotation=options[1]).height)
     with pytest.raises(io.InputError, match="registered with the heights of the press: give no others"):
         fused_anew(rotation={"heights": np.zeros(SMALL)})
 

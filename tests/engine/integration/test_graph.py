@@ -51,8 +51,8 @@ def test_components_are_what_links_hold_together(shape, with_cuts):
         components = find_components(flags, with_cuts)
         np.testing.assert_array_equal(components.labels, labels)
         assert components.labels.dtype == np.int32
-        labels_with_height = {
+        anchored = {
             labels[place] for place in np.argwhere(flags & KNOWN).tolist() for place in [tuple(place)]
         }
-        assert [n in labels_with_height for n in range(count)] == (~components.offset_unknown).tolist()
+        assert [n in anchored for n in range(count)] == (~components.offset_unknown).tolist()
         assert min(shape) == 1 or 10 < count < 400

@@ -154,12 +154,10 @@ def test_without_a_tolerance_two_cycles_are_done(device):
 
 
 def test_a_limit_that_is_too_low_is_reported(device):
-    solution = Multigrid(links_of(device, graphs.pixel_graph("holes", (45, 70)))).solve(
-        tolerance=1e-6, limit=2
-    )
-    assert solution.iterations == 2
-    assert not solution.converged
-    assert solution.residual > 1e-6
+    result = Multigrid(links_of(device, graphs.pixel_graph("holes", (45, 70)))).solve(tolerance=1e-6, limit=2)
+    assert result.iterations == 2
+    assert not result.converged
+    assert result.residual > 1e-6
 
 
 def test_a_deadline_that_is_over_allows_one_cycle(device):

@@ -15,9 +15,7 @@ AREAL = [name for name, parameter in PARAMETERS.items() if parameter.standard ==
 
 
 def values(height, size=SIZE, **options):
-    return {
-        name: parameter.value for name, parameter in roughness(height, size, **options).parameters.items()
-    }
+    return {name: entry.value for name, entry in roughness(height, size, **options).parameters.items()}
 
 
 def random(spread, seed=1, shape=SHAPE):

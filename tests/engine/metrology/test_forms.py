@@ -113,8 +113,7 @@ def test_heights_count_by_their_inverse_variance():
 
 
 @pytest.mark.parametrize(
-    "height",
-    [np.zeros((1, 9)), np.zeros((1, 1)), np.eye(5) + np.where(np.eye(5), 0, NAN)],
+    "height", [np.zeros((1, 9)), np.zeros((1, 1)), np.eye(5) + np.where(np.eye(5), 0, NAN)]
 )
 def test_pixels_in_one_line_make_no_form(height):
     at = io.pixel_axes(height.shape, (0.1, 0.1))

@@ -15,9 +15,7 @@ def wave(length=0.5, amplitude=0.002, count=1001):
 
 
 def values(heights, **options):
-    return {
-        name: parameter.value for name, parameter in profile_parameters(heights, STEP, **options)[0].items()
-    }
+    return {name: entry.value for name, entry in profile_parameters(heights, STEP, **options)[0].items()}
 
 
 def test_a_sine_has_its_closed_form():

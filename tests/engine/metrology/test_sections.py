@@ -172,18 +172,16 @@ def measured(height, ends, **more):
 
 def test_lengths_and_slope_are_those_between_the_ends():
     x, _ = places(LONG, FINE)
-    quantities = measured(0.75 * x, ((-1.0, 0.5), (1.0, 0.5)), sigma=0.01).quantities
-    assert quantities["section length"].value == pytest.approx(2)
-    assert quantities["height difference"].value == pytest.approx(1.5)
-    assert quantities["distance in space"].value == pytest.approx(2.5)
-    assert quantities["slope"].value == pytest.approx(np.degrees(np.arctan(0.75)))
-    assert quantities["height difference"].sigma == pytest.approx(0.01 * np.sqrt(2), rel=1e-4)
+    values = measured(0.75 * x, ((-1.0, 0.5), (1.0, 0.5)), sigma=0.01).quantities
+    assert values["section length"].value == pytest.approx(2)
+    assert values["height difference"].value == pytest.approx(1.5)
+    assert values["distance in space"].value == pytest.approx(2.5)
+    assert values["slope"].value == pytest.approx(np.degrees(np.arctan(0.75)))
+    assert values["height difference"].sigma == pytest.approx(0.01 * np.sqrt(2), rel=1e-4)
     rise, run = 0.01 * np.sqrt(2), FINE[0] / np.sqrt(6)  # the ends are known within half a pixel
-    assert quantities["distance in space"].sigma == pytest.approx(np.hypot(0.6 * rise, 0.8 * run), rel=1e-4)
-    assert quantities["slope"].sigma == pytest.approx(
-        np.degrees(np.hypot(0.8 * rise, 0.6 * run) / 2.5), rel=1e-4
-    )
-    assert "step height" not in quantities
+    assert values["distance in space"].sigma == pytest.approx(np.hypot(0.6 * rise, 0.8 * run), rel=1e-4)
+    assert values["slope"].sigma == pytest.approx(np.degrees(np.hypot(0.8 * rise, 0.6 * run) / 2.5), rel=1e-4)
+    assert "step height" not in values
 
 
 def test_a_step_is_reported_or_that_there_is_none():

@@ -147,9 +147,7 @@ def test_a_noise_length_is_taken_from_the_result():
     notes = {"correlated over 0.2 mm": fused, "those of integrated slopes": slopes}
     for words, result in notes.items():
         assert any(words in note for note in engine.measure(result).notes)
-    plain, with_length = (
-        engine.measure(fused, noise_length=noise_length).quantities for noise_length in (0.0, 0.2)
-    )
+    plain, with_length = (engine.measure(fused, noise_length=scale).quantities for scale in (0.0, 0.2))
     assert plain["Sdq"].sigma > 1.5 * with_length["Sdq"].sigma
 
 

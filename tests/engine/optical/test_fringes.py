@@ -236,14 +236,8 @@ STRIPES = {"stripe": np.ones((1, 1)), "risk": np.ones((1, 1))}
     ("call", "line"),
     [
         (lambda: fit_fringes(shown(FIELD, EVEN[:3]), EVEN[:3]), "no residual"),
-        (
-            lambda: fit_fringes(shown(FIELD, EVEN[:2]), EVEN[:2]),
-            "Fringes needs at least 3 frames",
-        ),
-        (
-            lambda: fit_fringes(shown(FIELD, EVEN), EVEN, noise=-1),
-            "noise -1: a number in counts",
-        ),
+        (lambda: fit_fringes(shown(FIELD, EVEN[:2]), EVEN[:2]), "Fringes needs at least 3 frames"),
+        (lambda: fit_fringes(shown(FIELD, EVEN), EVEN, noise=-1), "noise -1: a number in counts"),
         (lambda: fit_fringes(shown(FIELD, EVEN), EVEN, noise=-FIELD), "noise is below 0"),
         (lambda: fit_fringes(shown(FIELD, EVEN), EVEN, noise=[1, 2]), "noise has shape (2,)"),
         (lambda: unwrap_frequencies([ONE], [1, 2]), "frequency has shape (2,)"),
@@ -262,10 +256,7 @@ STRIPES = {"stripe": np.ones((1, 1)), "risk": np.ones((1, 1))}
         (lambda: decode_gray(ONE["phase"], 1, noise=1), "frames have shape (1, 1)"),
         (lambda: decode_gray(ONE["phase"][None], [1, 2], noise=1), "threshold has shape (2,)"),
         (lambda: unwrap_gray(ONE, ONE), "stripes has no stripe and no risk"),
-        (
-            lambda: unwrap_gray(ONE, {"stripe": FIELD, "risk": FIELD}),
-            "stripes have shape (50, 400)",
-        ),
+        (lambda: unwrap_gray(ONE, {"stripe": FIELD, "risk": FIELD}), "stripes have shape (50, 400)"),
         (lambda: unwrap_gray(ONE, STRIPES, width=1.1 * TURN), "at most a fringe"),
         (lambda: unwrap_gray(ONE, STRIPES, width=TURN), "stripes has no border and no border_risk"),
     ],

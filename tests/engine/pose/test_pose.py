@@ -132,15 +132,12 @@ def test_the_covariance_is_0_along_undetermined_directions_wherever_the_object_i
     part = slice(0, 25), slice(30, None)  # whose middle is not the origin
     pair = []
     for motion in ((), draw(rng)):
-        surface = sampled(bumpy, *motion, rng=rng)
-        apart = {
-            "component": np.zeros(surface.height.shape, np.int32),
-            "offset_unknown": np.ones(1, np.uint8),
-        }
-        maps = {name: np.full_like(values, np.nan) for name, values in surface.maps().items()}
+        touch = sampled(bumpy, *motion, rng=rng)
+        apart = {"component": np.zeros(touch.height.shape, np.int32), "offset_unknown": np.ones(1, np.uint8)}
+        maps = {name: np.full_like(values, np.nan) for name, values in touch.maps().items()}
         for name, values in maps.items():
-            values[part] = surface[name][part]
-        pair.append(surface.assign(maps | apart))
+            values[part] = touch[name][part]
+        pair.append(touch.assign(maps | apart))
     pose = engine.pose.estimate_pose(*pair)
     assert len(pose.undetermined) == 1
     along = pose.undetermined @ pose.covariance

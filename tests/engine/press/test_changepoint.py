@@ -78,10 +78,8 @@ def test_sigma_is_true_unknown_levels_cost_little_and_a_release_is_as_good(devic
 def test_a_device_agrees_with_the_reference_however_the_stack_is_cut(device, dtype, event):
     levels, generator = SPEC[dtype], np.random.default_rng(6)
     frames, travel = stroke(dtype, 40, (17, 61), event, seed=3, noise=0.05)
-    for hold, threshold, per_pixel in ((1, 0.5, False), (2, 0.3, True), (12, 0.8, False)):
-        dark, bright = (
-            (part * generator.uniform(0.8, 1.2, (17, 61)) for part in levels) if per_pixel else levels
-        )
+    for hold, threshold, maps in ((1, 0.5, False), (2, 0.3, True), (12, 0.8, False)):
+        dark, bright = (part * generator.uniform(0.8, 1.2, (17, 61)) for part in levels) if maps else levels
         options = {"threshold": threshold, "hold": hold, "noise": 0.05 * (levels[1] - levels[0])}
         options["event"] = event
         result = find_change_point(frames, travel, dark=dark, bright=bright, device=device, **options)

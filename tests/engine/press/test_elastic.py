@@ -9,11 +9,7 @@ from contact_theory import Pressed, cone, paraboloid, rectangle_responses, spher
 from mirrorskin.engine import NotConverged
 from mirrorskin.engine.force.halfspace import HalfSpace, press
 from mirrorskin.engine.press.cells import touched
-from mirrorskin.engine.press.elastic import (
-    correct_press,
-    fit_press,
-    threshold_at,
-)
+from mirrorskin.engine.press.elastic import correct_press, fit_press, threshold_at
 from mirrorskin.engine.press.spline import CellSplines
 from mirrorskin.io import Gel, InputError, Result, pixel_axes
 from mirrorskin.twin import Body, visible_zenith

@@ -65,15 +65,13 @@ def by_reference(frames, travel, dark, bright, **options):
 def test_the_reference_finds_the_first_run_that_holds(dtype, hold, event):
     dark, bright = SPEC[dtype]
     frames, travel = stroke(dtype, 25, (9, 11), event, seed=hold, noise=0.2)
-    result = by_reference(frames, travel, dark, bright, noise=1.0, hold=hold, event=event)
+    onset = by_reference(frames, travel, dark, bright, noise=1.0, hold=hold, event=event)
     light = frames.astype(float) >= (dark + bright) / 2
     runs = light if event == "onset" else ~light
     expected = np.array([first_run(series, hold) for series in runs.reshape(25, -1).T]).reshape(9, 11)
-    np.testing.assert_array_equal(result.frame, expected)
+    np.testing.assert_array_equal(onset.frame, expected)
     never, start = (2, 3) if event == "onset" else (3, 2)
-    np.testing.assert_array_equal(
-        result.status, np.select([expected == -1, expected == 0], [never, start], 1)
-    )
+    np.testing.assert_array_equal(onset.status, np.select([expected == -1, expected == 0], [never, start], 1))
 
 
 @BY_KIND
@@ -531,10 +529,8 @@ def test_levels_that_are_not_given_are_estimated_with_a_note():
 def test_levels_of_other_counts_than_the_frames_are_reported():
     frames, travel = twelve_bits()
     shares = (frames / 4096).astype(np.float32)
-    message = (
-        r"samples are 0\.\d+ to 0\.\d+, below the threshold of 1700 between dark 200 and bright 3200: are"
-    )
-    with pytest.warns(io.MirrorskinWarning, match=message):
+    line = r"samples are 0\.\d+ to 0\.\d+, below the threshold of 1700 between dark 200 and bright 3200: are"
+    with pytest.warns(io.MirrorskinWarning, match=line):
         engine.find_onset(shares, travel, dark=200, bright=3200)
-    with pytest.warns(io.MirrorskinWarning, match=message):
+    with pytest.warns(io.MirrorskinWarning, match=line):
         engine.reconstruct(shares, travel=travel, dark=200, bright=3200)

@@ -256,11 +256,7 @@ def test_registered_frames_of_the_twin_have_true_errors(camera):
 
 
 REFUSED = {
-    "a press's method": (
-        {},
-        {"method": "threshold"},
-        "^unknown method 'threshold'. Use exact or paper",
-    ),
+    "a press's method": ({}, {"method": "threshold"}, "^unknown method 'threshold'. Use exact or paper"),
     "two frames": ({"frames": slice(2)}, {}, "^made up: 2 frames at 2 different phases"),
     "no phases": ({"phase": None}, {}, "^made up: phase is missing"),
     "a gain of 0": ({}, {"zenith_gain": 0.0}, "^zenith_gain 0.0: counts per radian"),

@@ -104,14 +104,12 @@ def test_texture_that_seems_drawn_to_halves_of_a_pixel_does_not_pass_for_slip():
 
 
 def test_the_moment_of_slip_is_known_within_a_frame_and_its_sigma_is_of_that_size(slid):
-    result, _ = slid
-    error = (result.slip_onset - onset(COLUMN, ROW) * PIXEL)[INSIDE]
+    slip, _ = slid
+    error = (slip.slip_onset - onset(COLUMN, ROW) * PIXEL)[INSIDE]
     assert np.sqrt(np.nanmean(error**2)) < 0.35 * STEP * PIXEL
     assert abs(np.nanmean(error)) < 0.15 * STEP * PIXEL
-    assert (
-        0.2 < np.nanmean((error / result.slip_onset_sigma[INSIDE]) ** 2) < 1.5
-    )  # the exponent is right here
-    assert np.isnan(result.slip_onset[result.status == 2]).all()
+    assert 0.2 < np.nanmean((error / slip.slip_onset_sigma[INSIDE]) ** 2) < 1.5  # the exponent is right here
+    assert np.isnan(slip.slip_onset[slip.status == 2]).all()
 
 
 def test_the_stick_ratio_is_that_of_the_disc_that_sticks(slid):

@@ -87,18 +87,12 @@ def test_a_harmonic_is_the_fit_of_a_multiple_of_the_phase(harmonic, dtype, devic
     ("call", "line"),
     [
         (lambda: estimate_frequency(np.zeros(5), np.arange(5)), "5 frames .* at least 8"),
-        (
-            lambda: estimate_frequency(np.zeros(9), np.arange(9)[::-1]),
-            "times do not increase",
-        ),
+        (lambda: estimate_frequency(np.zeros(9), np.arange(9)[::-1]), "times do not increase"),
         (
             lambda: estimate_frequency(waves(np.zeros(3), np.zeros(3)), TIME),
             "no oscillation exceeds the noise",
         ),
-        (
-            lambda: estimate_frequency(np.full((9, 2), np.nan), np.arange(9)),
-            "a missing sample",
-        ),
+        (lambda: estimate_frequency(np.full((9, 2), np.nan), np.arange(9)), "a missing sample"),
         (
             lambda: engine.correlate(np.zeros((9, 2, 2), "u1"), np.arange(9), harmonic=0),
             "harmonic 0: a number of at least 1",

@@ -127,21 +127,19 @@ def test_a_travel_that_is_not_a_dither_is_one_line(travel, line):
 def test_the_frames_are_read_once_if_the_travel_is_known_and_twice_otherwise(elastic):
     elastic.rewind()
     frames = elastic.read(np.empty(elastic.shape, elastic.dtype)).frames.copy()
-    options = {"dark": elastic.header.dark, "bright": elastic.header.bright, "pixel_size": (PIXEL, PIXEL)}
-    growth = engine.vibration.find_growth(frames, DITHER, **options)
-    source = ArrayRecording(
-        frames, {"travel": DITHER}, {"dark": options["dark"], "bright": options["bright"]}
-    )
+    levels = {"dark": elastic.header.dark, "bright": elastic.header.bright, "pixel_size": (PIXEL, PIXEL)}
+    growth = engine.vibration.find_growth(frames, DITHER, **levels)
+    source = ArrayRecording(frames, {"travel": DITHER}, {"dark": levels["dark"], "bright": levels["bright"]})
     operation = engine.vibration.Growth().configured_for(source)
-    assert (operation.passes, engine.vibration.Growth(**options).passes) == (1, 2)
+    assert (operation.passes, engine.vibration.Growth(**levels).passes) == (1, 2)
     once = engine.run(source, engine.vibration.Growth(pixel_size=(PIXEL, PIXEL)))
-    blocks = bare(engine.vibration.Growth(**options), frames, [3, 50], travel=DITHER)
+    blocks = bare(engine.vibration.Growth(**levels), frames, [3, 50], travel=DITHER)
     for other in (once, blocks):
         for name in ("growth", "growth_sigma", "azimuth", "residual"):
             np.testing.assert_array_equal(other[name], growth[name])
         assert other.process["area_growth"] == growth.process["area_growth"]
     with pytest.raises(io.InputError, match="needs all frames twice"):
-        engine.Run(engine.vibration.Growth(**options)).push(frames, travel=DITHER)
+        engine.Run(engine.vibration.Growth(**levels)).push(frames, travel=DITHER)
 
 
 def test_a_recording_of_a_dither_has_growth_and_correlation(elastic, tmp_path):
@@ -161,6 +159,6 @@ def test_a_recording_of_a_dither_has_growth_and_correlation(elastic, tmp_path):
     assert {name: result.process[name] for name in message} == message
     assert result.process["area_growth"] == alone.process["area_growth"]
     assert set(result) == {
-        *("growth", "growth_sigma", "azimuth", "mean", "cosine", "sine", "modulation", "residual"),
+        *("growth", "growth_sigma", "azimuth", "mean", "cosine", "sine", "modulation", "residual")
     }
     np.testing.assert_array_equal(result.growth, alone.growth)

@@ -9,13 +9,7 @@ import pytest
 from mirrorskin.engine.integration.cycle import Cycle
 from mirrorskin.engine.integration.graph import Links
 from mirrorskin.engine.integration.height_variance import find_exact_variance, local_part
-from mirrorskin.engine.integration.hierarchy import (
-    STRENGTH,
-    Hierarchy,
-    near_nodes,
-    part_of,
-    place_of_coarse,
-)
+from mirrorskin.engine.integration.hierarchy import STRENGTH, Hierarchy, near_nodes, part_of, place_of_coarse
 from mirrorskin.kernels.integration import multigrid as twin
 
 SHAPE = 90, 300  # several tiles, parts of sums and items, none of them full
@@ -161,14 +155,10 @@ def test_steps_of_conjugate_gradients_and_sums(cases, graph):
         weighed = case.sums("weigh", anchor=case.h.graph["anchor"], x=x_given)
         assert weighed == pytest.approx((level.anchor * x**2).sum(), rel=1e-5)
     direction, buffers = case.h.array("direction"), {**case.h.graph, "inverse": case.h.inverse}
-    from_host, history = case.device.from_host, case.device.array("history", (3, 3, 1), np.float32)
+    put, history = case.device.from_host, case.device.array("history", (3, 3, 1), np.float32)
     history.write(np.array([[[10], [0.2], [1]]]))
     buffers |= {"cycle": 1, "history": history}
-    sums = {
-        "products": 2,
-        "product": from_host("product", [3, 4]),
-        "squares": from_host("squares", np.ones(99)),
-    }
+    sums = {"products": 2, "product": put("product", [3, 4]), "squares": put("squares", np.ones(99))}
     arrays = {"z": z_given, "before": before_given, "direction": direction, "x": x_given}
     curvature = case.sums("direct", step=2, count=99, **buffers, **sums, **arrays)
     p, x = z + 0.7 * before, x + 0.2 * before
@@ -176,8 +166,8 @@ def test_steps_of_conjugate_gradients_and_sums(cases, graph):
     close(case.get(direction), p)
     close(case.get(x_given), x)
     assert curvature == pytest.approx((p * image).sum(), rel=1e-5)
-    products = {"count": 3, "products": from_host("products", [5, 10, 5])}
-    moving = from_host("moving", [1])
+    products = {"count": 3, "products": put("products", [5, 10, 5])}
+    moving = put("moving", [1])
     square = case.sums("advance", moving=moving, **buffers, **products, direction=direction, b=b_given)
     b -= 7 / 20 * image
     close(case.get(b_given), b)
@@ -224,10 +214,8 @@ def test_the_best_step_in_a_plane(cases, graph, same):
     if same:
         p, p_given = z, case.h.array("same")
         p_given.write(z_given.read())
-    z_image, p_image = (-twin.residual(level, zero, vector) for vector in (z, p))
-    expected = [
-        (vector * other).sum() for vector, other in ((z, z_image), (z, p_image), (p, p_image), (b, p))
-    ]
+    z_image, p_image = (-twin.residual(level, zero, field) for field in (z, p))
+    expected = [(field * other).sum() for field, other in ((z, z_image), (z, p_image), (p, p_image), (b, p))]
     products = case.sums("curve", 4, **case.h.graph, b=b_given, z=z_given, p=p_given)
     np.testing.assert_allclose(products, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
     halves = np.array([0.25, 0.75]) * (b * z).sum()

@@ -28,16 +28,14 @@ def test_a_system_is_solved_where_unknowns_are_free():
     free = np.arange(COUNT) % 3 > 0
     weights = 1 / np.diag(matrix)
     face = Face.of(free, lambda residual: weights * residual)
-    solution = conjugate_gradients(lambda x: matrix @ x, target, face, converged=small, steps=5 * COUNT)
-    assert solution.converged
-    assert not solution.x[~free].any()
+    result = conjugate_gradients(lambda x: matrix @ x, target, face, converged=small, steps=5 * COUNT)
+    assert result.converged
+    assert not result.x[~free].any()
     np.testing.assert_allclose(
-        solution.x[free], np.linalg.solve(matrix[free][:, free], target[free]), atol=1e-9
+        result.x[free], np.linalg.solve(matrix[free][:, free], target[free]), atol=1e-9
     )
-    np.testing.assert_allclose(solution.product, matrix @ solution.x, atol=1e-9)
-    again = conjugate_gradients(
-        lambda x: matrix @ x, target, face, converged=small, steps=0, start=solution.x
-    )
+    np.testing.assert_allclose(result.product, matrix @ result.x, atol=1e-9)
+    again = conjugate_gradients(lambda x: matrix @ x, target, face, converged=small, steps=0, start=result.x)
     assert (again.steps, again.converged) == (0, True)
 
 

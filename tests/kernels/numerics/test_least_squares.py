@@ -102,11 +102,9 @@ def test_a_function_of_derivatives_replaces_differences():
         decayed = np.exp(-p[1] * TIMES)
         return np.stack([decayed, -p[0] * TIMES * decayed, np.ones_like(TIMES)], axis=1)
 
-    with_jacobian, numerical = (
-        fit(decay(values), [1.0, 1.0, 0.0], jacobian=function) for function in (jacobian, None)
-    )
-    assert with_jacobian.parameters == pytest.approx(numerical.parameters, abs=1e-6)
-    np.testing.assert_allclose(with_jacobian.covariance(), numerical.covariance(), rtol=1e-5)
+    analytic, numerical = (fit(decay(values), [1.0, 1.0, 0.0], jacobian=slope) for slope in (jacobian, None))
+    assert analytic.parameters == pytest.approx(numerical.parameters, abs=1e-6)
+    np.testing.assert_allclose(analytic.covariance(), numerical.covariance(), rtol=1e-5)
 
 
 class Parabola:

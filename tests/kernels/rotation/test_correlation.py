@@ -22,8 +22,6 @@ def test_the_reference_is_least_squares_in_fractions() -> None:
         column = [Fraction(row[pixel]) for row in counts]
         mean = sum(column) / 4
         cosine, sine = (column[0] - column[2]) / 2, (column[1] - column[3]) / 2
-        misfit = sum(
-            (e - mean - c * cosine - s * sine) ** 2 for e, (c, s) in zip(column, phases, strict=True)
-        )
-        expected = [float(mean), float(cosine), float(sine), float(misfit) ** 0.5]
+        cost = sum((e - mean - c * cosine - s * sine) ** 2 for e, (c, s) in zip(column, phases, strict=True))
+        expected = [float(mean), float(cosine), float(sine), float(cost) ** 0.5]
         np.testing.assert_allclose([answer[pixel] for answer in answers], expected, rtol=1e-6)

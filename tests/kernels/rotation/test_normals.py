@@ -298,16 +298,12 @@ def misfit(place, samples, setup, turn, frame):
     normal = middle + place[0] * right + place[1] * up
     low, high = np.sort((turn.scale[2:] / turn.scale[1]) + setup.offset)
     level = np.clip(rotations.levels(normal / np.linalg.norm(normal), setup), low, high)
-    log_likelihood = -((np.nan_to_num(samples) - level) ** 2) / (2 * setup.spread**2)
+    evidence = -((np.nan_to_num(samples) - level) ** 2) / (2 * setup.spread**2)
     if turn.frames.dtype.kind == "u":
         top = np.iinfo(turn.frames.dtype).max
-        log_likelihood = np.where(
-            samples <= 0, special.log_ndtr((0.5 - level) / setup.spread), log_likelihood
-        )
-        log_likelihood = np.where(
-            samples >= top, special.log_ndtr((level - top + 0.5) / setup.spread), log_likelihood
-        )
-    return -np.sum(turn.weights * np.where(np.isnan(samples), 0, log_likelihood))
+        evidence = np.where(samples <= 0, special.log_ndtr((0.5 - level) / setup.spread), evidence)
+        evidence = np.where(samples >= top, special.log_ndtr((level - top + 0.5) / setup.spread), evidence)
+    return -np.sum(turn.weights * np.where(np.isnan(samples), 0, evidence))
 
 
 def likeliest(samples, setup, turn, near):
