@@ -28,24 +28,6 @@ def stream(operation=None, **more):
     return Stream(operation or engine.Onset(**LEVELS), SHAPE, latency=math.inf, **more)
 
 
-def test_the_result_is_that_of_the_function_on_arrays(frames):
-    with stream() as pushed:
-        for frame, travel in zip(frames, TRAVEL, strict=True):
-            pushed.push(frame, travel=travel)
-        result = pushed.result()
-    expected = engine.find_onset(frames, TRAVEL, **LEVELS)
-    np.testing.assert_array_equal(result.height, expected.height)
-    np.testing.assert_array_equal(result.height_sigma, expected.height_sigma)
-
-
-def test_several_frames_are_pushed_at_once(frames):
-    with stream() as pushed:
-        pushed.push(frames[:25], travel=TRAVEL[:25])
-        pushed.push(frames[25:], travel=TRAVEL[25:])
-        result = pushed.result()
-    np.testing.assert_array_equal(result.height, engine.find_onset(frames, TRAVEL, **LEVELS).height)
-
-
 def test_frames_may_be_overwritten_after_they_were_pushed(frames):
     buffer = np.empty(SHAPE, np.uint8)
     with stream() as pushed:
@@ -94,22 +76,6 @@ def test_a_result_before_there_are_enough_frames_names_the_number_missing(frames
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ({"frames": np.zeros((3, 4), np.uint8)}, r"frames are uint8 \(3, 4\): uint8 \(24, 32\) are expected"),
-        ({"frames": np.zeros(SHAPE, np.uint16)}, "frames are uint16"),
-        ({"travel": None}, r"travel is needed of each frame: push\(frame, travel=\.\.\.\)"),
-        ({"travel": [0.1, 0.2]}, r"travel has shape \(2,\): one number is needed of each frame"),
-    ],
-)
-def test_what_does_not_fit_is_refused_at_once(frames, change, line):
-    arguments = {"frames": frames[:1], "travel": [0.0], **change}
-    arguments = {name: value for name, value in arguments.items() if value is not None}
-    with stream() as pushed, pytest.raises(io.InputError, match=line):
-        pushed.push(**arguments)
-
-
-@pytest.mark.parametrize(
-    ("change", "line"),
-    [
         ({"travel": [0.1]}, r"travel has shape \(1,\): one number is needed of each frame"),
         ({"travel": [[0.1], [0.2]]}, r"travel has shape \(2, 1\): one number is needed of each frame"),
         ({"travel": np.nan}, "travel is nan at frame 0: every frame needs a finite number"),
@@ -128,6 +94,8 @@ def test_what_does_not_fit_is_refused_at_once(frames, change, line):
         ({"time": np.nan}, "time is nan: a finite number of seconds is needed"),
         ({"time": -1.0}, "time -1 s is before that of an earlier frame, .* s. Push frames in the order"),
         ({"frames": "none"}, "frames is 'none': numbers are needed"),
+        ({"frames": np.zeros((3, 4), np.uint8)}, r"frames are uint8 \(3, 4\): uint8 \(24, 32\) are expected"),
+        ({"frames": np.zeros(SHAPE, np.uint16)}, "frames are uint16"),
         ({"frames": np.zeros((1, 2, *SHAPE), np.uint8)}, "frames are uint8"),
     ],
 )
