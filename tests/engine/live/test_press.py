@@ -13,15 +13,10 @@ SHAPE = (30, 17, 23)
 TRAVEL = np.sort(np.random.default_rng(3).uniform(0, 1.5, SHAPE[0]))
 
 
-def make(dtype="uint8", device=None, **options):
-    frames = press_frames(SHAPE, dtype)
-    dark, bright = references(SHAPE[1:], np.dtype(dtype))
-    header = press_header(dark=dark, bright=bright)
-    return frames, LiveRun(paced(frames, header, TRAVEL), Press(device=device, **options))
-
-
 def test_the_map_grows_as_contact_spreads_and_nothing_writes_to_it_later():
-    frames, live = make()
+    frames = press_frames(SHAPE)
+    dark, bright = references(SHAPE[1:], np.dtype("uint8"))
+    live = LiveRun(paced(frames, press_header(dark=dark, bright=bright), TRAVEL), Press())
     areas, kept = [], []
     for number in range(SHAPE[0]):
         live.push(frames[number : number + 1], travel=TRAVEL[number : number + 1])
