@@ -225,12 +225,12 @@ def _find_circle(picture: _Gradients, radius: float) -> _Circle | None:
     pixel = picture.pixel
     best, votes = None, 0.0
     margin = round(_OUTSIDE * radius / pixel)
-    least = min(_LEAST * pixel, radius)
-    for outline in np.linspace(least, radius, 1 + math.ceil((radius - least) / (_BLUR * pixel))):
+    min_radius = min(_LEAST * pixel, radius)
+    for outline in np.linspace(min_radius, radius, 1 + math.ceil((radius - min_radius) / (_BLUR * pixel))):
         count = _vote(picture, places + outline * inwards, margin)
         row, column = np.unravel_index(np.argmax(count), count.shape)
-        share = count[row, column] * pixel / (2 * np.pi * outline)
-        if share >= _SHARE and count[row, column] > votes:
+        coverage = count[row, column] * pixel / (2 * np.pi * outline)
+        if coverage >= _SHARE and count[row, column] > votes:
             votes = float(count[row, column])
             x, y = picture.corner + picture.step * (column - margin, row - margin)
             best = _Circle(float(x), float(y), float(outline))
@@ -310,8 +310,8 @@ def _locate_edge(picture: _Gradients, circle: _Circle, rays: Doubles) -> tuple[D
     along_x, along_y = (picture.at(slope, places) for slope in picture.slope)
     fall = -(rays[0, :, np.newaxis] * along_x + rays[1, :, np.newaxis] * along_y)
     peak = np.clip(np.argmax(fall, axis=1), 1, len(reach) - 2)
-    before, most, behind = (fall[np.arange(len(peak)), peak + step] for step in (-1, 0, 1))
+    before, steepest, behind = (fall[np.arange(len(peak)), peak + step] for step in (-1, 0, 1))
     # Vertex of the parabola through three values.
-    curvature = np.minimum(before - 2 * most + behind, -1e-300)
+    curvature = np.minimum(before - 2 * steepest + behind, -1e-300)
     beyond = np.clip((before - behind) / (2 * curvature), -1, 1)
-    return reach[peak] + beyond * 0.5 * pixel, most
+    return reach[peak] + beyond * 0.5 * pixel, steepest

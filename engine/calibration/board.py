@@ -178,11 +178,11 @@ def _paint_charuco(board: Charuco, x: Doubles, y: Doubles) -> NDArray[np.uint8]:
 
 
 def _cells(
-    position: Doubles, share: float, cells: int, count: int
+    position: Doubles, fraction: float, cells: int, count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return squares, -1 outside the board, and cells of a marker, 0 and cells + 1 outside the marker."""
     square = np.floor(position).astype(np.intp)
-    cell = np.floor(((position - square - 0.5) / share + 0.5) * cells).astype(np.intp) + 1
+    cell = np.floor(((position - square - 0.5) / fraction + 0.5) * cells).astype(np.intp) + 1
     return np.where((square >= 0) & (square < count), square, -1), np.clip(cell, 0, cells + 1)
 
 
@@ -215,8 +215,8 @@ def mean_of_still(source: Source) -> NDArray[Any]:
     return np.rint(mean * (257 if source.dtype.itemsize == 1 else 1)).astype(np.uint16)
 
 
-def _change(one: Doubles, other: Doubles) -> float:
+def _change(frame: Doubles, second_frame: Doubles) -> float:
     """Return the RMS difference of two frames, counts, after an offset and a gain of the light are fitted."""
-    first, second = one - one.mean(), other - other.mean()
+    first, second = frame - frame.mean(), second_frame - second_frame.mean()
     factor = np.sum(first * second) / max(np.sum(first * first), 1e-300)
     return float(np.sqrt(np.mean((second - factor * first) ** 2)))

@@ -99,8 +99,14 @@ class Check:
         """Return the reasons for missing numbers in the table."""
         both = self.before, self.after
         maps = {name: [when[name] for when in both if name in when] for name in self.after}
-        unknown = [name for name, each in maps.items() if all(math.isnan(one.expected) for one in each)]
-        few = [name for name, each in maps.items() if any(np.isnan(one.cells.rms).all() for one in each)]
+        unknown = [
+            name for name, each in maps.items() if all(math.isnan(error_map.expected) for error_map in each)
+        ]
+        few = [
+            name
+            for name, each in maps.items()
+            if any(np.isnan(error_map.cells.rms).all() for error_map in each)
+        ]
         notes = []
         if unknown:
             notes.append(f"expected: results contain no standard deviation of {' or '.join(unknown)} alone")
@@ -235,10 +241,12 @@ def _true_ball(sight: Doubles, centre: Doubles, radius: float, result: Result) -
     from scipy.ndimage import binary_erosion
 
     shape = sight.shape[1:]
-    seen = see_ball(sight.reshape(4, -1), centre, radius, np.zeros((1, 2)), np.zeros(3))
-    x, y, z = (part.reshape(shape) for part in np.moveaxis(seen.normal[0], -1, 0))
-    inside = binary_erosion(seen.contact[0].reshape(shape) & (result["contact"] != 0), iterations=_MARGIN)
-    maps = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x), seen.z[0].reshape(shape)
+    projected = see_ball(sight.reshape(4, -1), centre, radius, np.zeros((1, 2)), np.zeros(3))
+    x, y, z = (part.reshape(shape) for part in np.moveaxis(projected.normal[0], -1, 0))
+    inside = binary_erosion(
+        projected.contact[0].reshape(shape) & (result["contact"] != 0), iterations=_MARGIN
+    )
+    maps = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x), projected.z[0].reshape(shape)
     return [np.where(inside, values, np.nan) for values in maps]
 
 

@@ -72,11 +72,11 @@ def sphere_slope(distance: ArrayLike, touch: ArrayLike, radius: float, sheet: fl
     r, a = np.broadcast_arrays(np.asarray(distance, np.float64), np.asarray(touch, np.float64))
     depth = max(sheet, _THINNEST * radius)
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    share, weights = (nodes + 1) / 2, weights / 2
+    fraction, weights = (nodes + 1) / 2, weights / 2
     near, rest = np.minimum(r, a)[..., np.newaxis], np.maximum(a - r, 0.0)[..., np.newaxis]
     # Punches with x close to r have the largest slope, so nodes are denser there.
-    x = np.concatenate([near - near * share**2, near + rest * share**2], axis=-1)
-    width = np.concatenate([2 * near * share * weights, 2 * rest * share * weights], axis=-1)
+    x = np.concatenate([near - near * fraction**2, near + rest * fraction**2], axis=-1)
+    width = np.concatenate([2 * near * fraction * weights, 2 * rest * fraction * weights], axis=-1)
     ratio = x / radius
     pressed = width * (np.arctanh(ratio) + ratio / (1 - ratio**2))
     step = depth / 2
@@ -245,14 +245,14 @@ class _Fit:
         """Return the shared parameters and their standard errors."""
         for _ in range(2):  # the rates of slopes are more accurate in the second fit
             residuals = functools.partial(self._residuals, self._rates)
-            found = least_squares.fit(
+            solution = least_squares.fit(
                 residuals, self._solution, bounds=(self._low, self._high), loss=_LOSS, tolerance=1e-6
             )
-            self._solution = found.parameters
+            self._solution = solution.parameters
             self._rates = self._rates_of_slopes()
         count = sum(len(press.travel) for press in self._presses)
         dependent = max(1.0, count / (_INDEPENDENT * len(self._presses)))
-        errors = np.sqrt(np.diag(found.covariance(max(1.0, found.cost / count) * dependent)))
+        errors = np.sqrt(np.diag(solution.covariance(max(1.0, solution.cost / count) * dependent)))
         sigma = dict(zip(self._free, errors.tolist(), strict=False))
         sigma["travel_zero"] = float(errors[len(self._free) + 2])
         return self._gel(self._solution), sigma

@@ -67,7 +67,7 @@ def calibrate_lens(pictures: Sequence[tuple[str, NDArray[Any]]], board: Board) -
     first = pictures[0]
     for name, picture in pictures:
         if picture.shape != first[1].shape:
-            sizes = " and ".join(f"{one.shape[1]} x {one.shape[0]}" for one in (first[1], picture))
+            sizes = " and ".join(f"{image.shape[1]} x {image.shape[0]}" for image in (first[1], picture))
             raise InputError(f"{first[0]} and {name} differ: {sizes} pixels: take all with one camera")
     return fit_lens([locate_marks(picture, board, name) for name, picture in pictures])
 
@@ -126,9 +126,9 @@ def _centre_predicted(picture: Doubles, board: Board, fit: CameraFit, points: Do
         # The radius ends at the first cell inside a marker's black border, at least a ninth of a marker.
         clear = math.sqrt(2) * ((board.square - board.marker) / 2 + board.marker / 9) / board.square
         reach = min(0.9 * clear * pitch, _MOST_REACH)
-    places, found = centre_marks(picture, starts, max(_LEAST_REACH, reach))
-    found &= np.hypot(*(places - starts).T) < max(1.0, _FAR * pitch)
-    points, places = points[found], places[found]
+    places, detected = centre_marks(picture, starts, max(_LEAST_REACH, reach))
+    detected &= np.hypot(*(places - starts).T) < max(1.0, _FAR * pitch)
+    points, places = points[detected], places[detected]
     if len(points) == 0 or isinstance(board, Charuco):
         return Marks(name, picture.shape, points, places)
     radius = _dot_radius(picture, places, pitch) / pitch * board.pitch
@@ -210,7 +210,7 @@ class CameraFit:
         def noise(size: float) -> Doubles:
             return np.repeat([size, 1.0], [marks, _LIKELY.size])
 
-        found = least_squares.fit(
+        solution = least_squares.fit(
             self._residuals,
             start,
             jacobian=self._jacobian,
@@ -219,9 +219,9 @@ class CameraFit:
             rounds=2,
             loss=_LOSS,
         )
-        self.parameters = found.parameters
-        excess = max(1.0, found.cost / max(1, found.residuals.size - start.size))
-        self.covariance = found.covariance() * excess
+        self.parameters = solution.parameters
+        excess = max(1.0, solution.cost / max(1, solution.residuals.size - start.size))
+        self.covariance = solution.covariance() * excess
 
     def places(self, number: int, board: Doubles) -> Doubles:
         """Return the places of points of a board, (..., 2), mm, in a picture."""
@@ -229,7 +229,7 @@ class CameraFit:
 
     def residuals(self) -> list[Doubles]:
         """Return the residuals of each picture's marks, (n, 2), pixels."""
-        return [self._centres(self.parameters, k) - one.places for k, one in enumerate(self.pictures)]
+        return [self._centres(self.parameters, k) - picture.places for k, picture in enumerate(self.pictures)]
 
     def errors(self) -> tuple[float, ...]:
         """Return the RMS residual of each picture, pixels."""
@@ -266,8 +266,8 @@ class CameraFit:
         offsets = np.array([[0, 0], [step, 0], [-step, 0], [0, -step], [0, step]])
         ends = _mapped(to_sheet, self._middle + offsets)
         slopes = np.stack([ends[1] - ends[2], ends[3] - ends[4]], axis=1) / (2 * step)
-        left, stretch, right = np.linalg.svd(slopes)
-        rotation = (left @ right).T
+        u, stretch, v = np.linalg.svd(slopes)
+        rotation = (u @ v).T
         move = np.eye(3)
         move[:2, :2], move[:2, 2] = rotation, -rotation @ ends[0]
         camera = move @ to_sheet
@@ -296,7 +296,7 @@ class CameraFit:
 
     def _residuals(self, parameters: Doubles) -> Doubles:
         """Return residuals of marks, pixels, and the distortion in standard deviations, (..., m)."""
-        parts = [self._centres(parameters, k) - one.places for k, one in enumerate(self.pictures)]
+        parts = [self._centres(parameters, k) - picture.places for k, picture in enumerate(self.pictures)]
         flat = [part.reshape(*parameters.shape[:-1], -1) for part in parts]
         return np.concatenate([*flat, parameters[..., _PLANE:_LENS] / _LIKELY], axis=-1)
 

@@ -103,13 +103,13 @@ def level_below(moments: Moments, top: float | None) -> Level:
 
 
 def _level(
-    moments: Moments, mean: Floats, least: Floats, at_least: NDArray[np.int32], floor: float | None
+    moments: Moments, mean: Floats, lowest: Floats, at_least: NDArray[np.int32], floor: float | None
 ) -> Level:
     """Estimate the level of samples, or of their negatives, from their mean and minimum."""
     variance = moments.variance
     clipped = np.zeros(mean.shape)
     if floor is not None:
-        clipped = np.where(least == floor, at_least / np.maximum(moments.count, 1), 0.0)
+        clipped = np.where(lowest == floor, at_least / np.maximum(moments.count, 1), 0.0)
         unclipped = _unclipped_variance(mean - floor, variance, moments.integer)
         variance = np.where(clipped < 1 - _UNCLIPPED, unclipped, np.nan)
     usual, shrunk = pool_variance(mean, variance, moments.count - 1)
@@ -188,7 +188,7 @@ class _ClippedNormal(NamedTuple):
     u: Floats
     mean: Floats
     variance: Floats
-    share: Floats
+    unclipped: Floats
 
 
 @functools.cache
@@ -196,9 +196,9 @@ def _clipped_normal() -> _ClippedNormal:
     from scipy.special import ndtr, ndtri
 
     u = np.linspace(float(ndtri(_UNCLIPPED)), _FAR, 4096)
-    density, share = np.exp(-(u**2) / 2) / math.sqrt(math.tau), ndtr(u)
-    mean = u * share + density
-    return _ClippedNormal(u, mean, (u**2 + 1) * share + u * density - mean**2, share)
+    density, unclipped = np.exp(-(u**2) / 2) / math.sqrt(math.tau), ndtr(u)
+    mean = u * unclipped + density
+    return _ClippedNormal(u, mean, (u**2 + 1) * unclipped + u * density - mean**2, unclipped)
 
 
 @functools.cache
@@ -247,15 +247,15 @@ def _unclipped_mean(
         u = np.interp((mean + _lost_by_rounding(u, scale)) / scale, table.mean, table.u)
     value, error = distance.copy(), error.copy()
     value[near] = u * scale
-    estimated = error[near] * np.interp(u, table.u, table.variance / table.share**2)
+    estimated = error[near] * np.interp(u, table.u, table.variance / table.unclipped**2)
     error[near] = np.where(u > table.u[0], estimated, variance[near])
     return value, error
 
 
 def _lost_by_rounding(u: Floats, noise: Floats) -> Floats:
     """Return the decrease of the mean of samples clipped at 0 by rounding (Euler-Maclaurin)."""
-    least = math.sqrt(ROUNDING)  # the formula fails below it; `rounding_error` covers that
-    return np.asarray(np.exp(-(u**2) / 2) / (math.sqrt(math.tau) * 24 * np.maximum(noise, least)))
+    smallest = math.sqrt(ROUNDING)  # the formula fails below it; `rounding_error` covers that
+    return np.asarray(np.exp(-(u**2) / 2) / (math.sqrt(math.tau) * 24 * np.maximum(noise, smallest)))
 
 
 # --- full light under a rolled ball -------------------------------------------------------------------------

@@ -103,21 +103,25 @@ def _find_markers(pictures: Iterable[tuple[int, Bytes]], board: Charuco) -> tupl
 
     If the first picture shows many markers, most of them in another arrangement, all of these are returned.
     """
-    seen: dict[int, list[tuple[Doubles, Doubles]]] = {}  # by layout: corners on the board, and their places
+    corners_by_layout: dict[
+        int, list[tuple[Doubles, Doubles]]
+    ] = {}  # by layout: corners on the board, and their places
     families = [(dictionary, _layouts(board, dictionary)) for dictionary in board.dictionaries()]
     best: tuple[Doubles, Doubles] | None = None
     for scale, picture in pictures:
         for family in families:
             numbers, places = _detect_markers(picture, family[0], board.markers)
             for layout in family[1]:
-                markers = seen.setdefault(id(layout), [])
+                markers = corners_by_layout.setdefault(id(layout), [])
                 markers.append((layout[numbers], (places + 0.5) / scale - 0.5))
                 planar = _on_one_plane(markers)
                 if planar is not None and (best is None or len(planar[0]) > len(best[0])):
                     best, families = planar, [family]
         if best is not None and len(best[0]) > 4 * _ENOUGH * board.markers:
             break
-    points, places = max((markers[0] for markers in seen.values()), key=lambda pair: len(pair[0]))
+    points, places = max(
+        (markers[0] for markers in corners_by_layout.values()), key=lambda pair: len(pair[0])
+    )
     consistent = 0 if best is None else len(best[0]) // 4
     if len(points) > max(_ENOUGH * board.markers, consistent / _SAME_BOARD):
         return points.reshape(-1, 2), places.reshape(-1, 2)
@@ -130,9 +134,9 @@ def _layouts(board: Charuco, dictionary: Any) -> list[Doubles]:
 
     layouts = []
     for legacy in (False, True):
-        one = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary)
-        one.setLegacyPattern(legacy)
-        corners = np.array(one.getObjPoints(), np.float64)[..., :2]
+        layout = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary)
+        layout.setLegacyPattern(legacy)
+        corners = np.array(layout.getObjPoints(), np.float64)[..., :2]
         # OpenCV's origin is the board's upper left corner, with y down; here it is the middle, with y up.
         layouts.append((corners - np.array(board.size) / 2) * [1, -1])
     return layouts
@@ -150,9 +154,9 @@ def _detect_markers(picture: Bytes, dictionary: Any, count: int) -> tuple[NDArra
     settings.perspectiveRemovePixelPerCell, settings.perspectiveRemoveIgnoredMarginPerCell = 8, 0.25
     settings.errorCorrectionRate = 1.0
     corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, settings).detectMarkers(picture)
-    known = np.empty(0, np.intp) if numbers is None else np.array(numbers, np.intp).ravel()
+    ids = np.empty(0, np.intp) if numbers is None else np.array(numbers, np.intp).ravel()
     places = np.array(corners, np.float64).reshape(-1, 4, 2)
-    return known[known < count], places[known < count]
+    return ids[ids < count], places[ids < count]
 
 
 def _on_one_plane(markers: list[tuple[Doubles, Doubles]]) -> tuple[Doubles, Doubles] | None:
@@ -257,11 +261,11 @@ def centre_marks(picture: NDArray[Any], starts: Doubles, radius: float) -> tuple
         places, still = _centre(smooth, places, *disc, radius)
         near = np.hypot(*(places - starts).T) <= _SHIFT * radius
         inside = np.all((places >= radius) & (places <= np.array(picture.shape[::-1]) - 1 - radius), axis=1)
-        found = still & near & inside & _is_symmetric(smooth, places, *disc)
-        if last or not found.any():
+        accepted = still & near & inside & _is_symmetric(smooth, places, *disc)
+        if last or not accepted.any():
             break
-        light = _light(smooth, places[found], *disc)
-    return places, found
+        light = _light(smooth, places[accepted], *disc)
+    return places, accepted
 
 
 def _centre(
@@ -283,8 +287,8 @@ def _light(smooth: Doubles, places: Doubles, offsets: Doubles, weights: Doubles)
     """Return the light of all pixels, estimated from the asymmetry of marks; 1 if insignificant."""
     slopes = -_gauss_newton_step(smooth, places, offsets, weights, light=True)[:, 2:] / 2
     rows, columns = smooth.shape
-    (x, y), one, zero = (places - [columns / 2, rows / 2]).T, np.ones(len(places)), np.zeros(len(places))
-    terms = np.hstack([[one, zero, x, y, zero], [zero, one, zero, x, y]]).T
+    (x, y), ones, zeros = (places - [columns / 2, rows / 2]).T, np.ones(len(places)), np.zeros(len(places))
+    terms = np.hstack([[ones, zeros, x, y, zeros], [zeros, ones, zeros, x, y]]).T
     measured = slopes.T.ravel()
     solution = np.linalg.lstsq(terms, measured, rcond=None)[0]
     explained = float(np.sum((terms @ solution) ** 2)) / len(solution)
@@ -324,10 +328,10 @@ def _gauss_newton_step(
 def _is_symmetric(smooth: Doubles, places: Doubles, offsets: Doubles, weights: Doubles) -> NDArray[np.bool_]:
     """Return which places have enough contrast around them, most of it symmetric."""
     ahead, behind = (_interpolate(smooth, places[:, np.newaxis] + sign * offsets) for sign in (1, -1))
-    share = weights / weights.sum()
+    relative_weights = weights / weights.sum()
     even, odd = (ahead + behind) / 2, (ahead - behind) / 2
-    signal = (even - (even @ share)[:, np.newaxis]) ** 2 @ share
-    return np.asarray((signal > _FAINT**2) & (odd**2 @ share < _ASYMMETRIC * signal))
+    signal = (even - (even @ relative_weights)[:, np.newaxis]) ** 2 @ relative_weights
+    return np.asarray((signal > _FAINT**2) & (odd**2 @ relative_weights < _ASYMMETRIC * signal))
 
 
 def _interpolate(smooth: Doubles, places: Doubles) -> Doubles:

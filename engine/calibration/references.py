@@ -262,8 +262,8 @@ def _plateaus(samples: NDArray[Any], dark: Floats) -> Floats:
         values[~np.isfinite(values)] = np.nan
         plateau = find_plateau(values, dark[part], samples.dtype.kind == "u")
         highest = np.fmax.reduce(values, axis=0)
-        share = (values == highest).sum(axis=0) / np.maximum(plateau.count, 1)
-        maps[:, part] = plateau.value, plateau.sigma, plateau.noise, share, highest
+        at_highest = (values == highest).sum(axis=0) / np.maximum(plateau.count, 1)
+        maps[:, part] = plateau.value, plateau.sigma, plateau.noise, at_highest, highest
     return maps
 
 

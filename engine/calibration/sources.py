@@ -24,18 +24,21 @@ def read_blocks(source: Source) -> Iterator[Block]:
         yield block
 
 
-def read_turn(source: Source, most: int | None = None) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    """Return frames of an axial recording, (T, H, W), and their phases: all, or ``most`` evenly spaced."""
+def read_turn(source: Source, max_frames: int | None = None) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    """Return frames of an axial recording, (T, H, W), and their phases.
+
+    All are returned, or ``max_frames``, evenly spaced.
+    """
     if source.motion != "axial":
         raise InputError(f"{source.name} is of {source.motion} motion: an axial recording is needed")
     total = source.shape[0]
-    wanted = np.unique(np.linspace(0, total - 1, min(total, most or total)).round().astype(np.intp))
-    frames, phase, count = np.empty((len(wanted), *source.shape[1:]), source.dtype), np.zeros(len(wanted)), 0
+    chosen = np.unique(np.linspace(0, total - 1, min(total, max_frames or total)).round().astype(np.intp))
+    frames, phase, count = np.empty((len(chosen), *source.shape[1:]), source.dtype), np.zeros(len(chosen)), 0
     for block in read_blocks(source):
         if block.phase is None:
             raise InputError(f"{source.name} has no phases: give them, as in --phase-step 45deg")
         for number in range(len(block.frames)):
-            if count < len(wanted) and block.index + number >= wanted[count]:
+            if count < len(chosen) and block.index + number >= chosen[count]:
                 frames[count], phase[count] = block.frames[number], block.phase[number]
                 count += 1
     return frames[:count], phase[:count]
@@ -59,7 +62,9 @@ def check_one_camera(sources: Sequence[Source]) -> None:
     first = sources[0]
     for source in sources[1:]:
         if source.shape[1:] != first.shape[1:] or source.dtype != first.dtype:
-            sizes = [f"{one.shape[2]} x {one.shape[1]} {one.dtype.name}" for one in (first, source)]
+            sizes = [
+                f"{checked.shape[2]} x {checked.shape[1]} {checked.dtype.name}" for checked in (first, source)
+            ]
             raise InputError(
                 f"{source.name} is of {sizes[1]} and {first.name} of {sizes[0]}: take both with one camera"
             )

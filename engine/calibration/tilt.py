@@ -268,14 +268,14 @@ def _fit(model: _Model, start: Doubles, scale: Doubles, rounds: int) -> _Fit:
     parameters = start
     for _ in range(rounds):
         error = np.concatenate([scale[kinds], np.ones(len(start))])
-        found = least_squares.fit(
+        solution = least_squares.fit(
             functools.partial(model.residuals, start=start), parameters, noise=error, loss=_LOSS
         )
-        covariance, parameters = found.covariance(), found.parameters.copy()
-        spread = np.einsum("nk,kl,nl->n", found.jacobian, covariance, found.jacobian)
+        covariance, parameters = solution.covariance(), solution.parameters.copy()
+        spread = np.einsum("nk,kl,nl->n", solution.jacobian, covariance, solution.jacobian)
         if parameters[0] < 0:  # convert to the same lean with a positive tilt
             parameters[:2] = -parameters[0], parameters[1] + math.pi
-        freedom = (1 - found.information * spread)[: len(kinds)]
+        freedom = (1 - solution.information * spread)[: len(kinds)]
         residuals = model.residuals(parameters, start)[: len(kinds)]
         before, scale = scale, _scales(residuals, freedom, kinds, scale)
         if np.allclose(before, scale, rtol=_ALIKE):

@@ -170,7 +170,7 @@ def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Do
     first = residuals(centre)
     if np.count_nonzero(first != _OUT) < _FEWEST:
         return
-    found = least_squares.fit(
+    solution = least_squares.fit(
         residuals,
         centre.copy(),
         jacobian=jacobian,
@@ -179,18 +179,18 @@ def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Do
         loss=least_squares.geman_mcclure(_OUTLIER),
         prior=least_squares.Prior(np.array([[0, 0, 1 / prior]]), centre[2:] / prior),
     )
-    place, used = found.parameters, found.residuals != _OUT
+    place, used = solution.parameters, solution.residuals != _OUT
     if np.count_nonzero(used) < _FEWEST:
         return
     if np.linalg.norm((place - centre)[:2]) > _FAR * turn.radius:
         return
-    centre[:], sigma[:] = place, np.sqrt(np.diag(found.covariance()))
+    centre[:], sigma[:] = place, np.sqrt(np.diag(solution.covariance()))
     if linear:
         away = np.hypot(x - place[0], y - place[1])
         rim = away > _RIM * away.max()
-        off = found.residuals[rim & used]
+        off = solution.residuals[rim & used]
         visible = off.size >= max(1, _MOSTLY * np.count_nonzero(rim)) and (
-            abs(float(np.mean(off))) < _RIM_ERROR + _OUTLIER * noise(found.residuals) / math.sqrt(off.size)
+            abs(float(np.mean(off))) < _RIM_ERROR + _OUTLIER * noise(solution.residuals) / math.sqrt(off.size)
         )
         sigma[2] = outline_sigma if visible else _DEEP
 
@@ -199,7 +199,7 @@ def _expected(
     turn: _BallTurn, sight: Doubles, pixels: NDArray[np.intp], centre: Doubles
 ) -> tuple[Doubles, NDArray[np.bool_]]:
     """Return the brightness of pixels, (n,), for a ball at a position, and whether it is within range."""
-    seen = see_ball(sight, centre, turn.radius, np.zeros((1, 2)), (0.0, 0.0, 0.0))
+    projected = see_ball(sight, centre, turn.radius, np.zeros((1, 2)), (0.0, 0.0, 0.0))
     with np.errstate(invalid="ignore"):
-        light, within = turn.light.of_normals(seen.normal, seen.z, pixels)
-    return light[0], within[0] & seen.contact[0]
+        light, within = turn.light.of_normals(projected.normal, projected.z, pixels)
+    return light[0], within[0] & projected.contact[0]

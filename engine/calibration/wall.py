@@ -266,8 +266,8 @@ def _noise(samples: model.LightSamples, fit: wall_fit.WallFit, inside: Mask) -> 
     level = np.array([np.median(light[part]) for part in bins])
     square = np.array([_scale(residual[part]) ** 2 for part in bins])
     slope, offset = np.polyfit(level, square, 1) if np.ptp(level) > 0 else (0.0, float(square.mean()))
-    least = 0.25 * float(np.median(square)) + _QUIET**2
-    return np.asarray(np.sqrt(np.maximum(offset + slope * light, least)))
+    floor = 0.25 * float(np.median(square)) + _QUIET**2
+    return np.asarray(np.sqrt(np.maximum(offset + slope * light, floor)))
 
 
 def _scale(off: Doubles) -> float:
@@ -295,9 +295,9 @@ def _check_presses(
         raise InputError(misfit.format(presses[worst].name))
     if _prior_misfit(touch.fit, prior) > _UNLIKELY:
         misfits = [_prior_misfit(_without(touch, prior, number), prior) for number in range(len(presses))]
-        least = int(np.argmin(misfits))
-        if misfits[least] < _UNLIKELY:
-            raise InputError(misfit.format(presses[least].name))
+        best = int(np.argmin(misfits))
+        if misfits[best] < _UNLIKELY:
+            raise InputError(misfit.format(presses[best].name))
         raise InputError(
             "no likely sensor fits the presses: check the ball's diameter, pixel size, and the body's radius"
             " and height"

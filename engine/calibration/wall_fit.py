@@ -179,10 +179,10 @@ def _clipped_counts(frames: NDArray[Any]) -> NDArray[Any]:
     """Return the counts at which samples may be clipped: 0, and the full scale."""
     if frames.dtype.kind == "f":
         return np.empty(0, frames.dtype)
-    most = int(frames.max())
+    most_frames = int(frames.max())
     ends = [0, int(np.iinfo(frames.dtype).max)]
-    if most & (most + 1) == 0 and np.count_nonzero(frames == most) >= _CLIPPED:
-        ends.append(most)
+    if most_frames & (most_frames + 1) == 0 and np.count_nonzero(frames == most_frames) >= _CLIPPED:
+        ends.append(most_frames)
     return np.array(ends, frames.dtype)
 
 
@@ -251,7 +251,7 @@ def fit_wall(
     low[STEPS] = 0
     scatter = SENSOR.index("scatter")
     low[scatter], high[scatter] = _SCATTER
-    found = least_squares.fit(
+    solution = least_squares.fit(
         residuals,
         start[free],
         jacobian=jacobian,
@@ -262,8 +262,8 @@ def fit_wall(
         tolerance=tolerance,
     )
     covariance = np.zeros((len(start), len(start)))
-    covariance[np.ix_(free, free)] = found.covariance(_excess(found.residuals / noise))
-    return WallFit(filled(found.parameters), covariance, -found.residuals, prior.rising)
+    covariance[np.ix_(free, free)] = solution.covariance(_excess(solution.residuals / noise))
+    return WallFit(filled(solution.parameters), covariance, -solution.residuals, prior.rising)
 
 
 def _excess(residuals: Doubles) -> float:

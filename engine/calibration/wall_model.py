@@ -27,13 +27,13 @@ CURVE_COEFFICIENTS = _PIECES + _CUBIC
 _KNOTS = np.pad(np.linspace(0, 1, _PIECES + 1), _CUBIC, "edge")
 
 
-def curve_values(coefficients: ArrayLike, share: ArrayLike) -> Doubles:
+def curve_values(coefficients: ArrayLike, fraction: ArrayLike) -> Doubles:
     """Return the curve at shares u, (n,); 0 outside 0 to 1."""
     from scipy.interpolate import BSpline
 
-    share = np.asarray(share, np.float64)
+    fraction = np.asarray(fraction, np.float64)
     spline = BSpline(_KNOTS, np.asarray(coefficients, np.float64), _CUBIC)
-    return np.where((share >= 0) & (share <= 1), spline(np.clip(share, 0, 1)), 0.0)
+    return np.where((fraction >= 0) & (fraction <= 1), spline(np.clip(fraction, 0, 1)), 0.0)
 
 
 def curve_means(low: ArrayLike, high: ArrayLike) -> Doubles:
@@ -62,7 +62,7 @@ def curve_roughness() -> Doubles:
     return np.diff(np.eye(CURVE_COEFFICIENTS), 3, axis=0)
 
 
-def _antiderivatives(share: Doubles) -> Doubles:
+def _antiderivatives(fraction: Doubles) -> Doubles:
     """Return the antiderivative of each basis function, (n, CURVE_COEFFICIENTS).
 
     The antiderivative of a cubic spline with coefficients c is a spline of fourth degree with the cumulative
@@ -73,7 +73,7 @@ def _antiderivatives(share: Doubles) -> Doubles:
     order = _CUBIC + 1
     widths = (_KNOTS[order:] - _KNOTS[:-order]) / order
     sums = np.vstack([np.zeros(CURVE_COEFFICIENTS), np.tril(np.tile(widths, (CURVE_COEFFICIENTS, 1)))])
-    basis = BSpline.design_matrix(share, np.pad(_KNOTS, 1, "edge"), order)
+    basis = BSpline.design_matrix(fraction, np.pad(_KNOTS, 1, "edge"), order)
     return np.asarray(basis @ sums)
 
 

@@ -125,7 +125,7 @@ def make_response(
     Its scatter is 5 % larger than the fitted one, so that its range is on the safe side.
     """
     named, steps, centres = model.split(fit.parameters)
-    residual, most = error_left(samples, fit, noise)
+    residual, largest = error_left(samples, fit, noise)
     coefficients = model.curve_from_steps(fit.rising) @ steps
     if pattern == "uniform":
         powers, reach = coefficients[:1], _reach(named)
@@ -148,7 +148,7 @@ def make_response(
         azimuth_sigma=np.full(source.shape[1:], np.nan, np.float32),
         parameters=(*model.SENSOR, *(f"step_{number}" for number in range(model.CURVE_COEFFICIENTS))),
         covariance=fit.covariance[: model.STEPS.stop, : model.STEPS.stop],
-        error=most,
+        error=largest,
     )
     zenith_sigma, azimuth_sigma = _error_maps(response, fit, source)
     zenith_sigma = np.hypot(zenith_sigma, np.float32(residual))
@@ -252,10 +252,10 @@ def error_left(samples: model.LightSamples, fit: WallFit, noise: Doubles) -> tup
     count, total, expected, steep = (np.bincount(cell, values) for values in terms)
     # Square of each cell's mean minus its expectation from noise, summed over samples.
     filled = count > 0
-    share = expected[filled] / count[filled]
-    excess = max(0.0, float(np.sum(total[filled] ** 2 / count[filled] - share)))
+    mean_error = expected[filled] / count[filled]
+    excess = max(0.0, float(np.sum(total[filled] ** 2 / count[filled] - mean_error)))
     # The square of a normal variate of variance v has the variance 2 v^2.
-    chance = math.sqrt(2 * float(np.sum(share**2)))
+    chance = math.sqrt(2 * float(np.sum(mean_error**2)))
     over = max(float(np.sum(steep)), 1e-12)
     return math.sqrt(excess / over), math.sqrt((excess + chance) / over)
 

@@ -69,9 +69,9 @@ def functional_parameters(values: Doubles) -> dict[str, float]:
     # Area between the curve and a level, above or below; the last class is cut at the level.
     above = _area_above(ratio, curve, float(upper))
     below = _area_above(ratio, -curve[::-1], -float(lower))
-    at = {share: float(np.interp(share, ratio, curve)) for share in (_PEAK, _DALE)}
-    material = {share: _area_above(ratio, curve, at[share]) for share in at}
-    void = {share: _area_above(ratio, -curve[::-1], -at[share]) for share in at}
+    at = {percentile: float(np.interp(percentile, ratio, curve)) for percentile in (_PEAK, _DALE)}
+    material = {percentile: _area_above(ratio, curve, at[percentile]) for percentile in at}
+    void = {percentile: _area_above(ratio, -curve[::-1], -at[percentile]) for percentile in at}
     lengths = {
         "Sk": float(upper - lower),
         "Spk": 2 * above / smr1 if smr1 > 0 else 0.0,
@@ -92,16 +92,16 @@ def _area_above(ratio: Doubles, curve: Doubles, level: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Slopes:
-    """The neighbours and cells of a map that are known, from which slopes are computed."""
+    """The neighbours and cells of a map that are measured, from which slopes are computed."""
 
     across: Mask  # (H, W-1): both neighbours along x are known
     along: Mask  # (H-1, W)
     cells: Mask  # (H-1, W-1): all four corners are known
 
     @classmethod
-    def of(cls, known: Mask) -> Slopes:
-        """Find the neighbours and cells of known pixels."""
-        across, along = known[:, 1:] & known[:, :-1], known[1:] & known[:-1]
+    def of(cls, measured: Mask) -> Slopes:
+        """Find the neighbours and cells of measured pixels."""
+        across, along = measured[:, 1:] & measured[:, :-1], measured[1:] & measured[:-1]
         return cls(across, along, across[1:] & across[:-1])
 
     def hybrid_parameters(self, values: Doubles, pixel_size: tuple[float, float]) -> dict[str, float]:
@@ -114,25 +114,25 @@ class Slopes:
         if not self.cells.any():
             return {"Sdq": math.sqrt(square), "Sdr": math.nan}
         top, bottom = across[:-1][self.cells] ** 2, across[1:][self.cells] ** 2
-        left, right = along[:, :-1][self.cells] ** 2, along[:, 1:][self.cells] ** 2
+        before, after = along[:, :-1][self.cells] ** 2, along[:, 1:][self.cells] ** 2
         # sqrt(1 + s) - 1 without cancellation.
         excess = sum(
             float(np.mean(steep / (np.sqrt(1 + steep) + 1)))
-            for steep in (top + left, top + right, bottom + left, bottom + right)
+            for steep in (top + before, top + after, bottom + before, bottom + after)
         )
         return {"Sdq": math.sqrt(square), "Sdr": 100 * excess / 4}
 
 
 class Autocorrelation:
-    """The autocorrelation of a map with holes: sums over all pairs of known pixels, by their lag."""
+    """The autocorrelation of a map with holes: sums over all pairs of measured pixels, by their lag."""
 
-    def __init__(self, known: Mask, pixel_size: tuple[float, float]) -> None:
+    def __init__(self, measured: Mask, pixel_size: tuple[float, float]) -> None:
         from scipy import fft
 
-        self._known, self._size = known, pixel_size
-        self._shape = tuple(fft.next_fast_len(2 * count, real=True) for count in known.shape)
-        pairs = self._correlate(known.astype(np.float64))
-        self._counted = pairs > _OVERLAP * np.count_nonzero(known)
+        self._known, self._size = measured, pixel_size
+        self._shape = tuple(fft.next_fast_len(2 * count, real=True) for count in measured.shape)
+        pairs = self._correlate(measured.astype(np.float64))
+        self._counted = pairs > _OVERLAP * np.count_nonzero(measured)
         self._pairs = np.maximum(pairs, 1.0)
 
     def _correlate(self, values: Doubles) -> Doubles:
@@ -187,11 +187,11 @@ class Autocorrelation:
 class AngularSpectrum:
     """The direction of the strongest waves of a map (ISO 25178-2, angular amplitude density)."""
 
-    def __init__(self, known: Mask, pixel_size: tuple[float, float]) -> None:
+    def __init__(self, measured: Mask, pixel_size: tuple[float, float]) -> None:
         from scipy import fft
 
-        self._known = known
-        rows, columns = known.shape
+        self._known = measured
+        rows, columns = measured.shape
         across = fft.rfftfreq(columns, pixel_size[0])[np.newaxis]
         up = -fft.fftfreq(rows, pixel_size[1])[:, np.newaxis]  # rows run down
         radius = np.hypot(across, up)
@@ -216,6 +216,6 @@ class AngularSpectrum:
         amount = self._smooth(np.bincount(self._bin, wave, 180).astype(np.float64))
         density = amount / np.where(self._count > 0, self._count, np.inf)
         top = int(np.argmax(density))
-        left, middle, right = density[[top - 1, top, (top + 1) % 180]]
-        bend = left - 2 * middle + right
-        return float((top + (0.5 * (left - right) / bend if bend < 0 else 0.0)) % 180)
+        before, middle, after = density[[top - 1, top, (top + 1) % 180]]
+        bend = before - 2 * middle + after
+        return float((top + (0.5 * (before - after) / bend if bend < 0 else 0.0)) % 180)

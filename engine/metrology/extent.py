@@ -125,10 +125,10 @@ def border(mask: Mask, *, ends: bool = False) -> Mask:
 def _highest(patch: Patch) -> Quantity:
     row, column = apex(patch.height)
     rows, columns = (slice(max(at - _REACH, 0), at + _REACH + 1) for at in (row, column))
-    known = patch.measured[rows, columns]
-    y, x = np.nonzero(known)
-    y, x, z = y + rows.start - row, x + columns.start - column, patch.height[rows, columns][known]
-    sigma = np.nan if patch.sigma is None else float(np.median(patch.sigma[rows, columns][known]))
+    measured = patch.measured[rows, columns]
+    y, x = np.nonzero(measured)
+    y, x, z = y + rows.start - row, x + columns.start - column, patch.height[rows, columns][measured]
+    sigma = np.nan if patch.sigma is None else float(np.median(patch.sigma[rows, columns][measured]))
     top = _top(x, y, z)
     if top is None:
         near = z[(abs(y) <= 1) & (abs(x) <= 1)]
@@ -194,10 +194,10 @@ def areas(patch: Patch) -> dict[str, Quantity]:
             contact = replace(contact, sigma=math.nan)
         quantities["contact area with filled" if guessed else "contact area"] = contact
     if patch.secant is not None:
-        known = patch.contact & np.isfinite(patch.secant)
-        if known.any():
+        measured = patch.contact & np.isfinite(patch.secant)
+        if measured.any():
             name = "contact surface area" if in_contact else "measured surface area"
-            quantities[name] = _surface(patch, known, patch.secant)
+            quantities[name] = _surface(patch, measured, patch.secant)
     return quantities
 
 
@@ -222,12 +222,12 @@ def _area(patch: Patch, mask: Mask) -> Quantity:
     return Quantity(patch.pixel_area * int(np.count_nonzero(mask)), patch.pixel_area * edge, "mm2")
 
 
-def _surface(patch: Patch, known: Mask, secant: Doubles) -> Quantity:
+def _surface(patch: Patch, measured: Mask, secant: Doubles) -> Quantity:
     """Return the sum of secants. Errors of the zenith change them by the tangent, fully correlated."""
-    value = float(np.sum(secant[known]))
-    edge = 0.5 * _UNIFORM * float(np.sum(secant[border(known)]))
+    value = float(np.sum(secant[measured]))
+    edge = 0.5 * _UNIFORM * float(np.sum(secant[border(measured)]))
     errors = np.nan
     if patch.normals_sigma is not None:
         tangent = np.sqrt(np.maximum(secant**2 - 1, 0))
-        errors = float(np.nansum((secant * tangent * patch.normals_sigma)[known]))
+        errors = float(np.nansum((secant * tangent * patch.normals_sigma)[measured]))
     return Quantity(patch.pixel_area * value, patch.pixel_area * math.hypot(edge, errors), "mm2")

@@ -91,8 +91,8 @@ class PointCloud:
             where &= np.isfinite(sigma)
         across, up = np.meshgrid(np.asarray(x, np.float64), np.asarray(y, np.float64))
         points = np.stack([across[where], up[where], z[where]])
-        known = np.full(points.shape[1], np.nan) if sigma is None else np.asarray(sigma, np.float64)[where]
-        return cls(points, known, where)
+        sigmas = np.full(points.shape[1], np.nan) if sigma is None else np.asarray(sigma, np.float64)[where]
+        return cls(points, sigmas, where)
 
     @property
     def common_sigma(self) -> float:
@@ -133,27 +133,27 @@ class PointCloud:
         return Fit(parameters, covariance(gram, parameters.size, weight.size, claimed), kept, birge)
 
 
-def find_uncertain(sigma: Doubles, known: Mask) -> Mask:
-    """Return the known pixels, (H, W), with more than five times the median sigma, if at most 15 % are.
+def find_uncertain(sigma: Doubles, measured: Mask) -> Mask:
+    """Return the measured pixels, (H, W), with more than five times the median sigma, if at most 15 % are.
 
     Their errors would determine the highest and the lowest point. If there are more, none is excluded.
     """
-    uncertain = known & (sigma > _UNCERTAIN * np.median(sigma[known]))
-    return np.asarray(uncertain & (np.count_nonzero(uncertain) <= _FEW * np.count_nonzero(known)))
+    uncertain = measured & (sigma > _UNCERTAIN * np.median(sigma[measured]))
+    return np.asarray(uncertain & (np.count_nonzero(uncertain) <= _FEW * np.count_nonzero(measured)))
 
 
 def _fit_robustly(
     form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
 ) -> Doubles | None:
     """Fit with Huber weights (Huber 1964), so that outliers on one side have a limited effect."""
-    share = np.ones_like(weight)
+    confidence = np.ones_like(weight)
     for _ in range(_PASSES):
-        minimum = _minimise(form, points, weight * share, parameters, rounding)
+        minimum = _minimise(form, points, weight * confidence, parameters, rounding)
         if minimum is None:
             return None
         parameters = minimum
         misfit = form.distance(points, parameters) * np.sqrt(weight)
-        share = least_squares.huber(1.0).weights(misfit / (mad_sigma(misfit) + rounding))
+        confidence = least_squares.huber(1.0).weights(misfit / (mad_sigma(misfit) + rounding))
     return parameters
 
 
@@ -202,18 +202,18 @@ def _minimise(
     form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float
 ) -> Doubles | None:
     """Minimise the sum of squares; None if the points do not determine the parameters."""
-    found = least_squares.descend(
+    solution = least_squares.descend(
         functools.partial(_Sums, form, points, weight),
         parameters,
         damping=least_squares.Damping(first=_DAMPING),
         tolerance=_CONVERGED,
         rounding=rounding**2 * weight.size,
     )
-    lengths = np.sqrt(np.diag(found.gram)[:-1])
+    lengths = np.sqrt(np.diag(solution.gram)[:-1])
     if not np.all(lengths > 0):
         return None
-    normal = found.gram[:-1, :-1] / np.multiply.outer(lengths, lengths)
-    return found.parameters if np.linalg.eigvalsh(normal)[0] >= _SINGULAR else None
+    normal = solution.gram[:-1, :-1] / np.multiply.outer(lengths, lengths)
+    return solution.parameters if np.linalg.eigvalsh(normal)[0] >= _SINGULAR else None
 
 
 def _gram(

@@ -36,7 +36,7 @@ _CLEAR = 2.0  # smallest step that is reported, in standard uncertainties
 _POWERS = {"mm2": 2, "mm3": 2, "sphere radius": 2}
 _POWERS |= dict.fromkeys(("sphere centre x", "sphere centre y", "section length", "distance in space"), 1)
 _POWERS |= dict.fromkeys(("step at", "plane tilt", "slope", "slope beside step"), 1)
-_POWERS |= {name: one.pixel_power for name, one in PARAMETERS.items() if one.pixel_power}
+_POWERS |= {name: parameter.pixel_power for name, parameter in PARAMETERS.items() if parameter.pixel_power}
 _RATIO = 2.0  # Birge's ratio above which a surface does not have the form
 _SCALE = "calibration scale"  # contribution to an uncertainty
 # The contribution that quantities of a group have alone.
@@ -159,7 +159,7 @@ def measure(
     lens = None if maps.calibration is None else maps.calibration.lens
     scale = 0.0 if lens is None else lens.scale_sigma
     quantities, budget = _scaled(quantities, budget, scale)
-    inherited = [one.text for one in findings_of("result", maps.process)]
+    inherited = [finding.text for finding in findings_of("result", maps.process)]
     return Measures(quantities, [*inherited, *notes, *_assumed(patch, scale)], budget)
 
 
@@ -183,7 +183,7 @@ class _Removed:
     quantities: dict[str, Quantity]
     shapes: list[Doubles]  # (H, W): shapes that the form takes from the noise
     errors: list[Doubles]  # (H, W), mm: errors of the form
-    share: Doubles | float  # of an error of a height that is an error of the residual
+    sensitivity: Doubles | float  # of an error of a height that is an error of the residual
 
 
 def _remove_form(patch: Patch, form: FormName | None, notes: list[str]) -> _Removed:
@@ -201,8 +201,8 @@ def _remove_form(patch: Patch, form: FormName | None, notes: list[str]) -> _Remo
             f"the surface is no {kind} within its errors:"
             f" what the fit leaves is {fitted.birge:.0f} times as large"
         )
-    shapes, errors, share = _sensitivity(patch, fitted)
-    return _Removed(f"the {kind}", fitted.residual, fitted.quantities(), shapes, errors, share)
+    shapes, errors, sensitivity = _sensitivity(patch, fitted)
+    return _Removed(f"the {kind}", fitted.residual, fitted.quantities(), shapes, errors, sensitivity)
 
 
 def _sensitivity(
@@ -233,12 +233,12 @@ def _texture(
 ) -> dict[str, Quantity]:
     """Return the areal parameters of what the form leaves."""
     s_filter, l_filter = filters
-    found = roughness(
+    rough = roughness(
         removed.residual,
         patch.pixel_size,
         s_filter=s_filter,
         l_filter=l_filter,
-        sigma=None if patch.sigma is None else patch.sigma * removed.share,
+        sigma=None if patch.sigma is None else patch.sigma * removed.sensitivity,
         noise_length=patch.noise_length,
         form=removed.shapes,
         form_errors=removed.errors,
@@ -246,19 +246,19 @@ def _texture(
     names = (("S", s_filter), ("L", l_filter))
     used = "".join(f", {name}-filter {length:g} mm" for name, length in names if length is not None)
     notes.append(
-        f"texture by ISO 25178-2 from {removed.about}{used}, over {found.pixels} pixels, noise included"
+        f"texture by ISO 25178-2 from {removed.about}{used}, over {rough.pixels} pixels, noise included"
     )
-    notes.extend(found.notes)
-    if found.left_out:
+    notes.extend(rough.notes)
+    if rough.left_out:
         notes.append(
-            f"pixels left out of texture, too near to holes or ends for the filter: {found.left_out}"
+            f"pixels left out of texture, too near to holes or ends for the filter: {rough.left_out}"
         )
-    if found.uncertain:
+    if rough.uncertain:
         notes.append(
-            f"pixels left out of texture and lowest point, far less certain than others: {found.uncertain}"
+            f"pixels left out of texture and lowest point, far less certain than others: {rough.uncertain}"
         )
-    budget |= found.budget
-    return found.parameters
+    budget |= rough.budget
+    return rough.parameters
 
 
 def _profile(
@@ -276,9 +276,11 @@ def _profile(
     step = float(profile.distance[1] - profile.distance[0])
     errors: Iterator[Doubles] = iter(())
     if patch.sigma is not None:
-        known = np.isfinite(removed.residual)
-        without_form = FormRemoval(known, removed.shapes)
-        drawn = realisations(patch.sigma * removed.share, known, patch.pixel_size, patch.noise_length, DRAWS)
+        measured = np.isfinite(removed.residual)
+        without_form = FormRemoval(measured, removed.shapes)
+        drawn = realisations(
+            patch.sigma * removed.sensitivity, measured, patch.pixel_size, patch.noise_length, DRAWS
+        )
         errors = (along_section(without_form(noise)) for noise in drawn)
     try:
         quantities, parts = profile_parameters(profile.height, step, l_filter=l_filter, errors=errors)

@@ -23,24 +23,26 @@ _SEED = 20  # realisations are the same in each call
 
 
 def realisations(
-    sigma: Doubles, known: Mask, pixel_size: tuple[float, float], length: float, count: int
+    sigma: Doubles, measured: Mask, pixel_size: tuple[float, float], length: float, count: int
 ) -> Iterator[Doubles]:
-    """Yield independent errors of heights, (H, W) mm, 0 where a height is not known.
+    """Yield independent errors of heights, (H, W) mm, 0 where a height is not measured.
 
     ``sigma``, (H, W) mm, are standard deviations, and ``length``, mm, is that of the correlation. With an
     infinite length, heights are relative: their mean error is 0.
     """
     rng = np.random.default_rng(_SEED)
-    spread = np.where(known, sigma, 0.0)
+    spread = np.where(measured, sigma, 0.0)
     if not length > 0:
         for _ in range(count):
-            yield spread * rng.standard_normal(known.shape, np.float32)
+            yield spread * rng.standard_normal(measured.shape, np.float32)
         return
-    gain, shape = _gain(known.shape, pixel_size, length)
+    gain, shape = _gain(measured.shape, pixel_size, length)
     for _ in range(count):
-        field = _filtered(rng.standard_normal(shape, np.float32), gain)[: known.shape[0], : known.shape[1]]
+        field = _filtered(rng.standard_normal(shape, np.float32), gain)[
+            : measured.shape[0], : measured.shape[1]
+        ]
         if math.isinf(length):
-            field = (field - np.mean(field[known])) * _relative_gain(known, gain, shape)
+            field = (field - np.mean(field[measured])) * _relative_gain(measured, gain, shape)
         yield spread * field
 
 
@@ -76,14 +78,14 @@ def _filtered(white: NDArray[np.float32], gain: Doubles) -> Doubles:
     return np.asarray(fft.irfft2(fft.rfft2(white) * gain, white.shape))
 
 
-def _relative_gain(known: Mask, gain: Doubles, shape: tuple[int, int]) -> float:
+def _relative_gain(measured: Mask, gain: Doubles, shape: tuple[int, int]) -> float:
     """Return by what errors relative to their mean are smaller than fields of variance 1, inverted.
 
-    The variance of the mean over the known pixels is the mean covariance of all their pairs.
+    The variance of the mean over the measured pixels is the mean covariance of all their pairs.
     """
     from scipy import fft
 
-    wave = fft.rfft2(known.astype(np.float32), shape)
+    wave = fft.rfft2(measured.astype(np.float32), shape)
     covariance = np.sum(fft.irfft2(np.abs(wave) ** 2 * gain**2, shape)[0, 0])
-    share = float(covariance) / np.count_nonzero(known) ** 2
-    return 1 / math.sqrt(max(1 - share, 1e-6))
+    relative = float(covariance) / np.count_nonzero(measured) ** 2
+    return 1 / math.sqrt(max(1 - relative, 1e-6))

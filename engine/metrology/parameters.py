@@ -79,5 +79,5 @@ _PROFILE = {
     "Sm": Parameter(_LINE, "mm", "mean spacing of profile elements", PROFILE, "plain", 1),
 }
 
-PARAMETERS |= {f"{kind}{name}": one for kind in "RP" for name, one in _PROFILE.items()}
+PARAMETERS |= {f"{kind}{name}": parameter for kind in "RP" for name, parameter in _PROFILE.items()}
 """R of the roughness profile, with an L-filter; P of the primary profile, without."""

@@ -78,14 +78,14 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
     region.check((height.shape[0], height.shape[1]), "--region")
     part = region.slices
     filled = np.zeros(height.shape, bool) if result.filled is None else result.filled != 0
-    known, notes = _known(result, height, filled)
-    known, absolute, left_out = _comparable(result, known, part)
-    if not np.any(known[part] & ~filled[part]):
+    measured, notes = _known(result, height, filled)
+    measured, absolute, left_out = _comparable(result, measured, part)
+    if not np.any(measured[part] & ~filled[part]):
         raise InputError("no height was measured there: choose another region, or another result")
-    contact = known if result.contact is None else result.contact != 0
+    contact = measured if result.contact is None else result.contact != 0
     patch = Patch(
-        height=np.where(known & ~filled, height, np.nan)[part].astype(np.float64),
-        filled=np.where(known & filled, height, np.nan)[part].astype(np.float64),
+        height=np.where(measured & ~filled, height, np.nan)[part].astype(np.float64),
+        filled=np.where(measured & filled, height, np.nan)[part].astype(np.float64),
         sigma=None if result.height_sigma is None else result.height_sigma[part].astype(np.float64),
         contact=contact[part],
         contact_given=result.contact is not None,
@@ -100,7 +100,7 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
         of_press=result.fitted.event is not None,
         notes=(*left_out, *notes),
     )
-    return patch, result.assign(height=np.where(known, height, np.float32(np.nan)))
+    return patch, result.assign(height=np.where(measured, height, np.float32(np.nan)))
 
 
 def _noise_length(result: Result) -> float:
@@ -113,36 +113,36 @@ def _noise_length(result: Result) -> float:
 
 def _known(result: Result, height: NDArray[np.float32], filled: Mask) -> tuple[Mask, list[str]]:
     """Return which heights count, and notes."""
-    known, notes = np.isfinite(height), []
+    measured, notes = np.isfinite(height), []
     if result.height_sigma is not None:
-        undefined = known & ~np.isfinite(result.height_sigma) & ~filled
-        known &= ~undefined
+        undefined = measured & ~np.isfinite(result.height_sigma) & ~filled
+        measured &= ~undefined
         if undefined.any():
             notes.append(f"pixels left out, whose height has no standard deviation: {undefined.sum()}")
     if 1 in height.shape:
         notes.append("a single row or column: pixels are taken to be square")
-    return known, notes
+    return measured, notes
 
 
-def _comparable(result: Result, known: Mask, part: tuple[slice, slice]) -> tuple[Mask, bool, list[str]]:
+def _comparable(result: Result, measured: Mask, part: tuple[slice, slice]) -> tuple[Mask, bool, list[str]]:
     """Return which heights can be compared, whether they are absolute, and notes."""
     component, unknown = result.component, result.offset_unknown
     if component is None or unknown is None or not np.any(unknown):
-        return known, True, []
+        return measured, True, []
     # Component -1, which is none, counts as absolute.
     relative = np.concatenate([[False], unknown != 0])[component + 1]
-    inside = np.zeros(known.shape, bool)
-    inside[part] = known[part]
+    inside = np.zeros(measured.shape, bool)
+    inside[part] = measured[part]
     if np.any(inside & ~relative):
         lost = np.unique(component[inside & relative]).size
         note = f"components left out, whose height is only relative: {lost}"
-        return known & ~relative, True, [note] if lost else []
+        return measured & ~relative, True, [note] if lost else []
     labels, counts = np.unique(component[inside], return_counts=True)
     notes = ["heights are relative: their mean is 0"]
     if labels.size > 1:
-        known = known & (component == labels[np.argmax(counts)])
+        measured = measured & (component == labels[np.argmax(counts)])
         notes.append(f"only the largest of {labels.size} components is measured: their offsets are unknown")
-    return known, False, notes
+    return measured, False, notes
 
 
 def _secant(normals: NDArray[np.float32]) -> Doubles:

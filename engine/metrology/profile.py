@@ -34,10 +34,10 @@ class _Profile:
     section_lengths: int
 
     @classmethod
-    def of(cls, known: Mask, step: float, l_filter: float | None) -> _Profile:
+    def of(cls, measured: Mask, step: float, l_filter: float | None) -> _Profile:
         """Prepare the filter; InputError if fewer than eight samples are left."""
-        long = None if l_filter is None else Gaussian.of(known, (step,), l_filter)
-        kept = known if long is None else long.covered
+        long = None if l_filter is None else Gaussian.of(measured, (step,), l_filter)
+        kept = measured if long is None else long.covered
         if np.count_nonzero(kept) < _LEAST:
             raise InputError(f"a profile needs at least {_LEAST} measured samples")
         count = 1 if l_filter is None else max(int(np.count_nonzero(kept) * step / l_filter), 1)
@@ -56,7 +56,7 @@ class _Profile:
         skewness, kurtosis = shape_of(values, root)
         ranges = [float(np.ptp(part)) for part in np.array_split(values, self.section_lengths)]
         height = float(np.mean(ranges))
-        found = {
+        parameters = {
             "a": _MICROMETRES * float(np.mean(np.abs(values))),
             "q": _MICROMETRES * root,
             "z": _MICROMETRES * height,
@@ -66,34 +66,34 @@ class _Profile:
             "Sm": self._spacing(profile, _DISCRIMINATION * height),
         }
         kind = "P" if self.long is None else "R"
-        return {f"{kind}{name}": value for name, value in found.items()}
+        return {f"{kind}{name}": value for name, value in parameters.items()}
 
-    def _spacing(self, profile: Doubles, least: float) -> float:
+    def _spacing(self, profile: Doubles, min_rise: float) -> float:
         """Return the mean distance between rises through the mean line, mm; NaN with fewer than two.
 
-        Peaks and pits that do not exceed ``least`` do not count (crossing-the-line segmentation).
+        Peaks and pits that do not exceed ``min_rise`` do not count (crossing-the-line segmentation).
         """
         total, count = 0.0, 0
         breaks = np.flatnonzero(np.diff(self.kept.astype(np.int8)))
         for part in np.split(np.arange(profile.size), breaks + 1):
             if self.kept[part[0]]:
-                rises = _rises(profile[part], least)
+                rises = _rises(profile[part], min_rise)
                 if rises.size > 1:
                     total += float(rises[-1] - rises[0])
                     count += rises.size - 1
         return self.step * total / count if count else math.nan
 
 
-def _rises(values: Doubles, least: float) -> Doubles:
-    """Return where a profile rises through 0 from below ``-least`` to above ``least``, in samples."""
-    clear = np.flatnonzero(np.abs(values) > least)
+def _rises(values: Doubles, min_rise: float) -> Doubles:
+    """Return where a profile rises through 0 from below ``-min_rise`` to above ``min_rise``, in samples."""
+    clear = np.flatnonzero(np.abs(values) > min_rise)
     up = np.flatnonzero(np.diff(np.sign(values[clear])) > 0)
-    found = []
+    rises = []
     for before, after in zip(clear[up], clear[up + 1], strict=True):
         crossing = before + np.flatnonzero(values[before:after] <= 0)[-1]
         low, high = values[crossing], values[crossing + 1]
-        found.append(crossing - low / (high - low))
-    return np.array(found)
+        rises.append(crossing - low / (high - low))
+    return np.array(rises)
 
 
 def profile_parameters(
@@ -126,11 +126,11 @@ def profile_parameters(
     >>> print(round(found["Pq"].value, 3), round(found["PSm"].value, 6))
     0.707 1.0
     """
-    known = np.isfinite(heights)
-    profile = _Profile.of(known, step, l_filter)
+    measured = np.isfinite(heights)
+    profile = _Profile.of(measured, step, l_filter)
     texture = profile.filtered(heights)
     values = profile.evaluate(texture)
-    drawn = [profile.filtered(np.where(known, one, 0.0)) for one in errors]
+    drawn = [profile.filtered(np.where(measured, error, 0.0)) for error in errors]
     parameters, budget = {}, {}
     changes = None
     if drawn:
@@ -138,7 +138,7 @@ def profile_parameters(
         changes = add_noise(values, root, profile.evaluate, texture, profile.kept, drawn)
     for name, value in values.items():
         parts = {} if changes is None else {NOISE: changes.random[name], NOISE_BIAS: changes.bias[name]}
-        spread = math.nan if changes is None else math.sqrt(sum(one**2 for one in parts.values()))
+        spread = math.nan if changes is None else math.sqrt(sum(part**2 for part in parts.values()))
         parameters[name] = Quantity(value, spread, PARAMETERS[name].unit)
         budget[name] = parts
     return parameters, budget

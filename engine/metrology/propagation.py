@@ -47,7 +47,7 @@ class NoiseChanges:
     """
 
     level: float
-    share: float
+    noise_ratio: float
     random: dict[str, float] = field(default_factory=dict)
     bias: dict[str, float] = field(default_factory=dict)
     square_spread: float = 0.0
@@ -76,7 +76,7 @@ def add_noise(
     changes = NoiseChanges(level, min((level / whole) ** 2, 1.0) if whole > 0 else 1.0)
     for name, numbers in drawn.items():
         changes.random[name] = _spread(name, np.array(numbers))
-        changes.bias[name] = _bias(name, values[name], np.array(numbers), changes.share)
+        changes.bias[name] = _bias(name, values[name], np.array(numbers), changes.noise_ratio)
     changes.square_spread = float(np.std(np.array(drawn[root]) ** 2, ddof=1))
     return changes
 
@@ -89,7 +89,7 @@ def _spread(name: str, drawn: Doubles) -> float:
     return min(math.degrees(math.sqrt(max(-2 * math.log(mean), 0.0)) / 2), ANY_DIRECTION)
 
 
-def _bias(name: str, value: float, drawn: Doubles, share: float) -> float:
+def _bias(name: str, value: float, drawn: Doubles, noise_ratio: float) -> float:
     """Return the mean change by the noise that the texture has."""
     if name == "Std":
         return 0.0
@@ -99,16 +99,16 @@ def _bias(name: str, value: float, drawn: Doubles, share: float) -> float:
         if kind == "extreme":
             bias = min(_EXTREME * bias, value)
         if PARAMETERS[name].unit:  # heights: noise that is not normally distributed counts as in Sq
-            bias = max(bias, value * (1 - math.sqrt(1 - share)))
+            bias = max(bias, value * (1 - math.sqrt(1 - noise_ratio)))
         return bias
     if kind == "plain":
         return float(mean - value)
-    if share > HOPELESS:
+    if noise_ratio > HOPELESS:
         return math.nan
     if kind == "ratio":
-        return float(_EXTREME * (mean - value) * (1 - share) ** -_RATIO)
+        return float(_EXTREME * (mean - value) * (1 - noise_ratio) ** -_RATIO)
     normal, power = _SHAPES[name[1:]]  # noise leaves the third and the fourth cumulant as they are
-    return float(value - (normal + (value - normal) * (1 - share) ** -power))
+    return float(value - (normal + (value - normal) * (1 - noise_ratio) ** -power))
 
 
 def change(evaluate: Evaluate, texture: Doubles, errors: Sequence[Doubles]) -> dict[str, float]:

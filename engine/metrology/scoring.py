@@ -202,9 +202,9 @@ class SlipScore:
         }
 
     def _stick_radius(self) -> str:
-        found, true = self.stick_radius, self.true_stick_radius
-        error = f" ({100 * (found / true - 1):+.1f} %)" if true else ""
-        return f"{100 * found:.2f} % of the contact's, in truth {100 * true:.2f} %{error}"
+        radius, true = self.stick_radius, self.true_stick_radius
+        error = f" ({100 * (radius / true - 1):+.1f} %)" if true else ""
+        return f"{100 * radius:.2f} % of the contact's, in truth {100 * true:.2f} %{error}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +299,7 @@ def score(result: Maps, truth: Truth) -> Score:
     contact, edges = (None, None) if result.fitted.registered else (result.contact, result.edges)
     height, filled = _score_heights(result, truth.height, touched)
     left_out = _why_slip_is_left_out(result, truth)
-    found = Score(
+    result_score = Score(
         height=height,
         filled=filled,
         normal=None if result.normals is None else _score_normals(result, truth, touched),
@@ -308,13 +308,13 @@ def score(result: Maps, truth: Truth) -> Score:
         edges=None if edges is None else _score_edges(edges, _edges_of(truth)),
         slip=None if left_out or result.slip_onset is None else _score_slip(result, truth, touched),
         slip_left_out=left_out,
-        notes=tuple(one.text for one in findings_of("result", result.process)),
+        notes=tuple(finding.text for finding in findings_of("result", result.process)),
     )
-    if not found.parts() and left_out is not None:
+    if not result_score.parts() and left_out is not None:
         raise InputError(f"slip, all that the result has, cannot be scored: {left_out}")
-    if not found.parts():
+    if not result_score.parts():
         raise InputError("the result has no heights, normals, azimuths, contact, edges or slip to score")
-    return found
+    return result_score
 
 
 _SLIP_MAPS = ("displacement", "slip_onset", "status")
@@ -359,28 +359,28 @@ def _score_slip(result: Result, truth: Truth, touched: Mask) -> SlipScore:
     assert truth.slip_onset is not None
     true_onset = np.where(truth.slip_onset <= distance[-1], truth.slip_onset, np.nan)
     answered = touched & np.isin(result.status, (SlipStatus.SLIPPED, SlipStatus.STICKS))
-    found, true = result.status == SlipStatus.SLIPPED, np.isfinite(true_onset)
+    slipped, true = result.status == SlipStatus.SLIPPED, np.isfinite(true_onset)
     inside = answered & ~_around(~touched) & ~(_around(true) & _around(~true & touched))
-    both = answered & found & true
+    both = answered & slipped & true
     error = onset.astype(np.float64) - true_onset
     last = moved if moved.ndim == 3 else moved[-1]
     off = last.astype(np.float64) - truth.displacement[len(distance) - 1]
-    seen = touched & np.isfinite(off).all(axis=-1)
+    compared = touched & np.isfinite(off).all(axis=-1)
     sigma = result.displacement_sigma
     along = None if sigma is None else np.repeat(sigma[..., np.newaxis], 2, axis=-1)
     return SlipScore(
         answered=int(np.count_nonzero(answered)),
         touched=int(np.count_nonzero(touched)),
         coverage=_share(answered, touched),
-        recall=_share(found, inside & true),
-        precision=_share(true, inside & found),
-        stick_radius=math.sqrt(_share(~found, answered)),
+        recall=_share(slipped, inside & true),
+        precision=_share(true, inside & slipped),
+        stick_radius=math.sqrt(_share(~slipped, answered)),
         true_stick_radius=math.sqrt(_share(~true, answered)),
         unit=result.declaration("slip_onset").unit,
         onset_rms=_spread(np.abs(error[both]))["rms"],
         onset_chi_square=_chi_square(error, result.slip_onset_sigma, both),
-        displacement_rms=_spread(np.abs(off[seen]))["rms"],
-        displacement_chi_square=_chi_square(off, along, np.repeat(seen[..., np.newaxis], 2, axis=-1)),
+        displacement_rms=_spread(np.abs(off[compared]))["rms"],
+        displacement_chi_square=_chi_square(off, along, np.repeat(compared[..., np.newaxis], 2, axis=-1)),
     )
 
 
@@ -403,9 +403,9 @@ def _mean_differences(result: Result, error: Doubles) -> tuple[Doubles | float, 
     unknown, component = result.offset_unknown, result.component
     if unknown is None or component is None or not unknown.any():
         return 0.0, 0
-    known = np.isfinite(error) & (component >= 0)
-    count = np.bincount(component[known], minlength=unknown.size)
-    total = np.bincount(component[known], error[known], unknown.size)
+    compared = np.isfinite(error) & (component >= 0)
+    count = np.bincount(component[compared], minlength=unknown.size)
+    total = np.bincount(component[compared], error[compared], unknown.size)
     mean = np.where(unknown, total / np.maximum(count, 1), 0.0)
     # The last element is for pixels without a component.
     return np.append(mean, 0.0)[component], int(np.count_nonzero(count[unknown.astype(bool)]))
@@ -450,28 +450,28 @@ def _score_angles(error: Doubles, sigma: NDArray[np.float32] | None, touched: Ma
 
 def _score_contact(result: Result, touched: Mask) -> ContactScore:
     assert result.contact is not None
-    found = result.contact.astype(bool)
-    touched = np.broadcast_to(touched, found.shape)
+    contact = result.contact.astype(bool)
+    touched = np.broadcast_to(touched, contact.shape)
     answer = result.zenith if result.normals is None else result.normals[..., 2]
-    answered = np.isfinite(answer) if answer is not None else np.ones_like(found)
+    answered = np.isfinite(answer) if answer is not None else np.ones_like(contact)
     lost = answered & ~touched
     return ContactScore(
-        recall=_share(found, touched),
-        precision=_share(touched, found),
+        recall=_share(contact, touched),
+        precision=_share(touched, contact),
         lost=int(np.count_nonzero(lost)),
-        lost_flagged=_share(~found, lost),
-        wrongly_flagged=_share(~found, answered & touched),
+        lost_flagged=_share(~contact, lost),
+        wrongly_flagged=_share(~contact, answered & touched),
     )
 
 
 def _score_edges(edges: NDArray[np.uint8], truth: Mask) -> EdgeScore:
-    found = edges.astype(bool)
-    true = np.broadcast_to(truth, found.shape)
+    detected = edges.astype(bool)
+    true = np.broadcast_to(truth, detected.shape)
     return EdgeScore(
         true=int(np.count_nonzero(true)),
-        found=int(np.count_nonzero(found)),
-        recall=_share(_around(found), true),
-        precision=_share(_around(true), found),
+        found=int(np.count_nonzero(detected)),
+        recall=_share(_around(detected), true),
+        precision=_share(_around(true), detected),
     )
 
 

@@ -130,7 +130,7 @@ def section(
     along, distance = _samples(start, end, size)
     column, row_of = (along[0] - x[0]) / size[0], (y[0] - along[1]) / size[1]
     values = _between(maps, height, SamplePoints.at(column, row_of, (height.shape[0], height.shape[1])))
-    notes = tuple(one.text for one in findings_of("result", maps.process))
+    notes = tuple(finding.text for finding in findings_of("result", maps.process))
     return Section(distance, along[0], along[1], *values, unit, notes)
 
 
@@ -142,12 +142,18 @@ def section_columns(result: Result, ends: tuple[Point, Point] | None = None) -> 
     mirrorskin.io.InputError
         No height is known along the section.
     """
-    cut = section(result, *(ends or ()))
-    if not np.isfinite(cut.height).any():
+    profile = section(result, *(ends or ()))
+    if not np.isfinite(profile.height).any():
         raise InputError("no height is known along the section: choose other points, or leave it out")
-    known = {"sigma": result.height_sigma, "filled": result.filled}
-    names = ("distance", "x", "y", "height", *(name for name, values in known.items() if values is not None))
-    return {name: getattr(cut, name) for name in names}
+    optional = {"sigma": result.height_sigma, "filled": result.filled}
+    names = (
+        "distance",
+        "x",
+        "y",
+        "height",
+        *(name for name, values in optional.items() if values is not None),
+    )
+    return {name: getattr(profile, name) for name in names}
 
 
 def apex(height: NDArray[np.floating]) -> tuple[int, int]:
@@ -157,15 +163,15 @@ def apex(height: NDArray[np.floating]) -> tuple[int, int]:
     """
     import cv2
 
-    known = np.isfinite(height)
-    if not known.any():
+    measured = np.isfinite(height)
+    if not measured.any():
         raise InputError("there is no height to look for the highest point")
-    lowest = float(np.min(height[known]))
+    lowest = float(np.min(height[measured]))
     below = np.nextafter(np.float32(lowest), np.float32(-np.inf)) - np.float32(1)
-    smooth = cv2.medianBlur(np.where(known, height, below).astype(np.float32), _WINDOW)
-    smooth[~known] = below
+    smooth = cv2.medianBlur(np.where(measured, height, below).astype(np.float32), _WINDOW)
+    smooth[~measured] = below
     # The median is undefined everywhere if all areas are narrower than the window.
-    chosen = smooth if np.any(smooth > below) else np.where(known, height, below)
+    chosen = smooth if np.any(smooth > below) else np.where(measured, height, below)
     row, column = np.unravel_index(int(np.argmax(chosen)), height.shape)
     return int(row), int(column)
 
@@ -189,8 +195,10 @@ def _samples(start: Point, end: Point, size: tuple[float, float]) -> tuple[Doubl
     step = np.subtract(end, start)
     length = math.hypot(*step)
     pixels = math.hypot(step[0] / size[0], step[1] / size[1])
-    share = np.linspace(0, 1, max(round(pixels), 1) + 1) if length > 0 else np.zeros(1)
-    return np.add.outer(np.asarray(start), 0 * share) + np.multiply.outer(step, share), length * share
+    fraction = np.linspace(0, 1, max(round(pixels), 1) + 1) if length > 0 else np.zeros(1)
+    return np.add.outer(np.asarray(start), 0 * fraction) + np.multiply.outer(
+        step, fraction
+    ), length * fraction
 
 
 def _between(
@@ -252,8 +260,8 @@ def step_height(section: Section) -> Step:
     >>> round(step_height(stair).height.value, 6)
     0.2
     """
-    known = _measured(section)
-    distance, height = section.distance[known], section.height[known]
+    measured = _measured(section)
+    distance, height = section.distance[measured], section.height[measured]
     if distance.size < 2 * _LEAST:
         raise InputError(
             f"a step needs at least {2 * _LEAST} measured samples along the section: cut elsewhere"
@@ -295,8 +303,8 @@ def _split(distance: Doubles, height: Doubles) -> int:
     # The part of a step before each sample that a line does not fit: its squared length, and its projection.
     count = height.size
     after = count - np.arange(count)
-    share = np.cumsum(x[::-1])[::-1]
-    length = after * (count - after) / count - share**2
+    tail_sum = np.cumsum(x[::-1])[::-1]
+    length = after * (count - after) / count - tail_sum**2
     gain = np.cumsum(residual[::-1])[::-1] ** 2 / np.where(length > 0, length, np.inf)
     return _LEAST + int(np.argmax(gain[_LEAST : count - _LEAST + 1]))
 
@@ -322,12 +330,12 @@ def along(section: Section) -> dict[str, Quantity]:
     Errors of both heights are assumed to be independent. A height is a mean over its pixel, so positions
     along the section are known within half a sample. InputError if fewer than two were measured.
     """
-    known = np.flatnonzero(_measured(section))
-    if known.size < 2:
+    measured = np.flatnonzero(_measured(section))
+    if measured.size < 2:
         raise InputError(
             "the section has fewer than two measured heights that can be compared: cut elsewhere"
         )
-    first, last = known[0], known[-1]
+    first, last = measured[0], measured[-1]
     run = float(section.distance[last] - section.distance[first])
     rise = float(section.height[last] - section.height[first])
     rise_sigma = math.hypot(section.sigma[first], section.sigma[last])

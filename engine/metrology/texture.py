@@ -133,33 +133,33 @@ def roughness(
     1.0
     """
     height = np.asarray(residual, np.float64)
-    known = np.isfinite(height)
-    if not known.any():
+    measured = np.isfinite(height)
+    if not measured.any():
         raise InputError("there is no height to measure the roughness of")
     spread = np.full_like(height, np.nan) if sigma is None else np.asarray(sigma, np.float64)
-    uncertain = find_uncertain(spread, known)
-    box = _bounding_box(known & ~uncertain)
+    uncertain = find_uncertain(spread, measured)
+    box = _bounding_box(measured & ~uncertain)
     height, spread = height[box], spread[box]
-    form, form_errors = ([np.asarray(one, np.float64)[box] for one in maps] for maps in (form, form_errors))
-    chain = _Chain.of((known & ~uncertain)[box], pixel_size, s_filter, l_filter, form)
+    form, form_errors = ([np.asarray(map_, np.float64)[box] for map_ in maps] for maps in (form, form_errors))
+    chain = _Chain.of((measured & ~uncertain)[box], pixel_size, s_filter, l_filter, form)
     texture = chain.filtered(height)
     evaluate = _Evaluation(chain.kept, pixel_size)
     values = evaluate(texture)
     noise = None
-    if np.isfinite(spread[chain.known]).all():
+    if np.isfinite(spread[chain.measured]).all():
         noise = _noise_changes(chain, evaluate, texture, values, (spread, pixel_size, noise_length))
     systematic = {
         EDGES: change(evaluate, texture, chain.edge_errors(height)),
-        FORM: change(evaluate, texture, [chain.filtered(one) for one in form_errors]),
+        FORM: change(evaluate, texture, [chain.filtered(error) for error in form_errors]),
     }
     parameters, budget = {}, {}
     for name, value in values.items():
-        parts = {cause: found[name] for cause, found in systematic.items() if name in found}
+        parts = {cause: changes[name] for cause, changes in systematic.items() if name in changes}
         if name == "Std" and values["Str"] > _ISOTROPIC:
             parts = {DIRECTION: ANY_DIRECTION}
         if noise is not None:
             parts = {NOISE: noise.random[name], NOISE_BIAS: noise.bias[name]} | parts
-        spread_of = math.sqrt(sum(one**2 for one in parts.values())) if noise is not None else math.nan
+        spread_of = math.sqrt(sum(part**2 for part in parts.values())) if noise is not None else math.nan
         parameters[name] = Quantity(value, spread_of, PARAMETERS[name].unit)
         budget[name] = parts
     if noise is not None:
@@ -168,26 +168,26 @@ def roughness(
         parameters,
         budget,
         int(np.count_nonzero(chain.kept)),
-        int(np.count_nonzero(chain.known & ~chain.kept)),
+        int(np.count_nonzero(chain.measured & ~chain.kept)),
         int(np.count_nonzero(uncertain)),
         [] if noise is None else _notes(parameters, noise),
     )
 
 
-def _bounding_box(known: Mask) -> tuple[slice, slice]:
-    """Return the rows and columns that contain all known pixels."""
-    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+def _bounding_box(measured: Mask) -> tuple[slice, slice]:
+    """Return the rows and columns that contain all measured pixels."""
+    rows, columns = np.flatnonzero(measured.any(axis=1)), np.flatnonzero(measured.any(axis=0))
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 class FormRemoval:
     """What the removal of a form leaves of noise: the part that is orthogonal to the form's shapes."""
 
-    def __init__(self, known: Mask, form: Sequence[ArrayLike]) -> None:
-        rows = [np.ones(np.count_nonzero(known))]
-        rows += [np.asarray(shape, np.float64)[known] for shape in form]
+    def __init__(self, measured: Mask, form: Sequence[ArrayLike]) -> None:
+        rows = [np.ones(np.count_nonzero(measured))]
+        rows += [np.asarray(shape, np.float64)[measured] for shape in form]
         shapes, _ = np.linalg.qr(np.stack(rows).T)
-        self._known, self._shapes = known, np.ascontiguousarray(shapes.T)
+        self._known, self._shapes = measured, np.ascontiguousarray(shapes.T)
 
     def __call__(self, noise: Doubles) -> Doubles:
         """Return the rest of noise, (H, W); 0 where heights are not known."""
@@ -201,7 +201,7 @@ class FormRemoval:
 class _Chain:
     """What is done to heights, and to their noise alike: form removal of the noise, S-filter, L-filter."""
 
-    known: Mask
+    measured: Mask
     kept: Mask
     short: Gaussian | None
     long: Gaussian | None
@@ -210,23 +210,23 @@ class _Chain:
     @classmethod
     def of(
         cls,
-        known: Mask,
+        measured: Mask,
         pixel_size: tuple[float, float],
         s_filter: float | None,
         l_filter: float | None,
         form: Sequence[ArrayLike],
     ) -> _Chain:
-        sizes, kept = pixel_size[::-1], known
+        sizes, kept = pixel_size[::-1], measured
         filters = []
         for cutoff in (s_filter, l_filter):
-            one = None if cutoff is None else Gaussian.of(kept, sizes, cutoff)
-            kept = kept if one is None else one.covered
+            gaussian = None if cutoff is None else Gaussian.of(kept, sizes, cutoff)
+            kept = kept if gaussian is None else gaussian.covered
             if not kept.any():
                 raise InputError(
                     f"a cutoff of {cutoff:g} mm is too long for this surface: choose a shorter one"
                 )
-            filters.append(one)
-        return cls(known, kept, filters[0], filters[1], FormRemoval(known, form))
+            filters.append(gaussian)
+        return cls(measured, kept, filters[0], filters[1], FormRemoval(measured, form))
 
     def filtered(self, height: Doubles) -> Doubles:
         """Return the waves between both filters, with the mean 0, (H, W); 0 where left out."""
@@ -257,11 +257,11 @@ class _Evaluation:
 
     def __call__(self, texture: Doubles) -> dict[str, float]:
         values = texture[self._kept]
-        found = areal.height_parameters(values) | areal.functional_parameters(values)
-        found |= self._slopes.hybrid_parameters(texture, self._pixel_size)
-        found |= self.correlation.lengths(self.correlation.of(texture))
-        found["Std"] = self._spectrum.direction(texture)
-        return {name: found[name] for name in PARAMETERS if name in found}
+        parameters = areal.height_parameters(values) | areal.functional_parameters(values)
+        parameters |= self._slopes.hybrid_parameters(texture, self._pixel_size)
+        parameters |= self.correlation.lengths(self.correlation.of(texture))
+        parameters["Std"] = self._spectrum.direction(texture)
+        return {name: parameters[name] for name in PARAMETERS if name in parameters}
 
 
 def _noise_changes(
@@ -278,8 +278,8 @@ def _noise_changes(
 
     def errors() -> Iterator[Doubles]:
         nonlocal total
-        for number, one in enumerate(realisations(noise[0], chain.known, *noise[1:], count)):
-            error = chain.filtered(chain.form(one))
+        for number, realisation in enumerate(realisations(noise[0], chain.measured, *noise[1:], count)):
+            error = chain.filtered(chain.form(realisation))
             if number < _CORRELATED:
                 total = total + correlation.of(error) / _CORRELATED
             yield error
@@ -287,7 +287,7 @@ def _noise_changes(
     changes = add_noise(values, "Sq", evaluate, texture, chain.kept, errors())
     # The autocorrelation is the sum of those of surface and noise.
     cleaned = correlation.lengths(correlation.of(texture) - total)
-    rest = max(1 - changes.share, 1 - HOPELESS)
+    rest = max(1 - changes.noise_ratio, 1 - HOPELESS)
     for name, value in cleaned.items():  # the random error is larger relative to what is left
         changes.bias[name] = math.hypot(values[name] - value, changes.random[name] * math.sqrt(rest**-2 - 1))
     return changes
@@ -295,27 +295,27 @@ def _noise_changes(
 
 def _with_noise(parameters: dict[str, Quantity], noise: NoiseChanges) -> dict[str, Quantity]:
     """Add the Sq of the noise, and that without it."""
-    found: dict[str, Quantity] = {}
+    quantities: dict[str, Quantity] = {}
     for name, quantity in parameters.items():
-        found[name] = quantity
+        quantities[name] = quantity
         if name == "Sq":
             square = quantity.value**2 - noise.level**2
             value = math.sqrt(max(square, 0.0))
             error = math.hypot(noise.square_spread, 2 * _LEVEL * noise.level**2)
-            found["Sq of noise"] = Quantity(noise.level, _LEVEL * noise.level, "µm")
-            found["Sq without noise"] = Quantity(value, math.sqrt(value**2 + error) - value, "µm")
-    return found
+            quantities["Sq of noise"] = Quantity(noise.level, _LEVEL * noise.level, "µm")
+            quantities["Sq without noise"] = Quantity(value, math.sqrt(value**2 + error) - value, "µm")
+    return quantities
 
 
 def _notes(parameters: Mapping[str, Quantity], noise: NoiseChanges) -> list[str]:
     """Return comments where noise determines the parameters."""
     measured, level = parameters["Sq"].value, noise.level
-    said = f"Sq is {measured:.3g} µm, and that of the noise {level:.3g} µm"
+    levels = f"Sq is {measured:.3g} µm, and that of the noise {level:.3g} µm"
     if level > measured:
         return [
-            f"{said}: the surface cannot be distinguished from a smooth one. Standard deviations of heights"
+            f"{levels}: the surface cannot be distinguished from a smooth one. Standard deviations of heights"
             " are too large here, or describe errors that neighbours share"
         ]
     if level**2 > _DOMINATES * measured**2:
-        return [f"{said}: noise determines the texture parameters; 'Sq without noise' is the surface's own"]
+        return [f"{levels}: noise determines the texture parameters; 'Sq without noise' is the surface's own"]
     return []
