@@ -55,15 +55,15 @@ def _wrap_cl_errors(
     """Run a method of an array in one thread at a time, and add device and array to OpenCL's errors."""
 
     @wraps(work)
-    def told(array: Array | BorrowedBuffer, /, *given: _Given.args, **named: _Given.kwargs) -> _Made:
+    def locked(array: Array | BorrowedBuffer, /, *args: _Given.args, **kwargs: _Given.kwargs) -> _Made:
         with array._lock:
             try:
                 with waiting:
-                    return work(array, *given, **named)
+                    return work(array, *args, **kwargs)
             except cl.Error as error:
                 raise device_error(array.device, f"hold or copy {array.name}", error) from error
 
-    return told
+    return locked
 
 
 class Array:
@@ -73,9 +73,9 @@ class Array:
     ends the use, and does not copy shared memory. ``park`` frees memory on the device for other arrays.
     Kernels wait for earlier writes, and reads wait for kernels.
 
-    ``numpy.asarray(array)`` is a copy on the host, ``array[rows]`` another array on the device, and ``lend``
-    returns the same memory for pyopencl. If memory is shared, ``numpy.from_dlpack(array)`` is the array
-    itself.
+    ``numpy.asarray(array)`` is a copy on the host, ``array[rows]`` another array on the device, and
+    ``as_pyopencl`` returns the same memory for pyopencl. If memory is shared,
+    ``numpy.from_dlpack(array)`` is the array itself.
 
     Attributes
     ----------

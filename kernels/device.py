@@ -155,7 +155,7 @@ def open_devices(choice: Choice = None) -> list[Device]:
     """
     choice = _checked(choice)
     if not isinstance(choice, str | Device | None):
-        opened = [device for one in choice for device in open_devices(one)]
+        opened = [device for name in choice for device in open_devices(name)]
         if not opened:
             raise UnknownDeviceError("no device is given: give at least one, or None for the default one")
         return list(dict.fromkeys(opened))
@@ -164,8 +164,8 @@ def open_devices(choice: Choice = None) -> list[Device]:
         return [first]
     with _opening:
         alike = [device for device in _best_first(_find()) if _are_alike(_describe(device), first.info)]
-        found = dict.fromkeys([first, *map(_open_if_it_works, alike)])
-    return [device for device in found if device is not None]
+        candidates = dict.fromkeys([first, *map(_open_if_it_works, alike)])
+    return [device for device in candidates if device is not None]
 
 
 def are_several(choice: Choice) -> bool:
@@ -448,8 +448,8 @@ class Device:
                     raise DeviceError(
                         f"{name} is a function of OpenCL: rename the kernel, such as to my_{name}"
                     )
-                there = ", ".join(program.signatures) or "none"
-                raise DeviceError(f"there is no kernel {name} in the source; it has {there}")
+                names = ", ".join(program.signatures) or "none"
+                raise DeviceError(f"there is no kernel {name} in the source; it has {names}")
             try:
                 kernel = cl.Kernel(program.built, name + program.suffix)
             except cl.LogicError:  # the driver's cache of built programs is damaged: add a line to the source
@@ -517,7 +517,9 @@ class Device:
                 if program.signatures and all(name.endswith(suffix) for name in program.signatures):
                     binary = bitcode.find_bitcode(embedded.kernel_cache(), next(iter(program.signatures)))
                     built = program.built if binary is None else self._load(binary, options)
-                    named = {name.removesuffix(suffix): one for name, one in program.signatures.items()}
+                    named = {
+                        name.removesuffix(suffix): signature for name, signature in program.signatures.items()
+                    }
                     return _Program(built, suffix, named), binary
             except (cl.Error, OSError) as error:
                 _log.info("a program is not cached: %s", error)
@@ -676,16 +678,16 @@ class Kernel:
         return tuple(values)
 
 
-def _group_of(kernel: cl.Kernel, device: cl.Device, wanted: int) -> int:
+def _group_of(kernel: cl.Kernel, device: cl.Device, desired: int) -> int:
     """Return the size of a work-group: required by the kernel, or the desired one within the limits."""
     ask = cl.kernel_work_group_info
     demanded = int(kernel.get_work_group_info(ask.COMPILE_WORK_GROUP_SIZE, device)[0])
     if demanded:
         return demanded
     allowed = kernel.get_work_group_info(ask.WORK_GROUP_SIZE, device)
-    most = min(wanted, allowed, device.max_work_item_sizes[0])
+    size = min(desired, allowed, device.max_work_item_sizes[0])
     lanes = kernel.get_work_group_info(ask.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, device)
-    return most // lanes * lanes or most
+    return size // lanes * lanes or size
 
 
 def _queues(context: cl.Context) -> list[cl.CommandQueue]:
@@ -745,21 +747,21 @@ def _choose(choice: str | None) -> list[cl.Device]:
     titles = {_describe(device).title for device in matches}
     if len(titles) == 1 or (titles and choice.casefold().strip() in _KINDS[:2]):
         return _best_first(matches)
-    known = "; ".join(f"{i} = {_describe(d).title}" for i, d in enumerate(devices))
+    listed = "; ".join(f"{i} = {_describe(d).title}" for i, d in enumerate(devices))
     problem = "no such device" if not matches else "more than one device matches"
     reason = None if matches else embedded.why_no_device()
     raise UnknownDeviceError(
-        f"device {choice!r}: {problem}; there is {known}{f' ({reason})' if reason else ''}"
+        f"device {choice!r}: {problem}; there is {listed}{f' ({reason})' if reason else ''}"
     )
 
 
 def _matching(choice: str, devices: list[cl.Device]) -> list[cl.Device]:
     if choice.isdecimal():
         return devices[int(choice) : int(choice) + 1]
-    wanted = choice.casefold().strip()
-    if wanted in _KINDS[:2]:
-        return [device for device in devices if _describe(device).kind == wanted]
-    return [device for device in devices if wanted and wanted in _describe(device).title.casefold()]
+    text = choice.casefold().strip()
+    if text in _KINDS[:2]:
+        return [device for device in devices if _describe(device).kind == text]
+    return [device for device in devices if text and text in _describe(device).title.casefold()]
 
 
 def _default(devices: list[cl.Device]) -> list[cl.Device]:
@@ -798,12 +800,12 @@ def _open_if_it_works(device: cl.Device) -> Device | None:
     return None
 
 
-def _are_alike(one: DeviceInfo, other: DeviceInfo) -> bool:
+def _are_alike(first: DeviceInfo, second: DeviceInfo) -> bool:
     """Return whether devices are of one kind and platform.
 
     Another platform may list the same hardware again, with results that differ in the last digits.
     """
-    return (one.platform, one.kind) == (other.platform, other.kind)
+    return (first.platform, first.kind) == (second.platform, second.kind)
 
 
 def _is_all(choice: object) -> bool:
@@ -834,25 +836,25 @@ def _shared(name: str) -> str:
 def _explain_build(path: Path, source: str, log: str, info: DeviceInfo) -> str:
     """Return the first error of a compiler in one line."""
     errors = [line.strip() for line in log.splitlines() if "error" in line.lower()]
-    found = next(filter(None, (_PLACE.search(line) for line in errors)), _PLACE.search(log))
+    match = next(filter(None, (_PLACE.search(line) for line in errors)), _PLACE.search(log))
     lines = _lines_of(source)
-    if found is None:
+    if match is None:
         return f"{path.name} does not compile on {info.title}: {(errors or [log.strip()])[-1]}"
-    number, message = int(found[2]), found[4].strip()
-    if found[1] == "<kernel>":  # NVIDIA's compiler counts the lines of the whole source
+    number, message = int(match[2]), match[4].strip()
+    if match[1] == "<kernel>":  # NVIDIA's compiler counts the lines of the whole source
         file, number, text = lines[min(number, len(lines)) - 1]
     else:
-        file, text = found[1], next((text for *place, text in lines if place == [found[1], number]), "")
+        file, text = match[1], next((text for *place, text in lines if place == [match[1], number]), "")
     quoted = f" `{text.strip()}`" if text else ""
     return f"{file} line {number} does not compile on {info.title}: {message}{quoted}"
 
 
 def _lines_of(source: str) -> list[tuple[str, int, str]]:
     """Return each line of a source with its includes, with its file and its number there."""
-    found, file, number = [], "", 0
+    lines, file, number = [], "", 0
     for line in source.splitlines():
-        found.append((file, number, line))
+        lines.append((file, number, line))
         number += 1
         if place := re.fullmatch(r'#line (\d+) "(.+)"', line):
             number, file = int(place[1]), place[2]
-    return found
+    return lines

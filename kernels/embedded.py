@@ -103,8 +103,8 @@ def verify(device: cl.Device) -> None:
         It cannot run kernels here; the message names the packages to install.
     """
     circumstances = _circumstances(device)
-    known = recall("pocl", circumstances)
-    if known == b"system" or (known == b"ziglang" and provide_linker()):
+    cached = recall("pocl", circumstances)
+    if cached == b"system" or (cached == b"ziglang" and provide_linker()):
         return
     answer, problem = b"system", _probe(device.platform)
     if problem is not None and provide_linker():
@@ -125,28 +125,30 @@ def why_no_device() -> str | None:
         return f"OCL_ICD_VENDORS names {vendors}, which does not exist; unset it"
     files = sorted(place.glob("*.icd")) if place.is_dir() else [place] if vendors else []
     libraries = [_named_in(file) if file.suffix == ".icd" else str(file) for file in files]
-    own = find_library()
-    for library in libraries if own is None else [*libraries, str(own)]:
+    packaged = find_library()
+    for library in libraries if packaged is None else [*libraries, str(packaged)]:
         try:
             ctypes.CDLL(library)
         except OSError as error:
             named = "; OCL_ICD_VENDORS names it" if vendors and library in libraries else ""
             return f"OpenCL's library {library} cannot be loaded: {error}{named}"
-    return None if own is None else _why_no_cache()
+    return None if packaged is None else _why_no_cache()
 
 
 def why_no_kernel(is_pocl: bool) -> str | None:
     """Return the environment variable that may prevent a kernel from compiling, in one line."""
     problem = _why_no_cache() if is_pocl else None
     names = ("PYOPENCL_BUILD_OPTIONS", *(("POCL_EXTRA_BUILD_FLAGS", VARIABLE) if is_pocl else ()))
-    given = [f"{name} is {os.environ[name]!r}" for name in names if os.environ.get(name)]
-    return problem or ("; ".join(given) or None)
+    set_variables = [f"{name} is {os.environ[name]!r}" for name in names if os.environ.get(name)]
+    return problem or ("; ".join(set_variables) or None)
 
 
 def _shows_pocl() -> bool:
     """Return whether OpenCL shows a device of PoCL."""
     try:
-        platforms = [one for one in cl.get_platforms() if "Portable Computing Language" in one.name]
+        platforms = [
+            platform for platform in cl.get_platforms() if "Portable Computing Language" in platform.name
+        ]
         return any(platform.get_devices() for platform in platforms)
     except (cl.LogicError, cl.RuntimeError):
         return False
@@ -289,9 +291,9 @@ def _explain(status: int, complaints: str) -> str:
 
 def kernel_cache() -> Path:
     """Return the folder in which PoCL 3.0 caches compiled kernels."""
-    given = os.environ.get("POCL_CACHE_DIR")
-    if given is not None:
-        return Path(given)
+    folder = os.environ.get("POCL_CACHE_DIR")
+    if folder is not None:
+        return Path(folder)
     home = os.environ.get("HOME")
     caches = os.environ.get("XDG_CACHE_HOME") or ("/tmp" if home is None else f"{home}/.cache")
     return Path(caches, "pocl", "kcache")

@@ -45,16 +45,16 @@ def take(nbytes: int, zeroed: bool) -> NDArray[np.uint8]:
         start = -small.ctypes.data % PAGE
         return small[start : start + nbytes]
     with _lock:
-        most = nbytes + nbytes // 8 + PAGE
-        fitting = [place for place, raw in enumerate(_kept) if nbytes + PAGE <= len(raw) <= most]
+        capacity = nbytes + nbytes // 8 + PAGE
+        fitting = [place for place, raw in enumerate(_kept) if nbytes + PAGE <= len(raw) <= capacity]
         raw = _kept.pop(min(fitting, key=lambda place: (len(_kept[place]), -place))) if fitting else None
     _tidy()
     if raw is None:
         return np.asarray(_Block(np.zeros(nbytes + PAGE, np.uint8)))[:nbytes]
-    found = np.asarray(_Block(raw))[:nbytes]
+    array = np.asarray(_Block(raw))[:nbytes]
     if zeroed:
-        found.fill(0)
-    return found
+        array.fill(0)
+    return array
 
 
 def free() -> None:

@@ -88,8 +88,8 @@ def _read_flags() -> frozenset[str]:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return frozenset()
-    found = (line.partition(":")[2].split() for line in lines if line.startswith("flags"))
-    return frozenset(next(found, ()))
+    flags = (line.partition(":")[2].split() for line in lines if line.startswith("flags"))
+    return frozenset(next(flags, ()))
 
 
 class _Symbol(ctypes.Structure):
@@ -112,11 +112,13 @@ class _Found(ctypes.Structure):
 
 def look_up(address: int | None) -> tuple[Path | None, int]:
     """Return the library that contains an address, and the size of its function there, 0 if unknown."""
-    found, symbol = _Found(), ctypes.POINTER(_Symbol)()
+    description, symbol = _Found(), ctypes.POINTER(_Symbol)()
     search = getattr(ctypes.CDLL(None), "dladdr1", None)
-    if search is None or not search(ctypes.c_void_p(address), ctypes.byref(found), ctypes.byref(symbol), 1):
+    if search is None or not search(
+        ctypes.c_void_p(address), ctypes.byref(description), ctypes.byref(symbol), 1
+    ):
         return None, 0
-    return Path(os.fsdecode(found.file)), int(symbol.contents.size) if symbol else 0
+    return Path(os.fsdecode(description.file)), int(symbol.contents.size) if symbol else 0
 
 
 def _take_string(address: int) -> str:

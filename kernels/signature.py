@@ -34,8 +34,8 @@ def read_signatures(program: cl.Program) -> dict[str, Signature]:
 
 def _argument(kernel: cl.Kernel, place: int) -> tuple[str, str]:
     name, type_name = (
-        str(kernel.get_arg_info(place, one))
-        for one in (cl.kernel_arg_info.NAME, cl.kernel_arg_info.TYPE_NAME)
+        str(kernel.get_arg_info(place, info))
+        for info in (cl.kernel_arg_info.NAME, cl.kernel_arg_info.TYPE_NAME)
     )
     return name.removeprefix("_cl_"), type_name  # PoCL's prefix for the names of OpenCL functions
 

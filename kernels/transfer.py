@@ -248,19 +248,19 @@ def _cut(reads: Iterable[tuple[Piece, NDArray[Any]]]) -> Iterator[tuple[Piece, N
             offset += piece.nbytes
 
 
-def _pieces(values: NDArray[Any], most: int, flat: bool | None = None) -> Iterator[NDArray[Any]]:
-    """Yield parts of an array of at most ``most`` elements, in C order, anywhere if ``flat``, or by rows."""
-    if values.size <= most:
+def _pieces(values: NDArray[Any], length: int, flat: bool | None = None) -> Iterator[NDArray[Any]]:
+    """Yield parts of an array, of at most ``length`` elements, in C order: anywhere if ``flat``, or rows."""
+    if values.size <= length:
         yield values
         return
     if values.flags.c_contiguous if flat is None else flat:
         values = values.reshape(-1)
     row = values.size // len(values)
-    if row > most:
+    if row > length:
         for part in values:
-            yield from _pieces(part, most, flat)
+            yield from _pieces(part, length, flat)
     else:
-        step = most // row
+        step = length // row
         for start in range(0, len(values), step):
             yield values[start : start + step]
 
@@ -268,12 +268,12 @@ def _pieces(values: NDArray[Any], most: int, flat: bool | None = None) -> Iterat
 def _copy(copies: Sequence[_Copy]) -> None:
     """Copy each second array to the first, in several threads if worthwhile."""
     total = sum(target.nbytes for target, _ in copies)
-    share = max(_SHARE, -(-total // THREADS))
+    part_bytes = max(_SHARE, -(-total // THREADS))
     work: deque[_Copy] = deque()
     for pair in copies:
         flat = all(array.flags.c_contiguous for array in pair)
-        most = share // pair[0].itemsize
-        work.extend(zip(*(_pieces(array, most, flat) for array in pair), strict=True))
+        length = part_bytes // pair[0].itemsize
+        work.extend(zip(*(_pieces(array, length, flat) for array in pair), strict=True))
     helpers: list[Future[None]] = []
     with suppress(RuntimeError):  # the interpreter ends and starts no more threads
         while len(helpers) < min(THREADS, len(work)) - 1 and total > _SHARE:

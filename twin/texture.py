@@ -210,7 +210,7 @@ class _DraggedFlakes:
         """Return the share, (H, W), at points displaced from the pixels' positions at rest, (2, H, W), mm."""
         self._seen.write(off)
         drag.launch(
-            "skin_flakes", self._device, self._shape, seen=self._seen, share=self._share, **self._given
+            "skin_flakes", self._device, self._shape, visible=self._seen, fraction=self._share, **self._given
         )
         return self._share.read()
 

@@ -80,7 +80,7 @@ def _clip(weights: Array) -> float:
     typical = median_weight([sample_evenly(weights)])
     device, pixels = weights.device, math.prod(weights.shape)
     device.kernel("facing", "facing_clip")(
-        -(-pixels // device.layout.tile), pixels=pixels, least=typical * LEAST, most=typical * MOST,
+        -(-pixels // device.layout.tile), pixels=pixels, lowest=typical * LEAST, highest=typical * MOST,
         weight=weights, moved=2 * weights.nbytes,
     )  # fmt: skip
     return typical

@@ -170,7 +170,7 @@ def find_exact_variance(
     flags: Array,
     variance: Array,
     held: Array,
-    risen: Array,
+    swept_sum: Array,
     whole: Array,
     squares: Array,
 ) -> None:
@@ -178,8 +178,8 @@ def find_exact_variance(
     h, level = hierarchy, hierarchy.levels[number]
     masses = h.array("masses", level.nodes + 2 * level.stride, dtype=np.int32)
     levels: dict[str, Any] = {"levels": h.table, "number": number, "changes": h.changes, "to": h.to}
-    h.copy_picture("masses", masses, flags, wanted=SLOPE | KNOWN, **levels)
+    h.copy_picture("masses", masses, flags, flag=SLOPE | KNOWN, **levels)
     inverses = h.array("inverses", level.nodes * level.stride + 4 * COARSE)
     arrays: dict[str, Any] = {"masses": masses, "inverses": inverses, "variance": variance}
-    arrays |= {"held": held, "risen": risen, "whole": whole, "squares": squares}
+    arrays |= {"held": held, "swept_sum": swept_sum, "whole": whole, "squares": squares}
     h.alone("exact", level, **level.place, **h.graph, work=h.array("work", level.stride**2), **arrays)

@@ -104,8 +104,8 @@ class Hierarchy:
         self.graph["anchor"] = self.array("anchor") if anchored else device.from_host("anchor", [])
         self.inverse: Array = self.array("inverse")
         self.matrix: Array = self.array("inverse matrix", self.levels[-1].nodes ** 2)
-        self._parts, self._wanted, self.to = (
-            self.array(name, dtype=np.uint8) for name in ("parts", "wanted", "to")
+        self._parts, self._proposed, self.to = (
+            self.array(name, dtype=np.uint8) for name in ("parts", "proposed", "to")
         )
         self._touched, self.changed = (self.array(name, dtype=np.int32) for name in ("touched", "changed"))
         self.moves: NDArray[np.int32] = np.zeros(len(self.levels), np.int32)
@@ -137,7 +137,7 @@ class Hierarchy:
             if not plain:
                 self.between("parts", number, **arguments, level=number)
             for turn in range(0 if plain else ROUNDS):
-                old, new = (self._wanted, self.to)[:: 1 if turn % 2 else -1]
+                old, new = (self._proposed, self.to)[:: 1 if turn % 2 else -1]
                 ends = {"clear": turn < 2, "first_round": turn == 0, "last_round": turn == ROUNDS - 1}
                 counts: dict[str, Any] = {"level": number, "moves": self._counts}
                 self.between("move", number, **arguments, **ends, to=old, places=new, **counts)
@@ -264,7 +264,12 @@ class Hierarchy:
         """Build the levels after a given one, in one work-group."""
         arguments: dict[str, Any] = {"from": tail, "last": len(self.levels) - 1, "levels": self.table}
         arguments |= {"plain": plain, "strength": strength, **self.graph, "inverse": self.inverse}
-        arguments |= {"parts": self._parts, "wanted": self._wanted, "to": self.to, "touched": self._touched}
+        arguments |= {
+            "parts": self._parts,
+            "proposed": self._proposed,
+            "to": self.to,
+            "touched": self._touched,
+        }
         arguments |= {"splits": self._splits, "moves": self._counts}
         arguments |= {"changed": self.changed, "changes": self.changes, "matrix": self.matrix}
         self.alone("build", self.levels[tail], 8, **arguments)

@@ -167,7 +167,7 @@ class Multigrid:
         cycle = solver.cycle
         find_graph_variance(h, flags, (cycle.x, cycle.b, cycle.other_x, solver.before, solver.p))
         sigma = self._device.array("sigma", self._links.shape, np.float32)
-        limits: dict[str, Any] = {"least": LEAST, "wanted": SLOPE | KNOWN, "flags": flags}
+        limits: dict[str, Any] = {"min_variance": LEAST, "flag": SLOPE | KNOWN, "flags": flags}
         h.copy_picture("deviation", cycle.x, sigma, inverse=h.inverse, **limits)
         deviation: NDArray[np.float32] = sigma.release()
         return deviation

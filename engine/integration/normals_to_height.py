@@ -292,7 +292,7 @@ class SlopeKernels:
         find(
             -(-pixels // tile),
             pixels=pixels,
-            least=floor,
+            flat_limit=floor,
             vectors=normals["vectors"],
             sigma=normals["sigma"],
             contact=normals["contact"],
@@ -318,7 +318,7 @@ class SlopeKernels:
             -(-rows // strip) * -(-columns // min(tile, _CHUNK)),
             rows=rows,
             columns=columns,
-            least=floor,
+            flat_limit=floor,
             lowest=bounds[0],
             highest=bounds[1],
             sigma=sigma,

@@ -150,7 +150,7 @@ class _Search:
         limits = {"reach": reach, "noise": _CLEAR * self._noise, "wide": int(reach > 1)}
         self._run("spread", curl=self._curl, sums=sums, **limits, tears=maps["tears"])
         outputs = {name: maps[name] for name in ("tears", "weight_x", "weight_y", "rise_x", "rise_y")}
-        numbers = {"noise": noise**2, "bend": bend, "tear": tear, "least": _LEAST}
+        numbers = {"noise": noise**2, "bend": bend, "tear": tear, "min_trust": _LEAST}
         links = {"right": self._links.right, "down": self._links.down, **self._slopes}
         self._run("trust", **links, facing=self._facing, **numbers, **outputs)
 
@@ -177,7 +177,7 @@ class _Search:
     def link(self, heights: Array, scale: float = 1.0, cap: float = math.inf) -> float:
         """Compute the weights of links from the misfit of heights; return the number of broken links."""
         names = "weight_x", "weight_y", "rise_x", "rise_y", "right", "down", "source"
-        numbers = {"sharpness": self._sharpness / scale**2, "most": min(cap, _GONE), "slack": _SLACK}
+        numbers = {"sharpness": self._sharpness / scale**2, "max_square": min(cap, _GONE), "slack": _SLACK}
         maps = {**{name: self._maps[name] for name in names}, **self._slopes}
         maps |= {"held": self._held, "heights": heights, "sums": self._sums}
         self._run("links", **maps, **self._size, **numbers)

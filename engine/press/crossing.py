@@ -186,8 +186,8 @@ class Crossing:
         self._threshold = 1 - threshold if self._release else threshold
         planes = {
             "levels": Planes(2, np.float32),  # counts at the threshold, and of the dark plateau
-            "marks": Planes(3, dtype),  # least sample that is light, not clearly dark, near
-            "left": Planes(1, f"u{dtype.itemsize}"),  # frames until the pixel is finished
+            "thresholds": Planes(3, dtype),  # least sample that is light, not clearly dark, near
+            "frames_left": Planes(1, f"u{dtype.itemsize}"),  # frames until the pixel is finished
             "times": Planes(3, np.int32),  # start of the run; last frames that were clearly dark, not near
             "answers": Planes(2, np.float32),  # height and sigma
             "status": Planes(1, np.uint8),
@@ -198,7 +198,7 @@ class Crossing:
         fraction = threshold - _ROUNDING
         coarse = float(np.float32(fraction))
         self._maps.run(
-            "onset_levels", release=self._release, share=coarse, share_rest=fraction - coarse,
+            "onset_levels", release=self._release, fraction=coarse, fraction_rest=fraction - coarse,
             darks=PerPixel(dark), dark_step=dark.ndim // 2, brights=PerPixel(bright),
             bright_step=bright.ndim // 2,
         )  # fmt: skip

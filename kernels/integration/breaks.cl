@@ -64,14 +64,14 @@ __kernel void breaks_spread(SIZE, MAP curl, MAP sums, const int reach, const flo
 {
 #define ONE_TEAR(p, before, after, above, below)                                                     \
     const float mean = SIZE_OF(sums[p]) / (2 * reach + 1), both = SIZE_OF(curl[p]) * mean + 1e-30f;  \
-    const float left = (wide ? mean : root(both)) - noise;                                           \
-    tears[p] = left > 0 && row + 1 < rows && p + 1 < (row + 1) * columns ? left : 0;
+    const float excess = (wide ? mean : root(both)) - noise;                                         \
+    tears[p] = excess > 0 && row + 1 < rows && p + 1 < (row + 1) * columns ? excess : 0;
     PIECE(ONE_TEAR)
 }
 
 __kernel void breaks_trust(
     SIZE, MAP right, MAP down, MAP slope_x, MAP slope_y, MAP facing, MAP tears, const float noise, const float bend,
-    const float tear, const float least, OUT weight_x, OUT weight_y, OUT rise_x, OUT rise_y)
+    const float tear, const float min_trust, OUT weight_x, OUT weight_y, OUT rise_x, OUT rise_y)
 {
 #define LINK(to, other, slope, link, weight, rise)                                                   \
     const float sure_##slope = facing[to] * facing[to] * facing[to] * facing[to];                    \
@@ -79,7 +79,7 @@ __kernel void breaks_trust(
     const float bent_##slope = bend * (slope[p] - slope[to]);                                        \
     const float unsure_##slope = 0.5f * noise * (1 / sure + 1 / sure_##slope);                       \
     const float all_##slope = unsure_##slope + bent_##slope * bent_##slope + torn_##slope * torn_##slope; \
-    weight[p] = link[p] * GREATER(noise / all_##slope, least);                                                     \
+    weight[p] = link[p] * GREATER(noise / all_##slope, min_trust);                                                 \
     rise[p] = 0.5f * (slope[p] + slope[to]);
 #define ONE_TRUST(p, before, after, above, below)                                                    \
     const float sure = facing[p] * facing[p] * facing[p] * facing[p];                                \
@@ -90,16 +90,16 @@ __kernel void breaks_trust(
 
 __kernel GROUP_SIZE void breaks_links(
     SIZE, MAP weight_x, MAP weight_y, MAP rise_x, MAP rise_y, MAP slope_x, MAP slope_y, MAP held, MAP heights, const float width, const float height,
-    const float slack, const float sharpness, const float most, OUT right, OUT down, OUT source, OUT sums)
+    const float slack, const float sharpness, const float max_square, OUT right, OUT down, OUT source, OUT sums)
 {
 #define MISS(from, to, rise, slope, size)                                                              \
     GREATER(SIZE_OF((heights[to] - heights[from]) / size - rise[from]) - slack * SIZE_OF(slope[to] - slope[from]), 0)
-#define KEEP(square) (square > most ? 0.0f : 1 / ((1 + square) * (1 + square)))
+#define KEEP(square) (square > max_square ? 0.0f : 1 / ((1 + square) * (1 + square)))
 #define ONE_LINK(p, before, after, above, below)                                                     \
     const float x = MISS(p, after, rise_x, slope_x, width), y = MISS(p, below, rise_y, slope_y, height);               \
-    const float left = MISS(before, p, rise_x, slope_x, width), over = MISS(above, p, rise_y, slope_y, height);        \
+    const float excess = MISS(before, p, rise_x, slope_x, width), over = MISS(above, p, rise_y, slope_y, height);      \
     const float xx = sharpness * x * x, yy = sharpness * y * y;                                      \
-    const float ll = sharpness * left * left, oo = sharpness * over * over;                          \
+    const float ll = sharpness * excess * excess, oo = sharpness * over * over;                      \
     const float to_x = weight_x[p] * KEEP(xx), to_y = weight_y[p] * KEEP(yy);                        \
     const float from_x = weight_x[before] * KEEP(ll), from_y = weight_y[above] * KEEP(oo);           \
     right[p] = to_x;                                                                                 \

@@ -53,9 +53,9 @@ def breaks_curl(flags: Flags, slope_x: Floats, slope_y: Floats, width: float, he
 
 def breaks_sum(values: Floats, reach: int, downwards: bool) -> Doubles:
     """Return sums over 2 reach + 1 pixels centred on each pixel, along rows or columns."""
-    one = values.astype(np.float64) if downwards else values.T.astype(np.float64)
-    ring = np.pad(one, ((reach, reach), (0, 0)))
-    sums = sum((ring[i : i + len(one)] for i in range(2 * reach + 1)), np.zeros(one.shape))
+    columns = values.astype(np.float64) if downwards else values.T.astype(np.float64)
+    ring = np.pad(columns, ((reach, reach), (0, 0)))
+    sums = sum((ring[i : i + len(columns)] for i in range(2 * reach + 1)), np.zeros(columns.shape))
     return sums if downwards else sums.T
 
 
@@ -73,15 +73,16 @@ def breaks_spread(curl: Floats, sums: Floats, reach: int, noise: float, wide: bo
 
 
 def breaks_trust(right: Floats, down: Floats, slope_x: Floats, slope_y: Floats, facing: Floats, tears: Floats,
-                 noise: float, bend: float, tear: float, least: float) -> tuple[Doubles, ...]:  # fmt: skip
+                 noise: float, bend: float, tear: float,
+                 min_trust: float) -> tuple[Doubles, ...]:  # fmt: skip
     """Return weights of the links to the right and down, and their slopes.
 
     ``facing`` are the cosines a, ``right`` and ``down`` the weights w, ``noise`` is n^2, and n^2 / v is at
-    least ``least``. A link's slope is the mean of both: a crease may be anywhere between the pixels.
+    least ``min_trust``. A link's slope is the mean of both: a crease may be anywhere between the pixels.
     """
-    one = _trust(right, slope_x, facing, tears, noise, bend, tear, least)
-    other = _trust(down.T, slope_y.T, facing.T, tears.T, noise, bend, tear, least)
-    return one[0], other[0].T, one[1], other[1].T
+    along_x = _trust(right, slope_x, facing, tears, noise, bend, tear, min_trust)
+    along_y = _trust(down.T, slope_y.T, facing.T, tears.T, noise, bend, tear, min_trust)
+    return along_x[0], along_y[0].T, along_x[1], along_y[1].T
 
 
 def _trust(
@@ -92,35 +93,42 @@ def _trust(
     noise: float,
     bend: float,
     tear: float,
-    least: float,
+    min_trust: float,
 ) -> tuple[Doubles, Doubles]:
-    w, s, a, t = (one.astype(np.float64) for one in (link, slope, facing, tears))
+    w, s, a, t = (map_.astype(np.float64) for map_ in (link, slope, facing, tears))
     s_next, a_next = np.roll(s, -1, 1), np.roll(a, -1, 1)
     torn = np.maximum(t, np.roll(t, 1, 0))
     v = noise * (a**-4 + a_next**-4) / 2 + (bend * (s - s_next)) ** 2 + (tear * torn) ** 2
-    return w * np.maximum(noise / v, least), (s + s_next) / 2
+    return w * np.maximum(noise / v, min_trust), (s + s_next) / 2
 
 
 def breaks_links(weight_x: Floats, weight_y: Floats, rise_x: Floats, rise_y: Floats, slope_x: Floats,
                  slope_y: Floats, held: Floats, heights: Floats, width: float, height: float, slack: float,
-                 sharpness: float, most: float) -> tuple[Doubles, Doubles, Doubles, float]:  # fmt: skip
+                 sharpness: float, max_square: float) -> tuple[Doubles, Doubles, Doubles, float]:  # fmt: skip
     """Return links to the right and down, the right-hand side of the equations, and the broken links.
 
-    Links whose k m^2 exceeds ``most`` are cut. ``held`` is the right-hand side of known heights. Each link
-    adds k m^2 / (1 + k m^2) to the number of broken links; the kernel writes one sum per work-item.
+    Links whose k m^2 exceeds ``max_square`` are cut. ``held`` is the right-hand side of known heights. Each
+    link adds k m^2 / (1 + k m^2) to the number of broken links; the kernel writes one sum per work-item.
     """
     u = heights.astype(np.float64)
-    x = _links(weight_x, rise_x, slope_x, u, width, slack, sharpness, most)
-    y = _links(weight_y.T, rise_y.T, slope_y.T, u.T, height, slack, sharpness, most)
+    x = _links(weight_x, rise_x, slope_x, u, width, slack, sharpness, max_square)
+    y = _links(weight_y.T, rise_y.T, slope_y.T, u.T, height, slack, sharpness, max_square)
     return x[0], y[0].T, x[1] + y[1].T + held, x[2] + y[2]
 
 
 def _links(
-    weight: Floats, rise: Floats, slope: Floats, u: Doubles, size: float, slack: float, k: float, most: float
+    weight: Floats,
+    rise: Floats,
+    slope: Floats,
+    u: Doubles,
+    size: float,
+    slack: float,
+    k: float,
+    max_square: float,
 ) -> tuple[Doubles, Doubles, float]:
     bend = np.abs(np.roll(slope, -1, 1) - slope)
     miss = np.maximum(np.abs((np.roll(u, -1, 1) - u) / size - rise) - slack * bend, 0.0)
     square = k * miss**2
-    link = np.where(square > most, 0.0, weight / (1 + square) ** 2)
+    link = np.where(square > max_square, 0.0, weight / (1 + square) ** 2)
     pull = size * link * rise
     return link, np.roll(pull, 1, 1) - pull, float(np.sum(np.where(weight > 0, square / (1 + square), 0.0)))

@@ -28,9 +28,9 @@
 #endif
 
 // Both values are loaded before one is selected, which avoids a branch.
-float chosen(const int which, const float one, const float other)
+float chosen(const int which, const float if_true, const float if_false)
 {
-    return which ? one : other;
+    return which ? if_true : if_false;
 }
 
 // The averaged quantity: heights, or their excess over the known heights.
@@ -39,9 +39,9 @@ float chosen(const int which, const float one, const float other)
 #define VALUE(p, column) (heights ? RISEN(p, column) - heights[p] : RISEN(p, column))
 
 #define ADD(sum, total, p, column) {                                                                   \
-    const float share = SHARE(p), value = share * VALUE(p, column);                                    \
-    sum += share > 0.0f ? value : 0.0f;                                                                \
-    total += share;                                                                                    \
+    const float weight = SHARE(p), value = weight * VALUE(p, column);                                  \
+    sum += weight > 0.0f ? value : 0.0f;                                                               \
+    total += weight;                                                                                   \
 }
 
 // Sums over strips of rows, each into its own row of the output.
@@ -141,8 +141,8 @@ __kernel GROUP_SIZE void components_offsets(
     sum = normalised(sum);
     total = normalised(total);
     const float one = total.high > 0.0f ? total.high : 1.0f, ratio = sum.high / one;
-    const Pair left = normalised(minus(sum, times((Pair){ratio, 0.0f}, total)));
-    offsets[component] = normalised(minus((Pair){mean, mean_rest}, sum_of(ratio, left.high / one))).high;
+    const Pair remainder = normalised(minus(sum, times((Pair){ratio, 0.0f}, total)));
+    offsets[component] = normalised(minus((Pair){mean, mean_rest}, sum_of(ratio, remainder.high / one))).high;
 }
 
 __kernel void components_add_offsets(

@@ -26,14 +26,14 @@ def components_sum(flags: Flags, labels: Labels, relief: Array, plane: Triple, h
     and per row, and its height in the top left pixel, mm. Each of the kernel's items sums over a strip of
     rows.
     """
-    risen, share = relief + _level(plane, flags.shape), (labels >= 0).astype(np.float64)
+    height, weight = relief + _level(plane, flags.shape), (labels >= 0).astype(np.float64)
     if heights is not None:
-        known = flags & KNOWN != 0
-        share = known * np.where(known, 1.0 if height_weights is None else height_weights, 0.0)
-        risen = risen - np.where(known, heights, 0.0)
-    inside = share > 0
-    where, some = labels[inside], share[inside]
-    sums, totals = (np.bincount(where, part, components) for part in (some * risen[inside], some))
+        is_known = flags & KNOWN != 0
+        weight = is_known * np.where(is_known, 1.0 if height_weights is None else height_weights, 0.0)
+        height = height - np.where(is_known, heights, 0.0)
+    inside = weight > 0
+    where, some = labels[inside], weight[inside]
+    sums, totals = (np.bincount(where, part, components) for part in (some * height[inside], some))
     return np.asarray(sums, np.float64), np.asarray(totals, np.float64)
 
 

@@ -131,19 +131,19 @@ int kept(
     const int p, const int row, const int column, const int columns, __global const float *dz_dx,
     __global const float *dz_dy, __global const uchar *edges, __global const uchar *flags)
 {
-    const int there[4] = {p + 1, p - 1, p + columns, p - columns};
+    const int neighbours[4] = {p + 1, p - 1, p + columns, p - columns};
     const int linked[4] = {
         flags[p] & RIGHT, column > 0 && flags[p - (column > 0)] & RIGHT,
         flags[p] & DOWN, row > 0 && flags[row > 0 ? p - columns : p] & DOWN,
     };
     int best = -1;
-    float least = INFINITY;
-    for (int way = 0; way < 4; ++way) {
-        if (!linked[way] || edges[there[way]]) continue;
-        const float far = UNLIKE(there[way], p);
-        if (far < least) {
-            least = far;
-            best = there[way];
+    float smallest = INFINITY;
+    for (int side = 0; side < 4; ++side) {
+        if (!linked[side] || edges[neighbours[side]]) continue;
+        const float far = UNLIKE(neighbours[side], p);
+        if (far < smallest) {
+            smallest = far;
+            best = neighbours[side];
         }
     }
     return best;
@@ -269,17 +269,17 @@ __kernel void links_join(GRAPH, KEPT_MAPS OUT source, const int place)
 #else
 #define HEIGHT_SQUARE(p, row, column) 0.0f
 #endif
-#define ADD_SQUARES(column, left, bit) {                                                               \
+#define ADD_SQUARES(column, previous, bit) {                                                           \
     const int p = first + (column);                                                                    \
-    const float x = relief[p + 1] - relief[p] - size_x * (X_SLOPE(p, left, bit) - plane_x);            \
+    const float x = relief[p + 1] - relief[p] - size_x * (X_SLOPE(p, previous, bit) - plane_x);        \
     const float y = relief[p + next] - relief[p] + size_y * (Y_SLOPE(p) - plane_y);                    \
     squares[(column) - begin] += square(flags[p] & RIGHT, X_WEIGHT(p, p + 1), x)                       \
         + square(flags[p] & DOWN, Y_WEIGHT(p, p + next), y) + HEIGHT_SQUARE(p, row, column);           \
 }
 
-float square(const int linked, const float weight, const float left)
+float square(const int linked, const float weight, const float misfit)
 {
-    const float all = weight * left * left;
+    const float all = weight * misfit * misfit;
     return linked ? all : 0.0f;
 }
 

@@ -40,16 +40,18 @@ def links_flags(dz_dx: Array, dz_dy: Array, mask: Array | None, weight_x: Array 
     finite; invalid weights and masked pixels are 0. All but the slopes may be None: without ``weight_x``
     weights are uniform, without ``weight_y`` it equals ``weight_x``.
     """
-    wanted = np.ones(dz_dx.shape, bool) if mask is None else mask != 0
-    along_x = wanted if weight_x is None else wanted & (weight_x > 0)
-    along_y = along_x if weight_y is None else wanted & (weight_y > 0)
+    selected = np.ones(dz_dx.shape, bool) if mask is None else mask != 0
+    along_x = selected if weight_x is None else selected & (weight_x > 0)
+    along_y = along_x if weight_y is None else selected & (weight_y > 0)
     finite = np.isfinite(dz_dx) & np.isfinite(dz_dy)
     flags = np.where((along_x | along_y) & finite, SLOPE, 0) | np.where(
         (along_x | along_y) & ~finite, LOST, 0
     )
     if heights is not None:
-        known = wanted & np.isfinite(heights)
-        flags |= np.where(known if height_weights is None else known & (height_weights > 0), KNOWN, 0)
+        with_height = selected & np.isfinite(heights)
+        flags |= np.where(
+            with_height if height_weights is None else with_height & (height_weights > 0), KNOWN, 0
+        )
     right, down = np.zeros_like(finite), np.zeros_like(finite)
     right[:, :-1] = (along_x & finite)[:, :-1] & (along_x & finite)[:, 1:]
     down[:-1] = (along_y & finite)[:-1] & (along_y & finite)[1:]
@@ -62,13 +64,13 @@ def links_cut(dz_dx: Array, dz_dy: Array, edges: Array, flags: Flags) -> Flags:
     A pixel on an edge keeps one link, to the neighbour off the edge with the most similar slopes. If several
     are equal, the order is right, left, below, above.
     """
-    cut, marked = flags.copy(), edges != 0
+    kept, marked = flags.copy(), edges != 0
     for row, column in np.argwhere(marked):
         best = _most_alike(dz_dx, dz_dy, marked, flags, row, column)
-        for (there, below), (owner, bit) in _links_of(row, column, flags.shape).items():
-            if (there, below) != best:
-                cut[owner] &= ~np.uint8(bit)
-    return cut
+        for (neighbour, below), (owner, bit) in _links_of(row, column, flags.shape).items():
+            if (neighbour, below) != best:
+                kept[owner] &= ~np.uint8(bit)
+    return kept
 
 
 def _links_of(
@@ -82,7 +84,9 @@ def _links_of(
         (row - 1, column): ((row - 1, column), DOWN),
     }
     return {
-        there: link for there, link in links.items() if 0 <= there[0] < shape[0] and 0 <= there[1] < shape[1]
+        neighbour: link
+        for neighbour, link in links.items()
+        if 0 <= neighbour[0] < shape[0] and 0 <= neighbour[1] < shape[1]
     }
 
 
@@ -90,11 +94,11 @@ def _most_alike(
     dz_dx: Array, dz_dy: Array, marked: Mask, flags: Flags, row: int, column: int
 ) -> tuple[int, int] | None:
     """Return the linked neighbour off the edge with the most similar slopes."""
-    best, least = None, np.inf
-    for there, (owner, bit) in _links_of(row, column, flags.shape).items():
-        far = math.hypot(*(float(s[there]) - float(s[row, column]) for s in (dz_dx, dz_dy)))
-        if flags[owner] & bit and not marked[there] and far < least:
-            best, least = there, far
+    best, smallest = None, np.inf
+    for neighbour, (owner, bit) in _links_of(row, column, flags.shape).items():
+        far = math.hypot(*(float(s[neighbour]) - float(s[row, column]) for s in (dz_dx, dz_dy)))
+        if flags[owner] & bit and not marked[neighbour] and far < smallest:
+            best, smallest = neighbour, far
     return best
 
 
@@ -172,12 +176,12 @@ def _steps(dz_dx: Array, dz_dy: Array, flags: Flags, weight_x: Array | None, wei
 def link_slopes(slope: Array, linked: Mask) -> Doubles:
     """Return the slopes of the links to the next column: from four pixels in line, at the ends from two."""
     ends = linked | np.roll(linked, 1, axis=1)
-    known, found = np.where(ends, slope, 0.0).astype(np.float64), np.zeros(slope.shape)
-    found[:, :-1] = (known[:, :-1] + known[:, 1:]) / 2
+    slopes, of_links = np.where(ends, slope, 0.0).astype(np.float64), np.zeros(slope.shape)
+    of_links[:, :-1] = (slopes[:, :-1] + slopes[:, 1:]) / 2
     four = linked[:, :-3] & linked[:, 1:-2] & linked[:, 2:-1]
-    wide = (13 * (known[:, 1:-2] + known[:, 2:-1]) - known[:, :-3] - known[:, 3:]) / 24
-    found[:, 1:-2] = np.where(four, wide, found[:, 1:-2])
-    return found
+    wide = (13 * (slopes[:, 1:-2] + slopes[:, 2:-1]) - slopes[:, :-3] - slopes[:, 3:]) / 24
+    of_links[:, 1:-2] = np.where(four, wide, of_links[:, 1:-2])
+    return of_links
 
 
 def _harmonic(weight: Doubles) -> Doubles:
@@ -191,9 +195,9 @@ def _harmonic(weight: Doubles) -> Doubles:
 def _anchors(flags: Flags, heights: Array | None, height_weights: Array | None, weights: Triple,
              size: tuple[float, float], plane: Triple) -> tuple[Doubles, Doubles]:  # fmt: skip
     """Return the weight of each known height, and its height above the plane."""
-    known = flags & KNOWN != 0
+    is_known = flags & KNOWN != 0
     row, column = np.indices(flags.shape)
     level = plane[2] + plane[0] * size[0] * column - plane[1] * size[1] * row
     weight = np.ones(flags.shape) if height_weights is None else height_weights
     height = np.zeros(flags.shape) if heights is None else heights
-    return np.where(known, weights[2] * weight, 0.0), np.where(known, height - level, 0.0)
+    return np.where(is_known, weights[2] * weight, 0.0), np.where(is_known, height - level, 0.0)

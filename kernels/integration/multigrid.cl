@@ -243,7 +243,7 @@ INLINE void move_parts(MOVE_ARGS)
                     }
                 }
                 rest &= ~part;
-                float sums[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0}, most = 0;
+                float sums[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0}, largest = 0;
                 // the range in which no link would be too long
                 int top = -2, bottom = 2, left = -2, right_most = 2, old = 0, target = 0;
                 for (int k = 0; k < 36; ++k) {
@@ -268,8 +268,8 @@ INLINE void move_parts(MOVE_ARGS)
                 for (int way = 0; way < 9; ++way) {
                     const int y = way / 3 - 1, x = way % 3 - 1, is_old = way + 1 == old;
                     if (sums[way] == 0 || y < top || y > bottom || x < left || x > right_most) continue;
-                    if (last_round ? is_old : is_old || sums[way] > most) {
-                        most = is_old ? INFINITY : sums[way];
+                    if (last_round ? is_old : is_old || sums[way] > largest) {
+                        largest = is_old ? INFINITY : sums[way];
                         target = way + 1;
                     }
                 }
@@ -436,7 +436,8 @@ INLINE void invert_coarsest(
 __kernel GROUP_SIZE void multigrid_build(
     const int from, const int last, __global const Level *restrict levels, const int plain, const float strength,
     __global float *right, __global float *down, __global float *falling, __global float *rising, __global float *anchor,
-    OUT inverse, __global uchar *parts, __global uchar *wanted, __global uchar *to, __global int *touched, __global int *splits,
+    OUT inverse, __global uchar *parts, __global uchar *proposed, __global uchar *to, __global int *touched,
+    __global int *splits,
     __global int *moves, __global int *changed, __global int *changes, OUT matrix)
 {
     __local float m[COARSEST * COARSEST], held[COARSEST], pivots[COARSEST];
@@ -453,7 +454,7 @@ __kernel GROUP_SIZE void multigrid_build(
             find_parts(BETWEEN, strength, GRAPH, parts, touched, l, splits);
             FENCE
             for (int turn = 0; turn < ROUNDS; ++turn) {
-                __global uchar *old = turn % 2 ? wanted : to, *new = turn % 2 ? to : wanted;
+                __global uchar *old = turn % 2 ? proposed : to, *new = turn % 2 ? to : proposed;
                 const int first = turn == 0, last_round = turn == ROUNDS - 1;
                 move_parts(BETWEEN, strength, GRAPH, parts, turn < 2, first, last_round, old, new, touched, l, splits, moves);
                 FENCE
@@ -494,12 +495,12 @@ __kernel GROUP_SIZE void multigrid_build(
 #define INJECTED(NAME, SPACE)                                                                              \
     values NAME(const int i, const int J, const int coarse_stride, SPACE const value *e, const int moved, BYTES to) \
     {                                                                                                      \
-        values found = SPREAD(SPACE, J);                                                                   \
-        if (!moved || (WIDTH == 8 && *(__global const ulong *)(to + i) == 0)) return found;                \
+        values interpolated = SPREAD(SPACE, J);                                                            \
+        if (!moved || (WIDTH == 8 && *(__global const ulong *)(to + i) == 0)) return interpolated;         \
         for (int k = 0; k < WIDTH; ++k)                                                                    \
             if (to[i + k])                                                                                 \
-                ((value *)&found)[k] = e[J + k / 2 + WENT_DOWN(i + k) * coarse_stride + WENT_RIGHT(i + k)]; \
-        return found;                                                                                      \
+                ((value *)&interpolated)[k] = e[J + k / 2 + WENT_DOWN(i + k) * coarse_stride + WENT_RIGHT(i + k)]; \
+        return interpolated;                                                                               \
     }
 INJECTED(injected, __global)
 
@@ -527,21 +528,21 @@ GATHERED(gathered, __global)
     const int lines = get_local_size(0) / lanes;                                                           \
     const int line = (int)get_local_id(0) < lanes * lines ? (int)get_local_id(0) / lanes : ROWS + AROUND;  \
     const int across = (stride + COLUMNS - 1) / COLUMNS, top = get_group_id(0) / across * ROWS;            \
-    const int left = get_group_id(0) % across * COLUMNS, wide = LESSER(COLUMNS, stride - left);            \
+    const int first_column = get_group_id(0) % across * COLUMNS, wide = LESSER(COLUMNS, stride - first_column); \
     const int is_live = live[first_tile + get_group_id(0)];
 #define EACH_LINE(more) for (int y = line - (more); y < ROWS + (more) && is_live; y += lines)
 #define EACH_OF_LINE(more)                                                                                 \
-    for (int x = lane * WIDTH - ((more) ? SIDE : 0), i = base + stride * (top + y + 1) + left + x,         \
+    for (int x = lane * WIDTH - ((more) ? SIDE : 0), i = base + stride * (top + y + 1) + first_column + x, \
              p = (y + AROUND) * ACROSS + SIDE + x;                                                         \
          x < wide + ((more) ? SIDE : 0); x += lanes * WIDTH, i += lanes * WIDTH, p += lanes * WIDTH)
 // Applied to the nodes of a tile with a margin of `more`; memory outside the level's rows is set to 0.
-#define FILL(more, room)                                                                                   \
-    EACH_LINE(more) if (top + y < 0 || top + y >= rows) EACH_OF_LINE(more) PUT_NEAR(room + p) = 0;         \
+#define FILL(more, scratch)                                                                                \
+    EACH_LINE(more) if (top + y < 0 || top + y >= rows) EACH_OF_LINE(more) PUT_NEAR(scratch + p) = 0;      \
     EACH_LINE(more) if (top + y >= 0 && top + y < rows) EACH_OF_LINE(more)
 #define FILLED barrier(CLK_LOCAL_MEM_FENCE);
 #define STEP_NEAR(omega, from, to) SIDES PUT_NEAR(to + p) = STEP_BY(omega, NEAR, from + p, ACROSS);
 #define EACH_COARSE_OF_TILE                                                                                \
-    for (int y = line, coarse_of_tile = coarse_base + coarse_stride * (top / 2 + 1) + left / 2;            \
+    for (int y = line, coarse_of_tile = coarse_base + coarse_stride * (top / 2 + 1) + first_column / 2;    \
          y < ROWS / 2 && top / 2 + y < coarse_rows; y += lines)                                            \
         for (int x = lane * WIDTH; x < wide / 2; x += lanes * WIDTH)
 #if STEPS == 4
@@ -558,13 +559,14 @@ GATHERED(gathered, __global)
 __kernel void multigrid_invert(LEVEL_ARGS, GRAPH_ARGS, OUT inverse, const int first_tile, __global uchar *restrict live)
 {
     const int across = (stride + COLUMNS - 1) / COLUMNS, tile = get_group_id(0), top = tile / across * ROWS;
-    const int left = tile % across * COLUMNS, bottom = LESSER(top + ROWS, rows), right_end = LESSER(left + COLUMNS, stride);
+    const int bottom = LESSER(top + ROWS, rows);
+    const int first_column = tile % across * COLUMNS, right_end = LESSER(first_column + COLUMNS, stride);
     __local int any;
     if (get_local_id(0) == 0) any = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     reals sum = 0;
     for (int y = top; y < bottom; ++y) {
-        for (int x = left + (int)get_local_id(0) * WIDTH; x < right_end; x += (int)get_local_size(0) * WIDTH) {
+        for (int x = first_column + (int)get_local_id(0) * WIDTH; x < right_end; x += (int)get_local_size(0) * WIDTH) {
             const int i = base + stride * (y + 1) + x;
             SIDES
             const reals diagonal = SUM_OF_SIDES;
@@ -631,7 +633,7 @@ __kernel void multigrid_ascend(
 {
     TILE_ITEMS
     FILL(STEPS, STARTED) {
-        const int J = coarse_base + coarse_stride * (((top + y) >> 1) + 1) + ((left + x) >> 1);
+        const int J = coarse_base + coarse_stride * (((top + y) >> 1) + 1) + ((first_column + x) >> 1);
         PUT_NEAR(STARTED + p) = AT(t + i) + injected(i, J, coarse_stride, e, moved_nodes, to);
     }
     FILLED
@@ -795,23 +797,23 @@ __kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, VALUES b, VALUES x, OUT
 #if SUMS > 1
 #define SUM_GROUP __attribute__((reqd_work_group_size(SUMS, 1, 1)))
 #define PART_NODES                                                                                         \
-    __local value room[SUMS];                                                                              \
+    __local value scratch[SUMS];                                                                           \
     const int begin = base + stride + (int)get_group_id(0) * PART;                                         \
     const int end = LESSER(begin + PART, base + stride * (rows + 1));
 #define EACH_OF_PART for (int i = begin + (int)get_local_id(0); i < end; i += SUMS)
 #define WRITE_SUM(place, sum)                                                                              \
     barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
-    room[get_local_id(0)] = sum;                                                                           \
-    GROUP_SUM(room, SUMS)                                                                                  \
-    if (get_local_id(0) == 0) parts[(place) + get_group_id(0)] = room[0];
+    scratch[get_local_id(0)] = sum;                                                                        \
+    GROUP_SUM(scratch, SUMS)                                                                               \
+    if (get_local_id(0) == 0) parts[(place) + get_group_id(0)] = scratch[0];
 #define ADD_UP(sum, from, number)                                                                          \
     value sum = 0;                                                                                         \
     for (int k = get_local_id(0); k < (number); k += (int)get_local_size(0)) sum += (from)[k];             \
     barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
-    room[get_local_id(0)] = sum;                                                                           \
-    GROUP_SUM(room, (int)get_local_size(0))                                                                \
+    scratch[get_local_id(0)] = sum;                                                                        \
+    GROUP_SUM(scratch, (int)get_local_size(0))                                                             \
     barrier(CLK_LOCAL_MEM_FENCE);                                                                          \
-    sum = room[0];
+    sum = scratch[0];
 #else
 #define SUM_GROUP
 #define ADD_UP(sum, from, number)                                                                          \
@@ -951,7 +953,7 @@ __kernel SUM_GROUP void multigrid_curve(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP z, MA
 #define INDEPENDENT 1e-4f  // minimum share of the products' determinant for which both directions are used
 __kernel GROUP_SIZE void multigrid_best(const int products, MAP product, const int count, MAP parts, OUT lengths)
 {
-    __local float room[GROUP];
+    __local float scratch[GROUP];
     ADD_UP(bz, product, products)
     ADD_UP(zz, parts, count)
     ADD_UP(zp, parts + count, count)
@@ -1046,17 +1048,17 @@ __kernel void multigrid_release(
 
 // --- Variances --------------------------------------------------------------------------------------------------
 
-// The number of pixels with a flag of `wanted` in each node of a level: each pixel is followed from aggregate
+// The number of pixels with a flag of `flag` in each node of a level: each pixel is followed from aggregate
 // to aggregate.
 __kernel void multigrid_masses(
     LEVEL_ARGS, const int columns, __global const Level *restrict levels, const int number, COUNTS changes, BYTES to,
-    const int wanted, BYTES map, __global int *restrict level)
+    const int flag, BYTES map, __global int *restrict level)
 {
     PICTURE_ITEMS
     int last = -1, sum = 0;
     for (int c = from; c <= upto; ++c) {
         int y = row, x = c, node = -1;
-        if (c < upto && map[row * columns + c] & wanted) {
+        if (c < upto && map[row * columns + c] & flag) {
             for (int l = 0; l < number; ++l) {
                 const int i = levels[l].base + levels[l].stride * (y + 1) + x, moved = changes[l] > 0;
                 y = (y >> 1) + (moved ? WENT_DOWN(i) : 0);
@@ -1094,7 +1096,7 @@ __kernel void multigrid_masses(
     ((w) * ACROSS_LINKS(READ, (p) - stride) + (v) * ACROSS_LINKS(READ, p) + (u) * ACROSS_LINKS(READ, (p) + stride))
 __kernel GROUP_SIZE void multigrid_exact(
     LEVEL_ARGS, GRAPH_ARGS, COUNTS masses, __global float *restrict inverses, __global float *restrict work,
-    __global float *restrict held, __global float *restrict risen, __global float *restrict whole,
+    __global float *restrict held, __global float *restrict swept_sum, __global float *restrict whole,
     __global float *restrict squares, __global float *restrict variance)
 {
     __local float elements[LINE * (LINE + 7)], column[LINE + 4 + WIDTH], swept[LINE];
@@ -1113,7 +1115,7 @@ __kernel GROUP_SIZE void multigrid_exact(
         EACH_IN_ROW(a) {
             m[stride * stride + a] = rising[n] + down[n] + falling[n];
             m[(stride + 1) * stride + a] = (r ? FROM_ABOVE(held) : 0) WITH_ANCHOR(anchor[n]);
-            m[(stride + 2) * stride + a] = (r ? FROM_ABOVE(risen) : 0) + GREATER(masses[n - base], 1);
+            m[(stride + 2) * stride + a] = (r ? FROM_ABOVE(swept_sum) : 0) + GREATER(masses[n - base], 1);
             m[(stride + 3) * stride + a] = r ? FROM_ABOVE(variance) : 0;
             whole[n] = squares[n] = 0;
         }
@@ -1153,7 +1155,7 @@ __kernel GROUP_SIZE void multigrid_exact(
         }
         EACH_IN_ROW(a) {
             held[n] = swept[a] * m[(stride + 1) * stride + a];
-            risen[n] = swept[a] * m[(stride + 2) * stride + a];
+            swept_sum[n] = swept[a] * m[(stride + 2) * stride + a];
             variance[n] = swept[a] * m[(stride + 3) * stride + a];
         }
         EACH_ELEMENT(stride) PUT(inverses + 2 * LINE + r * stride * stride + e) = swept[a] * NEAR(swept + c) * NEAR(m + e);
@@ -1169,7 +1171,7 @@ __kernel GROUP_SIZE void multigrid_exact(
             PUT(work + e) = BETWEEN_LINKS(NEAR, m + e, rising[n], down[n], falling[n]);
         }
         EACH_IN_ROW(a) {
-            m[(stride + 2) * stride + a] = r < rows - 1 ? FROM_BELOW(risen) : 0;
+            m[(stride + 2) * stride + a] = r < rows - 1 ? FROM_BELOW(swept_sum) : 0;
             column[a] = r < rows - 1 ? FROM_BELOW(whole) : 0;
             m[(stride + 3) * stride + a] = r < rows - 1 ? FROM_BELOW(squares) : 0;
         }
@@ -1181,7 +1183,7 @@ __kernel GROUP_SIZE void multigrid_exact(
         }
         EACH_IN_ROW(a) {
             for (int k = 0; k < stride; ++k) {
-                risen[n] += G[a * stride + k] * m[(stride + 2) * stride + k];
+                swept_sum[n] += G[a * stride + k] * m[(stride + 2) * stride + k];
                 whole[n] += G[a * stride + k] * column[k];
                 squares[n] += G[a * stride + k] * m[(stride + 3) * stride + k];
             }
@@ -1196,7 +1198,7 @@ __kernel GROUP_SIZE void multigrid_exact(
         EACH_ELEMENT(stride) PUT_NEAR(m + e) = AT(work + e);
         NEAR_BARRIER
         EACH_IN_ROW(a) {
-            const float all = whole[n], centred = all > 0 ? (squares[n] / all - 2 * risen[n]) / all : 0;
+            const float all = whole[n], centred = all > 0 ? (squares[n] / all - 2 * swept_sum[n]) / all : 0;
             variance[n] = m[a * stride + a] + centred;
         }
     }
@@ -1259,15 +1261,15 @@ __kernel void multigrid_spread(
 }
 
 // Standard deviations: roots of variances, which are at least a share of the inverse diagonal; NaN without a
-// flag of `wanted`.
+// flag of `flag`.
 __kernel void multigrid_deviation(
-    LEVEL_ARGS, const int columns, const float least, const int wanted,
+    LEVEL_ARGS, const int columns, const float min_variance, const int flag,
     BYTES flags, MAP inverse, MAP level, OUT map)
 {
     PICTURE_ITEMS
     for (int c = from; c < upto; ++c) {
         const int i = base + (row + 1) * stride + c;
-        const float found = GREATER(level[i], least * inverse[i]);
-        map[row * columns + c] = flags[row * columns + c] & wanted ? sqrt(found) : NAN;
+        const float variance = GREATER(level[i], min_variance * inverse[i]);
+        map[row * columns + c] = flags[row * columns + c] & flag ? sqrt(variance) : NAN;
     }
 }

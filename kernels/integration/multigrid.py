@@ -131,15 +131,15 @@ def parts(level: Level, strength: float) -> tuple[Ints, Flags]:
     place: Any = np.indices(level.to.shape)
     (y, x), (right, down) = place, level.links[:2]
     along_x, along_y = np.maximum(right, shifted(right, 0, -1)), np.maximum(down, shifted(down, -1, 0))
-    most = np.maximum(along_x, along_y)
+    greatest_of_both = np.maximum(along_x, along_y)
     label: Ints = 2 * (y % 2) + x % 2
     for _ in range(3):
         for (v, u), w in level.sides():
-            greatest = along_x if v == 0 else along_y if u == 0 else most
+            greatest = along_x if v == 0 else along_y if u == 0 else greatest_of_both
             strong = (w > 0) & (w**2 >= strength**2 * greatest * shifted(greatest, v, u))
             inside = ((y + v) // 2 == y // 2) & ((x + u) // 2 == x // 2)
             label = np.where(strong & inside, np.minimum(label, shifted(label, v, u)), label)
-    live = most > 0
+    live = greatest_of_both > 0
     block = y // 2 * level.coarse_shape[1] + x // 2
     size = np.bincount((4 * block + label)[live], minlength=4 * block.max() + 4).reshape(-1, 4)
     return np.where(live, label, -1), live & (label == size.argmax(axis=1)[block])
@@ -152,11 +152,11 @@ def moves(level: Level, label: Ints, largest: Flags) -> Ints:
         groups.setdefault((y // 2, x // 2, int(label[y, x])), []).append((y, x))
     sides, to = list(level.sides()), np.zeros_like(label)
     for number in range(ROUNDS if groups else 0):
-        found = np.zeros_like(to)
+        targets = np.zeros_like(to)
         for nodes in groups.values():
             target = _place(nodes, sides, largest, to, last=number == ROUNDS - 1)
-            found[tuple(np.transpose(nodes))] = target
-        to = found
+            targets[tuple(np.transpose(nodes))] = target
+        to = targets
     return to
 
 
@@ -164,14 +164,14 @@ def _place(
     nodes: Sequence[Way], sides: Sequence[tuple[Way, Doubles]], largest: Flags, to: Ints, *, last: bool
 ) -> int:
     """Return the aggregate of a part; in the last round only the one chosen before, or it stays."""
-    own, old = np.array(nodes[0]) // 2, int(to[nodes[0]])
+    aggregate, old = np.array(nodes[0]) // 2, int(to[nodes[0]])
     sums, lowest, highest = np.zeros((3, 3)), np.full(2, -2), np.full(2, 2)
     for y, x in nodes:
         for (v, u), weights in sides:
             other = y + v, x + u
             if weights[y, x] == 0 or other in nodes:
                 continue
-            apart = np.array(other) // 2 - own
+            apart = np.array(other) // 2 - aggregate
             at = apart + step_of(to[other])
             lowest, highest = np.maximum(lowest, at - 1), np.minimum(highest, at + 1)
             if (to[other] or largest[other]) and apart.any() and abs(at).max() <= 1:
@@ -191,8 +191,8 @@ def coarsen(level: Level) -> Level:
         y, x = np.nonzero(weights)
         at = row[y, x], column[y, x]
         steps = row[y + v, x + u] - at[0], column[y + v, x + u] - at[1]
-        for coarse, way in zip(links, WAYS, strict=True):
-            np.add.at(coarse, at, weights[y, x] / 2 * ((steps[0] == way[0]) & (steps[1] == way[1])))
+        for coarse, step in zip(links, WAYS, strict=True):
+            np.add.at(coarse, at, weights[y, x] / 2 * ((steps[0] == step[0]) & (steps[1] == step[1])))
     return Level(links, gathered(level, level.anchor), np.zeros(level.coarse_shape, np.int64))
 
 
@@ -215,7 +215,7 @@ def build(right: Doubles, down: Doubles, anchor: Doubles | None, strength: float
 
 def around(level: Level, x: Doubles) -> Doubles:
     """Return W x."""
-    return sum((w * shifted(x, *way) for way, w in level.sides()), np.zeros(x.shape))
+    return sum((w * shifted(x, *step) for step, w in level.sides()), np.zeros(x.shape))
 
 
 def residual(level: Level, b: Doubles, x: Doubles) -> Doubles:
@@ -247,8 +247,8 @@ def inverse_matrix(level: Level) -> Doubles:
     """Return the inverse of A, with the last node of each component without anchors fixed at 0."""
     index: Any = np.arange(level.to.size).reshape(level.to.shape)
     w, held = np.zeros((index.size, index.size)), level.anchor.ravel().copy()
-    for way, weights in level.sides():
-        w[index[weights > 0], shifted(index, *way)[weights > 0]] = weights[weights > 0]
+    for step, weights in level.sides():
+        w[index[weights > 0], shifted(index, *step)[weights > 0]] = weights[weights > 0]
     pivots = np.zeros(index.size)
     for k in range(index.size):
         links = w[k, k + 1 :].copy()
@@ -307,17 +307,17 @@ def exact_variance(level: Level, masses: Doubles) -> Doubles:
     """Return the diagonal of A's inverse; without anchors, the mean of a component, by masses, is 0."""
     index: Any = np.arange(level.to.size).reshape(level.to.shape)
     matrix, label = np.diag(level.diagonal.ravel()), index.copy()
-    for way, weights in level.sides():
-        matrix[index[weights > 0], shifted(index, *way)[weights > 0]] -= weights[weights > 0]
+    for step, weights in level.sides():
+        matrix[index[weights > 0], shifted(index, *step)[weights > 0]] -= weights[weights > 0]
     for _ in range(index.size):  # to the first node of each component
-        for way, weights in level.sides():
-            label = np.where(weights > 0, np.minimum(label, shifted(label, *way)), label)
+        for step, weights in level.sides():
+            label = np.where(weights > 0, np.minimum(label, shifted(label, *step)), label)
     variance, mass = np.zeros(index.size), np.maximum(masses, 1).ravel()
     for first in np.unique(label):
         nodes = np.flatnonzero(label.ravel() == first)
-        part, share = matrix[np.ix_(nodes, nodes)], mass[nodes] / mass[nodes].sum()
+        part, mass_fraction = matrix[np.ix_(nodes, nodes)], mass[nodes] / mass[nodes].sum()
         free = not level.anchor.ravel()[nodes].any()
-        whole = np.linalg.inv(part + free * np.outer(share, share)) - free
+        whole = np.linalg.inv(part + free * np.outer(mass_fraction, mass_fraction)) - free
         variance[nodes] = np.diag(whole)
     return variance.reshape(index.shape)
 
@@ -326,26 +326,27 @@ def evened_sides(level: Level) -> tuple[list[tuple[Way, Doubles]], Doubles]:
     """Return links along the axes, scaled to the same mean along both, and a measure of their unevenness."""
     links = list(level.sides())[:4]  # right, left, below, above
     x, y = (
-        (one + two) * np.where((one > 0) & (two > 0), 0.5, 1) for (_, one), (_, two) in (links[:2], links[2:])
+        (first + second) * np.where((first > 0) & (second > 0), 0.5, 1)
+        for (_, first), (_, second) in (links[:2], links[2:])
     )
     both = np.sqrt(x * y)
     by = [np.where(both > 0, both * inverse_of(mean), 1) for mean in (x, y)]
     uneven = np.where(both > 0, 1 - 2 * both * inverse_of(x + y), 0)
-    return [(way, w * by[number // 2]) for number, (way, w) in enumerate(links)], uneven
+    return [(step, w * by[number // 2]) for number, (step, w) in enumerate(links)], uneven
 
 
 def walk(level: Level) -> tuple[Doubles, Doubles]:
     """Return the inverse diagonal of scaled links, and the return probability of a walk of two steps."""
     links, _ = evened_sides(level)
     d = inverse_of(sum((w for _, w in links), level.anchor))
-    return d, d * sum(w**2 * shifted(d, *way) for way, w in links)
+    return d, d * sum(w**2 * shifted(d, *step) for step, w in links)
 
 
 def local_part(level: Level, c: Sequence[float]) -> Doubles:
     """Return the local part of each node's variance."""
     (links, uneven), (d, r) = evened_sides(level), walk(level)
-    neighbours = sum(w * shifted(d * (c[3] + c[4] * r), *way) for way, w in links)
-    back = sum(w * shifted(r, *way) for way, w in links)
+    neighbours = sum(w * shifted(d * (c[3] + c[4] * r), *step) for step, w in links)
+    back = sum(w * shifted(r, *step) for step, w in links)
     return np.asarray(d * (c[0] + c[1] * r + c[2] * d * back + c[5] * uneven + neighbours))
 
 

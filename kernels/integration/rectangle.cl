@@ -64,20 +64,20 @@ C turned(const C z, MAP factor) { return factor[0] * z + factor[1] * (C)(-z.hi, 
 // rotated afterwards, backwards before.
 #if LANES == 8
 #define ALL_BLOCKS                                                                                         \
-    for (int block = 0; block < size / stretch; ++block)                                                   \
+    for (int block = 0; block < size / span; ++block)                                                      \
         for (int j = 0; j < far; ++j)
 #else
 #define ALL_BLOCKS                                                                                         \
-    for (int i = ME, block, j; block = (i + 0.5f) / far, j = i - block * far, block * stretch < size; i += OTHERS)
+    for (int i = ME, block, j; block = (i + 0.5f) / far, j = i - block * far, block * span < size; i += OTHERS)
 #endif
 #define UNROLL _Pragma("unroll")
 #define TURNED(n, value) turned(value, roots + 2 * (n) * j * apart)
 #define STEP(radix, add)                                                                                   \
     void step_##radix(Work work, const int size, const int far, MAP roots, const int up)                   \
     {                                                                                                      \
-        const int stretch = radix * far, apart = size / stretch;                                           \
+        const int span = radix * far, apart = size / span;                                                 \
         ALL_BLOCKS {                                                                                       \
-            Work at = work + block * stretch + j;                                                          \
+            Work at = work + block * span + j;                                                             \
             C z[radix];                                                                                    \
             UNROLL for (int n = 0; n < radix; ++n) z[n] = at[n * far];                                     \
             if (up && j) { UNROLL for (int n = 1; n < radix; ++n) z[n] = TURNED(n, z[n]); }                \
@@ -183,7 +183,7 @@ void transform(Work work, LINES, const int up)
 #if LANES == 8
 typedef struct __attribute__((packed)) { F values; } Loose;  // rows start at any address
 #define LOAD(from) (((__global const Loose *)(from))->values)
-#define STORE(to, given) (((__global Loose *)(to))->values = (given))
+#define STORE(to, stored) (((__global Loose *)(to))->values = (stored))
 #define SINGLES(a, b, c, d)                                                                                \
     const F c = (F)(a.s0, b.s0, a.s1, b.s1, a.s4, b.s4, a.s5, b.s5);                                       \
     const F d = (F)(a.s2, b.s2, a.s3, b.s3, a.s6, b.s6, a.s7, b.s7);
@@ -198,19 +198,19 @@ typedef struct __attribute__((packed)) { F values; } Loose;  // rows start at an
         QUADS(b0, b4, v[0], v[4]) QUADS(b1, b5, v[1], v[5])                                                \
         QUADS(b2, b6, v[2], v[6]) QUADS(b3, b7, v[3], v[7])                                                \
     }
-#define STORE_SOME(to, count, given)                                                                       \
+#define STORE_SOME(to, count, stored)                                                                      \
     {                                                                                                      \
         __global float *some = to;                                                                         \
-        if (count >= LANES) STORE(some, given);                                                            \
+        if (count >= LANES) STORE(some, stored);                                                           \
         else                                                                                               \
-            for (int l = 0; l < count; ++l) some[l] = ((const float *)&given)[l];                          \
+            for (int l = 0; l < count; ++l) some[l] = ((const float *)&stored)[l];                         \
     }
 // Non-temporal stores, if the compiler supports them: the data are read only after all are written. With the
 // prefetch of the next strip this saves a sixth of the time for 4 Mpx. OpenCL's own `prefetch` does nothing
 // in PoCL.
 #ifdef __has_builtin
 #if __has_builtin(__builtin_nontemporal_store)
-#define STREAM(to, given) __builtin_nontemporal_store(given, (__global F *)(to))
+#define STREAM(to, stored) __builtin_nontemporal_store(stored, (__global F *)(to))
 #endif
 #endif
 #ifdef POCL_DEVICE_ADDRESS_BITS
@@ -221,8 +221,8 @@ typedef struct __attribute__((packed)) { F values; } Loose;  // rows start at an
 #else
 #define AHEAD(from)
 #define LOAD(from) (*(from))
-#define STORE(to, given) (*(to) = (given))
-#define STORE_SOME(to, count, given) STORE(to, given);
+#define STORE(to, stored) (*(to) = (stored))
+#define STORE_SOME(to, count, stored) STORE(to, stored);
 #define TRANSPOSE(v)
 #endif
 #ifndef STREAM

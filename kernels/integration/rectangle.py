@@ -31,10 +31,10 @@ Floats = NDArray[np.floating[Any]]
 def rectangle_modes(source: Floats, spectrum: Floats) -> None:
     """Write the cosine modes of rows, twice the sums of their points times cosines."""
     rows, length = source.shape
-    found = np.pad(dct(source.astype(np.float64), axis=1), ((0, 0), (0, 1)))
+    modes = np.pad(dct(source.astype(np.float64), axis=1), ((0, 0), (0, 1)))
     low = np.minimum(np.arange(spectrum[:, 0].size // 2).reshape(len(spectrum), -1), length)
     slots = np.concatenate([low, length - low], axis=1)
-    spectrum[:, :rows] = found[:, slots].transpose(1, 0, 2)
+    spectrum[:, :rows] = modes[:, slots].transpose(1, 0, 2)
 
 
 def rectangle_divide(pictures: int, along: Floats, across: Floats, spectrum: Floats) -> None:
@@ -91,11 +91,11 @@ def rectangle_misfit(
     heights: Floats | None = None,
 ) -> float:
     """Return the residual of links and known heights: the sum of squares times their weights."""
-    left = 0.0 if heights is None else weight_z * float(((relief - heights.astype(np.float64)) ** 2).sum())
+    misfit = 0.0 if heights is None else weight_z * float(((relief - heights.astype(np.float64)) ** 2).sum())
     ways = (1, slopes[0], relief.astype(np.float64)), (-1, slopes[1].T, relief.T.astype(np.float64))
     for weight, size, (sign, slope, points) in zip(weights, sizes, ways, strict=True):
-        left += weight * float(((np.diff(points, axis=1) - sign * size / 24 * _links(slope)) ** 2).sum())
-    return left
+        misfit += weight * float(((np.diff(points, axis=1) - sign * size / 24 * _links(slope)) ** 2).sum())
+    return misfit
 
 
 def _links(slope: Floats) -> NDArray[np.float64]:

@@ -47,27 +47,27 @@ typedef int I;
 // The variance of the azimuth, radians^2, within bounds, and the share of the angular variance along the
 // meridian.
 #define UNSURE(flat, variance)                                                                         \
-    const F outside = GREATER(flat, (F)least), share = 0.5f * least / outside;                         \
-    const F wide = (1.0f - share) * (variance) / outside, turned = LESSER(wide, (F)WIDEST);
+    const F outside = GREATER(flat, (F)flat_limit), fraction = 0.5f * flat_limit / outside;            \
+    const F wide = (1.0f - fraction) * (variance) / outside, turned = LESSER(wide, (F)WIDEST);
 
 // Slopes, and the squares of the normal's components along x and y. Without a normal slopes are NaN, and the
 // squares 0.
 __kernel void slopes_find(
-    const int pixels, const float least, MAP vectors, MAP sigma, __global const uchar *restrict contact, OUT dz_dx,
+    const int pixels, const float flat_limit, MAP vectors, MAP sigma, __global const uchar *restrict contact, OUT dz_dx,
     OUT dz_dy, OUT squares_x, OUT squares_y)
 {
     const int first = (int)get_global_id(0) * TILE;
     for (int p = first; p < LESSER(first + TILE, pixels); p += WIDTH) {
         READ_VECTORS
         const F s = READ(sigma, p);
-        const I known = (FLAGS(contact, p) != 0) & (z > 0.0f) & (s > 0.0f) & (s < INFINITY);
-        x = known ? x : (F)0.0f;
-        y = known ? y : (F)0.0f;
+        const I valid = (FLAGS(contact, p) != 0) & (z > 0.0f) & (s > 0.0f) & (s < INFINITY);
+        x = valid ? x : (F)0.0f;
+        y = valid ? y : (F)0.0f;
         const F flat = x * x + y * y, slant = 1.0f / GREATER(z, (F)STEEPEST);
         UNSURE(flat, s * s)
         const F half_of = 0.5f * turned, longer = EXPONENTIAL(half_of);
-        WRITE(dz_dx, p, known ? -longer * x * slant : (F)NAN);
-        WRITE(dz_dy, p, known ? -longer * y * slant : (F)NAN);
+        WRITE(dz_dx, p, valid ? -longer * x * slant : (F)NAN);
+        WRITE(dz_dy, p, valid ? -longer * y * slant : (F)NAN);
         WRITE(squares_x, p, x * x);
         WRITE(squares_y, p, y * y);
     }
@@ -94,8 +94,8 @@ __kernel void slopes_find(
 
 // Inverse variances of slopes along x and y, within bounds; 0 without a normal.
 __kernel void slopes_weigh(
-    const int rows, const int columns, const float least, const float lowest, const float highest, MAP sigma, MAP dz_dx,
-    MAP squares_x, MAP squares_y, OUT weight_x, OUT weight_y)
+    const int rows, const int columns, const float flat_limit, const float lowest, const float highest, MAP sigma,
+    MAP dz_dx,     MAP squares_x, MAP squares_y, OUT weight_x, OUT weight_y)
 {
     const int across_all = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
     const int top = item / across_all * ROWS, bottom = LESSER(rows, top + ROWS);
@@ -115,18 +115,18 @@ __kernel void slopes_weigh(
         for (int i = 0; i < width; i += WIDTH) {
             const int p = row * columns + begin + i;
             const F sum_x = FIVE(x), sum_y = FIVE(y), slope = READ(dz_dx, p), s = READ(sigma, p);
-            const I known = slope == slope;
-            const F variance = known ? s * s : (F)1.0f, flat = READ(squares_x, p) + READ(squares_y, p);
+            const I valid = slope == slope;
+            const F variance = valid ? s * s : (F)1.0f, flat = READ(squares_x, p) + READ(squares_y, p);
             const F upright = 1.0f - flat, steep = 1.0f / GREATER(upright, (F)(STEEPEST * STEEPEST));
             UNSURE(flat, variance)
-            const F here = share * variance * steep * steep + 0.5f * flat * steep * turned * turned;
-            const F orthogonal = (1.0f - share) * variance * steep, twice = 2.0f * turned;
+            const F here = fraction * variance * steep * steep + 0.5f * flat * steep * turned * turned;
+            const F orthogonal = (1.0f - fraction) * variance * steep, twice = 2.0f * turned;
             const F east_of = (sum_x + LEAST) / (sum_x + sum_y + 2.0f * LEAST) - 0.5f;
             const F share_x = 0.5f + east_of * EXPONENTIAL(twice);
             const F high = LESSER(share_x, (F)1.0f), east = GREATER(high, (F)0.0f), north = 1.0f - east;
             const F one = GREATER(1.0f / (east * here + north * orthogonal), (F)lowest);
             const F two = GREATER(1.0f / (north * here + east * orthogonal), (F)lowest);
-            const F in_x = known ? LESSER(one, (F)highest) : (F)0.0f, in_y = known ? LESSER(two, (F)highest) : (F)0.0f;
+            const F in_x = valid ? LESSER(one, (F)highest) : (F)0.0f, in_y = valid ? LESSER(two, (F)highest) : (F)0.0f;
             if (i + WIDTH <= width) {
                 WRITE(weight_x, p, in_x);
                 WRITE(weight_y, p, in_y);

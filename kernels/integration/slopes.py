@@ -21,33 +21,43 @@ _AROUND = 2  # pixels on each side, in the window for the direction of the merid
 _LEAST = float(np.finfo(np.float32).tiny)
 
 
-def slopes_find(least: float, vectors: Array, sigma: Array, contact: Array) -> tuple[Doubles, ...]:
+def slopes_find(flat_limit: float, vectors: Array, sigma: Array, contact: Array) -> tuple[Doubles, ...]:
     """Return the slopes, NaN without a normal, and the squares of the normal's components, 0 there.
 
-    ``least`` is the squared sine of the tilt; if it is infinite (unknown), errors are isotropic.
+    ``flat_limit`` is the squared sine of the tilt; if it is infinite (unknown), errors are isotropic.
     """
-    return find(least, vectors.astype(np.float64), sigma.astype(np.float64), contact)
+    return find(flat_limit, vectors.astype(np.float64), sigma.astype(np.float64), contact)
 
 
-def slopes_weigh(least: float, lowest: float, highest: float, sigma: Array, dz_dx: Doubles,
+def slopes_weigh(flat_limit: float, lowest: float, highest: float, sigma: Array, dz_dx: Doubles,
                  squares_x: Doubles, squares_y: Doubles) -> tuple[Doubles, Doubles]:  # fmt: skip
     """Return inverse variances of the slopes along x and y, within bounds; 0 without a normal."""
-    return weigh(least, (lowest, highest), sigma.astype(np.float64), dz_dx, squares_x, squares_y)
+    return weigh(flat_limit, (lowest, highest), sigma.astype(np.float64), dz_dx, squares_x, squares_y)
 
 
-def find(least: float, vectors: Array, sigma: Array, contact: Array) -> tuple[Array, Array, Array, Array]:
+def find(
+    flat_limit: float, vectors: Array, sigma: Array, contact: Array
+) -> tuple[Array, Array, Array, Array]:
     """Return the result of `slopes_find` in the precision of the arguments."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     with np.errstate(invalid="ignore"):
-        known = (contact != 0) & (z > 0) & (sigma > 0) & (sigma < np.inf)
-    x, y, z = (np.where(known, one, other) for one, other in ((x, 0), (y, 0), (np.maximum(z, _STEEPEST), 1)))
-    _, turned = _unsure(least, x * x + y * y, np.where(known, sigma, 0) ** 2)
-    longer = np.where(known, -np.exp(turned / 2) / z, np.nan)
+        valid = (contact != 0) & (z > 0) & (sigma > 0) & (sigma < np.inf)
+    x, y, z = (
+        np.where(valid, component, other)
+        for component, other in ((x, 0), (y, 0), (np.maximum(z, _STEEPEST), 1))
+    )
+    _, turned = _unsure(flat_limit, x * x + y * y, np.where(valid, sigma, 0) ** 2)
+    longer = np.where(valid, -np.exp(turned / 2) / z, np.nan)
     return longer * x, longer * y, x * x, y * y
 
 
 def weigh(
-    least: float, bounds: tuple[float, float], sigma: Array, dz_dx: Array, squares_x: Array, squares_y: Array
+    flat_limit: float,
+    bounds: tuple[float, float],
+    sigma: Array,
+    dz_dx: Array,
+    squares_x: Array,
+    squares_y: Array,
 ) -> tuple[Array, Array]:
     """Return the result of `slopes_weigh` in the precision of the arguments.
 
@@ -57,24 +67,24 @@ def weigh(
     the azimuth reduces the contrast of their means by exp(-2 variance). An error e of the azimuth also
     shortens the slope by e^2 / 2.
     """
-    known = np.isfinite(dz_dx)
-    variance = np.where(known, sigma, 1) ** 2
+    valid = np.isfinite(dz_dx)
+    variance = np.where(valid, sigma, 1) ** 2
     flat = squares_x + squares_y
     steep = 1 / np.maximum(1 - flat, _STEEPEST**2)
-    share, turned = _unsure(least, flat, variance)
-    along = share * variance * steep**2 + flat * steep * turned**2 / 2
-    across = (1 - share) * variance * steep
-    x, y = (_sum_around(one) + _LEAST for one in (squares_x, squares_y))
+    fraction, turned = _unsure(flat_limit, flat, variance)
+    along = fraction * variance * steep**2 + flat * steep * turned**2 / 2
+    across = (1 - fraction) * variance * steep
+    x, y = (_sum_around(values) + _LEAST for values in (squares_x, squares_y))
     east = np.clip(0.5 + (x / (x + y) - 0.5) * np.exp(2 * turned), 0, 1)
     variances = east * along + (1 - east) * across, (1 - east) * along + east * across
-    weight_x, weight_y = (np.where(known, np.clip(1 / one, *bounds), 0) for one in variances)
+    weight_x, weight_y = (np.where(valid, np.clip(1 / values, *bounds), 0) for values in variances)
     return weight_x, weight_y
 
 
-def _unsure(least: float, flat: Array, variance: Array) -> tuple[Array, Array]:
+def _unsure(flat_limit: float, flat: Array, variance: Array) -> tuple[Array, Array]:
     """Return the share of the angular variance along the meridian, and the azimuth's variance."""
-    share = 0.5 * np.minimum(least / np.maximum(flat, _LEAST), 1)
-    return share, np.minimum((1 - share) * variance / np.maximum(flat, least), _WIDEST)
+    fraction = 0.5 * np.minimum(flat_limit / np.maximum(flat, _LEAST), 1)
+    return fraction, np.minimum((1 - fraction) * variance / np.maximum(flat, flat_limit), _WIDEST)
 
 
 def _sum_around(values: Array) -> Array:

@@ -93,8 +93,8 @@ def conjugate_gradients(
         rest = target - moved
         here = face(x, rest) if callable(face) else face
         residual = here.project(rest)
-        done = converged(residual)
-        if done or step == steps:
+        is_converged = converged(residual)
+        if is_converged or step == steps:
             break
         steepest = here.project(here.precondition(residual))
         before, gain = gain, inner(residual, steepest)
@@ -107,4 +107,4 @@ def conjugate_gradients(
         within = farther if limit is None else limit(farther)
         moved = moved + (length * along if within is farther else product(within - x))
         x = within
-    return Solution(x, moved, residual, step, done)
+    return Solution(x, moved, residual, step, is_converged)

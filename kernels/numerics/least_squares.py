@@ -187,8 +187,8 @@ def descend(
         added = np.diag(np.diag(matrix)) if damping.matrix is None else damping.matrix
         while True:
             step = _step(matrix + factor * added, right, solve, best.parameters, bounds)
-            there = best.parameters + (step if shorten is None else shorten(step))
-            trial = at(there if bounds is None else np.clip(there, *bounds))
+            candidate = best.parameters + (step if shorten is None else shorten(step))
+            trial = at(candidate if bounds is None else np.clip(candidate, *bounds))
             if trial.cost <= best.cost + rounding or factor > damping.stuck:
                 break
             factor *= 10

@@ -20,7 +20,7 @@ def samples_take(
     Value k of row j of line i has index first + i apart + j down + k step.
     """
     flat = values.reshape(-1)[first:]
-    strides = [one * flat.itemsize for one in (apart, down, step)]
+    strides = [elements * flat.itemsize for elements in (apart, down, step)]
     return as_strided(flat, (lines, rows, count), strides, writeable=False).copy()
 
 
@@ -45,7 +45,9 @@ def take_grids(*grids: Grid) -> list[NDArray[Any]]:
     parts = []
     for array, first, steps, shape in grids:
         if isinstance(array, np.ndarray):
-            return [samples_take(*one.shape, np.asarray(one.array), one.first, *one.steps) for one in grids]
+            return [
+                samples_take(*grid.shape, np.asarray(grid.array), grid.first, *grid.steps) for grid in grids
+            ]
         samples = array.device.array("samples", shape, array.dtype, zeroed=False)
         kernel = array.device.kernel("samples", "samples_take", VALUE=C_TYPES[array.dtype.name])
         (lines, rows, count), (apart, down, step) = shape, steps

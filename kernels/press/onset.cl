@@ -7,16 +7,17 @@
 //
 // A map is a plane of `stride` pixels; only the first `pixels` are in the picture:
 //
-// levels   counts at which a pixel turns light, NaN if it cannot; counts of its dark plateau
-// marks    the smallest light sample; the smallest that is not certainly dark; the smallest near the level
-// left     number of frames after which a pixel is decided if all are light, at most MOST
-// times    frame at which the run started; the last certainly dark frame and the last frame not near the level,
-//          before an incomplete run, or before now if the last sample is near the level
-// samples  the last sample; those before, at and after the onset of an incomplete run; the sample after the last
-//          one that was not near the level
-// answers  height; sigma: as if no frame followed
-// status   0 invalid input, 1 onset, 2 never light, 3 light at start (`release`: 2 dark at start, 3 light to the end)
-// travel   has planes of `row_length` frames: travel; the step to it; travel since the first frame
+// levels       counts at which a pixel turns light, NaN if it cannot; counts of its dark plateau
+// thresholds   the smallest light sample; the smallest that is not certainly dark; the smallest near the level
+// frames_left  number of frames after which a pixel is decided if all are light, at most MOST
+// times        frame at which the run started; the last certainly dark frame and the last frame not near the level,
+//              before an incomplete run, or before now if the last sample is near the level
+// samples      the last sample; those before, at and after the onset of an incomplete run; the sample after the last
+//              one that was not near the level
+// answers      height; sigma: as if no frame followed
+// status       0 invalid input, 1 onset, 2 never light, 3 light at start (`release`: 2 dark at start, 3 light to the
+//              end)
+// travel       has planes of `row_length` frames: travel; the step to it; travel since the first frame
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
@@ -24,7 +25,7 @@
 #define DARK -1
 #define INVALID -2
 #define BENT 1.5f  // onset.py
-#define SURE_WAY 34  // standard deviations: a quarter of it is 8.5, which noise does not reach
+#define CLEAR_RISE 34  // standard deviations: a quarter of it is 8.5, which noise does not reach
 
 // As wide as a sample, so that both have vectors of the same length.
 #if BITS == 8
@@ -57,19 +58,21 @@ float next_up(const float x)
     return as_float(x == 0 ? 1 : up);
 }
 
-// The smallest float not below dark + share (bright - dark), as if in double precision.
-float level_between(const float dark, const float bright, const float share, const float share_rest)
+// The smallest float not below dark + fraction (bright - dark), as if in double precision.
+float level_between(const float dark, const float bright, const float fraction, const float fraction_rest)
 {
-    const Pair range = sum_of(bright, -dark), product = product_of(share, range.high), sum = sum_of(dark, product.high);
-    const Pair level = sum_of(sum.high, sum.rest + (product.rest + (share * range.rest + share_rest * range.high)));
+    const Pair range = sum_of(bright, -dark), product = product_of(fraction, range.high);
+    const Pair sum = sum_of(dark, product.high);
+    const float rest = product.rest + (fraction * range.rest + fraction_rest * range.high);
+    const Pair level = sum_of(sum.high, sum.rest + rest);
     return level.rest > 0 ? next_up(level.high) : level.high;
 }
 
 // Converts bright and dark, maps of step 1 or single numbers of step 0, to level and dark, and computes the
 // smallest light sample.
 __kernel void onset_levels(
-    const int pixels, const int stride, const int release, const float share, const float share_rest, MAP brights,
-    const int bright_step, MAP darks, const int dark_step, OUT levels, __global FRAME *restrict marks)
+    const int pixels, const int stride, const int release, const float fraction, const float fraction_rest, MAP brights,
+    const int bright_step, MAP darks, const int dark_step, OUT levels, __global FRAME *restrict thresholds)
 {
     const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base);
     const int different = bright_step | dark_step ? width : 1;  // pixels; the others equal the first
@@ -81,23 +84,23 @@ __kernel void onset_levels(
     for (int p = 0; p < different; ++p) {
         const float bright = high[p], dark = low[p], range = bright - dark;
         const int usable = (range > 0) & (range - range == 0);  // the last condition: finite
-        const float between = level_between(dark, bright, share, share_rest), level = usable ? between : NAN;
+        const float between = level_between(dark, bright, fraction, fraction_rest), level = usable ? between : NAN;
 #if BITS == 32
-        marks[base + p] = release ? next_up(-level) : level;
+        thresholds[base + p] = release ? next_up(-level) : level;
         levels[base + p] = release ? -level : level;
         low[p] = release ? -bright : dark;
 #else
         // Rounded up; a saturated sample is light. A pixel that is never dark has no release.
         const float top = NONE, bound = level > 0 ? (level < top ? level : top) : usable ? 0 : top;
         const int whole = (int)bound, reached = whole + (whole < bound);
-        marks[base + p] = release ? (FRAME)(NONE - reached + 1) : (FRAME)reached;
+        thresholds[base + p] = release ? (FRAME)(NONE - reached + 1) : (FRAME)reached;
         levels[base + p] = release ? (reached > 0 ? top - level : NAN) : level;
         low[p] = release ? top - bright : dark;
 #endif
     }
-    const FRAME mark = marks[base];
+    const FRAME first_threshold = thresholds[base];
     const float level = levels[base], dark = low[0];
-    for (int p = different; p < width; ++p) marks[base + p] = mark;
+    for (int p = different; p < width; ++p) thresholds[base + p] = first_threshold;
     for (int p = different; p < width; ++p) levels[base + p] = level;
     for (int p = 0; p < different; ++p) levels[stride + base + p] = low[p];
     for (int p = different; p < width; ++p) levels[stride + base + p] = dark;
@@ -106,53 +109,54 @@ __kernel void onset_levels(
 // Computes the smallest samples that are not certainly dark (within `tolerance` counts of the level) and that
 // are near the level (within a quarter of the rise from dark).
 __kernel void onset_sure(
-    const int pixels, const int stride, const float tolerance, MAP levels, __global FRAME *restrict marks)
+    const int pixels, const int stride, const float tolerance, MAP levels, __global FRAME *restrict thresholds)
 {
     const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base);
-    FRAME sures[TILE], nears[TILE];
+    FRAME dark_limits[TILE], near_limits[TILE];
     for (int p = 0; p < width; ++p) {
-        const float level = levels[base + p], sure = level - tolerance;
-        const FRAME light = marks[base + p];
+        const float level = levels[base + p], dark_limit = level - tolerance;
+        const FRAME light = thresholds[base + p];
 #if BITS == 32
-        const FRAME above = next_up(sure);
+        const FRAME above = next_up(dark_limit);
 #else
-        const float bound = sure < NONE ? (sure < -1 ? -1 : sure) : NONE - 1;
+        const float bound = dark_limit < NONE ? (dark_limit < -1 ? -1 : dark_limit) : NONE - 1;
         const FRAME above = level < 0 ? light : (FRAME)((int)(bound + 1));
 #endif
         const FRAME dim = LESSER(above, light);
-        const float way = 0.25f * (level - levels[stride + base + p]), least = level - (way > 0 ? way : 0);
-        sures[p] = dim;
+        const float near_rise = 0.25f * (level - levels[stride + base + p]);
+        const float near_limit = level - (near_rise > 0 ? near_rise : 0);
+        dark_limits[p] = dim;
 #if BITS == 32
-        nears[p] = LESSER(least, dim);
+        near_limits[p] = LESSER(near_limit, dim);
 #else
-        const float bounded = least > 0 ? (least < NONE ? least : NONE) : 0;
+        const float bounded = near_limit > 0 ? (near_limit < NONE ? near_limit : NONE) : 0;
         const int whole = (int)bounded, reached = whole + (whole < bounded);
-        nears[p] = LESSER(reached, dim);
+        near_limits[p] = LESSER(reached, dim);
 #endif
     }
-    for (int p = 0; p < width; ++p) marks[stride + base + p] = sures[p];
-    for (int p = 0; p < width; ++p) marks[2 * stride + base + p] = nears[p];
+    for (int p = 0; p < width; ++p) thresholds[stride + base + p] = dark_limits[p];
+    for (int p = 0; p < width; ++p) thresholds[2 * stride + base + p] = near_limits[p];
 }
 
 // --- Samples around an onset --------------------------------------------------------------------------------------
 
 // The last frame below `bound`, from frame `from` of a pixel's `series` backwards; the very first counts as
-// dark. The series starts with frame `first`; `last` is the sample before it, and `known` the result there.
+// dark. The series starts with frame `first`; `last` is the sample before it, and `previous` the result there.
 int last_below(
     __global const FRAME *series, const int from, const int pixels, const int first, const int release,
-    const FRAME bound, const FRAME last, const int known)
+    const FRAME bound, const FRAME last, const int previous)
 {
     for (int k = from; k >= first && k > 0; --k)
         if (SEE(series[(size_t)(k - first) * pixels]) < bound) return k;
-    return first == 0 ? 0 : last < bound ? first - 1 : known;
+    return first == 0 ? 0 : last < bound ? first - 1 : previous;
 }
 
 // Height and variance of a pixel, see onset.py. Everything is computed and then selected, so that it
 // vectorises. `jumped` means that `from` and `step` describe the step in which the pixel rose to its plateau,
 // not the onset.
 float2 answer(
-    const float low, const float high, const float after, const float waited, const float doubt, const float from,
-    const float step, const float level, const float dark, const float threshold, const float noise,
+    const float low, const float high, const float after, const float waited, const float unclear_travel,
+    const float from, const float step, const float level, const float dark, const float threshold, const float noise,
     const float dark_tolerance, const float light_tolerance, const int jumped)
 {
     const float rise = high - low, steepness = 1 / rise;
@@ -161,17 +165,18 @@ float2 answer(
     const int hovered = waits & !jumped, sudden = (from_dark & to_light) | jumped, look = !(sudden | hovered);
     const float near = 0.125f * rise;
     const int at_plateau = (low <= dark + near) | (high >= after - near), guess = from_dark | to_light | at_plateau | hovered | jumped;
-    const float least = level > low ? level : low, most = least < high ? least : high;
-    const float crossed = (most - low) * steepness, rest = 1 - crossed;
-    const float share = sudden ? 0.5f : crossed;
-    const float slope = step * noise * steepness, width = step + (hovered ? doubt : 0);
-    // With the quantile of a normal distribution in place of the share: v + BENT v^3, v = share - 1/2.
-    const float way = level - dark, per_way = way > 0 ? threshold / way : 0, middle = threshold - 0.5f;
-    const float below = (low - dark) * per_way - 0.5f, above = (high - dark) * per_way - 0.5f;
+    const float raised = level > low ? level : low, clamped = raised < high ? raised : high;
+    const float crossed = (clamped - low) * steepness, rest = 1 - crossed;
+    const float fraction = sudden ? 0.5f : crossed;
+    const float slope = step * noise * steepness, width = step + (hovered ? unclear_travel : 0);
+    // With the quantile of a normal distribution in place of the fraction: v + BENT v^3, v = fraction - 1/2.
+    const float to_level = level - dark, per_count = to_level > 0 ? threshold / to_level : 0, middle = threshold - 0.5f;
+    const float below = (low - dark) * per_count - 0.5f, above = (high - dark) * per_count - 0.5f;
     const float both = below * below + below * above + above * above;
     const float off = step * crossed * BENT * (middle - above) * (middle + below + above) / (1 + BENT * both);
-    const float known = slope * slope * (crossed * crossed + rest * rest) + off * off, guessed = width * width / 12;
-    return (float2)(-(from + step * share), (look ? known : 0) + (guess ? guessed : 0));
+    const float from_noise = slope * slope * (crossed * crossed + rest * rest) + off * off;
+    const float from_interval = width * width / 12;
+    return (float2)(-(from + step * fraction), (look ? from_noise : 0) + (guess ? from_interval : 0));
 }
 
 // --- Frame by frame -----------------------------------------------------------------------------------------------
@@ -181,10 +186,10 @@ float2 answer(
 #define LOOK_BACK(p, from) \
     { \
         const FRAME last = first > 0 ? SEE(lasts[p]) : 0; \
-        darks[p] = last_below(frames + (p), from, pixels, first, release, sures[p], last, darks[p]); \
-        feet[p] = last_below(frames + (p), darks[p], pixels, first, release, nears[p], last, feet[p]); \
-        const int next = feet[p] + 1 - first; \
-        if (next >= 0 && next <= from - first) risens[p] = SEE(frames[(size_t)next * pixels + (p)]); \
+        darks[p] = last_below(frames + (p), from, pixels, first, release, dark_limits[p], last, darks[p]); \
+        last_fars[p] = last_below(frames + (p), darks[p], pixels, first, release, near_limits[p], last, last_fars[p]); \
+        const int next = last_fars[p] + 1 - first; \
+        if (next >= 0 && next <= from - first) first_rises[p] = SEE(frames[(size_t)next * pixels + (p)]); \
     }
 
 // One of several frames processed together: where it is dark, the run of the pixel restarts, unless it is
@@ -204,7 +209,7 @@ float2 answer(
     end_of_run = again ? next##i : end_of_run;
 #endif
 // Read from an array: compilers widen computed values to 32 bits.
-#define TIMES(i) const Count clock##i = CLOCK(t + i), next##i = CLOCK(t + i + 1) + most;
+#define TIMES(i) const Count clock##i = CLOCK(t + i), next##i = CLOCK(t + i + 1) + unconfirmed;
 #if TILE > 1
 #define CLOCK(t) clock[t]
 #else
@@ -226,8 +231,9 @@ float2 answer(
 // paper's equation 4, at the frame of the onset itself, and there are no `samples`.
 __kernel void onset_scan(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride, const int first,
-    const int hold, const int release, const int subframe, const float threshold, __global const FRAME *restrict marks,
-    __global Count *restrict left, __global int *restrict times, MAP levels, MAP travel, const int row_length,
+    const int hold, const int release, const int subframe, const float threshold,
+    __global const FRAME *restrict thresholds, __global Count *restrict frames_left, __global int *restrict times,
+    MAP levels, MAP travel, const int row_length,
     const float noise, const float dark_tolerance, const float light_tolerance, __global FRAME *restrict samples,
     OUT answers, __global uchar *restrict status)
 {
@@ -236,16 +242,16 @@ __kernel void onset_scan(
     const int needed = subframe && hold < 3 ? 3 : hold, after = needed - hold;
     const Count whole = LESSER(needed, MOST);
     // counted frames of a run: beyond this it cannot be confirmed within SPAN
-    const Count most = LESSER(hold, 2 * SPAN);
+    const Count unconfirmed = LESSER(hold, 2 * SPAN);
 #if TILE > 1
     Count clock[SPAN + 1];
     for (int t = 0; t <= SPAN; ++t) clock[t] = t;
 #endif
     FRAME light[TILE];
     Count remain[TILE];
-    for (int p = 0; p < width; ++p) light[p] = marks[base + p];
+    for (int p = 0; p < width; ++p) light[p] = thresholds[base + p];
     if (first > 0)
-        for (int p = 0; p < width; ++p) remain[p] = left[base + p];
+        for (int p = 0; p < width; ++p) remain[p] = frames_left[base + p];
     else {
         for (int p = 0; p < width; ++p) {
             const float level = levels[base + p];
@@ -262,14 +268,15 @@ __kernel void onset_scan(
     levels += base;
     answers += base;
     status += base;
-    __global int *restrict darks = times + stride, *restrict feet = darks + stride;
-    __global const FRAME *restrict sures = marks + stride + base, *restrict nears = sures + stride;
+    __global int *restrict darks = times + stride, *restrict last_fars = darks + stride;
+    __global const FRAME *restrict dark_limits = thresholds + stride + base;
+    __global const FRAME *restrict near_limits = dark_limits + stride;
     __global FRAME *restrict lasts = samples + base, *restrict lows = lasts + stride, *restrict highs = lows + stride,
-                   *restrict laters = highs + stride, *restrict risens = laters + stride;
+                   *restrict laters = highs + stride, *restrict first_rises = laters + stride;
     if (first == 0 && subframe)
-        for (int p = 0; p < width; ++p) darks[p] = feet[p] = 0;
+        for (int p = 0; p < width; ++p) darks[p] = last_fars[p] = 0;
     if (first < 2 && first + count > 1 && subframe)
-        for (int p = 0; p < width; ++p) risens[p] = SEE(frames[(size_t)(1 - first) * pixels + p]);
+        for (int p = 0; p < width; ++p) first_rises[p] = SEE(frames[(size_t)(1 - first) * pixels + p]);
 
     for (int start = 0; start < count; start += SPAN) {
         const int now = first + start, length = min(SPAN, count - start), end = now + length;
@@ -278,10 +285,10 @@ __kernel void onset_scan(
         for (int p = 0; p < width; ++p) any |= remain[p];
         if (!any) break;
 
-        // When a run is confirmed, counted from `now`, if all frames from its start are light; beyond `most`
+        // When a run is confirmed, counted from `now`, if all frames from its start are light; beyond `unconfirmed`
         // if it starts after `now`.
         Count held[TILE], bad[TILE];
-        for (int p = 0; p < width; ++p) held[p] = remain[p] > after ? LESSER(remain[p] - after, most) : 0;
+        for (int p = 0; p < width; ++p) held[p] = remain[p] > after ? LESSER(remain[p] - after, unconfirmed) : 0;
         for (int p = 0; p < width; ++p) bad[p] = 0;
         for (int t = 0; t < length;) {
             __global const FRAME *restrict group = span + (size_t)t * pixels;
@@ -304,13 +311,14 @@ __kernel void onset_scan(
             high = min(low + CHUNK, width);
             Count changed = needed > MOST, before[CHUNK];
             for (int p = low; p < high; ++p)
-                changed |= ((remain[p] > 0) & ((held[p] != length + most) | (remain[p] != whole))) | bad[p];
+                changed |= ((remain[p] > 0) & ((held[p] != length + unconfirmed) | (remain[p] != whole))) | bad[p];
             if (!changed) continue;
 
             for (int p = low; p < high; ++p) {
-                const int known = times[p], unbroken = known >= 0 ? known : now, broken = bad[p], began = held[p] - most;
+                const int start_of_run = times[p], unbroken = start_of_run >= 0 ? start_of_run : now;
+                const int broken = bad[p], began = held[p] - unconfirmed;
                 const int run = began <= 0 ? unbroken : began == length ? DARK : now + began;
-                const int begin = remain[p] == 0 ? known : broken ? INVALID : run, rest = needed - (end - begin);
+                const int begin = remain[p] == 0 ? start_of_run : broken ? INVALID : run, rest = needed - (end - begin);
                 const int lacks = begin == DARK ? needed : begin == INVALID || rest < 0 ? 0 : rest;
                 before[p - low] = remain[p];
                 times[p] = begin;
@@ -358,27 +366,29 @@ __kernel void onset_scan(
             }
 
             // If the previous sample is near the level, the search continues backwards, mostly by one sample.
-            float waited[CHUNK], doubt[CHUNK];
+            float waited[CHUNK], unclear_travel[CHUNK];
             int frame[CHUNK], jumped[CHUNK], waits[CHUNK], hard = 0;
             for (int p = low; p < high; ++p) {
                 waited[p - low] = 1;
-                doubt[p - low] = 0;
+                unclear_travel[p - low] = 0;
                 frame[p - low] = times[p] < 1 ? 1 : times[p];
                 jumped[p - low] = 0;
-                waits[p - low] = (before[p - low] > 0) & (times[p] > 0) & !(dim[p - low] < nears[p]);
+                waits[p - low] = (before[p - low] > 0) & (times[p] > 0) & !(dim[p - low] < near_limits[p]);
                 unsure |= waits[p - low];
             }
             if (unsure) {
                 int looks[CHUNK];
                 for (int p = low, i = 0; p < high; ++p, ++i) second[i] = span[(long)(start + at[i] > 1 ? at[i] - 2 : 0) * pixels + p];
                 for (int p = low, i = 0; p < high; ++p, ++i) {
-                    const FRAME sample = dim[i], earlier = SEE(second[i]), sure = sures[p], near = nears[p], risen = risens[p];
-                    const int begin = times[p], dark = darks[p], foot = feet[p];
-                    const int new = waits[i] & (begin >= now), next = new & (start + at[i] > 1) & (earlier < near);
-                    const int dimmed = begin - 2 + (sample < sure);
+                    const FRAME sample = dim[i], earlier = SEE(second[i]), first_rise = first_rises[p];
+                    const FRAME dark_limit = dark_limits[p], near_limit = near_limits[p];
+                    const int begin = times[p], dark = darks[p], last_far = last_fars[p];
+                    const int new = waits[i] & (begin >= now);
+                    const int next = new & (start + at[i] > 1) & (earlier < near_limit);
+                    const int dimmed = begin - 2 + (sample < dark_limit);
                     darks[p] = next ? dimmed : dark;
-                    feet[p] = next ? begin - 2 : foot;
-                    risens[p] = next ? sample : risen;
+                    last_fars[p] = next ? begin - 2 : last_far;
+                    first_rises[p] = next ? sample : first_rise;
                     looks[i] = new & !next;
                     hard |= looks[i];
                 }
@@ -387,11 +397,12 @@ __kernel void onset_scan(
                 for (int p = low, i = 0; p < high; ++p, ++i) {
                     const int begin = times[p], kept = waits[i], from = kept ? begin - 1 : 0, dark = kept ? darks[p] : 0;
                     waited[i] = kept ? begin - dark : 1;
-                    doubt[i] = travel[2 * row_length + from] - travel[2 * row_length + dark];
-                    const float way = levels[p] - levels[stride + p], light = later[i], risen = risens[p];
-                    const int rises = risen >= light - way * 0.125f;
-                    jumped[i] = kept & rises & (feet[p] + 1 < begin) & (way >= SURE_WAY * noise);
-                    frame[i] = jumped[i] ? feet[p] + 1 : frame[i];
+                    unclear_travel[i] = travel[2 * row_length + from] - travel[2 * row_length + dark];
+                    const float to_level = levels[p] - levels[stride + p];
+                    const float light = later[i], first_rise = first_rises[p];
+                    const int rises = first_rise >= light - to_level * 0.125f;
+                    jumped[i] = kept & rises & (last_fars[p] + 1 < begin) & (to_level >= CLEAR_RISE * noise);
+                    frame[i] = jumped[i] ? last_fars[p] + 1 : frame[i];
                 }
             }
 
@@ -399,40 +410,41 @@ __kernel void onset_scan(
             for (int p = low; p < high; ++p) sigma[p - low] = answers[stride + p];
             for (int p = low, i = 0; p < high; ++p, ++i) {
                 const int begin = times[p];
-                const float2 found = answer(dim[i], bright[i], later[i], waited[i], doubt[i], travel[frame[i] - 1],
-                                            travel[row_length + frame[i]], levels[p], levels[stride + p], threshold,
-                                            noise, dark_tolerance, light_tolerance, jumped[i]);
-                const float height = answers[p], spread = rough_inverse_root(found.y);
+                const float2 crossing = answer(dim[i], bright[i], later[i], waited[i], unclear_travel[i],
+                                               travel[frame[i] - 1], travel[row_length + frame[i]], levels[p],
+                                               levels[stride + p], threshold, noise, dark_tolerance,
+                                               light_tolerance, jumped[i]);
+                const float height = answers[p], spread = rough_inverse_root(crossing.y);
                 const uchar was = status[p], is = begin > 0 ? 1 : begin == 0 ? 3 - release : begin == DARK ? never : 0;
-                answers[p] = before[i] == 0 ? height : begin > 0 ? found.x : NAN;
-                sigma[i] = before[i] == 0 ? sigma[i] : begin > 0 ? found.y * spread : NAN;
+                answers[p] = before[i] == 0 ? height : begin > 0 ? crossing.x : NAN;
+                sigma[i] = before[i] == 0 ? sigma[i] : begin > 0 ? crossing.y * spread : NAN;
                 status[p] = before[i] == 0 ? was : is;
             }
             for (int p = low; p < high; ++p) answers[stride + p] = sigma[p - low];
             for (int p = low; p < high && running; ++p) {
-                const int begin = times[p], dark = darks[p], foot = feet[p];
-                const FRAME risen = risens[p];
-                const int rises = (begin > 0) & (dim[p - low] < nears[p]);
+                const int begin = times[p], dark = darks[p], last_far = last_fars[p];
+                const FRAME first_rise = first_rises[p];
+                const int rises = (begin > 0) & (dim[p - low] < near_limits[p]);
                 lows[p] = dim[p - low];
                 highs[p] = bright[p - low];
                 laters[p] = later[p - low];
-                darks[p] = ((begin > 0) & (dim[p - low] < sures[p])) ? begin - 1 : dark;
-                feet[p] = rises ? begin - 1 : foot;
-                risens[p] = rises ? bright[p - low] : risen;
+                darks[p] = ((begin > 0) & (dim[p - low] < dark_limits[p])) ? begin - 1 : dark;
+                last_fars[p] = rises ? begin - 1 : last_far;
+                first_rises[p] = rises ? bright[p - low] : first_rise;
             }
         }
     }
 
-    for (int p = 0; p < width; ++p) left[base + p] = remain[p];
+    for (int p = 0; p < width; ++p) frames_left[base + p] = remain[p];
     if (!subframe) return;
     // If the last sample is near the level, the next block cannot determine how long it has been.
     __global const FRAME *restrict final = frames + (size_t)(count - 1) * pixels;
     for (int low = 0, high; low < width; low = high) {
         high = min(low + CHUNK, width);
         int unsure = 0;
-        for (int p = low; p < high; ++p) unsure |= (remain[p] == whole) & !(SEE(final[p]) < nears[p]);
+        for (int p = low; p < high; ++p) unsure |= (remain[p] == whole) & !(SEE(final[p]) < near_limits[p]);
         for (int p = low; p < high && unsure; ++p)
-            if (times[p] == DARK && SEE(final[p]) >= nears[p]) LOOK_BACK(p, first + count - 1)
+            if (times[p] == DARK && SEE(final[p]) >= near_limits[p]) LOOK_BACK(p, first + count - 1)
     }
     for (int p = 0; p < width; ++p) lasts[p] = final[p];
 }

@@ -22,7 +22,7 @@ DARK = -1
 INVALID = -2
 BENT = 1.5
 """Coefficient of the normal quantile of a share v + 1/2: v + BENT v^3, within a tenth from 0.1 to 0.9."""
-_SURE_WAY = 34  # standard deviations: a quarter of it is 8.5, which noise does not reach
+_CLEAR_RISE = 34  # standard deviations: a quarter of it is 8.5, which noise does not reach
 
 
 def complement(samples: Array) -> Array:
@@ -72,23 +72,23 @@ def onset_sure(level: Array, light: Array, tolerance: float) -> Array:
     return np.asarray(np.minimum(above, light), light.dtype)
 
 
-def onset_near(level: Array, dark: Array, sure: Array) -> Array:
+def onset_near(level: Array, dark: Array, dark_limit: Array) -> Array:
     """Return the smallest samples, (P,), within a quarter of the range from dark to the level.
 
-    They are never above `sure`, and equal to `sure` where nothing is that far below the level.
+    They are never above `dark_limit`, and equal to `dark_limit` where nothing is that far below the level.
     """
     level = level.astype(np.float32)
     below = np.float32(0.25) * (level - dark)
     near = np.nan_to_num(level - np.maximum(below, np.float32(0)), nan=np.inf)
-    if sure.dtype.kind == "f":
-        return np.asarray(np.minimum(near, sure))
-    top = np.iinfo(sure.dtype).max
-    return np.asarray(np.minimum(np.ceil(near).clip(0, top), sure), sure.dtype)
+    if dark_limit.dtype.kind == "f":
+        return np.asarray(np.minimum(near, dark_limit))
+    top = np.iinfo(dark_limit.dtype).max
+    return np.asarray(np.minimum(np.ceil(near).clip(0, top), dark_limit), dark_limit.dtype)
 
 
-def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, near: Array, onset: Array,
-               below: Array, foot: Array, risen: Array, last: Array, before: Array, at: Array,
-               after: Array) -> None:  # fmt: skip
+def onset_scan(frames: Array, first: int, hold: int, light: Array, dark_limit: Array, near_limit: Array,
+               onset: Array, last_dark: Array, last_far: Array, first_rise: Array, last: Array,
+               before: Array, at: Array, after: Array) -> None:  # fmt: skip
     """Process a block of frames; the maps are the state, updated in place.
 
     Parameters
@@ -96,12 +96,12 @@ def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, 
     frames : (n, P), uint8, uint16 or float32
     first : number of the block's first frame in the stack
     hold : number of consecutive light frames that confirm an onset
-    light, sure, near : (P,), smallest samples that are light, not certainly dark, near the level
+    light, dark_limit, near_limit : (P,), smallest samples that are light, not certainly dark, near the level
     onset : (P,), first frame of the run; ``DARK`` without a run, ``INVALID`` after a NaN sample
-    below : (P,), last certainly dark frame before the run; the first frame counts as dark. The kernel stores
-        it only where it is not the last frame before the run
-    foot, risen : (P,), last frame before the run that was not near the level, stored like ``below``, and the
-        sample after it
+    last_dark : (P,), last certainly dark frame before the run; the first frame counts as dark. The
+        kernel stores it only where it is not the last frame before the run
+    last_far : (P,), last frame before the run that was not near the level, stored like ``last_dark``
+    first_rise : (P,), the sample after it
     last : (P,), last sample of the preceding block
     before, at, after : (P,), samples before and at the onset, and the smaller one of the next two
     """
@@ -114,11 +114,11 @@ def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, 
         before[begins] = last[begins]
         at[begins] = frame[begins]
         onset[undecided & ~is_light] = DARK
-        after_foot = undecided & (foot == number - 1)
-        risen[after_foot] = frame[after_foot]
+        after_far = undecided & (last_far == number - 1)
+        first_rise[after_far] = frame[after_far]
         if number > 0:
-            below[undecided & (frame < sure)] = number
-            foot[undecided & (frame < near)] = number
+            last_dark[undecided & (frame < dark_limit)] = number
+            last_far[undecided & (frame < near_limit)] = number
         onset[undecided & ~np.isfinite(frame)] = INVALID
 
         next_to = onset == number - 1
@@ -129,9 +129,9 @@ def onset_scan(frames: Array, first: int, hold: int, light: Array, sure: Array, 
         last[:] = frame
 
 
-def onset_heights(onset: Array, below: Array, foot: Array, risen: Array, before: Array, at: Array,
-                  after: Array, level: Array, dark: Array, threshold: float, travel: NDArray[np.float64],
-                  noise: float, dark_tolerance: float, light_tolerance: float,
+def onset_heights(onset: Array, last_dark: Array, last_far: Array, first_rise: Array, before: Array,
+                  at: Array, after: Array, level: Array, dark: Array, threshold: float,
+                  travel: NDArray[np.float64], noise: float, dark_tolerance: float, light_tolerance: float,
                   subframe: bool) -> tuple[NDArray[np.float64], NDArray[np.float64], Array]:  # fmt: skip
     """Return heights, standard deviations (mm) and status for onsets.
 
@@ -157,7 +157,7 @@ def onset_heights(onset: Array, below: Array, foot: Array, risen: Array, before:
 
     Parameters
     ----------
-    onset, below, foot, risen, before, at, after : results of ``onset_scan``
+    onset, last_dark, last_far, first_rise, before, at, after : results of ``onset_scan``
     level, dark : (P,), counts at which a pixel turns light, and of the dark plateau
     threshold : level, as a share of the range from the dark to the light plateau
     travel : (T,), mm, per frame
@@ -167,35 +167,41 @@ def onset_heights(onset: Array, below: Array, foot: Array, risen: Array, before:
     status = np.select([onset == INVALID, onset == DARK, onset == 0], [0, 2, 3], 1).astype(np.uint8)
     height = np.full(onset.shape, np.nan)
     sigma = np.full(onset.shape, np.nan)
-    found = status == 1
-    start = onset[found]
+    has_onset = status == 1
+    start = onset[has_onset]
     width = travel[start] - travel[start - 1]
     if not subframe:
-        height[found], sigma[found] = -travel[start], np.abs(width) / np.sqrt(3)
+        height[has_onset], sigma[has_onset] = -travel[start], np.abs(width) / np.sqrt(3)
         return height, sigma, status
 
-    low, high = before[found].astype(np.float64), at[found].astype(np.float64)
-    settled = np.where(start + 1 < len(travel), after[found], high)
-    from_dark, to_light = low <= dark[found] + dark_tolerance, high >= settled - light_tolerance
+    low, high = before[has_onset].astype(np.float64), at[has_onset].astype(np.float64)
+    settled = np.where(start + 1 < len(travel), after[has_onset], high)
+    from_dark, to_light = low <= dark[has_onset] + dark_tolerance, high >= settled - light_tolerance
     step = high - low
-    way = level[found] - dark[found]
-    jumped = (foot[found] + 1 < start) & (risen[found] >= settled - way / 8) & (way >= _SURE_WAY * noise)
-    at_plateau = (low <= dark[found] + step / 8) | (high >= settled - step / 8)
+    rise = level[has_onset] - dark[has_onset]
+    jumped = (
+        (last_far[has_onset] + 1 < start)
+        & (first_rise[has_onset] >= settled - rise / 8)
+        & (rise >= _CLEAR_RISE * noise)
+    )
+    at_plateau = (low <= dark[has_onset] + step / 8) | (high >= settled - step / 8)
     sudden, under_way = from_dark & to_light | jumped, ~(from_dark | to_light | at_plateau)
-    end = np.where(jumped, foot[found] + 1, start)
+    end = np.where(jumped, last_far[has_onset] + 1, start)
     width = travel[end] - travel[end - 1]
 
-    crossed = (np.clip(level[found], low, high) - low) / step
-    per_way = np.divide(threshold, way, out=np.zeros_like(low), where=way > 0)
-    first, second = ((part - dark[found]) * per_way - 0.5 for part in (low, high))
+    crossed = (np.clip(level[has_onset], low, high) - low) / step
+    per_count = np.divide(threshold, rise, out=np.zeros_like(low), where=rise > 0)
+    first, second = ((part - dark[has_onset]) * per_count - 0.5 for part in (low, high))
     middle, both = threshold - 0.5, first**2 + first * second + second**2
     # Minus the crossing of the quantile z(v) = v + BENT v^3: (z(middle) - z(first)) / (z(second) - z(first)).
     off = crossed * BENT * (middle - second) * (middle + first + second) / (1 + BENT * both)
-    known = np.abs(width) * np.hypot(noise * np.hypot(crossed, 1 - crossed) / step, off)
-    hovered = (step <= light_tolerance) | ((start - 2 - below[found]) * step > 2.5 * light_tolerance)
+    from_noise = np.abs(width) * np.hypot(noise * np.hypot(crossed, 1 - crossed) / step, off)
+    hovered = (step <= light_tolerance) | ((start - 2 - last_dark[has_onset]) * step > 2.5 * light_tolerance)
     hovered &= ~jumped
-    interval = np.abs(np.where(hovered, travel[start] - travel[below[found]], width))
-    guessed = interval / 2 / np.sqrt(3)
-    height[found] = -(travel[end - 1] + width * np.where(sudden, 0.5, crossed))
-    sigma[found] = np.select([sudden | hovered, under_way], [guessed, known], np.hypot(known, guessed))
+    interval = np.abs(np.where(hovered, travel[start] - travel[last_dark[has_onset]], width))
+    from_interval = interval / 2 / np.sqrt(3)
+    height[has_onset] = -(travel[end - 1] + width * np.where(sudden, 0.5, crossed))
+    sigma[has_onset] = np.select(
+        [sudden | hovered, under_way], [from_interval, from_noise], np.hypot(from_noise, from_interval)
+    )
     return height, sigma, status

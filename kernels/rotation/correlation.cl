@@ -28,11 +28,11 @@ typedef Pair Exact;
 #define ANSWER(p, reference, total, along, across, square) \
     { \
         const Exact a = total, b = along, c = across, x = ROW(0), y = ROW(1), z = ROW(2); \
-        const float left = FLOAT(MISFIT(square)); \
+        const float residual_square = FLOAT(MISFIT(square)); \
         mean[p] = reference + (fit[18] * FLOAT(x) + fit[19] * FLOAT(y) + fit[20] * FLOAT(z)); \
         cosine_part[p] = fit[22] * FLOAT(y) + fit[23] * FLOAT(z); \
         sine_part[p] = fit[26] * FLOAT(z); \
-        residual[p] = root((left < 0 ? 0 : left) * fit[27]); \
+        residual[p] = root((residual_square < 0 ? 0 : residual_square) * fit[27]); \
     }
 
 // --- Sums of integer counts: nothing is rounded -------------------------------------------------------------------
@@ -114,13 +114,13 @@ __kernel void correlation_add(
 {
     const int low = get_global_id(0) * TILE, width = min(TILE, pixels - low);
     for (int start = 0; start < count; start += WINDOW) {
-        const int stop = min(count, start + WINDOW), known = first > 0 || start > 0;
+        const int stop = min(count, start + WINDOW), started = first > 0 || start > 0;
         SUM(start, stop)
         for (int p = 0; p < width; ++p) {
-            total[low + p] = totals[p] + (known ? total[low + p] : 0);
-            cosine[low + p] = waves[p] + (known ? cosine[low + p] : 0);
-            sine[low + p] = others[p] + (known ? sine[low + p] : 0);
-            square[low + p] = squares[p] + (known ? square[low + p] : 0);
+            total[low + p] = totals[p] + (started ? total[low + p] : 0);
+            cosine[low + p] = waves[p] + (started ? cosine[low + p] : 0);
+            sine[low + p] = others[p] + (started ? sine[low + p] : 0);
+            square[low + p] = squares[p] + (started ? square[low + p] : 0);
         }
     }
 }

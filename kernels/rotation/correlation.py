@@ -143,5 +143,10 @@ def _solve(sums: Floats, fit: Array) -> Answers:
     table = fit.astype(np.float64)
     parts = (table[:9] + table[9:18]).reshape(3, 3) @ sums[1:4]
     mean, cosine, sine = table[18:27].reshape(3, 3) @ parts
-    left = sums[4] - np.sum(parts**2, axis=0)
-    return sums[0] + mean, cosine, sine, np.sqrt(np.where(left < 0, 0, left) * table[27])
+    residual_square = sums[4] - np.sum(parts**2, axis=0)
+    return (
+        sums[0] + mean,
+        cosine,
+        sine,
+        np.sqrt(np.where(residual_square < 0, 0, residual_square) * table[27]),
+    )

@@ -21,12 +21,12 @@ def facing_slopes(normals: Array, edge_on: float, unit: float) -> tuple[Array, A
     """
     x, y, z = np.moveaxis(normals.astype(np.float64), -1, 0)
     with np.errstate(all="ignore"):
-        share = z * z / (x * x + y * y + z * z)
-        seen = (z > 0) & (share > edge_on)
-        factor = np.where(seen, -1 / z, np.nan)
-        return x * factor, y * factor, unit * np.where(seen, share, 1)
+        cosine_square = z * z / (x * x + y * y + z * z)
+        visible = (z > 0) & (cosine_square > edge_on)
+        factor = np.where(visible, -1 / z, np.nan)
+        return x * factor, y * factor, unit * np.where(visible, cosine_square, 1)
 
 
-def facing_clip(least: float, most: float, weight: Array) -> Array:
+def facing_clip(lowest: float, highest: float, weight: Array) -> Array:
     """Return weights within limits; 0 where they are not above 0."""
-    return np.where(weight > 0, np.clip(weight, least, most), 0)
+    return np.where(weight > 0, np.clip(weight, lowest, highest), 0)

@@ -125,12 +125,12 @@ __kernel void registration_resample(
         for (int i = 0; i < width; ++i) {
             const int p = start + i;
             const float counts = LEVELS ? offset[p] + gain[p] * value[i] : value[i];
-            const int known = counts == counts;
+            const int defined = counts == counts;
             const float square_x = x_1[i] * x_1[i] + x0[i] * x0[i] + x1[i] * x1[i] + x2[i] * x2[i];
             const float square_y = y_1[i] * y_1[i] + y0[i] * y0[i] + y1[i] * y1[i] + y2[i] * y2[i];
             registered[p] = counts;
-            noise[p] += known ? square_x * square_y : 0;
-            noise[pixels + p] += known;
+            noise[p] += defined ? square_x * square_y : 0;
+            noise[pixels + p] += defined;
         }
     }
 }

@@ -68,9 +68,9 @@ __kernel void displacement_across(
         float sum = 0, count = 0;
         for (int k = FIRST_OF_MEAN; k < FIRST_OF_MEAN + WINDOW; ++k) {
             const FRAME sample = samples[MIRROR(column + k, columns)];
-            const int known = KNOWN(sample);
-            sum += known ? (float)sample : 0;
-            count += known;
+            const int defined = KNOWN(sample);
+            sum += defined ? (float)sample : 0;
+            count += defined;
         }
         sums[row * columns + column] = sum;
         counts[row * columns + column] = count;
@@ -191,8 +191,8 @@ __kernel void displacement_warp(
         const int p = (row + halo) * width + column + halo;
         const float counts = planes[p];
         const int measured = counts - counts == 0;
-        const float found = counts - value + planes[plane + p] * right + planes[2 * plane + p] * down;
-        difference[p] = measured ? (inside ? found : NAN) : 0;
+        const float deviation = counts - value + planes[plane + p] * right + planes[2 * plane + p] * down;
+        difference[p] = measured ? (inside ? deviation : NAN) : 0;
         difference[plane + p] = measured ? 1 + NOISE_GAIN(x) * NOISE_GAIN(y) : 0;
     }
 }
@@ -213,10 +213,11 @@ __kernel void displacement_pixels(
     for (int column = first; column < end; ++column) {
         SPLIT(column, node_columns, x, part_x)
         KEYS(x, part_x, node_columns)
-        const int left = max(x - 1, 0), right = min(x + 1, node_columns - 1), farthest = min(x + 2, node_columns - 1);
+        const int previous = max(x - 1, 0), right = min(x + 1, node_columns - 1);
+        const int farthest = min(x + 2, node_columns - 1);
         for (int k = 0; k < parts; ++k) {
             MAP at = nodes + (number * parts + k) * node_rows * node_columns;
-            float value = x0 * DOWN(left) + x1 * DOWN(x) + x2 * DOWN(right) + x3 * DOWN(farthest);
+            float value = x0 * DOWN(previous) + x1 * DOWN(x) + x2 * DOWN(right) + x3 * DOWN(farthest);
             if (!(value - value == 0)) {
                 value = (1 - part_x) * ((1 - part_y) * at[here + x] + part_y * at[low + x])
                     + part_x * ((1 - part_y) * at[here + right] + part_y * at[low + right]);
@@ -254,15 +255,15 @@ __kernel void displacement_solve(
             const float below = PLACE(j);
             for (int i = 0; i < LANES; ++i) {
                 const float along_x = at[plane + i], along_y = at[2 * plane + i];
-                const float left = differs[i] - along_x * right - along_y * down;
-                x[i] += along_x * left;
-                y[i] += along_y * left;
-                x_down[i] += along_x * left * below;
-                y_down[i] += along_y * left * below;
-                level[i] += left;
-                level_down[i] += left * below;
-                gain[i] += at[3 * plane + i] * left;
-                square[i] += left * left;
+                const float residual = differs[i] - along_x * right - along_y * down;
+                x[i] += along_x * residual;
+                y[i] += along_y * residual;
+                x_down[i] += along_x * residual * below;
+                y_down[i] += along_y * residual * below;
+                level[i] += residual;
+                level_down[i] += residual * below;
+                gain[i] += at[3 * plane + i] * residual;
+                square[i] += residual * residual;
                 variance[i] += differs[plane + i];
             }
         }
@@ -285,11 +286,11 @@ __kernel void displacement_solve(
     }
 
     for (int k = 0; k < PARAMETERS; ++k) {
-        float found = 0;
-        for (int l = 0; l < PARAMETERS; ++l) found += inverse[(k * PARAMETERS + l) * nodes + node] * sums[l];
-        squares -= found * sums[k];
-        if (k < AFFINE) answer[k * nodes + node] = found + (k == 0 ? right : k == 1 ? down : 0);
-        if (k == PARAMETERS - 1) answer[AFFINE * nodes + node] = 1 - found;
+        float coefficient = 0;
+        for (int l = 0; l < PARAMETERS; ++l) coefficient += inverse[(k * PARAMETERS + l) * nodes + node] * sums[l];
+        squares -= coefficient * sums[k];
+        if (k < AFFINE) answer[k * nodes + node] = coefficient + (k == 0 ? right : k == 1 ? down : 0);
+        if (k == PARAMETERS - 1) answer[AFFINE * nodes + node] = 1 - coefficient;
     }
     answer[(AFFINE + 1) * nodes + node] = squares;
     answer[(AFFINE + 2) * nodes + node] = variances;
@@ -350,9 +351,10 @@ __kernel void displacement_normals(
     for (int j = 0; j < WINDOW; ++j) {
         for (int i = 0; i < WINDOW; ++i) {
             MAP at = corner + j * width + i;
-            const float x = at[plane], y = at[2 * plane], known = at[0] - at[0] == 0, across = PLACE(i), below = PLACE(j);
-            const float column[PARAMETERS] = {x, y, x * across, x * below, y * across, y * below, known, known * across,
-                known * below, at[3 * plane]};
+            const float x = at[plane], y = at[2 * plane], defined = at[0] - at[0] == 0;
+            const float across = PLACE(i), below = PLACE(j);
+            const float column[PARAMETERS] = {x, y, x * across, x * below, y * across, y * below, defined,
+                defined * across, defined * below, at[3 * plane]};
             #pragma unroll
             for (int k = 0; k < PARAMETERS; ++k) {
                 #pragma unroll

@@ -62,8 +62,8 @@ def displacement_across(window: int, frame: Array, sums: Array, counts: Array) -
 
     Valid samples are finite, and below the maximum of an integer type.
     """
-    samples, known = _known(frame)
-    for values, summed in ((np.where(known, samples, 0.0), sums), (known, counts)):
+    samples, defined = _known(frame)
+    for values, summed in ((np.where(defined, samples, 0.0), sums), (defined, counts)):
         summed[:] = np.sum(_around(values.astype(np.float64), window, axis=1), axis=-1)
 
 
@@ -82,7 +82,7 @@ def displacement_planes(
     ``coefficients`` are the coefficients of its spline; ``sums`` and ``counts`` are results of
     `displacement_across`.
     """
-    samples, known = _known(frame)
+    samples, defined = _known(frame)
     c = coefficients[MARGIN - 1 : 1 - MARGIN, MARGIN - 1 : 1 - MARGIN].astype(np.float64)
     along_x, along_y = c[:, 2:] - c[:, :-2], c[2:] - c[:-2]
     along_x = (along_x[:-2] + 4 * along_x[1:-1] + along_x[2:]) / 12
@@ -92,15 +92,15 @@ def displacement_planes(
     )
     with np.errstate(invalid="ignore", divide="ignore"):
         parts = [along_x, along_y, samples - total / number]
-    rest = [np.pad(np.where(known, part, 0.0), halo) for part in parts]
-    planes[:] = np.stack([np.pad(np.where(known, samples, np.nan), halo, constant_values=np.nan), *rest])
+    rest = [np.pad(np.where(defined, part, 0.0), halo) for part in parts]
+    planes[:] = np.stack([np.pad(np.where(defined, samples, np.nan), halo, constant_values=np.nan), *rest])
     difference[:] = 0
 
 
 def _known(frame: Array) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return samples, and which of them are measurements."""
-    known = frame < np.iinfo(frame.dtype).max if frame.dtype.kind == "u" else np.isfinite(frame)
-    return frame.astype(np.float64), np.asarray(known)
+    defined = frame < np.iinfo(frame.dtype).max if frame.dtype.kind == "u" else np.isfinite(frame)
+    return frame.astype(np.float64), np.asarray(defined)
 
 
 def _around(values: Array, window: int, axis: int) -> Array:
@@ -163,8 +163,8 @@ def displacement_pixels(step: int, start: float, logarithms: bool, nodes: Array,
             pairs = zip(taps, weights, strict=True)
             fine = np.sum([weight.reshape(shape) * fine.take(tap, axis) for tap, weight in pairs], axis=0)
         linear = interpolate_nodes(values, start, step, written.shape[:2])
-        found = np.where(np.isfinite(fine), fine, linear)
-        written[:] = np.moveaxis(np.exp(found) if logarithms else found, 0, -1)
+        interpolated = np.where(np.isfinite(fine), fine, linear)
+        written[:] = np.moveaxis(np.exp(interpolated) if logarithms else interpolated, 0, -1)
 
 
 def displacement_warp(
@@ -193,14 +193,14 @@ def displacement_warp(
     value = np.zeros((rows, columns))
     for j in range(4):
         for i in range(4):
-            found = coefficients[north + j - 1 + MARGIN, west + i - 1 + MARGIN].astype(np.float64)
-            value += weights_y[j] * weights_x[i] * found
+            warped = coefficients[north + j - 1 + MARGIN, west + i - 1 + MARGIN].astype(np.float64)
+            value += weights_y[j] * weights_x[i] * warped
     core = np.s_[halo : halo + rows, halo : halo + columns]
     counts, along_x, along_y = planes[:3, *core].astype(np.float64)
     measured = np.isfinite(counts)
-    found = np.where(inside, counts - value + along_x * right + along_y * down, np.nan)
+    warped = np.where(inside, counts - value + along_x * right + along_y * down, np.nan)
     variance = 1 + noise_gain(weights_x) * noise_gain(weights_y)
-    difference[0][core] = np.where(measured, found, 0)
+    difference[0][core] = np.where(measured, warped, 0)
     difference[1][core] = np.where(measured, variance, 0)
 
 
@@ -223,9 +223,9 @@ def basis(planes: NDArray[np.float64], window: int) -> NDArray[np.float64]:
     counts, along_x, along_y, texture = planes
     place = (2 * np.arange(window) - (window - 1)) / window
     y, x = (part.reshape(-1) for part in np.meshgrid(place, place, indexing="ij"))
-    known = np.isfinite(counts).astype(np.float64)
+    defined = np.isfinite(counts).astype(np.float64)
     columns = [along_x, along_y, along_x * x, along_x * y, along_y * x, along_y * y]
-    return np.stack([*columns, known, known * x, known * y, texture], axis=-1)
+    return np.stack([*columns, defined, defined * x, defined * y, texture], axis=-1)
 
 
 def displacement_normals(
@@ -251,11 +251,11 @@ def displacement_normals(
         normal /= scale[:, :, None] * scale[:, None, :]
         usable &= np.linalg.eigvalsh(normal)[:, 0] > 1e-9
         normal[~usable] = np.eye(PARAMETERS)
-        found = np.linalg.inv(normal)
-        usable &= np.sum(found**2, axis=(1, 2)) < MOST**2
-        found /= scale[:, :, None] * scale[:, None, :]
-        found[~usable] = np.nan
-        inverse[:, :, row] = found.transpose(1, 2, 0)
+        inverted = np.linalg.inv(normal)
+        usable &= np.sum(inverted**2, axis=(1, 2)) < MOST**2
+        inverted /= scale[:, :, None] * scale[:, None, :]
+        inverted[~usable] = np.nan
+        inverse[:, :, row] = inverted.transpose(1, 2, 0)
     summary[:3] = inverse[[0, 1, 1], [0, 0, 1]]
 
 
@@ -284,13 +284,13 @@ def displacement_solve(
     for row in range(node_rows):
         here = np.s_[row * node_columns : (row + 1) * node_columns]
         columns = basis(windows(planes, row, step, first, window, node_columns), window)
-        left, variance = windows(difference, row, step, first, window, node_columns)
+        residual, variance = windows(difference, row, step, first, window, node_columns)
         centre = field[:, row].astype(np.float64)
-        left = left - columns[..., 0] * centre[0][:, None] - columns[..., 1] * centre[1][:, None]
-        sums = np.einsum("npk,np->kn", columns, left)
-        found = np.einsum("kln,ln->kn", inverse[..., here].astype(np.float64), sums)
-        answer[:AFFINE, here] = found[:AFFINE]
+        residual = residual - columns[..., 0] * centre[0][:, None] - columns[..., 1] * centre[1][:, None]
+        sums = np.einsum("npk,np->kn", columns, residual)
+        solution = np.einsum("kln,ln->kn", inverse[..., here].astype(np.float64), sums)
+        answer[:AFFINE, here] = solution[:AFFINE]
         answer[:2, here] += centre
-        answer[AFFINE, here] = 1 - found[-1]
-        answer[AFFINE + 1, here] = np.sum(left**2, axis=1) - np.sum(found * sums, axis=0)
+        answer[AFFINE, here] = 1 - solution[-1]
+        answer[AFFINE + 1, here] = np.sum(residual**2, axis=1) - np.sum(solution * sums, axis=0)
         answer[AFFINE + 2, here] = np.sum(variance, axis=1)

@@ -21,8 +21,8 @@
 #define VAGUE 100.0f
 
 #define LOAD(map, p) (*(__global const Loose *)((map) + 8 * (p)))
-#define KEEP(values, room) (*(Lanes *)(room) = (values))
-#define KEPT(room) (*(const Lanes *)(room))
+#define KEEP(values, memory) (*(Lanes *)(memory) = (values))
+#define KEPT(memory) (*(const Lanes *)(memory))
 typedef float8 __attribute__((aligned(4))) Loose;  // unaligned
 typedef F __attribute__((aligned(4))) Lanes;
 typedef I __attribute__((aligned(4))) Places;
@@ -67,32 +67,32 @@ float sum_over_lanes(const F x) { return x; }
 #endif
 
 // Invalid pixels get weight 0 and finite values.
-Record where(const I known, const Record r)
+Record where(const I defined, const Record r)
 {
     const F none = 0.0f;
-    return (Record){known ? r.x : none, known ? r.y : none, known ? r.square : (F)1.0f, known ? r.z : none,
-                    known ? r.variance : none, known ? r.xx : none, known ? r.xy : none, known ? r.yy : none};
+    return (Record){defined ? r.x : none, defined ? r.y : none, defined ? r.square : (F)1.0f, defined ? r.z : none,
+                    defined ? r.variance : none, defined ? r.xx : none, defined ? r.xy : none, defined ? r.yy : none};
 }
 
 Vector upright(const F x, const F y) { return (Vector){x, y, roots(GREATER(1.0f - x * x - y * y, (F)1e-6f))}; }
 
 // Covariance of a normal after a rotation; u, v: its x and y then.
-Symmetric variances(const Vector n, const float *turn, const F u, const F v, const F square, const float least)
+Symmetric variances(const Vector n, const float *turn, const F u, const F v, const F square, const float flat_limit)
 {
-    const F flat = n.x * n.x + n.y * n.y, outside = GREATER(flat, (F)least), per_outside = 1.0f / outside;
-    const F share = 0.5f * least * per_outside, across = (1.0f - share) * square;
-    const F more = (2.0f * share - 1.0f) * square * per_outside;
+    const F flat = n.x * n.x + n.y * n.y, outside = GREATER(flat, (F)flat_limit), per_outside = 1.0f / outside;
+    const F fraction = 0.5f * flat_limit * per_outside, across = (1.0f - fraction) * square;
+    const F more = (2.0f * fraction - 1.0f) * square * per_outside;
     const F a = n.z * (turn[0] * n.x + turn[1] * n.y) - turn[2] * flat;
     const F b = n.z * (turn[3] * n.x + turn[4] * n.y) - turn[5] * flat;
     return (Symmetric){across * (1.0f - u * u) + more * a * a, more * a * b - across * u * v,
                        across * (1.0f - v * v) + more * b * b};
 }
 
-Symmetric same_variances(const Vector n, const F square, const float least)
+Symmetric same_variances(const Vector n, const F square, const float flat_limit)
 {
-    const F flat = n.x * n.x + n.y * n.y, per_outside = 1.0f / GREATER(flat, (F)least);
-    const F share = 0.5f * least * per_outside, across = (1.0f - share) * square;
-    const F more = (2.0f * share - 1.0f) * square * per_outside * n.z * n.z - across;
+    const F flat = n.x * n.x + n.y * n.y, per_outside = 1.0f / GREATER(flat, (F)flat_limit);
+    const F fraction = 0.5f * flat_limit * per_outside, across = (1.0f - fraction) * square;
+    const F more = (2.0f * fraction - 1.0f) * square * per_outside * n.z * n.z - across;
     return (Symmetric){across + more * n.x * n.x, more * n.x * n.y, across + more * n.y * n.y};
 }
 
@@ -116,7 +116,8 @@ typedef struct { F x[5], y[5], z[6]; } Jacobian;
 #define PRODUCT(a, i, b, k) \
     (((i) < 5 && (k) < 5 ? (a).x[i] * (b).x[k] + (a).y[i] * (b).y[k] : 0.0f) + (a).z[i] * (b).z[k])
 
-void jacobian(const Vector n, const Symmetric h, const F over_z, const Vector arm, const Vector lower, const F sure, Jacobian *rows)
+void jacobian(const Vector n, const Symmetric h, const F over_z, const Vector arm, const Vector lower,
+              const F height_weight, Jacobian *rows)
 {
     const F change_x[5] = {-h.xy * arm.z, h.xx * arm.z, h.xy * arm.x - h.xx * arm.y, h.xx, h.xy};
     const F change_y[5] = {-h.yy * arm.z, h.xy * arm.z, h.yy * arm.x - h.xy * arm.y, h.xy, h.yy};
@@ -126,13 +127,13 @@ void jacobian(const Vector n, const Symmetric h, const F over_z, const Vector ar
         rows->x[i] = (turn_x[i] + n.z * (change_x[i] - n.x * along)) * lower.x;
         rows->y[i] = (turn_y[i] + n.z * (change_y[i] - n.y * along) - lower.y * rows->x[i]) * lower.z;
     }
-    const F by = sure * over_z, by_x = by * n.x, by_y = by * n.y;
-    rows->z[0] = sure * arm.y - by_y * arm.z;
-    rows->z[1] = by_x * arm.z - sure * arm.x;
+    const F by = height_weight * over_z, by_x = by * n.x, by_y = by * n.y;
+    rows->z[0] = height_weight * arm.y - by_y * arm.z;
+    rows->z[1] = by_x * arm.z - height_weight * arm.x;
     rows->z[2] = by_y * arm.x - by_x * arm.y;
     rows->z[3] = by_x;
     rows->z[4] = by_y;
-    rows->z[5] = sure;
+    rows->z[5] = height_weight;
 }
 
 // For each pose and each block of the first map's pixels: the SUMS sums described in pose.py.
@@ -148,8 +149,8 @@ __kernel void pose_equations(
     float turn[9];
     UNROLL for (int i = 0; i < 9; ++i) turn[i] = pose[i];
     const float3 shift = vload3(3, pose), centre = vload3(4, pose);
-    const float x0 = pose[15], y0 = pose[16], step_x = pose[17], step_y = pose[18], least = pose[23];
-    const float other_x = pose[19], other_y = pose[20], wide = pose[21], high = pose[22], other_least = pose[24];
+    const float x0 = pose[15], y0 = pose[16], step_x = pose[17], step_y = pose[18], flat_limit = pose[23];
+    const float other_x = pose[19], other_y = pose[20], wide = pose[21], high = pose[22], other_flat_limit = pose[24];
     const float east_x = 1.0f / wide, south_y = 1.0f / high;
     F total[SUMS];
     UNROLL for (int i = 0; i < SUMS; ++i) total[i] = 0.0f;
@@ -187,48 +188,50 @@ __kernel void pose_equations(
                 bents_x[i] = change_x.s0;
                 bents_y[i] = change_y.s1;
             }
-            Record found = transposed(records);
-            const I known = inside & (found.x == found.x);
-            if (!any_of(known)) continue;
-            mine = where(known, mine);
-            found = where(known, found);
+            Record theirs = transposed(records);
+            const I defined = inside & (theirs.x == theirs.x);
+            if (!any_of(defined)) continue;
+            mine = where(defined, mine);
+            theirs = where(defined, theirs);
 
-            const F share = (u * u + (1.0f - u) * (1.0f - u)) * (v * v + (1.0f - v) * (1.0f - v));
-            const Vector n = upright(found.x, found.y), before = upright(mine.x, mine.y);
-            const Vector arm = {known ? place.x - centre.x : (F)0.0f, known ? place.y - centre.y : (F)0.0f,
-                                known ? place.z - centre.z : (F)0.0f};
+            const F fraction = (u * u + (1.0f - u) * (1.0f - u)) * (v * v + (1.0f - v) * (1.0f - v));
+            const Vector n = upright(theirs.x, theirs.y), before = upright(mine.x, mine.y);
+            const Vector arm = {defined ? place.x - centre.x : (F)0.0f, defined ? place.y - centre.y : (F)0.0f,
+                                defined ? place.z - centre.z : (F)0.0f};
             const F bent = u * (1.0f - u) * wide * KEPT(bents_x) - v * (1.0f - v) * high * KEPT(bents_y);
-            const F over_z = 1.0f / n.z, height = found.z - 0.5f * bent * over_z;
+            const F over_z = 1.0f / n.z, height = theirs.z - 0.5f * bent * over_z;
             const Vector turned = {turn[0] * before.x + turn[1] * before.y + turn[2] * before.z,
                                    turn[3] * before.x + turn[4] * before.y + turn[5] * before.z,
                                    turn[6] * before.x + turn[7] * before.y + turn[8] * before.z};
-            const Symmetric own = variances(before, turn, turned.x, turned.y, mine.square, least);
-            const Symmetric other = same_variances(n, found.square, other_least);
-            const F xx = own.xx + other.xx, xy = own.xy + other.xy, yy = own.yy + other.yy, area = xx * yy - xy * xy;
-            const F told = (known & (xx + yy < VAGUE)) ? (F)1.0f : (F)0.0f, low = inverse_roots(xx);
-            const Vector lower = {told * low, xy * low, told * inverse_roots(area) * xx * low};
+            const Symmetric shape_here = variances(before, turn, turned.x, turned.y, mine.square, flat_limit);
+            const Symmetric other = same_variances(n, theirs.square, other_flat_limit);
+            const F xx = shape_here.xx + other.xx, xy = shape_here.xy + other.xy, yy = shape_here.yy + other.yy;
+            const F area = xx * yy - xy * xy;
+            const F is_clear = (defined & (xx + yy < VAGUE)) ? (F)1.0f : (F)0.0f, low = inverse_roots(xx);
+            const Vector lower = {is_clear * low, xy * low, is_clear * inverse_roots(area) * xx * low};
             const F lift = (turn[2] * n.x + turn[5] * n.y + turn[8] * n.z) * over_z, own_height = lift * lift * mine.variance;
-            const I compared = known & (mine.variance < NEAR) & (found.variance < NEAR);
-            const F sure = compared ? inverse_roots(own_height + found.variance) : (F)0.0f;
+            const I compared = defined & (mine.variance < NEAR) & (theirs.variance < NEAR);
+            const F height_weight = compared ? inverse_roots(own_height + theirs.variance) : (F)0.0f;
             const F r0 = (turned.x - n.x) * lower.x, r1 = (turned.y - n.y - lower.y * r0) * lower.z;
-            const F r2 = compared ? sure * (place.z - height) : (F)0.0f;
+            const F r2 = compared ? height_weight * (place.z - height) : (F)0.0f;
             const F traced = (yy * other.xx - 2.0f * xy * other.xy + xx * other.yy) / area;
             Jacobian j;
-            jacobian(n, (Symmetric){found.xx, found.xy, found.yy}, over_z, arm, lower, sure, &j);
+            jacobian(n, (Symmetric){theirs.xx, theirs.xy, theirs.yy}, over_z, arm, lower, height_weight, &j);
             UNROLL for (int i = 0; i < 6; ++i) {
                 UNROLL for (int k = 0; k < 6; ++k)
                     if (k >= i) total[UPPER(i, k)] += PRODUCT(j, i, j, k);
                 total[21 + i] += (i < 5 ? j.x[i] * r0 + j.y[i] * r1 : 0.0f) + j.z[i] * r2;
             }
             total[27] += r0 * r0 + r1 * r1 + r2 * r2;
-            total[28] += told * (2.0f - (1.0f - share) * traced) + sure * sure * (own_height + share * found.variance);
+            total[28] += is_clear * (2.0f - (1.0f - fraction) * traced)
+                + height_weight * height_weight * (own_height + fraction * theirs.variance);
             total[29] += compared ? (F)1.0f : (F)0.0f;
-            total[30] += told;
+            total[30] += is_clear;
 #if BESIDE
             const F over_turned = 1.0f / turned.z;
             const Symmetric curved = turn_curvature(before.z, (Symmetric){mine.xx, mine.xy, mine.yy}, over_turned, turn, turned);
             Jacobian other_jacobian;
-            jacobian(turned, curved, over_turned, arm, lower, sure, &other_jacobian);
+            jacobian(turned, curved, over_turned, arm, lower, height_weight, &other_jacobian);
             UNROLL for (int i = 0; i < 6; ++i)
                 UNROLL for (int k = 0; k < 6; ++k) total[31 + 6 * i + k] += PRODUCT(j, i, other_jacobian, k);
 #endif

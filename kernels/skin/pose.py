@@ -63,7 +63,7 @@ def pose_equations(step: int, first: Array, second: Array, poses: Array, sums: A
 
 
 def _equations_at(step: int, first: Array, second: Array, pose: Array, sums: Array) -> None:
-    row, column = (one.ravel() for one in np.indices(first.shape[:2]))
+    row, column = (index.ravel() for index in np.indices(first.shape[:2]))
     across = -(-first.shape[1] // (BLOCK * step))
     block = row // (BLOCK * step) * across + column // (BLOCK * step)
     mine = first.reshape(-1, 8).astype(np.float64)
@@ -73,39 +73,39 @@ def _equations_at(step: int, first: Array, second: Array, pose: Array, sums: Arr
     x0, y0, step_x, step_y = pose[15:19]
     place = np.stack([x0 + column * step_x, y0 - row * step_y, mine[:, 3]]) if len(mine) else np.zeros((3, 0))
     place = turn @ place + shift[:, None]
-    theirs, share, inside = _interpolate(second.astype(np.float64), place, pose[19:23])
+    theirs, weight_square, inside = _interpolate(second.astype(np.float64), place, pose[19:23])
     block, mine, place = block[inside], mine[inside], place[:, inside]
     arm = place - centre[:, None]
 
     n = _upright(theirs[0], theirs[1])
     shape = Shape(*n, *theirs[5:8])
     turned = turn @ _upright(mine[:, 0], mine[:, 1])
-    own = Shape(*turned, *_turn_curvature(turn, mine[:, 0], mine[:, 1], mine[:, 5:8].T))
+    shape_here = Shape(*turned, *_turn_curvature(turn, mine[:, 0], mine[:, 1], mine[:, 5:8].T))
     variance = _variances(mine[:, 0], mine[:, 1], turn, mine[:, 2], pose[23])
     other = _variances(theirs[0], theirs[1], np.eye(3), theirs[2], pose[24])
     xx, xy, yy = variance + other
-    told = xx + yy < VAGUE
-    lower = told / np.sqrt(xx), xy / np.sqrt(xx), told / np.sqrt(yy - xy * xy / xx)
-    part = (1 - share) * _trace(other, xx, xy, yy)
+    is_clear = xx + yy < VAGUE
+    lower = is_clear / np.sqrt(xx), xy / np.sqrt(xx), is_clear / np.sqrt(yy - xy * xy / xx)
+    part = (1 - weight_square) * _trace(other, xx, xy, yy)
     lift = turn[:, 2] @ n / n[2]
     own_height = lift**2 * mine[:, 4]
     sure = 1 / np.sqrt(own_height + theirs[4])
     compared = (mine[:, 4] < NEAR) & (theirs[4] < NEAR)
     sure = np.where(compared, sure, 0)
     residual = np.stack([*_whiten(turned[0] - n[0], turned[1] - n[1], lower), sure * (place[2] - theirs[3])])
-    jacobian, other_jacobian = (_jacobian(one, arm, lower, sure) for one in (shape, own))
-    expected = told * (2 - part) + sure**2 * (own_height + share * theirs[4])
+    jacobian, other_jacobian = (_jacobian(surface, arm, lower, sure) for surface in (shape, shape_here))
+    expected = is_clear * (2 - part) + sure**2 * (own_height + weight_square * theirs[4])
 
     upper = np.triu_indices(6)
     whole = np.concatenate(
         [
             np.einsum("kin,kjn->ijn", jacobian, jacobian)[upper],
             np.einsum("kin,kn->in", jacobian, residual),
-            [np.sum(residual**2, axis=0), expected, compared, told],
+            [np.sum(residual**2, axis=0), expected, compared, is_clear],
             np.einsum("kin,kjn->ijn", jacobian, other_jacobian).reshape(36, -1),
         ]
     )
-    sums[...] = np.stack([np.bincount(block, one, len(sums)) for one in whole[: sums.shape[1]]], axis=-1)
+    sums[...] = np.stack([np.bincount(block, terms, len(sums)) for terms in whole[: sums.shape[1]]], axis=-1)
 
 
 def _upright(x: Doubles, y: Doubles) -> Doubles:
@@ -124,29 +124,29 @@ def _interpolate(second: Doubles, place: Doubles, grid: Array) -> tuple[Doubles,
     inside = (right >= 0) & (right < columns - 1) & (down >= 0) & (down < rows - 1)
     right, down = right[inside], down[inside]
     west, north = right.astype(np.intp), down.astype(np.intp)
-    found, share, bent = np.zeros((8, len(west))), np.zeros(len(west)), np.zeros(len(west))
+    interpolated, weight_square, bent = np.zeros((8, len(west))), np.zeros(len(west)), np.zeros(len(west))
     for below in (0, 1):
         for right_of in (0, 1):
             from_x, from_y = right - west - right_of, down - north - below
             weight = (1 - np.abs(from_x)) * (1 - np.abs(from_y))
             record = second[north + below, west + right_of].T
-            found += weight * record
+            interpolated += weight * record
             bent += weight / 2 * (record[0] * from_x * step_x - record[1] * from_y * step_y)
-            share += weight**2
-    found[3] -= bent / np.sqrt(1 - found[0] ** 2 - found[1] ** 2)
-    known = np.isfinite(found[0])
-    inside[inside] = known
-    return found[:, known], share[known], inside
+            weight_square += weight**2
+    interpolated[3] -= bent / np.sqrt(1 - interpolated[0] ** 2 - interpolated[1] ** 2)
+    defined = np.isfinite(interpolated[0])
+    inside[inside] = defined
+    return interpolated[:, defined], weight_square[defined], inside
 
 
-def _variances(x: Doubles, y: Doubles, turn: Array, square: Doubles, least: float) -> Doubles:
+def _variances(x: Doubles, y: Doubles, turn: Array, square: Doubles, flat_limit: float) -> Doubles:
     """Return the covariance xx, xy, yy of a normal's x and y after a rotation.
 
-    The share ``least`` / (2 sin^2 zenith) of the variance of an angular error is along the meridian.
+    The share ``flat_limit`` / (2 sin^2 zenith) of the variance of an angular error is along the meridian.
     """
     flat = x * x + y * y
-    share = least / 2 / np.maximum(flat, least)
-    across, more = (1 - share) * square, (2 * share - 1) * square / np.maximum(flat, least)
+    fraction = flat_limit / 2 / np.maximum(flat, flat_limit)
+    across, more = (1 - fraction) * square, (2 * fraction - 1) * square / np.maximum(flat, flat_limit)
     n = _upright(x, y)
     turned, along = turn @ n, turn @ np.stack([x * n[2], y * n[2], -flat])
     return np.stack(
@@ -194,11 +194,14 @@ def _whiten(x: Doubles, y: Doubles, lower: tuple[Doubles, ...]) -> tuple[Doubles
 def _jacobian(shape: Shape, arm: Doubles, lower: tuple[Doubles, ...], sure: Doubles) -> Doubles:
     """Return the change, (3, 6, n), of the weighted residuals by a further rotation and translation."""
     x, y, z = arm
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    move_x, move_y = np.stack([zero, z, -y, one, zero, zero]), np.stack([-z, zero, x, zero, one, zero])
-    move_z = np.stack([y, -x, zero, zero, zero, one])
-    turn_x = np.stack([zero, shape.z, -shape.y, zero, zero, zero])
-    turn_y = np.stack([-shape.z, zero, shape.x, zero, zero, zero])
+    zeros, ones = np.zeros_like(x), np.ones_like(x)
+    move_x, move_y = (
+        np.stack([zeros, z, -y, ones, zeros, zeros]),
+        np.stack([-z, zeros, x, zeros, ones, zeros]),
+    )
+    move_z = np.stack([y, -x, zeros, zeros, zeros, ones])
+    turn_x = np.stack([zeros, shape.z, -shape.y, zeros, zeros, zeros])
+    turn_y = np.stack([-shape.z, zeros, shape.x, zeros, zeros, zeros])
     slope_x, slope_y = -shape.x / shape.z, -shape.y / shape.z
     change = shape.xx * move_x + shape.xy * move_y, shape.xy * move_x + shape.yy * move_y
     along = shape.x * change[0] + shape.y * change[1]

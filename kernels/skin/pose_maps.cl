@@ -36,9 +36,10 @@ INLINE float2 gradient_at(
     for (int below = -LESSER(AROUND, row); below <= LESSER(AROUND, rows - 1 - row); ++below)
         for (int right_of = -left; right_of <= right; ++right_of) {
             const float value = values[p + below * columns + right_of] - here;
-            const int known = value == value;
-            const float one = known ? 1.0f : 0.0f, rise = known ? value : 0.0f, i = right_of * one, j = below * one;
-            count += one;
+            const int defined = value == value;
+            const float used = defined ? 1.0f : 0.0f, rise = defined ? value : 0.0f;
+            const float i = right_of * used, j = below * used;
+            count += used;
             x += i;
             y += j;
             xx += i * right_of;
@@ -74,13 +75,13 @@ INLINE int is_near_border(
     __global const uchar *edges, __global const uchar *contact, const int rows, const int columns, const int p)
 {
     const int row = p / columns, column = p % columns;
-    int found = 0;
+    int is_left_out = 0;
     for (int y = GREATER(row - AROUND, 0); y <= LESSER(row + AROUND, rows - 1); ++y)
         for (int x = GREATER(column - AROUND, 0); x <= LESSER(column + AROUND, columns - 1); ++x) {
-            if (edges) found |= edges[y * columns + x] != 0;
-            if (contact) found |= contact[y * columns + x] == 0;
+            if (edges) is_left_out |= edges[y * columns + x] != 0;
+            if (contact) is_left_out |= contact[y * columns + x] == 0;
         }
-    return found;
+    return is_left_out;
 }
 
 __kernel void pose_records(
@@ -158,7 +159,7 @@ __kernel void pose_summary(
         x += x0 + column * step_x;
         z += record[3];
     }
-    const float share = 1 / GREATER(count, 1.0f), mean_x = share * x, mean_z = share * z;
+    const float per_count = 1 / GREATER(count, 1.0f), mean_x = per_count * x, mean_z = per_count * z;
     for (int column = start; column < end; ++column) {
         MAP record = records + NUMBERS * (row * columns + column);
         if (record[0] != record[0]) continue;

@@ -37,12 +37,12 @@ def pose_gradient(step_x: float, step_y: float, values: Array, gradient: Array) 
     sums = np.zeros((9, rows, columns))
     for row in range(-AROUND, AROUND + 1):
         for column in range(-AROUND, AROUND + 1):
-            top, left = AROUND + row, AROUND + column
-            value = wide[top : top + rows, left : left + columns] - values
-            known = np.isfinite(value)
-            value = np.where(known, value, 0)
+            first_row, first_column = AROUND + row, AROUND + column
+            value = wide[first_row : first_row + rows, first_column : first_column + columns] - values
+            defined = np.isfinite(value)
+            value = np.where(defined, value, 0)
             for number, factor in enumerate((1, column, row, column**2, column * row, row**2)):
-                sums[number] += known * factor
+                sums[number] += defined * factor
             for number, factor in enumerate((1, column, row), 6):
                 sums[number] += value * factor
     count, x, y, xx, xy, yy, z, xz, yz = sums
@@ -128,11 +128,11 @@ def pose_summary(x0: float, y0: float, step_x: float, step_y: float, records: Ar
     rows, columns = records.shape[:2]
     row, column = np.indices((rows, columns))
     places = np.stack([x0 + column * step_x, y0 - row * step_y, records[..., 3]], axis=-1)
-    known = np.isfinite(records[..., 0])
-    compared = known & ((records[..., 2] < VAGUE) | (records[..., 4] < NEAR))
+    defined = np.isfinite(records[..., 0])
+    compared = defined & ((records[..., 2] < VAGUE) | (records[..., 4] < NEAR))
     strip = row * -(-columns // STRIP) + column // STRIP
     for number, out in enumerate(summary):
-        here = (strip == number) & known
+        here = (strip == number) & defined
         points = places[here]
         spread = np.sum((points - points.mean(axis=0)) ** 2) if len(points) else 0.0
         out[:] = len(points), np.count_nonzero(compared[here]), *points.sum(axis=0), spread

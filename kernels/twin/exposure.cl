@@ -23,11 +23,11 @@
 
 // Round i of Philox on the words a to d; the keys are incremented by Weyl's constants.
 #define ROUND(i) { \
-    const ulong left = (ulong)a * 0xD2511F53u, right = (ulong)c * 0xCD9E8D57u; \
-    a = (uint)(right >> 32) ^ b ^ ((uint)seed + i * 0x9E3779B9u); \
-    b = (uint)right; \
-    c = (uint)(left >> 32) ^ d ^ ((uint)(seed >> 32) + i * 0xBB67AE85u); \
-    d = (uint)left; \
+    const ulong first_product = (ulong)a * 0xD2511F53u, second_product = (ulong)c * 0xCD9E8D57u; \
+    a = (uint)(second_product >> 32) ^ b ^ ((uint)seed + i * 0x9E3779B9u); \
+    b = (uint)second_product; \
+    c = (uint)(first_product >> 32) ^ d ^ ((uint)(seed >> 32) + i * 0xBB67AE85u); \
+    d = (uint)first_product; \
 }
 
 // Radius of Box and Muller: sqrt(-2 ln u) of a uniform number u in (0, 1].

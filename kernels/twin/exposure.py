@@ -35,9 +35,9 @@ def philox(counter: Words, key: tuple[int, int]) -> Words:
     a, b, c, d = counter.astype(np.uint64)
     for number in range(10):
         near, far = ((word + number * step) & _LOW for word, step in zip(key, _STEPS, strict=True))
-        left, right = a * np.uint64(_FACTORS[0]), c * np.uint64(_FACTORS[1])
-        a, b = (right >> 32) ^ b ^ np.uint64(near), right & _LOW
-        c, d = (left >> 32) ^ d ^ np.uint64(far), left & _LOW
+        first, second = a * np.uint64(_FACTORS[0]), c * np.uint64(_FACTORS[1])
+        a, b = (second >> 32) ^ b ^ np.uint64(near), second & _LOW
+        c, d = (first >> 32) ^ d ^ np.uint64(far), first & _LOW
     return np.stack([a, b, c, d]).astype(np.uint32)
 
 

@@ -76,20 +76,20 @@ __kernel void skin_displacement(
     for (int p = first; p < end; ++p) {
         const int row = p / columns, column = p - row * columns;
         float x = displacement[p], y = displacement[pixels + p];
-        int found = x - x == 0 && y - y == 0;
-        x = found ? x : 0;
-        y = found ? y : 0;
-        found = 0;
-        for (int round = 0; round < ROUNDS && !found; ++round) {
+        int converged = x - x == 0 && y - y == 0;
+        x = converged ? x : 0;
+        y = converged ? y : 0;
+        converged = 0;
+        for (int round = 0; round < ROUNDS && !converged; ++round) {
             const float2 next = dragged(
                 x, y, row, column, rows, columns, grid_rows, grid_columns, along_x, along_y, place, shift);
             const float step_x = next.x - x, step_y = next.y - y;
-            found = step_x * step_x + step_y * step_y <= close * close;
+            converged = step_x * step_x + step_y * step_y <= close * close;
             x = next.x;
             y = next.y;
         }
-        displacement[p] = found ? x : NAN;
-        displacement[pixels + p] = found ? y : NAN;
+        displacement[p] = converged ? x : NAN;
+        displacement[pixels + p] = converged ? y : NAN;
     }
 }
 
@@ -106,15 +106,15 @@ __kernel void skin_displacement(
 
 __kernel void skin_flakes(
     const int rows, const int columns, const int grid_rows, const int grid_columns, const float along_x,
-    const float along_y, const float place_x, const float place_y, const float spacing, MAP shift, MAP seen,
+    const float along_y, const float place_x, const float place_y, const float spacing, MAP shift, MAP visible,
     __global const uchar *restrict flakes, __global const int *restrict cell_x, __global const int *restrict cell_y,
-    MAP part_x, MAP part_y, OUT share)
+    MAP part_x, MAP part_y, OUT fraction)
 {
     const int pixels = rows * columns, first = get_global_id(0) * TILE, end = min(first + TILE, pixels);
     const float2 place = PLACE;
     for (int p = first; p < end; ++p) {
         const int row = p / columns, column = p - row * columns;
-        const float x = seen[p], y = seen[pixels + p];
+        const float x = visible[p], y = visible[pixels + p];
         const float2 drag = dragged(
             x, y, row, column, rows, columns, grid_rows, grid_columns, along_x, along_y, place, shift);
         const float across = part_x[column] + (x - drag.x) / spacing, along = part_y[row] + (y - drag.y) / spacing;
@@ -129,6 +129,6 @@ __kernel void skin_flakes(
             for (int j = 0; j < 4; ++j) inner += w_y[j] * line[WRAPPED(south + j)];
             sum += w_x[i] * inner;
         }
-        share[p] = sum;
+        fraction[p] = sum;
     }
 }

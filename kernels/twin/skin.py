@@ -57,7 +57,7 @@ def skin_displacement(
 
 def skin_flakes(
     shift: NDArray[Any],
-    seen: NDArray[Any],
+    visible: NDArray[Any],
     flakes: NDArray[np.uint8],
     cell_x: NDArray[np.int32],
     cell_y: NDArray[np.int32],
@@ -83,14 +83,14 @@ def skin_flakes(
     """
     from scipy.ndimage import map_coordinates
 
-    rest = _rest(seen.shape[1], seen.shape[2], along_x, along_y)
+    rest = _rest(visible.shape[1], visible.shape[2], along_x, along_y)
     place = np.array([place_x] if twist else [place_x, place_y])
-    dragged = material(shift, (along_x, along_y), place, rest + seen) - rest
+    dragged = material(shift, (along_x, along_y), place, rest + visible) - rest
     cells = np.stack(np.meshgrid(cell_x + part_x.astype(float), cell_y + part_y.astype(float)))
-    share: Doubles = map_coordinates(
+    fraction: Doubles = map_coordinates(
         flakes.astype(float), cells + dragged / spacing, order=3, mode="grid-wrap", prefilter=False
     )
-    return share
+    return fraction
 
 
 def _rest(rows: int, columns: int, along_x: float, along_y: float) -> Doubles:
@@ -132,8 +132,8 @@ def _behind(place: Doubles, at: Doubles, lag: Doubles) -> Doubles:
     if len(place) != 1:
         return at + lag
     point, ahead = at[0] + 1j * at[1], lag[0] + 1j * lag[1]
-    share = np.divide(ahead, point, out=np.zeros_like(point), where=point != 0)
-    return _as_plane(np.where(point != 0, point * (1 + share.real) * np.exp(1j * share.imag), ahead))
+    fraction = np.divide(ahead, point, out=np.zeros_like(point), where=point != 0)
+    return _as_plane(np.where(point != 0, point * (1 + fraction.real) * np.exp(1j * fraction.imag), ahead))
 
 
 def _as_plane(number: NDArray[np.complex128]) -> Doubles:

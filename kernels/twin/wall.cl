@@ -47,12 +47,13 @@ float azimuth_of(const float x, const float y)
 
 // A ray from a point inside a cylinder: its cosine to the side times the radius, and the inverse of its
 // length.
-float2 leave(const float x, const float y, const float ray_x, const float ray_y, const float room, const float per_room)
+float2 leave(
+    const float x, const float y, const float ray_x, const float ray_y, const float power, const float per_power)
 {
     const float along = x * ray_x + y * ray_y;
-    const float square = along * along + (ray_x * ray_x + ray_y * ray_y) * room + TINY;
+    const float square = along * along + (ray_x * ray_x + ray_y * ray_y) * power + TINY;
     const float cosine = square * INVERSE_ROOT(square);
-    return (float2)(cosine, (along + cosine) * per_room);
+    return (float2)(cosine, (along + cosine) * per_power);
 }
 
 #if GAP
@@ -82,12 +83,12 @@ float cross_gap(const float out, const float ray_x, const float ray_y, const flo
 // 1 below the rim, `below` above the height where the ray starts, and above the rest plane, `z` below;
 // otherwise 0.
 float within_edges(
-    const float z, const float below, const float ray_z, const float cosine, const float per_way, const float radius,
-    const float sharpness)
+    const float z, const float below, const float ray_z, const float cosine, const float per_distance,
+    const float radius, const float sharpness)
 {
-    const float edge = below * per_way, bound = radius * edge;
+    const float edge = below * per_distance, bound = radius * edge;
     const float over = (edge - ray_z) * cosine * ROUGH_INVERSE_ROOT(cosine * cosine + bound * bound);
-    const float above = ray_z + z * per_way;
+    const float above = ray_z + z * per_distance;
     const float inside = 0.5f + sharpness * LESSER(over, above);
     return LESSER(GREATER(inside, 0), 1);
 }
@@ -132,7 +133,7 @@ __kernel void wall_light(
 
     for (int base = first; base < end; base += CHUNK) {
         const int width = min(CHUNK, end - base);
-        float x[CHUNK], y[CHUNK], z[CHUNK], room[CHUNK], per_room[CHUNK], total[CHUNK];
+        float x[CHUNK], y[CHUNK], z[CHUNK], power[CHUNK], per_power[CHUNK], total[CHUNK];
         float ray_x[CHUNK], ray_y[CHUNK], ray_z[CHUNK];
         float steep_x[CHUNK], steep_y[CHUNK], steep_z[CHUNK];
         int lit[CHUNK];
@@ -160,13 +161,13 @@ __kernel void wall_light(
             ray_z[i] = twice - 1;
 #endif
             const float off = x[i] * x[i] + y[i] * y[i] + TINY, flat = ray_x[i] * ray_x[i] + ray_y[i] * ray_y[i] + TINY;
-            const float way = radius - off * INVERSE_ROOT(off), level = flat * INVERSE_ROOT(flat);
+            const float distance = radius - off * INVERSE_ROOT(off), level = flat * INVERSE_ROOT(flat);
             // Dark without tracing its rays: even the most inclined one passes over the rim of the nearest
             // wall.
-            const int over = (level + ray_z[i] * slack) * (rim - z[i]) < way * (ray_z[i] - level * slack);
-            lit[i] = (way > 0) & !over;
+            const int over = (level + ray_z[i] * slack) * (rim - z[i]) < distance * (ray_z[i] - level * slack);
+            lit[i] = (distance > 0) & !over;
             busy |= lit[i];
-            room[i] = lit[i] ? way * (2 * radius - way) : radius * radius;
+            power[i] = lit[i] ? distance * (2 * radius - distance) : radius * radius;
             total[i] = 0;
         }
         if (!busy) {
@@ -175,16 +176,16 @@ __kernel void wall_light(
         }
 
         for (int i = 0; i < width; ++i) {
-            per_room[i] = 1 / room[i];
-            const float2 left = leave(x[i], y[i], ray_x[i], ray_y[i], room[i], per_room[i]);
-            const float span = 1 / GREATER(left.y, LEAST);
+            per_power[i] = 1 / power[i];
+            const float2 exit = leave(x[i], y[i], ray_x[i], ray_y[i], power[i], per_power[i]);
+            const float span = 1 / GREATER(exit.y, LEAST);
             const float up_x = -ray_z[i] * (x[i] + span * ray_x[i]), up_y = -ray_z[i] * (y[i] + span * ray_y[i]);
-            const float square = (up_x * up_x + up_y * up_y + left.x * left.x) * per_radius * per_radius;
+            const float square = (up_x * up_x + up_y * up_y + exit.x * exit.x) * per_radius * per_radius;
             const float scale = INVERSE_ROOT(square + TINY) * per_radius;
-            const int known = square > 1e-12f;
-            steep_x[i] = known ? up_x * scale : 1;
-            steep_y[i] = known ? up_y * scale : 0;
-            steep_z[i] = known ? left.x * scale : 0;
+            const int determined = square > 1e-12f;
+            steep_x[i] = determined ? up_x * scale : 1;
+            steep_y[i] = determined ? up_y * scale : 0;
+            steep_z[i] = determined ? exit.x * scale : 0;
         }
 
         for (int s = 0; s < samples; ++s) {
@@ -196,32 +197,32 @@ __kernel void wall_light(
                 const float to_x = part * ray_x[i] + part_up * steep_x[i] + part_aside * aside_x;
                 const float to_y = part * ray_y[i] + part_up * steep_y[i] + part_aside * aside_y;
                 const float to_z = part * ray_z[i] + part_up * steep_z[i] + part_aside * aside_z;
-                const float2 left = leave(x[i], y[i], to_x, to_y, room[i], per_room[i]);
-                float per_way = left.y, share = 1;
+                const float2 exit = leave(x[i], y[i], to_x, to_y, power[i], per_power[i]);
+                float per_distance = exit.y, transmitted = 1;
 #if TABLE || LAMPS || GAP
-                float span = 1 / GREATER(per_way, LEAST);
+                float span = 1 / GREATER(per_distance, LEAST);
                 float at_x = x[i] + span * to_x, at_y = y[i] + span * to_y;
 #endif
 #if GAP
-                const float in = left.x * per_radius, out = refracted(in, index);
+                const float in = exit.x * per_radius, out = refracted(in, index);
                 const float bend = (out - index * in) * per_radius;
                 const float air_x = index * to_x + bend * at_x, air_y = index * to_y + bend * at_y;
                 const float more = cross_gap(out, air_x, air_y, radius, outer);
-                share = passed(in, out, index);
+                transmitted = passed(in, out, index);
                 at_x += more * air_x;
                 at_y += more * air_y;
                 span += more * index;  // as long as it rises
-                per_way = 1 / span;
+                per_distance = 1 / span;
 #endif
-                share *= within_edges(z[i], rim - z[i], to_z, left.x, per_way, radius, sharpness);
+                transmitted *= within_edges(z[i], rim - z[i], to_z, exit.x, per_distance, radius, sharpness);
 #if TABLE
                 const float high = z[i] + to_z * span, kept = LESSER(GREATER(high, 0), rim);
-                share *= look_up(table, columns, GREATER(last_row - kept * per_row, 0), at_x, at_y);
+                transmitted *= look_up(table, columns, GREATER(last_row - kept * per_row, 0), at_x, at_y);
 #endif
 #if LAMPS
-                share *= 1 + lamp_x * at_x + lamp_y * at_y;
+                transmitted *= 1 + lamp_x * at_x + lamp_y * at_y;
 #endif
-                total[i] += share;
+                total[i] += transmitted;
             }
         }
 #if TABLE

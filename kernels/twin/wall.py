@@ -72,21 +72,21 @@ def wall_light(sheet: Array, places: Array, rays: Array, table: Array, radius: f
     for along, up, across in rays.astype(np.float64):
         ray = along * mirrored + up * upwards + across * aside
         cosine, per_way = _leave(x, y, ray, radius)
-        at_x, at_y, per_way, share = _cross_gap(x, y, ray, cosine, per_way, radius, gap, index)
-        share = share * _seen(z, ray, cosine, per_way, radius, rim, fade)
+        at_x, at_y, per_way, transmitted = _cross_gap(x, y, ray, cosine, per_way, radius, gap, index)
+        transmitted = transmitted * _seen(z, ray, cosine, per_way, radius, rim, fade)
         height = np.clip(z + ray[2] / np.maximum(per_way, _LEAST), 0, rim)
-        share = share * _look_up(table, height / rim, np.arctan2(at_y, at_x))
-        total += share * (1 + (asymmetry_x * at_x + asymmetry_y * at_y) / (radius + gap))
+        transmitted = transmitted * _look_up(table, height / rim, np.arctan2(at_y, at_x))
+        total += transmitted * (1 + (asymmetry_x * at_x + asymmetry_y * at_y) / (radius + gap))
     total /= len(rays) * (1 + np.hypot(asymmetry_x, asymmetry_y))
     return np.where(inside, total, 0).astype(np.float32)
 
 
 def _leave(x: Floats, y: Floats, ray: Floats, radius: float) -> tuple[Floats, Floats]:
     """Return a ray's cosine to the cylinder that it leaves, times the radius, and its inverse length."""
-    room = radius * radius - x * x - y * y
+    square = radius * radius - x * x - y * y
     along = x * ray[0] + y * ray[1]
-    cosine = np.sqrt(along * along + (ray[0] ** 2 + ray[1] ** 2) * room + _TINY)
-    return cosine, (along + cosine) / room
+    cosine = np.sqrt(along * along + (ray[0] ** 2 + ray[1] ** 2) * square + _TINY)
+    return cosine, (along + cosine) / square
 
 
 def _steepest(x: Floats, y: Floats, ray: Floats, radius: float) -> Floats:
@@ -97,11 +97,11 @@ def _steepest(x: Floats, y: Floats, ray: Floats, radius: float) -> Floats:
     direction is returned.
     """
     cosine, per_way = _leave(x, y, ray, radius)
-    way = 1 / np.maximum(per_way, _LEAST)
-    m_x, m_y = (x + way * ray[0]) / radius, (y + way * ray[1]) / radius
+    distance = 1 / np.maximum(per_way, _LEAST)
+    m_x, m_y = (x + distance * ray[0]) / radius, (y + distance * ray[1]) / radius
     steepest = np.stack([-ray[2] * m_x, -ray[2] * m_y, cosine / radius])
-    known = (steepest**2).sum(axis=0) > 1e-12
-    return _unit(np.where(known, steepest, np.array([[1.0], [0.0], [0.0]])))
+    determined = (steepest**2).sum(axis=0) > 1e-12
+    return _unit(np.where(determined, steepest, np.array([[1.0], [0.0], [0.0]])))
 
 
 def _cross_gap(x: Floats, y: Floats, ray: Floats, cosine: Floats, per_way: Floats, radius: float,
@@ -112,20 +112,20 @@ def _cross_gap(x: Floats, y: Floats, ray: Floats, cosine: Floats, per_way: Float
     gap, the ray is refracted at the side of the body (Snell) and partly reflected there (Fresnel,
     unpolarised), and crosses the gap.
     """
-    way = 1 / np.maximum(per_way, _LEAST)
-    at_x, at_y = x + way * ray[0], y + way * ray[1]
+    distance = 1 / np.maximum(per_way, _LEAST)
+    at_x, at_y = x + distance * ray[0], y + distance * ray[1]
     if gap == 0:
         return at_x, at_y, per_way, np.ones_like(x)
     cos_in = cosine / radius
     cos_out = np.sqrt(np.maximum(1 - index**2 * (1 - cos_in**2), 0))
     across, within = (index * cos_in + cos_out) ** 2, (cos_in + index * cos_out) ** 2
-    share = 2 * index * cos_in * cos_out * (1 / across + 1 / within)
+    transmitted = 2 * index * cos_in * cos_out * (1 / across + 1 / within)
     bend = (cos_out - index * cos_in) / radius
     air_x, air_y = index * ray[0] + bend * at_x, index * ray[1] + bend * at_y
     outer = (radius + gap) ** 2 - radius**2
     towards = radius * cos_out
     more = outer / (towards + np.sqrt(towards**2 + (air_x**2 + air_y**2) * outer + _TINY))
-    return at_x + more * air_x, at_y + more * air_y, 1 / (way + index * more), share
+    return at_x + more * air_x, at_y + more * air_y, 1 / (distance + index * more), transmitted
 
 
 def _seen(

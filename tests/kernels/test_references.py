@@ -59,7 +59,7 @@ RIGHTWARDS, DOWNWARDS = near(1e-5, 1e-6, of="right"), near(1e-5, 1e-6, of="down"
 
 @case("breaks_trust", **BREAKS, checks=named("weight_x weight_y rise_x rise_y", *[RIGHTWARDS, DOWNWARDS] * 2))
 def _(shape):
-    numbers = {"noise": 0.01, "bend": 0.5, "tear": 2.0, "least": 1e-3}
+    numbers = {"noise": 0.01, "bend": 0.5, "tear": 2.0, "min_trust": 1e-3}
     _, *links, facing, maps = linked(shape, "slope_x slope_y tears", **numbers)
     tears = np.pad(np.abs(maps["tears"])[:-1, :-1], (0, 1))
     return maps | named("right down facing tears", *links, facing, tears)
@@ -68,7 +68,7 @@ def _(shape):
 # A square of 6 is cut, or not, by its last digit.
 @case("breaks_links", **BREAKS, checks=dict.fromkeys(("right", "down", "source"), near(0, 2e-5, share=0.002)))
 def _(shape):
-    numbers = SIZE | {"slack": 0.25, "sharpness": 4.0, "most": 6.0}
+    numbers = SIZE | {"slack": 0.25, "sharpness": 4.0, "max_square": 6.0}
     _, *links, held, maps = linked(shape, "slope_x slope_y rise_x rise_y heights", **numbers)
     return maps | named("weight_x weight_y held", *links, held)
 
@@ -476,7 +476,7 @@ def _(shape):
 @case("facing_clip", SHAPES, returns="weight")
 def _(shape):
     weight = np.random.default_rng(shape[1]).normal(1, 2, shape)
-    return {"weight": weight, "least": 0.5, "most": 3.0, "shape": shape}
+    return {"weight": weight, "lowest": 0.5, "highest": 3.0, "shape": shape}
 
 
 @case(
@@ -729,13 +729,13 @@ def _(**chosen):
     return dragged(**chosen) | {"displacement": displacement}
 
 
-@case("skin_flakes", **DRAGGED, checks={"share": near(0, 1e-5)})
+@case("skin_flakes", **DRAGGED, checks={"fraction": near(0, 1e-5)})
 def _(**chosen):
     rng = np.random.default_rng(6)
     flakes = (rng.random((FLAKES, FLAKES)) < 0.5).astype(np.uint8)
     cells = [rng.integers(-99, 99, size).astype(np.int32) for size in (40, 30)]
     maps = named("flakes cell_x cell_y part_x part_y", flakes, *cells, rng.random(40), rng.random(30))
-    return dragged(**chosen) | maps | {"seen": rng.normal(0, 0.05, (2, 30, 40)), "spacing": 0.15}
+    return dragged(**chosen) | maps | {"visible": rng.normal(0, 0.05, (2, 30, 40)), "spacing": 0.15}
 
 
 # --- The wall in the mirror

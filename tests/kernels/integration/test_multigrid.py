@@ -263,7 +263,12 @@ def test_pictures_come_to_the_finest_level_and_back(cases):
     case.h.copy_picture("release", level, back)
     np.testing.assert_array_equal(back.read(), picture)
     flags = case.rng.choice([1, 4, 6, 8], SHAPE)
-    arguments = {"least": 0.12, "wanted": 12, "flags": case.map(flags, np.uint8), "inverse": case.h.inverse}
+    arguments = {
+        "min_variance": 0.12,
+        "flag": 12,
+        "flags": case.map(flags, np.uint8),
+        "inverse": case.h.inverse,
+    }
     case.h.copy_picture("deviation", level, returned, **arguments)
     lowest = 0.12 * twin.inverse_of(case.levels[0].diagonal)
     expected = np.where(flags & 12, np.sqrt(np.maximum(picture, lowest)), np.nan)
