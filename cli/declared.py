@@ -365,13 +365,13 @@ def _by_motion(variants: list[Term], name: str) -> str:
 def declarations() -> dict[str, list[dict[str, Any]]]:
     """Return what ``declared.json`` contains: the options of each command."""
     from mirrorskin.engine.base.reconstruction import method_for
-    from mirrorskin.engine.vibration.lock_in import Correlation
+    from mirrorskin.engine.vibration.lock_in import LockIn
 
     methods: dict[str, type[Any]] = {motion: method_for(motion) for motion in MOTIONS}
     fused = ("tilt", "zenith_gain", "zenith_offset", "robust")
     terms = {
         "reconstruct": terms_of(methods),
-        "correlate": terms_of({"": Correlation}),
+        "correlate": terms_of({"": LockIn}),
         "fuse": [term for term in terms_of({"": methods["axial"]}) if term.name in fused],
     }
     return {

@@ -34,7 +34,7 @@ from .rotation.edges import find_edges
 from .rotation.moving_normals import estimate_normals
 from .rotation.normals import Normals
 from .rotation.rotation import Rotation
-from .slip.slip import Sliding
+from .slip.slip import Slide
 
 __all__ = [
     "ChangePoint",
@@ -48,7 +48,7 @@ __all__ = [
     "Press",
     "Rotation",
     "Run",
-    "Sliding",
+    "Slide",
     "Step",
     "calibration",
     "correlate",

@@ -31,7 +31,7 @@ def find_slip(movement):
         texture=SheetTexture("flakes", size=0.12, contrast=0.9),
     )
     contact = twin.sheet(0).contact
-    slip = engine.slip.Slip(pixel_size=PIXEL, motion=twin.motion, contact=contact)
+    slip = engine.slip.SlipOnset(pixel_size=PIXEL, motion=twin.motion, contact=contact)
     return engine.run(twin, slip), twin.truth, contact
 
 

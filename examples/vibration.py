@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from mirrorskin import engine, io
-from mirrorskin.engine.vibration.lock_in import Correlation
+from mirrorskin.engine.vibration.lock_in import LockIn
 from mirrorskin.io.model.positions import stroke_starts
 from mirrorskin.twin import Camera, HeightMap, Leaning, Twin, Vertical
 
@@ -84,7 +84,7 @@ print(f"slope: RMS error {rms(error):.4f}, expected {rms(sigma):.4f}")
 # A press that dithers by 0.05 mm on a ball in elastic contact; without noise the area grows by `growth`.
 SWING, contact = 0.05, {"contact": "elastic", "references": "exact"}
 twin, _ = simulate("sphere", Vertical(1.0 + SWING * np.cos(math.tau / 7.3 * np.arange(74))), **contact)
-dithered = Correlation(dither=True).run(twin)
+dithered = LockIn(dither=True).run(twin)
 noiseless = Camera(np.dtype(np.uint16), noise=0.0)
 twin, frames = simulate("sphere", Vertical(1.0 + SWING * np.array([-0.5, 0.5])), camera=noiseless, **contact)
 lit = (frames - twin.header.dark.astype(float)) / (twin.header.bright - twin.header.dark)

@@ -101,7 +101,7 @@ class _Symbol(ctypes.Structure):
     )  # fmt: skip
 
 
-class _Found(ctypes.Structure):
+class _SymbolInfo(ctypes.Structure):
     """Information of the dynamic linker about an address (Dl_info)."""
 
     _fields_ = (
@@ -112,7 +112,7 @@ class _Found(ctypes.Structure):
 
 def look_up(address: int | None) -> tuple[Path | None, int]:
     """Return the library that contains an address, and the size of its function there, 0 if unknown."""
-    description, symbol = _Found(), ctypes.POINTER(_Symbol)()
+    description, symbol = _SymbolInfo(), ctypes.POINTER(_Symbol)()
     search = getattr(ctypes.CDLL(None), "dladdr1", None)
     if search is None or not search(
         ctypes.c_void_p(address), ctypes.byref(description), ctypes.byref(symbol), 1

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mirrorskin.engine.calibration.check import Check, Errors
+    from mirrorskin.engine.calibration.check import Check, ErrorMap
 
 _COLOURS = {
     "sound": "0.9",
@@ -276,7 +276,7 @@ def check_figure(check: Check, title: str, path: Path) -> None:
     save_figure(figure, title, path)
 
 
-def _draw(axes: Axes, name: str, errors: Errors, check: Check, worst: float) -> None:
+def _draw(axes: Axes, name: str, errors: ErrorMap, check: Check, worst: float) -> None:
     place, label = extent(check.x, check.y), f"found - true ({errors.unit})"
     signed = bool(np.nanmin(errors.error, initial=0.0) < 0)  # the angle between normals has no sign
     colours = DIVERGING if signed else ERROR

@@ -26,7 +26,7 @@ def command(
     from mirrorskin import io
     from mirrorskin.cli.output import progress, report_unverified, save_and_report
     from mirrorskin.cli.quantity import memory as bytes_of
-    from mirrorskin.engine.vibration.lock_in import Correlation
+    from mirrorskin.engine.vibration.lock_in import LockIn
 
     phases = chosen.get("phases")
     opening = stack_options(chosen)
@@ -44,7 +44,7 @@ def command(
     with io.open_recording(stack, memory_limit=limit, override_motion=override, **opening) as source:
         target = output or stack.with_name(f"{stack.stem}-correlation.h5")
         io.check_result_output(target, stack, phases, overwrite=overwrite)
-        method = Correlation(**{**chosen, "memory_limit": limit, "device": device})
+        method = LockIn(**{**chosen, "memory_limit": limit, "device": device})
         with progress("correlating", source.shape[0]) as show:
             result = method.run(source, show)
     save_and_report(result, target, device, as_json, overwrite=overwrite)

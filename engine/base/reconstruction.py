@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 _METHODS: Mapping[str, str] = {
     "vertical": "press.press.Press",
     "axial": "rotation.rotation.Rotation",
-    "horizontal": "slip.slip.Sliding",
-    "twist": "slip.slip.Sliding",
+    "horizontal": "slip.slip.Slide",
+    "twist": "slip.slip.Slide",
 }
 
 
@@ -198,7 +198,7 @@ def reconstruct(
         Called with the number of frames so far.
     **options
         Options of `mirrorskin.engine.Press` for a vertical motion, of `mirrorskin.engine.Rotation` for an
-        axial motion, and of `mirrorskin.engine.Sliding` for a slide or a twist; see ``help(engine.Press)``.
+        axial motion, and of `mirrorskin.engine.Slide` for a slide or a twist; see ``help(engine.Press)``.
 
     Returns
     -------

@@ -104,7 +104,7 @@ class Plan:
     press: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Press`
     rotation: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Rotation`
     memory_limit: int = MEMORY_LIMIT  # bytes of host memory for frames that are read ahead, per device
-    slip: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Sliding`
+    slip: Mapping[str, Any] = field(default_factory=dict)  # options of `engine.Slide`
     operation: str | type = ""  # class of an operation that is run instead of all methods, or MODULE:CLASS
     operation_options: Mapping[str, Any] = field(default_factory=dict)
     strict: bool = False  # whether warnings are errors

@@ -1,6 +1,6 @@
 from .board import Charuco, Dots, mean_of_still, paint_board
 from .brightness import LinearBrightness, WallBrightness
-from .check import Check, Errors, Summary, check_ball
+from .check import Check, ErrorMap, ErrorSummary, check_ball
 from .force import KnownPress, StiffnessFit, fit_stiffness, known_press
 from .gel import BallOnset, BallPlace, GelFit, ball_onset, fit_gel
 from .lens import LensFit, calibrate_lens
@@ -17,7 +17,8 @@ __all__ = [
     "Charuco",
     "Check",
     "Dots",
-    "Errors",
+    "ErrorMap",
+    "ErrorSummary",
     "GelFit",
     "KnownPress",
     "LensFit",
@@ -27,7 +28,6 @@ __all__ = [
     "PlateTrack",
     "PrecessionFit",
     "StiffnessFit",
-    "Summary",
     "WallBrightness",
     "ball_onset",
     "calibrate_lens",

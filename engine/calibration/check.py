@@ -25,7 +25,7 @@ _MARGIN = 2  # pixels: width of the excluded margin of the contact
 _ROUNDS = 3  # iterations of the ball's centre, which depends slightly on its depth
 
 
-class Summary(NamedTuple):
+class ErrorSummary(NamedTuple):
     """Errors of groups of pixels; NaN for groups with too few."""
 
     pixels: NDArray[np.intp]
@@ -34,12 +34,12 @@ class Summary(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Errors:
+class ErrorMap:
     """Errors of one map."""
 
     error: Doubles  # (H, W): result minus truth, in ``unit``; NaN where there is no error
-    whole: Summary  # all pixels
-    cells: Summary  # equal parts of the picture, (n, n); row 0 is at the top
+    whole: ErrorSummary  # all pixels
+    cells: ErrorSummary  # equal parts of the picture, (n, n); row 0 is at the top
     unit: str  # "deg" or "mm"
     expected: float = math.nan  # RMS of the result's standard deviations, in ``unit``; NaN without any
 
@@ -75,8 +75,8 @@ class Check:
     place: tuple[float, float]  # position of the ball, mm from the picture's centre
     x: Doubles  # (W,): mm
     y: Doubles  # (H,): mm
-    after: dict[str, Errors]
-    before: dict[str, Errors] = field(default_factory=dict)
+    after: dict[str, ErrorMap]
+    before: dict[str, ErrorMap] = field(default_factory=dict)
 
     def numbers(self) -> dict[str, Any]:
         """Return numbers for JSON."""
@@ -172,7 +172,7 @@ def _check_rotation(
     sight = _sight_of(response, result)
     centre = _centre_by_normals(result, sight, ball / 2, source.header.press)
     truth = _true_ball(sight, centre, ball / 2, result)
-    before: dict[str, Errors] = {}
+    before: dict[str, ErrorMap] = {}
     if references is not None:
         # Nominal response of a central pixel: counts per radian, and counts at zenith 0.
         rim = math.atan2(response.radius, response.rim) / 2
@@ -194,7 +194,7 @@ def _check_press(
     """Check the heights of a press."""
     result = reconstruct(source, calibration=calibration, device=device)
     place = _top_by_heights(result, ball / 2)
-    before: dict[str, Errors] = {}
+    before: dict[str, ErrorMap] = {}
     if calibration.gel is not None:
         source.rewind()
         plain = reconstruct(source, calibration=replace(calibration, gel=None), device=device)
@@ -250,7 +250,7 @@ def _true_ball(sight: Doubles, centre: Doubles, radius: float, result: Result) -
     return [np.where(inside, values, np.nan) for values in maps]
 
 
-def _normal_errors(result: Result, truth: list[Doubles], cells: int) -> dict[str, Errors]:
+def _normal_errors(result: Result, truth: list[Doubles], cells: int) -> dict[str, ErrorMap]:
     zenith, azimuth, height = truth
     difference = result["azimuth"] - azimuth
     lean, turn = result["zenith"] - zenith, np.arctan2(np.sin(difference), np.cos(difference))
@@ -306,7 +306,7 @@ def _top_by_heights(result: Result, radius: float) -> tuple[float, float]:
 
 def _height_errors(
     result: Result, place: tuple[float, float], radius: float, cells: int
-) -> dict[str, Errors]:
+) -> dict[str, ErrorMap]:
     """Compare heights with a ball whose top is touched at travel 0."""
     x, y = np.meshgrid(*_axes(result))
     square = radius**2 - (x - place[0]) ** 2 - (y - place[1]) ** 2
@@ -319,7 +319,7 @@ def _height_errors(
 # --- summaries ----------------------------------------------------------------------------------------------
 
 
-def _errors(error: Doubles, unit: str, cells: int, sigma: NDArray[np.float32] | None = None) -> Errors:
+def _errors(error: Doubles, unit: str, cells: int, sigma: NDArray[np.float32] | None = None) -> ErrorMap:
     """Summarise a map of errors."""
     error = np.asarray(error, np.float64)
     valid = np.isfinite(error)
@@ -329,13 +329,13 @@ def _errors(error: Doubles, unit: str, cells: int, sigma: NDArray[np.float32] | 
     if sigma is not None and valid.any():
         expected = float(np.sqrt(np.nanmean(sigma[valid].astype(np.float64) ** 2)))
     whole = _summary(error[valid], np.zeros(len(rows), np.intp), (), 1)
-    return Errors(error, whole, _summary(error[valid], cell, (cells, cells), _FEWEST), unit, expected)
+    return ErrorMap(error, whole, _summary(error[valid], cell, (cells, cells), _FEWEST), unit, expected)
 
 
-def _summary(values: Doubles, group: NDArray[np.intp], shape: tuple[int, ...], fewest: int) -> Summary:
+def _summary(values: Doubles, group: NDArray[np.intp], shape: tuple[int, ...], fewest: int) -> ErrorSummary:
     """Summarise values by the number of their group, row by row."""
     count = np.bincount(group, minlength=math.prod(shape))
     divisor = np.where(count >= fewest, count, np.nan)
     bias = np.bincount(group, values, minlength=count.size) / divisor
     rms = np.sqrt(np.bincount(group, values**2, minlength=count.size) / divisor)
-    return Summary(count.reshape(shape), rms.reshape(shape), bias.reshape(shape))
+    return ErrorSummary(count.reshape(shape), rms.reshape(shape), bias.reshape(shape))

@@ -226,7 +226,7 @@ class LevelUncertainty(Step):
             rise = np.asarray(bright, np.float64) - np.asarray(dark, np.float64)
             fraction = scatter / float(np.nanmedian(rise))
         if samples is not None:
-            trace = _Seen.of(samples, context.positions("travel"), dark, bright, operation.shape)
+            trace = _PixelTraces.of(samples, context.positions("travel"), dark, bright, operation.shape)
             height, *beside = context.neighbours(result)
             errors = _find_errors(trace, -height.astype(np.float64))
             fraction = math.hypot(fraction, *(error / math.sqrt(2) for error in errors))
@@ -246,7 +246,7 @@ class LevelUncertainty(Step):
         return result.assign(height_sigma=partial(_with_levels, result, fraction, width))
 
 
-class _Seen(NamedTuple):
+class _PixelTraces(NamedTuple):
     """What a grid of pixels shows from the least travel on, and their levels."""
 
     values: NDArray[Any]  # (T, rows, columns)
@@ -262,7 +262,7 @@ class _Seen(NamedTuple):
         dark: ArrayLike,
         bright: ArrayLike,
         shape: tuple[int, ...],
-    ) -> _Seen:
+    ) -> _PixelTraces:
         """Return the samples of a press or a release."""
         low, high = (
             samples.of_map(np.broadcast_to(np.asarray(level, np.float32), shape)) for level in (dark, bright)
@@ -271,7 +271,7 @@ class _Seen(NamedTuple):
         return cls(samples.values[forward], travel[forward], low, high)
 
 
-def _find_errors(trace: _Seen, onset: Doubles) -> tuple[float, float]:
+def _find_errors(trace: _PixelTraces, onset: Doubles) -> tuple[float, float]:
     """Return by how much dark and light differ from the references, in shares of the rise; 0 if hardly."""
     values, travel, low, high = trace
     few, start, end = max(1, round(_PART * len(travel))), float(travel.min()), float(travel.max())
@@ -293,7 +293,7 @@ def _find_errors(trace: _Seen, onset: Doubles) -> tuple[float, float]:
     return level_errors[0], level_errors[1]
 
 
-def _width(trace: _Seen, slope: NDArray[np.float32]) -> float:
+def _width(trace: _PixelTraces, slope: NDArray[np.float32]) -> float:
     """Return the travel in which the flattest pixels turn light in addition to their slopes, mm."""
     values, travel, low, high = trace
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -27,7 +27,7 @@ _CLEAR, _SMALLEST = 8.0, math.radians(1.5)  # standard errors and angle from whi
 
 
 @dataclass(frozen=True, slots=True)
-class AzimuthError:
+class AzimuthBias:
     """Angle by which slopes are rotated, radians: ``first`` in the first row, ``last`` in the last."""
 
     first: float
@@ -42,9 +42,9 @@ class AzimuthError:
         return np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=-1)
 
 
-def find_azimuth_error(
+def find_azimuth_bias(
     normals: AnyArray, contact: NDArray[Any], pixel_size: tuple[float, float]
-) -> AzimuthError | None:
+) -> AzimuthBias | None:
     """Return the rotation of the slopes of normals, (H, W, 3), in contact; None if it is not significant."""
     rows, columns = contact.shape
     extent = math.isqrt(int(np.count_nonzero(contact)))
@@ -74,7 +74,7 @@ def find_azimuth_error(
     return _regression(curl[finite], divergence[finite], place[finite], overlap)
 
 
-def _regression(curl: Doubles, divergence: Doubles, place: Doubles, overlap: float) -> AzimuthError | None:
+def _regression(curl: Doubles, divergence: Doubles, place: Doubles, overlap: float) -> AzimuthBias | None:
     """Fit a rotation that may change with the place of the row, 1 for the first and -1 for the last."""
     columns = np.stack([divergence, divergence * place], axis=1)
     result = fit_clipped(columns, curl, condition=1e9)
@@ -88,4 +88,4 @@ def _regression(curl: Doubles, divergence: Doubles, place: Doubles, overlap: flo
         return None
     middle, change = fit[0], fit[1] if clear[1] else 0.0
     first, last = math.atan(middle + change), math.atan(middle - change)
-    return AzimuthError(first, last, float(np.hypot(spread[0], spread[1] if clear[1] else 0.0)))
+    return AzimuthBias(first, last, float(np.hypot(spread[0], spread[1] if clear[1] else 0.0)))

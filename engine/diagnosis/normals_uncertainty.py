@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.base.device_arrays import AnyArray, stored_map
 from mirrorskin.engine.base.frames import QUANTUM, take_places, thin_out
 from mirrorskin.engine.base.steps import Context, Step
-from mirrorskin.engine.diagnosis.curl import AzimuthError, find_azimuth_error
+from mirrorskin.engine.diagnosis.curl import AzimuthBias, find_azimuth_bias
 from mirrorskin.engine.diagnosis.registration import Registered
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
-from mirrorskin.engine.diagnosis.swing import Swing, find_swing
+from mirrorskin.engine.diagnosis.swing import ModulationEffects, find_modulation_effects
 from mirrorskin.io import Result
 from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
@@ -81,7 +81,7 @@ class PhaseUncertainty(Step):
         if several:
             return result
         size = context.source.header.pixel_size or (1.0, 1.0)
-        error = find_azimuth_error(normals, result.contact, size)
+        error = find_azimuth_bias(normals, result.contact, size)
         if error is None:
             return result
         normals = error.remove(result.normals)
@@ -112,7 +112,7 @@ class ResponseUncertainty(Step):
             return result
         cosine, sine = (stored_map(context.computed, name) for name in ("cosine", "sine"))
         base = noise**2 - slope * _median(mean)
-        modulation = find_swing(
+        modulation = find_modulation_effects(
             normals,
             mean,
             cosine,
@@ -162,7 +162,7 @@ def _median(values: AnyArray) -> float:
     return float(np.median(some)) if some.size else 0.0
 
 
-def _uneven(modulation: Swing) -> Iterator[Finding]:
+def _uneven(modulation: ModulationEffects) -> Iterator[Finding]:
     if modulation.gain > 0:
         text = f"the gains of pixels differ by {100 * modulation.gain:.2g} %, which is part of the errors"
         yield Finding("pixel gains", text, False)
@@ -189,7 +189,7 @@ def _uneven(modulation: Swing) -> Iterator[Finding]:
         )
 
 
-def _rotated(error: AzimuthError) -> Finding:
+def _rotated(error: AzimuthBias) -> Finding:
     first, last = math.degrees(error.first), math.degrees(error.last)
     if error.first == error.last:
         text = f"by {first:+.1f} degrees, which is corrected: calibrate the phases (calibrate tilt)"

@@ -60,7 +60,7 @@ class PositionUncertainty(Step):
         """Return a result with larger standard deviations, or a warning, where positions do not fit."""
         operation = cast("PressOperation", context.operation)
         travel = context.positions("travel")
-        errors = _find_errors(stored_map(result, "height"), travel)
+        errors = _fit_positions(stored_map(result, "height"), travel)
         if errors is None:
             return result
         jump = errors.lost_frame()
@@ -81,7 +81,7 @@ class PositionUncertainty(Step):
 
 
 @dataclass(frozen=True)
-class _Errors:
+class _PositionFit:
     """Estimated errors of frames at some travel, (n,), mm, and where they are meaningful.
 
     ``clear``, (n - 1,), is True for the intervals between frames over which heights are spread: many heights
@@ -176,7 +176,7 @@ class _Rows:
         return _Rows(self.bends[inside], frame - first, change)
 
 
-def _find_errors(height: AnyArray, pushed: Doubles) -> _Errors | None:
+def _fit_positions(height: AnyArray, pushed: Doubles) -> _PositionFit | None:
     """Return the errors of the frames' positions; None if the heights do not show any."""
     travel = np.unique(pushed)
     if len(travel) < _FEWEST:
@@ -270,7 +270,7 @@ def _spread(heights: Doubles, travel: Doubles) -> NDArray[np.bool_]:
     return np.asarray((total > 0) & (total**2 >= _SPREAD * np.sum(count**2, axis=1)))
 
 
-def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], reach: int) -> _Errors:
+def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], reach: int) -> _PositionFit:
     """Fit the errors of all frames, and those of a single jump between any two of them."""
     count, (first, second) = len(travel), np.triu_indices(len(rows.frame))
     pairs = (count * rows.frame[first] + rows.frame[second]).ravel()
@@ -308,7 +308,9 @@ def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], re
     weights = np.sum(after * (squares @ after), axis=0) - np.sum(mixed * (inner @ mixed), axis=0)
     weights = np.maximum(weights, 1e-9 * np.trace(squares))
     jumps = (after.T @ gradient - mixed.T @ inner @ (smooth.T @ gradient)) / weights
-    return _Errors(travel, step, error, covariance, clear, jumps, bend * np.sqrt(_OVERLAP / weights), reach)
+    return _PositionFit(
+        travel, step, error, covariance, clear, jumps, bend * np.sqrt(_OVERLAP / weights), reach
+    )
 
 
 def with_travel_error(result: Result, sigma: float) -> Result:

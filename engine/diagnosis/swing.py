@@ -41,7 +41,7 @@ _GAIN = 0.01  # least standard deviation of the gains of pixels
 
 
 @dataclass(frozen=True, slots=True)
-class Swing:
+class ModulationEffects:
     """Effects on the swing of the brightness; 0 if one is not significant.
 
     Attributes
@@ -60,7 +60,7 @@ class Swing:
     blur: float = 0.0
 
 
-def find_swing(
+def find_modulation_effects(
     normals: AnyArray,
     mean: AnyArray,
     cosine: AnyArray,
@@ -69,7 +69,7 @@ def find_swing(
     zenith_gain: ArrayLike,
     tilt: float,
     noise_of_mean: CountNoise,
-) -> Swing:
+) -> ModulationEffects:
     """Return what the swing of brightness shows.
 
     ``normals``, (H, W, 3), and the fit of ``mean``, ``cosine`` and ``sine``, (H, W) counts, are used at
@@ -78,7 +78,7 @@ def find_swing(
     rows, columns = usable.shape
     thin = max(1, math.isqrt(int(np.count_nonzero(usable))) // _LINES)
     if min(rows, columns) <= 2 * _REACH:
-        return Swing()
+        return ModulationEffects()
     down, right = range(_REACH, rows - _REACH, thin), range(_REACH, columns - _REACH, thin)
     places = (0, 0), (0, _REACH), (0, -_REACH), (-_REACH, 0), (_REACH, 0)
     scale = np.broadcast_to(np.abs(np.asarray(zenith_gain, np.float64)), usable.shape)
@@ -105,7 +105,7 @@ def find_swing(
         noise = math.sqrt(2) * noise_of_mean.at(means[0]) / (scales[0] * tilt)
     finite = np.isfinite(rough) & np.isfinite(turning) & np.isfinite(noise) & (noise > 0)
     if np.count_nonzero(finite) < _FEWEST:
-        return Swing()
+        return ModulationEffects()
     y, x = (
         np.broadcast_to(positions, finite.shape)[finite]
         for positions in np.ix_(1 - 2 * np.array(down) / (rows - 1), 2 * np.array(right) / (columns - 1) - 1)
@@ -143,11 +143,11 @@ def _gain(rough: Doubles, noise: Doubles) -> float:
     return gain if excess > _CLEAR_GAIN * _JOINED * math.sqrt(2 / len(rough)) and gain > _GAIN else 0.0
 
 
-def _fit(ratio: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing:
+def _fit(ratio: Doubles, columns: Doubles, noise: Doubles, gain: float) -> ModulationEffects:
     """Fit the effects to the ratio of the swing to the expected one."""
     result = fit_clipped(columns, ratio, noise)
     if result is None:
-        return Swing(gain=gain)
+        return ModulationEffects(gain=gain)
     fit, inverse, residual, kept = result
     covariance = inverse * max(1.0, float(np.mean(residual[kept] ** 2)))
 
@@ -173,4 +173,4 @@ def _fit(ratio: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Swing
     response, light = (
         extent if extent > _UNEVEN else 0.0 for extent in (effect(slice(3, 4)), effect(slice(4, 9)))
     )
-    return Swing(response, light, gain, spread if blurs else 0.0)
+    return ModulationEffects(response, light, gain, spread if blurs else 0.0)

@@ -20,7 +20,7 @@ from mirrorskin.engine.fusion.agreement import (
 from mirrorskin.engine.integration.arrays import integrate_arrays
 from mirrorskin.engine.integration.normals_to_height import Slopes
 from mirrorskin.engine.press.holes import fill_holes
-from mirrorskin.engine.press.intervals import estimate_interval_errors, fit_paraboloids, interval_evidence
+from mirrorskin.engine.press.intervals import estimate_interval_scatter, fit_paraboloids, interval_evidence
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.arguments import check_pixel_size
 from mirrorskin.io.base.types import ProcessValue
@@ -268,7 +268,7 @@ def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> t
     half *= _share_used(middle - shape - lift[label], half, shape)
     for _ in range(_ITERATIONS):
         at = shape + lift[label]
-        spread = estimate_interval_errors(middle - at, half)
+        spread = estimate_interval_scatter(middle - at, half)
         inside = interval_evidence(at, middle, half, spread)
         firm = np.bincount(label, inside.weight, size.size)
         move = np.bincount(label, inside.weight * (inside.height - at), size.size) / np.where(firm, firm, 1)

@@ -56,8 +56,8 @@ class Multigrid:
 
     def _allocate(self, links: Links) -> None:
         self._hierarchy = Hierarchy(links.shape, links.anchor is not None, links.device)
-        self._alone = _Gradients(self._hierarchy, 1)
-        self._together: _Gradients | None = None
+        self._alone = ConjugateGradients(self._hierarchy, 1)
+        self._together: ConjugateGradients | None = None
         self._products: Array | None = None
         self._lengths: Array
 
@@ -107,14 +107,14 @@ class Multigrid:
             iterations, residual[batch] = max(iterations, count), residuals[: batch.stop - batch.start]
         return _solution(height, iterations, residual, tolerance)
 
-    def _batches(self, sides: int) -> list[tuple[slice, _Gradients]]:
+    def _batches(self, sides: int) -> list[tuple[slice, ConjugateGradients]]:
         """Return which right sides are solved together, and their solver."""
         lanes = choose_lanes(self._device, sides)
         if lanes == 1:
             return [(slice(0, 1), self._alone)]
         if self._together is None or self._together.lanes != lanes:
             self._together = None  # frees its memory first
-            self._together = _Gradients(self._hierarchy, lanes)
+            self._together = ConjugateGradients(self._hierarchy, lanes)
             self._together.cycle.prepare()
         return [(slice(k, min(k + lanes, sides)), self._together) for k in range(0, sides, lanes)]
 
@@ -186,7 +186,7 @@ def _solution(height: Array, iterations: int, residual: Doubles, tolerance: floa
     return Solution(height, iterations, worst, worst <= (_FAILED if tolerance is None else tolerance))
 
 
-class _Gradients:
+class ConjugateGradients:
     """Conjugate gradients for one or several right sides of one graph, and their memory.
 
     Numbers are kept for each right side, (lanes,). Right sides whose residual is small enough do not change.

@@ -6,7 +6,7 @@ from mirrorskin.engine.metrology.measures import FormName, Measures, group_of, m
 from mirrorskin.engine.metrology.parameters import PARAMETERS, Parameter
 from mirrorskin.engine.metrology.profile import profile_parameters
 from mirrorskin.engine.metrology.quantity import Quantity
-from mirrorskin.engine.metrology.sections import Section, Step, section, section_columns, step_height
+from mirrorskin.engine.metrology.sections import Section, StepHeight, section, section_columns, step_height
 from mirrorskin.engine.metrology.texture import Roughness, roughness
 
 __all__ = [
@@ -20,7 +20,7 @@ __all__ = [
     "Roughness",
     "Section",
     "Sphere",
-    "Step",
+    "StepHeight",
     "fit_plane",
     "fit_sphere",
     "group_of",

@@ -228,7 +228,7 @@ def _mean(values: NDArray[np.float32], points: SamplePoints, counts: Mask) -> Do
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class StepHeight:
     """Two levels along a section.
 
     Attributes
@@ -246,7 +246,7 @@ class Step:
     slope: Quantity
 
 
-def step_height(section: Section) -> Step:
+def step_height(section: Section) -> StepHeight:
     """Measure the step along a section in millimetres.
 
     The step is where two parallel lines fit the measured samples before and after it best. Then the nearest
@@ -280,7 +280,7 @@ def step_height(section: Section) -> Step:
         raise InputError("there is no step along the section: a smooth curve fits it better than two levels")
     slope, rise = float(parameters[1]), float(parameters[2])
     across = math.sqrt(1 + slope**2)
-    return Step(
+    return StepHeight(
         Quantity(rise / across, math.sqrt(spread[2, 2]) / across, "mm"),
         Quantity(float(place), float(half) / math.sqrt(3), "mm"),
         Quantity(math.degrees(math.atan(slope)), math.degrees(math.sqrt(spread[1, 1]) / across**2), "deg"),

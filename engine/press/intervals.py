@@ -124,14 +124,14 @@ def _between_frames(
     return -(ends[place] + ends[place - 1]) / 2, usual, between
 
 
-class IntervalErrors(NamedTuple):
+class IntervalScatter(NamedTuple):
     """Distribution of the errors of interval-valued heights."""
 
     blur: float  # standard deviation of the ends of intervals, mm
     outlier_density: float  # density of outliers, 1/mm, over the share of the other heights
 
 
-def estimate_interval_errors(error: Doubles, half: Doubles) -> IntervalErrors:
+def estimate_interval_scatter(error: Doubles, half: Doubles) -> IntervalScatter:
     """Estimate the blur of intervals' ends and the share of outliers, by maximum likelihood.
 
     With P(e) the probability of an error e for a blurred interval, and m the share of outliers, which are
@@ -168,10 +168,10 @@ def estimate_interval_errors(error: Doubles, half: Doubles) -> IntervalErrors:
     low, high = sizes[max(best - 1, 0)], sizes[min(best + 1, sizes.size - 1)]
     size = min((lowest, _lowest(unlikely, low, high)), key=unlikely)
     outliers = share(_chance(error, half, float(np.exp(size))) / (2 * half))
-    return IntervalErrors(float(np.exp(size)), outliers / (1 - outliers) / span)
+    return IntervalScatter(float(np.exp(size)), outliers / (1 - outliers) / span)
 
 
-def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: IntervalErrors) -> Evidence:
+def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: IntervalScatter) -> Evidence:
     """Return heights and weights that approximate the likelihood of intervals, by one Newton step.
 
     The likelihood of a height u is the probability that u plus an error of standard deviation ``blur`` is
@@ -185,7 +185,7 @@ def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: I
         Predicted heights, mm.
     middle, half : ndarray, (n,), float64
         Middles and half-widths of the intervals, mm.
-    spread : IntervalErrors
+    spread : IntervalScatter
     """
     blur, outlier_density = spread
     below, above = (middle - half - height) / blur, (middle + half - height) / blur

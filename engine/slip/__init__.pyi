@@ -1,9 +1,9 @@
 from .displacement import find_displacement
-from .search import Slip
-from .slip import Sliding
+from .search import SlipOnset
+from .slip import Slide
 
 __all__ = [
-    "Sliding",
-    "Slip",
+    "Slide",
+    "SlipOnset",
     "find_displacement",
 ]

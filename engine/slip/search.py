@@ -55,7 +55,7 @@ _STILL = 1e-9  # motion, relative to the body's path, up to which it is at rest
 _BLOCK = 16  # frames read at once
 
 
-class Slip(Operation):
+class SlipOnset(Operation):
     """Displacement of the skin, and where and when it slips while the body slides or twists.
 
     The first frame is the reference. In the body's frame, skin that sticks to an object at rest moves with
@@ -72,7 +72,7 @@ class Slip(Operation):
     >>> from mirrorskin import engine
     >>> texture = np.random.default_rng(1).normal(100, 20, (60, 80))
     >>> texture = cv2.GaussianBlur(texture, (0, 0), 1.5).astype(np.float32)
-    >>> slip = engine.slip.Slip(pixel_size=0.1, contact=np.ones((60, 80)), noise=0.1)
+    >>> slip = engine.slip.SlipOnset(pixel_size=0.1, contact=np.ones((60, 80)), noise=0.1)
     >>> frames = [np.roll(texture, -k, axis=1) for k in range(4)]  # the skin sticks to the object
     >>> found = engine.run(frames, slip, displacement=np.outer(range(4), [0.1, 0.0]))
     >>> [round(float(part), 3) for part in found.displacement[30, 40]], int(found.status[30, 40])

@@ -15,7 +15,7 @@ from mirrorskin.engine.base.operation import Plan
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.base.summary import status_shares
-from mirrorskin.engine.slip.search import Slip
+from mirrorskin.engine.slip.search import SlipOnset
 from mirrorskin.io import Calibrated, InputError, Result, Source
 from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.io.model.maps import SlipStatus
@@ -31,7 +31,7 @@ class Traction(Step):
         help="Young's modulus, for traction and the force along the sheet",
         shown_default="that of the calibration",
     )
-    window_size: int = Slip.window_size
+    window_size: int = SlipOnset.window_size
 
     def apply(self, result: Result, context: Context) -> Result:
         """Return the result with traction and force; if they cannot be computed, the process says why."""
@@ -72,11 +72,11 @@ class NoContact(Step):
         return with_findings(result, Finding("no contact", text))
 
 
-class Sliding(Method):
+class Slide(Method):
     """Displacement of the skin and slip in a slide or a twist; with Young's modulus also the force.
 
     ``traction``, ``force_x`` and ``force_y`` assume that there is no load along the sheet in the first frame.
-    ``process`` contains ``angle``, ``centre_x`` and ``centre_y`` of a twist; see `Slip`.
+    ``process`` contains ``angle``, ``centre_x`` and ``centre_y`` of a twist; see `SlipOnset`.
 
     `run` returns ``displacement``, ``slip_onset``, ``status``, and for each frame ``slide_distance`` or
     ``twist_angle`` and ``stick_ratio``; with Young's modulus also ``traction``, ``force_x`` and ``force_y``.
@@ -100,18 +100,18 @@ class Sliding(Method):
 
     motions = ("horizontal", "twist")
 
-    contact: Maps | None = Slip.contact
-    per_frame: bool = Slip.per_frame
-    window_size: int = Slip.window_size
-    window_step: int = Slip.window_step
-    noise: float | None = Slip.noise
-    motion: Literal["horizontal", "twist"] = Slip.motion
-    pixel_size: ArrayLike | None = Slip.pixel_size
-    centre: tuple[float, float] = Slip.centre
+    contact: Maps | None = SlipOnset.contact
+    per_frame: bool = SlipOnset.per_frame
+    window_size: int = SlipOnset.window_size
+    window_step: int = SlipOnset.window_step
+    noise: float | None = SlipOnset.noise
+    motion: Literal["horizontal", "twist"] = SlipOnset.motion
+    pixel_size: ArrayLike | None = SlipOnset.pixel_size
+    centre: tuple[float, float] = SlipOnset.centre
     modulus: float | None = Traction.modulus
 
     def plan(self, source: Source) -> Plan:
         """Return the search for slip, with the source's motion and pixel size, and the step for the force."""
-        slip: Slip = self.configure(Slip).configured_for(source)
+        slip: SlipOnset = self.configure(SlipOnset).configured_for(source)
         process = {"window_size": slip.window_size, "window_step": slip.window_step}
         return Plan(slip, [self.configure(NoContact), self.configure(Traction)], process)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mirrorskin.io.base.types import ProcessValue
 
 
-class Correlation(Method):
+class LockIn(Method):
     """Mean, cosine and sine of the phase in each pixel's brightness, over all frames of a recording."""
 
     frequency: float | Literal["estimate"] | None = option(

@@ -220,8 +220,8 @@ BUILT_IN = {
     "Correlate": ("turn", {"harmonic": 1}),
     "Normals": ("turn", {"method": "paper"}),
     "rotation.rotation:Rotation": ("turn", {"robust": True}),
-    "slip:Slip": ("slide", {"window_size": 10}),
-    "Sliding": ("slide", {"per_frame": True}),
+    "slip:SlipOnset": ("slide", {"window_size": 10}),
+    "Slide": ("slide", {"per_frame": True}),
 }
 
 

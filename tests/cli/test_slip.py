@@ -49,7 +49,7 @@ def slide_result(slide, contact):
 def test_a_slide_is_reported_as_found_in_its_frames(slide, contact, slide_result):
     touched = io.open_result(contact).contact
     with io.open_recording(slide) as recording:
-        expected = engine.run(recording, engine.slip.Slip(contact=touched, per_frame=True))
+        expected = engine.run(recording, engine.slip.SlipOnset(contact=touched, per_frame=True))
     for name in ("displacement", "displacement_sigma", "slip_onset", "slip_onset_sigma", "status", "contact"):
         np.testing.assert_array_equal(getattr(slide_result, name), getattr(expected, name), err_msg=name)
     np.testing.assert_allclose(slide_result.slide_distance, np.arange(12) * 0.02, atol=1e-12)

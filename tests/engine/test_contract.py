@@ -211,7 +211,14 @@ def test_running_it_over_a_recording_gives_the_same(name):
 def test_the_function_on_arrays_gives_the_same(name):
     case = CASES[name]
     if case.function is None:
-        assert case.kind.__name__ in {"Levels", "Strokes", "Normals", "LastTurn", "MovingNormals", "Slip"}
+        assert case.kind.__name__ in {
+            "Levels",
+            "Strokes",
+            "Normals",
+            "LastTurn",
+            "MovingNormals",
+            "SlipOnset",
+        }
         return
     assert_same(case.function(case.frames, **case.given, **case.options), whole(name))
 
@@ -326,7 +333,7 @@ LIVE = ["live Strokes", "live LastTurn", "live MovingNormals", "live Slip"]
 @pytest.mark.parametrize("name", [*ONCE.args[1], *LIVE])
 def test_each_answer_next_to_pushes_is_that_of_a_single_thread(name):
     case = CASES[name.removeprefix("live ")]
-    slow = case.kind.__name__ in ("Slip", "LastTurn")
+    slow = case.kind.__name__ in ("SlipOnset", "LastTurn")
 
     def make():
         return LiveRun(case.source(), case.make()) if name in LIVE else case.loop()

@@ -104,7 +104,7 @@ METHODS: dict[str, Any] = {
     "Rotation of the last turn": Case(
         engine.Rotation, TURNS, ON_PHASE, {"tilt": TILT, "window_frames": 8, **SENSOR}, **ROTATION
     ),
-    "Sliding": Case(engine.slip.Sliding, SKIN, {"displacement": SLIDE}, motion="horizontal"),
+    "Slide": Case(engine.slip.Slide, SKIN, {"displacement": SLIDE}, motion="horizontal"),
 }
 EVERYTHING = {name: with_fewer_frames(case) for name, case in {**CASES, **TWICE, **OWN, **METHODS}.items()}
 

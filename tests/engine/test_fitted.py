@@ -196,7 +196,7 @@ def blind(method):
 
 
 @pytest.mark.parametrize(
-    ("method", "source"), [(engine.Press, press), (engine.Rotation, turn), (engine.slip.Sliding, slide)]
+    ("method", "source"), [(engine.Press, press), (engine.Rotation, turn), (engine.slip.Slide, slide)]
 )
 def test_steps_do_not_read_the_process(method, source):
     assert_equal(blind(method)().run(source()), method().run(source()))

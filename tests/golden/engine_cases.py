@@ -47,7 +47,7 @@ from mirrorskin.engine.metrology import fit_sphere as engine_fit_sphere
 from mirrorskin.engine.metrology import roughness as engine_roughness
 from mirrorskin.engine.metrology import section as engine_section
 from mirrorskin.engine.metrology import step_height as engine_step_height
-from mirrorskin.engine.vibration.lock_in import Correlation
+from mirrorskin.engine.vibration.lock_in import LockIn
 
 PROCESS = Tolerance(1e-3, 1e-6)  # numbers of solved heights
 ONSET = {"height": HEIGHT, "height_sigma": HEIGHT, "process": FITTED}
@@ -498,7 +498,7 @@ def registered_frames() -> Answer:
 
 @case(FITTED)
 def correlate_a_source() -> Answer:
-    return result_maps(Correlation().run(turn_source(2)))
+    return result_maps(LockIn().run(turn_source(2)))
 
 
 # Surfaces.

@@ -171,7 +171,7 @@ def slip_search() -> Answer:
     x, y = np.meshgrid(np.arange(72) - 36, np.arange(64) - 32)
     contact = np.hypot(x, y) < 26
     for motion, position in (("horizontal", "displacement"), ("twist", "twist")):
-        run = engine.Run(slip.Slip(pixel_size=PIXEL, motion=motion, contact=contact))
+        run = engine.Run(slip.SlipOnset(pixel_size=PIXEL, motion=motion, contact=contact))
         for k in range(12):
             run.push(slipping(motion, k)[None], **{position: places_of(motion, k)})
         result = run.result()

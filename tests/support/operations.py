@@ -158,11 +158,11 @@ CASES = {
         {"zenith_gain": 400.0, "noise": 1.0}, **ROTATION,
     ),
     "Slip": Case(
-        engine.slip.Slip, SKIN, {"displacement": SLIDE},
+        engine.slip.SlipOnset, SKIN, {"displacement": SLIDE},
         {"pixel_size": PIXEL, "contact": np.ones(SKIN.shape[1:])}, motion="horizontal",
     ),
     "Slip of each frame": Case(
-        engine.slip.Slip, SKIN, {"displacement": SLIDE},
+        engine.slip.SlipOnset, SKIN, {"displacement": SLIDE},
         {"pixel_size": PIXEL, "contact": np.ones(SKIN.shape[1:]), "per_frame": True}, motion="horizontal",
     ),
     "Fringes": Case(Fringes, TURNS, ON_PHASE, {}, fit_fringes, **ROTATION),

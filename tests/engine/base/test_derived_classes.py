@@ -246,7 +246,7 @@ def test_a_changed_default_may_be_set_to_none_where_the_option_may_be():
         (engine.Press, {"fill": 1}, "Own: fill is 1: use True or False$"),
         (HoleFilling, {"fill": "no"}, "Own: fill is 'no': use True or False$"),
         (engine.Onset, {"threshold": lambda self: 0.3}, "Own: threshold is an option. Assign a value"),
-        (engine.slip.Slip, {"contact": property(len)}, "Own: contact is an option. Assign a value"),
+        (engine.slip.SlipOnset, {"contact": property(len)}, "Own: contact is an option. Assign a value"),
         (engine.Onset, {"hold": io.Map("hold", "mm")}, "Own: hold is an option and a map. Rename one"),
     ],
 )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine, io
-from mirrorskin.engine.diagnosis.curl import find_azimuth_error
+from mirrorskin.engine.diagnosis.curl import find_azimuth_bias
 from mirrorskin.evaluation.scenes import rotations
 from mirrorskin.evaluation.scenes.rotations import Setup
 from mirrorskin.io.files.arrays import ArrayRecording
@@ -33,7 +33,7 @@ def noisy(normals, sigma=0.02):
 
 
 def error_of(normals):
-    return find_azimuth_error(normals, np.ones(SHAPE, np.uint8), PIXEL)
+    return find_azimuth_bias(normals, np.ones(SHAPE, np.uint8), PIXEL)
 
 
 @cache
@@ -68,7 +68,7 @@ def test_slopes_without_curvature_show_no_rotation():
 
 
 def test_few_slopes_show_no_rotation():
-    assert find_azimuth_error(rotated(12), np.eye(*SHAPE, dtype=np.uint8), PIXEL) is None
+    assert find_azimuth_bias(rotated(12), np.eye(*SHAPE, dtype=np.uint8), PIXEL) is None
 
 
 def test_normals_seen_by_a_rolling_shutter_have_the_errors_that_they_state():

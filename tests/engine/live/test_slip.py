@@ -5,7 +5,7 @@ import pytest
 from speckle import Speckle
 from stacks import MadeUp
 
-from mirrorskin.engine import Sliding
+from mirrorskin.engine import Slide
 from mirrorskin.engine.live import LiveRun, Loop
 from mirrorskin.io import Block, Header, InputError
 
@@ -29,7 +29,7 @@ class Timed(MadeUp):
 
 
 def test_the_displacement_of_the_newest_frame_is_shown_from_the_second_on():
-    live = LiveRun(source(), Sliding(contact=CONTACT))
+    live = LiveRun(source(), Slide(contact=CONTACT))
     for number in range(COUNT):
         live.push_block(BLOCK, slice(number, number + 1))
         maps = live.maps()
@@ -43,7 +43,7 @@ def test_a_whole_run_shows_how_far_the_body_has_come():
     recording = source()
     timed = Timed(FRAMES, recording.header, displacement=PLACES, time=0.01 * np.arange(COUNT))
     updates = []
-    live = LiveRun(timed, Sliding(contact=CONTACT))
+    live = LiveRun(timed, Slide(contact=CONTACT))
     status = Loop(timed, live, updates=1e6, on_update=lambda update, _: updates.append(update)).run()
     assert status.used == COUNT
     assert updates[-1].position == pytest.approx(np.hypot(0.14, 0.07))
@@ -52,8 +52,8 @@ def test_a_whole_run_shows_how_far_the_body_has_come():
 
 @pytest.mark.parametrize(
     ("recording", "message"),
-    [(source("vertical"), "Sliding needs horizontal or twist"), (source(pixel_size=None), "pixel size")],
+    [(source("vertical"), "Slide needs horizontal or twist"), (source(pixel_size=None), "pixel size")],
 )
 def test_what_shows_no_slip_is_refused(recording, message):
     with pytest.raises(InputError, match=message):
-        LiveRun(recording, Sliding())
+        LiveRun(recording, Slide())

@@ -112,7 +112,7 @@ def test_what_cannot_be_used_is_refused_where_it_is_pushed_and_changes_nothing(f
 
 @pytest.mark.parametrize("place", [0.1, [0.1], [0.1, 0.2, 0.3], [[0.1, 0.2]], [0.1, np.nan]])
 def test_a_displacement_that_is_not_two_numbers_is_refused_where_it_is_pushed(place):
-    operation = engine.slip.Slip(pixel_size=0.1)
+    operation = engine.slip.SlipOnset(pixel_size=0.1)
     with stream(operation, motion="horizontal") as pushed, pytest.raises(io.InputError, match="displacement"):
         pushed.push(np.zeros(SHAPE, np.uint8), displacement=place)
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import norm
 
 from mirrorskin.engine.press.intervals import (
-    IntervalErrors,
-    estimate_interval_errors,
+    IntervalScatter,
+    estimate_interval_scatter,
     fit_paraboloids,
     heights_as_intervals,
     interval_evidence,
@@ -23,7 +23,7 @@ def log_likelihood(height, middle, half, blur):
 def test_an_interval_pulls_as_its_likelihood_does(blur):
     middle, half = np.full(41, -0.3), np.full(41, 0.05)
     height = np.linspace(-0.3 - 0.05 - 2 * blur, -0.3 + 0.05 + 2 * blur, 41)
-    evidence = interval_evidence(height, middle, half, IntervalErrors(blur, 0.0))
+    evidence = interval_evidence(height, middle, half, IntervalScatter(blur, 0.0))
     step = 1e-4 * blur
     below, here, above = (log_likelihood(height + sign * step, middle, half, blur) for sign in (-1, 0, 1))
     slope, curvature = (above - below) / (2 * step), -(above - 2 * here + below) / step**2
@@ -35,19 +35,21 @@ def test_an_interval_pulls_as_its_likelihood_does(blur):
 
 def test_sharp_ends_leave_what_is_inside_alone():
     height = np.array([-0.34, -0.3, -0.26])
-    evidence = interval_evidence(height, np.full(3, -0.3), np.full(3, 0.05), IntervalErrors(1e-3, 0.0))
+    evidence = interval_evidence(height, np.full(3, -0.3), np.full(3, 0.05), IntervalScatter(1e-3, 0.0))
     assert evidence.height == pytest.approx(height, abs=1e-9)
     assert (evidence.weight < 1e-3 * 1e6).all()
 
 
 def test_wide_blurs_make_a_plain_known_height():
-    evidence = interval_evidence(np.array([0.7]), np.array([0.2]), np.array([0.3]), IntervalErrors(10.0, 0.0))
+    evidence = interval_evidence(
+        np.array([0.7]), np.array([0.2]), np.array([0.3]), IntervalScatter(10.0, 0.0)
+    )
     assert evidence.height == pytest.approx(0.2, abs=1e-3)
     assert evidence.weight == pytest.approx(1 / (10.0**2 + 0.3**2 / 3), rel=1e-3)
 
 
 def test_what_is_far_outside_is_a_mistake():
-    far = interval_evidence(np.zeros(2), np.array([2.9, -2.9]), np.full(2, 0.05), IntervalErrors(0.01, 0.0))
+    far = interval_evidence(np.zeros(2), np.array([2.9, -2.9]), np.full(2, 0.05), IntervalScatter(0.01, 0.0))
     assert (far.weight == 0).all()
     assert np.isfinite(far.height).all()
 
@@ -55,7 +57,7 @@ def test_what_is_far_outside_is_a_mistake():
 def test_heights_count_by_the_chance_that_they_are_no_mistakes():
     height, middle, half = np.linspace(-0.07, 0.07, 15), np.zeros(15), np.full(15, 0.05)
     sure, unsure = (
-        interval_evidence(height, middle, half, IntervalErrors(0.01, mistakes)) for mistakes in (0.0, 0.3)
+        interval_evidence(height, middle, half, IntervalScatter(0.01, mistakes)) for mistakes in (0.0, 0.3)
     )
     good = (norm.cdf((0.05 - height) / 0.01) - norm.cdf((-0.05 - height) / 0.01)) / 0.1
     assert unsure.weight == pytest.approx(sure.weight * good / (good + 0.3))
@@ -67,7 +69,7 @@ def test_the_blur_is_found(blur):
     random = np.random.default_rng(3)
     half = np.full(200_000, 0.05)
     error = random.uniform(-1, 1, half.size) * half + random.normal(0, blur, half.size)
-    assert estimate_interval_errors(error, half).blur == pytest.approx(blur, rel=0.1)
+    assert estimate_interval_scatter(error, half).blur == pytest.approx(blur, rel=0.1)
 
 
 def test_mistakes_on_one_side_do_not_blur():
@@ -75,16 +77,16 @@ def test_mistakes_on_one_side_do_not_blur():
     half = np.full(20_000, 0.05)
     error = random.uniform(-1, 1, half.size) * half + random.normal(0, 0.005, half.size)
     error[::25] = random.uniform(-1.5, 0, 800)
-    errors = estimate_interval_errors(error, half)
+    errors = estimate_interval_scatter(error, half)
     assert errors.blur == pytest.approx(0.005, rel=0.25)
     assert errors.outlier_density == pytest.approx(0.04 / 0.96 / np.ptp(error), rel=0.15)
 
 
 def test_the_least_blur_is_a_fiftieth_of_half_an_interval():
     half = np.full(100, 0.05)
-    assert estimate_interval_errors(np.linspace(-0.049, 0.049, 100), half).blur == pytest.approx(0.001)
-    assert estimate_interval_errors(np.zeros(1), half[:1]).blur == pytest.approx(0.001)
-    assert np.isfinite(estimate_interval_errors(np.full(100, 9.0), half)).all()
+    assert estimate_interval_scatter(np.linspace(-0.049, 0.049, 100), half).blur == pytest.approx(0.001)
+    assert estimate_interval_scatter(np.zeros(1), half[:1]).blur == pytest.approx(0.001)
+    assert np.isfinite(estimate_interval_scatter(np.full(100, 9.0), half)).all()
 
 
 ROWS, COLUMNS = np.mgrid[:30, :40].astype(float)

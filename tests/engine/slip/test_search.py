@@ -12,7 +12,7 @@ from speckle import Speckle
 from stacks import MadeUp
 
 from mirrorskin import engine, io
-from mirrorskin.engine.slip import Slip
+from mirrorskin.engine.slip import SlipOnset
 from mirrorskin.io import InputError
 
 SHAPE, PIXEL, NOISE = (128, 140), 0.05, 1.5
@@ -71,7 +71,7 @@ INSIDE = radius(COLUMN, ROW) < CONTACT
 
 
 def search(**options):
-    return Slip(**({"contact": INSIDE, "pixel_size": PIXEL} | options))
+    return SlipOnset(**({"contact": INSIDE, "pixel_size": PIXEL} | options))
 
 
 @pytest.fixture(scope="module")
@@ -201,13 +201,13 @@ def test_bad_input_is_one_line():
         with pytest.raises(InputError, match=message):
             engine.run(frames, search(**options), displacement=places)
     run = engine.Run(search())
-    with pytest.raises(InputError, match="displacement is missing: Slip needs it of each frame"):
+    with pytest.raises(InputError, match="displacement is missing: SlipOnset needs it of each frame"):
         run.push(frames)
-    with pytest.raises(InputError, match="Slip has no position twist: it has displacement"):
+    with pytest.raises(InputError, match="SlipOnset has no position twist: it has displacement"):
         run.push(frames, displacement=places, twist=np.arange(20.0))
     with pytest.raises(InputError, match=r"displacement has shape \(20,\) for 20 frames: two numbers"):
         run.push(frames, displacement=places[:, 0])
-    with pytest.raises(InputError, match="Slip needs at least 3 frames; none have been pushed so far"):
+    with pytest.raises(InputError, match="SlipOnset needs at least 3 frames; none have been pushed so far"):
         run.result()
     run.push(frames[:4], displacement=0 * places[:4])
     with pytest.raises(InputError, match="the body does not move"):

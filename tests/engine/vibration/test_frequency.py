@@ -7,7 +7,7 @@ import pytest
 
 from mirrorskin import engine, io
 from mirrorskin.engine.vibration import estimate_frequency
-from mirrorskin.engine.vibration.lock_in import Correlation
+from mirrorskin.engine.vibration.lock_in import LockIn
 from mirrorskin.io.files.arrays import ArrayRecording
 
 RATE, COUNT, HERTZ = 60.0, 150, 7.321
@@ -58,13 +58,13 @@ def test_a_lock_in_finds_the_waves_of_an_estimated_frequency(harmonic, device):
     phase = np.linspace(-1, 1, 12)
     clean = waves(np.full(12, 20.0), phase, harmonic=8.0)
     frames = np.clip(np.rint(clean), 0, 255).astype(np.uint8).reshape(COUNT, 3, 4)
-    result = Correlation(harmonic=harmonic, frequency="estimate", device=device).run(stack(frames, TIME))
+    result = LockIn(harmonic=harmonic, frequency="estimate", device=device).run(stack(frames, TIME))
     assert result.process["frequency"] == pytest.approx(HERTZ, abs=4 * result.process["frequency_sigma"])
     assert result.process.get("harmonic", 1) == harmonic
     expected = {1: phase, 2: np.full(12, 0.4)}[harmonic].reshape(3, 4)
     np.testing.assert_allclose(result.modulation, {1: 20.0, 2: 8.0}[harmonic], atol=1.2)
     np.testing.assert_allclose(result.azimuth, expected, atol=0.2)
-    fitted = Correlation(harmonic=harmonic, frequency=HERTZ, frame_rate=RATE).run(stack(frames, None))
+    fitted = LockIn(harmonic=harmonic, frequency=HERTZ, frame_rate=RATE).run(stack(frames, None))
     np.testing.assert_allclose(fitted.modulation, result.modulation, rtol=1e-2)
 
 
@@ -98,11 +98,11 @@ def test_a_harmonic_is_the_fit_of_a_multiple_of_the_phase(harmonic, dtype, devic
             "harmonic 0: a number of at least 1",
         ),
         (
-            lambda: Correlation(frequency=1.0).run(stack(np.zeros((9, 2, 2), "u1"), None)),
+            lambda: LockIn(frequency=1.0).run(stack(np.zeros((9, 2, 2), "u1"), None)),
             "the array of frames: the time of each frame is unknown: give the frame rate",
         ),
         (
-            lambda: Correlation(frequency="estimate", frame_rate=-1.0),
+            lambda: LockIn(frequency="estimate", frame_rate=-1.0),
             "frame_rate -1.*: a number in frames/s above 0",
         ),
     ],

@@ -10,7 +10,7 @@ from commands import run
 from scipy import optimize
 
 from mirrorskin import engine, io
-from mirrorskin.engine.vibration.lock_in import Correlation
+from mirrorskin.engine.vibration.lock_in import LockIn
 from mirrorskin.io.files.arrays import ArrayRecording
 from mirrorskin.twin import Camera, Twin, Vertical
 
@@ -147,10 +147,10 @@ def test_a_recording_of_a_dither_has_growth_and_correlation(elastic, tmp_path):
     with io.Recorder(elastic, tmp_path / "d.h5") as recorder:
         recorder.drain(lambda count: None)
     with io.open_recording(tmp_path / "d.h5") as recording:
-        result = Correlation(dither=True).run(recording)
+        result = LockIn(dither=True).run(recording)
         alone = engine.run(recording, engine.vibration.Growth)
         with pytest.raises(io.InputError, match="takes the phase from the travel: leave harmonic out"):
-            Correlation(dither=True, harmonic=2).run(recording)
+            LockIn(dither=True, harmonic=2).run(recording)
     message = {
         "method": "correlation",
         "zenith": "none: the recording has no zenith gain",
