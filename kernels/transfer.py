@@ -43,7 +43,7 @@ SMALL = 2**18
 """Maximum size of a copy on the kernels' queue, bytes: it takes less than waiting for another queue."""
 
 _PATIENCE = 0.1  # seconds after which the slots are counted again, because some may be lost after an error
-_SHARE = 2**20  # minimum number of bytes for a thread
+_MIN_BYTES_PER_THREAD = 2**20  # minimum number of bytes for a thread
 _LINE = 256  # alignment of copies in a staging buffer, bytes
 
 
@@ -268,7 +268,7 @@ def _pieces(values: NDArray[Any], length: int, flat: bool | None = None) -> Iter
 def _copy(copies: Sequence[_Copy]) -> None:
     """Copy each second array to the first, in several threads if worthwhile."""
     total = sum(target.nbytes for target, _ in copies)
-    part_bytes = max(_SHARE, -(-total // THREADS))
+    part_bytes = max(_MIN_BYTES_PER_THREAD, -(-total // THREADS))
     work: deque[_Copy] = deque()
     for pair in copies:
         flat = all(array.flags.c_contiguous for array in pair)
@@ -276,7 +276,7 @@ def _copy(copies: Sequence[_Copy]) -> None:
         work.extend(zip(*(_pieces(array, length, flat) for array in pair), strict=True))
     helpers: list[Future[None]] = []
     with suppress(RuntimeError):  # the interpreter ends and starts no more threads
-        while len(helpers) < min(THREADS, len(work)) - 1 and total > _SHARE:
+        while len(helpers) < min(THREADS, len(work)) - 1 and total > _MIN_BYTES_PER_THREAD:
             helpers.append(_threads().submit(_copy_all, work))
     _copy_all(work)
     for helper in helpers:

@@ -24,9 +24,10 @@ QUANTUM = 1 / math.sqrt(12)
 """Standard deviation of the rounding of integer counts."""
 
 _AT_ONCE = 65536  # pixels processed at once
-_PAIRS, _FEWEST = 16, 64  # maximum number of pairs of frames for the noise, and minimum of samples of each
+_MAX_PAIRS = 16  # of frames for an estimate of the noise
+_MIN_SAMPLES = 64  # of a pair of frames
 _MEDIAN = 0.6745  # magnitude of half of the values of a normal distribution, standard deviations
-_ROUNDS = 3  # of clipping, after which the noise changes by less than a percent
+_CLIP_ITERATIONS = 3  # of clipping, after which the noise changes by less than a percent
 _CLIP = 4.0  # standard deviations beyond which differences are clipped
 
 
@@ -194,13 +195,13 @@ def estimate_noise_of_all(samples: NDArray[Any]) -> float:
     ends of the scale, where noise is clipped, are excluded.
     """
     integer = samples.dtype.kind == "u"
-    pairs = np.unique(np.linspace(0, len(samples) - 2, _PAIRS).round().astype(int))
+    pairs = np.unique(np.linspace(0, len(samples) - 2, _MAX_PAIRS).round().astype(int))
     first, second = (samples[pairs + step].astype(np.float32) for step in (0, 1))
     usable = np.isfinite(first) & np.isfinite(second)
     if integer:
         top = samples.max()
         usable &= (first > 0) & (second > 0) & (first < top) & (second < top)
-    enough = np.count_nonzero(usable, axis=1) >= _FEWEST
+    enough = np.count_nonzero(usable, axis=1) >= _MIN_SAMPLES
     if not enough.any():
         return math.nan
     change = np.where(usable, second - first, np.nan)[enough]
@@ -218,7 +219,7 @@ def _side(change: NDArray[np.float32], integer: bool) -> NDArray[np.float64]:
     place = np.clip(((count + same) / 2 - same).astype(int), 0, None)  # index of the median, after the zeros
     middle = np.sqrt(ordered[np.arange(len(ordered)), np.minimum(place, np.maximum(count - 1, 0))])
     spread = np.maximum(np.where(count > 0, middle, 0) / _MEDIAN, 1.0 if integer else 0.0)
-    for _ in range(_ROUNDS):
+    for _ in range(_CLIP_ITERATIONS):
         kept = below & (square <= (_CLIP * spread[:, np.newaxis]) ** 2)
         spread = np.sqrt(np.sum(square, axis=1, where=kept) / np.maximum(kept.sum(axis=1) + same, 1))
     return np.asarray(spread)

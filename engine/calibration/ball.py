@@ -72,13 +72,14 @@ def see_ball(
 
 # --- the outline of the light -------------------------------------------------------------------------------
 
-_COARSE, _LONGEST = 128, 256  # longer side of a downscaled picture for the search, and for the fit, pixels
-_BLUR = 1.5  # pixels, standard deviation: blur of the search for edges
-_FINE = 0.7  # pixels: blur of the last fit; more would shift the edge of a disc that brightens outwards
-_CLEAR = 6.0  # minimum slope of an edge, times the median slope of the picture
-_FAINT = 0.1  # minimum slope of an edge, as a share of the maximum slope of the picture
-_LEAST = 2.5  # pixels: minimum radius of an outline
-_SHARE = 0.25  # minimum share of an outline that is visible
+_SEARCH_SIZE = 128  # pixels: longer side of a downscaled picture for the search
+_FIT_SIZE = 256  # the same for the fit
+_SEARCH_BLUR = 1.5  # pixels, standard deviation: blur of the search for edges
+_FIT_BLUR = 0.7  # pixels: blur of the last fit; more would shift the edge of a disc that brightens outwards
+_MIN_EDGE_CONTRAST = 6.0  # minimum slope of an edge, times the median slope of the picture
+_MIN_EDGE_SLOPE = 0.1  # minimum slope of an edge, as a share of the maximum slope of the picture
+_MIN_RADIUS = 2.5  # pixels: minimum radius of an outline
+_MIN_VISIBLE = 0.25  # minimum share of an outline that is visible
 _NEAR = 4  # pixels: distance from the outline within which its edge is searched for
 _OUTSIDE = 0.5  # maximum distance of a ball's centre from the picture, in radii of the ball
 _RAYS = 90  # number of rays from the centre along which the edge is located
@@ -86,7 +87,7 @@ _SHARP = 0.5  # pixels: minimum scatter of the edge's distances, for weights
 _CONVERGED = 3e-3  # pixels: size of the last step of a fit
 _ROUND = 1.5  # pixels: maximum distance of the edge from the fitted circle
 _STRAY, _OFF = 3.0, 2.0  # times the median residual: scale of the robust weights of frames, and of an edge
-_ROUNDS = 8  # iterations of a fit
+_FIT_ITERATIONS = 8  # iterations of a fit
 
 
 class BallCentres(NamedTuple):
@@ -141,7 +142,7 @@ def smooth_turn(values: Doubles, phase: Doubles) -> Doubles:
     valid = np.isfinite(values).all(axis=1)
     functions, values = basis(phase[valid]), values[valid]
     weight = np.ones(len(values))
-    for _ in range(_ROUNDS):
+    for _ in range(_FIT_ITERATIONS):
         root = np.sqrt(weight)[:, np.newaxis]
         wave = np.linalg.lstsq(functions * root, values * root, rcond=None)[0]
         residual = np.sqrt(np.sum((values - functions @ wave) ** 2, axis=1))
@@ -182,10 +183,10 @@ def _outline(
     frame: NDArray[Any], pixel_size: tuple[float, float], radius: float
 ) -> tuple[_Circle, Doubles] | None:
     """Return the circle where the light of a frame ends, and its standard errors; None if none."""
-    circle = _find_circle(_gradients(*_downscale(frame, pixel_size, _COARSE), _BLUR), radius)
-    small = _downscale(frame, pixel_size, _LONGEST)
+    circle = _find_circle(_gradients(*_downscale(frame, pixel_size, _SEARCH_SIZE), _SEARCH_BLUR), radius)
+    small = _downscale(frame, pixel_size, _FIT_SIZE)
     fitted = None
-    for blur in (_BLUR, _FINE):
+    for blur in (_SEARCH_BLUR, _FIT_BLUR):
         if circle is None:
             return None
         fitted = _fit_circle(_gradients(*small, blur), circle, radius)
@@ -225,12 +226,14 @@ def _find_circle(picture: _Gradients, radius: float) -> _Circle | None:
     pixel = picture.pixel
     best, votes = None, 0.0
     margin = round(_OUTSIDE * radius / pixel)
-    min_radius = min(_LEAST * pixel, radius)
-    for outline in np.linspace(min_radius, radius, 1 + math.ceil((radius - min_radius) / (_BLUR * pixel))):
+    min_radius = min(_MIN_RADIUS * pixel, radius)
+    for outline in np.linspace(
+        min_radius, radius, 1 + math.ceil((radius - min_radius) / (_SEARCH_BLUR * pixel))
+    ):
         count = _vote(picture, places + outline * inwards, margin)
         row, column = np.unravel_index(np.argmax(count), count.shape)
         coverage = count[row, column] * pixel / (2 * np.pi * outline)
-        if coverage >= _SHARE and count[row, column] > votes:
+        if coverage >= _MIN_VISIBLE and count[row, column] > votes:
             votes = float(count[row, column])
             x, y = picture.corner + picture.step * (column - margin, row - margin)
             best = _Circle(float(x), float(y), float(outline))
@@ -240,7 +243,9 @@ def _find_circle(picture: _Gradients, radius: float) -> _Circle | None:
 def _edges(picture: _Gradients) -> tuple[Doubles, Doubles]:
     """Return the points of greatest slope along their gradient, and the uphill directions, (2, n) each."""
     steepness = picture.steepness
-    threshold = max(_CLEAR * float(np.median(steepness)), _FAINT * float(steepness.max()), 1e-12)
+    threshold = max(
+        _MIN_EDGE_CONTRAST * float(np.median(steepness)), _MIN_EDGE_SLOPE * float(steepness.max()), 1e-12
+    )
     rows, columns = np.nonzero(steepness > threshold)
     places = (picture.corner + picture.step * np.stack([columns, rows], axis=1)).T
     here = steepness[rows, columns]
@@ -262,8 +267,8 @@ def _vote(picture: _Gradients, centres: Doubles, margin: int) -> Doubles:
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     count = np.bincount((row * columns + column)[inside], minlength=rows * columns)
     count = count.reshape(rows, columns).astype(np.float64)
-    near = gaussian_filter(count, _BLUR, mode="constant", truncate=2.0)
-    return np.asarray(near * (2 * np.pi * _BLUR**2))
+    near = gaussian_filter(count, _SEARCH_BLUR, mode="constant", truncate=2.0)
+    return np.asarray(near * (2 * np.pi * _SEARCH_BLUR**2))
 
 
 def _fit_circle(picture: _Gradients, circle: _Circle, radius: float) -> tuple[_Circle, Doubles] | None:
@@ -275,7 +280,7 @@ def _fit_circle(picture: _Gradients, circle: _Circle, radius: float) -> tuple[_C
     angle = np.arange(_RAYS) * 2 * np.pi / _RAYS
     rays = np.stack([np.cos(angle), np.sin(angle)])
     functions = np.stack([*rays, np.ones(_RAYS)], axis=1)
-    for _ in range(_ROUNDS):
+    for _ in range(_FIT_ITERATIONS):
         away, fall = _locate_edge(picture, circle, rays)
         if not (fall > 0).any():
             return None
@@ -288,13 +293,13 @@ def _fit_circle(picture: _Gradients, circle: _Circle, radius: float) -> tuple[_C
         circle = _Circle(float(x), float(y), min(max(float(outline), pixel), radius))
         if np.max(np.abs(step)) < _CONVERGED * pixel:
             break
-    on_circle = (fall > _FAINT * float(picture.steepness.max())) & (np.abs(away) <= _ROUND * pixel)
+    on_circle = (fall > _MIN_EDGE_SLOPE * float(picture.steepness.max())) & (np.abs(away) <= _ROUND * pixel)
     ends = np.array(circle[:2])[:, np.newaxis] + rays * circle.radius
     in_picture = picture.at(np.ones_like(picture.steepness), ends)
     if 2 * np.count_nonzero(on_circle) <= np.count_nonzero(in_picture):
         return None
     # Rays that pass less than a blur apart are not independent.
-    shared = max(1.0, _RAYS * 2 * _BLUR * pixel / (2 * np.pi * circle.radius))
+    shared = max(1.0, _RAYS * 2 * _SEARCH_BLUR * pixel / (2 * np.pi * circle.radius))
     variance = shared * np.sum((weight * (away - functions @ step)) ** 2) / np.sum(weight**2)
     covariance = np.linalg.pinv(weighted.T @ weighted)
     error = np.sqrt(np.maximum(variance, (_CONVERGED * pixel) ** 2) * np.diag(covariance))

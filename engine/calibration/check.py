@@ -19,10 +19,10 @@ from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.numerics import least_squares
 from mirrorskin.kernels.rotation.response import sight_slopes
 
-_FEWEST = 20  # minimum number of pixels with errors in a cell
-_LEAST = 100  # minimum number of pixels of the ball
-_MARGIN = 2  # pixels: width of the excluded margin of the contact
-_ROUNDS = 3  # iterations of the ball's centre, which depends slightly on its depth
+_MIN_PIXELS_OF_CELL = 20  # minimum number of pixels with errors in a cell
+_MIN_PIXELS_OF_BALL = 100  # minimum number of pixels of the ball
+_CONTACT_MARGIN = 2  # pixels: width of the excluded margin of the contact
+_CENTRE_ITERATIONS = 3  # iterations of the ball's centre, which depends slightly on its depth
 
 
 class ErrorSummary(NamedTuple):
@@ -112,8 +112,8 @@ class Check:
             notes.append(f"expected: results contain no standard deviation of {' or '.join(unknown)} alone")
         if few:
             notes.append(
-                f"worst cell's rms: no cell has {_FEWEST} pixels of {' and '.join(few)} that could be judged:"
-                " take fewer cells, or press deeper"
+                f"worst cell's rms: no cell has {_MIN_PIXELS_OF_CELL} pixels of {' and '.join(few)} that"
+                " could be judged: take fewer cells, or press deeper"
             )
         return notes
 
@@ -225,7 +225,7 @@ def _centre_by_normals(result: Result, sight: Doubles, radius: float, press: flo
     x, y, slope_x, slope_y = sight[:, valid]
     normal_x, normal_y, normal_z = result["normals"][valid].astype(np.float64).T
     centre = np.zeros(3)
-    for _ in range(_ROUNDS):
+    for _ in range(_CENTRE_ITERATIONS):
         depth = press
         if depth is None:
             outline = np.percentile(np.hypot(x - centre[0], y - centre[1]), 99)
@@ -244,7 +244,7 @@ def _true_ball(sight: Doubles, centre: Doubles, radius: float, result: Result) -
     projected = see_ball(sight.reshape(4, -1), centre, radius, np.zeros((1, 2)), np.zeros(3))
     x, y, z = (part.reshape(shape) for part in np.moveaxis(projected.normal[0], -1, 0))
     inside = binary_erosion(
-        projected.contact[0].reshape(shape) & (result["contact"] != 0), iterations=_MARGIN
+        projected.contact[0].reshape(shape) & (result["contact"] != 0), iterations=_CONTACT_MARGIN
     )
     maps = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x), projected.z[0].reshape(shape)
     return [np.where(inside, values, np.nan) for values in maps]
@@ -273,7 +273,7 @@ def _normal_errors(result: Result, truth: list[Doubles], cells: int) -> dict[str
 
 
 def _check_enough(pixels: Any, what: str = "could be judged") -> None:
-    if pixels < _LEAST:
+    if pixels < _MIN_PIXELS_OF_BALL:
         raise InputError(
             f"too little of a ball is seen: {pixels} pixels {what}; press deeper, or on a larger ball"
         )
@@ -329,7 +329,9 @@ def _errors(error: Doubles, unit: str, cells: int, sigma: NDArray[np.float32] | 
     if sigma is not None and valid.any():
         expected = float(np.sqrt(np.nanmean(sigma[valid].astype(np.float64) ** 2)))
     whole = _summary(error[valid], np.zeros(len(rows), np.intp), (), 1)
-    return ErrorMap(error, whole, _summary(error[valid], cell, (cells, cells), _FEWEST), unit, expected)
+    return ErrorMap(
+        error, whole, _summary(error[valid], cell, (cells, cells), _MIN_PIXELS_OF_CELL), unit, expected
+    )
 
 
 def _summary(values: Doubles, group: NDArray[np.intp], shape: tuple[int, ...], fewest: int) -> ErrorSummary:

@@ -22,8 +22,8 @@ _NODES = 24  # number of nodes of the Gauss-Legendre quadrature over punches
 _THINNEST = 1e-3  # minimum depth of the mirror below the surface, in radii of the ball
 
 _RIM = 0.1  # variance of the dark top's radius in pixels, times its radius in pixels
-_MOST = 600  # maximum number of pixels used of a press
-_FEWEST = 50  # minimum number of pixels of a press that turned bright
+_MAX_PIXELS = 600  # maximum number of pixels used of a press
+_MIN_PIXELS = 50  # minimum number of pixels of a press that turned bright
 
 _SHARED = ("threshold", "compliance", "curvature")  # parameters common to all presses, with the numbers below
 _START = (0.2, 0.005, 0.03)
@@ -31,10 +31,10 @@ _BOUNDS = ((0.02, 0.0, 0.0), (0.78, 2.0, 0.2))
 _WORST = (0.01, 0.02, 0.02)  # standard errors above which they are not determined
 _LATER = np.linspace(-0.1, 0.2, 13)  # delays of the contact tried for the start, in radii of the ball
 _INDEPENDENT = 200  # number of pixels of a press with independent errors
-_AROUND = 24  # points on a dark top's rim
+_RIM_POINTS = 24  # points on a dark top's rim
 _LOSS = soft_l1(1.0)  # standard deviations
 _TABLE = 400  # entries of the table from travel to contact radius
-_WIDEST = 0.999  # radii of the ball: largest contact radius
+_MAX_CONTACT_RADIUS = 0.999  # radii of the ball: largest contact radius
 _SLOPE_ERROR = 0.003  # standard deviation of the sheet's slope computed by the theory
 _TRAVEL_ERROR = 0.004  # mm: minimum standard deviation of onsets, which are between two frames
 _DELAY = 1e-3  # mm of travel: step of numerical derivatives
@@ -131,11 +131,12 @@ def ball_onset(result: Result, source: Source, radius: float) -> BallOnset:
     size = pixel_size_of(source)
     check_ball_radius(radius)
     lit = np.flatnonzero((status == PressStatus.ONSET) & np.isfinite(height))
-    if len(lit) < _FEWEST:
+    if len(lit) < _MIN_PIXELS:
         raise InputError(
-            f"{source.name}: {len(lit)} pixels turned bright, and {_FEWEST} are needed: press the ball deeper"
+            f"{source.name}: {len(lit)} pixels turned bright, and {_MIN_PIXELS} are needed:"
+            " press the ball deeper"
         )
-    some = lit[:: math.ceil(len(lit) / _MOST)]
+    some = lit[:: math.ceil(len(lit) / _MAX_PIXELS)]
     x, y = np.meshgrid(*pixel_axes((height.shape[0], height.shape[1]), size))
     maps = [values.ravel()[some].astype(np.float64) for values in (-height, sigma, x, y)]
     onset = BallOnset(maps[0], maps[1], maps[2], maps[3], radius)
@@ -326,7 +327,7 @@ class _Fit:
         press, gel = self._presses[number], self._gel(parameters)
         x, y, zero = self._places(parameters)[number]
         from_x, from_y = press.x - x, press.y - y
-        touches = np.linspace(0.0, _WIDEST * press.radius, _TABLE)
+        touches = np.linspace(0.0, _MAX_CONTACT_RADIUS * press.radius, _TABLE)
         travels = sphere_travel(touches, press.radius, gel.compliance)
         touch = np.interp(press.travel + later - zero, travels, touches)
         zenith = threshold_at(gel, press.x, press.y, np.arctan2(from_y, from_x))
@@ -339,10 +340,10 @@ class _Fit:
         The sheet touches the ball there, so the residual does not depend on the elastomer.
         """
         press = self._presses[number]
-        azimuth = np.linspace(0, 2 * math.pi, _AROUND, endpoint=False)
+        azimuth = np.linspace(0, 2 * math.pi, _RIM_POINTS, endpoint=False)
         x, y, _ = self._places(parameters)[number]
         rim = x + press.inner * np.cos(azimuth), y + press.inner * np.sin(azimuth)
-        zenith = math.asin(min(press.inner / press.radius, _WIDEST))
+        zenith = math.asin(min(press.inner / press.radius, _MAX_CONTACT_RADIUS))
         error = math.hypot(_SLOPE_ERROR, press.inner_sigma / press.radius)
         return float(np.nanmean(zenith - threshold_at(self._gel(parameters), *rim, azimuth))) / error
 

@@ -18,7 +18,7 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics import least_squares
 from mirrorskin.kernels.numerics.least_squares import mad_sigma, soft_l1
 
-_ROUNDS = 8  # maximum number of fits; each predicts further marks
+_MAX_FITS = 8  # maximum number of fits; each predicts further marks
 _ADJACENT = 1.5  # pitches: distance from located marks within which others are predicted
 _FEWEST_YET = 6  # minimum number of marks before all are predicted
 _LEAST_REACH, _MOST_REACH = 2.5, 12.0  # pixels: limits of the radius around a corner in which it is centred
@@ -105,7 +105,7 @@ def locate_marks(picture: NDArray[Any], board: Board, name: str) -> Marks:
     fit = CameraFit([rough])
     _check_kind(rough, board, fit)
     stretched, marks = scale_contrast(picture, name), rough
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_FITS):
         count = len(marks.board)
         adjacent = KDTree(marks.board).query(board.marks())[0] < _ADJACENT * board.pitch
         marks = _centre_predicted(stretched, board, fit, board.marks()[adjacent], name)

@@ -24,7 +24,7 @@ _BIN, _BINS = 2048, 32  # minimum number of pixels in a bin of equal levels; max
 _RARE = 6.0  # standard deviations beyond which a variance is an outlier
 _UNCLIPPED = 0.05  # minimum share of unclipped samples for the estimate of a level
 _FAR = 6.0  # standard deviations from the end of the scale beyond which clipping is negligible
-_STEPS = 4  # number of iterations; fewer are needed
+_NEWTON_STEPS = 4  # number of iterations; fewer are needed
 _TINY = 1e-30  # counts^2: avoids division by 0
 
 
@@ -221,7 +221,7 @@ def _unclipped_variance(distance: Floats, variance: Floats, integer: bool) -> Fl
     near = distance < _FAR * np.sqrt(variance)
     mean, observed = distance[near], variance[near]
     exact, spread = mean, observed
-    for _ in range(_STEPS):
+    for _ in range(_NEWTON_STEPS):
         ratio = exact / np.sqrt(np.maximum(spread, _TINY))
         u = np.interp(ratio, table.mean / np.sqrt(table.variance), table.u)
         noise = np.sqrt(np.maximum(spread / np.interp(u, table.u, table.variance), _TINY))
@@ -243,7 +243,7 @@ def _unclipped_mean(
     near = distance < _FAR * noise
     mean, scale = distance[near], noise[near]
     u = np.interp(mean / scale, table.mean, table.u)
-    for _ in range(_STEPS if integer else 0):
+    for _ in range(_NEWTON_STEPS if integer else 0):
         u = np.interp((mean + _lost_by_rounding(u, scale)) / scale, table.mean, table.u)
     value, error = distance.copy(), error.copy()
     value[near] = u * scale
@@ -264,7 +264,7 @@ _BRIGHTEST = 3  # rank by brightness of the sample used as the initial level, wh
 _LIT = 0.75  # share of that light above which samples may be in full light
 _WIDTH = 3.0  # standard deviations to either side that count as full light
 _BELOW = 6.0  # standard deviations below full light within which the number in half light is estimated
-_ROUNDS = 30  # maximum number of iterations
+_MAX_ITERATIONS = 30  # maximum number of iterations
 _CONVERGED = 1e-3  # standard deviations: change of the level in the last iteration
 _PLATEAU_BIN, _PLATEAU_BINS = 256, 16  # as _BIN and _BINS
 
@@ -293,7 +293,7 @@ def find_plateau(samples: Floats, dark: Floats, integer: bool) -> Plateau:
     lit = samples >= dark + _LIT * (np.where(np.isfinite(rough), rough, np.nan) - dark)
     value = _masked_mean(samples, lit)
     noise = _noise_above(samples, value, np.full(value.shape, np.inf))
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ITERATIONS):
         before = value
         value = _masked_mean(samples, np.abs(samples - value) <= _WIDTH * noise)
         noise = _noise_above(samples, value, _BELOW * noise)

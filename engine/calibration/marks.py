@@ -22,7 +22,7 @@ _LEAST_DOT = 9.0  # pixels: minimum area of a dot
 _RANGE = 0.5, 99.5  # percentiles between which a picture's contrast is measured
 _LEAST_MARKER = 12.0  # pixels: minimum side of a marker
 _FEWEST_MARKERS = 3  # minimum number of markers in a picture
-_ENOUGH = 0.5  # share of a board's markers from which on sharpened pictures are not searched
+_ENOUGH_MARKERS = 0.5  # share of a board's markers from which on sharpened pictures are not searched
 _SAME_BOARD = 0.7  # minimum share of the markers of a clear picture that are on one plane
 _OFF_PLANE = 0.35  # maximum distance of a marker's corner from the plane of others, as a share of its side
 _OFF_GRID = 0.25  # maximum distance of a dot from the grid, as a share of the pitch
@@ -30,14 +30,14 @@ _MOST_BLOBS = 2  # maximum number of blobs per dot that are searched
 _DARK = 25.0  # brightness, at a contrast of 255, below which details are not normalised by brightness
 _LIGHT = 16  # parts of a picture's longer side within which the light is assumed to be even
 
-_BLUR = 1.0  # pixels, standard deviation
-_STEPS = 20  # maximum number of Gauss-Newton steps
+_SEARCH_BLUR = 1.0  # pixels, standard deviation
+_MAX_STEPS = 20  # maximum number of Gauss-Newton steps
 _CONVERGED = 1e-4  # pixels: size of the last step
 _STEP, _SHIFT = 0.25, 0.6  # longest step, and longest distance from the start, as shares of the radius
 _SPACING, _FEWEST_SAMPLES, _MOST_SAMPLES = 1.5, 6, 24  # pixels between samples along a radius; their number
 _UNEVEN = 8.0  # F ratio of the light's slopes and of their noise above which the picture is corrected
 _ASYMMETRIC = 0.3  # greatest share of the variance around a mark that is asymmetric
-_FAINT = 3.0  # counts, at a contrast of 255: least standard deviation around a mark
+_MIN_CONTRAST = 3.0  # counts, at a contrast of 255: least standard deviation around a mark
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,13 +117,13 @@ def _find_markers(pictures: Iterable[tuple[int, Bytes]], board: Charuco) -> tupl
                 planar = _on_one_plane(markers)
                 if planar is not None and (best is None or len(planar[0]) > len(best[0])):
                     best, families = planar, [family]
-        if best is not None and len(best[0]) > 4 * _ENOUGH * board.markers:
+        if best is not None and len(best[0]) > 4 * _ENOUGH_MARKERS * board.markers:
             break
     points, places = max(
         (markers[0] for markers in corners_by_layout.values()), key=lambda pair: len(pair[0])
     )
     consistent = 0 if best is None else len(best[0]) // 4
-    if len(points) > max(_ENOUGH * board.markers, consistent / _SAME_BOARD):
+    if len(points) > max(_ENOUGH_MARKERS * board.markers, consistent / _SAME_BOARD):
         return points.reshape(-1, 2), places.reshape(-1, 2)
     return best
 
@@ -253,7 +253,7 @@ def centre_marks(picture: NDArray[Any], starts: Doubles, radius: float) -> tuple
     """
     from scipy import ndimage
 
-    blurred = ndimage.gaussian_filter(np.asarray(picture, np.float64), _BLUR, mode="mirror")
+    blurred = ndimage.gaussian_filter(np.asarray(picture, np.float64), _SEARCH_BLUR, mode="mirror")
     disc = _half_disc(radius)
     places, inside, light = np.array(starts, np.float64), np.ones(len(starts), bool), np.ones_like(blurred)
     for last in (False, True):
@@ -273,7 +273,7 @@ def _centre(
 ) -> tuple[Doubles, NDArray[np.bool_]]:
     """Return centres of symmetry near places, and which of the iterations converged."""
     step = np.full_like(places, np.inf)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_STEPS):
         step = _gauss_newton_step(smooth, places, offsets, weights)
         length = np.hypot(*step.T)[:, np.newaxis]
         step *= np.minimum(1, _STEP * radius / np.maximum(length, 1e-12))
@@ -331,7 +331,7 @@ def _is_symmetric(smooth: Doubles, places: Doubles, offsets: Doubles, weights: D
     relative_weights = weights / weights.sum()
     even, odd = (ahead + behind) / 2, (ahead - behind) / 2
     signal = (even - (even @ relative_weights)[:, np.newaxis]) ** 2 @ relative_weights
-    return np.asarray((signal > _FAINT**2) & (odd**2 @ relative_weights < _ASYMMETRIC * signal))
+    return np.asarray((signal > _MIN_CONTRAST**2) & (odd**2 @ relative_weights < _ASYMMETRIC * signal))
 
 
 def _interpolate(smooth: Doubles, places: Doubles) -> Doubles:

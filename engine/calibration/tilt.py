@@ -27,11 +27,11 @@ _NOMINAL = math.radians(2.5)  # initial value of the tilt
 _PRIOR = np.array([0.0, 10.0, 1.0, 1.0, 0.2, 0.2, 1e3, 1e3, 1e3])  # weak prior standard deviations
 _HALF = 0.5  # prior standard deviation of the tilt relative to its start
 _FIXED = 1e-9  # prior standard deviation of a fixed parameter
-_ROUNDS = 5  # number of fits, each weighted by the residuals of the preceding one
+_REWEIGHTINGS = 5  # number of fits, each weighted by the residuals of the preceding one
 _LOSS = least_squares.soft_l1(3.0)  # standard deviations
-_BEYOND = 5.0  # standard deviations beyond which a residual is excluded from the scale of its kind
-_ALIKE = 0.03  # relative change of the scales that ends the fits
-_CLEAR = 16.0  # difference of chi^2 that decides between two solutions
+_OUTLIER_Z_SCORE = 5.0  # standard deviations beyond which a residual is excluded from the scale of its kind
+_SETTLED_CHANGE = 0.03  # relative change of the scales that ends the fits
+_CLEAR_CHI2 = 16.0  # difference of chi^2 that decides between two solutions
 _DIRECTION = 5.0  # standard errors: minimum significance of the sense of rotation
 _VAGUE_TILT = 0.1  # relative standard error above which the tilt is not determined
 _VAGUE_PHASE = math.radians(5.0)  # the same for the phase offset
@@ -96,12 +96,12 @@ def fit_precession(
     free_centre = any(track.level for track in plates)
     model = _Model(balls, plates, _direction(balls), free_centre)
     kinds = model.kinds()
-    best = _fit(model, _start(model), np.ones(3), _ROUNDS)
+    best = _fit(model, _start(model), np.ones(3), _REWEIGHTINGS)
     mirrored = _fit(model, _mirrored(model, best.parameters), best.scale, 1)
     half_a_turn = abs(math.remainder(mirrored.parameters[1] - best.parameters[1], math.tau)) > math.pi / 2
     chi2, other = (float(np.sum((fit.residuals / best.scale[kinds]) ** 2)) for fit in (best, mirrored))
     notes = []
-    if half_a_turn and other - chi2 < _CLEAR:
+    if half_a_turn and other - chi2 < _CLEAR_CHI2:
         best = min(best, mirrored, key=lambda fit: abs(math.remainder(fit.parameters[1], math.tau)))
         notes.append(
             "the phase offset is assumed to be within 90 deg of 0: a ball at another place would show it"
@@ -278,7 +278,7 @@ def _fit(model: _Model, start: Doubles, scale: Doubles, rounds: int) -> _Fit:
         freedom = (1 - solution.information * spread)[: len(kinds)]
         residuals = model.residuals(parameters, start)[: len(kinds)]
         before, scale = scale, _scales(residuals, freedom, kinds, scale)
-        if np.allclose(before, scale, rtol=_ALIKE):
+        if np.allclose(before, scale, rtol=_SETTLED_CHANGE):
             break
     return _Fit(parameters, covariance, residuals, scale)
 
@@ -288,7 +288,7 @@ def _scales(residuals: Doubles, freedom: Doubles, kinds: NDArray[np.intp], befor
     scales = before.copy()
     for kind in np.unique(kinds):
         chosen = kinds == kind
-        chosen &= np.abs(residuals) <= _BEYOND * mad_sigma(residuals[chosen]) + 1e-12
+        chosen &= np.abs(residuals) <= _OUTLIER_Z_SCORE * mad_sigma(residuals[chosen]) + 1e-12
         degrees = float(np.sum(freedom[chosen]))
         if degrees >= 1:
             scales[kind] = max(1.0, math.sqrt(float(np.sum(residuals[chosen] ** 2)) / degrees))

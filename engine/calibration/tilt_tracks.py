@@ -21,11 +21,11 @@ from mirrorskin.kernels.numerics.least_squares import mad_sigma
 _MOST_BYTES = 2_000_000_000  # maximum size of frames in memory
 _PHASES = 4  # minimum number of phases for an ellipse and its mean
 _SAME_PHASE = 1e-6  # radians
-_MARGIN = 2.0  # pixels from the outline within which a sample may show the free sheet
-_MOST = 20_000  # maximum number of fitted samples of a frame
-_FEWEST = 30  # minimum number of samples of a frame
-_STEP = 1e-3  # mm: step of numerical derivatives
-_OUTLIER = 4.0  # standard deviations: scale of the robust weights
+_OUTLINE_MARGIN = 2.0  # pixels from the outline within which a sample may show the free sheet
+_MAX_SAMPLES = 20_000  # maximum number of fitted samples of a frame
+_MIN_SAMPLES = 30  # minimum number of samples of a frame
+_DERIVATIVE_STEP = 1e-3  # mm: step of numerical derivatives
+_OUTLIER_Z_SCORE = 4.0  # standard deviations: scale of the robust weights
 _OUT = 1e3  # residual of a sample that does not show the ball, or is out of range
 _FAR = 0.25  # radii: maximum distance of the fitted centre from the outline's centre
 _DEEP = 0.5  # mm: standard deviation of the depth if the outline is not the outline of the contact
@@ -33,7 +33,7 @@ _RIM = 0.85  # inner radius of the rim, as a share of the outline's radius
 _MOSTLY = 0.8  # minimum share of the rim that shows the ball
 _SHALLOWER = 0.1  # maximum relative difference of the depth from the recorded press
 _RIM_ERROR = 0.01  # radians: maximum mean residual of a valid rim
-_FAINT = 0.01  # share of the range, at both ends, that is excluded for a plate
+_EXCLUDED_ENDS = 0.01  # share of the range, at both ends, that is excluded for a plate
 
 
 class BallTrack(NamedTuple):
@@ -113,17 +113,17 @@ def track_plate(source: Source, level: bool, light: Brightness) -> PlateTrack:
     zenith = light.of_counts(frames.reshape(len(frames), -1), np.arange(frames[0].size))
     mean = zenith.mean(axis=0)
     with np.errstate(invalid="ignore"):
-        margin = np.where(np.isfinite(light.high - light.low), _FAINT * (light.high - light.low), 0.0)
+        margin = np.where(np.isfinite(light.high - light.low), _EXCLUDED_ENDS * (light.high - light.low), 0.0)
         zenith = zenith[:, (mean > light.low + margin) & (mean < light.high - margin)]
     for _ in range(2):  # without the plate's edge, where brightness varies differently
-        if zenith.shape[1] < _FEWEST:
+        if zenith.shape[1] < _MIN_SAMPLES:
             raise InputError(
                 f"{source.name}: no flat plate is seen: with this pattern it is dark unless it is inclined"
                 " more; take a wedge of 25 degrees, say"
             )
         middle = np.median(zenith, axis=1, keepdims=True)
         residual = np.sqrt(np.mean((zenith - middle) ** 2, axis=0))
-        zenith = zenith[:, residual < _OUTLIER * np.median(residual) + 1e-12]
+        zenith = zenith[:, residual < _OUTLIER_Z_SCORE * np.median(residual) + 1e-12]
     sigma = (zenith.std(axis=1) + 1e-9) / math.sqrt(zenith.shape[1])
     return PlateTrack(phase, zenith.mean(axis=1), sigma, level)
 
@@ -144,9 +144,11 @@ def _read_turn(source: Source) -> tuple[NDArray[Any], Doubles]:
 def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Doubles) -> None:
     """Fit the centre in one frame, (3,), and its standard errors to the light, in place."""
     x, y = np.meshgrid(*pixel_axes((frame.shape[0], frame.shape[1]), turn.pixel_size))
-    outline = math.sqrt(max(turn.radius**2 - float(centre[2]) ** 2, 0.0)) - _MARGIN * max(turn.pixel_size)
+    outline = math.sqrt(max(turn.radius**2 - float(centre[2]) ** 2, 0.0)) - _OUTLINE_MARGIN * max(
+        turn.pixel_size
+    )
     pixels = np.flatnonzero(np.hypot(x - centre[0], y - centre[1]) < outline)
-    pixels = pixels[:: max(1, len(pixels) // _MOST)]
+    pixels = pixels[:: max(1, len(pixels) // _MAX_SAMPLES)]
     x, y = x.ravel()[pixels], y.ravel()[pixels]
     light = turn.light.of_counts(frame.ravel()[pixels], pixels)
     sight = np.stack([x, y, *turn.light.sight(pixels)])
@@ -161,14 +163,14 @@ def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Do
 
     def jacobian(place: Doubles) -> Doubles:
         expected, _ = _expected(turn, sight, pixels, place)
-        moved = [_expected(turn, sight, pixels, place + step)[0] for step in _STEP * np.eye(3)]
-        return np.nan_to_num((np.stack(moved, axis=1) - expected[:, np.newaxis]) / _STEP)
+        moved = [_expected(turn, sight, pixels, place + step)[0] for step in _DERIVATIVE_STEP * np.eye(3)]
+        return np.nan_to_num((np.stack(moved, axis=1) - expected[:, np.newaxis]) / _DERIVATIVE_STEP)
 
     def noise(off: Doubles) -> float:
         return mad_sigma(off[off != _OUT]) + 1e-9
 
     first = residuals(centre)
-    if np.count_nonzero(first != _OUT) < _FEWEST:
+    if np.count_nonzero(first != _OUT) < _MIN_SAMPLES:
         return
     solution = least_squares.fit(
         residuals,
@@ -176,11 +178,11 @@ def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Do
         jacobian=jacobian,
         noise=noise(first),
         rescale=noise,
-        loss=least_squares.geman_mcclure(_OUTLIER),
+        loss=least_squares.geman_mcclure(_OUTLIER_Z_SCORE),
         prior=least_squares.Prior(np.array([[0, 0, 1 / prior]]), centre[2:] / prior),
     )
     place, used = solution.parameters, solution.residuals != _OUT
-    if np.count_nonzero(used) < _FEWEST:
+    if np.count_nonzero(used) < _MIN_SAMPLES:
         return
     if np.linalg.norm((place - centre)[:2]) > _FAR * turn.radius:
         return
@@ -190,7 +192,8 @@ def _fit_centre(turn: _BallTurn, frame: NDArray[Any], centre: Doubles, sigma: Do
         rim = away > _RIM * away.max()
         off = solution.residuals[rim & used]
         visible = off.size >= max(1, _MOSTLY * np.count_nonzero(rim)) and (
-            abs(float(np.mean(off))) < _RIM_ERROR + _OUTLIER * noise(solution.residuals) / math.sqrt(off.size)
+            abs(float(np.mean(off)))
+            < _RIM_ERROR + _OUTLIER_Z_SCORE * noise(solution.residuals) / math.sqrt(off.size)
         )
         sigma[2] = outline_sigma if visible else _DEEP
 

@@ -39,18 +39,21 @@ _LIKELY = {
 }
 """wall_fit.Prior means and standard deviations of a sensor's parameters."""
 
-_FEW, _MANY = 4_000, 30_000  # number of samples of the first fits, and of the last
-_TOLERANCES = {_FEW: 1e-4, _MANY: 3e-6}  # relative change of the sum of squares at which these fits end
+_FIRST_SAMPLES, _LAST_SAMPLES = 4_000, 30_000  # number of samples of the first fits, and of the last
+_TOLERANCES = {
+    _FIRST_SAMPLES: 1e-4,
+    _LAST_SAMPLES: 3e-6,
+}  # relative change of the sum of squares at which these fits end
 _COARSE = 0.1  # share of full light: noise assumed in the first fit, large for convergence
 _QUIET = 1e-3  # share of full light: minimum error of the model
 _INNER = 0.7  # share of the outline's radius within which the sheet certainly touches the ball
 _RING = 0.05  # share of the outline's radius: width of the rings that are added
 _AT_ONCE = 2  # number of rings that are added at once
-_USUAL = 1.2  # maximum standard deviation of a ring, in usual standard deviations
+_MAX_RING_SPREAD = 1.2  # maximum standard deviation of a ring, in usual standard deviations
 _BIASED = 0.3  # maximum median of a ring, in usual standard deviations
 _CHANCE = 4.0  # allowance for chance in both, divided by the root of the number of samples of the ring
 _BAD = 2.0  # maximum ratio of the noise of a press to the noise of the other presses
-_UNLIKELY = 1.5  # maximum RMS deviation of the sensor from its prior, standard deviations
+_MAX_PRIOR_DEVIATION = 1.5  # maximum RMS deviation of the sensor from its prior, standard deviations
 _TOUCHED = 0.02  # mm: minimum height of a sample above the rest plane
 _MODEST = 0.01  # share of full light: minimum noise assumed in a fit without one of the presses
 _FEWEST_IN_RING = 30  # minimum number of samples to test a ring
@@ -177,18 +180,20 @@ def fit_touch(
     rings = _Rings(samples, presses)
     taken = np.full(len(presses), round(_INNER / _RING))
     inner = rings.within(taken)
-    fit = _first_fit(samples[_evenly(inner, _FEW)], prior)
+    fit = _first_fit(samples[_evenly(inner, _FIRST_SAMPLES)], prior)
     prior = replace(prior, rising=fit.rising)
-    touch, off = _refit(samples, _noise(samples, fit, inner), inner, prior, fit, _FEW)
+    touch, off = _refit(samples, _noise(samples, fit, inner), inner, prior, fit, _FIRST_SAMPLES)
     noise = _noise(samples, touch.fit, inner)
     _check_presses(touch, np.where(inner, off, np.nan), rings, presses, prior)
     grows = np.ones(len(presses), bool)
     while grows.any():
-        touch, off = _refit(samples, noise, rings.within(taken + _AT_ONCE * grows), prior, touch.fit, _FEW)
+        touch, off = _refit(
+            samples, noise, rings.within(taken + _AT_ONCE * grows), prior, touch.fit, _FIRST_SAMPLES
+        )
         for press in np.flatnonzero(grows):
             chosen = (rings.press == press) & np.isfinite(off)
             taken[press], grows[press] = _grow(off[chosen], rings.number[chosen], int(taken[press]))
-    touch, off = _refit(samples, noise, rings.within(taken), prior, touch.fit, _MANY)
+    touch, off = _refit(samples, noise, rings.within(taken), prior, touch.fit, _LAST_SAMPLES)
     _check_presses(touch, np.where(rings.within(taken), off, np.nan), rings, presses, prior)
     return touch
 
@@ -249,7 +254,10 @@ def _grow(off: Doubles, ring: Numbers, taken: int) -> tuple[int, bool]:
         if len(part) < _FEWEST_IN_RING:
             return number, False
         chance = _CHANCE / np.sqrt(len(part))
-        if _scale(part) / usual > _USUAL + chance or abs(np.median(part)) / usual > _BIASED + chance:
+        if (
+            _scale(part) / usual > _MAX_RING_SPREAD + chance
+            or abs(np.median(part)) / usual > _BIASED + chance
+        ):
             return number - 1, False
     return taken + _AT_ONCE, True
 
@@ -293,10 +301,10 @@ def _check_presses(
     misfit = "{}: its ball does not fit to the other presses: leave it out or take it again"
     if scales[worst] > _BAD * max(1.0, float(np.median(scales))):
         raise InputError(misfit.format(presses[worst].name))
-    if _prior_misfit(touch.fit, prior) > _UNLIKELY:
+    if _prior_misfit(touch.fit, prior) > _MAX_PRIOR_DEVIATION:
         misfits = [_prior_misfit(_without(touch, prior, number), prior) for number in range(len(presses))]
         best = int(np.argmin(misfits))
-        if misfits[best] < _UNLIKELY:
+        if misfits[best] < _MAX_PRIOR_DEVIATION:
             raise InputError(misfit.format(presses[best].name))
         raise InputError(
             "no likely sensor fits the presses: check the ball's diameter, pixel size, and the body's radius"
@@ -307,11 +315,11 @@ def _check_presses(
 def _without(touch: Touch, prior: wall_fit.Prior, press: int) -> wall_fit.WallFit:
     """Return the fit without a press."""
     samples = touch.samples
-    others = _evenly(samples.press[samples.pose] != press, _FEW)
+    others = _evenly(samples.press[samples.pose] != press, _FIRST_SAMPLES)
     start = prior.mean.copy()
     start[model.STEPS] = touch.fit.parameters[model.STEPS]
     noise = np.maximum(touch.noise[others], _MODEST)
-    return wall_fit.fit_wall(samples[others], prior, start, noise, _TOLERANCES[_FEW])
+    return wall_fit.fit_wall(samples[others], prior, start, noise, _TOLERANCES[_FIRST_SAMPLES])
 
 
 def _prior_misfit(fit: wall_fit.WallFit, prior: wall_fit.Prior) -> float:

@@ -27,18 +27,18 @@ from mirrorskin.io import InputError, Precession, References, Source, pixel_axes
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics import least_squares
 
-_STEEPEST = math.radians(50.0)  # maximum zenith of the ball at a sample
-_BEYOND = 1.35  # maximum distance of a sample from the ball's centre, relative to the outline of the light
-_PLACE = 1.0  # mm: standard deviation of a ball's centre located in the picture
+_MAX_ZENITH = math.radians(50.0)  # maximum zenith of the ball at a sample
+_MAX_RADIUS = 1.35  # distance of a sample from the ball's centre, relative to the outline of the light
+_CENTRE_SIGMA = 1.0  # mm: standard deviation of a ball's centre located in the picture
 _DEPTH = 0.2  # mm: standard deviation of the recorded press
-_LEAST = 20  # minimum of the mean number of samples per frame
+_MIN_SAMPLES_PER_FRAME = 20  # minimum of the mean number of samples per frame
 _FRAMES = 16  # maximum number of frames used of a recording
 _CLIPPED = 64  # number of samples at a value 2^n - 1 above which it is assumed to be the camera's full scale
 _UNKNOWN_PIVOT = 30.0  # mm: standard deviation of a pivot without information
 _RECORDED_PIVOT = 3.0  # mm: standard deviation of a recorded pivot
 _CALIBRATED_PHASE = math.radians(2.0)  # standard deviation of a calibrated phase without a standard error
 _RECORDED_PHASE = math.radians(45.0)  # standard deviation of a recorded phase
-_FLOOR = 0.02  # minimum standard error of a calibrated value, relative to the standard deviation without one
+_MIN_RELATIVE_ERROR = 0.02  # standard error of a calibrated value, relative to that without calibration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,16 +79,16 @@ def read_press(
     else:
         raise InputError(f"{source.name} has no tilt: give it, as in --tilt 2.5deg")
     with naming(source):
-        centre, sigma = find_ball(frames, phase, pixel_size, ball), np.full(3, _PLACE)
+        centre, sigma = find_ball(frames, phase, pixel_size, ball), np.full(3, _CENTRE_SIGMA)
     outline = math.sqrt(max(ball**2 - centre[2] ** 2, 1e-6))
     press = source.header.press
-    if press is not None and abs(press - centre[2] - ball) < _PLACE:
+    if press is not None and abs(press - centre[2] - ball) < _CENTRE_SIGMA:
         centre[2], sigma[2] = press - ball, _DEPTH
-    reach = min(ball * math.sin(_STEEPEST), _BEYOND * outline)
+    reach = min(ball * math.sin(_MAX_ZENITH), _MAX_RADIUS * outline)
     places = np.stack([axis.ravel() for axis in np.meshgrid(*pixel_axes(frames.shape[1:], pixel_size))])
     chosen = _choose(frames, levels, places, moved(centre, lean, pivot), reach, count)
     total = sum(map(len, chosen))
-    if total < _LEAST * len(frames):
+    if total < _MIN_SAMPLES_PER_FRAME * len(frames):
         raise InputError(
             f"{source.name}: only {total} samples of the ball have references and are not at the ends of the"
             " camera's range: expose less, or take the references anew"
@@ -141,7 +141,7 @@ def pivot_of(source: Source, precession: Precession | None) -> Pivot:
 def _calibrated_sigma(precession: Precession, name: str, without: float) -> float:
     """Return a calibration's standard error, or the standard deviation without one."""
     sigma = precession.sigma.get(name, math.nan)
-    return math.hypot(sigma, _FLOOR * without) if math.isfinite(sigma) else without
+    return math.hypot(sigma, _MIN_RELATIVE_ERROR * without) if math.isfinite(sigma) else without
 
 
 def join(presses: Sequence[BallPress], ball: float) -> LightSamples:

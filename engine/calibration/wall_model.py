@@ -89,7 +89,8 @@ STEPS = slice(len(SENSOR), len(SENSOR) + CURVE_COEFFICIENTS)
 
 _GEOMETRIC = len(SENSOR) - 7  # number of parameters that change the path of rays; others change their light
 _OF_THE_WALL = ("radius", "rim", "scatter")  # parameters without influence on where rays are reflected
-_STEEPEST = np.radians(89.0)  # maximum elevation of a ray that is followed to the wall
+MAX_RAY_ELEVATION = np.radians(89.0)
+"""Maximum elevation of a ray that is followed to the wall."""
 _CLOSEST = 1e-6  # mm^2: minimum difference to the wall; see `follow`
 _SMALL = 1e-5  # step of numerical derivatives, relative to a parameter's scale
 SCALES = dict(zip(SENSOR, (1, 1, 1, 1, 1e-3, 1e-6, 1e-2, 1, 1, 1, 1e-2, *[0.1] * 7), strict=True))
@@ -176,7 +177,11 @@ def reach_wall(met: SheetPoints, named: Mapping[str, float]) -> WallHit:
     spread = named["scatter"] * np.sqrt(out**2 + (rise * radius * out / ray.cosine) ** 2)
     whole = np.arctan2(named["rim"], radius)
     high, low = (
-        1 - np.arctan2(met.z + ray.way * out * np.tan(np.clip(angle, -_STEEPEST, _STEEPEST)), radius) / whole
+        1
+        - np.arctan2(
+            met.z + ray.way * out * np.tan(np.clip(angle, -MAX_RAY_ELEVATION, MAX_RAY_ELEVATION)), radius
+        )
+        / whole
         for angle in (elevation - spread, elevation + spread)
     )
     return WallHit(low, high, ray)

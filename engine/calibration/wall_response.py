@@ -28,24 +28,23 @@ from mirrorskin.kernels.rotation.response import (
 
 _ZENITHS = 16  # number of zeniths at which the first light is searched for
 _HALVINGS = 16  # number of bisections of the interval of the first light
-_STEEPEST = math.radians(89.0)  # maximum elevation of a ray that is followed to the wall
 
-_MARGIN = 1.05  # factor of the scatter, whose edges are not sharp; off the centre it is slightly wider
+_SCATTER_MARGIN = 1.05  # factor of the scatter: edges are not sharp, and off the centre it is wider
 _EXACT = 1e-4  # share of full light: maximum error of the polynomial
 _TERMS = 12  # maximum number of terms of the polynomial
 _PLACES = 400  # number of points of the curve to which the polynomial is fitted
 _HALF = 0.5  # share of full light: threshold of a uniform wall
 _GRADED = 0.2  # minimum variation of a graded wall, as a share of its maximum light
-_FLAT = 0.02  # minimum slope of the curve, relative to the slope in its middle
+_MIN_CURVE_SLOPE = 0.02  # minimum slope of the curve, relative to the slope in its middle
 _FEW = 2e-3  # share of the samples outside the reach, at either end
 
 _SIDE = 5  # number of positions along a side at which errors are computed
 _TURN = 8  # number of azimuths at each position
 _LEAN = math.radians(2.5)  # tilt of a typical rotation; errors of the normals hardly depend on it
 _FRAMES = 8  # number of frames of that rotation
-_STEP = 1e-4  # radians: step of numerical derivatives by angles
+_DERIVATIVE_STEP = 1e-4  # radians: step of numerical derivatives by angles
 _SMALL = 1e-3  # step of numerical derivatives by a parameter, relative to its scale
-_OUTLIER = 3.0  # times the noise at which residuals are clipped
+_CLIP_Z_SCORE = 3.0  # times the noise at which residuals are clipped
 _RINGS, _OCTANTS = 6, 8  # cells of a press, in which residuals are averaged
 
 
@@ -103,7 +102,7 @@ def full_light(response: WallResponse, places: Doubles, zenith: Doubles, azimuth
     # Share of the ray, spread evenly over the scatter, that meets the wall.
     out = np.sqrt(ray.direction[0] ** 2 + ray.direction[1] ** 2)
     elevation, spread = np.arctan2(ray.direction[2], out), max(response.scatter, 1e-9)
-    top = np.minimum(np.arctan2(response.rim - z, ray.way * out), _STEEPEST)
+    top = np.minimum(np.arctan2(response.rim - z, ray.way * out), model.MAX_RAY_ELEVATION)
     bottom = np.arctan2(-z, ray.way * out)
     lit = np.minimum(elevation + spread, top) - np.maximum(elevation - spread, bottom)
     q = np.clip(half_tangent(ray.height, radius), *response.reach)
@@ -139,7 +138,7 @@ def make_response(
         axis=(named["axis_x"], named["axis_y"]),
         sight=(named["sight_0"], named["sight_2"]),
         lamps=(named["lamp_x"], named["lamp_y"]),
-        scatter=_MARGIN * named["scatter"],
+        scatter=_SCATTER_MARGIN * named["scatter"],
         curve=powers,
         reach=reach,
         shade=np.array([named[f"shade_{number}"] for number in range(5)]),
@@ -157,7 +156,7 @@ def make_response(
 
 def _reach(named: Mapping[str, float], shares: tuple[float, float] = (0.0, 1.0)) -> tuple[float, float]:
     """Return the range of q in which the whole scattered ray meets the wall, and there are samples."""
-    whole, spread = math.atan2(named["rim"], named["radius"]), _MARGIN * named["scatter"]
+    whole, spread = math.atan2(named["rim"], named["radius"]), _SCATTER_MARGIN * named["scatter"]
     low = max(spread, (1 - shares[1]) * whole)
     high = min(whole - spread, (1 - shares[0]) * whole)
     return math.tan(low / 2), math.tan(high / 2)
@@ -182,7 +181,7 @@ def _polynomial(
         )
     slope = fit.deriv()(q)
     middle = _PLACES // 2
-    flat = np.flatnonzero(slope * np.sign(slope[middle]) < _FLAT * np.median(np.abs(slope)))
+    flat = np.flatnonzero(slope * np.sign(slope[middle]) < _MIN_CURVE_SLOPE * np.median(np.abs(slope)))
     first = flat[flat < middle].max(initial=-1) + 1
     last = flat[flat > middle].min(initial=_PLACES) - 1
     return np.asarray(fit.convert().coef), (float(q[first]), float(q[last]))
@@ -238,16 +237,16 @@ def error_left(samples: model.LightSamples, fit: WallFit, noise: Doubles) -> tup
     met = model.meet_balls(samples, named, centres)
     coefficients = model.curve_from_steps(fit.rising) @ steps
     flat = np.hypot(met.normal[0], met.normal[1])
-    steeper = np.cos(_STEP) * met.normal + np.sin(_STEP) * np.stack(
-        [*(met.normal[:2] * met.normal[2] / np.maximum(flat, _STEP)), -flat]
+    steeper = np.cos(_DERIVATIVE_STEP) * met.normal + np.sin(_DERIVATIVE_STEP) * np.stack(
+        [*(met.normal[:2] * met.normal[2] / np.maximum(flat, _DERIVATIVE_STEP)), -flat]
     )
     light = model.light_of(met, named, coefficients)
-    slope = (model.light_of(met._replace(normal=steeper), named, coefficients) - light) / _STEP
+    slope = (model.light_of(met._replace(normal=steeper), named, coefficients) - light) / _DERIVATIVE_STEP
     turn = np.arctan2(met.normal[1], met.normal[0]) / (2 * np.pi) + 0.5
     octant = np.minimum((turn * _OCTANTS).astype(np.intp), _OCTANTS - 1)
     ring = np.minimum((flat / flat.max() * _RINGS).astype(np.intp), _RINGS - 1)
     cell = (samples.press[samples.pose] * _RINGS + ring) * _OCTANTS + octant
-    residual = np.clip(samples.light - light, -_OUTLIER * noise, _OUTLIER * noise)
+    residual = np.clip(samples.light - light, -_CLIP_Z_SCORE * noise, _CLIP_Z_SCORE * noise)
     terms = np.ones_like(light), residual, noise**2, slope**2
     count, total, expected, steep = (np.bincount(cell, values) for values in terms)
     # Square of each cell's mean minus its expectation from noise, summed over samples.
@@ -267,14 +266,15 @@ def _normal_slopes(fit: WallFit, places: Doubles, azimuth: Doubles, zenith: Doub
     def light(values: Doubles, theta: Doubles, phi: Doubles) -> Doubles:
         return _light_of_turn(values, fit.rising, places, theta, phi)
 
-    across = _STEP / np.sin(zenith)
+    across = _DERIVATIVE_STEP / np.sin(zenith)
     design = np.stack(
         [
-            light(parameters, zenith + _STEP, azimuth) - light(parameters, zenith - _STEP, azimuth),
+            light(parameters, zenith + _DERIVATIVE_STEP, azimuth)
+            - light(parameters, zenith - _DERIVATIVE_STEP, azimuth),
             light(parameters, zenith, azimuth + across) - light(parameters, zenith, azimuth - across),
         ],
         axis=-1,
-    ) / (2 * _STEP)
+    ) / (2 * _DERIVATIVE_STEP)
     by_parameter = np.zeros((*design.shape[:2], len(parameters)))
     scales = np.append([model.SCALES[name] for name in model.SENSOR], np.ones(model.CURVE_COEFFICIENTS))
     for number, step in enumerate(_SMALL * scales):

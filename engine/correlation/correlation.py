@@ -29,7 +29,10 @@ from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.rotation.correlation import WINDOW
 
-_STEPS = {1: 2**17, 2: 2**23}  # steps per unit of a cosine, by bytes of a sample: no integer sum overflows
+_STEPS_PER_UNIT = {
+    1: 2**17,
+    2: 2**23,
+}  # steps per unit of a cosine, by bytes of a sample: no integer sum overflows
 _MAX_FRAMES = 2**23  # limit of integer sums
 _SUMS = "total", "cosine", "sine", "square"
 _FIT = "mean", "cosine_part", "sine_part", "residual"
@@ -174,7 +177,7 @@ class _Sums:
     weight: Doubles  # 0 of a missing frame
 
     def __init__(self, maps: Picture, dtype: np.dtype[Any]) -> None:
-        self.maps, self._integer, self._step = maps, dtype.kind == "u", _STEPS.get(dtype.itemsize, 1)
+        self.maps, self._integer, self._step = maps, dtype.kind == "u", _STEPS_PER_UNIT.get(dtype.itemsize, 1)
 
     def result(self, *, on_host: bool = False) -> Result:
         """Return the fit, with maps on the device if frames are; InputError if phases do not determine it."""

@@ -16,7 +16,7 @@ LONGEST = 64
 """Largest number of frames of one turn."""
 
 _MAX_CONDITION = 1e8  # of the Gram matrix
-_SAME = 1e-9  # radians: tolerance of equal phases
+_PHASE_TOLERANCE = 1e-9  # radians: tolerance of equal phases
 _DIGITS = 9  # decimals of phases, radians, in the comparison of turns
 _FULL_TURN = 2 * np.pi - 1e-6  # radians, with a tolerance for rounding
 
@@ -57,7 +57,7 @@ def check_phases(phase: ArrayLike, frame_weights: ArrayLike | None = None) -> Do
         raise InputError(
             f"all {len(alpha)} frames have weight 0: at least 3 with a weight above 0 are needed"
         )
-    different = max(1, int(np.count_nonzero(_gaps(used) > _SAME))) if len(used) else 0
+    different = max(1, int(np.count_nonzero(_gaps(used) > _PHASE_TOLERANCE))) if len(used) else 0
     if different < 3:
         frames = "1 frame" if len(used) == 1 else f"{len(used)} frames"
         phases = "1 phase" if different == 1 else f"{different} different phases"

@@ -16,10 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.numerics.least_squares import fit_clipped
+from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, fit_clipped
 
-_LINES, _FEWEST = 48, 400  # lines of pixels along a side that are used; least number of pixels
-_CLEAR, _CLEAR_SIDE, _SMALLEST = 6.0, 2.0, 0.4  # standard errors, and pixels, from which on a blur is one
+GRID_LINES = 48
+"""Lines of pixels along a side that are used."""
+MIN_PIXELS = 400
+"""Least number of pixels that determine a blur."""
+MIN_BLUR = 0.4
+"""Least standard deviation of a point spread that is reported, pixels."""
+
+_SIDE_Z_SCORE = 2.0  # standard errors from which on the blur of a side of the picture is one
 
 
 def with_blur(
@@ -62,7 +68,7 @@ def find_blur(vectors: Sequence[NDArray[np.floating]], strength: NDArray[np.floa
     rows, columns = strength.shape
     if min(rows, columns) < 3:
         return 0.0
-    thin = max(1, math.isqrt(rows * columns) // _LINES)
+    thin = max(1, math.isqrt(rows * columns) // GRID_LINES)
     down, right = np.arange(1, rows - 1, thin), np.arange(1, columns - 1, thin)
 
     def look(by_rows: int, by_columns: int) -> Doubles:
@@ -77,7 +83,7 @@ def find_blur(vectors: Sequence[NDArray[np.floating]], strength: NDArray[np.floa
     turning = np.sum(across**2 + upright**2, axis=0) / 4
     level = strength[np.ix_(down, right)].astype(np.float64)
     usable = np.isfinite(turning) & (level > 0) & np.isfinite(level)
-    if np.count_nonzero(usable) < _FEWEST:
+    if np.count_nonzero(usable) < MIN_PIXELS:
         return 0.0
     y, x = (
         np.broadcast_to(positions, usable.shape)[usable]
@@ -86,11 +92,11 @@ def find_blur(vectors: Sequence[NDArray[np.floating]], strength: NDArray[np.floa
     turning, values = turning[usable], np.log(level[usable])
     terms = np.stack([turning, np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     variance, error = _fit(terms, values)
-    if not variance > max(_CLEAR * error, _SMALLEST**2):
+    if not variance > max(CLEAR_Z_SCORE * error, MIN_BLUR**2):
         return 0.0
     # Reflectance that changes with the place may look like blur somewhere, but not on all sides.
     sides = (_fit(terms[half], values[half]) for half in (x < 0, x >= 0, y < 0, y >= 0))
-    clear = all(side > max(variance / 2, _CLEAR_SIDE * its_error) for side, its_error in sides)
+    clear = all(side > max(variance / 2, _SIDE_Z_SCORE * its_error) for side, its_error in sides)
     return variance if clear else 0.0
 
 

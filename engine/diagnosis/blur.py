@@ -25,16 +25,16 @@ PIXEL = 1 / 12
 """Variance of a pixel's area, square pixels."""
 
 _SHARES = 0.16, 0.84  # of the way from dark to bright, two standard deviations of a blurred edge apart
-_STEEPEST = 0.75  # quantile of the slopes of those pixels that show the blur
+_STEEP_QUANTILE = 0.75  # quantile of the slopes of those pixels that show the blur
 _STEEPER = 1.5  # ratio of the square slopes of these pixels to those of the flattest ones
-_FEWEST = 16  # of these pixels
+_MIN_PIXELS = 16  # minimum number of these pixels
 _INTERPOLATED = 0.34**2  # square steps: what interpolation adds to the variance of an edge within one step
 _SHARP = 0.2  # square pixels: variance of a footprint that is hardly larger than the pixel
 _BLURRED = 9.0  # square pixels: what is larger is no lens
 _LEAST_FRAMES = 8
 _OF_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
 _UNSURE = 0.25, 1.0  # relative uncertainty of what interpolation adds: usual, and greatest
-_CLEAR = 3.0  # standard errors: least difference of a blur from none
+_CLEAR_Z_SCORE = 3.0  # standard errors: least difference of a blur from none
 _RESOLVED = 0.35  # steps of the travel within a standard deviation of the footprint on a slope
 
 
@@ -154,11 +154,11 @@ def _footprint(
     middle, before, after, above, below = (values[inner].ravel() for values in heights)
     slope = np.hypot((after - before) / 2, (below - above) / 2).astype(np.float64)
     sloped = np.isfinite(slope) & np.isfinite(middle) & (slope > 0)
-    if np.count_nonzero(sloped) < _FEWEST:
+    if np.count_nonzero(sloped) < _MIN_PIXELS:
         return None
     ordered = np.sort(slope[sloped])
     flattest, steepest = (
-        ordered[round(fraction * (len(ordered) - 1))] for fraction in (1 - _STEEPEST, _STEEPEST)
+        ordered[round(fraction * (len(ordered) - 1))] for fraction in (1 - _STEEP_QUANTILE, _STEEP_QUANTILE)
     )
     sloped &= (slope <= flattest) | (slope >= steepest)  # the others show less
     row, column, slope = row[sloped], column[sloped], slope[sloped]
@@ -175,7 +175,7 @@ def _footprint(
         shares = (values - dark) / (bright - dark)
     spread = (first_travel(shares, travel, _SHARES[1]) - first_travel(shares, travel, _SHARES[0])) / 2
     flat, steep = (_Quarter.of(slope[part], spread[part]) for part in (slope <= flattest, slope >= steepest))
-    if min(flat.count, steep.count) < _FEWEST // 4 or steep.slope < _STEEPER * flat.slope:
+    if min(flat.count, steep.count) < _MIN_PIXELS // 4 or steep.slope < _STEEPER * flat.slope:
         return None
     # What flat parts show as well is no footprint: interpolation, or a skin that touches slowly.
     step = float(np.median(np.diff(travel)))
@@ -189,9 +189,9 @@ def _footprint(
         math.hypot(steep.error, flat.error, unsure * interpolated) / (steep.slope - flat.slope)
         for unsure in _UNSURE
     )
-    if variance - PIXEL <= _CLEAR * usual:
+    if variance - PIXEL <= _CLEAR_Z_SCORE * usual:
         return None
-    return Footprint(math.hypot(variance, usual), variance - PIXEL > _CLEAR * greatest)
+    return Footprint(math.hypot(variance, usual), variance - PIXEL > _CLEAR_Z_SCORE * greatest)
 
 
 def first_travel(shares: NDArray[Any], travel: Doubles, level: float) -> Doubles:

@@ -24,16 +24,17 @@ from mirrorskin.kernels.numerics.least_squares import mad_sigma, median
 if TYPE_CHECKING:
     from mirrorskin.engine.press.crossing import Event, PressOperation
 
-_FEWEST = 16  # pixels that must have turned light
+_MIN_PIXELS = 16  # pixels that must have turned light
 _RISE = 8.0  # standard deviations of the noise: least rise of brightness between dark and light
 
-_PART = 0.1  # of the frames, at each end, in which levels are compared with the references
-_AWAY = 0.3  # of the travel, least distance of these frames from the onset of a pixel
-_FEWEST_OF_GRID = 64  # pixels
-_FLAT = 0.25  # share of the pixels: the flattest ones
+_END_FRACTION = 0.1  # of the frames, at each end, in which levels are compared with the references
+_MIN_DISTANCE = 0.3  # of the travel, least distance of these frames from the onset of a pixel
+_MIN_GRID_PIXELS = 64  # pixels
+_FLAT_QUANTILE = 0.25  # share of the pixels: the flattest ones
 _OF_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
-_CLEAR, _LEAST = 5.0, 0.01  # standard errors, and share of the rise to light, from which on a level differs
-_COMMON = 2.0  # standard deviations of the pixels' own differences: a smaller one is not common to them
+_CLEAR_Z_SCORE = 5.0  # standard errors from which on a level differs from its reference
+_MIN_DIFFERENCE = 0.01  # share of the rise to light from which on it differs
+_COMMON_Z_SCORE = 2.0  # sigmas of the pixels' own differences above which a difference is common
 
 
 T = TypeVar("T", bound="PressOperation")
@@ -164,9 +165,9 @@ def estimate_levels(
     first, second, last = samples[:, np.isfinite(samples).all(axis=0)]
     integer = pictures[0].dtype.kind == "u"
     rise = last - first
-    if rise.size < _FEWEST:
+    if rise.size < _MIN_PIXELS:
         return None
-    top = float(np.partition(rise, -_FEWEST)[-_FEWEST])
+    top = float(np.partition(rise, -_MIN_PIXELS)[-_MIN_PIXELS])
     noise = estimate_noise(first, second, integer)
     if top < _RISE * noise:
         return None
@@ -274,8 +275,8 @@ class _PixelTraces(NamedTuple):
 def _find_errors(trace: _PixelTraces, onset: Doubles) -> tuple[float, float]:
     """Return by how much dark and light differ from the references, in shares of the rise; 0 if hardly."""
     values, travel, low, high = trace
-    few, start, end = max(1, round(_PART * len(travel))), float(travel.min()), float(travel.max())
-    away = _AWAY * (end - start)
+    few, start, end = max(1, round(_END_FRACTION * len(travel))), float(travel.min()), float(travel.max())
+    away = _MIN_DISTANCE * (end - start)
     level_errors = []
     for frames, level, usable in (
         (values[:few], low, onset > start + away),
@@ -283,12 +284,16 @@ def _find_errors(trace: _PixelTraces, onset: Doubles) -> tuple[float, float]:
     ):
         error = ((frames.mean(axis=0) - level) / (high - low))[usable]
         error = error[np.isfinite(error)]
-        if error.size < _FEWEST_OF_GRID:
+        if error.size < _MIN_GRID_PIXELS:
             level_errors.append(0.0)
             continue
         middle = float(np.median(error))
         spread = mad_sigma(error - middle)
-        clear = max(_LEAST, _COMMON * spread, _CLEAR * _OF_MEDIAN * spread / math.sqrt(error.size))
+        clear = max(
+            _MIN_DIFFERENCE,
+            _COMMON_Z_SCORE * spread,
+            _CLEAR_Z_SCORE * _OF_MEDIAN * spread / math.sqrt(error.size),
+        )
         level_errors.append(middle if abs(middle) > clear else 0.0)
     return level_errors[0], level_errors[1]
 
@@ -301,10 +306,10 @@ def _width(trace: _PixelTraces, slope: NDArray[np.float32]) -> float:
     width = 2 * (first_travel(shares, travel, 0.75) - first_travel(shares, travel, 0.25))
     slope = slope.ravel()
     finite = np.isfinite(width) & np.isfinite(slope)
-    if np.count_nonzero(finite) < _FEWEST_OF_GRID:
+    if np.count_nonzero(finite) < _MIN_GRID_PIXELS:
         return 0.0
     width, slope = width[finite], slope[finite]
-    flat = slope <= np.quantile(slope, _FLAT)
+    flat = slope <= np.quantile(slope, _FLAT_QUANTILE)
     return math.sqrt(max(0.0, float(np.median(width[flat] ** 2 - slope[flat] ** 2))))
 
 

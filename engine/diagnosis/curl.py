@@ -20,10 +20,13 @@ from mirrorskin.engine.base.frames import take_places
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import fit_clipped
 
-_LOOPS, _LEAST, _LINES = 40, 3, 48  # of the extent of the normals: half a side of a loop; its least; loops
-_FEWEST = 200  # loops
+_EXTENT_PER_HALF_SIDE = 40  # extent of the normals over half a side of a loop
+_MIN_HALF_SIDE = 3  # pixels
+_GRID_LINES = 48  # lines of loops along a side
+_MIN_LOOPS = 200  # loops
 _EXPLAINED = np.array([0.2, 0.5])  # least share of the curl that an angle explains, and one that changes
-_CLEAR, _SMALLEST = 8.0, math.radians(1.5)  # standard errors and angle from which on a rotation is one
+_CLEAR_Z_SCORE = 8.0  # standard errors from which on a rotation is reported
+_MIN_ANGLE = math.radians(1.5)  # least rotation that is reported
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +51,7 @@ def find_azimuth_bias(
     """Return the rotation of the slopes of normals, (H, W, 3), in contact; None if it is not significant."""
     rows, columns = contact.shape
     extent = math.isqrt(int(np.count_nonzero(contact)))
-    half, thin = max(_LEAST, extent // _LOOPS), max(1, extent // _LINES)
+    half, thin = max(_MIN_HALF_SIDE, extent // _EXTENT_PER_HALF_SIDE), max(1, extent // _GRID_LINES)
     if min(rows, columns) <= 2 * half:
         return None
     down, right, along = range(half, rows - half, thin), range(half, columns - half, thin), half // 2
@@ -68,7 +71,7 @@ def find_azimuth_bias(
     divergence = (p_right - p_left) * across + (q_up - q_down) * upwards
     place = np.broadcast_to((1 - 2 * np.array(down) / (rows - 1))[:, np.newaxis], curl.shape)
     finite = np.isfinite(curl) & np.isfinite(divergence)
-    if np.count_nonzero(finite) < _FEWEST:
+    if np.count_nonzero(finite) < _MIN_LOOPS:
         return None
     overlap = max(1.0, (2 * half / thin) ** 2 / 12)  # of loops, whose errors are then correlated
     return _regression(curl[finite], divergence[finite], place[finite], overlap)
@@ -83,7 +86,11 @@ def _regression(curl: Doubles, divergence: Doubles, place: Doubles, overlap: flo
     fit, inverse, residual, kept = result
     spread = np.sqrt(np.diag(inverse) * float(np.mean(residual[kept] ** 2)) * overlap)
     explained = 1 - float(np.var(residual[kept])) / max(float(np.var(curl[kept])), 1e-30)
-    clear = (np.abs(fit) > _CLEAR * spread) & (np.abs(fit) > math.tan(_SMALLEST)) & (explained > _EXPLAINED)
+    clear = (
+        (np.abs(fit) > _CLEAR_Z_SCORE * spread)
+        & (np.abs(fit) > math.tan(_MIN_ANGLE))
+        & (explained > _EXPLAINED)
+    )
     if not clear.any():
         return None
     middle, change = fit[0], fit[1] if clear[1] else 0.0

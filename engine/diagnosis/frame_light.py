@@ -19,19 +19,19 @@ from mirrorskin.engine.diagnosis.residual_noise import valid
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
-_FEWEST_PIXELS, _FEWEST_FRAMES, _MOST_FRAMES = 64, 7, 128
+_MIN_PIXELS, _MIN_FRAMES, _MAX_FRAMES = 64, 7, 128
 _STEEP, _UPRIGHT = 1.5, math.radians(80)  # range of zeniths: minimum in tilts, and maximum
-_SUSPECT = 4.0  # minimum excess of the common variance over that of noise for a fit, standard deviations
-_CLEAR = 5.0  # minimum of flicker or drift, standard errors
+_SUSPECT_Z_SCORE = 4.0  # excess of the common variance over that of noise from which on light is fitted
+_CLEAR_Z_SCORE = 5.0  # minimum of flicker or drift, standard errors
 _FLICKER, _DRIFT = 0.005, 1.0  # minimum flicker, share of the light, and drift, counts of 8 bits
 _PRIOR = 0.05, 0.02  # initial standard deviations of gains, and of offsets as a share of the light
-_ROUNDS = 6  # iterations
-_STEADY = 1e-6  # standard deviation of gains and offsets that are not fitted
-_SWING = 2.0  # maximum amplitude of the zenith of a usable pixel, in tilts
-_MOST = 0.2  # maximum standard deviation of gains
-_AS_ONE = 0.5  # mean direction above which pixels face the same way, so that the light is not determined
-_ALIKE = 0.5  # maximum difference of the light at steep and at other pixels, as a share of its change
-_OUTLIER = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
+_ITERATIONS = 6  # iterations
+_FIXED_SIGMA = 1e-6  # standard deviation of gains and offsets that are not fitted
+_MAX_MODULATION = 2.0  # maximum amplitude of the zenith of a usable pixel, in tilts
+_MAX_GAIN_SIGMA = 0.2  # maximum standard deviation of gains
+_MAX_MEAN_DIRECTION = 0.5  # above it pixels face one way, and do not determine the light
+_MAX_DISAGREEMENT = 0.5  # between steep and other pixels, as a share of the light's change
+_OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
 _LEAST_NOISE = 1e-3  # counts
 
 
@@ -98,12 +98,12 @@ def find_frame_light(
     ``samples`` is (T, n); the zenith's ``gain``, counts/rad, ``offset`` and ``dark`` are numbers or (n,).
     """
     count = len(samples)
-    if not _FEWEST_FRAMES <= count <= _MOST_FRAMES or count != len(phase):
+    if not _MIN_FRAMES <= count <= _MAX_FRAMES or count != len(phase):
         return None
     whole = valid(samples).all(axis=0)
     scale = [np.broadcast_to(np.asarray(values, np.float64), whole.shape) for values in (gain, offset, dark)]
     whole &= np.isfinite(scale).all(axis=0) & (scale[0] != 0)
-    if np.count_nonzero(whole) < _FEWEST_PIXELS or not _is_suspect(samples[:, whole], phase):
+    if np.count_nonzero(whole) < _MIN_PIXELS or not _is_suspect(samples[:, whole], phase):
         return None
     counts = samples[:, whole].astype(np.float64)
     per_angle, base, low = (values[whole] for values in scale)
@@ -111,10 +111,13 @@ def find_frame_light(
     wave = np.linalg.pinv(basis(phase)) @ ((counts - base) / per_angle)
     modulation = np.hypot(wave[1], wave[2]) / tilt  # 1 if the response is as stated
     usable = (
-        (wave[0] > _STEEP * tilt) & (wave[0] < _UPRIGHT) & (modulation > 1 / _SWING) & (modulation < _SWING)
+        (wave[0] > _STEEP * tilt)
+        & (wave[0] < _UPRIGHT)
+        & (modulation > 1 / _MAX_MODULATION)
+        & (modulation < _MAX_MODULATION)
     )
     facing = np.exp(1j * np.arctan2(wave[2], wave[1]))[usable]
-    if np.count_nonzero(usable) < _FEWEST_PIXELS or abs(np.mean(facing)) > _AS_ONE:
+    if np.count_nonzero(usable) < _MIN_PIXELS or abs(np.mean(facing)) > _MAX_MEAN_DIRECTION:
         return None
     if not _is_suspect(counts[:, usable], phase):  # level pixels are not cosines, and may lose contact
         return None
@@ -133,7 +136,7 @@ def find_frame_light(
     # A wrong response differs between zeniths; a change of the light does not.
     middle = float(np.median(counts[:, usable] - low[usable]))
     difference = np.std(at_steep.change(middle) - at_level.change(middle))
-    return whole_fit.light() if difference < _ALIKE * np.std(whole_fit.change(middle)) else None
+    return whole_fit.light() if difference < _MAX_DISAGREEMENT * np.std(whole_fit.change(middle)) else None
 
 
 def _fitted(
@@ -144,11 +147,11 @@ def _fitted(
     fit = _Fit(counts, phase, tilt, gain, base, dark, wave)
     if free is not None:
         fit.leave_out(~free)
-    fit.keep(fit.misfit < _OUTLIER * float(np.median(fit.misfit)))
-    for _ in range(_ROUNDS):
+    fit.keep(fit.misfit < _OUTLIER_RATIO * float(np.median(fit.misfit)))
+    for _ in range(_ITERATIONS):
         fit.improve()
-        fit.keep(fit.misfit < _OUTLIER * float(np.median(fit.misfit)))
-        if fit.pixels < _FEWEST_PIXELS // 3:
+        fit.keep(fit.misfit < _OUTLIER_RATIO * float(np.median(fit.misfit)))
+        if fit.pixels < _MIN_PIXELS // 3:
             return None
     while free is None and (steady := fit.free & ~fit.significant).any():
         fit.leave_out(steady)
@@ -174,7 +177,7 @@ def _is_suspect(samples: NDArray[Any], phase: Doubles) -> bool:
         each = residual @ common / size
         noise = max(mad_sigma((residual - np.outer(each, common)).astype(np.float64)), _LEAST_NOISE)
         usual = noise**2 * len(phase)  # residuals have less than the noise, by the degrees of freedom
-        if float(np.sum(each**2)) * size > (1 + _SUSPECT * math.sqrt(2 / freedom)) * usual:
+        if float(np.sum(each**2)) * size > (1 + _SUSPECT_Z_SCORE * math.sqrt(2 / freedom)) * usual:
             return True
     return False
 
@@ -261,7 +264,7 @@ class _Fit:
         self._azimuth += turn[:, 1] / np.maximum(np.sin(self._zenith), 1e-3)
         self._light -= self._light.mean(axis=1, keepdims=True)
         spread = np.diag(np.linalg.inv(matrix)).reshape(2, frames) * noise
-        self._prior = np.where(self.free, np.sqrt(np.mean(self._light**2 + spread, axis=1)), _STEADY)
+        self._prior = np.where(self.free, np.sqrt(np.mean(self._light**2 + spread, axis=1)), _FIXED_SIGMA)
         self._look()
 
     @property
@@ -273,11 +276,11 @@ class _Fit:
         chi2 = np.sum(self._light**2 / variance, axis=1)
         span = max(1.0, float(np.ptp(self._counts)) / 255)
         sizes = np.std(self._light[0]) / _FLICKER, _range(self._light[1]) / (_DRIFT * span)
-        return np.asarray((chi2 > frames + _CLEAR * math.sqrt(2 * frames)) & (np.array(sizes) > 1))
+        return np.asarray((chi2 > frames + _CLEAR_Z_SCORE * math.sqrt(2 * frames)) & (np.array(sizes) > 1))
 
     def leave_out(self, chosen: NDArray[np.bool_]) -> None:
         """Assume steady light for gains, offsets or both, (2,)."""
-        self._light[chosen], self._prior[chosen] = 0.0, _STEADY
+        self._light[chosen], self._prior[chosen] = 0.0, _FIXED_SIGMA
         self.free &= ~chosen
         self._look()
 
@@ -289,7 +292,7 @@ class _Fit:
     def light(self) -> FrameLight | None:
         """Return the light; None if it is steady."""
         free = self.free
-        if not free.any() or np.std(self._light[0]) > _MOST:
+        if not free.any() or np.std(self._light[0]) > _MAX_GAIN_SIGMA:
             return None
         _, through, matrix, noise = self._normal_equations()
         covariance = np.linalg.inv(matrix) * noise

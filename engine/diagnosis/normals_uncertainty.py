@@ -20,7 +20,7 @@ from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.engine.diagnosis.swing import ModulationEffects, find_modulation_effects
 from mirrorskin.io import Result
 from mirrorskin.io.base.findings import Finding, with_findings
-from mirrorskin.kernels.numerics.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, mad_sigma
 from mirrorskin.kernels.rotation.normals import azimuth_of
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _PARTS, _POINTS = 8, 128  # of the extent of the normals: distance between slopes; slopes along a side
 _GRID = 64  # points along a side that show this extent
-_FEWEST, _CLEAR, _ALIKE = 100, 6.0, 0.1  # points, standard errors, and correlation that decide
+_MIN_POINTS, _MIN_CORRELATION = 100, 0.1  # points, and their correlation, that decide
 _REACH = 5  # pixels: size of the neighbourhood whose loss of contact affects a registered sample
 
 
@@ -222,12 +222,14 @@ def _mirrored(normals: AnyArray) -> bool:
         dp_dy = down[0] / down[2] - here[0] / here[2]  # y points up
         dq_dx = here[1] / here[2] - across[1] / across[2]
     defined = np.isfinite(dp_dy) & np.isfinite(dq_dx)
-    if np.count_nonzero(defined) < _FEWEST:
+    if np.count_nonzero(defined) < _MIN_POINTS:
         return False
     dp_dy, dq_dx = (_clip_outliers(values[defined]) for values in (dp_dy, dq_dx))
     product = dp_dy * dq_dx
-    clear = -float(np.mean(product)) > _CLEAR * float(np.std(product)) / math.sqrt(len(product))
-    return clear and bool(-np.sum(product) >= _ALIKE * math.sqrt(np.sum(dp_dy**2) * np.sum(dq_dx**2)))
+    clear = -float(np.mean(product)) > CLEAR_Z_SCORE * float(np.std(product)) / math.sqrt(len(product))
+    return clear and bool(
+        -np.sum(product) >= _MIN_CORRELATION * math.sqrt(np.sum(dp_dy**2) * np.sum(dq_dx**2))
+    )
 
 
 def _clip_outliers(values: NDArray[np.float64]) -> NDArray[np.float64]:

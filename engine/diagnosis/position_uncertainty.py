@@ -25,22 +25,22 @@ _BEND = np.array([-1.0, 3.0, -3.0, 1.0])  # third difference of four pixels in a
 _RISE = np.array([-1.0, -1.0, 1.0, 1.0]) / 4  # mean difference of neighbours
 _LEAST_RISE = 0.2  # steps from pixel to pixel of a slope that shows positions
 _FARTHER = (1.5, 2.2)  # steps over the rise to the next pixel: above each, rows of pixels are longer
-_LONGEST = 3  # pixels: their greatest distance, with which jitter is not estimated
-_FEW, _MOST = 2000, 4000  # rows of four pixels along each axis, to begin with and in all
-_SUSPICIOUS = 2.5  # standard errors: least difference of a frame from its neighbours
-_CLOSEST = 0.3  # steps: least distance of two frames whose errors are estimated
-_FEWEST, _MOST_FRAMES = 7, 160  # frames that show positions
-_SEEN = 40  # times that a frame is next to a pixel
+_MAX_REACH = 3  # pixels: their greatest distance, with which jitter is not estimated
+_FIRST_ROWS, _MAX_ROWS = 2000, 4000  # rows of four pixels along each axis, to begin with and in all
+_SUSPICIOUS_Z_SCORE = 2.5  # standard errors: least difference of a frame from its neighbours
+_MIN_STEP = 0.3  # steps: least distance of two frames whose errors are estimated
+_MIN_FRAMES, _MAX_FRAMES = 7, 160  # frames that show positions
+_MIN_ROWS_PER_FRAME = 40  # times that a frame is next to a pixel
 _PRIOR = 0.3  # steps: standard deviation of a position, so that none is undetermined
 _SMOOTH = 4  # frames per degree of the polynomial that the surface itself may have
-_ROUNDS = 3
+_ITERATIONS = 3  # of the reweighted fit
 _LEAST_BEND = 0.05  # least standard deviation of a bend, relative to the rise
 _OVERLAP = 6  # rows of four pixels that share a pixel, along both axes
-_BINS, _SPREAD = 8, 3.0  # parts of an interval, and how many of them heights must fill
-_LEAST_JITTER, _CLEARER = 0.07, 3.0  # steps, and standard errors, of a jitter that is one
-_SURE_FRAMES = 7  # frames from which a jitter is estimated
-_JUMP, _CLEAR_JUMP = (0.6, 1.5), 5.0  # steps, and standard errors, of one lost frame
-_ALONE = 0.7  # greatest jump elsewhere, relative to it
+_BINS, _MIN_FILLED_BINS = 8, 3.0  # parts of an interval, and how many of them heights must fill
+_MIN_JITTER, _JITTER_Z_SCORE = 0.07, 3.0  # steps, and standard errors, of a jitter that is one
+_MIN_JITTER_FRAMES = 7  # frames from which a jitter is estimated
+_JUMP, _JUMP_Z_SCORE = (0.6, 1.5), 5.0  # steps, and standard errors, of one lost frame
+_MAX_OTHER_JUMP = 0.7  # greatest jump elsewhere, relative to it
 
 
 class PositionUncertainty(Step):
@@ -101,19 +101,19 @@ class _PositionFit:
 
     def jitter(self) -> float:
         """Return the standard deviation of random errors, mm; 0 if there are none."""
-        if self.reach == _LONGEST:
+        if self.reach == _MAX_REACH:
             return 0.0
         clear = self.clear[:-2] & self.clear[1:-1] & self.clear[2:]
         clear[[0, -1]] = False
-        if np.count_nonzero(clear) < _SURE_FRAMES:
+        if np.count_nonzero(clear) < _MIN_JITTER_FRAMES:
             return 0.0
         differences = np.diff(np.eye(len(self.error)), 3, axis=0)[clear] / math.sqrt(20)
         jitter = mad_sigma(differences @ self.error)
-        if jitter < _LEAST_JITTER * self.step:
+        if jitter < _MIN_JITTER * self.step:
             return 0.0
         variance = np.einsum("ij,jk,ik->i", differences, self.covariance(), differences)
         error = math.sqrt(float(np.median(variance)))
-        if jitter < _CLEARER * error:
+        if jitter < _JITTER_Z_SCORE * error:
             return 0.0
         return math.sqrt(jitter**2 - error**2)
 
@@ -127,8 +127,8 @@ class _PositionFit:
         largest = int(np.nanargmax(jumps))
         jump, error = jumps[largest], self.jump_errors[largest] / self.step
         jumps[max(0, largest - 2) : largest + 3] = 0
-        alone = np.nanmax(np.abs(jumps)) < _ALONE * jump
-        return largest if _JUMP[0] < jump < _JUMP[1] and jump > _CLEAR_JUMP * error and alone else None
+        alone = np.nanmax(np.abs(jumps)) < _MAX_OTHER_JUMP * jump
+        return largest if _JUMP[0] < jump < _JUMP[1] and jump > _JUMP_Z_SCORE * error and alone else None
 
 
 @dataclass(frozen=True)
@@ -160,12 +160,12 @@ class _Rows:
         gradient = (weight * self.bends * self.change).ravel()
         frame, count = self.frame.ravel(), len(clear) + 1
         total, square = (np.bincount(frame, part, minlength=count) for part in (gradient, gradient**2))
-        usable = self.seen(count) >= _SEEN
+        usable = self.seen(count) >= _MIN_ROWS_PER_FRAME
         usable[[0, -1]] = False
         usable[1:-1] &= clear[:-1] & clear[1:]
         scores = np.where(usable, total / np.sqrt(np.maximum(square, np.finfo(float).tiny)), np.nan)
         changes = np.diff(scores, 2)
-        return bool(np.any(np.abs(changes) > math.sqrt(6) * _SUSPICIOUS))
+        return bool(np.any(np.abs(changes) > math.sqrt(6) * _SUSPICIOUS_Z_SCORE))
 
     def between(self, first: int, stop: int) -> _Rows:
         """Return the rows that lie between two frames, which are then numbered from the first."""
@@ -179,36 +179,36 @@ class _Rows:
 def _fit_positions(height: AnyArray, pushed: Doubles) -> _PositionFit | None:
     """Return the errors of the frames' positions; None if the heights do not show any."""
     travel = np.unique(pushed)
-    if len(travel) < _FEWEST:
+    if len(travel) < _MIN_FRAMES:
         return None
     step = float(np.median(np.diff(travel)))
-    travel = _apart(travel, _CLOSEST * step)
-    if len(travel) < _FEWEST:
+    travel = _apart(travel, _MIN_STEP * step)
+    if len(travel) < _MIN_FRAMES:
         return None
-    pixels, reach = _pixels_of(height, 1, _FEW), 1
+    pixels, reach = _pixels_of(height, 1, _FIRST_ROWS), 1
     clear = _spread(pixels[0][np.isfinite(pixels[0])], travel)
     rise = np.abs(pixels[1] - pixels[0])
     rise = rise[rise > _LEAST_RISE / 2 * step]
-    if np.count_nonzero(clear) < _FEWEST - 2 or rise.size < _SEEN:
+    if np.count_nonzero(clear) < _MIN_FRAMES - 2 or rise.size < _MIN_ROWS_PER_FRAME:
         return None
     reach = 1 + int(np.searchsorted(_FARTHER, step / float(np.median(rise))))
     if reach > 1:
-        pixels = _pixels_of(height, reach, _FEW)
+        pixels = _pixels_of(height, reach, _FIRST_ROWS)
     rows = _rows_of(pixels, travel, step)
     if not rows.suspicious(clear):
         return None
-    more = _pixels_of(height, reach, _MOST)
+    more = _pixels_of(height, reach, _MAX_ROWS)
     if more.shape != pixels.shape:
         rows = _rows_of(more, travel, step)
     clear = _spread(more[0][np.isfinite(more[0])], travel)
-    covered = np.flatnonzero(rows.seen(len(travel)) >= _SEEN)
-    if len(covered) < _FEWEST:
+    covered = np.flatnonzero(rows.seen(len(travel)) >= _MIN_ROWS_PER_FRAME)
+    if len(covered) < _MIN_FRAMES:
         return None
     first, stop = int(covered[0]), int(covered[-1]) + 1
-    if stop - first > _MOST_FRAMES:
+    if stop - first > _MAX_FRAMES:
         middle = int(np.median(rows.frame))
-        first = min(max(first, middle - _MOST_FRAMES // 2), stop - _MOST_FRAMES)
-        stop = first + _MOST_FRAMES
+        first = min(max(first, middle - _MAX_FRAMES // 2), stop - _MAX_FRAMES)
+        stop = first + _MAX_FRAMES
     return _fit(rows.between(first, stop), travel[first:stop], step, clear[first : stop - 1], reach)
 
 
@@ -267,7 +267,7 @@ def _spread(heights: Doubles, travel: Doubles) -> NDArray[np.bool_]:
     count = np.bincount(interval * _BINS + part, minlength=(len(travel) - 1) * _BINS)
     count = count.reshape(-1, _BINS).astype(np.float64)
     total = count.sum(axis=1)
-    return np.asarray((total > 0) & (total**2 >= _SPREAD * np.sum(count**2, axis=1)))
+    return np.asarray((total > 0) & (total**2 >= _MIN_FILLED_BINS * np.sum(count**2, axis=1)))
 
 
 def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], reach: int) -> _PositionFit:
@@ -288,7 +288,7 @@ def _fit(rows: _Rows, travel: Doubles, step: float, clear: NDArray[np.bool_], re
     smooth, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, count), degree))
     of_surface = np.sum(smooth[:, np.newaxis] * smooth[np.newaxis], axis=2)
     bend, error, residual = rows.bend, np.zeros(count), rows.bends
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         weight = 1 / np.sqrt(1 + (residual / (2 * bend)) ** 2)
         squares = normal(weight)
         slope = (weight * rows.bends * rows.change).ravel()

@@ -21,8 +21,9 @@ _FRAMES_OF_TWO = 7  # minimum number of frames for a fit with the second harmoni
 _MAX_CONDITION = 100.0  # maximum condition of this fit
 _BINS, _BIN_PIXELS = 16, 200  # maximum number of bins of brightness, and minimum number of pixels per bin
 _AT_ONCE = 4096  # pixels per block, which fits into the cache
-_ROUNDS, _OUTLYING = 10, 0.2  # iterations of the line's robust fit, and its limit of relative residuals
-_BEYOND = 1e-3  # significance level of outliers
+_LINE_ITERATIONS = 10  # of the line's robust fit
+_OUTLYING = 0.2  # limit of its relative residuals
+_OUTLIER_PROBABILITY = 1e-3  # significance level of outliers
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,7 @@ def valid(samples: NDArray[Any]) -> NDArray[np.bool_]:
 
 def _variance(squares: Doubles, freedom: int) -> float:
     """Return the variance of normally distributed samples from sums of squares with outliers."""
-    furthest = _chi_square_beyond(freedom, _BEYOND)
+    furthest = _chi_square_beyond(freedom, _OUTLIER_PROBABILITY)
     kept_share = (1 - _share_beyond(freedom + 2, furthest)) / (1 - _share_beyond(freedom, furthest))
     variance = float(np.median(squares)) / _chi_square_beyond(freedom, 0.5)
     for _ in range(10):
@@ -147,7 +148,7 @@ def _line(levels: Doubles, variances: Doubles, floor: float) -> CountNoise:
     """Fit a non-decreasing line to variances by iteratively reweighted least squares."""
     weights = 1 / variances
     base, slope = float(np.median(variances)), 0.0
-    for _ in range(_ROUNDS if np.ptp(levels) > 0 else 0):
+    for _ in range(_LINE_ITERATIONS if np.ptp(levels) > 0 else 0):
         centre = np.average(levels, weights=weights**2)
         mean = np.average(variances, weights=weights**2)
         off_centre = levels - centre

@@ -24,20 +24,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.device_arrays import AnyArray
 from mirrorskin.engine.base.frames import take_places
+from mirrorskin.engine.diagnosis.amplitude_blur import GRID_LINES, MIN_BLUR, MIN_PIXELS
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.numerics.least_squares import OUTLYING, fit_clipped, gram, mad_sigma
+from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, OUTLYING, fit_clipped, gram, mad_sigma
 
-_STEEP = 3.0  # tilts, from which on the zenith and the swing are independent
-_REACH, _LINES = 2, 48  # pixels between the middle and its neighbours; lines of pixels that are used
-_FEWEST = 400  # pixels
-_CLEAR, _CLEAR_GAIN = 6.0, 5.0  # standard errors from which on an effect is one
-_UNEVEN = 0.03  # least range of the swing, as a share of it, that is a response or uneven light
-_ALONE = 0.25  # least share of an effect's variance that the others do not explain
-_JOINED = 1.25  # ratio of that error to that of independent values
-_WIDELY, _TURNING = 100, 0.02  # pixels: a tip is not blur; square of the turning of azimuths, 1/pixel^2
-_BLUR = 0.4  # pixels: least standard deviation of a lens's point spread
-_GAIN = 0.01  # least standard deviation of the gains of pixels
+_MIN_ZENITH = 3.0  # tilts, from which on the zenith and the swing are independent
+_REACH = 2  # pixels between the middle and its neighbours
+_GAIN_Z_SCORE = 5.0  # standard errors from which on the scatter of gains is reported
+_MIN_RANGE = 0.03  # least range of the swing, as a share of it, that is a response or uneven light
+_MIN_UNEXPLAINED = 0.25  # least share of an effect's variance that the others do not explain
+_ERROR_RATIO = 1.25  # ratio of that error to that of independent values
+_MIN_DECIDING_PIXELS = 100  # that show a blur: a tip does not
+_MIN_TURNING = 0.02  # square of the turning of azimuths, 1/pixel^2
+_MIN_GAIN = 0.01  # least standard deviation of the gains of pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def find_modulation_effects(
     ``usable`` pixels, (H, W).
     """
     rows, columns = usable.shape
-    thin = max(1, math.isqrt(int(np.count_nonzero(usable))) // _LINES)
+    thin = max(1, math.isqrt(int(np.count_nonzero(usable))) // GRID_LINES)
     if min(rows, columns) <= 2 * _REACH:
         return ModulationEffects()
     down, right = range(_REACH, rows - _REACH, thin), range(_REACH, columns - _REACH, thin)
@@ -89,7 +89,9 @@ def find_modulation_effects(
         """Return zenith, its sine's direction and the ratio of the swing, NaN where it is not usable."""
         x, y, z = vectors[place].astype(np.float64)
         flat, amplitude = np.hypot(x, y), np.hypot(cosines[place], sines[place])
-        zenith = np.where((used[place] > 0) & (flat > math.sin(_STEEP * tilt)), np.arctan2(flat, z), np.nan)
+        zenith = np.where(
+            (used[place] > 0) & (flat > math.sin(_MIN_ZENITH * tilt)), np.arctan2(flat, z), np.nan
+        )
         return zenith, x / flat, y / flat, amplitude / (scales[place] * _expected(zenith, tilt))
 
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -104,7 +106,7 @@ def find_modulation_effects(
         rough = middle[3] - (east[3] + west[3] + north[3] + south[3]) / 4
         noise = math.sqrt(2) * noise_of_mean.at(means[0]) / (scales[0] * tilt)
     finite = np.isfinite(rough) & np.isfinite(turning) & np.isfinite(noise) & (noise > 0)
-    if np.count_nonzero(finite) < _FEWEST:
+    if np.count_nonzero(finite) < MIN_PIXELS:
         return ModulationEffects()
     y, x = (
         np.broadcast_to(positions, finite.shape)[finite]
@@ -140,7 +142,11 @@ def _gain(rough: Doubles, noise: Doubles) -> float:
     # Neighbours are in several means, so that the error of the variance is larger than of independent values.
     excess = float(np.mean(ratio[np.abs(ratio) <= OUTLYING * mad_sigma(ratio)] ** 2)) - 1
     gain = math.sqrt(max(excess, 0)) * float(np.median(noise))
-    return gain if excess > _CLEAR_GAIN * _JOINED * math.sqrt(2 / len(rough)) and gain > _GAIN else 0.0
+    return (
+        gain
+        if excess > _GAIN_Z_SCORE * _ERROR_RATIO * math.sqrt(2 / len(rough)) and gain > _MIN_GAIN
+        else 0.0
+    )
 
 
 def _fit(ratio: Doubles, columns: Doubles, noise: Doubles, gain: float) -> ModulationEffects:
@@ -160,17 +166,17 @@ def _fit(ratio: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Modul
         mixed = part @ products[chosen, others]
         square = float(part @ products[chosen, chosen] @ part)
         unexplained = square - float(mixed @ np.linalg.solve(products[np.ix_(others, others)], mixed))
-        alone = unexplained > _ALONE * (square - float(part @ sums[chosen]) ** 2 / number)
+        alone = unexplained > _MIN_UNEXPLAINED * (square - float(part @ sums[chosen]) ** 2 / number)
         chi2 = float(part @ np.linalg.solve(covariance[chosen, chosen], part))
         extent = float(np.ptp(np.percentile(columns[kept, chosen] @ part, [5, 95]))) / abs(float(fit[0]))
-        return extent if alone and chi2 > len(part) * _CLEAR**2 else 0.0
+        return extent if alone and chi2 > len(part) * CLEAR_Z_SCORE**2 else 0.0
 
     turning = columns[kept, 1]
     deciding = float(np.sum(turning**2)) ** 2 / float(np.sum(turning**4))  # pixels
     spread = math.sqrt(-2 * min(float(fit[1]), 0.0))
-    widely = deciding > _WIDELY and float(np.percentile(turning, 95)) > _TURNING
-    blurs = spread > _BLUR and widely and effect(slice(1, 2)) > 0
+    widely = deciding > _MIN_DECIDING_PIXELS and float(np.percentile(turning, 95)) > _MIN_TURNING
+    blurs = spread > MIN_BLUR and widely and effect(slice(1, 2)) > 0
     response, light = (
-        extent if extent > _UNEVEN else 0.0 for extent in (effect(slice(3, 4)), effect(slice(4, 9)))
+        extent if extent > _MIN_RANGE else 0.0 for extent in (effect(slice(3, 4)), effect(slice(4, 9)))
     )
     return ModulationEffects(response, light, gain, spread if blurs else 0.0)

@@ -24,12 +24,12 @@ TOLERANCE = 1e-4
 """Maximum gap in contact, as a share of the surface's maximum height above the rest plane."""
 
 _SOFTNESS = 3 / (4 * math.pi)  # 1 / (pi E*) at E = 1, with E* = E / (1 - nu^2) and nu = 1/2
-_ROUNDS = 40  # maximum number of changes of the contact
-_STEPS = 300  # maximum number of conjugate-gradient steps
+_MAX_CONTACT_CHANGES = 40  # maximum number of changes of the contact
+_MAX_STEPS = 300  # maximum number of conjugate-gradient steps
 _GRADIENT_ERROR = 1e-3  # maximum gap of a flat punch that is pressed in by 1
 _NO_SLOPE = 1e-9  # slope below which its direction is undefined
 _FIRM = 0.05  # share of the maximum pressure below which the contact of a cell is neglected in derivatives
-_ROUGH, _ROUGH_STEPS = 2e-2, 60  # relative residual, and maximum number of steps, for derivatives
+_ROUGH_TOLERANCE, _ROUGH_STEPS = 2e-2, 60  # relative residual, and maximum number of steps, for derivatives
 _SIZES = 4  # cells: granularity of the size of windows
 
 
@@ -112,14 +112,14 @@ def press(
         contact, strain = reach & start.contact, start.strain
     if not contact.any():
         contact = reach
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_CONTACT_CHANGES):
         strain, gap = _solve(space, surface, compliance, tolerance, contact, np.where(contact, strain, 0.0))
         changed = np.where(contact, strain > 0, gap < -tolerance)
         if np.array_equal(changed, contact):
             load = float(strain.sum()) * space.pixel_area
             return Pressed(strain, space.displacement(strain), contact, load)
         contact = changed
-    raise NotConverged(f"the contact did not converge in {_ROUNDS} rounds")
+    raise NotConverged(f"the contact did not converge in {_MAX_CONTACT_CHANGES} rounds")
 
 
 def load_gradient(space: HalfSpace, contact: Mask, compliance: float = 0.0) -> Doubles:
@@ -143,11 +143,11 @@ def _solve(
         surface,
         Face.of(contact, space.pressed),
         converged=lambda residual: float(np.abs(residual).max()) <= tolerance,
-        steps=_STEPS,
+        steps=_MAX_STEPS,
         start=strain,
     )
     if not solution.converged:
-        raise NotConverged(f"the pressure in contact was not found in {_STEPS} steps")
+        raise NotConverged(f"the pressure in contact was not found in {_MAX_STEPS} steps")
     return solution.x, solution.product - surface
 
 
@@ -320,7 +320,7 @@ def _pressed_by(space: HalfSpace, contact: Mask, heights: Singles, compliance: f
     """
     window, space = _window(space, contact)
     contact, heights = contact[window], heights[(slice(None), *window)]
-    enough = _ROUGH**2 * _square(heights)
+    enough = _ROUGH_TOLERANCE**2 * _square(heights)
     solution = conjugate_gradients(
         _opening(space, compliance),
         heights,

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mirrorskin.io import Stiffness
 
 _UNCERTAIN = 0.4  # relative standard deviation of the correction for errors of heights
-_BEYOND = 0.01  # maximum share of the load outside the picture
+_MAX_OUTSIDE = 0.01  # maximum share of the load outside the picture
 
 
 @checked(
@@ -207,6 +207,6 @@ def press_within(fit: PressFit) -> Pressed:
     if not pressed.load > 0:
         raise NotConverged("nothing touches")
     inside = float(fit.scene.cells.inside(pressed.strain).sum()) * fit.scene.space.pixel_area
-    if pressed.load - inside > _BEYOND * pressed.load:
+    if pressed.load - inside > _MAX_OUTSIDE * pressed.load:
         raise NotConverged(f"{1 - inside / pressed.load:.0%} of the load lies beyond the picture")
     return pressed

@@ -25,9 +25,9 @@ Mask = NDArray[np.bool_]
 _SOFTNESS = 3 / (4 * math.pi)  # 1 / (4 pi G) at E = 1: G = E / 3
 _UP = np.array([1.0, -1.0]).reshape(2, 1, 1)  # y points up, rows increase downwards
 _TOLERANCE, _ROUGH = 1e-5, 1e-3  # residual relative to the largest displacement; with damping, the second
-_STEPS = 400  # maximum number of conjugate gradient steps
-_FARTHEST = 1e6  # maximum displacement, mm
-_LEAST_KNOWN = 0.8  # minimum share of the contact with a displacement
+_MAX_STEPS = 400  # maximum number of conjugate gradient steps
+_MAX_DISPLACEMENT = 1e6  # maximum displacement, mm
+_MIN_COVERAGE = 0.8  # minimum share of the contact with a displacement
 _DAMPING = 1e-4, 1e4  # range of the damping, relative to the compliance of the contact as a whole
 
 
@@ -167,13 +167,13 @@ def _checked(
     if window_size < 1:
         raise InputError(f"window_size {window_size} is not possible: give pixels, 1 or more")
     finite = np.isfinite(moved).all(axis=-1)
-    if finite.any() and not (farthest := np.abs(moved[finite]).max()) < _FARTHEST:
-        raise InputError(f"a displacement is {farthest:.3g} mm: less than {_FARTHEST:g} are needed")
+    if finite.any() and not (farthest := np.abs(moved[finite]).max()) < _MAX_DISPLACEMENT:
+        raise InputError(f"a displacement is {farthest:.3g} mm: less than {_MAX_DISPLACEMENT:g} are needed")
     fraction = np.count_nonzero(finite & touches) / np.count_nonzero(touches)
     if not np.isfinite(spread).any() or np.any(spread < 0):
         raise InputError("sigma is below 0, or nowhere known: give millimetres, 0 or more")
-    if fraction < _LEAST_KNOWN:
-        raise InputError(f"{fraction:.0%} of the contact has a displacement: {_LEAST_KNOWN:.0%} are needed")
+    if fraction < _MIN_COVERAGE:
+        raise InputError(f"{fraction:.0%} of the contact has a displacement: {_MIN_COVERAGE:.0%} are needed")
     filled = (
         np.stack([fill_with_nearest(np.where(finite, part, np.nan)) for part in np.moveaxis(values, -1, 0)])
         for values in (moved, spread)
@@ -228,10 +228,10 @@ class _System:
             target,
             Face.of(self._contact, lambda residual: _filtered(residual, self._inverse, shape)),
             converged=lambda residual: float(np.abs(residual).max()) <= goal,
-            steps=_STEPS,
+            steps=_MAX_STEPS,
         )
         if not solution.converged:
-            raise NotConverged(f"the traction in contact was not found in {_STEPS} steps")
+            raise NotConverged(f"the traction in contact was not found in {_MAX_STEPS} steps")
         return np.asarray(solution.x)
 
     def damped(self, target: Doubles, sigma: Doubles) -> Doubles:

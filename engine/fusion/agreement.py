@@ -21,14 +21,15 @@ from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.kernels.array_types import Doubles
 
 _CELL, _IN_CELL = 16, 64  # pixels along the side of a cell, and least number of them with both
-_FEWEST, _CLEAR = 4, 3.0  # least number of cells, and standard deviations of their mean square that decide
-_LINES, _APART = 48, 4  # largest number of lines in each direction; least pixels between them
-_LONGEST, _SHORTEST = 64, 8  # pixels of a part of a line
+_MIN_CELLS = 4  # number of cells that decide
+_CLEAR_Z_SCORE = 3.0  # standard deviations of their mean square
+_MAX_LINES, _MIN_LINE_DISTANCE = 48, 4  # largest number of lines in each direction; least pixels between them
+_MAX_PART, _MIN_PART = 64, 8  # pixels of a part of a line
 _WITH_HEIGHT = 4  # pixels with a height that a part needs
-_FEWEST_PARTS = 12
-_SIGNIFICANT = 30.0  # chi^2 of a gain and an offset
-_MOST_GAIN, _MOST_OFFSET = 0.25, math.radians(10)  # larger errors than these are something else
-_LEVEL = 0.05  # least slope at which an offset of the zenith has a direction
+_MIN_PARTS = 12
+_MIN_CHI2 = 30.0  # chi^2 of a gain and an offset
+_MAX_GAIN, _MAX_OFFSET = 0.25, math.radians(10)  # larger errors than these are something else
+_MIN_SLOPE = 0.05  # least slope at which an offset of the zenith has a direction
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,7 @@ class ZenithBias:
             return slopes
         steepness = np.hypot(slopes.dz_dx, slopes.dz_dy)
         zenith = np.arctan(steepness)
-        true = np.maximum(zenith - np.where(steepness > _LEVEL, self.offset, 0.0), 0.0) / (1 + self.gain)
+        true = np.maximum(zenith - np.where(steepness > _MIN_SLOPE, self.offset, 0.0), 0.0) / (1 + self.gain)
         with np.errstate(divide="ignore", invalid="ignore"):
             factor = np.where(steepness > 0, np.tan(true) / steepness, 1.0).astype(np.float32)
         return replace(slopes, dz_dx=slopes.dz_dx * factor, dz_dy=slopes.dz_dy * factor)
@@ -93,10 +94,10 @@ def find_disagreement(
     pixels, total, first = (_cells(values) for values in (both, firm, firm * error))
     enough = (pixels >= _IN_CELL) & (total > 0)
     count = int(np.count_nonzero(enough))
-    if count < _FEWEST:
+    if count < _MIN_CELLS:
         return Disagreement()
     chi2 = float(np.mean(first[enough] ** 2 / total[enough]))
-    clear = chi2 > 1 + _CLEAR * math.sqrt(2 / count)
+    clear = chi2 > 1 + _CLEAR_Z_SCORE * math.sqrt(2 / count)
     mean = first[enough] / total[enough]
     square = np.sum(firm * error**2) / np.sum(firm) if clear else np.average(mean**2, weights=total[enough])
     rms = math.sqrt(float(square))
@@ -159,13 +160,13 @@ def find_zenith_bias(
     with np.errstate(divide="ignore", invalid="ignore"):
         factors = (
             np.where(steepness > 0, rise * np.arctan(steepness) / steepness, 0.0),
-            np.where(steepness > _LEVEL, rise / steepness, 0.0),
+            np.where(steepness > _MIN_SLOPE, rise / steepness, 0.0),
         )
     parts = []
     for slope, size, turned in ((dz_dx, pixel_size[0], False), (-dz_dy, pixel_size[1], True)):
         maps = [slope * size, *(factor * slope * size for factor in factors), slopes.defined, height, weight]
         parts += _parts([values.T for values in maps] if turned else maps)
-    if len(parts) < _FEWEST_PARTS:
+    if len(parts) < _MIN_PARTS:
         return None
     matrix = np.sum([normal for normal, _ in parts], axis=0)
     right = np.sum([values for _, values in parts], axis=0)
@@ -177,7 +178,7 @@ def find_zenith_bias(
     covariance = inverse @ (scatter.T @ scatter) @ inverse
     chi2 = float(error @ np.linalg.solve(covariance, error))
     gain, offset = (float(value) for value in error)
-    if not chi2 > _SIGNIFICANT or abs(gain) > _MOST_GAIN or abs(offset) > _MOST_OFFSET:
+    if not chi2 > _MIN_CHI2 or abs(gain) > _MAX_GAIN or abs(offset) > _MAX_OFFSET:
         return None
     return ZenithBias(gain, offset)
 
@@ -187,14 +188,14 @@ def _parts(maps: Sequence[NDArray[Any]]) -> list[tuple[Doubles, Doubles]]:
     slope, by_gain, by_offset, defined, height, weight = maps
     rows = slope.shape[0]
     parts = []
-    step = max(_APART, -(-rows // _LINES))
+    step = max(_MIN_LINE_DISTANCE, -(-rows // _MAX_LINES))
     for row in range(step // 2, rows, step):
         ends = np.flatnonzero(np.diff(defined[row].astype(np.int8), prepend=0, append=0))
         for start, end in zip(ends[::2], ends[1::2], strict=True):
-            for first in range(start, end, _LONGEST):
-                part = row, slice(first, min(first + _LONGEST, end))
+            for first in range(start, end, _MAX_PART):
+                part = row, slice(first, min(first + _MAX_PART, end))
                 used = weight[part]
-                if len(used) < _SHORTEST or np.count_nonzero(used) < _WITH_HEIGHT:
+                if len(used) < _MIN_PART or np.count_nonzero(used) < _WITH_HEIGHT:
                     continue
                 values = np.stack([by_gain[part], by_offset[part], slope[part]])
                 sums = np.zeros(values.shape)

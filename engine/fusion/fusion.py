@@ -47,10 +47,10 @@ from mirrorskin.kernels.device import Choice, open_devices
 
 Mask = NDArray[np.bool_]
 
-_SAME = 1e-6  # largest relative difference of pixel sizes
+_SIZE_TOLERANCE = 1e-6  # largest relative difference of pixel sizes
 _PASSES = 3  # over the axial frames, at most
-_STILL = 0.02  # pixels that points may move between the last two passes
-_SHARPEST = 1e-4  # radians: smallest standard deviation of normals; neighbours at a curve contradict by more
+_MAX_MOVEMENT = 0.02  # pixels that points may move between the last two passes
+_MIN_SIGMA = 1e-4  # radians: smallest standard deviation of normals; neighbours at a curve contradict by more
 _FROM_RESULTS = Finding(
     "fused results",
     "the surface is that of two results. If these are of a press and a rotation, engine.fuse of both"
@@ -287,7 +287,7 @@ def _slopes_of_maps(normals: Result, selected: Mask, moved: float) -> Slopes:
         contact[inner == 0] = 0
     contact[~selected] = 0
     sigma = np.asarray(normals.normals_sigma, np.float32)
-    sigma = np.where((sigma >= 0) & (sigma < _SHARPEST), np.float32(_SHARPEST), sigma)
+    sigma = np.where((sigma >= 0) & (sigma < _MIN_SIGMA), np.float32(_MIN_SIGMA), sigma)
     return slopes_of(*separate_errors(normals.assign(normals_sigma=sigma)), contact)
 
 
@@ -346,7 +346,7 @@ def _fuse_sources(
         surface = solver.surface(slopes, sigma=number > 0 or passes == 1)
         assert turned.fitted.tilt is not None
         moved = _moved(before, surface.height, turned.fitted.tilt, pixel_size)
-        if moved <= _STILL:
+        if moved <= _MAX_MOVEMENT:
             break
         before = fill_with_nearest(surface.height)
     if surface.height_sigma is None:
@@ -438,7 +438,7 @@ def _check_sources(vertical: Source, axial: Source) -> tuple[float, float]:
         differences.append(
             " and ".join(f"regions from column {column}, row {row}" for row, column in origins)
         )
-    if not np.allclose(pixels[0], pixels[1], rtol=_SAME, atol=0):
+    if not np.allclose(pixels[0], pixels[1], rtol=_SIZE_TOLERANCE, atol=0):
         differences.append(" and ".join(f"pixels of {width:g} x {height:g} mm" for width, height in pixels))
     if differences:
         differ = "; ".join(differences)

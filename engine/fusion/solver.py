@@ -30,26 +30,26 @@ from mirrorskin.kernels.device import Device
 Mask = NDArray[np.bool_]
 
 _UNIFORM = np.sqrt(3.0)  # half the width of a uniform distribution, in its standard deviations
-_SHARPEST = 1e-5  # smallest standard deviation of a height, mm
-_NARROWEST, _WIDEST = 2.0, 8.0  # range of the standard deviation of windows for slopes of heights, pixels
+_MIN_SIGMA = 1e-5  # smallest standard deviation of a height, mm
+_MIN_WINDOW, _MAX_WINDOW = 2.0, 8.0  # pixels: standard deviation of windows for slopes of heights
 _NEAR = 3.0  # largest distance from a normal at which slopes of heights are used, in windows
-_LEVEL = 0.05  # smallest slope from which the width of terraces is computed
+_MIN_SLOPE = 0.05  # smallest slope from which the width of terraces is computed
 _FIRM = 30.0  # standard deviation of a press' height over that of the surface near normals
 _OFF = 4.0  # standard deviations from the heights around, above which a height is an outlier
-_ROUGH = 3.0  # mean squared misfit, in standard deviations, above which a surface is not smooth
+_MAX_MISFIT = 3.0  # mean squared misfit, in standard deviations, above which a surface is not smooth
 _OVERSTATED = 2.0  # ratio of errors of heights to their sigmas up to which the sigmas are not changed
 _SEVERAL = 6.0  # smallest range of heights, in half intervals, for uniformly distributed errors
 _NEARLY_ALL = 0.9  # quantile of the errors from which the used share of the intervals is estimated
-_LEAST_USED = 0.5  # smallest used share of the intervals
+_MIN_USED = 0.5  # smallest used share of the intervals
 _FIRST = 1e-4  # tolerance of the surfaces before the last; with 1e-5, errors are the same within 0.1 %
 _USUAL_MISFIT = 0.25  # median square misfit of slopes whose errors are as stated, in variances
-_FEWEST = 1000  # slopes that tell it
-_LEAST_MISFIT = 1.15  # ratio of the median to this from which on it is no chance
+_MIN_SLOPES = 1000  # slopes that determine this median
+_MIN_EXCESS = 1.15  # ratio of the median to the usual one from which on chance does not explain it
 _COMPARED = 1 << 16  # slopes whose misfit is computed
 _CORRECTIONS = 3  # largest number of corrections of the slopes
 _IMPROVED = 0.5  # share of the disagreement that a correction must leave at most
 _ITERATIONS = 5  # largest number of updates of the components' offsets
-_SETTLED = 1e-3  # change of an offset, in half intervals, that ends them
+_OFFSET_TOLERANCE = 1e-3  # change of an offset, in half intervals, that ends them
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class AbsoluteHeights:
         height, sigma = np.asarray(height, np.float64), np.asarray(sigma, np.float64)
         usable = mask & np.isfinite(height) & (sigma >= 0) & (sigma < np.inf)
         # Most pixels with a far smaller sigma than others have an unusual rise of the light.
-        lowest_sigma = max(float(np.median(sigma[usable])), _SHARPEST) if usable.any() else _SHARPEST
+        lowest_sigma = max(float(np.median(sigma[usable])), _MIN_SIGMA) if usable.any() else _MIN_SIGMA
         return cls(
             np.where(usable, height, np.nan), np.where(usable, np.maximum(sigma, lowest_sigma), np.nan)
         )
@@ -229,7 +229,7 @@ def _extend(
     if off.any():  # fit again without outliers
         weight[gaps] = np.where(off, 0.0, weight[gaps])
         trend = fit_paraboloids(height, weight, gaps, width)
-    smooth = trend.misfit < _ROUGH
+    smooth = trend.misfit < _MAX_MISFIT
     gaps[gaps] = smooth
     along = trend.along[:, smooth] / np.array([[pixel_size[0]], [-pixel_size[1]]])
     variance = trend.variance[:, smooth] * trend.pixels[smooth] / np.square(pixel_size)[:, np.newaxis]
@@ -242,8 +242,8 @@ def _extend(
 def _window(slopes: Slopes, sigma: float, pixel: float) -> float:
     """Return the width of windows, in pixels, that span a terrace at the median slope."""
     steepness = np.hypot(slopes.dz_dx[slopes.defined], slopes.dz_dy[slopes.defined])
-    terrace = 2 * _UNIFORM * sigma / (pixel * max(float(np.median(steepness)), _LEVEL))
-    return float(np.clip(terrace, _NARROWEST, _WIDEST))
+    terrace = 2 * _UNIFORM * sigma / (pixel * max(float(np.median(steepness)), _MIN_SLOPE))
+    return float(np.clip(terrace, _MIN_WINDOW, _MAX_WINDOW))
 
 
 def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> tuple[Doubles, Doubles]:
@@ -273,7 +273,7 @@ def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> t
         firm = np.bincount(label, inside.weight, size.size)
         move = np.bincount(label, inside.weight * (inside.height - at), size.size) / np.where(firm, firm, 1)
         lift += move
-        if np.max(np.abs(move)) < _SETTLED * float(np.median(half)):
+        if np.max(np.abs(move)) < _OFFSET_TOLERANCE * float(np.median(half)):
             break
     weight = np.nan_to_num(1 / (press.sigma**2 + spread.blur**2))
     weight[has_both[surface.component] & ~slopes.defined & (surface.component >= 0)] = 0.0
@@ -304,7 +304,7 @@ def _share_used(error: Doubles, half: Doubles, height: Doubles) -> float:
     if np.ptp(height) < _SEVERAL * float(np.median(half)):
         return 1.0
     used = np.quantile(np.abs(error) / half, _NEARLY_ALL) / _NEARLY_ALL
-    return float(np.clip(used, _LEAST_USED, 1.0))
+    return float(np.clip(used, _MIN_USED, 1.0))
 
 
 def _sizes(surface: Result) -> NDArray[np.intp]:
@@ -340,8 +340,8 @@ def _scatter(surface: NDArray[np.floating], slopes: Slopes, pixel_size: tuple[fl
             error = np.diff(height, axis=1) - (rise[:, 1:] + rise[:, :-1]) / 2
             misfits.append(error**2 / (variance * (1 / weight[:, 1:] + 1 / weight[:, :-1]) / 4))
     misfit = np.concatenate([values[np.isfinite(values)] for values in misfits])
-    ratio = float(np.median(misfit)) / _USUAL_MISFIT if misfit.size >= _FEWEST else 0.0
-    return float(np.sqrt(2 * ratio - 1)) if ratio > _LEAST_MISFIT else 1.0
+    ratio = float(np.median(misfit)) / _USUAL_MISFIT if misfit.size >= _MIN_SLOPES else 0.0
+    return float(np.sqrt(2 * ratio - 1)) if ratio > _MIN_EXCESS else 1.0
 
 
 def _add_error_of_averaging(surface: Result, footprint: float) -> Result:

@@ -17,16 +17,16 @@ from mirrorskin.kernels.array import Array, fetch
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.integration.links import KNOWN, SLOPE
 
-_USUAL = 40  # number of cycles after which coarse levels are replaced by a direct solver
+_USUAL_CYCLES = 40  # number of cycles after which coarse levels are replaced by a direct solver
 _CYCLES = 2  # number of cycles without a tolerance
 _DEEP = 3e-4  # tolerance below which two cycles are done before the first test: one from 0 does not reach it
 _DEEPEST = 1e-5  # tolerance below which three cycles are done first if a wait takes long
-_LONGEST = 100  # maximum number of cycles
+_MAX_CYCLES = 100  # maximum number of cycles
 _PATIENCE, _PROGRESS = 8, 0.7  # iterations in which the residual must decrease to this share of the minimum
 _SOONER = 0.75  # share of the expected cycles after which to test, because later cycles reduce more
 _UNTESTED = 6  # maximum number of cycles between tests of convergence
 _WORSE = 10  # residual above which rounding errors dominate, in minima so far
-_FAILED = 0.3  # residual above which two cycles count as failed
+_MAX_FAILED_RESIDUAL = 0.3  # residual above which two cycles count as failed
 _FACTORS = 8e-6  # maximum duration of a factorisation, seconds per node of the second level
 _ROUNDING = 1e-6  # residual of an exact solution, relative to the right side
 _FIRM = 1e-3  # minimum share of the energy that remains after subtracting that of known heights
@@ -79,7 +79,7 @@ class Multigrid:
         start: Array | None = None,
         *,
         tolerance: float | None = 1e-5,
-        limit: int = _LONGEST,
+        limit: int = _MAX_CYCLES,
         deadline: float | None = None,
     ) -> Solution:
         """Solve for the heights, starting from ``start``, (H, W), or from 0.
@@ -102,7 +102,7 @@ class Multigrid:
         iterations, residual = 0, np.zeros(sides)
         for batch, solver in self._batches(sides):
             solver.begin(sources, None, batch)
-            count, residuals = solver.solve(tolerance, _LONGEST, deadline)
+            count, residuals = solver.solve(tolerance, _MAX_CYCLES, deadline)
             solver.finish(height, batch)
             iterations, residual[batch] = max(iterations, count), residuals[: batch.stop - batch.start]
         return _solution(height, iterations, residual, tolerance)
@@ -183,7 +183,9 @@ class Multigrid:
 
 def _solution(height: Array, iterations: int, residual: Doubles, tolerance: float | None) -> Solution:
     worst = float(residual.max())
-    return Solution(height, iterations, worst, worst <= (_FAILED if tolerance is None else tolerance))
+    return Solution(
+        height, iterations, worst, worst <= (_MAX_FAILED_RESIDUAL if tolerance is None else tolerance)
+    )
 
 
 class ConjugateGradients:
@@ -204,7 +206,7 @@ class ConjugateGradients:
         # a cycle: product, length of the step, and the squared residual before it.
         names = "parts", "squares", "squares of right sides"
         self.parts, self._squares, self._sides = (h.array(name, count, lanes=lanes) for name in names)
-        self._history = h.device.array("history", (_LONGEST, 3, lanes), np.float32)
+        self._history = h.device.array("history", (_MAX_CYCLES, 3, lanes), np.float32)
         self._moving, self._active = h.device.array("moving", (lanes,), np.float32), np.zeros(lanes, bool)
         self._taken: int | None = None  # the cycle whose step is not yet added to the heights
         self._given: Doubles | None = None  # squared right sides
@@ -233,9 +235,9 @@ class ConjugateGradients:
 
     def solve(self, tolerance: float | None, limit: int, deadline: float | None) -> tuple[int, Doubles]:
         """Solve; return the number of cycles, and the residuals."""
-        enough = _FAILED if tolerance is None else tolerance
+        enough = _MAX_FAILED_RESIDUAL if tolerance is None else tolerance
         count, goal = (_CYCLES, 0.0) if tolerance is None else (limit, tolerance)
-        cycles, residual = self._iterate(goal, min(count, _USUAL), deadline)
+        cycles, residual = self._iterate(goal, min(count, _USUAL_CYCLES), deadline)
         ready = time.perf_counter() + _FACTORS * sum(level.nodes for level in self._h.levels[1:2])
         late = deadline is not None and ready > deadline
         assert self._given is not None

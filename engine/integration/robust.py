@@ -29,16 +29,17 @@ _BROKEN = 6.0
 """k r^2 (see ``mirrorskin.kernels.integration.breaks``) above which a link crosses a discontinuity."""
 
 _SCALES = 16.0, 8.0, 4.0, 2.0, 1.0  # tolerated misfits of a link, in 1 / sqrt(2 k)
-_MOST, _REST = 4, 0.02  # maximum number of steps at a scale; relative decrease of broken links to continue
+_MAX_STEPS = 4  # at a scale
+_MIN_DECREASE = 0.02  # relative decrease of broken links from which on steps continue
 _LOOSE = 0.001  # residual of a step's solution
 _CYCLES = 10  # maximum number of cycles of a step
 
-_GONE = 1e4  # k r^2 above which a link is cut for a step, because tiny weights cannot be solved
+_MAX_SQUARE = 1e4  # k r^2 above which a link is cut for a step, because tiny weights cannot be solved
 _AGAIN = 3  # largest number of additional solutions at the end
-_NOISE = 0.03  # smallest standard deviation of slopes
-_CLEAR = 3.0  # standard deviations of the curl's noise up to which there is no contradiction
+_MIN_NOISE = 0.03  # smallest standard deviation of slopes
+_CLEAR_Z_SCORE = 3.0  # standard deviations of the curl's noise up to which there is no contradiction
 _SLACK = 0.25  # share of the difference of slopes that is no misfit: a crease may be anywhere between pixels
-_LEAST = 1e-5  # smallest confidence, relative to a link's weight
+_MIN_TRUST = 1e-5  # smallest confidence, relative to a link's weight
 _SAMPLES = 1 << 16  # pixels from which the curl's noise is estimated
 _LOCAL, _WIDE = (1, 0.5, 2.0), (5, 0.1, 2.0)  # searches: reach of the curl's sums; factors of bend and tear
 
@@ -142,15 +143,15 @@ class _Search:
 
     def trust(self, reach: int, bend: float, tear: float) -> None:
         """Compute the initial confidence of the links, which does not depend on heights."""
-        maps, noise = self._maps, max(_NOISE, self._noise / math.sqrt(2))
+        maps, noise = self._maps, max(_MIN_NOISE, self._noise / math.sqrt(2))
         sums = self._curl
         for downwards, name in enumerate(("rise_x", "rise_y")):
             self._run("sum", values=sums, reach=reach, downwards=downwards, sums=maps[name])
             sums = maps[name]
-        limits = {"reach": reach, "noise": _CLEAR * self._noise, "wide": int(reach > 1)}
+        limits = {"reach": reach, "noise": _CLEAR_Z_SCORE * self._noise, "wide": int(reach > 1)}
         self._run("spread", curl=self._curl, sums=sums, **limits, tears=maps["tears"])
         outputs = {name: maps[name] for name in ("tears", "weight_x", "weight_y", "rise_x", "rise_y")}
-        numbers = {"noise": noise**2, "bend": bend, "tear": tear, "min_trust": _LEAST}
+        numbers = {"noise": noise**2, "bend": bend, "tear": tear, "min_trust": _MIN_TRUST}
         links = {"right": self._links.right, "down": self._links.down, **self._slopes}
         self._run("trust", **links, facing=self._facing, **numbers, **outputs)
 
@@ -165,11 +166,11 @@ class _Search:
             heights, scales = self._solve(None, _LOOSE).height, _SCALES
         for scale in scales:
             broken = math.inf
-            for _ in range(_MOST):
+            for _ in range(_MAX_STEPS):
                 if self.late():
                     return heights
                 before, broken = broken, self.link(heights, scale)
-                if broken > (1 - _REST) * before:
+                if broken > (1 - _MIN_DECREASE) * before:
                     break
                 heights = self._solve(heights, _LOOSE).height
         return heights
@@ -177,7 +178,11 @@ class _Search:
     def link(self, heights: Array, scale: float = 1.0, cap: float = math.inf) -> float:
         """Compute the weights of links from the misfit of heights; return the number of broken links."""
         names = "weight_x", "weight_y", "rise_x", "rise_y", "right", "down", "source"
-        numbers = {"sharpness": self._sharpness / scale**2, "max_square": min(cap, _GONE), "slack": _SLACK}
+        numbers = {
+            "sharpness": self._sharpness / scale**2,
+            "max_square": min(cap, _MAX_SQUARE),
+            "slack": _SLACK,
+        }
         maps = {**{name: self._maps[name] for name in names}, **self._slopes}
         maps |= {"held": self._held, "heights": heights, "sums": self._sums}
         self._run("links", **maps, **self._size, **numbers)
@@ -280,7 +285,7 @@ class _Search:
         largest, step = float(sizes.max()), max(1, sizes.size // _SAMPLES)
         samples = sizes.ravel()[::step][(flags & (RIGHT | DOWN) == RIGHT | DOWN).ravel()[::step]]
         noise = mad_sigma(samples)
-        self.contradicted = largest > _CLEAR * noise
+        self.contradicted = largest > _CLEAR_Z_SCORE * noise
         return curl, noise
 
     def _array(self, name: str, shape: tuple[int, ...]) -> Array:

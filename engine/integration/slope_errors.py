@@ -18,9 +18,9 @@ from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _SIDES = 8, 16  # of the loops whose curl is compared with that of single corners, pixels
 _CROP = 128  # largest side of the part of a picture that is examined, pixels
-_FEWEST = 6  # loops that do not overlap, below which a correlation is not estimated
+_MIN_LOOPS = 6  # loops that do not overlap, below which a correlation is not estimated
 _CHANCE = 4.0  # ratio of an estimated variance to the true one, up to which chance explains it
-_CLEAR = 5.0  # standard errors of the ratio of curls above which slopes count as correlated
+_CLEAR_Z_SCORE = 5.0  # standard errors of the ratio of curls above which slopes count as correlated
 
 
 def correlation_of(inputs: Inputs, length: float | None) -> tuple[float, dict[str, ProcessValue]]:
@@ -87,11 +87,11 @@ def find_correlation(inputs: Inputs) -> float:
     for side in _SIDES:
         curls = _curls(rises, gaps, side)
         loops = curls.size * (_step(side) / side) ** 2
-        if loops < _FEWEST or not corner:
+        if loops < _MIN_LOOPS or not corner:
             break
         increase = (mad_sigma(curls) / corner) ** 2
         ratio = increase * 2 / (4 * side - 2)
-        if increase <= _CHANCE * side**4 and ratio > 1 + _CLEAR * math.sqrt(3 / loops):
+        if increase <= _CHANCE * side**4 and ratio > 1 + _CLEAR_Z_SCORE * math.sqrt(3 / loops):
             longest = max(longest, (2 * ratio / math.sqrt(math.pi)) ** (1 / 3))
     return longest
 

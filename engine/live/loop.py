@@ -25,7 +25,7 @@ Mark = Callable[[int, NDArray[np.bool_]], None]
 
 _INTERVALS = 32  # number of frames from which the frame rate is estimated
 _PATIENCE = 0.01  # seconds: least time that an update waits for slow maps
-_MARGIN = 0.001  # seconds before the next expected frame in which no work is started
+_IDLE_MARGIN = 0.001  # seconds before the next expected frame in which no work is started
 
 
 class Loop:
@@ -156,4 +156,4 @@ class Loop:
         if len(self._times) < 2:
             return 0.0
         interval = (self._times[-1] - self._times[0]) / (len(self._times) - 1)
-        return self._times[-1] + interval - _MARGIN - self._source.now()
+        return self._times[-1] + interval - _IDLE_MARGIN - self._source.now()

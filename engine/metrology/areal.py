@@ -19,7 +19,7 @@ _PEAK, _DALE = 0.1, 0.8  # material ratios p and q of the volume parameters
 _DECAY = 0.2  # of the autocorrelation, at Sal
 _DIRECTIONS = 90  # in which the autocorrelation is followed
 _STEP = 0.5  # pixels along a direction
-_OVERLAP = 0.1  # smallest share of pixels that overlap at a lag that counts
+_MIN_OVERLAP = 0.1  # smallest share of pixels that overlap at a lag that counts
 _ANGLE_SPREAD = 2  # degrees: standard deviation of the window over the angular spectrum
 
 
@@ -132,7 +132,7 @@ class Autocorrelation:
         self._known, self._size = measured, pixel_size
         self._shape = tuple(fft.next_fast_len(2 * count, real=True) for count in measured.shape)
         pairs = self._correlate(measured.astype(np.float64))
-        self._counted = pairs > _OVERLAP * np.count_nonzero(measured)
+        self._counted = pairs > _MIN_OVERLAP * np.count_nonzero(measured)
         self._pairs = np.maximum(pairs, 1.0)
 
     def _correlate(self, values: Doubles) -> Doubles:

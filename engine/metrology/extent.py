@@ -18,7 +18,7 @@ from mirrorskin.kernels.array_types import Doubles
 Mask = NDArray[np.bool_]
 
 _REACH = 3  # pixels on either side of the highest one to which a paraboloid is fitted
-_ENOUGH = 20  # of these 49 pixels that must have a height
+_MIN_PIXELS = 20  # of these 49 pixels that must have a height
 _NEAR = 3.0  # standard deviations above the lowest pixel, up to which others count as candidates
 _UNIFORM = 1 / math.sqrt(3)  # standard deviation of a uniform distribution between -1 and 1
 
@@ -139,7 +139,7 @@ def _highest(patch: Patch) -> Quantity:
 
 def _top(x: NDArray[np.intp], y: NDArray[np.intp], z: Doubles) -> tuple[float, float] | None:
     """Return the top of a paraboloid fitted to pixels, and the RMS residual; None if it has no top."""
-    if z.size < _ENOUGH:
+    if z.size < _MIN_PIXELS:
         return None
     rows = np.stack([np.ones(z.size), x, y, x * x, x * y, y * y]).astype(np.float64)
     c, *_ = np.linalg.lstsq(rows.T, z, rcond=None)

@@ -34,7 +34,7 @@ _SINGULAR = 1e-14  # minimum eigenvalue of normal equations with columns of leng
 _FAR = 5.0  # standard deviations, estimated from the median distance, beyond which points are outliers
 _FEW = 0.15  # maximum share of outliers or uncertain points; if there are more, they belong to the surface
 _PASSES = 5  # maximum number of updates of the outliers
-_ENOUGH = 65536  # number of points for the first fit
+_FIRST_POINTS = 65536  # number of points for the first fit
 _CHUNK = 16384  # points per block, whose derivatives fit into the processor's cache
 _NOTHING = 1e-300  # avoids a division by 0
 _ROUNDING = 1e-9  # relative to the points' extent: smaller distances count as 0; also for squared lengths
@@ -116,7 +116,9 @@ class PointCloud:
         points, sigma = self.points, self.sigma
         weight = _weights(sigma)
         rounding = _ROUNDING * float(np.ptp(points, axis=1).max())
-        step = max(1, weight.size // _ENOUGH)  # the first fit takes most steps, with a subset of the points
+        step = max(
+            1, weight.size // _FIRST_POINTS
+        )  # the first fit takes most steps, with a subset of the points
         first = _fit_robustly(form, points[:, ::step], weight[::step], form.start(), rounding)
         final = None if first is None else _fit_without_outliers(form, points, weight, first, rounding)
         if final is None:

@@ -30,7 +30,7 @@ from mirrorskin.kernels.array_types import Doubles
 FormName = Literal["plane", "sphere", "none"]
 
 _MUCH_BETTER = 0.5  # ratio of the residuals of sphere and plane below which the sphere is chosen
-_CLEAR = 2.0  # smallest step that is reported, in standard uncertainties
+_CLEAR_Z_SCORE = 2.0  # smallest step that is reported, in standard uncertainties
 # Power of the pixel size that a quantity is proportional to, by unit or name. The radius of a shallow cap is
 # proportional to the square of its width, and its centre is a radius away from its top.
 _POWERS = {"mm2": 2, "mm3": 2, "sphere radius": 2}
@@ -340,7 +340,7 @@ def _section(result: Result, ends: tuple[Point, Point], notes: list[str]) -> dic
         )
     with suppress(InputError):
         step = step_height(profile)
-        if abs(step.height.value) > _CLEAR * step.height.sigma:
+        if abs(step.height.value) > _CLEAR_Z_SCORE * step.height.sigma:
             return quantities | {
                 "step height": step.height,
                 "step at": step.place,

@@ -17,7 +17,7 @@ from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
 
-_MARGIN = 4.0  # correlation lengths between the map and its periodic continuation
+_PERIODIC_MARGIN = 4.0  # correlation lengths between the map and its periodic continuation
 _LARGEST = 2  # times the size of the map: the periodic picture where the correlation is longer
 _SEED = 20  # realisations are the same in each call
 
@@ -53,7 +53,10 @@ def _gain(
     from scipy import fft
 
     sizes = pixel_size[::-1]
-    margin = [min(_MARGIN * length / size, (_LARGEST - 1) * n) for n, size in zip(shape, sizes, strict=True)]
+    margin = [
+        min(_PERIODIC_MARGIN * length / size, (_LARGEST - 1) * n)
+        for n, size in zip(shape, sizes, strict=True)
+    ]
     rows, columns = (
         fft.next_fast_len(math.ceil(n + more), real=True) for n, more in zip(shape, margin, strict=True)
     )

@@ -20,7 +20,7 @@ from mirrorskin.kernels.array_types import Doubles
 Mask = NDArray[np.bool_]
 
 _MICROMETRES = 1e3  # per mm
-_LEAST = 8  # smallest number of samples of a profile
+_MIN_SAMPLES = 8  # smallest number of samples of a profile
 _DISCRIMINATION = 0.1  # share of Rz that a peak or a pit must exceed to be one
 
 
@@ -38,8 +38,8 @@ class _Profile:
         """Prepare the filter; InputError if fewer than eight samples are left."""
         long = None if l_filter is None else Gaussian.of(measured, (step,), l_filter)
         kept = measured if long is None else long.covered
-        if np.count_nonzero(kept) < _LEAST:
-            raise InputError(f"a profile needs at least {_LEAST} measured samples")
+        if np.count_nonzero(kept) < _MIN_SAMPLES:
+            raise InputError(f"a profile needs at least {_MIN_SAMPLES} measured samples")
         count = 1 if l_filter is None else max(int(np.count_nonzero(kept) * step / l_filter), 1)
         return cls(kept, step, long, count)
 

@@ -25,7 +25,7 @@ Point = tuple[float, float]
 _ROUNDING = 1e-6  # share of a pixel that is neglected
 _LEVEL = 0.01  # share of the range of heights within which points are as high as the highest one
 _WINDOW = 3  # pixels per side of the median filter that removes spikes
-_LEAST = 4  # smallest number of samples on either side of a step
+_MIN_SAMPLES = 4  # smallest number of samples on either side of a step
 _LEFT_OUT = 1 / 3  # share of either side that is ignored next to the step, which may be rounded or a ramp
 
 
@@ -262,9 +262,9 @@ def step_height(section: Section) -> StepHeight:
     """
     measured = _measured(section)
     distance, height = section.distance[measured], section.height[measured]
-    if distance.size < 2 * _LEAST:
+    if distance.size < 2 * _MIN_SAMPLES:
         raise InputError(
-            f"a step needs at least {2 * _LEAST} measured samples along the section: cut elsewhere"
+            f"a step needs at least {2 * _MIN_SAMPLES} measured samples along the section: cut elsewhere"
         )
     split = _split(distance, height)
     place = (distance[split - 1] + distance[split]) / 2
@@ -306,7 +306,7 @@ def _split(distance: Doubles, height: Doubles) -> int:
     tail_sum = np.cumsum(x[::-1])[::-1]
     length = after * (count - after) / count - tail_sum**2
     gain = np.cumsum(residual[::-1])[::-1] ** 2 / np.where(length > 0, length, np.inf)
-    return _LEAST + int(np.argmax(gain[_LEAST : count - _LEAST + 1]))
+    return _MIN_SAMPLES + int(np.argmax(gain[_MIN_SAMPLES : count - _MIN_SAMPLES + 1]))
 
 
 def _lines(x: Doubles, z: Doubles) -> tuple[Doubles, Doubles, float]:

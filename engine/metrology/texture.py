@@ -34,7 +34,7 @@ EDGES, FORM, DIRECTION = "filter edges", "form", "no direction"
 DRAWS = 24
 """Realisations of the noise; half as many for maps with many pixels."""
 
-_MANY = 500_000  # pixels
+_MAX_DRAWN_PIXELS = 500_000  # pixels
 _CORRELATED = 8  # realisations from which the autocorrelation of the noise is computed
 _UNIFORM = 1 / math.sqrt(3)  # standard deviation of a uniform distribution between -1 and 1
 _LEVEL = 0.1  # relative uncertainty of standard deviations, whose squares are right within a fifth
@@ -272,7 +272,7 @@ def _noise_changes(
     noise: tuple[Doubles, tuple[float, float], float],
 ) -> NoiseChanges:
     """Return how noise, of given sigma, pixel size and length, changes the parameters."""
-    count = DRAWS if np.count_nonzero(chain.kept) <= _MANY else DRAWS // 2
+    count = DRAWS if np.count_nonzero(chain.kept) <= _MAX_DRAWN_PIXELS else DRAWS // 2
     correlation = evaluate.correlation
     total = np.zeros(1)
 

@@ -26,17 +26,17 @@ FEWEST_SHARED = 20
 
 _UPPER = np.zeros((6, 6), np.intp)  # index of each element of a symmetric matrix in the upper triangle
 _UPPER[np.triu_indices(6)] = _UPPER.T[np.triu_indices(6)] = np.arange(21)
-_FLOOR = 1e-5  # share of the mean information that is added to all directions, for rounding errors
+_MIN_INFORMATION = 1e-5  # share of the mean information that is added to all directions, for rounding errors
 _LIKELY = 0.5, 0.02  # noise assumed by `Equations.free` during steps, near the solution and far from it
-_AWAY = 3.0  # chi square above which a motion is far from the solution
+_MAX_CHI2 = 3.0  # chi square above which a motion is far from the solution
 _COARSEST = 24  # pixels along the shorter side of the coarsest maps
-_STEPS, _STILL = 40, 1e-2  # maximum number of steps; step, in standard deviations, that ends them
+_MAX_STEPS, _LAST_STEP = 40, 1e-2  # maximum number of steps; step, in standard deviations, that ends them
 _BLOCKS = 100  # weight, in blocks, of the covariance of independent errors
 _POOR = 2.0  # typical chi square above which other starts are tried
 _ANGLES, _SHIFTS, _TRIED = 24, 13, 6  # starts of the search: rotations, shifts per axis, and number refined
-_REACH, _SHARED = 0.8, 0.2  # maximum shift relative to the map's extent; minimum share of common pixels
+_REACH, _MIN_COMMON = 0.8, 0.2  # maximum shift relative to the map's extent; minimum share of common pixels
 _NONE = np.zeros((6, 0))
-_LONGEST = 0.35  # longest step, relative to the object's size
+_MAX_STEP = 0.35  # longest step, relative to the object's size
 
 
 class Equations:
@@ -80,7 +80,7 @@ class Equations:
         information is spurious; the limit is lower if the fit is worse than predicted by the standard
         deviations.
         """
-        full = self.normal_matrix + _FLOOR * np.trace(self.normal_matrix) / 6 * np.eye(6)
+        full = self.normal_matrix + _MIN_INFORMATION * np.trace(self.normal_matrix) / 6 * np.eye(6)
         eigenvalues, directions = eigh((self.unbiased + self.unbiased.T) / 2, full)
         noise = noise or max(self.chi_square, 1.0)
         return np.linalg.qr(directions[:, eigenvalues < noise / (1 + noise)])[0]
@@ -219,9 +219,14 @@ class PairFit:
         for starts in self._starts():
             sums = self._sums(starts).sum(axis=1, dtype=np.float64)
             upper, right, chi, compared, heights, normals = _split(sums)
-            overlap = np.maximum(heights, normals)[:, 0] > _SHARED * self.first.extent.pixels
+            overlap = np.maximum(heights, normals)[:, 0] > _MIN_COMMON * self.first.extent.pixels
             matrix, slope = _symmetric(upper[overlap], scale), right[overlap] * scale
-            matrix += _FLOOR * np.trace(matrix, axis1=1, axis2=2)[:, np.newaxis, np.newaxis] / 6 * np.eye(6)
+            matrix += (
+                _MIN_INFORMATION
+                * np.trace(matrix, axis1=1, axis2=2)[:, np.newaxis, np.newaxis]
+                / 6
+                * np.eye(6)
+            )
             gain = np.vecdot(slope, np.linalg.solve(matrix, slope[..., np.newaxis])[..., 0])
             merit = (chi[overlap, 0] - gain) / np.maximum(compared[overlap, 0], 1e-9)
             candidates += zip(merit, itertools.compress(starts, overlap), strict=True)
@@ -231,7 +236,7 @@ class PairFit:
             motion = self.refine(start)
             if motion is not None:
                 now = self.equations(motion)
-                if now.pixels > _SHARED * self.first.extent.pixels and now.typical < lowest:
+                if now.pixels > _MIN_COMMON * self.first.extent.pixels and now.typical < lowest:
                     best, lowest = motion, now.typical
         return best
 
@@ -247,24 +252,24 @@ class PairFit:
 
     def refine(self, motion: Motion, free: Doubles = _NONE) -> Motion | None:
         """Refine a motion until steps outside of the free directions are small; None without overlap."""
-        for _ in range(_STEPS):
+        for _ in range(_MAX_STEPS):
             now = self.equations(motion, unbiased=not free.size)
             if now.pixels < FEWEST_SHARED:
                 return None
-            directions = complement(free if free.size else now.free(_LIKELY[now.chi_square > _AWAY]))
+            directions = complement(free if free.size else now.free(_LIKELY[now.chi_square > _MAX_CHI2]))
             if not directions.size:
                 break
             motion, moved = self.step(motion, now, directions)
-            if moved < _STILL:
+            if moved < _LAST_STEP:
                 break
         return motion
 
     def step(self, motion: Motion, now: Equations, directions: Doubles) -> tuple[Motion, float]:
         """Return the motion after a Gauss-Newton step in given directions, and its length in sigmas."""
         matrix = directions.T @ now.normal_matrix @ directions
-        matrix += _FLOOR / 10 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
+        matrix += _MIN_INFORMATION / 10 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
         step = -directions @ np.linalg.solve(matrix, directions.T @ now.right)
-        step /= max(float(np.linalg.norm(step)) / (_LONGEST * self.second.extent.size), 1.0)
+        step /= max(float(np.linalg.norm(step)) / (_MAX_STEP * self.second.extent.size), 1.0)
         sigmas = math.sqrt(step @ now.normal_matrix @ step / max(now.chi_square, 1.0))
         return motion.small_step(step * _scale_of(self.second.extent.size), self.second.extent.middle), sigmas
 

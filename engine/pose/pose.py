@@ -18,8 +18,8 @@ from mirrorskin.io.base.findings import findings_of
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 
-_SHARE = 1e-3  # component of an undetermined direction above which the parameter is undetermined
-_ALIKE = 0.01  # directions that differ by less are equal
+_MAX_UNDETERMINED = 1e-3  # component of an undetermined direction above which the parameter is undetermined
+_EQUAL_TOLERANCE = 0.01  # directions that differ by less are equal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +61,7 @@ class Pose:
     @property
     def sigma(self) -> Doubles:
         """Standard deviations of the six parts, (6,); infinite for undetermined directions."""
-        free = (np.abs(self.undetermined) > _SHARE).any(axis=0)
+        free = (np.abs(self.undetermined) > _MAX_UNDETERMINED).any(axis=0)
         return np.where(free, np.inf, np.sqrt(np.diag(self.covariance)))
 
     def apply(self, points: ArrayLike) -> Doubles:
@@ -90,7 +90,7 @@ class Pose:
         """Return another motion with its errors, and orthonormal undetermined directions."""
         directions, sizes, _ = np.linalg.svd(free.T, full_matrices=False)
         vector = np.asarray(Rotation.from_matrix(motion.turn).as_rotvec(), np.float64)
-        kept = directions[:, sizes > _ALIKE]
+        kept = directions[:, sizes > _EQUAL_TOLERANCE]
         others = np.eye(6) - kept @ kept.T
         return replace(
             self,

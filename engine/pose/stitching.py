@@ -26,11 +26,11 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.skin.pose_maps import SHARPEST
 
-_SHARED = 0.2  # smallest share of the smaller map's pixels that two touches must have in common
-_ALIKE = 4.0  # largest chi square of a link between two touches
-_ROUNDS, _NEWTON = 5, 8  # steps for the poses, and for a height along z
+_MIN_COMMON = 0.2  # smallest share of the smaller map's pixels that two touches must have in common
+_MAX_CHI2 = 4.0  # largest chi square of a link between two touches
+_POSE_ITERATIONS, _NEWTON_STEPS = 5, 8  # steps for the poses, and for a height along z
 _LEVELLINGS = 3  # iterations for a touch of unknown offset, because positions of pixels depend on the height
-_APART = 4.0  # sigmas between a touch and the mean above which they disagree
+_DISAGREEMENT_Z_SCORE = 4.0  # sigmas between a touch and the mean above which they disagree
 _LARGEST = 1 << 28  # largest number of pixels of the stitched surface
 _UNFIT = 1e-9  # smallest information of a direction, relative to the largest
 
@@ -164,7 +164,7 @@ class _Graph:
         """Link two touches if they overlap at their current poses, and agree there."""
         start = self._motions[first].inverse().then(self._motions[second])
         fit = PairFit(self._maps[first], self._maps[second], self._device)
-        if fit.equations(start).pixels < _SHARED * self._smaller(first, second):
+        if fit.equations(start).pixels < _MIN_COMMON * self._smaller(first, second):
             return
         try:
             pose = pose_of(fit, *fit.solve(start, near=True))
@@ -177,12 +177,12 @@ class _Graph:
         return min(self._maps[number].extent.pixels for number in numbers)
 
     def _is_link(self, pose: Pose, first: int, second: int) -> bool:
-        return pose.chi_square < _ALIKE and pose.pixels >= _SHARED * self._smaller(first, second)
+        return pose.chi_square < _MAX_CHI2 and pose.pixels >= _MIN_COMMON * self._smaller(first, second)
 
     def solve(self) -> list[Pose]:
         """Return the motion from the first touch to each, by least squares over all links."""
         count, motions = 6 * (len(self._maps) - 1), self._motions
-        for _ in range(_ROUNDS):
+        for _ in range(_POSE_ITERATIONS):
             normal, gradient = np.zeros((count, count)), np.zeros(count)
             for (first, second), link in self.links.items():
                 between = motions[first].inverse().then(motions[second])
@@ -294,7 +294,7 @@ class _Moved:
         level, middle, of_level = 0.0, np.zeros(6), 0.0
         for _ in range(1 if before is None else _LEVELLINGS):
             motion = Motion(motion.turn, motion.shift - [0.0, 0.0, level * motion.turn[2, 2]])
-            for _ in range(_NEWTON):
+            for _ in range(_NEWTON_STEPS):
                 place = motion.apply(np.stack([across, up, above], axis=-1))
                 points = SamplePoints.at(
                     (place[:, 0] - x0) / step_x, (y0 - place[:, 1]) / step_y, height.shape
@@ -404,7 +404,7 @@ class _Sums:
             apart = np.fmax(apart, off**2 / np.where(np.isfinite(moved.variance), moved.variance, 1.0))
             spread += np.where(np.isfinite(moved.variance), off**2 / moved.variance, 0.0)
         covered = self._weight > 0
-        differs = covered & (apart > _APART**2)
+        differs = covered & (apart > _DISAGREEMENT_Z_SCORE**2)
         with np.errstate(invalid="ignore", divide="ignore"):
             sigma = np.where(differs, np.maximum(sigma, np.sqrt(spread / self._weight)), sigma)
         status = np.where(

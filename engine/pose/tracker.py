@@ -18,8 +18,9 @@ from mirrorskin.io.base.threads import ThreadSafe
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 
-_SHARED = 0.6  # share of the key's pixels below which the next result becomes the key
-_COARSE, _STEPS, _STILL = 4, 8, 0.3  # pixel step of the coarse fit; maximum steps, and the last one (sigmas)
+_MIN_COMMON = 0.6  # share of the key's pixels below which the next result becomes the key
+_COARSE_STRIDE = 4  # pixel step of the coarse fit
+_MAX_STEPS, _LAST_STEP = 8, 0.3  # maximum number of steps; size of the step that ends them, sigmas
 _LOST = 3.0  # times the key's first chi square, above which the motion is searched again
 
 
@@ -96,13 +97,13 @@ class PoseTracker(ThreadSafe):
             return self._first_after_key(result)
         fit = PairFit(self._map(result, curved=False), self._key, self._device)
         directions, motion = complement(self._free), self._last.then(self._back)
-        for step in (_COARSE, 1):
-            for _ in range(_STEPS):
+        for step in (_COARSE_STRIDE, 1):
+            for _ in range(_MAX_STEPS):
                 now = fit.equations(motion, step=step)
                 if now.pixels < FEWEST_SHARED:
                     return self._search(result)
                 motion, moved = fit.step(motion, now, directions)
-                if moved < _STILL:
+                if moved < _LAST_STEP:
                     break
         if now.chi_square > self._worst:
             return self._search(result)
@@ -116,7 +117,7 @@ class PoseTracker(ThreadSafe):
         assert self._key is not None
         fit = PairFit(self._map(result), self._key, self._device)
         motion, now, self._free = fit.solve(self._last.then(self._back), near=True)
-        self._fewest, self._worst = _SHARED * now.pixels, _LOST * max(now.chi_square, 1.0)
+        self._fewest, self._worst = _MIN_COMMON * now.pixels, _LOST * max(now.chi_square, 1.0)
         return self._moved_to(motion, pose_of(fit, motion, now, self._free))
 
     def _search(self, result: Result) -> Pose:

@@ -15,9 +15,9 @@ from mirrorskin.kernels.array_types import Doubles
 Mask = NDArray[np.bool_]
 
 _CELLS = 32  # along each side of the lit area, if it were square
-_AROUND = 2  # cells around the lit area
-_MARGIN = 6  # cells outside the picture, where the object reaches its border
-_SHARE = 0.5  # minimum share of a cell's pixels with a height
+_LIT_MARGIN = 2  # cells around the lit area
+_OUTER_CELLS = 6  # cells outside the picture, where the object reaches its border
+_MIN_COVERAGE = 0.5  # minimum share of a cell's pixels with a height
 _SMALL = 4  # cells: gaps up to this size belong to the surface
 
 
@@ -36,7 +36,7 @@ class Cells:
         finite = np.isfinite(blocks)
         count = finite.sum(axis=(1, 3))
         sums = np.where(finite, blocks, 0.0).sum(axis=(1, 3))
-        enough = count >= max(1.0, _SHARE * self.block[0] * self.block[1])
+        enough = count >= max(1.0, _MIN_COVERAGE * self.block[0] * self.block[1])
         return self._with_margin(np.where(enough, sums / np.maximum(count, 1), np.nan))
 
     def share(self, mask: Mask) -> Doubles:
@@ -97,10 +97,10 @@ def split_into_cells(lit: Mask, pixel_size: tuple[float, float]) -> Cells:
     axes = []
     for (first, last), step, size in zip(ends, spacing, lit.shape, strict=True):
         block = max(1, round(cell / step))
-        start = max(0, first - _AROUND * block)
-        count = math.ceil((min(size, last + 1 + _AROUND * block) - start) / block)
-        before = _MARGIN if first == 0 else 0
-        after = _MARGIN if last == size - 1 else 0
+        start = max(0, first - _LIT_MARGIN * block)
+        count = math.ceil((min(size, last + 1 + _LIT_MARGIN * block) - start) / block)
+        before = _OUTER_CELLS if first == 0 else 0
+        after = _OUTER_CELLS if last == size - 1 else 0
         axes.append((slice(int(start), int(start + count * block)), block, before, count + before + after))
     rows, columns = axes
     return Cells(*zip(rows, columns, strict=True))

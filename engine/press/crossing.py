@@ -35,12 +35,12 @@ Event = Literal["onset", "release"]
 STATUS: Mapping[str, Map] = {"onset": status_of(PressStatus), "release": status_of(ReleaseStatus)}
 """Declaration of the status map of each event."""
 
-_PLATEAU = 3.0  # standard deviations: tolerance of a sample that belongs to a dark or light plateau
-_CLEARLY_DARK = 6.0  # standard deviations below the threshold: a sample whose plateau is not near it
+_PLATEAU_Z_SCORE = 3.0  # standard deviations: tolerance of a sample that belongs to a dark or light plateau
+_DARK_Z_SCORE = 6.0  # standard deviations below the threshold: a sample whose plateau is not near it
 _ROUNDING = 1e-12  # tolerance of a threshold such as 0.55, which has no exact binary value
 _TILE = 4096  # pixels of a work-item on a CPU; 0.8 times the run time of 1024 for long rows
-_MISLED = 1.6  # ratio of two estimates of the noise that chance, or shot noise, hardly explains
-_LONGEST = 2**30  # frames: limit of `hold`, so that sums of frame numbers do not overflow
+_MAX_NOISE_RATIO = 1.6  # ratio of two estimates of the noise that chance, or shot noise, hardly explains
+_MAX_HOLD = 2**30  # frames: limit of `hold`, so that sums of frame numbers do not overflow
 
 
 class PressOperation(Operation):
@@ -127,7 +127,7 @@ class PressOperation(Operation):
             return None
         values = samples.values
         noise = estimate_noise_of_all(values.reshape(len(values), -1))
-        if not noise or used / _MISLED <= noise <= used * _MISLED or math.isnan(noise):
+        if not noise or used / _MAX_NOISE_RATIO <= noise <= used * _MAX_NOISE_RATIO or math.isnan(noise):
             return None
         return self.with_options(noise=noise)
 
@@ -176,7 +176,7 @@ class Crossing:
         event: Event = "onset",
     ) -> None:
         self._release, self._subframe = event == "release", operation.subframe
-        self._hold = min(operation.hold, _LONGEST)
+        self._hold = min(operation.hold, _MAX_HOLD)
         self._noise = Noise(operation.noise, dtype.kind == "u")
         self.travel: NDArray[np.float64] = np.empty(0)  # of the frames so far, (T,), mm
         self._travel_table = np.zeros((3, 64), np.float32)  # travel; the step to it; since the first frame
@@ -217,8 +217,8 @@ class Crossing:
         if self._subframe:
             self._set_plateaus(frames[0] if first == 0 else None)
         noise = self._noise.value or 0.0  # not needed for a single frame, which is assumed to be dark
-        light = _PLATEAU * np.sqrt(2) * noise  # the plateau is a sample itself
-        dark = light if self._dark_from_frames else _PLATEAU * noise
+        light = _PLATEAU_Z_SCORE * np.sqrt(2) * noise  # the plateau is a sample itself
+        dark = light if self._dark_from_frames else _PLATEAU_Z_SCORE * noise
         arguments: dict[str, Any] = {"noise": noise, "dark_tolerance": dark, "light_tolerance": light}
         arguments |= {"hold": self._hold, "release": self._release, "subframe": self._subframe}
         arguments["threshold"] = self._threshold  # as a share of the way from the plateau before the event
@@ -234,7 +234,7 @@ class Crossing:
             self._maps.fill("levels", complement(plateau) if self._release else plateau, plane=1)
         noise = self._noise.value
         if noise is not None and noise != self._marked_noise:
-            self._maps.run("onset_sure", tolerance=_CLEARLY_DARK * noise)
+            self._maps.run("onset_sure", tolerance=_DARK_Z_SCORE * noise)
 
     def event_maps(self, on_host: bool = True) -> EventMaps:
         """Return the maps of the frames so far, on the device if frames are, unless ``on_host``."""

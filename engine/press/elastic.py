@@ -35,14 +35,14 @@ Mask = NDArray[np.bool_]
 LEARNED_AT = 0.5
 """Threshold at which gels are calibrated, as a share of the range from dark to bright."""
 
-_FEWEST = 12  # minimum number of cells that turned light
+_MIN_CELLS = 12  # minimum number of cells that turned light
 _SAMPLED = 250  # cells whose onsets are fitted; the splines have too few coefficients to need more
 _TRAVELS = 16  # travels at which the press is simulated
 _BENDING = 1.0  # expected third derivatives of the surface, 1/mm^2
 # Stages of the fit, which is stiff at first: bending, number of steps, relative decrease of the cost.
 _STAGES = (0.1, 1, 0.0), (0.1, 1, 0.0), (0.3, 1, 0.0), (_BENDING, 1, 0.0), (_BENDING, 10, 0.1)
-_RELAXED, _STUCK = 3.0, 1e3  # divisor of the damping from step to step, and its limit; see `_STEP`
-_STEP = 0.3  # mm: largest change of the surface in a step
+_RELAXED, _STUCK = 3.0, 1e3  # divisor of the damping from step to step, and its limit; see `_MAX_CHANGE`
+_MAX_CHANGE = 0.3  # mm: largest change of the surface in a step
 _SLOPE_ERROR = 0.006  # standard deviation of the sheet's slope at the resolution of cells
 _LOSS = least_squares.huber(2.0)  # of slopes, in units of `_SLOPE_ERROR`
 _MISFIT = 0.08  # largest median slope residual of an accepted fit
@@ -50,9 +50,9 @@ _DEPTH = (
     0.6  # initial depth over that of eq. 3; the exact ratio is 0.5 for a paraboloid, more for steeper tips
 )
 _INITIAL_ERROR = 0.01  # mm: standard deviation of heights in `_interpolate`
-_BEYOND = 0.3  # largest share of the contact outside the picture, where the object is extrapolated
+_MAX_OUTSIDE = 0.3  # largest share of the contact outside the picture, where the object is extrapolated
 _SHARE_LEFT = 0.02  # standard deviation of a correction over the correction, from the size of cells
-_FARTHEST = 0.05  # mm: largest standard deviation of heights that are kept outside the contact
+_MAX_OUTER_SIGMA = 0.05  # mm: largest standard deviation of heights that are kept outside the contact
 _RIDGE = 1e-12  # relative
 
 
@@ -175,14 +175,14 @@ def fit_press(
     surface = _fit_surface(scene, _initial_surface(scene))
     factors, fit, form = surface.parameters, surface.slopes, surface.equations()[0]
     here, everywhere = (int(np.sum(part)) for part in (scene.cells.inside(fit.contact), fit.contact))
-    if everywhere - here > _BEYOND * everywhere:
+    if everywhere - here > _MAX_OUTSIDE * everywhere:
         raise NotConverged("much of the contact is outside the picture")
     change = np.zeros(heights.shape)
     change[scene.cells.box] = scene.splines.at(factors - smooth, *scene.cells.places(heights.shape))
     variance = _on_pixels(scene, heights.shape, _variances(scene, fit, form))
     contact = _on_pixels(scene, heights.shape, fit.contact.astype(np.float64)) >= 0.5
     variance = variance + (_SHARE_LEFT * change) ** 2 + gel.error**2
-    usable = np.isfinite(heights) & (contact | (variance <= _FARTHEST**2))
+    usable = np.isfinite(heights) & (contact | (variance <= _MAX_OUTER_SIGMA**2))
     heights = np.where(usable, heights + change, np.nan)
     sigmas = np.where(usable, np.sqrt(sigmas**2 + variance), np.nan)
     return PressFit(heights.astype(np.float32), sigmas.astype(np.float32), scene, factors, fit, form)
@@ -252,9 +252,10 @@ def _scene_of(
     cells = split_into_cells(lit, size)
     means = cells.means(heights)
     onsets = -means[np.isfinite(means)]
-    if len(onsets) < _FEWEST:
+    if len(onsets) < _MIN_CELLS:
         raise NotConverged(
-            f"{len(onsets)} cells of the picture turned light, too little for a surface: {_FEWEST} are needed"
+            f"{len(onsets)} cells of the picture turned light, too little for a surface:"
+            f" {_MIN_CELLS} are needed"
         )
     dark = cells.share(status == PressStatus.NEVER_LIGHT) == 1
     hidden = cells.inside(cells.share(status == PressStatus.LIGHT_AT_START)) >= 0.5
@@ -312,9 +313,9 @@ def _fit_surface(scene: _Scene, factors: Doubles) -> _Surface:
     lit = np.isfinite(scene.height)
 
     def shorten(step: Doubles) -> Doubles:
-        return step / max(1.0, float(np.abs(scene.splines.surface(step)[lit]).max()) / _STEP)
+        return step / max(1.0, float(np.abs(scene.splines.surface(step)[lit]).max()) / _MAX_CHANGE)
 
-    still = (scene.splines.basis.T @ scene.splines.basis).toarray() / _STEP**2
+    still = (scene.splines.basis.T @ scene.splines.basis).toarray() / _MAX_CHANGE**2
     surface = _Surface(scene, _stiffness(scene, _BENDING), None, factors)
     for number, (bending, steps, tolerance) in enumerate(_STAGES):
         surface = least_squares.descend(

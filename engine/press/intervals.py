@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
 
-_USUAL = 0.9, 1.5  # range of the sigma of a height between two frames, in sigmas of the interval
+_USUAL_RANGE = 0.9, 1.5  # range of the sigma of a height between two frames, in sigmas of the interval
 _ROUNDED = 1e-3  # error of a height by its rounding, as a share of an interval
 _LEAST_EXACT, _SHARED_BY = 0.25, 4  # least share of heights that are a middle; samples that show one
 _ADJOIN = 0.6  # least distance of the middles of intervals, in their widths by sigma
-_LEAST = 0.02  # minimum blur of an interval's ends, as a share of its half-width
+_MIN_BLUR = 0.02  # minimum blur of an interval's ends, as a share of its half-width
 _FAR = 6.0  # blurs outside an interval beyond which an onset is an outlier
 _SPAN = 20.0  # half-widths: minimum range over which outliers are distributed
-_FEWEST, _MOST = 1e-4, 0.5  # limits of the share of outliers
+_MIN_OUTLIERS, _MAX_OUTLIERS = 1e-4, 0.5  # limits of the share of outliers
 _SAMPLES = 8192  # maximum number of errors from which their distribution is estimated
-_ROUNDS = 12  # iterations of the share of outliers
-_FAINT = 1e-4  # least curvature of the log-likelihood, relative to that of a single sharp end
+_ITERATIONS = 12  # iterations of the share of outliers
+_MIN_CURVATURE = 1e-4  # least curvature of the log-likelihood, relative to that of a single sharp end
 _NEAR = 0.02  # tolerance of the logarithm of the blur
 # Coefficients of a rational function, highest power first: Hart's algorithm 5666, see West (2005), "Better
 # approximations to cumulative normal functions".
@@ -119,7 +119,7 @@ def _between_frames(
     earlier = -np.nan_to_num(height) - np.sign(travel[-1] - travel[0]) * _ROUNDED * np.min(np.diff(ends))
     place = np.clip(np.searchsorted(ends, earlier), 1, ends.size - 1)
     usual = (ends[place] - ends[place - 1]) / math.sqrt(12)
-    between = (sigma > _USUAL[0] * usual) & (sigma < _USUAL[1] * usual)
+    between = (sigma > _USUAL_RANGE[0] * usual) & (sigma < _USUAL_RANGE[1] * usual)
     between &= (-height >= ends[0]) & (-height <= ends[-1])
     return -(ends[place] + ends[place - 1]) / 2, usual, between
 
@@ -151,17 +151,17 @@ def estimate_interval_scatter(error: Doubles, half: Doubles) -> IntervalScatter:
     span = max(float(np.ptp(error)), _SPAN * middle)
 
     def share(density: Doubles) -> float:
-        outliers = _MOST / 2
-        for _ in range(_ROUNDS):
+        outliers = _MAX_OUTLIERS / 2
+        for _ in range(_ITERATIONS):
             outliers = float(np.mean(outliers / (outliers + (1 - outliers) * span * density)))
-        return float(np.clip(outliers, _FEWEST, _MOST))
+        return float(np.clip(outliers, _MIN_OUTLIERS, _MAX_OUTLIERS))
 
     def unlikely(size: float) -> float:
         density = _chance(error, half, float(np.exp(size))) / (2 * half)
         outliers = share(density)
         return -float(np.sum(np.log(outliers / span + (1 - outliers) * density)))
 
-    lowest = np.log(_LEAST * middle)
+    lowest = np.log(_MIN_BLUR * middle)
     highest = np.log(max(float(np.max(np.abs(error))), middle)) + 1.0
     sizes = np.linspace(lowest, highest, 12)
     best = int(np.argmin([unlikely(size) for size in sizes]))
@@ -196,7 +196,7 @@ def interval_evidence(height: Doubles, middle: Doubles, half: Doubles, spread: I
         np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) / chance for end in (below, above)
     )
     pull = density_below - density_above
-    weight = np.clip(pull**2 - (below * density_below - above * density_above), _FAINT, 1.0)
+    weight = np.clip(pull**2 - (below * density_below - above * density_above), _MIN_CURVATURE, 1.0)
     sound = chance / (chance + 2 * half * outlier_density)
     return Evidence(height + blur * pull / weight, np.where(near, sound * weight / blur**2, 0.0))
 
@@ -238,7 +238,7 @@ def _lowest(function: Callable[[float], float], low: float, high: float) -> floa
 
 _TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of the column and row offsets
 _REACH = 3.0  # half the size of the window, in its widths
-_FLAT = 1e-9  # least eigenvalue of a scaled normal matrix that is inverted
+_MIN_EIGENVALUE = 1e-9  # least eigenvalue of a scaled normal matrix that is inverted
 
 
 class Paraboloids(NamedTuple):
@@ -311,6 +311,6 @@ def _invert(matrix: Doubles) -> tuple[Doubles, NDArray[np.bool_]]:
     """Return the inverses of matrices, and which are regular; the others are replaced by the identity."""
     size = np.sqrt(np.maximum(np.einsum("nii->ni", matrix), np.finfo(float).tiny))
     scaled = matrix / (size[:, :, np.newaxis] * size[:, np.newaxis, :])
-    sound = np.linalg.eigvalsh(scaled)[:, 0] > _FLAT
+    sound = np.linalg.eigvalsh(scaled)[:, 0] > _MIN_EIGENVALUE
     scaled[~sound] = np.eye(matrix.shape[-1])
     return np.linalg.inv(scaled) / (size[:, :, np.newaxis] * size[:, np.newaxis, :]), sound

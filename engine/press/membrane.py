@@ -14,8 +14,8 @@ Mask = NDArray[np.bool_]
 _SQUARE = np.ones((3, 3), np.uint8)
 _STEPS = tuple(1 / (1.25 + sign * 0.75 * math.sqrt(0.5)) for sign in (-1, 1))  # Jacobi steps, Chebyshev roots
 _LONGER = 1.5  # aspect ratio of pixels from which only the shorter side is doubled
-_SMALLEST = 4  # pixels along the sides of the coarsest level
-_SETTLED = 3e-4  # RMS change that ends the cycles, as a share of the range of heights at the rim
+_MIN_SIDE = 4  # pixels along the sides of the coarsest level
+_LAST_CHANGE = 3e-4  # RMS change that ends the cycles, as a share of the range of heights at the rim
 _CYCLES = 8  # maximum number of cycles
 
 
@@ -31,7 +31,7 @@ def stretch(height: NDArray[np.floating], fixed: Mask, free: Mask, spacing: tupl
     lowest, highest, _, _ = cv2.minMaxLoc(height, mask=rim)
     middle = np.float32((lowest + highest) / 2)
     heights = level.solve(np.where(fixed, height - middle, np.float32(0)))
-    tolerance = _SETTLED * (highest - lowest) * math.sqrt(np.count_nonzero(free))
+    tolerance = _LAST_CHANGE * (highest - lowest) * math.sqrt(np.count_nonzero(free))
     for _ in range(_CYCLES):
         before = heights.copy()
         level.improve(heights)
@@ -53,7 +53,7 @@ class _Level:
         self._share = np.divide(free, around, out=np.zeros_like(free), where=around > 0)
         self._buffers = np.empty_like(free), np.empty_like(free)
         self._coarse: _Level | None = None
-        if max(free.shape) > _SMALLEST and free.any():
+        if max(free.shape) > _MIN_SIDE and free.any():
             steps = [
                 step if length > 1 else math.inf for step, length in zip(spacing, free.shape, strict=True)
             ]
@@ -78,7 +78,7 @@ class _Level:
         """Improve heights by one V-cycle; each is the mean of its neighbours plus a source."""
         self._smooth(heights, source)
         if self._coarse is None:
-            for _ in range(_SMALLEST):
+            for _ in range(_MIN_SIDE):
                 self._smooth(heights, source)
             return
         residual = self._reduce(self._residual(heights, source))

@@ -24,7 +24,7 @@ _ORDER = 3  # order of the penalised derivatives; those of a paraboloid are 0
 _PULL = 1e-3  # weight of the middle of an interval, relative to that of its ends
 _ITERATIONS = 20  # maximum number of iterations
 _HEAVIEST = 1e4  # largest weight of a pixel, relative to a typical one
-_SETTLED = 0.01  # half-widths: changes of the surface below this end the iterations
+_LAST_CHANGE = 0.01  # half-widths: changes of the surface below this end the iterations
 _LARGEST = 2.0  # half-widths: limit of a pixel's excess in the misfit
 _FAR, _PATIENCE = (
     1.0,
@@ -234,7 +234,7 @@ def fit_within(spline: Spline, low: Doubles, high: Doubles, stiffness: float) ->
         excess = np.abs(np.clip(height, low, high) - height) / half
         misfit = float(np.sqrt(np.mean(np.minimum(excess[bounded], _LARGEST) ** 2)))
         moved = np.max(np.abs(height - before)[bounded]) / typical
-        if step and (moved < _SETTLED or (step >= _PATIENCE and misfit > _FAR)):
+        if step and (moved < _LAST_CHANGE or (step >= _PATIENCE and misfit > _FAR)):
             break
         pull = np.where(both, _PULL * weights, 0.0)
     return Fit(height + datum, factors + datum, misfit)  # the splines sum to 1

@@ -23,10 +23,10 @@ from mirrorskin.io.model.positions import check_strokes, stroke_starts
 if TYPE_CHECKING:
     from mirrorskin.io import Source
 
-_ALIKE = 1e-3  # relative tolerance of equal numbers, for rounding
-_CONTRADICT = 0.001  # share of pixels with contradictory intervals above which travel is not exact
-_NOISY = 2.0  # standard deviations: displacement of a crossing by noise that is tolerated
-_UNLIKELY = 1e-3  # significance level of scatter beyond the predicted one
+_EQUAL_TOLERANCE = 1e-3  # relative tolerance of equal numbers, for rounding
+_MAX_CONTRADICTIONS = 0.001  # share of pixels with contradictory intervals above which travel is not exact
+_NOISE_Z_SCORE = 2.0  # standard deviations: displacement of a crossing by noise that is tolerated
+_SCATTER_PROBABILITY = 1e-3  # significance level of scatter beyond the predicted one
 
 
 class Strokes(PressOperation):
@@ -195,14 +195,14 @@ class _JoinedOnsets:
         ends = -travel[frame - 1], -travel[frame]
         low, high = np.minimum(*ends), np.maximum(*ends)
         # An event that noise delayed is located in another step: that step is its interval.
-        elsewhere = np.maximum(low - height, height - high) > _ALIKE * (high - low)
+        elsewhere = np.maximum(low - height, height - high) > _EQUAL_TOLERANCE * (high - low)
         low = np.where(elsewhere, height - np.sqrt(3) * sigma, low)
         high = np.where(elsewhere, height + np.sqrt(3) * sigma, high)
         half = (high - low) / 2
         interval_sigma = half / np.sqrt(3)  # without a sample between the levels
-        guessed = sigma >= (1 - _ALIKE) * interval_sigma
-        sudden = guessed & (sigma <= (1 + _ALIKE) * interval_sigma)
-        sudden &= abs(height - low - half) <= _ALIKE * half
+        guessed = sigma >= (1 - _EQUAL_TOLERANCE) * interval_sigma
+        sudden = guessed & (sigma <= (1 + _EQUAL_TOLERANCE) * interval_sigma)
+        sudden &= abs(height - low - half) <= _EQUAL_TOLERANCE * half
 
         first = self._count[at] == 0
         self._height[at[first]] = height[first]
@@ -214,7 +214,9 @@ class _JoinedOnsets:
         self._guessed[at] += np.where(guessed, weight, 0.0)
         self._moment[at] += weight * apart
         self._square[at] += weight * apart**2
-        noisy = _NOISY * np.sqrt(np.maximum(sigma**2 - np.where(guessed, interval_sigma, 0.0) ** 2, 0.0))
+        noisy = _NOISE_Z_SCORE * np.sqrt(
+            np.maximum(sigma**2 - np.where(guessed, interval_sigma, 0.0) ** 2, 0.0)
+        )
         noisy[sudden] = 0.0
         self._low[at] = np.maximum(self._low[at], low - noisy)
         self._high[at] = np.minimum(self._high[at], high + noisy)
@@ -239,7 +241,7 @@ class _JoinedOnsets:
             guessed = np.maximum(1 / self._guessed, width.clip(0) ** 2 / 12)
             predicted = 1 / (self._weight - self._guessed + 1 / guessed)
             square = np.where(several, self._square - mean * self._moment, 0.0)
-            limits = special.chdtri(np.arange(1, freedom.max() + 1), _UNLIKELY)
+            limits = special.chdtri(np.arange(1, freedom.max() + 1), _SCATTER_PROBABILITY)
             apart = square > limits[freedom.astype(np.intp) - 1]
             alike = several & ~apart
             overall = np.sum(square[alike]) / max(1.0, np.sum(freedom[alike]))
@@ -251,7 +253,7 @@ class _JoinedOnsets:
             outside = (height < self._low) | (height > self._high)
             better = sudden | apart | outside | (width**2 / 12 < variance)
             shared = several & (width > 0) & better
-            if np.count_nonzero(shared & sudden) < (1 - _CONTRADICT) * np.count_nonzero(sudden):
+            if np.count_nonzero(shared & sudden) < (1 - _MAX_CONTRADICTIONS) * np.count_nonzero(sudden):
                 shared[:] = False
             height = np.where(shared, (self._low + self._high) / 2, height)
             sigma = np.sqrt(np.where(shared, width**2 / 12, variance))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mirrorskin.io import Source
 
 _UPDATES_BETWEEN_PLACINGS = 8  # updates between estimates of the object's height in the body
-_FEWEST = 3  # minimum number of frames of a fit
+_MIN_FRAMES = 3  # minimum number of frames of a fit
 _WARMING = 10  # number of updates that run all kernels
 _PARTS = 24  # number of parts of the longest kernel of the edges
 _OVERDUE = 0.1  # seconds without a part after which one is run without idle time
@@ -47,11 +47,11 @@ def choose_window(frames_per_turn: float, window_frames: int | None = None) -> t
     mirrorskin.io.InputError
         A turn has fewer than three frames, or fewer than the window.
     """
-    if not _FEWEST <= frames_per_turn < math.inf:
+    if not _MIN_FRAMES <= frames_per_turn < math.inf:
         raise InputError(f"{frames_per_turn:g} frames a turn: at least 3 are needed; turn more slowly")
     if window_frames is None:
         every = math.ceil(round(frames_per_turn) / LONGEST)
-        return max(_FEWEST, round(frames_per_turn / every)), every
+        return max(_MIN_FRAMES, round(frames_per_turn / every)), every
     if window_frames > round(frames_per_turn):
         count = round(frames_per_turn)
         raise InputError(f"window_frames {window_frames}: a turn has only {count} frames. Leave it out")

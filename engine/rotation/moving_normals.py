@@ -22,7 +22,7 @@ from mirrorskin.kernels.array_types import Doubles
 
 P = ParamSpec("P")
 
-_FEWEST = 4  # minimum number of frames of a preview: one more than for a slope, to estimate the noise
+_MIN_FRAMES = 4  # minimum number of frames of a preview: one more than for a slope, to estimate the noise
 _WARMING = 8  # number of frames that run all kernels
 
 
@@ -79,7 +79,7 @@ class MovingNormals(NormalsOperation):
 
     def preview(self, seconds: float) -> Result:
         """Return the maps of the frames so far; none before they determine a slope and its noise."""
-        return Result() if self.count < _FEWEST else self.result()
+        return Result() if self.count < _MIN_FRAMES else self.result()
 
     def precompile(self) -> None:
         """Push frames of a rocking plane."""

@@ -32,7 +32,7 @@ MAPS = "vectors", "sigma", "contact", "mean", "cosines", "sines", "residual"
 SLOPE_MAPS = "slopes", "slope_errors", "zeniths"
 """Names of the additional maps of a body that rocks."""
 
-_ENOUGH = 500  # minimum number of clear pixels for an estimate of the noise
+_MIN_CLEAR_PIXELS = 500  # minimum number of clear pixels for an estimate of the noise
 _MOST_NOISE = 1e12  # counts
 
 
@@ -130,7 +130,9 @@ class NormalKernel:
             with np.errstate(invalid="ignore"):
                 clear = self._scale.clear_pixels(fit.matrix @ samples.astype(np.float64), self._step)
             steep = samples.compress(clear, axis=1)
-            noise = residual_noise(steep if steep.shape[1] >= _ENOUGH else samples, fit.phase, fit.weights)
+            noise = residual_noise(
+                steep if steep.shape[1] >= _MIN_CLEAR_PIXELS else samples, fit.phase, fit.weights
+            )
         if tilt is None:
             if isinstance(self._scale, Response):
                 raise InputError(

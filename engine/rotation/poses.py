@@ -18,7 +18,7 @@ from mirrorskin.kernels.array_types import Doubles
 PRESSES = 0.02
 """Minimum range of travel of a body that also presses, as a share of the maximum travel."""
 
-_SAME = 1e-4  # ratio of singular values of the axes below which all axes are the same
+_AXES_TOLERANCE = 1e-4  # ratio of singular values of the axes below which all axes are the same
 _PLANE = 1e-2  # ratio of singular values of the axes below which they are in a plane
 _UPRIGHT = 0.05  # sine of the maximum angle between this plane and the vertical
 _FRAMES_OF_SECOND = 9  # minimum number of frames for a fit of second order
@@ -104,7 +104,7 @@ def pose_fit(pose: Doubles, weights: Doubles, rocked: float | None = None) -> Po
     if len(axes) < 3:
         raise InputError(f"{len(axes)} frames determine no slope: at least 3 are needed")
     _, swings, planes = np.linalg.svd(axes, full_matrices=False)
-    if swings[1] <= _SAME * swings[0]:
+    if swings[1] <= _AXES_TOLERANCE * swings[0]:
         raise InputError(f"all {len(axes)} frames have the same tilt and phase: they determine no slope")
     direction = None
     if swings[2] <= _PLANE * swings[1]:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from mirrorskin.io.base.types import ProcessValue
 
 _NO_GAIN = "none: the recording has no zenith gain"
-_ROUNDS = 2  # iterations of the height of the object
+_HEIGHT_ITERATIONS = 2  # iterations of the height of the object
 _OMIT = ("cosine", "sine")  # redundant: they follow from azimuth and modulation
 
 
@@ -214,7 +214,7 @@ class Rotation(Method):
         assert pixel_size is not None
         assert press is not None
         turn, heights = first_turn(source), _half_way(source, press)
-        for _ in range(_ROUNDS):
+        for _ in range(_HEIGHT_ITERATIONS):
             stream, response = self._placed(turn, header, response, heights)
             operation = self._turns(stream, header, response).with_options(per_turn=False)
             maps = Run(Plan(operation, checked=False), stream).complete()

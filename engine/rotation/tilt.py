@@ -16,14 +16,14 @@ from mirrorskin.kernels.array_types import Doubles
 STEEP = 4.0
 """Ratio of zenith and tilt above which one wave per turn is a good approximation."""
 
-_STEEPEST = math.radians(30.0)  # maximum tilt that the sheet can follow
-_FEWEST = 30  # minimum number of pixels of an estimate
-_ROUNDS = 5  # iterations
+_MAX_TILT = math.radians(30.0)  # maximum tilt that the sheet can follow
+_MIN_PIXELS = 30  # minimum number of pixels of an estimate
+_ITERATIONS = 5  # iterations
 
 
 def check_tilt(tilt: float) -> float:
     """Return the tilt, radians, or raise InputError if it is impossible."""
-    if not 0 < tilt <= _STEEPEST:
+    if not 0 < tilt <= _MAX_TILT:
         raise InputError(
             f"tilt {math.degrees(tilt):g} deg: above 0 and up to 30 deg is needed, such as 2.5deg"
         )
@@ -35,7 +35,7 @@ def check_tilts(tilt: ArrayLike, count: int) -> Doubles:
     values = np.asarray(tilt, np.float64)
     if values.shape not in ((), (count,)):
         raise InputError(f"tilt has shape {values.shape} for {count} frames: one number, or one a frame")
-    wrong = ~(np.abs(values) <= _STEEPEST)
+    wrong = ~(np.abs(values) <= _MAX_TILT)
     if np.any(wrong):
         at = f" at frame {int(np.argmax(wrong))}" if values.ndim else ""
         raise InputError(f"tilt {math.degrees(values[wrong].flat[0]):g} deg{at}: 30 deg at most is needed")
@@ -67,9 +67,9 @@ def estimate_tilt(samples: NDArray[Any], fit: TurnFit, scale: Doubles, noise: Co
     square = cosine**2 + sine**2 - (fit.covariance[1, 1] + fit.covariance[2, 2]) * error**2
 
     tilt = math.sqrt(max(0.0, float(np.median(square[clean])))) if clean.any() else 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         chosen = clean & (mean > max(STEEP * tilt, 1e-3))
-        if np.count_nonzero(chosen) < _FEWEST or not tilt > 0:
+        if np.count_nonzero(chosen) < _MIN_PIXELS or not tilt > 0:
             raise InputError(
                 "too few pixels are steep and clear enough to estimate the tilt: give it, such as 2.5deg"
             )

@@ -31,7 +31,7 @@ MAPS = {
 
 _RANK = np.array([1, 0, 2, 3], np.uint8)  # rank of a status: a pixel has the highest of its nodes
 _MOST_STEP = 64  # maximum distance of nodes, pixels
-_ALIKE = 4  # samples over which residuals are correlated
+_CORRELATED_SAMPLES = 4  # samples over which residuals are correlated
 _LAPLACIAN_NOISE = 4 * 20 / 24**2  # noise of the squared bias (two standard deviations) per variance
 _LEAST_TEXTURED = 0.1  # minimum share of windows with texture; edges of light on a clear sheet may reach it
 
@@ -208,7 +208,7 @@ def misfit(field: NodeField, texture: Texture, window: int) -> Doubles:
     """
     chance = 1 + 2 * math.sqrt(2) / window  # two standard deviations of a window's variance
     more = np.fmax(field.variance / texture.variance - chance, 0)
-    return np.asarray(np.sqrt(1 + _ALIKE * more)[..., None])
+    return np.asarray(np.sqrt(1 + _CORRELATED_SAMPLES * more)[..., None])
 
 
 def bending_variance(displacement: Doubles, variance: Doubles, step: int, window: int) -> Doubles:

@@ -16,17 +16,17 @@ from mirrorskin.kernels.array_types import Doubles
 
 _CANDIDATES = 48  # number of onsets tried for the initial map
 _EVIDENCE = 8.0  # minimum log-likelihood ratio of a departure for the initial onset of a node
-_ROUNDS = 20  # maximum number of Gauss-Newton steps
+_MAX_STEPS = 20  # maximum number of Gauss-Newton steps
 _WIDE = 5  # number of initial steps in which departures begin gradually
-_MANY = 1000  # number of nodes above which a quarter of them is fitted first, to save time
-_SETTLED = 1e-6  # change of an onset, relative to the path, that ends the steps
+_MAX_FINE_NODES = 1000  # number of nodes above which a quarter of them is fitted first, to save time
+_LAST_CHANGE = 1e-6  # change of an onset, relative to the path, that ends the steps
 _NEAR = 0.01  # change of an onset, relative to the path, below which steps reuse earlier equations
-_FARTHEST = 0.08  # maximum change of an onset in a step, relative to the path
+_MAX_CHANGE = 0.08  # maximum change of an onset in a step, relative to the path
 _LOCKING = 0.05  # prior sigma of the bias of displacements towards halves of a pixel, pixels
 _POWER_SIGMA = 0.1  # standard deviation of the power; those of slides and twists differ by twice that
-_APART = 9  # distance of nodes above which errors of onsets are independent
-_NEVER = 1.5  # onset, relative to the path, of a node that has not slipped
-_FLOOR = 1e-6  # weight added to all equations, so that they have a solution
+_INDEPENDENT_DISTANCE = 9  # distance of nodes above which errors of onsets are independent
+_NO_SLIP_ONSET = 1.5  # onset, relative to the path, of a node that has not slipped
+_MIN_WEIGHT = 1e-6  # weight added to all equations, so that they have a solution
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ def fit_onsets(
     fit = _fit(departure, sigma, distance, window, radius, expected, locking)
     length = float(distance[-1])
     if fit is None:
-        return OnsetMap(np.full(sigma.shape, _NEVER * length), np.full(sigma.shape, length))
+        return OnsetMap(np.full(sigma.shape, _NO_SLIP_ONSET * length), np.full(sigma.shape, length))
     return OnsetMap(length * fit.onset, length * np.sqrt(fit.system.variances() + fit.shift**2))
 
 
@@ -127,10 +127,10 @@ def _fit(
     second, third = (_bending(measured.shape, order) for order in (2, 3))
     onset_stiff = third * (radius**3 / expected.onset_bend) ** 2
     stiff = sparse.block_diag([onset_stiff, second * (radius**2 / expected.growth_bend) ** 2], format="csc")
-    prior = stiff + _FLOOR * sparse.identity(stiff.shape[0], format="csc")
+    prior = stiff + _MIN_WEIGHT * sparse.identity(stiff.shape[0], format="csc")
 
     coarse, number = None, 0
-    if measured.size > _MANY:
+    if measured.size > _MAX_FINE_NODES:
         half = np.s_[..., ::2, ::2]
         coarse = _fit(departure[half], sigma[half], distance, window / 2, radius / 2, expected, locking[half])
     if coarse is not None:
@@ -150,7 +150,7 @@ def _fit(
         shape, rate = (_whitened(growth * part) for part in _blurred(times - onset, half, power))
         columns = np.stack([-rate, shape])
         # Close to the answer, the equations of an earlier step lead to the same one.
-        ends = number == _ROUNDS or (number >= _WIDE and moved < _SETTLED)
+        ends = number == _MAX_STEPS or (number >= _WIDE and moved < _LAST_CHANGE)
         if ends or number < _WIDE or moved > _NEAR:
             system = _Normal(columns, locks, prior)
         if ends:
@@ -158,7 +158,7 @@ def _fit(
         off = np.stack([onset, log_growth]).ravel()
         residual = data - shape - np.tensordot(lock, locks, 1)
         step, more = system.solve(columns, residual, -(stiff @ off), -lock / _LOCKING**2)
-        change = np.clip(step[0], -_FARTHEST, _FARTHEST)
+        change = np.clip(step[0], -_MAX_CHANGE, _MAX_CHANGE)
         onset, log_growth, lock = onset + change, log_growth + np.clip(step[1], -0.3, 0.3), lock + more
         # Others, which no frame shows, never settle.
         moved = float(np.abs(change[measured & (onset < 1.0)]).max(initial=0.0))
@@ -250,7 +250,7 @@ def _first_onsets(
     evident = best > _EVIDENCE
     if not evident.any():
         return None
-    trust = np.where(evident, (_CANDIDATES / length) ** 2, _FLOOR)
+    trust = np.where(evident, (_CANDIDATES / length) ** 2, _MIN_WEIGHT)
     onset = _factor(stiff + sparse.diags(trust.ravel())).solve((trust * onset).ravel())
     onset = onset.reshape(scale.shape)
     shape = _whitened(_blurred(times - onset, length / len(times), power)[0] * scale)
@@ -273,9 +273,9 @@ def _variances(system: Any, shape: tuple[int, int]) -> Doubles:
     """Estimate the diagonal of a system's inverse for its first map, by probing distant nodes at once."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], shape)
     diagonal = np.empty(shape)
-    for row in range(min(_APART, shape[0])):
-        for column in range(min(_APART, shape[1])):
-            here = np.s_[row::_APART, column::_APART]
+    for row in range(min(_INDEPENDENT_DISTANCE, shape[0])):
+        for column in range(min(_INDEPENDENT_DISTANCE, shape[1])):
+            here = np.s_[row::_INDEPENDENT_DISTANCE, column::_INDEPENDENT_DISTANCE]
             right = np.zeros((2, *shape))
             right[0][here] = signs[here]
             answer = system.solve(right.ravel()).reshape(2, *shape)[0]

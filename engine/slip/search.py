@@ -49,9 +49,9 @@ _RIM, _ENOUGH = (
     1.5,
     0.25,
 )  # windows from its rim that are left out, and least share of the nodes that are left
-_FOLLOWS = 0.5  # minimum displacement of skin in contact, as a share of the object's
+_MIN_FOLLOWING = 0.5  # minimum displacement of skin in contact, as a share of the object's
 _LEAST_STUCK = 4  # minimum number of nodes for the centre and the angle of a twist
-_STILL = 1e-9  # motion, relative to the body's path, up to which it is at rest
+_REST_TOLERANCE = 1e-9  # motion, relative to the body's path, up to which it is at rest
 _BLOCK = 16  # frames read at once
 
 
@@ -310,7 +310,7 @@ class SlipOnset(Operation):
         measured = np.isfinite(fraction).any(axis=0)
         lag = np.full(fraction.shape[1:], np.nan)
         lag[measured] = np.nanmedian(fraction[:, measured], axis=0)
-        touched: NDArray[np.bool_] = np.nan_to_num(fill_with_nearest(lag), nan=1.0) < 1 - _FOLLOWS
+        touched: NDArray[np.bool_] = np.nan_to_num(fill_with_nearest(lag), nan=1.0) < 1 - _MIN_FOLLOWING
         return touched
 
     def _fit(
@@ -395,7 +395,7 @@ class SlipOnset(Operation):
         about, to = first.mean(), last.mean()
         angle = float(np.angle(np.sum((last - to) * np.conj(first - about))))
         turn = np.exp(1j * angle)
-        if abs(turn - 1) < _STILL:
+        if abs(turn - 1) < _REST_TOLERANCE:
             return (math.nan, math.nan), angle
         centre = (to - turn * about) / (1 - turn)
         return (float(centre.real), float(centre.imag)), angle
@@ -415,7 +415,7 @@ class _Course:
         lengths = np.sqrt(np.sum(steps**2, axis=1))
         self.distance: Doubles = np.cumsum(lengths)
         from_start = np.sqrt(np.sum((places[1:] - places[0]) ** 2, axis=1))
-        back = np.flatnonzero(np.diff(from_start, prepend=0.0) < -_STILL * self.distance[-1])
+        back = np.flatnonzero(np.diff(from_start, prepend=0.0) < -_REST_TOLERANCE * self.distance[-1])
         self.forward = int(back[0]) if back.size else len(self.distance)
         self.end = float(self.distance[self.forward - 1])
         self._moved = -(places[1:] - places[0])

@@ -23,13 +23,13 @@ GRADIENT_NOISE = 1.3923
 """Variance of a cubic spline's derivative at a sample, for samples with noise of variance 1."""
 
 _LEVELS = 4  # maximum number of resolutions
-_ENOUGH = 0.5  # minimum share of windows that are found
-_LIKE = 0.5  # minimum contrast of the same texture, relative to the reference
-_MOST = 0.98  # share of the nodes that must converge; windows with little texture never do
-_SETTLED = 0.03  # change, pixels, that ends iterations: the linearisation error is then below 0.001 pixels
-_FARTHEST = 1.5  # maximum change in one iteration, pixels
+_MIN_CONVERGED = 0.5  # minimum share of windows that are found
+_MIN_CONTRAST = 0.5  # minimum contrast of the same texture, relative to the reference
+_CONVERGED_FRACTION = 0.98  # share of the nodes that must converge; windows with little texture never do
+_LAST_CHANGE = 0.03  # pixels: the linearisation error is then below 0.001 pixels
+_MAX_CHANGE = 1.5  # maximum change in one iteration, pixels
 _KERNEL = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16  # smoothing of the field over nodes
-_HOLD = 0.01  # weight of the previous field, relative to that of the median node
+_FIELD_WEIGHT = 0.01  # weight of the previous field, relative to that of the median node
 _TILE = 4096  # pixels per work-item on a CPU
 
 
@@ -100,7 +100,7 @@ class Tracker:
         begin = last + stride * (last - before)
         best, field = self.finest.follow(frame, begin)
         for correlated in (False, True):
-            if np.mean(best.converged) >= _ENOUGH * np.mean(self.finest.usable):
+            if np.mean(best.converged) >= _MIN_CONVERGED * np.mean(self.finest.usable):
                 break
             frame = on_host(frame)
             displacement, other = self._follow_down(frame, self._correlated(frame) if correlated else begin)
@@ -306,7 +306,7 @@ class _Level:
         for _ in range(ITERATIONS):
             answer = self._solve(field)
             last, field = field, self._next_field(field, answer[:AFFINE])
-            if np.mean(np.abs(field - last) < _SETTLED) > _MOST:
+            if np.mean(np.abs(field - last) < _LAST_CHANGE) > _CONVERGED_FRACTION:
                 break
         moved = answer[:2]
         gain, squares, variances = answer[AFFINE:]
@@ -314,7 +314,7 @@ class _Level:
             # The reference's noise is multiplied by the gain.
             variances += (gain**2 - 1) * self.measured
             variance = squares / (variances * (1 - PARAMETERS / self.measured))
-            converged = (np.abs(moved - last).max(axis=0) < 0.5) & (gain > _LIKE)
+            converged = (np.abs(moved - last).max(axis=0) < 0.5) & (gain > _MIN_CONTRAST)
         return NodeField(moved, variance, converged), field
 
     def _solve(self, field: Doubles) -> Doubles:
@@ -337,12 +337,12 @@ class _Level:
         """
         finite = np.isfinite(affine[0])
         weight = np.where(finite, self._trust, 0.0)
-        hold = _HOLD * np.median(self._trust)
+        hold = _FIELD_WEIGHT * np.median(self._trust)
         y, x = np.meshgrid(*(2 * self.step / self._window * np.arange(n) for n in self.grid), indexing="ij")
         total = self._over_nodes(weight) + hold
         parts = []
         for coarse, centre, right, down in zip(field, affine[:2], affine[2::2], affine[3::2], strict=True):
-            step = np.clip(np.nan_to_num(centre - coarse), -_FARTHEST, _FARTHEST)
+            step = np.clip(np.nan_to_num(centre - coarse), -_MAX_CHANGE, _MAX_CHANGE)
             along_x, along_y = (weight * np.clip(np.nan_to_num(part), -1, 1) for part in (right, down))
             here = weight * (coarse + step) - along_x * x - along_y * y
             position = self._over_nodes(along_x) * x + self._over_nodes(along_y) * y

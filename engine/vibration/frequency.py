@@ -14,13 +14,13 @@ from mirrorskin.io import InputError, Source
 from mirrorskin.io.base.arguments import as_array, checked, in_unit
 from mirrorskin.kernels.array_types import Doubles
 
-_FEWEST = 8  # minimum number of frames
+_MIN_FRAMES = 8  # minimum number of frames
 _PIXELS, _SAMPLES = 4096, 2**22  # maximum numbers of pixels and of samples that are used
 _GREATEST = 1e12  # counts: maximum sample
 _FINER = 4  # lines of the periodogram per independent line
 _SPARSE = 64  # maximum mean interval between frames, in median intervals
 _SIGNIFICANT = 8.0  # minimum power of an oscillation, in standard deviations of the power of noise
-_STEPS = 3  # Gauss-Newton steps
+_NEWTON_STEPS = 3  # Gauss-Newton steps
 
 
 class Frequency(NamedTuple):
@@ -64,8 +64,10 @@ def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
     seconds = np.asarray(time, np.float64)
     if not samples.ndim:
         raise InputError("samples are one number: (T, ...) is needed")
-    if len(samples) < _FEWEST or seconds.shape != (len(samples),):
-        raise InputError(f"{len(samples)} frames with {seconds.size} times: at least {_FEWEST} are needed")
+    if len(samples) < _MIN_FRAMES or seconds.shape != (len(samples),):
+        raise InputError(
+            f"{len(samples)} frames with {seconds.size} times: at least {_MIN_FRAMES} are needed"
+        )
     if not np.all(np.diff(seconds) > 0):
         raise InputError("frame times do not increase: give the frame rate instead")
     flat = samples.reshape(len(samples), -1)
@@ -89,7 +91,7 @@ def estimate_frequency(samples: NDArray[Any], time: ArrayLike) -> Frequency:
             unexplained, bounds=(max(start - width, width / 2), start + width), method="bounded"
         ).x
     )
-    for _ in range(_STEPS):
+    for _ in range(_NEWTON_STEPS):
         step, information, variance = _newton(counts, apart, frequency)
         frequency += step
     explained = -unexplained(frequency) / max(variance, np.finfo(float).tiny)

@@ -15,10 +15,10 @@ from mirrorskin.kernels.array_types import Doubles
 
 Array = NDArray[Any]
 
-_STEEPEST = math.cos(math.radians(80.0))  # cosine of the largest zenith whose slope is used
-_WIDEST = 0.5**2  # radians^2: limit of the variance of an azimuth
-_AROUND = 2  # pixels on each side, in the window for the direction of the meridian
-_LEAST = float(np.finfo(np.float32).tiny)
+_MIN_COSINE = math.cos(math.radians(80.0))  # cosine of the largest zenith whose slope is used
+_MAX_AZIMUTH_VARIANCE = 0.5**2  # radians^2: limit of the variance of an azimuth
+_WINDOW_REACH = 2  # pixels on each side, in the window for the direction of the meridian
+_TINY = float(np.finfo(np.float32).tiny)
 
 
 def slopes_find(flat_limit: float, vectors: Array, sigma: Array, contact: Array) -> tuple[Doubles, ...]:
@@ -44,7 +44,7 @@ def find(
         valid = (contact != 0) & (z > 0) & (sigma > 0) & (sigma < np.inf)
     x, y, z = (
         np.where(valid, component, other)
-        for component, other in ((x, 0), (y, 0), (np.maximum(z, _STEEPEST), 1))
+        for component, other in ((x, 0), (y, 0), (np.maximum(z, _MIN_COSINE), 1))
     )
     _, turned = _unsure(flat_limit, x * x + y * y, np.where(valid, sigma, 0) ** 2)
     longer = np.where(valid, -np.exp(turned / 2) / z, np.nan)
@@ -70,11 +70,11 @@ def weigh(
     valid = np.isfinite(dz_dx)
     variance = np.where(valid, sigma, 1) ** 2
     flat = squares_x + squares_y
-    steep = 1 / np.maximum(1 - flat, _STEEPEST**2)
+    steep = 1 / np.maximum(1 - flat, _MIN_COSINE**2)
     fraction, turned = _unsure(flat_limit, flat, variance)
     along = fraction * variance * steep**2 + flat * steep * turned**2 / 2
     across = (1 - fraction) * variance * steep
-    x, y = (_sum_around(values) + _LEAST for values in (squares_x, squares_y))
+    x, y = (_sum_around(values) + _TINY for values in (squares_x, squares_y))
     east = np.clip(0.5 + (x / (x + y) - 0.5) * np.exp(2 * turned), 0, 1)
     variances = east * along + (1 - east) * across, (1 - east) * along + east * across
     weight_x, weight_y = (np.where(valid, np.clip(1 / values, *bounds), 0) for values in variances)
@@ -83,13 +83,15 @@ def weigh(
 
 def _unsure(flat_limit: float, flat: Array, variance: Array) -> tuple[Array, Array]:
     """Return the share of the angular variance along the meridian, and the azimuth's variance."""
-    fraction = 0.5 * np.minimum(flat_limit / np.maximum(flat, _LEAST), 1)
-    return fraction, np.minimum((1 - fraction) * variance / np.maximum(flat, flat_limit), _WIDEST)
+    fraction = 0.5 * np.minimum(flat_limit / np.maximum(flat, _TINY), 1)
+    return fraction, np.minimum(
+        (1 - fraction) * variance / np.maximum(flat, flat_limit), _MAX_AZIMUTH_VARIANCE
+    )
 
 
 def _sum_around(values: Array) -> Array:
     """Return the sums over squares of 5 x 5 pixels, 0 beyond the picture."""
     rows, columns = values.shape
-    wide, size = np.pad(values, _AROUND), 2 * _AROUND + 1
+    wide, size = np.pad(values, _WINDOW_REACH), 2 * _WINDOW_REACH + 1
     lines = np.asarray(sum(wide[row : row + rows] for row in range(size)))
     return np.asarray(sum(lines[:, column : column + columns] for column in range(size)))

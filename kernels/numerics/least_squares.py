@@ -42,13 +42,13 @@ from mirrorskin.kernels.array_types import Doubles
 
 _MEDIAN = 0.6744897501960817  # median magnitude of a standard normal variate
 _SAMPLES = 4096  # values that show where a median is
-_TOLERANCE = 1e-8  # relative decrease of the cost that ends the iteration
-_STEPS = 100  # maximum number of steps
+_COST_TOLERANCE = 1e-8  # relative decrease of the cost that ends the iteration
+_MAX_STEPS = 100  # maximum number of steps
 _RIDGE = 1e-12  # relative to the curvature: keeps the damped matrix regular
 _SINGULAR = 1e-13  # relative to the largest eigenvalue of scaled equations: directions without information
 _DIFFERENCE = 1e-8  # step of forward differences; relative for parameters above 1
-_ROUNDS = 8  # maximum number of fits with noise estimated from the preceding fit
-_ALIKE = 0.01  # relative change of this noise that ends the repetition
+_MAX_FITS = 8  # maximum number of fits with noise estimated from the preceding fit
+_NOISE_TOLERANCE = 0.01  # relative change of this noise that ends the repetition
 
 
 def median(values: NDArray[Any]) -> Any:
@@ -157,9 +157,9 @@ def descend(
     bounds: Bounds | None = None,
     shorten: Callable[[Doubles], Doubles] | None = None,
     damping: Damping = Damping(),  # noqa: B008
-    tolerance: float = _TOLERANCE,
+    tolerance: float = _COST_TOLERANCE,
     rounding: float = 0.0,
-    steps: int = _STEPS,
+    steps: int = _MAX_STEPS,
     solve: Callable[..., Any] = np.linalg.solve,
 ) -> AnyModel:
     """Return the model at the minimum of its cost.
@@ -236,6 +236,8 @@ def _scale(matrix: Doubles) -> Doubles:
 
 # --- linear fits without outliers ---------------------------------------------------------------------------
 
+CLEAR_Z_SCORE = 6.0
+"""Standard errors from which on an effect that a clipped fit determines is reported."""
 OUTLYING = 4.0
 """Standard deviations beyond which a value is left out of a linear fit."""
 
@@ -373,11 +375,11 @@ def fit(
     jacobian: Callable[[Doubles], Doubles] | None = None,
     noise: float | Doubles = 1.0,
     rescale: Callable[[Doubles], float | Doubles] | None = None,
-    rounds: int = _ROUNDS,
+    rounds: int = _MAX_FITS,
     loss: Loss = SQUARES,
     prior: Prior | None = None,
     bounds: Bounds | None = None,
-    tolerance: float = _TOLERANCE,
+    tolerance: float = _COST_TOLERANCE,
 ) -> Fit:
     """Fit parameters to residuals; see the module.
 
@@ -420,6 +422,6 @@ def fit(
         at = functools.partial(Fit, residuals, slopes, loss, noise, prior)
         fitted = descend(at, parameters, bounds=bounds, tolerance=tolerance)
         parameters, before = fitted.parameters, noise
-        if rescale is None or np.allclose(noise := rescale(fitted.residuals), before, rtol=_ALIKE):
+        if rescale is None or np.allclose(noise := rescale(fitted.residuals), before, rtol=_NOISE_TOLERANCE):
             break
     return fitted

@@ -23,8 +23,8 @@ SHARPEST = 1e-10
 SUMMARY, STRIP = 6, 16
 """Length of the record of a strip in `pose_summary`, and number of its pixels."""
 AROUND = 2  # pixels around edges and the border of contact that are excluded; reach of a gradient
-_LEAST = 7  # minimum number of pixels of a gradient
-_FLAT = 1e-3  # relative determinant of a singular arrangement of them
+_MIN_PIXELS = 7  # minimum number of pixels of a gradient
+_SINGULAR = 1e-3  # relative determinant of a singular arrangement of them
 
 
 def pose_gradient(step_x: float, step_y: float, values: Array, gradient: Array) -> None:
@@ -50,7 +50,7 @@ def pose_gradient(step_x: float, step_y: float, values: Array, gradient: Array) 
         xx, xy, yy = xx - x * x / count, xy - x * y / count, yy - y * y / count
         xz, yz = xz - x * z / count, yz - y * z / count
         area = xx * yy - xy * xy
-        good = (count >= _LEAST) & (area > _FLAT * count**2)
+        good = (count >= _MIN_PIXELS) & (area > _SINGULAR * count**2)
         gradient[..., 0] = np.where(good, (yy * xz - xy * yz) / area / step_x, np.nan)
         gradient[..., 1] = np.where(good, -(xx * yz - xy * xz) / area / step_y, np.nan)
 

@@ -25,7 +25,7 @@ Array = NDArray[Any]
 Floats = NDArray[np.float64]
 
 _TINY = 1e-20
-_LEAST = 1e-6  # inverse of a distance that no ray travels, mm
+_MIN_INVERSE = 1e-6  # inverse of a distance that no ray travels, mm
 _HARD = 1e30
 
 
@@ -74,7 +74,7 @@ def wall_light(sheet: Array, places: Array, rays: Array, table: Array, radius: f
         cosine, per_way = _leave(x, y, ray, radius)
         at_x, at_y, per_way, transmitted = _cross_gap(x, y, ray, cosine, per_way, radius, gap, index)
         transmitted = transmitted * _seen(z, ray, cosine, per_way, radius, rim, fade)
-        height = np.clip(z + ray[2] / np.maximum(per_way, _LEAST), 0, rim)
+        height = np.clip(z + ray[2] / np.maximum(per_way, _MIN_INVERSE), 0, rim)
         transmitted = transmitted * _look_up(table, height / rim, np.arctan2(at_y, at_x))
         total += transmitted * (1 + (asymmetry_x * at_x + asymmetry_y * at_y) / (radius + gap))
     total /= len(rays) * (1 + np.hypot(asymmetry_x, asymmetry_y))
@@ -97,7 +97,7 @@ def _steepest(x: Floats, y: Floats, ray: Floats, radius: float) -> Floats:
     direction is returned.
     """
     cosine, per_way = _leave(x, y, ray, radius)
-    distance = 1 / np.maximum(per_way, _LEAST)
+    distance = 1 / np.maximum(per_way, _MIN_INVERSE)
     m_x, m_y = (x + distance * ray[0]) / radius, (y + distance * ray[1]) / radius
     steepest = np.stack([-ray[2] * m_x, -ray[2] * m_y, cosine / radius])
     determined = (steepest**2).sum(axis=0) > 1e-12
@@ -112,7 +112,7 @@ def _cross_gap(x: Floats, y: Floats, ray: Floats, cosine: Floats, per_way: Float
     gap, the ray is refracted at the side of the body (Snell) and partly reflected there (Fresnel,
     unpolarised), and crosses the gap.
     """
-    distance = 1 / np.maximum(per_way, _LEAST)
+    distance = 1 / np.maximum(per_way, _MIN_INVERSE)
     at_x, at_y = x + distance * ray[0], y + distance * ray[1]
     if gap == 0:
         return at_x, at_y, per_way, np.ones_like(x)

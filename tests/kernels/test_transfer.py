@@ -18,7 +18,7 @@ def opened(device, monkeypatch):
     """The device as one with memory of its own, with staging buffers of 4 KiB that threads fill."""
     monkeypatch.setattr(transfer, "SLOT", 2**12)
     monkeypatch.setattr(transfer, "SMALL", 2**10)
-    monkeypatch.setattr(transfer, "_SHARE", 2**8)
+    monkeypatch.setattr(transfer, "_MIN_BYTES_PER_THREAD", 2**8)
     monkeypatch.setattr(transfer, "THREADS", 3)
     opened = device_layer.Device(device.context.devices[0])
     opened.info, opened.layout = replace(device.info, shares_memory=False), device.layout

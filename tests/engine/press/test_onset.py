@@ -384,18 +384,18 @@ def test_levels_are_those_of_the_reference_to_the_last_bit(device, dtype, event)
             bright, dark, threshold - 1e-12, np.dtype(dtype), release=event == "release"
         )
         alive = np.isfinite(level)
-        np.testing.assert_array_equal(read("left")[0] > 0, alive)
+        np.testing.assert_array_equal(read("frames_left")[0] > 0, alive)
         # A level that is 0 but for rounding is so in float64, too.
         zero = np.abs(level) < 1e-6
         np.testing.assert_array_equal(levels[0][alive & ~zero], level[alive & ~zero])
         np.testing.assert_allclose(levels[0][alive & zero], level[alive & zero], rtol=0, atol=1e-9)
         np.testing.assert_array_equal(levels[1][alive], plateau[alive])
-        np.testing.assert_array_equal(read(("marks", 0))[0][alive], light[alive])
+        np.testing.assert_array_equal(read(("thresholds", 0))[0][alive], light[alive])
         sure = reference.onset_sure(level, light, 6 * noise)
-        np.testing.assert_array_equal(read(("marks", 1))[0][alive], sure[alive])
+        np.testing.assert_array_equal(read(("thresholds", 1))[0][alive], sure[alive])
         plane = reference.complement(np.zeros(shape, dtype)) if event == "release" else plateau
         near = reference.onset_near(level, plane, sure)
-        np.testing.assert_array_equal(read(("marks", 2))[0][alive], near[alive])
+        np.testing.assert_array_equal(read(("thresholds", 2))[0][alive], near[alive])
 
 
 def test_the_whole_range_of_uint16(device):
