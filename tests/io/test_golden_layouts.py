@@ -36,8 +36,10 @@ def test_a_recording_of_any_layout_is_read(name):
                 )
         assert (recording.truth is not None) == ("truth" in name)
         if recording.truth is not None:
-            for one in ("height", "zenith", "azimuth", "contact"):
-                np.testing.assert_array_equal(getattr(recording.truth, one), getattr(make.TRUTH, one))
+            for name_of_map in ("height", "zenith", "azimuth", "contact"):
+                np.testing.assert_array_equal(
+                    getattr(recording.truth, name_of_map), getattr(make.TRUTH, name_of_map)
+                )
     np.testing.assert_array_equal(block.frames, source.frames)
     if source.motion == "axial":
         np.testing.assert_array_equal(block.phase, make.PHASE)
@@ -48,36 +50,38 @@ def test_a_recording_of_any_layout_is_read(name):
 @pytest.mark.parametrize("name", of("result"))
 def test_a_result_of_any_layout_is_read(name):
     expected = make.DECLARED if "press-" in name else make.ROTATION
-    found = io.open_result(make.FOLDER / name)
-    for one in ("height", "height_sigma", "status", "normals", "zenith", "azimuth"):
-        np.testing.assert_array_equal(getattr(found, one), getattr(expected, one), err_msg=one)
-    assert found.process == expected.process
+    actual = io.open_result(make.FOLDER / name)
+    for name_of_map in ("height", "height_sigma", "status", "normals", "zenith", "azimuth"):
+        np.testing.assert_array_equal(
+            getattr(actual, name_of_map), getattr(expected, name_of_map), err_msg=name_of_map
+        )
+    assert actual.process == expected.process
     if name.endswith("-2.h5"):
-        assert list(found) == list(expected)
-        assert found.declarations == expected.declarations
+        assert list(actual) == list(expected)
+        assert actual.declarations == expected.declarations
 
 
 @pytest.mark.parametrize("name", of("calibration"))
 def test_a_calibration_of_any_layout_is_read(name):
-    found = io.open_calibration(make.FOLDER / name)
-    known = [part for part in found.parts() if found.parts()[part] is not None]
-    assert name.startswith("early") or "stiffness" in known  # which came later
-    assert_same(found, a_calibration(only=known))
+    actual = io.open_calibration(make.FOLDER / name)
+    expected = [part for part in actual.parts() if actual.parts()[part] is not None]
+    assert name.startswith("early") or "stiffness" in expected  # which came later
+    assert_same(actual, a_calibration(only=expected))
 
 
 def structure(path):
     """Return what readers rely on: names, ranks, kinds of numbers and attributes."""
-    found = {}
+    actual = {}
 
     def visit(name, node):
         if isinstance(node, h5py.Dataset):
             number = node.dtype.kind in "iuf"  # the size of a text is that of its words
-            found[name] = node.ndim, node.dtype.kind, node.dtype.itemsize if number else None
-        found.update({f"{name}@{key}": str(value) for key, value in node.attrs.items()})
+            actual[name] = node.ndim, node.dtype.kind, node.dtype.itemsize if number else None
+        actual.update({f"{name}@{key}": str(value) for key, value in node.attrs.items()})
 
     with h5py.File(path) as file:
         file.visititems(visit)
-    return found
+    return actual
 
 
 @pytest.mark.parametrize("name", NAMES)

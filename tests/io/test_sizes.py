@@ -324,10 +324,10 @@ def test_a_png_that_is_not_one_whole_picture_is_refused_before_libpng_prints(chu
 
 def png_of(chunks):
     """Return a PNG of these chunks, and its end."""
-    found = b"\x89PNG\r\n\x1a\n"
+    actual = b"\x89PNG\r\n\x1a\n"
     for kind, data in [*chunks, (b"IEND", b"")]:
-        found += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    return found
+        actual += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return actual
 
 
 @pytest.mark.parametrize("kind", ["L", "LA", "RGB", "RGBA", "P", "1", "I;16"])

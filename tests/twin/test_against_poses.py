@@ -47,22 +47,22 @@ def compare(name: str, pose: poses.Pose, sheet: Sheet, distance: float | None = 
     solid = SOLIDS[name][0]
     x, y = pixel_centres(SHAPE, PIXEL_SIZE)
     view = (0.0, 0.0) if distance is None else rays.sight_line(x, y, distance)
-    seen = poses.see(solid, pose, x, y, view)
+    sight = poses.see(solid, pose, x, y, view)
     clear = poses.clear(solid, pose, x, y, view, hair=HAIR, edge=EDGE)
-    away = np.stack([np.hypot(x + h * view[0], y + h * view[1]) for h in (0.0, seen.height)])
+    away = np.stack([np.hypot(x + h * view[0], y + h * view[1]) for h in (0.0, sight.height)])
     assert not sheet.contact[away.min(axis=0) > RADIUS + HAIR].any()
     clear &= away.max(axis=0) < RADIUS - HAIR
     assert clear.sum() > 0.8 * np.sum(away.max(axis=0) < RADIUS)
-    np.testing.assert_array_equal(sheet.contact[clear], seen.contact[clear])
+    np.testing.assert_array_equal(sheet.contact[clear], sight.contact[clear])
 
-    touching = clear & seen.contact
+    touching = clear & sight.contact
     normal = poses.normals(sheet.dz_dx, sheet.dz_dy)
-    assert poses.between(normal, seen.normal)[touching].max(initial=0) <= TARGET
+    assert poses.between(normal, sight.normal)[touching].max(initial=0) <= TARGET
     zenith, _ = poses.angles(normal)
-    assert np.abs(zenith - seen.zenith)[touching].max(initial=0) <= TARGET
-    assert np.abs(sheet.height - seen.height)[touching].max(initial=0) <= 1e-6
+    assert np.abs(zenith - sight.zenith)[touching].max(initial=0) <= TARGET
+    assert np.abs(sheet.height - sight.height)[touching].max(initial=0) <= 1e-6
 
-    free = clear & ~seen.contact
+    free = clear & ~sight.contact
     assert not sheet.height[free].any()
     assert not sheet.dz_dx[free].any()
     assert not sheet.dz_dy[free].any()
@@ -109,7 +109,7 @@ def test_a_lowered_body_sees_the_object_rise(name: str, distance: float | None) 
 
 
 @pytest.mark.parametrize("tilt", TILTS)
-def test_the_zenith_of_an_object_point_goes_round_as_equation_10_says(tilt: float) -> None:
+def test_the_zenith_of_an_object_point_follows_equation_10(tilt: float) -> None:
     # All of a cone has a zenith of 30 degrees, and the azimuth of its place.
     press = 1.5
     twin = make_twin("cone", Axial(PHASES, tilt, press, (0.0, 0.0, press)))
@@ -120,7 +120,7 @@ def test_the_zenith_of_an_object_point_goes_round_as_equation_10_says(tilt: floa
         chosen = sheet.contact & poses.clear(SOLIDS["cone"][0], pose, x, y, hair=HAIR, edge=EDGE)
         assert chosen.sum() > 20
         point = pose.to_world(np.stack([x, y, sheet.height], axis=-1))
-        swing = np.cos(np.arctan2(point[..., 1], point[..., 0]) - phase)
-        expected = np.cos(np.pi / 6) * np.cos(tilt) - np.sin(np.pi / 6) * np.sin(tilt) * swing
+        modulation = np.cos(np.arctan2(point[..., 1], point[..., 0]) - phase)
+        expected = np.cos(np.pi / 6) * np.cos(tilt) - np.sin(np.pi / 6) * np.sin(tilt) * modulation
         zenith, _ = poses.angles(poses.normals(sheet.dz_dx, sheet.dz_dy))
         assert np.abs(zenith - np.arccos(expected))[chosen].max() <= TARGET

@@ -139,14 +139,14 @@ def test_under_a_linear_wall_brightness_is_linear_in_zenith_and_saturates_beyond
 
 @pytest.mark.parametrize(("pattern", "scatter"), [("uniform", np.radians(3.0)), ("linear", 0.0)])
 def test_an_ideal_mirror_is_a_traced_one_at_the_centre(pattern: str, scatter: float, device: Device) -> None:
-    truth, made = PATTERNS[pattern]
+    truth, pattern_of_twin = PATTERNS[pattern]
     body = body_of(rays.Chamber(scatter=scatter))
     zenith = np.radians(np.linspace(2, 43, 83))[np.newaxis]
     clear = (np.abs(zenith - RIM) > 1e-3) | (scatter > 0)
     sheet = level_sheet(zenith, azimuth=0.6)
     shape, pixel_size = zenith.shape, (1e-6, 1e-6)  # all of it at the centre
-    wall = Wall(body, made, View(shape, pixel_size, body, np.inf), device)
-    ideal = Ideal(body, made).light(sheet)
+    wall = Wall(body, pattern_of_twin, View(shape, pixel_size, body, np.inf), device)
+    ideal = Ideal(body, pattern_of_twin).light(sheet)
     assert np.ptp(ideal) > 0.9
     error = np.abs(wall.light(sheet) - ideal)[clear]
     # The ideal mirror scatters in the plane of incidence, a real one by the angle a to all sides. Aside, the
@@ -207,16 +207,16 @@ def test_a_frame_of_the_twin_is_what_single_rays_make_of_the_object_in_its_pose(
     level = np.zeros(shape)
     view = (level, level) if np.isinf(distance) else rays.sight_line(x, y, distance)
     for frame, pose in zip(frames, places, strict=True):
-        seen = poses.see(solid, pose, x, y, view)
+        sight = poses.see(solid, pose, x, y, view)
         clear = poses.clear(solid, pose, x, y, view, hair=0.01, edge=pixel_size)
         clear &= np.hypot(x, y) < 17.0
-        chosen = np.argwhere(clear & seen.contact)[::3]
-        chosen = np.concatenate([chosen, np.argwhere(clear & ~seen.contact)[::40]])
+        chosen = np.argwhere(clear & sight.contact)[::3]
+        chosen = np.concatenate([chosen, np.argwhere(clear & ~sight.contact)[::40]])
         assert len(chosen) > 8
         for row, column in chosen:
-            height, line = seen.height[row, column], (view[0][row, column], view[1][row, column])
+            height, line = sight.height[row, column], (view[0][row, column], view[1][row, column])
             point = (x[row, column] + height * line[0], y[row, column] + height * line[1], height)
-            light = rays.wall_light(chamber, pattern, point, seen.normal[row, column], line)
+            light = rays.wall_light(chamber, pattern, point, sight.normal[row, column], line)
             assert (frame[row, column] - 16) / 208 == pytest.approx(light, abs=WORST)
 
 

@@ -107,18 +107,18 @@ def test_light_without_noise_gives_the_pixels_exact_counts(
         ("float32", (1, 2)),
     ],
 )
-def test_odd_sizes_show_what_the_reference_says(device: Device, dtype: str, shape: tuple[int, int]) -> None:
+def test_odd_sizes_agree_with_the_reference(device: Device, dtype: str, shape: tuple[int, int]) -> None:
     camera = make_camera(dtype, noise=3, seed=5, electrons=2.0, gain_deviation=0.02, offset_deviation=1)
     sensor = Sensor(camera, shape, device)
     light = np.random.default_rng(1).random(shape, np.float32)
-    pixels, room = light.size, -(-light.size // 4) * 4
-    maps = [np.zeros(room, np.float32) for _ in range(3)]
+    pixels, buffer = light.size, -(-light.size // 4) * 4
+    maps = [np.zeros(buffer, np.float32) for _ in range(3)]
     for place, values in zip(maps, (light, sensor.offset, sensor.full - sensor.offset), strict=True):
         place[:pixels] = values.ravel()
-    expected = np.empty(room, dtype)
+    expected = np.empty(buffer, dtype)
     exposure.expose(*maps, frame=4, seed=5, read=3, grain=0.5, top=camera.top, counts=expected)
-    found = shoot(sensor, light, [4])[0].astype(np.float64)
-    difference = np.abs(found - expected[:pixels].reshape(shape))
+    actual = shoot(sensor, light, [4])[0].astype(np.float64)
+    difference = np.abs(actual - expected[:pixels].reshape(shape))
     assert difference.max() < 0.01 or (dtype != "float32" and difference.sum() <= 1)
 
 
@@ -170,14 +170,14 @@ def test_noise_of_a_pixel_depends_on_no_other_pixel_frame_or_seed() -> None:
         counts = shoot(Sensor(make_camera(noise=1, seed=seed), (384, 512)), lit(0, (384, 512)), [frame])[0]
         return counts.astype(np.float64) - 16
 
-    one = noise(0)
-    pairs = [(one[:, 1:], one[:, :-1]), (one[1:], one[:-1]), (one[1:, 1:], one[:-1, :-1])]
-    pairs += [(one, noise(1)), (one, noise(-1)), (one, noise(2**40)), (one, noise(0, seed=1))]
-    pairs += [(one, noise(0, seed=2**63)), (noise(1), noise(0, seed=1))]
-    for left, right in pairs:
+    first = noise(0)
+    pairs = [(first[:, 1:], first[:, :-1]), (first[1:], first[:-1]), (first[1:, 1:], first[:-1, :-1])]
+    pairs += [(first, noise(1)), (first, noise(-1)), (first, noise(2**40)), (first, noise(0, seed=1))]
+    pairs += [(first, noise(0, seed=2**63)), (noise(1), noise(0, seed=1))]
+    for left_picture, right in pairs:
         for power in (1, 2):
-            correlation = np.corrcoef(left.ravel() ** power, right.ravel() ** power)[0, 1]
-            assert abs(correlation) < 4 / np.sqrt(left.size)
+            correlation = np.corrcoef(left_picture.ravel() ** power, right.ravel() ** power)[0, 1]
+            assert abs(correlation) < 4 / np.sqrt(left_picture.size)
 
 
 @pytest.mark.parametrize(("dtype", "bits"), KINDS)
@@ -191,8 +191,8 @@ def test_counts_stop_at_both_ends_and_do_not_wrap(dtype: str, bits: int) -> None
         kept = shoot(free, lit(light), range(5)).astype(np.float64) * scale
         expected = np.clip(kept, 0, camera.top)
         np.testing.assert_allclose(counts, expected, rtol=0, atol=0.5 + 1e-6 * camera.top)
-        share = stats.norm.sf((abs(level - end) - 0.5) / camera.noise)
-        assert (counts == end).mean() == pytest.approx(share, abs=4 * np.sqrt(share / counts.size))
+        fraction = stats.norm.sf((abs(level - end) - 0.5) / camera.noise)
+        assert (counts == end).mean() == pytest.approx(fraction, abs=4 * np.sqrt(fraction / counts.size))
 
 
 def test_pixels_deviate_as_much_as_stated() -> None:
@@ -215,8 +215,8 @@ def test_the_seed_decides_the_pixels_and_one_deviation_does_not_change_the_other
         return sensor.offset, sensor.full
 
     both = maps(gain_deviation=0.1, offset_deviation=2)
-    for left, right in zip(both, maps(gain_deviation=0.1, offset_deviation=2), strict=True):
-        np.testing.assert_array_equal(left, right)
+    for left_map, right in zip(both, maps(gain_deviation=0.1, offset_deviation=2), strict=True):
+        np.testing.assert_array_equal(left_map, right)
     np.testing.assert_array_equal(both[0], maps(offset_deviation=2)[0])
     np.testing.assert_allclose(both[1] - both[0], maps(gain_deviation=0.1)[1] - 16, rtol=1e-5)
     assert (both[0] != maps(offset_deviation=2, seed=1)[0]).all()

@@ -118,5 +118,5 @@ def test_an_unknown_name_is_refused_with_the_known_ones(name: str) -> None:
         named(name)
     message = str(caught.value)
     assert repr(name) in message
-    assert all(known in message for known in (*OBJECT_NAMES, ".png", ".npy", ".stl", ".ply"))
+    assert all(expected in message for expected in (*OBJECT_NAMES, ".png", ".npy", ".stl", ".ply"))
     assert "\n" not in message

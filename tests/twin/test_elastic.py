@@ -48,31 +48,31 @@ BODIES: dict[str, tuple[Callable[[float], contact_theory.Pressed], Callable[[Map
 def test_bodies_of_revolution_follow_closed_forms(body: str, radius: float) -> None:
     theory, fall = BODIES[body][0](radius), BODIES[body][1]
     r = np.hypot(*centres((SIDE, SIDE), (PIXEL, PIXEL)))
-    found = press(space((SIDE, SIDE), (PIXEL, PIXEL)), theory.depth - fall(r))
-    touching = found.pressure > 0
+    actual = press(space((SIDE, SIDE), (PIXEL, PIXEL)), theory.depth - fall(r))
+    touching = actual.pressure > 0
     assert np.sqrt(touching.sum() * PIXEL**2 / np.pi) == pytest.approx(radius, rel=0.01)
-    assert found.force == pytest.approx(theory.force, rel=0.01)
-    assert found.force / (touching.sum() * PIXEL**2) == pytest.approx(
+    assert actual.force == pytest.approx(theory.force, rel=0.01)
+    assert actual.force / (touching.sum() * PIXEL**2) == pytest.approx(
         theory.force / (np.pi * radius**2), rel=0.01
     )
     # A cone's pressure has no bound at the tip; near the edge a pixel is as wide as the pressure changes.
     well_inside = (r < 0.9 * radius) & (r > (0.1 * radius if body == "cone" else -1))
-    np.testing.assert_allclose(found.pressure[well_inside], theory.pressure(r[well_inside]), rtol=0.01)
+    np.testing.assert_allclose(actual.pressure[well_inside], theory.pressure(r[well_inside]), rtol=0.01)
     if body != "cone":
-        assert found.pressure.max() == pytest.approx(theory.pressure(np.zeros(1))[0], rel=0.01)
+        assert actual.pressure.max() == pytest.approx(theory.pressure(np.zeros(1))[0], rel=0.01)
     outside = r > radius
-    np.testing.assert_allclose(found.displacement[outside], theory.surface(r[outside]), rtol=0.01)
+    np.testing.assert_allclose(actual.displacement[outside], theory.surface(r[outside]), rtol=0.01)
 
 
 @pytest.mark.parametrize("pixel_size", [(0.05, 0.05), (0.04, 0.06)])
 @pytest.mark.parametrize("depth", [0.0, 0.05, 0.4])
-def test_a_smooth_load_pushes_in_as_its_spectrum_says(pixel_size: tuple[float, float], depth: float) -> None:
+def test_a_smooth_load_indents_by_its_spectrum(pixel_size: tuple[float, float], depth: float) -> None:
     x, y = centres((90, 101), pixel_size)
     r = np.hypot(x, y)
-    found = space(r.shape, pixel_size, depth).mirror(np.exp(-(r**2) / (2 * 0.3**2)))
+    actual = space(r.shape, pixel_size, depth).mirror(np.exp(-(r**2) / (2 * 0.3**2)))
     some = np.s_[::11, ::11]
     np.testing.assert_allclose(
-        found[some], contact_theory.gaussian_load(0.3, depth, MODULUS, r[some]), rtol=2e-3
+        actual[some], contact_theory.gaussian_load(0.3, depth, MODULUS, r[some]), rtol=2e-3
     )
 
 
@@ -104,10 +104,10 @@ def test_rough_objects_rest_where_a_dense_solver_puts_them(shape: tuple[int, int
     # Least of p K p / 2 - p h over p >= 0 is least of |R p - R^-T h|, with K = R^T R.
     root = np.linalg.cholesky(matrix).T
     expected, _ = optimize.nnls(root, np.linalg.solve(root.T, obstacle.ravel()))
-    found = press(space(shape, pixel_size), obstacle, compliance=compliance)
+    actual = press(space(shape, pixel_size), obstacle, compliance=compliance)
     assert (expected > 0).any()
     scale = expected.max()
-    np.testing.assert_allclose(found.pressure.ravel(), expected, rtol=0, atol=1e-4 * scale)
+    np.testing.assert_allclose(actual.pressure.ravel(), expected, rtol=0, atol=1e-4 * scale)
 
 
 def rough(shape: tuple[int, int]) -> Map:
@@ -115,13 +115,13 @@ def rough(shape: tuple[int, int]) -> Map:
     return 0.05 * np.random.default_rng(4).normal(size=shape) + 0.5 * np.cos(x / 9) * np.cos(y / 7)
 
 
-def assert_at_rest(found: Contact, obstacle: Map, compliance: float = 0.0) -> None:
-    gap = np.nan_to_num(found.displacement + compliance * found.force - obstacle, nan=np.inf)
+def assert_at_rest(actual: Contact, obstacle: Map, compliance: float = 0.0) -> None:
+    gap = np.nan_to_num(actual.displacement + compliance * actual.force - obstacle, nan=np.inf)
     tolerance = 1.01 * TOLERANCE * np.nanmax(obstacle)
-    assert (found.pressure >= 0).all()
+    assert (actual.pressure >= 0).all()
     assert gap.min() >= -tolerance
-    assert np.abs(gap[found.pressure > 0]).max() <= tolerance
-    assert (found.pressure > 0).any()
+    assert np.abs(gap[actual.pressure > 0]).max() <= tolerance
+    assert (actual.pressure > 0).any()
 
 
 @pytest.mark.parametrize("compliance", [0.0, 0.1, 5.0])
@@ -129,20 +129,20 @@ def assert_at_rest(found: Contact, obstacle: Map, compliance: float = 0.0) -> No
 def test_pressure_and_gap_exclude_each_other(shape: tuple[int, int], compliance: float) -> None:
     obstacle = rough(shape)
     obstacle[10:14, :20] = np.nan
-    found = press(space(shape, (0.05, 0.08)), obstacle, compliance=compliance)
-    assert_at_rest(found, obstacle, compliance)
-    assert (found.pressure[10:14, :20] == 0).all()
-    assert found.force == pytest.approx(0.05 * 0.08 * found.pressure.sum())
+    actual = press(space(shape, (0.05, 0.08)), obstacle, compliance=compliance)
+    assert_at_rest(actual, obstacle, compliance)
+    assert (actual.pressure[10:14, :20] == 0).all()
+    assert actual.force == pytest.approx(0.05 * 0.08 * actual.pressure.sum())
 
 
 def test_a_flexible_stage_takes_its_share_of_the_travel() -> None:
     travel, compliance = 1.2, 0.15
     r = np.hypot(*centres((161, 161), (0.03, 0.03)))
-    found = press(space(r.shape, (0.03, 0.03)), travel - r**2 / (2 * CURVATURE), compliance=compliance)
-    depth = travel - compliance * found.force
+    actual = press(space(r.shape, (0.03, 0.03)), travel - r**2 / (2 * CURVATURE), compliance=compliance)
+    depth = travel - compliance * actual.force
     hertz = contact_theory.paraboloid(CURVATURE, np.sqrt(CURVATURE * depth), MODULUS)
     assert 0.2 < depth < 0.8 * travel
-    assert found.force == pytest.approx(hertz.force, rel=0.002)
+    assert actual.force == pytest.approx(hertz.force, rel=0.002)
 
 
 def test_a_press_that_does_not_come_to_rest_reports_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,25 +26,25 @@ def force(movement: Movement, **changes: object) -> Floats:
         camera=Camera(**changes),  # type: ignore[arg-type]
         contact="elastic",
     )
-    found = twin.truth.force
-    assert found is not None
-    return found
+    actual = twin.truth.force
+    assert actual is not None
+    return actual
 
 
 @pytest.mark.parametrize("exposure", [0.0, 0.02])
 def test_a_press_has_the_force_of_hertz_at_the_middle_of_each_exposure(exposure: float) -> None:
-    found = force(Vertical([theory.depth for theory in PRESSED]), exposure=exposure)
-    assert found.shape == (3, 3)
-    assert not found[:, :2].any()
-    np.testing.assert_allclose(found[:, 2], [theory.force for theory in PRESSED], rtol=0.01)
+    actual = force(Vertical([theory.depth for theory in PRESSED]), exposure=exposure)
+    assert actual.shape == (3, 3)
+    assert not actual[:, :2].any()
+    np.testing.assert_allclose(actual[:, 2], [theory.force for theory in PRESSED], rtol=0.01)
 
 
 def test_a_push_has_the_force_of_cattaneo_and_mindlin_against_the_movement() -> None:
     shares, along = np.array([0.0, 0.2, 0.5, 0.8, 1.3]), np.array([0.6, -0.8])
-    found = force(Horizontal(FAR * np.outer(shares, along), DEEP.depth))
-    theory = [contact_theory.pushed(DEEP, MU, MODULUS, share * FAR).force for share in shares]
-    np.testing.assert_allclose(found[:, :2], -np.outer(theory, along), atol=0.01 * MU * DEEP.force)
-    np.testing.assert_allclose(found[:, 2], DEEP.force, rtol=0.01)
+    actual = force(Horizontal(FAR * np.outer(shares, along), DEEP.depth))
+    theory = [contact_theory.pushed(DEEP, MU, MODULUS, fraction * FAR).force for fraction in shares]
+    np.testing.assert_allclose(actual[:, :2], -np.outer(theory, along), atol=0.01 * MU * DEEP.force)
+    np.testing.assert_allclose(actual[:, 2], DEEP.force, rtol=0.01)
 
 
 def test_a_twist_and_a_turn_of_the_axis_have_no_force_along_the_sheet() -> None:
@@ -53,6 +53,6 @@ def test_a_twist_and_a_turn_of_the_axis_have_no_force_along_the_sheet() -> None:
         Twist([0.0, 0.2], DEEP.depth),
         Axial([0.0, 2], 0.04, DEEP.depth, about_the_ball_s_centre),
     ):
-        found = force(movement)
-        np.testing.assert_allclose(found[:, :2], 0, atol=1e-3 * DEEP.force)
-        np.testing.assert_allclose(found[:, 2], DEEP.force, rtol=0.01)
+        actual = force(movement)
+        np.testing.assert_allclose(actual[:, :2], 0, atol=1e-3 * DEEP.force)
+        np.testing.assert_allclose(actual[:, 2], DEEP.force, rtol=0.01)

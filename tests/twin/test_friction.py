@@ -47,7 +47,7 @@ def stick_radius(slips: NDArray[np.bool_], pressure: Map) -> float:
 
 
 @pytest.mark.parametrize("pixel_size", [(0.1, 0.1), (0.05, 0.2)])
-def test_tractions_shift_the_surface_as_cerruti_says(pixel_size: tuple[float, float]) -> None:
+def test_tractions_shift_the_surface_by_cerrutis_solution(pixel_size: tuple[float, float]) -> None:
     rows, columns = 4, 5
     half_space = HalfSpace((rows, columns), pixel_size, MODULUS)
     for loaded in [(0, 0), (2, 3)]:
@@ -55,18 +55,18 @@ def test_tractions_shift_the_surface_as_cerruti_says(pixel_size: tuple[float, fl
             traction = np.zeros((2, rows, columns))
             traction[(axis, *loaded)] = 1.0
             shift = half_space.tangential(traction)
-            for there in np.ndindex(rows, columns):
-                x, y = (there[1] - loaded[1]) * pixel_size[0], (loaded[0] - there[0]) * pixel_size[1]
+            for target in np.ndindex(rows, columns):
+                x, y = (target[1] - loaded[1]) * pixel_size[0], (loaded[0] - target[0]) * pixel_size[1]
                 expected = contact_theory.traction_response(x, y, pixel_size, MODULUS)[:, axis]
-                np.testing.assert_allclose(shift[:, *there], expected, rtol=1e-6, atol=1e-9)
+                np.testing.assert_allclose(shift[:, *target], expected, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
-def test_a_pushed_ball_sticks_in_the_disc_of_cattaneo_and_mindlin(share: float) -> None:
-    theory = contact_theory.pushed(HERTZ, MU, MODULUS, share * FAR)
+@pytest.mark.parametrize("fraction", [0.2, 0.5, 0.8])
+def test_a_pushed_ball_sticks_in_the_disc_of_cattaneo_and_mindlin(fraction: float) -> None:
+    theory = contact_theory.pushed(HERTZ, MU, MODULUS, fraction * FAR)
     contact = Friction(SPACE, BALL, MU)
-    contact.move(push(share * FAR / 2))
-    slips = contact.move(push(share * FAR))
+    contact.move(push(fraction * FAR / 2))
+    slips = contact.move(push(fraction * FAR))
     assert force(contact)[0] == pytest.approx(theory.force, rel=0.01)
     assert force(contact)[1] == pytest.approx(0, abs=1e-3 * theory.force)
     assert stick_radius(slips, BALL) == pytest.approx(theory.stick_radius, rel=0.01)
@@ -87,25 +87,25 @@ def test_a_ball_pushed_far_enough_slides() -> None:
 
 def test_a_ball_pushed_back_goes_through_mindlins_loop() -> None:
     # By Masing's rule the way back is the way there, doubled: Johnson (1985), section 7.4.
-    there = 0.6 * FAR
+    target = 0.6 * FAR
     contact = Friction(SPACE, BALL, MU)
-    contact.move(push(there))
-    most = contact_theory.pushed(HERTZ, MU, MODULUS, there).force
+    contact.move(push(target))
+    limit = contact_theory.pushed(HERTZ, MU, MODULUS, target).force
     for back in (0.2, 0.6, 1.0):
-        slips = contact.move(push(there - back * FAR))
+        slips = contact.move(push(target - back * FAR))
         half = contact_theory.pushed(HERTZ, MU, MODULUS, back * FAR / 2)
-        assert force(contact)[0] == pytest.approx(most - 2 * half.force, abs=0.01 * most)
+        assert force(contact)[0] == pytest.approx(limit - 2 * half.force, abs=0.01 * limit)
         assert stick_radius(slips, BALL) == pytest.approx(half.stick_radius, rel=0.01)
 
 
-@pytest.mark.parametrize("share", [0.9, 0.6, 0.3])
-def test_a_twisted_ball_sticks_in_the_disc_of_lubkin(share: float) -> None:
-    theory = contact_theory.twisted(HERTZ, MU, MODULUS, share * RADIUS)
+@pytest.mark.parametrize("fraction", [0.9, 0.6, 0.3])
+def test_a_twisted_ball_sticks_in_the_disc_of_lubkin(fraction: float) -> None:
+    theory = contact_theory.twisted(HERTZ, MU, MODULUS, fraction * RADIUS)
     contact = Friction(SPACE, BALL, MU)
     contact.move(twist(theory.angle / 2))
     slips = contact.move(twist(theory.angle))
     assert torque(contact) == pytest.approx(theory.torque, rel=0.005)
-    assert stick_radius(slips, BALL) == pytest.approx(share * RADIUS, abs=0.01 * RADIUS)
+    assert stick_radius(slips, BALL) == pytest.approx(fraction * RADIUS, abs=0.01 * RADIUS)
     np.testing.assert_allclose(force(contact), 0, atol=1e-4 * HERTZ.force)
 
 
@@ -115,7 +115,7 @@ def glued() -> tuple[Friction, float]:
     return Friction(SPACE, disc, 1e6), float(np.sqrt(disc.sum() / np.pi)) * PIXEL
 
 
-def test_a_glued_disc_resists_twist_as_reissner_and_sagoci_say(glued: tuple[Friction, float]) -> None:
+def test_a_glued_disc_has_the_stiffness_of_reissner_and_sagoci(glued: tuple[Friction, float]) -> None:
     contact, radius = glued
     slips = contact.move(twist(-0.1))
     assert not slips.any()
@@ -130,10 +130,10 @@ def test_each_pixel_obeys_coulomb() -> None:
     y, x = np.indices(shape, dtype=float)
     here = np.zeros((2, *shape))
     shares = []
-    for there in (push(0.02, shape=shape), push(0.05, 0.03, shape=shape), 0.002 * np.stack([y - 20, x - 9])):
+    for target in (push(0.02, shape=shape), push(0.05, 0.03, shape=shape), 0.002 * np.stack([y - 20, x - 9])):
         before = contact.traction.copy()
-        slips = contact.move(there)
-        step = there - here
+        slips = contact.move(target)
+        step = target - here
         slip = step - half_space.tangential(contact.traction - before)
         close = 2 * friction.TOLERANCE * float(np.hypot(*step)[pressure > 0].max())
         size = np.hypot(*contact.traction)
@@ -145,8 +145,8 @@ def test_each_pixel_obeys_coulomb() -> None:
         assert (along[slips] > 0).all()
         assert np.abs(np.hypot(*slip) - along)[slips].max() <= close
         shares.append(slips.sum() / (pressure > 0).sum())
-        here = there
-    assert all(0.02 < share < 0.98 for share in shares)
+        here = target
+    assert all(0.02 < fraction < 0.98 for fraction in shares)
 
 
 def test_a_body_that_stands_still_does_not_slip() -> None:

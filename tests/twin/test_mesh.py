@@ -86,7 +86,7 @@ def test_a_heap_of_triangles_against_brute_force() -> None:
     triangles[6] = triangles[6, 0]  # a point
     triangles[7, :, 1] = 0.1  # upright, along a row
     shape, pixel = (71, 84), (0.06, 0.05)
-    found = top_surface(triangles, shape, pixel)
+    actual = top_surface(triangles, shape, pixel)
     x, y = np.meshgrid((np.arange(84) - 41.5) * 0.06, (35 - np.arange(71)) * 0.05)
     expected = np.full(shape, np.nan)
     for p, q, r in triangles:
@@ -99,7 +99,7 @@ def test_a_heap_of_triangles_against_brute_force() -> None:
         inside = (share_q >= 0) & (share_r >= 0) & (share_q + share_r <= 1)
         expected = np.fmax(expected, np.where(inside, z, np.nan))
     assert 0.2 < np.isnan(expected).mean() < 0.8
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9)
 
 
 def test_only_what_is_seen_from_above_counts(tmp_path: Path) -> None:

@@ -53,11 +53,11 @@ BALL = poses.Ball()
 
 def make_twin(movement: Movement | str, **changes: Any) -> Twin:
     movement = MOVEMENTS[movement] if isinstance(movement, str) else movement
-    given: dict[str, Any] = {"object": "sphere", "shape": SHAPE, "pixel_size": PIXEL}
+    options: dict[str, Any] = {"object": "sphere", "shape": SHAPE, "pixel_size": PIXEL}
     names = ("dtype", "noise", "seed", "exposure", "gain_deviation", "offset_deviation", "electrons")
     names += ("point_spread", "distance")
     camera = {"dtype": FLOAT, "noise": 0.0} | {name: changes.pop(name) for name in names if name in changes}
-    return Twin(movement=movement, camera=Camera(**camera), **(given | changes))
+    return Twin(movement=movement, camera=Camera(**camera), **(options | changes))
 
 
 def read_all(twin: Twin, size: int = 1000) -> Frames:
@@ -131,11 +131,11 @@ def test_blocks_contain_the_position(name: str) -> None:
         assert block.index == at
         here = slice(at, at + len(block.frames))
         for motion, field in part.items():
-            told = getattr(block, field)
+            positions = getattr(block, field)
             if motion == name:
-                np.testing.assert_array_equal(told, movement.positions[here])
+                np.testing.assert_array_equal(positions, movement.positions[here])
             else:
-                assert told is None
+                assert positions is None
         np.testing.assert_allclose(block.time, np.arange(*here.indices(1000)) / 30)
         at += len(block.frames)
     assert at == len(movement.positions)
@@ -153,10 +153,10 @@ def test_blocks_contain_the_position(name: str) -> None:
 )
 def test_truth_is_the_object_under_the_upright_body(name: str, contact: str) -> None:
     truth = make_twin(name, contact=contact).truth
-    for found, expected in zip(
+    for actual, expected in zip(
         (truth.height, truth.zenith, truth.azimuth), geometry.sphere(SHAPE, PIXEL), strict=True
     ):
-        np.testing.assert_allclose(found, expected, atol=1e-6)
+        np.testing.assert_allclose(actual, expected, atol=1e-6)
     assert truth.contact.dtype == np.uint8
     assert 0 < truth.contact.sum() < truth.contact.size
     assert (truth.slip is None) == (contact == "conform" or name in ("vertical", "axial"))
@@ -186,12 +186,12 @@ def test_contact_of_a_rotation_is_that_in_every_frame(tilt: float, pivot: tuple[
     x, y = geometry.pixel_centres(SHAPE, PIXEL)
     touched, clear, once = np.ones(SHAPE, bool), np.ones(SHAPE, bool), np.zeros(SHAPE, bool)
     for pose in book(movement):
-        seen = poses.see(BALL, pose, x, y)
+        sight = poses.see(BALL, pose, x, y)
         clear &= poses.clear(BALL, pose, x, y, hair=1e-3, edge=0.01)
-        touched &= seen.contact
-        once |= seen.contact
-    found = make_twin(movement).truth.contact
-    np.testing.assert_array_equal(found[clear], touched[clear])
+        touched &= sight.contact
+        once |= sight.contact
+    actual = make_twin(movement).truth.contact
+    np.testing.assert_array_equal(actual[clear], touched[clear])
     assert clear.mean() > 0.9
     assert 50 < touched.sum() < once.sum() - 20
 
@@ -227,12 +227,12 @@ def test_counts_are_linear_in_the_zenith_of_each_frame() -> None:
     x, y = geometry.pixel_centres(SHAPE, PIXEL)
     low, high = design_range(Body())
     for frame, pose in zip(frames, book(MOVEMENTS["axial"]), strict=True):
-        seen = poses.see(BALL, pose, x, y)
-        linear = seen.contact & (seen.zenith > low) & (seen.zenith < high)
+        sight = poses.see(BALL, pose, x, y)
+        linear = sight.contact & (sight.zenith > low) & (sight.zenith < high)
         assert linear.sum() > 200
-        expected = (offset + gain * seen.zenith)[linear]
+        expected = (offset + gain * sight.zenith)[linear]
         np.testing.assert_allclose(frame[linear], expected, rtol=0, atol=1e-4)
-        assert (frame[~seen.contact] == 16).all()
+        assert (frame[~sight.contact] == 16).all()
 
 
 def test_a_rolled_ball_determines_the_nominal_zenith_scale() -> None:
@@ -258,33 +258,33 @@ def turn(pivot: tuple[float, float, float]) -> tuple[Frames, Frames, NDArray[np.
     movement = Axial(PHASES[:10], TILT, PRESS, pivot)
     twin = make_twin(movement, pattern="linear")
     assert twin.header.zenith_gain is not None
-    told = (read_all(twin).astype(float) - twin.header.zenith_offset) / twin.header.zenith_gain
+    zenith = (read_all(twin).astype(float) - twin.header.zenith_offset) / twin.header.zenith_gain
     low, high = design_range(Body())
-    good = ((told > low) & (told < high)).all(axis=0) & (twin.truth.contact == 1)
+    good = ((zenith > low) & (zenith < high)).all(axis=0) & (twin.truth.contact == 1)
     surface = geometry.sphere(SHAPE, PIXEL)
-    swing = np.cos(surface.azimuth - movement.positions[:, np.newaxis, np.newaxis])
-    cosine = np.cos(surface.zenith) * np.cos(TILT) - np.sin(surface.zenith) * np.sin(TILT) * swing
-    return told, np.arccos(cosine), good
+    modulation = np.cos(surface.azimuth - movement.positions[:, np.newaxis, np.newaxis])
+    cosine = np.cos(surface.zenith) * np.cos(TILT) - np.sin(surface.zenith) * np.sin(TILT) * modulation
+    return zenith, np.arccos(cosine), good
 
 
 def test_equation_10_holds_with_the_pivot_in_the_apex_and_fails_with_it_far_up() -> None:
     zenith, azimuth = geometry.sphere(SHAPE, PIXEL)[1:]
-    told, expected, good = turn(APEX)
+    seen_zenith, expected, good = turn(APEX)
     assert good.sum() > 300
     # What lies deeper than the pivot moves in the picture, and the ball bends: to first order that is
-    error = np.abs(told - expected)[:, good]
+    error = np.abs(seen_zenith - expected)[:, good]
     bend = TILT * (1 / np.cos(zenith) - 1)[good]
     assert (error <= 1.1 * bend + 1e-3).all()
     assert np.median(error) < TILT / 5
     # The paper's estimates over the turn, eq. 16 to 22, hardly feel it.
-    turned = -np.tensordot(np.exp(1j * PHASES[:10]), told, 1)[good]
+    turned = -np.tensordot(np.exp(1j * PHASES[:10]), seen_zenith, 1)[good]
     away = np.angle(-turned * np.exp(-1j * azimuth[good]))
-    assert np.abs(told.mean(axis=0) - zenith)[good].max() < np.radians(0.3)
+    assert np.abs(seen_zenith.mean(axis=0) - zenith)[good].max() < np.radians(0.3)
     assert np.abs(away).max() < np.radians(0.5)
 
-    told, expected, good = turn((0.0, 0.0, 40.0))
+    seen_zenith, expected, good = turn((0.0, 0.0, 40.0))
     assert good.sum() > 50
-    assert np.median(np.abs(told - expected)[:, good]) > np.radians(5)
+    assert np.median(np.abs(seen_zenith - expected)[:, good]) > np.radians(5)
 
 
 def test_what_moves_in_the_picture_is_the_object() -> None:
@@ -419,15 +419,15 @@ ALL = {
 def test_frames_are_the_same_however_they_are_read(
     how: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given: dict[str, Any] = {"shape": (22, 26), "pixel_size": 0.3, "noise": 1.5} | ALL[how]
-    monkeypatch.setattr(twin_module, "_MEMORY", given.pop("memory", twin_module._MEMORY))
-    twin = make_twin(SHORT[name], **given)
+    options: dict[str, Any] = {"shape": (22, 26), "pixel_size": 0.3, "noise": 1.5} | ALL[how]
+    monkeypatch.setattr(twin_module, "_MEMORY", options.pop("memory", twin_module._MEMORY))
+    twin = make_twin(SHORT[name], **options)
     whole = read_all(twin)
     assert np.unique(whole.reshape(len(whole), -1), axis=0).shape[0] == len(whole)  # noise, at least
     for size in (1, 3):
         twin.rewind()
         np.testing.assert_array_equal(read_all(twin, size), whole)
-    fresh = make_twin(SHORT[name], **given)
+    fresh = make_twin(SHORT[name], **options)
     fresh.read(np.empty((2, *fresh.shape[1:]), fresh.dtype))
     contact = fresh.truth.contact  # in between
     np.testing.assert_array_equal(read_all(fresh), whole[2:])
@@ -435,7 +435,7 @@ def test_frames_are_the_same_however_they_are_read(
     fresh.read()
     fresh.rewind()
     np.testing.assert_array_equal(read_all(fresh), whole)
-    np.testing.assert_array_equal(make_twin(SHORT[name], **given).truth.contact, contact)
+    np.testing.assert_array_equal(make_twin(SHORT[name], **options).truth.contact, contact)
 
 
 @pytest.mark.parametrize(("name", "contact"), [("vertical", "conform"), ("axial", "elastic")])
@@ -473,9 +473,9 @@ EVERYTHING: dict[str, Any] = {
 
 @pytest.mark.parametrize("name", ["vertical", "twist"])
 def test_a_seed_gives_one_recording_and_another_seed_another(device: Device, name: str) -> None:
-    for given in ({"noise": 1.5, "shape": (24, 30)}, EVERYTHING):
+    for options in ({"noise": 1.5, "shape": (24, 30)}, EVERYTHING):
         first, again, other = (
-            make_twin(SHORT[name], seed=seed, device=device, **given) for seed in (7, 7, 8)
+            make_twin(SHORT[name], seed=seed, device=device, **options) for seed in (7, 7, 8)
         )
         frames = read_all(first)
         np.testing.assert_array_equal(read_all(again, 2), frames)
@@ -518,7 +518,7 @@ def test_a_seed_gives_one_recording_and_another_seed_another(device: Device, nam
     ],
 )
 def test_impossible_input_is_refused_in_one_line(changes: dict[str, Any], words: str) -> None:
-    given: dict[str, Any] = {"movement": Vertical([1.0]), **changes}
+    options: dict[str, Any] = {"movement": Vertical([1.0]), **changes}
     with pytest.raises(InputError, match=words) as caught:
-        make_twin(given.pop("movement"), **given)
+        make_twin(options.pop("movement"), **options)
     assert "\n" not in str(caught.value)

@@ -101,7 +101,7 @@ def test_bad_input_is_refused_in_one_line(make: Any, words: str) -> None:
 
 
 @pytest.mark.parametrize("pivot", [(0.0, 0.0, 0.0), (0.0, 0.0, 40.0), (3.0, -2.0, -1.5), (-30.0, 10.0, 0.0)])
-def test_a_rotation_raises_the_rim_of_a_disc_as_far_as_it_says(pivot: tuple[float, float, float]) -> None:
+def test_a_rotation_raises_the_rim_of_a_disc_by_the_stated_height(pivot: tuple[float, float, float]) -> None:
     angles = np.linspace(-np.pi, np.pi, 721)
     movement = Axial(angles[:-1], 0.3, 1.2, pivot)
     rim = 8.0 * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)

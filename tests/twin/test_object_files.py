@@ -51,8 +51,8 @@ def test_floating_point_is_millimetres_below_the_highest(tmp_path: Path, suffix:
     heights = hill().astype(dtype)
     heights[3:9, 5] = np.nan
     path = write(tmp_path / f"hill{suffix.lower()}", heights).rename(tmp_path / f"hill{suffix}")
-    found = load_height_map(path, (PIXEL, PIXEL)).heights
-    np.testing.assert_allclose(found, heights.astype(float) - np.nanmax(heights), rtol=0, atol=1e-12)
+    actual = load_height_map(path, (PIXEL, PIXEL)).heights
+    np.testing.assert_allclose(actual, heights.astype(float) - np.nanmax(heights), rtol=0, atol=1e-12)
 
 
 def test_a_file_of_the_truth_is_like_the_object_itself(tmp_path: Path) -> None:
@@ -62,8 +62,8 @@ def test_a_file_of_the_truth_is_like_the_object_itself(tmp_path: Path) -> None:
     assert copy.name == "ball.npy"
     np.testing.assert_array_equal(copy.height(x, y), heights)
     gentle = np.hypot(x, y) < 5 * np.sin(np.radians(40))
-    for found, expected in zip(copy.slope(x, y), Sphere().slope(x, y), strict=True):
-        np.testing.assert_allclose(found[gentle], expected[gentle], atol=3e-3)
+    for actual, expected in zip(copy.slope(x, y), Sphere().slope(x, y), strict=True):
+        np.testing.assert_allclose(actual[gentle], expected[gentle], atol=3e-3)
 
 
 @pytest.mark.parametrize(

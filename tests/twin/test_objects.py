@@ -47,14 +47,14 @@ def test_slope_is_the_height_differentiated(thing: Object) -> None:
     x, y = places[:, np.hypot(*places) < 4.5]
     step = 1e-5
     dz_dx, dz_dy = thing.slope(x, y)
-    found = np.stack([dz_dx, dz_dy])
+    actual = np.stack([dz_dx, dz_dy])
     expected = np.stack(
         [
             (thing.height(x + step, y) - thing.height(x - step, y)) / (2 * step),
             (thing.height(x, y + step) - thing.height(x, y - step)) / (2 * step),
         ]
     )
-    near = np.isclose(found, expected, rtol=1e-5, atol=1e-6, equal_nan=True)
+    near = np.isclose(actual, expected, rtol=1e-5, atol=1e-6, equal_nan=True)
     assert near.mean() > 0.998  # a kink of the coin may fall between the two steps
 
 
@@ -64,13 +64,13 @@ def test_slope_is_the_height_differentiated(thing: Object) -> None:
 )
 def test_azimuth_is_counter_clockwise_downhill(slope: tuple[float, float], azimuth: float) -> None:
     dz_dx, dz_dy = (np.array([component], float) for component in slope)
-    zenith, found = zenith_azimuth(dz_dx, dz_dy)
-    assert np.degrees(found[0]) == pytest.approx(azimuth)
+    zenith, actual = zenith_azimuth(dz_dx, dz_dy)
+    assert np.degrees(actual[0]) == pytest.approx(azimuth)
     assert np.tan(zenith[0]) == pytest.approx(np.hypot(*slope))
 
 
 @pytest.mark.parametrize(
-    ("degrees", "share"),
+    ("degrees", "fraction"),
     [
         (0, 0),
         (10.31, 0),
@@ -83,8 +83,8 @@ def test_azimuth_is_counter_clockwise_downhill(slope: tuple[float, float], azimu
         (46.51, 0),
     ],
 )
-def test_response_in_numbers(degrees: float, share: float) -> None:
-    assert uniform_response(np.radians([degrees]))[0] == pytest.approx(share, abs=2e-5)
+def test_response_in_numbers(degrees: float, fraction: float) -> None:
+    assert uniform_response(np.radians([degrees]))[0] == pytest.approx(fraction, abs=2e-5)
 
 
 def test_height_map_gives_its_samples_between_them_the_line_and_outside_nothing() -> None:

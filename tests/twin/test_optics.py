@@ -175,8 +175,8 @@ def test_every_cut_through_the_scatter_is_a_box() -> None:
     turned = rays[:, 1:] * (off / np.sin(off))[:, np.newaxis]
     even = (np.arange(len(rays)) + 0.5) / len(rays) * 2 - 1
     for turn in np.linspace(0, np.pi, 37):
-        cut = np.sort(turned @ [np.cos(turn), np.sin(turn)]) / BODY.scatter
-        assert np.abs(cut - even).max() < 0.06
+        places = np.sort(turned @ [np.cos(turn), np.sin(turn)]) / BODY.scatter
+        assert np.abs(places - even).max() < 0.06
 
 
 def exact_light(zenith: float, azimuth: float, place: tuple[float, float]) -> float:
@@ -236,15 +236,15 @@ def test_mirrors_show_the_wall_from_the_visible_zenith_on(device: Device, gap: f
             (upper - margin, 1),
             (upper + margin, 0),
         ):
-            known = ~np.isnan(zenith)
-            light = look_from(place, mirrors(zenith[known], azimuth[known]), body, Uniform(), device)
+            expected = ~np.isnan(zenith)
+            light = look_from(place, mirrors(zenith[expected], azimuth[expected]), body, Uniform(), device)
             np.testing.assert_array_equal(light > 0, visible)
         hidden = np.isnan(lower)
         assert hidden.any() == (gap > 0 and np.hypot(*place) > 17.5 / 1.41)
         for zenith in np.radians([15.0, 40.0]):
-            seen = mirrors(np.full(hidden.sum(), zenith), azimuth[hidden])
+            calls = mirrors(np.full(hidden.sum(), zenith), azimuth[hidden])
             if hidden.any():
-                assert not look_from(place, seen, body, Uniform(), device).any()
+                assert not look_from(place, calls, body, Uniform(), device).any()
 
 
 @pytest.mark.parametrize("distance", [np.inf, 60.0])

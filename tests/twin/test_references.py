@@ -20,9 +20,9 @@ NOISE = 1.5
 
 
 def make_twin(shape: tuple[int, int] = SHAPE, pixel: float = PIXEL, **changes: Any) -> Twin:
-    given: dict[str, Any] = {"object": "sphere", "movement": Vertical([0.0, 1.0]), "references": "ball"}
-    given["camera"] = Camera(np.dtype(np.float32), NOISE)
-    return Twin(shape=shape, pixel_size=pixel, **(given | changes))
+    options: dict[str, Any] = {"object": "sphere", "movement": Vertical([0.0, 1.0]), "references": "ball"}
+    options["camera"] = Camera(np.dtype(np.float32), NOISE)
+    return Twin(shape=shape, pixel_size=pixel, **(options | changes))
 
 
 def references(shape: tuple[int, int] = SHAPE, pixel: float = PIXEL, **changes: Any) -> tuple[Counts, Counts]:
@@ -42,7 +42,7 @@ def test_a_ball_brings_dark_and_bright_of_each_pixel(dtype: str, optics: str) ->
     camera = Camera(np.dtype(dtype), NOISE * scale, 3, gain_deviation=0.03, offset_deviation=4.0 * scale)
     exact = references(camera=camera, optics=optics, references="exact")
     taken = references(camera=camera, optics=optics)
-    dark, bright = (found - level for found, level in zip(taken, exact, strict=True))
+    dark, bright = (actual - level for actual, level in zip(taken, exact, strict=True))
     # Dark is the mean of 16 samples, which may be rounded.
     noise = scale * np.hypot(NOISE, (12**-0.5 / scale if dtype != "float32" else 0))
     assert dark.std() == pytest.approx(noise / 4, rel=0.1)
@@ -71,10 +71,10 @@ def test_beyond_the_body_there_are_no_references(shape: tuple[int, int], pixel: 
 
 def test_without_noise_the_ball_shows_the_exact_levels() -> None:
     camera = Camera(np.dtype(np.float32), 0.0, gain_deviation=0.05, offset_deviation=2.0)
-    for found, exact in zip(
+    for actual, exact in zip(
         references(camera=camera), references(camera=camera, references="exact"), strict=True
     ):
-        np.testing.assert_allclose(found, exact, atol=1e-3)
+        np.testing.assert_allclose(actual, exact, atol=1e-3)
 
 
 def test_references_have_noise_of_their_own() -> None:
@@ -100,11 +100,11 @@ def test_bright_follows_the_lamps() -> None:
     inside = np.hypot(x, y) < 15
     _, even = references(shape, pixel, camera=camera, optics="cylinder")
     _, uneven = references(shape, pixel, camera=camera, optics="cylinder", body=lamps)
-    share = ((uneven - 16) / (even - 16))[inside]
-    assert share.max() <= 1 + 1e-4
-    assert share.min() > 0.6 / 1.4  # of the darkest side
-    assert share[np.hypot(x, y)[inside] < 8].min() > 0.75  # what sees all sides has the brighter ones
-    assert share.std() > 0.005
+    fraction = ((uneven - 16) / (even - 16))[inside]
+    assert fraction.max() <= 1 + 1e-4
+    assert fraction.min() > 0.6 / 1.4  # of the darkest side
+    assert fraction[np.hypot(x, y)[inside] < 8].min() > 0.75  # what sees all sides has the brighter ones
+    assert fraction.std() > 0.005
     # Mirrored lamps, mirrored references.
     turned = Body(asymmetry=0.4, asymmetry_azimuth=np.pi)
     _, mirrored = references(shape, pixel, camera=camera, optics="cylinder", body=turned)
@@ -134,7 +134,7 @@ def test_references_are_those_of_the_clear_wall(tmp_path: Path) -> None:
     )
     for optics, pattern in (("ideal", "linear"), ("cylinder", "linear"), ("cylinder", picture)):
         taken = references(camera=camera, optics=optics, pattern=pattern)
-        for found, level in zip(taken, exact, strict=True):
-            np.testing.assert_allclose(found, level, atol=0.02 * 208)
+        for level_taken, level in zip(taken, exact, strict=True):
+            np.testing.assert_allclose(level_taken, level, atol=0.02 * 208)
         if optics == "cylinder":
             np.testing.assert_array_equal(taken, clear)

@@ -62,13 +62,13 @@ def test_a_small_field_shows_what_a_field_as_large_as_the_body_shows(reach: str)
     # What touches beyond the field's edge pushes the sheet in within it, too.
     thing, pose = REACHES[reach]
     small, large, pixel = (10, 16), (90, 90), 0.4
-    found, expected = drape(thing, pose, small, pixel), drape(thing, pose, large, pixel)
+    actual, expected = drape(thing, pose, small, pixel), drape(thing, pose, large, pixel)
     assert expected.contact.sum() > inner(expected.contact, small).sum() + 10
-    assert found.height.max() > 0.05
-    np.testing.assert_array_equal(found.contact, inner(expected.contact, small))
-    for here, there in zip(parts(found), parts(expected), strict=True):
+    assert actual.height.max() > 0.05
+    np.testing.assert_array_equal(actual.contact, inner(expected.contact, small))
+    for here, target in zip(parts(actual), parts(expected), strict=True):
         assert here.shape == small
-        np.testing.assert_allclose(here, inner(there, small), atol=2e-5)
+        np.testing.assert_allclose(here, inner(target, small), atol=2e-5)
 
 
 def test_an_object_that_needs_too_many_points_is_refused_with_a_remedy() -> None:
@@ -83,21 +83,21 @@ def test_the_sheet_is_on_the_object_in_contact_and_bulges_next_to_it() -> None:
     # A ball of 20 mm, and a sheet without thickness. Hertz: contact to sqrt(10 mm x 0.6 mm).
     body, pose, shape, pixel = Body(sheet=0.0), pose_at_press(0.6), (100, 100), 0.08
     thing = Sphere(20.0)
-    found = drape(thing, pose, shape, pixel, body)
+    actual = drape(thing, pose, shape, pixel, body)
     soft = Conform(thing, view(shape, pixel)).drape(pose)
     x, y = pixel_centres(shape, pixel)
     theory = contact_theory.sphere(10.0, 2.4164, 1.0)
     assert theory.depth == pytest.approx(0.6, rel=0.01)
-    radius = np.sqrt(found.contact.sum() / np.pi) * pixel
+    radius = np.sqrt(actual.contact.sum() / np.pi) * pixel
     assert radius == pytest.approx(2.4164 * np.sqrt(0.6 / theory.depth), rel=0.01)
-    np.testing.assert_allclose(found.height[found.contact], soft.height[found.contact], atol=1e-5)
-    assert (soft.contact | ~found.contact).all()
-    assert soft.contact.sum() > 1.5 * found.contact.sum()
-    assert (found.height >= soft.height - 1e-5).all()
-    assert (found.height[~found.contact] > soft.height[~found.contact]).all()
+    np.testing.assert_allclose(actual.height[actual.contact], soft.height[actual.contact], atol=1e-5)
+    assert (soft.contact | ~actual.contact).all()
+    assert soft.contact.sum() > 1.5 * actual.contact.sum()
+    assert (actual.height >= soft.height - 1e-5).all()
+    assert (actual.height[~actual.contact] > soft.height[~actual.contact]).all()
     well_inside = np.hypot(x, y) < 0.9 * radius
-    np.testing.assert_allclose(found.dz_dx[well_inside], soft.dz_dx[well_inside], atol=1e-3)
-    np.testing.assert_allclose(found.dz_dy[well_inside], soft.dz_dy[well_inside], atol=1e-3)
+    np.testing.assert_allclose(actual.dz_dx[well_inside], soft.dz_dx[well_inside], atol=1e-3)
+    np.testing.assert_allclose(actual.dz_dy[well_inside], soft.dz_dy[well_inside], atol=1e-3)
     assert soft.dz_dx[well_inside].min() < -0.15
 
 
@@ -105,18 +105,18 @@ def test_slopes_are_those_of_the_height_along_x_and_y() -> None:
     body = Body(sheet=0.0)
     field = View((40, 30), (0.2, 0.1), body)
     pose = Pose(np.eye(3), np.array([0.5, -0.4, 1.0]))
-    found = Elastic(Sphere(20.0), [pose], field, body).drape(pose)
-    by_row, by_column = np.gradient(found.height)
+    actual = Elastic(Sphere(20.0), [pose], field, body).drape(pose)
+    by_row, by_column = np.gradient(actual.height)
     some = np.s_[1:-1, 1:-1]  # the grid goes on beyond the edge
-    np.testing.assert_allclose(found.dz_dx[some], by_column[some] / 0.2, atol=1e-12)
-    np.testing.assert_allclose(found.dz_dy[some], -by_row[some] / 0.1, atol=1e-12)
+    np.testing.assert_allclose(actual.dz_dx[some], by_column[some] / 0.2, atol=1e-12)
+    np.testing.assert_allclose(actual.dz_dy[some], -by_row[some] / 0.1, atol=1e-12)
     # In contact the sheet falls as the ball does, away from its apex.
     x, y = field.x - 0.5, field.y + 0.4
     down = np.sqrt(10.0**2 - x**2 - y**2)
     inside = np.hypot(x, y) < 1.5
-    assert found.contact[inside].all()
-    np.testing.assert_allclose(found.dz_dx[inside], (-x / down)[inside], atol=1e-3)
-    np.testing.assert_allclose(found.dz_dy[inside], (-y / down)[inside], atol=1e-3)
+    assert actual.contact[inside].all()
+    np.testing.assert_allclose(actual.dz_dx[inside], (-x / down)[inside], atol=1e-3)
+    np.testing.assert_allclose(actual.dz_dy[inside], (-y / down)[inside], atol=1e-3)
 
 
 @pytest.mark.parametrize("shape", [(1, 9), (9, 1), (1, 1)])
@@ -158,7 +158,7 @@ def test_a_pinhole_camera_sees_where_its_lines_meet_the_sheet(distance: float) -
     upright = elastic(Sphere(20.0), pose, shape, pixel)
     assert oblique.space.shape == upright.space.shape == shape
     pressure = upright.solve(pose).pressure
-    seen, whole = oblique.sheet(pressure), upright.sheet(pressure)
+    slanted, whole = oblique.sheet(pressure), upright.sheet(pressure)
 
     x, y = pixel_centres(shape, pixel)
     lean_x, lean_y = rays.sight_line(x, y, distance)
@@ -168,8 +168,8 @@ def test_a_pinhole_camera_sees_where_its_lines_meet_the_sheet(distance: float) -
     ]
 
     def on_line(values: RegularGridInterpolator, z: Map) -> Map:
-        found: Map = values(np.stack([y + z * lean_y, x + z * lean_x], axis=-1))
-        return found
+        actual: Map = values(np.stack([y + z * lean_y, x + z * lean_x], axis=-1))
+        return actual
 
     low, high = np.zeros(shape), np.full(shape, 4.0)
     for _ in range(30):
@@ -178,16 +178,16 @@ def test_a_pinhole_camera_sees_where_its_lines_meet_the_sheet(distance: float) -
         low, high = np.where(above, low, middle), np.where(above, middle, high)
     # The grid's outermost row is where brute force knows no more.
     clear = (np.hypot(x, y) < RADIUS) & np.pad(np.ones((56, 76), bool), 2)
-    np.testing.assert_allclose(seen.height[clear], low[clear], atol=5e-6)
-    for part, values in zip(parts(seen)[1:], maps[1:], strict=True):
+    np.testing.assert_allclose(slanted.height[clear], low[clear], atol=5e-6)
+    for part, values in zip(parts(slanted)[1:], maps[1:], strict=True):
         np.testing.assert_allclose(part[clear], on_line(values, low)[clear], atol=1e-5)
-    assert np.abs(seen.height - whole.height)[clear].max() > 0.03  # it does matter
+    assert np.abs(slanted.height - whole.height)[clear].max() > 0.03  # it does matter
     # Contact is that of the nearest point of the grid.
     row, column = (29.5 - (y + low * lean_y) / pixel, 39.5 + (x + low * lean_x) / pixel)
     sure = clear & (np.abs(row % 1 - 0.5) > 1e-3) & (np.abs(column % 1 - 0.5) > 1e-3)
     nearest = whole.contact[np.rint(row).astype(int).clip(0, 59), np.rint(column).astype(int).clip(0, 79)]
-    np.testing.assert_array_equal(seen.contact[sure], nearest[sure])
-    assert (seen.contact != whole.contact).sum() > 10
+    np.testing.assert_array_equal(slanted.contact[sure], nearest[sure])
+    assert (slanted.contact != whole.contact).sum() > 10
 
 
 def test_the_field_is_in_the_middle_of_the_grown_grid() -> None:

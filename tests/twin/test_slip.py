@@ -30,9 +30,9 @@ def history(movement: Horizontal | Twist, friction: float, pixel: float, side: i
     return SkinHistory(skin, movement, friction, open_device())
 
 
-def displacement(found: SkinHistory, frame: int) -> NDArray[np.float32]:
+def displacement(actual: SkinHistory, frame: int) -> NDArray[np.float32]:
     """Return that of a frame, (2, H, W)."""
-    return np.moveaxis(found.displacements()[frame], -1, 0)
+    return np.moveaxis(actual.displacements()[frame], -1, 0)
 
 
 class Pushed:
@@ -49,8 +49,8 @@ class Pushed:
 
     def stick_radius(self, frame: int) -> float:
         """Return the radius by the force along the sheet: Cattaneo and Mindlin."""
-        share = np.hypot(*self.found.force[frame]) / (self.friction * self.press.force)
-        return float(self.radius * np.cbrt(1 - share))
+        fraction = np.hypot(*self.found.force[frame]) / (self.friction * self.press.force)
+        return float(self.radius * np.cbrt(1 - fraction))
 
 
 pushed = functools.cache(Pushed)
@@ -66,8 +66,8 @@ def test_a_pushed_ball_sticks_within_the_radius_of_cattaneo_and_mindlin(
     case = pushed(friction, radius)
     for frame in range(1, FRAMES):
         stuck = (case.r < radius) & ~(case.found.slip_onset <= case.found.travel[frame])
-        found = np.sqrt(stuck.sum() / np.pi) * case.pixel
-        assert found == pytest.approx(case.stick_radius(frame), rel=0.02)
+        actual = np.sqrt(stuck.sum() / np.pi) * case.pixel
+        assert actual == pytest.approx(case.stick_radius(frame), rel=0.02)
 
 
 @CASES
@@ -76,10 +76,10 @@ def test_what_has_slipped_is_known_but_for_a_pixel_at_the_border(friction: float
     for frame in range(1, FRAMES):
         border = case.stick_radius(frame)
         clear = (np.abs(case.r - border) > case.pixel) & (case.r < radius - case.pixel)
-        found = (case.found.slip_onset <= case.found.travel[frame])[clear]
+        actual = (case.found.slip_onset <= case.found.travel[frame])[clear]
         expected = (case.r > border)[clear]
-        both = (found & expected).sum()
-        assert both >= 0.98 * found.sum()
+        both = (actual & expected).sum()
+        assert both >= 0.98 * actual.sum()
         assert both >= 0.98 * expected.sum()
 
 
@@ -107,11 +107,11 @@ def test_a_twisted_ball_sticks_within_the_radius_of_lubkin() -> None:
     press = contact_theory.sphere(10.0, radius, 1.0)
     inner = np.array([0.95, 0.8, 0.6, 0.4]) * radius
     angles = [contact_theory.twisted(press, friction, 1.0, rest).angle for rest in inner]
-    found = history(Twist(-np.array(angles), press.depth), friction, pixel)
-    np.testing.assert_allclose(found.travel, angles)
-    pressed = np.hypot(*found._skin.places) < radius
+    actual = history(Twist(-np.array(angles), press.depth), friction, pixel)
+    np.testing.assert_allclose(actual.travel, angles)
+    pressed = np.hypot(*actual._skin.places) < radius
     for angle, rest in zip(angles, inner, strict=True):
-        stuck = (pressed & ~(found.slip_onset <= angle)).sum()
+        stuck = (pressed & ~(actual.slip_onset <= angle)).sum()
         assert np.sqrt(stuck / np.pi) * pixel == pytest.approx(rest, rel=0.02)
 
 
@@ -129,23 +129,25 @@ def test_stuck_skin_goes_with_the_object_and_far_skin_stays() -> None:
     x, y = twisted._skin.places
     near = np.hypot(x, y) < 0.55  # of a contact of 0.7 mm
     turned = (x + 1j * y) * np.exp(-0.6j)
-    found = displacement(twisted, 1)
-    np.testing.assert_allclose((x + found[0] - turned.real)[near], 0, atol=2e-3)
-    np.testing.assert_allclose((y + found[1] - turned.imag)[near], 0, atol=2e-3)
-    assert np.abs(found[:, 0, 0]).max() < 0.02
+    actual = displacement(twisted, 1)
+    np.testing.assert_allclose((x + actual[0] - turned.real)[near], 0, atol=2e-3)
+    np.testing.assert_allclose((y + actual[1] - turned.imag)[near], 0, atol=2e-3)
+    assert np.abs(actual[:, 0, 0]).max() < 0.02
 
 
-def test_a_sliding_ball_drags_the_skin_as_johnson_says() -> None:
+def test_a_sliding_ball_drags_the_skin_by_johnsons_theory() -> None:
     radius, friction, shear = 0.8, 0.5, 1 / 3
     press = contact_theory.paraboloid(10.0, radius, 1.0)
-    way = 1.5 * contact_theory.sliding_distance(press, friction, 1.0)
-    found = history(Horizontal([[0.0, 0.0], [way / 2, 0.0], [way, 0.0]], press.depth), friction, 0.03)
-    x, y = found._skin.places
-    object_s = np.stack([x - way, y])  # where the object's points of the press have gone
-    dragged = object_s - found.drag(2).material(object_s)
-    most = friction * float(press.pressure(np.zeros(())))
+    distance = 1.5 * contact_theory.sliding_distance(press, friction, 1.0)
+    actual = history(
+        Horizontal([[0.0, 0.0], [distance / 2, 0.0], [distance, 0.0]], press.depth), friction, 0.03
+    )
+    x, y = actual._skin.places
+    object_s = np.stack([x - distance, y])  # where the object's points of the press have gone
+    dragged = object_s - actual.drag(2).material(object_s)
+    limit = friction * float(press.pressure(np.zeros(())))
     # Eq. 3.91 at Poisson ratio 0.5; the object goes to the left, and so does the skin.
-    scale, inside = np.pi * most / (32 * shear * radius), np.hypot(x, y) < 0.9 * radius
+    scale, inside = np.pi * limit / (32 * shear * radius), np.hypot(x, y) < 0.9 * radius
     along, across = -scale * (6 * radius**2 - 2.5 * x**2 - 3.5 * y**2), -scale * x * y
     np.testing.assert_allclose(dragged[0][inside], along[inside], rtol=0.02)
     np.testing.assert_allclose(dragged[1][inside], across[inside], atol=0.02 * np.abs(along).max())
@@ -153,9 +155,9 @@ def test_a_sliding_ball_drags_the_skin_as_johnson_says() -> None:
 
 def test_displacement_and_material_are_each_other_s_inverse() -> None:
     case = pushed(0.9, 1.6)
-    there = case.found._skin.places + displacement(case.found, 7)
+    target = case.found._skin.places + displacement(case.found, 7)
     np.testing.assert_allclose(
-        case.found.drag(7).material(there), case.found._skin.places, atol=1e-4 * case.pixel
+        case.found.drag(7).material(target), case.found._skin.places, atol=1e-4 * case.pixel
     )
 
 
@@ -163,8 +165,8 @@ def test_a_long_slide_drags_the_skin_along_beneath_the_object_alone() -> None:
     # The object goes 3 mm to the left over a field of 6 mm: the dragged skin goes with it and springs back.
     far, press = 3.0, 0.1
     path = np.stack([np.linspace(0, far, 7), np.zeros(7)], axis=1)
-    found = history(Horizontal(path, press), 0.3, 0.1, side=61)
-    half, last = displacement(found, 3), displacement(found, 6)
+    actual = history(Horizontal(path, press), 0.3, 0.1, side=61)
+    half, last = displacement(actual, 3), displacement(actual, 6)
     assert np.isfinite(last).all()
     assert np.unravel_index(half[0].argmin(), (61, 61)) == pytest.approx((30, 15), abs=2)
     assert np.unravel_index(last[0].argmin(), (61, 61)) == pytest.approx((30, 1), abs=2)

@@ -22,8 +22,8 @@ EACH = pytest.mark.parametrize("kind", TEXTURES)
 def make_twin(movement: Movement, texture: SheetTexture | None, **changes: Any) -> Twin:
     camera = {"dtype": np.dtype(np.float32), "noise": 0.0}
     camera |= {name: changes.pop(name) for name in ("exposure", "distance", "noise") if name in changes}
-    given: dict[str, Any] = {"object": Sphere(20.0), "shape": SHAPE, "pixel_size": PIXEL, **changes}
-    return Twin(movement=movement, texture=texture, camera=Camera(**camera), **given)
+    options: dict[str, Any] = {"object": Sphere(20.0), "shape": SHAPE, "pixel_size": PIXEL, **changes}
+    return Twin(movement=movement, texture=texture, camera=Camera(**camera), **options)
 
 
 def read_all(twin: Twin) -> NDArray[np.float32]:
@@ -46,19 +46,19 @@ def reflectance_of_the_dark(frames: NDArray[np.float32]) -> NDArray[np.float64]:
 def test_a_texture_takes_its_contrast_and_has_no_end(kind: Any) -> None:
     texture = SheetTexture(kind, 0.2, contrast=0.4)
     near, far = (texture.reflectance(grid((200, 200)) + away) for away in (0.0, 1e4))
-    for seen in (near, far):
-        assert 0.6 - 1e-12 <= seen.min() < 0.65
-        assert 0.95 < seen.max() <= 1 + 1e-12
+    for maps in (near, far):
+        assert 0.6 - 1e-12 <= maps.min() < 0.65
+        assert 0.95 < maps.max() <= 1 + 1e-12
     assert (near != SheetTexture(kind, 0.2, 0.4, seed=1).reflectance(grid((200, 200)))).any() == (
         kind != "dots"
     )
 
 
-def test_flakes_are_as_wide_as_they_are_said_to_be() -> None:
+def test_flakes_have_the_stated_width() -> None:
     size, pixel = 0.3, 0.025
-    seen = SheetTexture("flakes", size).reflectance(grid((600, 600), pixel))
-    seen -= seen.mean()
-    power = np.abs(np.fft.fft2(seen)) ** 2
+    reflectance = SheetTexture("flakes", size).reflectance(grid((600, 600), pixel))
+    reflectance -= reflectance.mean()
+    power = np.abs(np.fft.fft2(reflectance)) ** 2
     likeness = np.fft.ifft2(power).real[0, :40] / power.mean()
     width = 2 * pixel * np.interp(0.5, -likeness[:30] / likeness[0] + 1, np.arange(30))
     assert width == pytest.approx(size, rel=0.1)
@@ -75,9 +75,9 @@ def test_dots_are_averaged_over_the_pixel() -> None:
 
 def test_dots_are_round_and_two_diameters_apart() -> None:
     size, pixel = 0.4, 0.01
-    seen = SheetTexture("dots", size, contrast=1.0).reflectance(grid((160, 160), pixel))
-    np.testing.assert_allclose(seen[:80], seen[80:], atol=1e-9)
-    assert (seen < 0.5).sum() * pixel**2 == pytest.approx(4 * np.pi / 4 * size**2, rel=0.03)
+    reflectance = SheetTexture("dots", size, contrast=1.0).reflectance(grid((160, 160), pixel))
+    np.testing.assert_allclose(reflectance[:80], reflectance[80:], atol=1e-9)
+    assert (reflectance < 0.5).sum() * pixel**2 == pytest.approx(4 * np.pi / 4 * size**2, rel=0.03)
 
 
 @EACH
@@ -87,18 +87,18 @@ def test_dots_are_round_and_two_diameters_apart() -> None:
 def test_the_texture_is_where_the_skin_has_gone(kind: Any, movement: Movement) -> None:
     texture = SheetTexture(kind, 0.4)
     twin = make_twin(movement, texture, contact="elastic", body=Body(friction=0.9))
-    seen = reflectance_of_the_dark(read_all(twin))
+    pictures = reflectance_of_the_dark(read_all(twin))
     moved = np.moveaxis(twin.truth.displacement, -1, 1)  # type: ignore[arg-type]
     assert np.abs(moved[-1]).max() > 1.5 * PIXEL
     rest = texture.reflectance(grid(), (PIXEL, PIXEL))
-    for frame, shift in zip(seen, moved, strict=True):
+    for frame, shift in zip(pictures, moved, strict=True):
         at = grid() + shift
         index = np.stack([(SHAPE[0] - 1) / 2 - at[1] / PIXEL, at[0] / PIXEL + (SHAPE[1] - 1) / 2])
-        there = map_coordinates(frame, index, order=5)
+        target = map_coordinates(frame, index, order=5)
         inside = np.s_[8:-8, 8:-8]
         close = 4e-3 if kind == "flakes" else 0.02  # what interpolation leaves of the dots' rims
-        np.testing.assert_allclose(there[inside], rest[inside], atol=close)
-    np.testing.assert_allclose(seen[0], rest, atol=1e-4)
+        np.testing.assert_allclose(target[inside], rest[inside], atol=close)
+    np.testing.assert_allclose(pictures[0], rest, atol=1e-4)
 
 
 def test_references_know_the_texture_of_a_sheet_at_rest() -> None:

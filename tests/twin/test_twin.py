@@ -19,10 +19,10 @@ TRAVEL = np.cumsum(np.linspace(0.05, 0.16, 25)) - 0.0137
 
 
 def make_twin(**changes: Any) -> Twin:
-    given: dict[str, Any] = {"object": "sphere", "shape": SHAPE, "pixel_size": PIXEL}
+    options: dict[str, Any] = {"object": "sphere", "shape": SHAPE, "pixel_size": PIXEL}
     camera = {name: changes.pop(name) for name in ("dtype", "noise", "seed") if name in changes}
     movement = Vertical(changes.pop("travel", TRAVEL))
-    return Twin(movement=movement, camera=Camera(**camera), **(given | changes))
+    return Twin(movement=movement, camera=Camera(**camera), **(options | changes))
 
 
 def read_all(source: Source, size: int | None = None) -> NDArray[Any]:
@@ -85,9 +85,9 @@ def test_a_sheet_that_just_reaches_the_height_touches_and_may_wait_there() -> No
 def test_truth_is_the_geometry(name: str) -> None:
     surface = geometry.SURFACES[name](SHAPE, PIXEL)
     truth = make_twin(object=name).truth
-    for found, expected in zip((truth.height, truth.zenith, truth.azimuth), surface, strict=True):
-        assert found.dtype == np.float32
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    for actual, expected in zip((truth.height, truth.zenith, truth.azimuth), surface, strict=True):
+        assert actual.dtype == np.float32
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-6)
     assert truth.contact.dtype == np.uint8
     np.testing.assert_array_equal(truth.contact, -surface.height <= TRAVEL[-1])
 

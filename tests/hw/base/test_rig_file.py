@@ -152,31 +152,31 @@ def refusal(rig):
     def read(text):
         with pytest.raises(InputError) as caught:
             rig(text)
-        said = str(caught.value)
-        assert said.startswith("r.toml")
-        assert "\n" not in said
-        assert said.isprintable()
-        return said
+        message = str(caught.value)
+        assert message.startswith("r.toml")
+        assert "\n" not in message
+        assert message.isprintable()
+        return message
 
     return read
 
 
 def test_every_key_arrives(rig):
-    found = rig(EVERYTHING)
-    assert (found.path, found.name) == (Path("r.toml"), "bench 2")
-    said = tomllib.loads(EVERYTHING)
-    said["camera"]["fourcc"] = "Y16 "
-    stage, camera = (json.loads(msgspec.json.encode(one)) for one in (found.stage, found.camera))
-    assert stage == said["stage"]
-    assert camera == said["camera"]
+    actual = rig(EVERYTHING)
+    assert (actual.path, actual.name) == (Path("r.toml"), "bench 2")
+    keys = tomllib.loads(EVERYTHING)
+    keys["camera"]["fourcc"] = "Y16 "
+    stage, camera = (json.loads(msgspec.json.encode(result)) for result in (actual.stage, actual.camera))
+    assert stage == keys["stage"]
+    assert camera == keys["camera"]
     degree = math.pi / 180
-    pitch, travel = found.stage.pitch, found.stage.travel
+    pitch, travel = actual.stage.pitch, actual.stage.travel
     assert (pitch.low, pitch.high, pitch.top_speed) == pytest.approx((-6 * degree, 4 * degree, 90 * degree))
     assert (travel.low, travel.high, travel.top_speed) == (-5.0, 3.0, 4.0)
     assert pitch.coordinate(2 * degree) == pytest.approx(9.5)
     assert travel.value(-21.0) == 1.0
-    assert found.camera.shape == (48, 64)
-    assert found.camera.counts_per_radian == pytest.approx(5.7 / degree)
+    assert actual.camera.shape == (48, 64)
+    assert actual.camera.counts_per_radian == pytest.approx(5.7 / degree)
 
 
 @pytest.mark.parametrize(
@@ -188,8 +188,8 @@ def test_every_key_arrives(rig):
     ],
 )
 def test_a_camera_without_a_name_is_called_as_its_source_without_a_password(rig, source, name):
-    found = rig(LEAST.replace("source = 0", f"source = {source}"))
-    assert (str(found.camera.source), found.camera.name, found.name) == (source.strip('"'), name, "r")
+    actual = rig(LEAST.replace("source = 0", f"source = {source}"))
+    assert (str(actual.camera.source), actual.camera.name, actual.name) == (source.strip('"'), name, "r")
 
 
 def test_one_pixel_size_is_of_both_sides(rig):
@@ -214,7 +214,7 @@ def test_the_half_angle_is_the_largest_whole_circle_within_the_limits(rig):
     assert (limits.travel, limits.tilt, limits.press) == ((-5.0, 3.0), pytest.approx(math.radians(4)), 2.0)
 
 
-def test_x_y_and_twist_are_limited_as_the_file_says_and_missing_ones_do_not_move(rig):
+def test_x_y_and_twist_have_the_limits_of_the_file(rig):
     limits = rig(EVERYTHING).stage.limits
     assert (limits.x, limits.y) == ((-1.5, 2.5), (-3.5, 3.5))
     assert limits.twist == pytest.approx((math.radians(-30), math.radians(60)))
@@ -329,10 +329,12 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("line", "wrong", "said"), WRONG, ids=[f"{row[0]}-{row[1]}"[:60] for row in WRONG])
-def test_impossible_input_is_refused_with_its_key(refusal, line, wrong, said):
+@pytest.mark.parametrize(
+    ("line", "wrong", "message"), WRONG, ids=[f"{row[0]}-{row[1]}"[:60] for row in WRONG]
+)
+def test_impossible_input_is_refused_with_its_key(refusal, line, wrong, message):
     assert EVERYTHING.count(line) == 1
-    assert refusal(EVERYTHING.replace(line, wrong)).startswith(f"r.toml: {said}")
+    assert refusal(EVERYTHING.replace(line, wrong)).startswith(f"r.toml: {message}")
 
 
 def test_pitch_without_roll_is_refused_and_roll_without_pitch(refusal):
@@ -345,8 +347,8 @@ def test_pitch_without_roll_is_refused_and_roll_without_pitch(refusal):
 @pytest.mark.parametrize("table", ["stage", "camera", "stage.travel"])
 def test_a_missing_table_is_reported(refusal, table):
     tables = re.split(r"(?=\n\[)", LEAST)
-    left = "".join(one for one in tables if not one.startswith(f"\n[{table}"))
-    assert f"{table} is missing: add table [{table}]" in refusal(left)
+    others = "".join(item for item in tables if not item.startswith(f"\n[{table}"))
+    assert f"{table} is missing: add table [{table}]" in refusal(others)
 
 
 def test_what_is_no_table_or_no_toml_is_reported(refusal, tmp_path):
@@ -378,9 +380,9 @@ def test_a_reference_next_to_the_rig_file_is_read(rig, tmp_path, name):
     save(tmp_path / name, PICTURE)
     camera = rig(with_reference(name)).camera
     assert camera.bright == name
-    found = read_reference(camera, "bright", "r.toml")
-    assert found.dtype == np.float32
-    np.testing.assert_array_equal(found, PICTURE)
+    actual = read_reference(camera, "bright", "r.toml")
+    assert actual.dtype == np.float32
+    np.testing.assert_array_equal(actual, PICTURE)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -401,7 +403,7 @@ def test_a_reference_of_a_camera_of_floats_may_lie_anywhere(rig, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("picture", "said"),
+    ("picture", "message"),
     [
         (PICTURE.T, r"b.npy is 3 x 4, but the camera's pictures are 4 x 3 \(columns x rows\)"),
         (PICTURE[0], "b.npy is 4, but the camera's pictures are 4 x 3"),
@@ -414,9 +416,9 @@ def test_a_reference_of_a_camera_of_floats_may_lie_anywhere(rig, tmp_path):
         (np.where(PICTURE == 105, np.inf, PICTURE), "b.npy contains 100 to inf, but counts of uint8"),
     ],
 )
-def test_a_reference_that_the_camera_cannot_give_is_refused(refusal, tmp_path, picture, said):
+def test_a_reference_that_the_camera_cannot_give_is_refused(refusal, tmp_path, picture, message):
     np.save(tmp_path / "b.npy", picture)
-    assert re.match(f"r.toml: camera.bright: {said}", refusal(with_reference("b.npy")))
+    assert re.match(f"r.toml: camera.bright: {message}", refusal(with_reference("b.npy")))
 
 
 def test_a_damaged_reference_is_refused(refusal, tmp_path):
@@ -463,14 +465,14 @@ TABLES = {
 
 
 def test_documentation_and_code_agree_on_keys_and_defaults():
-    told = documented()
-    assert set(told) == set(TABLES)
+    tables = documented()
+    assert set(tables) == set(TABLES)
     for table, model in TABLES.items():
         fields = {field.encode_name: field for field in structs.fields(model)}
         keys = {key for key in fields if not (f"stage.{key}" in TABLES or key in TABLES)}
-        assert keys == set(told[table]), table
+        assert keys == set(tables[table]), table
         for key in keys:
-            field, default = fields[key], told[table][key]
+            field, default = fields[key], tables[table][key]
             assert (default == "required") == field.required, (table, key)
             if isinstance(field.default, int | float):
                 assert tomllib.loads(f"a = {default}") == {"a": field.default}, (table, key)
@@ -480,13 +482,13 @@ def test_the_example_of_the_documentation_is_the_template():
     assert f"```toml\n{TEMPLATE}```" in DOCS.read_text()
 
 
-def test_the_template_loads_with_all_its_keys_and_says_their_defaults(rig, tmp_path):
+def test_the_template_has_all_keys_with_their_defaults(rig, tmp_path):
     plain = rig(TEMPLATE)
     save(tmp_path / "bright.tif", np.full((480, 640), 200, np.uint8))
     whole = re.sub(r"^# (?=\w+ = |\[)", "", TEMPLATE, flags=re.MULTILINE)
-    said = tomllib.loads(whole)
-    tables = {"": said} | {name: said[name] for name in ("stage", "camera")}
-    tables |= {f"stage.{name}": said["stage"][name] for name in said["stage"] if f"stage.{name}" in TABLES}
+    keys = tomllib.loads(whole)
+    tables = {"": keys} | {name: keys[name] for name in ("stage", "camera")}
+    tables |= {f"stage.{name}": keys["stage"][name] for name in keys["stage"] if f"stage.{name}" in TABLES}
     for table, model in TABLES.items():
         assert {field.encode_name for field in structs.fields(model)} == set(tables[table]), table
     axes = {name: structs.replace(axis, steps=250.0) for name, axis in plain.stage.axes.items()}

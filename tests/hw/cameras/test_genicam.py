@@ -79,17 +79,17 @@ def wait_until(holds: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize(("dtype", "most"), [("uint8", 255), ("uint16", 65535)])
-def test_the_rig_files_source_opens_it_with_the_size_and_type_asked_for(fake, dtype, most) -> None:
+@pytest.mark.parametrize(("dtype", "limit"), [("uint8", 255), ("uint16", 65535)])
+def test_the_rig_files_source_opens_it_with_the_size_and_type_asked_for(fake, dtype, limit) -> None:
     with closing(open_camera(settings(fake, dtype=dtype, rate=200.0, exposure=0.002, gain=1.0))) as camera:
         frames = camera.take(1, SOON)
     assert (frames.pixels.shape, frames.pixels.dtype) == ((1, 48, 64), dtype)
-    assert most / 4 < frames.pixels.max() <= most
+    assert limit / 4 < frames.pixels.max() <= limit
     assert frames.number.tolist() == [0]
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "message"),
     [
         ({"size": (4096, 48)}, r"cannot be set as the rig file says: \[Width\] Value '4096' greater than"),
         ({"gain": 99.0}, r"cannot be set as the rig file says: \[GainRaw\] Value '99' greater than"),
@@ -101,8 +101,8 @@ def test_the_rig_files_source_opens_it_with_the_size_and_type_asked_for(fake, dt
         ({"source": "genicam:4711"}, "camera genicam:4711 cannot be opened: .*; there are Fake_1$"),
     ],
 )
-def test_what_it_has_not_is_refused_in_one_line(fake, more, said) -> None:
-    with pytest.raises(InputError, match=said) as refused:
+def test_what_it_has_not_is_refused_in_one_line(fake, more, message) -> None:
+    with pytest.raises(InputError, match=message) as refused:
         GenicamCamera(settings(**{"source": fake, **more}))
     assert "\n" not in str(refused.value)
 

@@ -96,7 +96,7 @@ def opened(tmp_path):
 
 
 @pytest.mark.parametrize("source", ["my_camera.py:Steady", "my_camera:Steady"])
-def test_a_class_beside_the_rig_file_is_opened(opened, source):
+def test_a_class_next_to_the_rig_file_is_opened(opened, source):
     camera = opened(source)
     try:
         np.testing.assert_array_equal(camera.take(1, 20.0).pixels[0], np.full((6, 8), 7))

@@ -176,17 +176,17 @@ def test_a_fast_writer_and_a_slow_reader_never_meet_in_a_place() -> None:
 
     writer = threading.Thread(target=write)
     writer.start()
-    kept, seen, missed = [], [], 0
-    while not (sent.is_set() and seen and seen[-1] == count - 1):
+    kept, numbers, missed = [], [], 0
+    while not (sent.is_set() and numbers and numbers[-1] == count - 1):
         frames = ring.take(4, SOON)
         missed += frames.dropped
-        seen += frames.number.tolist()
+        numbers += frames.number.tolist()
         kept = [*kept[-3:], frames]
         for block in kept:
             np.testing.assert_array_equal(block.pixels, block.number[:, None, None] * np.ones((1, 16, 16)))
     writer.join()
-    assert seen == sorted(set(seen))
-    assert len(seen) + missed == count
+    assert numbers == sorted(set(numbers))
+    assert len(numbers) + missed == count
     assert missed == ring.dropped
 
 
@@ -198,17 +198,17 @@ def test_a_device_works_in_the_ring_while_the_camera_goes_on(device) -> None:
     whole = bare(Onset(device=device), frames, travel=travel)
     ring = Ring(shape, np.uint8, 6)
     search = ready(Onset(device=device), frames, travel)
-    sent = done = 0
+    sent = taken_so_far = 0
     for stop in range(2, count + 1, 2):
         while sent < stop:
             ring.slot()[...] = frames[sent]
             ring.put(time=sent, number=sent)
             sent += 1
-        while done < stop:
+        while taken_so_far < stop:
             taken = ring.take(2, SOON)
-            part = slice(done, done + len(taken.pixels))
-            search.push_block(Block(taken.pixels, done, travel=travel[part], stays_valid=True))
-            done = part.stop
+            part = slice(taken_so_far, taken_so_far + len(taken.pixels))
+            search.push_block(Block(taken.pixels, taken_so_far, travel=travel[part], stays_valid=True))
+            taken_so_far = part.stop
             ring.slot()[...] = 255  # a kernel that is still at work must not see it
     for name in ("height", "status", "frame"):
         np.testing.assert_array_equal(getattr(search.result(), name), getattr(whole, name))

@@ -70,8 +70,8 @@ def open_camera(clock):
         return opened[-1]
 
     yield open_it
-    for one in opened:
-        one.close()
+    for camera in opened:
+        camera.close()
 
 
 def wait_until(clock: Clock, holds: Callable[[], bool]) -> None:
@@ -210,13 +210,13 @@ class Driver:
 
 @pytest.fixture
 def driver(clock, tmp_path, monkeypatch):
-    made = Driver(clock)
+    driver = Driver(clock)
     (tmp_path / "video0").touch()
     monkeypatch.setattr(video, "_DEVICES", tmp_path)
-    monkeypatch.setattr(video.cv2, "VideoCapture", made)
-    yield made
-    made.begins.set()
-    made.give(None)
+    monkeypatch.setattr(video.cv2, "VideoCapture", driver)
+    yield driver
+    driver.begins.set()
+    driver.give(None)
     clock.sleep(1.0)
 
 
@@ -242,11 +242,11 @@ def test_what_a_camera_does_not_take_is_reported(driver, open_camera, caplog) ->
     driver.values[cv2.CAP_PROP_FOURCC] = cv2.VideoWriter.fourcc(*"MJPG")
     driver.give(noise(1)[0])
     open_camera(fourcc="GREY", exposure=0.004, gain=3.0, rate=60.0)
-    told = " / ".join(record.getMessage() for record in caplog.records)
-    assert "rate 60 Hz was requested, but the camera set 30" in told
-    assert "exposure 0.004 s was requested, but the camera set 0" in told
-    assert "gain 3 was requested, but the camera set 0" in told
-    assert "fourcc GREY was requested, but the camera set MJPG" in told
+    text = " / ".join(record.getMessage() for record in caplog.records)
+    assert "rate 60 Hz was requested, but the camera set 30" in text
+    assert "exposure 0.004 s was requested, but the camera set 0" in text
+    assert "gain 3 was requested, but the camera set 0" in text
+    assert "fourcc GREY was requested, but the camera set MJPG" in text
 
 
 @pytest.mark.parametrize(
@@ -299,8 +299,8 @@ def test_a_camera_that_is_lost_comes_back(driver, open_camera, caplog) -> None:
     assert (frames.number.tolist(), frames.dropped) == ([2], 1)
     assert opened.counts.reconnects == 1
     assert opened.counts.dropped == 1
-    told = [record.getMessage() for record in caplog.records]
-    assert ["lost after frame 1" in told[0], "is back after" in told[1]] == [True, True]
+    warnings = [record.getMessage() for record in caplog.records]
+    assert ["lost after frame 1" in warnings[0], "is back after" in warnings[1]] == [True, True]
 
 
 def test_a_camera_that_waits_for_a_trigger_is_not_lost(driver, open_camera) -> None:
@@ -487,9 +487,9 @@ def test_the_camera_of_the_documentation_works(monkeypatch) -> None:
     pictures = noise(5)
     vendor = Vendor(pictures)
     monkeypatch.setitem(sys.modules, "vendor", vendor)
-    made: dict[str, Any] = {}
-    exec(example, made)
-    with made["VendorCamera"](SimpleNamespace(name="40123456")) as opened:
+    built: dict[str, Any] = {}
+    exec(example, built)
+    with built["VendorCamera"](SimpleNamespace(name="40123456")) as opened:
         wait_until(SYSTEM, lambda: opened.error is not None)
         before, after = opened.take(9, SOON), opened.take(9, SOON)
         with pytest.raises(HardwareError, match=r"^camera 40123456 failed: the cable is out$"):

@@ -53,7 +53,9 @@ class Kept(Closing):
         self._next = part.stop
         out = out[: part.stop - part.start]
         out[:] = self.frames[part]
-        travel, phase = (None if one is None else one[part] for one in (self.travel, self.phase))
+        travel, phase = (
+            None if positions is None else positions[part] for positions in (self.travel, self.phase)
+        )
         return Block(out, index=part.start, travel=travel, phase=phase)
 
 
@@ -62,47 +64,47 @@ def capture(plan, seed):
     optics = {"shape": (48, 64), "pixel_size": 0.125}
     optics["pattern"] = "uniform" if plan.motion == "vertical" else "linear"
     # Steps need few frames, and no delay that is measured.
-    rate, known = (10.0, {"dark": 16.0, "delay": DELAY}) if plan.in_steps else (20.0, {"dark": 16.0})
+    rate, arrivals = (10.0, {"dark": 16.0, "delay": DELAY}) if plan.in_steps else (20.0, {"dark": 16.0})
     clock = SimulatedClock()
     with EmulatedRig(
         "sphere", **optics, rate=rate, delay=DELAY, jitter=0.003, seed=seed, clock=clock
     ) as emulated:
         settings = emulated.settings
-        settings = replace(settings, camera=structs.replace(settings.camera, **known))
+        settings = replace(settings, camera=structs.replace(settings.camera, **arrivals))
         with Rig(emulated.open_stage(settings.stage), emulated.camera, settings, clock) as rig:
             frames, numbers, take = [], {}, rig.take
 
-            def noted(most):
-                taken = take(most)
+            def noted(limit):
+                taken = take(limit)
                 numbers.update(zip(taken.time.tolist(), taken.number.tolist(), strict=True))
                 return taken
 
             rig.take = noted
             with StepScan(rig, plan) if plan.in_steps else SweepScan(rig, plan) as scan:
-                room = np.empty((16, *scan.shape[1:]), scan.dtype)
-                while (block := scan.read(room)) is not None:
+                buffer = np.empty((16, *scan.shape[1:]), scan.dtype)
+                while (block := scan.read(buffer)) is not None:
                     frames.append(replace(block, frames=block.frames.copy()))
                 origin = clock.now() - scan.now()
             (places,) = scan.positions().values()
         is_axial = isinstance(plan, AxialPlan)
         movement = Axial(places, plan.tilt, plan.press) if is_axial else Vertical(places)
         arrival = origin + np.concatenate([block.time for block in frames])
-        known = np.array(list(numbers))
-        number = [numbers[known[np.argmin(abs(known - one))]] for one in arrival]
+        arrivals = np.array(list(numbers))
+        number = [numbers[arrivals[np.argmin(abs(arrivals - item))]] for item in arrival]
         captured = Kept(np.concatenate([block.frames for block in frames]), places, scan.header)
         return captured, number, scan, emulated.twin(movement)
 
 
 def errors(source, truth):
-    found = engine.score(engine.reconstruct(source), truth)
-    return tuple(math.nan if one is None else one.rms for one in (found.height, found.normal))
+    actual = engine.score(engine.reconstruct(source), truth)
+    return tuple(math.nan if result is None else result.rms for result in (actual.height, actual.normal))
 
 
 @pytest.fixture(scope="module")
 def compared():
     """RMS errors of heights and normals, captured and rendered."""
     captures = {name: capture(plan, seed) for seed, (name, plan) in enumerate(PLANS.items())}
-    found = {}
+    actual = {}
     for name, (captured, numbers, scan, twin) in captures.items():
         rendered = np.empty_like(captured.frames)
         # The same noise and the same references, so that only the places differ.
@@ -110,9 +112,9 @@ def compared():
             pose = twin.movement.pose(place)
             twin.look(lambda late, pose=pose: pose, number, frame)
         direct = Kept(rendered, captured.places, captured.header)
-        heights, normals = zip(*(errors(one, twin.truth) for one in (captured, direct)), strict=True)
-        found[name] = heights, normals, scan
-    return found
+        heights, normals = zip(*(errors(source, twin.truth) for source in (captured, direct)), strict=True)
+        actual[name] = heights, normals, scan
+    return actual
 
 
 @pytest.mark.parametrize("name", PLANS)

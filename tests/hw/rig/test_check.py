@@ -101,7 +101,7 @@ class Camera:
         self.counts, self._after = Counts(rate=rate), counts
         self._lost, self.closed = lost, False
 
-    def take(self, most, timeout):
+    def take(self, limit, timeout):
         self.clock.sleep(self._every)
         lost, self._lost = (self._lost, 0) if self.counts.frames else (0, self._lost)
         self.counts = replace(self.counts, frames=self.counts.frames + 1, **self._after)
@@ -115,28 +115,31 @@ class Camera:
 
 
 def look(stage, settings=STAGE):
-    return {one.what: one for one in check_stage(stage, settings, stage.clock)}
+    return {result.what: result for result in check_stage(stage, settings, stage.clock)}
 
 
 def film(camera, **settings):
-    return {one.what: one for one in check_camera(camera, structs.replace(CAMERA, **settings), camera.clock)}
+    return {
+        result.what: result
+        for result in check_camera(camera, structs.replace(CAMERA, **settings), camera.clock)
+    }
 
 
-def test_a_stage_that_is_as_its_file_says_is_sound():
+def test_a_stage_that_agrees_with_its_file_is_sound():
     stage = Stage()
-    found = look(stage)
-    assert {one.verdict for one in found.values()} == {"ok"}
-    assert found["firmware"].found == "Grbl 1.1h"
-    assert found["position"].found == ("travel -15.000 mm, pitch 0.000 deg, roll 0.000 deg (before homing)")
-    assert found["travel: limits against $132"].found == "-10 to 3 mm, 13 mm in the controller"
-    assert found["pitch: speed against $110"].found == "20 deg/s, 20 deg/s in the controller"
-    assert found["reports"].found == "20.0 Hz, requested 20 Hz"
-    assert found["round trip of a report"].found == "4.0 ms"
+    actual = look(stage)
+    assert {result.verdict for result in actual.values()} == {"ok"}
+    assert actual["firmware"].found == "Grbl 1.1h"
+    assert actual["position"].found == ("travel -15.000 mm, pitch 0.000 deg, roll 0.000 deg (before homing)")
+    assert actual["travel: limits against $132"].found == "-10 to 3 mm, 13 mm in the controller"
+    assert actual["pitch: speed against $110"].found == "20 deg/s, 20 deg/s in the controller"
+    assert actual["reports"].found == "20.0 Hz, requested 20 Hz"
+    assert actual["round trip of a report"].found == "4.0 ms"
     assert stage.did == []
 
 
 @pytest.mark.parametrize(
-    ("number", "value", "what", "said"),
+    ("number", "value", "what", "message"),
     [
         (132, 12.9, "travel: limits against $132", "the limits are 13 mm apart, but the axis is shorter"),
         (131, 8.9, "roll: limits against $131", "the limits are 9 deg apart, but the axis is shorter"),
@@ -144,11 +147,11 @@ def test_a_stage_that_is_as_its_file_says_is_sound():
         (110, 600.0, "pitch: speed against $110", "set stage.pitch.speed = 10"),
     ],
 )
-def test_a_file_beyond_the_controller_is_warned_of(number, value, what, said):
-    found = look(Stage(parameters=ABLE | {number: value}))
-    assert found[what].verdict == "warning"
-    assert said in found[what].remedy
-    assert [one.what for one in found.values() if one.verdict != "ok"] == [what]
+def test_a_file_beyond_the_controller_is_warned_of(number, value, what, message):
+    actual = look(Stage(parameters=ABLE | {number: value}))
+    assert actual[what].verdict == "warning"
+    assert message in actual[what].remedy
+    assert [result.what for result in actual.values() if result.verdict != "ok"] == [what]
 
 
 @pytest.mark.parametrize(
@@ -159,20 +162,20 @@ def test_limits_that_the_controller_s_soft_limits_cut_are_warned_of(zero, soft, 
     # -3 to 3 mm from that zero; the machine goes from -6 to 0, or from 0 to 6.
     travel = structs.replace(TRAVEL, zero=zero, direction=1, limits=(-3.0, 3.0))
     settings = structs.replace(STAGE, travel=travel)
-    found = look(Stage(settings, ABLE | {20: soft, 132: 6.0}), settings)["travel: limits against $132"]
-    assert found.verdict == verdict, found
+    actual = look(Stage(settings, ABLE | {20: soft, 132: 6.0}), settings)["travel: limits against $132"]
+    assert actual.verdict == verdict, actual
 
 
 def test_what_the_controller_does_not_report_is_not_a_fault():
-    found = look(Stage(parameters={22: 1.0}))
-    assert {one.verdict for one in found.values()} == {"ok"}
-    assert found["roll: limits against $131"].found == "-5 to 4 deg, unknown in the controller"
+    actual = look(Stage(parameters={22: 1.0}))
+    assert {result.verdict for result in actual.values()} == {"ok"}
+    assert actual["roll: limits against $131"].found == "-5 to 4 deg, unknown in the controller"
 
 
 def test_homing_that_the_controller_cannot_do_fails():
-    found = look(Stage(parameters=ABLE | {22: 0.0}))["homing ($22)"]
-    assert (found.verdict, found.found) == ("failed", "off")
-    assert "home = false" in found.remedy
+    actual = look(Stage(parameters=ABLE | {22: 0.0}))["homing ($22)"]
+    assert (actual.verdict, actual.found) == ("failed", "off")
+    assert "home = false" in actual.remedy
     by_hand = structs.replace(STAGE, home=False)
     assert look(Stage(by_hand, ABLE | {22: 0.0}, (0.0, 0.0, 0.0)), by_hand)["homing ($22)"].verdict == "ok"
 
@@ -185,15 +188,15 @@ def test_a_stage_without_homing_beyond_its_limits_is_reported(at, verdict):
 
 def test_an_alarm_is_a_fault_unless_homing_ends_it():
     assert look(Stage(state="alarm"))["state"].verdict == "ok"
-    found = look(Stage(state="alarm"), structs.replace(STAGE, home=False))["state"]
-    assert (found.verdict, found.found) == ("failed", "alarm")
+    actual = look(Stage(state="alarm"), structs.replace(STAGE, home=False))["state"]
+    assert (actual.verdict, actual.found) == ("failed", "alarm")
     assert look(Stage(state="door"))["state"].verdict == "failed"
 
 
 def test_slow_and_missing_reports_are_reported():
-    found = look(Stage(every=0.1))["reports"]
-    assert (found.verdict, found.found) == ("warning", "10.0 Hz, requested 20 Hz")
-    assert "set stage.report_rate = 10" in found.remedy
+    actual = look(Stage(every=0.1))["reports"]
+    assert (actual.verdict, actual.found) == ("warning", "10.0 Hz, requested 20 Hz")
+    assert "set stage.report_rate = 10" in actual.remedy
     assert look(Stage(every=100.0))["reports"].verdict == "failed"
     slow = Stage()
     slow.round_trip = 0.2
@@ -203,9 +206,9 @@ def test_slow_and_missing_reports_are_reported():
 def test_an_answer_that_came_late_asks_for_more_silence():
     late = Stage()
     late.longest_trip = 0.06
-    found = look(late)["longest round trip"]
-    assert (found.verdict, found.found) == ("warning", "60.0 ms; the limit in motion is 70 ms")
-    assert "set stage.silence = 0.18" in found.remedy
+    actual = look(late)["longest round trip"]
+    assert (actual.verdict, actual.found) == ("warning", "60.0 ms; the limit in motion is 70 ms")
+    assert "set stage.silence = 0.18" in actual.remedy
 
 
 # Moves
@@ -217,9 +220,9 @@ def moves(stage, settings=STAGE):
 
 def test_each_axis_goes_a_little_there_and_back_within_the_limits():
     stage = Stage()
-    found = moves(stage)
-    assert {one.verdict for one in found} == {"ok"}
-    assert [one.what for one in found] == ["homing", "travel (Z)", "pitch (X)", "roll (Y)"]
+    actual = moves(stage)
+    assert {result.verdict for result in actual} == {"ok"}
+    assert [result.what for result in actual] == ["homing", "travel (Z)", "pitch (X)", "roll (Y)"]
     start, lean = Position(-10.0), pytest.approx(0.4 * DEGREE)
     assert stage.did == [
         "home",
@@ -231,8 +234,8 @@ def test_each_axis_goes_a_little_there_and_back_within_the_limits():
         Position(-10.0, 0.0, lean),
         start,
     ]
-    assert found[1].found == "+0.5 mm and back, off by 0.0000 mm"
-    assert found[2].found == "+0.4 deg and back, off by 0.0000 deg"
+    assert actual[1].found == "+0.5 mm and back, off by 0.0000 mm"
+    assert actual[2].found == "+0.4 deg and back, off by 0.0000 deg"
 
 
 def test_travel_goes_up_where_it_can_and_the_body_is_set_upright_first():
@@ -247,9 +250,9 @@ def test_x_y_and_twist_are_moved_of_a_lifted_body():
     twist = TwistAxis(letter="C", limits=(-1.0, 2.0), speed=1.0)
     settings = structs.replace(STAGE, home=False, x=x, twist=twist)
     stage = Stage(settings, at=(1.0, 0.0, 0.0, 0.05, 0.0, 0.01))
-    found = moves(stage, settings)
-    assert {one.verdict for one in found} == {"ok"}
-    assert [one.what for one in found[-2:]] == ["x (A)", "twist (C)"]
+    actual = moves(stage, settings)
+    assert {result.verdict for result in actual} == {"ok"}
+    assert [result.what for result in actual[-2:]] == ["x (A)", "twist (C)"]
     assert stage.did[0] == Position(1.0, x=0.05, twist=0.01), "it stays where it may touch something"
     lifted = Position(-10.0, x=0.05, twist=0.01)
     assert stage.did[-6:] == [
@@ -263,29 +266,29 @@ def test_x_y_and_twist_are_moved_of_a_lifted_body():
 
 
 def test_an_axis_that_stops_elsewhere_fails():
-    found = moves(Stage(off=0.03))[1]
-    assert (found.verdict, found.found) == ("failed", "+0.5 mm and back, off by 0.0300 mm")
-    assert "steps per unit" in found.remedy
+    actual = moves(Stage(off=0.03))[1]
+    assert (actual.verdict, actual.found) == ("failed", "+0.5 mm and back, off by 0.0300 mm")
+    assert "steps per unit" in actual.remedy
     assert moves(Stage(off=0.015))[1].verdict == "ok"
 
 
 # The camera
 
 
-def test_a_camera_that_is_as_its_file_says_is_sound():
-    found = film(Camera(), rate=102.0)
-    assert {one.verdict for one in found.values()} == {"ok"}
-    assert found["pictures"].found == "7 x 5 uint8"
-    assert found["rate"].found == "100.00 Hz, requested 102 Hz"
-    assert found["brightness"].found == "0 to 34, median 17; 0.00% saturated, 2.86% black"
-    total = int(found["frames"].found.split()[0])
+def test_a_camera_that_agrees_with_its_file_is_sound():
+    actual = film(Camera(), rate=102.0)
+    assert {result.verdict for result in actual.values()} == {"ok"}
+    assert actual["pictures"].found == "7 x 5 uint8"
+    assert actual["rate"].found == "100.00 Hz, requested 102 Hz"
+    assert actual["brightness"].found == "0 to 34, median 17; 0.00% saturated, 2.86% black"
+    total = int(actual["frames"].found.split()[0])
     assert 90 <= total <= 110
 
 
 def test_a_frame_that_came_late_asks_for_a_longer_stall():
-    found = film(Camera(every=0.08))["longest wait for a frame"]
-    assert (found.verdict, found.found) == ("warning", "80.0 ms; the limit in motion is 100 ms")
-    assert "set camera.stall = 0.24" in found.remedy
+    actual = film(Camera(every=0.08))["longest wait for a frame"]
+    assert (actual.verdict, actual.found) == ("warning", "80.0 ms; the limit in motion is 100 ms")
+    assert "set camera.stall = 0.24" in actual.remedy
 
 
 def test_a_slow_camera_that_is_on_time_asks_for_nothing():
@@ -302,16 +305,16 @@ def test_lost_frames_and_reconnections_are_reported():
 def test_too_much_light_is_reported(dtype):
     picture = np.arange(35, dtype=dtype).reshape(5, 7)
     picture[0, 0] = np.iinfo(dtype).max
-    found = film(Camera(picture))["brightness"]
-    assert found.verdict == "warning"
-    assert "2.86% saturated" in found.found
-    assert "shorten the exposure" in found.remedy
+    actual = film(Camera(picture))["brightness"]
+    assert actual.verdict == "warning"
+    assert "2.86% saturated" in actual.found
+    assert "shorten the exposure" in actual.remedy
 
 
 def test_a_picture_of_floats_may_have_pixels_that_are_no_numbers():
     picture = np.array([[np.nan, -1.0, 1e9]], np.float32)
-    found = film(Camera(picture))["brightness"]
-    assert (found.verdict, found.found.split(";")[0]) == ("ok", "-1 to 1e+09, median 5e+08")
+    actual = film(Camera(picture))["brightness"]
+    assert (actual.verdict, actual.found.split(";")[0]) == ("ok", "-1 to 1e+09, median 5e+08")
     assert film(Camera(np.full((2, 2), np.nan, np.float32)))["brightness"].verdict == "warning"
 
 
@@ -331,7 +334,7 @@ def opened(stage, camera, move=False):
 @pytest.mark.parametrize("move", [False, True])
 def test_nothing_moves_unless_asked_and_both_are_closed(move):
     stage, camera = Stage(), Camera()
-    parts = list(dict.fromkeys(one.part for one in opened(stage, camera, move)))
+    parts = list(dict.fromkeys(result.part for result in opened(stage, camera, move)))
     assert parts == ["stage", "camera", "move"][: 2 + move]
     assert stage.did[-1] == "close"
     assert (len(stage.did) > 1) == move
@@ -348,7 +351,7 @@ def test_the_stage_is_closed_when_the_camera_is_not_there_or_is_lost():
     assert stage.did == ["close"]
 
     class Lost(Camera):
-        def take(self, most, timeout):
+        def take(self, limit, timeout):
             raise HardwareError("camera: no frame came")
 
     stage, camera = Stage(), Lost()
@@ -382,9 +385,9 @@ def test_warnings_of_hardware_are_findings_and_not_also_printed(caplog):
     log = logging.getLogger("mirrorskin.hw")
 
     class Talking(Camera):
-        def take(self, most, timeout):
+        def take(self, limit, timeout):
             log.info("a frame")
-            return super().take(most, timeout)
+            return super().take(limit, timeout)
 
     def open_camera(settings):
         log.warning("camera 0: gain %g was asked for, the camera set %g", 2, 3)
@@ -393,7 +396,7 @@ def test_warnings_of_hardware_are_findings_and_not_also_printed(caplog):
     findings = list(
         check_rig(RIG, open_stage=lambda settings: Stage(), open_camera=open_camera, clock=Stage.clock)
     )
-    assert [one.found for one in findings if one.verdict != "ok"] == [
+    assert [finding.found for finding in findings if finding.verdict != "ok"] == [
         "camera 0: gain 2 was asked for, the camera set 3"
     ]
     assert not caplog.records

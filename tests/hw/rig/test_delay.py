@@ -32,31 +32,31 @@ def watch(seed, delay, jitter=0.005, noise=0.5, rate=60.0):
 
 @pytest.mark.parametrize(("seed", "rate"), [(0, 30.0), (1, 30.0), (2, 100.0)])
 def test_a_delay_of_50_ms_is_found_within_2_ms_although_frames_jitter_by_5(seed, rate):
-    found = estimate_delay(*watch(seed, 0.05, rate=rate), place)
-    assert found.seconds == pytest.approx(0.05, abs=0.002)
-    assert found.error < 0.001
+    actual = estimate_delay(*watch(seed, 0.05, rate=rate), place)
+    assert actual.seconds == pytest.approx(0.05, abs=0.002)
+    assert actual.error < 0.001
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.0123, 0.45])
 def test_a_steady_delay_is_found_within_a_tenth_of_a_millisecond(delay):
-    found = estimate_delay(*watch(0, delay, jitter=0.0, noise=0.1), place)
-    assert found.seconds == pytest.approx(delay, abs=1e-4)
+    actual = estimate_delay(*watch(0, delay, jitter=0.0, noise=0.1), place)
+    assert actual.seconds == pytest.approx(delay, abs=1e-4)
 
 
 def test_the_standard_error_is_what_the_estimate_scatters_by():
-    found = [estimate_delay(*watch(seed, 0.05), place) for seed in range(8)]
-    scatter = np.std([one.seconds for one in found])
-    told = np.mean([one.error for one in found])
-    assert 0.5 < scatter / told < 1.7
+    actual = [estimate_delay(*watch(seed, 0.05), place) for seed in range(8)]
+    scatter = np.std([result.seconds for result in actual])
+    stated = np.mean([result.error for result in actual])
+    assert 0.5 < scatter / stated < 1.7
 
 
 def test_frames_that_are_late_in_turn_make_the_delay_as_uncertain():
     number, random = np.arange(300), np.random.default_rng(3)
     even = number / 60
-    for wander, least, most in ((0.0, 0.0, 0.0012), (0.008, 0.003, 0.008)):
+    for wander, lowest, limit in ((0.0, 0.0, 0.0012), (0.008, 0.003, 0.008)):
         late = wander * np.sin(math.tau * even / 2) + 0.003 * random.standard_normal(len(even))
         _, error = frame_times(number, even + late)
-        assert least <= error < most
+        assert lowest <= error < limit
 
 
 def test_frames_of_a_camera_that_keeps_time_are_on_a_line():
@@ -67,9 +67,9 @@ def test_frames_of_a_camera_that_keeps_time_are_on_a_line():
 
 
 def test_lamps_that_warm_up_do_not_matter():
-    arrival, seen = watch(0, 0.05)
+    arrival, pictures = watch(0, 0.05)
     warm = np.linspace(0, 20, len(arrival))[:, None]
-    assert estimate_delay(arrival, seen + warm, place).seconds == pytest.approx(0.05, abs=0.002)
+    assert estimate_delay(arrival, pictures + warm, place).seconds == pytest.approx(0.05, abs=0.002)
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])

@@ -39,15 +39,15 @@ def test_a_press_in_steps_takes_every_place_to_its_end():
 
 @ways
 def test_legs_follow_one_another(length, speed, acceleration):
-    one, three = Trapezoid(length, speed, acceleration), Trapezoid(3 * length, speed, acceleration, 3)
-    assert three.duration == pytest.approx(3 * one.duration)
-    time = np.linspace(0, one.duration, 101)
+    single, three = Trapezoid(length, speed, acceleration), Trapezoid(3 * length, speed, acceleration, 3)
+    assert three.duration == pytest.approx(3 * single.duration)
+    time = np.linspace(0, single.duration, 101)
     for number in range(3):
-        later = number * one.duration + time[1:-1]
+        later = number * single.duration + time[1:-1]
         np.testing.assert_allclose(
-            three.place(later), number * length + one.place(time[1:-1]), atol=1e-9 * length
+            three.place(later), number * length + single.place(time[1:-1]), atol=1e-9 * length
         )
-        np.testing.assert_allclose(three.time(three.place(later)), later, atol=1e-6 * one.duration)
+        np.testing.assert_allclose(three.time(three.place(later)), later, atol=1e-6 * single.duration)
 
 
 def test_strokes_go_down_and_up_between_two_depths():
@@ -80,7 +80,7 @@ def test_a_rotation_leans_by_its_tilt_towards_each_phase():
         assert math.cos(place.phase - phase) == pytest.approx(1)
 
 
-def test_a_slide_goes_straight_where_it_is_directed_and_says_its_displacement():
+def test_a_slide_is_straight_and_its_displacement_is_stored():
     plan = HorizontalPlan(1.5, 0.5, math.radians(30), step=0.25)
     along = [math.cos(math.radians(30)), math.sin(math.radians(30))]
     np.testing.assert_allclose(plan.values, np.outer([0, 0.25, 0.5], along), atol=1e-12)
@@ -208,7 +208,7 @@ def test_an_impossible_slide_or_twist_is_refused(make, wrong):
 
 
 @pytest.mark.parametrize(
-    ("plan", "said"),
+    ("plan", "message"),
     [
         (VerticalPlan(0.0, 1.0, speed=20.1), "too fast for the axis of travel"),
         (VerticalPlan(0.0, 1.0, speed=0.016), "too slow for the controller"),
@@ -219,8 +219,8 @@ def test_an_impossible_slide_or_twist_is_refused(make, wrong):
         (VerticalPlan(0.0, 2.5, step=1.0), "exceeds the maximum"),
     ],
 )
-def test_what_the_stage_cannot_do_is_refused(plan, said):
-    with pytest.raises(InputError, match=said):
+def test_what_the_stage_cannot_do_is_refused(plan, message):
+    with pytest.raises(InputError, match=message):
         check_plan(plan, STAGE, "stage")
 
 

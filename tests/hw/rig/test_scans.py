@@ -33,10 +33,10 @@ def make_rig(picture=told, rate=250.0, delay=0.03, jitter=0.0, late=1e-3, **came
     return fake_rig(picture, rate=rate, delay=delay, jitter=jitter, late=late, told={"dark": 5.0, **camera})
 
 
-def drain(scan, room=ROOM):
+def drain(scan, buffer=ROOM):
     """Return all blocks, with copies of their frames."""
     blocks = []
-    while (block := scan.read(room)) is not None:
+    while (block := scan.read(buffer)) is not None:
         blocks.append(replace(block, frames=block.frames.copy()))
     return blocks
 
@@ -208,7 +208,7 @@ def test_of_many_frames_a_turn_only_some_are_given():
 def test_losses_between_frames_that_are_skipped_are_counted(monkeypatch):
     with make_rig(rate=200.0) as rig, SweepScan(rig, AxialPlan(0.5, TILT, rate=2.0), 60) as scan:
         take = rig.camera.take
-        monkeypatch.setattr(rig.camera, "take", lambda *given: replace(take(*given), dropped=1))
+        monkeypatch.setattr(rig.camera, "take", lambda *words: replace(take(*words), dropped=1))
         blocks = drain(scan)
     assert scan.dropped == sum(block.dropped for block in blocks)
     assert scan.dropped > 2 * scan.count

@@ -19,14 +19,14 @@ def reports(seed, jitter=0.004, lag=0.07):
     """Reports at 20 Hz, rounded as GRBL does, of which each tells a time that is wrong by some ms."""
     random = np.random.default_rng(seed)
     time = np.arange(BEGAN - 0.2, BEGAN + 2.6, 0.05) + random.uniform(0, 0.05)
-    way = np.round(TRUE.place(time - BEGAN - lag), 3)
-    return time + jitter * random.standard_normal(len(time)), way
+    places = np.round(TRUE.place(time - BEGAN - lag), 3)
+    return time + jitter * random.standard_normal(len(time)), places
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_track_is_more_accurate_than_single_reports(seed):
-    time, way = reports(seed)
-    track = Track(time, way, PLAN)
+    time, places = reports(seed)
+    track = Track(time, places, PLAN)
     frames = np.linspace(BEGAN - 0.5, BEGAN + 3, 500)
     error = track.at(frames) - TRUE.place(frames - BEGAN - 0.07)
     assert np.sqrt(np.mean(error**2)) < 0.002  # mm; a report errs by 4
@@ -44,9 +44,9 @@ def test_exact_reports_give_the_exact_way():
 
 def test_a_stage_that_pauses_is_followed():
     time = np.arange(0.0, 5.0, 0.05)
-    way = np.interp(time, [1, 2, 3, 4], [0, 1, 1, 2])
+    places = np.interp(time, [1, 2, 3, 4], [0, 1, 1, 2])
     frames = np.linspace(0, 5, 300)
-    error = Track(time, way, PLAN).at(frames) - np.interp(frames, [1, 2, 3, 4], [0, 1, 1, 2])
+    error = Track(time, places, PLAN).at(frames) - np.interp(frames, [1, 2, 3, 4], [0, 1, 1, 2])
     assert abs(error).max() < 0.1
     assert np.sqrt(np.mean(error**2)) < 0.04
 
@@ -57,27 +57,27 @@ def test_a_move_too_short_for_any_report_is_assumed_at_its_command():
     np.testing.assert_array_equal(track.at([BEGAN - 1, BEGAN + 5]), [0, LENGTH])
 
 
-def live(time, way, frames, began=BEGAN):
+def live(time, method, frames, began=BEGAN):
     """Tell the live ways at some times, each with the reports that were there 20 ms later."""
     track = LiveTrack(PLAN, began)
-    given, found = 0, []
+    next_report, actual = 0, []
     for frame in frames:
-        while given < len(time) and time[given] < frame + 0.02:
-            track.add(time[given], way[given])
-            given += 1
-        found.append(float(track.at([frame])[0]))
-    return np.array(found)
+        while next_report < len(time) and time[next_report] < frame + 0.02:
+            track.add(time[next_report], method[next_report])
+            next_report += 1
+        actual.append(float(track.at([frame])[0]))
+    return np.array(actual)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_live_distance_is_accurate_and_never_decreases(seed):
-    time, way = reports(seed)
+    time, places = reports(seed)
     frames = np.linspace(BEGAN, BEGAN + 3, 600)
-    found = live(time, way, frames)
-    error = found - TRUE.place(frames - BEGAN - 0.07)
-    assert np.all(np.diff(found) >= 0)
-    assert found[0] == 0
-    assert found[-1] == LENGTH
+    actual = live(time, places, frames)
+    error = actual - TRUE.place(frames - BEGAN - 0.07)
+    assert np.all(np.diff(actual) >= 0)
+    assert actual[0] == 0
+    assert actual[-1] == LENGTH
     assert abs(error).max() < 0.12  # before the first report of the move nothing tells that it began late
     assert np.sqrt(np.mean(error[frames > BEGAN + 0.5] ** 2)) < 0.006
 
@@ -99,9 +99,9 @@ def test_the_progress_of_a_rotation_counts_whole_turns():
     plan = AxialPlan(1.0, 0.05, turns=3, rate=2.0)
     progress = Progress(plan)
     time = np.arange(0, plan.path.duration + 0.3, 0.1)
-    way = plan.path.place(time - 0.15)  # begins late
-    found = [progress(Report(t, plan.place(w), "run")) for t, w in zip(time, way, strict=True)]
-    np.testing.assert_allclose(found, way, atol=1e-9)
+    places = plan.path.place(time - 0.15)  # begins late
+    actual = [progress(Report(t, plan.place(w), "run")) for t, w in zip(time, places, strict=True)]
+    np.testing.assert_allclose(actual, places, atol=1e-9)
 
 
 @pytest.mark.parametrize("acceleration", [2.0, 500.0])
@@ -110,11 +110,11 @@ def test_the_progress_of_strokes_counts_them_and_their_track_is_found(accelerati
     true = replace(plan.path, speed=0.57, acceleration=acceleration)
     progress = Progress(plan)
     time = np.arange(0, true.duration + 0.4, 0.04) + 0.004 * np.random.default_rng(3).uniform(-1, 1)
-    way = true.place(time - 0.15)
-    found = [progress(Report(t, plan.place(w), "run")) for t, w in zip(time, way, strict=True)]
-    assert abs(found - way).max() < 0.57 * 0.04, "a turn between two reports may be told late"
+    places = true.place(time - 0.15)
+    actual = [progress(Report(t, plan.place(w), "run")) for t, w in zip(time, places, strict=True)]
+    assert abs(actual - places).max() < 0.57 * 0.04, "a turn between two reports may be told late"
     frames = np.arange(0, true.duration + 0.2, 0.01)
-    travel = plan.recorded(Track(time, found, plan.path).at(frames))
+    travel = plan.recorded(Track(time, actual, plan.path).at(frames))
     error = travel - plan.recorded(true.place(frames - 0.15))
     assert np.sqrt(np.mean(error**2)) < 0.004
 
@@ -124,9 +124,9 @@ def test_times_become_even_and_keep_what_was_lost(window):
     random = np.random.default_rng(1)
     number = np.delete(np.arange(400), slice(100, 117))
     true = 5.0 + number / 60 * (1 + 1e-4)
-    found = even_times(number, np.maximum.accumulate(true + 0.004 * random.standard_normal(383)), window)
-    assert np.all(np.diff(found) > 0)
-    error = found - true
+    actual = even_times(number, np.maximum.accumulate(true + 0.004 * random.standard_normal(383)), window)
+    assert np.all(np.diff(actual) > 0)
+    error = actual - true
     assert error.std() < 0.004 / math.sqrt(window)
 
 

@@ -58,9 +58,9 @@ def drain(scan):
 
 @pytest.mark.parametrize("line", ["coolant", "spindle"])
 def test_each_frame_of_steps_is_triggered_once_at_rest(emulated, line):
-    rig, told = emulated(line)
+    rig, settings = emulated(line)
     plan = VerticalPlan(0.0, 1.0, step=0.5)
-    with rigs.open_rig(told, steps=True) as opened, StepScan(opened, plan, settle=0.0, frames=2) as scan:
+    with rigs.open_rig(settings, steps=True) as opened, StepScan(opened, plan, settle=0.0, frames=2) as scan:
         travel = drain(scan)
     switched = rig.machine.switched(line)
     assert travel == [0, 0, 0.5, 0.5, 1, 1]
@@ -95,9 +95,9 @@ def test_a_missing_frame_ends_a_capture_in_one_line_and_the_line_is_off(emulated
 
 
 def test_a_camera_that_runs_freely_is_a_fault(emulated):
-    _, told = emulated(free=True)
+    _, settings = emulated(free=True)
     with (
-        rigs.open_rig(told, steps=True) as opened,
+        rigs.open_rig(settings, steps=True) as opened,
         StepScan(opened, VerticalPlan(0.0, 1.0, step=0.5), settle=0.0) as scan,
         pytest.raises(HardwareError, match=r"delivered frames without a trigger \(\d+\): check that it is"),
     ):
@@ -105,10 +105,10 @@ def test_a_camera_that_runs_freely_is_a_fault(emulated):
 
 
 def test_a_surplus_frame_after_the_last_trigger_is_a_fault(emulated):
-    rig, told = emulated()
+    rig, settings = emulated()
     with (
-        rig.open_stage(told.stage) as stage,
-        Rig(stage, rig.camera, told, rig.clock) as opened,
+        rig.open_stage(settings.stage) as stage,
+        Rig(stage, rig.camera, settings, rig.clock) as opened,
         StepScan(opened, VerticalPlan(0.0, 1.0, step=1.0), settle=0.0) as scan,
     ):
         for _ in range(2):
@@ -123,23 +123,23 @@ def test_a_surplus_frame_after_the_last_trigger_is_a_fault(emulated):
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
 def test_the_line_is_off_whatever_interrupts(emulated, monkeypatch, error):
-    rig, told = emulated()
-    seen = []
+    rig, settings = emulated()
+    calls = []
 
-    def interrupt(most, timeout):
-        seen.append(is_on(rig))
+    def interrupt(limit, timeout):
+        calls.append(is_on(rig))
         raise error
 
-    with pytest.raises(error), rigs.open_rig(told, steps=True) as opened:  # noqa: PT012
+    with pytest.raises(error), rigs.open_rig(settings, steps=True) as opened:  # noqa: PT012
         monkeypatch.setattr(opened.camera, "take", interrupt)
         opened.take(1)
-    assert seen == [True]
+    assert calls == [True]
     assert not is_on(rig)
 
 
 def test_a_stop_of_the_stage_switches_the_line_off(emulated):
-    rig, told = emulated()
-    with rig.open_stage(told.stage) as stage:
+    rig, settings = emulated()
+    with rig.open_stage(settings.stage) as stage:
         stage.switch("coolant", True)
         assert is_on(rig)
         stage.stop()
@@ -148,7 +148,7 @@ def test_a_stop_of_the_stage_switches_the_line_off(emulated):
 
 
 def test_what_needs_frames_all_the_time_is_refused(emulated, tmp_path):
-    rig, told = emulated()
+    rig, settings = emulated()
     file = rig.write(tmp_path / "rig", "genicam:")
     words = ("--rig", file, "--stop", "1mm", "--speed", "1mm/s")
     for ended in (
@@ -158,8 +158,8 @@ def test_what_needs_frames_all_the_time_is_refused(emulated, tmp_path):
         assert ended.code == 2
         assert "camera.trigger works only for captures in steps: give" in ended.said
     with (
-        rig.open_stage(told.stage) as stage,
-        Rig(stage, rig.camera, told, rig.clock) as opened,
+        rig.open_stage(settings.stage) as stage,
+        Rig(stage, rig.camera, settings, rig.clock) as opened,
         pytest.raises(InputError, match=r"camera\.trigger works only for captures in steps"),
     ):
         SweepScan(opened, VerticalPlan(0.0, 1.0, speed=1.0))
@@ -185,8 +185,8 @@ def test_a_stage_that_has_no_line_is_not_homed(monkeypatch):
 
 
 def test_rig_check_triggers_a_few_frames(emulated):
-    rig, told = emulated()
-    found = {one.what: one for one in check.check_rig(told)}
-    assert found["trigger"].found.startswith("3 frames, at most ")
-    assert found["brightness"].verdict == "ok"
+    rig, settings = emulated()
+    actual = {result.what: result for result in check.check_rig(settings)}
+    assert actual["trigger"].found.startswith("3 frames, at most ")
+    assert actual["brightness"].verdict == "ok"
     assert not is_on(rig)

@@ -187,16 +187,16 @@ def test_what_moves_by_others_is_left_alone_unless_it_is_unlocked(opened, clock)
 
 
 @pytest.mark.parametrize(
-    ("behaviour", "told"),
+    ("behaviour", "message"),
     [
         ({"version": "0.9j"}, "version 0.9j"),
         ({"settings": {13: 1}}, re.escape("$13=0")),
         ({"answers": {"$$": "error:8"}}, "error:8"),
     ],
 )
-def test_a_controller_that_cannot_be_worked_with_is_refused(opened, clock, behaviour, told):
+def test_a_controller_that_cannot_be_worked_with_is_refused(opened, clock, behaviour, message):
     port = ScriptedGrbl(clock, **behaviour)
-    with pytest.raises(InputError, match=f"^stage in memory: .*{told}"):
+    with pytest.raises(InputError, match=f"^stage in memory: .*{message}"):
         opened(port)
     assert port.closed
 

@@ -51,9 +51,9 @@ def bench(request, tmp_path):
         else:
             clock, machine = SYSTEM, stack.enter_context(Firmware(PROGRAM, tmp_path, QUICK))
             line = stack.enter_context(GrblPort(machine))
-        made = Bench(machine, line, clock, silence=0.07 if clock is not SYSTEM else 0.3)
-        stack.enter_context(made.stage)
-        yield made
+        bench = Bench(machine, line, clock, silence=0.07 if clock is not SYSTEM else 0.3)
+        stack.enter_context(bench.stage)
+        yield bench
 
 
 def test_the_stage_goes_round_on_its_circle_and_ends_where_it_should(bench):
@@ -153,9 +153,9 @@ def go(**faults):
 
 
 @pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("way", ["said", "heard"])
-def test_each_reply_and_byte_may_fail_once(way, change):
-    assert None in outcomes(go, way, change, least=40), "some of it does not matter"
+@pytest.mark.parametrize("method", ["said", "heard"])
+def test_each_reply_and_byte_may_fail_once(method, change):
+    assert None in outcomes(go, method, change, least=40), "some of it does not matter"
 
 
 @pytest.mark.parametrize("every", [2, 3, 7, 20])

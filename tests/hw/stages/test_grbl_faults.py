@@ -75,12 +75,12 @@ def test_a_little_noise_is_borne(moving):
     assert stage.report().state == "run"
 
 
-def test_an_unplugged_stage_says_so_at_once(moving):
+def test_an_unplugged_stage_is_reported_at_once(moving):
     stage, port = moving
     port.unplug()
-    told = failure(stage, 0.0)
-    assert "the connection is lost" in told
-    assert "switch it off" in told
+    text = failure(stage, 0.0)
+    assert "the connection is lost" in text
+    assert "switch it off" in text
     stage.stop()
     for ask in (stage.report, stage.wait, lambda: stage.move(Position())):
         with pytest.raises(HardwareError, match="connection is lost"):
@@ -101,7 +101,7 @@ def _jump(*place):
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "message"),
     [
         (lambda port: port.alarm(1), "ALARM:1"),
         (lambda port: port.alarm(99), "ALARM:99"),
@@ -116,13 +116,13 @@ def _jump(*place):
         (_jump(34, 44, 10), "beyond the limits"),
     ],
 )
-def test_what_happens_in_motion_is_reported(moving, fault, told):
+def test_what_happens_in_motion_is_reported(moving, fault, message):
     stage, port = moving
     fault(port)
-    assert told in failure(stage)
-    assert told in str(stage.error)
+    assert message in failure(stage)
+    assert message in str(stage.error)
     assert port.held_at
-    with pytest.raises(HardwareError, match=told):
+    with pytest.raises(HardwareError, match=message):
         stage.report()
 
 
@@ -151,9 +151,9 @@ def test_a_stage_that_rests_elsewhere_than_it_was_sent_reports_it(opened):
     stage, port = opened()
     port.on_move = lambda: port.plan.__setitem__(-1, ([30.0, 40.0, 8.0], 0.1))
     stage.move(Position(1.0), 10.0)
-    told = failure(stage, 0.5)
-    assert "rests 1 mm or degrees from its target" in told
-    assert str(stage.error) == told
+    text = failure(stage, 0.5)
+    assert "rests 1 mm or degrees from its target" in text
+    assert str(stage.error) == text
 
 
 def test_the_steps_of_a_coarse_axis_are_no_fault(opened, clock):
@@ -199,14 +199,14 @@ def test_a_stage_that_does_not_come_to_rest_in_time_is_stopped(moving):
 
 def test_a_stop_goes_out_at_once_and_ends_others_waits(moving, clock):
     stage, port = moving
-    told = []
-    other = clock.thread(lambda: told.append(failure(stage, 1.0)), "other")
+    failures = []
+    other = clock.thread(lambda: failures.append(failure(stage, 1.0)), "other")
     other.start()
     clock.sleep(0.1)
     stage.stop()
     assert port.held_at == clock.now()
     other.join()
-    assert "was stopped" in told[0]
+    assert "was stopped" in failures[0]
     assert clock.now() - port.held_at < SOON
     port.until(lambda: port.reset_at)
     assert port.bytes.rindex(b"!") < port.bytes.index(b"\x18")
@@ -217,11 +217,11 @@ def test_a_stop_goes_out_at_once_and_ends_others_waits(moving, clock):
 
 def test_a_stop_needs_no_lock_of_other_threads(moving, clock):
     stage, port = moving
-    done = clock.event()
+    finished = clock.event()
 
     def keep():
         with stage._link.lock:
-            done.wait()
+            finished.wait()
 
     other = clock.thread(keep, "other")
     other.start()
@@ -229,7 +229,7 @@ def test_a_stop_needs_no_lock_of_other_threads(moving, clock):
     stage.stop()
     assert port.held_at == clock.now()
     assert other.is_alive(), "it waited for the lock"
-    done.set()
+    finished.set()
     other.join()
 
 
@@ -259,19 +259,19 @@ def test_a_machine_that_never_holds_is_reset_all_the_same(moving, clock):
 @pytest.mark.parametrize("what", ["lost", "undone"])
 def test_a_hold_that_is_lost_or_undone_is_repeated(moving, what):
     stage, port = moving
-    hold, told = port.hold, []
+    hold, failures = port.hold, []
 
     def once(*_):
-        told.append(port.state)
-        if what == "undone" or len(told) > 1:
+        failures.append(port.state)
+        if what == "undone" or len(failures) > 1:
             hold()
-        if what == "undone" and len(told) == 1:
+        if what == "undone" and len(failures) == 1:
             port.state = "Run"
 
     port.hold = once
     stage.stop()
     port.until(lambda: port.reset_at)
-    assert len(told) > 1
+    assert len(failures) > 1
     assert port.state == "Idle", "it was held when it was reset"
 
 
@@ -359,6 +359,6 @@ def test_a_program_that_ends_without_closing_stops_the_stage():
         check=False,
     )
     assert "forgot to close it" in ended.stderr
-    said = ended.stdout.split()
-    assert said[0] == "b'!'"
-    assert r"b'\x18'" in said
+    words = ended.stdout.split()
+    assert words[0] == "b'!'"
+    assert r"b'\x18'" in words

@@ -29,10 +29,10 @@ PATIENCE = 60.0  # seconds, for a busy machine
 
 
 def axes() -> Axes:
-    made = Axes(stage_settings(**ZEROED), "rig")
+    able = Axes(stage_settings(**ZEROED), "rig")
     for motion in ZEROED:
-        made.limit_acceleration(motion, 100.0)
-    return made
+        able.limit_acceleration(motion, 100.0)
+    return able
 
 
 class Played:
@@ -42,8 +42,8 @@ class Played:
         clock = SimulatedClock(0.0)
         self.machine = GrblMachine(SETTINGS, clock=clock)
         window = Window()
-        for one in commands:
-            window.add(one.line, one.duration, one.ramp)
+        for command in commands:
+            window.add(command.line, command.duration, command.ramp)
         while (window.busy or self.machine.moving()) and clock.now() <= silent_at + 10:
             while clock.now() < silent_at and (data := window.next(clock.now())) is not None:
                 self.machine.receive(data)
@@ -57,15 +57,15 @@ class Played:
         return times, np.array([list(self.machine.position(at).values()) for at in times])
 
 
-def strokes(made, cut):
+def strokes(able, cut_leg):
     places = [Position(), Position(2.0), Position(0.5), Position(2.0, 0.02, 0.03)]
-    return [one for leg in pairwise(places) for one in cut(made, *leg)]
+    return [item for leg in pairwise(places) for item in cut_leg(able, *leg)]
 
 
 @pytest.mark.parametrize("speed", [0.3, 2.0])
 def test_motion_in_pieces_is_that_of_whole_lines(speed):
-    in_pieces = Played(strokes(axes(), lambda made, *leg: made.pieces(*leg, speed)))
-    whole = Played(strokes(axes(), lambda made, *leg: [made.straight(*leg, speed)]))
+    in_pieces = Played(strokes(axes(), lambda able, *leg: able.pieces(*leg, speed)))
+    whole = Played(strokes(axes(), lambda able, *leg: [able.straight(*leg, speed)]))
     (times, places), (longer, expected) = in_pieces.places(), whole.places()
     count = min(len(times), len(longer))
     np.testing.assert_allclose(places[:count], expected[:count], atol=speed * 0.01)  # a line waits to be read
@@ -74,9 +74,9 @@ def test_motion_in_pieces_is_that_of_whole_lines(speed):
 
 @pytest.mark.parametrize("rate", [0.05, 0.5])
 def test_a_precession_in_pieces_keeps_its_circle_and_its_speed(rate):
-    made = axes()
-    lean = made.pieces(Position(), Position(0.0, LEAN), None)
-    commands = [*lean, *made.arcs(LEAN, 1.0, rate, 0.0, dict.fromkeys("XYZ", 0.0))]
+    able = axes()
+    lean = able.pieces(Position(), Position(0.0, LEAN), None)
+    commands = [*lean, *able.arcs(LEAN, 1.0, rate, 0.0, dict.fromkeys("XYZ", 0.0))]
     times, places = Played(commands).places()
     phase = np.unwrap(np.arctan2(places[:, 1], places[:, 0]))
     turning = (phase > 0.3) & (phase < math.tau - 0.3)
@@ -87,11 +87,11 @@ def test_a_precession_in_pieces_keeps_its_circle_and_its_speed(rate):
 @pytest.mark.parametrize("silent_at", [0.1, 1.0, 3.3])
 @pytest.mark.parametrize("strokes", [1, 20])
 def test_when_the_host_falls_silent_it_moves_on_for_less_than_a_second(silent_at, strokes):
-    made, speed = axes(), 0.5
+    able, speed = axes(), 0.5
     places = [Position(0.1 if number % 2 else 0.0) for number in range(strokes + 1)]
     if strokes == 1:
         places = [Position(), Position(4.0)]
-    commands = [one for leg in pairwise(places) for one in made.pieces(*leg, speed)]
+    commands = [piece for leg in pairwise(places) for piece in able.pieces(*leg, speed)]
     machine = Played(commands, silent_at).machine
     moving = [at for at in np.arange(silent_at, silent_at + 5, 0.01) if machine.moving(at)]
     assert max(moving, default=0.0) - silent_at < AHEAD + PIECE + 0.05

@@ -13,12 +13,12 @@ TEXT = st.binary(max_size=40).map(lambda text: text.replace(b"\n", b"").replace(
 @given(st.lists(TEXT, max_size=12), st.lists(st.integers(1, 30), max_size=40))
 def test_lines_are_the_same_however_they_arrive(lines, cuts):
     data = b"".join(line + b"\r\n" for line in lines)
-    splitter, found = Splitter(), []
-    for cut in cuts:
-        found += splitter.feed(data[:cut], 0.0)
-        data = data[cut:]
-    found += splitter.feed(data, 0.0)
-    assert [line for line, _ in found] == [line for line in lines if line]
+    splitter, actual = Splitter(), []
+    for part in cuts:
+        actual += splitter.feed(data[:part], 0.0)
+        data = data[part:]
+    actual += splitter.feed(data, 0.0)
+    assert [line for line, _ in actual] == [line for line in lines if line]
 
 
 def test_a_line_is_as_old_as_its_first_byte():

@@ -56,7 +56,7 @@ def answering(terminal):
 
 
 @pytest.mark.parametrize(
-    ("url", "told"),
+    ("url", "message"),
     [
         ("/dev/no-such-port", "no such port"),
         ("nonsense://here", "correct the rig file"),
@@ -64,8 +64,8 @@ def answering(terminal):
         ("/dev/null", "correct the rig file"),
     ],
 )
-def test_a_port_that_cannot_be_opened_is_refused_in_one_line(url, told):
-    with pytest.raises(InputError, match=f"^stage {url}: .*{told}") as caught:
+def test_a_port_that_cannot_be_opened_is_refused_in_one_line(url, message):
+    with pytest.raises(InputError, match=f"^stage {url}: .*{message}") as caught:
         GrblStage(stage_settings(port=url))
     assert "\n" not in str(caught.value)
 

@@ -63,7 +63,7 @@ def test_steps_are_recorded(stage, line, clock, tmp_path):
 def test_it_goes_no_faster_than_the_controller(stage, line):
     stage.move(Position(-1.0))
     stage.wait()
-    assert [said for said in line.log if said.startswith("G1")] == [
+    assert [message for message in line.log if message.startswith("G1")] == [
         "G1Z-1.00000X0.00000Y0.00000F480.0000"  # 8 mm/s of M203
     ]
 
@@ -123,7 +123,10 @@ def test_a_stop_in_motion_comes_at_once(clock, emergency):
         (lambda line: line.say("start"), "was reset and has lost its position"),
         (lambda line: line.say("ok"), "answered a line that this program did not send"),
         (lambda line: line.say(*["\x01\xe9\x7f" * 40] * 5), "sends garbled characters"),
-        (lambda line: setattr(line, "noise", lambda said: said.replace("M110", "M111")), "checksum mismatch"),
+        (
+            lambda line: setattr(line, "noise", lambda message: message.replace("M110", "M111")),
+            "checksum mismatch",
+        ),
         (lambda line: line.say("Error:Heating failed, system stopped!"), "Heating failed"),
     ],
 )
@@ -189,35 +192,35 @@ def test_the_rig_file_chooses_it(line, clock, monkeypatch):
 
 def test_chatter_without_an_answer_is_silence(stage, line, clock):
     begin_slow(stage)
-    line.silent, told = True, clock.event()
+    line.silent, failed = True, clock.event()
 
     def chatter():
-        while not told.wait(0.02):
+        while not failed.wait(0.02):
             line.chat("T:20.0 /0.0")
 
     talk = clock.thread(chatter, "chatter")
     talk.start()
     with pytest.raises(HardwareError, match="no longer answers"):
         stage.wait()
-    told.set()
+    failed.set()
     talk.join()
     assert rests_on_its_way(line)
 
 
 def test_a_word_that_noise_changed_does_not_move_it(stage, line):
-    line.noise = lambda said: said.replace("Z-1.0", "Z-9.0")
+    line.noise = lambda message: message.replace("Z-1.0", "Z-9.0")
     with pytest.raises(HardwareError, match="checksum mismatch"):
         stage.move(Position(-1.0))
     assert not line.moving
-    assert not any(said.startswith("G1") for said in line.log)
+    assert not any(message.startswith("G1") for message in line.log)
 
 
 def test_a_stop_just_before_a_move_is_sent_stops_it(stage, line):
-    def late(said):
-        if "G1" in said:
+    def late(message):
+        if "G1" in message:
             line.noise = str
             stage.stop()
-        return said
+        return message
 
     line.noise = late
     with pytest.raises(HardwareError, match="the stage was stopped"):
@@ -269,9 +272,9 @@ def go(**faults):
 
 
 @pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("way", ["said", "heard"])
-def test_each_reply_and_byte_may_fail_once(way, change):
-    assert None in outcomes(go, way, change, least=30), "some of it does not matter"
+@pytest.mark.parametrize("method", ["said", "heard"])
+def test_each_reply_and_byte_may_fail_once(method, change):
+    assert None in outcomes(go, method, change, least=30), "some of it does not matter"
 
 
 RIG_FILE = """
@@ -315,10 +318,10 @@ def test_a_sweep_is_refused_before_it_homes(capture, line):
 @pytest.mark.parametrize("fault", [lambda line: line.unplug(), lambda line: setattr(line, "silent", True)])
 def test_a_fault_ends_the_capture_with_a_line(capture, line, fault):
 
-    def noticed(said):
-        if "G1Z2.0" in said:
+    def noticed(message):
+        if "G1Z2.0" in message:
             fault(line)
-        return said
+        return message
 
     line.noise = noticed
     ended = capture("--start 0mm --stop 2mm --step 2mm --settle 0s")

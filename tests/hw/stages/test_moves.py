@@ -34,16 +34,16 @@ def words(line):
 
 def swept(line, start, plane):
     """The points of an arc as G-code means it: G3 turns from the plane's first axis to its second."""
-    one, two = {"G17": "XY", "G18": "ZX", "G19": "YZ"}[plane]
-    said = words(line)
-    centre = [start[x] + said[{"X": "I", "Y": "J", "Z": "K"}[x]] for x in (one, two)]
-    begin = math.atan2(start[two] - centre[1], start[one] - centre[0])
-    end = math.atan2(said[two] - centre[1], said[one] - centre[0])
-    radius = math.hypot(start[one] - centre[0], start[two] - centre[1])
-    assert radius == pytest.approx(math.hypot(said[one] - centre[0], said[two] - centre[1]), abs=3e-5)
+    first, two = {"G17": "XY", "G18": "ZX", "G19": "YZ"}[plane]
+    values = words(line)
+    centre = [start[x] + values[{"X": "I", "Y": "J", "Z": "K"}[x]] for x in (first, two)]
+    begin = math.atan2(start[two] - centre[1], start[first] - centre[0])
+    end = math.atan2(values[two] - centre[1], values[first] - centre[0])
+    radius = math.hypot(start[first] - centre[0], start[two] - centre[1])
+    assert radius == pytest.approx(math.hypot(values[first] - centre[0], values[two] - centre[1]), abs=3e-5)
     turn = (end - begin) % math.tau if line.startswith("G3") else -((begin - end) % math.tau)
     angles = begin + np.linspace(0, turn, 25)
-    return [{one: centre[0] + radius * np.cos(t), two: centre[1] + radius * np.sin(t)} for t in angles]
+    return [{first: centre[0] + radius * np.cos(t), two: centre[1] + radius * np.sin(t)} for t in angles]
 
 
 def path(commands, start, plane):
@@ -72,12 +72,12 @@ def test_a_long_straight_move_is_sent_in_short_pieces_that_end_where_it_does():
     rig = axes()
     whole, pieces = rig.straight(start, place, 0.5), rig.pieces(start, place, 0.5)
     assert pieces[-1].line == whole.line
-    assert sum(one.duration for one in pieces) == pytest.approx(whole.duration)
-    assert max(one.duration for one in pieces) <= PIECE + 1e-9
-    share = np.arange(1, len(pieces) + 1)[:, None] / len(pieces)
-    ends = [[words(one.line)[letter] for letter in "XYZ"] for one in pieces]
-    np.testing.assert_allclose(ends, [30, 40, 10] + share * [1.0, -3.0, -2.0], atol=1e-5)
-    assert {words(one.line)["F"] for one in pieces} == {words(whole.line)["F"]}
+    assert sum(piece.duration for piece in pieces) == pytest.approx(whole.duration)
+    assert max(piece.duration for piece in pieces) <= PIECE + 1e-9
+    fraction = np.arange(1, len(pieces) + 1)[:, None] / len(pieces)
+    ends = [[words(piece.line)[letter] for letter in "XYZ"] for piece in pieces]
+    np.testing.assert_allclose(ends, [30, 40, 10] + fraction * [1.0, -3.0, -2.0], atol=1e-5)
+    assert {words(piece.line)["F"] for piece in pieces} == {words(whole.line)["F"]}
 
 
 @pytest.mark.parametrize(("speed", "ramp"), [(2.0, 0.5), (20.0, 5.0)])
@@ -86,15 +86,15 @@ def test_the_time_of_a_move_includes_that_to_speed_up_and_to_slow_down(speed, ra
     rig.limit_acceleration("travel", 4.0)
     rig.limit_acceleration("pitch", 0.001)  # it does not move
     pieces = rig.pieces(Position(), Position(4.0), speed)
-    assert sum(one.duration for one in pieces) == pytest.approx(path.duration)
-    assert {one.ramp for one in pieces} == {ramp}
+    assert sum(piece.duration for piece in pieces) == pytest.approx(path.duration)
+    assert {piece.ramp for piece in pieces} == {ramp}
 
 
 @pytest.mark.parametrize("rate", [0.01, 0.1, 1.0, 5.0])
 def test_no_arc_takes_long_however_slow_it_is(rate):
     arcs = axes().arcs(LEAN, 1.5, rate, 0.3, NONE)[1:]
-    assert max(one.duration for one in arcs) <= PIECE + 1e-9
-    assert sum(one.duration for one in arcs) == pytest.approx(1.5 / rate)
+    assert max(arc.duration for arc in arcs) <= PIECE + 1e-9
+    assert sum(arc.duration for arc in arcs) == pytest.approx(1.5 / rate)
 
 
 def test_without_a_speed_the_slowest_axis_sets_the_time():
@@ -107,7 +107,7 @@ def test_without_a_speed_the_slowest_axis_sets_the_time():
 
 
 @pytest.mark.parametrize(
-    ("place", "speed", "told"),
+    ("place", "speed", "message"),
     [
         (Position(1), 20.1, "too fast for the axis of travel; the maximum is 20 mm/s"),
         (Position(1, 0.05), 19.0, r"too fast for the axis of pitch"),
@@ -119,10 +119,10 @@ def test_without_a_speed_the_slowest_axis_sets_the_time():
         (Position(1), math.inf, "positive"),
     ],
 )
-def test_an_impossible_speed_is_refused(place, speed, told):
+def test_an_impossible_speed_is_refused(place, speed, message):
     rig = axes()
     rig.limit("pitch", math.degrees(0.1) if place.travel else 1e9)
-    with pytest.raises(InputError, match=f"^rig: .*{told}"):
+    with pytest.raises(InputError, match=f"^rig: .*{message}"):
         rig.straight(Position(), place, speed)
 
 
@@ -158,7 +158,7 @@ def test_every_line_of_a_precession_fits_a_line_of_the_controller():
 
 
 @pytest.mark.parametrize(
-    ("tilt", "turns", "rate", "told"),
+    ("tilt", "turns", "rate", "message"),
     [
         (LEAN, 1.0, 0.0, "a precession with .* is not possible"),
         (LEAN, 1.0, -1.0, "a precession with .* is not possible"),
@@ -173,13 +173,13 @@ def test_every_line_of_a_precession_fits_a_line_of_the_controller():
         (math.radians(0.01), 1.0, 0.1, "too slow for the controller"),
     ],
 )
-def test_an_impossible_precession_is_refused(tilt, turns, rate, told):
-    with pytest.raises(InputError, match=f"^rig: .*{told}"):
+def test_an_impossible_precession_is_refused(tilt, turns, rate, message):
+    with pytest.raises(InputError, match=f"^rig: .*{message}"):
         axes().arcs(tilt, turns, rate, 0.0, NONE)
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"pitch": axis("A"), "roll": axis("B")}, "not support arcs in the axes A and B"),
         ({"pitch": axis("X"), "roll": axis("A")}, "not support arcs in the axes X and A"),
@@ -187,6 +187,6 @@ def test_an_impossible_precession_is_refused(tilt, turns, rate, told):
         ({"pitch": axis("X", unit="mm"), "roll": axis("Y")}, "same unit"),
     ],
 )
-def test_axes_that_span_no_plane_are_refused(changes, told):
-    with pytest.raises(InputError, match=told):
+def test_axes_that_span_no_plane_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
         axes(**changes).arcs(LEAN, 1.0, 0.5, 0.0, NONE)

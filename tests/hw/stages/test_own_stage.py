@@ -47,8 +47,8 @@ class Controller:
     def write(self, data):
         now, words = self.clock.now(), data.decode().split()
         if words[0] == "MOVE":
-            here, there, speed = self.travel(now), float(words[1]), float(words[2])
-            self.way = [(now, here, speed), (now + abs(there - here) / speed, there, speed)]
+            here, target, speed = self.travel(now), float(words[1]), float(words[2])
+            self.way = [(now, here, speed), (now + abs(target - here) / speed, target, speed)]
         elif words[0] == "STOP":
             self.stopped += 1
             self.way = [(now, self.travel(now), 0.0)] * 2
@@ -67,18 +67,18 @@ class Controller:
 @pytest.fixture
 def line(clock, monkeypatch):
     """A controller behind every port."""
-    made = Controller(clock)
-    monkeypatch.setattr("serial.serial_for_url", lambda *_words, **_named: made)
-    return made
+    controller = Controller(clock)
+    monkeypatch.setattr("serial.serial_for_url", lambda *_words, **_named: controller)
+    return controller
 
 
 @pytest.fixture
 def lab(line, clock, monkeypatch):
     """The page's class, opened on a controller."""
-    made = {"__name__": __name__}
-    exec(EXAMPLE, made)
-    made |= on_clock(clock)
-    stage = made["LabStage"](STAGE)
+    namespace = {"__name__": __name__}
+    exec(EXAMPLE, namespace)
+    namespace |= on_clock(clock)
+    stage = namespace["LabStage"](STAGE)
     yield stage, line
     stage.close()
     assert line.closed
@@ -115,12 +115,12 @@ def test_steps_and_sweeps_are_recorded(lab, tmp_path):
 def test_what_it_cannot_do_is_refused_before_it_moves(lab):
     stage, line = lab
     with rig_of(stage, line) as rig:
-        for plan, said in (
+        for plan, message in (
             (VerticalPlan(0.0, 1.0, speed=101.0), "cannot go at 101 mm"),
             (VerticalPlan(0.0, 2.5, speed=1.0), "exceeds the maximum"),
             (AxialPlan(1.0, 0.02, rate=0.5), "tilt"),
         ):
-            with pytest.raises(io.InputError, match=said):
+            with pytest.raises(io.InputError, match=message):
                 SweepScan(rig, plan)
     assert line.way[1][1] == -1.0
 
@@ -159,14 +159,14 @@ def test_a_move_that_the_controller_refuses_stops_it(lab):
 
 
 @pytest.mark.parametrize(
-    ("answer", "said"),
+    ("answer", "message"),
     [("garbage", "look at its cable"), ("nan run", "no place"), ("2.50000 run", "beyond its limits")],
 )
-def test_a_report_that_cannot_be_stops_it(lab, answer, said):
+def test_a_report_that_cannot_be_stops_it(lab, answer, message):
     stage, line = lab
     stage.move(Position(1.0), 0.5)
     line.instead["WHERE?"] = answer
-    with pytest.raises(HardwareError, match=said):
+    with pytest.raises(HardwareError, match=message):
         stage.wait(timeout=60.0)
     assert line.stopped
 
@@ -222,7 +222,7 @@ def test_commands_move_it_from_a_rig_file(folder):
 
 
 @pytest.mark.parametrize(
-    ("words", "change", "said"),
+    ("words", "change", "message"),
     [
         (
             "home",
@@ -241,12 +241,12 @@ def test_commands_move_it_from_a_rig_file(folder):
         ),
     ],
 )
-def test_what_a_class_lacks_is_refused_in_a_line(folder, words, change, said):
+def test_what_a_class_lacks_is_refused_in_a_line(folder, words, change, message):
     for file in ("rig.toml", "my_stage.py"):
         (folder / file).write_text((folder / file).read_text().replace(*change))
     ended = run("rig", words, folder / "rig.toml")
     assert (ended.code, ended.said.count("\n")) == (2, 1), ended
-    assert said in ended.said
+    assert message in ended.said
 
 
 @pytest.fixture

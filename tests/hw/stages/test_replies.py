@@ -77,7 +77,7 @@ def test_the_banner_contains_the_version(line, version):
         b"$x=1",
     ],
 )
-def test_what_no_controller_says_is_nothing(line):
+def test_lines_of_no_controller_are_ignored(line):
     assert parse(line) is None
 
 

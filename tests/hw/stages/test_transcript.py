@@ -36,8 +36,8 @@ def both(request, tmp_path_factory):
 
 def statuses(exchange):
     """The states of reports, and where they say that it is."""
-    found = (re.match(r"<([^|>]*)\|MPos:([-\d.,]+)", line) for line in exchange.said)
-    return [(one[1], [float(value) for value in one[2].split(",")]) for one in found if one]
+    match = (re.match(r"<([^|>]*)\|MPos:([-\d.,]+)", line) for line in exchange.said)
+    return [(result[1], [float(value) for value in result[2].split(",")]) for result in match if result]
 
 
 def words(exchange):
@@ -45,8 +45,8 @@ def words(exchange):
     return [re.sub(r"(VER:\S+?)\..*", r"\1", line) for line in exchange.said if line[0] not in "<$"]
 
 
-def test_it_says_the_same(both):
-    ours, theirs = ([(one.sent, words(one)) for one in played] for played in both)
+def test_the_emulator_gives_the_same_replies(both):
+    ours, theirs = ([(exchange.sent, words(exchange)) for exchange in played] for played in both)
     assert ours == theirs
 
 
@@ -60,8 +60,8 @@ def test_it_reports_the_same_states_and_places(both):
 
 def test_its_settings_have_the_same_values(both):
     ours, theirs = (
-        {number: float(value) for line in one for number, value in re.findall(r"^\$(\d+)=([-\d.]+)", line)}
-        for one in (played[2].said for played in both)
+        {number: float(value) for line in lines for number, value in re.findall(r"^\$(\d+)=([-\d.]+)", line)}
+        for lines in (played[2].said for played in both)
     )
     assert len(ours) >= 20
     assert ours == {number: theirs[number] for number in ours}
@@ -71,13 +71,13 @@ def test_moves_take_as_long(both):
     for last, exchange in enumerate(both[1]):
         if exchange.sent == REST:
             two = slice(last - 1, last + 1)  # the line of an arc is answered late, as its pieces find room
-            ours, theirs = (sum(one.seconds for one in played[two]) for played in both)
+            ours, theirs = (sum(exchange.seconds for exchange in played[two]) for played in both)
             assert ours == pytest.approx(theirs, abs=LATE)
 
 
 @pytest.mark.parametrize("played", [GRBL, HAL])
 def test_the_driver_reads_every_line(played):
-    assert [line for one in played for line in one.said if parse(line.encode()) is None] == []
+    assert [line for item in played for line in item.said if parse(line.encode()) is None] == []
 
 
 @pytest.fixture
@@ -85,8 +85,10 @@ def hal(opened, clock):
     """Open a controller that tells of itself what grblHAL does."""
 
     def open_hal(settings=(), **answers):
-        told = {one.sent: "\r\n".join(one.said) for one in HAL if one.sent in ("$I", "$$")}
-        return opened(ScriptedGrbl(clock, answers=told | answers), **dict(settings))[0]
+        text = {
+            exchange.sent: "\r\n".join(exchange.said) for exchange in HAL if exchange.sent in ("$I", "$$")
+        }
+        return opened(ScriptedGrbl(clock, answers=text | answers), **dict(settings))[0]
 
     return open_hal
 
@@ -98,9 +100,9 @@ def test_the_driver_supports_grblhal(hal):
 
 
 def test_axes_that_grblhal_calls_otherwise_are_missed(hal):
-    told = "[VER:1.1f.20260817:]\r\n[AXS:6:XYZUVW]\r\n[FIRMWARE:grblHAL]\r\nok"
+    text = "[VER:1.1f.20260817:]\r\n[AXS:6:XYZUVW]\r\n[FIRMWARE:grblHAL]\r\nok"
     with pytest.raises(InputError, match="no axis C"):
-        hal({"twist": TwistAxis(letter="C", limits=(-9, 9), speed=9.0)}, **{"$I": told})
+        hal({"twist": TwistAxis(letter="C", limits=(-9, 9), speed=9.0)}, **{"$I": text})
 
 
 def test_feeds_of_linear_axes_alone_are_refused(hal):

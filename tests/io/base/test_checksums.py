@@ -88,8 +88,8 @@ def test_damaged_frames_are_used_without_verification(press):
 
 @pytest.mark.parametrize("opening", [{"region": io.Region((1, 4), (0, 7))}, {"verify": False}])
 def test_frames_that_are_not_verified_are_noted(press, opening):
-    notes = [one for one in io.check(press, **opening).findings if one.kind == "unverified"]
-    assert [one.warning for one in notes] == [False]
+    notes = [finding for finding in io.check(press, **opening).findings if finding.kind == "unverified"]
+    assert [note.warning for note in notes] == [False]
 
 
 def test_a_result_notes_that_its_frames_are_not_verified(press):
@@ -99,7 +99,7 @@ def test_a_result_notes_that_its_frames_are_not_verified(press):
 
 
 def test_verified_frames_leave_no_note(press):
-    assert not [one for one in io.check(press).findings if one.kind == "unverified"]
+    assert not [finding for finding in io.check(press).findings if finding.kind == "unverified"]
 
 
 def test_a_recording_without_checksums_is_read(press):
@@ -110,7 +110,7 @@ def test_a_recording_without_checksums_is_read(press):
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "message"),
     [
         (np.zeros(7, np.uint32), r"has shape \(7,\) where \(8,\) is needed"),
         (np.zeros(8, np.float32), "is of type float32 where uint32 is needed"),
@@ -118,9 +118,9 @@ def test_a_recording_without_checksums_is_read(press):
         (b"none", "contains no numbers"),
     ],
 )
-def test_checksums_that_cannot_be_used_are_refused(press, values, said):
+def test_checksums_that_cannot_be_used_are_refused(press, values, message):
     put(press, CHECKSUM, values)
-    with pytest.raises(io.InputError, match=rf"press.h5: {CHECKSUM} {said}: .*--no-verify$"):
+    with pytest.raises(io.InputError, match=rf"press.h5: {CHECKSUM} {message}: .*--no-verify$"):
         io.open_recording(press)
 
 

@@ -20,23 +20,23 @@ def stack(dtype="u2", top=1000):
     return np.random.default_rng(2).integers(0, top, SHAPE).astype(dtype)
 
 
-def opened(path, **given):
-    return io.open_recording(path, **{**GIVEN, **given})
+def opened(path, **options):
+    return io.open_recording(path, **{**GIVEN, **options})
 
 
-def read(path, **given):
-    with opened(path, **given) as recording:
+def read(path, **options):
+    with opened(path, **options) as recording:
         return read_all(recording, 4).frames
 
 
 def written(path, frames, encoding=None, dims=("t", "y", "x"), attributes=None, **coordinates):
     """Write a stack as xarray does: netCDF-4, or Zarr of version 2 or 3."""
     data = xarray.Dataset({"frames": (dims, frames, attributes)}, coordinates)
-    given = {"encoding": {"frames": encoding or {}}}
+    options = {"encoding": {"frames": encoding or {}}}
     if path.suffix == ".nc":
-        data.to_netcdf(path, engine="h5netcdf", **given)
+        data.to_netcdf(path, engine="h5netcdf", **options)
     else:
-        data.to_zarr(path, zarr_format=2 if "2" in path.name else 3, consolidated=False, **given)
+        data.to_zarr(path, zarr_format=2 if "2" in path.name else 3, consolidated=False, **options)
     return path
 
 
@@ -49,9 +49,9 @@ def path(request, tmp_path):
 def test_fill_values_are_unknown(path, name):
     frames = stack()
     frames[3:, 2, 1] = 65535
-    found = read(written(path, frames, {name: np.uint16(65535)}))
-    assert found.dtype == np.float32
-    np.testing.assert_array_equal(found, np.where(frames == 65535, np.nan, frames.astype("f4")))
+    actual = read(written(path, frames, {name: np.uint16(65535)}))
+    assert actual.dtype == np.float32
+    np.testing.assert_array_equal(actual, np.where(frames == 65535, np.nan, frames.astype("f4")))
 
 
 @pytest.mark.parametrize("chunks", [None, (4, 3, 5), (1, 6, 5)])
@@ -61,16 +61,16 @@ def test_packed_samples_are_unpacked(path, chunks):
     encoding = {"dtype": "i2", "scale_factor": 0.5, "add_offset": -3.0, "_FillValue": -1}
     if chunks:
         encoding["chunksizes" if path.suffix == ".nc" else "chunks"] = chunks
-    found = read(written(path, values, encoding))
-    np.testing.assert_array_equal(found, values.astype("f4"))
+    actual = read(written(path, values, encoding))
+    np.testing.assert_array_equal(actual, values.astype("f4"))
 
 
 def test_unsigned_integers_are_read_as_such(path):
     frames = stack("i2")
     frames[2, 2, 2] = -1  # 65535
-    found = read(written(path, frames, attributes={"_Unsigned": "true"}))
-    assert found.dtype == np.uint16
-    np.testing.assert_array_equal(found, frames.view("u2"))
+    actual = read(written(path, frames, attributes={"_Unsigned": "true"}))
+    assert actual.dtype == np.uint16
+    np.testing.assert_array_equal(actual, frames.view("u2"))
 
 
 @pytest.mark.parametrize(
@@ -79,9 +79,9 @@ def test_unsigned_integers_are_read_as_such(path):
 )
 def test_samples_outside_of_the_valid_range_are_unknown(path, attributes):
     frames = stack()
-    found = read(written(path, frames, attributes=attributes))
+    actual = read(written(path, frames, attributes=attributes))
     np.testing.assert_array_equal(
-        found, np.where((frames < 10) | (frames > 900), np.nan, frames.astype("f4"))
+        actual, np.where((frames < 10) | (frames > 900), np.nan, frames.astype("f4"))
     )
 
 
@@ -110,7 +110,9 @@ def test_axes_are_in_the_order_of_their_names(path, dims, chunks):
     written(path, frames.transpose([kinds.get(name, 0) for name in dims]), encoding, dims)
     with opened(path) as recording:
         assert recording.shape == SHAPE
-        assert [(one.kind, one.warning) for one in recording.findings] == [("order of axes", False)]
+        assert [(finding.kind, finding.warning) for finding in recording.findings] == [
+            ("order of axes", False)
+        ]
         np.testing.assert_array_equal(recording.frame(5), frames[5])
         np.testing.assert_array_equal(read_all(recording, 4).frames, frames)
 
@@ -118,21 +120,21 @@ def test_axes_are_in_the_order_of_their_names(path, dims, chunks):
 def test_a_region_of_transposed_frames_is_that_part(path):
     frames = stack()
     written(path, frames.transpose(1, 2, 0), dims=("y", "x", "t"))
-    found = read(path, region=io.Region((1, 5), (2, 4)), frames=(2, 8))
-    np.testing.assert_array_equal(found, frames[2:8, 1:5, 2:4])
+    actual = read(path, region=io.Region((1, 5), (2, 4)), frames=(2, 8))
+    np.testing.assert_array_equal(actual, frames[2:8, 1:5, 2:4])
 
 
 @pytest.mark.parametrize(
-    ("dims", "said"),
+    ("dims", "message"),
     [
         (("t", "y", "channel"), "give one channel, as a stack"),
         (("y", "row", "t"), "name frames, rows and columns differently"),
         (("x", "a", "b"), "the others are not known: name them t, y and x"),
     ],
 )
-def test_names_that_contradict_a_stack_are_refused(path, dims, said):
+def test_names_that_contradict_a_stack_are_refused(path, dims, message):
     written(path, stack(), dims=dims)
-    with pytest.raises(io.InputError, match=said):
+    with pytest.raises(io.InputError, match=message):
         opened(path)
 
 
@@ -175,16 +177,16 @@ def test_a_stack_of_matlab_is_not_mirrored(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("start", "said"),
+    ("start", "message"),
     [
         (b"MATLAB 5.0 MAT-file, Platform: GLNXA64", "MATLAB before version 7.3: write it with save"),
         (b"CDF\x01\0\0\0\0", "netCDF file of version 3, .*: convert it with 'nccopy -k nc4'"),
     ],
 )
-def test_older_files_of_other_programs_have_a_remedy(tmp_path, start, said):
+def test_older_files_of_other_programs_have_a_remedy(tmp_path, start, message):
     path = tmp_path / "stack.mat"
     path.write_bytes(start.ljust(512, b" "))
-    with pytest.raises(io.InputError, match=said):
+    with pytest.raises(io.InputError, match=message):
         opened(path)
 
 
@@ -212,13 +214,13 @@ def test_samples_that_have_an_exact_equivalent_are_converted(tmp_path, stored, d
     for path in files_of(tmp_path, frames):
         with opened(path) as recording:
             assert recording.dtype == np.dtype(dtype)
-            kinds = [one.kind for one in recording.findings]
+            kinds = [finding.kind for finding in recording.findings]
             assert kinds == ([] if stored[0] == ">" else ["converted samples"])
             np.testing.assert_array_equal(read_all(recording, 4).frames, frames)
 
 
 @pytest.mark.parametrize(
-    ("stored", "wrong", "said"),
+    ("stored", "wrong", "message"),
     [
         ("i1", -1, "a sample of -1; int8 is read as uint8, 0 to 127: divide them, or write them as float32"),
         ("i2", -5, "a sample of -5; int16 is read as uint16, 0 to 65535"),
@@ -226,11 +228,11 @@ def test_samples_that_have_an_exact_equivalent_are_converted(tmp_path, stored, d
         ("f8", 1e9, "a sample of 1e\\+09; float64 is read as float32, -16777216 to 16777216: divide them"),
     ],
 )
-def test_samples_without_an_equivalent_are_refused_with_their_frame(tmp_path, stored, wrong, said):
+def test_samples_without_an_equivalent_are_refused_with_their_frame(tmp_path, stored, wrong, message):
     frames = stack(stored, 100)
     frames[6, 2, 2] = wrong
     for path in files_of(tmp_path, frames):
-        with pytest.raises(io.InputError, match=f"frame 6 has {said}".replace("0 to 127", "0 to 255")):
+        with pytest.raises(io.InputError, match=f"frame 6 has {message}".replace("0 to 127", "0 to 255")):
             read(path)
 
 
@@ -249,17 +251,17 @@ def test_doubles_that_are_not_finite_stay_so(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("attributes", "said"),
+    ("attributes", "message"),
     [
         ({"scale_factor": "two"}, "its attribute scale_factor is not a number"),
         ({"scale_factor": 0.0}, "scale_factor 0"),
     ],
 )
-def test_attributes_that_make_no_sense_are_refused(tmp_path, attributes, said):
+def test_attributes_that_make_no_sense_are_refused(tmp_path, attributes, message):
     with h5py.File(tmp_path / "stack.h5", "w") as file:
         file["x"] = stack()
         file["x"].attrs.update(attributes)
-    with pytest.raises(io.InputError, match=said):
+    with pytest.raises(io.InputError, match=message):
         opened(tmp_path / "stack.h5")
 
 
@@ -294,7 +296,7 @@ def test_coordinates_with_units_are_positions_and_the_pixel_size(path):
         assert recording.motion == "vertical"
         assert recording.travel == pytest.approx(TRAVEL)
         assert recording.header.pixel_size == pytest.approx((0.04, 0.03))
-        assert not any(one.warning for one in recording.findings)
+        assert not any(finding.warning for finding in recording.findings)
 
 
 def test_times_are_in_seconds_from_milliseconds_or_dates(path):
@@ -328,7 +330,7 @@ def test_rows_that_rise_are_reported(path):
     axes = along_axes() | {"y": ("y", 0.03 * np.arange(SHAPE[1]), {"units": "mm"})}
     written(path, stack(), dims=("travel", "y", "x"), **axes)
     with io.open_recording(path) as recording:
-        warned = [one.text for one in recording.findings if one.warning]
+        warned = [finding.text for finding in recording.findings if finding.warning]
         assert len(warned) == 1
         assert "its coordinate y rises with the row, and the first one is taken as the top" in warned[0]
 
@@ -338,7 +340,7 @@ def test_uneven_pixels_are_reported(path):
     written(path, stack(), dims=("travel", "y", "x"), **axes)
     with io.open_recording(path) as recording:
         assert recording.header.pixel_size is None
-        assert [one.kind for one in recording.findings if one.warning] == ["uneven pixels"]
+        assert [finding.kind for finding in recording.findings if finding.warning] == ["uneven pixels"]
 
 
 def test_the_voxel_size_of_fiji_is_the_pixel_size(tmp_path):
@@ -353,8 +355,8 @@ def test_frames_of_xarray_are_in_the_order_of_their_names():
     frames = np.zeros((5, 2, 3), np.uint8)
     frames[3:, 1] = 255
     transposed = xarray.DataArray(frames.transpose(1, 2, 0), dims=("y", "x", "t"))
-    found = engine.find_onset(transposed, [0.0, 0.1, 0.2, 0.3, 0.4])
-    np.testing.assert_array_equal(np.isfinite(found.height), [[False] * 3, [True] * 3])
+    actual = engine.find_onset(transposed, [0.0, 0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_array_equal(np.isfinite(actual.height), [[False] * 3, [True] * 3])
 
 
 def ball_stack():
@@ -372,11 +374,11 @@ def test_unknown_pixels_have_no_height_and_the_others_the_right_one(path):
     frames[10:, 7, :] = 65535
     written(path, frames, {"_FillValue": np.uint16(65535)}, dims=("t", "y", "x"))
     with opened(path, travel=travel, pixel_size=(0.1, 0.1)) as recording:
-        found = engine.reconstruct(recording, fill=False)
-    assert np.isnan(found.height[3, 4])
+        actual = engine.reconstruct(recording, fill=False)
+    assert np.isnan(actual.height[3, 4])
     unknown = np.zeros(heights.shape, bool)
     unknown[3, 4] = unknown[7] = True
-    np.testing.assert_allclose(found.height[~unknown], heights[~unknown], atol=0.03)
+    np.testing.assert_allclose(actual.height[~unknown], heights[~unknown], atol=0.03)
 
 
 @pytest.mark.parametrize("order", [(1, 2, 0), (2, 1, 0)])
@@ -385,8 +387,8 @@ def test_the_surface_of_transposed_frames_is_neither_mirrored_nor_turned(path, o
     frames, heights = frames[:, :12], heights[:12]
     written(path, frames.transpose(order), dims=tuple("tyx"[axis] for axis in order))
     with opened(path, travel=travel) as recording:
-        found = engine.reconstruct(recording)
-    np.testing.assert_allclose(found.height, heights, atol=0.03)
+        actual = engine.reconstruct(recording)
+    np.testing.assert_allclose(actual.height, heights, atol=0.03)
 
 
 @pytest.mark.parametrize("value", [np.arange(3), np.float32(2), "three", np.empty(0)])

@@ -37,7 +37,7 @@ def load(tmp_path, text):
     return load_toml(path, Rig, "write it anew")
 
 
-def test_what_is_not_said_has_its_default(tmp_path):
+def test_missing_keys_have_their_defaults(tmp_path):
     assert load(tmp_path, "[stage]\npress-depth = 2") == Rig(Stage(2.0))
     assert load(tmp_path, "size=[1, 2]\n[stage]\npress-depth = 2").size == (1.0, 2.0)
     lean = load(tmp_path, "[stage]\npress-depth = 2\n[stage.lean]\nlimits = [1, 2]").stage.lean
@@ -45,7 +45,7 @@ def test_what_is_not_said_has_its_default(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "answer"),
     [
         ("", "stage is missing: add table [stage]"),
         ("[stage]", "stage.press-depth is missing: add press-depth = 0.5 in [stage]"),
@@ -75,13 +75,13 @@ def test_what_is_not_said_has_its_default(tmp_path):
         ("[stage", "is not TOML: "),
     ],
 )
-def test_a_message_names_file_key_and_remedy(tmp_path, text, said):
+def test_a_message_names_file_key_and_remedy(tmp_path, text, answer):
     with pytest.raises(io.InputError) as caught:
         load(tmp_path, text)
     message = str(caught.value)
     assert message.startswith(str(tmp_path / "rig.toml"))
     assert "\n" not in message
-    assert said in message
+    assert answer in message
 
 
 def test_a_file_that_is_not_text_or_missing(tmp_path):

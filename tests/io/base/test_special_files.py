@@ -62,8 +62,8 @@ def commands_for(make):
     lines = []
     for name, words in COMMANDS.items():
         make(Path(name))
-        given = [name if word == "{}" else word for word in words]
-        lines.append(given if "{}" in words else [*given, name])
+        arguments = [name if word == "{}" else word for word in words]
+        lines.append(arguments if "{}" in words else [*arguments, name])
     return lines
 
 
@@ -72,21 +72,21 @@ def outcomes(lines):
     import json
 
     support = Path(__file__).parents[2] / "support"
-    done = subprocess.run(
+    ended = subprocess.run(
         [sys.executable, "-c", PROGRAM, json.dumps(lines)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(support), os.environ.get("PYTHONPATH", "")])},
         capture_output=True,
         text=True,
         timeout=LIMIT,
     )
-    found = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(found) == len(lines), f"{lines[len(found)]} did not end: {done.stderr}"
-    return found
+    actual = [json.loads(line) for line in ended.stdout.splitlines()]
+    assert len(actual) == len(lines), f"{lines[len(actual)]} did not end: {ended.stderr}"
+    return actual
 
 
 def make_socket(path):
-    with socket.socket(socket.AF_UNIX) as one:
-        one.bind(str(path))
+    with socket.socket(socket.AF_UNIX) as item:
+        item.bind(str(path))
 
 
 @pytest.mark.parametrize(
@@ -101,19 +101,19 @@ def make_socket(path):
 )
 def test_what_is_not_a_file_is_refused_by_every_reader(tmp_path, monkeypatch, make, words):
     monkeypatch.chdir(tmp_path)
-    for line, code, said in outcomes(commands_for(make)):
-        assert code == 2, (line, said)
-        assert said.startswith("mirrorskin: "), line
-        assert said.count("\n") == 1, (line, said)
-        assert words in said, (line, said)
+    for line, code, message in outcomes(commands_for(make)):
+        assert code == 2, (line, message)
+        assert message.startswith("mirrorskin: "), line
+        assert message.count("\n") == 1, (line, message)
+        assert words in message, (line, message)
 
 
 def test_a_fifo_in_a_folder_of_pictures_is_left_out(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("frames").mkdir()
     os.mkfifo("frames/frame1.png")
-    ((_, code, said),) = outcomes([["import", "frames", *STEPS]])
-    assert (code, "without numbered pictures" in said) == (2, True)
+    ((_, code, message),) = outcomes([["import", "frames", *STEPS]])
+    assert (code, "without numbered pictures" in message) == (2, True)
 
 
 @pytest.mark.parametrize("opens", [check_regular, open_regular, read_regular])

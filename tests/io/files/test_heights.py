@@ -58,9 +58,9 @@ def test_heights_of_unknown_offset_are_left_out(tmp_path):
     piece[:, 4:] = 1
     result = io.Result(height=heights(), component=piece, offset_unknown=np.array([1, 0], np.uint8))
     io.save_result(result, tmp_path / "r.h5")
-    found = io.open_heights(tmp_path / "r.h5")
-    assert np.isnan(found[:, :4]).all()
-    np.testing.assert_array_equal(found[:, 4:], heights()[:, 4:])
+    actual = io.open_heights(tmp_path / "r.h5")
+    assert np.isnan(actual[:, :4]).all()
+    np.testing.assert_array_equal(actual[:, 4:], heights()[:, 4:])
 
 
 ROWS, COLUMNS = (1, 4), (2, 6)
@@ -71,11 +71,11 @@ def simulation(path):
     return record(twin, path, truth=twin.truth), twin.truth.height
 
 
-def source_region(tmp_path, told, shape=(5, 7)):
+def source_region(tmp_path, region, shape=(5, 7)):
     """The heights in a result that tells which part it is of, cut for a region of a recording."""
     rows, columns = shape
     values = np.arange(rows * columns, dtype=np.float32).reshape(shape)
-    fitted = io.Fitted(source_region=told)
+    fitted = io.Fitted(source_region=region)
     io.save_result(io.Result(height=values, fitted=fitted), tmp_path / "h.h5", overwrite=True)
     path, _ = simulation(tmp_path / "r.h5")
     with io.open_recording(path, region=io.Region(ROWS, COLUMNS)) as source:
@@ -91,19 +91,19 @@ def test_the_truth_is_cut_for_a_region(tmp_path):
 
 
 def test_the_heights_of_a_result_are_cut_for_a_region(tmp_path):
-    for told in (None, (0, 5, 0, 7)):
-        found, values = source_region(tmp_path, told)
-        np.testing.assert_array_equal(found, values[1:4, 2:6])
-    found, values = source_region(tmp_path, (1, 4, 1, 7), (3, 6))
-    np.testing.assert_array_equal(found, values[:, 1:5])
-    found, values = source_region(tmp_path, (1, 4, 2, 6), (3, 4))
-    np.testing.assert_array_equal(found, values)
+    for region in (None, (0, 5, 0, 7)):
+        actual, values = source_region(tmp_path, region)
+        np.testing.assert_array_equal(actual, values[1:4, 2:6])
+    actual, values = source_region(tmp_path, (1, 4, 1, 7), (3, 6))
+    np.testing.assert_array_equal(actual, values[:, 1:5])
+    actual, values = source_region(tmp_path, (1, 4, 2, 6), (3, 4))
+    np.testing.assert_array_equal(actual, values)
 
 
 @pytest.mark.parametrize(
-    ("told", "shape"),
+    ("region", "shape"),
     [((1, 4, 3, 7), (3, 4)), ((1, 3, 2, 6), (2, 4)), (None, (6, 7))],
 )
-def test_heights_of_other_pixels_are_refused(tmp_path, told, shape):
+def test_heights_of_other_pixels_are_refused(tmp_path, region, shape):
     with pytest.raises(io.InputError, match=r"h\.h5 contains the heights of rows .* and columns .*, where "):
-        source_region(tmp_path, told, shape=shape)
+        source_region(tmp_path, region, shape=shape)

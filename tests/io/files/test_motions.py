@@ -39,9 +39,9 @@ EACH = pytest.mark.parametrize("motion", MOTIONS)
 def make(path, motion, truth=None, **changes):
     name, positions = SERIES[motion]
     series = {"time": TIME, name: positions} | changes
-    known = {name: values for name, values in series.items() if values is not None}
+    options = {name: values for name, values in series.items() if values is not None}
     return record(
-        MadeUp(random_stack(), HEADERS[motion], **known), path / f"{motion}.h5", truth=truth, block=3
+        MadeUp(random_stack(), HEADERS[motion], **options), path / f"{motion}.h5", truth=truth, block=3
     )
 
 
@@ -54,15 +54,15 @@ def some_truth(slip=None):
 def test_where_the_body_was_comes_back_to_the_last_bit(tmp_path, motion):
     name, positions = SERIES[motion]
     with io.open_recording(make(tmp_path, motion)) as recording:
-        found = read_all(recording, 3)
+        actual = read_all(recording, 3)
         assert_same(recording.header, HEADERS[motion])
         expected = dict.fromkeys(("travel", "phase", "displacement", "twist")) | {name: positions}
         for series, values in expected.items():
-            for given in (getattr(recording, series), getattr(found, series)):
-                assert given is None if values is None else given.dtype == np.float64
-                np.testing.assert_array_equal(given, values)
-    np.testing.assert_array_equal(found.frames, random_stack())
-    np.testing.assert_array_equal(found.time, TIME)
+            for options in (getattr(recording, series), getattr(actual, series)):
+                assert options is None if values is None else options.dtype == np.float64
+                np.testing.assert_array_equal(options, values)
+    np.testing.assert_array_equal(actual.frames, random_stack())
+    np.testing.assert_array_equal(actual.time, TIME)
 
 
 @pytest.mark.parametrize(("motion", "shape", "unit"), [("horizontal", (8, 2), "mm"), ("twist", (8,), "rad")])
@@ -103,17 +103,17 @@ def test_a_wrong_statement_in_a_recording_is_reported_in_one_line(tmp_path, moti
 
 
 @pytest.mark.parametrize(
-    ("slip", "known"),
+    ("slip", "expected"),
     [(None, "height, zenith, azimuth, contact"), (np.eye(5, 7, 2), "height, zenith, azimuth, contact, slip")],
 )
-def test_slip_may_be_known(tmp_path, slip, known):
+def test_slip_may_be_known(tmp_path, slip, expected):
     truth = some_truth(None if slip is None else slip.astype(np.uint8))
     path = make(tmp_path, "twist", truth)
     with io.open_recording(path) as recording:
         assert_same(recording.truth, truth)
-    assert io.describe(path)["truth"] == known
+    assert io.describe(path)["truth"] == expected
     with h5py.File(path) as file:
-        assert set(file[TRUTH]) == set(known.split(", "))
+        assert set(file[TRUTH]) == set(expected.split(", "))
 
 
 @pytest.mark.parametrize(("motion", "unit"), [("horizontal", "mm"), ("twist", "rad")])
@@ -158,8 +158,8 @@ def test_the_twin_s_recording_is_the_twin(tmp_path, motion):
     assert (twin.truth.slip is not None) == (motion in ("horizontal", "twist"))
     twin.rewind()
     with io.open_recording(path) as recording:
-        for found, expected in zip(read_all(recording, 8), read_all(twin, 5), strict=True):
-            np.testing.assert_array_equal(found, expected)
+        for actual, expected in zip(read_all(recording, 8), read_all(twin, 5), strict=True):
+            np.testing.assert_array_equal(actual, expected)
         assert_same(recording.truth, twin.truth)
         start = recording.header.start_time
         assert_same(recording.header, replace(twin.header, start_time=start))

@@ -89,7 +89,7 @@ def seen_by_nexpy(path):
 
 
 @pytest.fixture(params=[seen_by_silx, seen_by_nexpy], ids=["silx", "nexpy"])
-def seen(request):
+def plot_of(request):
     return request.param
 
 
@@ -102,25 +102,25 @@ def assert_shows(plot, signal, unit, values, axes):
     assert (plot.signal, plot.unit) == (signal, unit)
     np.testing.assert_array_equal(plot.values, values)
     assert [axis[:2] for axis in plot.axes] == [axis[:2] for axis in axes]
-    for found, (_, _, expected) in zip(plot.axes, axes, strict=True):
-        assert expected is None or found.values == pytest.approx(list(expected))
+    for axis, (_, _, expected) in zip(plot.axes, axes, strict=True):
+        assert expected is None or axis.values == pytest.approx(list(expected))
 
 
 NONE = (None, None, None)
 
 
 @pytest.mark.parametrize("motion", SERIES)
-def test_a_recording_is_shown_along_where_the_body_was(seen, motion, tmp_path):
+def test_a_recording_is_shown_along_where_the_body_was(plot_of, motion, tmp_path):
     frames = random_stack("uint16", (T, H, W))
     record(MadeUp(frames, header(motion), **SERIES[motion], time=0.5 * np.arange(T)), tmp_path / "rec.h5")
-    assert_shows(seen(tmp_path / "rec.h5"), "frames", "counts", frames, [ALONG[motion], NONE, NONE])
+    assert_shows(plot_of(tmp_path / "rec.h5"), "frames", "counts", frames, [ALONG[motion], NONE, NONE])
 
 
 @pytest.mark.parametrize("packing", ["raw", "bitshuffle"])
-def test_a_recording_of_a_live_run_is_shown_once_it_is_complete(seen, packing, tmp_path):
+def test_a_recording_of_a_live_run_is_shown_once_it_is_complete(plot_of, packing, tmp_path):
     frames = np.concatenate([block.frames for block in stream(Feed(T), tmp_path / "rec.h5", packing)])
     travel = ("travel", "mm", 0.01 * np.arange(T) + 0.001)
-    assert_shows(seen(tmp_path / "rec.h5"), "frames", "counts", frames, [travel, NONE, NONE])
+    assert_shows(plot_of(tmp_path / "rec.h5"), "frames", "counts", frames, [travel, NONE, NONE])
 
 
 SHOWN = """
@@ -135,14 +135,14 @@ with silx.io.open(sys.argv[1]) as file:
 
 def test_an_unfinished_recording_is_shown_as_far_as_it_is_written(tmp_path):
     path, frames = tmp_path / "rec.h5", random_stack("uint8", (T, H, W))
-    known = header("vertical"), frames.shape, frames.dtype, "raw", None, ()
-    with path.open("wb") as place, GrowingRecording(path, place.fileno(), *known) as recording:
+    expected = header("vertical"), frames.shape, frames.dtype, "raw", None, ()
+    with path.open("wb") as place, GrowingRecording(path, place.fileno(), *expected) as recording:
         recording.append(io.Block(frames[:4], 0, time=TRAVEL[:4], travel=TRAVEL[:4]))
         recording.publish()
         words = [sys.executable, "-c", SHOWN, str(path)]
-        done = subprocess.run(words, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == [[4, H, W], "counts", pytest.approx(TRAVEL[:4]), "mm"]
+        ended = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 0, ended.stderr
+    assert json.loads(ended.stdout) == [[4, H, W], "counts", pytest.approx(TRAVEL[:4]), "mm"]
 
 
 def made_up(*names, turns=()):
@@ -166,30 +166,30 @@ PLACES = [("y", "mm", Y), ("x", "mm", X)]
 
 
 @pytest.mark.parametrize("maps", [OF_A_PRESS, OF_A_ROTATION, (*OF_A_ROTATION, "filled", "status")])
-def test_heights_are_shown_in_millimetres_over_millimetres_and_with_their_errors(seen, maps, tmp_path):
+def test_heights_are_shown_in_millimetres_over_millimetres_and_with_their_errors(plot_of, maps, tmp_path):
     result = made_up(*maps)
     io.save_result(result, tmp_path / "res.h5")
-    plot = seen(tmp_path / "res.h5")
+    plot = plot_of(tmp_path / "res.h5")
     assert_shows(plot, "height", "mm", result.height, PLACES)
     np.testing.assert_array_equal(plot.errors, result.height_sigma)
 
 
-def test_each_turn_is_a_picture_of_a_stack(seen, tmp_path):
+def test_each_turn_is_a_picture_of_a_stack(plot_of, tmp_path):
     result = made_up(*OF_A_ROTATION, turns=(3,))
     io.save_result(result, tmp_path / "res.h5")
     turns = ("turn", None, range(3))
-    assert_shows(seen(tmp_path / "res.h5"), "height", "mm", result.height, [turns, *PLACES])
+    assert_shows(plot_of(tmp_path / "res.h5"), "height", "mm", result.height, [turns, *PLACES])
 
 
 @pytest.mark.parametrize(
     ("parts", "signal", "unit"),
     [(("references", "zenith"), "bright", "counts"), (("zenith",), "zenith_sigma", "rad")],
 )
-def test_a_calibration_is_shown_by_its_first_map(seen, parts, signal, unit, tmp_path):
-    known = a_calibration((H, W), only=parts)
-    io.save_calibration(known, tmp_path / "cal.h5")
-    part = known.references if "references" in parts else known.zenith
-    assert_shows(seen(tmp_path / "cal.h5"), signal, unit, getattr(part, signal), [NONE, NONE])
+def test_a_calibration_is_shown_by_its_first_map(plot_of, parts, signal, unit, tmp_path):
+    expected = a_calibration((H, W), only=parts)
+    io.save_calibration(expected, tmp_path / "cal.h5")
+    part = expected.references if "references" in parts else expected.zenith
+    assert_shows(plot_of(tmp_path / "cal.h5"), signal, unit, getattr(part, signal), [NONE, NONE])
 
 
 def test_every_map_of_a_result_has_its_unit(tmp_path):

@@ -42,7 +42,7 @@ def found(frames, *, pixel_size=(PIXEL, PIXEL), where=None, **series):
 
 
 def kinds(check):
-    return [one.kind for one in check.findings]
+    return [finding.kind for finding in check.findings]
 
 
 @pytest.mark.parametrize(
@@ -90,8 +90,8 @@ def test_a_rotation_with_travels_is_not_a_press():
 
 
 def test_a_press_and_its_release_return():
-    there = np.concatenate([pressed()[::2], pressed()[::-2]])
-    assert kinds(found(noisy(there), travel=np.concatenate([TRAVEL[::2], TRAVEL[::2][::-1]]))) == []
+    target = np.concatenate([pressed()[::2], pressed()[::-2]])
+    assert kinds(found(noisy(target), travel=np.concatenate([TRAVEL[::2], TRAVEL[::2][::-1]]))) == []
 
 
 def test_a_press_with_phases_is_not_a_rotation():
@@ -139,10 +139,10 @@ def jumped(steps, count=24):
     return np.where(np.arange(count) >= 10, PHASE + steps * PHASE[1], PHASE)
 
 
-@pytest.mark.parametrize(("share", "expected"), [(0.01, ["outliers"]), (0.001, [])])
-def test_outlying_samples_of_a_press_are_found(share, expected):
+@pytest.mark.parametrize(("fraction", "expected"), [(0.01, ["outliers"]), (0.001, [])])
+def test_outlying_samples_of_a_press_are_found(fraction, expected):
     generator, frames = np.random.default_rng(2), noisy(pressed())
-    wrong = generator.random(frames.shape) < share
+    wrong = generator.random(frames.shape) < fraction
     frames[wrong] = generator.integers(0, 256, np.count_nonzero(wrong))
     assert kinds(found(frames)) == expected
 
@@ -226,7 +226,7 @@ def test_what_was_found_at_an_import_stays_in_the_recording(tmp_path):
     source = Timed(noisy(pressed()), TRAVEL, np.arange(30) / 30)
     source.findings = (io.Finding("lossy", "the frames were compressed"), io.Finding("grey", "a note", False))
     with io.Recorder(source, tmp_path / "rec.h5") as recorder:
-        recorder.drain(lambda done: None)
+        recorder.drain(lambda finished: None)
     with io.open_recording(tmp_path / "rec.h5") as recording:
         assert recording.findings == source.findings
     assert io.describe(tmp_path / "rec.h5")["finding: lossy"] == "the frames were compressed"

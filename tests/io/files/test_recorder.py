@@ -37,27 +37,27 @@ def full_header():
 
 def layout(path):
     """Return everything in a file: links, and the classes, types, shapes and attributes of objects."""
-    found = {}
+    actual = {}
 
     def look(group):
         for name in group:
             link = group.get(name, getlink=True)
             if isinstance(link, h5py.SoftLink):
-                found[f"{group.name}/{name}"] = f"-> {link.path}"
+                actual[f"{group.name}/{name}"] = f"-> {link.path}"
                 continue
             node = group[name]
             attrs = {key: np.asarray(value).tolist() for key, value in node.attrs.items()}
             if isinstance(node, h5py.Group):
-                found[node.name] = attrs
+                actual[node.name] = attrs
                 look(node)
             else:
                 text = h5py.check_string_dtype(node.dtype)
-                found[node.name] = (node.shape, "text" if text else node.dtype.str[1:], attrs)
+                actual[node.name] = (node.shape, "text" if text else node.dtype.str[1:], attrs)
 
     with h5py.File(path) as file:
-        found["/"] = dict(file.attrs)
+        actual["/"] = dict(file.attrs)
         look(file)
-    return {name.replace("//", "/"): value for name, value in found.items()}
+    return {name.replace("//", "/"): value for name, value in actual.items()}
 
 
 def test_a_vertical_recording_has_the_layout_of_the_design(tmp_path):
@@ -95,20 +95,20 @@ def test_a_vertical_recording_has_the_layout_of_the_design(tmp_path):
 
 def test_an_axial_recording_has_the_layout_of_the_design(tmp_path):
     path = record(MadeUp(random_stack(), full_header(), phase=PHASE), tmp_path / "turn.h5")
-    found = layout(path)
+    actual = layout(path)
     stage, detector = "/entry/instrument/stage", "/entry/instrument/detector"
-    assert found["/entry/data"]["axes"] == ["phase", ".", "."]
-    assert found["/entry/data/phase"] == f"-> {stage}/phase"
-    assert {name: value for name, value in found.items() if name.startswith(f"{stage}/")} == {
+    assert actual["/entry/data"]["axes"] == ["phase", ".", "."]
+    assert actual["/entry/data/phase"] == f"-> {stage}/phase"
+    assert {name: value for name, value in actual.items() if name.startswith(f"{stage}/")} == {
         f"{stage}/motion": ((), "text", {}),
         f"{stage}/phase": ((8,), "f8", {"units": "rad"}),
         f"{stage}/tilt": ((), "f8", {"units": "rad"}),
         f"{stage}/pivot": ((3,), "f8", {"units": "mm"}),
         f"{stage}/travel": ((), "f8", {"units": "mm"}),
     }
-    assert found[f"{detector}/zenith_gain"] == ((5, 7), "f8", {"units": "1/rad"})
-    assert found[f"{detector}/zenith_offset"] == ((), "f8", {"units": "counts"})
-    assert f"{detector}/frame_time" not in found
+    assert actual[f"{detector}/zenith_gain"] == ((5, 7), "f8", {"units": "1/rad"})
+    assert actual[f"{detector}/zenith_offset"] == ((), "f8", {"units": "counts"})
+    assert f"{detector}/frame_time" not in actual
     with h5py.File(path) as file:
         assert file["/entry/title"].asstr()[()] == "a coin, drawn and dull"
         assert file[f"{stage}/motion"].asstr()[()] == "axial"
@@ -116,7 +116,7 @@ def test_an_axial_recording_has_the_layout_of_the_design(tmp_path):
 
 @pytest.mark.parametrize(
     ("compression", "dtype", "block"),
-    [*((one, "uint16", 3) for one in COMPRESSIONS), ("raw", "uint8", 1), ("bitshuffle", "float32", 8)],
+    [*((item, "uint16", 3) for item in COMPRESSIONS), ("raw", "uint8", 1), ("bitshuffle", "float32", 8)],
 )
 def test_what_was_recorded_is_read_back(tmp_path, compression, dtype, block):
     frames, header = random_stack(dtype), full_header()
@@ -127,11 +127,11 @@ def test_what_was_recorded_is_read_back(tmp_path, compression, dtype, block):
         assert (recording.truth, recording.travel) == (None, None)
         for size in (1, 3, 8, 20):
             recording.rewind()
-            found = read_all(recording, size)
-            np.testing.assert_array_equal(found.frames, frames)
-            np.testing.assert_array_equal(found.time, TRAVEL)
-            np.testing.assert_array_equal(found.phase, PHASE)
-            assert (found.travel, found.displacement, found.twist) == (None, None, None)
+            actual = read_all(recording, size)
+            np.testing.assert_array_equal(actual.frames, frames)
+            np.testing.assert_array_equal(actual.time, TRAVEL)
+            np.testing.assert_array_equal(actual.phase, PHASE)
+            assert (actual.travel, actual.displacement, actual.twist) == (None, None, None)
 
 
 def test_the_twin_s_recording_is_the_twin(tmp_path):
@@ -139,8 +139,8 @@ def test_the_twin_s_recording_is_the_twin(tmp_path):
     path = record(twin, tmp_path / "press.h5", "bitshuffle", block=3, truth=twin.truth)
     twin.rewind()
     with io.open_recording(path) as recording:
-        for found, expected in zip(read_all(recording, 8), read_all(twin, 8), strict=True):
-            np.testing.assert_array_equal(found, expected)
+        for actual, expected in zip(read_all(recording, 8), read_all(twin, 8), strict=True):
+            np.testing.assert_array_equal(actual, expected)
         assert_same(recording.truth, twin.truth)
         for name in ("title", "pixel_size", "motion"):
             assert getattr(recording.header, name) == getattr(twin.header, name)
@@ -203,8 +203,8 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path):
     # HDF5 used to crash at the end of the process.
     support = Path(sys.modules["stacks"].__file__).parent
     command = [sys.executable, "-B", "-c", FULL_DISK, str(tmp_path), str(support)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
     why = "could not be written: File too large; make room, or choose another place with -o"
-    assert done.stdout.splitlines() == [f"{tmp_path}/old.h5 {why}"] * (len(COMPRESSIONS) + 1)
+    assert ended.stdout.splitlines() == [f"{tmp_path}/old.h5 {why}"] * (len(COMPRESSIONS) + 1)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"old.h5": b"as it was"}

@@ -129,13 +129,13 @@ def test_another_stack_of_a_recording_can_be_named(press):
 def test_frames_are_read_into_the_given_array(tmp_path, packing):
     frames = random_stack()
     path = record(MadeUp(frames, io.Header("axial"), phase=PHASE), tmp_path / "a.h5", packing)
-    room = np.full(SHAPE, 255, np.uint8)
+    buffer = np.full(SHAPE, 255, np.uint8)
     with io.open_recording(path) as recording:
-        block = recording.read(room[:3])
-        assert np.shares_memory(block.frames, room)
+        block = recording.read(buffer[:3])
+        assert np.shares_memory(block.frames, buffer)
         assert not block.stays_valid
         np.testing.assert_array_equal(block.frames, frames[:3])
-        assert (room[3:] == 255).all()
+        assert (buffer[3:] == 255).all()
 
 
 @pytest.mark.parametrize(("chunk", "sizes"), [(4, [2, 2, 3, 1, 3, 1, 3, 1]), (1, [3, 3, 3, 3, 3, 1])])
@@ -145,11 +145,11 @@ def test_reads_end_where_chunks_end(tmp_path, chunk, sizes):
         file.create_dataset("x", data=frames, chunks=(chunk, 5, 7), compression="gzip")
     with io.open_recording(path, motion="vertical", travel=io.Steps(0.1)) as recording:
         first = recording.read(np.empty((2, 5, 7), "u1")) if chunk == 4 else None
-        room, found = np.empty((3, 5, 7), "u1"), [] if first is None else [first.frames]
-        while (block := recording.read(room)) is not None:
-            found.append(block.frames.copy())
-    np.testing.assert_array_equal(np.concatenate(found), frames)
-    assert [len(part) for part in found] == sizes
+        buffer, actual = np.empty((3, 5, 7), "u1"), [] if first is None else [first.frames]
+        while (block := recording.read(buffer)) is not None:
+            actual.append(block.frames.copy())
+    np.testing.assert_array_equal(np.concatenate(actual), frames)
+    assert [len(part) for part in actual] == sizes
 
 
 def test_a_packed_chunk_may_not_be_larger_than_the_memory(tmp_path):
@@ -158,15 +158,15 @@ def test_a_packed_chunk_may_not_be_larger_than_the_memory(tmp_path):
         file.create_dataset("x", (8, 500, 700), "u1", chunks=(8, 500, 700), **hdf5plugin.Bitshuffle())
         file["x"][...] = 0
         file.create_dataset("plain", (8, 500, 700), "u1", chunks=(8, 500, 700))[...] = 0
-    given = {"motion": "vertical", "travel": io.Steps(0.1)}
+    options = {"motion": "vertical", "travel": io.Steps(0.1)}
     line = r"lump\.h5: /x is packed in chunks of 2.8 MB where memory is limited to 1 MB: raise --memory"
     with pytest.raises(io.InputError, match=line):
-        io.open_recording(path, dataset="x", memory_limit=1_000_000, **given)
+        io.open_recording(path, dataset="x", memory_limit=1_000_000, **options)
     with h5py.File(path, "r+") as file:
         file.create_dataset("single", (8, 500, 700), "u1", chunks=(1, 500, 700), compression="lzf")[...] = 0
-    io.open_recording(path, dataset="single", memory_limit=100_000, **given).close()
-    io.open_recording(path, dataset="x", memory_limit=2_800_000, **given).close()
-    io.open_recording(path, dataset="plain", memory_limit=1_000_000, **given).close()
+    io.open_recording(path, dataset="single", memory_limit=100_000, **options).close()
+    io.open_recording(path, dataset="x", memory_limit=2_800_000, **options).close()
+    io.open_recording(path, dataset="plain", memory_limit=1_000_000, **options).close()
 
 
 BAD = [
@@ -205,7 +205,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("name", "value", "units", "line"), BAD)
-def test_what_a_recording_says_wrongly_is_reported(press, name, value, units, line):
+def test_wrong_properties_of_a_recording_are_reported(press, name, value, units, line):
     put(press, name, value, units)
     with pytest.raises(io.InputError, match=line) as caught:
         io.open_recording(press)
@@ -214,7 +214,7 @@ def test_what_a_recording_says_wrongly_is_reported(press, name, value, units, li
     assert "\n" not in message
 
 
-def test_what_an_axial_recording_says_wrongly_is_reported(turn):
+def test_wrong_properties_of_an_axial_recording_are_reported(turn):
     put(turn, f"{STAGE}/phase", np.where(PHASE > 3, np.nan, PHASE))
     with pytest.raises(io.InputError, match=r"turn\.h5: /entry/instrument/stage/phase is nan at frame 4"):
         io.open_recording(turn)

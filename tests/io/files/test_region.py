@@ -35,12 +35,12 @@ def axial(path, pivot=(0.5, -0.25, 40.0), pixel_size=(0.1, 0.2), gain=MAP, offse
 def test_everything_is_cut_alike(tmp_path):
     path = axial(tmp_path / "a.h5")
     with io.open_recording(path, region=REGION, frames=(2, 7)) as recording:
-        header, found = recording.header, read_all(recording, 3)
+        header, actual = recording.header, read_all(recording, 3)
         assert (recording.shape, recording.full_shape) == ((5, 3, 5), SHAPE)
         assert (recording.origin, recording.first_frame) == ((1, 2), 2)
-    np.testing.assert_array_equal(found.frames, random_stack()[2:7][:, *PART])
-    np.testing.assert_array_equal(found.phase, np.arange(2, 7) / 2)
-    np.testing.assert_array_equal(found.time, np.arange(2, 7) / 30)
+    np.testing.assert_array_equal(actual.frames, random_stack()[2:7][:, *PART])
+    np.testing.assert_array_equal(actual.phase, np.arange(2, 7) / 2)
+    np.testing.assert_array_equal(actual.time, np.arange(2, 7) / 30)
     np.testing.assert_array_equal(header.dark, MAP[PART])
     np.testing.assert_array_equal(header.bright, MAP[PART] + 200)
     np.testing.assert_array_equal(header.zenith_gain, MAP[PART])

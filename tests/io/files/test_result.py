@@ -98,9 +98,9 @@ def test_a_result_has_the_layout_of_the_design(path):
 def test_a_result_comes_back_as_it_was(path, changes):
     result = a_press(**changes)
     io.save_result(result, path)
-    found = io.open_result(path)
-    assert_same(found, result)
-    assert {name: type(value) for name, value in found.process.items()} == {
+    actual = io.open_result(path)
+    assert_same(actual, result)
+    assert {name: type(value) for name, value in actual.process.items()} == {
         name: type(value) for name, value in result.process.items()
     }
     group, signal, axes = plot_of(path)
@@ -158,8 +158,8 @@ def test_a_file_that_is_written_like_the_one_before_is_what_hdf5_would_write(tmp
         maps = {name: rng.normal(size=(50, 70)).astype("f4") for name in ("height", "height_sigma")}
         references = io.References(*rng.uniform(0, 9, (4, 50, 70)).astype("f4"), np.zeros((50, 70), "u1"))
         facts = PROCESS | {"noise": rng.uniform(), "source": f"{seed} 五円.h5", "frames": seed}
-        known = {"calibration": io.Calibration(camera, references=references), "process": facts}
-        return io.Result(**maps, status=rng.integers(0, 4, (50, 70)).astype("u1"), **known)
+        facts_of = {"calibration": io.Calibration(camera, references=references), "process": facts}
+        return io.Result(**maps, status=rng.integers(0, 4, (50, 70)).astype("u1"), **facts_of)
 
     paths = tmp_path / "a.h5", tmp_path / "b.h5", tmp_path / "c.h5"
     for seed, path in enumerate(paths[:2]):
@@ -167,10 +167,10 @@ def test_a_file_that_is_written_like_the_one_before_is_what_hdf5_would_write(tmp
     io.save_result(result(1), paths[2])
     first, like, anew = (path.read_bytes() for path in paths)
     assert like == anew != first
-    found = io.open_result(paths[1])
-    np.testing.assert_array_equal(found.height, result(1).height)
-    assert found.process["source"] == "1 五円.h5"
-    assert found.calibration.references.dark.tobytes() == result(1).calibration.references.dark.tobytes()
+    actual = io.open_result(paths[1])
+    np.testing.assert_array_equal(actual.height, result(1).height)
+    assert actual.process["source"] == "1 五円.h5"
+    assert actual.calibration.references.dark.tobytes() == result(1).calibration.references.dark.tobytes()
 
 
 def test_a_result_of_another_program_s_types_is_read(path):

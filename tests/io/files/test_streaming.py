@@ -46,28 +46,28 @@ def held(path):
 def test_what_comes_is_what_is_in_the_file(tmp_path, packing, dtype):
     blocks = stream(Feed(20, (1, 4, 3), dtype=dtype), tmp_path / "a.h5", packing)
     numbers = np.arange(20)
-    found = held(tmp_path / "a.h5")
-    np.testing.assert_array_equal(found["data"], frames_of(numbers, dtype=dtype))
-    np.testing.assert_array_equal(found["frame_time"], numbers)
-    np.testing.assert_array_equal(found["travel_live"], 0.01 * numbers)
-    np.testing.assert_array_equal(found["travel"], 0.01 * numbers + 0.001)
-    np.testing.assert_array_equal(found["used"], 1)
+    actual = held(tmp_path / "a.h5")
+    np.testing.assert_array_equal(actual["data"], frames_of(numbers, dtype=dtype))
+    np.testing.assert_array_equal(actual["frame_time"], numbers)
+    np.testing.assert_array_equal(actual["travel_live"], 0.01 * numbers)
+    np.testing.assert_array_equal(actual["travel"], 0.01 * numbers + 0.001)
+    np.testing.assert_array_equal(actual["used"], 1)
     lost = np.zeros(20)
     lost[[block.index for block in blocks]] = [block.index % 3 for block in blocks]
-    np.testing.assert_array_equal(found["dropped"], lost)
-    assert found["state"] == "complete"
-    assert found["data"].dtype == np.dtype(dtype)
+    np.testing.assert_array_equal(actual["dropped"], lost)
+    assert actual["state"] == "complete"
+    assert actual["data"].dtype == np.dtype(dtype)
 
 
 @pytest.mark.parametrize(("shape", "cuts"), [((1, 1), (20,)), ((13, 1), (2, 5)), ((64, 64), (2, 5))])
 def test_frames_of_any_size_in_blocks_of_any_cut_read_back(tmp_path, shape, cuts):
     stream(Feed(20, cuts, shape=shape, dtype="u2"), tmp_path / "a.h5")
     with io.open_recording(tmp_path / "a.h5") as recording:
-        found = read_all(recording, 6)
+        actual = read_all(recording, 6)
         assert recording.how.startswith("chunks read")
         assert (recording.state, recording.full_shape) == ("complete", (20, *shape))
-    np.testing.assert_array_equal(found.frames, frames_of(np.arange(20), shape, "u2"))
-    np.testing.assert_array_equal(found.travel, 0.01 * np.arange(20) + 0.001)
+    np.testing.assert_array_equal(actual.frames, frames_of(np.arange(20), shape, "u2"))
+    np.testing.assert_array_equal(actual.travel, 0.01 * np.arange(20) + 0.001)
 
 
 def test_raw_frames_are_in_one_piece_behind_little_else(tmp_path):
@@ -85,22 +85,22 @@ def test_every_motion_keeps_its_positions_and_its_plot(tmp_path, motion):
     name = {"vertical": "travel", "axial": "phase", "horizontal": "frame_time", "twist": "twist"}[motion]
     assert axes == [name, ".", "."]
     with io.open_recording(tmp_path / "a.h5") as recording:
-        found = read_all(recording, 3)
+        actual = read_all(recording, 3)
         assert recording.header.press == (None if motion == "vertical" else 1.0)
     for series, values in Feed(motion=motion).positions_of(np.arange(8), 0.001).items():
-        np.testing.assert_array_equal(getattr(found, series), values)
+        np.testing.assert_array_equal(getattr(actual, series), values)
     moved = {"horizontal": "displacement"}.get(motion, name)
-    found = held(tmp_path / "a.h5")
-    assert {series for series in found if series.endswith("_live")} == {f"{moved}_live"}
+    actual = held(tmp_path / "a.h5")
+    assert {series for series in actual if series.endswith("_live")} == {f"{moved}_live"}
     with io.open_recording(tmp_path / "a.h5", live=True) as recording:
-        np.testing.assert_array_equal(getattr(recording, moved), found[f"{moved}_live"])
+        np.testing.assert_array_equal(getattr(recording, moved), actual[f"{moved}_live"])
 
 
 def test_lent_frames_are_given_back_once_they_are_written(tmp_path):
     with io.StreamRecorder(Feed(10), tmp_path / "a.h5", period=60) as recorder:
-        lent = [weakref.ref(recorder.read().frames) for _ in range(2)]
+        references = [weakref.ref(recorder.read().frames) for _ in range(2)]
         until = time.monotonic() + 30
-        while any(frames() is not None for frames in lent):
+        while any(frames() is not None for frames in references):
             assert time.monotonic() < until
             time.sleep(0.001)
 
@@ -123,7 +123,7 @@ def test_marks_reach_frames_that_are_written_and_frames_that_are_yet_to_come(tmp
 
 
 def names(folder):
-    return sorted(one.name for one in folder.iterdir())
+    return sorted(path.name for path in folder.iterdir())
 
 
 @pytest.fixture(params=["a.h5", "a.mcap"])
@@ -139,8 +139,10 @@ def partial(path, number=1):
 
 def test_an_older_file_is_refused_unless_it_may_be_replaced(older):
     before, source = older.read_bytes(), Feed()
-    said = f"{older} exists and is a recording: add --overwrite to replace it, or choose another name with -o"
-    with pytest.raises(io.InputError, match=f"^{re.escape(said)}$"):
+    message = (
+        f"{older} exists and is a recording: add --overwrite to replace it, or choose another name with -o"
+    )
+    with pytest.raises(io.InputError, match=f"^{re.escape(message)}$"):
         stream(source, older)
     assert not source.entered
     assert older.read_bytes() == before
@@ -188,13 +190,13 @@ def test_a_source_that_is_not_read_to_its_end_is_cut_short(older):
     assert older.read_bytes() == before
 
 
-def test_a_recording_of_its_own_name_says_that_it_was_cut_short(tmp_path):
+def test_a_recording_that_was_cut_short_has_this_state(tmp_path):
     stream(Feed(3), tmp_path / "a.h5")
     with pytest.raises(KeyboardInterrupt):
         stream(Feed(fails=(4, KeyboardInterrupt())), tmp_path / "a.h5", overwrite=True)
-    found = held(tmp_path / "a-partial.h5")
-    assert found["state"] == "cut short: stopped by the user"
-    np.testing.assert_array_equal(found["data"], frames_of(np.arange(4)))
+    actual = held(tmp_path / "a-partial.h5")
+    assert actual["state"] == "cut short: stopped by the user"
+    np.testing.assert_array_equal(actual["data"], frames_of(np.arange(4)))
     assert len(held(tmp_path / "a.h5")["data"]) == 3
 
 
@@ -222,8 +224,8 @@ def test_of_two_runs_at_once_each_keeps_its_recording(tmp_path, overwrite):
         with pytest.raises(io.InputError, match=r"a\.h5 was made by another program meanwhile"):
             second.__exit__(None, None, None)
     assert (first.file, second.file) == (path, tmp_path / "a-partial.h5")
-    assert [len(held(one.file)["data"]) for one in (first, second)] == [6, 4]
-    assert [held(one.file)["state"] for one in (first, second)] == ["complete"] * 2
+    assert [len(held(item.file)["data"]) for item in (first, second)] == [6, 4]
+    assert [held(item.file)["state"] for item in (first, second)] == ["complete"] * 2
 
 
 def test_a_recording_without_hard_links_has_its_name_all_the_same(older, monkeypatch):
@@ -276,10 +278,10 @@ def test_what_was_taken_is_kept_whatever_ends_it(tmp_path, error, why):
     with pytest.raises(type(error)):
         stream(source, tmp_path / "a.h5")
     assert source.left
-    found = held(tmp_path / "a.h5")
-    assert found.pop("state") == f"cut short: {why}"
-    assert {len(values) for values in found.values()} == {12}
-    np.testing.assert_array_equal(found["travel"], 0.01 * np.arange(12) + 0.001)
+    actual = held(tmp_path / "a.h5")
+    assert actual.pop("state") == f"cut short: {why}"
+    assert {len(values) for values in actual.values()} == {12}
+    np.testing.assert_array_equal(actual["travel"], 0.01 * np.arange(12) + 0.001)
     with io.open_recording(tmp_path / "a.h5") as recording:
         assert recording.state == f"cut short: {why}"
         np.testing.assert_array_equal(read_all(recording, 5).frames, frames_of(np.arange(12)))
@@ -292,9 +294,9 @@ def test_positions_that_cannot_be_corrected_stay_and_their_error_is_reported(tmp
 
     with pytest.raises(ZeroDivisionError):
         stream(Lost(5), tmp_path / "a.h5")
-    found = held(tmp_path / "a.h5")
-    assert found["state"] == "cut short: no reports"
-    np.testing.assert_array_equal(found["travel"], 0.01 * np.arange(5))
+    actual = held(tmp_path / "a.h5")
+    assert actual["state"] == "cut short: no reports"
+    np.testing.assert_array_equal(actual["travel"], 0.01 * np.arange(5))
     with pytest.raises(io.InputError, match="camera"):
         stream(Lost(5, fails=(3, io.InputError("camera"))), tmp_path / "b.h5")
     assert held(tmp_path / "b.h5")["state"] == "cut short: camera"
@@ -330,10 +332,10 @@ def test_a_disk_that_is_too_slow_ends_it_and_nothing_waits(tmp_path, monkeypatch
     monkeypatch.setattr(streaming, "_BACKLOG", 6 * 35)
     with pytest.raises(io.InputError, match=r"a\.h5: the disk is too slow: 0 MB of frames wait for it; take"):
         stream(Released(20, (2,)), tmp_path / "a.h5")
-    found = held(tmp_path / "a.h5")
-    assert found["state"].startswith("cut short: ")
-    assert "the disk is too slow" in found["state"]
-    np.testing.assert_array_equal(found["data"], frames_of(np.arange(6)))
+    actual = held(tmp_path / "a.h5")
+    assert actual["state"].startswith("cut short: ")
+    assert "the disk is too slow" in actual["state"]
+    np.testing.assert_array_equal(actual["data"], frames_of(np.arange(6)))
 
 
 FULL = r"a\.h5: the disk is full \(File too large\); make room, or choose another place with -o"
@@ -341,12 +343,12 @@ FULL = r"a\.h5: the disk is full \(File too large\); make room, or choose anothe
 
 def hold_full(path, limit):
     """Hold a recording that filled its disk to be sound."""
-    found = held(path)
-    assert re.fullmatch(f"cut short: .*{FULL}", found.pop("state"))
-    (count,) = {len(values) for values in found.values()}
+    actual = held(path)
+    assert re.fullmatch(f"cut short: .*{FULL}", actual.pop("state"))
+    (count,) = {len(values) for values in actual.values()}
     assert count >= 40
-    np.testing.assert_array_equal(found["data"], frames_of(np.arange(count), (100, 300)))
-    np.testing.assert_array_equal(found["travel"], 0.01 * np.arange(count) + 0.001)
+    np.testing.assert_array_equal(actual["data"], frames_of(np.arange(count), (100, 300)))
+    np.testing.assert_array_equal(actual["travel"], 0.01 * np.arange(count) + 0.001)
     assert path.stat().st_size <= limit
 
 
@@ -362,7 +364,7 @@ try:
 except io.InputError as error:
     print(error)
 """
-    told = subprocess.run(
+    text = subprocess.run(
         [sys.executable, "-B", "-c", code],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": os.fspath(SUPPORT)},
@@ -371,8 +373,8 @@ except io.InputError as error:
         check=True,
         timeout=60,
     )
-    assert re.fullmatch(FULL + "\n", told.stdout)
-    assert not told.stderr
+    assert re.fullmatch(FULL + "\n", text.stdout)
+    assert not text.stderr
     hold_full(tmp_path / "a.h5", limit)
 
 

@@ -25,12 +25,12 @@ def kill(child):
     assert child.wait(60) == -signal.SIGKILL
 
 
-def opened(path, **given):
+def opened(path, **options):
     """Open a recording as soon as it holds two frames."""
     until = time.monotonic() + 60
     while True:
         try:
-            return io.open_recording(path, **given)
+            return io.open_recording(path, **options)
         except io.InputError as error:
             if "at least 2 are needed" not in str(error) or time.monotonic() > until:
                 raise
@@ -40,12 +40,12 @@ def opened(path, **given):
 def hold(recording):
     """Hold a recording of a feed to be right: every frame, and whatever is told of it."""
     count = recording.shape[0]
-    found = read_all(recording, 7)
-    np.testing.assert_array_equal(found.frames, frames_of(np.arange(count)))
-    np.testing.assert_array_equal(found.travel, 0.01 * np.arange(count))
-    assert len(found.time) == len(recording.used) == len(recording.dropped) == count
+    actual = read_all(recording, 7)
+    np.testing.assert_array_equal(actual.frames, frames_of(np.arange(count)))
+    np.testing.assert_array_equal(actual.travel, 0.01 * np.arange(count))
+    assert len(actual.time) == len(recording.used) == len(recording.dropped) == count
     assert recording.used.all()
-    assert np.all(np.diff(found.time) >= 0)
+    assert np.all(np.diff(actual.time) >= 0)
     return count
 
 
@@ -74,14 +74,14 @@ def test_others_watch_while_it_grows_and_what_is_left_when_it_is_killed_is_sound
     with io.open_recording(path) as recording:
         assert hold(recording) >= counts[-1]
         assert recording.state == "cut short: its writer was killed"
-        left = recording.fingerprint()
+        whole = recording.fingerprint()
     with io.open_recording(path) as recording:
-        assert recording.fingerprint() == left
+        assert recording.fingerprint() == whole
     with io.open_recording(path, frames=(0, 2)) as recording:
         np.testing.assert_array_equal(read_all(recording, 5).frames, frames_of([0, 1]))
     stream(Feed(4), path, overwrite=True)  # since its writer is gone
     with io.open_recording(path) as recording:
-        assert recording.fingerprint() != left
+        assert recording.fingerprint() != whole
 
 
 @pytest.mark.parametrize("packing", ["raw", "bitshuffle", "lzf"])
@@ -91,16 +91,16 @@ def test_kill_loses_nothing_that_a_reader_has_seen(tmp_path, packing):
     try:
         with opened(path) as recording:
             first = recording.shape[0]
-        seen = first
-        while seen == first:  # it is written out as it grows
+        count = first
+        while count == first:  # it is written out as it grows
             assert child.poll() is None
             with opened(path) as recording:
-                seen = recording.shape[0]
+                count = recording.shape[0]
         time.sleep(random.uniform(0.0, 0.3))  # to be killed at any moment between two writes
     finally:
         kill(child)
     with io.open_recording(path) as recording:
-        assert hold(recording) >= seen
+        assert hold(recording) >= count
     remove_leftovers(tmp_path)
     assert list(tmp_path.iterdir()) == [path]
 
@@ -126,11 +126,11 @@ def test_live_reads_the_used_frames_at_their_live_positions(tmp_path, motion, pa
     where = "travel" if motion == "vertical" else "phase"
     numbers = np.flatnonzero(USED)
     with io.open_recording(path, live=True) as recording:
-        for room in (1, 2, 40):
-            found = read_all(recording, room)
-            np.testing.assert_array_equal(found.frames, frames_of(numbers))
-            np.testing.assert_array_equal(getattr(found, where), 0.01 * numbers)
-            np.testing.assert_array_equal(found.time, numbers)
+        for count in (1, 2, 40):
+            actual = read_all(recording, count)
+            np.testing.assert_array_equal(actual.frames, frames_of(numbers))
+            np.testing.assert_array_equal(getattr(actual, where), 0.01 * numbers)
+            np.testing.assert_array_equal(actual.time, numbers)
             recording.rewind()
         assert recording.shape == (len(numbers), *SHAPE)
         assert recording.full_shape == (len(USED), *SHAPE)
@@ -138,16 +138,16 @@ def test_live_reads_the_used_frames_at_their_live_positions(tmp_path, motion, pa
         assert recording.which == "0:12, used live"
     with io.open_recording(path, live=True, frames=(2, 9), region=io.Region((1, 4), (2, 7))) as recording:
         part = numbers[(numbers >= 2) & (numbers < 9)]
-        found = read_all(recording, 3)
-        np.testing.assert_array_equal(found.frames, frames_of(part)[:, 1:4, 2:7])
-        np.testing.assert_array_equal(getattr(found, where), 0.01 * part)
+        actual = read_all(recording, 3)
+        np.testing.assert_array_equal(actual.frames, frames_of(part)[:, 1:4, 2:7])
+        np.testing.assert_array_equal(getattr(actual, where), 0.01 * part)
         assert recording.which == "2:9, used live"
     with io.open_recording(path) as recording:
         assert recording.which == "0:12"
 
 
 @pytest.mark.parametrize(
-    ("prepare", "given", "line"),
+    ("prepare", "options", "line"),
     [
         ("mark", {}, r"a\.h5: a live run used 1 frames: at least 2 are needed; leave --live out"),
         ("used", {}, r"a\.h5 does not state which frames a live run used: leave --live out"),
@@ -156,7 +156,7 @@ def test_live_reads_the_used_frames_at_their_live_positions(tmp_path, motion, pa
         ("lost", {}, r"travel_live of the frames that were used is nan at frame 3"),
     ],
 )
-def test_live_is_refused_where_there_was_no_live_run(tmp_path, prepare, given, line):
+def test_live_is_refused_where_there_was_no_live_run(tmp_path, prepare, options, line):
     stream(Feed(9), tmp_path / "a.h5")
     with h5py.File(tmp_path / "a.h5", "r+") as file:
         if prepare == "mark":
@@ -168,7 +168,7 @@ def test_live_is_refused_where_there_was_no_live_run(tmp_path, prepare, given, l
         elif prepare == "lost":
             file[f"{STAGE}/travel_live"][3:5] = np.nan
     with pytest.raises(io.InputError, match=line):
-        io.open_recording(tmp_path / "a.h5", live=True, **given)
+        io.open_recording(tmp_path / "a.h5", live=True, **options)
 
 
 def cut_short(path, damaged):

@@ -62,16 +62,16 @@ def virtual_in_itself(file):
 FOUND = [bare, big_endian, compact, resizable, twelve_bits, virtual_in_itself]
 
 
-def read(path, **given):
-    with io.open_recording(path, **GIVEN | given) as recording:
+def read(path, **options):
+    with io.open_recording(path, **GIVEN | options) as recording:
         return read_all(recording, 3)[0]
 
 
-def refused(path, line, **given):
+def refused(path, line, **options):
     """Hold that a file is refused, in one line that matches."""
     with (
         pytest.raises(io.InputError, match=line) as caught,
-        io.open_recording(path, **GIVEN | given) as recording,
+        io.open_recording(path, **GIVEN | options) as recording,
     ):
         read_all(recording, 3)
     message = str(caught.value)
@@ -182,10 +182,10 @@ def test_a_virtual_stack_that_is_not_whole_is_refused(path, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("way", "kind"),
+    ("method", "kind"),
     [("..", "link"), ("absolute", "virtual"), ("symlink", "raw"), ("by another", "link"), ("..", "raw")],
 )
-def test_nothing_outside_the_folder_is_read(tmp_path, way, kind):
+def test_nothing_outside_the_folder_is_read(tmp_path, method, kind):
     outside, home = tmp_path / "outside", tmp_path / "home"
     for folder in (outside, home / "sub"):
         folder.mkdir(parents=True)
@@ -199,8 +199,8 @@ def test_nothing_outside_the_folder_is_read(tmp_path, way, kind):
         "symlink": "sub/link",
         "by another": "../../outside",
     }
-    name = f"{names[way]}/x.{'raw' if kind == 'raw' else 'h5'}"
-    path = home / ("sub/theirs.h5" if way == "by another" else "theirs.h5")
+    name = f"{names[method]}/x.{'raw' if kind == 'raw' else 'h5'}"
+    path = home / ("sub/theirs.h5" if method == "by another" else "theirs.h5")
     with h5py.File(path, "w") as file:
         if kind == "link":
             file["x"] = h5py.ExternalLink(name, "/frames")
@@ -210,7 +210,7 @@ def test_nothing_outside_the_folder_is_read(tmp_path, way, kind):
             layout = h5py.VirtualLayout(SHAPE, "u1")
             layout[...] = h5py.VirtualSource(name, "frames", SHAPE)
             file.create_virtual_dataset("x", layout)
-    if way == "by another":
+    if method == "by another":
         with h5py.File(home / "theirs.h5", "w") as file:
             file["x"] = h5py.ExternalLink("sub/theirs.h5", "/x")
     refused(

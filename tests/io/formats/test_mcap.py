@@ -39,7 +39,9 @@ TIME = {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "camera"}}
 def messages(path):
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        return [(one[1].topic, one[2].log_time, one[3]) for one in reader.iter_decoded_messages()]
+        return [
+            (decoded[1].topic, decoded[2].log_time, decoded[3]) for decoded in reader.iter_decoded_messages()
+        ]
 
 
 def write_sample(path):
@@ -62,21 +64,21 @@ def test_a_result_becomes_points_in_metres_with_their_sigma(tmp_path):
         **AXIS,
     )
     assert io.export_result(result, tmp_path / "a.mcap") == "5 points"
-    found = {topic: (time, said) for topic, time, said in messages(tmp_path / "a.mcap")}
-    assert set(found) == {"/surface", "/height", "/force"}
-    time, cloud = found["/surface"]
+    actual = {topic: (time, message) for topic, time, message in messages(tmp_path / "a.mcap")}
+    assert set(actual) == {"/surface", "/height", "/force"}
+    time, cloud = actual["/surface"]
     assert time == 1795435200_000000000
     names = [field.name for field in cloud.fields]
     assert names == ["x", "y", "z", "sigma", "normal_x", "normal_y", "normal_z"]
     points = np.frombuffer(cloud.data, "<f4").reshape(-1, len(names))
-    known = [(x, y, HEIGHT[i, j]) for i, y in enumerate(AXIS["y"]) for j, x in enumerate(AXIS["x"])]
-    expected = [one for one in known if np.isfinite(one[2])]
+    properties = [(x, y, HEIGHT[i, j]) for i, y in enumerate(AXIS["y"]) for j, x in enumerate(AXIS["x"])]
+    expected = [point for point in properties if np.isfinite(point[2])]
     np.testing.assert_allclose(points[:, :3], np.array(expected) * 1e-3, rtol=1e-6)
     np.testing.assert_allclose(points[:, 3:], [[1e-5, 0, 0, 1]] * 5, rtol=1e-6)
-    picture = found["/height"][1]
+    picture = actual["/height"][1]
     assert (picture.encoding, picture.height, picture.width) == ("32FC1", 2, 3)
     np.testing.assert_allclose(np.frombuffer(picture.data, "<f4").reshape(2, 3), HEIGHT * 1e-3, rtol=1e-6)
-    assert found["/force"][1].wrench.force.z == 2.5
+    assert actual["/force"][1].wrench.force.z == 2.5
 
 
 def test_a_result_without_millimetres_is_refused(tmp_path):
@@ -89,12 +91,12 @@ def test_a_recording_comes_back_through_the_command_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     record(sphere(), "rec.h5")
     assert run("export", "rec.h5", "-o", "rec.mcap").code == 0
-    done = run("import", "rec.mcap", "-o", "back.h5", "--motion", "vertical", "--pixel-size", "0.1mm")
-    assert done.code == 0, done.said
+    ended = run("import", "rec.mcap", "-o", "back.h5", "--motion", "vertical", "--pixel-size", "0.1mm")
+    assert ended.code == 0, ended.said
     with io.open_recording("rec.h5") as before, io.open_recording("back.h5") as after:
-        room = np.empty(before.shape, before.dtype)
-        frames = before.read(room).frames.copy()
-        np.testing.assert_array_equal(after.read(room).frames, frames)
+        buffer = np.empty(before.shape, before.dtype)
+        frames = before.read(buffer).frames.copy()
+        np.testing.assert_array_equal(after.read(buffer).frames, frames)
         np.testing.assert_allclose(after.travel, before.travel, rtol=1e-12)
 
 
@@ -112,12 +114,12 @@ def test_an_exported_recording_needs_no_options(tmp_path):
 
 
 def test_numbers_of_an_exported_recording_come_back(tmp_path):
-    known = {"travel_sigma": 0.002, "line_time": -1.5e-05, "pixel_size": (0.1, 0.2)}
+    options = {"travel_sigma": 0.002, "line_time": -1.5e-05, "pixel_size": (0.1, 0.2)}
     frames = np.zeros((3, 4, 5), np.uint8)
-    source = ArrayRecording(frames, {"travel": np.arange(3.0)}, known)
+    source = ArrayRecording(frames, {"travel": np.arange(3.0)}, options)
     io.save_messages(source, tmp_path / "rec.mcap")
     with io.open_recording(tmp_path / "rec.mcap") as after:
-        assert {name: getattr(after.header, name) for name in known} == known
+        assert {name: getattr(after.header, name) for name in options} == options
 
 
 def test_a_motion_that_contradicts_the_file_is_refused(tmp_path):
@@ -154,12 +156,12 @@ def film(tmp_path):
     return write
 
 
-def opened(path, **known):
-    return io.open_recording(path, motion="vertical", travel=io.Steps(0.1), **known)
+def opened(path, **options):
+    return io.open_recording(path, motion="vertical", travel=io.Steps(0.1), **options)
 
 
-def frames_of(path, **known):
-    with opened(path, **known) as source:
+def frames_of(path, **options):
+    with opened(path, **options) as source:
         assert source.shape[0] == 3
         return source.read(np.empty(source.shape, source.dtype))
 
@@ -178,8 +180,8 @@ def test_grey_colours_and_compressed_images_are_read(film):
 
 
 def test_of_several_topics_one_is_named(film):
-    one, other = np.zeros((2, 3), np.uint8), np.full((2, 3), 9, np.uint8)
-    path = film(("/left", one), ("/right", other))
+    left, other = np.zeros((2, 3), np.uint8), np.full((2, 3), 9, np.uint8)
+    path = film(("/left", left), ("/right", other))
     with pytest.raises(io.InputError, match=r"topics of images are /left, /right: name one with --dataset"):
         frames_of(path)
     assert frames_of(path, dataset="/right").frames[0, 0, 0] == 9
@@ -195,16 +197,18 @@ def test_frames_and_maps_are_written_while_they_come(tmp_path):
     with io.StreamRecorder(Feed(6, (2,)), tmp_path / "a.mcap") as recorder:
         while recorder.read() is not None:
             recorder.add_maps(float(recorder.count - 1), height, 3.0)
-    found = messages(tmp_path / "a.mcap")
-    begun = found[0][1]
-    pictures = [np.frombuffer(said.data, np.uint8) for topic, _, said in found if topic == "/camera/image"]
+    actual = messages(tmp_path / "a.mcap")
+    begun = actual[0][1]
+    pictures = [
+        np.frombuffer(message.data, np.uint8) for topic, _, message in actual if topic == "/camera/image"
+    ]
     np.testing.assert_array_equal(np.reshape(pictures, (6, 5, 7)), feed_of(np.arange(6)))
-    travel = [said.data for topic, _, said in found if topic == "/travel"]
+    travel = [message.data for topic, _, message in actual if topic == "/travel"]
     np.testing.assert_allclose(travel, (0.01 * np.arange(6) + 0.001) * 1e-3)  # those of the end
-    heights = [(time - begun, said) for topic, time, said in found if topic == "/height"]
+    heights = [(time - begun, message) for topic, time, message in actual if topic == "/height"]
     assert [time for time, _ in heights] == [1_000_000_000, 3_000_000_000, 5_000_000_000]
     np.testing.assert_array_equal(np.frombuffer(heights[0][1].data, "<f4"), np.float32(2e-3))
-    assert [said.data for topic, _, said in found if topic == "/contact_area"] == [3e-6] * 3
+    assert [message.data for topic, _, message in actual if topic == "/contact_area"] == [3e-6] * 3
 
 
 def test_frames_that_came_before_a_fault_are_kept(tmp_path):
@@ -214,7 +218,7 @@ def test_frames_that_came_before_a_fault_are_kept(tmp_path):
             pass
     assert sum(topic == "/camera/image" for topic, _, _ in messages(tmp_path / "a.mcap")) == 4
     with (tmp_path / "a.mcap").open("rb") as file:
-        notes = [one.metadata for one in make_reader(file).iter_metadata()]
+        notes = [note.metadata for note in make_reader(file).iter_metadata()]
     assert notes[-1] == {"state": "cut short: unplugged"}
 
 
@@ -321,15 +325,15 @@ def test_a_compressed_mosaic_is_refused_like_one_that_is_not(tmp_path, kind):
 
 def test_a_loss_is_reported(tmp_path):
     with opened(write_packed(tmp_path / "a.mcap", [("mono8; jpeg compressed ", JPEG)] * 3)) as source:
-        (found,) = source.findings
-    assert (found.kind, found.warning) == ("lossy compression", True)
+        (actual,) = source.findings
+    assert (actual.kind, actual.warning) == ("lossy compression", True)
 
 
 def test_colours_are_reported_once_and_a_channel_is_one_of_them(film):
     colours = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
     path = film(("/a", colours), encoding="rgb8")
     with opened(path) as source:
-        assert [(one.kind, one.warning) for one in source.findings] == [("colour", False)]
+        assert [(finding.kind, finding.warning) for finding in source.findings] == [("colour", False)]
     for channel in range(3):
         np.testing.assert_array_equal(frames_of(path, channel=channel).frames[1], colours[..., channel] + 1)
 
@@ -350,7 +354,7 @@ def test_a_jump_of_the_sequence_numbers_is_lost_frames(tmp_path):
     with opened(write_numbered(tmp_path / "a.mcap", [3, 4, 7])) as source:
         assert source.dropped.tolist() == [0, 0, 2]
         assert source.travel.tolist() == pytest.approx([0.0, 0.1, 0.4])
-        assert [one.kind for one in source.findings] == ["lost frames"]
+        assert [finding.kind for finding in source.findings] == ["lost frames"]
 
 
 @pytest.mark.parametrize("numbers", [[0, 0, 0], [9, 3, 4], [0, 100, 200]])
@@ -395,8 +399,8 @@ def test_messages_are_decoded_as_ros_defines_them_and_not_as_the_file_does(tmp_p
         writer.start()
         schema = writer.register_schema(IMAGE, "ros2msg", b"uint8[<=1000000000] \x1b not a definition")
         channel = writer.register_channel("/a", "cdr", schema)
-        for _, _, one in messages:
-            writer.add_message(channel, one.log_time, one.data, one.publish_time)
+        for _, _, decoded in messages:
+            writer.add_message(channel, decoded.log_time, decoded.data, decoded.publish_time)
         writer.finish()
     assert frames_of(path).frames[:, 0, 0].tolist() == [0, 1, 2]
 
@@ -413,8 +417,8 @@ def damaged_messages(path):
 
 def test_images_that_differ_from_what_was_recorded_are_refused(tmp_path):
     path = damaged_messages(tmp_path / "a.mcap")
-    said = "the chunk that begins with message 0 of /a differs from what was recorded: .*--no-verify"
-    with pytest.raises(io.InputError, match=said):
+    message = "the chunk that begins with message 0 of /a differs from what was recorded: .*--no-verify"
+    with pytest.raises(io.InputError, match=message):
         frames_of(path)
 
 
@@ -437,8 +441,8 @@ def replace_chunk(path, compression, packed, size):
     moved = replace(index, chunk_start_offset=len(whole), chunk_length=len(body), compression=compression)
     tail = RecordBuilder()
     start = len(whole) + len(body)
-    for one in (*summary.schemas.values(), *summary.channels.values(), moved):
-        one.write(tail)
+    for item in (*summary.schemas.values(), *summary.channels.values(), moved):
+        item.write(tail)
     Footer(summary_crc=0, summary_offset_start=0, summary_start=start).write(tail)
     path.write_bytes(whole + body + tail.end() + whole[:8])
     return path
@@ -459,10 +463,10 @@ def chunk_bomb(path, compression):
 def records_of(path):
     """Return the records of the messages of a file, which begin with a code and a size."""
     with path.open("rb") as file:
-        found = [(channel.id, one) for _, channel, one in make_reader(file).iter_messages()]
+        actual = [(channel.id, result) for _, channel, result in make_reader(file).iter_messages()]
     return [
-        struct.pack("<BQHIQQ", 5, 22 + len(one.data), channel, 0, one.log_time, 0) + one.data
-        for channel, one in found
+        struct.pack("<BQHIQQ", 5, 22 + len(result.data), channel, 0, result.log_time, 0) + result.data
+        for channel, result in actual
     ]
 
 

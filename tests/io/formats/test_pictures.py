@@ -41,9 +41,9 @@ SAMPLES = {"pictures": write_sample}
 
 def drain(source, size=None):
     """Read to the end, ``size`` frames at a time; return copies of the frames, and the blocks."""
-    room = None if size is None else np.empty((size, *source.shape[1:]), source.dtype)
+    buffer = None if size is None else np.empty((size, *source.shape[1:]), source.dtype)
     frames, blocks = [], []
-    while (block := source.read(room)) is not None:
+    while (block := source.read(buffer)) is not None:
         frames.append(block.frames.copy())
         blocks.append(block)
     return np.concatenate(frames), blocks
@@ -110,7 +110,7 @@ def test_blocks_of_any_size_give_the_same_frames(tmp_path, size):
     assert {b.dropped for b in blocks} == {0}
 
 
-def test_no_block_spans_a_gap_and_the_next_says_how_many_were_lost(tmp_path):
+def test_a_block_ends_at_a_gap_and_the_next_counts_lost_frames(tmp_path):
     save(tmp_path, ["image5.png", "image6.png", "image9.png", "image10.png", "image12.png"])
     source = opened(tmp_path, travel=Steps(0.5, 1.0))
     for _ in range(2):
@@ -222,15 +222,15 @@ def test_numbers_with_a_common_step_are_consecutive_frames(tmp_path, numbers):
     np.testing.assert_array_equal(frames, [frame(k) for k in range(40)])
     np.testing.assert_allclose(np.concatenate([b.travel for b in blocks]), 0.05 * np.arange(40))
     assert not source.dropped.any()
-    assert [found for found in source.findings if found.warning] == []
+    assert [finding for finding in source.findings if finding.warning] == []
 
 
 def test_a_common_step_is_reported(tmp_path):
     save(tmp_path, [f"frame_{33 * k:06d}.png" for k in range(5)])
     with opened(tmp_path) as source:
-        (found,) = source.findings
-    assert (found.kind, found.warning) == ("numbering", False)
-    assert "the names step by 33" in found.text
+        (actual,) = source.findings
+    assert (actual.kind, actual.warning) == ("numbering", False)
+    assert "the names step by 33" in actual.text
 
 
 def test_a_gap_in_numbers_with_a_common_step_counts_in_steps(tmp_path):
@@ -242,17 +242,17 @@ def test_a_gap_in_numbers_with_a_common_step_counts_in_steps(tmp_path):
 def test_numbers_that_are_mostly_missing_give_the_order_and_a_warning(tmp_path):
     save(tmp_path, [f"frame_{number}.png" for number in (7, 40, 73, 107, 140)])
     with opened(tmp_path) as source:
-        (found,) = source.findings
+        (actual,) = source.findings
         assert source.travel.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
-    assert (found.kind, found.warning) == ("numbering", True)
+    assert (actual.kind, actual.warning) == ("numbering", True)
 
 
 def test_missing_numbers_are_reported_as_lost_frames(tmp_path):
     save(tmp_path, [f"frame_{number}.png" for number in (1, 2, 3, 5, 8)])
     with opened(tmp_path) as source:
-        (found,) = source.findings
-    assert (found.kind, found.warning) == ("lost frames", True)
-    assert "3 frames are missing, before frames 3, 4" in found.text
+        (actual,) = source.findings
+    assert (actual.kind, actual.warning) == ("lost frames", True)
+    assert "3 frames are missing, before frames 3, 4" in actual.text
 
 
 def pgm(path, picture):
@@ -282,16 +282,16 @@ def test_jpeg_is_read_with_a_warning(tmp_path):
         cv2.imwrite(str(tmp_path / f"frame{number}.jpg"), smooth(number), [cv2.IMWRITE_JPEG_QUALITY, 95])
     with opened(tmp_path) as source:
         frames, _ = drain(source)
-        (found,) = source.findings
+        (actual,) = source.findings
     assert np.abs(frames - np.stack([smooth(k) for k in range(10)]).astype(int)).max() <= 6
-    assert (found.kind, found.warning) == ("lossy compression", True)
+    assert (actual.kind, actual.warning) == ("lossy compression", True)
 
 
 def test_a_loss_is_reported_wherever_it_is(tmp_path):
     cv2.imwrite(str(tmp_path / "frame1.png"), smooth(0))
     cv2.imwrite(str(tmp_path / "frame2.jpg"), smooth(0))
     with opened(tmp_path) as source:
-        assert [found.kind for found in source.findings] == ["lossy compression"]
+        assert [finding.kind for finding in source.findings] == ["lossy compression"]
 
 
 def test_a_jpeg_is_turned_as_it_states(tmp_path):
@@ -322,8 +322,8 @@ def test_colour_is_reported_once(tmp_path):
         picture = np.dstack([frame(number), frame(number + 1), frame(number + 2)])
         cv2.imwrite(str(tmp_path / f"frame{number}.png"), picture)
     with opened(tmp_path) as source:
-        (found,) = source.findings
-    assert (found.kind, found.warning) == ("colour", False)
+        (actual,) = source.findings
+    assert (actual.kind, actual.warning) == ("colour", False)
 
 
 @pytest.mark.parametrize(("channel", "number"), [(0, 9), (1, 5), (2, 1)])
@@ -364,7 +364,7 @@ def with_table(path, table):
 def test_a_table_of_colours_gives_indices_or_its_greys(tmp_path, suffix, table, expected):
     picture = decode_picture(with_table(tmp_path / f"a.{suffix}", table))
     np.testing.assert_array_equal(picture.samples, expected)
-    assert [found.kind for found in picture.findings] == (["colour table"] if expected is INDICES else [])
+    assert [finding.kind for finding in picture.findings] == (["colour table"] if expected is INDICES else [])
 
 
 @pytest.mark.parametrize("suffix", ["png", "bmp", "tif"])
@@ -429,6 +429,6 @@ for path in sys.argv[1:]:
         print("refused")
 """
     arguments = [sys.executable, "-c", program, tmp_path, tmp_path / "stack.tif"]
-    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["read", "refused", "refused"]
-    assert done.stderr == ""
+    ended = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    assert ended.stdout.split() == ["read", "refused", "refused"]
+    assert ended.stderr == ""

@@ -47,9 +47,9 @@ def installed(tmp_path, monkeypatch):
 def test_frames_of_a_package_s_format_give_the_result_of_an_array(line):
     for name in ("raw", "npy"):
         done(line, f"press.{name}", *TRAVEL, *LEVELS, "-o", f"{name}.h5")
-    own, array = (io.open_result(f"{name}.h5") for name in ("raw", "npy"))
-    np.testing.assert_array_equal(own.height, array.height)
-    assert np.isfinite(own.height).any()
+    raw, array = (io.open_result(f"{name}.h5") for name in ("raw", "npy"))
+    np.testing.assert_array_equal(raw.height, array.height)
+    assert np.isfinite(raw.height).any()
 
 
 @pytest.mark.usefixtures("installed")
@@ -150,8 +150,8 @@ def test_no_two_formats_have_the_same_use_of_a_suffix():
     for use in ("reader", "encoder"):
         suffixes = [
             suffix
-            for one in registry.formats(installed=False)
-            if getattr(one, use)
-            for suffix in one.suffixes
+            for form in registry.formats(installed=False)
+            if getattr(form, use)
+            for suffix in form.suffixes
         ]
         assert len(suffixes) == len(set(suffixes))

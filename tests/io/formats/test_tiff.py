@@ -77,9 +77,9 @@ def test_float32_comes_back_exactly(tmp_path):
 @pytest.mark.parametrize("dtype", ["int8", "int16", "uint32", "int32", "float64"])
 def test_other_types_are_converted_where_that_is_exact(tmp_path, dtype):
     frames = stack(5, BITS8) // 2
-    found, source = frames_of(write(tmp_path / "a.tif", frames.astype(dtype)))
-    np.testing.assert_array_equal(found, frames)
-    assert [(one.kind, one.warning) for one in source.findings] == [("converted samples", False)]
+    actual, source = frames_of(write(tmp_path / "a.tif", frames.astype(dtype)))
+    np.testing.assert_array_equal(actual, frames)
+    assert [(finding.kind, finding.warning) for finding in source.findings] == [("converted samples", False)]
 
 
 def test_a_sample_that_cannot_be_converted_is_named(tmp_path):
@@ -105,8 +105,8 @@ def test_lzw_with_a_predictor_comes_back_exactly(tmp_path, suffix):
 def test_a_part_is_read_as_a_part_of_the_whole(tmp_path, options):
     frames = stack(6)
     part = {"frames": (2, 5), "region": Region((1, 5), (3, 8))}
-    found, source = frames_of(write(tmp_path / "a.tif", frames, **options), **part)
-    np.testing.assert_array_equal(found, frames[2:5, 1:5, 3:8])
+    actual, source = frames_of(write(tmp_path / "a.tif", frames, **options), **part)
+    np.testing.assert_array_equal(actual, frames[2:5, 1:5, 3:8])
     assert source.travel.tolist() == pytest.approx([0.2, 0.3, 0.4])
 
 
@@ -147,9 +147,9 @@ def test_channels_that_may_be_the_colours_of_one_picture_are_not_frames(tmp_path
 
 def test_more_channels_without_time_or_depth_are_frames(tmp_path):
     """What tifffile writes for ImageJ where no axes are given."""
-    found, source = frames_of(write(tmp_path / "a.tif", stack(5), imagej=True))
-    np.testing.assert_array_equal(found, stack(5))
-    assert [(one.kind, one.warning) for one in source.findings] == [("channels", False)]
+    actual, source = frames_of(write(tmp_path / "a.tif", stack(5), imagej=True))
+    np.testing.assert_array_equal(actual, stack(5))
+    assert [(finding.kind, finding.warning) for finding in source.findings] == [("channels", False)]
 
 
 @pytest.mark.parametrize("options", [{"imagej": True}, {"ome": True}, {}], ids=str)
@@ -207,9 +207,9 @@ def test_of_several_series_one_is_chosen(tmp_path):
 @pytest.mark.parametrize("options", [PLAIN, {"compression": "zlib"}], ids=str)
 def test_where_white_is_zero_samples_are_inverted(tmp_path, dtype, options):
     frames = stack(3, dtype)
-    found, source = frames_of(write(tmp_path / "a.tif", frames, photometric="miniswhite", **options))
-    np.testing.assert_array_equal(found, np.iinfo(dtype).max - frames)
-    assert [(one.kind, one.warning) for one in source.findings] == [("white is zero", False)]
+    actual, source = frames_of(write(tmp_path / "a.tif", frames, photometric="miniswhite", **options))
+    np.testing.assert_array_equal(actual, np.iinfo(dtype).max - frames)
+    assert [(finding.kind, finding.warning) for finding in source.findings] == [("white is zero", False)]
 
 
 def test_floats_whose_white_is_zero_are_refused(tmp_path):
@@ -242,11 +242,11 @@ def test_frames_are_turned_as_they_are_displayed(tmp_path, options, orientation,
 def test_a_microscope_s_table_of_colours_gives_indices(tmp_path, options):
     frames, green = stack(3, BITS8), np.zeros((3, 256), np.uint16)
     green[1] = np.arange(256) * 257
-    found, source = frames_of(
+    actual, source = frames_of(
         write(tmp_path / "a.tif", frames, photometric="palette", colormap=green, **options)
     )
-    np.testing.assert_array_equal(found, frames)
-    assert [(one.kind, one.warning) for one in source.findings] == [("colour table", False)]
+    np.testing.assert_array_equal(actual, frames)
+    assert [(finding.kind, finding.warning) for finding in source.findings] == [("colour table", False)]
 
 
 @pytest.mark.filterwarnings("ignore:.*writing.*photometric:DeprecationWarning")
@@ -266,9 +266,9 @@ def test_colours_become_luma_and_are_reported(tmp_path, planar, options):
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, pages, photometric="rgb", planarconfig=planar, **options)
     luma = np.tensordot([0.299, 0.587, 0.114], frames.astype(float), axes=(0, 1))
-    found, source = frames_of(path)
-    np.testing.assert_allclose(found, luma, atol=0.51)
-    assert "colour" in [one.kind for one in source.findings]
+    actual, source = frames_of(path)
+    np.testing.assert_allclose(actual, luma, atol=0.51)
+    assert "colour" in [finding.kind for finding in source.findings]
     np.testing.assert_array_equal(frames_of(path, channel=2)[0], frames[:, 2])
 
 
@@ -291,10 +291,10 @@ def test_colours_become_luma_and_are_reported(tmp_path, planar, options):
 )
 def test_a_pixel_size_in_the_metadata_is_reported(tmp_path, options, text):
     _, source = frames_of(write(tmp_path / "a.tif", stack(3), **options))
-    (found,) = source.findings
-    assert (found.kind, found.warning) == ("pixel size", False)
-    assert text in found.text
-    assert "--pixel-size" in found.text
+    (actual,) = source.findings
+    assert (actual.kind, actual.warning) == ("pixel size", False)
+    assert text in actual.text
+    assert "--pixel-size" in actual.text
     assert source.header.pixel_size is None
 
 

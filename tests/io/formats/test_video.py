@@ -53,8 +53,8 @@ def exact(tmp_path):
 
 def opened(path, **options):
     """Open frames as a rotation."""
-    known = {"motion": "axial", "phase": np.linspace(0, 6, COUNT), "tilt": 0.04}
-    return open_recording(path, **(known | options))
+    properties = {"motion": "axial", "phase": np.linspace(0, 6, COUNT), "tilt": 0.04}
+    return open_recording(path, **(properties | options))
 
 
 def film(path, codec, pixels, frames, stamps=None, kind="gray", **options):
@@ -63,10 +63,15 @@ def film(path, codec, pixels, frames, stamps=None, kind="gray", **options):
         stream = container.add_stream(codec, rate=int(RATE), options=options)
         stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pixels
         for number, picture in enumerate(frames):
-            one = av.VideoFrame.from_ndarray(picture, kind)
-            one = one if kind == pixels else one.reformat(format=pixels)
-            one.pts, one.time_base = (stamps or range(len(frames)))[number], Fraction(1, int(RATE))
-            container.mux(stream.encode(one))
+            picture_of_video = av.VideoFrame.from_ndarray(picture, kind)
+            picture_of_video = (
+                picture_of_video if kind == pixels else picture_of_video.reformat(format=pixels)
+            )
+            picture_of_video.pts, picture_of_video.time_base = (
+                (stamps or range(len(frames)))[number],
+                Fraction(1, int(RATE)),
+            )
+            container.mux(stream.encode(picture_of_video))
         container.mux(stream.encode(None))
     return path
 
@@ -82,9 +87,9 @@ def frames_of(path, **options):
 
 def drain(source, size=None):
     """Read to the end, ``size`` frames at a time; return copies of the frames, and the blocks."""
-    room = None if size is None else np.empty((size, *source.shape[1:]), source.dtype)
+    buffer = None if size is None else np.empty((size, *source.shape[1:]), source.dtype)
     frames, blocks = [], []
-    while (block := source.read(room)) is not None:
+    while (block := source.read(buffer)) is not None:
         frames.append(block.frames.copy())
         blocks.append(block)
     return np.concatenate(frames), blocks
@@ -165,8 +170,8 @@ def test_frames_that_are_declared_but_missing_are_damage(exact):
 def test_a_rotation_that_the_file_asks_for_is_applied(tmp_path):
     video = encode(tmp_path / "stack.mp4", "mp4v")
     upright, _ = drain(opened(video))
-    one = 1 << 16
-    quarter_turn = (0, one, 0, -one, 0, 0, SHAPE[0] * one, 0, 1 << 30)
+    unit = 1 << 16
+    quarter_turn = (0, unit, 0, -unit, 0, 0, SHAPE[0] * unit, 0, 1 << 30)
     patch(video, b"tkhd", 40, ">9i", *quarter_turn)
     source = opened(video)
     assert source.shape == (COUNT, *SHAPE[::-1])
@@ -188,8 +193,8 @@ def test_times_are_the_files_where_they_increase_else_the_rates(stamps, rate, ex
 
 def test_uneven_time_stamps_are_the_times_of_the_frames(tmp_path):
     stamps = [0, 1, 2, 5, 6, 8, 9]
-    found, source = frames_of(film(tmp_path / "a.mkv", "ffv1", "gray", GREY, stamps))
-    np.testing.assert_array_equal(found, GREY)
+    actual, source = frames_of(film(tmp_path / "a.mkv", "ffv1", "gray", GREY, stamps))
+    np.testing.assert_array_equal(actual, GREY)
     np.testing.assert_allclose(source.time, np.array(stamps) / RATE, atol=1e-9)
 
 
@@ -200,9 +205,9 @@ def test_a_jump_of_an_avi_s_time_stamps_is_lost_frames(tmp_path):
         frames, blocks = drain(source, 5)
         assert len(frames) == COUNT
         assert source.dropped.tolist() == [0, 0, 0, 4, 0, 0, 0]
-        assert [(one.index, one.dropped) for one in blocks] == [(0, 0), (3, 4)]
+        assert [(block.index, block.dropped) for block in blocks] == [(0, 0), (3, 4)]
         np.testing.assert_allclose(source.phase, 0.5 * np.array(stamps))
-        assert "lost frames" in [one.kind for one in source.findings]
+        assert "lost frames" in [finding.kind for finding in source.findings]
 
 
 def test_a_closed_video_is_not_opened_again(tmp_path):
@@ -222,16 +227,16 @@ def test_all_frames_are_read_whatever_an_edit_list_leaves_out(tmp_path, suffix, 
             if packet.dts is not None:
                 packet.pts, packet.dts, packet.stream = packet.pts - ticks, packet.dts - ticks, stream
                 written.mux(packet)
-    found, source = frames_of(tmp_path / f"b{suffix}")
-    np.testing.assert_array_equal(found, frames_of(tmp_path / "a.mp4")[0])
+    actual, source = frames_of(tmp_path / f"b{suffix}")
+    np.testing.assert_array_equal(actual, frames_of(tmp_path / "a.mp4")[0])
     np.testing.assert_allclose(source.time, np.arange(COUNT) / RATE, atol=1e-9)
-    (one,) = [one for one in source.findings if one.kind == "edit list"]
-    assert f"leaves out {hidden} of the 7 frames, which are read as well" in one.text
+    (finding,) = [finding for finding in source.findings if finding.kind == "edit list"]
+    assert f"leaves out {hidden} of the 7 frames, which are read as well" in finding.text
 
 
 def test_a_video_without_edit_list_has_none_reported(tmp_path):
     _, source = frames_of(film(tmp_path / "a.mp4", "mpeg4", "yuv420p", GREY))
-    assert [one.kind for one in source.findings] == ["lossy compression"]
+    assert [finding.kind for finding in source.findings] == ["lossy compression"]
 
 
 @pytest.mark.parametrize(
@@ -245,9 +250,9 @@ def test_a_video_without_edit_list_has_none_reported(tmp_path):
 )
 def test_sixteen_bits_come_back_exactly(tmp_path, codec, pixels, suffix):
     path = film(tmp_path / f"a{suffix}", codec, pixels, DEEP, kind="gray16le")
-    found, source = frames_of(path)
+    actual, source = frames_of(path)
     assert source.dtype == np.uint16
-    np.testing.assert_array_equal(found, DEEP)
+    np.testing.assert_array_equal(actual, DEEP)
 
 
 @pytest.mark.parametrize("bits", [10, 12])
@@ -255,30 +260,30 @@ def test_sixteen_bits_come_back_exactly(tmp_path, codec, pixels, suffix):
 def test_samples_of_more_than_eight_bits_are_those_stored(tmp_path, pixels, bits):
     counts = (GREY.astype(np.uint16) * (3 if bits == 10 else 13) + 64).astype(np.uint16)
     name = pixels.format(bits)
-    stored = [av.VideoFrame.from_ndarray(one, f"gray{bits}le") for one in counts]
+    stored = [av.VideoFrame.from_ndarray(count, f"gray{bits}le") for count in counts]
     if not name.startswith("gray"):  # its luma is stored in limited range
-        stored = [one.reformat(format=name) for one in stored]
-    expected = [np.frombuffer(one.planes[0], "<u2").reshape(SHAPE[0], -1)[:, : SHAPE[1]] for one in stored]
-    found, source = frames_of(film(tmp_path / "a.mkv", "ffv1", name, counts, kind=f"gray{bits}le"))
+        stored = [item.reformat(format=name) for item in stored]
+    expected = [np.frombuffer(item.planes[0], "<u2").reshape(SHAPE[0], -1)[:, : SHAPE[1]] for item in stored]
+    actual, source = frames_of(film(tmp_path / "a.mkv", "ffv1", name, counts, kind=f"gray{bits}le"))
     assert source.dtype == np.uint16
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(actual, expected)
 
 
 def test_deep_colours_become_deep_luma(tmp_path):
     colours = np.stack([DEEP, DEEP + 300, DEEP + 700], axis=-1).astype(np.uint16)
     path = film(tmp_path / "a.mov", "png", "rgb48be", colours, kind="rgb48le")
-    found, source = frames_of(path)
-    np.testing.assert_allclose(found, colours @ np.array([0.299, 0.587, 0.114]), atol=1.5)
-    assert [(one.kind, one.warning) for one in source.findings] == [("colour", False)]
+    actual, source = frames_of(path)
+    np.testing.assert_allclose(actual, colours @ np.array([0.299, 0.587, 0.114]), atol=1.5)
+    assert [(finding.kind, finding.warning) for finding in source.findings] == [("colour", False)]
     np.testing.assert_array_equal(frames_of(path, channel=1)[0], colours[..., 1])
 
 
 def test_planar_rgb_of_ten_bits_keeps_its_bits(tmp_path):
     counts = (GREY.astype(np.uint16) * 4).astype(np.uint16)
-    found, _ = frames_of(
+    actual, _ = frames_of(
         film(tmp_path / "a.mkv", "ffv1", "gbrp10le", np.repeat(counts[..., None], 3, 3), kind="gbrp10le")
     )
-    np.testing.assert_array_equal(found, counts)
+    np.testing.assert_array_equal(actual, counts)
 
 
 @pytest.mark.parametrize(
@@ -295,9 +300,9 @@ def test_planar_rgb_of_ten_bits_keeps_its_bits(tmp_path):
     ],
 )
 def test_formats_without_loss_give_the_grey_of_the_frames(tmp_path, codec, pixels, suffix):
-    found, source = frames_of(film(tmp_path / f"a{suffix}", codec, pixels, GREY))
+    actual, source = frames_of(film(tmp_path / f"a{suffix}", codec, pixels, GREY))
     # Limited range has 220 of 256 levels.
-    assert np.abs(found.astype(int) - GREY).max() <= (1 if pixels[0] in "yn" else 0)
+    assert np.abs(actual.astype(int) - GREY).max() <= (1 if pixels[0] in "yn" else 0)
     assert source.dtype == np.uint8
     assert source.findings == ()
 
@@ -317,13 +322,13 @@ def test_no_loss_is_reported_where_there_is_none(tmp_path, codec, pixels, option
 )
 def test_a_loss_is_reported(tmp_path, codec, pixels, suffix):
     _, source = frames_of(film(tmp_path / f"a{suffix}", codec, pixels, GREY))
-    assert [(one.kind, one.warning) for one in source.findings] == [("lossy compression", True)]
+    assert [(finding.kind, finding.warning) for finding in source.findings] == [("lossy compression", True)]
 
 
 def test_few_bits_are_reported(tmp_path):
     """FFmpeg writes 16 bits of grey into an AVI as if they were colours of 5 bits."""
     _, source = frames_of(film(tmp_path / "a.avi", "rawvideo", "gray16le", DEEP, kind="gray16le"))
-    assert [one.kind for one in source.findings] == ["few bits", "colour"]
+    assert [finding.kind for finding in source.findings] == ["few bits", "colour"]
 
 
 def test_pixels_that_are_not_square_are_reported(tmp_path):
@@ -332,18 +337,18 @@ def test_pixels_that_are_not_square_are_reported(tmp_path):
         stream.height, stream.width, stream.pix_fmt = *SHAPE, "yuv420p"
         stream.codec_context.sample_aspect_ratio = Fraction(16, 15)
         for picture in GREY:
-            one = av.VideoFrame.from_ndarray(picture, "gray").reformat(format="yuv420p")
-            container.mux(stream.encode(one))
+            picture_of_video = av.VideoFrame.from_ndarray(picture, "gray").reformat(format="yuv420p")
+            container.mux(stream.encode(picture_of_video))
         container.mux(stream.encode(None))
     _, source = frames_of(tmp_path / "a.mp4")
-    (found,) = [one for one in source.findings if one.kind == "pixel aspect"]
-    assert "1.067 times as wide as high" in found.text
+    (actual,) = [finding for finding in source.findings if finding.kind == "pixel aspect"]
+    assert "1.067 times as wide as high" in actual.text
 
 
 def test_interlaced_frames_are_reported(tmp_path):
     path = film(tmp_path / "a.mkv", "mpeg2video", "yuv420p", GREY, flags="+ildct+ilme", field_order="tt")
     _, source = frames_of(path)
-    assert "interlaced" in [found.kind for found in source.findings]
+    assert "interlaced" in [finding.kind for finding in source.findings]
 
 
 def test_a_palette_gives_its_greys(tmp_path):
@@ -396,9 +401,9 @@ def test_of_several_streams_one_is_chosen(tmp_path):
             stream.height, stream.width, stream.pix_fmt = *SHAPE, "gray"
         for number, picture in enumerate(GREY):
             for stream, shown in zip(streams, (picture, 255 - picture), strict=True):
-                one = av.VideoFrame.from_ndarray(shown, "gray")
-                one.pts = number
-                container.mux(stream.encode(one))
+                picture_of_video = av.VideoFrame.from_ndarray(shown, "gray")
+                picture_of_video.pts = number
+                container.mux(stream.encode(picture_of_video))
         for stream in streams:
             container.mux(stream.encode(None))
     with pytest.raises(InputError, match="2 streams of frames, numbered from 0: choose one with --dataset"):
@@ -419,8 +424,8 @@ def test_frames_are_the_same_whether_kept_or_decoded_again(tmp_path, limit):
 def test_a_mirrored_video_is_shown_as_it_states(tmp_path):
     video = film(tmp_path / "a.mp4", "mpeg4", "yuv420p", GREY)
     upright, _ = frames_of(video)
-    one = 1 << 16
-    patch(video, b"tkhd", 40, ">9i", -one, 0, 0, 0, one, 0, SHAPE[1] * one, 0, 1 << 30)
+    unit = 1 << 16
+    patch(video, b"tkhd", 40, ">9i", -unit, 0, 0, 0, unit, 0, SHAPE[1] * unit, 0, 1 << 30)
     np.testing.assert_array_equal(frames_of(video)[0], upright[:, :, ::-1])
 
 
@@ -432,9 +437,9 @@ def test_without_its_package_the_extra_is_named(tmp_path, monkeypatch):
 
 
 def test_decoders_print_nothing(video):
-    cut = video.with_stem("cut")
+    truncated = video.with_stem("cut")
     data = video.read_bytes()
-    cut.write_bytes(data[: len(data) * 2 // 3])
+    truncated.write_bytes(data[: len(data) * 2 // 3])
     program = """
 import sys
 from mirrorskin.io import InputError, Steps, open_recording
@@ -449,10 +454,10 @@ for path in sys.argv[1:]:
 """
     text = video.with_name("text.avi")
     text.write_text("no video")
-    arguments = [sys.executable, "-c", program, video, cut, text]
-    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["read", "refused", "refused"]
-    assert done.stderr == ""
+    arguments = [sys.executable, "-c", program, video, truncated, text]
+    ended = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    assert ended.stdout.split() == ["read", "refused", "refused"]
+    assert ended.stderr == ""
 
 
 @pytest.mark.parametrize(

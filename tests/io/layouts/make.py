@@ -74,8 +74,8 @@ def live(path: Path) -> None:
     source = a_press()
     source.positions = lambda: {"travel": TRAVEL}
     with io.StreamRecorder(source, path) as recorder:
-        room = np.empty((2, *SHAPE[1:]), np.uint8)
-        while recorder.read(room) is not None:
+        buffer = np.empty((2, *SHAPE[1:]), np.uint8)
+        while recorder.read(buffer) is not None:
             pass
 
 

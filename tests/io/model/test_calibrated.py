@@ -31,14 +31,14 @@ def a_source(dtype="uint8", **changes):
     return MadeUp(random_stack(dtype), replace(OWN, **changes), phase=PHASE)
 
 
-def calibrated(only=None, source=None, **known):
-    return io.Calibrated(source or a_source(), a_calibration(only=only, **known))
+def calibrated(only=None, source=None, **options):
+    return io.Calibrated(source or a_source(), a_calibration(only=only, **options))
 
 
-def differing(header, own=OWN):
+def differing(header, reference=OWN):
     """Name what two headers say differently; equal maps are the same object."""
-    names = [one.name for one in fields(own)]
-    return {name for name in names if getattr(header, name) is not getattr(own, name)}
+    names = [field.name for field in fields(reference)]
+    return {name for name in names if getattr(header, name) is not getattr(reference, name)}
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_each_part_replaces_its_values_and_the_rest_is_the_source_s(only, change
     with_calibration = calibrated(only)
     header, calibration = with_calibration.header, with_calibration.calibration
     assert differing(header) == changed
-    told = {
+    stated = {
         "dark": lambda: calibration.references.dark,
         "bright": lambda: calibration.references.bright,
         "pixel_size": lambda: calibration.lens.pixel_size,
@@ -62,27 +62,27 @@ def test_each_part_replaces_its_values_and_the_rest_is_the_source_s(only, change
         "pivot": lambda: calibration.precession.pivot,
     }
     for name in changed:
-        np.testing.assert_array_equal(getattr(header, name), told[name]())
+        np.testing.assert_array_equal(getattr(header, name), stated[name]())
     assert (with_calibration.whole, with_calibration.calibration) == (calibration, calibration)
 
 
 @pytest.mark.parametrize(
-    ("found", "own", "told"),
+    ("actual", "of_source", "message"),
     [
         ((0.5, -0.5, np.nan), (1.0, 2.0, 3.0), (0.5, -0.5, 3.0)),
         ((0.5, -0.5, 9.0), None, (0.5, -0.5, 9.0)),
         ((0.5, -0.5, np.nan), None, None),
     ],
 )
-def test_what_was_not_found_of_the_pivot_is_the_source_s(found, own, told):
-    calibration = replace(a_calibration(only=[]), precession=a_precession(pivot=found))
-    assert io.Calibrated(a_source(pivot=own), calibration).header.pivot == told
+def test_what_was_not_found_of_the_pivot_is_the_source_s(actual, of_source, message):
+    calibration = replace(a_calibration(only=[]), precession=a_precession(pivot=actual))
+    assert io.Calibrated(a_source(pivot=of_source), calibration).header.pivot == message
 
 
 def test_phases_are_those_of_the_precession_however_blocks_are_cut():
-    found = read_all(calibrated(["precession"]), 3)
-    np.testing.assert_array_equal(found.phase, a_precession().phase(PHASE))
-    np.testing.assert_array_equal(found.frames, random_stack())
+    actual = read_all(calibrated(["precession"]), 3)
+    np.testing.assert_array_equal(actual.phase, a_precession().phase(PHASE))
+    np.testing.assert_array_equal(actual.frames, random_stack())
     np.testing.assert_array_equal(read_all(calibrated(["references"]), 3).phase, PHASE)
 
 
@@ -128,8 +128,8 @@ def test_a_live_source_reports_time_and_corrected_positions_and_can_be_left():
         while source.read() is not None:
             pass
         assert source.now() == feed.now()
-        told, positions = feed.positions()["phase"], source.positions()
-    np.testing.assert_array_equal(positions["phase"], a_precession().phase(told))
+        live, positions = feed.positions()["phase"], source.positions()
+    np.testing.assert_array_equal(positions["phase"], a_precession().phase(live))
     assert list(positions) == ["phase"]
     assert feed.left
 
@@ -143,12 +143,12 @@ def test_a_part_of_the_picture_has_its_part_of_every_map(tmp_path):
     whole = a_calibration()
     with io.open_recording(path, region=region) as recording:
         source = io.Calibrated(recording, whole)
-        cut = source.calibration
+        part = source.calibration
         np.testing.assert_array_equal(source.header.dark, whole.references.dark[1:4, 2:7])
-    np.testing.assert_array_equal(cut.references.defects, whole.references.defects[1:4, 2:7])
-    np.testing.assert_array_equal(cut.zenith.azimuth_sigma, whole.zenith.azimuth_sigma[1:4, 2:7])
-    assert cut.zenith.zenith_sigma.flags.c_contiguous
-    assert cut.camera.shape == (3, 5)
+    np.testing.assert_array_equal(part.references.defects, whole.references.defects[1:4, 2:7])
+    np.testing.assert_array_equal(part.zenith.azimuth_sigma, whole.zenith.azimuth_sigma[1:4, 2:7])
+    assert part.zenith.zenith_sigma.flags.c_contiguous
+    assert part.camera.shape == (3, 5)
     assert source.whole is whole
 
 
@@ -159,23 +159,23 @@ def test_places_are_relative_to_the_centre_of_a_part(tmp_path, lens, pixel):
     region = io.Region((1, 4), (2, 7))
     whole = replace(a_calibration(), lens=lens)
     with io.open_recording(path, region=region) as recording:
-        cut = io.Calibrated(recording, whole).calibration
+        part = io.Calibrated(recording, whole).calibration
     (x, y), (part_x, part_y) = (io.pixel_axes(shape, pixel) for shape in (PICTURE, (3, 5)))
-    for there, here in (
-        (whole.zenith.axis, cut.zenith.axis),
-        (whole.precession.pivot, cut.precession.pivot),
-        (whole.gel.axis, cut.gel.axis),
+    for target, here in (
+        (whole.zenith.axis, part.zenith.axis),
+        (whole.precession.pivot, part.precession.pivot),
+        (whole.gel.axis, part.gel.axis),
     ):
-        assert here[0] - part_x[0] == pytest.approx(there[0] - x[2])
-        assert here[1] - part_y[0] == pytest.approx(there[1] - y[1])
-        assert here[2:] == there[2:]
+        assert here[0] - part_x[0] == pytest.approx(target[0] - x[2])
+        assert here[1] - part_y[0] == pytest.approx(target[1] - y[1])
+        assert here[2:] == target[2:]
 
 
 # What is refused.
 
 
 @pytest.mark.parametrize(
-    ("known", "said"),
+    ("expected", "message"),
     [
         ({"name": "right"}, "the camera 'right', made up of 'left': calibrate again"),
         ({"dtype": "uint16"}, "uint16 samples, made up of uint8: calibrate again"),
@@ -185,11 +185,11 @@ def test_places_are_relative_to_the_centre_of_a_part(tmp_path, lens, pixel):
         ),
     ],
 )
-def test_the_calibration_of_another_camera_is_refused_in_a_line(known, said):
-    calibration = replace(a_calibration(**known), name="cal.h5")
-    with pytest.raises(io.InputError, match=rf"^cal\.h5 is of {said}") as told:
+def test_the_calibration_of_another_camera_is_refused_in_a_line(expected, message):
+    calibration = replace(a_calibration(**expected), name="cal.h5")
+    with pytest.raises(io.InputError, match=rf"^cal\.h5 is of {message}") as caught:
         io.Calibrated(a_source(), calibration)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("tilt", "fits"), [(0.033, True), (0.049, True), (0.031, False), (0.051, False)])
@@ -207,7 +207,7 @@ def test_a_rotation_by_another_tilt_is_refused(tilt, fits):
 # What carries a copy.
 
 
-def test_a_recording_carries_a_copy_and_stays_what_the_source_said(tmp_path):
+def test_a_recording_contains_a_copy_and_the_header_of_the_source(tmp_path):
     path = tmp_path / "turn.h5"
     source, calibration = a_source(), a_calibration()
     with io.Recorder(source, path, calibration=calibration) as recorder:
@@ -249,14 +249,14 @@ def test_a_result_carries_a_copy_also_where_its_form_was_written_before(tmp_path
         for _ in range(2):
             result = io.Result(height=height, process={"hold": 2}, calibration=calibration)
             io.save_result(result, path, overwrite=True)
-        found = io.open_result(path)
-        assert found.process == {"hold": 2}
-        assert list(found.maps()) == ["height"]
+        actual = io.open_result(path)
+        assert actual.process == {"hold": 2}
+        assert list(actual.maps()) == ["height"]
         if calibration is None:
-            assert found.calibration is None
+            assert actual.calibration is None
             assert "carried calibration" not in io.describe(path)
         else:
-            assert_same(found.calibration, calibration)
+            assert_same(actual.calibration, calibration)
             assert_same(io.open_calibration(path), calibration)
             assert io.describe(path)["carried calibration"].startswith("references, scale")
 

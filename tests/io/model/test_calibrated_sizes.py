@@ -25,8 +25,8 @@ def made_with(size, only, lens=None):
 
 
 def source(motion="axial", size=(0.1, 0.2)):
-    known = {"phase": PHASE} if motion == "axial" else {"travel": PHASE}
-    return MadeUp(random_stack(), io.Header(motion, pixel_size=size), **known)
+    positions = {"phase": PHASE} if motion == "axial" else {"travel": PHASE}
+    return MadeUp(random_stack(), io.Header(motion, pixel_size=size), **positions)
 
 
 @pytest.mark.parametrize(
@@ -34,9 +34,9 @@ def source(motion="axial", size=(0.1, 0.2)):
     [("axial", "zenith", "zenith"), ("axial", "precession", "tilt"), ("vertical", "gel", "elastic")],
 )
 def test_a_part_that_was_made_with_another_pixel_size_is_refused_in_a_line(motion, only, command):
-    with pytest.raises(io.InputError) as told:
+    with pytest.raises(io.InputError) as caught:
         io.Calibrated(source(motion), made_with((0.0998, 0.2), [only]))
-    assert str(told.value) == (
+    assert str(caught.value) == (
         f"cal.h5: calibrate {command} again: it was made with pixels of 0.0998 x 0.2 mm,"
         " made up states 0.1 x 0.2 mm"
     )
@@ -57,7 +57,7 @@ def test_a_live_source_is_refused_before_it_moves():
 
 
 @pytest.mark.parametrize("motion", ["axial", "vertical"])
-def test_the_scale_counts_rather_than_what_the_recording_says(motion):
+def test_the_scale_takes_precedence_over_the_recording(motion):
     calibration = made_with((0.5, 0.6), ["zenith", "precession", "gel"], a_lens())
     assert io.Calibrated(source(motion), calibration).header.pixel_size == (0.5, 0.6)
 

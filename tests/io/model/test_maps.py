@@ -257,15 +257,17 @@ def test_a_file_of_layout_1_has_the_names_of_today(tmp_path, motion, name, unit)
     declared = TWIST if motion == "twist" else {}
     result = io.Result(maps, process={"motion": motion}, declarations=declared)
     of_layout_1(tmp_path / "old.h5", result, {name: "way", "normals_sigma": "normal_sigma"})
-    found = io.open_result(tmp_path / "old.h5")
-    assert set(found) == set(maps)
-    np.testing.assert_array_equal(found[name], distance)
-    assert [found.declaration(one).unit for one in ("slip_onset", "slip_onset_sigma", name)] == [unit] * 3
+    actual = io.open_result(tmp_path / "old.h5")
+    assert set(actual) == set(maps)
+    np.testing.assert_array_equal(actual[name], distance)
+    assert [actual.declaration(result).unit for result in ("slip_onset", "slip_onset_sigma", name)] == [
+        unit
+    ] * 3
 
 
 def test_a_file_of_today_may_have_maps_with_the_names_of_layout_1(tmp_path):
     result = io.Result(height=FLAT, normal_sigma=FLAT, status=CODES, process={"event": "onset"})
     io.save_result(result, tmp_path / "own.h5")
-    found = io.open_result(tmp_path / "own.h5")
-    assert list(found) == ["height", "status", "normal_sigma"]
-    assert found.declaration("status").codes == {}
+    actual = io.open_result(tmp_path / "own.h5")
+    assert list(actual) == ["height", "status", "normal_sigma"]
+    assert actual.declaration("status").codes == {}

@@ -79,22 +79,22 @@ def test_holes_and_pieces_stay_apart_and_all_else_is_covered(pieces_too):
         height[rng.random((7, 10)) < 0.2] = np.nan
         pieces = rng.choice(3, (7, 10), p=(0.6, 0.3, 0.1)) if pieces_too else np.zeros((7, 10), int)
         mesh = io.surface_mesh(height, X, Y, component=pieces if pieces_too else None)
-        found = triangles(mesh)
-        assert len(set(found)) == len(found)
+        actual = triangles(mesh)
+        assert len(set(actual)) == len(actual)
         assert (areas_from_above(mesh) > 0).all()
-        known = np.where(np.isnan(height), -1, pieces)
+        properties = np.where(np.isnan(height), -1, pieces)
         expected = 0
-        for cell in cells(known):
+        for cell in cells(properties):
             for together in cell:
-                own = [three for three in found if three <= set(together)]
-                assert len(own) == max(0, len(together) - 2)
-                expected += len(own)
+                inside = [three for three in actual if three <= set(together)]
+                assert len(inside) == max(0, len(together) - 2)
+                expected += len(inside)
                 # The two of a full cell share a diagonal, and so cover it.
-                assert len(own) < 2 or sorted(own[0] & own[1]) in (
+                assert len(inside) < 2 or sorted(inside[0] & inside[1]) in (
                     [together[0], together[3]],
                     [together[1], together[2]],
                 )
             several |= len(cell) > 1
-        assert len(found) == expected
-        np.testing.assert_array_equal(mesh.pixels, sorted(set().union(*found)))
+        assert len(actual) == expected
+        np.testing.assert_array_equal(mesh.pixels, sorted(set().union(*actual)))
     assert several == pieces_too

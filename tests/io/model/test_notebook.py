@@ -25,7 +25,7 @@ def result():
     )
 
 
-def test_printed_it_says_what_it_holds(result):
+def test_a_printed_result_lists_its_maps(result):
     assert repr(result).splitlines() == [
         "Result of press.h5",
         "  height        2 x 3           -2 to 0 mm, 83% known",
@@ -71,11 +71,11 @@ def test_a_dataset_becomes_the_result_again(result):
 
 
 def test_what_is_known_of_maps_is_an_attribute_of_the_dataset(result):
-    known = io.Fitted(
+    expected = io.Fitted(
         tilt=0.05, registered=True, event="onset", height_correlation=np.inf, source_region=(1, 4, 2, 6)
     )
-    dataset = result.assign(fitted=known).to_xarray()
-    assert io.Result.from_xarray(dataset).fitted == known
+    dataset = result.assign(fitted=expected).to_xarray()
+    assert io.Result.from_xarray(dataset).fitted == expected
     dataset.attrs["fitted"] = '{"tilt": "steep", "source_region": [4, 1, 2, 6], "turns": 3}'
     assert io.Result.from_xarray(dataset).fitted == io.Fitted(turns=3)
     dataset.attrs["fitted"] = "tilt=3"
@@ -90,9 +90,9 @@ def test_a_map_is_drawn_where_its_pixels_are(result):
     axes = result.plot("height")
     (image,) = axes.images
     np.testing.assert_array_equal(image.get_array(), result.height)
-    left, right, bottom, top = image.get_extent()
+    first, right, bottom, top = image.get_extent()
     half = (result.x[1] - result.x[0]) / 2
-    assert (left, right) == pytest.approx((result.x[0] - half, result.x[-1] + half))
+    assert (first, right) == pytest.approx((result.x[0] - half, result.x[-1] + half))
     assert bottom < top
     assert axes.figure.axes[1].get_ylabel() == "height mm"
 

@@ -52,10 +52,10 @@ def test_older_files_lack_the_new_parameter(worn, tmp_path):
 
 @pytest.mark.parametrize("name", types.PARTS)
 def test_every_parameter_has_a_text_and_every_number_shown_a_unit_that_converts(name):
-    for one in parameters(types.PARTS[name]).values():
-        assert one.text
-        assert not one.text.endswith(".")
-        assert one.factor > 0 or one.convert
+    for declared in parameters(types.PARTS[name]).values():
+        assert declared.text
+        assert not declared.text.endswith(".")
+        assert declared.factor > 0 or parameter.convert
 
 
 def test_standard_errors_are_found_wherever_a_part_keeps_them():

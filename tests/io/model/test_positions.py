@@ -13,9 +13,9 @@ from mirrorskin.io.model.positions import check_phase, check_strokes, check_trav
     "values", [[0, 1, 2, 3], [3, 2, 2, -1], [0, 2, 2, 1], [5, 5, 5, 5], np.array([0, 200, 7, 90], np.uint8)]
 )
 def test_strokes_may_begin_in_either_direction(values):
-    found = check_strokes(values, 4, "travel")
-    np.testing.assert_array_equal(found, np.asarray(values, float))
-    assert found.dtype == np.float64
+    actual = check_strokes(values, 4, "travel")
+    np.testing.assert_array_equal(actual, np.asarray(values, float))
+    assert actual.dtype == np.float64
 
 
 @pytest.mark.parametrize(

@@ -26,13 +26,13 @@ def test_a_result_without_turns_passes():
 @pytest.mark.parametrize("turn", [0, 2])
 def test_the_maps_of_a_turn_are_those_of_it(turn):
     result = a_result(3, 4, 5)
-    found = io.select_turn(result, turn)
-    assert set(found.maps()) == {"zenith", "normals", "edges"}
-    for name, values in found.maps().items():
+    actual = io.select_turn(result, turn)
+    assert set(actual.maps()) == {"zenith", "normals", "edges"}
+    for name, values in actual.maps().items():
         np.testing.assert_array_equal(values, getattr(result, name)[turn])
-    np.testing.assert_array_equal(found.x, result.x)
-    np.testing.assert_array_equal(found.y, result.y)
-    assert found.process == {"source": "a.h5", "turn": turn}
+    np.testing.assert_array_equal(actual.x, result.x)
+    np.testing.assert_array_equal(actual.y, result.y)
+    assert actual.process == {"source": "a.h5", "turn": turn}
     assert result.process == {"source": "a.h5"}
 
 

@@ -68,7 +68,7 @@ def test_the_next_file_in_a_folder_takes_the_place_of_what_was_killed(tmp_path):
         subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as killed,
         subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as alive,
     ):
-        assert [one.stdout.readline() for one in (killed, alive)] == [b"begun\n"] * 2
+        assert [item.stdout.readline() for item in (killed, alive)] == [b"begun\n"] * 2
         killed.kill()
         killed.wait()
         write_new(tmp_path / "b.h5", [b"new"])
@@ -117,15 +117,15 @@ def test_what_a_link_leads_to_is_replaced_and_the_link_stays(tmp_path):
 @pytest.fixture
 def steps(monkeypatch, tmp_path):
     """What is synchronised to the disk, and renamed or linked, in order."""
-    done = []
+    steps = []
 
     def watch(name, describe):
         call = getattr(os, name)
 
-        def watched(*given, **options):
-            what = describe(*given)
-            call(*given, **options)
-            done.append(what)
+        def watched(*words, **options):
+            what = describe(*words)
+            call(*words, **options)
+            steps.append(what)
 
         monkeypatch.setattr(os, name, watched)
 
@@ -135,7 +135,7 @@ def steps(monkeypatch, tmp_path):
     watch("fsync", lambda descriptor: f"synchronise {kind(descriptor)}")
     for name in ("rename", "replace", "link"):
         watch(name, lambda *_: "name")
-    return done
+    return steps
 
 
 def write_result(path):
@@ -190,7 +190,7 @@ def test_a_live_recording_that_replaces_another_is_on_the_disk_first(tmp_path, s
 
 def test_a_folder_of_zarr_is_on_the_disk_before_its_name(tmp_path, steps):
     write_result(tmp_path / "a.zarr")
-    files = sum(one.is_file() for one in (tmp_path / "a.zarr").rglob("*"))
+    files = sum(path.is_file() for path in (tmp_path / "a.zarr").rglob("*"))
     assert steps[-2:] == ["name", "synchronise folder"]
     last = itertools.takewhile(lambda step: step != "name", reversed(steps[:-2]))
     assert [*last].count("synchronise file") == files
@@ -198,7 +198,7 @@ def test_a_folder_of_zarr_is_on_the_disk_before_its_name(tmp_path, steps):
 
 def test_the_names_in_a_folder_of_zarr_are_on_the_disk_before_its_name(tmp_path, steps):
     write_result(tmp_path / "a.zarr")
-    folders = 1 + sum(one.is_dir() for one in (tmp_path / "a.zarr").rglob("*"))
+    folders = 1 + sum(path.is_dir() for path in (tmp_path / "a.zarr").rglob("*"))
     last = itertools.takewhile(lambda step: step != "name", reversed(steps[:-2]))
     assert [*last].count("synchronise folder") == folders
 

@@ -30,35 +30,35 @@ def saved(path):
 def test_a_calibration_comes_back_as_it_was(path, shape, dtype):
     calibration = a_calibration(shape, dtype, "münze 五")
     io.save_calibration(calibration, path)
-    found = io.open_calibration(path)
-    assert_same(found, calibration)
-    assert found.name == str(path)
+    actual = io.open_calibration(path)
+    assert_same(actual, calibration)
+    assert actual.name == str(path)
 
 
 @pytest.mark.parametrize("part", [*PARTS, None])
 def test_parts_may_be_missing(path, part):
     calibration = a_calibration(only=[part])
     io.save_calibration(calibration, path)
-    found = io.open_calibration(path)
-    assert_same(found, calibration)
-    assert list(found.parts()) == ([] if part is None else [part])
+    actual = io.open_calibration(path)
+    assert_same(actual, calibration)
+    assert list(actual.parts()) == ([] if part is None else [part])
 
 
 def test_it_has_the_layout_that_is_documented(saved):
-    found = {}
+    actual = {}
     with h5py.File(saved) as file:
         assert dict(file.attrs) == {"NX_class": "NXroot", "default": "entry"}
-        file["entry"].visititems(lambda name, node: found.update({name: dict(node.attrs)}))
+        file["entry"].visititems(lambda name, node: actual.update({name: dict(node.attrs)}))
         assert dict(file["entry"].attrs) == {
             "NX_class": "NXentry",
             "default": "references",
             "mirrorskin_calibration": 1,
         }
-        nodes = {name: file["entry"][name] for name in found}
+        nodes = {name: file["entry"][name] for name in actual}
         shapes = {name: node.shape for name, node in nodes.items() if isinstance(node, h5py.Dataset)}
         assert file["entry/camera/dtype"].asstr()[()] == "uint8"
         assert file["entry/zenith/parameters"].asstr()[()].tolist() == ["radius", "k0"]
-    groups = {name: attrs["NX_class"] for name, attrs in found.items() if "NX_class" in attrs}
+    groups = {name: attrs["NX_class"] for name, attrs in actual.items() if "NX_class" in attrs}
     assert groups == {
         "camera": "NXcollection",
         "references": "NXdata",
@@ -69,11 +69,13 @@ def test_it_has_the_layout_that_is_documented(saved):
         "force": "NXcollection",
         "process": "NXprocess",
     }
-    assert (found["references"]["signal"], found["zenith"]["signal"]) == ("bright", "zenith_sigma")
-    assert found["references/dark"] == {"interpretation": "image", "units": "counts"}
-    assert found["scale/pixel_size"] == found["tilt/pivot"] == found["tilt/sigma/pivot_z"] == {"units": "mm"}
-    assert found["tilt/tilt"] == found["tilt/sigma/tilt"] == {"units": "rad"}
-    assert found["force/modulus"] == {"units": "MPa"}
+    assert (actual["references"]["signal"], actual["zenith"]["signal"]) == ("bright", "zenith_sigma")
+    assert actual["references/dark"] == {"interpretation": "image", "units": "counts"}
+    assert (
+        actual["scale/pixel_size"] == actual["tilt/pivot"] == actual["tilt/sigma/pivot_z"] == {"units": "mm"}
+    )
+    assert actual["tilt/tilt"] == actual["tilt/sigma/tilt"] == {"units": "rad"}
+    assert actual["force/modulus"] == {"units": "MPa"}
     assert shapes["force/covariance"] == (4, 4)
     assert shapes["references/defects"] == shapes["zenith/azimuth_sigma"] == SHAPE
     assert (shapes["camera/name"], shapes["camera/shape"], shapes["zenith/curve"]) == ((), (2,), (3,))
@@ -98,12 +100,12 @@ def test_a_field_that_came_later_may_be_missing(saved):
 
 
 def test_parts_are_added_one_by_one(path):
-    told = {"program": "mirrorskin", "frames": 8}
-    io.update_calibration(path, some_references(), CAMERA, told)
-    found = io.update_calibration(path, a_precession(), CAMERA, {"tilt.frames": 9})
-    assert_same(found, io.open_calibration(path))
-    assert list(found.parts()) == ["references", "precession"]
-    assert found.process == {"references.program": "mirrorskin", "references.frames": 8, "tilt.frames": 9}
+    process = {"program": "mirrorskin", "frames": 8}
+    io.update_calibration(path, some_references(), CAMERA, process)
+    actual = io.update_calibration(path, a_precession(), CAMERA, {"tilt.frames": 9})
+    assert_same(actual, io.open_calibration(path))
+    assert list(actual.parts()) == ["references", "precession"]
+    assert actual.process == {"references.program": "mirrorskin", "references.frames": 8, "tilt.frames": 9}
 
 
 def test_a_part_is_replaced_with_its_notes_and_others_stay(saved):
@@ -118,16 +120,16 @@ def test_a_part_is_replaced_with_its_notes_and_others_stay(saved):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"name": "right"}, "'left', this of 'right'"),
         ({"shape": (7, 5)}, "7 x 5 pixels, this of 5 x 7"),
         ({"dtype": np.dtype("uint16")}, "uint8 samples, this of uint16"),
     ],
 )
-def test_a_part_of_another_camera_is_refused(saved, changes, said):
+def test_a_part_of_another_camera_is_refused(saved, changes, message):
     before = saved.read_bytes()
-    with pytest.raises(io.InputError, match=f"cal.h5 is of .*{said}: name another file with -o"):
+    with pytest.raises(io.InputError, match=f"cal.h5 is of .*{message}: name another file with -o"):
         io.update_calibration(saved, a_precession(), replace(CAMERA, **changes))
     assert saved.read_bytes() == before
 
@@ -171,7 +173,7 @@ def without(name):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (a_version(0), "older layout, 0, where 1 is read: calibrate again"),
         (a_version(2), "newer layout, 2, where 1 is read: update the program, or calibrate again"),
@@ -192,13 +194,13 @@ def without(name):
         (a_value("tilt/sigma/tilt", "much"), "contains no numbers: calibrate again"),
     ],
 )
-def test_a_file_that_is_damaged_or_of_another_version_is_printed_in_a_line(saved, change, said):
+def test_a_file_that_is_damaged_or_of_another_version_is_printed_in_a_line(saved, change, message):
     with h5py.File(saved, "r+") as file:
         change(file)
-    with pytest.raises(io.InputError, match=said) as told:
+    with pytest.raises(io.InputError, match=message) as caught:
         io.open_calibration(saved)
-    assert str(told.value).startswith(str(saved))
-    assert "\n" not in str(told.value)
+    assert str(caught.value).startswith(str(saved))
+    assert "\n" not in str(caught.value)
 
 
 def test_what_is_not_a_calibration_is_reported(path, tmp_path):
@@ -231,13 +233,13 @@ def test_a_calibration_is_described(saved):
 
 
 def test_every_dataset_is_documented(saved):
-    said = (Path(__file__).parents[3] / "docs" / "calibration.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "calibration.md").read_text(encoding="utf-8")
     names = []
     with h5py.File(saved) as file:
         file["entry"].visititems(
             lambda name, node: names.append(name) if isinstance(node, h5py.Dataset) else None
         )
-    wanted = {
+    expected = {
         "process/PART.NAME"
         if name.startswith("process/")
         else f"{name.partition('/sigma/')[0]}/sigma/NAME"
@@ -245,5 +247,5 @@ def test_every_dataset_is_documented(saved):
         else name
         for name in names
     }
-    assert len(wanted) > 30
-    assert [name for name in sorted(wanted) if f"`{name}`" not in said] == []
+    assert len(expected) > 30
+    assert [name for name in sorted(expected) if f"`{name}`" not in page] == []

@@ -58,8 +58,8 @@ def test_chunks_may_have_been_left_out_by_filters(tmp_path, left_out):
         packed = data if left_out & 2 else zlib.compress(data)
         file["x"].id.write_direct_chunk((4, 0, 0), packed, filter_mask=left_out)
     np.testing.assert_array_equal(theirs(path), frames)
-    found, how = ours(path, 3)
-    np.testing.assert_array_equal(found, frames)
+    actual, how = ours(path, 3)
+    np.testing.assert_array_equal(actual, frames)
     assert how.startswith("chunks decoded")
 
 
@@ -70,17 +70,17 @@ def test_chunks_at_the_edge_may_be_raw(tmp_path, packing):
         pytest.skip("this h5py does not bring its HDF5")
     set_options = ctypes.CDLL(str(library)).H5Pset_chunk_opts
     set_options.argtypes = [ctypes.c_int64, ctypes.c_uint]
-    frames, made = compressible(SHAPE, "u2"), h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    made.set_chunk((2, 5, 17))
-    made.set_shuffle()
+    frames, settings = compressible(SHAPE, "u2"), h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    settings.set_chunk((2, 5, 17))
+    settings.set_shuffle()
     if packing == "gzip":
-        made.set_deflate(1)
-    assert set_options(made.id, 2) == 0  # H5D_CHUNK_DONT_FILTER_PARTIAL_CHUNKS
+        settings.set_deflate(1)
+    assert set_options(settings.id, 2) == 0  # H5D_CHUNK_DONT_FILTER_PARTIAL_CHUNKS
     with h5py.File(tmp_path / "a.h5", "w", libver="latest") as file:
         space = h5py.h5s.create_simple(SHAPE)
-        h5py.Dataset(h5py.h5d.create(file.id, b"x", h5py.h5t.NATIVE_UINT16, space, made))[...] = frames
-    found, how = ours(tmp_path / "a.h5", 4, threads=2)
-    np.testing.assert_array_equal(found, frames)
+        h5py.Dataset(h5py.h5d.create(file.id, b"x", h5py.h5t.NATIVE_UINT16, space, settings))[...] = frames
+    actual, how = ours(tmp_path / "a.h5", 4, threads=2)
+    np.testing.assert_array_equal(actual, frames)
     alone = "through HDF5 (perhaps raw at the edge)"  # nothing in such a chunk shows whether it was shuffled
     assert how == (alone if packing == "shuffle" else "chunks decoded by 2 threads")
 
@@ -101,7 +101,7 @@ def test_every_kind_of_index_is_read(tmp_path, libver, maxshape):
 
 @st.composite
 def stacks(draw):
-    shape = tuple(draw(st.integers(least, 12)) for least in (2, 1, 1))
+    shape = tuple(draw(st.integers(lowest, 12)) for lowest in (2, 1, 1))
     chunks = tuple(draw(st.integers(1, n)) for n in shape)
     start = draw(st.integers(0, shape[0] - 2))
     frames = (start, draw(st.integers(start + 2, shape[0])))
@@ -125,7 +125,7 @@ def stacks(draw):
     st.integers(1, 14),
     st.sampled_from([None, 200, 2000]),
 )
-def test_any_part_of_any_stack_is_what_hdf5_gives(tmp_path_factory, what, packing, dtype, room, limit):
+def test_any_part_of_any_stack_is_what_hdf5_gives(tmp_path_factory, what, packing, dtype, buffer, limit):
     shape, chunks, frames, region = what
     packing = {} if packing == "scaleoffset" and "f" in dtype else (PACKINGS | ONLY_HDF5)[packing]
     path = tmp_path_factory.mktemp("any") / "a.h5"
@@ -133,8 +133,8 @@ def test_any_part_of_any_stack_is_what_hdf5_gives(tmp_path_factory, what, packin
     size = int(np.prod(chunks)) * np.dtype(dtype).itemsize
     with pytest.MonkeyPatch.context() as patch:
         counts = count_unpacked(patch)
-        found, _ = ours(path, room, frames=frames, region=region, memory_limit=limit and max(limit, size))
-    np.testing.assert_array_equal(found, theirs(path, frames, region))
+        actual, _ = ours(path, buffer, frames=frames, region=region, memory_limit=limit and max(limit, size))
+    np.testing.assert_array_equal(actual, theirs(path, frames, region))
     assert set(counts.values()) == {1}
     needed = [
         -(-stop // c) - start // c
@@ -221,9 +221,9 @@ def test_damage_is_reported_with_the_frames_on_every_way(tmp_path):
     data = bytearray(path.read_bytes())
     data[chunk.byte_offset + 12] ^= 0xFF
     path.write_bytes(data)
-    for room, limit in ((24, 60 * FRAME), (3, 60 * FRAME), (3, 8 * FRAME)):
+    for count, limit in ((24, 60 * FRAME), (3, 60 * FRAME), (3, 8 * FRAME)):
         with pytest.raises(io.InputError, match="frames 8 to 15 of /x cannot be read: it is damaged"):
-            ours(path, room, memory_limit=limit)
+            ours(path, count, memory_limit=limit)
 
 
 FORKED = """
@@ -245,5 +245,5 @@ def test_a_forked_process_unpacks_with_threads_of_its_own(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("x", data=stack, chunks=(1, 5, 7), compression="gzip")
     command = [sys.executable, "-c", FORKED, str(tmp_path / "a.h5")]
-    said = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert said.stdout.split() == [str(stack[8:].sum())]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert ended.stdout.split() == [str(stack[8:].sum())]

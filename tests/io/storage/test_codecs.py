@@ -18,10 +18,10 @@ def packed_chunk(path, packing, dtype="u2", shape=(2, 31, 37)):
     frames = compressible(shape, dtype) // 5 * 5
     write(path, frames, shape, packing)
     with h5py.File(path) as file:
-        found = chunks.find_codecs(file["x"].id)
+        actual = chunks.find_codecs(file["x"].id)
         mask, data = file["x"].id.read_direct_chunk((0, 0, 0))
     assert mask == 0
-    return np.frombuffer(data, "u1").copy(), frames, found
+    return np.frombuffer(data, "u1").copy(), frames, actual
 
 
 @pytest.mark.parametrize(
@@ -29,9 +29,9 @@ def packed_chunk(path, packing, dtype="u2", shape=(2, 31, 37)):
 )
 @pytest.mark.parametrize("cname", ["lz4", "zstd"])
 def test_bitshuffle_s_odd_ends_are_unpacked(tmp_path, cname, shape, dtype):
-    data, frames, found = packed_chunk(tmp_path / "a.h5", hdf5plugin.Bitshuffle(cname=cname), dtype, shape)
+    data, frames, actual = packed_chunk(tmp_path / "a.h5", hdf5plugin.Bitshuffle(cname=cname), dtype, shape)
     out = np.zeros(frames.nbytes, "u1")
-    chunks.decode(found, 0, data, out)
+    chunks.decode(actual, 0, data, out)
     assert out.tobytes() == frames.tobytes()
 
 
@@ -39,23 +39,23 @@ def test_bitshuffle_s_odd_ends_are_unpacked(tmp_path, cname, shape, dtype):
     ("cname", "shuffle"), [("blosclz", 0), ("lz4", 1), ("lz4hc", 2), ("zlib", 0), ("zstd", 1)]
 )
 def test_every_packer_of_blosc_is_known(tmp_path, cname, shuffle):
-    data, frames, found = packed_chunk(
+    data, frames, actual = packed_chunk(
         tmp_path / "a.h5", hdf5plugin.Blosc(cname=cname, shuffle=shuffle), "f4"
     )
     out = np.zeros(frames.nbytes, "u1")
-    chunks.decode(found, 0, data, out)
+    chunks.decode(actual, 0, data, out)
     assert out.tobytes() == frames.tobytes()
 
 
 @pytest.mark.parametrize("packing", CHECKED)
 def test_a_chunk_of_another_size_is_refused(tmp_path, packing):
-    data, frames, found = packed_chunk(tmp_path / "a.h5", PACKINGS[packing])
+    data, frames, actual = packed_chunk(tmp_path / "a.h5", PACKINGS[packing])
     for size in (frames.nbytes - 2, frames.nbytes + 2, frames.nbytes // 2, 2 * frames.nbytes):
         with pytest.raises(ValueError, match=r"^\("):
-            chunks.decode(found, 0, data, np.zeros(size, "u1"))
+            chunks.decode(actual, 0, data, np.zeros(size, "u1"))
     for length in (0, 1, 3, 8, 12, 15, len(data) // 2, len(data) - 1):
         with pytest.raises(ValueError, match=r"^\("):
-            chunks.decode(found, 0, data[:length].copy(), np.zeros(frames.nbytes, "u1"))
+            chunks.decode(actual, 0, data[:length].copy(), np.zeros(frames.nbytes, "u1"))
 
 
 @pytest.mark.parametrize("packing", ["bitshuffle", "small blocks", "bitshuffle zstd"])
@@ -69,15 +69,15 @@ def test_a_block_beyond_the_end_of_its_chunk_does_not_reach_the_library(tmp_path
         return lambda *values: reached.append(name) or function(*values)
 
     monkeypatch.setattr(chunks, "_function", watched)
-    data, frames, found = packed_chunk(tmp_path / "a.h5", PACKINGS[packing])
+    data, frames, actual = packed_chunk(tmp_path / "a.h5", PACKINGS[packing])
     with pytest.raises(ValueError, match="a chunk gives"):
-        chunks.decode(found, 0, data[:-16].copy(), np.zeros(frames.nbytes, "u1"))
+        chunks.decode(actual, 0, data[:-16].copy(), np.zeros(frames.nbytes, "u1"))
     assert not reached
 
 
 @pytest.mark.parametrize("packing", CHECKED)
 def test_damage_and_noise_are_refused_or_give_something(tmp_path, packing):
-    data, frames, found = packed_chunk(tmp_path / "a.h5", PACKINGS[packing])
+    data, frames, actual = packed_chunk(tmp_path / "a.h5", PACKINGS[packing])
     generator = np.random.default_rng(0)
     refused = 0
     for trial in range(600):
@@ -90,7 +90,7 @@ def test_damage_and_noise_are_refused_or_give_something(tmp_path, packing):
             bad[keep:] = generator.integers(0, 256, len(bad) - keep)
         out = np.zeros(frames.nbytes + 64, "u1")
         try:
-            chunks.decode(found, 0, bad, out[:-64])
+            chunks.decode(actual, 0, bad, out[:-64])
         except ValueError as error:
             assert str(error).startswith("(")  # noqa: PT017
             refused += 1

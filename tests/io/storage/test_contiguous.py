@@ -29,8 +29,8 @@ def path(tmp_path):
 )
 def test_what_is_lent_is_what_hdf5_gives(tmp_path, shape, dtype):
     path = write(tmp_path / "a.h5", compressible(shape, dtype))
-    for room in (1, 2, 4, 20):
-        frames, how = ours(path, room)
+    for count in (1, 2, 4, 20):
+        frames, how = ours(path, count)
         np.testing.assert_array_equal(frames, theirs(path))
         assert how == "directly"
 
@@ -38,14 +38,14 @@ def test_what_is_lent_is_what_hdf5_gives(tmp_path, shape, dtype):
 def test_many_bytes_are_read_by_several_threads(tmp_path, monkeypatch):
     monkeypatch.setattr("mirrorskin.io.storage.stack._MANY", 10_000)
     path = write(tmp_path / "a.h5", compressible(SHAPE, "u2"))
-    for room in (1, 2, 4, 9):
-        np.testing.assert_array_equal(ours(path, room)[0], theirs(path))
+    for count in (1, 2, 4, 9):
+        np.testing.assert_array_equal(ours(path, count)[0], theirs(path))
 
 
 def test_a_part_is_what_hdf5_gives(path):
-    for region, given in ((None, {"frames": (1, 8)}), (Region((3, 40), (5, 60)), {"frames": (2, 8)})):
-        found, how = ours(path, 4, region=region, **given)
-        np.testing.assert_array_equal(found, theirs(path, region=region, **given))
+    for region, options in ((None, {"frames": (1, 8)}), (Region((3, 40), (5, 60)), {"frames": (2, 8)})):
+        actual, how = ours(path, 4, region=region, **options)
+        np.testing.assert_array_equal(actual, theirs(path, region=region, **options))
         assert how == "directly"
 
 
@@ -53,8 +53,8 @@ def test_a_part_is_what_hdf5_gives(path):
 def test_another_byte_order_is_converted(tmp_path, dtype):
     path = write(tmp_path / "a.h5", compressible(SHAPE, dtype[1:]).astype(dtype))
     for region in (None, Region((3, 40), (5, 60)), Region((3, 40), (0, 70))):
-        found, how = ours(path, 4, region=region)
-        np.testing.assert_array_equal(found, theirs(path, region=region))
+        actual, how = ours(path, 4, region=region)
+        np.testing.assert_array_equal(actual, theirs(path, region=region))
         assert how == "directly"
 
 
@@ -65,13 +65,13 @@ def test_no_page_of_a_file_is_mapped(path):
         assert str(path) not in Path("/proc/self/maps").read_text()
 
 
-@pytest.mark.parametrize("left", [0, 1000, 20_000, -1])
-def test_a_file_that_becomes_shorter_is_reported_before_it_is_touched(path, left):
+@pytest.mark.parametrize("rest", [0, 1000, 20_000, -1])
+def test_a_file_that_becomes_shorter_is_reported_before_it_is_touched(path, rest):
     with io.open_recording(path, **GIVEN) as recording:
         recording.read()
         with h5py.File(path) as file:
             end = file["x"].id.get_offset() + file["x"].nbytes
-        os.truncate(path, left if left >= 0 else end - 1)
+        os.truncate(path, rest if rest >= 0 else end - 1)
         line = r"a\.h5: frames 1 to 8 of /x cannot be read: it is truncated: copy it again"
         with pytest.raises(io.InputError, match=line):
             recording.read(np.empty((8, 50, 70), "u2"))
@@ -100,10 +100,10 @@ def test_a_batch_survives_files_that_are_cut_while_kernels_read_them(tmp_path):
         with io.Recorder(source, path) as recorder:
             recorder.drain(lambda count: None)
     command = [sys.executable, "-c", CUT, "batch", *paths, "-o", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1, done
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1, ended
     for path in paths[:2]:
-        assert f"{path} was changed while it was open: start again" in done.stdout + done.stderr
+        assert f"{path} was changed while it was open: start again" in ended.stdout + ended.stderr
     assert [path.name for path in tmp_path.glob("*-result.h5")] == ["c-result.h5"]
 
 
@@ -126,9 +126,9 @@ print(total, peak() - before)
 def test_pages_that_were_used_do_not_pile_up(tmp_path):
     frames = np.ones((320, 256, 1024), "u1")
     path = write(tmp_path / "a.h5", frames)
-    done = subprocess.run(
+    ended = subprocess.run(
         [sys.executable, "-c", CHILD, str(path), "16"], capture_output=True, text=True, check=True
     )
-    total, more = map(int, done.stdout.split())
+    total, more = map(int, ended.stdout.split())
     assert total == 304 * 256 * 1024
     assert more < 4 * frames[:16].nbytes

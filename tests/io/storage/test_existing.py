@@ -86,8 +86,8 @@ def test_nothing_that_can_be_computed_replaces_what_cannot(protected, write):
     if kind == "a calibration" and write is calibrate:
         calibrate(path)
         return
-    said = f"{path} is {kind}, which this command never replaces: choose another name with -o"
-    with pytest.raises(io.InputError, match=f"^{re.escape(said)}$"):
+    message = f"{path} is {kind}, which this command never replaces: choose another name with -o"
+    with pytest.raises(io.InputError, match=f"^{re.escape(message)}$"):
         write(path)
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
@@ -188,8 +188,8 @@ def test_no_command_writes_over_a_result_unless_that_is_asked_for(desk, words):
     (desk / "old.h5").write_bytes((desk / "res.h5").read_bytes())
     ended = run(*words, "-o", "old.h5")
     assert ended.code == 2
-    said = "old.h5 exists: add --overwrite to replace it, or choose another name with -o"
-    assert ended.said == f"mirrorskin: {said}\n"
+    message = "old.h5 exists: add --overwrite to replace it, or choose another name with -o"
+    assert ended.said == f"mirrorskin: {message}\n"
 
 
 def test_a_result_is_replaced_with_overwrite(desk):
@@ -241,8 +241,8 @@ def test_a_recording_replaces_another_where_that_is_asked_for(desk, words):
 def test_a_sample_of_several_files_replaces_none_of_the_user_s(desk, sample):
     path = desk / ("frame07.png" if sample == "pictures" else "ball-3.h5")
     (desk / "precious.h5").rename(path)
-    before = sorted(one.name for one in desk.iterdir())
+    before = sorted(path.name for path in desk.iterdir())
     ended = run("sample", sample, "-o", ".")
     assert ended.code == 2
     assert f"{path.name} exists and is a recording" in ended.said
-    assert sorted(one.name for one in desk.iterdir()) == before
+    assert sorted(path.name for path in desk.iterdir()) == before

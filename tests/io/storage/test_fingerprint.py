@@ -17,8 +17,8 @@ SHAPE = (9, 50, 70)
 EVERY, TAKEN = 4 << 20, 4 << 10
 
 
-def fingerprint(path, **given):
-    with io.open_recording(path, **GIVEN, **given) as recording:
+def fingerprint(path, **options):
+    with io.open_recording(path, **GIVEN, **options) as recording:
         return recording.fingerprint()
 
 
@@ -99,26 +99,26 @@ def test_files_that_frames_are_taken_from_count(tmp_path, monkeypatch):
     with h5py.File("linked.h5", "w") as file:
         file["x"] = h5py.ExternalLink("part.h5", "x")
     for name, other in (("virtual.h5", "part.h5"), ("external.h5", "raw.bin"), ("linked.h5", "part.h5")):
-        given = {"dataset": "x"}
-        before = fingerprint(tmp_path / name, **given)
-        assert fingerprint(tmp_path / name, **given) == before
+        options = {"dataset": "x"}
+        before = fingerprint(tmp_path / name, **options)
+        assert fingerprint(tmp_path / name, **options) == before
         data = (tmp_path / other).read_bytes()
         (tmp_path / other).write_bytes(data + b"x")
-        assert fingerprint(tmp_path / name, **given) != before
+        assert fingerprint(tmp_path / name, **options) != before
         (tmp_path / other).write_bytes(data)
-        assert fingerprint(tmp_path / name, **given) == before
+        assert fingerprint(tmp_path / name, **options) == before
 
 
 @pytest.mark.parametrize("packing", [{}, {"chunks": (1, 50, 70), "compression": "gzip"}])
-@pytest.mark.parametrize("way", ["renamed", "written"])
-def test_a_file_that_is_replaced_while_it_is_open_is_reported(tmp_path, packing, way):
+@pytest.mark.parametrize("places", ["renamed", "written"])
+def test_a_file_that_is_replaced_while_it_is_open_is_reported(tmp_path, packing, places):
     path = tmp_path / "a.h5"
     frames = compressible(SHAPE, "u1")
     with h5py.File(path, "w") as file:
         file.create_dataset("x", data=frames, **packing)
     with io.open_recording(path, **GIVEN) as recording:
         before = recording.fingerprint(), recording.modified
-        if way == "renamed":
+        if places == "renamed":
             write(tmp_path / "b.h5", compressible(SHAPE, "u1", seed=1))
             (tmp_path / "b.h5").replace(path)
             np.testing.assert_array_equal(recording.read(np.empty_like(frames)).frames, frames)

@@ -38,9 +38,9 @@ def bucket(press, tmp_path, monkeypatch):
 def test_results_are_those_of_the_file_bit_for_bit(bucket):
     for name, result in ((ADDRESS, "s3.h5"), ("press.h5", "file.h5")):
         assert run("reconstruct", name, "-o", result).code == 0
-    found = [io.open_result(name).maps() for name in ("s3.h5", "file.h5")]
-    assert {name: values.tobytes() for name, values in found[0].items()} == {
-        name: values.tobytes() for name, values in found[1].items()
+    actual = [io.open_result(name).maps() for name in ("s3.h5", "file.h5")]
+    assert {name: values.tobytes() for name, values in actual[0].items()} == {
+        name: values.tobytes() for name, values in actual[1].items()
     }
 
 
@@ -72,8 +72,8 @@ def test_a_chunk_that_is_gone_leaves_no_result(bucket, tmp_path):
     bucket.copy("presses/press.zarr/", "presses/short.zarr/", recursive=True)
     bucket.rm("presses/short.zarr/entry/instrument/detector/data/c/0/0/0")
     before = sorted(tmp_path.iterdir())
-    said = refused("reconstruct", "s3://presses/short.zarr", "-o", "s3.h5")
-    assert "data/c/0/0/0, is missing: copy it again" in said
+    message = refused("reconstruct", "s3://presses/short.zarr", "-o", "s3.h5")
+    assert "data/c/0/0/0, is missing: copy it again" in message
     assert sorted(tmp_path.iterdir()) == before
 
 

@@ -109,13 +109,13 @@ def trap(flag):
 
 def consolidated_2(folder):
     """Copy all metadata into one document, and remove what it was copied from."""
-    found = {
-        str(one.relative_to(folder)): json.loads(one.read_text())
-        for one in folder.rglob(".z*")
-        if one.parent != folder or one.name == ".zgroup"
+    actual = {
+        str(path.relative_to(folder)): json.loads(path.read_text())
+        for path in folder.rglob(".z*")
+        if path.parent != folder or path.name == ".zgroup"
     }
-    put(folder, ".zmetadata", {"zarr_consolidated_format": 1, "metadata": found})
-    for name in found:
+    put(folder, ".zmetadata", {"zarr_consolidated_format": 1, "metadata": actual})
+    for name in actual:
         if name != ".zgroup":
             (folder / name).unlink()
 
@@ -143,11 +143,11 @@ def served(folder, handler=http.server.SimpleHTTPRequestHandler, **settings):
 
 
 @contextlib.contextmanager
-def delivered(folder, way):
+def delivered(folder, method):
     """Yield the path or address of a store that was written to a folder."""
-    if way == "zip":
+    if method == "zip":
         yield Path(shutil.make_archive(str(folder), "zip", folder))
-    elif way == "http":
+    elif method == "http":
         with served(folder.parent) as address:
             yield Url(f"{address}/{folder.name}")
     else:
@@ -164,15 +164,15 @@ DANGEROUS = {
 
 
 @pytest.mark.parametrize("consolidated", [False, True])
-@pytest.mark.parametrize("way", ["folder", "zip", "http"])
+@pytest.mark.parametrize("method", ["folder", "zip", "http"])
 @pytest.mark.parametrize("kind", DANGEROUS)
-def test_no_pickle_is_decoded(tmp_path, flag, kind, way, consolidated):
+def test_no_pickle_is_decoded(tmp_path, flag, kind, method, consolidated):
     folder = theirs(tmp_path / "x.zarr")
     name = "entry/title" if "text" in kind else "entry/instrument/stage/tilt"
     put_array(folder, name, trap(flag), **DANGEROUS[kind])
     if consolidated:
         consolidated_2(folder)
-    with delivered(folder, way) as path:
+    with delivered(folder, method) as path:
         assert f"/{name} needs the codec 'pickle'; only" in refused(path)
         with pytest.raises(io.InputError, match="needs the codec 'pickle'"):
             io.describe(path)
@@ -261,12 +261,12 @@ def test_version_2_is_read_in_all_codecs_that_are_allowed(tmp_path, settings, dt
     frames, folder = random_stack("uint16").astype(dtype), tmp_path / "x.zarr"
     document = {"dtype": dtype, "shape": list(SHAPE)}
     packed = frames.tobytes()
-    for one in settings.get("filters", []):
-        packed = bytes(one.encode(packed))
+    for settings_of_filter in settings.get("filters", []):
+        packed = bytes(settings_of_filter.encode(packed))
     if settings["compressor"]:
         packed = settings["compressor"].encode(packed)
         document["compressor"] = settings["compressor"].get_config()
-    document["filters"] = [one.get_config() for one in settings.get("filters", [])]
+    document["filters"] = [codec.get_config() for codec in settings.get("filters", [])]
     put_array(folder, "", bytes(packed), key="0.0.0", **document)
     with io.open_recording(folder, **GIVEN) as recording:
         np.testing.assert_array_equal(read_all(recording, 3).frames, frames)
@@ -307,8 +307,8 @@ def test_a_chunk_that_states_more_than_the_memory_limit_is_refused(tmp_path, siz
     folder, limit = tmp_path / "x.zarr", {"memory_limit": 100, **GIVEN}
     zarr.create_array(folder, data=random_stack(), **sizes)
     if refused_size:
-        said = f"/data is in chunks of {refused_size} MB: raise --memory, or write smaller ones"
-        assert said in refused(folder, **limit)
+        message = f"/data is in chunks of {refused_size} MB: raise --memory, or write smaller ones"
+        assert message in refused(folder, **limit)
     else:
         io.open_recording(folder, **limit).close()
 
@@ -374,15 +374,15 @@ def test_links_inside_of_a_folder_are_followed(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [("zarr.json", "is not a regular file"), ("c/0/0/0", "is not"), ("c/7/0/0", "is missing")],
 )
-def test_a_pipe_in_a_folder_is_refused(tmp_path, name, said):
+def test_a_pipe_in_a_folder_is_refused(tmp_path, name, message):
     folder = tmp_path / "x.zarr"
     zarr.create_array(folder, data=random_stack(), chunks=(1, 5, 7), compressors=None)
     (folder / name).unlink()
     os.mkfifo(folder / name)
-    assert said in refused(folder, **GIVEN)
+    assert message in refused(folder, **GIVEN)
 
 
 def test_a_pipe_in_place_of_a_store_is_refused(tmp_path):

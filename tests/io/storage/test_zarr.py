@@ -29,16 +29,16 @@ GIVEN = {"motion": "vertical", "travel": io.Steps(0.3)}
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def stores(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     io.save_zarr(record(sphere(), folder / "press.h5", truth=sphere().truth), folder / "press.zarr")
     return folder
 
 
 @pytest.fixture
-def pair(made, tmp_path):
+def pair(stores, tmp_path):
     """A recording of a simulated press, and the same in Zarr."""
-    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(stores, tmp_path, dirs_exist_ok=True)
     return tmp_path / "press.h5", tmp_path / "press.zarr"
 
 
@@ -62,10 +62,10 @@ def line(path, **options):
     """Return what is said of a stack that is refused, without its name."""
     with pytest.raises(io.InputError) as caught, io.open_recording(path, **options) as recording:
         read_all(recording, 3)
-    said = str(caught.value)
-    assert "\n" not in said
-    assert said.startswith(str(path))
-    return said.removeprefix(str(path))
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(str(path))
+    return message.removeprefix(str(path))
 
 
 def edit(folder, name, **changes):
@@ -102,12 +102,12 @@ def test_attributes_are_those_of_hdf5(pair):
 
 
 def test_results_are_the_same_bit_for_bit(pair):
-    found = []
+    actual = []
     for path in pair:
         with io.open_recording(path) as recording:
-            found.append(engine.reconstruct(recording))
-    for name, values in found[0].maps().items():
-        assert values.tobytes() == found[1].maps()[name].tobytes(), name
+            actual.append(engine.reconstruct(recording))
+    for name, values in actual[0].maps().items():
+        assert values.tobytes() == actual[1].maps()[name].tobytes(), name
 
 
 def test_frames_are_fetched_next_to_the_kernels(pair, monkeypatch):
@@ -137,7 +137,7 @@ def test_a_zip_is_read(pair, tmp_path):
 
 @pytest.mark.parametrize("dtype", ["uint8", ">u2", "float32"])
 @pytest.mark.parametrize("chunks", [(3, 4, 7), SHAPE, (1, 5, 7)])
-def test_stacks_of_others_need_what_they_do_not_say(tmp_path, dtype, chunks):
+def test_foreign_stacks_need_their_missing_properties(tmp_path, dtype, chunks):
     frames = random_stack(np.dtype(dtype).newbyteorder("=")).astype(dtype)
     path = bare(tmp_path / "x.zarr", frames, chunks=chunks)
     assert "does not state how the sensor moved: give --motion" in line(path)
@@ -147,8 +147,8 @@ def test_stacks_of_others_need_what_they_do_not_say(tmp_path, dtype, chunks):
 
 def test_a_region_and_some_frames_are_cut_out(pair):
     part = io.Region((1, 4), (2, 7))
-    with io.open_recording(pair[0]) as whole, io.open_recording(pair[1], region=part, frames=(2, 7)) as cut:
-        np.testing.assert_array_equal(read_all(cut, 3).frames, read_all(whole, 3).frames[2:7, 1:4, 2:7])
+    with io.open_recording(pair[0]) as whole, io.open_recording(pair[1], region=part, frames=(2, 7)) as piece:
+        np.testing.assert_array_equal(read_all(piece, 3).frames, read_all(whole, 3).frames[2:7, 1:4, 2:7])
 
 
 def test_results_are_read_and_exported(pair, tmp_path):
@@ -181,7 +181,7 @@ def test_a_fingerprint_distinguishes_recordings(pair, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"shape": [8, 5]}, "it is damaged"),
         ({"shape": [1 << 40, 5, 7]}, "is missing: copy it again, or write empty ones, too"),
@@ -198,8 +198,8 @@ def test_a_fingerprint_distinguishes_recordings(pair, tmp_path):
         ({"node_type": "sheep"}, ""),
     ],
 )
-def test_impossible_metadata_is_refused(pair, changes, said):
-    assert said in line(edit(pair[1], STACK, **changes))
+def test_impossible_metadata_is_refused(pair, changes, message):
+    assert message in line(edit(pair[1], STACK, **changes))
 
 
 def test_broken_json_is_refused(pair):
@@ -219,15 +219,15 @@ def test_a_claim_of_another_size_is_refused(pair):
 
 
 @pytest.mark.parametrize(
-    ("harm", "said"),
+    ("harm", "message"),
     [(lambda place: place.write_bytes(b"abc" * 9), "it is damaged"), (os.remove, "is missing")],
 )
-def test_a_damaged_chunk_is_named_by_its_frames(tmp_path, harm, said):
+def test_a_damaged_chunk_is_named_by_its_frames(tmp_path, harm, message):
     path = bare(tmp_path / "x.zarr", random_stack(), chunks=(2, 5, 7))
     harm(path / "c/1/0/0")
-    found = line(path, **GIVEN)
-    assert ": frames 2 to 3 of /data cannot be read" in found
-    assert said in found
+    actual = line(path, **GIVEN)
+    assert ": frames 2 to 3 of /data cannot be read" in actual
+    assert message in actual
 
 
 def test_what_is_not_there_is_reported_with_its_address(memory):
@@ -314,11 +314,11 @@ def test_what_a_killed_writer_has_left_is_removed_by_the_next(pair, tmp_path):
 
 
 def test_a_folder_that_is_being_written_is_not_a_leftover_of_the_next_writer(pair, tmp_path):
-    seen = []
+    progress = []
 
     def write_another(count):
-        if not seen:
-            seen.append(count)
+        if not progress:
+            progress.append(count)
             io.save_zarr(pair[0], tmp_path / "second.zarr")
 
     io.save_zarr(pair[0], tmp_path / "first.zarr", write_another)
@@ -338,9 +338,9 @@ def test_lists_in_attributes_and_those_of_the_root_are_kept(tmp_path):
         io.save_result(flat, path)
     with Hdf5File(tmp_path / "flat.h5") as theirs, ZarrFile(tmp_path / "flat.zarr") as ours:
         for name in ("/", "/entry", "/entry/result"):
-            known = theirs.root[name].attrs
-            assert set(ours.root[name].attrs) == set(known)
-            for attribute, value in known.items():
+            expected = theirs.root[name].attrs
+            assert set(ours.root[name].attrs) == set(expected)
+            for attribute, value in expected.items():
                 np.testing.assert_array_equal(
                     np.asarray(ours.root[name].attrs[attribute]).astype(str), np.asarray(value).astype(str)
                 )

@@ -128,8 +128,8 @@ def test_a_frame_shows_the_body_where_it_was_when_it_was_exposed(running, clock)
     for frames in take(running(where, 20.0, delay=0.03, pivot=PIVOT), 4):
         for pixels, number, arrived in zip(frames.pixels, frames.number, frames.time, strict=True):
             pose = lean_at(where(float(arrived) - 0.03))
-            seen = look(twin, int(number), lambda late, pose=pose: pose)
-            assert np.mean(pixels != seen) < 0.001  # times are rounded
+            sight = look(twin, int(number), lambda late, pose=pose: pose)
+            assert np.mean(pixels != sight) < 0.001  # times are rounded
 
 
 def test_frames_arrive_late_by_delay_and_jitter_and_in_order(running, clock) -> None:
@@ -175,7 +175,7 @@ def test_each_nth_frame_may_be_lost_or_late(running, every: int) -> None:
     assert (np.diff(arrived) >= 0).all()
 
 
-def test_a_stalled_camera_says_nothing(running) -> None:
+def test_a_stalled_camera_delivers_nothing(running) -> None:
     camera = running(still, delay=0.02)
     take(camera, 3)
     camera.stall()
@@ -194,10 +194,10 @@ def test_a_lost_camera_is_reported_to_readers(running) -> None:
         list(drain(camera))
 
 
-@pytest.mark.parametrize("given", [{"delay": -0.1}, {"jitter": math.nan}])
-def test_impossible_input_is_refused(given: dict[str, float]) -> None:
-    with pytest.raises(InputError, match=f"^{next(iter(given))} .* is not possible"):
-        TwinCamera(make_twin(MOVEMENTS["press"]), still, **given)
+@pytest.mark.parametrize("options", [{"delay": -0.1}, {"jitter": math.nan}])
+def test_impossible_input_is_refused(options: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=f"^{next(iter(options))} .* is not possible"):
+        TwinCamera(make_twin(MOVEMENTS["press"]), still, **options)
 
 
 @pytest.mark.parametrize(
@@ -209,10 +209,10 @@ def test_impossible_input_is_refused(given: dict[str, float]) -> None:
     ids=["horizontal", "twist"],
 )
 def test_a_skin_with_a_texture_is_dragged_as_in_the_twin_itself(movement: Horizontal | Twist) -> None:
-    given: dict[str, Any] = {"object": Sphere(8.0), "shape": (40, 50), "pixel_size": 0.12}
+    options: dict[str, Any] = {"object": Sphere(8.0), "shape": (40, 50), "pixel_size": 0.12}
     camera = Camera(noise=0.0, exposure=0.0)
     twin = Twin(
-        movement=movement, contact="elastic", texture=SheetTexture("flakes", 0.4), camera=camera, **given
+        movement=movement, contact="elastic", texture=SheetTexture("flakes", 0.4), camera=camera, **options
     )
     expected = read_all(twin)
     places = [
@@ -221,6 +221,6 @@ def test_a_skin_with_a_texture_is_dragged_as_in_the_twin_itself(movement: Horizo
     ]
     look(twin, 0, lambda late: pose_at(Position(0.2)))
     for place, frame in zip(places, expected, strict=True):
-        seen = look(twin, 0, lambda late, at=place: pose_at(at))
-        np.testing.assert_allclose(seen.astype(int), frame, atol=1)
+        sight = look(twin, 0, lambda late, at=place: pose_at(at))
+        np.testing.assert_allclose(sight.astype(int), frame, atol=1)
     assert (expected[0] != expected[-1]).any()

@@ -311,11 +311,11 @@ def test_what_is_long_past_is_forgotten() -> None:
     bench = Bench(memory=3.0)
     bench.send("G91G0X0.1")
     bench.until_rest()
-    seen = bench.place(1000.005)
+    here = bench.place(1000.005)
     for _ in range(600):
         bench.send("X0.1", "X-0.1")
         bench.until_rest()
-    assert bench.place(1000.005) != seen
+    assert bench.place(1000.005) != here
     assert bench.place(bench.now) == pytest.approx((0.1, 0, 0))
 
 
@@ -332,8 +332,8 @@ def test_a_hold_slows_down_evenly_and_a_resume_goes_on(line: str) -> None:
     assert bench.machine.state == "Hold:1"
     bench.wait(1)
     assert bench.machine.state == "Hold:0"
-    share = 1.0 if line.startswith("G1") else math.sqrt(1 - (speed**2 / 4 / ACCELERATION) ** 2)
-    rest = begin + speed / (share * ACCELERATION)  # on an arc a part points to the centre
+    fraction = 1.0 if line.startswith("G1") else math.sqrt(1 - (speed**2 / 4 / ACCELERATION) ** 2)
+    rest = begin + speed / (fraction * ACCELERATION)  # on an arc a part points to the centre
     assert bench.machine.moving(rest - 1e-6)
     assert not bench.machine.moving(rest + 1e-6)
     held = bench.place()

@@ -40,12 +40,12 @@ def test_it_answers_moves_and_reports_right_in_time(port: GrblPort, line: serial
     line.write(b"G1X2F600\n")
     assert line.read_until() == b"ok\r\n"
     while port.machine.moving() and time.monotonic() < begun + SOON:
-        before, told, after = (
+        before, between, after = (
             port.machine.position()["X"],
             float(ask(line)["MPos"].split(",")[0]),
             port.machine.position()["X"],
         )
-        assert before - 1e-3 <= told <= after + 1e-3
+        assert before - 1e-3 <= between <= after + 1e-3
     assert 0.15 < time.monotonic() - begun < SOON  # 0.22 s, and as late as we looked
 
 
@@ -67,8 +67,8 @@ def test_a_fault_reaches_the_host_and_the_controller_still_hears(port, line, fau
         line.timeout = 0.1
         assert line.read(1) == b""
     else:
-        said = {"garble": b"[VER:1.1h", "alarm": b"ALARM:9"}[fault]
-        assert said in line.read_until(said)
+        message = {"garble": b"[VER:1.1h", "alarm": b"ALARM:9"}[fault]
+        assert message in line.read_until(message)
     until = time.monotonic() + SOON
     while port.machine.position()["X"] != (fault != "garble"):
         assert time.monotonic() < until

@@ -80,25 +80,25 @@ def test_pitch_and_roll_are_the_lean_of_a_precession(running, clock) -> None:
     pivot = (0.5, -0.2, 3.0)
     rig = running(pattern="linear", pivot=pivot)
     command(rig, "G21 G90 G1 X1.5 Y-2 Z-5 F2000")
-    number, seen = newest(rig)
+    number, sight = newest(rig)
     phase, tilt = math.atan2(-2.0, 1.5), math.radians(2.5)
     place = rig.where(clock.now())
     assert (place.travel, place.tilt, place.phase) == pytest.approx((1.0, tilt, phase))
-    there = Axial(np.full(number + 1, phase), tilt, 1.0, pivot)
-    assert np.mean(seen != direct(rig.twin(there), number)) < 0.001  # the angles are rounded
+    target = Axial(np.full(number + 1, phase), tilt, 1.0, pivot)
+    assert np.mean(sight != direct(rig.twin(target), number)) < 0.001  # the angles are rounded
 
 
 def test_x_y_and_twist_are_those_of_the_twins_movements(running) -> None:
     rig = running("coin", pattern="linear")
     command(rig, "G21 G90 G1 Z-5 A0.6 B-0.3 F2000")
-    number, seen = newest(rig)
+    number, sight = newest(rig)
     slide = Horizontal(np.tile((0.6, -0.3), (number + 1, 1)), 1.0)
-    np.testing.assert_array_equal(seen, direct(rig.twin(slide), number))
+    np.testing.assert_array_equal(sight, direct(rig.twin(slide), number))
     command(rig, "G1 A0 B0 C30 F2000")
     number, turned = newest(rig)
     twist = Twist(np.full(number + 1, math.radians(30)), 1.0)
     assert np.mean(turned != direct(rig.twin(twist), number)) < 0.001  # the angle is rounded
-    assert np.any(turned != seen)
+    assert np.any(turned != sight)
 
 
 def test_friction_drags_the_skin_and_its_texture_along(running) -> None:
@@ -107,11 +107,11 @@ def test_friction_drags_the_skin_and_its_texture_along(running) -> None:
     command(rig, "G21 G90 G1 Z-4.4 F600")
     _, pressed = newest(rig)
     command(rig, "A0.2 F60")
-    number, seen = newest(rig)
+    number, sight = newest(rig)
     slide = Horizontal(np.tile((0.2, 0.0), (number + 1, 1)), 0.4)
     expected = direct(rig.twin(slide), number).astype(int)
-    assert abs(seen - expected).mean() < 0.3
-    assert abs(seen.astype(int) - pressed).mean() > 3
+    assert abs(sight - expected).mean() < 0.3
+    assert abs(sight.astype(int) - pressed).mean() > 3
 
 
 def test_an_arc_goes_round_at_the_tilt(running, clock) -> None:
@@ -150,19 +150,19 @@ def test_all_places_that_the_settings_allow_are_on_the_axes(running, home: bool)
             assert max(ends) <= -0.5 + 1e-9  # where homing ends
 
 
-def test_the_rig_file_says_what_the_settings_say(tmp_path: Path) -> None:
+def test_the_rig_file_contains_the_settings(tmp_path: Path) -> None:
     with EmulatedRig(pattern="linear", home=True, camera=Camera(np.dtype(np.uint16)), **SMALL) as rig:
         path = rig.write(tmp_path / "a new one", "tcp://127.0.0.1:1234")
-        found, said = load_rig(path), rig.settings
+        actual, expected = load_rig(path), rig.settings
         bright = str(path.parent / "bright.npy")
         np.testing.assert_array_equal(np.load(bright), rig.twin(Vertical([0.0])).header.bright)
-    assert (found.name, found.stage) == (said.name, structs.replace(said.stage, silence=0.5))
-    camera = structs.replace(said.camera, source="tcp://127.0.0.1:1234", bright=bright, stall=0.5)
-    assert found.camera == camera
-    assert (found.camera.shape, found.camera.dtype, found.camera.rate) == (SMALL["shape"], "uint16", 100.0)
+    assert (actual.name, actual.stage) == (expected.name, structs.replace(expected.stage, silence=0.5))
+    camera = structs.replace(expected.camera, source="tcp://127.0.0.1:1234", bright=bright, stall=0.5)
+    assert actual.camera == camera
+    assert (actual.camera.shape, actual.camera.dtype, actual.camera.rate) == (SMALL["shape"], "uint16", 100.0)
     header = rig.twin(Vertical([0.0])).header
-    assert found.camera.pixel_sides == header.pixel_size
-    assert (found.camera.counts_per_radian, found.camera.zenith_offset) == pytest.approx(
+    assert actual.camera.pixel_sides == header.pixel_size
+    assert (actual.camera.counts_per_radian, actual.camera.zenith_offset) == pytest.approx(
         (float(np.mean(header.zenith_gain)), float(np.mean(header.zenith_offset))), rel=1e-5
     )
     np.testing.assert_array_equal(rig.references()[0], header.dark)
@@ -206,12 +206,12 @@ def test_a_sweep_with_lost_or_late_frames_has_the_right_positions(running, clock
     rig = running(delay=0.02)
     rig.camera.lateness = lambda number: late if number % every == 0 else 0.0
     camera = structs.replace(rig.settings.camera, delay=0.02, dark=16.0)
-    told = replace(rig.settings, camera=camera)
-    with Rig(rig.open_stage(told.stage), rig.camera, told, clock) as opened:
+    settings = replace(rig.settings, camera=camera)
+    with Rig(rig.open_stage(settings.stage), rig.camera, settings, clock) as opened:
         with SweepScan(opened, VerticalPlan(0.0, 1.0, speed=1.0)) as scan:
             while scan.read(np.empty((8, *SMALL["shape"]), np.uint8)) is not None:
                 pass
-        number, arrival = (np.concatenate(one) for one in zip(*scan._frames, strict=True))
+        number, arrival = (np.concatenate(frame) for frame in zip(*scan._frames, strict=True))
         sound = np.flatnonzero(number % every)[0]  # a frame in time
         exposed = arrival[sound] - 0.02 + (number - number[sound]) / SMALL["rate"]
         true = np.array([rig.where(float(at)).travel for at in exposed])

@@ -79,7 +79,7 @@ def watch(url: str, count: int) -> list[NDArray[Any]]:
         read = [viewer.read() for _ in range(count)]
     finally:
         viewer.release()
-    assert all(there for there, _ in read)
+    assert all(target for target, _ in read)
     return [pixels for _, pixels in read]
 
 

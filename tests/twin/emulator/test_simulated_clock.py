@@ -87,11 +87,11 @@ def test_a_day_takes_no_time(clock):
 
 
 def test_the_time_does_not_pass_while_a_thread_works(clock):
-    seen = []
-    clock.thread(lambda: (time.sleep(0.01), seen.append(clock.now())), "works").start()
+    times = []
+    clock.thread(lambda: (time.sleep(0.01), times.append(clock.now())), "works").start()
     began = clock.now()
     clock.sleep(1e-9)
-    assert seen == [began]
+    assert times == [began]
 
 
 def test_rounding_does_not_keep_the_time_from_passing(clock):
@@ -167,17 +167,17 @@ def test_a_wait_for_what_never_comes_names_all_who_wait(clock):
 
 
 def test_locks_taken_in_both_orders_are_noticed(clock):
-    one, other = clock.condition(), clock.condition()
+    first, other = clock.condition(), clock.condition()
 
     def take():
         with other:
             clock.sleep(1.0)
-            with one:
+            with first:
                 pass
 
     thread = clock.thread(take, "other")
     thread.start()
-    with one:
+    with first:
         clock.sleep(0.5)
         with pytest.raises(DeadlockError, match="other for a lock"), other:
             pass
@@ -185,13 +185,13 @@ def test_locks_taken_in_both_orders_are_noticed(clock):
 
 
 def test_something_is_done_at_an_exact_instant(clock):
-    began, done = clock.now(), []
-    threads = [clock.later(delay, lambda: done.append(clock.now() - began)) for delay in (0.3, 0.1, 0.2)]
+    began, finished = clock.now(), []
+    threads = [clock.later(delay, lambda: finished.append(clock.now() - began)) for delay in (0.3, 0.1, 0.2)]
     clock.sleep(0.25)
-    assert done == pytest.approx([0.1, 0.2])
+    assert finished == pytest.approx([0.1, 0.2])
     for thread in threads:
         thread.join()
-    assert done == pytest.approx([0.1, 0.2, 0.3])
+    assert finished == pytest.approx([0.1, 0.2, 0.3])
 
 
 def test_an_interrupt_comes_where_the_first_thread_waits(clock):
@@ -206,18 +206,18 @@ def test_an_interrupt_comes_where_the_first_thread_waits(clock):
 
 
 def test_a_foreign_thread_cannot_wait(clock):
-    said = []
+    lines = []
 
     def work():
         try:
             clock.sleep(1.0)
         except RuntimeError as error:
-            said.append(str(error))
+            lines.append(str(error))
 
     stranger = threading.Thread(target=work, name="stranger")
     stranger.start()
     stranger.join()
-    assert said == ["stranger cannot wait on a simulated clock that did not create it"]
+    assert lines == ["stranger cannot wait on a simulated clock that did not create it"]
 
 
 def test_looking_at_the_time_without_end_is_an_error(clock):

@@ -12,10 +12,10 @@ from mirrorskin import io
 
 def test_all_maps_come_back_as_they_were(slope, tmp_path):
     path = tmp_path / "out.npz"
-    told = io.export_result(slope, path)
+    description = io.export_result(slope, path)
     with np.load(path, allow_pickle=False) as file:
         arrays = dict(file)
-    assert told == ", ".join(slope.maps())
+    assert description == ", ".join(slope.maps())
     texts = ("units", "legends", "process", "fitted")
     units, legends, process, fitted = (json.loads(str(arrays.pop(name))) for name in texts)
     assert set(arrays) == {*slope.maps(), "x", "y", "offset_unknown"}

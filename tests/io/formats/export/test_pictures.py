@@ -37,29 +37,31 @@ def scale_of(path):
     """Return the height at count 0 and that of one count, mm, as the file tells them."""
     if path.suffix == ".png":
         with Image.open(path) as picture:
-            told = [picture.text["height offset"], picture.text["height step"]]
-        assert all(text.endswith(" mm") for text in told)
-        return [float(text.removesuffix(" mm")) for text in told]
+            texts = [picture.text["height offset"], picture.text["height step"]]
+        assert all(text.endswith(" mm") for text in texts)
+        return [float(text.removesuffix(" mm")) for text in texts]
     with tifffile.TiffFile(path) as file:
-        told = file.imagej_metadata
-    assert (told["vunit"], told["cf"]) == ("mm", 0)
-    return told["c0"], told["c1"]
+        metadata = file.imagej_metadata
+    assert (metadata["vunit"], metadata["cf"]) == ("mm", 0)
+    return metadata["c0"], metadata["c1"]
 
 
 @pytest.mark.parametrize(("suffix", "read"), READERS)
 def test_heights_come_back_within_half_a_count(slope, tmp_path, suffix, read):
     path = tmp_path / f"out.{suffix}"
-    told = io.export_result(slope, path)
+    description = io.export_result(slope, path)
     counts = read(path)
     assert (counts.shape, counts.dtype) == ((6, 9), np.uint16)
     offset, step = scale_of(path)
-    assert told == f"height in mm = {offset!r} + {step!r} x count; count 0: no answer"
-    known = np.isfinite(slope.height)
-    np.testing.assert_allclose(offset + step * counts[known], slope.height[known], rtol=0, atol=0.501 * step)
+    assert description == f"height in mm = {offset!r} + {step!r} x count; count 0: no answer"
+    finite = np.isfinite(slope.height)
+    np.testing.assert_allclose(
+        offset + step * counts[finite], slope.height[finite], rtol=0, atol=0.501 * step
+    )
     # The range is used, and nothing but the hole is 0.
-    assert step == pytest.approx((slope.height[known].max() - slope.height[known].min()) / 65534)
+    assert step == pytest.approx((slope.height[finite].max() - slope.height[finite].min()) / 65534)
     assert np.argwhere(counts == 0).tolist() == [list(HOLE)]
-    assert (counts[known].min(), counts.max()) == (1, 65535)
+    assert (counts[finite].min(), counts.max()) == (1, 65535)
     # Row 0 is the top: the peak is above the middle.
     assert np.unravel_index(np.argmax(counts), counts.shape) == PEAK
 
@@ -77,18 +79,18 @@ def test_a_tiff_contains_what_imagej_and_gdal_need(slope, tmp_path):
     path = tmp_path / "out.tif"
     io.export_result(slope, path)
     with tifffile.TiffFile(path) as file:
-        page, told = file.pages[0], file.imagej_metadata
+        page, metadata = file.pages[0], file.imagej_metadata
     assert page.nodata == 0
     assert page.resolutionunit == tifffile.RESUNIT.CENTIMETER
-    assert told["unit"] == "cm"
+    assert metadata["unit"] == "cm"
     # A column's x and a row's y, mm, as ImageJ reckons them with a y that runs up.
-    assert told["inverty"] is True
+    assert metadata["inverty"] is True
     across, up = (10 / number for number in page.resolution)
-    np.testing.assert_allclose((np.arange(9) - told["xorigin"]) * across, slope.x)
-    np.testing.assert_allclose((told["yorigin"] - np.arange(6)) * up, slope.y)
+    np.testing.assert_allclose((np.arange(9) - metadata["xorigin"]) * across, slope.x)
+    np.testing.assert_allclose((metadata["yorigin"] - np.arange(6)) * up, slope.y)
     assert page.software == "mirrorskin 1.2.3"
-    assert told["source"] == "Münze 五円.h5"
-    assert told["date"] == "2026-01-02T03:04:05+00:00"
+    assert metadata["source"] == "Münze 五円.h5"
+    assert metadata["date"] == "2026-01-02T03:04:05+00:00"
 
 
 def test_a_png_contains_what_gwyddion_needs(slope, tmp_path):
@@ -96,13 +98,13 @@ def test_a_png_contains_what_gwyddion_needs(slope, tmp_path):
     # Of a part of the picture, so that the middle of it is not the origin.
     io.export_result(slope.assign(x=slope.x + 3, y=slope.y + 7), path)
     with Image.open(path) as picture:
-        told = {
+        numbers = {
             name.removeprefix("Gwy::"): text for name, text in picture.text.items() if name[:5] == "Gwy::"
         }
-    texts = {name: told.pop(name) for name in ("XYUnit", "XYUnits", "ZUnit", "ZUnits", "Title")}
+    texts = {name: numbers.pop(name) for name in ("XYUnit", "XYUnits", "ZUnit", "ZUnits", "Title")}
     assert set(texts.values()) == {"m", "Münze 五円.h5"}
     offset, _ = scale_of(path)
-    assert {name: float(text) for name, text in told.items()} == pytest.approx(
+    assert {name: float(text) for name, text in numbers.items()} == pytest.approx(
         {
             "XReal": 4.5e-3,
             "YReal": 1.5e-3,

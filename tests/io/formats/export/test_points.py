@@ -29,11 +29,11 @@ def test_text_is_one_line_a_point_and_names_its_columns(slope, tmp_path):
     assert comments[-1].split() == COLUMNS
     assert len(lines) == len(comments) + 53
     table = np.loadtxt(path, encoding="utf-8")
-    known = np.isfinite(slope.height)
-    rows, columns = np.nonzero(known)
+    finite = np.isfinite(slope.height)
+    rows, columns = np.nonzero(finite)
     expected = [
-        *(slope.x[columns], slope.y[rows], slope.height[known], *slope.normals[known].T),
-        *(slope.height_sigma[known], slope.filled[known]),
+        *(slope.x[columns], slope.y[rows], slope.height[finite], *slope.normals[finite].T),
+        *(slope.height_sigma[finite], slope.filled[finite]),
     ]
     np.testing.assert_allclose(table, np.stack(expected, axis=1), rtol=1.2e-7)
     # What has no normal says so, and does not get one from its neighbours.
@@ -45,5 +45,5 @@ def test_a_relief_of_nanometres_keeps_its_roughness(tmp_path):
     height = np.random.default_rng(1).normal(0, 1.4e-6, (20, 20)).astype(np.float32)
     axis = np.arange(20) * 0.01
     io.export_result(io.Result(height=height, x=axis, y=axis[::-1].copy()), tmp_path / "out.xyz")
-    found = np.loadtxt(tmp_path / "out.xyz", encoding="utf-8")[:, 2]
-    np.testing.assert_array_equal(found.astype(np.float32), height.ravel())
+    actual = np.loadtxt(tmp_path / "out.xyz", encoding="utf-8")[:, 2]
+    np.testing.assert_array_equal(actual.astype(np.float32), height.ravel())

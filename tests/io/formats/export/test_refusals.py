@@ -77,7 +77,7 @@ def test_a_full_disk_is_one_line_and_leaves_the_older_file(slope, tmp_path, monk
     path = tmp_path / "out.ply"
     path.write_text("older")
     with monkeypatch.context() as patched:
-        patched.setattr("os.fdopen", lambda *given, **options: Full())
+        patched.setattr("os.fdopen", lambda *words, **options: Full())
         assert " could not be written: No space left on device; make room" in refused(slope, path)
     assert path.read_text() == "older"
     assert list(tmp_path.iterdir()) == [path]

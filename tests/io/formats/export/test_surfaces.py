@@ -28,12 +28,12 @@ def path(request, tmp_path):
 
 
 def test_a_surface_has_its_size_in_millimetres(slope, path):
-    told = io.export_result(slope, path)
+    description = io.export_result(slope, path)
     mesh = opened(path)
     # From the first pixel's centre to the last one's, and from the lowest corner to the peak.
     np.testing.assert_allclose(mesh.bounds[:, :2], [[-2, -0.625], [2, 0.625]])
     np.testing.assert_allclose(mesh.extents[2], -0.0125 + 1.3875, rtol=1e-6)
-    assert told == "76 triangles between 53 points, 4 x 1.25 x 1.375 mm"
+    assert description == "76 triangles between 53 points, 4 x 1.25 x 1.375 mm"
     assert len(mesh.faces) == 76
 
 
@@ -71,19 +71,19 @@ def test_a_ply_contains_all_values_of_each_vertex(slope, tmp_path):
     path = tmp_path / "out.ply"
     io.export_result(slope, path)
     mesh = opened(path)
-    known = np.isfinite(slope.height)
-    told = properties_of(mesh)
-    assert told.dtype.names == ("x", "y", "z", "nx", "ny", "nz", "sigma", "filled")
-    np.testing.assert_array_equal(told["z"], slope.height[known])
-    np.testing.assert_array_equal(told["sigma"], slope.height_sigma[known])
-    np.testing.assert_array_equal(told["filled"], slope.filled[known])
-    assert told["filled"].sum() == 1
-    np.testing.assert_array_equal(mesh.vertex_normals[1:], slope.normals[known][1:])
+    finite = np.isfinite(slope.height)
+    properties = properties_of(mesh)
+    assert properties.dtype.names == ("x", "y", "z", "nx", "ny", "nz", "sigma", "filled")
+    np.testing.assert_array_equal(properties["z"], slope.height[finite])
+    np.testing.assert_array_equal(properties["sigma"], slope.height_sigma[finite])
+    np.testing.assert_array_equal(properties["filled"], slope.filled[finite])
+    assert properties["filled"].sum() == 1
+    np.testing.assert_array_equal(mesh.vertex_normals[1:], slope.normals[finite][1:])
     # The result has none there, but the one triangle in that corner has.
     np.testing.assert_allclose(mesh.vertex_normals[0], slope.normals[0, 1], atol=1e-6)
 
 
-def test_a_ply_says_its_unit_and_its_origin_in_ascii(slope, tmp_path):
+def test_a_ply_states_its_unit_and_origin_in_ascii(slope, tmp_path):
     path = tmp_path / "out.ply"
     io.export_result(slope, path)
     comments = [line.removeprefix("comment ") for line in head_of(path) if line.startswith("comment ")]
@@ -98,20 +98,20 @@ def test_a_ply_says_its_unit_and_its_origin_in_ascii(slope, tmp_path):
     ]
 
 
-def test_an_stl_says_its_unit_and_does_not_pass_for_text(slope, tmp_path):
+def test_an_stl_states_its_unit_and_is_not_taken_for_text(slope, tmp_path):
     path = tmp_path / "out.stl"
     io.export_result(slope.assign(process=slope.process | {"source": "ü" * 200}), path)
     data = path.read_bytes()
     assert data[:80].startswith(b"unit mm, mirrorskin 1.2.3, 2026-01-02T03:04:05+00:00, ")
     assert len(data) == 84 + 50 * 76
     mesh = opened(path)
-    told = np.frombuffer(data[84:], [("n", "<f4", 3), ("rest", "V38")])["n"]
-    np.testing.assert_allclose(told, mesh.face_normals, atol=1e-5)
+    normals = np.frombuffer(data[84:], [("n", "<f4", 3), ("rest", "V38")])["n"]
+    np.testing.assert_allclose(normals, mesh.face_normals, atol=1e-5)
 
 
 @pytest.mark.parametrize("suffix", ["ply", "stl", "png", "csv"])
 def test_relative_heights_are_reported(slope, tmp_path, suffix):
     relative = slope.assign(offset_unknown=np.ones(1, np.uint8))
     section = {"distance": np.arange(3.0), "height": np.arange(3.0)}
-    told = io.export_result(relative, tmp_path / f"out.{suffix}", section=section)
-    assert told.endswith(", heights relative: the mean of a piece is 0")
+    description = io.export_result(relative, tmp_path / f"out.{suffix}", section=section)
+    assert description.endswith(", heights relative: the mean of a piece is 0")

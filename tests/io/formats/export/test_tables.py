@@ -45,16 +45,16 @@ def test_a_table_comes_back_in_full(path):
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     assert list(rows[0]) == ["distance [mm]", "height"]
-    found = np.array([[float(cell or "nan") for cell in row.values()] for row in rows])
-    np.testing.assert_array_equal(found[:, 1].astype(np.float32), height)
-    np.testing.assert_allclose(found[:, 0], distance, rtol=1e-8)
+    actual = np.array([[float(cell or "nan") for cell in row.values()] for row in rows])
+    np.testing.assert_array_equal(actual[:, 1].astype(np.float32), height)
+    np.testing.assert_allclose(actual[:, 0], distance, rtol=1e-8)
     again = np.genfromtxt(path, delimiter=",", skip_header=3, encoding="utf-8")
-    np.testing.assert_array_equal(again, found)
+    np.testing.assert_array_equal(again, actual)
 
 
 def test_a_cross_section_of_a_result_has_its_units_and_origin(slope, path):
-    told = io.export_result(slope, path, section=COLUMNS)
-    assert told == "3 points of a cross-section"
+    description = io.export_result(slope, path, section=COLUMNS)
+    assert description == "3 points of a cross-section"
     lines = path.read_text(encoding="utf-8").splitlines()
     assert lines[0] == "# source: Münze 五円.h5"
     assert "# heights: from the sheet at rest" in lines

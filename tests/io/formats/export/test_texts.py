@@ -59,9 +59,9 @@ def png_texts(data):
 def test_no_control_code_of_a_result_gets_into_a_text(odd, tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     io.export_result(odd, path, section=SECTION)
-    said = texts_of(path)
-    assert [letter for letter in said if letter != "\n" and not letter.isprintable()] == []
-    assert not any(line.startswith(("forged", "# forged")) for line in said.splitlines())
+    texts = texts_of(path)
+    assert [letter for letter in texts if letter != "\n" and not letter.isprintable()] == []
+    assert not any(line.startswith(("forged", "# forged")) for line in texts.splitlines())
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
