@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from mirrorskin.cli.commands.bench.records import Run, open_run
-from mirrorskin.evaluation import bounds, ramps, sample_fusion
+from mirrorskin.evaluation import bounds, ramps, robust, sample_fusion
 from mirrorskin.evaluation.base.tables import Table, replace_part
 from mirrorskin.evaluation.calibration import report
 from mirrorskin.evaluation.faults import matrix
@@ -53,7 +53,7 @@ TABLES: Mapping[str, Callable[[], Table]] = {
 def measure(name: str) -> None:
     """Measure a table, and store it; or the bounds of this device."""
     if name == "bounds":
-        _BOUNDS.write_bytes(bounds.measure(open_device()).as_json())
+        _BOUNDS.write_bytes(bounds.measure(open_device(), more=robust.CASES).as_json())
         return
     table = msgspec.json.format(msgspec.json.encode(TABLES[name]()), indent=1)
     (_STORED / f"{name}.json").write_bytes(table + b"\n")

@@ -18,7 +18,7 @@ _MOST, _CLOSE = 5000, 1e-3  # iterations of conjugate gradients, and the relativ
 
 
 def integrate_bilaterally(
-    scene: Scene, k: float = 2.0, most: int = 150, rest: float = 1e-4
+    scene: Scene, k: float = 2.0, iterations: int = 150, rest: float = 1e-4
 ) -> tuple[Map, int]:
     """Return heights, (H, W), and the number of iterations.
 
@@ -31,20 +31,20 @@ def integrate_bilaterally(
     from scipy import sparse
     from scipy.special import expit
 
-    matrix, wanted, there = _equations(scene)
-    both = there.reshape(2, 2, -1).all(axis=1, keepdims=True)  # axis, side, pixel
-    share = np.where(both, 0.5, there.reshape(2, 2, -1))
+    matrix, targets, valid = _equations(scene)
+    both = valid.reshape(2, 2, -1).all(axis=1, keepdims=True)  # axis, side, pixel
+    weights = np.where(both, 0.5, valid.reshape(2, 2, -1))
     depth, energy, steps = np.zeros(matrix.shape[1]), np.inf, 0
-    while steps < most:
+    while steps < iterations:
         steps += 1
-        weighted = matrix.T @ sparse.diags_array(share.ravel())
-        depth = _solve(sparse.csr_array(weighted @ matrix), weighted @ wanted, depth)
+        weighted = matrix.T @ sparse.diags_array(weights.ravel())
+        depth = _solve(sparse.csr_array(weighted @ matrix), weighted @ targets, depth)
         differences = matrix @ depth
-        last, energy = energy, float(share.ravel() @ (differences - wanted) ** 2)
+        last, energy = energy, float(weights.ravel() @ (differences - targets) ** 2)
         if abs(last - energy) < rest * last:
             break
         square = (differences**2).reshape(2, 2, -1)
-        share = np.where(both, expit(k * (square[:, ::-1] - square)), there.reshape(2, 2, -1))
+        weights = np.where(both, expit(k * (square[:, ::-1] - square)), valid.reshape(2, 2, -1))
     height = np.full(scene.mask.shape, np.nan)
     height[scene.mask] = -scene.pixel_size * depth
     return height, steps
@@ -53,8 +53,8 @@ def integrate_bilaterally(
 def _solve(matrix: Any, source: Map, start: Map) -> Map:
     """Solve by conjugate gradients; SciPy's solver spends most of its time on threads for sums."""
 
-    def dot(one: Map, other: Map) -> float:
-        return float(np.einsum("i,i", one, other))
+    def dot(left: Map, other: Map) -> float:
+        return float(np.einsum("i,i", left, other))
 
     x, residual = start.copy(), source - matrix @ start
     inverse = 1 / np.maximum(matrix.diagonal(), 1e-30)
@@ -80,13 +80,13 @@ def _equations(scene: Scene) -> tuple[Any, Map, NDArray[np.bool_]]:
     row, column = np.nonzero(mask)
     ringed = np.pad(np.where(mask, np.cumsum(mask).reshape(mask.shape) - 1, -1), 1, constant_values=-1)
     here = np.arange(len(row))
-    parts, wanted, there = [], [], []
+    parts, targets, valid = [], [], []
     for below, right, slope in ((0, 1, across), (0, -1, across), (-1, 0, up), (1, 0, up)):
         other = ringed[row + 1 + below, column + 1 + right]
         exists = other >= 0
         factor = np.where(exists, (right - below) * towards, 0.0)
         places = np.tile(here, 2), np.concatenate([np.where(exists, other, here), here])
         parts.append(sparse.coo_array((np.concatenate([factor, -factor]), places), (len(here),) * 2))
-        wanted.append(np.where(exists, slope, 0.0))
-        there.append(exists)
-    return sparse.csr_array(sparse.vstack(parts)), np.concatenate(wanted), np.concatenate(there)
+        targets.append(np.where(exists, slope, 0.0))
+        valid.append(exists)
+    return sparse.csr_array(sparse.vstack(parts)), np.concatenate(targets), np.concatenate(valid)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +23,6 @@ from mirrorskin.engine import (
     fuse,
     integrate,
 )
-from mirrorskin.evaluation import robust
 from mirrorskin.evaluation.base.sources import run_unchecked
 from mirrorskin.evaluation.base.tables import at_most, within
 from mirrorskin.evaluation.scenes import rotations
@@ -60,13 +59,13 @@ def run_press(device: Device, quick: bool) -> Case:
 def _sudden(kind: str, shape: tuple[int, int], device: Device, slack: float) -> list[Target]:
     """Return targets of changes between two frames."""
     place = np.random.default_rng(1).uniform(2, _FRAMES - 2, shape)
-    frames, known = _changes(kind, place, 0.0)
-    found = find_onset(frames, **known, noise=_press_noise(kind), device=device)
+    frames, options = _changes(kind, place, 0.0)
+    onset = find_onset(frames, **options, noise=_press_noise(kind), device=device)
     first = np.ceil(place)
-    error = _frame_error(found, place) * np.sqrt(12)
-    sigma = float(np.mean(found.height_sigma)) / _STEP * np.sqrt(12)
+    error = _frame_error(onset, place) * np.sqrt(12)
+    sigma = float(np.mean(onset.height_sigma)) / _STEP * np.sqrt(12)
     return [
-        at_most(f"{kind}, sudden: onsets in another frame", float(np.mean(found.frame != first)), 0),
+        at_most(f"{kind}, sudden: onsets in another frame", float(np.mean(onset.frame != first)), 0),
         within(f"{kind}, sudden: RMS error of 1/sqrt(12) frame", _rms(error), 1 - slack, 1 + slack),
         within(f"{kind}, sudden: sigma of 1/sqrt(12) frame", sigma, 0.999, 1.001),
     ]
@@ -76,14 +75,14 @@ def _ramps(kind: str, shape: tuple[int, int], device: Device, slack: float) -> l
     """Return targets of ramps of 6 frames, and of the error relative to the best estimate's."""
     lasts = 6.0
     place = np.random.default_rng(2).uniform(2 + lasts, _FRAMES - 2 - lasts, shape)
-    frames, known = _changes(kind, place, lasts)
+    frames, options = _changes(kind, place, lasts)
     noise = _press_noise(kind)
-    onset = find_onset(frames, **known, noise=noise, device=device)
-    travel = known.pop("travel")
-    change = run_unchecked(ChangePoint(**known, noise=noise, device=device), frames, travel=travel)
-    share = np.ceil(place) - place  # share of the interval after the crossing
+    onset = find_onset(frames, **options, noise=noise, device=device)
+    travel = options.pop("travel")
+    change = run_unchecked(ChangePoint(**options, noise=noise, device=device), frames, travel=travel)
+    fraction = np.ceil(place) - place  # share of the interval after the crossing
     span = _LEVELS[kind][1] - _LEVELS[kind][0]
-    line = noise * lasts / span * np.sqrt(np.mean(share**2 + (1 - share) ** 2))
+    line = noise * lasts / span * np.sqrt(np.mean(fraction**2 + (1 - fraction) ** 2))
     best = noise * lasts / span / np.sqrt(lasts)  # Cramer-Rao bound for known levels
     error, other = _frame_error(onset, place), _frame_error(change, place)
     return [
@@ -99,9 +98,9 @@ def _changes(kind: str, place: Doubles, lasts: float) -> tuple[NDArray[Any], dic
     """Return frames, (T, H, W), that cross the threshold at a time, and travel, dark and bright."""
     dark, bright = _LEVELS[kind]
     number = np.arange(_FRAMES)[:, np.newaxis, np.newaxis]
-    share = np.clip((number - place) / lasts + 0.5, 0, 1) if lasts else (number >= place).astype(float)
-    noise = np.random.default_rng(3).normal(0, _CHANGE_NOISE, share.shape)
-    counts = dark + (bright - dark) * (share + noise)
+    light = np.clip((number - place) / lasts + 0.5, 0, 1) if lasts else (number >= place).astype(float)
+    noise = np.random.default_rng(3).normal(0, _CHANGE_NOISE, light.shape)
+    counts = dark + (bright - dark) * (light + noise)
     frames = counts.astype(kind) if kind == "float32" else np.rint(counts).astype(kind)
     return frames, {"travel": np.arange(_FRAMES) * _STEP, "dark": dark, "bright": bright}
 
@@ -112,13 +111,13 @@ def _press_noise(kind: str) -> float:
     return light if kind == "float32" else float(np.hypot(light, 1 / np.sqrt(12)))
 
 
-def _frame_error(found: Result, place: Doubles) -> Doubles:
+def _frame_error(result: Result, place: Doubles) -> Doubles:
     """Return the error of the height in frames; NaN if there is no height."""
-    return np.asarray(-found.height.astype(np.float64) / _STEP - place)
+    return np.asarray(-result.height.astype(np.float64) / _STEP - place)
 
 
-def _chi_square(found: Result, error: Doubles) -> float:
-    return float(np.mean((error * _STEP / found.height_sigma) ** 2))
+def _chi_square(result: Result, error: Doubles) -> float:
+    return float(np.mean((error * _STEP / result.height_sigma) ** 2))
 
 
 def _rms(error: Doubles) -> float:
@@ -177,10 +176,10 @@ def run_surfaces(device: Device, quick: bool) -> Case:
     shape = (45, 60) if quick else (600, 801)
     targets = []
     for name, (make, bound) in _SURFACES.items():
-        known = make(*_grid(shape))
+        truth = make(*_grid(shape))
         for where, mask, slack in (("whole picture", None, 0.0), ("a ring", _ring(shape), 2e-5)):
-            found = integrate(known.dz_dx, known.dz_dy, _PIXEL, mask=mask, sigma=False, device=device)
-            off = _range_error(found, known)
+            result = integrate(truth.dz_dx, truth.dz_dy, _PIXEL, mask=mask, sigma=False, device=device)
+            off = _range_error(result, truth)
             targets.append(at_most(f"{name}, {where}: RMS error, of the range", off, bound + slack))
     targets += _noisy(device, quick)
     title = f"heights of {shape[0]} x {shape[1]} slopes of analytic surfaces"
@@ -226,14 +225,14 @@ _SURFACES: dict[str, tuple[Callable[[Doubles, Doubles], Known], float]] = {
 def _noisy(device: Device, quick: bool) -> list[Target]:
     """Return the target that errors of heights from noisy slopes agree with sigma."""
     shape, draws = ((24, 30), 3) if quick else ((60, 80), 20)
-    known = _waves(*_grid(shape))
+    truth = _waves(*_grid(shape))
     generator, square = np.random.default_rng(9), []
     for _ in range(draws):
         noise = generator.normal(0, _SLOPE_NOISE, (2, *shape))
-        given = known.dz_dx + noise[0], known.dz_dy + noise[1]
-        found = integrate(*given, _PIXEL, slope_weights=1 / _SLOPE_NOISE**2, device=device)
-        error = found.height - known.height
-        square.append(np.mean(((error - error.mean()) / found.height_sigma) ** 2))
+        slopes = truth.dz_dx + noise[0], truth.dz_dy + noise[1]
+        result = integrate(*slopes, _PIXEL, slope_weights=1 / _SLOPE_NOISE**2, device=device)
+        error = result.height - truth.height
+        square.append(np.mean(((error - error.mean()) / result.height_sigma) ** 2))
     low, high = (0.5, 1.5) if quick else (0.75, 1.25)
     return [within("noisy slopes: chi-square", float(np.mean(square)), low, high)]
 
@@ -245,8 +244,8 @@ def run_fusion(device: Device, quick: bool) -> Case:
     x, y = 201 / size * x, 201 / size * y
     away = np.hypot(x, y)
     zenith = np.arcsin(np.minimum(away / _RADIUS, 0.999))
-    there = zenith <= _DEEP
-    truth = np.where(there, np.sqrt(np.maximum(_RADIUS**2 - away**2, 0)) - _RADIUS, np.nan)
+    touched = zenith <= _DEEP
+    truth = np.where(touched, np.sqrt(np.maximum(_RADIUS**2 - away**2, 0)) - _RADIUS, np.nan)
     lit = (zenith >= _LIT[0]) & (zenith <= _LIT[1])
     middle = (np.floor(np.nan_to_num(truth) / _PRESS_STEP) + 0.5) * _PRESS_STEP
     height, sigma = (
@@ -254,13 +253,15 @@ def run_fusion(device: Device, quick: bool) -> Case:
     )
     press = Result(height=height, height_sigma=sigma)
     setup = rotations.SETUPS["uint16"]
-    frames = rotations.expose(rotations.direction(np.where(there, zenith, 0.0), np.arctan2(y, x)), setup, 10)
+    frames = rotations.expose(
+        rotations.direction(np.where(touched, zenith, 0.0), np.arctan2(y, x)), setup, 10
+    )
     turned = _normals(frames, setup, device)
-    turn = turned.assign(contact=(turned.contact * there).astype(np.uint8))
-    found = fuse(press, turn, _PIXEL * 201 / size, mask=there, device=device)
+    turn = turned.assign(contact=(turned.contact * touched).astype(np.uint8))
+    fused = fuse(press, turn, _PIXEL * 201 / size, mask=touched, device=device)
     inner = zenith <= _LIT[1]
-    error = (found.height - truth)[inner]
-    top = (found.height - truth)[zenith <= np.radians(5)]
+    error = (fused.height - truth)[inner]
+    top = (fused.height - truth)[zenith <= np.radians(5)]
     answered = float(np.isfinite(error).mean())
     targets = [
         within("pixels with a height", answered, 1.0, 1.0),
@@ -287,29 +288,30 @@ def _ring(shape: tuple[int, int]) -> NDArray[np.uint8]:
     return ((away < 0.95) & (away > 0.02)).astype(np.uint8)
 
 
-def _range_error(found: Result, known: Known) -> float:
+def _range_error(result: Result, truth: Known) -> float:
     """Return the root mean square error about its mean, in ranges of the heights."""
-    error = (found.height - known.height)[np.isfinite(found.height)]
-    return float(np.std(error) / np.ptp(known.height[np.isfinite(found.height)]))
+    error = (result.height - truth.height)[np.isfinite(result.height)]
+    return float(np.std(error) / np.ptp(truth.height[np.isfinite(result.height)]))
 
 
 def _case(name: str, title: str, targets: list[Target]) -> Case:
     return Case(name, title, [], {}, (), tuple(targets))
 
 
-CASES: dict[str, Callable[[Device, bool], Case]] = {
+Measurement = Callable[[Device, bool], Case]
+
+CASES: dict[str, Measurement] = {
     "accuracy-press": run_press,
     "accuracy-normals": run_normals,
     "accuracy-surfaces": run_surfaces,
     "accuracy-fusion": run_fusion,
-    **robust.CASES,
 }
 
 
-def measure(device: Device, quick: bool = False) -> Run:
-    """Run all cases."""
+def measure(device: Device, quick: bool = False, more: Mapping[str, Measurement] | None = None) -> Run:
+    """Run all cases, and some more."""
     cases = []
-    for name, run in CASES.items():
+    for name, run in {**CASES, **(more or {})}.items():
         print(name, file=sys.stderr)
         cases.append(run(device, quick))
     return describe_run(device, cases, quick)

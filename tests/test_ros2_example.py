@@ -107,7 +107,7 @@ def bag(monkeypatch, tmp_path):
 @pytest.fixture
 def published(bag, clock, monkeypatch):
     """Run the node; return what another program reads in the bag, by topic."""
-    rig = fake_rig(spreading(SHAPE), clock, rate=60.0, told={"pixel_size": (0.05, 0.05), "rate": 60.0})
+    rig = fake_rig(spreading(SHAPE), clock, rate=60.0, stated={"pixel_size": (0.05, 0.05), "rate": 60.0})
     monkeypatch.setattr(hw, "load_rig", lambda _path: rig.settings)
     monkeypatch.setattr(hw, "open_rig", lambda settings: rig)
     runpy.run_path(str(NODE))["main"]("rig.toml", 1.0)

@@ -45,19 +45,19 @@ def run_batch(device: Device, quick: bool) -> Case:
         press = make_press(shape)
         jobs = make_jobs(_record_all(press, count, folder), folder / "results")
         results = jobs[0].target.parent
-        least = partial(_do_least, jobs, press, _frames_offset(jobs[0].source), device)
+        bare_work = partial(_do_least, jobs, press, _frames_offset(jobs[0].source), device)
         clear = partial(_clear, results)
         works = {
-            LEAST: Work(least, size, count * shape[0], before=clear),
+            LEAST: Work(bare_work, size, count * shape[0], before=clear),
             LOOP: Work(partial(_loop, jobs, device), size, count * shape[0], before=clear),
             BATCH: Work(partial(_run, jobs, device), size, count * shape[0], before=clear),
         }
 
-        def check(found: dict[str, Any]) -> None:
-            maps = {LOOP: found[LOOP]}
+        def check(results: dict[str, Any]) -> None:
+            maps = {LOOP: results[LOOP]}
             maps |= {f"{BATCH}, {job.target.name}": io.open_result(job.target).maps() for job in jobs}
             for name, mine in maps.items():
-                agree(name, mine, found[LEAST], whose=f"{OURS}, in memory")
+                agree(name, mine, results[LEAST], whose=f"{OURS}, in memory")
 
         copies = min(count, _COPIES) * math.prod(shape)
         rows = time_works(works, copies, device, quick, check, rounds=_ROUNDS)

@@ -68,7 +68,7 @@ def _change_point(shape: Shape, device: Device) -> Call:
 
 def _edges(shape: Shape, device: Device) -> Call:
     maps = roof(shape)
-    return partial(engine.find_edges, *maps, device=device), sum(one.nbytes for one in maps), 0
+    return partial(engine.find_edges, *maps, device=device), sum(array.nbytes for array in maps), 0
 
 
 def _fuse(shape: Shape, device: Device) -> Call:
@@ -109,8 +109,8 @@ def run_function(function: str, device: Device, quick: bool) -> Case:
 
 def run_sizes(device: Device, quick: bool) -> Case:
     """Time functions on arrays of several sizes, whose checks do not grow with them; also processor time."""
-    works, used, most = dict[str, Work](), dict[str, list[float]](), max(map(math.prod, _SIZES))
-    check_memory("call-sizes", (_WORKING + 2 * (_TRAVELS + _TURN)) * most)
+    works, used, largest = dict[str, Work](), dict[str, list[float]](), max(map(math.prod, _SIZES))
+    check_memory("call-sizes", (_WORKING + 2 * (_TRAVELS + _TURN)) * largest)
     for shape in _SIZES[:1] if quick else _SIZES:
         for title, call in _of_size(shape, device):
             name = f"{OURS} {title}, {shape[0]} x {shape[1]}"
@@ -168,10 +168,10 @@ def run_commands(device: Device, quick: bool) -> Case:
             command = [sys.executable, "-m", "mirrorskin.cli.main", what.split()[0], *words]
             command += ["-o", str(output), "--json", "--device", device.info.title]
             row = _time_process(f"{OURS} {what}", command, 1 if quick else _ROUNDS, output)
-            most, took = _WITHIN[what], row.wall.median
+            limit, took = _WITHIN[what], row.wall.median
             rows.append(row)
             notes.append(f"{row.name}: {1e3 * took:.0f} ms, {100 * row.kernel / took:.0f} % in kernels")
-            targets.append(Target(row.name, f"at most {most:g} s", f"{took:.2f} s", took <= most))
+            targets.append(Target(row.name, f"at most {limit:g} s", f"{took:.2f} s", took <= limit))
     title = f"commands on a press of {_FRAMES} and a turn of {STEPS} x {shape[0]} x {shape[1]} uint8"
     return Case(name, title, rows, {}, tuple(notes), () if quick else tuple(targets))
 

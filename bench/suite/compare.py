@@ -68,8 +68,11 @@ class Comparison:
     @property
     def summary(self) -> tuple[str, ...]:
         """Numbers of changed works; limits, which are properties of the machine, are counted separately."""
-        every = [one for rows in self.cases.values() for one in rows]
-        limits, works = ([one for one in every if ("limit" in one.name) is kind] for kind in (True, False))
+        every = [difference for rows in self.cases.values() for difference in rows]
+        limits, works = (
+            [difference for difference in every if ("limit" in difference.name) is kind]
+            for kind in (True, False)
+        )
         return tuple(
             f"{what}: {_count(rows)}; B takes {_mean(rows):.2f} times as long as A (geometric mean)"
             for what, rows in (("works", works), ("limits of the machine", limits))
@@ -100,26 +103,26 @@ def compare(before: Run, after: Run) -> Comparison:
 
 def as_text(before: Run, after: Run) -> str:
     """Compare two runs, and return titles, tables and other differences as text."""
-    found = compare(before, after)
-    parts = [f"A: {before.title}", f"B: {after.title}", *(f"warning: {line}" for line in found.warnings)]
-    for name, rows in found.cases.items():
+    comparison = compare(before, after)
+    parts = [f"A: {before.title}", f"B: {after.title}", *(f"warning: {line}" for line in comparison.warnings)]
+    for name, rows in comparison.cases.items():
         parts += ["", name, *_aligned([list(HEAD), *as_rows(rows)])]
-    return "\n".join([*parts, "", *found.targets, *found.apart, *found.summary])
+    return "\n".join([*parts, "", *comparison.targets, *comparison.apart, *comparison.summary])
 
 
 def as_rows(differences: Sequence[Difference]) -> list[list[str]]:
     """Return the table of a case as cells under `HEAD`."""
     return [
         [
-            one.name,
-            as_ms(one.before),
-            as_ms(one.after),
-            f"{one.ratio:.2f}",
-            f"{one.lower:.2f}-{one.upper:.2f}",
-            one.verdict if one.verdict != "as before" else "",
-            *map(as_percent, one.shares),
+            difference.name,
+            as_ms(difference.before),
+            as_ms(difference.after),
+            f"{difference.ratio:.2f}",
+            f"{difference.lower:.2f}-{difference.upper:.2f}",
+            difference.verdict if difference.verdict != "as before" else "",
+            *map(as_percent, difference.shares),
         ]
-        for one in differences
+        for difference in differences
     ]
 
 
@@ -192,16 +195,16 @@ def _apart(old: dict[str, Case], new: dict[str, Case], cases: dict[str, list[Dif
         if only := [name for name in mine if name not in others]:
             yield f"only in {word}: {', '.join(only)}"
     for name in (name for name in old if name in new):
-        compared = {one.name for one in cases.get(name, [])}
+        compared = {difference.name for difference in cases.get(name, [])}
         names = dict.fromkeys(row.name for case in (old[name], new[name]) for row in case.rows)
         if rest := [row for row in names if row not in compared]:
             yield f"{name}: not the same work in both, or only in one: {', '.join(rest)}"
 
 
 def _count(rows: Sequence[Difference]) -> str:
-    counts = Counter(one.verdict for one in rows)
+    counts = Counter(difference.verdict for difference in rows)
     return ", ".join(f"{counts[verdict]} {verdict}" for verdict in get_args(Verdict) if counts[verdict])
 
 
 def _mean(rows: Sequence[Difference]) -> float:
-    return math.exp(sum(math.log(one.ratio) for one in rows) / len(rows))
+    return math.exp(sum(math.log(difference.ratio) for difference in rows) / len(rows))

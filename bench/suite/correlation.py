@@ -92,10 +92,10 @@ def _numpy(frames: Counts, phase: Doubles) -> Floats:
         # Differences are small, so that their squares are exact.
         x = np.subtract(raw[:, pixels], reference, out=scratch[:, : len(reference)])
         wave = fit @ x
-        left = np.einsum("kp,kp->p", x, x) - np.einsum("kp,kp->p", wave, gram @ wave)
+        squares = np.einsum("kp,kp->p", x, x) - np.einsum("kp,kp->p", wave, gram @ wave)
         np.add(wave[0], reference, out=maps[0, pixels])
         maps[1:3, pixels] = wave[1:]
-        np.sqrt(np.maximum(left, 0) / np.float32(len(frames) - 3), out=maps[3, pixels])
+        np.sqrt(np.maximum(squares, 0) / np.float32(len(frames) - 3), out=maps[3, pixels])
     return maps.reshape(4, *frames.shape[1:])
 
 
@@ -122,13 +122,13 @@ def _numba_kernel() -> Any:  # noqa: C901  # functions to compile
 
     @numba.njit(**options)
     def add_four(frames, k, first, end, model, work):  # type: ignore[no-untyped-def]
-        one, two = frames[k, first:end], frames[k + 1, first:end]
+        first_row, two = frames[k, first:end], frames[k + 1, first:end]
         three, four = frames[k + 2, first:end], frames[k + 3, first:end]
         c1, c2, c3, c4 = model[1, k], model[1, k + 1], model[1, k + 2], model[1, k + 3]
         s1, s2, s3, s4 = model[2, k], model[2, k + 1], model[2, k + 2], model[2, k + 3]
         for p in range(end - first):
             reference = work[first_sample + p]
-            a, b = np.float32(one[p]) - reference, np.float32(two[p]) - reference
+            a, b = np.float32(first_row[p]) - reference, np.float32(two[p]) - reference
             c, d = np.float32(three[p]) - reference, np.float32(four[p]) - reference
             work[total + p] += a + b + c + d
             work[along + p] += c1 * a + c2 * b + c3 * c + c4 * d
@@ -146,17 +146,17 @@ def _numba_kernel() -> Any:  # noqa: C901  # functions to compile
 
     @numba.njit(**options)
     def put(count, first, end, solve, work, maps):  # type: ignore[no-untyped-def]
-        share = np.float32(1 / (count - 3))
+        scale = np.float32(1 / (count - 3))
         mean, cosine, sine, residual = maps[0], maps[1], maps[2], maps[3]
         for p in range(end - first):
             x, y, z = work[total + p], work[along + p], work[across + p]
             a = solve[0, 0] * x + solve[0, 1] * y + solve[0, 2] * z
             b = solve[1, 0] * x + solve[1, 1] * y + solve[1, 2] * z
             c = solve[2, 0] * x + solve[2, 1] * y + solve[2, 2] * z
-            left = work[square + p] - a * x - b * y - c * z
+            squares = work[square + p] - a * x - b * y - c * z
             mean[first + p] = work[first_sample + p] + a
             cosine[first + p], sine[first + p] = b, c
-            residual[first + p] = math.sqrt(max(left, np.float32(0)) * share)
+            residual[first + p] = math.sqrt(max(squares, np.float32(0)) * scale)
 
     def correlate(frames, model, solve, maps):  # type: ignore[no-untyped-def]
         for tile in numba.prange(-(-frames.shape[1] // _TILE)):

@@ -72,29 +72,29 @@ def call_targets(rows: Mapping[str, Row], faster: Mapping[str, float] | None = N
     goals = {**_PEERS, **(faster or {})}
     targets = []
     for name, factor in ((OURS, _SECOND_CALL), (FIRST, _FIRST_CALL)):
-        most, took = factor * rows[OURS].kernel + _OTHER, rows[name].wall.median
-        bound = f"at most {factor} times the kernels and {1e3 * _OTHER:.0f} ms: {1e3 * most:.1f} ms"
-        targets.append(Target(name, bound, f"{1e3 * took:.1f} ms", took <= most))
+        limit, took = factor * rows[OURS].kernel + _OTHER, rows[name].wall.median
+        bound = f"at most {factor} times the kernels and {1e3 * _OTHER:.0f} ms: {1e3 * limit:.1f} ms"
+        targets.append(Target(name, bound, f"{1e3 * took:.1f} ms", took <= limit))
     for peer in rows.values():
         name, comma, part = peer.name.partition(", ")
         if name != OURS and not peer.is_limit:
-            mine, wanted = rows[OURS + comma + part], goals.get(peer.name, goals.get(name, 1.0))
-            targets.append(ratio_target(mine.name, wanted, mine, peer, peer.name, faster=True))
+            mine, goal = rows[OURS + comma + part], goals.get(peer.name, goals.get(name, 1.0))
+            targets.append(ratio_target(mine.name, goal, mine, peer, peer.name, faster=True))
     return tuple(targets)
 
 
 def agree(
     name: str,
-    found: Mapping[str, NDArray[Any]],
+    maps: Mapping[str, NDArray[Any]],
     expected: Mapping[str, NDArray[Any]],
     tolerance: Mapping[str, Any] | None = None,
     whose: str = OURS,
 ) -> None:
     """Raise DisagreementError unless maps equal the expected ones within a tolerance, with the same NaN."""
     for word, right in expected.items():
-        if word not in found:
+        if word not in maps:
             raise DisagreementError(f"{name}: there is no {word}; nothing was timed")
-        mine = np.asarray(found[word])
+        mine = np.asarray(maps[word])
         with np.errstate(invalid="ignore"):
             near = np.abs(mine.astype(np.float64) - right) <= (tolerance or {}).get(word, 0.0)
         same = near | (mine == right) | (np.isnan(mine) & np.isnan(right))

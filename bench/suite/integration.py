@@ -69,9 +69,9 @@ def run_rectangle(name: str, shape: Shape, device: Device, quick: bool) -> Case:
 
     def check(results: dict[str, Any]) -> None:
         for work in works:
-            found = results[work] - results[work].mean()
-            agree(work, {"height": found}, {"height": exact}, {"height": _NEAR["full"] * span})
-            errors[work] = float(np.sqrt(np.mean(np.square(found - exact)))) / span
+            heights = results[work] - results[work].mean()
+            agree(work, {"height": heights}, {"height": exact}, {"height": _NEAR["full"] * span})
+            errors[work] = float(np.sqrt(np.mean(np.square(heights - exact)))) / span
 
     rows = time_works(works, moved, device, quick, check, first="triad")
     title = f"heights of a full picture; {' x '.join(map(str, shape))} float32"
@@ -153,13 +153,13 @@ def run_many(device: Device, quick: bool) -> Case:
         height: Floats = engine.integrate(some[0], some[1], PIXEL, mask=mask, device=device).height
         return height
 
-    one, all_ = (count * _FULL * pixels + pixels for count in (1, _SIDES))
-    works = {OURS: Work(partial(find, slopes), all_), alone: Work(partial(find, slopes[:, -1]), one)}
+    one_side, all_ = (count * _FULL * pixels + pixels for count in (1, _SIDES))
+    works = {OURS: Work(partial(find, slopes), all_), alone: Work(partial(find, slopes[:, -1]), one_side)}
     absent, solve = missing(PYAMG), f"{PYAMG}, solve only"
     if not absent:
         error = truth.error(np.asarray(works[alone].call()))
         theirs, _ = _pyamg_works(slopes[:, -1], mask, None, truth, error)
-        works |= {f"{PYAMG}, {part}": Work(call, one) for part, call in theirs.items()}
+        works |= {f"{PYAMG}, {part}": Work(call, one_side) for part, call in theirs.items()}
 
     def check(results: dict[str, Any]) -> None:
         truth.check(OURS, results[OURS][-1], "mask")
@@ -295,13 +295,13 @@ class Graph(NamedTuple):
 
 def link(slopes: Floats, mask: Flags | None = None, edges: Flags | None = None) -> Graph:
     """Return the graph of slopes dz/dx and dz/dy, (2, H, W), equal to the engine's, as plain arrays."""
-    known = np.isfinite(slopes[0]) & np.isfinite(slopes[1])
+    valid = np.isfinite(slopes[0]) & np.isfinite(slopes[1])
     if mask is not None:
-        known &= mask != 0
-    right, down = known[:, :-1] & known[:, 1:], known[:-1] & known[1:]
+        valid &= mask != 0
+    right, down = valid[:, :-1] & valid[:, 1:], valid[:-1] & valid[1:]
     if edges is not None:
-        _cut(right, down, known, edges != 0, slopes)
-    source = np.zeros(known.shape)  # in double precision it sums to 0
+        _cut(right, down, valid, edges != 0, slopes)
+    source = np.zeros(valid.shape)  # in double precision it sums to 0
     across, up = _rises(slopes[0], right), _rises(slopes[1].T, down.T).T
     source[:, :-1] -= across
     source[:, 1:] += across
@@ -310,26 +310,26 @@ def link(slopes: Floats, mask: Flags | None = None, edges: Flags | None = None) 
     return Graph(right, down, source)
 
 
-def _cut(right: Mask, down: Mask, known: Mask, edges: Mask, slopes: Floats) -> None:
+def _cut(right: Mask, down: Mask, valid: Mask, edges: Mask, slopes: Floats) -> None:
     """Keep one link of each pixel on an edge: to the most similar neighbour that is not on an edge."""
     right &= ~(edges[:, :-1] | edges[:, 1:])
     down &= ~(edges[:-1] | edges[1:])
-    free, values = np.pad(known & ~edges, 1), np.pad(slopes, ((0, 0), (1, 1), (1, 1)))
-    row, column = np.nonzero(known & edges)
+    free, values = np.pad(valid & ~edges, 1), np.pad(slopes, ((0, 0), (1, 1), (1, 1)))
+    row, column = np.nonzero(valid & edges)
     here = values[:, row + 1, column + 1].astype(np.float64)
     unlike = np.empty((4, len(row)))
     for far, (below, right_of) in zip(unlike, _AROUND, strict=True):
-        there = np.s_[row + 1 + below, column + 1 + right_of]
-        far[:] = np.where(free[there], np.sum(np.square(values[:, *there] - here), axis=0), np.inf)
+        neighbour = np.s_[row + 1 + below, column + 1 + right_of]
+        far[:] = np.where(free[neighbour], np.sum(np.square(values[:, *neighbour] - here), axis=0), np.inf)
     nearest = np.where(np.isfinite(unlike).any(axis=0), unlike.argmin(axis=0), -1)
-    for number, (links, up, left) in enumerate(((right, 0, 0), (right, 0, 1), (down, 0, 0), (down, 1, 0))):
+    for number, (links, up, back) in enumerate(((right, 0, 0), (right, 0, 1), (down, 0, 0), (down, 1, 0))):
         chosen = nearest == number
-        links[row[chosen] - up, column[chosen] - left] = True
+        links[row[chosen] - up, column[chosen] - back] = True
 
 
 def _rises(slope: Floats, linked: Mask) -> Floats:
     """Return the rise along each link to the next column; 0 where there is none."""
-    half, inner, outer = (slope.dtype.type(share * PIXEL) for share in (1 / 2, 13 / 24, 1 / 24))
+    half, inner, outer = (slope.dtype.type(weight * PIXEL) for weight in (1 / 2, 13 / 24, 1 / 24))
     rises: Floats = half * (slope[:, :-1] + slope[:, 1:])
     wide = inner * (slope[:, 1:-2] + slope[:, 2:-1]) - outer * (slope[:, :-3] + slope[:, 3:])
     four = linked[:, :-2] & linked[:, 1:-1] & linked[:, 2:]
@@ -364,9 +364,9 @@ def assemble(graph: Graph) -> System:
     place = np.flatnonzero(linked).astype(np.int32)
     values = entries.reshape(5, -1)[:, place].T
     columns = place[:, np.newaxis] + np.array([-shape[1], -1, 0, 1, shape[1]], np.int32)
-    there = values != 0
-    starts = np.concatenate([[0], np.cumsum(np.count_nonzero(there, axis=1))]).astype(np.int32)
-    parts = values[there].astype(np.float64), number[columns[there]], starts
+    nonzero = values != 0
+    starts = np.concatenate([[0], np.cumsum(np.count_nonzero(nonzero, axis=1))]).astype(np.int32)
+    parts = values[nonzero].astype(np.float64), number[columns[nonzero]], starts
     return System(
         sparse.csr_matrix(parts, (len(place),) * 2), graph.source[linked].astype(np.float64), linked
     )
@@ -375,12 +375,12 @@ def assemble(graph: Graph) -> System:
 class Truth:
     """The direct solution of one problem in double precision, and the errors of other solutions."""
 
-    def __init__(self, system: System, wanted: Mask) -> None:
+    def __init__(self, system: System, members: Mask) -> None:
         import scipy.sparse as sparse
         from scipy.sparse.csgraph import connected_components
         from scipy.sparse.linalg import splu
 
-        self.system, self.wanted = system, wanted
+        self.system, self.wanted = system, members
         self.count, self._label = connected_components(system.matrix, directed=False)
         first = np.unique(self._label, return_index=True)[1]  # pixel of each component, fixed at 0
         held = sparse.csc_matrix((np.ones(len(first)), (first, first)), system.matrix.shape)

@@ -104,8 +104,10 @@ def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
     assert height is not None
     off = (height - best)[np.isfinite(best)].astype(np.float64)
     span = float(np.nanmax(best) - np.nanmin(best))
-    rms, most = math.sqrt(float(np.mean(off**2))) / span, float(np.abs(off).max()) / span
-    note = f"the last heights differ from the converged ones by {rms:.1e} of their range, at most {most:.1e}"
+    rms, largest = math.sqrt(float(np.mean(off**2))) / span, float(np.abs(off).max()) / span
+    note = (
+        f"the last heights differ from the converged ones by {rms:.1e} of their range, at most {largest:.1e}"
+    )
     targets = () if quick else judge_rotation(ran, rms)
     title = f"normals, heights and edges during a rotation; {case.size}"
     return Case(case.name, title, [], {}, (*_notes(ran), note), targets)
@@ -123,10 +125,10 @@ def _run(source: Paced, operation: LiveRun) -> Ran:
     return Ran(status, time.monotonic() - begun, last[0], load)
 
 
-def judge_press(ran: Ran, least: float) -> tuple[Target, ...]:
+def judge_press(ran: Ran, required_rate: float) -> tuple[Target, ...]:
     """Return the targets of the sustained rate and of losses."""
     rate, lost = ran.status.used / ran.seconds, ran.status.dropped + ran.status.skipped
-    bound, met = f"at least {least:g} a second", rate >= _KEPT_UP * least
+    bound, met = f"at least {required_rate:g} a second", rate >= _KEPT_UP * required_rate
     return (
         Target("frames that were used", bound, f"{rate:.1f} a second", met),
         Target("frames dropped or skipped", "none", f"{lost} of {ran.status.frames}", lost == 0),

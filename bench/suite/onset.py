@@ -65,20 +65,20 @@ def run_onset(name: str, shape: Shape, stack: StackName, full: bool, device: Dev
         options |= {"hold": 1, "subframe": False, "noise": press_noise(_BYTE)}
     maps = reference_maps(dark, bright, shape[1:] if full else (), _BYTE)  # type: ignore[arg-type]
     level, plateau, light = onset_levels(maps[1], maps[0], _THRESHOLD, _BYTE)
-    known = References(np.asarray(level), np.asarray(light), plateau)
+    levels = References(np.asarray(level), np.asarray(light), plateau)
     absent = missing("torch", "numba")
-    peers = _peers(full, frames, travel, known, absent)
+    peers = _peers(full, frames, travel, levels, absent)
 
     def check(results: dict[str, Any]) -> None:
         words = ("height", "height_sigma", "status") if full else ("frame",)
-        found = {word: getattr(results[OURS], word) for word in words}
+        expected = {word: getattr(results[OURS], word) for word in words}
         for peer in peers:
             if full:
-                sigma = 1e-5 * np.abs(found["height_sigma"])
-                near = {"height": np.spacing(np.abs(found["height"])), "height_sigma": sigma}
-                agree(peer, results[peer], found, near)
+                sigma = 1e-5 * np.abs(expected["height_sigma"])
+                near = {"height": np.spacing(np.abs(expected["height"])), "height_sigma": sigma}
+                agree(peer, results[peer], expected, near)
             else:  # a pixel with invalid input has no onset either
-                agree(peer, {"frame": np.maximum(results[peer], -1)}, found)
+                agree(peer, {"frame": np.maximum(results[peer], -1)}, expected)
 
     what = "full default" if full else "frame of the onset, one threshold, hold 1"
     title = f"{what}; {' x '.join(map(str, shape))} uint8, {stack}"
@@ -126,7 +126,7 @@ class References(NamedTuple):
 
 
 def _peers(
-    full: bool, frames: NDArray[Any], travel: NDArray[np.float64], known: References, absent: dict[str, str]
+    full: bool, frames: NDArray[Any], travel: NDArray[np.float64], levels: References, absent: dict[str, str]
 ) -> dict[str, Callable[[], object]]:
     libraries: dict[str, Library] = {"NumPy": _numpy, "OpenCV": _opencv}
     if "torch" not in absent and not full:  # heights would be computed by NumPy, as for OpenCV
@@ -134,14 +134,14 @@ def _peers(
     noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), True)
     run = _heights if full else _onsets
     works: dict[str, Callable[[], object]] = {
-        name: functools.partial(run, _TILES[name], library, frames, travel, known, noise)
+        name: functools.partial(run, _TILES[name], library, frames, travel, levels, noise)
         for name, library in libraries.items()
     }
     if "numba" not in absent:
         works["Numba"] = (
-            functools.partial(_numba_heights, frames, travel, known, noise)
+            functools.partial(_numba_heights, frames, travel, levels, noise)
             if full
-            else functools.partial(_numba_onsets, frames, known.light)
+            else functools.partial(_numba_onsets, frames, levels.light)
         )
     return works
 
@@ -155,12 +155,12 @@ def _in_tiles(tiles: tuple[int, int], frames: NDArray[Any], fill: Callable[[slic
 
 
 def _onsets(
-    tiles: tuple[int, int], library: Library, frames: NDArray[Any], _: object, known: References, __: float
+    tiles: tuple[int, int], library: Library, frames: NDArray[Any], _: object, levels: References, __: float
 ) -> NDArray[np.int32]:
     onset = np.empty(frames.shape[1:], np.int32)
 
     def fill(rows: slice) -> None:
-        onset[rows] = _first_light(library, frames[:, rows], known.of(rows).light, 1)
+        onset[rows] = _first_light(library, frames[:, rows], levels.of(rows).light, 1)
 
     _in_tiles(tiles, frames, fill)
     return onset
@@ -171,14 +171,14 @@ def _heights(
     library: Library,
     frames: NDArray[Any],
     travel: NDArray[np.float64],
-    known: References,
+    levels: References,
     noise: float,
 ) -> Maps:
     height, sigma = (np.full(frames.shape[1:], np.nan, np.float32) for _ in range(2))
     status = np.empty(height.shape, np.uint8)
 
     def fill(rows: slice) -> None:
-        part, mine = frames[:, rows], known.of(rows)
+        part, mine = frames[:, rows], levels.of(rows)
         onset = _first_light(library, part, mine.light, 2)
         height[rows], sigma[rows], status[rows] = _answer(part, onset, travel, mine, noise)
 
@@ -262,14 +262,14 @@ def _answer(
     frames: NDArray[Any],
     onset: NDArray[np.int32],
     travel: NDArray[np.float64],
-    known: References,
+    levels: References,
     noise: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
     """Return height, sigma and status of onsets in NumPy: the full default, decision 2."""
-    status = np.select([np.isnan(known.level), onset == DARK, onset == 0], [0, 2, 3], 1).astype(np.uint8)
+    status = np.select([np.isnan(levels.level), onset == DARK, onset == 0], [0, 2, 3], 1).astype(np.uint8)
     height, sigma = (np.full(onset.shape, np.nan, np.float32) for _ in range(2))
-    row, column = found = np.nonzero(status == 1)
-    start, level, light = onset[found].astype(np.intp), known.level[found], known.light[found]
+    row, column = pixels = np.nonzero(status == 1)
+    start, level, light = onset[pixels].astype(np.intp), levels.level[pixels], levels.light[pixels]
     sure = onset_sure(level, light, _CONFIDENT * noise)
 
     def last_below(bounds: NDArray[Any]) -> NDArray[np.intp]:
@@ -280,12 +280,12 @@ def _answer(
             frame[todo] -= 1
         return frame
 
-    below, foot = last_below(sure), last_below(onset_near(level, known.dark[found], sure))
+    below, last_dark = last_below(sure), last_below(onset_near(level, levels.dark[pixels], sure))
     last, slack = len(frames) - 1, _PLATEAU * noise
     before, at, *later = (frames[np.minimum(start + k, last), row, column] for k in (-1, 0, 1, 2))
-    height[found], sigma[found], _ = onset_heights(
-        start, below, foot, frames[foot + 1, row, column], before, at, np.fmin(*later), level,
-        known.dark[found], _THRESHOLD, travel, noise, slack, slack * np.sqrt(2), True,
+    height[pixels], sigma[pixels], _ = onset_heights(
+        start, below, last_dark, frames[last_dark + 1, row, column], before, at, np.fmin(*later), level,
+        levels.dark[pixels], _THRESHOLD, travel, noise, slack, slack * np.sqrt(2), True,
     )  # fmt: skip
     return height, sigma, status
 
@@ -298,13 +298,13 @@ def _numba_onsets(frames: NDArray[Any], light: Levels) -> NDArray[np.int32]:
 
 
 def _numba_heights(
-    frames: NDArray[Any], travel: NDArray[np.float64], known: References, noise: float
+    frames: NDArray[Any], travel: NDArray[np.float64], levels: References, noise: float
 ) -> Maps:
     shape = frames.shape[1:]
     maps = {"height": np.empty(shape, np.float32), "height_sigma": np.empty(shape, np.float32)}
     maps |= {"status": np.empty(shape, np.uint8)}
     run = _numba_scan(2, whole=True)
-    flat = (values.reshape(-1) for values in (*known, *maps.values()))
+    flat = (values.reshape(-1) for values in (*levels, *maps.values()))
     run(frames.reshape(len(frames), -1), travel, *flat, noise)
     return maps
 
@@ -340,14 +340,16 @@ def _numba_scan(hold: int, *, whole: bool) -> Any:  # noqa: C901  # to compile
     @numba.njit(error_model="numpy")
     def answer(frames, pixel, start, travel, level, light, dark, noise):  # type: ignore[no-untyped-def]
         confident = level - np.float32(_CONFIDENT * noise)
-        way = level - dark
-        span = way / _THRESHOLD
-        near = level - max(np.float32(0.25) * way, np.float32(0))
-        foot = start - 1
-        while foot > 0 and (
-            frames[foot, pixel] >= light or frames[foot, pixel] > confident or frames[foot, pixel] >= near
+        rise = level - dark
+        span = rise / _THRESHOLD
+        near = level - max(np.float32(0.25) * rise, np.float32(0))
+        last_dark = start - 1
+        while last_dark > 0 and (
+            frames[last_dark, pixel] >= light
+            or frames[last_dark, pixel] > confident
+            or frames[last_dark, pixel] >= near
         ):
-            foot -= 1
+            last_dark -= 1
         below = start - 1
         while below > 0 and (frames[below, pixel] >= light or frames[below, pixel] > confident):
             below -= 1
@@ -358,21 +360,23 @@ def _numba_scan(hold: int, *, whole: bool) -> Any:  # noqa: C901  # to compile
         from_dark, to_light = low <= dark + _PLATEAU * noise, high >= after - sudden_step
         step = high - low
         sudden = from_dark and to_light
-        jumped = foot + 1 < start and frames[foot + 1, pixel] >= after - way / 8 and way >= 34 * noise
-        end = foot + 1 if jumped else start
+        jumped = (
+            last_dark + 1 < start and frames[last_dark + 1, pixel] >= after - rise / 8 and rise >= 34 * noise
+        )
+        end = last_dark + 1 if jumped else start
         from_dark, to_light = from_dark or low <= dark + step / 8, to_light or high >= after - step / 8
-        share = (min(np.float64(level), high) - low) / step
+        fraction = (min(np.float64(level), high) - low) / step
         width = travel[end] - travel[end - 1]
         first, second, middle = (low - dark) / span - 0.5, (high - dark) / span - 0.5, _THRESHOLD - 0.5
         both = first * first + first * second + second * second
-        off = share * BENT * (middle - second) * (middle + first + second) / (1 + BENT * both)
-        noisy = noise * math.sqrt(share * share + (1 - share) * (1 - share)) / step
+        off = fraction * BENT * (middle - second) * (middle + first + second) / (1 + BENT * both)
+        noisy = noise * math.sqrt(fraction * fraction + (1 - fraction) * (1 - fraction)) / step
         line = width * math.sqrt(noisy * noisy + off * off)
         hovers = not jumped and (step <= sudden_step or (start - 2 - below) * step > 2.5 * sudden_step)
         interval = (travel[start] - travel[below] if hovers else width) / math.sqrt(12)
         spread = math.sqrt(line * line + interval * interval) if from_dark or to_light else line
         sudden = sudden or jumped
-        height = -(travel[end - 1] + width * (0.5 if sudden else share))
+        height = -(travel[end - 1] + width * (0.5 if sudden else fraction))
         return height, interval if sudden or hovers else spread
 
     def onsets(frames, light, onset):  # type: ignore[no-untyped-def]

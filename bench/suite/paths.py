@@ -122,9 +122,9 @@ def _beside_memory(
             rows = time_works(works, size, device, quick, check, rounds=ROUNDS)
             notes = (f"frames: {recording.storage}; {recording.how}",)
     if name == "file-turns":
-        share = rows[PATH].bandwidth / rows["read limit"].bandwidth
+        ratio = rows[PATH].bandwidth / rows["read limit"].bandwidth
         bound = f"at least {100 * _LIMIT_SHARE:.0f} % of read bandwidth"
-        target_ = Target(PATH, bound, f"{100 * share:.0f} %", bool(share >= _LIMIT_SHARE))
+        target_ = Target(PATH, bound, f"{100 * ratio:.0f} %", bool(ratio >= _LIMIT_SHARE))
     elif compression == "raw":
         target_ = ratio_target(PATH, 1.25, rows[PATH], rows[IN_MEMORY], "the same in memory", faster=False)
     else:
@@ -151,7 +151,7 @@ def run_zarr(name: str, place: str, device: Device, quick: bool) -> Case:
             calls[_OBJECTS] = lambda: files.cat(files.find("bench/press.zarr"))
         record(make_press(shape), path, "bitshuffle")
         storage = io.save_zarr(path, copy)
-        first, second = (stack.enter_context(io.open_recording(one)) for one in (path, copy))
+        first, second = (stack.enter_context(io.open_recording(source)) for source in (path, copy))
         calls |= {
             PATH: to_new_results(path, folder / "hdf5.h5", device),
             _ZARR_PATH: to_new_results(copy, folder / "zarr.h5", device),
@@ -276,7 +276,7 @@ def run_budget(device: Device, quick: bool) -> Case:
     with new_folder("file-budget", 2 * size + MAPS * math.prod(shape[1:])) as folder:
         press = make_press(shape)
         expected = _reconstruct(press, device, {}).maps()
-        number = [one.title for one in list_devices()].index(device.info.title)
+        number = [info.title for info in list_devices()].index(device.info.title)
         for kind, write in _KINDS.items():
             few, source, target = (folder / f"{name}.h5" for name in ("few", "press", "result"))
             write(press.first(_FEW), few)
@@ -288,10 +288,12 @@ def run_budget(device: Device, quick: bool) -> Case:
             )
             source.unlink()
             agree(f"{OURS}, {kind}", io.open_result(target).maps(), expected)
-            peak, own = json.loads(process.stdout)
+            peak, base = json.loads(process.stdout)
             bound = f"at most {_MORE * budget / 1e6:.0f} MB, the budget of {budget / 1e6:.0f} and 10 %"
-            value = f"{own / 1e6:.0f} MB, and {max(0, peak - own) / 1e6:.0f} of the files' pages in the cache"
-            targets.append(Target(f"{OURS}, peak memory, {kind}", bound, value, own <= _MORE * budget))
+            value = (
+                f"{base / 1e6:.0f} MB, and {max(0, peak - base) / 1e6:.0f} of the files' pages in the cache"
+            )
+            targets.append(Target(f"{OURS}, peak memory, {kind}", bound, value, base <= _MORE * budget))
     return Case("file-budget", title, [], {}, (), () if quick else tuple(targets))
 
 
@@ -335,20 +337,20 @@ def _watch_memory() -> None:
     to_result(Path(few), Path(target), device, **within)
     gc.collect()
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # resets the peak
-    before, own = _resident("VmRSS"), _resident("RssAnon", "RssShmem")
-    most, finished = own, threading.Event()
+    before, base = _resident("VmRSS"), _resident("RssAnon", "RssShmem")
+    largest, finished = base, threading.Event()
 
     def look() -> None:
-        nonlocal most
+        nonlocal largest
         while not finished.wait(0.001):
-            most = max(most, _resident("RssAnon", "RssShmem"))
+            largest = max(largest, _resident("RssAnon", "RssShmem"))
 
     watcher = threading.Thread(target=look)
     watcher.start()
     to_result(Path(source), Path(target), device, **within)
     finished.set()
     watcher.join()
-    json.dump([_resident("VmHWM") - before, most - own], sys.stdout)
+    json.dump([_resident("VmHWM") - before, largest - base], sys.stdout)
 
 
 def _resident(*names: str) -> int:

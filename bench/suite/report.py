@@ -69,7 +69,9 @@ def as_rows(case: Case) -> list[list[str]]:
 
 def as_targets(case: Case) -> list[list[str]]:
     """Return the targets of a case as cells under `TARGET_HEAD`."""
-    return [[one.what, one.bound, one.measured, "yes" if one.met else "no"] for one in case.targets]
+    return [
+        [target.what, target.bound, target.measured, "yes" if target.met else "no"] for target in case.targets
+    ]
 
 
 def as_notes(case: Case) -> list[str]:
@@ -162,7 +164,7 @@ def _runs(runs: Mapping[Path, Run]) -> str:
     for run in runs.values():
         for name, version in run.versions.items():
             versions.setdefault(name, {}).update({version: None} if version else {})
-    used = ", ".join(f"{name} {' and '.join(found)}" for name, found in versions.items() if found)
+    used = ", ".join(f"{name} {' and '.join(releases)}" for name, releases in versions.items() if releases)
     return "\n".join([*lines, _wrap(f"With {used}.", "- ")])
 
 
@@ -219,12 +221,12 @@ def _peers(machine: Machine) -> list[str]:
             continue
         works = [row for row in case.rows if not row.is_limit]
         rivals = {row.name: _fastest(row, works) for row in works if _is_ours(row)}
-        wanted = {target.what for target in case.targets} | {name for name in rivals if rivals[name]}
+        compared = {target.what for target in case.targets} | {name for name in rivals if rivals[name]}
         alone = not any(rivals.values())
         cells += [
             [case.name, *_pair(case, row, rivals[row.name])]
             for row in works
-            if _is_ours(row) and (alone or row.name in wanted)
+            if _is_ours(row) and (alone or row.name in compared)
         ]
     head = ("case", "work", "ms", "GB/s", "of limit", "fastest peer", "ms", "times as fast")
     about = [_wrap(f"{name}: {machine[name].title}", "- ") for name in dict.fromkeys(row[0] for row in cells)]
@@ -238,8 +240,8 @@ def _is_ours(row: Row) -> bool:
 
 def _fastest(row: Row, works: Iterable[Row]) -> Row | None:
     """Return the fastest peer with the same result: the names are equal after the comma."""
-    same = [one for one in works if not _is_ours(one) and _part(one) == _part(row)]
-    return min(same, key=lambda one: one.wall.median, default=None)
+    same = [work for work in works if not _is_ours(work) and _part(work) == _part(row)]
+    return min(same, key=lambda work: work.wall.median, default=None)
 
 
 def _pair(case: Case, row: Row, rival: Row | None) -> list[str]:

@@ -26,10 +26,10 @@ def object_store(bucket: str) -> Iterator[Any]:
         [sys.executable, "-c", _SERVE], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as server:
         assert server.stdout is not None
-        told = {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{int(server.stdout.readline())}"}
-        told |= {"AWS_ACCESS_KEY_ID": "testing", "AWS_SECRET_ACCESS_KEY": "testing"}
+        variables = {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{int(server.stdout.readline())}"}
+        variables |= {"AWS_ACCESS_KEY_ID": "testing", "AWS_SECRET_ACCESS_KEY": "testing"}
         try:
-            with patch.dict(os.environ, told):
+            with patch.dict(os.environ, variables):
                 files = s3fs.S3FileSystem(use_listings_cache=False, skip_instance_cache=True)
                 files.mkdir(bucket)
                 yield files

@@ -110,13 +110,13 @@ def field_scores(
     before, after = Judge(cells), Judge(cells)
     plain, scale = as_designed(lab, calibration)
     for number, (surface, press) in enumerate(things):
-        seen = scorer.see(lab.rig, surface, x, y, press)
-        bound = scorer.bounds(lab.rig, seen, CREASE * lab.pixel_size, lab.half)
+        view = scorer.see(lab.rig, surface, x, y, press)
+        bound = scorer.bounds(lab.rig, view, CREASE * lab.pixel_size, lab.half)
         frames = lab.turned(surface, press, 20 + number)
-        found = normals_of(frames, plain, **scale)
-        before.add(found.zenith, found.azimuth, seen, bound, found.normals_sigma)
-        found = normals_of(frames, calibration)
-        after.add(found.zenith, found.azimuth, seen, bound, found.normals_sigma)
+        normals = normals_of(frames, plain, **scale)
+        before.add(normals.zenith, normals.azimuth, view, bound, normals.normals_sigma)
+        normals = normals_of(frames, calibration)
+        after.add(normals.zenith, normals.azimuth, view, bound, normals.normals_sigma)
     return before.score(), after.score()
 
 
@@ -127,19 +127,19 @@ def rows_of_the_field(name: str, lab: Lab, calibration: io.Calibration, number: 
     """Judge the normals of held-out objects."""
     before, after = field_scores(lab, calibration, [*held_out(REACH)[:number], *balls()])
     for angle in ("zenith", "azimuth"):
-        share, old = getattr(after, f"{angle}_share"), getattr(before, f"{angle}_share")
+        within, old = getattr(after, f"{angle}_share"), getattr(before, f"{angle}_share")
         part, was = (getattr(score.cells, angle) for score in (after, before))
         yield Row(
             f"{name}: {angle}, cells within 1.2 x bound",
             "90 %",
-            f"{100 * share:.0f} % (ratio {np.nanmedian(part.ratio):.2f}, worst {np.nanmax(part.ratio):.2f})",
+            f"{100 * within:.0f} % (ratio {np.nanmedian(part.ratio):.2f}, worst {np.nanmax(part.ratio):.2f})",
             f"{100 * old:.0f} % (ratio {np.nanmedian(was.ratio):.1f}, RMS {np.nanmedian(was.rms):.2f} deg)",
-            share >= 0.9,
+            within >= 0.9,
         )
     worst, old = (np.nanmax(np.abs(score.bins.zenith.bias)) for score in (after, before))
     printed = lab.gamma != 1  # the others' bias counts in the bound already
-    told = f"{worst:.3f} deg", f"{old:.2f} deg", worst <= 0.1 or not printed
-    yield Row(f"{name}: zenith bias, worst bin", "0.1 deg" if printed else "", *told)
+    cells = f"{worst:.3f} deg", f"{old:.2f} deg", worst <= 0.1 or not printed
+    yield Row(f"{name}: zenith bias, worst bin", "0.1 deg" if printed else "", *cells)
     yield Row(
         f"{name}: zenith bias, all",
         "",
@@ -151,18 +151,18 @@ def rows_of_the_field(name: str, lab: Lab, calibration: io.Calibration, number: 
 
 def rows_of_the_movement(name: str, lab: Lab, calibration: io.Calibration) -> Iterator[Row]:
     """Judge the precession: the recordings told another one."""
-    found = calibration.precession
-    assert found is not None
-    turned = math.degrees(math.remainder(found.phase_offset - lab.phase_error, math.tau))
+    precession = calibration.precession
+    assert precession is not None
+    turned = math.degrees(math.remainder(precession.phase_offset - lab.phase_error, math.tau))
     errors = {
-        "d": (math.degrees(found.tilt - lab.tilt), math.degrees(found.sigma["tilt"]), 0.02, "deg"),
-        "phase": (turned, math.degrees(found.sigma["phase_offset"]), 0.1, "deg"),
-        "pivot height": (found.pivot[2] - lab.pivot[2], found.sigma["pivot_z"], 1.0, "mm"),
+        "d": (math.degrees(precession.tilt - lab.tilt), math.degrees(precession.sigma["tilt"]), 0.02, "deg"),
+        "phase": (turned, math.degrees(precession.sigma["phase_offset"]), 0.1, "deg"),
+        "pivot height": (precession.pivot[2] - lab.pivot[2], precession.sigma["pivot_z"], 1.0, "mm"),
     }
-    told = (math.degrees(-lab.tilt_error), math.degrees(-lab.phase_error), -lab.pivot_error)
-    for (what, (error, sigma, most, unit)), was in zip(errors.items(), told, strict=True):
+    stated = (math.degrees(-lab.tilt_error), math.degrees(-lab.phase_error), -lab.pivot_error)
+    for (what, (error, sigma, bound, unit)), was in zip(errors.items(), stated, strict=True):
         measured = f"{error:+.4f} {unit} (sigma {sigma:.4f})"
-        yield Row(f"{name}: {what}", f"{most:g} {unit}", measured, f"{was:+.2f} {unit}", abs(error) <= most)
+        yield Row(f"{name}: {what}", f"{bound:g} {unit}", measured, f"{was:+.2f} {unit}", abs(error) <= bound)
 
 
 def row_of_the_print(lab: Lab, calibration: io.Calibration) -> Row:
@@ -190,13 +190,13 @@ def rows_of_the_gel(cache: Path) -> Iterator[Row]:
     plain = io.Calibration(io.CameraId("", lab.shape, np.dtype("uint8")), taken)
     learned = lab.pressed(scorer.ball(BALL), TRAVEL, 1, COMPLIANCE)
     onset = engine.reconstruct(learned, calibration=plain, fill=False)
-    found = gel.fit_gel([ball_onset(onset, learned, BALL / 2)]).gel
+    compliance = gel.fit_gel([ball_onset(onset, learned, BALL / 2)]).gel
     x, y = scorer.pixel_grid(lab.shape, lab.pixel_size)
     for take, size in enumerate((6.0, 10.0), 2):
         press = lab.pressed(scorer.ball(size), TRAVEL, take, COMPLIANCE)
         true = scorer.ball(size).height(x, y)
         maps = []
-        for calibration in (plain, replace(plain, gel=found)):
+        for calibration in (plain, replace(plain, gel=compliance)):
             press.rewind()
             maps.append(engine.reconstruct(press, calibration=calibration, fill=False).height)
         where = np.isfinite(true) & np.isfinite(maps).all(axis=0)

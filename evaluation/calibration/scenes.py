@@ -207,8 +207,8 @@ class Lab:
         body = self.body
         height = body.height * (1 - (np.arange(_ROWS) + 0.5) / _ROWS)
         first = math.atan2(body.radius, body.height) / 2
-        share = (np.arctan2(body.radius, height) / 2 - first) / (math.pi / 4 - first)
-        column = np.rint(np.iinfo(np.uint16).max * np.clip(share, 0, 1) ** self.gamma)
+        fraction = (np.arctan2(body.radius, height) / 2 - first) / (math.pi / 4 - first)
+        column = np.rint(np.iinfo(np.uint16).max * np.clip(fraction, 0, 1) ** self.gamma)
         return np.repeat(column.astype(np.uint16)[:, np.newaxis], 4, axis=1)
 
 
@@ -242,5 +242,5 @@ def press_for(surface: Surface) -> float:
 def balls() -> list[tuple[Surface, float]]:
     """Return balls and a cone that no calibration is made with, and how far to press."""
     places = ((3.0, (2.2, 1.4)), (6.0, (-1.0, -1.5)))
-    found = [(scorer.ball(size, place), 0.13 * size) for size, place in places]
-    return [*found, (scorer.cone(math.radians(30), 4.0, (0.8, -0.6)), 1.6)]
+    objects = [(scorer.ball(size, place), 0.13 * size) for size, place in places]
+    return [*objects, (scorer.cone(math.radians(30), 4.0, (0.8, -0.6)), 1.6)]

@@ -291,12 +291,12 @@ def see(rig: Rig, thing: Surface, x: Map, y: Map, press: float) -> Seen:
     Each round follows the line of sight to the height found before: slopes of lines of sight are small, so
     that the error falls by ten at least.
     """
-    left, up = sight(rig, x, y)
+    slope, up = sight(rig, x, y)
     z = np.zeros(x.shape)
     for _ in range(_ROUNDS):
-        z = press + thing.height(x + np.nan_to_num(z) * left, y + np.nan_to_num(z) * up)
+        z = press + thing.height(x + np.nan_to_num(z) * slope, y + np.nan_to_num(z) * up)
     z = np.where(z >= 0, z, np.nan)
-    at_x, at_y = x + z * left, y + z * up
+    at_x, at_y = x + z * slope, y + z * up
     along_x, along_y = thing.slope(at_x, at_y)
     zenith = np.arctan(np.hypot(along_x, along_y))
     return Seen(at_x, at_y, z, zenith, np.arctan2(-along_y, -along_x), thing.clearance(at_x, at_y))
@@ -363,27 +363,27 @@ def _looking(rig: Rig, place: Map) -> Map:
     x, y, z = place
     foot_x, foot_y = x, y
     for _ in range(5):
-        left, up = sight(rig, foot_x, foot_y)
-        foot_x, foot_y = x - z * left, y - z * up
-    return _unit(np.stack([-left, -up, -np.ones_like(x)]))
+        slope, up = sight(rig, foot_x, foot_y)
+        foot_x, foot_y = x - z * slope, y - z * up
+    return _unit(np.stack([-slope, -up, -np.ones_like(x)]))
 
 
 def _meets(rig: Rig, place: Map, ray: Map) -> tuple[Map, Map, Map]:
     """Return where rays from points meet the cylinder: cosine and sine of the azimuth there, and height."""
     level = ray[0] ** 2 + ray[1] ** 2
     half = place[0] * ray[0] + place[1] * ray[1]
-    room = rig.radius**2 - place[0] ** 2 - place[1] ** 2
-    way = (np.sqrt(half**2 + level * room) - half) / level
-    at = place + way * ray
+    chord = rig.radius**2 - place[0] ** 2 - place[1] ** 2
+    length = (np.sqrt(half**2 + level * chord) - half) / level
+    at = place + length * ray
     return at[0] / rig.radius, at[1] / rig.radius, at[2]
 
 
 def _printed(rig: Rig, cos: Map, sin: Map, height: Map) -> Map:
     """Return the light of the wall at a place: its print, and the lamps behind it."""
     zenith = np.arctan2(rig.radius, height) / 2
-    share = (zenith - rig.dark_zenith) / (rig.light_zenith - rig.dark_zenith)
+    fraction = (zenith - rig.dark_zenith) / (rig.light_zenith - rig.dark_zenith)
     lamps = 1 + rig.asymmetry * (cos * np.cos(rig.lamp_azimuth) + sin * np.sin(rig.lamp_azimuth))
-    return np.asarray(np.clip(share, 0, 1) ** rig.gamma * lamps / (1 + abs(rig.asymmetry)))
+    return np.asarray(np.clip(fraction, 0, 1) ** rig.gamma * lamps / (1 + abs(rig.asymmetry)))
 
 
 def _steepest(rig: Rig, place: Map, ray: Map) -> Map:
@@ -408,17 +408,17 @@ def _unit(vectors: Map) -> Map:
 # --- what can be known --------------------------------------------------------------------------------------
 
 
-def bounds(rig: Rig, seen: Seen, away: float, edges: tuple[float, float] = (np.inf, np.inf)) -> Bound:
+def bounds(rig: Rig, view: Seen, away: float, edges: tuple[float, float] = (np.inf, np.inf)) -> Bound:
     """Return the bounds of zenith and azimuth where both can be known, each with the other unknown too.
 
     The point's place is taken for known. ``away`` is how far from a crease, and from where contact ends, a
     pixel must be, mm, and so far inside of the picture its point must stay: ``edges`` are half its width and
     height.
     """
-    good, point, zenith, azimuth = _points(rig, seen)
+    good, point, zenith, azimuth = _points(rig, view)
     steps = ((_STEP, 0.0), (0.0, _STEP))
     fisher = np.zeros((len(zenith), 2, 2))
-    inside = seen.clearance[good] >= away
+    inside = view.clearance[good] >= away
     for phase in rig.phase:
         slopes, here = [], stand(rig, point, phase)
         for up, along in steps:
@@ -428,20 +428,20 @@ def bounds(rig: Rig, seen: Seen, away: float, edges: tuple[float, float] = (np.i
         gradient = np.stack(slopes, axis=-1)
         fisher += gradient[:, :, np.newaxis] * gradient[:, np.newaxis, :]
         inside &= within & (here.place[2] >= away * np.tan(zenith))
-        for foot, edge in zip(_foot(here), edges, strict=True):
-            inside &= np.abs(foot) <= edge - away
-    spread = np.full((2, *seen.x.shape), np.nan)
+        for distance, edge in zip(_foot(here), edges, strict=True):
+            inside &= np.abs(distance) <= edge - away
+    spread = np.full((2, *view.x.shape), np.nan)
     inverse = np.linalg.inv(fisher[inside])
     spread.reshape(2, -1)[:, np.flatnonzero(good)[inside]] = np.sqrt(inverse[:, [0, 1], [0, 1]].T)
     return Bound(*spread)
 
 
-def _points(rig: Rig, seen: Seen) -> tuple[NDArray[np.bool_], Map, Map, Map]:
+def _points(rig: Rig, view: Seen) -> tuple[NDArray[np.bool_], Map, Map, Map]:
     """Return which pixels see the object on the body, with their points (3, n), zeniths and azimuths."""
-    good = np.isfinite(seen.z) & np.isfinite(seen.zenith) & (np.hypot(seen.x, seen.y) < 0.98 * rig.radius)
-    good &= (seen.zenith > 1e-3) & (seen.zenith < np.radians(60))
-    point = np.stack([seen.x[good], seen.y[good], seen.z[good]])
-    return good, point, seen.zenith[good], seen.azimuth[good]
+    good = np.isfinite(view.z) & np.isfinite(view.zenith) & (np.hypot(view.x, view.y) < 0.98 * rig.radius)
+    good &= (view.zenith > 1e-3) & (view.zenith < np.radians(60))
+    point = np.stack([view.x[good], view.y[good], view.z[good]])
+    return good, point, view.zenith[good], view.azimuth[good]
 
 
 # --- judging ------------------------------------------------------------------------------------------------
@@ -457,24 +457,24 @@ class Judge:
     cells: int = 8
     _kept: list[Map] = field(default_factory=list)
 
-    def add(self, zenith: Map, azimuth: Map, seen: Seen, bound: Bound, sigma: ArrayLike = 0.0) -> None:
+    def add(self, zenith: Map, azimuth: Map, view: Seen, bound: Bound, sigma: ArrayLike = 0.0) -> None:
         """Add what was found of an object, maps of (H, W), radians.
 
         NaN is no answer, and nor is one whose own ``sigma``, the RMS angle between it and the truth that it
         expects, is several times what the bounds allow: it says that it is not to be believed.
         """
-        if not zenith.shape == azimuth.shape == seen.x.shape:
-            raise ValueError(f"maps of {zenith.shape} do not fit the truth's {seen.x.shape}")
+        if not zenith.shape == azimuth.shape == view.x.shape:
+            raise ValueError(f"maps of {zenith.shape} do not fit the truth's {view.x.shape}")
         row, column = (
             self.cells * place // size
-            for place, size in zip(np.indices(seen.x.shape), seen.x.shape, strict=True)
+            for place, size in zip(np.indices(view.x.shape), view.x.shape, strict=True)
         )
         here = np.isfinite(bound.zenith)
-        around = azimuth - seen.azimuth
-        poor = np.asarray(sigma) > POOR * np.hypot(bound.zenith, np.sin(seen.zenith) * bound.azimuth)
-        level = np.where(poor, np.nan, np.asarray(zenith, float) - seen.zenith)
+        around = azimuth - view.azimuth
+        poor = np.asarray(sigma) > POOR * np.hypot(bound.zenith, np.sin(view.zenith) * bound.azimuth)
+        level = np.where(poor, np.nan, np.asarray(zenith, float) - view.zenith)
         error = level, np.arctan2(np.sin(around), np.cos(around))
-        parts = row * self.cells + column, seen.zenith, *error, *bound
+        parts = row * self.cells + column, view.zenith, *error, *bound
         self._kept.append(np.stack([np.asarray(part, float)[here] for part in parts]))
 
     def score(self) -> Score:
@@ -486,25 +486,25 @@ class Judge:
         return Score(_table(kept[2:], cell, square), _table(kept[2:], number, (len(ZENITHS) - 1,)))
 
 
-def score_heights(found: Map, true: Map, where: NDArray[np.bool_]) -> Heights:
+def score_heights(heights: Map, true: Map, where: NDArray[np.bool_]) -> Heights:
     """Return bias and RMS error of heights, mm, where they are asked for."""
     if not where.any():
         raise ValueError("there is no height to judge")
-    error = (np.asarray(found, float) - true)[where]
-    known = error[np.isfinite(error)]
-    if known.size == 0:
+    error = (np.asarray(heights, float) - true)[where]
+    finite = error[np.isfinite(error)]
+    if finite.size == 0:
         return Heights(np.nan, np.nan, 0.0)
-    return Heights(float(known.mean()), float(np.sqrt(np.mean(known**2))), known.size / error.size)
+    return Heights(float(finite.mean()), float(np.sqrt(np.mean(finite**2))), finite.size / error.size)
 
 
 def _table(values: Map, group: NDArray[np.intp], shape: Sequence[int]) -> Table:
     zenith, azimuth, zenith_bound, azimuth_bound = values
     expected = np.bincount(group, minlength=int(np.prod(shape))).reshape(shape)
-    known = np.isfinite(zenith) & np.isfinite(azimuth)
-    kept = group[known]
+    finite = np.isfinite(zenith) & np.isfinite(azimuth)
+    kept = group[finite]
     answered = np.bincount(kept, minlength=expected.size).reshape(shape)
     parts = [
-        _part(error[known], best[known], kept, shape)
+        _part(error[finite], best[finite], kept, shape)
         for error, best in ((zenith, zenith_bound), (azimuth, azimuth_bound))
     ]
     return Table(expected, answered / np.where(expected > 0, expected, 1), *parts)
@@ -517,5 +517,5 @@ def _part(error: Map, best: Map, group: NDArray[np.intp], shape: Sequence[int]) 
         total = np.bincount(group, part, minlength=count.size)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(shape)
 
-    rms, least = (np.degrees(np.sqrt(mean(part**2))) for part in (error, best))
-    return Part(rms, np.degrees(mean(error)), least, np.sqrt(mean((error / best) ** 2)))
+    rms, smallest = (np.degrees(np.sqrt(mean(part**2))) for part in (error, best))
+    return Part(rms, np.degrees(mean(error)), smallest, np.sqrt(mean((error / best) ** 2)))

@@ -149,8 +149,8 @@ def record(light: Light, positions: Floats, fault: Fault, seed: int) -> NDArray[
     flicker = 1 + fault.flicker * generator.normal(size=len(true))
     drift = fault.drift * np.linspace(0, 1, len(true))
     pixels = 1 + fault.gain * np.random.default_rng(_CAMERA).normal(size=shares.shape[1:])
-    light_counts = _expose(shares * pixels * flicker[:, np.newaxis, np.newaxis], fault, generator)
-    counts = _sample(light_counts + drift[:, np.newaxis, np.newaxis], fault, generator)
+    mean_lightcounts = _expose(shares * pixels * flicker[:, np.newaxis, np.newaxis], fault, generator)
+    counts = _sample(mean_lightcounts + drift[:, np.newaxis, np.newaxis], fault, generator)
     if fault.duplicated:
         counts[middle] = counts[middle - 1]
     return _compress(counts, fault)
@@ -179,10 +179,10 @@ def _share(light: Light, position: float, step: float, fault: Fault) -> Floats:
         if fault.blur:
             fine = gaussian_filter1d(fine, fault.blur * POINTS, axis=axis, mode="nearest")
     rows, columns = (size // POINTS for size in fine.shape)
-    share: Floats = fine.reshape(rows, POINTS, columns, POINTS).mean(axis=(1, 3))
-    share = (1 - fault.stray) * share + fault.stray * share.mean()
+    mean_light: Floats = fine.reshape(rows, POINTS, columns, POINTS).mean(axis=(1, 3))
+    mean_light = (1 - fault.stray) * mean_light + fault.stray * mean_light.mean()
     x, y = np.linspace(-1, 1, columns)[np.newaxis], np.linspace(-1, 1, rows)[:, np.newaxis]
-    return share * (1 - fault.vignetting * (x**2 + y**2) / 2)
+    return mean_light * (1 - fault.vignetting * (x**2 + y**2) / 2)
 
 
 def _expose(shares: Floats, fault: Fault, generator: np.random.Generator) -> Floats:

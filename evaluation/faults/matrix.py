@@ -203,9 +203,9 @@ def _focused(travel: Floats) -> Floats:
     blur = np.clip(np.sqrt(1 + (15 * (travel + height)) ** 2), 0, _BLURS[-2])[0]
     number = blur / _BLURS[1]
     low = np.floor(number).astype(int)
-    levels, share = _defocused(), number - low
+    levels, fraction = _defocused(), number - low
     at = np.arange(blur.shape[0])[:, np.newaxis], np.arange(blur.shape[1])
-    return np.asarray((1 - share) * levels[low, *at] + share * levels[low + 1, *at])[np.newaxis]
+    return np.asarray((1 - fraction) * levels[low, *at] + fraction * levels[low + 1, *at])[np.newaxis]
 
 
 # --- Estimators ----------------------------------------------------------------------------------------
@@ -272,9 +272,9 @@ def _change_point(source: ArrayRecording) -> Result:
     return engine.reconstruct(source, fill=False, method="change-point")
 
 
-def _angle(found: NDArray[Any], true: Floats) -> Floats:
-    across = np.linalg.norm(np.cross(found.astype(np.float64), true), axis=-1)
-    return np.asarray(np.arctan2(across, np.sum(found * true, axis=-1)))
+def _angle(normals: NDArray[Any], true: Floats) -> Floats:
+    across = np.linalg.norm(np.cross(normals.astype(np.float64), true), axis=-1)
+    return np.asarray(np.arctan2(across, np.sum(normals * true, axis=-1)))
 
 
 @functools.cache
@@ -366,7 +366,7 @@ def _watched(compute: Callable[[], Result]) -> tuple[Result, bool]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MirrorskinWarning)
         result = compute()
-    warned = any(issubclass(one.category, MirrorskinWarning) for one in caught)
+    warned = any(issubclass(warning.category, MirrorskinWarning) for warning in caught)
     return result, warned or "warnings" in result.process
 
 
@@ -561,15 +561,15 @@ def freeze(table: Mapping[str, Mapping[str, Cell]], arrays: Mapping[str, Mapping
     ``first`` keeps the chi^2 with which a cell was first stored.
     """
     stored = _stored()
-    before, known, worse = stored["cells"], stored["open"], []
+    before, opened_before, worse = stored["cells"], stored["open"], []
     for name, cells in table.items():
         opened = [fault for fault, cell in cells.items() if not cell.honest]
         worse += [
             f"{name}: {fault}"
             for fault in opened
-            if name in known and fault not in known[name] and fault in before[name]
+            if name in opened_before and fault not in opened_before[name] and fault in before[name]
         ]
-        known[name] = opened
+        opened_before[name] = opened
         before[name] = {
             fault: _rounded(cell)
             | {"first": before.get(name, {}).get(fault, {}).get("first", _number(cell.chi2))}
@@ -581,7 +581,7 @@ def freeze(table: Mapping[str, Mapping[str, Cell]], arrays: Mapping[str, Mapping
         name: {fault: _rounded(cell) | {"open": not cell.honest} for fault, cell in cells.items()}
         for name, cells in arrays.items()
     }
-    content = {"open": known, "cells": before, "functions": functions}
+    content = {"open": opened_before, "cells": before, "functions": functions}
     _STORED.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     text = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(with_tables(text), encoding="utf-8")
@@ -676,7 +676,9 @@ def main() -> None:
     parser.add_argument("--fault", default="", help="part of the name of a fault")
     parser.add_argument("--freeze", action="store_true", help="store all cells of these, and write the page")
     asked = parser.parse_args()
-    names = [one for one in ESTIMATORS if not asked.estimator or any(part in one for part in asked.estimator)]
+    names = [
+        name for name in ESTIMATORS if not asked.estimator or any(part in name for part in asked.estimator)
+    ]
     table, arrays = {}, {}
     fault = "" if asked.freeze else asked.fault
     for name in names:

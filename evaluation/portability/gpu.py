@@ -57,12 +57,12 @@ class Trial:
 
     def run(self, name: str, section: Callable[[Trial, float], object], seconds: float) -> None:
         """Run a section within so many seconds, and write what is known by then."""
-        start, most = time.monotonic(), min(seconds, self.left)
-        if most < 5:
+        start, limit = time.monotonic(), min(seconds, self.left)
+        if limit < 5:
             self.data[name] = "no time left"
         else:
             try:
-                self.data[name] = section(self, start + most)
+                self.data[name] = section(self, start + limit)
             except Exception:
                 self.data[name] = {"failed": traceback.format_exc()}
         print(f"{name}: {time.monotonic() - start:.0f} s", flush=True)
@@ -85,14 +85,14 @@ def main() -> int:
     trial = Trial(device, words.output, words.seconds)
     run = describe_run(device, [], trial.quick)
     trial.data["run"] = {**json.loads(run.as_json()), "title": run.title}
-    way = f"{device.info.kind}{number}-copied-gpu"
+    layout = f"{device.info.kind}{number}-copied-gpu"
     taken_for_gpu(device)
     shapes = ((96, 128), (128, 160)) if trial.quick else (gpu_calls.MEGAPIXEL, gpu_calls.UHD)
     trial.run("device", measure_device, 40)
     trial.run("calls at 1 Mpx", lambda trial, end: measure_calls(trial, end, shapes[0], 64), 120)
     trial.run("calls at 4K", lambda trial, end: measure_calls(trial, end, shapes[1], 240), 90)
     trial.run("answers", compare_answers, 170)
-    trial.run("tests", lambda trial, end: run_tests(way, end), 200)
+    trial.run("tests", lambda trial, end: run_tests(layout, end), 200)
     print(trial.output.with_suffix(".md").read_text(encoding="utf-8"))
     return 0 if is_right(trial.data) else 1
 
@@ -125,9 +125,9 @@ def measure_copies(device: Device, size: int) -> dict[str, float]:
     )
     pinned[:] = 1
     seconds = {
-        f"{name} {way}": median(partial(cl.enqueue_copy, device.queue, *pair))
+        f"{name} {direction}": median(partial(cl.enqueue_copy, device.queue, *pair))
         for name, host in (("pageable", plain), ("pinned", pinned))
-        for way, pair in (("up", (buffer, host)), ("down", (host, buffer)))
+        for direction, pair in (("up", (buffer, host)), ("down", (host, buffer)))
     }
 
     def write() -> None:
@@ -141,8 +141,8 @@ def measure_copies(device: Device, size: int) -> dict[str, float]:
     with ThreadPoolExecutor(4) as pool:
         seconds["host to host, four threads"] = median(lambda: list(pool.map(np.copyto, *parts)))
     rows = {f"{name}, GB/s": size / 1e9 / each for name, each in seconds.items()}
-    room = median(lambda: device.array("room", (size,), np.uint8, zeroed=False))
-    return {**rows, "an array of 64 MB, us": 1e6 * room}
+    allocation = median(lambda: device.array("room", (size,), np.uint8, zeroed=False))
+    return {**rows, "an array of 64 MB, us": 1e6 * allocation}
 
 
 def measure_launches(device: Device) -> dict[str, float]:
@@ -155,10 +155,10 @@ def measure_launches(device: Device) -> dict[str, float]:
             kernel(1, words=few, count=1, moved=32)
         device.finish()
 
-    one, many = median(partial(launch, 1)), median(partial(launch, 1000))
+    single, many = median(partial(launch, 1)), median(partial(launch, 1000))
     return {
-        "a launch and a wait, us": 1e6 * one,
-        "a further launch, us": 1e6 * (many - one) / 999,
+        "a launch and a wait, us": 1e6 * single,
+        "a further launch, us": 1e6 * (many - single) / 999,
         "4 bytes down, us": 1e6 * median(partial(cl.enqueue_copy, device.queue, word, few.buffer)),
     }
 
@@ -176,10 +176,10 @@ def median(work: Callable[[], object], rounds: int = ROUNDS) -> float:
 def measure_calls(trial: Trial, end: float, shape: tuple[int, int], frames: int) -> list[Data]:
     """Time every public call, as long as there is time."""
     rows: list[Data] = []
-    found = gpu_calls.calls(shape, trial.device, frames if not trial.quick else 16)
+    calls = gpu_calls.calls(shape, trial.device, frames if not trial.quick else 16)
     while time.monotonic() < end:
         try:
-            name, call = next(found)
+            name, call = next(calls)
         except StopIteration:
             return rows
         except Exception:
@@ -192,42 +192,44 @@ def measure_calls(trial: Trial, end: float, shape: tuple[int, int], frames: int)
     return [*rows, {"call": "the others", "failed": "no time left"}]
 
 
-def run_tests(way: str, end: float) -> str:
+def run_tests(layout: str, end: float) -> str:
     """Run the kernels' tests on one device in one way of holding memory; return pytest's last line."""
-    words = f"-q -n auto -p no:cacheprovider -p no:benchmark -m device -k {way} tests/kernels".split()
+    words = f"-q -n auto -p no:cacheprovider -p no:benchmark -m device -k {layout} tests/kernels".split()
     command = [sys.executable, "-P", "-m", "pytest", *words]
     try:
-        most = end - time.monotonic()
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=most)
+        limit = end - time.monotonic()
+        process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=limit)
     except subprocess.TimeoutExpired:
-        return f"not done within {most:.0f} s"
-    *said, last = done.stdout.strip().splitlines() or ["pytest says nothing"]
-    wrong = [line for line in said if re.match(r"FAILED|ERROR|E  ", line)]
-    return "; ".join([last.partition(" in ")[0], *wrong, *([done.stderr[-2000:]] if done.stderr else [])])
+        return f"not done within {limit:.0f} s"
+    *lines, last = process.stdout.strip().splitlines() or ["pytest says nothing"]
+    wrong = [line for line in lines if re.match(r"FAILED|ERROR|E  ", line)]
+    return "; ".join(
+        [last.partition(" in ")[0], *wrong, *([process.stderr[-2000:]] if process.stderr else [])]
+    )
 
 
 def compare_answers(trial: Trial, end: float) -> dict[str, dict[str, str]]:
     """Run the frozen cases; return how each one's arrays differ from the frozen ones, where they do."""
-    found: dict[str, dict[str, str]] = {}
+    differences: dict[str, dict[str, str]] = {}
     golden = from_tests("golden")
     frozen_answers = golden.load()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         for name, _ in frozen_cases():
             if time.monotonic() > end:
-                found[name] = {"not run": "no time left"}
+                differences[name] = {"not run": "no time left"}
                 continue
             try:
                 answers, frozen = golden.answers(name), frozen_answers[name]
             except ModuleNotFoundError as error:
-                found[name] = {"not run": str(error)}
+                differences[name] = {"not run": str(error)}
                 continue
             except Exception as error:  # the next ones are tried all the same
-                found[name] = {"fails with": f"{type(error).__name__}: {error}"}
+                differences[name] = {"fails with": f"{type(error).__name__}: {error}"}
                 continue
             within = {key: golden.CASES[name].within(key, frozen) for key in answers}
-            said = {key: differs(answers, frozen, key, within[key]) for key in answers}
-            found[name] = {key: words for key, words in said.items() if words}
-    return found
+            texts = {key: differs(answers, frozen, key, within[key]) for key in answers}
+            differences[name] = {key: words for key, words in texts.items() if words}
+    return differences
 
 
 def differs(answers: dict[str, Any], frozen: dict[str, Any], key: str, within: tuple[float, float]) -> str:
@@ -236,34 +238,34 @@ def differs(answers: dict[str, Any], frozen: dict[str, Any], key: str, within: t
     contact = frozen.get(".".join([*key.split(".")[:-1], "contact"]), np.array(True))
     if NO_CONTACT.search(key) and contact.ndim == 2 and contact.shape == mine.shape[:2] == theirs.shape[:2]:
         mine, theirs = mine[contact != 0], theirs[contact != 0]
-    same, said = from_tests("golden").compare(mine, theirs, loose)
+    same, text = from_tests("golden").compare(mine, theirs, loose)
     if same or mine.shape != theirs.shape or mine.dtype.kind == "U":
-        return "" if same else said
+        return "" if same else text
     wrong = ~np.isclose(mine.astype(float), theirs.astype(float), *loose, equal_nan=True)
-    return "" if np.mean(wrong) <= FEW else f"{said}; {np.count_nonzero(wrong)} of {wrong.size} by too much"
+    return "" if np.mean(wrong) <= FEW else f"{text}; {np.count_nonzero(wrong)} of {wrong.size} by too much"
 
 
 def page(data: Data) -> str:
     """Return the results in Markdown."""
     lines = [f"# {data['run']['title']}", ""]
-    for name, found in data.items():
+    for name, section in data.items():
         if name == "run":
             continue
         lines += [f"## {name[0].upper()}{name[1:]}", ""]
-        if isinstance(found, str) or "failed" in found:
-            lines += [str(found), ""]
+        if isinstance(section, str) or "failed" in section:
+            lines += [str(section), ""]
         elif name == "device":
             lines += ["| what | measured |", "|---|---|"]
-            lines += [f"| {key} | {value:.3g} |" for key, value in found.items()] + [""]
+            lines += [f"| {key} | {value:.3g} |" for key, value in section.items()] + [""]
         elif name == "answers":
-            wrong = {key: said for key, said in found.items() if said}
-            lines += [f"{len(found) - len(wrong)} of {len(found)} are the CPU's.", ""]
+            wrong = {key: arrays for key, arrays in section.items() if arrays}
+            lines += [f"{len(section) - len(wrong)} of {len(section)} are the CPU's.", ""]
             lines += [
-                f"- {case}: {key} {words}" for case, said in wrong.items() for key, words in said.items()
+                f"- {case}: {key} {words}" for case, arrays in wrong.items() for key, words in arrays.items()
             ]
             lines += [""]
         else:
-            lines += [*table(found), ""]
+            lines += [*table(section), ""]
     return "\n".join(lines)
 
 

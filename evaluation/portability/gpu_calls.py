@@ -84,19 +84,22 @@ def presses(shape: Shape, device: Device, frames: int) -> Iterator[tuple[str, Ca
 def rotations(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
     """Give what is called with two turns."""
     turns, phase = tiled(shape, 16, fill_turns), phases(16)
-    there = placed(turns, device)
+    placed_turns = placed(turns, device)
     yield "correlate, 16 frames", partial(engine.correlate, turns, phase, device=device)
-    yield "correlate, 16 frames on the device", partial(engine.correlate, there, phase)
+    yield "correlate, 16 frames on the device", partial(engine.correlate, placed_turns, phase)
     yield "fit_fringes, 16 frames", partial(engine.optical.fit_fringes, turns, phase, device=device)
     yield (
         "estimate_normals, 16 frames",
         partial(engine.estimate_normals, turns, phase, device=device, **TURN),
     )
-    yield "estimate_normals, 16 frames on the device", partial(engine.estimate_normals, there, phase, **TURN)
+    yield (
+        "estimate_normals, 16 frames on the device",
+        partial(engine.estimate_normals, placed_turns, phase, **TURN),
+    )
     yield (
         "from frames to heights on the device",
         lambda: engine.integrate(
-            normals=engine.estimate_normals(there, phase, noise=1.0, **TURN).on_device("normals"),
+            normals=engine.estimate_normals(placed_turns, phase, noise=1.0, **TURN).on_device("normals"),
             pixel_size=PIXEL,
             sigma=False,
         ),
@@ -113,11 +116,14 @@ def surfaces(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
     options: dict[str, Any] = {"device": device}
     integrate: Any = engine.integrate
     yield "integrate", lambda: integrate(*slopes, PIXEL, sigma=False, **options)
-    there = [placed(slope, device) for slope in slopes]
-    yield "integrate on the device", lambda: integrate(*there, PIXEL, sigma=False)
+    placed_slopes = [placed(slope, device) for slope in slopes]
+    yield "integrate on the device", lambda: integrate(*placed_slopes, PIXEL, sigma=False)
     yield "integrate with sigma", lambda: integrate(*slopes, PIXEL, **options)
     yield "integrate, same mask", lambda: integrate(*slopes, PIXEL, mask=mask, sigma=False, **options)
-    yield "integrate, same mask, on the device", lambda: integrate(*there, PIXEL, mask=mask, sigma=False)
+    yield (
+        "integrate, same mask, on the device",
+        lambda: integrate(*placed_slopes, PIXEL, mask=mask, sigma=False),
+    )
     yield "integrate, same mask, sigma", lambda: integrate(*slopes, PIXEL, mask=mask, **options)
     yield "integrate, new mask, sigma", lambda: integrate(*slopes, PIXEL, mask=next(masks), **options)
     if math.prod(shape) <= 1 << 20:
@@ -138,8 +144,8 @@ def pressed_and_turned(shape: Shape) -> tuple[dict[str, Any], dict[str, Any]]:
     along_x, along_y = (slope + generator.normal(0, noise, shape) for slope in (along_x, along_y))
     normal = np.stack([-along_x, -along_y, np.ones(shape)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    seen = np.where(height < -0.5, (np.floor(height / step) + 0.5) * step, np.nan)  # a hole at each top
-    heights = {"height": seen, "height_sigma": np.where(np.isfinite(seen), step / np.sqrt(12), np.nan)}
+    steps = np.where(height < -0.5, (np.floor(height / step) + 0.5) * step, np.nan)  # a hole at each top
+    heights = {"height": steps, "height_sigma": np.where(np.isfinite(steps), step / np.sqrt(12), np.nan)}
     normals = {"normals": normal, "normals_sigma": np.full(shape, noise)}
     first, second = (
         {name: map_.astype(np.float32) for name, map_ in maps.items()} for maps in (heights, normals)
@@ -265,11 +271,11 @@ def account(device: Device) -> Row:
     records = device.profile.records()
     row: Row = {}
     for kind in ("kernel", "upload", "download"):
-        mine = [one for one in records if one.kind == kind]
-        row[f"{kind}s"] = sum(one.runs for one in mine)
-        row[f"{kind}_MB"] = sum(one.bytes for one in mine) / 1e6
-        row[f"{kind}_ms"] = 1e3 * sum(one.seconds for one in mine)
-    row["waits"] = sum(one.runs for one in records if one.kind == "wait")
-    kernels = [one for one in records if one.kind == "kernel"][:LONGEST]
-    row["longest"] = {one.name: [one.runs, round(1e3 * one.seconds, 4)] for one in kernels}
+        mine = [record for record in records if record.kind == kind]
+        row[f"{kind}s"] = sum(record.runs for record in mine)
+        row[f"{kind}_MB"] = sum(record.bytes for record in mine) / 1e6
+        row[f"{kind}_ms"] = 1e3 * sum(record.seconds for record in mine)
+    row["waits"] = sum(record.runs for record in records if record.kind == "wait")
+    kernels = [record for record in records if record.kind == "kernel"][:LONGEST]
+    row["longest"] = {kernel.name: [kernel.runs, round(1e3 * kernel.seconds, 4)] for kernel in kernels}
     return row

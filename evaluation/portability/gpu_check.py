@@ -76,16 +76,16 @@ def main() -> int:
         print(f"make gpu-check: {tools}", file=sys.stderr)
         return 2
     builds = {build: names for build, names in record().items() if build[0] in (words.files or [build[0]])}
-    found = worst(row for build in builds.items() for row in examine(build, tools))
-    known = json.loads(TABLE.read_text(encoding="utf-8")) if TABLE.exists() else {}
-    print(page(found))
-    gone = [] if words.files else sorted(known.keys() - found.keys())
+    rows = worst(row for build in builds.items() for row in examine(build, tools))
+    stored = json.loads(TABLE.read_text(encoding="utf-8")) if TABLE.exists() else {}
+    print(page(rows))
+    gone = [] if words.files else sorted(stored.keys() - rows.keys())
     if words.freeze:
-        known = found = {**(known if words.files else {}), **found}
+        stored = rows = {**(stored if words.files else {}), **rows}
         gone = []
-        TABLE.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-        TABLE.with_suffix(".md").write_text(page(found), encoding="utf-8")
-    wrong = [line for name, row in found.items() for line in complaints(row, known.get(name))]
+        TABLE.write_text(json.dumps(rows, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        TABLE.with_suffix(".md").write_text(page(rows), encoding="utf-8")
+    wrong = [line for name, row in rows.items() for line in complaints(row, stored.get(name))]
     wrong += [f"{name} is in {TABLE.name}, and no longer built: gpu_check.py --freeze" for name in gone]
     print(*wrong, sep="\n", end="\n" * bool(wrong), file=sys.stderr)
     return 1 if wrong else 0
@@ -166,8 +166,8 @@ def examine(build: tuple[Build, set[str]], tools: tuple[str, str]) -> list[Row]:
             compile_for(target, path, options, tools[0], Path(folder)) for target in (NVIDIA, AMD)
         )
         command = [tools[1], "-v", "-arch=sm_90", str(ptx), "-o", str(Path(folder, "cubin"))]
-        said = subprocess.run(command, check=True, capture_output=True, text=True).stderr
-        nvidia, amd = read_ptxas(said, ptx.read_text()), read_assembly(assembly.read_text())
+        report = subprocess.run(command, check=True, capture_output=True, text=True).stderr
+        nvidia, amd = read_ptxas(report, ptx.read_text()), read_assembly(assembly.read_text())
     frame = next((option.removeprefix("-DFRAME=") for option in options if option.startswith("-DFRAME=")), "")
     return [
         {"kernel": f"{name} {frame}".strip(), "options": " ".join(options), **nvidia[name], **amd[name]}
@@ -180,26 +180,28 @@ def compile_for(
 ) -> Path:
     """Compile a file for a target of clang; return the assembly."""
     *words, library = target
-    made = folder / library
+    output = folder / library
     command = [clang, *CLANG, *words, "-Xclang", "-mlink-builtin-bitcode", "-Xclang", str(BITCODE / library)]
-    done = subprocess.run(
-        [*command, "-S", "-o", str(made), *options, str(path)], capture_output=True, text=True
+    process = subprocess.run(
+        [*command, "-S", "-o", str(output), *options, str(path)], capture_output=True, text=True
     )
-    if done.returncode != 0:
-        raise SystemExit(f"{path.name} {' '.join(options)} does not compile for {target[0]}:\n{done.stderr}")
-    return made
+    if process.returncode != 0:
+        raise SystemExit(
+            f"{path.name} {' '.join(options)} does not compile for {target[0]}:\n{process.stderr}"
+        )
+    return output
 
 
-def read_ptxas(said: str, ptx: str) -> dict[str, Row]:
+def read_ptxas(report: str, ptx: str) -> dict[str, Row]:
     """Return what ptxas says of each kernel, how many warps have room, and what its instructions are."""
-    found = re.compile(
+    pattern = re.compile(
         r"properties for (\w+)\n"
         r"\s+(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads\n"
         r".*?Used (\d+) registers"
     )
     bodies = dict(re.findall(r"\.entry (\w+)\(.*?\n\{(.*?)\n\}", ptx, re.DOTALL))
     rows = {}
-    for name, *rest in found.findall(said):
+    for name, *rest in pattern.findall(report):
         stack, stores, loads, registers = map(int, rest)
         each = -(-32 * registers // UNIT) * UNIT
         rows[name] = {
@@ -215,12 +217,12 @@ def read_ptxas(said: str, ptx: str) -> dict[str, Row]:
 
 def read_assembly(text: str) -> dict[str, Row]:
     """Return what clang says of each kernel for AMD: of a lane, and how many waves a SIMD has room for."""
-    found = re.compile(
+    pattern = re.compile(
         r"\.name: +(\w+)\n +\.private_segment_fixed_size: (\d+)\n(?: +[.-].*\n)*?"
         r" +\.vgpr_count: +(\d+)\n +\.vgpr_spill_count: (\d+)"
     )
     rows = {}
-    for name, scratch, vgprs, spills in found.findall(text):
+    for name, scratch, vgprs, spills in pattern.findall(text):
         waves = re.compile(r"; Occupancy: (\d+)").search(text, text.index(f"\n{name}:"))
         rows[name] = {
             "AMD registers": int(vgprs),
@@ -233,35 +235,33 @@ def read_assembly(text: str) -> dict[str, Row]:
 
 def worst(rows: Iterable[Row]) -> dict[str, Row]:
     """Return, for each kernel and type of frames, the row that takes the most registers and stack."""
-    found: dict[str, Row] = {}
+    worst_rows: dict[str, Row] = {}
     for row in sorted(
         rows, key=lambda row: (row["spills"], row["AMD spills"], row["registers"], row["stack"])
     ):
-        of_all = found.get(row["kernel"], {})
-        most = {key: max(value, of_all.get(key, 0)) for key, value in row.items() if key in COUNTED}
-        found[row["kernel"]] = {**row, **most}
-    return dict(sorted(found.items()))
+        of_all = worst_rows.get(row["kernel"], {})
+        highest = {key: max(value, of_all.get(key, 0)) for key, value in row.items() if key in COUNTED}
+        worst_rows[row["kernel"]] = {**row, **highest}
+    return dict(sorted(worst_rows.items()))
 
 
-def complaints(row: Row, known: Row | None) -> Iterator[str]:
+def complaints(row: Row, stored: Row | None) -> Iterator[str]:
     """Say in a line each what no kernel may take, and what one takes clearly more of than in the table."""
     for key in ("spills", "AMD spills", "doubles"):
         if row[key]:
             yield f"{row['kernel']}: {row[key]} {key}, with {row['options']}"
-    if known is None:
+    if stored is None:
         yield f"{row['kernel']} is not in {TABLE.name}: gpu_check.py --freeze"
         return
     for key in COUNTED:
-        if row[key] > MORE[0] * known[key] + MORE[1]:
-            yield f"{row['kernel']}: {row[key]} {key} where it took {known[key]}, with {row['options']}"
+        if row[key] > MORE[0] * stored[key] + MORE[1]:
+            yield f"{row['kernel']}: {row[key]} {key} where it took {stored[key]}, with {row['options']}"
 
 
-def page(found: dict[str, Row]) -> str:
+def page(rows: dict[str, Row]) -> str:
     """Return the table in Markdown."""
     lines = [f"| kernel | {' | '.join(COLUMNS)} |", "|---" * (len(COLUMNS) + 1) + "|"]
-    lines += [
-        f"| {name} | {' | '.join(str(found[name][key]) for key in COLUMNS)} |" for name in sorted(found)
-    ]
+    lines += [f"| {name} | {' | '.join(str(rows[name][key]) for key in COLUMNS)} |" for name in sorted(rows)]
     return "\n".join([HEAD, *lines, ""])
 
 

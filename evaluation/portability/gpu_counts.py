@@ -56,16 +56,16 @@ def main() -> int:
     if words.freeze:
         TABLE.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
         TABLE.with_suffix(".md").write_text(page(rows), encoding="utf-8")
-    known = load()
-    wrong = [line for name, row in rows.items() for line in complaints(name, row, known.get(name))]
+    stored = load()
+    wrong = [line for name, row in rows.items() for line in complaints(name, row, stored.get(name))]
     print(*wrong, sep="\n", end="\n" * bool(wrong), file=sys.stderr)
     return 1 if wrong else 0
 
 
 def load() -> dict[str, Row]:
     """Return the table that was kept."""
-    known: dict[str, Row] = json.loads(TABLE.read_text(encoding="utf-8"))
-    return known
+    stored: dict[str, Row] = json.loads(TABLE.read_text(encoding="utf-8"))
+    return stored
 
 
 def count_all() -> Iterator[tuple[str, Row]]:
@@ -82,20 +82,22 @@ def count(call: Callable[[], object], device: Device) -> Row:
     device.finish()
     device.profile.clear()
     del kept
-    with launches() as found:
+    with launches() as kernels:
         kept = call()  # noqa: F841, what is given back too early would be used again
     records = device.profile.records()
-    waits = [one for one in records if one.kind == "wait" and one.name not in NOT_COUNTED]
+    waits = [record for record in records if record.kind == "wait" and record.name not in NOT_COUNTED]
     row: Row = {
-        "launches": len(found),
-        "small launches": sum(items < FEW for _, items, _ in found),
-        "waits": sum(one.runs for one in waits),
+        "launches": len(kernels),
+        "small launches": sum(items < FEW for _, items, _ in kernels),
+        "waits": sum(record.runs for record in waits),
     }
-    for kind, way in (("upload", "up"), ("download", "down")):
-        row[f"copies {way}"] = sum(one.runs for one in records if one.kind == kind)
-        row[f"MB {way}"] = round(sum(one.bytes for one in records if one.kind == kind) / 1e6, 1)
+    for kind, direction in (("upload", "up"), ("download", "down")):
+        row[f"copies {direction}"] = sum(record.runs for record in records if record.kind == kind)
+        row[f"MB {direction}"] = round(
+            sum(record.bytes for record in records if record.kind == kind) / 1e6, 1
+        )
     longest: dict[str, float] = {}
-    for kernel, items, moved in found:
+    for kernel, items, moved in kernels:
         longest[kernel] = longest.get(kernel, 0.0) + seconds_of(items, moved)
     counted = LAUNCH * row["launches"] + WAIT * row["waits"]
     copies = 1e6 * (row["MB up"] + row["MB down"]) / BUS
@@ -113,28 +115,28 @@ def seconds_of(items: int, moved: int) -> float:
 @contextmanager
 def launches() -> Iterator[list[tuple[str, int, int]]]:
     """Collect names, work-items and bytes of the kernels that are started."""
-    found: list[tuple[str, int, int]] = []
+    kernels: list[tuple[str, int, int]] = []
     start = Kernel.__call__
 
     def started(kernel: Kernel, items: int, /, *, moved: int, **arguments: Any) -> None:
-        found.append((kernel.name, items, moved))
+        kernels.append((kernel.name, items, moved))
         start(kernel, items, moved=moved, **arguments)
 
     Kernel.__call__ = started  # type: ignore[method-assign]
     try:
-        yield found
+        yield kernels
     finally:
         Kernel.__call__ = start  # type: ignore[method-assign]
 
 
-def complaints(name: str, row: Row, known: Row | None) -> Iterator[str]:
+def complaints(name: str, row: Row, stored: Row | None) -> Iterator[str]:
     """Say in a line each what a call does more of than in the table."""
-    if known is None:
+    if stored is None:
         yield f"{name} is not in {TABLE.name}: gpu_counts.py --freeze"
         return
     for key in COUNTS:
-        if row[key] > known[key] * (MORE if ITERATED.search(name) else 1):
-            yield f"{name}: {key} {row[key]}, and the table has {known[key]}"
+        if row[key] > stored[key] * (MORE if ITERATED.search(name) else 1):
+            yield f"{name}: {key} {row[key]}, and the table has {stored[key]}"
 
 
 def page(rows: dict[str, Row]) -> str:

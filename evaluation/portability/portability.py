@@ -53,7 +53,7 @@ SMALL = (
 
 @dataclass(frozen=True)
 class Check:
-    """An OpenCL implementation, what it is told, and the tests that it is given."""
+    """An OpenCL implementation, its environment variables, and the tests that it is given."""
 
     name: str
     remedy: str  # where it is missing
@@ -62,7 +62,7 @@ class Check:
     folders: tuple[str, ...] = ("tests",)  # of the whole
     part: tuple[str, ...] = ("tests/kernels",)  # of what is run without being asked for the whole
     faults: tuple[str, ...] = ()  # that it must report
-    told: Mapping[str, str] = field(default_factory=dict)
+    variables: Mapping[str, str] = field(default_factory=dict)
 
     def find(self) -> Path | None:
         """Return the library; None if it is not installed."""
@@ -76,7 +76,10 @@ CHECKS = (
     Check("PoCL, the wheel", "pip install pocl-binary-distribution", f"{WHEELS}/libpocl-*.so"),
     Check("PoCL, the system's", BUILT, "/usr/lib/*/libpocl.so.2"),
     Check(
-        "rusticl, llvmpipe", BUILT, "/usr/lib/*/libRusticlOpenCL.so.1", told={"RUSTICL_ENABLE": "llvmpipe"}
+        "rusticl, llvmpipe",
+        BUILT,
+        "/usr/lib/*/libRusticlOpenCL.so.1",
+        variables={"RUSTICL_ENABLE": "llvmpipe"},
     ),
     Check(
         "Intel",
@@ -96,7 +99,7 @@ CHECKS = (
             "tests/kernels/test_references.py",
         ),
         faults=RACES,
-        told={"OCLGRIND_DATA_RACES": "1", **LITTLE_MEMORY},
+        variables={"OCLGRIND_DATA_RACES": "1", **LITTLE_MEMORY},
     ),
     Check(
         "Oclgrind: races between vectors",
@@ -106,7 +109,7 @@ CHECKS = (
         folders=KERNELS,
         part=("tests/kernels/rotation/test_normals_wall.py", "tests/kernels/rotation/test_normals_pose.py"),
         faults=RACES,
-        told={"OCLGRIND_DATA_RACES": "1", **UNOPTIMISED, **LITTLE_MEMORY},
+        variables={"OCLGRIND_DATA_RACES": "1", **UNOPTIMISED, **LITTLE_MEMORY},
     ),
     Check(
         "Oclgrind: unset",
@@ -116,7 +119,7 @@ CHECKS = (
         folders=KERNELS,
         faults=(NEVER_SET,),
         # Of optimised kernels it does not know all instructions, and crashes on some.
-        told={"OCLGRIND_UNINITIALIZED": "1", **UNOPTIMISED, **LITTLE_MEMORY},
+        variables={"OCLGRIND_UNINITIALIZED": "1", **UNOPTIMISED, **LITTLE_MEMORY},
     ),
 )
 
@@ -138,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--whole", action="store_true", help="all tests, which take hours")
     parser.add_argument("--inside", action="store_true", help="in a root of its own: run what is there")
     words = parser.parse_args(arguments)
-    checks = [one for one in CHECKS if not words.names or any(name in one.name for name in words.names)]
+    checks = [check for check in CHECKS if not words.names or any(name in check.name for name in words.names)]
     here = [check for check in checks if check.find() is not None]
     if not words.inside:
         print(ROW.format("implementation", "version", "device tests passed", "reports", "min"))
@@ -203,7 +206,7 @@ def environment_for(check: Check, folder: Path) -> dict[str, str]:
         "OCLGRIND_LOG": str(folder / "reports"),
         "XDG_CACHE_HOME": str(folder / "cache"),
     }
-    return {**kept, **ours, **check.told}
+    return {**kept, **ours, **check.variables}
 
 
 def missed_faults(faults: Iterable[str], environment: Mapping[str, str], log: Path) -> list[str]:

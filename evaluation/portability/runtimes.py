@@ -68,11 +68,11 @@ def measure(
         for target in (THIS, *(targets if "wheel" in check.name else ())):
             for layout in layouts:
                 print(f"{check.name}, {target}, {layout}", file=sys.stderr)
-                told = ["--inside", "--layouts", layout, "--calls", *calls]
+                options = ["--inside", "--layouts", layout, "--calls", *calls]
                 with tempfile.TemporaryDirectory() as folder:
                     environment = environment_for(check, Path(folder))
                     environment |= {} if target == THIS else {VARIABLE: target}
-                    command = [sys.executable, "-W", "ignore", __file__, *told]
+                    command = [sys.executable, "-W", "ignore", __file__, *options]
                     child = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True)
                 yield {"runtime": check.name, "target": target, **json.loads(child.stdout)}
 
@@ -106,8 +106,11 @@ def time_calls(calls: Sequence[str], layout: str) -> Column:
 
 def page(columns: Sequence[Column]) -> str:
     """Return the table, of one processor."""
-    heads = [f"{one['runtime']} {one['driver']}; {one['target']}; {one['layout']}" for one in columns]
-    rows = [[name, *(f"{one['ms'][name]:.3g}" for one in columns)] for name in columns[0]["ms"]]
+    heads = [
+        f"{column['runtime']} {column['driver']}; {column['target']}; {column['layout']}"
+        for column in columns
+    ]
+    rows = [[name, *(f"{column['ms'][name]:.3g}" for column in columns)] for name in columns[0]["ms"]]
     lines = [["call", *heads], ["---"] * (1 + len(heads)), *rows]
     processor = f"{columns[0]['processor']} with {columns[0]['threads']} threads"
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -44,10 +44,13 @@ class Scene(NamedTuple):
 
     def error(self, height: NDArray[np.floating[Any]]) -> float:
         """Return the mean absolute error, mm, after the best offset of each piece."""
-        total, (found, true, piece) = 0.0, (one[self.mask] for one in (height, self.height, self.piece))
+        total, (measured, true, piece) = (
+            0.0,
+            (values[self.mask] for values in (height, self.height, self.piece)),
+        )
         order = np.argsort(piece, kind="stable")
         for mine in np.split(order, np.flatnonzero(np.diff(piece[order])) + 1):
-            error = true[mine] - found[mine].astype(float)
+            error = true[mine] - measured[mine].astype(float)
             total += float(np.abs(error - np.median(error)).sum())
         return total / len(piece)
 
@@ -60,7 +63,7 @@ def _see(shape: Shape, surfaces: Sequence[Surface], noise: float = 0.0, *, ragge
         (np.arange(columns) - (columns - 1) / 2) * pixel, ((rows - 1) / 2 - np.arange(rows)) * pixel
     )
     with np.errstate(invalid="ignore"):
-        heights = np.stack([np.nan_to_num(one(x, y), nan=-np.inf) for one in surfaces])
+        heights = np.stack([np.nan_to_num(surface(x, y), nan=-np.inf) for surface in surfaces])
         number = heights.argmax(axis=0)
         slopes = np.zeros((2, *shape))
         for count, surface in enumerate(surfaces):
@@ -109,16 +112,16 @@ def _pieces(height: Map, normals: Map, number: NDArray[np.int_], pixel: float) -
     place = np.arange(height.size).reshape(height.shape)
     ends: list[Map] = []
     for axis, sign in ((1, -1.0), (0, 1.0)):
-        here, there = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+        here, beyond = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
         rise = sign * normals[1 - axis] / normals[2] * pixel
-        gap = height[there] - height[here]
-        low, high = np.minimum(rise[here], rise[there]), np.maximum(rise[here], rise[there])
+        gap = height[beyond] - height[here]
+        low, high = np.minimum(rise[here], rise[beyond]), np.maximum(rise[here], rise[beyond])
         slack = 0.1 * np.maximum(high - low, pixel)
-        facing = np.minimum(normals[2][here], normals[2][there]) > _FACING
+        facing = np.minimum(normals[2][here], normals[2][beyond]) > _FACING
         seam = (gap > low - slack) & (gap < high + slack) & facing
-        seam &= (number[here] >= 0) & (number[there] >= 0)
-        linked = (number[here] == number[there]) | seam
-        ends.append(np.stack([place[here][linked], place[there][linked]]))
+        seam &= (number[here] >= 0) & (number[beyond] >= 0)
+        linked = (number[here] == number[beyond]) | seam
+        ends.append(np.stack([place[here][linked], place[beyond][linked]]))
     first, second = np.concatenate(ends, axis=1)
     graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), (height.size,) * 2)
     _, label = connected_components(graph, directed=False)
@@ -173,9 +176,9 @@ def leaves(shape: Shape) -> Scene:
     generator = np.random.default_rng(3)
 
     def leaf(numbers: Map, x: Map, y: Map) -> Map:
-        wide, long, rise, azimuth, left, low = numbers
+        wide, long, rise, azimuth, from_left, low = numbers
         cosine, sine = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
-        u, v = cosine * (x - left) + sine * (y - low), cosine * (y - low) - sine * (x - left)
+        u, v = cosine * (x - from_left) + sine * (y - low), cosine * (y - low) - sine * (x - from_left)
         height = 2 + np.tan(np.radians(rise)) * v - 0.03 * u * u - 0.012 * v * v
         return np.where((u / wide) ** 2 + (v / long - 1) ** 2 < 1, height, np.nan)
 

@@ -53,8 +53,8 @@ class Figure(NamedTuple):
         parts, count = label(self.mask)
         errors = []
         for number in range(1, count + 1):
-            found, true = height[parts == number].astype(float), self.truth[parts == number]
-            error = found * np.nanmedian(true / found) - true if self.camera else found - true
+            heights, true = height[parts == number].astype(float), self.truth[parts == number]
+            error = heights * np.nanmedian(true / heights) - true if self.camera else heights - true
             errors.append(error if self.camera else error - np.nanmedian(error))
         return float(np.nanmean(np.abs(np.concatenate(errors))))
 
@@ -66,13 +66,13 @@ class Figure(NamedTuple):
         scores = []
         for number in range(int(result.component.max()) + 1):
             part = (result.component == number) & self.mask & np.isfinite(result.height)
-            found, true, sigma = (
+            heights, true, sigma = (
                 m[part].astype(float) for m in (result.height, self.truth, result.height_sigma)
             )
             if self.camera:
-                scale = np.exp(np.mean(np.log(true / found)))
-                found, sigma = scale * found, scale * sigma
-            error = found - true
+                scale = np.exp(np.mean(np.log(true / heights)))
+                heights, sigma = scale * heights, scale * sigma
+            error = heights - true
             if part.sum() > 1:
                 scores.append((error - (0 if self.camera else np.mean(error))) / sigma)
         return np.concatenate(scores)
@@ -99,9 +99,9 @@ def capsule(start: Any, end: Any, radius: float, end_radius: float | None = None
     change = 0.0 if end_radius is None else end_radius - radius
 
     def body(at: Map) -> Map:
-        share = np.clip((at - start) @ along / (along @ along), 0, 1)
-        distance = np.linalg.norm(at - start - share[..., np.newaxis] * along, axis=-1)
-        return np.asarray((distance - radius - change * share) * 0.9)
+        fraction = np.clip((at - start) @ along / (along @ along), 0, 1)
+        distance = np.linalg.norm(at - start - fraction[..., np.newaxis] * along, axis=-1)
+        return np.asarray((distance - radius - change * fraction) * 0.9)
 
     return body
 
@@ -145,8 +145,8 @@ def melted(reach: float, *bodies: Body) -> Body:
 
     def body(at: Map) -> Map:
         total = bodies[0](at)
-        for one in bodies[1:]:
-            other = one(at)
+        for body in bodies[1:]:
+            other = body(at)
             near = np.maximum(reach - np.abs(total - other), 0) / reach
             total = np.minimum(total, other) - near**2 * reach / 4
         return total
@@ -216,23 +216,25 @@ def noisy(figure: Figure, angle: float, seed: int = 0, reach: float = 0.0) -> Fi
     return figure._replace(normals=_unit(figure.normals + np.radians(angle) * noise))
 
 
-def with_outliers(figure: Figure, share: float, seed: int = 0) -> Figure:
+def with_outliers(figure: Figure, fraction: float, seed: int = 0) -> Figure:
     """Replace a share of the normals by any that face the viewer."""
     generator = np.random.default_rng([seed, 6])
     wrong = _unit(generator.standard_normal(figure.normals.shape))
     wrong[..., 2] = np.maximum(np.abs(wrong[..., 2]), 0.1)
-    hit = figure.mask & (generator.random(figure.mask.shape) < share)
+    hit = figure.mask & (generator.random(figure.mask.shape) < fraction)
     return figure._replace(normals=np.where(hit[..., np.newaxis], _unit(wrong), figure.normals))
 
 
-def flattened(figure: Figure, share: float) -> Figure:
+def flattened(figure: Figure, fraction: float) -> Figure:
     """Flatten steep slopes, as light from other parts of the body does: by the share at 60 degrees."""
     x, y, z = np.moveaxis(figure.normals, -1, 0)
     steep = np.clip((1 - z) / 0.5, 0, None)
-    return figure._replace(normals=_unit(np.stack([x * (1 - share * steep), y * (1 - share * steep), z], -1)))
+    return figure._replace(
+        normals=_unit(np.stack([x * (1 - fraction * steep), y * (1 - fraction * steep), z], -1))
+    )
 
 
-def shadowed(figure: Figure, share: float, reach: float = 0.06) -> Figure:
+def shadowed(figure: Figure, fraction: float, reach: float = 0.06) -> Figure:
     """Tilt normals next to depth steps on one side, as a shadow does there."""
     filled = np.where(figure.mask, figure.truth, np.nanmedian(figure.truth))
     high = -filled if figure.camera else filled
@@ -240,7 +242,7 @@ def shadowed(figure: Figure, share: float, reach: float = 0.06) -> Figure:
     above = (
         np.clip(gaussian_filter(shift(high, (0, width), mode="nearest"), width / 3) - high - 2, 0, 10) / 10
     )
-    tilt = np.stack([share * above, np.zeros_like(above), np.zeros_like(above)], axis=-1)
+    tilt = np.stack([fraction * above, np.zeros_like(above), np.zeros_like(above)], axis=-1)
     return figure._replace(normals=_unit(figure.normals + tilt))
 
 

@@ -157,8 +157,8 @@ def fill_turns(frames: NDArray[Any]) -> None:
     for phase, frame in zip(phases(len(frames)), frames, strict=True):
         start = generator.integers(65_536)
         lean = np.cos(azimuth - np.float32(phase))
-        seen = zenith - np.float32(_SAG) * (rim & (lean > _LOST))
-        counts = np.float32(offset) + np.float32(gain) * _angle(seen, lean)
+        shown = zenith - np.float32(_SAG) * (rim & (lean > _LOST))
+        counts = np.float32(offset) + np.float32(gain) * _angle(shown, lean)
         counts += grain[start : start + counts.size].reshape(counts.shape)
         if frame.dtype.kind == "f":
             frame[:] = counts
@@ -208,7 +208,7 @@ def noisy_slopes(shape: Shape, seed: int = 0) -> Floats:
     return smooth_slopes(shape, seed) + np.float32(NOISE) * noise
 
 
-def drifting_slopes(shape: Shape, count: int, share: float) -> list[Floats]:
+def drifting_slopes(shape: Shape, count: int, fraction: float) -> list[Floats]:
     """Return noisy slopes of `count` frames on a circle, with equal changes between consecutive frames.
 
     The root mean square of a change is `share` times the root mean square of the slopes: half of it is in the
@@ -219,7 +219,7 @@ def drifting_slopes(shape: Shape, count: int, share: float) -> list[Floats]:
     for seed in (1, 2):
         surface = smooth_slopes(shape, seed)
         axis = noisy_slopes(shape, seed) - np.float32(1 - NOISE / _rms(surface)) * surface
-        axes.append(np.float32(share * _rms(middle) / _rms(axis) / (2 * np.sin(np.pi / count))) * axis)
+        axes.append(np.float32(fraction * _rms(middle) / _rms(axis) / (2 * np.sin(np.pi / count))) * axis)
     angles = 2 * np.pi * np.arange(count) / count
     return [middle + np.float32(np.cos(a)) * axes[0] + np.float32(np.sin(a)) * axes[1] for a in angles]
 

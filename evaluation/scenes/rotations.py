@@ -168,8 +168,8 @@ def information(normals: Map, setup: Setup, weights: ArrayLike = 1.0) -> Map:
     """
     right, up = tangents(normals)
     total = np.zeros((*normals.shape[:-1], 2, 2))
-    share = np.broadcast_to(np.asarray(weights, float), (len(setup.phase), *normals.shape[:-1]))
-    for axis, weight in zip(axes(setup.phase, setup.tilt), share, strict=True):
+    fraction = np.broadcast_to(np.asarray(weights, float), (len(setup.phase), *normals.shape[:-1]))
+    for axis, weight in zip(axes(setup.phase, setup.tilt), fraction, strict=True):
         along = np.stack([-(right @ axis), -(up @ axis)], axis=-1)
         away = along / np.linalg.norm(along, axis=-1, keepdims=True)
         total += weight[..., np.newaxis, np.newaxis] * away[..., :, np.newaxis] * away[..., np.newaxis, :]
@@ -199,17 +199,17 @@ def clipped_share(normals: Map, setup: Setup) -> Map:
 def tangents(normals: Map) -> tuple[Map, Map]:
     """Return two unit vectors (..., 3), at right angles to each other and to the normals, which face up."""
     x, y, z = np.moveaxis(normals, -1, 0)
-    share = 1 / (1 + z)
-    right = np.stack([1 - x * x * share, -x * y * share, -x], axis=-1)
-    return right, np.stack([-x * y * share, 1 - y * y * share, -y], axis=-1)
+    factor = 1 / (1 + z)
+    right = np.stack([1 - x * x * factor, -x * y * factor, -x], axis=-1)
+    return right, np.stack([-x * y * factor, 1 - y * y * factor, -y], axis=-1)
 
 
 def scores(vectors: NDArray[np.floating], sigma: NDArray[np.floating] | None, stack: Stack) -> Scores:
     """Score answers (bins, draws, 3) and their sigmas, radians; a missing answer makes its bin NaN."""
     square = between(np.asarray(vectors, float), stack.normals) ** 2
     best, rms = np.sqrt(stack.bound.mean(axis=-1)), np.sqrt(square.mean(axis=-1))
-    told = np.full_like(square, np.nan) if sigma is None else np.asarray(sigma, float)
-    return Scores(best, rms, rms / best, np.mean(square / told**2, axis=-1))
+    stated = np.full_like(square, np.nan) if sigma is None else np.asarray(sigma, float)
+    return Scores(best, rms, rms / best, np.mean(square / stated**2, axis=-1))
 
 
 def mean_error(vectors: NDArray[np.floating], stack: Stack) -> Map:
@@ -219,15 +219,15 @@ def mean_error(vectors: NDArray[np.floating], stack: Stack) -> Map:
     of the azimuth, large far from the axis, does not look like one of the zenith: there zenith and azimuth,
     at less than twice the tilt those of the normal's shadow on the picture.
     """
-    found, true = np.asarray(vectors, float), stack.normals
+    measured, true = np.asarray(vectors, float), stack.normals
     zenith, azimuth = angles(true)
-    found_zenith, found_azimuth = angles(found)
+    found_zenith, found_azimuth = angles(measured)
     turned = found_azimuth - azimuth
     turned = np.arctan2(np.sin(turned), np.cos(turned))
     steep = zenith > 2 * stack.setup.tilt
-    shadow, own = np.sin(found_zenith), np.sin(zenith)
-    along = np.where(steep, found_zenith - zenith, shadow * np.cos(turned) - own)
-    across = np.where(steep, own * turned, shadow * np.sin(turned))
+    shadow, sine = np.sin(found_zenith), np.sin(zenith)
+    along = np.where(steep, found_zenith - zenith, shadow * np.cos(turned) - sine)
+    across = np.where(steep, sine * turned, shadow * np.sin(turned))
     error = np.stack([along, across], axis=-1)
     spread = error.std(axis=1, ddof=1) / np.sqrt(error.shape[1])
     return np.asarray(error.mean(axis=1) / spread)
@@ -267,8 +267,8 @@ def tilt_bound(normals: Map, setup: Setup) -> float:
     step = 1e-5
     right, up = tangents(normals)
     changes = [
-        (levels(normals + step * way, setup) - levels(normals - step * way, setup)) / (2 * step)
-        for way in (right, up)
+        (levels(normals + step * tangent, setup) - levels(normals - step * tangent, setup)) / (2 * step)
+        for tangent in (right, up)
     ]
     wider, narrower = (replace(setup, tilt=setup.tilt + change) for change in (step, -step))
     tilting = (levels(normals, wider) - levels(normals, narrower)) / (2 * step)

@@ -109,17 +109,17 @@ def cap(radius: float) -> Shape:
     return Shape(lambda x, y: rise(x, y) - radius, lambda x, y: (-x / rise(x, y), -y / rise(x, y)))
 
 
-def ball_on_plane(radius: float, lift: float, foot: float = 1.0) -> Shape:
+def ball_on_plane(radius: float, lift: float, base: float = 1.0) -> Shape:
     """Return a ball's cap that stands above a level plane: side 1, which jumps to side 0.
 
     `foot` is the cap's radius as a share of the ball's, `lift` the height of its rim above the plane. Of
     the lift, normals tell nothing: it lies on all of the rim.
     """
     ball = cap(radius)
-    rim = -radius + radius * np.sqrt(1 - foot**2)
+    rim = -radius + radius * np.sqrt(1 - base**2)
 
     def side(x: Map, y: Map) -> NDArray[np.intp]:
-        return (np.hypot(x, y) < 0.9999 * foot * radius).astype(np.intp)
+        return (np.hypot(x, y) < 0.9999 * base * radius).astype(np.intp)
 
     def height(x: Map, y: Map) -> Map:
         return np.where(side(x, y) == 1, ball.height(x, y) - rim + lift, 0.0)
@@ -175,8 +175,8 @@ def tear(height: float, length: float, steep: float = 0.0) -> Shape:
 def joined(sides: NDArray[np.intp]) -> tuple[Mask, Mask]:
     """Return whether the depth is continuous from each pixel to the next, along x (H, W-1) and y (H-1, W)."""
 
-    def same(here: NDArray[np.intp], there: NDArray[np.intp]) -> Mask:
-        return np.asarray((here == there) | (here == 0) | (there == 0))
+    def same(here: NDArray[np.intp], other: NDArray[np.intp]) -> Mask:
+        return np.asarray((here == other) | (here == 0) | (other == 0))
 
     if sides.max() < 2:
         return sides[:, :-1] == sides[:, 1:], sides[:-1] == sides[1:]
@@ -189,11 +189,11 @@ def _fade(x: Map, start: float, end: float) -> tuple[Map, Map]:
     return 1 - along * along * (3 - 2 * along), -6 * along * (1 - along) / (end - start)
 
 
-def disc(shape: tuple[int, int], share: float = 1.0, hole: float = 0.0) -> Mask:
+def disc(shape: tuple[int, int], fraction: float = 1.0, hole: float = 0.0) -> Mask:
     """Return a disc that fills a share of the picture's smaller side, with a hole of a share of it."""
     x, y = places(shape)
     distance = np.hypot(x, y) / (0.5 * min(shape))
-    return np.asarray((distance <= share) & (distance >= hole))
+    return np.asarray((distance <= fraction) & (distance >= hole))
 
 
 def blobs(shape: tuple[int, int], seed: int = 0, waves: int = 5) -> Mask:
@@ -218,9 +218,9 @@ def two_contacts(shape: tuple[int, int], bridge: bool = False) -> Mask:
     return np.asarray(mask)
 
 
-def holes(shape: tuple[int, int], share: float = 0.2, seed: int = 0) -> Mask:
+def holes(shape: tuple[int, int], fraction: float = 0.2, seed: int = 0) -> Mask:
     """Return all but a share of the pixels, missing here and there."""
-    return np.random.default_rng([seed, 3]).random(shape) >= share
+    return np.random.default_rng([seed, 3]).random(shape) >= fraction
 
 
 def specks(shape: tuple[int, int], seed: int = 0) -> Mask:
@@ -267,10 +267,10 @@ def random_cuts(shape: tuple[int, int], count: int = 10, seed: int = 0, length: 
     generator = np.random.default_rng([seed, 5])
     marked = np.zeros(shape, bool)
     for _ in range(count):
-        start, way = generator.uniform(0, shape), generator.uniform(0, 2 * np.pi)
+        start, angle = generator.uniform(0, shape), generator.uniform(0, 2 * np.pi)
         along = np.arange(0, length * max(shape) * generator.uniform(0.3, 1), 0.5)
-        row = np.rint(start[0] + along * np.sin(way)).astype(int)
-        column = np.rint(start[1] + along * np.cos(way)).astype(int)
+        row = np.rint(start[0] + along * np.sin(angle)).astype(int)
+        column = np.rint(start[1] + along * np.cos(angle)).astype(int)
         inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
         marked[row[inside], column[inside]] = True
     return marked

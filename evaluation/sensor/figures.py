@@ -70,7 +70,7 @@ def draw_trades(path: Path, tables: Mapping[str, Table]) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 6.2), layout="constrained")
-    (seen, lean), (step, many) = figure.subplots(2, 2)
+    (zenith_axes, lean), (step, many) = figure.subplots(2, 2)
     away = np.linspace(0, 16.5, 60)
     for azimuth, name, colour in (
         (math.pi, "inward", "tab:blue"),
@@ -80,11 +80,11 @@ def draw_trades(path: Path, tables: Mapping[str, Table]) -> None:
         for air, style in ((0.0, "-"), (0.5, ":")):
             lower, _ = visible_zenith(Body(air_gap=air), away, 0.0, azimuth)
             label = f"faces {name}" if air == 0 else None
-            seen.plot(away, np.degrees(lower), style, color=colour, label=label)
-    seen.set(
+            zenith_axes.plot(away, np.degrees(lower), style, color=colour, label=label)
+    zenith_axes.set(
         xlabel="mm off the centre", ylabel="least zenith, deg", title="where light begins (dotted: air gap)"
     )
-    seen.legend(frameon=False)
+    zenith_axes.legend(frameon=False)
     _curve(lean, tables["tilts"], "half-angle", ("zenith, RMS deg", "across, RMS deg"), "degrees")
     lean.set_title("normals by half-angle")
     _curve(

@@ -44,7 +44,10 @@ def dimensions() -> Table:
     rows = []
     for diameter, height in ((35, 20), (35, 30), (35, 40), (35, 60), (20, 40), (50, 40), (25, 25)):
         body = Body(diameter=diameter, height=height)
-        at = [_least(body, 0.0, 0.0), *(_least(body, diameter / 4, way) for way in (math.pi, math.pi / 2, 0))]
+        at = [
+            _least(body, 0.0, 0.0),
+            *(_least(body, diameter / 4, azimuth) for azimuth in (math.pi, math.pi / 2, 0)),
+        ]
         rows.append((f"{diameter}", f"{height}", *(f"{value:.1f}" for value in at)))
     places = ("half-way: inward", "sideways", "outward")
     return Table("Least zenith that shows the wall, degrees", ("diameter", "height", "centre", *places), rows)
@@ -97,10 +100,10 @@ def steps() -> Table:
         travel = np.arange(0.0, 1.5 + step / 2, step)
         twin = _twin(Sphere(), Vertical(travel), pattern="uniform")
         plain, fine = (engine.reconstruct(twin, subframe=subframe) for subframe in (False, True))
-        eq4, found = (_errors(one, twin.truth, FULL) for one in (plain, fine))
+        eq4, interpolated = (_errors(result, twin.truth, FULL) for result in (plain, fine))
         centre = tuple(size // 2 for size in SHAPE)
         apex = fine.height[centre] - twin.truth.height[centre]
-        parts = _rms(eq4), eq4.mean(), _rms(found), found.mean(), step / math.sqrt(12)
+        parts = _rms(eq4), eq4.mean(), _rms(interpolated), interpolated.mean(), step / math.sqrt(12)
         rows.append((f"{step}", *(f"{1000 * part:.1f}" for part in (*parts, apex))))
     head = ("step, mm", "eq. 4: RMS", "mean", "sub-frame: RMS", "mean", "step/sqrt(12)", "apex, filled")
     return Table("Heights of a press by its step, errors in micrometres", head, rows)
@@ -147,7 +150,7 @@ def skin() -> Table:
     rows = []
     for thickness in (0.02, 0.05, 0.1, 0.2, 0.5):
         kept = [_passed(thickness, length) for length in (0.5, 1.0, 2.0, 4.0)]
-        rows.append((f"{thickness}", *(f"{100 * share:.0f}" for share in kept)))
+        rows.append((f"{thickness}", *(f"{100 * fraction:.0f}" for fraction in kept)))
     head = ("sheet, mm", "ridges every 0.5 mm", "1 mm", "2 mm", "4 mm")
     return Table("What a mirror under the sheet sees of the height of ridges, %", head, rows)
 
@@ -237,15 +240,15 @@ def pivots() -> Table:
     for high in (0.0, 5.0, 10.0, 40.0):
         twin = _turn(pivot=(0.0, 0.0, high), camera=Camera(dtype=np.dtype(np.float32), noise=0.0))
         truth = twin.truth
-        found = [
+        results = [
             engine.reconstruct(twin),
             engine.reconstruct(twin, heights=truth.height),
             *(_reconstruct_about(twin, (0.0, 0.0, high + off)) for off in (1.0, 2.0)),
         ]
         shift = abs(PRESS - high) * math.sin(TILT)
-        each = (_angles(one, truth, (15.0, 35.0), told=False) for one in found)
-        told = [f"{math.hypot(*map(_rms, sides)):.2f}".replace("nan", "none") for sides in each]
-        rows.append((f"{high:g}", f"{shift:.2f}", *told))
+        each = (_angles(result, truth, (15.0, 35.0), marked_only=False) for result in results)
+        cells = [f"{math.hypot(*map(_rms, sides)):.2f}".replace("nan", "none") for sides in each]
+        rows.append((f"{high:g}", f"{shift:.2f}", *cells))
     head = (
         "pivot above the sheet, mm",
         "shift, mm",
@@ -288,10 +291,10 @@ def mistakes() -> Table:
     rows = []
     for name, numbers in wrong.items():
         phase, tilt, gain, offset = numbers
-        known = {"tilt": tilt, "zenith_gain": gain, "zenith_offset": offset, "noise": 0.1}
-        found = engine.estimate_normals(frames, phase, **known)
+        options = {"tilt": tilt, "zenith_gain": gain, "zenith_offset": offset, "noise": 0.1}
+        result = engine.estimate_normals(frames, phase, **options)
         zenith, azimuth = rotations.angles(normals)
-        other_zenith, other_azimuth = rotations.angles(found.normals.astype(float))
+        other_zenith, other_azimuth = rotations.angles(result.normals.astype(float))
         turned = np.angle(np.exp(1j * (other_azimuth - azimuth)))
         means = (np.degrees(np.nanmean(part, axis=-1)) for part in (other_zenith - zenith, turned))
         rows.append((name, *(f"{value:+.2f}" for pair in zip(*means, strict=True) for value in pair)))
@@ -320,23 +323,23 @@ def bumps() -> Table:
     """Tell how much of a small bump's height integration finds, by its width in pixels."""
     rows = []
     for sigma in (1.5, 2.0, 3.0, 4.0, 6.0):
-        seen = surfaces.sample(surfaces.bump(sigma, 0.6 * sigma), (96, 96))
-        wide = engine.integrate(seen.dz_dx, seen.dz_dy, 1.0, sigma=False).height
-        lost = (1 - np.ptp(found) / np.ptp(seen.height) for found in (wide, _by_means(seen)))
-        rows.append((f"{sigma:g}", *(f"{100 * share:.2f}" for share in lost)))
+        bump = surfaces.sample(surfaces.bump(sigma, 0.6 * sigma), (96, 96))
+        wide = engine.integrate(bump.dz_dx, bump.dz_dy, 1.0, sigma=False).height
+        lost = (1 - np.ptp(height) / np.ptp(bump.height) for height in (wide, _by_means(bump)))
+        rows.append((f"{sigma:g}", *(f"{100 * fraction:.2f}" for fraction in lost)))
     head = ("sigma of the bump, pixels", "lost, %", "lost with the mean of two slopes, %")
     return Table("Bumps of a few pixels: height that is lost", head, rows)
 
 
-def _by_means(seen: surfaces.Sample) -> Map:
+def _by_means(view: surfaces.Sample) -> Map:
     """Return the heights whose differences fit the means of neighbours' slopes best, in pixels."""
-    rows, columns = seen.height.shape
+    rows, columns = view.height.shape
     down, across = (
         sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(n - 1, n)) for n in (rows, columns)
     )
     each = sparse.eye_array(rows), sparse.eye_array(columns)
     links = sparse.vstack([sparse.kron(each[0], across), sparse.kron(down, each[1])])
-    rises = [(seen.dz_dx[:, 1:] + seen.dz_dx[:, :-1]) / 2, -(seen.dz_dy[1:] + seen.dz_dy[:-1]) / 2]
+    rises = [(view.dz_dx[:, 1:] + view.dz_dx[:, :-1]) / 2, -(view.dz_dy[1:] + view.dz_dy[:-1]) / 2]
     matrix = sparse.csc_array(links.T @ links + 1e-9 * sparse.eye_array(rows * columns))
     return np.reshape(
         spsolve(matrix, links.T @ np.concatenate([rise.ravel() for rise in rises])), (rows, columns)
@@ -348,9 +351,9 @@ def _ball_radius(result: io.Result) -> float:
     assert result.height is not None
     assert result.x is not None
     assert result.y is not None
-    known = np.isfinite(result.height)
-    x, y = (axis[known] for axis in np.meshgrid(result.x, result.y))
-    z = result.height[known].astype(np.float64)
+    finite = np.isfinite(result.height)
+    x, y = (axis[finite] for axis in np.meshgrid(result.x, result.y))
+    z = result.height[finite].astype(np.float64)
 
     def left(ball: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.sqrt((x - ball[0]) ** 2 + (y - ball[1]) ** 2 + (z - ball[2]) ** 2) - ball[3])
@@ -362,8 +365,8 @@ def _ball_radius(result: io.Result) -> float:
 
 
 def _twin(thing: Any, movement: Any, **options: Any) -> Twin:
-    given = {"shape": SHAPE, "pixel_size": PIXEL, "camera": Camera(seed=1), **options}
-    return Twin(object=thing, movement=movement, **given)
+    settings = {"shape": SHAPE, "pixel_size": PIXEL, "camera": Camera(seed=1), **options}
+    return Twin(object=thing, movement=movement, **settings)
 
 
 def _turn(
@@ -379,19 +382,19 @@ def _errors(result: io.Result, truth: io.Truth, between: tuple[float, float] = (
     """Return the errors of measured heights, mm, where the zenith is between two, degrees."""
     assert result.height is not None
     filled = np.zeros(truth.height.shape, bool) if result.filled is None else result.filled != 0
-    known = np.isfinite(result.height) & np.isfinite(truth.height) & ~filled
-    known &= (np.degrees(truth.zenith) > between[0]) & (np.degrees(truth.zenith) < between[1])
-    return np.asarray((result.height - truth.height)[known], np.float64)
+    valid = np.isfinite(result.height) & np.isfinite(truth.height) & ~filled
+    valid &= (np.degrees(truth.zenith) > between[0]) & (np.degrees(truth.zenith) < between[1])
+    return np.asarray((result.height - truth.height)[valid], np.float64)
 
 
 def _micro(result: io.Result, truth: io.Truth) -> str:
     """Return the RMS of the heights of a rotation in contact about their mean, micrometres."""
-    told = engine.score(result, truth).height
-    return "-" if told is None else f"{1000 * told.rms:.1f}"
+    score = engine.score(result, truth).height
+    return "-" if score is None else f"{1000 * score.rms:.1f}"
 
 
 def _angles(
-    result: io.Result, truth: io.Truth, between: tuple[float, float] = STEEP, told: bool = True
+    result: io.Result, truth: io.Truth, between: tuple[float, float] = STEEP, marked_only: bool = True
 ) -> tuple[Map, Map]:
     """Return errors of normals along the meridian and across it, degrees, where the zenith is between two.
 
@@ -404,9 +407,9 @@ def _angles(
     error = result.normals - true
     across = error[..., 1] * away[..., 0] - error[..., 0] * away[..., 1]
     zenith = np.degrees(truth.zenith)
-    known = (truth.contact != 0) & (zenith > between[0]) & (zenith < between[1])
-    known &= np.isfinite(error[..., 0]) & (not told or result.contact != 0)
-    return np.degrees(np.sum(error * meridian, axis=-1)[known]), np.degrees(across[known])
+    valid = (truth.contact != 0) & (zenith > between[0]) & (zenith < between[1])
+    valid &= np.isfinite(error[..., 0]) & (not marked_only or result.contact != 0)
+    return np.degrees(np.sum(error * meridian, axis=-1)[valid]), np.degrees(across[valid])
 
 
 def _answered(result: io.Result, truth: io.Truth) -> float:
@@ -421,8 +424,8 @@ def _rms(values: Map) -> float:
 
 
 TABLES: Mapping[str, Callable[[], Table]] = {
-    one.__name__: one
-    for one in (
+    measure.__name__: measure
+    for measure in (
         *(dimensions, gap, distance, steps, gel, skin),
         *(tilts, phases, cameras, pivots, mistakes, pixels, bumps),
     )
@@ -434,14 +437,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", help="names of tables, with commas between them")
     parser.add_argument("--figures", type=Path, help="folder for the figures; needs all of their tables")
-    given = parser.parse_args()
-    made: dict[str, Table] = {}
-    for name in given.only.split(",") if given.only else TABLES:
-        made[name] = TABLES[name]()
-        print(made[name], flush=True)
-    if given.figures:
-        sensor_figures.draw_section(given.figures / "sensor.png")
-        sensor_figures.draw_trades(given.figures / "sensor-trade-offs.png", made)
+    options = parser.parse_args()
+    tables: dict[str, Table] = {}
+    for name in options.only.split(",") if options.only else TABLES:
+        tables[name] = TABLES[name]()
+        print(tables[name], flush=True)
+    if options.figures:
+        sensor_figures.draw_section(options.figures / "sensor.png")
+        sensor_figures.draw_trades(options.figures / "sensor-trade-offs.png", tables)
 
 
 if __name__ == "__main__":

@@ -72,9 +72,9 @@ def test_the_targets_of_a_call_are_its_kernels_and_its_peers():
 
     ours = of(OURS, 16.1, 10), of(FIRST, 18.9, 10), of(f"{OURS}, solve", 5, 5)
     peers = of("NumPy", 150), of("Numba", 16.2), of("OpenCV, solve", 4)
-    rows = {one.name: one for one in (of("read limit", 1), *ours, *peers)}
-    found = [(one.what, one.met) for one in call_targets(rows)]
-    assert found == [(OURS, False), (FIRST, True), (OURS, False), (OURS, True), (f"{OURS}, solve", False)]
+    rows = {work.name: work for work in (of("read limit", 1), *ours, *peers)}
+    targets = [(target.what, target.met) for target in call_targets(rows)]
+    assert targets == [(OURS, False), (FIRST, True), (OURS, False), (OURS, True), (f"{OURS}, solve", False)]
 
 
 def test_patterns_choose_cases_in_their_order():
@@ -107,8 +107,8 @@ def test_a_direct_solution_solves_its_own_equations():
     shape = (40, 50)
     slopes, mask, edges = noisy_slopes(shape), blob_mask(shape), random_cuts(shape, 5)
     truth = integration.find_truth(slopes, mask, edges)
-    left = truth.system.matrix @ truth.values - truth.system.source
-    assert np.abs(left).max() < 1e-12
+    residual = truth.system.matrix @ truth.values - truth.system.source
+    assert np.abs(residual).max() < 1e-12
     assert truth.error(truth.values) < 1e-15
     assert truth.error(truth.map) < 1e-6
 
@@ -151,14 +151,14 @@ def test_runs_are_compared_and_become_a_page(cases, tmp_path):
         assert call("run", "one", "-o", tmp_path / name).exit_code == 0
     compared = call("compare", tmp_path / "a.json", tmp_path / "b.json")
     assert "works: 1 as before" in compared.output
-    made = call("report", tmp_path / "a.json", "-o", tmp_path / "page.md")
-    assert made.exit_code == 0
+    report = call("report", tmp_path / "a.json", "-o", tmp_path / "page.md")
+    assert report.exit_code == 0
     assert "a.json: " in (tmp_path / "page.md").read_text(encoding="utf-8")
     assert call("run", "--list").output.split() == ["one", "bad", "stopped"]
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["run", "nothing"], "case 'nothing': there is no such case"),
         (["run", "one", "-o", "run.txt"], "must end in .json"),
@@ -167,9 +167,9 @@ def test_runs_are_compared_and_become_a_page(cases, tmp_path):
         (["compare", "none.json", "none.json"], "none.json"),
     ],
 )
-def test_bad_input_is_refused(cases, tmp_path, monkeypatch, words, said):
+def test_bad_input_is_refused(cases, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     ended = call(*words)
     assert isinstance(ended.exception, InputError)
-    assert said in str(ended.exception)
+    assert message in str(ended.exception)
     assert not list(tmp_path.iterdir())

@@ -17,8 +17,8 @@ def one(seconds, run=None, **changes):
 
 
 def difference(before, after):
-    (found,) = compare(before, after).cases["press"]
-    return found
+    (work,) = compare(before, after).cases["press"]
+    return work
 
 
 @pytest.mark.parametrize(
@@ -26,12 +26,12 @@ def difference(before, after):
     [(0.85, "faster"), (0.95, "as before"), (1.0, "as before"), (1.05, "as before"), (1.15, "slower")],
 )
 def test_only_what_differs_by_more_than_its_spread_is_faster_or_slower(seconds, verdict):
-    found = difference(one(1.0), one(seconds))
-    assert found.verdict == verdict
-    assert found.ratio == pytest.approx(seconds)
+    work = difference(one(1.0), one(seconds))
+    assert work.verdict == verdict
+    assert work.ratio == pytest.approx(seconds)
     # Quartiles lie 5 % on either side.
-    assert found.lower == pytest.approx(seconds * 0.95 / 1.05)
-    assert found.upper == pytest.approx(seconds * 1.05 / 0.95)
+    assert work.lower == pytest.approx(seconds * 0.95 / 1.05)
+    assert work.upper == pytest.approx(seconds * 1.05 / 0.95)
 
 
 def test_a_wide_spread_hides_a_difference_and_a_narrow_one_shows_it():
@@ -54,11 +54,11 @@ def test_limits_of_nearly_as_many_bytes_are_compared_for_as_much_work():
 def test_other_work_under_the_same_name_is_not_compared(changes):
     other = row("mirrorskin", 1.0, **changes)
     same = row("NumPy", 2.0, moved=1000)
-    found = compare(
+    comparison = compare(
         made(case("press", row("mirrorskin", 1.0, moved=1000), same)), made(case("press", other, same))
     )
-    assert [one.name for one in found.cases["press"]] == ["NumPy"]
-    assert found.apart == ("press: not the same work in both, or only in one: mirrorskin",)
+    assert [work.name for work in comparison.cases["press"]] == ["NumPy"]
+    assert comparison.apart == ("press: not the same work in both, or only in one: mirrorskin",)
 
 
 def test_works_and_limits_are_counted_apart():
@@ -72,8 +72,8 @@ def test_works_and_limits_are_counted_apart():
             )
         )
 
-    found = compare(of(1, 1, 1), of(2, 4, 1))
-    assert found.summary == (
+    comparison = compare(of(1, 1, 1), of(2, 4, 1))
+    assert comparison.summary == (
         "works: 1 slower, 1 as before; B takes 2.00 times as long as A (geometric mean)",
         "limits of the machine: 1 slower; B takes 2.00 times as long as A (geometric mean)",
     )
@@ -83,9 +83,9 @@ def test_cases_and_works_of_only_one_run_are_named():
     shared = row("mirrorskin", 1.0)
     before = made(case("gone", shared), case("press", shared, row("Numba", 1.0)))
     after = made(case("press", shared, row("PyTorch", 1.0)), case("new", shared))
-    found = compare(before, after)
-    assert list(found.cases) == ["press"]
-    assert found.apart == (
+    comparison = compare(before, after)
+    assert list(comparison.cases) == ["press"]
+    assert comparison.apart == (
         "only in A: gone",
         "only in B: new",
         "press: not the same work in both, or only in one: Numba, PyTorch",
@@ -106,7 +106,7 @@ GPU = Machine("Other GPU", "Some platform", "1.0", "gpu")
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"device": GPU}, "other machine or device: Some platform: Some GPU .* / Some platform: Other GPU"),
         ({"processor": "Other"}, "other machine or device: .*; Some processor / .*; Other"),
@@ -117,10 +117,10 @@ GPU = Machine("Other GPU", "Some platform", "1.0", "gpu")
         ({"quick": True}, "B: made with --quick; the times mean nothing"),
     ],
 )
-def test_what_else_differs_is_warned_of(changes, said):
-    found = compare(one(1.0), one(1.0, run=changes))
-    assert len(found.warnings) == 1
-    assert re.fullmatch(f"{said}.*", found.warnings[0])
+def test_other_differences_are_warnings(changes, message):
+    comparison = compare(one(1.0), one(1.0, run=changes))
+    assert len(comparison.warnings) == 1
+    assert re.fullmatch(f"{message}.*", comparison.warnings[0])
 
 
 def test_another_commit_and_what_one_run_did_not_record_are_no_reason_for_a_warning():
@@ -132,8 +132,8 @@ def test_targets_that_only_one_run_met_are_reported():
     def of(first, second):
         return made(case("file", targets=(target("whole path", first), target("memory", second))))
 
-    found = compare(of(True, False), of(False, True))
-    assert found.targets == (
+    comparison = compare(of(True, False), of(False, True))
+    assert comparison.targets == (
         "file, whole path: missed now: 1.3 times before, 1.3 times now (at most 1.25 times)",
         "file, memory: met now: 1.3 times before, 1.3 times now (at most 1.25 times)",
     )
@@ -143,8 +143,8 @@ def test_targets_that_only_one_run_met_are_reported():
 def test_a_comparison_is_a_table():
     limit = row("read limit", 1.0, moved=1000)
     before, after = (made(case("press", limit, row("mirrorskin", t, moved=1000))) for t in (2.0, 4.0))
-    found = compare(before, after)
-    _, cells = as_rows(found.cases["press"])
+    comparison = compare(before, after)
+    _, cells = as_rows(comparison.cases["press"])
     assert dict(zip(HEAD, cells, strict=True)) == {
         "work": "mirrorskin",
         "A, ms": "2000",

@@ -29,11 +29,11 @@ def test_targets_are_judged_by_what_was_counted():
 def test_frames_come_when_they_are_due_and_those_that_wait_come_together():
     clock, frames, phase = SimulatedClock(), turn_frames(SHAPE), phases(SHAPE[0])
     source = paced(frames, turn_header(), phase, 10.0, clock)
-    room = np.empty((8, *SHAPE[1:]), np.uint8)
-    block = source.read(room)
+    staging = np.empty((8, *SHAPE[1:]), np.uint8)
+    block = source.read(staging)
     assert (block.index, len(block.frames), block.stays_valid) == (0, 1, True)
     clock.sleep(0.45)
-    block = source.read(room)
+    block = source.read(staging)
     assert (block.index, len(block.frames), block.dropped) == (1, 4, 0)
     np.testing.assert_array_equal(block.frames, frames[1:5])
     np.testing.assert_array_equal(block.phase, phase[1:5])
@@ -45,16 +45,16 @@ def test_frames_come_when_they_are_due_and_those_that_wait_come_together():
 def test_what_a_late_reader_loses_is_reported():
     clock, frames = SimulatedClock(), turn_frames(SHAPE)
     source = paced(frames, turn_header(), phases(SHAPE[0]), 10.0, clock, slots=4)
-    room, given = np.empty((8, *SHAPE[1:]), np.uint8), []
+    staging, numbers = np.empty((8, *SHAPE[1:]), np.uint8), []
     lost = 0
-    source.read(room)
+    source.read(staging)
     clock.sleep(1.0)
-    while (block := source.read(room)) is not None:
+    while (block := source.read(staging)) is not None:
         lost += block.dropped
-        given += range(block.index, block.index + len(block.frames))
-        np.testing.assert_array_equal(block.frames, frames[given[-len(block.frames) :]])
+        numbers += range(block.index, block.index + len(block.frames))
+        np.testing.assert_array_equal(block.frames, frames[numbers[-len(block.frames) :]])
     assert lost == 6
-    assert given == list(range(7, SHAPE[0]))
+    assert numbers == list(range(7, SHAPE[0]))
 
 
 def test_it_cannot_be_rewound():

@@ -27,20 +27,22 @@ def test_a_run_is_read_as_it_was_written(tmp_path):
 
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.stem)
 def test_the_committed_runs_are_readable(path):
-    found = open_run(path)
-    assert found.cases
+    run_read = open_run(path)
+    assert run_read.cases
     written = json.loads(path.read_text(encoding="utf-8"))
-    for mine, theirs in zip(found.cases, written["cases"], strict=True):
-        assert [one.what for one in mine.targets] == [one["what"] for one in theirs.get("targets", [])]
+    for mine, theirs in zip(run_read.cases, written["cases"], strict=True):
+        assert [row_read.what for row_read in mine.targets] == [
+            row_read["what"] for row_read in theirs.get("targets", [])
+        ]
         assert list(mine.notes) == theirs.get("notes", [])
-        for one, other in zip(mine.rows, theirs["rows"], strict=True):
-            assert (one.name, one.bytes, one.wall.median) == (
+        for row_read, other in zip(mine.rows, theirs["rows"], strict=True):
+            assert (row_read.name, row_read.bytes, row_read.wall.median) == (
                 other["name"],
                 other["bytes"],
                 other["wall"]["median"],
             )
-            if one.bytes and other["share"] is not None:
-                assert mine.share(one) == pytest.approx(other["share"])
+            if row_read.bytes and other["share"] is not None:
+                assert mine.share(row_read) == pytest.approx(other["share"])
 
 
 def test_the_table_of_the_package_has_the_cases_that_the_command_measures():
@@ -53,14 +55,14 @@ def refused(path):
     """Return the one line that a file is refused with."""
     with pytest.raises(InputError) as caught:
         open_run(path)
-    said = str(caught.value)
-    assert said.startswith(str(path))
-    assert "\n" not in said
-    return said
+    message = str(caught.value)
+    assert message.startswith(str(path))
+    assert "\n" not in message
+    return message
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (b"", "input data was truncated"),
         (b"# a page\n", "the JSON is malformed"),
@@ -73,10 +75,10 @@ def refused(path):
         (b"{}", "missing required field `date`"),
     ],
 )
-def test_what_is_not_a_run_is_refused(tmp_path, content, said):
+def test_what_is_not_a_run_is_refused(tmp_path, content, message):
     path = tmp_path / "other.json"
     path.write_bytes(content)
-    assert said in refused(path)
+    assert message in refused(path)
 
 
 def test_a_file_that_is_not_there_or_is_a_folder_is_refused(tmp_path):
@@ -85,7 +87,7 @@ def test_a_file_that_is_not_there_or_is_a_folder_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "said"),
+    ("place", "value", "message"),
     [
         (("device",), "a GPU", "expected `object`, got `str` - at `$.device`"),
         (("device", "driver"), None, "expected `str`, got `null` - at `$.device.driver`"),
@@ -102,7 +104,7 @@ def test_a_file_that_is_not_there_or_is_a_folder_is_refused(tmp_path):
         (("cases", 0, "rows", 0, "first"), 10**400, "rows[0].first"),
     ],
 )
-def test_what_is_not_of_its_type_is_named(tmp_path, place, value, said):
+def test_what_is_not_of_its_type_is_named(tmp_path, place, value, message):
     data = json.loads(SOUND.as_json())
     holder = data
     for step in place[:-1]:
@@ -110,7 +112,7 @@ def test_what_is_not_of_its_type_is_named(tmp_path, place, value, said):
     holder[place[-1]] = value
     path = tmp_path / "run.json"
     path.write_text(json.dumps(data), encoding="utf-8")
-    assert said in refused(path)
+    assert message in refused(path)
 
 
 def test_what_is_missing_is_named(tmp_path):

@@ -30,18 +30,18 @@ def test_works_take_turns_after_a_warm_up():
     works = {"a": Work(lambda: calls.append("a")), "b": Work(lambda: calls.append("b"))}
     measured = take_turns(works, 3, Profile())
     assert calls == ["a", "b"] * 4
-    assert {name: one.wall.rounds for name, one in measured.items()} == {"a": 3, "b": 3}
+    assert {name: row.wall.rounds for name, row in measured.items()} == {"a": 3, "b": 3}
 
 
 def test_the_spread_is_the_quartiles_and_the_first_call_is_separate(clock):
     seconds = iter([100, *np.random.default_rng(0).permutation(9)])
-    one = take_turns({"a": Work(lambda: clock.move(next(seconds)))}, 9, Profile())["a"]
+    row = take_turns({"a": Work(lambda: clock.move(next(seconds)))}, 9, Profile())["a"]
     # Nine turns, of 0 to 8 seconds, are not all taken: ten seconds of patience end them.
-    assert one.first == 100
-    assert 3 <= one.wall.rounds < 9
+    assert row.first == 100
+    assert 3 <= row.wall.rounds < 9
     few = iter([100, 0, 1, 2, 3, 4, *[0] * 4])
-    one = take_turns({"a": Work(lambda: clock.move(next(few) / 10))}, 5, Profile())["a"]
-    assert (one.wall.lower, one.wall.median, one.wall.upper) == pytest.approx((0.1, 0.2, 0.3))
+    row = take_turns({"a": Work(lambda: clock.move(next(few) / 10))}, 5, Profile())["a"]
+    assert (row.wall.lower, row.wall.median, row.wall.upper) == pytest.approx((0.1, 0.2, 0.3))
 
 
 def test_a_slow_work_leaves_its_turns_to_the_others(clock):
@@ -78,20 +78,20 @@ def test_device_times_are_reported_by_kind_and_by_kernel(clock):
             profile.add("kernel", name, 0.1 * turn)
         clock.move(turn)
 
-    one = take_turns({"a": Work(work, 8, 2)}, 3, profile)["a"]
-    assert one.compile == 0.5
-    assert one.kernels == pytest.approx({"scan": 0.3, "heights": 0.6})
-    assert set(one.device) == {"upload", "kernel"}
-    assert one.kernel == pytest.approx(0.9)
-    assert one.device["upload"].median == pytest.approx(0.03)
-    assert one.wall.median == 3
-    assert (one.name, one.bytes, one.frames) == ("a", 8, 2)
+    row = take_turns({"a": Work(work, 8, 2)}, 3, profile)["a"]
+    assert row.compile == 0.5
+    assert row.kernels == pytest.approx({"scan": 0.3, "heights": 0.6})
+    assert set(row.device) == {"upload", "kernel"}
+    assert row.kernel == pytest.approx(0.9)
+    assert row.device["upload"].median == pytest.approx(0.03)
+    assert row.wall.median == 3
+    assert (row.name, row.bytes, row.frames) == ("a", 8, 2)
 
 
 def test_a_work_without_a_device_has_no_account_of_it(clock):
-    one = take_turns({"a": Work(lambda: clock.move(1))}, 3, Profile())["a"]
-    assert one.device == {}
-    assert np.isnan(one.kernel)
+    row = take_turns({"a": Work(lambda: clock.move(1))}, 3, Profile())["a"]
+    assert row.device == {}
+    assert np.isnan(row.kernel)
 
 
 def test_what_is_done_before_a_work_is_not_timed(clock):

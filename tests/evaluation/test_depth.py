@@ -13,14 +13,14 @@ def rises(scene):
     """Give the rise of heights along links, in pixels, and that according to the normals of both ends."""
     across, up, towards = np.moveaxis(scene.normals, -1, 0)
     for axis, slope in ((1, -across / towards), (0, up / towards)):
-        ends = [np.moveaxis(one, axis, 0) for one in (scene.height, slope, towards, scene.piece)]
+        ends = [np.moveaxis(values, axis, 0) for values in (scene.height, slope, towards, scene.piece)]
         kept = (np.minimum(ends[2][1:], ends[2][:-1]) > 0.4) & (ends[3][1:] == ends[3][:-1])
         rise = np.diff(ends[0], axis=0)[kept] / scene.pixel_size
         yield rise, np.stack([ends[1][1:], ends[1][:-1]])[:, kept]
 
 
 @pytest.mark.parametrize("name", [*SCENES, "heap 0", "heap 2", "heap 4"])
-def test_heights_rise_as_normals_say(name):
+def test_heights_rise_along_the_normals(name):
     options = {"noise": 0.0} if name == "folds" else {}
     scene = (SCENES | HELD_OUT)[name](SHAPE, **options)
     assert scene.mask[SHAPE[0] // 2].any()
@@ -33,11 +33,11 @@ def test_heights_rise_as_normals_say(name):
 
 
 def test_heaps_are_the_same_each_time_and_differ_from_each_other():
-    one, again, other = (HELD_OUT[f"heap {k}"]((48, 64)) for k in (2, 2, 3))
-    np.testing.assert_array_equal(one.height, again.height)
-    assert one.mask.mean() > 0.2
-    assert one.piece.max() > 3
-    assert not np.array_equal(one.height, other.height)
+    heap, again, other = (HELD_OUT[f"heap {k}"]((48, 64)) for k in (2, 2, 3))
+    np.testing.assert_array_equal(heap.height, again.height)
+    assert heap.mask.mean() > 0.2
+    assert heap.piece.max() > 3
+    assert not np.array_equal(heap.height, other.height)
 
 
 def test_errors_are_after_the_offset_of_each_piece():
@@ -49,6 +49,6 @@ def test_errors_are_after_the_offset_of_each_piece():
 
 def test_the_published_method_finds_what_is_in_front_and_behind():
     scene = SCENES["ball"](SHAPE)
-    found, steps = integrate_bilaterally(scene)
+    height, steps = integrate_bilaterally(scene)
     assert 5 < steps < 150
-    assert scene.error(found) < 0.25
+    assert scene.error(height) < 0.25

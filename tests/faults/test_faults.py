@@ -17,9 +17,9 @@ from mirrorskin.kernels import device as device_layer
 @pytest.fixture
 def lost(monkeypatch):
     """Errors that nobody could catch, of destructors: Python prints them with a traceback."""
-    found = []
-    monkeypatch.setattr(sys, "unraisablehook", lambda error: found.append(error.exc_value))
-    yield found
+    names = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda error: names.append(error.exc_value))
+    yield names
     device_layer._open.cache_clear()
 
 
@@ -51,23 +51,23 @@ def check(command, kind, numbers, tmp_path, lost):
             ended = run(*words, output)
             gc.collect()
         where = f"{kind} {number} of {calls.count}: {ended}"
-        found = heights(output, names)
-        for name, height in found.items():
+        stored = heights(output, names)
+        for name, height in stored.items():
             np.testing.assert_array_equal(height, sound[name], where)
         assert not lost, where
         assert not list(tmp_path.rglob("*.part")), where
         if ended.code == 0:
-            assert found.keys() == sound.keys(), where
+            assert stored.keys() == sound.keys(), where
             continue
         ended_so += 1
         assert ended.code in (1, 2), where
         failures = re.findall("^failed: (.*)$", ended.out, re.MULTILINE)
         if failures:
-            assert len(set(failures)) == len(names) - len(found), where
+            assert len(set(failures)) == len(names) - len(stored), where
             assert ended.said == "", where
         else:
             assert re.fullmatch("mirrorskin: .+\n", ended.said), where
-            assert not found, where
+            assert not stored, where
         assert "unexpected" not in ended.out, where
     assert run(*words, tmp_path / "after").code == 0
     for name, height in heights(tmp_path / "after", names).items():
@@ -75,9 +75,9 @@ def check(command, kind, numbers, tmp_path, lost):
     return ended_so
 
 
-def at_most(wanted):
+def at_most(size):
     """Choose so many calls, evenly, of all that there are."""
-    return lambda count: range(0, count, 1 + count // wanted)
+    return lambda count: range(0, count, 1 + count // size)
 
 
 @pytest.mark.parametrize("command", ["press"], indirect=True)

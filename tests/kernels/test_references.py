@@ -66,7 +66,9 @@ def _(shape):
 
 
 # A square of 6 is cut, or not, by its last digit.
-@case("breaks_links", **BREAKS, checks=dict.fromkeys(("right", "down", "source"), near(0, 2e-5, share=0.002)))
+@case(
+    "breaks_links", **BREAKS, checks=dict.fromkeys(("right", "down", "source"), near(0, 2e-5, fraction=0.002))
+)
 def _(shape):
     numbers = SIZE | {"slack": 0.25, "sharpness": 4.0, "max_square": 6.0}
     _, *links, held, maps = linked(shape, "slope_x slope_y rise_x rise_y heights", **numbers)
@@ -399,7 +401,7 @@ def sound(rtol, atol=0.0):
 
 
 FITTED = named("height spread gain", sound(1e-5), sound(1e-3), sound(1e-3))
-FITTED |= named("misfit sharpness status", sound(2e-2, 1e-3), near(1e-4, 0.0), near(0.0, 0.0, share=1e-3))
+FITTED |= named("misfit sharpness status", sound(2e-2, 1e-3), near(1e-4, 0.0), near(0.0, 0.0, fraction=1e-3))
 
 
 @case("focus_fit", {"reach": (1, 2, 4), "variance": (0.0, 2.25)}, checks=FITTED)

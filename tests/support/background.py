@@ -23,9 +23,9 @@ def install(folder: Path) -> dict[str, str]:
 
 def process_of(printed: str) -> int:
     """Return the process that ``twin serve --background`` says how to end."""
-    found = re.search(r"end it with 'kill (\d+)'", printed)
-    assert found is not None, printed
-    return int(found[1])
+    number = re.search(r"end it with 'kill (\d+)'", printed)
+    assert number is not None, printed
+    return int(number[1])
 
 
 def end(process: int, number: int = signal.SIGTERM) -> None:

@@ -14,8 +14,8 @@ class Parts(ArraySource):
         super().__init__(frames, operation, positions)
         self._parts = {start: stop - start for start, stop in pairwise([0, *cuts, len(frames)])}
 
-    def read_in_place(self, most):
-        return super().read_in_place(min(most, self._parts.get(self._next, most)))
+    def read_in_place(self, limit):
+        return super().read_in_place(min(limit, self._parts.get(self._next, limit)))
 
 
 def bare_run(operation):
@@ -25,7 +25,7 @@ def bare_run(operation):
 
 def bare(operation, frames, cuts=(), **positions):
     """Return the maps of frames that are read in parts, without checks."""
-    cuts = sorted({int(cut) for cut in cuts if 0 < cut < len(frames)})
+    cuts = sorted({int(edge) for edge in cuts if 0 < edge < len(frames)})
     return Run(Plan(operation, checked=False), Parts(frames, operation, positions, cuts)).complete()
 
 

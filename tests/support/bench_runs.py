@@ -64,7 +64,7 @@ def run(*cases: Case, **changes: Any) -> Run:
     return Run(**{**values, **changes})
 
 
-def save(made: Run, path: Path) -> Path:
+def save(run_: Run, path: Path) -> Path:
     """Write a run as `mirrorskin bench -o` does, and return its path."""
-    path.write_bytes(made.as_json())
+    path.write_bytes(run_.as_json())
     return path

@@ -56,9 +56,9 @@ class View:
 
     def place(self, x, y):
         """Column and row at which a point of the sheet is seen."""
-        seen = np.tensordot(self.plane(), np.stack([x, y, np.ones_like(x)]), 1)
+        image = np.tensordot(self.plane(), np.stack([x, y, np.ones_like(x)]), 1)
         # The principal ray of a camera whose middle is off the centre still meets the origin off its middle.
-        u, v = seen[:2] / seen[2] - (self.middle / np.float64(self.focal))[:, None].reshape(
+        u, v = image[:2] / image[2] - (self.middle / np.float64(self.focal))[:, None].reshape(
             2, *[1] * np.ndim(x)
         )
         u, v = self._bend(u, v)
@@ -79,31 +79,35 @@ class View:
         else:
             raise ValueError("nothing is seen at the corners")
         off = self.middle / np.float64(self.focal)
-        found = np.tensordot(
+        homography = np.tensordot(
             np.linalg.inv(self.plane()), np.stack([u + off[0], v + off[1], np.ones_like(u)]), 1
         )
-        return found[0] / found[2], found[1] / found[2]
+        return homography[0] / homography[2], homography[1] / homography[2]
 
 
 def charuco(columns, rows, square, marker, dictionary=cv2.aruco.DICT_4X4_50):
     """A ChArUco board about its middle as a function of x and y up, mm: 1 white, 0 black."""
-    known = cv2.aruco.getPredefinedDictionary(dictionary)
-    side = known.markerSize + 2
+    markers = cv2.aruco.getPredefinedDictionary(dictionary)
+    side = markers.markerSize + 2
     numbers = iter(range(columns * rows))
     bits = np.zeros((rows, columns, side, side))
     for row in range(rows):
         for column in range(columns):
             if (row + column) % 2:
-                bits[row, column] = cv2.aruco.generateImageMarker(known, next(numbers), side) / 255
+                bits[row, column] = cv2.aruco.generateImageMarker(markers, next(numbers), side) / 255
 
     def paint(x, y):
         across, down = x / square + columns / 2, rows / 2 - y / square
         inside = (across >= 0) & (across < columns) & (down >= 0) & (down < rows)
-        i, j = (np.clip(np.floor(one), 0, n - 1).astype(int) for one, n in ((down, rows), (across, columns)))
+        i, j = (
+            np.clip(np.floor(position), 0, n - 1).astype(int)
+            for position, n in ((down, rows), (across, columns))
+        )
         white = (i + j) % 2 == 1
         margin = (square - marker) / 2
         p, q = (
-            np.floor(((one - k) * square - margin) / marker * side) for one, k in ((down, i), (across, j))
+            np.floor(((position - k) * square - margin) / marker * side)
+            for position, k in ((down, i), (across, j))
         )
         coded = white & (p >= 0) & (p < side) & (q >= 0) & (q < side)
         cell = bits[i, j, np.clip(p, 0, side - 1).astype(int), np.clip(q, 0, side - 1).astype(int)]
@@ -147,22 +151,22 @@ def photograph(
     x, y = view.sheet(*np.meshgrid(across, down))
     angle, dx, dy = pose
     c, s = cos(radians(angle)), sin(radians(angle))
-    seen = paint(c * (x - dx) + s * (y - dy), c * (y - dy) - s * (x - dx))
-    seen = seen.reshape(rows + 2 * reach, fine, columns + 2 * reach, fine).mean((1, 3))
+    picture = paint(c * (x - dx) + s * (y - dy), c * (y - dy) - s * (x - dx))
+    picture = picture.reshape(rows + 2 * reach, fine, columns + 2 * reach, fine).mean((1, 3))
     # The mean over a pixel is a blur of its own; a Gauss over means differs from one over rays by little.
-    seen = (
-        ndimage.gaussian_filter(seen, blur)[reach:-reach, reach:-reach]
+    picture = (
+        ndimage.gaussian_filter(picture, blur)[reach:-reach, reach:-reach]
         if blur
-        else seen[reach:-reach, reach:-reach]
+        else picture[reach:-reach, reach:-reach]
     )
-    samples = counts[0] + (counts[1] - counts[0]) * seen
+    samples = counts[0] + (counts[1] - counts[0]) * picture
     if light is not None:
         samples = samples * light
     samples = samples + noise * np.random.default_rng(seed).standard_normal(samples.shape)
     if np.dtype(dtype).kind == "f":
         return samples.astype(dtype)
-    most = np.iinfo(dtype).max
-    return np.clip(np.rint(samples * (most / 255)), 0, most).astype(dtype)
+    full = np.iinfo(dtype).max
+    return np.clip(np.rint(samples * (full / 255)), 0, full).astype(dtype)
 
 
 def marks_in(view, board, pose):

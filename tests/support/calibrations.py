@@ -21,13 +21,13 @@ def some_references(shape=SHAPE, dark=10.0, bright=200.0):
     defects = np.zeros(shape, np.uint8)
     defects[-1, -1] = 2
     maps = [a_map(seed, shape, middle) for seed, middle in enumerate((dark, bright))]
-    maps = [np.where(defects, np.float32(np.nan), one) for one in maps]
+    maps = [np.where(defects, np.float32(np.nan), values) for values in maps]
     return io.References(*maps, a_map(2, shape, 0.1), a_map(3, shape, 0.2), defects)
 
 
 def a_precession(**changes):
     """Return a precession that goes round the other way, on an ellipse."""
-    known = {
+    parameters = {
         "tilt": 0.04,
         "phase_offset": 0.3,
         "direction": -1,
@@ -37,7 +37,7 @@ def a_precession(**changes):
         "pivot": (0.5, -0.25, 12.0),
         "sigma": {"tilt": 1e-4, "pivot_z": 0.3},
     }
-    return io.Precession(**known | changes)
+    return io.Precession(**parameters | changes)
 
 
 def a_response(shape=SHAPE):
@@ -88,15 +88,15 @@ def a_calibration(shape=SHAPE, dtype="uint8", name="left", only=None):
     return io.Calibration(io.CameraId(name, shape, np.dtype(dtype)), **chosen, process=process)
 
 
-def assert_same(found, expected):
+def assert_same(actual, expected):
     """Hold two calibrations, or two parts, equal: arrays to the last bit and type, the rest by value."""
-    assert type(found) is type(expected)
-    for one in fields(expected):
-        left, right = getattr(found, one.name), getattr(expected, one.name)
+    assert type(actual) is type(expected)
+    for field in fields(expected):
+        mine, right = getattr(actual, field.name), getattr(expected, field.name)
         if hasattr(right, "__dataclass_fields__"):
-            assert_same(left, right)
+            assert_same(mine, right)
         elif isinstance(right, np.ndarray):
-            assert left.dtype == right.dtype, one.name
-            np.testing.assert_array_equal(left, right, err_msg=one.name)
-        elif one.name != "name" or not isinstance(expected, io.Calibration):
-            assert repr(left) == repr(right) if isinstance(right, float) else left == right, one.name
+            assert mine.dtype == right.dtype, field.name
+            np.testing.assert_array_equal(mine, right, err_msg=field.name)
+        elif field.name != "name" or not isinstance(expected, io.Calibration):
+            assert repr(mine) == repr(right) if isinstance(right, float) else mine == right, field.name

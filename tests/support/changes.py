@@ -24,8 +24,8 @@ def numpy_change(frames, travel, dark, bright, noise, threshold=0.5, hold=2, eve
     excess, below, since = np.zeros((3, low.size), np.int32)
     ring = np.zeros((reference.SLOTS, low.size), dtype)
     level, quiet = round(threshold * reference.UNIT), np.float32(EVIDENCE * noise**2)
-    least = hold * (reference.UNIT - level)
-    reference.changepoint_scan(flat, 0, level, least, quiet, low, gain, start, excess, below, ring)
+    required = hold * (reference.UNIT - level)
+    reference.changepoint_scan(flat, 0, level, required, quiet, low, gain, start, excess, below, ring)
     maps = reference.changepoint_heights(
         start,
         excess,
@@ -81,15 +81,15 @@ def _onset(maps, start, shape, noise, event):
     return Result({name: values.reshape(shape) for name, values in maps.items()}, process={"noise": noise})
 
 
-def assert_near(found, expected, travel):
+def assert_near(actual, expected, travel):
     """Hold a device's answer against the reference's: same states, heights far closer than their sigma."""
-    np.testing.assert_array_equal(found.status, expected.status)
-    np.testing.assert_array_equal(found.frame, expected.frame)
+    np.testing.assert_array_equal(actual.status, expected.status)
+    np.testing.assert_array_equal(actual.frame, expected.frame)
     answered = expected.status == 1
-    np.testing.assert_array_equal(np.isnan(found.height), ~answered)
-    np.testing.assert_array_equal(np.isnan(found.height_sigma), ~answered)
-    gap = np.abs(found.height - expected.height)[answered]
+    np.testing.assert_array_equal(np.isnan(actual.height), ~answered)
+    np.testing.assert_array_equal(np.isnan(actual.height_sigma), ~answered)
+    gap = np.abs(actual.height - expected.height)[answered]
     # The weights of hypotheses have the rounding of the misfit, in square sigmas, of float32.
     assert np.all(gap <= 0.01 * expected.height_sigma[answered] + 1e-6 * np.max(np.abs(travel)))
-    sigma, exact_sigma = (one.height_sigma[answered] for one in (found, expected))
+    sigma, exact_sigma = (result.height_sigma[answered] for result in (actual, expected))
     np.testing.assert_allclose(sigma, exact_sigma, rtol=0.02, atol=1e-7)

@@ -33,19 +33,19 @@ class Ended(NamedTuple):
 
 def run(line: object, *words: object) -> Ended:
     """Run the command line with the words of a line and further words, in the working directory."""
-    out, said = io.StringIO(), io.StringIO()
-    given = mock.patch.object(sys, "argv", ["mirrorskin", *str(line).split(), *map(str, words)])
+    out, errors = io.StringIO(), io.StringIO()
+    arguments = mock.patch.object(sys, "argv", ["mirrorskin", *str(line).split(), *map(str, words)])
     with (
-        given,
+        arguments,
         contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(said),
+        contextlib.redirect_stderr(errors),
         warnings.catch_warnings(action="always", category=MirrorskinWarning),  # printed, as for a user
     ):
         try:
             main()
         except SystemExit as ended:
             code = ended.code or 0
-    return Ended(code, out.getvalue(), said.getvalue())
+    return Ended(code, out.getvalue(), errors.getvalue())
 
 
 def done(line: object, *words: object) -> Ended:
@@ -68,16 +68,16 @@ print(json.dumps(list(sys.modules)))
 def loaded(*words: str, **variables: str) -> set[str]:
     """Return which modules a command imports, in a separate process with these environment variables."""
     command, environment = [sys.executable, "-c", _LOADED, *words], {**os.environ, **variables}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    return set(json.loads(done.stdout))
+    process = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    return set(json.loads(process.stdout))
 
 
-def refused(said: str, *words: object, run: Callable[..., Ended] = run, code: int = 2) -> str:
+def refused(message: str, *words: object, run: Callable[..., Ended] = run, code: int = 2) -> str:
     """Run the command line, which must refuse in one line that says so and write nothing; return the line."""
     before = _files()
     ended = run(*words)
     assert (ended.code, ended.out) == (code, ""), ended
-    assert said in ended.said
+    assert message in ended.said
     assert ended.said.startswith("mirrorskin: ")
     assert ended.said.count("\n") == 1
     assert _files() == before
@@ -91,8 +91,8 @@ def _files() -> dict[Path, tuple[int, int]]:
     """
     assert not Path("pyproject.toml").exists(), "work in a temporary folder"
     paths = (path for path in Path().rglob("*") if "__pycache__" not in path.parts)
-    found = {path: path.lstat() for path in paths if not path.is_dir()}
-    return {path: (stat.st_size, stat.st_mtime_ns) for path, stat in found.items()}
+    states = {path: path.lstat() for path in paths if not path.is_dir()}
+    return {path: (stat.st_size, stat.st_mtime_ns) for path, stat in states.items()}
 
 
 def small_presses() -> dict[str, demo.Press]:

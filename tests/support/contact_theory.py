@@ -162,9 +162,9 @@ def pushed(hertz: Pressed, friction: float, modulus: float, distance: float) -> 
 
     The books leave out that slip is not quite along the push.
     """
-    most = friction * hertz.force
+    limit = friction * hertz.force
     rest = np.sqrt(max(0.0, 1 - distance / sliding_distance(hertz, friction, modulus)))
-    return Pushed(most * (1 - rest**3), hertz.radius * rest)
+    return Pushed(limit * (1 - rest**3), hertz.radius * rest)
 
 
 def sliding_distance(hertz: Pressed, friction: float, modulus: float) -> float:
@@ -187,11 +187,11 @@ class Twisted:
 
 def twisted(hertz: Pressed, friction: float, modulus: float, stick_radius: float) -> Twisted:
     """Return the twist that leaves a disc of a given radius stuck."""
-    shear, most = modulus / 3, friction * float(hertz.pressure(np.zeros(())))
+    shear, limit = modulus / 3, friction * float(hertz.pressure(np.zeros(())))
     rest = (stick_radius / hertz.radius) ** 2
     moment = integrate.quad(lambda t: t**2 * special.ellipe(1 - t**2), np.sqrt(rest), 1)[0]
-    angle = most / (2 * shear) * (special.ellipk(1 - rest) - special.ellipe(1 - rest))
-    return Twisted(float(angle), 8 / 3 * most * hertz.radius**3 * float(moment))
+    angle = limit / (2 * shear) * (special.ellipk(1 - rest) - special.ellipe(1 - rest))
+    return Twisted(float(angle), 8 / 3 * limit * hertz.radius**3 * float(moment))
 
 
 def disc_torque(radius: float, modulus: float, angle: float) -> float:
@@ -213,10 +213,10 @@ def traction_response(x: float, y: float, pixel_size: tuple[float, float], modul
         away = start[0] * side[1] - start[1] * side[0]  # signed distance of the side's line from (x, y)
         if away == 0:
             continue
-        foot = np.array([side[1], -side[0]]) * away
-        first, last = (np.arctan2((corner - foot) @ side, abs(away)) for corner in (start, end))
+        nearest = np.array([side[1], -side[0]]) * away
+        first, last = (np.arctan2((corner - nearest) @ side, abs(away)) for corner in (start, end))
         t = first + (last - first) * (1 + _NODES) / 2
-        unit = (foot[:, None] / abs(away)) * np.cos(t) + side[:, None] * np.sin(t)
+        unit = (nearest[:, None] / abs(away)) * np.cos(t) + side[:, None] * np.sin(t)
         reach = away / np.cos(t) * (last - first) / 2 * _WEIGHTS
         total += np.einsum("n,ijn->ij", reach, np.eye(2)[:, :, None] + unit[:, None] * unit[None])
     return total * 3 / (4 * np.pi * modulus)

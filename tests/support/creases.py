@@ -131,18 +131,18 @@ class Dome:
     """A cap of a ball on a level plate."""
 
     ball: float
-    foot: float  # radius of the cap's foot
+    base: float  # radius of the cap's foot
     name: str = "dome"
     radius: float = 8.0
     tips: tuple[tuple[float, float], ...] = ()
 
     def piece(self, x: Map, y: Map) -> NDArray[np.intp]:
         """Number the cap 0, the plate 1."""
-        return (np.hypot(x, y) > self.foot).astype(np.intp)
+        return (np.hypot(x, y) > self.base).astype(np.intp)
 
     def height(self, x: Map, y: Map) -> Map:
         """Return the ball's height within the foot, that of the foot beyond."""
-        within = np.minimum(np.hypot(x, y), self.foot)
+        within = np.minimum(np.hypot(x, y), self.base)
         return np.sqrt(self.ball**2 - within**2) - self.ball
 
     def slope(self, x: Map, y: Map) -> tuple[Map, Map]:
@@ -205,7 +205,7 @@ def edges_of(
     x = (columns - 0.5 * (shape[1] - 1)) * pixel
     y = (0.5 * (shape[0] - 1) - rows) * pixel
     facing, piece, touched = normals(relief, x, y), relief.piece(x, y), touch(x, y)
-    found = []
+    lines = []
     for first, second in (
         (np.s_[:, :-1], np.s_[:, 1:]),
         (np.s_[:-1], np.s_[1:]),
@@ -213,11 +213,11 @@ def edges_of(
         creased = (piece[first] != piece[second]) & (between(facing[first], facing[second]) > jump)
         line = (touched[first] & touched[second] & creased) | (touched[first] != touched[second])
         middle = [(place[first] + place[second]) / 2 for place in (rows, columns)]
-        found.append(np.stack(middle, axis=-1)[line])
+        lines.append(np.stack(middle, axis=-1)[line])
     tips = np.array(
         [(0.5 * (shape[0] - 1) - y / pixel, 0.5 * (shape[1] - 1) + x / pixel) for x, y in relief.tips]
     )
-    return Lines(np.concatenate(found), tips.reshape(-1, 2))
+    return Lines(np.concatenate(lines), tips.reshape(-1, 2))
 
 
 class Agreement(NamedTuple):

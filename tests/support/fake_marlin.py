@@ -119,8 +119,8 @@ class FakeMarlin(ScriptedPort):
                     "ok",
                 ]
             case "M114":
-                told = " ".join(f"{letter}:{value:.2f}" for letter, value in self.place().items())
-                return [f"{told} E:0.00 Count X:0 Y:0 Z:0", "ok"]
+                report = " ".join(f"{letter}:{value:.2f}" for letter, value in self.place().items())
+                return [f"{report} E:0.00 Count X:0 Y:0 Z:0", "ok"]
             case "M503":
                 return ["echo:  M203 X50.00 Y50.00 Z8.00 E25.00", "echo:  M201 X500 Y500 Z100", "ok"]
             case "M27":

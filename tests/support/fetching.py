@@ -73,17 +73,17 @@ def theirs(path, frames=(0, None), region=None):
     return stack.astype(stack.dtype.newbyteorder("="))
 
 
-def ours(path, room, **given):
+def ours(path, buffer, **options):
     """What we read, so many frames at a time; and how."""
-    with io.open_recording(path, **GIVEN | given) as recording:
-        out = np.full((room, *recording.shape[1:]), 77, recording.dtype)
+    with io.open_recording(path, **GIVEN | options) as recording:
+        out = np.full((buffer, *recording.shape[1:]), 77, recording.dtype)
         parts = []
         while (block := recording.read(out)) is not None:
             assert block.index == sum(map(len, parts))
-            assert len(block.frames) <= room
+            assert len(block.frames) <= buffer
             assert np.shares_memory(block.frames, out)
             parts.append(block.frames.copy())
-        assert len(parts) <= -(-recording.shape[0] // room) * 2 + recording.shape[0]
+        assert len(parts) <= -(-recording.shape[0] // buffer) * 2 + recording.shape[0]
         return np.concatenate(parts), recording.how
 
 

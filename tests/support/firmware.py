@@ -65,9 +65,9 @@ class Firmware(Closing):
         self._follower = threading.Thread(target=self._follow, name="steps", daemon=True)
         self._follower.start()
         self._expect(b"help]\r\n")
-        given = {} if hal else _INVERTED
-        given |= {n: value for n, value in settings.items() if n not in _PER_AXIS or n % 10 < len(self.axes)}
-        for number, value in sorted(given.items(), reverse=True):  # $22 before $20
+        values = {} if hal else _INVERTED
+        values |= {n: value for n, value in settings.items() if n not in _PER_AXIS or n % 10 < len(self.axes)}
+        for number, value in sorted(values.items(), reverse=True):  # $22 before $20
             self.receive(f"${number}={value:g}\n".encode())
             self._expect(b"ok\r\n")
 
@@ -88,8 +88,8 @@ class Firmware(Closing):
         """Return what has been replied since the last call."""
         with self._lock:
             self._hear()
-            said, self._said = self._said, b""
-            return said
+            output, self._said = self._said, b""
+            return output
 
     def next_event(self) -> float:
         """Return when to look next."""
@@ -101,7 +101,7 @@ class Firmware(Closing):
             place = self.report()[2].split(b",")
             return {letter: float(value) for letter, value in zip(self.axes, place, strict=True)}
         places = self._places
-        last = max(1, bisect.bisect_right(places, at, key=lambda one: one[0]))
+        last = max(1, bisect.bisect_right(places, at, key=lambda entry: entry[0]))
         return dict(zip(self.axes, places[last - 1][1], strict=True))
 
     def moving(self, at: float | None = None) -> bool:
@@ -120,12 +120,12 @@ class Firmware(Closing):
             self._heard = b""
         self.receive(b"?")
         end = time.monotonic() + _START
-        while not (found := _REPORT.search(self._heard)):
+        while not (report := _REPORT.search(self._heard)):
             assert time.monotonic() < end, "the firmware does not answer"
             time.sleep(_TICK)
             with self._lock:
                 self._hear()
-        return found
+        return report
 
     def cut_power(self) -> None:
         """Kill it."""
@@ -146,11 +146,11 @@ class Firmware(Closing):
             self._heard += heard
 
     def _expect(self, words: bytes) -> None:
-        end, said = time.monotonic() + _START, b""
-        while words not in said:
-            assert time.monotonic() < end, said
+        end, output = time.monotonic() + _START, b""
+        while words not in output:
+            assert time.monotonic() < end, output
             time.sleep(_TICK)
-            said += self.take()
+            output += self.take()
 
     def _follow(self) -> None:
         """Read the steps as they are written."""

@@ -96,10 +96,10 @@ def response(zenith: Map) -> Map:
     """
     rim, horizon, blur = np.degrees(np.arctan(17.5 / 40)), 90.0, 3.0
     ray = 2 * np.degrees(zenith)
-    share: Map = np.interp(
+    fraction: Map = np.interp(
         ray, [rim - blur, rim + blur, horizon - blur, horizon + blur], [0.0, 1.0, 1.0, 0.0]
     )
-    return np.where(np.isnan(zenith), 0.0, share)
+    return np.where(np.isnan(zenith), 0.0, fraction)
 
 
 def light_level(zenith: Map, dark: float, bright: float) -> Map:

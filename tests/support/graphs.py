@@ -53,8 +53,8 @@ class PixelGraph:
         first = np.unique(label, return_index=True)[1][free]
         pin = np.zeros(n)
         pin[first] = 1
-        found = spsolve((self.matrix + sp.diags(pin)).tocsc(), self.source.ravel())
-        return self.centred(found.reshape(self.right.shape))
+        heights = spsolve((self.matrix + sp.diags(pin)).tocsc(), self.source.ravel())
+        return self.centred(heights.reshape(self.right.shape))
 
     def centred(self, heights: Array) -> Array:
         """Take away the means of what is free."""
@@ -113,7 +113,7 @@ def _mask(kind: str, y: Array, x: Array, rng: np.random.Generator) -> NDArray[np
     return np.ones(y.shape, bool)
 
 
-def _cut(right: Array, down: Array, y: Array, x: Array, left: float, rng: np.random.Generator) -> None:
+def _cut(right: Array, down: Array, y: Array, x: Array, fraction: float, rng: np.random.Generator) -> None:
     rows, columns = right.shape
     for _ in range(12):
         angle, length = rng.uniform(0, np.pi), rng.uniform(0.1, 0.5) * columns
@@ -121,5 +121,5 @@ def _cut(right: Array, down: Array, y: Array, x: Array, left: float, rng: np.ran
         along = from_x * np.cos(angle) + from_y * np.sin(angle)
         side = from_y * np.cos(angle) - from_x * np.sin(angle) > 0
         near = np.abs(along) < length / 2
-        right[:, :-1][(side[:, 1:] != side[:, :-1]) & near[:, 1:]] *= left
-        down[:-1][(side[1:] != side[:-1]) & near[1:]] *= left
+        right[:, :-1][(side[:, 1:] != side[:, :-1]) & near[:, 1:]] *= fraction
+        down[:-1][(side[1:] != side[:-1]) & near[1:]] *= fraction

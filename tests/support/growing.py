@@ -95,9 +95,9 @@ class Feed:
         self.left = True
 
 
-def stream(source, path, packing="raw", **given):
+def stream(source, path, packing="raw", **options):
     """Record all of a source; return the blocks as they went by."""
-    with io.StreamRecorder(source, path, packing, **given) as recorder:
+    with io.StreamRecorder(source, path, packing, **options) as recorder:
         return list(iter(recorder.read, None))
 
 

@@ -22,15 +22,15 @@ FILES = {
 
 def _public_names() -> dict[tuple[str, str], tuple[str, str]]:
     """Return where a name of a package, listed in its ``__init__.pyi``, comes from."""
-    found: dict[tuple[str, str], tuple[str, str]] = {}
+    names: dict[tuple[str, str], tuple[str, str]] = {}
     for package, file in FILES.items():
         stub = file.with_suffix(".pyi")
         if file.stem == "__init__" and stub.exists():
             for node in ast.parse(stub.read_text(encoding="utf-8")).body:
                 if isinstance(node, ast.ImportFrom):
                     module = f"{package}.{node.module}" if node.module else package
-                    found |= {(package, name.name): (module, name.name) for name in node.names}
-    return found
+                    names |= {(package, name.name): (module, name.name) for name in node.names}
+    return names
 
 
 _PUBLIC = _public_names()
@@ -91,5 +91,5 @@ def knots(pairs: Iterable[tuple[str, str]]) -> list[set[str]]:
     rows, columns = ([number[pair[side]] for pair in pairs] for side in (0, 1))
     graph = coo_matrix((np.ones(len(pairs)), (rows, columns)), (len(names), len(names)))
     _, group = connected_components(graph, connection="strong")
-    groups = [{name for name, of in zip(names, group, strict=True) if of == one} for one in set(group)]
+    groups = [{name for name, of in zip(names, group, strict=True) if of == number} for number in set(group)]
     return [group for group in groups if len(group) > 1]

@@ -93,9 +93,9 @@ def pictures(
 
 def poses(lean: Map, press: float, pivot: ArrayLike) -> list[Pose]:
     """Lower the body, then let it lean about its pivot."""
-    centre, made = np.asarray(pivot, float), []
+    centre, presses = np.asarray(pivot, float), []
     for x, y in lean:
         azimuth = math.atan2(y, x)
         turn = rotation_z(azimuth) @ rotation_y(math.hypot(x, y)) @ rotation_z(-azimuth)
-        made.append(Pose(turn, turn @ (np.array([0.0, 0.0, press]) - centre) + centre))
-    return made
+        presses.append(Pose(turn, turn @ (np.array([0.0, 0.0, press]) - centre) + centre))
+    return presses

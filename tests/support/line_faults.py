@@ -12,7 +12,7 @@ def flipped(what):
 CHANGES = {"lost": lambda what: b"", "changed": flipped, "twice": lambda what: what + what}
 
 
-def outcomes(go, way, change, least):
+def outcomes(go, stream, change, required):
     """Let `go` speak through a line whose replies ("said") or bytes ("heard") fail, one after the other.
 
     It gets what each of them becomes, and returns what went wrong; without faults nothing does.
@@ -23,8 +23,9 @@ def outcomes(go, way, change, least):
         numbers.append(number)
         return what
 
-    assert go(**{way: count}) is None
-    assert len(numbers) >= least
+    assert go(**{stream: count}) is None
+    assert len(numbers) >= required
     return [
-        go(**{way: lambda number, what, n=n: CHANGES[change](what) if number == n else what}) for n in numbers
+        go(**{stream: lambda number, what, n=n: CHANGES[change](what) if number == n else what})
+        for n in numbers
     ]

@@ -40,8 +40,8 @@ def press_header(**other: Any) -> Header:
 
 def turn_header(dtype: str = "uint8", **other: Any) -> Header:
     offset, gain, _ = scenes.SCALES[dtype]
-    known = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset), "tilt": scenes.TILT}
-    return Header("axial", **{"pixel_size": (PIXEL, PIXEL), **known, **other})
+    scale = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset), "tilt": scenes.TILT}
+    return Header("axial", **{"pixel_size": (PIXEL, PIXEL), **scale, **other})
 
 
 def paced(

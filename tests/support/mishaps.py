@@ -100,8 +100,8 @@ def capture_with(fault: str, seed: int, path: Path) -> Outcome:
 
 def _drain(rig: Rig, plan: Plan, path: Path) -> None:
     with io.StreamRecorder(SweepScan(rig, plan), path) as recorder:
-        room = np.empty((8, *recorder.shape[1:]), recorder.dtype)
-        while recorder.read(room) is not None:
+        buffer = np.empty((8, *recorder.shape[1:]), recorder.dtype)
+        while recorder.read(buffer) is not None:
             pass
 
 
@@ -130,9 +130,9 @@ class Child:
         return self.process.communicate(timeout=_START)[1]
 
 
-def starved(said: str) -> bool:
+def starved(message: str) -> bool:
     """Return whether a capture ended because this machine was too busy to emulate a rig in time."""
-    return any(words in said for words in ("no longer answers", "delivered no frame", "stood still"))
+    return any(words in message for words in ("no longer answers", "delivered no frame", "stood still"))
 
 
 def state_of(path: Path) -> str | None:
@@ -141,8 +141,8 @@ def state_of(path: Path) -> str | None:
         return None
     try:
         with io.open_recording(path) as recording:
-            room = np.empty(recording.shape, recording.dtype)
-            assert recording.read(room) is not None
+            buffer = np.empty(recording.shape, recording.dtype)
+            assert recording.read(buffer) is not None
             return recording.state
     except io.InputError as error:
         if "at least 2 are needed" not in str(error):
@@ -153,8 +153,8 @@ def state_of(path: Path) -> str | None:
 def frames_of(path: Path) -> np.ndarray:
     """Return the frames of a recording, which can be read."""
     with io.open_recording(path) as recording:
-        room = np.empty(recording.shape, recording.dtype)
-        block = recording.read(room)
+        buffer = np.empty(recording.shape, recording.dtype)
+        block = recording.read(buffer)
         assert block is not None
         return block.frames
 

@@ -23,10 +23,10 @@ RADIUS = 5.0
 
 def bumpy(x: Map, y: Map) -> tuple[Map, Map, Map]:
     """A dome with waves in it, which no motion leaves as it is."""
-    one, two = 1.5 * x + 0.3, 2.1 * y + x
-    height = -0.05 * (x * x + 0.7 * y * y + 0.3 * x * y) + 0.05 * np.sin(one) * np.cos(1.2 * y)
-    dz_dx = -0.05 * (2 * x + 0.3 * y) + 0.075 * np.cos(one) * np.cos(1.2 * y) + 0.03 * np.cos(two)
-    dz_dy = -0.05 * (1.4 * y + 0.3 * x) - 0.06 * np.sin(one) * np.sin(1.2 * y) + 0.063 * np.cos(two)
+    first, two = 1.5 * x + 0.3, 2.1 * y + x
+    height = -0.05 * (x * x + 0.7 * y * y + 0.3 * x * y) + 0.05 * np.sin(first) * np.cos(1.2 * y)
+    dz_dx = -0.05 * (2 * x + 0.3 * y) + 0.075 * np.cos(first) * np.cos(1.2 * y) + 0.03 * np.cos(two)
+    dz_dy = -0.05 * (1.4 * y + 0.3 * x) - 0.06 * np.sin(first) * np.sin(1.2 * y) + 0.063 * np.cos(two)
     return height + 0.03 * np.sin(two), dz_dx, dz_dy
 
 
@@ -63,10 +63,10 @@ def sampled(
     place = np.stack([*np.meshgrid(x, y), np.zeros(shape)], axis=-1)
     turn = Rotation.from_rotvec(vector).as_matrix()
     for _ in range(30):  # Newton's steps along z
-        own = (place - np.asarray(shift)) @ turn
-        height, dz_dx, dz_dy = form(own[..., 0], own[..., 1])
+        local = (place - np.asarray(shift)) @ turn
+        height, dz_dx, dz_dy = form(local[..., 0], local[..., 1])
         upright = np.dstack([-dz_dx, -dz_dy, np.ones(shape)]) @ turn.T
-        step = (own[..., 2] - height) / upright[..., 2]
+        step = (local[..., 2] - height) / upright[..., 2]
         place[..., 2] -= step
         if np.abs(step).max() < 1e-9:
             break
@@ -96,9 +96,9 @@ def error_of(pose: Pose, vector: Map, shift: Map) -> Map:
     return np.concatenate([rest.as_rotvec(), shift - rest.apply(pose.translation)])
 
 
-def error_at(pose: Pose, point: Map, wanted: Map, ways: Map) -> float:
+def error_at(pose: Pose, point: Map, expected: Map, ways: Map) -> float:
     """Return chi square of where a point comes to, for each of some ways (k, 3)."""
     x, y, z = moved = pose.apply(point)
     change = ways @ np.hstack([[[0, z, -y], [-z, 0, x], [y, -x, 0]], np.eye(3)])
-    error = ways @ (wanted - moved)
+    error = ways @ (expected - moved)
     return float(error @ np.linalg.solve(change @ pose.covariance @ change.T, error)) / len(ways)

@@ -46,11 +46,11 @@ LAMPS = np.stack([np.cos(PHASE), np.sin(PHASE), np.ones(len(PHASE))], axis=1)
 
 def engine_classes() -> Iterator[type]:
     """Yield each class that a module of the engine defines; those of batches need Dask."""
-    for found in pkgutil.walk_packages(engine.__path__, "mirrorskin.engine."):
-        if not found.name.startswith("mirrorskin.engine.batch"):
-            for one in vars(importlib.import_module(found.name)).values():
-                if inspect.isclass(one) and one.__module__ == found.name:
-                    yield one
+    for module in pkgutil.walk_packages(engine.__path__, "mirrorskin.engine."):
+        if not module.name.startswith("mirrorskin.engine.batch"):
+            for value in vars(importlib.import_module(module.name)).values():
+                if inspect.isclass(value) and value.__module__ == module.name:
+                    yield value
 
 
 class Readable(MadeUp):
@@ -180,10 +180,10 @@ CUTS = {
 }
 
 
-def assert_same(found: Result, expected: Result) -> None:
+def assert_same(actual: Result, expected: Result) -> None:
     """Hold maps and numbers equal bit by bit."""
-    assert list(found) == list(expected)
+    assert list(actual) == list(expected)
     for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name, strict=True)
+        np.testing.assert_array_equal(actual[name], values, err_msg=name, strict=True)
     numbers = {name: value for name, value in expected.process.items() if isinstance(value, float)}
-    assert {name: found.process[name] for name in numbers} == pytest.approx(numbers, nan_ok=True, rel=0)
+    assert {name: actual.process[name] for name in numbers} == pytest.approx(numbers, nan_ok=True, rel=0)

@@ -110,8 +110,8 @@ class Ball:
         from_centre = start - self.centre
         linear = _dot(from_centre, along)
         square = _dot(along, along)
-        left = linear**2 - square * (_dot(from_centre, from_centre) - self.radius**2)
-        t = (np.sqrt(_or_nan(left, left >= 0)) - linear) / square
+        discriminant = linear**2 - square * (_dot(from_centre, from_centre) - self.radius**2)
+        t = (np.sqrt(_or_nan(discriminant, discriminant >= 0)) - linear) / square
         return _or_nan(t, start[..., 2] + t * along[..., 2] > self.centre[2])
 
     def under(self, points: Map) -> Mask:
@@ -143,10 +143,10 @@ class Cone:
         """Solve ``z^2 = tan^2(zenith) (x^2 + y^2)`` for z <= 0: the double cone without its upper half."""
         scale = np.array([np.tan(self.zenith), np.tan(self.zenith), 1.0])
         flip = np.array([-1.0, -1.0, 1.0])
-        place, way = start * scale, along * scale
+        place, ray = start * scale, along * scale
         square, linear, constant = (
             np.sum(flip * first * second, axis=-1)
-            for first, second in ((way, way), (way, place), (place, place))
+            for first, second in ((ray, ray), (ray, place), (place, place))
         )
         # A ray steeper than the cone's sides meets each half once; rounding may leave less than 0 at the tip.
         assert np.all(square > 0)
@@ -241,13 +241,13 @@ def see(solid: Solid, pose: Pose, x: Map, y: Map, view: tuple[ArrayLike, ArrayLi
     x, y, view_x, view_y = np.broadcast_arrays(x, y, *(np.asarray(part, dtype=float) for part in view))
     on_plane = np.stack([x, y, np.zeros_like(x)], axis=-1)
     along = np.stack([view_x, view_y, np.ones_like(x)], axis=-1)
-    start, way = pose.to_world(on_plane), along @ pose.turn
-    struck = solid.strike(start, way)  # the body's frame has z = t on such a line
+    start, ray = pose.to_world(on_plane), along @ pose.turn
+    struck = solid.strike(start, ray)  # the body's frame has z = t on such a line
     contact = struck >= 0  # False for NaN
-    place = _or_nan(start + struck[..., np.newaxis] * way, contact[..., np.newaxis])
+    place = _or_nan(start + struck[..., np.newaxis] * ray, contact[..., np.newaxis])
     # Coming down, the line passes the edge as seen from above, and is already below the surface there.
-    last = solid.leave(start, way)
-    below = (last >= 0) & solid.under(start + last[..., np.newaxis] * way) & ~contact
+    last = solid.leave(start, ray)
+    below = (last >= 0) & solid.under(start + last[..., np.newaxis] * ray) & ~contact
     upright = np.array([0.0, 0.0, 1.0])
     normal = np.where(contact[..., np.newaxis], solid.normal(place) @ pose.turn.T, upright)
     zenith, azimuth = angles(normal)
@@ -269,11 +269,11 @@ def clear(
     Brute force: five lines of sight, moved by a hair, touch or not as the pixel's own does. What sees
     something below the object's edge is not clear either.
     """
-    seen = see(solid, pose, x, y, view)
-    fine = ~(seen.contact & solid.sharp(seen.place, edge)) & ~seen.below
+    sight = see(solid, pose, x, y, view)
+    fine = ~(sight.contact & solid.sharp(sight.place, edge)) & ~sight.below
     for angle in np.linspace(0, 2 * np.pi, 5, endpoint=False):
         beside = see(solid, pose, x + hair * np.cos(angle), y + hair * np.sin(angle), view)
-        fine &= (beside.contact == seen.contact) & ~beside.below
+        fine &= (beside.contact == sight.contact) & ~beside.below
     return np.asarray(fine)
 
 
@@ -305,8 +305,8 @@ def _in_cylinder(start: Map, along: Map, radius: float) -> tuple[Map, Map]:
     """Return t where lines enter an upright cylinder round the z axis and leave it; NaN where they do not."""
     square = np.sum(along[..., :2] ** 2, axis=-1)
     linear = np.sum(start[..., :2] * along[..., :2], axis=-1)
-    left = linear**2 + square * (radius**2 - np.sum(start[..., :2] ** 2, axis=-1))
-    root = np.sqrt(_or_nan(left, left > 0))  # 0 for upright lines
+    discriminant = linear**2 + square * (radius**2 - np.sum(start[..., :2] ** 2, axis=-1))
+    root = np.sqrt(_or_nan(discriminant, discriminant > 0))  # 0 for upright lines
     return (-linear - root) / _or_nan(square, square > 0), (-linear + root) / _or_nan(square, square > 0)
 
 

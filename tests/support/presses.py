@@ -20,8 +20,8 @@ def random_press(dtype, frames, shape, seed=0, noise=0.008):
     lasts = generator.choice([1e-3, 1, 4, 20], shape)
     plateau = generator.uniform(0.2, 1.1, shape)
     number = np.arange(frames)[:, np.newaxis, np.newaxis]
-    share = plateau * np.clip((number - start) / lasts, 0, 1) + generator.normal(0, noise, (frames, *shape))
-    counts = dark + (bright - dark) * share
+    light = plateau * np.clip((number - start) / lasts, 0, 1) + generator.normal(0, noise, (frames, *shape))
+    counts = dark + (bright - dark) * light
     if dtype == "float32":
         return counts.astype(dtype)
     return np.clip(np.rint(counts), 0, np.iinfo(dtype).max).astype(dtype)
@@ -50,14 +50,16 @@ def numpy_onset(
     plateau = flat[0].astype(np.float32) if own_dark else plateau
     sure = reference.onset_sure(level, light, 6 * noise)
     near = reference.onset_near(level, plateau, sure)
-    below, foot = np.zeros((2, level.size), np.int32)
+    below, last_dark = np.zeros((2, level.size), np.int32)
     onset = np.where(np.isnan(level), reference.INVALID, reference.DARK).astype(np.int32)
     risen, last, before, at, after = (np.zeros(level.size, dtype) for _ in range(5))
-    reference.onset_scan(flat, 0, hold, light, sure, near, onset, below, foot, risen, last, before, at, after)
+    reference.onset_scan(
+        flat, 0, hold, light, sure, near, onset, below, last_dark, risen, last, before, at, after
+    )
     height, sigma, status = reference.onset_heights(
         onset,
         below,
-        foot,
+        last_dark,
         risen,
         before,
         at,
@@ -87,24 +89,24 @@ def first_run(light, hold):
     return -1
 
 
-def assert_equal(left, right):
+def assert_equal(first, right):
     """Hold two onsets equal to the last bit."""
     for name in ("height", "height_sigma", "status", "frame"):
-        np.testing.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(first, name), getattr(right, name), err_msg=name)
 
 
-def assert_within_an_ulp(found, expected, travel):
+def assert_within_an_ulp(actual, expected, travel):
     """Hold a device's onset against the reference's: same states, heights within one float32 ulp."""
-    np.testing.assert_array_equal(found.status, expected.status)
-    np.testing.assert_array_equal(found.frame, expected.frame)
+    np.testing.assert_array_equal(actual.status, expected.status)
+    np.testing.assert_array_equal(actual.frame, expected.frame)
     answered = expected.status == 1
-    np.testing.assert_array_equal(np.isnan(found.height), ~answered)
+    np.testing.assert_array_equal(np.isnan(actual.height), ~answered)
     exact = expected.height[answered]
     # A travel and a share of a step, each known to half an ulp, and their sum.
     travel = np.asarray(travel, float)
     ulp = np.spacing(np.abs(exact).astype(np.float32)) + np.spacing(
         np.float32(np.max(np.abs(np.diff(travel))))
     )
-    assert np.all(np.abs(found.height[answered] - exact) <= 2 * ulp)
-    sigma, exact_sigma = (one.height_sigma[answered] for one in (found, expected))
+    assert np.all(np.abs(actual.height[answered] - exact) <= 2 * ulp)
+    sigma, exact_sigma = (result.height_sigma[answered] for result in (actual, expected))
     np.testing.assert_allclose(sigma, exact_sigma, rtol=1e-4, atol=1e-9)

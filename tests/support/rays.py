@@ -128,15 +128,15 @@ def traced(chamber: Chamber, pattern: Pattern, point: Map, rays: Map) -> Map:
     # A ray straight up never meets the wall.
     chosen = np.hypot(rays[:, 0], rays[:, 1]) > 1e-12
     place, ray = _to_cylinder(np.broadcast_to(point, (int(chosen.sum()), 3)), rays[chosen], chamber.radius)
-    share = np.ones(len(place))
+    fraction = np.ones(len(place))
     if chamber.air_gap > 0:
-        ray, share = _into_air(place, ray, chamber.index)
+        ray, fraction = _into_air(place, ray, chamber.index)
         place, _ = _to_cylinder(place, ray, chamber.radius + chamber.air_gap)
-    share = np.where((place[:, 2] >= 0) & (place[:, 2] <= chamber.height), share, 0.0)
+    fraction = np.where((place[:, 2] >= 0) & (place[:, 2] <= chamber.height), fraction, 0.0)
     azimuth = np.arctan2(place[:, 1], place[:, 0])
     lamps = 1 + chamber.asymmetry * np.cos(azimuth - chamber.asymmetry_azimuth)
     shown = pattern(place[:, 2], azimuth) * lamps / (1 + abs(chamber.asymmetry))
-    light[chosen] = np.where(share > 0, share * shown, 0.0)
+    light[chosen] = np.where(fraction > 0, fraction * shown, 0.0)
     return light
 
 

@@ -17,7 +17,7 @@ def source_of(surface, wx=1.0, wy=1.0, screening=0.0):
     source = screening * surface
     for axis, weight in ((1, wx), (0, wy)):
         step = weight * np.diff(surface, axis=axis)
-        edge = [(1, 1) if axis == way else (0, 0) for way in (0, 1)]
+        edge = [(1, 1) if axis == direction else (0, 0) for direction in (0, 1)]
         source -= np.diff(np.pad(step, edge), axis=axis)
     return source
 

@@ -14,9 +14,9 @@ SCALES = {"uint8": 1.0, "uint16": 16.0, "float32": 1.0}
 def source(frames, name="made up", again=False):
     """Return a source of given frames, (T, H, W)."""
     travel = 0.01 * np.arange(len(frames))
-    made = Frames(frames, io.Header("vertical", camera="lab"), name, travel=travel)
-    made.rewindable = again
-    return made
+    source = Frames(frames, io.Header("vertical", camera="lab"), name, travel=travel)
+    source.rewindable = again
+    return source
 
 
 def expose(level, noise, count, dtype="uint8", seed=0, top=None):
@@ -46,5 +46,7 @@ def rolled(dark, light, count, full, half, noise=2.0, dtype="uint8", seed=2, top
     """Return frames of a ball rolled about: which shares of a pixel's samples are in full and half light."""
     generator = np.random.default_rng(seed)
     chance = generator.random((count, *dark.shape))
-    share = np.where(chance < full, 1.0, np.where(chance < full + half, generator.random(chance.shape), 0.0))
-    return expose(dark + share * light, noise, count, dtype, seed + 1, top)
+    fraction = np.where(
+        chance < full, 1.0, np.where(chance < full + half, generator.random(chance.shape), 0.0)
+    )
+    return expose(dark + fraction * light, noise, count, dtype, seed + 1, top)

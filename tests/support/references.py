@@ -49,13 +49,13 @@ def named(names: str, *values: Any) -> Values:
     return dict(zip(names.split(), values, strict=True))
 
 
-def near(rtol: float, atol: float, *, share: float = 0.0, of: str = "", inside: Any = ...) -> Check:
+def near(rtol: float, atol: float, *, fraction: float = 0.0, of: str = "", inside: Any = ...) -> Check:
     """Return a check: all but a share of the values are close; inside, or where ``of`` is not 0."""
 
-    def check(found: Any, wanted: Any, values: Values) -> None:
+    def check(actual: Any, expected: Any, values: Values) -> None:
         part = values[of] != 0 if of else inside
-        off = ~np.isclose(found[part], wanted[part], rtol, atol, equal_nan=True)
-        assert np.count_nonzero(off) <= share * off.size, np.nanmax(np.abs(found - wanted)[part])
+        off = ~np.isclose(actual[part], expected[part], rtol, atol, equal_nan=True)
+        assert np.count_nonzero(off) <= fraction * off.size, np.nanmax(np.abs(actual - expected)[part])
 
     return check
 
@@ -107,39 +107,41 @@ def agree(
 
     file = FILES[KERNELS[name]]
     function = getattr(importlib.import_module(f"mirrorskin.kernels.{file.parent.name}.{file.stem}"), name)
-    known = inspect.signature(function).parameters
+    parameters = inspect.signature(function).parameters
     expected = {key: np.copy(value) for key, value in values.items() if isinstance(value, np.ndarray)}
-    answer = function(**{key: expected.get(key, value) for key, value in values.items() if key in known})
+    answer = function(**{key: expected.get(key, value) for key, value in values.items() if key in parameters})
     answers = answer if isinstance(answer, tuple) else () if answer is None else (answer,)
     others = returns.split() or [key for key in kernel.arguments if key not in values]
     expected |= dict(zip(others, answers, strict=True))
 
     arrays = {}
     for key in kernel.arguments:
-        given = values[key] if key in values else _untouched(expected[key], items)
+        values_in = values[key] if key in values else _untouched(expected[key], items)
         if key == "frames" and max(values.get("each", 0), values.get("stride", 0)) > pixels:
             # The reference sees the pixels of rows.
-            given = expected[key] = np.pad(given, ((0, 0), (0, 3)), constant_values=77)
+            values_in = expected[key] = np.pad(values_in, ((0, 0), (0, 3)), constant_values=77)
         if key in pairs.split():
-            given = np.stack([given.astype(np.float32), given - given.astype(np.float32)], axis=-1)
-        if isinstance(given, np.ndarray):
-            kind = np.float32 if given.dtype == np.float64 else given.dtype
-            arrays[key] = device.from_host(key, given, kind)
+            values_in = np.stack(
+                [values_in.astype(np.float32), values_in - values_in.astype(np.float32)], axis=-1
+            )
+        if isinstance(values_in, np.ndarray):
+            kind = np.float32 if values_in.dtype == np.float64 else values_in.dtype
+            arrays[key] = device.from_host(key, values_in, kind)
     kernel(items, **{key: arrays[key] if key in arrays else values[key] for key in kernel.arguments}, moved=0)
 
     for key, array in arrays.items():
-        found, wanted = array.read(), expected[key]
-        found = found.sum(axis=-1, dtype=np.float64) if key in pairs.split() else found
+        actual, goal = array.read(), expected[key]
+        actual = actual.sum(axis=-1, dtype=np.float64) if key in pairs.split() else actual
         if key in (checks or {}):
-            checks[key](found, wanted, values | expected)
-        elif np.asarray(wanted).dtype.kind != "f":
-            np.testing.assert_array_equal(found, wanted, err_msg=key)
+            checks[key](actual, goal, values | expected)
+        elif np.asarray(goal).dtype.kind != "f":
+            np.testing.assert_array_equal(actual, goal, err_msg=key)
         else:
-            changed = key in others or not np.array_equal(wanted, values.get(key, wanted), equal_nan=True)
-            largest = np.max(np.abs(np.where(np.isfinite(wanted), wanted, 0.0)), initial=0.0)
-            found = found if np.ndim(wanted) else found.sum(dtype=np.float64)
+            changed = key in others or not np.array_equal(goal, values.get(key, goal), equal_nan=True)
+            largest = np.max(np.abs(np.where(np.isfinite(goal), goal, 0.0)), initial=0.0)
+            actual = actual if np.ndim(goal) else actual.sum(dtype=np.float64)
             close = (rtol, atol * largest) if changed else (1e-13, 0.0)
-            np.testing.assert_allclose(found, wanted, *close, err_msg=key)
+            np.testing.assert_allclose(actual, goal, *close, err_msg=key)
 
 
 def _rounded(value: Any, pair: bool) -> Any:
@@ -149,7 +151,7 @@ def _rounded(value: Any, pair: bool) -> Any:
     return float(np.float32(value)) if isinstance(value, float) else value
 
 
-def _untouched(wanted: Any, items: int) -> Any:
+def _untouched(expected: Any, items: int) -> Any:
     """Return an array for an answer that holds what no kernel should leave there."""
-    wanted = np.asarray(wanted)
-    return np.full(wanted.shape or items, 77 if wanted.dtype.kind in "iu" else np.nan, wanted.dtype)
+    expected = np.asarray(expected)
+    return np.full(expected.shape or items, 77 if expected.dtype.kind in "iu" else np.nan, expected.dtype)

@@ -32,7 +32,9 @@ PERIOD = 0.05  # seconds between reports
 
 def settings(shape=(8, 8), **camera):
     degrees = math.degrees(0.1)
-    pitch, roll = (TiltAxis(letter=one, limits=(-degrees, degrees), speed=math.degrees(20.0)) for one in "XY")
+    pitch, roll = (
+        TiltAxis(letter=letter, limits=(-degrees, degrees), speed=math.degrees(20.0)) for letter in "XY"
+    )
     stage = StageSettings(
         port="none",
         timeout=1.0,
@@ -66,7 +68,7 @@ class FakeStage:
         self._late, self._random = late, np.random.default_rng(seed)
         self._start = self.clock.now()
         self._reports = []
-        self._legs = [(self._start, None, lambda way: Position(-1.0, 0.0, 0.0))]
+        self._legs = [(self._start, None, lambda moved: Position(-1.0, 0.0, 0.0))]
 
     def position(self, at=None):
         at = self.clock.now() if at is None else at
@@ -95,13 +97,13 @@ class FakeStage:
         length = float(shift if shift else np.linalg.norm(gap))
         if length == 0:
             return
-        self._add(length, speed or 100.0, lambda way: Position(*(start + gap * way / length)))
+        self._add(length, speed or 100.0, lambda moved: Position(*(start + gap * moved / length)))
 
     def precess(self, tilt, turns, rate, start=0.0):
         travel = self.position(math.inf).travel
 
-        def place(way):
-            return Position(travel, tilt * math.cos(start + way), tilt * math.sin(start + way))
+        def place(moved):
+            return Position(travel, tilt * math.cos(start + moved), tilt * math.sin(start + moved))
 
         self._add(math.tau * turns, math.tau * rate, place)
 
@@ -123,9 +125,11 @@ class FakeStage:
     def history(self, since=-math.inf):
         while (due := self._start + len(self._reports) * PERIOD) < self.clock.now() - 0.002:
             place = self.position(due)
-            told = due + float(np.clip(self._late * self._random.standard_normal(), -PERIOD / 3, PERIOD / 3))
+            reported = due + float(
+                np.clip(self._late * self._random.standard_normal(), -PERIOD / 3, PERIOD / 3)
+            )
             rounded = np.round(astuple(place), 6)
-            self._reports.append(Report(told, Position(*map(float, rounded)), "run"))
+            self._reports.append(Report(reported, Position(*map(float, rounded)), "run"))
         return [report for report in self._reports if since < report.time]
 
     def stop(self):
@@ -187,7 +191,7 @@ class FakeCamera:
     def flush(self):
         self._next = max(self._next, math.ceil((self.clock.now() - self._start - self._delay) * self._rate))
 
-    def take(self, most, timeout):
+    def take(self, limit, timeout):
         if self.error is not None:
             raise self.error
         until = self.clock.now() + timeout
@@ -197,25 +201,25 @@ class FakeCamera:
         if count < 1:
             self.clock.sleep(max(0.0, until - self.clock.now()))
             raise HardwareError("fake camera: no frame")
-        number = np.arange(self._next, self._next + min(most, count))
+        number = np.arange(self._next, self._next + min(limit, count))
         self._next += len(number)
         exposed = self._start + number / self._rate
         arrival = exposed + self._delay + self._jitter * self._random.standard_normal(len(number))
         arrival = np.maximum.accumulate(np.maximum(arrival, self._last))
         self._last = arrival[-1]
-        pixels = np.stack([self._picture(self._where(float(one))) for one in exposed])
+        pixels = np.stack([self._picture(self._where(float(instant))) for instant in exposed])
         return Frames(pixels, number, arrival, 0)
 
     def close(self):
         self.closed = True
 
 
-def fake_rig(picture, clock=None, *, late=0.0, seed=0, delay=0.0, told=None, **camera):
-    """Open a rig of both on a simulated clock; what its file says of the camera is `told`."""
+def fake_rig(picture, clock=None, *, late=0.0, seed=0, delay=0.0, stated=None, **camera):
+    """Open a rig of both on a simulated clock; `stated` are settings of the camera in its file."""
     clock = clock or SimulatedClock()
     stage = FakeStage(clock, late=late, seed=seed)
     eye = FakeCamera(clock, stage.position, picture, delay=delay, seed=seed, **camera)
-    return Rig(stage, eye, settings(eye.shape, **{"delay": delay, **(told or {})}), clock)
+    return Rig(stage, eye, settings(eye.shape, **{"delay": delay, **(stated or {})}), clock)
 
 
 def spreading(shape=(32, 32), steepness=0.05):

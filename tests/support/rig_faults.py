@@ -107,7 +107,7 @@ class Ending:
 
     error: BaseException | None
     moved: float  # seconds that the stage went on
-    told: float  # seconds until the reader was told
+    reported: float  # seconds until the reader was told
     count: int  # frames that can be read
     state: str
 
@@ -152,27 +152,29 @@ def capture(
         if controller != "emulator" and fault not in _SILENT:
             stage = structs.replace(stage, silence=LATE)
         try:
-            told = replace(settings, camera=camera, stage=stage)
-            with Rig(emulated.open_stage(stage), emulated.camera, told, clock) as rig:
+            stated = replace(settings, camera=camera, stage=stage)
+            with Rig(emulated.open_stage(stage), emulated.camera, stated, clock) as rig:
                 scan = SweepScan(rig, VerticalPlan(0.0, 3.0, speed=0.6))
                 with io.StreamRecorder(scan, path) as recorder:
-                    room = np.empty((4, *scan.shape[1:]), scan.dtype)
-                    while recorder.read(room) is not None:
+                    buffer = np.empty((4, *scan.shape[1:]), scan.dtype)
+                    while recorder.read(buffer) is not None:
                         if at is None and recorder.count > 8:
                             at = clock.now()
                             FAULTS[fault][0](emulated)
         except (HardwareError, io.InputError, KeyboardInterrupt) as caught:
             error = caught
-        told = clock.now()
+        reported = clock.now()
         if changed and at is None:
             return Ending(error, 0.0, 0.0, 0, "")
         if at is None:
             raise TooBusyError(str(error))
         clock.sleep(0.3)
-        moved = [one - at for one in np.arange(at, clock.now(), 0.01) if emulated.machine.moving(one)]
+        moved = [
+            instant - at for instant in np.arange(at, clock.now(), 0.01) if emulated.machine.moving(instant)
+        ]
     with io.open_recording(path) as recording:
         count, state = recording.shape[0], recording.state
-    return Ending(error, max(moved, default=0.0), told - at, count, state)
+    return Ending(error, max(moved, default=0.0), reported - at, count, state)
 
 
 def try_capture(fault: str, controller: str, changed: Mapping[int, float] = MappingProxyType({})) -> Ending:
@@ -199,10 +201,12 @@ def main() -> None:
 
 def _print(fault: str, controller: str, ending: Ending) -> None:
     name = controller if controller == "emulator" else "grblHAL" if is_hal(controller) else "GRBL"
-    said = "stopped by the user" if isinstance(ending.error, KeyboardInterrupt) else str(ending.error or "-")
-    said = re.sub(r"stage /dev/\S+: | \(device reports.*\?\)\)", "", said)
-    times = f"{ending.moved:.2f} s | {ending.told:.2f} s" if ending.count else "- | -"
-    print(f"| {fault} | {name} | {times} | {said} | {ending.count or '-'} |", flush=True)
+    message = (
+        "stopped by the user" if isinstance(ending.error, KeyboardInterrupt) else str(ending.error or "-")
+    )
+    message = re.sub(r"stage /dev/\S+: | \(device reports.*\?\)\)", "", message)
+    times = f"{ending.moved:.2f} s | {ending.reported:.2f} s" if ending.count else "- | -"
+    print(f"| {fault} | {name} | {times} | {message} | {ending.count or '-'} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ SETTINGS |= dict.fromkeys((130, 131, 132), 100)
 
 def stage_settings(**changes):
     """Travel down on Z, pitch on X, roll on Y in degrees; nothing is at 0."""
-    given = {
+    settings = {
         "port": "in memory",
         "baud": 115200,
         "home": False,
@@ -28,7 +28,7 @@ def stage_settings(**changes):
         "press": 3.0,
         "pivot": None,
     }
-    return StageSettings(**(given | changes))
+    return StageSettings(**(settings | changes))
 
 
 class ScriptedGrbl(ScriptedPort):
@@ -77,12 +77,12 @@ class ScriptedGrbl(ScriptedPort):
 
     def advance(self):
         now = self.clock.now()
-        left, self._last = now - self._last, now
-        while self.plan and left > 0 and self.state in ("Idle", "Run"):
+        rest, self._last = now - self._last, now
+        while self.plan and rest > 0 and self.state in ("Idle", "Run"):
             self.state = "Run"
             target, duration = self.plan[0]
-            part = min(left, duration)
-            left -= part
+            part = min(rest, duration)
+            rest -= part
             for k in range(3):
                 self.place[k] += (target[k] - self.place[k]) * (part / duration if duration else 1)
             self.plan[0] = target, duration - part

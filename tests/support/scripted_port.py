@@ -45,12 +45,12 @@ class ScriptedPort:
         with self._change:
             while True:
                 self._present()
-                due, left = self.advance(), end - self.clock.now()
-                if self._out or left <= 0:
+                due, rest = self.advance(), end - self.clock.now()
+                if self._out or rest <= 0:
                     data = bytes(self._out[:size])
                     del self._out[:size]
                     return data
-                self._change.wait(min(due, left))
+                self._change.wait(min(due, rest))
 
     def write(self, data):
         self._present()
@@ -90,9 +90,9 @@ class ScriptedPort:
             assert self.clock.now() < end, "it never came to be so"
             self.clock.sleep(0.001)
 
-    def _passed(self, way, what):
-        self._count[way] += 1
-        return getattr(self, way)(self._count[way], what)
+    def _passed(self, direction, what):
+        self._count[direction] += 1
+        return getattr(self, direction)(self._count[direction], what)
 
     def _present(self):
         if self.gone:

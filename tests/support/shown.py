@@ -21,7 +21,7 @@ def ball(shape=(24, 32), pixel_size=(0.1, 0.12), radius=2.0, **maps):
     height[hole], normals[hole] = np.nan, np.nan
     edges = np.zeros(shape, np.uint8)
     edges[shape[0] // 2] = 1
-    known = {
+    arrays = {
         "height": height.astype(np.float32),
         "height_sigma": np.where(hole | (filled == 1), np.nan, 0.002).astype(np.float32),
         "status": np.where(hole, 2, 1).astype(np.uint8),
@@ -38,7 +38,7 @@ def ball(shape=(24, 32), pixel_size=(0.1, 0.12), radius=2.0, **maps):
         "y": y,
         "declarations": {"status": status_of(PressStatus)},
     }
-    return io.Result(**(known | maps))
+    return io.Result(**(arrays | maps))
 
 
 def rendered(figure):
@@ -57,6 +57,6 @@ def colours_at(axes, places):
 
 def panel(figure, title):
     """Return the panel whose title begins like this."""
-    found = [one for one in figure.axes if one.get_title("left").startswith(title)]
-    assert len(found) == 1, [one.get_title("left") for one in figure.axes]
-    return found[0]
+    matches = [axes for axes in figure.axes if axes.get_title("left").startswith(title)]
+    assert len(matches) == 1, [one.get_title("left") for one in figure.axes]
+    return matches[0]

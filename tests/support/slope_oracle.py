@@ -81,7 +81,7 @@ def build(problem: Problem, whole: tuple[Mask, Mask] | None = None) -> Graph:
         np.asarray(1.0 if problem.slope_weights is None else problem.slope_weights, float), slopes.shape
     )
     has = mask & np.isfinite(slopes).all(axis=0) & (weights > 0)  # (2, H, W)
-    known, pull = _known_heights(problem, mask)
+    heights, pull = _known_heights(problem, mask)
     valid = has.any(axis=0) | (pull > 0)
     pixel = np.where(valid, np.cumsum(valid.ravel()).reshape(shape) - 1, -1)
     across = has[0, :, :-1] & has[0, :, 1:]
@@ -99,21 +99,21 @@ def build(problem: Problem, whole: tuple[Mask, Mask] | None = None) -> Graph:
     reading = sparse.csr_array(sparse.block_diag([_resized(part[1], pixel.size) for part in parts]))
     label, free = _components(difference, pull[valid])
     weight = np.concatenate([part[2] for part in parts])
-    return Graph(pixel, difference, reading, weight, pull[valid], known[valid], label, free)
+    return Graph(pixel, difference, reading, weight, pull[valid], heights[valid], label, free)
 
 
 def solve(problem: Problem, whole: tuple[Mask, Mask] | None = None) -> Answer:
     """Return the heights of least energy; the mean of a component with an unknown offset is 0."""
     graph = build(problem, whole)
-    wanted = graph.reading @ np.nan_to_num(np.concatenate([problem.dz_dx, problem.dz_dy], axis=None))
-    return spread_out(graph, minimise(graph, graph.weight, wanted))
+    rises = graph.reading @ np.nan_to_num(np.concatenate([problem.dz_dx, problem.dz_dy], axis=None))
+    return spread_out(graph, minimise(graph, graph.weight, rises))
 
 
-def minimise(graph: Graph, weight: Map, wanted: Map) -> Map:
+def minimise(graph: Graph, weight: Map, rises: Map) -> Map:
     """Return the heights (n,) of least energy for weights and wants of the links, mm."""
     matrix = graph.difference.T @ sparse.diags_array(weight) @ graph.difference
     matrix = sparse.csr_array(matrix + sparse.diags_array(graph.pull))
-    source = graph.difference.T @ (weight * wanted) + graph.pull * graph.known
+    source = graph.difference.T @ (weight * rises) + graph.pull * graph.known
     kept = np.ones(len(source), bool)
     _, first = np.unique(graph.label, return_index=True)
     kept[first[graph.free]] = False  # one pixel of each floating component stays at 0 for now
@@ -204,16 +204,16 @@ def _cut(marked: Mask, slopes: Map, across: Mask, down: Mask) -> None:
     across[marked[:, :-1] | marked[:, 1:]] = False
     down[marked[:-1] | marked[1:]] = False
     for row, column in np.argwhere(marked):
-        found = []
+        links = []
         for y, x in ((row, column - 1), (row, column + 1), (row - 1, column), (row + 1, column)):
             if not (0 <= y < rows and 0 <= x < columns) or marked[y, x]:
                 continue
             number, link = (0, (row, min(x, column))) if y == row else (1, (min(y, row), column))
             if before[number][link]:
                 apart = np.sum((slopes[:, y, x] - slopes[:, row, column]) ** 2)
-                found.append((apart, len(found), number, link))
-        if found:
-            _, _, number, link = min(found)
+                links.append((apart, len(links), number, link))
+        if links:
+            _, _, number, link = min(links)
             (across, down)[number][link] = True
 
 
@@ -231,13 +231,13 @@ def _links(
     difference = sparse.coo_array((sign, (np.tile(number, 2), ends.ravel())))
     ringed = np.pad(joined, ((0, 0), (1, 1)))
     wide = ringed[line, start] & ringed[line, start + 2]
-    share = np.where(wide[:, np.newaxis], FOUR_POINTS, [0, 0.5, 0.5, 0])
+    factors = np.where(wide[:, np.newaxis], FOUR_POINTS, [0, 0.5, 0.5, 0])
     at = np.clip(start[:, np.newaxis] + np.arange(-1, 3), 0, place.shape[1] - 1)
     reading = sparse.coo_array(
-        ((size * share).ravel(), (np.repeat(number, 4), place[line[:, np.newaxis], at].ravel()))
+        ((size * factors).ravel(), (np.repeat(number, 4), place[line[:, np.newaxis], at].ravel()))
     )
-    here, there = weights[line, start], weights[line, start + 1]
-    return difference, reading, 2 / (1 / here + 1 / there) / size**2
+    here, beyond = weights[line, start], weights[line, start + 1]
+    return difference, reading, 2 / (1 / here + 1 / beyond) / size**2
 
 
 def _resized(matrix: sparse.coo_array, columns: int) -> sparse.csr_array:

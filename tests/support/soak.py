@@ -58,7 +58,10 @@ ROUNDS: list[Round] = []
 
 def table() -> list[str]:
     """Return the rounds so far, a line each, and how many there were of a kind."""
-    rows = [(one.what, *map(str, (one.seed, one.whole, one.after)), f"{one.seconds:.1f}") for one in ROUNDS]
+    rows = [
+        (round_.what, *map(str, (round_.seed, round_.whole, round_.after)), f"{round_.seconds:.1f}")
+        for round_ in ROUNDS
+    ]
     widths = [max(map(len, column)) for column in zip(_HEADINGS, *rows, strict=True)]
     return [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -131,7 +134,7 @@ class Batch:
 def results(folder: Path) -> dict[str, tuple[int, int]]:
     """Return which file each result is, by its name: that it was written again would show."""
     stats = {path.name: path.stat() for path in folder.glob("*-result.h5")}
-    return {name: (one.st_ino, one.st_mtime_ns) for name, one in stats.items()}
+    return {name: (status.st_ino, status.st_mtime_ns) for name, status in stats.items()}
 
 
 def leftovers(folder: Path) -> list[Path]:
@@ -142,17 +145,17 @@ def leftovers(folder: Path) -> list[Path]:
 def data(path: Path) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
     """Return every array of a result to the last bit, and every word of how it came about but the date."""
     io.open_result(path)  # it is a whole result
-    found = {}
+    states = {}
 
     def keep(name: str, item: h5py.HLObject) -> None:
         if isinstance(item, h5py.Dataset) and name != "entry/process/date":
             value = np.asarray(item[()])
             kept = repr(item[()]).encode() if value.dtype.hasobject else value.tobytes()
-            found[name] = str(item.dtype), item.shape, kept
+            states[name] = str(item.dtype), item.shape, kept
 
     with h5py.File(path) as file:
         file.visititems(keep)
-    return found
+    return states
 
 
 def all_data(folder: Path) -> dict[str, dict[str, tuple[str, tuple[int, ...], bytes]]]:

@@ -115,17 +115,17 @@ def put(path, name, value, units=None):
                 file[name].attrs["units"] = units
 
 
-def assert_same(found, expected):
+def assert_same(actual, expected):
     """Hold two headers, truths or results equal: arrays to the last bit and type, the rest by value."""
     names = expected.__dataclass_fields__ if is_dataclass(expected) else (*expected, *FIELDS)
-    assert is_dataclass(expected) or list(found) == list(expected)
+    assert is_dataclass(expected) or list(actual) == list(expected)
     for name in names:
-        left, right = getattr(found, name), getattr(expected, name)
+        mine, right = getattr(actual, name), getattr(expected, name)
         if isinstance(right, np.ndarray):
-            assert left.dtype == right.dtype, name
-            np.testing.assert_array_equal(left, right, err_msg=name)
+            assert mine.dtype == right.dtype, name
+            np.testing.assert_array_equal(mine, right, err_msg=name)
         else:
-            assert left == right, name
+            assert mine == right, name
 
 
 def plot_of(path):

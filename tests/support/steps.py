@@ -55,8 +55,8 @@ def on_coin(x: float, y: float, shape: tuple[int, int], pixel: float = 0.016) ->
 
     columns, rows = surfaces.places(shape)
     place = x + pixel * columns, y + pixel * rows
-    seen = surfaces.Sample(Coin().height(*place), *Coin().slope(*place), np.zeros(shape, np.intp))
-    return Case(seen, (pixel, pixel), RELIEF, np.ones(shape, bool))
+    view = surfaces.Sample(Coin().height(*place), *Coin().slope(*place), np.zeros(shape, np.intp))
+    return Case(view, (pixel, pixel), RELIEF, np.ones(shape, bool))
 
 
 def cap(size: float) -> surfaces.Shape:
@@ -74,9 +74,9 @@ CASES: dict[str, Callable[[], Case]] = {
 }
 
 
-def tilted(seen: surfaces.Sample, angle: float, seed: int = 0) -> Map:
+def tilted(view: surfaces.Sample, angle: float, seed: int = 0) -> Map:
     """Return the slopes (2, H, W) of normals with noise of so many radians on each of their three numbers."""
-    normals = np.stack([-seen.dz_dx, -seen.dz_dy, np.ones_like(seen.dz_dx)])
+    normals = np.stack([-view.dz_dx, -view.dz_dy, np.ones_like(view.dz_dx)])
     normals /= np.linalg.norm(normals, axis=0)
     normals += np.random.default_rng([seed, 21]).normal(0, angle, normals.shape)
     return np.asarray(-normals[:2] / normals[2])
@@ -85,11 +85,11 @@ def tilted(seen: surfaces.Sample, angle: float, seed: int = 0) -> Map:
 def determined(case: Case, slopes: Map) -> NDArray[np.intp]:
     """Return the part to which a pixel belongs whose height normals determine, else -1, (H, W)."""
     problem = slope_oracle.Problem(slopes[0], slopes[1], case.pixel_size, case.mask)
-    told = slope_oracle.solve(problem, surfaces.joined(case.seen.side))
-    off = told.height - case.seen.height
+    exact = slope_oracle.solve(problem, surfaces.joined(case.seen.side))
+    off = exact.height - case.seen.height
     part = np.full(case.mask.shape, -1)
-    for label in range(len(told.offset_unknown)):
-        within = told.component == label
+    for label in range(len(exact.offset_unknown)):
+        within = exact.component == label
         part[within & (np.abs(off - np.median(off[within])) <= 0.01 * case.step)] = label
     part[ndimage.binary_dilation(beside_steps(case, below=5.0), iterations=3)] = -1
     return part

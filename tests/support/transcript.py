@@ -52,12 +52,12 @@ def play(machine: Firmware | GrblMachine, clock: Clock = SYSTEM) -> Iterator[Exc
     for request in REQUESTS:
         began = clock.now()
         if request == REST:
-            said: list[str] = []
-            while not said or not re.match("<(Idle|Hold:0)", said[-1]):
+            output: list[str] = []
+            while not output or not re.match("<(Idle|Hold:0)", output[-1]):
                 clock.sleep(_POLL)
                 machine.receive(b"?")
-                said = listen(machine, clock, lambda lines, _: bool(lines))
-            yield Exchange(request, said[-1:], clock.now() - began)
+                output = listen(machine, clock, lambda lines, _: bool(lines))
+            yield Exchange(request, output[-1:], clock.now() - began)
             continue
         if request == WAIT:
             clock.sleep(_QUIET)
@@ -66,16 +66,16 @@ def play(machine: Firmware | GrblMachine, clock: Clock = SYSTEM) -> Iterator[Exc
         machine.receive(_BYTES.get(request) or (b"?" if request == "?" else f"{request}\n".encode()))
         if request in _BYTES:
             last = "Grbl" if request == RESET else ""
-            said = listen(
+            output = listen(
                 machine,
                 clock,
                 lambda lines, quiet, last=last: quiet > _QUIET and last in " ".join(lines),
             )
         elif request == "?":
-            said = listen(machine, clock, lambda lines, _: bool(lines))
+            output = listen(machine, clock, lambda lines, _: bool(lines))
         else:
-            said = listen(machine, clock, lambda lines, _: re.match("ok|error", (lines or [""])[-1]))
-        yield Exchange(request, said, clock.now() - began)
+            output = listen(machine, clock, lambda lines, _: re.match("ok|error", (lines or [""])[-1]))
+        yield Exchange(request, output, clock.now() - began)
 
 
 def listen(
@@ -95,24 +95,24 @@ def listen(
 
 def write(exchanges: Iterable[Exchange]) -> Iterator[str]:
     """Yield the lines of a transcript."""
-    for sent, said, seconds in exchanges:
+    for sent, output, seconds in exchanges:
         yield f"> {sent}"
-        yield from (f"< {line}" for line in said)
+        yield from (f"< {line}" for line in output)
         yield f"= {seconds:.2f}"
 
 
 def read(path: Path) -> list[Exchange]:
     """Read a transcript."""
-    found: list[Exchange] = []
+    exchanges: list[Exchange] = []
     for line in path.read_text().splitlines():
         kind, text = line[:1], line[2:]
         if kind == ">":
-            found.append(Exchange(text, [], 0.0))
+            exchanges.append(Exchange(text, [], 0.0))
         elif kind == "<":
-            found[-1].said.append(text)
+            exchanges[-1].said.append(text)
         elif kind == "=":
-            found[-1] = found[-1]._replace(seconds=float(text))
-    return found
+            exchanges[-1] = exchanges[-1]._replace(seconds=float(text))
+    return exchanges
 
 
 if __name__ == "__main__":

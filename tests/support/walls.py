@@ -28,8 +28,8 @@ def light_at(height, gamma=1.0):
     half = math.atan2(RIM, RADIUS) / 2
     steps = np.linspace(-1, 1, 401)[1::2]
     elevation = np.arctan2(height, RADIUS)[..., np.newaxis] + SCATTER * steps
-    share = np.clip(1 - elevation / (2 * half), 0, 1)
-    return (share**gamma).mean(axis=-1)
+    fraction = np.clip(1 - elevation / (2 * half), 0, 1)
+    return (fraction**gamma).mean(axis=-1)
 
 
 def response(shape, gamma=1.0, sigma=(0.0, 0.0), **other):
@@ -38,8 +38,8 @@ def response(shape, gamma=1.0, sigma=(0.0, 0.0), **other):
     elevation = np.linspace(SCATTER, top - SCATTER, 200)
     q, light = np.tan(elevation / 2), light_at(RADIUS * np.tan(elevation), gamma)
     curve = np.polynomial.Polynomial.fit(q, light, 8).convert().coef
-    maps = (np.full(shape, one, np.float32) for one in sigma)
-    known = {
+    maps = (np.full(shape, value, np.float32) for value in sigma)
+    parameters = {
         "radius": RADIUS,
         "rim": RIM,
         "axis": AXIS,
@@ -55,7 +55,7 @@ def response(shape, gamma=1.0, sigma=(0.0, 0.0), **other):
         "covariance": np.eye(1),
         "error": 0.002,
     }
-    return WallResponse(**(known | other))
+    return WallResponse(**(parameters | other))
 
 
 def light_of(curve, x, y, height, normal, phase, follows, tilt=TILT):
@@ -80,9 +80,9 @@ def light_of(curve, x, y, height, normal, phase, follows, tilt=TILT):
     ray = sight - 2 * (sight * facing).sum(axis=0) * facing
     near, far = np.zeros_like(x), np.full_like(x, 1e4)
     for _ in range(80):
-        way = (near + far) / 2
-        inside = np.hypot(*(point + way * ray)[:2]) < RADIUS
-        near, far = np.where(inside, way, near), np.where(inside, far, way)
+        middle = (near + far) / 2
+        inside = np.hypot(*(point + middle * ray)[:2]) < RADIUS
+        near, far = np.where(inside, middle, near), np.where(inside, far, middle)
     end = point + near * ray
     q = np.tan(np.arctan2(end[2], RADIUS) / 2)
     lamp = 1 + (LAMPS[0] * end[0] + LAMPS[1] * end[1]) / RADIUS
@@ -113,5 +113,5 @@ def response_of_twin(shape, pixel_size, body, distance, sigma=(0.0, 0.0)):
         body.asymmetry * math.cos(body.asymmetry_azimuth),
         body.asymmetry * math.sin(body.asymmetry_azimuth),
     )
-    found = response(shape, sigma=sigma, axis=(0.0, 0.0), sight=tuple(sight), lamps=lamps, shade=np.zeros(5))
-    return replace(found, curve=found.curve / (1 + body.asymmetry))
+    wall = response(shape, sigma=sigma, axis=(0.0, 0.0), sight=tuple(sight), lamps=lamps, shade=np.zeros(5))
+    return replace(wall, curve=wall.curve / (1 + body.asymmetry))

@@ -228,9 +228,9 @@ def as_ms(seconds: float) -> str:
     return f"{milliseconds:.{2 if milliseconds < 10 else 1 if milliseconds < 1000 else 0}f}"
 
 
-def as_percent(share: float) -> str:
+def as_percent(ratio: float) -> str:
     """Return a ratio in percent; empty if it is not finite."""
-    return f"{100 * share:.0f} %" if np.isfinite(share) else ""
+    return f"{100 * ratio:.0f} %" if np.isfinite(ratio) else ""
 
 
 def _version(package: str) -> str | None:
@@ -262,5 +262,5 @@ def _processor() -> str:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
         return platform.processor()
-    found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
-    return found[1] if found else platform.processor()
+    model = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    return model[1] if model else platform.processor()

@@ -42,7 +42,9 @@ class _Turn:
     result: object = None
 
     def seconds(self, kind: Kind, name: str | None = None) -> float:
-        return sum(one.seconds for one in self.records if one.kind == kind and name in (None, one.name))
+        return sum(
+            record.seconds for record in self.records if record.kind == kind and name in (None, record.name)
+        )
 
 
 def take_turns(
@@ -85,8 +87,8 @@ def _turn(work: Work, profile: Profile) -> _Turn:
 
 def _row(name: str, work: Work, turns: list[_Turn], first: float, compiling: float) -> Row:
     device = {kind: [turn.seconds(kind) for turn in turns] for kind in _KINDS}
-    moved = {one.name: float(one.bytes) for one in turns[-1].records if one.kind == "kernel"}
-    kernels = {one: [turn.seconds("kernel", one) for turn in turns] for one in sorted(moved)}
+    moved = {record.name: float(record.bytes) for record in turns[-1].records if record.kind == "kernel"}
+    kernels = {kernel: [turn.seconds("kernel", kernel) for turn in turns] for kernel in sorted(moved)}
     return Row(
         name=name,
         wall=Timing.of([turn.wall for turn in turns]),
@@ -94,7 +96,7 @@ def _row(name: str, work: Work, turns: list[_Turn], first: float, compiling: flo
         frames=work.frames,
         operations=work.operations,
         device={kind: Timing.of(seconds) for kind, seconds in device.items() if any(seconds)},
-        kernels={one: float(np.median(seconds)) for one, seconds in kernels.items()},
+        kernels={kernel: float(np.median(seconds)) for kernel, seconds in kernels.items()},
         moved=moved,
         first=first,
         compile=compiling,

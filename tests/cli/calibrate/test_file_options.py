@@ -173,7 +173,7 @@ def fake(clock, monkeypatch):
 
     monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, **rig_options))
     monkeypatch.setattr(
-        rig, "open_rig", lambda *_: fake_rig(spreading(SHAPE), clock, rate=60.0, told=rig_options)
+        rig, "open_rig", lambda *_: fake_rig(spreading(SHAPE), clock, rate=60.0, stated=rig_options)
     )
     Path("rig.toml").touch()
 

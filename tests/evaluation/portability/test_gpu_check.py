@@ -71,13 +71,13 @@ ROW = {
 }
 
 
-def test_what_ptxas_says_is_read_for_each_kernel():
+def test_report_of_ptxas_is_read_by_kernel():
     scan, total = gpu_check.read_ptxas(PTXAS, PTX).values()
     assert scan == {"registers": 65, "stack": 16, "spills": 12, "warps": 28, "doubles": 1, "byte loads": 1}
     assert total == {"registers": 20, "stack": 0, "spills": 0, "warps": 64, "doubles": 0, "byte loads": 0}
 
 
-def test_what_clang_says_for_amd_is_read_for_each_kernel():
+def test_assembly_for_amd_is_read_by_kernel():
     assert gpu_check.read_assembly(ASSEMBLY) == {
         "scan": {"AMD registers": 70, "AMD scratch": 24, "AMD spills": 3, "AMD waves": 7},
         "sum": {"AMD registers": 9, "AMD scratch": 0, "AMD spills": 0, "AMD waves": 8},
@@ -90,7 +90,7 @@ def test_the_most_of_all_options_is_kept():
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "complaints"),
     [
         ({}, []),
         ({"registers": 70}, []),
@@ -99,24 +99,26 @@ def test_the_most_of_all_options_is_kept():
         ({"AMD spills": 5}, ["sum: 5 AMD spills, with -DA=1"]),
     ],
 )
-def test_a_kernel_that_takes_clearly_more_or_what_none_may_is_printed_in_a_line(changed, said):
-    assert list(gpu_check.complaints({**ROW, **changed}, ROW)) == said
+def test_kernels_with_more_registers_or_spills_are_printed(changed, complaints):
+    assert list(gpu_check.complaints({**ROW, **changed}, ROW)) == complaints
 
 
 def test_without_tools_the_remedy_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr(gpu_check.shutil, "which", lambda *_, **__: None)
     monkeypatch.setattr("sys.argv", ["gpu_check.py"])
     assert gpu_check.main() == 2
-    said = "make gpu-check: install a clang and its libclc first (Debian: apt install clang-19 libclc-19)\n"
-    assert capsys.readouterr().err == said
+    message = (
+        "make gpu-check: install a clang and its libclc first (Debian: apt install clang-19 libclc-19)\n"
+    )
+    assert capsys.readouterr().err == message
 
 
 def test_answers_differ_only_where_they_mean_something():
     contact = np.zeros((40, 50), np.uint8)
     contact[10:] = 1
     frozen = {"a.contact": contact, "a.normals": np.zeros((40, 50, 3), np.float32)}
-    found = {**frozen, "a.normals": frozen["a.normals"].copy()}
-    found["a.normals"][:10] = 1
-    assert not gpu.differs(found, frozen, "a.normals", (0, 1e-3))
-    found["a.normals"][20] = 1
-    assert "150 of 4500" in gpu.differs(found, frozen, "a.normals", (0, 1e-3))
+    answers = {**frozen, "a.normals": frozen["a.normals"].copy()}
+    answers["a.normals"][:10] = 1
+    assert not gpu.differs(answers, frozen, "a.normals", (0, 1e-3))
+    answers["a.normals"][20] = 1
+    assert "150 of 4500" in gpu.differs(answers, frozen, "a.normals", (0, 1e-3))

@@ -12,7 +12,7 @@ KNOWN = gpu_counts.load()
 
 
 @pytest.fixture(scope="module")
-def found():
+def counts():
     device = open_device()
     as_it_is = device.info, device.layout
     with warnings.catch_warnings(action="ignore", category=MirrorskinWarning):  # its press is not its turn
@@ -24,13 +24,13 @@ def found():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", KNOWN)
-def test_a_call_has_a_gpu_do_no_more_than_before(found, name):
-    assert list(gpu_counts.complaints(name, found[name], KNOWN[name])) == []
+def test_a_call_has_a_gpu_do_no_more_than_before(counts, name):
+    assert list(gpu_counts.complaints(name, counts[name], KNOWN[name])) == []
 
 
 @pytest.mark.slow
-def test_every_call_is_in_the_table(found):
-    assert found.keys() == KNOWN.keys()
+def test_every_call_is_in_the_table(counts):
+    assert counts.keys() == KNOWN.keys()
 
 
 def test_what_rises_is_printed_in_a_line():

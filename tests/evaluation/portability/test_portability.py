@@ -36,23 +36,23 @@ def library(tmp_path):
 def other(library):
     """A check that can be made, and watches for all faults."""
     pattern = str(library.relative_to("/"))
-    return Check("other", "package", pattern, faults=tuple(faults.FAULTS), told={"OTHER": "1"})
+    return Check("other", "package", pattern, faults=tuple(faults.FAULTS), variables={"OTHER": "1"})
 
 
 @pytest.fixture
 def kernels(monkeypatch):
     """Kernels that end with a status and leave a report, by the name of their fault; without one: sound."""
-    said = {name: (0, f"{words} of some kind\n") for name, (_, words) in faults.FAULTS.items()}
-    said[None] = (0, "")
+    reports = {name: (0, f"{words} of some kind\n") for name, (_, words) in faults.FAULTS.items()}
+    reports[None] = (0, "")
 
     def run(environment, fault=None):
-        status, report = said[fault]
+        status, report = reports[fault]
         if report:
             Path(environment["OCLGRIND_LOG"]).write_text(report)
         return subprocess.CompletedProcess([], status, "1.0\n", "no such luck")
 
     monkeypatch.setattr(portability, "run_kernel", run)
-    return said
+    return reports
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_missing_ones_are_reported_in_one_line_after_the_others_ran(monkeypatch,
 
 
 @pytest.mark.parametrize(("details", "status"), [((), 0), (("this is wrong",), 1)])
-def test_the_table_has_a_row_for_each_and_the_status_says_whether_all_is_well(
+def test_table_has_a_row_for_each_check_and_status_is_1_after_an_error(
     monkeypatch, capsys, other, details, status
 ):
     monkeypatch.setattr(portability, "CHECKS", (other, Check("unasked", "", "/no/such/file")))
@@ -121,9 +121,9 @@ def test_an_implementation_that_lets_a_fault_pass_is_not_believed(kernels, other
 
 
 @pytest.mark.usefixtures("passing")
-@pytest.mark.parametrize(("said", "detail"), [((1, ""), "no such luck"), ((0, REPORT), REPORT)])
-def test_an_implementation_that_fails_a_sound_kernel_is_not_believed(kernels, other, said, detail):
-    kernels[None] = said
+@pytest.mark.parametrize(("report", "detail"), [((1, ""), "no such luck"), ((0, REPORT), REPORT)])
+def test_an_implementation_that_fails_a_sound_kernel_is_not_believed(kernels, other, report, detail):
+    kernels[None] = report
     finding = portability.examine(other)
     assert finding.tests == "-"
     assert detail in finding.details
@@ -162,7 +162,7 @@ def write_test(folder, body):
         ("os._exit(9)", "ended with 9", ""),
     ],
 )
-def test_what_pytest_says_is_shown_unless_all_pass(monkeypatch, tmp_path, body, shown, word):
+def test_output_of_pytest_is_shown_unless_all_pass(monkeypatch, tmp_path, body, shown, word):
     monkeypatch.setattr(portability, "ROOT", tmp_path)
     environment = write_test(tmp_path, body)
     tests, details = portability.run_tests(asking(""), environment, tmp_path / "tests.xml")

@@ -24,7 +24,7 @@ def hold(name, ending, within=SOON):
         return
     late = PRESS if name in AFTERWARDS else 0
     assert ending.moved < within + late
-    assert ending.told < LATE + late
+    assert ending.reported < LATE + late
     assert ending.count >= 8
     assert "\n" not in str(ending.error)
     if name not in AFTERWARDS:

@@ -30,7 +30,7 @@ def told(place):
 
 
 def make_rig(picture=told, rate=250.0, delay=0.03, jitter=0.0, late=1e-3, **camera):
-    return fake_rig(picture, rate=rate, delay=delay, jitter=jitter, late=late, told={"dark": 5.0, **camera})
+    return fake_rig(picture, rate=rate, delay=delay, jitter=jitter, late=late, stated={"dark": 5.0, **camera})
 
 
 def drain(scan, buffer=ROOM):

@@ -169,7 +169,7 @@ def test_a_stage_that_has_no_line_is_refused():
     with pytest.raises(
         InputError, match=r"^fake stage: camera.trigger needs a GRBL controller; remove it from the rig file$"
     ):
-        fake_rig(lambda place: np.zeros((8, 8), np.uint8), told={"trigger": "coolant"})
+        fake_rig(lambda place: np.zeros((8, 8), np.uint8), stated={"trigger": "coolant"})
 
 
 def test_a_stage_that_has_no_line_is_not_homed(monkeypatch):
