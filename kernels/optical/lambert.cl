@@ -6,22 +6,24 @@
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
 
-// Rotates the pair (a, x) so that x becomes 0; ALONG rotates another pair in the same way (Givens).
-#define TURN(a, x)                                                                          \
-    do {                                                                                    \
-        const float square = (a) * (a) + (x) * (x), inverse = inverse_root(square);         \
-        along = (x) == 0 ? 1 : (a) * inverse;                                               \
-        across = (x) == 0 ? 0 : (x) * inverse;                                              \
-        (a) = (x) == 0 ? (a) : square * inverse;                                            \
-    } while (0)
-#define ALONG(b, y)                                                                         \
-    do {                                                                                    \
-        const float kept = (b);                                                             \
-        (b) = along * kept + across * (y);                                                  \
-        (y) = along * (y) - across * kept;                                                  \
-    } while (0)
+// A block is small enough for its state to stay in the nearest cache.
+#define BLOCK (TILE < 128 ? TILE : 128)
 
-#define R(k) triangle[(k) * plane + p]
+#define STATE(k) triangle[(k) * plane + p]
+
+// Eliminates x, the number in column i of a row with a weight (Gentleman 1973). OTHER does the same to another column.
+#define ELIMINATE(i, x)                                                                      \
+    const float x##_new = size[i][p] + weight * (x) * (x), x##_inverse = 1 / x##_new;        \
+    const float x##_keep = x##_new > 0 ? size[i][p] * x##_inverse : 1;                       \
+    const float x##_add = x##_new > 0 ? weight * (x) * x##_inverse : 0;                      \
+    size[i][p] = x##_new;                                                                    \
+    weight *= x##_keep;
+#define OTHER(x, r, y)                                                                       \
+    do {                                                                                     \
+        const float before = (r);                                                            \
+        (r) = x##_keep * before + x##_add * (y);                                             \
+        (y) -= (x) * before;                                                                 \
+    } while (0)
 
 __kernel void lambert_add(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride, MAP lights, MAP darks,
@@ -29,24 +31,53 @@ __kernel void lambert_add(
 {
     const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
     const size_t plane = stride;
-    for (int t = 0; t < count; ++t)
-        for (int p = low; p < end; ++p) {
-            const float sample = frames[(size_t)t * pixels + p], light = sample - darks[p];
-            const int seen = (light > shadow) & (sample < bright);
-            float x = seen ? lights[3 * t] : 0, y = seen ? lights[3 * t + 1] : 0, z = seen ? lights[3 * t + 2] : 0;
-            float e = seen ? light : 0, along, across;
-            TURN(R(0), x);
-            ALONG(R(1), y);
-            ALONG(R(2), z);
-            ALONG(R(3), e);
-            TURN(R(4), y);
-            ALONG(R(5), z);
-            ALONG(R(6), e);
-            TURN(R(7), z);
-            ALONG(R(8), e);
-            R(9) += e * e;
-            R(10) += seen;
+    for (int base = low; base < end; base += BLOCK) {
+        const int width = min(BLOCK, end - base);
+        // Squares of the diagonal, what is above it by rows, the right-hand side, residual sum, number of samples.
+        float size[3][BLOCK], above[3][BLOCK], right[3][BLOCK], residual[BLOCK], samples[BLOCK], dark[BLOCK];
+        for (int k = 0; k < 3; ++k)
+            for (int i = 0, p = base; i < width; ++i, ++p) {
+                size[k][i] = STATE(k);
+                above[k][i] = STATE(3 + k);
+                right[k][i] = STATE(6 + k);
+            }
+        for (int i = 0, p = base; i < width; ++i, ++p) {
+            residual[i] = STATE(9);
+            samples[i] = STATE(10);
+            dark[i] = darks[p];
         }
+        for (int t = 0; t < count; ++t) {
+            const float light_x = lights[3 * t], light_y = lights[3 * t + 1], light_z = lights[3 * t + 2];
+            __global const FRAME *restrict frame = frames + (size_t)t * pixels + base;
+            for (int p = 0; p < width; ++p) {
+                const float sample = frame[p], light = sample - dark[p];
+                const int usable = (light > shadow) & (sample < bright);
+                const float x = light_x;
+                float y = light_y, z = light_z, e = usable ? light : 0, weight = usable ? 1 : 0;
+                ELIMINATE(0, x)
+                OTHER(x, above[0][p], y);
+                OTHER(x, above[1][p], z);
+                OTHER(x, right[0][p], e);
+                ELIMINATE(1, y)
+                OTHER(y, above[2][p], z);
+                OTHER(y, right[1][p], e);
+                ELIMINATE(2, z)
+                OTHER(z, right[2][p], e);
+                residual[p] += weight * e * e;
+                samples[p] += usable;
+            }
+        }
+        for (int k = 0; k < 3; ++k)
+            for (int i = 0, p = base; i < width; ++i, ++p) {
+                STATE(k) = size[k][i];
+                STATE(3 + k) = above[k][i];
+                STATE(6 + k) = right[k][i];
+            }
+        for (int i = 0, p = base; i < width; ++i, ++p) {
+            STATE(9) = residual[i];
+            STATE(10) = samples[i];
+        }
+    }
 }
 
 #define LEAST_PIVOT 1e-3f
@@ -58,12 +89,14 @@ __kernel void lambert_normals(
     const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
     const size_t plane = stride;
     for (int p = low; p < end; ++p) {
-        const float r00 = R(0), r01 = R(1), r02 = R(2), r11 = R(4), r12 = R(5), r22 = R(7), freedom = R(10) - 3;
+        const float r00 = sqrt(STATE(0)), r11 = sqrt(STATE(1)), r22 = sqrt(STATE(2)), freedom = STATE(10) - 3;
+        const float r01 = r00 * STATE(3), r02 = r00 * STATE(4), r12 = r11 * STATE(5);
+        const float r03 = r00 * STATE(6), r13 = r11 * STATE(7), r23 = r22 * STATE(8);
         const float size = sqrt(r00 * r00 + r01 * r01 + r02 * r02 + r11 * r11 + r12 * r12 + r22 * r22);
         // The inverse of the triangle, whose product with its transpose is the covariance for noise 1.
         const float a = 1 / r00, d = 1 / r11, f = 1 / r22, b = -r01 * a * d, e = -r12 * d * f;
         const float c = -(r01 * e + r02 * f) * a;
-        float x = a * R(3) + b * R(6) + c * R(8), y = d * R(6) + e * R(8), z = f * R(8);
+        float x = a * r03 + b * r13 + c * r23, y = d * r13 + e * r23, z = f * r23;
         const float length = sqrt(x * x + y * y + z * z);
         const int answered = LESSER(LESSER(r00, r11), r22) > LEAST_PIVOT * size && length > 0 && length < INFINITY;
         x /= length;
@@ -78,7 +111,7 @@ __kernel void lambert_normals(
         normals_spread[p] = answered ? sqrt(whole - radial) / length : NAN;
         albedo[p] = answered ? length : NAN;
         albedo_spread[p] = answered ? sqrt(radial) : NAN;
-        residual[p] = freedom > 0 ? sqrt(R(9) / freedom) : NAN;
-        samples[p] = R(10);
+        residual[p] = freedom > 0 ? sqrt(STATE(9) / freedom) : NAN;
+        samples[p] = STATE(10);
     }
 }

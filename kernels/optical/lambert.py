@@ -3,7 +3,8 @@
 The samples E_k of a pixel that are neither dark nor saturated, and the lamps' vectors l_k, are the rows (l_k,
 E_k) of a matrix. The triangle R of its QR decomposition (Golub and Van Loan, Matrix Computations, section
 5.3) is sufficient for least squares, loses nothing by cancellation, and is updated with further rows by
-rotations.
+rotations. It is stored as squares of the diagonal and rows divided by the diagonal, whose rotations need no
+roots (Gentleman, J. Inst. Maths Applics 12, 1973).
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ Array = NDArray[Any]
 LEAST_PIVOT = 1e-3
 """Relative pivot of the lamps' directions below which they count as coplanar."""
 
-_PLACES = np.triu_indices(4)
+_DIAGONAL = np.diag_indices(4)
+_ABOVE = np.array([0, 0, 1, 0, 1, 2]), np.array([1, 2, 2, 3, 3, 3])
 
 
 def lambert_add(
@@ -33,20 +35,21 @@ def lambert_add(
     darks : (P,), counts without light, which are subtracted
     shadow : lower limit of usable samples (exclusive), counts above dark
     bright : upper limit of usable samples (exclusive), counts
-    triangle : (11, P), at first 0. First R by rows, with a diagonal that is not negative; its last element is
-        squared, and is then the residual sum of squares. Then the number of usable samples
+    triangle : (11, P), at first 0. Squares of the diagonal of R in planes 0 to 2; its elements above the
+        diagonal, each divided by that of its row, in 3 to 5, and the last column of these rows in 6 to 8. Then
+        the residual sum of squares, and the number of usable samples
     """
     light = frames.astype(np.float32) - darks
     seen = (light > shadow) & (frames < bright)
     rows = np.concatenate([np.broadcast_to(lights[:, None], (*seen.shape, 3)), light[..., None]], axis=2)
     before = np.zeros((frames.shape[1], 4, 4))
-    before[:, *_PLACES] = triangle[:10].T
-    before[:, 3, 3] = np.sqrt(before[:, 3, 3])
+    before[:, *_DIAGONAL] = np.sqrt(triangle[[0, 1, 2, 9]].T)
+    before[:, *_ABOVE] = triangle[3:9].T * before[:, _ABOVE[0], _ABOVE[0]]
     lit = np.where(seen.T[..., None], rows.swapaxes(0, 1), 0)
     after: Array = np.linalg.qr(np.concatenate([before, lit], axis=1)).R
-    after *= np.where(np.diagonal(after, axis1=1, axis2=2) < 0, -1, 1)[..., None]
-    triangle[:10] = after[:, *_PLACES].T
-    triangle[9] **= 2
+    pivots = after[:, _ABOVE[0], _ABOVE[0]]
+    triangle[[0, 1, 2, 9]] = after[:, *_DIAGONAL].T ** 2
+    triangle[3:9] = np.divide(after[:, *_ABOVE], pivots, out=np.zeros_like(pivots), where=pivots != 0).T
     triangle[10] += seen.sum(axis=0)
 
 
@@ -64,7 +67,9 @@ def lambert_normals(triangle: Array, normals: Array, normals_spread: Array, albe
     residual : (P,), standard deviation of a sample; NaN unless more than three samples are usable
     samples : (P,), number of usable samples
     """
-    r00, r01, r02, r03, r11, r12, r13, r22, r23, rest, used = triangle.astype(np.float64)
+    *squares, r01, r02, r12, r03, r13, r23, rest, used = triangle.astype(np.float64)
+    r00, r11, r22 = np.sqrt(squares)
+    r01, r02, r12, r03, r13, r23 = r00 * r01, r00 * r02, r11 * r12, r00 * r03, r11 * r13, r22 * r23
     size = np.sqrt(r00**2 + r01**2 + r02**2 + r11**2 + r12**2 + r22**2)
     freedom = used - 3
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
