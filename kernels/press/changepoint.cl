@@ -194,7 +194,7 @@ answer_t single(const samples_t *samples, const int begin, const levels_t levels
 // are added to the misfit. The crossing is on the line.
 answer_t ramp(
     const samples_t *samples, const int begin, const int length, const levels_t levels, const float noise,
-    const float enough)
+    const float enough, float *bent)
 {
     const int end = begin + length, first = begin - REACH;
     const long value = samples->values[end] - samples->values[begin];
@@ -205,6 +205,7 @@ answer_t ramp(
     const long slope = length * moment - places * value;
     const long rest = (length * square - value * value) * spread - slope * slope;
     const float misfit = (float)rest / ((float)spread * length) / (STEP * STEP);
+    *bent = misfit;
     if (misfit > enough || slope * 1000 <= spread * (long)STEP) return IMPOSSIBLE;
 
     const float duration = (float)spread / (float)slope * STEP;
@@ -226,32 +227,52 @@ answer_t ramp(
     return answer;
 }
 
-answer_t hypothesis(
-    const samples_t *samples, const query_t query, const int begin, const int length, const float enough)
-{
-    const int end = begin + length;
-    const int before = begin - samples->low, after = samples->high - end;
-    const float noise = query.noise, slack = (noise / SPREAD) * (noise / SPREAD);
+// The samples on the dark level before each slot, and on the light level from it on: levels above dark and below light,
+// and misfits. A misfit grows with the number of samples.
+typedef struct {
+    float dark[SLOTS + 1], missing[SLOTS + 1], before[SLOTS + 1], after[SLOTS + 1];
+    float slack;
+} ends_t;
 
-    const int low_sum = samples->values[begin] - samples->values[samples->low];
-    const int lack = after * (int)STEP - (samples->values[samples->high] - samples->values[end]);
-    const int low_square = samples->squares[begin] - samples->squares[samples->low];
-    const int high_square = samples->squares[samples->high] - samples->squares[end];
-    const int lack_square = high_square + (int)STEP * (2 * lack - after * (int)STEP);
-    const float dark = low_sum / STEP / (before + slack), missing = lack / STEP / (after + slack);
-    const float misfit = low_square / (STEP * STEP) - low_sum / STEP * dark
-        + lack_square / (STEP * STEP) - lack / STEP * missing;
+ends_t ends_of(const samples_t *samples, const float noise)
+{
+    ends_t ends;
+    const float slack = (noise / SPREAD) * (noise / SPREAD);
+    ends.slack = slack;
+    for (int slot = samples->low; slot <= samples->high; ++slot) {
+        const int before = slot - samples->low, after = samples->high - slot;
+        const int low_sum = samples->values[slot] - samples->values[samples->low];
+        const int lack = after * (int)STEP - (samples->values[samples->high] - samples->values[slot]);
+        const int low_square = samples->squares[slot] - samples->squares[samples->low];
+        const int high_square = samples->squares[samples->high] - samples->squares[slot];
+        const int lack_square = high_square + (int)STEP * (2 * lack - after * (int)STEP);
+        ends.dark[slot] = low_sum / STEP / (before + slack);
+        ends.missing[slot] = lack / STEP / (after + slack);
+        ends.before[slot] = low_square / (STEP * STEP) - low_sum / STEP * ends.dark[slot];
+        ends.after[slot] = lack_square / (STEP * STEP) - lack / STEP * ends.missing[slot];
+    }
+    return ends;
+}
+
+// The hypothesis of some samples in transition; `bent` is the misfit of a line through them.
+answer_t hypothesis(
+    const samples_t *samples, const query_t query, const ends_t *ends, const int begin, const int length, const float enough,
+    float *bent)
+{
+    const int end = begin + length, before = begin - samples->low, after = samples->high - end;
+    const float noise = query.noise, dark = ends->dark[begin], missing = ends->missing[end];
+    const float misfit = ends->before[begin] + ends->after[end];
     if (misfit > enough) return IMPOSSIBLE;
 
     levels_t levels = {dark, 1 - missing, query.level, 0};
     if (query.own) {
         const float low_part = (1 - query.level) * noise, high_part = query.level * noise;
         levels.wanted = dark + query.level * (levels.light - dark);
-        levels.unsure = low_part * low_part / (before + slack) + high_part * high_part / (after + slack);
+        levels.unsure = low_part * low_part / (before + ends->slack) + high_part * high_part / (after + ends->slack);
     }
     answer_t answer = {0, 1, begin - REACH - 0.5f, 1 / 12.0f};
     if (length == 1) answer = single(samples, begin, levels, noise);
-    if (length > 1) answer = ramp(samples, begin, length, levels, noise, enough - misfit);
+    if (length > 1) answer = ramp(samples, begin, length, levels, noise, enough - misfit, bent);
     answer.misfit += misfit;
     return answer;
 }
@@ -260,14 +281,29 @@ answer_t hypothesis(
 // relative to the most likely hypothesis.
 float3 weigh(const samples_t *samples, const query_t query)
 {
+    const ends_t ends = ends_of(samples, query.noise);
     const float scale = 1 / (query.noise * query.noise);
     float best = INFINITY, enough = INFINITY, weight = 0, mean = 0, square = 0;
+    for (int slot = samples->low + 1; slot < samples->high; ++slot)
+        enough = fmin(enough, ends.before[slot] + ends.after[slot] + NEGLIGIBLE / scale);
+
+    // The misfit of each part grows with the part. Hence the dark part ends at `last` or before, the light part
+    // begins at `first` or later, and a line can fit only where both lines that are shorter by a sample fit.
+    int last = samples->high, first = samples->low;
+    uint fits = ~0u;  // a bit for each first slot of a line
     for (int length = 0; length <= SLOTS; ++length) {
+        while (last > samples->low && ends.before[last] > enough) --last;
+        while (first < samples->high && ends.after[first] > enough) ++first;
+        if (length > 2) fits &= fits >> 1;
         const int least = length < 2;  // these need a sample on each level
-        for (int begin = samples->low + least; begin + length <= samples->high - least; ++begin) {
-            const answer_t answer = hypothesis(samples, query, begin, length, enough);
+        const int end = min(last, samples->high - least - length);
+        for (int begin = max(samples->low + least, first - length); begin <= end; ++begin) {
+            if (!(fits >> begin & 1)) continue;
+            float bent = 0;
+            const answer_t answer = hypothesis(samples, query, &ends, begin, length, enough, &bent);
+            if (bent > enough) fits &= ~(1u << begin);
+            if (answer.misfit > enough) continue;
             const float cost = answer.misfit * scale;
-            if (cost > best + NEGLIGIBLE) continue;
             const float lesser = exp(-0.5f * fabs(cost - best));
             const float kept = cost < best ? lesser : 1, share = answer.prior * (cost < best ? 1 : lesser);
             const float sum = weight * kept + share, gap = answer.crossing - mean;
@@ -275,7 +311,7 @@ float3 weigh(const samples_t *samples, const query_t query)
             mean += gap * share / sum;
             weight = sum;
             best = fmin(best, cost);
-            enough = (best + NEGLIGIBLE) / scale;
+            enough = fmin(enough, (best + NEGLIGIBLE) / scale);
         }
     }
     return (float3)(mean, square / weight, best);
