@@ -41,10 +41,22 @@ float share_of(const FRAME sample, const float dark, const float gain)
     return (SATURATED(sample) & ((share - light) * gain < 0)) ? light : share;
 }
 
+#define LIMITED(value, low, high) LESSER(GREATER(value, low), high)
+
 // Round to even in a way that vectorises: above 2^23 a float is an integer. For values below 2^22.
 int round_even(const float value)
 {
     return as_int(value + 12582912.0f) - as_int(12582912.0f);
+}
+
+// Of x <= 0, within 2e-7 of 1.
+float exponential(const float x)
+{
+    const float limited = GREATER(x, -80.0f);
+    const int power = round_even(limited * M_LOG2E_F);
+    const float r = (limited - power * 0.693145752f) - power * 1.42860677e-6f;
+    const float sum = 1 + r * (1 + r * (1 / 2.0f + r * (1 / 6.0f + r * (1 / 24.0f + r * (1 / 120.0f + r * (1 / 720.0f))))));
+    return sum * as_float((power + 127) << 23);
 }
 
 int excess_of_noise(const float quiet, const float gain)
@@ -178,8 +190,8 @@ typedef struct {
 answer_t single(const samples_t *samples, const int begin, const levels_t levels, const float noise)
 {
     const float above = (samples->values[begin + 1] - samples->values[begin]) / STEP - levels.dark;
-    const float rise = fmax(levels.light - levels.dark, 0.1f), share = clamp(above / rise, 0.0f, 1.0f);
-    const float longest = 1 / fmax(share, 1 - share);
+    const float rise = GREATER(levels.light - levels.dark, 0.1f), share = LIMITED(above / rise, 0, 1);
+    const float longest = 1 / GREATER(share, 1 - share);
     const float shift = longest * ((levels.wanted - levels.dark) / rise - share);
     const float known = 2 / 3.0f * longest * noise / rise, missed = above - share * rise;
     answer_t answer;
@@ -214,16 +226,16 @@ answer_t ramp(
     const float arrives = middle + (levels.light - mean) * duration;
     const float early = begin > samples->low ? first - 1 - leaves : 0;
     const float late = end < samples->high ? arrives - first - length : 0;
-    const float away = fmax(fmax(early, leaves - first), 0.0f);
-    const float back = fmax(fmax(late, first + length - 1 - arrives), 0.0f);
-    const float reach = 0.5f * (length + 1), off = clamp((levels.wanted - mean) * duration, -reach, reach);
+    const float away = GREATER(GREATER(early, leaves - first), 0);
+    const float back = GREATER(GREATER(late, first + length - 1 - arrives), 0);
+    const float reach = 0.5f * (length + 1), off = LIMITED((levels.wanted - mean) * duration, -reach, reach);
     answer_t answer;
     answer.misfit = misfit + (away * away + back * back) / (duration * duration);
     answer.prior = RAMP * 2 * M_PI_F * noise * noise * sqrt(12.0f) * duration / length;
     answer.crossing = middle + off;
     const float apart = off * off * length / (float)spread;
     const float variance = noise * noise * (1.0f / length + apart) + levels.unsure;
-    answer.variance = fmin(variance * duration * duration, reach * reach / 3);
+    answer.variance = LESSER(variance * duration * duration, reach * reach / 3);
     return answer;
 }
 
@@ -239,7 +251,7 @@ ends_t ends_of(const samples_t *samples, const float noise)
     ends_t ends;
     const float slack = (noise / SPREAD) * (noise / SPREAD);
     ends.slack = slack;
-    for (int slot = samples->low; slot <= samples->high; ++slot) {
+    for (int slot = 0; slot <= SLOTS; ++slot) {  // those outside of the range are not used
         const int before = slot - samples->low, after = samples->high - slot;
         const int low_sum = samples->values[slot] - samples->values[samples->low];
         const int lack = after * (int)STEP - (samples->values[samples->high] - samples->values[slot]);
@@ -277,15 +289,15 @@ answer_t hypothesis(
     return answer;
 }
 
-// Mean and variance over all hypotheses by weight, and the least misfit in squared sigmas. The sums are
-// relative to the most likely hypothesis.
+// Mean and variance over all hypotheses by weight, and the least misfit in squared sigmas. The sums are of crossings
+// relative to that of the most likely hypothesis.
 float3 weigh(const samples_t *samples, const query_t query)
 {
     const ends_t ends = ends_of(samples, query.noise);
     const float scale = 1 / (query.noise * query.noise);
-    float best = INFINITY, enough = INFINITY, weight = 0, mean = 0, square = 0;
+    float best = INFINITY, enough = INFINITY, likely = 0, weight = 0, sum = 0, square = 0;
     for (int slot = samples->low + 1; slot < samples->high; ++slot)
-        enough = fmin(enough, ends.before[slot] + ends.after[slot] + NEGLIGIBLE / scale);
+        enough = LESSER(enough, ends.before[slot] + ends.after[slot] + NEGLIGIBLE / scale);
 
     // The misfit of each part grows with the part. Hence the dark part ends at `last` or before, the light part
     // begins at `first` or later, and a line can fit only where both lines that are shorter by a sample fit.
@@ -304,17 +316,25 @@ float3 weigh(const samples_t *samples, const query_t query)
             if (bent > enough) fits &= ~(1u << begin);
             if (answer.misfit > enough) continue;
             const float cost = answer.misfit * scale;
-            const float lesser = exp(-0.5f * fabs(cost - best));
-            const float kept = cost < best ? lesser : 1, share = answer.prior * (cost < best ? 1 : lesser);
-            const float sum = weight * kept + share, gap = answer.crossing - mean;
-            square = square * kept + share * answer.variance + gap * gap * share * (weight * kept) / sum;
-            mean += gap * share / sum;
-            weight = sum;
-            best = fmin(best, cost);
-            enough = fmin(enough, (best + NEGLIGIBLE) / scale);
+            const float lesser = exponential(-0.5f * fabs(cost - best));
+            float share = answer.prior, away = answer.crossing - likely;
+            if (cost < best) {
+                square = (square - 2 * away * sum + away * away * weight) * lesser;
+                sum = (sum - away * weight) * lesser;
+                weight *= lesser;
+                likely += away;
+                away = 0;
+            } else
+                share *= lesser;
+            weight += share;
+            sum += share * away;
+            square += share * (answer.variance + away * away);
+            best = LESSER(best, cost);
+            enough = LESSER(enough, (best + NEGLIGIBLE) / scale);
         }
     }
-    return (float3)(mean, square / weight, best);
+    const float mean = sum / weight;
+    return (float3)(likely + mean, GREATER(square / weight - mean * mean, 0), best);
 }
 
 // The variance of a crossing between two samples in transition if the edge is blurred by a lens, in excess of
@@ -332,7 +352,7 @@ float variance_of_blur(const samples_t *samples, const query_t query, const floa
     const float both = first * first + first * second + second * second, share = (level - low) / rise;
     const float bent = share * (1 + BENT * (middle * middle + middle * first + first * first)) / (1 + BENT * both);
     const float off = frame + bent - crossing, known = query.noise / rise;
-    return fmax(off * off - known * known * (share * share + (1 - share) * (1 - share)), 0.0f);
+    return GREATER(off * off - known * known * (share * share + (1 - share) * (1 - share)), 0.0f);
 }
 
 // The same without the misfit, and with a variance that includes it and the blur.
@@ -359,9 +379,9 @@ void gather(
     for (int i = samples->low; i < samples->high; ++i) {
         const int number = start - REACH + i;
         const float share = share_of(ring[(size_t)(number % SLOTS) * pixels + pixel], dark, gain);
-        values[i] = convert_int_rte(clamp(share, -1.0f, 2.0f) * STEP);
+        values[i] = round_even(LIMITED(share, -1, 2) * STEP);
     }
-    const int limit = convert_int_rte(SPIKE * noise * STEP);
+    const int limit = round_even(SPIKE * LESSER(noise, 100) * STEP);
     samples->values[0] = samples->moments[0] = samples->squares[0] = 0;
     for (int i = 0; i < SLOTS; ++i) {
         int value = i >= samples->low && i < samples->high ? values[i] : 0;
@@ -409,14 +429,14 @@ __kernel void changepoint_heights(
         status[p] = start[p] == INVALID ? 0 : never ? 2 : start[p] == 0 ? 3 : 1;
         if (status[p] != 1) continue;
 
-        const float spread = fmax(noise * fabs(gain[p]), STRAIGHT);
+        const float spread = GREATER(noise * fabs(gain[p]), STRAIGHT);
         samples_t samples;
         gather(&samples, p, pixels, count, start[p], since[p], dark[p], gain[p], spread, ring);
         const float dim = start[p] - below[p];
         const int hovered = dim > REACH && is_flat(&samples, spread);
         const float2 crossing = hovered ? (float2)(-dim / 2, dim * dim / 12)
                                         : estimate(&samples, (query_t){spread, level, own});
-        const float middle = clamp(crossing.x, (float)-start[p], (float)(count - 1 - start[p]));
+        const float middle = LIMITED(crossing.x, (float)-start[p], (float)(count - 1 - start[p]));
         const float deviation = sqrt(crossing.y);
         const float2 at = travel_at(travel, count, start[p], middle);
         const float2 late = travel_at(travel, count, start[p], middle + deviation);
