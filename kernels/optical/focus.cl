@@ -2,45 +2,138 @@
 //
 // TILE     pixels of one work-item: 1 on a GPU, many on a CPU
 // FRAME    type of a sample
+// BITS     its width
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
+
+#define STRIP (TILE < 256 ? TILE : 256)  // pixels of a row that are processed together
+#define CHUNK 32
+#define WIDEST 50
+
+// Sums of squares of differences from the middle lose no digits.
+#define CONTRAST(sum, square, count) ((square) - (sum) * (sum) / (count))
+
+// Updates the peaks of some pixels by their contrast in frame t.
+void remember(
+    const float *sharp, const int p, const int width, const size_t plane, const int t, const int reach,
+    __global int *restrict best, OUT peak, OUT recent)
+{
+    OUT top = peak + reach * plane;
+    for (int low = 0; low < width; low += CHUNK) {
+        const int end = min(low + CHUNK, width);
+        int better[CHUNK], since[CHUNK], changed = 0;
+        for (int i = low; i < end; ++i) {
+            better[i - low] = (t == 0) | (sharp[i] > top[p + i]) | (top[p + i] != top[p + i]);
+            since[i - low] = better[i - low] ? 0 : t - best[p + i];
+            changed |= since[i - low] <= reach;
+        }
+        for (int k = 1; changed && k <= reach; ++k) {
+            OUT before = top - k * plane + p;
+            OUT after = top + k * plane + p;
+            MAP earlier = recent + (t - k + (k > t ? reach : 0)) % reach * plane + p;
+            for (int i = low; i < end; ++i) {
+                const float kept = before[i], last = k > t ? NAN : earlier[i];
+                before[i] = better[i - low] ? last : kept;
+                after[i] = better[i - low] ? NAN : since[i - low] == k ? sharp[i] : after[i];
+            }
+        }
+        for (int i = low; changed && i < end; ++i) {
+            top[p + i] = better[i - low] ? sharp[i] : top[p + i];
+            best[p + i] = better[i - low] ? t : best[p + i];
+        }
+    }
+    OUT now = recent + t % reach * plane + p;
+    for (int i = 0; i < width; ++i) now[i] = sharp[i];
+}
+
+#if TILE > 1 && BITS < 32
+// Sums along columns move down row by row, and their sums along rows to the right, in integers.
+#if BITS == 8
+typedef int Sum;
+#else
+typedef long Sum;
+#endif
+
+void add_row(__global const FRAME *row, const int width, const int sign, Sum *restrict sums, Sum *restrict squares)
+{
+    for (int i = 0; i < width; ++i) {
+        const Sum sample = row[i];
+        sums[i] += sign * sample;
+        squares[i] += sign * sample * sample;
+    }
+}
+#endif
 
 __kernel void focus_scan(
     __global const FRAME *restrict frames, const int count, const int rows, const int columns, const int stride,
     const int first, const int radius, const int reach, __global int *restrict best, OUT peak, OUT recent)
 {
-    const int pixels = rows * columns, low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
+    const int pixels = rows * columns;
+#if TILE == 1
+    const int row_low = get_global_id(0) / columns, row_end = min(row_low + 1, rows);
+    const int column_low = get_global_id(0) % columns, column_end = column_low + 1;
+#else
+    const long items = (pixels + TILE - 1) / TILE, item = get_global_id(0);
+    const int row_low = min(item, items) * rows / items, row_end = min(item + 1, items) * rows / items;
+    const int column_low = 0, column_end = columns;
+#endif
     for (int t = first; t < first + count; ++t) {
         __global const FRAME *restrict frame = frames + (size_t)(t - first) * pixels;
-        for (int p = low; p < end; ++p) {
-            const int row = p / columns, column = p % columns;
-            const int top = max(row - radius, 0), bottom = min(row + radius, rows - 1);
-            const int left = max(column - radius, 0), right = min(column + radius, columns - 1);
-            const float middle = frame[p];  // squares of differences from it lose no digits
-            float sum = 0, square = 0;
-            for (int y = top; y <= bottom; ++y)
-                for (int x = left; x <= right; ++x) {
-                    const float difference = frame[(size_t)y * columns + x] - middle;
-                    sum += difference;
-                    square += difference * difference;
+        for (int base = column_low; base < column_end; base += STRIP) {
+            const int width = min(STRIP, column_end - base);
+            int wide[STRIP];
+            for (int i = 0; i < width; ++i)
+                wide[i] = LESSER(base + i + radius, columns - 1) - GREATER(base + i - radius, 0) + 1;
+#if TILE > 1 && BITS < 32
+            Sum sums[STRIP + 2 * WIDEST + 1], squares[STRIP + 2 * WIDEST + 1];
+            const int leftmost = max(base - radius, 0), used = min(base + width + radius, columns) - leftmost;
+            const int start = leftmost - (base - radius);
+            for (int i = 0; i < width + 2 * radius + 1; ++i) sums[i] = squares[i] = 0;
+            for (int y = max(row_low - radius, 0); y < min(row_low + radius, rows); ++y)
+                add_row(frame + (size_t)y * columns + leftmost, used, 1, sums + start, squares + start);
+#endif
+            for (int row = row_low; row < row_end; ++row) {
+                const int top = max(row - radius, 0), bottom = min(row + radius, rows - 1);
+                __global const FRAME *restrict middle = frame + (size_t)row * columns + base;
+                float sharp[STRIP], sum[STRIP], square[STRIP];
+#if TILE > 1 && BITS < 32
+                if (row + radius < rows)
+                    add_row(frame + (size_t)(row + radius) * columns + leftmost, used, 1, sums + start, squares + start);
+                if (row - radius > 0 && row > row_low)
+                    add_row(frame + (size_t)(row - radius - 1) * columns + leftmost, used, -1, sums + start, squares + start);
+                Sum total[STRIP], all[STRIP], moving = 0, moving_square = 0;
+                for (int i = 0; i < 2 * radius; ++i) {
+                    moving += sums[i];
+                    moving_square += squares[i];
                 }
-            const float sharp = square - sum * sum / ((bottom - top + 1) * (right - left + 1));
-
-            OUT at = peak + p;
-            OUT before = recent + p;
-            const size_t plane = stride;
-            const int since = t - best[p];
-            if (t == 0 || sharp > at[reach * plane] || at[reach * plane] != at[reach * plane]) {
-                for (int k = 1; k <= reach; ++k) {
-                    at[(reach - k) * plane] = k <= t ? before[((t - k) % reach) * plane] : NAN;
-                    at[(reach + k) * plane] = NAN;
+                for (int i = 0; i < width; ++i) {
+                    total[i] = moving += sums[i + 2 * radius];
+                    all[i] = moving_square += squares[i + 2 * radius];
+                    moving -= sums[i];
+                    moving_square -= squares[i];
                 }
-                at[reach * plane] = sharp;
-                best[p] = t;
-            } else if (since <= reach)
-                at[(reach + since) * plane] = sharp;
-            before[(t % reach) * plane] = sharp;
+                for (int i = 0; i < width; ++i) {
+                    const Sum size = (bottom - top + 1) * wide[i], sample = middle[i];
+                    sum[i] = total[i] - size * sample;
+                    square[i] = all[i] - 2 * sample * total[i] + size * sample * sample;
+                }
+#else
+                for (int i = 0; i < width; ++i) sum[i] = square[i] = 0;
+                for (int y = top; y <= bottom; ++y)
+                    for (int x = -radius; x <= radius; ++x) {
+                        __global const FRAME *restrict other = frame + (size_t)y * columns + base + x;
+                        const int end = min(width, columns - base - x);
+                        for (int i = max(0, -base - x); i < end; ++i) {
+                            const float difference = other[i] - (float)middle[i];
+                            sum[i] += difference;
+                            square[i] += difference * difference;
+                        }
+                    }
+#endif
+                for (int i = 0; i < width; ++i) sharp[i] = CONTRAST(sum[i], square[i], (bottom - top + 1) * wide[i]);
+                remember(sharp, row * columns + base, width, stride, t, reach, best, peak, recent);
+            }
         }
     }
 }
@@ -50,15 +143,29 @@ __kernel void focus_scan(
 #define AT_AN_END 3
 #define INVALID 0
 
-#define SIGNAL(k) (peak[(k) * plane + p] - noisy)
+#define BLOCK (TILE < 64 ? TILE : 64)
+#define EACH for (int i = 0, p = base; i < width; ++i, ++p)
 
-// Inverse variance of the signal's logarithm for noise of variance 1, from a non-central chi-square.
-#define WEIGHT(signal) ((signal) > 0 ? (signal) * ((signal) / (2 * noisy + 4 * (signal))) : 0)
+// Natural logarithm of a positive number, by the series of its inverse hyperbolic tangent.
+float logarithm(const float x)
+{
+    const int power = (as_int(x) - 0x3f3504f3) >> 23;  // x / 2^power is between root 1/2 and root 2
+    const float part = as_float(as_int(x) - (power << 23)), s = (part - 1) / (part + 1), square = s * s;
+    const float sum = s * (2 + square * (2 / 3.0f + square * (2 / 5.0f + square * (2 / 7.0f + square * (2 / 9.0f)))));
+    return power * M_LN2_F + sum;
+}
 
-// One of the points of the fit; used in a loop over k.
-#define POINT                                                                     \
-    const float signal = SIGNAL(k), weight = WEIGHT(signal), place = at[k];       \
-    if (!(weight > 0)) continue;
+#define SIGNAL(k) (peak[(k) * plane + p] - noisy[i])
+
+// One of the points of the fit; its weight is the inverse variance of the logarithm for noise of variance 1, from a
+// non-central chi-square, or 0 without a signal.
+#define POINT                                                                                                   \
+    const float signal = SIGNAL(k), place = places[best[p] * (2 * reach + 1) + k];                              \
+    const float weight = signal > 0 ? signal * (signal / (2 * noisy[i] + 4 * signal)) : 0;
+// The same, and the polynomials that are orthogonal over the positions.
+#define POLYNOMIALS                                                                                             \
+    POINT const float line = place - mean[i], parabola = line * line - skew[i] * line - norm[i] / total[i];     \
+    const float value = weight > 0 ? logarithm(signal / top[i]) : 0;
 
 __kernel void focus_fit(
     const int rows, const int columns, const int stride, const int count, const int radius, const int reach, const float variance,
@@ -66,71 +173,79 @@ __kernel void focus_fit(
     __global const int *restrict best, MAP peak, OUT height, OUT spread, OUT gain, OUT misfit, OUT sharpness,
     __global uchar *restrict status)
 {
-    const int pixels = rows * columns, low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
+    const int pixels = rows * columns, low = get_global_id(0) * TILE, limit = min(pixels, low + TILE);
     const size_t plane = stride;
-    for (int p = low; p < end; ++p) {
-        const int row = p / columns, column = p % columns, sharpest = best[p];
-        const int high = min(row + radius, rows - 1) - max(row - radius, 0) + 1;
-        const int wide = min(column + radius, columns - 1) - max(column - radius, 0) + 1;
-        const float freedom = high * wide - 1, noisy = freedom * variance, top = SIGNAL(reach);
-        MAP at = places + sharpest * (2 * reach + 1);
-
-        // Polynomials that are orthogonal over the positions, and their sums with the logarithms.
-        float total = 0, mean = 0, norm = 0, skew = 0, bent = 0, level = 0, along = 0, across = 0;
-        int points = 0;
-        for (int k = 0; k <= 2 * reach; ++k) {
-            POINT
-            total += weight;
-            mean += weight * place;
-            points += 1;
+    for (int base = low; base < limit; base += BLOCK) {
+        const int width = min(BLOCK, limit - base);
+        float freedom[BLOCK], noisy[BLOCK], top[BLOCK], points[BLOCK], total[BLOCK], mean[BLOCK], norm[BLOCK], skew[BLOCK];
+        float bent[BLOCK], level[BLOCK], along[BLOCK], across[BLOCK], residual[BLOCK], taken[BLOCK], moved[BLOCK];
+        EACH {
+            const int row = p / columns, column = p % columns;
+            const int high = LESSER(row + radius, rows - 1) - GREATER(row - radius, 0) + 1;
+            const int wide = LESSER(column + radius, columns - 1) - GREATER(column - radius, 0) + 1;
+            freedom[i] = high * wide - 1;
+            noisy[i] = freedom[i] * variance;
+            top[i] = SIGNAL(reach);
+            points[i] = total[i] = mean[i] = norm[i] = skew[i] = bent[i] = 0;
+            level[i] = along[i] = across[i] = residual[i] = taken[i] = moved[i] = 0;
         }
-        mean /= total;
-        for (int k = 0; k <= 2 * reach; ++k) {
+        for (int k = 0; k <= 2 * reach; ++k) EACH {
             POINT
-            const float first = place - mean;
-            norm += weight * first * first;
-            skew += weight * first * first * first;
+            total[i] += weight;
+            mean[i] += weight * place;
+            points[i] += weight > 0 ? 1 : 0;
         }
-        skew /= norm;
-        for (int k = 0; k <= 2 * reach; ++k) {
+        EACH mean[i] /= total[i];
+        for (int k = 0; k <= 2 * reach; ++k) EACH {
             POINT
-            const float first = place - mean, second = first * first - skew * first - norm / total;
-            const float value = log(signal / top);
-            bent += weight * second * second;
-            level += weight * value;
-            along += weight * value * first;
-            across += weight * value * second;
+            const float line = place - mean[i];
+            norm[i] += weight * line * line;
+            skew[i] += weight * line * line * line;
         }
-        level /= total;
-        along /= norm;
-        across /= bent;
-        float residual = 0, taken = 0, each = 0;
-        for (int k = 0; k <= 2 * reach; ++k) {
-            POINT
-            const float first = place - mean, second = first * first - skew * first - norm / total;
-            const float missed = log(signal / top) - level - along * first - across * second;
-            const float moves = weight * (first / norm - along / across * second / bent);
-            residual += weight * missed * missed;
-            taken += weight * weight * (1 / total + first * first / norm + second * second / bent);
-            each += moves * moves;
+        EACH skew[i] /= norm[i];
+        for (int k = 0; k <= 2 * reach; ++k) EACH {
+            POLYNOMIALS
+            bent[i] += weight * parabola * parabola;
+            level[i] += weight * value;
+            along[i] += weight * value * line;
+            across[i] += weight * value * parabola;
         }
-        const float vertex = mean + skew / 2 - along / (2 * across), scale = unit / (2 * across), free = total - taken;
-        const float curvature = across < 0 ? across * across * bent : 0;
-        int found = points > 2 && top > least_contrast * variance * sqrt(2 * freedom)
-            && curvature > least_curvature * least_curvature * variance;
-        const float chi = 1 - 2 / (9 * (points - 3.0f));
-        misfit[p] = found && points > 3 && free > 0
-            ? (residual / (chi * chi * chi) - (points - 3) * variance) / free : NAN;
-        const float before = at[reach - 1], after = at[reach + 1];
-        found &= vertex > LESSER(LESSER(before, after), 0) && vertex < GREATER(GREATER(before, after), 0);
-        int code = found ? IN_FOCUS : NO_PEAK;
-        if (sharpest == 0 || sharpest == count - 1) code = AT_AN_END;
-        if (!(top - top == 0)) code = INVALID;
-        found = code == IN_FOCUS;
-        status[p] = code;
-        height[p] = found ? -(travel[sharpest] + unit * vertex) : NAN;
-        spread[p] = found ? (1 / norm + along / across * (along / across) / bent) * scale * scale : NAN;
-        gain[p] = each * scale * scale;
-        sharpness[p] = top < 0 ? 0 : sqrt(top / GREATER(freedom, 1));
+        EACH {
+            level[i] /= total[i];
+            along[i] /= norm[i];
+            across[i] /= bent[i];
+        }
+        for (int k = 0; k <= 2 * reach; ++k) EACH {
+            POLYNOMIALS
+            const float missed = weight > 0 ? value - level[i] - along[i] * line - across[i] * parabola : 0;
+            const float moves = weight * (line / norm[i] - along[i] / across[i] * parabola / bent[i]);
+            residual[i] += weight * missed * missed;
+            taken[i] += weight * weight * (1 / total[i] + line * line / norm[i] + parabola * parabola / bent[i]);
+            moved[i] += moves * moves;
+        }
+        EACH {
+            const int sharpest = best[p];
+            MAP at = places + sharpest * (2 * reach + 1);
+            const float vertex = mean[i] + skew[i] / 2 - along[i] / (2 * across[i]);
+            const float scale = unit / (2 * across[i]), free = total[i] - taken[i];
+            const float curvature = across[i] < 0 ? across[i] * across[i] * bent[i] : 0;
+            int fitted = points[i] > 2 && top[i] > least_contrast * variance * sqrt(2 * freedom[i])
+                && curvature > least_curvature * least_curvature * variance;
+            const float chi = 1 - 2 / (9 * (points[i] - 3));
+            misfit[p] = fitted && points[i] > 3 && free > 0
+                ? (residual[i] / (chi * chi * chi) - (points[i] - 3) * variance) / free : NAN;
+            const float before = at[reach - 1], after = at[reach + 1];
+            fitted &= vertex > LESSER(LESSER(before, after), 0) && vertex < GREATER(GREATER(before, after), 0);
+            int code = fitted ? IN_FOCUS : NO_PEAK;
+            if (sharpest == 0 || sharpest == count - 1) code = AT_AN_END;
+            if (!(top[i] - top[i] == 0)) code = INVALID;
+            fitted = code == IN_FOCUS;
+            status[p] = code;
+            height[p] = fitted ? -(travel[sharpest] + unit * vertex) : NAN;
+            const float tilt = along[i] / across[i];
+            spread[p] = fitted ? (1 / norm[i] + tilt * tilt / bent[i]) * scale * scale : NAN;
+            gain[p] = moved[i] * scale * scale;
+            sharpness[p] = top[i] < 0 ? 0 : sqrt(top[i] / GREATER(freedom[i], 1));
+        }
     }
 }

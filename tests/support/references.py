@@ -94,7 +94,7 @@ def agree(
     rows, columns = values.pop("shape", (1, 1))
     macros, frames = values.get("macros", {}), values.get("frames", values.get("frame"))
     if isinstance(frames, np.ndarray):
-        macros = {"FRAME": C_TYPES[frames.dtype.name]} | macros
+        macros = {"FRAME": C_TYPES[frames.dtype.name], "BITS": 8 * frames.itemsize} | macros
     kernel = device.kernel(KERNELS[name], name, **macros)
     pixels, tile = rows * columns, device.layout.tile
     sizes = {"rows": rows, "columns": columns, "pixels": pixels}
