@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 from weakref import proxy
 
 import numpy as np
@@ -196,6 +196,11 @@ class Picture:
             return self.bands[0].maps[name]
         (values,) = self.read(name)
         return self.bands[0].device.from_host(name, values, values.dtype)
+
+    def view(self, name: str) -> AnyArray:
+        """Return a map, (H, W), as a view on the host if the device shares its memory, else on the device."""
+        array = self.array(name)
+        return np.from_dlpack(cast(Any, array)) if array.device.info.shares_memory else array
 
     def _fetch(self, parts: Sequence[Part], keep: bool) -> list[NDArray[Any]]:
         chosen, planes = [_named(part) for part in parts], dict[str, list[int]]()

@@ -8,8 +8,9 @@ are summed as pairs of floats, in the order of the frames. See `mirrorskin.kerne
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,6 +44,8 @@ class CorrelationOperation(Operation):
 
     dtypes = FRAME_DTYPES
     for_device = True
+    _more_maps: ClassVar[Mapping[str, Any]] = {}
+    """Types of maps that are computed from the fit, besides its own."""
 
     def _window(self) -> int | None:
         """Return the number of the last frames that are fitted; None for all."""
@@ -77,8 +80,11 @@ class CorrelationOperation(Operation):
 
     def _fit(self) -> Result:
         """Return the fit of the frames so far, or of those in the window."""
-        sums = self._sums if self._stack is None else StackSums(self, *self._stack)
-        return sums.result(on_host=self._window() is not None)
+        return self._frame_sums().result(on_host=self._window() is not None)
+
+    def _frame_sums(self) -> TurnSums | WindowSums | StackSums:
+        """Return the sums over the frames so far, or over those in the window."""
+        return self._sums if self._stack is None else StackSums(self, *self._stack)
 
 
 class Correlate(CorrelationOperation):
@@ -181,9 +187,7 @@ class _Sums:
 
     def result(self, *, on_host: bool = False) -> Result:
         """Return the fit, with maps on the device if frames are; InputError if phases do not determine it."""
-        used = self.weight > 0
-        check_phases(self.phase[used], self.weight[used])
-        self._solve()
+        used = self.solve()
         mean, cosine, sine, residual = self.maps.take(*_FIT, on_host=on_host)
         return Result(
             mean=mean,
@@ -194,6 +198,13 @@ class _Sums:
             residual=residual,
             process={"frames": int(np.count_nonzero(used))},
         )
+
+    def solve(self) -> NDArray[np.bool_]:
+        """Compute the maps of the fit, and return which frames have a weight; see `result`."""
+        used = self.weight > 0
+        check_phases(self.phase[used], self.weight[used])
+        self._solve()
+        return used
 
     def _solve(self) -> None:
         """Compute the maps of the fit."""
@@ -217,8 +228,10 @@ class _Sums:
 class StackSums(_Sums):
     """Sums over a complete stack, which one kernel computes and solves, without storing them."""
 
-    def __init__(self, operation: Operation, frames: AnyArray, phase: Doubles, weight: Doubles) -> None:
-        maps = dict.fromkeys(_FIT, np.float32)
+    def __init__(
+        self, operation: CorrelationOperation, frames: AnyArray, phase: Doubles, weight: Doubles
+    ) -> None:
+        maps = {**dict.fromkeys(_FIT, np.float32), **operation._more_maps}
         super().__init__(Picture(operation, "correlation", maps, whole=len(frames)), operation.dtype)
         self.phase, self.weight, self._frames = phase, weight, frames
 
@@ -239,9 +252,10 @@ class StackSums(_Sums):
 class TurnSums(_Sums):
     """Sums over all frames so far: integers until the first weight that is neither 0 nor 1, then pairs."""
 
-    def __init__(self, operation: Operation) -> None:
+    def __init__(self, operation: CorrelationOperation) -> None:
         # Eight bytes are one integer or two floats.
         maps = {**dict.fromkeys(_SUMS, np.int64), **dict.fromkeys(("reference", *_FIT), np.float32)}
+        maps |= operation._more_maps
         super().__init__(Picture(operation, "correlation", maps), operation.dtype)
         self.phase, self.weight = np.empty((2, 0))
         # Number of frames that were summed as integers; None: all.

@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.base.device_arrays import AnyArray, on_host
+from mirrorskin.engine.base.frames import take_places
+from mirrorskin.engine.base.picture import Picture
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, fit_clipped
 
@@ -28,38 +31,36 @@ MIN_BLUR = 0.4
 _SIDE_Z_SCORE = 2.0  # standard errors from which on the blur of a side of the picture is one
 
 
-def with_blur(
-    sigma: NDArray[np.float32], vectors: Sequence[NDArray[np.floating]], strength: NDArray[np.floating]
-) -> NDArray[np.float32]:
-    """Return standard deviations of directions, (H, W) radians, with that because of blur.
+def add_blur(maps: Picture, sigma: str, vectors: Sequence[str], strength: str) -> None:
+    """Add the error because of blur to the standard deviations of directions, radians, a map of a picture.
 
-    ``vectors`` are the components of a signal, (H, W) each and of any length, NaN where unknown; ``strength``
-    is that of the signal, (H, W).
+    ``vectors`` are the maps of the components of a signal, (H, W) each or (H, W, 3) together, of any length
+    and NaN where unknown; ``strength`` is that of the signal, (H, W).
     """
-    variance = find_blur(vectors, strength)
+    variance = find_blur([maps.view(name) for name in vectors], maps.view(strength))
     if variance == 0:
-        return sigma
-    reach = max(1, round(2 * math.sqrt(variance)))
-    length = np.sqrt(np.sum([part * part for part in vectors], axis=0))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        direction = [np.asarray(part / length, np.float32) for part in vectors]
-    kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
-    kernel[[0, reach, reach, -1], [reach, 0, -1, reach]] = 1 / reach**2
-    kernel[reach, reach] = -4 / reach**2
-    bent = [cv2.filter2D(part, -1, kernel, borderType=cv2.BORDER_REPLICATE) for part in direction]
-    along = np.sum([part * other for part, other in zip(bent, direction, strict=True)], axis=0)
-    square = np.sum([part**2 for part in bent], axis=0) - along**2
-    square = np.maximum(square, 0)
-    finite = np.isfinite(square)
-    size = 2 * reach + 1, 2 * reach + 1
-    total, coverage = (
-        cv2.blur(part.astype(np.float32), size) for part in (np.where(finite, square, 0), finite)
-    )
-    mean = np.divide(total, coverage, out=np.zeros_like(total), where=coverage > 0)
-    return np.asarray(np.hypot(sigma, np.float32(variance / 2) * np.sqrt(mean)), np.float32)
+        return
+    parts, spread = [maps.array(name) for name in vectors], maps.array(sigma)
+    device, (rows, columns) = spread.device, spread.shape
+    tile, count = device.layout.tile, 3 if len(parts) == 1 else 2
+    bend = device.array("bend", spread.shape, np.float32, zeroed=False)
+    sizes: dict[str, Any] = {
+        "rows": rows,
+        "columns": columns,
+        "reach": max(1, round(2 * math.sqrt(variance))),
+    }
+
+    def launch(name: str, planes: int, **arguments: Any) -> None:
+        kernel = device.kernel("blur", name, TILE=tile, PARTS=count)
+        kernel(-(-rows * columns // tile), moved=planes * spread.nbytes, bend=bend, **sizes, **arguments)
+
+    launch("blur_bend", count + 1, first=parts[0], second=parts[-1])
+    launch("blur_add", 3, factor=variance / 2, sigma=spread)
+    if len(maps.bands) > 1:
+        maps.fill(sigma, on_host(spread))
 
 
-def find_blur(vectors: Sequence[NDArray[np.floating]], strength: NDArray[np.floating]) -> float:
+def find_blur(vectors: Sequence[AnyArray], strength: AnyArray) -> float:
     """Return the variance of the point spread, pixels^2; 0 if it is not significant.
 
     The logarithm of the strength is fitted by a quadratic of the place, as of uneven light, and the square
@@ -69,25 +70,21 @@ def find_blur(vectors: Sequence[NDArray[np.floating]], strength: NDArray[np.floa
     if min(rows, columns) < 3:
         return 0.0
     thin = max(1, math.isqrt(rows * columns) // GRID_LINES)
-    down, right = np.arange(1, rows - 1, thin), np.arange(1, columns - 1, thin)
-
-    def look(by_rows: int, by_columns: int) -> Doubles:
-        at = np.ix_(down + by_rows, right + by_columns)
-        components = np.stack([part[at] for part in vectors]).astype(np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(components / np.sqrt(np.sum(components**2, axis=0)))
-
-    across, upright = (
-        look(*first) - look(*second) for first, second in (((0, 1), (0, -1)), ((1, 0), (-1, 0)))
-    )
-    turning = np.sum(across**2 + upright**2, axis=0) / 4
-    level = strength[np.ix_(down, right)].astype(np.float64)
+    down, right = range(1, rows - 1, thin), range(1, columns - 1, thin)
+    sampled = take_places([*vectors, strength], down, right, [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)])
+    *parts, levels = sampled
+    if vectors[0].ndim == 2:  # a map for each component
+        parts = [[np.stack(components) for components in zip(*parts, strict=True)]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        east, west, south, north = (_unit(part) for part in parts[0][1:])
+    turning = np.sum((east - west) ** 2 + (south - north) ** 2, axis=0) / 4
+    level = levels[0].astype(np.float64)
     usable = np.isfinite(turning) & (level > 0) & np.isfinite(level)
     if np.count_nonzero(usable) < MIN_PIXELS:
         return 0.0
     y, x = (
         np.broadcast_to(positions, usable.shape)[usable]
-        for positions in np.ix_(2 * down / (rows - 1) - 1, 2 * right / (columns - 1) - 1)
+        for positions in np.ix_(2 * np.array(down) / (rows - 1) - 1, 2 * np.array(right) / (columns - 1) - 1)
     )
     turning, values = turning[usable], np.log(level[usable])
     terms = np.stack([turning, np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
@@ -98,6 +95,12 @@ def find_blur(vectors: Sequence[NDArray[np.floating]], strength: NDArray[np.floa
     sides = (_fit(terms[half], values[half]) for half in (x < 0, x >= 0, y < 0, y >= 0))
     clear = all(side > max(variance / 2, _SIDE_Z_SCORE * its_error) for side, its_error in sides)
     return variance if clear else 0.0
+
+
+def _unit(vectors: NDArray[Any]) -> Doubles:
+    """Return vectors, (components, ...), of length 1."""
+    vectors = vectors.astype(np.float64)
+    return np.asarray(vectors / np.sqrt(np.sum(vectors**2, axis=0)))
 
 
 def _fit(terms: Doubles, values: Doubles) -> tuple[float, float]:

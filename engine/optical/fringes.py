@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, ndtr
 
-from mirrorskin.engine.base.frames import noise_of_residual
+from mirrorskin.engine.base.frames import noise_of_residual, thinned
 from mirrorskin.engine.base.functions import phase_function
 from mirrorskin.engine.base.inputs import Maps, as_result
 from mirrorskin.engine.base.options import option
+from mirrorskin.engine.base.picture import PerPixel
 from mirrorskin.engine.correlation.correlation import CorrelationOperation
 from mirrorskin.engine.correlation.design_matrix import check_weights, fit_matrix
-from mirrorskin.engine.diagnosis.amplitude_blur import with_blur
+from mirrorskin.engine.diagnosis.amplitude_blur import add_blur
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.base.arguments import as_array, as_array_or_number, check_number, checked, in_unit
 from mirrorskin.io.base.findings import carried
@@ -41,6 +42,7 @@ _STRIPES = {
 }
 _WHOLE_FIELD = 1 + 1e-6  # fringes over the field, up to which a phase is absolute; rounded
 _LEAST_SIGMA = 1e-12  # radians
+_ANSWERS = "phase", "phase_sigma", "mean", "modulation", "residual"
 _MISFIT = 4.0  # standard deviations of noise: maximum residual of samples that follow a cosine of the shift
 _UNCLEAR = 0.5  # distance of a bit from the threshold, RMS distances, below which the pixel is on a border
 
@@ -63,6 +65,7 @@ class Fringes(CorrelationOperation):
     """
 
     least_frames = 3
+    _more_maps = dict.fromkeys(("phase", "phase_sigma", "modulation"), np.float32)
 
     noise: ArrayLike | None = option(
         default=None,
@@ -92,34 +95,29 @@ class Fringes(CorrelationOperation):
 
     def result(self) -> dict[str, Any]:
         """Return phase, mean and modulation of the frames so far."""
-        fit, weights = self._fit(), np.concatenate(self._weights)
-        used = weights > 0
+        sums, weights = self._frame_sums(), np.concatenate(self._weights)
+        used, fit = sums.solve(), sums.maps
         freedom = np.count_nonzero(used) - 3
-        modulation, phase = fit.modulation, fit.azimuth
-        seen = np.asarray(math.nan)  # noise estimated from the residuals of the half with more modulation
+        seen = math.nan  # noise estimated from the residuals of the half with more modulation
         if freedom > 0:
-            strong = modulation >= np.median(modulation[np.isfinite(modulation)])
-            seen = np.asarray(noise_of_residual(fit.residual[strong], freedom))
+            cosine, sine, residual = (
+                thinned(fit.view(name)) for name in ("cosine_part", "sine_part", "residual")
+            )
+            square = cosine * cosine + sine * sine
+            seen = noise_of_residual(residual[square >= np.median(square[np.isfinite(square)])], freedom)
         elif self._noise is None:
             raise InputError("3 frames leave no residual to estimate the noise from: specify noise, counts")
-        noise = seen if self._noise is None else self._noise
+        noise = np.asarray(seen if self._noise is None else self._noise, np.float32)
         matrix = fit_matrix(self.positions_so_far("phase")[used], weights[used])
         (cc, cs), (_, ss) = ((matrix @ (matrix / weights[used]).T)[1:, 1:]).tolist()
-        # sin p = sine / modulation, likewise the cosine; without modulation there is no error bound.
-        variance = (cc * fit.sine - 2 * cs * fit.cosine) * fit.sine + ss * fit.cosine * fit.cosine
-        square = modulation * modulation
-        spread = np.full(square.shape, np.inf, np.float32)
-        np.divide(noise.astype(np.float32) * np.sqrt(variance), square, out=spread, where=square != 0)
-        # These samples do not follow a cosine, as at a hot pixel or a moving reflection.
-        misfit = fit.residual > _MISFIT * np.fmax(noise, seen)
-        spread = with_blur(spread, (fit.cosine, fit.sine), modulation)
-        maps = {
-            "phase": np.where(misfit, np.float32(np.nan), phase),
-            "phase_sigma": np.where(misfit, np.float32(np.inf), spread),
-            "mean": fit.mean,
-            "modulation": modulation,
-            "residual": fit.residual,
-        }
+        # sin p = sine / modulation, likewise the cosine; without modulation there is no error bound. Samples
+        # do not follow a cosine where the residual is too large, as at a hot pixel or a moving reflection.
+        fit.run(
+            "fringes_phase", source="fringes", noise=PerPixel(noise), noise_step=noise.ndim // 2, seen=seen,
+            misfit=_MISFIT, cosine_variance=cc, covariance=cs, sine_variance=ss,
+        )  # fmt: skip
+        add_blur(fit, "phase_sigma", ["cosine_part", "sine_part"], "modulation")
+        maps = dict(zip(_ANSWERS, fit.take(*_ANSWERS), strict=True))
         return maps if noise.ndim else maps | {"noise": float(noise)}
 
 

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.base.frames import noise_of_residual
+from mirrorskin.engine.base.frames import noise_of_residual, thinned
 from mirrorskin.engine.base.functions import optional_phase_function
 from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.options import option
-from mirrorskin.engine.base.picture import PerFrame, Picture
+from mirrorskin.engine.base.picture import PerFrame, PerPixel, Picture
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.base.tiling import Planes
-from mirrorskin.engine.diagnosis.amplitude_blur import with_blur
+from mirrorskin.engine.diagnosis.amplitude_blur import add_blur
 from mirrorskin.io import InputError, Map, Result
 from mirrorskin.io.base.arguments import as_array
 from mirrorskin.io.base.findings import Finding, with_findings
@@ -34,10 +34,10 @@ _PLANES: Mapping[str, Any] = {
     "darks": np.float32,
     "triangle": Planes(11, np.float32),  # least squares of the frames so far, see lambert.cl
     "normals": np.dtype((np.float32, 3)),
-    **dict.fromkeys(("albedo", "residual", "normals_spread", "albedo_spread"), np.float32),
+    **dict.fromkeys(("albedo", "residual", "normals_sigma", "albedo_sigma"), np.float32),
     "samples": np.int32,
 }
-_ANSWERS = "normals", "albedo", "residual", "samples", "normals_spread", "albedo_spread"
+_ANSWERS = "normals", "albedo", "residual", "samples", "normals_sigma", "albedo_sigma"
 
 
 class ResponseLinearity(Step):
@@ -181,14 +181,16 @@ class PhotometricStereo(Operation):
         if self.ended and self._lights is not None:
             self._check_lights(self.count, len(self._lights) == self.count)
         self._maps.run("lambert_normals")
+        noise = self._noise
+        if noise is None:
+            residual, samples = (thinned(self._maps.view(name)) for name in ("residual", "samples"))
+            noise = np.asarray(noise_of_residual(residual, samples - 3), np.float32)
+        self._maps.run(
+            "lambert_scale", noise=PerPixel(noise), noise_step=noise.ndim // 2, limits=_limits(self.count)
+        )
+        add_blur(self._maps, "normals_sigma", ["normals"], "albedo")
         maps = dict(zip(_ANSWERS, self._maps.take(*_ANSWERS), strict=True))
-        normals, albedo, residual, samples = (np.asarray(maps[name]) for name in _ANSWERS[:4])
-        noise = noise_of_residual(residual, samples - 3) if self._noise is None else self._noise
-        scale = np.asarray(noise, np.float32) * _misfit(residual, samples - 3, noise)
-        for name in ("normals", "albedo"):
-            maps[f"{name}_sigma"] = np.asarray(maps.pop(f"{name}_spread")) * scale
-        maps["normals_sigma"] = with_blur(maps["normals_sigma"], [*np.moveaxis(normals, -1, 0)], albedo)
-        return maps if np.ndim(noise) or np.isnan(noise) else maps | {"noise": float(noise)}
+        return maps if noise.ndim or np.isnan(noise) else maps | {"noise": float(noise)}
 
 
 photometric_stereo = optional_phase_function(
@@ -228,16 +230,13 @@ photometric_stereo = optional_phase_function(
 )
 
 
-def _misfit(residual: NDArray[Any], freedom: NDArray[Any], noise: Any) -> NDArray[Any]:
-    """Return the residual over the noise where noise does not explain it, such as gloss; 1 elsewhere."""
-    freedom = np.maximum(freedom, 0)
+def _limits(frames: int) -> NDArray[np.float32]:
+    """Return the largest residual that noise of 1 explains, unlike gloss, by the degrees of freedom."""
     # The cube root of chi^2 / n is nearly normal (Wilson and Hilferty, PNAS 17, 1931).
-    spread = 2 / (9 * np.maximum(np.arange(freedom.max() + 1), 1))
-    limit = ((1 - spread + _BEYOND * np.sqrt(spread)) ** 1.5).astype(np.float32)
-    limit[0] = np.inf
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = residual / np.asarray(noise, np.float32)
-        return np.where(ratio > limit[freedom], ratio, np.float32(1))
+    spread = 2 / (9 * np.maximum(np.arange(frames + 1), 1))
+    limits = ((1 - spread + _BEYOND * np.sqrt(spread)) ** 1.5).astype(np.float32)
+    limits[0] = np.inf
+    return limits
 
 
 def _power(light: Doubles, lamps: Doubles) -> float:

@@ -83,7 +83,7 @@ __kernel void lambert_add(
 #define LEAST_PIVOT 1e-3f
 
 __kernel void lambert_normals(
-    const int pixels, const int stride, MAP triangle, OUT normals, OUT normals_spread, OUT albedo, OUT albedo_spread, OUT residual,
+    const int pixels, const int stride, MAP triangle, OUT normals, OUT normals_sigma, OUT albedo, OUT albedo_sigma, OUT residual,
     __global int *restrict samples)
 {
     const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
@@ -108,10 +108,24 @@ __kernel void lambert_normals(
         normals[3 * p] = answered ? x : NAN;
         normals[3 * p + 1] = answered ? y : NAN;
         normals[3 * p + 2] = answered ? z : NAN;
-        normals_spread[p] = answered ? sqrt(whole - radial) / length : NAN;
+        normals_sigma[p] = answered ? sqrt(whole - radial) / length : NAN;
         albedo[p] = answered ? length : NAN;
-        albedo_spread[p] = answered ? sqrt(radial) : NAN;
+        albedo_sigma[p] = answered ? sqrt(radial) : NAN;
         residual[p] = freedom > 0 ? sqrt(STATE(9) / freedom) : NAN;
         samples[p] = STATE(10);
+    }
+}
+
+__kernel void lambert_scale(
+    const int pixels, MAP residual, __global const int *restrict samples, MAP noise, const int noise_step, MAP limits,
+    OUT normals_sigma, OUT albedo_sigma)
+{
+    const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
+    for (int p = low; p < end; ++p) {
+        const float deviation = noise[noise_step * p], ratio = residual[p] / deviation;
+        const int freedom = GREATER(samples[p] - 3, 0);
+        const float scale = deviation * (ratio > limits[freedom] ? ratio : 1);
+        normals_sigma[p] *= scale;
+        albedo_sigma[p] *= scale;
     }
 }

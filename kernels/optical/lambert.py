@@ -19,8 +19,8 @@ Array = NDArray[Any]
 LEAST_PIVOT = 1e-3
 """Relative pivot of the lamps' directions below which they count as coplanar."""
 
-_DIAGONAL = np.diag_indices(4)
-_ABOVE = np.array([0, 0, 1, 0, 1, 2]), np.array([1, 2, 2, 3, 3, 3])
+_DIAGONAL: Any = np.diag_indices(4)
+_ABOVE: Any = np.array([0, 0, 1, 0, 1, 2]), np.array([1, 2, 2, 3, 3, 3])
 
 
 def lambert_add(
@@ -35,26 +35,28 @@ def lambert_add(
     darks : (P,), counts without light, which are subtracted
     shadow : lower limit of usable samples (exclusive), counts above dark
     bright : upper limit of usable samples (exclusive), counts
-    triangle : (11, P), at first 0. Squares of the diagonal of R in planes 0 to 2; its elements above the
-        diagonal, each divided by that of its row, in 3 to 5, and the last column of these rows in 6 to 8. Then
+    triangle : (11, P), at first 0. Planes 0 to 2 are the squares of the diagonal of R; 3 to 5 its elements
+        above the diagonal, each divided by that of its row, and 6 to 8 the last column of these rows. Then
         the residual sum of squares, and the number of usable samples
     """
     light = frames.astype(np.float32) - darks
     seen = (light > shadow) & (frames < bright)
     rows = np.concatenate([np.broadcast_to(lights[:, None], (*seen.shape, 3)), light[..., None]], axis=2)
     before = np.zeros((frames.shape[1], 4, 4))
-    before[:, *_DIAGONAL] = np.sqrt(triangle[[0, 1, 2, 9]].T)
-    before[:, *_ABOVE] = triangle[3:9].T * before[:, _ABOVE[0], _ABOVE[0]]
+    before[(slice(None), *_DIAGONAL)] = np.sqrt(triangle[[0, 1, 2, 9]].T)
+    before[(slice(None), *_ABOVE)] = triangle[3:9].T * before[:, _ABOVE[0], _ABOVE[0]]
     lit = np.where(seen.T[..., None], rows.swapaxes(0, 1), 0)
     after: Array = np.linalg.qr(np.concatenate([before, lit], axis=1)).R
     pivots = after[:, _ABOVE[0], _ABOVE[0]]
-    triangle[[0, 1, 2, 9]] = after[:, *_DIAGONAL].T ** 2
-    triangle[3:9] = np.divide(after[:, *_ABOVE], pivots, out=np.zeros_like(pivots), where=pivots != 0).T
+    triangle[[0, 1, 2, 9]] = after[(slice(None), *_DIAGONAL)].T ** 2
+    triangle[3:9] = np.divide(
+        after[(slice(None), *_ABOVE)], pivots, out=np.zeros_like(pivots), where=pivots != 0
+    ).T
     triangle[10] += seen.sum(axis=0)
 
 
-def lambert_normals(triangle: Array, normals: Array, normals_spread: Array, albedo: Array,
-                    albedo_spread: Array, residual: Array, samples: Array) -> None:  # fmt: skip
+def lambert_normals(triangle: Array, normals: Array, normals_sigma: Array, albedo: Array,
+                    albedo_sigma: Array, residual: Array, samples: Array) -> None:  # fmt: skip
     """Solve the fits represented by triangles, (11, P).
 
     Parameters
@@ -62,7 +64,7 @@ def lambert_normals(triangle: Array, normals: Array, normals_spread: Array, albe
     triangle : as of `lambert_add`
     normals : (P, 3), unit vectors; ``normals`` and ``albedo`` are NaN if the lamps of the usable samples are
         coplanar
-    normals_spread, albedo_spread : (P,), standard deviations for noise of standard deviation 1
+    normals_sigma, albedo_sigma : (P,), standard deviations for noise of standard deviation 1
     albedo : (P,)
     residual : (P,), standard deviation of a sample; NaN unless more than three samples are usable
     samples : (P,), number of usable samples
@@ -85,7 +87,24 @@ def lambert_normals(triangle: Array, normals: Array, normals_spread: Array, albe
         x, y, z = normals.T
         radial = (a * x) ** 2 + (b * x + d * y) ** 2 + (c * x + e * y + f * z) ** 2
         whole = a**2 + b**2 + c**2 + d**2 + e**2 + f**2
-        normals_spread[:] = np.sqrt(whole - radial) / length
-        albedo_spread[:] = np.sqrt(radial)
+        normals_sigma[:] = np.sqrt(whole - radial) / length
+        albedo_sigma[:] = np.sqrt(radial)
     albedo[:] = np.where(answered, length, np.nan)
     samples[:] = used
+
+
+def lambert_scale(residual: Array, samples: Array, noise: Array, limits: Array, normals_sigma: Array,
+                  albedo_sigma: Array) -> None:  # fmt: skip
+    """Multiply standard deviations, in place, by the noise, or by the residual that noise does not explain.
+
+    Parameters
+    ----------
+    residual, samples, normals_sigma, albedo_sigma : as of `lambert_normals`
+    noise : (P,) or (1,), standard deviation of a sample; in the kernel value ``noise_step * p``
+    limits : (n,), largest residual that noise of 1 explains, by the degrees of freedom
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = residual / noise
+        scale = noise * np.where(ratio > limits[np.maximum(samples - 3, 0)], ratio, 1)
+    normals_sigma *= scale
+    albedo_sigma *= scale

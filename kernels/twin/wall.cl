@@ -23,28 +23,6 @@
 #define INVERSE_ROOT(x) inverse_root(x)
 #endif
 
-#if TABLE == 2
-// atan2 within 1e-7, in a form that vectorises.
-float azimuth_of(const float x, const float y)
-{
-    const float across = GREATER(x, -x), up = GREATER(y, -y);
-    const float longer = GREATER(across, up), shorter = LESSER(across, up);
-    const float a = shorter / (longer + TINY), b = a * a;
-    float sum = 0.00245672441f;
-    sum = sum * b - 0.0144013604f;
-    sum = sum * b + 0.0397812352f;
-    sum = sum * b - 0.0723485947f;
-    sum = sum * b + 0.104989477f;
-    sum = sum * b - 0.141612306f;
-    sum = sum * b + 0.199859068f;
-    sum = sum * b - 0.333325982f;
-    const float low = a * (sum * b + 0.999999881f);
-    const float turned = up > across ? 1.57079633f - low : low;
-    const float front = x < 0 ? 3.14159265f - turned : turned;
-    return y < 0 ? -front : front;
-}
-#endif
-
 // A ray from a point inside a cylinder: its cosine to the side times the radius, and the inverse of its
 // length.
 float2 leave(

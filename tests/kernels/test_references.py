@@ -447,7 +447,7 @@ def solved(actual, expected, values):
     assert np.isfinite(expected).mean() > 0.9
 
 
-SOLVED = dict.fromkeys(("normals", "normals_spread", "albedo", "albedo_spread", "residual"), solved)
+SOLVED = dict.fromkeys(("normals", "normals_sigma", "albedo", "albedo_sigma", "residual"), solved)
 
 
 @case("lambert_normals", checks=SOLVED)
@@ -462,6 +462,52 @@ def _():
     answers = {name: np.zeros(pixels) for name in SOLVED} | {"normals": np.zeros((pixels, 3))}
     answers |= {"samples": np.zeros(pixels, np.int32), "triangle": triangle}
     return answers | {"shape": (1, pixels), "stride": pixels, "macros": {"FRAME": "uchar"}}
+
+
+@case("lambert_scale", {"noise": (1, 1100)}, rtol=2e-6)
+def _(noise):
+    rng, pixels = np.random.default_rng(0), 1100
+    values = {"samples": rng.integers(0, 9, pixels).astype(np.int32), "residual": rng.uniform(0, 9, pixels)}
+    values["residual"][values["samples"] < 4] = np.nan
+    values |= {
+        "noise": rng.uniform(1, 3, noise),
+        "noise_step": int(noise > 1),
+        "limits": np.linspace(3, 2, 7),
+    }
+    values |= {name: rng.uniform(0, 1, pixels) for name in ("normals_sigma", "albedo_sigma")}
+    return values | {"shape": (1, pixels), "macros": {"FRAME": "uchar"}}
+
+
+@case("fringes_phase", {"noise": (1, 1100), "seen": (2.5, np.nan)}, rtol=3e-6, atol=1e-7)
+def _(noise, seen):
+    rng, pixels = np.random.default_rng(0), 1100
+    values = {name: rng.normal(0, 50, pixels) for name in ("cosine_part", "sine_part")}
+    values |= {"residual": rng.uniform(0, 15, pixels), "noise": rng.uniform(1, 3, noise)}
+    values["cosine_part"][:5], values["sine_part"][:5] = [0, 7, -7, 0, np.nan], [0, 0, 0, -7, 3]
+    numbers = {"noise_step": int(noise > 1), "seen": seen, "misfit": 4.0}
+    numbers |= {"cosine_variance": 0.2, "covariance": 0.05, "sine_variance": 0.3}
+    return values | numbers | {"shape": (1, pixels)}
+
+
+@case("blur_bend", {"parts": (2, 3), "reach": (1, 3)}, rtol=1e-4, atol=1e-6)
+def _(parts, reach):
+    rng, shape = np.random.default_rng(0), (11, 130)
+    vectors = [rng.normal(size=shape + (() if parts == 2 else (3,))) for _ in range(2)]
+    vectors[0][4, 9] = np.nan
+    return {
+        "first": vectors[0],
+        "second": vectors[1],
+        "reach": reach,
+        "shape": shape,
+        "macros": {"PARTS": parts},
+    }
+
+
+@case("blur_add", {"reach": (1, 3)}, rtol=2e-6)
+def _(reach):
+    bend, sigma = np.random.default_rng(0).uniform(0, 1, (2, 11, 130))
+    bend[3, 7] = bend[0, 0] = np.nan
+    return {"bend": bend, "reach": reach, "factor": 0.8, "sigma": sigma, "shape": bend.shape}
 
 
 # --- Slopes and samples of arrays on a device
