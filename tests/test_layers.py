@@ -78,6 +78,7 @@ SMALL = {
     "kernels/bitcode.py": "the one place that knows how PoCL keeps programs",
     "kernels/errors.py": "other packages import it alone",
     "kernels/layout.py": "tests choose a layout without the device",
+    "kernels/optical/fringes.py": "it belongs to fringes.cl",
     "kernels/rotation/facing.py": "it belongs to facing.cl",
 }
 """Why a module has less than 40 lines; a command may."""

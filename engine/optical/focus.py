@@ -22,6 +22,7 @@ from mirrorskin.io.model.maps import TABLE, FocusStatus, status_of
 from mirrorskin.io.model.positions import check_strokes
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
+_TILE = 16384  # pixels of a work-item on a CPU: some rows, whose sums along columns it moves down
 _LARGEST = 1e18  # noise whose square a float32 holds
 _LEAST_CONTRAST = 5.0  # smallest contrast of a peak above that of noise, in standard errors
 _BETWEEN = 2 / 3  # variance of noise between pixels two reaches apart, whose windows overlap
@@ -80,7 +81,7 @@ class Focus(Operation):
             raise InputError("noise is missing: give the standard deviation of a sample in counts, such as 2")
         maps: dict[str, Any] = {"best": np.int32, "status": np.uint8, **dict.fromkeys(_FLOATS, np.float32)}
         maps |= {"peak": Planes(2 * self.reach + 1, np.float32), "recent": Planes(self.reach, np.float32)}
-        self._maps = Picture(self, "focus", maps, around=self.radius)
+        self._maps = Picture(self, "focus", maps, around=self.radius, tile=_TILE)
 
     def peaks(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the contrast in the frames around the sharpest one of each pixel, and its number."""

@@ -8,42 +8,57 @@
 #include "common.clh"
 
 #define STRIP (TILE < 256 ? TILE : 256)  // pixels of a row that are processed together
-#define CHUNK 32
+#define CHUNK (STRIP < 64 ? STRIP : 64)
 #define WIDEST 50
 
 // Sums of squares of differences from the middle lose no digits.
 #define CONTRAST(sum, square, count) ((square) - (sum) * (sum) / (count))
 
-// Updates the peaks of some pixels by their contrast in frame t.
+#define CHOSEN(mask, yes, no) (((mask) & (yes)) | (~(mask) & (no)))
+
+// Updates the peaks of some pixels, from `place` on, by their contrast in frame t. Loops over copies vectorise.
+__attribute__((always_inline)) void update(
+    const float *sharp, const size_t place, const int size, const size_t plane, const int t, const int reach,
+    __global int *restrict best, OUT top, OUT recent)
+{
+    // Numbers are chosen by bits: conditional copies of array elements become branches.
+    int now[CHUNK], most[CHUNK], where[CHUNK], last[CHUNK], before[CHUNK], after[CHUNK], better[CHUNK], since[CHUNK];
+    int changed = 0;
+    for (int i = 0; i < size; ++i) now[i] = as_int(sharp[i]);
+    for (int i = 0; i < size; ++i) most[i] = as_int(top[place + i]);
+    for (int i = 0; i < size; ++i) where[i] = best[place + i];
+    for (int i = 0; i < size; ++i) {
+        const float value = as_float(now[i]), largest = as_float(most[i]);
+        better[i] = -((t == 0) | (value > largest) | (largest != largest));
+        since[i] = ~better[i] & (t - where[i]);
+        changed |= since[i] <= reach;
+    }
+    if (!changed) return;
+    for (int i = 0; i < size; ++i) top[place + i] = as_float(CHOSEN(better[i], now[i], most[i]));
+    for (int i = 0; i < size; ++i) best[place + i] = CHOSEN(better[i], t, where[i]);
+    for (int k = 1; k <= reach; ++k) {
+        OUT earlier = recent + (t - k + (k > t ? reach : 0)) % reach * plane + place;
+        const int none = as_int(NAN), missing = -(k > t);
+        for (int i = 0; i < size; ++i) last[i] = as_int(earlier[i]);
+        for (int i = 0; i < size; ++i) before[i] = as_int(top[place + i - k * plane]);
+        for (int i = 0; i < size; ++i) after[i] = as_int(top[place + i + k * plane]);
+        for (int i = 0; i < size; ++i) before[i] = CHOSEN(better[i], CHOSEN(missing, none, last[i]), before[i]);
+        for (int i = 0; i < size; ++i) after[i] = CHOSEN(better[i], none, CHOSEN(-(since[i] == k), now[i], after[i]));
+        for (int i = 0; i < size; ++i) top[place + i - k * plane] = as_float(before[i]);
+        for (int i = 0; i < size; ++i) top[place + i + k * plane] = as_float(after[i]);
+    }
+}
+
 void remember(
-    const float *sharp, const int p, const int width, const size_t plane, const int t, const int reach,
+    const float *sharp, const size_t place, const int width, const size_t plane, const int t, const int reach,
     __global int *restrict best, OUT peak, OUT recent)
 {
     OUT top = peak + reach * plane;
-    for (int low = 0; low < width; low += CHUNK) {
-        const int end = min(low + CHUNK, width);
-        int better[CHUNK], since[CHUNK], changed = 0;
-        for (int i = low; i < end; ++i) {
-            better[i - low] = (t == 0) | (sharp[i] > top[p + i]) | (top[p + i] != top[p + i]);
-            since[i - low] = better[i - low] ? 0 : t - best[p + i];
-            changed |= since[i - low] <= reach;
-        }
-        for (int k = 1; changed && k <= reach; ++k) {
-            OUT before = top - k * plane + p;
-            OUT after = top + k * plane + p;
-            MAP earlier = recent + (t - k + (k > t ? reach : 0)) % reach * plane + p;
-            for (int i = low; i < end; ++i) {
-                const float kept = before[i], last = k > t ? NAN : earlier[i];
-                before[i] = better[i - low] ? last : kept;
-                after[i] = better[i - low] ? NAN : since[i - low] == k ? sharp[i] : after[i];
-            }
-        }
-        for (int i = low; changed && i < end; ++i) {
-            top[p + i] = better[i - low] ? sharp[i] : top[p + i];
-            best[p + i] = better[i - low] ? t : best[p + i];
-        }
-    }
-    OUT now = recent + t % reach * plane + p;
+    int low = 0;
+    for (; low + CHUNK <= width; low += CHUNK)
+        update(sharp + low, place + low, CHUNK, plane, t, reach, best, top, recent);
+    if (low < width) update(sharp + low, place + low, width - low, plane, t, reach, best, top, recent);
+    OUT now = recent + t % reach * plane + place;
     for (int i = 0; i < width; ++i) now[i] = sharp[i];
 }
 
