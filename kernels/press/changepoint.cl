@@ -239,10 +239,10 @@ answer_t ramp(
     return answer;
 }
 
-// The samples on the dark level before each slot, and on the light level from it on: levels above dark and below light,
-// and misfits. A misfit grows with the number of samples.
+// The samples on the dark level before each slot, and on the light level from it on: levels above dark and below
+// light, and misfits, which grow with the number of samples; that of light is `square` - `fitted`.
 typedef struct {
-    float dark[SLOTS + 1], missing[SLOTS + 1], before[SLOTS + 1], after[SLOTS + 1];
+    float dark[SLOTS + 1], missing[SLOTS + 1], before[SLOTS + 1], square[SLOTS + 1], fitted[SLOTS + 1];
     float slack;
 } ends_t;
 
@@ -261,7 +261,8 @@ ends_t ends_of(const samples_t *samples, const float noise)
         ends.dark[slot] = low_sum / STEP / (before + slack);
         ends.missing[slot] = lack / STEP / (after + slack);
         ends.before[slot] = low_square / (STEP * STEP) - low_sum / STEP * ends.dark[slot];
-        ends.after[slot] = lack_square / (STEP * STEP) - lack / STEP * ends.missing[slot];
+        ends.square[slot] = lack_square / (STEP * STEP);
+        ends.fitted[slot] = lack / STEP * ends.missing[slot];
     }
     return ends;
 }
@@ -273,7 +274,7 @@ answer_t hypothesis(
 {
     const int end = begin + length, before = begin - samples->low, after = samples->high - end;
     const float noise = query.noise, dark = ends->dark[begin], missing = ends->missing[end];
-    const float misfit = ends->before[begin] + ends->after[end];
+    const float misfit = ends->before[begin] + ends->square[end] - ends->fitted[end];
     if (misfit > enough) return IMPOSSIBLE;
 
     levels_t levels = {dark, 1 - missing, query.level, 0};
@@ -290,14 +291,14 @@ answer_t hypothesis(
 }
 
 // Mean and variance over all hypotheses by weight, and the least misfit in squared sigmas. The sums are of crossings
-// relative to that of the most likely hypothesis.
+// relative to that of a likely hypothesis.
 float3 weigh(const samples_t *samples, const query_t query)
 {
     const ends_t ends = ends_of(samples, query.noise);
     const float scale = 1 / (query.noise * query.noise);
     float best = INFINITY, enough = INFINITY, likely = 0, weight = 0, sum = 0, square = 0;
     for (int slot = samples->low + 1; slot < samples->high; ++slot)
-        enough = LESSER(enough, ends.before[slot] + ends.after[slot] + NEGLIGIBLE / scale);
+        enough = LESSER(enough, ends.before[slot] + ends.square[slot] - ends.fitted[slot] + NEGLIGIBLE / scale);
 
     // The misfit of each part grows with the part. Hence the dark part ends at `last` or before, the light part
     // begins at `first` or later, and a line can fit only where both lines that are shorter by a sample fit.
@@ -305,7 +306,7 @@ float3 weigh(const samples_t *samples, const query_t query)
     uint fits = ~0u;  // a bit for each first slot of a line
     for (int length = 0; length <= SLOTS; ++length) {
         while (last > samples->low && ends.before[last] > enough) --last;
-        while (first < samples->high && ends.after[first] > enough) ++first;
+        while (first < samples->high && ends.square[first] - ends.fitted[first] > enough) ++first;
         if (length > 2) fits &= fits >> 1;
         const int least = length < 2;  // these need a sample on each level
         const int end = min(last, samples->high - least - length);
@@ -316,19 +317,18 @@ float3 weigh(const samples_t *samples, const query_t query)
             if (bent > enough) fits &= ~(1u << begin);
             if (answer.misfit > enough) continue;
             const float cost = answer.misfit * scale;
-            const float lesser = exponential(-0.5f * fabs(cost - best));
-            float share = answer.prior, away = answer.crossing - likely;
-            if (cost < best) {
-                square = (square - 2 * away * sum + away * away * weight) * lesser;
-                sum = (sum - away * weight) * lesser;
-                weight *= lesser;
-                likely += away;
+            const float lesser = exponential(-0.5f * fabs(cost - best)), kept = cost < best ? lesser : 1;
+            const float share = cost < best ? answer.prior : answer.prior * lesser;
+            float away = answer.crossing - likely;
+            if (share > weight * kept) {
+                square += away * (away * weight - 2 * sum);
+                sum -= away * weight;
+                likely = answer.crossing;
                 away = 0;
-            } else
-                share *= lesser;
-            weight += share;
-            sum += share * away;
-            square += share * (answer.variance + away * away);
+            }
+            weight = weight * kept + share;
+            sum = sum * kept + share * away;
+            square = square * kept + share * (answer.variance + away * away);
             best = LESSER(best, cost);
             enough = LESSER(enough, (best + NEGLIGIBLE) / scale);
         }
