@@ -104,6 +104,18 @@ def thinned(frames: AnyArray) -> NDArray[Any]:
     return samples
 
 
+def thinned_maps(maps: Sequence[AnyArray]) -> list[NDArray[Any]]:
+    """Return maps of one size, (H, W), thinned out; those on a device are waited for once."""
+    if not isinstance(maps[0], Array):
+        return [thinned(values) for values in maps]
+    step, pixels = thinning(maps[0].shape), math.prod(maps[0].shape)
+    shape = 1, 1, -(-pixels // step)
+    return [
+        samples.ravel()
+        for samples in take_grids(*(Grid(array, 0, (pixels, 0, step), shape) for array in maps))
+    ]
+
+
 def take_grid(frames: AnyArray, grid: FrameSamples) -> NDArray[Any]:
     """Return a copy of the samples of frames, (n, H, W), on the host or a device, at the pixels of a grid."""
     if not isinstance(frames, Array):

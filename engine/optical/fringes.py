@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, ndtr
 
-from mirrorskin.engine.base.frames import noise_of_residual, thinned
+from mirrorskin.engine.base.frames import noise_of_residual, thinned_maps
 from mirrorskin.engine.base.functions import phase_function
 from mirrorskin.engine.base.inputs import Maps, as_result
 from mirrorskin.engine.base.options import option
@@ -100,9 +100,8 @@ class Fringes(CorrelationOperation):
         freedom = np.count_nonzero(used) - 3
         seen = math.nan  # noise estimated from the residuals of the half with more modulation
         if freedom > 0:
-            cosine, sine, residual = (
-                thinned(fit.view(name)) for name in ("cosine_part", "sine_part", "residual")
-            )
+            parts = [fit.view(name) for name in ("cosine_part", "sine_part", "residual")]
+            cosine, sine, residual = thinned_maps(parts)
             square = cosine * cosine + sine * sine
             seen = noise_of_residual(residual[square >= np.median(square[np.isfinite(square)])], freedom)
         elif self._noise is None:

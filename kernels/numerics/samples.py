@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from mirrorskin.kernels.array import Array, fetch
 from mirrorskin.kernels.device import C_TYPES
 
+_TYPES = {**C_TYPES, "int32": "int"}
+
 
 def samples_take(
     lines: int, rows: int, count: int, values: NDArray[Any], first: int, apart: int, down: int, step: int
@@ -49,7 +51,7 @@ def take_grids(*grids: Grid) -> list[NDArray[Any]]:
                 samples_take(*grid.shape, np.asarray(grid.array), grid.first, *grid.steps) for grid in grids
             ]
         samples = array.device.array("samples", shape, array.dtype, zeroed=False)
-        kernel = array.device.kernel("samples", "samples_take", VALUE=C_TYPES[array.dtype.name])
+        kernel = array.device.kernel("samples", "samples_take", VALUE=_TYPES[array.dtype.name])
         (lines, rows, count), (apart, down, step) = shape, steps
         kernel(
             lines * rows * count, lines=lines, rows=rows, count=count, values=array, first=first, apart=apart,
