@@ -29,12 +29,13 @@ from mirrorskin.bench.suite import (
     twin,
 )
 from mirrorskin.bench.suite.harness import Cases, DisagreementError
+from mirrorskin.cli.commands.bench import operations
 from mirrorskin.cli.commands.bench.records import Case, describe_run, open_run
 from mirrorskin.io import InputError, check_output
 from mirrorskin.io.storage.atomic import write_new
 from mirrorskin.kernels.device import open_device
 
-_MODULES = calls, onset, normals, correlation, integration, robust, twin, paths, batch, live, pose
+_MODULES = operations, calls, onset, normals, correlation, integration, robust, twin, paths, batch, live, pose
 CASES: Cases = {name: run for module in _MODULES for name, run in module.CASES.items()}
 _FILE = click.Path(path_type=Path)
 

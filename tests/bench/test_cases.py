@@ -79,8 +79,8 @@ def test_the_targets_of_a_call_are_its_kernels_and_its_peers():
 
 def test_patterns_choose_cases_in_their_order():
     assert program.choose(["full-*", "equation4-uint8"])[:2] == ["equation4-uint8", "full-uint8"]
-    with pytest.raises(InputError, match=r"case 'onset': there is no such case.*; --list prints all"):
-        program.choose(["onset"])
+    with pytest.raises(InputError, match=r"case 'onsets': there is no such case.*; --list prints all"):
+        program.choose(["onsets"])
 
 
 def test_maps_that_differ_are_named_with_a_pixel():

@@ -18,7 +18,9 @@ def made_up(monkeypatch):
     """Cases that take no time, instead of the operations."""
     limit = row("read limit", 0.1, moved=10**9, kernel=0.1)
     cases = [case("onset", limit, row("mirrorskin", 0.2, moved=10**9, frames=64, kernel=0.15))]
-    monkeypatch.setattr(operations, "MEASUREMENTS", [lambda device, quick, one=one: one for one in cases])
+    monkeypatch.setattr(
+        operations, "CASES", {case.name: lambda device, quick, case=case: case for case in cases}
+    )
 
 
 def test_the_operations_and_the_limits_are_measured_and_written(tmp_path):

@@ -35,7 +35,6 @@ REQUESTS = (
 _QUIET = 0.3  # seconds without a word, after what no line answers
 _LONGEST = 20.0
 _POLL = 0.05
-_STATUS = re.compile(r"<([^|>]*)\|MPos:([-\d.,]+)")
 
 
 class Exchange(NamedTuple):

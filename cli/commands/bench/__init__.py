@@ -43,7 +43,7 @@ def command(
     and launches; compares both with a table. Takes about half a minute.
     """
     from mirrorskin import io
-    from mirrorskin.cli.commands.bench.operations import MEASUREMENTS
+    from mirrorskin.cli.commands.bench.operations import CASES
     from mirrorskin.cli.commands.bench.records import describe_run, open_run
     from mirrorskin.cli.output import progress
     from mirrorskin.io.storage.atomic import write_new
@@ -56,8 +56,8 @@ def command(
     table = open_run(against or TABLE)
     opened = open_device(device)
     cases = []
-    with progress("measuring", len(MEASUREMENTS)) as show:
-        for measure in MEASUREMENTS:
+    with progress("measuring", len(CASES)) as show:
+        for measure in CASES.values():
             cases.append(measure(opened, quick))
             show(len(cases))
     run = describe_run(opened, cases, quick)

@@ -73,7 +73,12 @@ def measure_device(device: Device, quick: bool) -> Case:
     return measure_limits(device, LIMIT_BYTES >> (6 * quick), 1 if quick else ROUNDS)
 
 
-MEASUREMENTS = (measure_device, measure_onset, measure_correlation, measure_integration)
+CASES = {
+    "limits": measure_device,
+    "onset": measure_onset,
+    "correlation": measure_correlation,
+    "integration": measure_integration,
+}
 
 
 def _time(
