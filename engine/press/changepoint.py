@@ -117,7 +117,9 @@ class ChangePoint(PressOperation):
         if not self._twice:
             level = round(self._level * UNIT)
             lowest_drift = self.hold * (UNIT - level)
-            self._maps.scan("changepoint_scan", frames, level=level, least=lowest_drift, quiet=self._quiet())
+            self._maps.scan(
+                "changepoint_scan", frames, level=level, min_excess=lowest_drift, quiet=self._quiet()
+            )
         elif self._weight is None:
             self._maps.scan("changepoint_sum", frames)
         elif self.count + len(frames) < len(self._weight):
@@ -136,7 +138,7 @@ class ChangePoint(PressOperation):
         pairs = np.stack([high, travel - high], axis=1)  # whose sums have the precision of float64
         self._maps.run(
             "changepoint_heights", count=len(travel), travel=pairs, noise=noise, quiet=self._quiet(),
-            level=self._level, own=self._twice,
+            level=self._level, own_levels=self._twice,
         )  # fmt: skip
         height, sigma, *integers = self._maps.take("height", "sigma", "status", "start")
         status, frame = map(np.asarray, integers)

@@ -35,10 +35,10 @@
 #define SATURATED(sample) 0
 #endif
 
-float share_of(const FRAME sample, const float dark, const float gain)
+float fraction_of(const FRAME sample, const float dark, const float gain)
 {
-    const float share = ((float)sample - dark) * gain, light = gain < 0 ? 0 : 1;
-    return (SATURATED(sample) & ((share - light) * gain < 0)) ? light : share;
+    const float fraction = ((float)sample - dark) * gain, light = gain < 0 ? 0 : 1;
+    return (SATURATED(sample) & ((fraction - light) * gain < 0)) ? light : fraction;
 }
 
 #define LIMITED(value, low, high) LESSER(GREATER(value, low), high)
@@ -66,7 +66,7 @@ int excess_of_noise(const float quiet, const float gain)
 
 __kernel void changepoint_scan(
     __global const FRAME *restrict frames, const int count, const int pixels, const int first, const int level,
-    const int least, const float quiet, MAP dark, MAP gain, __global int *restrict start, __global int *restrict excess,
+    const int min_excess, const float quiet, MAP dark, MAP gain, __global int *restrict start, __global int *restrict excess,
     __global int *restrict below, __global FRAME *restrict ring)
 {
     const int base = get_global_id(0) * TILE;
@@ -82,7 +82,7 @@ __kernel void changepoint_scan(
         dim[p] = below[base + p];
         low[p] = dark[base + p];
         rate[p] = gain[base + p];
-        alarm[p] = max(least, excess_of_noise(quiet, rate[p]));
+        alarm[p] = max(min_excess, excess_of_noise(quiet, rate[p]));
         broken[p] = change[p] == INVALID;
         sum[p] = broken[p] ? DECIDED : excess[base + p];
         busy |= !broken[p] & (sum[p] != DECIDED || first - change[p] <= REACH);
@@ -96,8 +96,8 @@ __kernel void changepoint_scan(
         for (int p = 0; p < width; ++p) {
             const FRAME sample = frame[p], kept = slot[p];  // conditional loads would stay scalar
             const int undecided = sum[p] != DECIDED;
-            const float share = share_of(sample, low[p], rate[p]);
-            const int units = round_even((share < 0 ? 0 : share > 1 ? 1 : share) * UNIT);
+            const float fraction = fraction_of(sample, low[p], rate[p]);
+            const int units = round_even((fraction < 0 ? 0 : fraction > 1 ? 1 : fraction) * UNIT);
             const int more = undecided ? sum[p] + units - level : 0;
             const int grown = more > 0 ? more : 0;
             change[p] = (undecided & (grown == 0)) ? number + 1 : change[p];
@@ -152,11 +152,11 @@ __kernel void changepoint_split(
             total[p] = sum.high;
             total_rest[p] = sum.rest;
 
-            const float found = -sum.high * weight[number + 1];
-            const int better = found > score[p];
+            const float explained = -sum.high * weight[number + 1];
+            const int better = explained > score[p];
             since[p] = (better & (number - start[p] > REACH)) ? number : since[p];
             start[p] = better ? number + 1 : start[p];
-            score[p] = better ? found : score[p];
+            score[p] = better ? explained : score[p];
             slot[p] = number - start[p] <= REACH ? sample : slot[p];
         }
     }
@@ -176,12 +176,12 @@ typedef struct {
 
 typedef struct {
     float noise, level;
-    int own;
+    int own_levels;
 } query_t;
 
 // The levels of a pixel, the level to be crossed, and its variance.
 typedef struct {
-    float dark, light, wanted, unsure;
+    float dark, light, crossed, variance;
 } levels_t;
 
 #define IMPOSSIBLE ((answer_t){INFINITY, 1, 0, 0})
@@ -190,15 +190,15 @@ typedef struct {
 answer_t single(const samples_t *samples, const int begin, const levels_t levels, const float noise)
 {
     const float above = (samples->values[begin + 1] - samples->values[begin]) / STEP - levels.dark;
-    const float rise = GREATER(levels.light - levels.dark, 0.1f), share = LIMITED(above / rise, 0, 1);
-    const float longest = 1 / GREATER(share, 1 - share);
-    const float shift = longest * ((levels.wanted - levels.dark) / rise - share);
-    const float known = 2 / 3.0f * longest * noise / rise, missed = above - share * rise;
+    const float rise = GREATER(levels.light - levels.dark, 0.1f), fraction = LIMITED(above / rise, 0, 1);
+    const float longest = 1 / GREATER(fraction, 1 - fraction);
+    const float shift = longest * ((levels.crossed - levels.dark) / rise - fraction);
+    const float noise_sigma = 2 / 3.0f * longest * noise / rise, missed = above - fraction * rise;
     answer_t answer;
     answer.misfit = missed * missed;
     answer.prior = SINGLE * sqrt(2 * M_PI_F) * noise;
     answer.crossing = begin - REACH + 2 / 3.0f * shift;
-    answer.variance = known * known + shift * shift / 18;
+    answer.variance = noise_sigma * noise_sigma + shift * shift / 18;
     return answer;
 }
 
@@ -228,13 +228,13 @@ answer_t ramp(
     const float late = end < samples->high ? arrives - first - length : 0;
     const float away = GREATER(GREATER(early, leaves - first), 0);
     const float back = GREATER(GREATER(late, first + length - 1 - arrives), 0);
-    const float reach = 0.5f * (length + 1), off = LIMITED((levels.wanted - mean) * duration, -reach, reach);
+    const float reach = 0.5f * (length + 1), off = LIMITED((levels.crossed - mean) * duration, -reach, reach);
     answer_t answer;
     answer.misfit = misfit + (away * away + back * back) / (duration * duration);
     answer.prior = RAMP * 2 * M_PI_F * noise * noise * sqrt(12.0f) * duration / length;
     answer.crossing = middle + off;
     const float apart = off * off * length / (float)spread;
-    const float variance = noise * noise * (1.0f / length + apart) + levels.unsure;
+    const float variance = noise * noise * (1.0f / length + apart) + levels.variance;
     answer.variance = LESSER(variance * duration * duration, reach * reach / 3);
     return answer;
 }
@@ -278,10 +278,10 @@ answer_t hypothesis(
     if (misfit > enough) return IMPOSSIBLE;
 
     levels_t levels = {dark, 1 - missing, query.level, 0};
-    if (query.own) {
+    if (query.own_levels) {
         const float low_part = (1 - query.level) * noise, high_part = query.level * noise;
-        levels.wanted = dark + query.level * (levels.light - dark);
-        levels.unsure = low_part * low_part / (before + ends->slack) + high_part * high_part / (after + ends->slack);
+        levels.crossed = dark + query.level * (levels.light - dark);
+        levels.variance = low_part * low_part / (before + ends->slack) + high_part * high_part / (after + ends->slack);
     }
     answer_t answer = {0, 1, begin - REACH - 0.5f, 1 / 12.0f};
     if (length == 1) answer = single(samples, begin, levels, noise);
@@ -308,9 +308,9 @@ float3 weigh(const samples_t *samples, const query_t query)
         while (last > samples->low && ends.before[last] > enough) --last;
         while (first < samples->high && ends.square[first] - ends.fitted[first] > enough) ++first;
         if (length > 2) fits &= fits >> 1;
-        const int least = length < 2;  // these need a sample on each level
-        const int end = min(last, samples->high - least - length);
-        for (int begin = max(samples->low + least, first - length); begin <= end; ++begin) {
+        const int per_level = length < 2;  // these need a sample on each level
+        const int end = min(last, samples->high - per_level - length);
+        for (int begin = max(samples->low + per_level, first - length); begin <= end; ++begin) {
             if (!(fits >> begin & 1)) continue;
             float bent = 0;
             const answer_t answer = hypothesis(samples, query, &ends, begin, length, enough, &bent);
@@ -318,17 +318,17 @@ float3 weigh(const samples_t *samples, const query_t query)
             if (answer.misfit > enough) continue;
             const float cost = answer.misfit * scale;
             const float lesser = exponential(-0.5f * fabs(cost - best)), kept = cost < best ? lesser : 1;
-            const float share = cost < best ? answer.prior : answer.prior * lesser;
+            const float relative_weight = cost < best ? answer.prior : answer.prior * lesser;
             float away = answer.crossing - likely;
-            if (share > weight * kept) {
+            if (relative_weight > weight * kept) {
                 square += away * (away * weight - 2 * sum);
                 sum -= away * weight;
                 likely = answer.crossing;
                 away = 0;
             }
-            weight = weight * kept + share;
-            sum = sum * kept + share * away;
-            square = square * kept + share * (answer.variance + away * away);
+            weight = weight * kept + relative_weight;
+            sum = sum * kept + relative_weight * away;
+            square = square * kept + relative_weight * (answer.variance + away * away);
             best = LESSER(best, cost);
             enough = LESSER(enough, (best + NEGLIGIBLE) / scale);
         }
@@ -349,24 +349,24 @@ float variance_of_blur(const samples_t *samples, const query_t query, const floa
     if (low < margin || low >= level || high < level || high > 1 - margin) return 0;
     // The quantile of a share is proportional to v + BENT v^3, with v = share - 1/2.
     const float first = low - 0.5f, second = high - 0.5f, middle = level - 0.5f, rise = high - low;
-    const float both = first * first + first * second + second * second, share = (level - low) / rise;
-    const float bent = share * (1 + BENT * (middle * middle + middle * first + first * first)) / (1 + BENT * both);
-    const float off = frame + bent - crossing, known = query.noise / rise;
-    return GREATER(off * off - known * known * (share * share + (1 - share) * (1 - share)), 0.0f);
+    const float both = first * first + first * second + second * second, fraction = (level - low) / rise;
+    const float bent = fraction * (1 + BENT * (middle * middle + middle * first + first * first)) / (1 + BENT * both);
+    const float off = frame + bent - crossing, noise_sigma = query.noise / rise;
+    return GREATER(off * off - noise_sigma * noise_sigma * (fraction * fraction + (1 - fraction) * (1 - fraction)), 0.0f);
 }
 
 // The same without the misfit, and with a variance that includes it and the blur.
 float2 estimate(const samples_t *samples, query_t query)
 {
-    const float3 found = weigh(samples, query);
+    const float3 posterior = weigh(samples, query);
     const int freedom = max(samples->high - samples->low - 4, 1);
-    const float blur = variance_of_blur(samples, query, found.x);
-    if (found.z <= DOUBT * freedom) return (float2)(found.x, found.y + blur);
+    const float blur = variance_of_blur(samples, query, posterior.x);
+    if (posterior.z <= DOUBT * freedom) return (float2)(posterior.x, posterior.y + blur);
     // Samples that no hypothesis fits are noisier than stated, or change in another way.
-    query.noise *= sqrt(found.z / freedom);
+    query.noise *= sqrt(posterior.z / freedom);
     const float3 again = weigh(samples, query);
-    const float moved = again.x - found.x;
-    return (float2)(found.x, again.y + moved * moved + blur);
+    const float moved = again.x - posterior.x;
+    return (float2)(posterior.x, again.y + moved * moved + blur);
 }
 
 void gather(
@@ -378,8 +378,8 @@ void gather(
     int values[SLOTS];
     for (int i = samples->low; i < samples->high; ++i) {
         const int number = start - REACH + i;
-        const float share = share_of(ring[(size_t)(number % SLOTS) * pixels + pixel], dark, gain);
-        values[i] = round_even(LIMITED(share, -1, 2) * STEP);
+        const float fraction = fraction_of(ring[(size_t)(number % SLOTS) * pixels + pixel], dark, gain);
+        values[i] = round_even(LIMITED(fraction, -1, 2) * STEP);
     }
     const int limit = round_even(SPIKE * LESSER(noise, 100) * STEP);
     samples->values[0] = samples->moments[0] = samples->squares[0] = 0;
@@ -410,15 +410,15 @@ float2 travel_at(__global const float2 *restrict travel, const int count, const 
 {
     const int frame = clamp(start + (int)floor(crossing), 0, count - 2);
     const float2 step = travel[frame + 1] - travel[frame];
-    const float share = crossing - (frame - start);
-    return (float2)(travel[frame].x, travel[frame].y + share * (step.x + step.y));
+    const float fraction = crossing - (frame - start);
+    return (float2)(travel[frame].x, travel[frame].y + fraction * (step.x + step.y));
 }
 
 __kernel void changepoint_heights(
     const int pixels, const int count, __global const int *restrict start, __global const int *restrict excess,
     __global const int *restrict below, __global const int *restrict since, MAP dark, MAP gain,
     __global const FRAME *restrict ring, __global const float2 *restrict travel, const float noise, const float quiet,
-    const float level, const int own, OUT height, OUT sigma, __global uchar *restrict status)
+    const float level, const int own_levels, OUT height, OUT sigma, __global uchar *restrict status)
 {
     const int base = get_global_id(0) * TILE;
     const int end = min(pixels, base + TILE);
@@ -435,7 +435,7 @@ __kernel void changepoint_heights(
         const float dim = start[p] - below[p];
         const int hovered = dim > REACH && is_flat(&samples, spread);
         const float2 crossing = hovered ? (float2)(-dim / 2, dim * dim / 12)
-                                        : estimate(&samples, (query_t){spread, level, own});
+                                        : estimate(&samples, (query_t){spread, level, own_levels});
         const float middle = LIMITED(crossing.x, (float)-start[p], (float)(count - 1 - start[p]));
         const float deviation = sqrt(crossing.y);
         const float2 at = travel_at(travel, count, start[p], middle);

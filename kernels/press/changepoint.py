@@ -40,7 +40,7 @@ PLATEAU = 3  # sigmas within which a sample is on a level
 SINGLE, RAMP = 1 / 3, 1 / 5
 
 
-def changepoint_scan(frames: Array, first: int, level: int, least: int, quiet: np.float32, dark: Array,
+def changepoint_scan(frames: Array, first: int, level: int, min_excess: int, quiet: np.float32, dark: Array,
                      gain: Array, start: Array, excess: Array, below: Array,
                      ring: Array) -> None:  # fmt: skip
     """Search a block of frames for a change between known levels; the maps are updated in place.
@@ -54,7 +54,7 @@ def changepoint_scan(frames: Array, first: int, level: int, least: int, quiet: n
     frames : (n, P), uint8, uint16 or float32
     first : number of the block's first frame in the stack
     level : units, of ``UNIT`` from dark to bright, at which a pixel is light
-    least : excess, in units, that confirms a change; an excess for ``REACH`` frames confirms it as well
+    min_excess : excess, in units, that confirms a change; an excess for ``REACH`` frames confirms it as well
     quiet : counts^2; times gain^2, it is the excess caused by noise
     dark, gain : (P,), counts without light, and 1 / (counts from dark to bright). For a release: counts with
         full light, and 1 / (counts from bright to dark), which is negative
@@ -63,12 +63,12 @@ def changepoint_scan(frames: Array, first: int, level: int, least: int, quiet: n
     below : (P,), last frame whose sample was closer to dark than to the level
     ring : (SLOTS, P), ring buffer of the samples around the change; frame t is in slot t % ``SLOTS``
     """
-    alarm = np.maximum(least, excess_of_noise(quiet, gain))
+    alarm = np.maximum(min_excess, excess_of_noise(quiet, gain))
     for number, frame in enumerate(frames, start=first):
         excess[start == INVALID] = DECIDED
         undecided = excess != DECIDED
-        share = np.clip(_share(frame, dark, gain), 0, 1)
-        units = np.rint(np.nan_to_num(share) * np.float32(UNIT)).astype(np.int64)
+        fraction = np.clip(_fraction(frame, dark, gain), 0, 1)
+        units = np.rint(np.nan_to_num(fraction) * np.float32(UNIT)).astype(np.int64)
         grown = np.maximum(excess + units - level, 0)
         start[undecided & (grown == 0)] = number + 1
         below[undecided & (2 * units < level)] = number
@@ -106,18 +106,18 @@ def changepoint_split(frames: Array, first: int, mean: Floats, weight: Array, to
     """
     for number, frame in enumerate(frames, start=first):
         total += frame - mean
-        found = -total.astype(np.float32) * weight[number + 1]
-        better = found > score
+        explained = -total.astype(np.float32) * weight[number + 1]
+        better = explained > score
         since[better & (number - start > REACH)] = number
         start[better] = number + 1
-        score[better] = found[better]
+        score[better] = explained[better]
         taken = number - start <= REACH
         ring[number % SLOTS, taken] = frame[taken]
 
 
 def changepoint_heights(start: Array, excess: Array, below: Array, since: Array, dark: Array, gain: Array,
                         ring: Array, travel: Floats, noise: float, quiet: np.float32, level: float,
-                        own: bool) -> tuple[Floats, Floats, Array]:  # fmt: skip
+                        own_levels: bool) -> tuple[Floats, Floats, Array]:  # fmt: skip
     """Return heights, standard deviations (mm) and status, from the samples around the changes.
 
     A hypothesis divides these samples into three groups: on the dark level, in transition, and on the light
@@ -138,40 +138,40 @@ def changepoint_heights(start: Array, excess: Array, below: Array, since: Array,
     noise : standard deviation of a sample, counts
     quiet : as of ``changepoint_scan``
     level : the level to be crossed, as a share of the range from dark to bright
-    own : whether the share refers to the pixel's own levels instead of the given ones
+    own_levels : whether the share refers to the pixel's own levels instead of the given ones
     """
     never = excess <= excess_of_noise(quiet, gain)
     status = np.select([start == INVALID, never, start == 0], [0, 2, 3], 1).astype(np.uint8)
     height, sigma = np.full((2, start.size), np.nan)
-    found = np.flatnonzero(status == 1)
-    if found.size:
-        spread = np.maximum(noise * np.abs(gain[found].astype(np.float64)), STRAIGHT)
-        values, there = _gather(
-            start[found], since[found], ring[:, found], dark[found], gain[found], len(travel)
+    changed = np.flatnonzero(status == 1)
+    if changed.size:
+        spread = np.maximum(noise * np.abs(gain[changed].astype(np.float64)), STRAIGHT)
+        values, available = _gather(
+            start[changed], since[changed], ring[:, changed], dark[changed], gain[changed], len(travel)
         )
-        samples = _add_up(_without_spikes(values, there, np.rint(SPIKE * spread * STEP)), there)
-        dim = start[found] - below[found]
+        samples = _add_up(_without_spikes(values, available, np.rint(SPIKE * spread * STEP)), available)
+        dim = start[changed] - below[changed]
         hovered = (dim > REACH) & _flat(samples, spread)
-        crossing, deviation, misfit = _weigh(samples, spread, level, own)
+        crossing, deviation, misfit = _weigh(samples, spread, level, own_levels)
         # Samples that no hypothesis fits are noisier than stated, or change in another way.
         blur = _variance_of_blur(samples, spread, level, crossing)
         odd = misfit > DOUBT * samples.freedom
         spread = np.where(odd, spread * np.sqrt(misfit / samples.freedom), spread)
-        again = _weigh(samples, spread, level, own)
+        again = _weigh(samples, spread, level, own_levels)
         deviation = np.where(odd, np.hypot(again[1], again[0] - crossing), deviation)
         deviation = np.hypot(deviation, np.sqrt(blur))
         crossing, deviation = np.where(hovered, (-dim / 2, dim / np.sqrt(12)), (crossing, deviation))
-        crossing = np.clip(crossing + start[found], 0, len(travel) - 1)
-        height[found] = -_travel_at(travel, crossing)
+        crossing = np.clip(crossing + start[changed], 0, len(travel) - 1)
+        height[changed] = -_travel_at(travel, crossing)
         late, early = (_travel_at(travel, crossing + side * deviation) for side in (1, -1))
-        sigma[found] = np.abs(late - early) / 2
+        sigma[changed] = np.abs(late - early) / 2
     return height, sigma, status
 
 
 def excess_of_noise(quiet: np.float32, gain: Array) -> Array:
     """Return the excess caused by noise, in units; inlined in the kernel."""
-    share = np.minimum(quiet * gain * gain, np.float32(1000))
-    return np.asarray(np.rint(share * np.float32(UNIT)), np.int32)
+    excess = np.minimum(quiet * gain * gain, np.float32(1000))
+    return np.asarray(np.rint(excess * np.float32(UNIT)), np.int32)
 
 
 @dataclass(frozen=True)
@@ -202,17 +202,17 @@ class _Levels:
 
     dark: Floats
     light: Floats
-    wanted: Floats
-    unsure: Floats
+    crossed: Floats
+    variance: Floats
 
 
-def _share(frame: Array, dark: Array, gain: Array) -> Array:
+def _fraction(frame: Array, dark: Array, gain: Array) -> Array:
     """Return the share of the range from dark to bright; a saturated sample is light."""
-    share = (frame.astype(np.float32) - dark) * gain
+    fraction = (frame.astype(np.float32) - dark) * gain
     if frame.dtype.kind == "f":
-        return share
-    light = np.where(gain < 0, np.minimum(share, np.float32(0)), np.maximum(share, np.float32(1)))
-    return np.where(frame == np.iinfo(frame.dtype).max, light, share)
+        return fraction
+    light = np.where(gain < 0, np.minimum(fraction, np.float32(0)), np.maximum(fraction, np.float32(1)))
+    return np.where(frame == np.iinfo(frame.dtype).max, light, fraction)
 
 
 def _gather(
@@ -220,15 +220,15 @@ def _gather(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the samples around each change, (SLOTS, P), in integer steps, and which are available."""
     number = start + np.arange(-REACH, REACH + 1)[:, np.newaxis]
-    there = (number >= since) & (number < count) & (number >= 0)
-    share = np.clip(_share(np.take_along_axis(ring, number % SLOTS, 0), dark, gain), -1, 2)
-    return np.where(there, np.rint(share * np.float32(STEP)), 0.0), there
+    available = (number >= since) & (number < count) & (number >= 0)
+    fraction = np.clip(_fraction(np.take_along_axis(ring, number % SLOTS, 0), dark, gain), -1, 2)
+    return np.where(available, np.rint(fraction * np.float32(STEP)), 0.0), available
 
 
-def _without_spikes(values: Floats, there: NDArray[np.bool_], limit: Floats) -> Floats:
+def _without_spikes(values: Floats, available: NDArray[np.bool_], limit: Floats) -> Floats:
     """Replace a sample that exceeds both of its neighbours by the nearer one."""
     calm = values.copy()
-    inner = there[:-2] & there[2:]
+    inner = available[:-2] & available[2:]
     sides = np.stack([values[:-2], values[2:]])
     low, high = sides.min(axis=0), sides.max(axis=0)
     middle = values[1:-1]
@@ -237,12 +237,12 @@ def _without_spikes(values: Floats, there: NDArray[np.bool_], limit: Floats) -> 
     return calm
 
 
-def _add_up(values: Floats, there: NDArray[np.bool_]) -> _Samples:
+def _add_up(values: Floats, available: NDArray[np.bool_]) -> _Samples:
     place = np.arange(-REACH, REACH + 1)[:, np.newaxis]
-    shares = values / STEP
-    low = np.argmax(there, axis=0)
-    sums = (np.cumsum(part, axis=0) for part in (shares, place * shares, shares**2))
-    return _Samples(low, low + np.sum(there, axis=0), *(np.pad(part, ((1, 0), (0, 0))) for part in sums))
+    fractions = values / STEP
+    low = np.argmax(available, axis=0)
+    sums = (np.cumsum(part, axis=0) for part in (fractions, place * fractions, fractions**2))
+    return _Samples(low, low + np.sum(available, axis=0), *(np.pad(part, ((1, 0), (0, 0))) for part in sums))
 
 
 def _flat(samples: _Samples, noise: Floats) -> NDArray[np.bool_]:
@@ -254,16 +254,16 @@ def _flat(samples: _Samples, noise: Floats) -> NDArray[np.bool_]:
 
 
 def _hypotheses(
-    samples: _Samples, noise: Floats, level: float, own: bool
+    samples: _Samples, noise: Floats, level: float, own_levels: bool
 ) -> Iterator[tuple[Floats, Floats, Floats, Floats]]:
     """Yield misfit, prior, crossing in frames from the start, and its variance of each hypothesis."""
     for length in range(SLOTS + 1):
         for begin in range(SLOTS - length + 1):
-            yield _hypothesis(samples, noise, level, own, begin, length)
+            yield _hypothesis(samples, noise, level, own_levels, begin, length)
 
 
 def _hypothesis(
-    samples: _Samples, noise: Floats, level: float, own: bool, begin: int, length: int
+    samples: _Samples, noise: Floats, level: float, own_levels: bool, begin: int, length: int
 ) -> tuple[Floats, Floats, Floats, Floats]:
     end = begin + length
     before, after = begin - samples.low, samples.high - end
@@ -278,9 +278,9 @@ def _hypothesis(
     misfit = low_square - low_sum * dark + high_square - after + 2 * lack - lack * (1 - light)
 
     levels = _Levels(dark, light, np.full_like(dark, level), np.zeros_like(dark))
-    if own:
-        unsure = noise**2 * ((1 - level) ** 2 / (before + slack) + level**2 / (after + slack))
-        levels = _Levels(dark, light, dark + level * (light - dark), unsure)
+    if own_levels:
+        level_variance = noise**2 * ((1 - level) ** 2 / (before + slack) + level**2 / (after + slack))
+        levels = _Levels(dark, light, dark + level * (light - dark), level_variance)
     if length == 0:
         shape = np.ones_like(noise)
         missed, prior, crossing, variance = 0 * shape, shape, (begin - REACH - 0.5) * shape, shape / 12
@@ -296,18 +296,18 @@ def _single(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """One sample in transition between samples on the levels: the length of the ramp is not determined.
 
-    It lasts at most 1 / max(share, 1 - share) frames, otherwise a neighbour would be in transition, too.
-    Longer ramps are more likely to be sampled: the mean length is two thirds of that, with a variance of an
-    eighteenth.
+    It lasts at most 1 / max(fraction, 1 - fraction) frames, otherwise a neighbour would be in transition,
+    too. Longer ramps are more likely to be sampled: the mean length is two thirds of that, with a variance of
+    an eighteenth.
     """
     above = samples.total(begin, begin + 1)[0] - levels.dark
     rise = np.maximum(levels.light - levels.dark, 0.1)
-    share = np.clip(above / rise, 0, 1)
-    longest = 1 / np.maximum(share, 1 - share)
-    shift = longest * ((levels.wanted - levels.dark) / rise - share)
+    fraction = np.clip(above / rise, 0, 1)
+    longest = 1 / np.maximum(fraction, 1 - fraction)
+    shift = longest * ((levels.crossed - levels.dark) / rise - fraction)
     variance = (2 / 3 * longest * noise / rise) ** 2 + shift**2 / 18
     prior = SINGLE * np.sqrt(2 * np.pi) * noise
-    return (above - share * rise) ** 2, prior, begin - REACH + 2 / 3 * shift, variance
+    return (above - fraction * rise) ** 2, prior, begin - REACH + 2 / 3 * shift, variance
 
 
 def _ramp(
@@ -326,7 +326,7 @@ def _ramp(
     rises = slope > 1e-3
     duration = 1 / np.where(rises, slope, 1)
     crossing, leaves, arrives = (
-        middle + (part - value / length) * duration for part in (levels.wanted, levels.dark, levels.light)
+        middle + (part - value / length) * duration for part in (levels.crossed, levels.dark, levels.light)
     )
     early = np.where(begin > samples.low, first - 1 - leaves, 0)
     late = np.where(begin + length < samples.high, arrives - last - 1, 0)
@@ -337,7 +337,7 @@ def _ramp(
     prior = RAMP * 2 * np.pi * noise**2 * np.sqrt(12) * duration / length
     reach = (length + 1) / 2
     off = np.clip(crossing - middle, -reach, reach)
-    variance = duration**2 * (noise**2 * (1 / length + off**2 / spread) + levels.unsure)
+    variance = duration**2 * (noise**2 * (1 / length + off**2 / spread) + levels.variance)
     return np.where(rises, missed, np.inf), prior, middle + off, np.minimum(variance, reach**2 / 3)
 
 
@@ -349,11 +349,11 @@ def _variance_of_blur(samples: _Samples, noise: Floats, level: float, crossing: 
     under_way = (slot == frame + REACH) & (low < level) & (high >= level)
     under_way &= (low >= PLATEAU * noise) & (high <= 1 - PLATEAU * noise)
     rise = np.where(under_way, high - low, 1)
-    first, second, middle, share = low - 0.5, high - 0.5, level - 0.5, (level - low) / rise
+    first, second, middle, fraction = low - 0.5, high - 0.5, level - 0.5, (level - low) / rise
     both = first**2 + first * second + second**2
     # The quantile of a share is proportional to v + BENT v^3, with v = share - 1/2.
-    bent = share * (1 + BENT * (middle**2 + middle * first + first**2)) / (1 + BENT * both)
-    variance = (frame + bent - crossing) ** 2 - (noise / rise) ** 2 * (share**2 + (1 - share) ** 2)
+    bent = fraction * (1 + BENT * (middle**2 + middle * first + first**2)) / (1 + BENT * both)
+    variance = (frame + bent - crossing) ** 2 - (noise / rise) ** 2 * (fraction**2 + (1 - fraction) ** 2)
     return np.where(under_way, np.maximum(variance, 0), 0)
 
 
@@ -363,9 +363,9 @@ def _travel_at(travel: Floats, frame: Floats) -> Floats:
     return np.asarray(travel[before] + (frame - before) * (travel[before + 1] - travel[before]))
 
 
-def _weigh(samples: _Samples, noise: Floats, level: float, own: bool) -> tuple[Floats, Floats, Floats]:
+def _weigh(samples: _Samples, noise: Floats, level: float, own_levels: bool) -> tuple[Floats, Floats, Floats]:
     """Return mean and standard deviation over all hypotheses, and the least misfit, squared sigmas."""
-    answers = zip(*_hypotheses(samples, noise, level, own), strict=True)
+    answers = zip(*_hypotheses(samples, noise, level, own_levels), strict=True)
     misfit, prior, crossing, variance = (np.array(part) for part in answers)
     misfit /= noise**2
     best = misfit.min(axis=0)
