@@ -103,7 +103,9 @@ class EdgeDrawing:
         kinds: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
             "vectors": ((*shape, 3), np.float32),
             **dict.fromkeys(("sigma", "strength"), (shape, np.float32)),
-            **dict.fromkeys(("contact", "clean", "doubt", "lines", "more", "ways"), (shape, np.uint8)),
+            **dict.fromkeys(
+                ("contact", "clean", "undecided", "lines", "more", "directions"), (shape, np.uint8)
+            ),
             **dict.fromkeys(("cells", "joined"), (cells, np.float32)),
         }
         # Every kernel writes its maps completely, so they need no initialisation.
@@ -154,7 +156,7 @@ class EdgeDrawing:
         macros: dict[str, str | int] = {
             "SPACING": chosen.spacing,
             "STEPS": chosen.steps,
-            "LEAST": f"{chosen.least}f",
+            "MIN_PAIRS": f"{chosen.min_pairs}f",
             "REACH": chosen.reach,
             "GUARD": chosen.guard,
             "PART": f"{chosen.part}f",
@@ -162,7 +164,7 @@ class EdgeDrawing:
             "LAST": int(chosen is COARSE),
         }
         maps, (rows, columns) = self._maps, self._shape
-        jumps: dict[str, Any] = {name: maps[name] for name in ("strength", "ways")}
+        jumps: dict[str, Any] = {name: maps[name] for name in ("strength", "directions")}
         yield from self._run(
             "edges_jumps",
             parts,
@@ -176,7 +178,7 @@ class EdgeDrawing:
             quiet=LIMITS.quiet,
             floor_=LIMITS.floor,
             lowest=LIMITS.lowest,
-            doubt=maps["doubt"],
+            undecided=maps["undecided"],
             **jumps,
         )
         lines: dict[str, Any] = {"edges": maps[before], "added": maps[after]}

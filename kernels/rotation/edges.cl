@@ -3,7 +3,7 @@
 // TILE      pixels of one work-item, at most CHUNK of them at a time; 1 on a GPU
 // SPACING   distance between evaluated pixels, and side of a cell, pixels
 // STEPS     number of distances of pairs from the pixel: 3, or 2 that must agree
-// LEAST     minimum number of valid pairs
+// MIN_PAIRS minimum number of valid pairs
 // REACH     half-width of the non-maximum suppression, pixels
 // GUARD     minimum distance from the lines of earlier passes, pixels
 // PART      minimum share of the mean difference that the jump must be
@@ -15,7 +15,7 @@
 
 #include "common.clh"
 
-#define WAYS 8
+#define DIRECTIONS 8
 #define MARGIN 10
 #define LINES 3
 
@@ -30,15 +30,15 @@ __kernel void edges_clean(
 {
     EACH_PIXEL {
         const int row = p / columns, column = p % columns;
-        int near = 0, known = 0;
+        int near = 0, neighbours = 0;
         for (int y = GREATER(row - 1, 0); y <= LESSER(row + 1, rows - 1); ++y) {
             for (int x = GREATER(column - 1, 0); x <= LESSER(column + 1, columns - 1); ++x) {
                 const int other = y != row || x != column;
                 near += other && contact[y * columns + x];
-                known += other;
+                neighbours += other;
             }
         }
-        clean[p] = contact[p] ? near > 1 || known < 2 : 4 * near >= 3 * known && known > 0;
+        clean[p] = contact[p] ? near > 1 || neighbours < 2 : 4 * near >= 3 * neighbours && neighbours > 0;
     }
 }
 
@@ -59,17 +59,17 @@ __kernel void edges_cells(
         const int inside = row >= 0 && row < rows && column >= 0 && column < columns;
         const int p = inside ? row * columns + column : -1;
         float part[4] = {0, 0, 0, 0};
-        int known = 0;
+        int valid = 0;
         if (p >= 0 && clean[p] && contact[p]) {
             part[3] = sigma[p] * sigma[p];
-            known = sigma[p] >= 0 && sigma[p] < INFINITY;
+            valid = sigma[p] >= 0 && sigma[p] < INFINITY;
             for (int i = 0; i < 3; ++i) {
                 part[i] = vectors[3 * p + i];
-                known &= isfinite(part[i]) != 0;
+                valid &= isfinite(part[i]) != 0;
             }
         }
-        for (int i = 0; i < 4; ++i) cells[i * plane + q] = known ? part[i] : 0;
-        cells[4 * plane + q] = known;
+        for (int i = 0; i < 4; ++i) cells[i * plane + q] = valid ? part[i] : 0;
+        cells[4 * plane + q] = valid;
         cells[5 * plane + q] = 1;
     }
 }
@@ -98,30 +98,30 @@ __kernel void edges_join(const int rows, const int columns, MAP cells, __global 
 __kernel void edges_jumps(
     const int rows, const int columns, MAP cells, MAP pairs, const float jump, const float bend,
     const float significance, const float quiet, const float floor_, const float lowest,
-    __global uchar *restrict doubt, OUT strength, __global uchar *restrict ways)
+    __global uchar *restrict undecided, OUT strength, __global uchar *restrict directions)
 {
     const int runs = (columns + CHUNK - 1) / CHUNK, row = (int)get_global_id(0) / runs;
     const int first = (int)get_global_id(0) % runs * CHUNK;
     if (row >= rows) return;
     const int width = LESSER(CHUNK, columns - first), target = row * columns + first;
     int busy = 0;
-    for (int i = 0; i < width; ++i) busy |= FIRST || doubt[target + i];
+    for (int i = 0; i < width; ++i) busy |= FIRST || undecided[target + i];
     if (!busy) {
         for (int i = 0; i < width; ++i) strength[target + i] = 0;
         return;
     }
     const int stride = columns + 2 * MARGIN, plane = (rows + 2 * MARGIN) * stride;
     __global const float *x = cells + (row + MARGIN) * stride + first + MARGIN, *y = x + plane, *z = y + plane;
-    __global const float *variance = z + plane, *share = variance + plane, *unbarred = share + plane;
+    __global const float *variance = z + plane, *valid = variance + plane, *unbarred = valid + plane;
 
-    float best[CHUNK], square[CHUNK], error[CHUNK], least[CHUNK];
-    int way[CHUNK];
+    float best[CHUNK], square[CHUNK], error[CHUNK], min_variance[CHUNK];
+    int direction[CHUNK];
     for (int i = 0; i < width; ++i) {
         best[i] = square[i] = error[i] = 0;
-        least[i] = 1e30f;
-        way[i] = 0;
+        min_variance[i] = 1e30f;
+        direction[i] = 0;
     }
-    for (int w = 0; w < WAYS; ++w) {
+    for (int w = 0; w < DIRECTIONS; ++w) {
         float n[CHUNK], u1[CHUNK], u2[CHUNK], v[CHUNK];
         float x0[CHUNK], y0[CHUNK], z0[CHUNK], x1[CHUNK], y1[CHUNK], z1[CHUNK];
         for (int i = 0; i < width; ++i) n[i] = u1[i] = u2[i] = v[i] = x0[i] = y0[i] = z0[i] = x1[i] = y1[i] = z1[i] = 0;
@@ -139,7 +139,7 @@ __kernel void edges_jumps(
 #endif
                 if (!(u > 0)) continue;
                 for (int i = 0; i < width; ++i) {
-                    const float both = share[i + away] * share[i - away] * open[i];
+                    const float both = valid[i + away] * valid[i - away] * open[i];
 #if STEPS == 2
                     const float weight = step == 0 ? both : 0, moment = step == 0 ? 0 : both;
 #else
@@ -161,15 +161,15 @@ __kernel void edges_jumps(
             }
         }
         for (int i = 0; i < width; ++i) {
-            int usable = n[i] >= LEAST;
+            int usable = n[i] >= MIN_PAIRS;
             const float per_n = 1 / GREATER(n[i], 0.1f);
             const float mean = (x0[i] * x0[i] + y0[i] * y0[i] + z0[i] * z0[i]) * per_n * per_n;
 #if STEPS == 2
-            usable &= u1[i] >= LEAST;
+            usable &= u1[i] >= MIN_PAIRS;
             const float part = per_n, per_far = 1 / GREATER(u1[i], 0.1f);
             const float far = (x1[i] * x1[i] + y1[i] * y1[i] + z1[i] * z1[i]) * per_far * per_far;
             const float common = (x0[i] * x1[i] + y0[i] * y1[i] + z0[i] * z1[i]) * per_n * per_far;
-            const float found = common * common / GREATER(GREATER(mean, far), 1e-30f);
+            const float jump_square = common * common / GREATER(GREATER(mean, far), 1e-30f);
             const int real = usable & (common > 0);
 #else
             const float spread = n[i] * u2[i] - u1[i] * u1[i];
@@ -178,29 +178,29 @@ __kernel void edges_jumps(
             const float jump_x = (u2[i] * x0[i] - u1[i] * x1[i]) * per_spread;
             const float jump_y = (u2[i] * y0[i] - u1[i] * y1[i]) * per_spread;
             const float jump_z = (u2[i] * z0[i] - u1[i] * z1[i]) * per_spread;
-            const float found = jump_x * jump_x + jump_y * jump_y + jump_z * jump_z;
+            const float jump_square = jump_x * jump_x + jump_y * jump_y + jump_z * jump_z;
             const float both = (jump_x * x0[i] + jump_y * y0[i] + jump_z * z0[i]) * per_n;
-            const int real = usable & (found >= PART * PART * mean) & (2 * both >= found);
+            const int real = usable & (jump_square >= PART * PART * mean) & (2 * both >= jump_square);
 #endif
             const float noise = part * v[i] * per_n * (1.0f / (SPACING * SPACING)) + floor_ * floor_;
-            const float contrast = real ? found / noise : 0;
+            const float contrast = real ? jump_square / noise : 0;
             const int better = contrast > best[i];
-            least[i] = (usable & (noise < least[i])) ? noise : least[i];
+            min_variance[i] = (usable & (noise < min_variance[i])) ? noise : min_variance[i];
             best[i] = better ? contrast : best[i];
-            square[i] = better ? found : square[i];
+            square[i] = better ? jump_square : square[i];
             error[i] = better ? noise : error[i];
-            way[i] = better ? w : way[i];
+            direction[i] = better ? w : direction[i];
         }
     }
     for (int i = 0; i < width; ++i) {
-        const int unclear = (STEPS == 2) | (least[i] > quiet * quiet);
+        const int unclear = (STEPS == 2) | (min_variance[i] > quiet * quiet);
         const int clear = LAST | !unclear;
-        const float deviation = sqrt(error[i]), wanted = jump + (clear ? -1 : 0.5f) * deviation;
-        const float enough = GREATER(GREATER(wanted, lowest), significance * deviation) + (STEPS == 2 ? bend : 0);
-        const int doubtful = FIRST || doubt[target + i], edge = doubtful && best[i] > 0 && sqrt(square[i]) >= enough;
+        const float deviation = sqrt(error[i]), required = jump + (clear ? -1 : 0.5f) * deviation;
+        const float enough = GREATER(GREATER(required, lowest), significance * deviation) + (STEPS == 2 ? bend : 0);
+        const int open_pixel = FIRST || undecided[target + i], edge = open_pixel && best[i] > 0 && sqrt(square[i]) >= enough;
         strength[target + i] = edge ? sqrt(best[i]) : 0;
-        ways[target + i] = way[i];
-        doubt[target + i] = doubtful && unclear;
+        directions[target + i] = direction[i];
+        undecided[target + i] = open_pixel && unclear;
     }
 }
 
@@ -225,7 +225,7 @@ int guarded(
 }
 
 __kernel void edges_thin(
-    const int rows, const int columns, MAP strength, __global const uchar *restrict ways,
+    const int rows, const int columns, MAP strength, __global const uchar *restrict directions,
     __global const uchar *restrict edges, __global uchar *restrict added)
 {
     EACH_PIXEL {
@@ -233,7 +233,7 @@ __kernel void edges_thin(
         added[p] = FIRST ? 0 : edges[p];
         if (!(here > 0)) continue;
         const int row = p / columns, column = p % columns;
-        const float angle = M_PI_F / WAYS * ways[p], cosine = cos(angle), sine = sin(angle);
+        const float angle = M_PI_F / DIRECTIONS * directions[p], cosine = cos(angle), sine = sin(angle);
         for (int step = 1; step <= REACH; ++step) {
             const int right = (int)floor(step * cosine + 0.5f), down = (int)floor(step * sine + 0.5f);
             if (at(strength, rows, columns, row + down, column + right) > here) here = 0;

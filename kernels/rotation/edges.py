@@ -21,9 +21,9 @@ from mirrorskin.kernels.array_types import Doubles
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]
 
-WAYS = 8  # number of directions, over half a turn
+DIRECTIONS = 8  # number of directions, over half a turn
 MARGIN = 10  # pixels around the cells, which contain all pairs
-CELLS = ("x", "y", "z", "variance", "share", "free")
+CELLS = ("x", "y", "z", "variance", "valid", "free")
 """Planes of the cells: mean normal, mean square sigma, share of valid pixels, 1 where no line is drawn."""
 
 
@@ -37,7 +37,7 @@ class Pass:
         Distance between positions, and side of a cell, pixels.
     steps : int
         Number of distances of pairs from the pixel; with two, no bend is fitted.
-    least : float
+    min_pairs : float
         Minimum number of valid pairs, at each of two distances, otherwise in all.
     reach : int
         Half-width of the non-maximum suppression, pixels.
@@ -49,15 +49,15 @@ class Pass:
 
     spacing: int
     steps: int
-    least: float
+    min_pairs: float
     reach: int
     guard: int
     part: float = 0.0
 
 
-NEAR = Pass(spacing=1, steps=2, least=1.5, reach=2, guard=0)
-FINE = Pass(spacing=1, steps=3, least=4.5, reach=2, guard=2, part=0.5)
-COARSE = Pass(spacing=3, steps=3, least=5.4, reach=3, guard=5, part=0.6)
+NEAR = Pass(spacing=1, steps=2, min_pairs=1.5, reach=2, guard=0)
+FINE = Pass(spacing=1, steps=3, min_pairs=4.5, reach=2, guard=2, part=0.5)
+COARSE = Pass(spacing=3, steps=3, min_pairs=5.4, reach=3, guard=5, part=0.6)
 PASSES = (NEAR, FINE, COARSE)
 
 
@@ -96,7 +96,7 @@ def pairs(chosen: Pass) -> tuple[Array, Array]:
     second position of a pair is the negative. ``distances``, (WAYS, 3, steps), are measured from the pixel
     along the direction; 0 for duplicates.
     """
-    angle = np.pi / WAYS * np.arange(WAYS)
+    angle = np.pi / DIRECTIONS * np.arange(DIRECTIONS)
     along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, np.newaxis, np.newaxis]
     across = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)[:, np.newaxis, np.newaxis]
     away = chosen.spacing * np.arange(chosen.steps) + (chosen.spacing + 1) / 2
@@ -104,10 +104,10 @@ def pairs(chosen: Pass) -> tuple[Array, Array]:
     exact = away[:, np.newaxis] * along + aside[:, np.newaxis, np.newaxis] * across
     places = np.floor(exact + 0.5 + 1e-9).astype(np.int32)
     distances = np.sum(places * along, axis=-1).astype(np.float32)
-    for way in range(WAYS):
-        flat = places[way].reshape(-1, 2)
-        again = [any((one == flat[:k]).all(axis=1)) for k, one in enumerate(flat)]
-        distances[way].reshape(-1)[again] = 0
+    for direction in range(DIRECTIONS):
+        flat = places[direction].reshape(-1, 2)
+        duplicate = [any((position == flat[:k]).all(axis=1)) for k, position in enumerate(flat)]
+        distances[direction].reshape(-1)[duplicate] = 0
     return places, distances
 
 
@@ -122,8 +122,8 @@ def edges_clean(contact: Array) -> Array:
     inside = np.pad(np.ones(contact.shape, np.int64), 1)
     rows, columns = contact.shape
     around = [np.s_[y : y + rows, x : x + columns] for y in range(3) for x in range(3) if (y, x) != (1, 1)]
-    near, known = (np.sum([one[place] for place in around], axis=0) for one in (touched, inside))
-    stays, fills = (near > 1) | (known < 2), (4 * near >= 3 * known) & (known > 0)
+    near, neighbours = (np.sum([mask[place] for place in around], axis=0) for mask in (touched, inside))
+    stays, fills = (near > 1) | (neighbours < 2), (4 * near >= 3 * neighbours) & (neighbours > 0)
     return np.asarray(np.where(contact != 0, stays, fills), np.uint8)
 
 
@@ -134,54 +134,55 @@ def edges_cells(vectors: Array, sigma: Array, contact: Array, clean: Array) -> D
     if both ``contact`` and ``clean`` are set: a pixel that only ``clean`` adds along a crease has seen both
     sides of it in turn.
     """
-    known = (clean != 0) & (contact != 0) & np.isfinite(vectors).all(axis=-1) & (sigma >= 0)
-    known &= sigma < np.inf
+    valid = (clean != 0) & (contact != 0) & np.isfinite(vectors).all(axis=-1) & (sigma >= 0)
+    valid &= sigma < np.inf
     maps = [*np.moveaxis(vectors.astype(np.float64), -1, 0), sigma.astype(np.float64) ** 2]
-    planes = [*(np.where(known, one, 0.0) for one in maps), known.astype(np.float64)]
+    planes = [*(np.where(valid, part, 0.0) for part in maps), valid.astype(np.float64)]
     cells = np.pad(np.stack(planes), ((0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
     return np.concatenate([cells, np.ones((1, *cells.shape[1:]))])
 
 
 def edges_join(cells: Doubles, edges: Array) -> Doubles:
     """Return cells of 3 x 3 pixels around each pixel, from cells of one pixel and the lines so far."""
-    known, drawn = cells[4], np.pad(edges != 0, MARGIN)
+    valid, drawn = cells[4], np.pad(edges != 0, MARGIN)
     joined = np.zeros_like(cells)
-    rows, columns = (slice(1, size - 1) for size in known.shape)
-    last = known.shape[0] - 2, known.shape[1] - 2
+    rows, columns = (slice(1, size - 1) for size in valid.shape)
+    last = valid.shape[0] - 2, valid.shape[1] - 2
     around = [np.s_[y : y + last[0], x : x + last[1]] for y in range(3) for x in range(3)]
-    count = np.sum([known[place] for place in around], axis=0)
+    count = np.sum([valid[place] for place in around], axis=0)
     for number in range(4):
-        total = np.sum([(known * cells[number])[place] for place in around], axis=0)
+        total = np.sum([(valid * cells[number])[place] for place in around], axis=0)
         joined[number, rows, columns] = total / np.maximum(count, 1)
     joined[4, rows, columns] = count / 9
     joined[5, rows, columns] = ~np.any([drawn[place] for place in around], axis=0)
     return joined
 
 
-def edges_jumps(cells: Doubles, chosen: Pass, limits: Limits, doubt: Array) -> tuple[Doubles, Array]:
+def edges_jumps(cells: Doubles, chosen: Pass, limits: Limits, undecided: Array) -> tuple[Doubles, Array]:
     """Return strengths and directions of the jumps of the normal.
 
     The strength is the largest jump over all directions, in standard errors; 0 where there is no edge.
-    Directions are numbered clockwise from x as seen in the picture. ``doubt``, (H, W), is updated in place:
-    1 where all passes so far were too noisy to decide. Pixels already decided get no jump.
+    Directions are numbered clockwise from x as seen in the picture. ``undecided``, (H, W), is updated in
+    place: 1 where all passes so far were too noisy to decide. Pixels already decided get no jump.
     """
-    strength, way = np.zeros(doubt.shape), np.zeros(doubt.shape, np.uint8)
-    jump, error, least = np.zeros(doubt.shape), np.zeros(doubt.shape), np.full(doubt.shape, np.inf)
+    strength, direction = np.zeros(undecided.shape), np.zeros(undecided.shape, np.uint8)
+    jump, error = np.zeros((2, *undecided.shape))
+    min_error = np.full(undecided.shape, np.inf)
     for number, (places, distances) in enumerate(zip(*pairs(chosen), strict=True)):
         fitted = _fit(cells, chosen, places, distances, limits.floor)
-        least = np.fmin(least, fitted[1])
+        min_error = np.fmin(min_error, fitted[1])
         contrast = np.where(fitted[2], fitted[0] / fitted[1], 0)
         better = contrast > strength
-        strength[better], way[better] = contrast[better], number
+        strength[better], direction[better] = contrast[better], number
         jump[better], error[better] = fitted[0][better], fitted[1][better]
-    unclear = (least > limits.quiet) | (chosen is NEAR)
+    unclear = (min_error > limits.quiet) | (chosen is NEAR)
     clear = (chosen is COARSE) | ~unclear
-    wanted = limits.jump + np.where(clear, -1.0, 0.5) * error
+    required = limits.jump + np.where(clear, -1.0, 0.5) * error
     bend = limits.bend if chosen is NEAR else 0.0
-    enough = np.maximum(np.maximum(wanted, limits.lowest), limits.significance * error) + bend
-    strength[(jump < enough) | (doubt == 0)] = 0
-    doubt &= unclear
-    return strength, way
+    enough = np.maximum(np.maximum(required, limits.lowest), limits.significance * error) + bend
+    strength[(jump < enough) | (undecided == 0)] = 0
+    undecided &= unclear
+    return strength, direction
 
 
 def _fit(
@@ -197,25 +198,25 @@ def _fit(
     for line, away in zip(places, distances, strict=True):
         open_ = np.ones((rows, columns))
         for step, ((right, down), u) in enumerate(zip(line.tolist(), away.tolist(), strict=True)):
-            here, there = at(right, down), at(-right, -down)
+            position, opposite = at(right, down), at(-right, -down)
             if step > 0:
-                open_ = open_ * here[5] * there[5]
-            weight = here[4] * there[4] * open_ * (u > 0)
+                open_ = open_ * position[5] * opposite[5]
+            weight = position[4] * opposite[4] * open_ * (u > 0)
             # With two distances each one is summed separately.
             once, moment = (step == 0, step == 1) if chosen.steps == 2 else (1.0, u)
-            difference = here[:3] - there[:3]
-            parts = [once, moment, moment * u, once * (here[3] + there[3])]
+            difference = position[:3] - opposite[:3]
+            parts = [once, moment, moment * u, once * (position[3] + opposite[3])]
             parts += [*(once * difference), *(moment * difference)]
             sums += np.stack([weight * part for part in parts])
-    jump, share, usable, real = (_agreed if chosen.steps == 2 else _straight)(sums, chosen)
+    jump, factor, usable, real = (_agreed if chosen.steps == 2 else _straight)(sums, chosen)
     variance = sums[3] / np.where(usable, sums[0], 1.0) / chosen.spacing**2
-    error = np.where(usable, np.sqrt(share * variance + floor**2), np.inf)
+    error = np.where(usable, np.sqrt(factor * variance + floor**2), np.inf)
     return jump, error, usable & real
 
 
 def _agreed(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask]:
-    """Return the jump on which differences at two distances agree, its share of the variance, and flags."""
-    usable = (sums[0] >= chosen.least) & (sums[1] >= chosen.least)
+    """Return the jump on which differences at two distances agree, its variance as a factor, and flags."""
+    usable = (sums[0] >= chosen.min_pairs) & (sums[1] >= chosen.min_pairs)
     near, far = (np.where(usable, part, 1.0) for part in sums[:2])
     first, second = sums[4:7] / near, sums[7:] / far
     longer = np.sqrt(np.maximum(np.sum(first**2, axis=0), np.sum(second**2, axis=0)))
@@ -225,9 +226,9 @@ def _agreed(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask]:
 
 
 def _straight(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask]:
-    """Return the jump of straight lines, its share of the variance, and where it is valid and not a bend."""
+    """Return the jump of straight lines, its variance as a factor, and where it is valid and not a bend."""
     n, u1, u2 = sums[:3]
-    usable = n >= chosen.least
+    usable = n >= chosen.min_pairs
     spread = n * u2 - u1 * u1
     usable &= spread > 1e-3 * n * u2
     n, spread = np.where(usable, n, 1.0), np.where(usable, spread, 1.0)
@@ -239,7 +240,7 @@ def _straight(sums: Doubles, chosen: Pass) -> tuple[Doubles, Doubles, Mask, Mask
     return np.sqrt(square), u2 / spread, usable, real
 
 
-def edges_thin(strength: Doubles, way: Array, chosen: Pass, edges: Array) -> Array:
+def edges_thin(strength: Doubles, direction: Array, chosen: Pass, edges: Array) -> Array:
     """Add lines, where the strength has a maximum across them, to those drawn so far.
 
     A pixel is not drawn if a line of an earlier pass is within ``guard`` pixels in the direction of its jump,
@@ -247,7 +248,7 @@ def edges_thin(strength: Doubles, way: Array, chosen: Pass, edges: Array) -> Arr
     """
     added = np.array(edges)
     for row, column in np.argwhere(strength > 0):
-        angle = np.pi / WAYS * way[row, column]
+        angle = np.pi / DIRECTIONS * direction[row, column]
         cosine, sine = np.cos(angle), np.sin(angle)
         here = strength[row, column]
         for step in range(1, chosen.reach + 1):

@@ -31,10 +31,10 @@ def draw(vectors, sigma, contact):
     """The whole way, in the reference."""
     clean = edges.edges_clean(contact)
     cells = edges.edges_cells(vectors, sigma, contact, clean)
-    doubt, lines = np.ones_like(contact), np.zeros_like(contact)
+    undecided, lines = np.ones_like(contact), np.zeros_like(contact)
     for chosen in PASSES:
         looked = edges.edges_join(cells, lines) if chosen is COARSE else cells
-        strength, direction = edges.edges_jumps(looked, chosen, LIMITS, doubt)
+        strength, direction = edges.edges_jumps(looked, chosen, LIMITS, undecided)
         lines = edges.edges_thin(strength, direction, chosen, lines)
     return edges.edges_bound(clean, lines)
 
