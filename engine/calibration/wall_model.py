@@ -179,7 +179,7 @@ def reach_wall(met: SheetPoints, named: Mapping[str, float]) -> WallHit:
     high, low = (
         1
         - np.arctan2(
-            met.z + ray.way * out * np.tan(np.clip(angle, -MAX_RAY_ELEVATION, MAX_RAY_ELEVATION)), radius
+            met.z + ray.distance * out * np.tan(np.clip(angle, -MAX_RAY_ELEVATION, MAX_RAY_ELEVATION)), radius
         )
         / whole
         for angle in (elevation - spread, elevation + spread)

@@ -102,8 +102,8 @@ def full_light(response: WallResponse, places: Doubles, zenith: Doubles, azimuth
     # Share of the ray, spread evenly over the scatter, that meets the wall.
     out = np.sqrt(ray.direction[0] ** 2 + ray.direction[1] ** 2)
     elevation, spread = np.arctan2(ray.direction[2], out), max(response.scatter, 1e-9)
-    top = np.minimum(np.arctan2(response.rim - z, ray.way * out), model.MAX_RAY_ELEVATION)
-    bottom = np.arctan2(-z, ray.way * out)
+    top = np.minimum(np.arctan2(response.rim - z, ray.distance * out), model.MAX_RAY_ELEVATION)
+    bottom = np.arctan2(-z, ray.distance * out)
     lit = np.minimum(elevation + spread, top) - np.maximum(elevation - spread, bottom)
     q = np.clip(half_tangent(ray.height, radius), *response.reach)
     light = level(q, response.curve, response.reach)[0]

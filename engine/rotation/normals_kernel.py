@@ -203,11 +203,11 @@ class NormalKernel:
             "sin_tilt": math.sin(tilt),
             "noise_base": noise.base,
             "noise_slope": noise.slope,
-            "noise_least": noise.floor,
+            "noise_floor": noise.floor,
             "noise_limit": limits.noise,
             "limit": limits.model,
-            "still_below": limits.still - fitted,
-            "wild_above": limits.most - fitted,
+            "lowest_tilt": limits.lowest_tilt - fitted,
+            "highest_tilt": limits.highest_tilt - fitted,
             "rest_below": limits.rest,
         }
         if frames is None:

@@ -33,15 +33,15 @@ Pose pose_of(const Direction at, const float cos_tilt, const float sin_tilt)
 Expected expect(const Pose pose, const Samples of, const int k)
 {
     const float c = entry(of, COSINE, k), s = entry(of, SINE, k);
-    const F near = pose.at.cp * c + pose.at.sp * s, most = LESSER(pose.base + pose.lean * near, (F)0.5f);
-    const F x = GREATER(most, (F)1e-12f), rest = x - x * x, inverse = inverse_roots(rest);
+    const F near = pose.at.cp * c + pose.at.sp * s, limited = LESSER(pose.base + pose.lean * near, (F)0.5f);
+    const F x = GREATER(limited, (F)1e-12f), rest = x - x * x, inverse = inverse_roots(rest);
     const F by_sine = entry(of, ROOT_WEIGHT, k) * inverse;
-    Expected found;
-    found.zenith = rest * inverse * angle_by_half_sine(x);
-    found.u1 = (pose.low * near + pose.high) * by_sine;
-    found.u2 = (pose.beside_x * s - pose.beside_y * c) * by_sine;
-    found.u3 = (pose.high * near + pose.low) * by_sine;
-    return found;
+    Expected expected;
+    expected.zenith = rest * inverse * angle_by_half_sine(x);
+    expected.u1 = (pose.low * near + pose.high) * by_sine;
+    expected.u2 = (pose.beside_x * s - pose.beside_y * c) * by_sine;
+    expected.u3 = (pose.high * near + pose.low) * by_sine;
+    return expected;
 }
 
 // Eq. 10 is linear in the normal for the cosine of the zenith: its wave is the normal. A missing sample is
@@ -50,13 +50,13 @@ INLINE Direction begin_at(const Samples of, const I usable, const float cos_tilt
 {
     F mean = 0.0f, x = 0.0f, y = 0.0f, z = 0.0f;
     if (!COUNTED && any_of(usable < of.count)) {
-        F known = 0.0f;
+        F present = 0.0f;
         for (int k = 0; k < of.count; ++k) {
             const F zenith = zenith_of(of, raw_of(of, k));
-            known += zenith == zenith ? (F)1.0f : (F)0.0f;
+            present += zenith == zenith ? (F)1.0f : (F)0.0f;
             mean += zenith == zenith ? cosine(zenith) : (F)0.0f;
         }
-        mean /= known;
+        mean /= present;
     }
     for (int k = 0; k < of.count; ++k) {
         const F zenith = zenith_of(of, raw_of(of, k)), level = zenith == zenith ? cosine(zenith) : mean;
@@ -78,17 +78,17 @@ INLINE Sums look(
     for (int k = 0; k < of.count; ++k) {
         const F zenith = zenith_of(of, raw_of(of, k));
         const float root = entry(of, ROOT_WEIGHT, k);
-        const Expected seen = expect(pose, of, k);
-        const F error = root * (zenith - seen.zenith);
-        sums.m12 += seen.u1 * seen.u2;
-        sums.m22 += seen.u2 * seen.u2;
-        sums.b1 += seen.u1 * error;
-        sums.b2 += seen.u2 * error;
+        const Expected expected = expect(pose, of, k);
+        const F error = root * (zenith - expected.zenith);
+        sums.m12 += expected.u1 * expected.u2;
+        sums.m22 += expected.u2 * expected.u2;
+        sums.b1 += expected.u1 * error;
+        sums.b2 += expected.u2 * error;
         if (!last) continue;
         const F off = off_wave(of, k, zenith, wave);
-        sums.m13 += seen.u1 * seen.u3;
-        sums.m23 += seen.u2 * seen.u3;
-        sums.b3 += seen.u3 * error;
+        sums.m13 += expected.u1 * expected.u3;
+        sums.m23 += expected.u2 * expected.u3;
+        sums.b3 += expected.u3 * error;
         sums.square += error * error;
         sums.waves += off * off;
     }
@@ -105,11 +105,12 @@ Sums look_closely(
     Sums sums = {0};
     const Pose pose = pose_of(at, cos_tilt, sin_tilt);
     for (int k = 0; k < of.count; ++k) {
-        const Expected seen = expect(pose, of, k);
-        const F least = GREATER(seen.zenith, of.low);
-        const I inside = (seen.zenith > of.low) & (seen.zenith < of.high);
+        const Expected expected = expect(pose, of, k);
+        const F above_low = GREATER(expected.zenith, of.low);
+        const I inside = (expected.zenith > of.low) & (expected.zenith < of.high);
         add_closely(
-            &sums, of, k, raw_of(of, k), LESSER(least, of.high), inside, (I)-1, error_of_one, seen.u1, seen.u2, seen.u3);
+            &sums, of, k, raw_of(of, k), LESSER(above_low, of.high), inside, (I)-1, error_of_one, expected.u1, expected.u2,
+            expected.u3);
     }
     return sums;
 }
@@ -125,24 +126,24 @@ __kernel void normals_exact(ARGUMENTS)
     }
     for (int from = first; from < end; from += PART * LANES) {
         Samples of[PART];
-        Known known[PART];
+        Summary summary[PART];
         Direction begin[PART], nearer[PART];
         Sums sums[PART];
         for (int i = 0; i < PART; ++i) {
             const int next = from + i * LANES, p = next < end ? next : from;
             of[i] = SAMPLES(SCALE(2), SCALE(3));
-            known[i] = survey(of[i], noise);
+            summary[i] = survey(of[i], noise);
         }
-        for (int i = 0; i < PART; ++i) begin[i] = begin_at(of[i], known[i].usable, cos_tilt, sin_tilt);
-        for (int i = 0; i < PART; ++i) sums[i] = look(begin[i], of[i], known[i].wave, weights, cos_tilt, sin_tilt, 0);
+        for (int i = 0; i < PART; ++i) begin[i] = begin_at(of[i], summary[i].usable, cos_tilt, sin_tilt);
+        for (int i = 0; i < PART; ++i) sums[i] = look(begin[i], of[i], summary[i].wave, weights, cos_tilt, sin_tilt, 0);
         for (int i = 0; i < PART; ++i) nearer[i] = step(begin[i], sums[i]);
-        for (int i = 0; i < PART; ++i) sums[i] = look(nearer[i], of[i], known[i].wave, weights, cos_tilt, sin_tilt, 1);
+        for (int i = 0; i < PART; ++i) sums[i] = look(nearer[i], of[i], summary[i].wave, weights, cos_tilt, sin_tilt, 1);
         for (int i = 0; i < PART; ++i) {
             const int p = from + i * LANES;
             if (p >= end) break;
-            const F error_of_one = known[i].error_of_one, waves = sums[i].waves;
-            const I usable = known[i].usable;
-            Direction found = step(nearer[i], sums[i]);
+            const F error_of_one = summary[i].error_of_one, waves = sums[i].waves;
+            const I usable = summary[i].usable;
+            Direction normal = step(nearer[i], sums[i]);
             // Too few informative samples give no result, whatever the steps.
             const I irregular = (usable < count) & (usable >= LEAST);
             if (any_of(irregular)) {
@@ -152,12 +153,12 @@ __kernel void normals_exact(ARGUMENTS)
                     sums[i] = blend_sums(sums[i], closer, irregular);
                     at = step(at, closer);
                 }
-                found = blend(found, at, irregular);
+                normal = blend(normal, at, irregular);
             }
             // A sheet at rest has zenith 0; one in contact has a mean of at least the tilt.
-            const I at_rest = known[i].wave.mean < limits.rest;
-            conclude(maps, p, turns, found, sums[i], error_of_one, count, usable, at_rest, limits, limits.model);
-            if (!bare) keep_wave(maps, p, turns, of[i], known[i].wave, waves);
+            const I at_rest = summary[i].wave.mean < limits.rest;
+            conclude(maps, p, turns, normal, sums[i], error_of_one, count, usable, at_rest, limits, limits.model);
+            if (!bare) keep_wave(maps, p, turns, of[i], summary[i].wave, waves);
         }
     }
 }
@@ -170,26 +171,26 @@ __kernel void normals_paper(
     GATHER_ARGUMENTS
     for (int p = first; p < end; p += LANES) {
         const Samples of = SAMPLES(SCALE(2), SCALE(3));
-        const Known known = survey(of, noise);
-        const Wave wave = known.wave;
+        const Summary summary = survey(of, noise);
+        const Wave wave = summary.wave;
         F waves = 0.0f;
         for (int k = 0; k < count; ++k) {
             const F off = off_wave(of, k, zenith_of(of, raw_of(of, k)), wave);
             waves += off * off;
         }
-        const F swing = wave.cosine * wave.cosine + wave.sine * wave.sine;
-        const I swings = swing > STEADY * STEADY;
-        const F inverse = inverse_roots(swings ? swing : (F)1.0f);
-        const F cp = swings ? wave.cosine * inverse : (F)1.0f, sp = swings ? wave.sine * inverse : (F)0.0f;
+        const F square = wave.cosine * wave.cosine + wave.sine * wave.sine;
+        const I modulated = square > STEADY * STEADY;
+        const F inverse = inverse_roots(modulated ? square : (F)1.0f);
+        const F cp = modulated ? wave.cosine * inverse : (F)1.0f, sp = modulated ? wave.sine * inverse : (F)0.0f;
         const F st = sine(wave.mean), ct = cosine(wave.mean), slant = st * inverse, both = 2.0f * cp * sp * of_both;
         const F across = sp * sp * of_cosine - both + cp * cp * of_sine;
         const F along = cp * cp * of_cosine + both + sp * sp * of_sine;
-        const F error = known.error_of_one * roots(of_mean + slant * slant * across);
-        const I answered = swings & (ct > 0.0f);
-        const F swung = swing * inverse, uncertainty = 3.0f * known.error_of_one * roots(along);
-        const I off_tilt = (wave.mean < limits.rest) | (swung + uncertainty < limits.still)
-            | (swung - uncertainty > limits.wild);
-        const I touches = like_noise(waves, known.error_of_one, count, limits.noise, limits.model) & !off_tilt;
+        const F error = summary.error_of_one * roots(of_mean + slant * slant * across);
+        const I answered = modulated & (ct > 0.0f);
+        const F amplitude = square * inverse, uncertainty = 3.0f * summary.error_of_one * roots(along);
+        const I off_tilt = (wave.mean < limits.rest) | (amplitude + uncertainty < limits.lowest_tilt)
+            | (amplitude - uncertainty > limits.highest_tilt);
+        const I touches = like_noise(waves, summary.error_of_one, count, limits.noise, limits.model) & !off_tilt;
         keep_answer(maps, p, turns, answered, st * cp, st * sp, ct, error, touches);
         if (!bare) keep_wave(maps, p, turns, of, wave, waves);
     }

@@ -38,22 +38,22 @@ _MARGIN = 3.0  # minimum distance of a sample within the range from its ends, st
 _MODEL = 0.2  # RMS error of the model in contact, as a share of the tilt
 _DOUBT = 2.0  # tolerated ratio of the actual to the assumed variance of the noise
 _REST = 0.5  # share of the tilt below which a mean zenith is that of a sheet at rest
-_MOST = 2.0  # maximum amplitude, in tilts: a pixel with constant brightness looks level and tilted
-_STILL = 0.25  # share of the tilt below which a sheet does not follow the object
+_HIGHEST_TILT = 2.0  # maximum amplitude, in tilts: a pixel with constant brightness looks level and tilted
+_LOWEST_TILT = 0.25  # share of the tilt below which a sheet does not follow the object
 
 
 class Variance(NamedTuple):
-    """Variance of a sample of weight 1: base + slope x the mean of its pixel's samples, at least `least`.
+    """Variance of a sample of weight 1: base + slope x the mean of its pixel's samples, at least `floor`.
 
     Attributes
     ----------
-    base, slope, least : float
+    base, slope, floor : float
         Counts squared, counts, counts squared.
     """
 
     base: float
     slope: float
-    least: float
+    floor: float
 
 
 class Limits(NamedTuple):
@@ -65,9 +65,9 @@ class Limits(NamedTuple):
         Largest sum of squares that is attributed to noise, in variances of a sample.
     model : float
         Largest sum of squares that is attributed to errors of the model, radians squared.
-    still : float
+    lowest_tilt : float
         Minimum apparent tilt of a sheet in contact, radians; three standard errors are tolerated.
-    most : float
+    highest_tilt : float
         Maximum apparent tilt of a sheet in contact, radians; three standard errors are tolerated.
     rest : float
         Minimum mean zenith of a sheet in contact, radians: the mean is 0 at rest, and at least the tilt in
@@ -76,8 +76,8 @@ class Limits(NamedTuple):
 
     noise: float
     model: float
-    still: float
-    most: float
+    lowest_tilt: float
+    highest_tilt: float
     rest: float
 
 
@@ -87,7 +87,9 @@ def contact_limits(freedom: int, tilt: float) -> Limits:
     ``noise`` is based on the 99.9 % quantile of chi-square, n + 4.37 sqrt(n) + 5.7 within 3 %.
     """
     noise = _DOUBT * (freedom + 4.37 * math.sqrt(freedom) + 5.7)
-    return Limits(noise, (freedom + 3) * (_MODEL * tilt) ** 2, _STILL * tilt, _MOST * tilt, _REST * tilt)
+    return Limits(
+        noise, (freedom + 3) * (_MODEL * tilt) ** 2, _LOWEST_TILT * tilt, _HIGHEST_TILT * tilt, _REST * tilt
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,28 +170,32 @@ def normals_paper(
     """
     samples = Samples(frames, turn, scale, noise)
     zenith, c, s = samples.mean, samples.cosine, samples.sine
-    swing = np.hypot(c, s)
+    amplitude = np.hypot(c, s)
     with np.errstate(divide="ignore", invalid="ignore"):
-        cp, sp = c / swing, s / swing
+        cp, sp = c / amplitude, s / amplitude
         both = 2 * cp * sp * spread[2]
         across = sp**2 * spread[1] - both + cp**2 * spread[3]
         along = cp**2 * spread[1] + both + sp**2 * spread[3]
-        sigma = samples.error * np.sqrt(spread[0] + (np.sin(zenith) / swing) ** 2 * across)
+        sigma = samples.error * np.sqrt(spread[0] + (np.sin(zenith) / amplitude) ** 2 * across)
         uncertainty = 3 * samples.error * np.sqrt(along)
-        off_tilt = (swing + uncertainty < limits.still) | (swing - uncertainty > limits.most)
+        off_tilt = (amplitude + uncertainty < limits.lowest_tilt) | (
+            amplitude - uncertainty > limits.highest_tilt
+        )
         touching = (
             _like_noise(samples.square, samples, limits.noise, limits.model)
             & ~off_tilt
             & ~(zenith < limits.rest)
         )
     normal = np.stack([np.sin(zenith) * cp, np.sin(zenith) * sp, np.cos(zenith)], axis=1)
-    return _answer(normal, np.where(swing > _STEADY, sigma, np.nan), touching, samples)
+    return _answer(normal, np.where(amplitude > _STEADY, sigma, np.nan), touching, samples)
 
 
 def add_turn(before: Answer, now: Answer, turns: int) -> Answer:
     """Return the combination of a turn with the mean of the ``turns`` - 1 before it, by inverse variances."""
-    own, theirs = (np.where(np.isnan(one.sigma), 0.0, 1 / one.sigma**2) for one in (now, before))
-    sums = own[:, np.newaxis] * np.nan_to_num(now.vectors) + theirs[:, np.newaxis] * np.nan_to_num(
+    new_weight, old_weight = (
+        np.where(np.isnan(answer.sigma), 0.0, 1 / answer.sigma**2) for answer in (now, before)
+    )
+    sums = new_weight[:, np.newaxis] * np.nan_to_num(now.vectors) + old_weight[:, np.newaxis] * np.nan_to_num(
         before.vectors
     )
 
@@ -198,7 +204,7 @@ def add_turn(before: Answer, now: Answer, turns: int) -> Answer:
         return np.where(np.isnan(new), old, np.where(np.isnan(old), new, joined))
 
     with np.errstate(divide="ignore"):
-        sigma = 1 / np.sqrt(own + theirs)
+        sigma = 1 / np.sqrt(new_weight + old_weight)
     return Answer(
         vectors=normalise(sums),
         sigma=np.where(np.isinf(sigma), np.nan, sigma),
@@ -232,10 +238,10 @@ class Samples:
         raw = frames.astype(np.float64)
         self.zenith: NDArray[Any] = (raw - self.offset) * per_count
         self.missing: NDArray[np.bool_] = np.isnan(raw)
-        known = np.maximum((~self.missing).sum(axis=0), 1)
-        level = np.where(self.missing, 0.0, raw).sum(axis=0) / known
+        present = np.maximum((~self.missing).sum(axis=0), 1)
+        level = np.where(self.missing, 0.0, raw).sum(axis=0) / present
         self.error: NDArray[Any] = np.sqrt(
-            np.maximum(noise.base + noise.slope * level, noise.least)
+            np.maximum(noise.base + noise.slope * level, noise.floor)
         ) * np.abs(per_count)
         self.under, self.over = np.zeros((2, count, pixels), bool)
         self.top: float = np.inf
@@ -251,11 +257,11 @@ class Samples:
         wave = self.mean + np.multiply.outer(turn[0], self.cosine) + np.multiply.outer(turn[1], self.sine)
         self.square: NDArray[Any] = np.sum((turn[2][:, np.newaxis] * (self.zenith - wave)) ** 2, axis=0)
 
-    def keep(self, there: NDArray[np.bool_]) -> None:
+    def keep(self, kept: NDArray[np.bool_]) -> None:
         """Treat all samples as missing except for some, (N, n)."""
-        self.missing = self.missing | ~there
-        self.usable: NDArray[Any] = (self.whole & there).sum(axis=0)
-        self.irregular: NDArray[Any] = self.usable < len(there)
+        self.missing = self.missing | ~kept
+        self.usable: NDArray[Any] = (self.whole & kept).sum(axis=0)
+        self.irregular: NDArray[Any] = self.usable < len(kept)
 
 
 def conclude(normal: Doubles, sums: Sums, samples: Samples, usable: Array, tilt: float, limits: Limits,
@@ -286,8 +292,8 @@ def touches(
     with np.errstate(divide="ignore", invalid="ignore"):
         more_tilt, information, residual = _free_tilt(sums, det)
         uncertainty = 3 * samples.error / np.sqrt(information)
-        off_tilt = (tilt + more_tilt + uncertainty < limits.still) | (
-            tilt + more_tilt - uncertainty > limits.most
+        off_tilt = (tilt + more_tilt + uncertainty < limits.lowest_tilt) | (
+            tilt + more_tilt - uncertainty > limits.highest_tilt
         )
         like_noise = _like_noise(residual, samples, limits.noise, model)
         misfit = _misfit(residual, samples, limits.noise)
@@ -311,16 +317,16 @@ class Sums:
 
     @classmethod
     def of(
-        cls, u1: Doubles, u2: Doubles, u3: Doubles, share: Doubles, pull: Doubles, squares: Doubles
+        cls, u1: Doubles, u2: Doubles, u3: Doubles, information: Doubles, pull: Doubles, squares: Doubles
     ) -> Sums:
         """Return sums over the samples, (N, n): derivatives, information, gradients and squared misfits."""
         return cls(
-            m11=(share * u1 * u1).sum(axis=0),
-            m12=(share * u1 * u2).sum(axis=0),
-            m22=(share * u2 * u2).sum(axis=0),
-            m13=(share * u1 * u3).sum(axis=0),
-            m23=(share * u2 * u3).sum(axis=0),
-            m33=(share * u3 * u3).sum(axis=0),
+            m11=(information * u1 * u1).sum(axis=0),
+            m12=(information * u1 * u2).sum(axis=0),
+            m22=(information * u2 * u2).sum(axis=0),
+            m13=(information * u1 * u3).sum(axis=0),
+            m23=(information * u2 * u3).sum(axis=0),
+            m33=(information * u3 * u3).sum(axis=0),
             b1=(u1 * pull).sum(axis=0),
             b2=(u2 * pull).sum(axis=0),
             b3=(u3 * pull).sum(axis=0),
@@ -335,8 +341,8 @@ class Sums:
 def _start(samples: Samples, turn: Doubles, tilt: float) -> Doubles:
     level = np.cos(samples.zenith)
     if samples.missing.any():
-        known = np.maximum((~samples.missing).sum(axis=0), 1)
-        level = np.where(samples.missing, np.where(samples.missing, 0.0, level).sum(axis=0) / known, level)
+        present = np.maximum((~samples.missing).sum(axis=0), 1)
+        level = np.where(samples.missing, np.where(samples.missing, 0.0, level).sum(axis=0) / present, level)
     mean, cosine, sine = turn[3:] @ level
     return normalise(
         np.stack([-cosine * math.cos(tilt), -sine * math.cos(tilt), mean * math.sin(tilt)], axis=1)
@@ -353,19 +359,19 @@ def _look(normal: Doubles, samples: Samples, axes: Doubles, tilting: Doubles, cl
     by_sine = -root / np.sin(zenith)
     u1, u2, u3 = by_sine * (axes @ along.T), by_sine * (axes @ across.T), by_sine * (tilting @ normal.T)
     error = samples.zenith - zenith
-    share, pull, misfit = np.ones_like(error), error, error**2
+    information, pull, misfit = np.ones_like(error), error, error**2
     if closely:
         inside = (zenith > samples.low) & (zenith < samples.high)
-        share, pull, misfit = likelihood(samples, np.clip(zenith, samples.low, samples.high), inside)
-    return Sums.of(u1, u2, u3, share, root * pull, root**2 * misfit)
+        information, pull, misfit = likelihood(samples, np.clip(zenith, samples.low, samples.high), inside)
+    return Sums.of(u1, u2, u3, information, root * pull, root**2 * misfit)
 
 
 def likelihood(
-    samples: Samples, seen: Doubles, inside: NDArray[np.bool_]
+    samples: Samples, expected: Doubles, inside: NDArray[np.bool_]
 ) -> tuple[Doubles, Doubles, Doubles]:
     """Return for each sample its information, its residual, and its squared misfit.
 
-    The expected sample is ``share``; if that is not inside the range, a sample contributes nothing.
+    ``expected`` are the expected samples. One that is not ``inside`` the range contributes nothing.
 
     A clipped sample has the probability of being beyond its bound as its likelihood (Tobin 1958): with z the
     bound's distance in standard deviations and m the ratio of the normal density to its integral there, its
@@ -373,21 +379,21 @@ def likelihood(
     """
     from scipy import special
 
-    error = samples.zenith - seen
+    error = samples.zenith - expected
     clipped = samples.under | samples.over
     bound = (np.where(samples.under, 0.5, samples.top - 0.5) - samples.offset) * samples.per_count
     side = np.where(samples.under == (samples.per_count > 0), -1.0, 1.0)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        z = side * (seen - bound) / samples.each
+        z = side * (expected - bound) / samples.each
         slope = math.sqrt(2 / math.pi) / special.erfcx(-z / math.sqrt(2))
-        share = np.where(clipped, slope * (slope + z), 1.0)
+        information = np.where(clipped, slope * (slope + z), 1.0)
         pull = np.where(clipped, side * slope * samples.each, error)
         misfit = np.where(clipped, (np.minimum(z, 0) * samples.each) ** 2, error**2)
-    known = ~samples.missing
+    present = ~samples.missing
     return (
-        np.where(inside & known, share, 0.0),
-        np.where(inside & known, pull, 0.0),
-        np.where(known, misfit, 0.0),
+        np.where(inside & present, information, 0.0),
+        np.where(inside & present, pull, 0.0),
+        np.where(present, misfit, 0.0),
     )
 
 
@@ -434,8 +440,8 @@ def _like_noise(square: Doubles, samples: Samples, noise: float, model: float | 
     """Return where a sum of squares is explained by noise and model error; everywhere for three frames."""
     if samples.freedom == 0:
         return np.ones(len(square), bool)
-    found: NDArray[np.bool_] = square <= noise * samples.error**2 + model
-    return found
+    explained: NDArray[np.bool_] = square <= noise * samples.error**2 + model
+    return explained
 
 
 def _misfit(square: Doubles, samples: Samples, noise: float) -> Doubles:

@@ -115,7 +115,7 @@ def normals_rock(
     assert sums is not None
     det = sums.m11 * sums.m22 - sums.m12**2
     rests = _rests(samples, limits, presses)
-    found, misfit = touches(sums, det, samples, tilt, limits, limits.model, rests)
+    touching, misfit = touches(sums, det, samples, tilt, limits, limits.model, rests)
     with np.errstate(divide="ignore", invalid="ignore"):
         p, q = part.T
         slope = -p / q
@@ -124,8 +124,8 @@ def normals_rock(
         answered = (samples.usable >= _LEAST) & (sigma < _NO_ANSWER) & (q > 0)
         sigma = np.minimum(sigma * misfit, _NO_ANSWER)
         zenith = np.arctan2(np.sqrt(np.maximum(1 - q**2, 0)), q)
-    slope, sigma, zenith = (np.where(answered, one, np.nan) for one in (slope, sigma, zenith))
-    return Slopes(slope, sigma, zenith, found & answered)
+    slope, sigma, zenith = (np.where(answered, values, np.nan) for values in (slope, sigma, zenith))
+    return Slopes(slope, sigma, zenith, touching & answered)
 
 
 def _samples(
@@ -135,8 +135,8 @@ def _samples(
     samples = Samples(frames, table[:6], scale, noise)
     if presses:
         with np.errstate(invalid="ignore"):
-            least = np.maximum(samples.low, 0.0) + _AT_REST * samples.each
-            resting = samples.zenith < np.maximum(limits.rest, least)
+            rest_zenith = np.maximum(samples.low, 0.0) + _AT_REST * samples.each
+            resting = samples.zenith < np.maximum(limits.rest, rest_zenith)
             resting |= np.where(samples.per_count > 0, samples.under, samples.over)
         travel = table[TRAVEL][:, np.newaxis]
         lost = np.where(resting, travel, -np.inf).max(axis=0)
@@ -164,11 +164,11 @@ def _look(part: Doubles, samples: Samples, axes: Doubles, leaning: Doubles, clos
     by_sine = -root / np.sin(zenith)
     u1, u2, u3 = by_sine * axes[:, :1], by_sine * axes[:, 1:], by_sine * (leaning @ part.T)
     error = samples.zenith - zenith
-    share, pull, misfit = np.ones_like(error), error, error**2
+    information, pull, misfit = np.ones_like(error), error, error**2
     if closely:
         inside = (zenith > samples.low) & (zenith < samples.high)
-        share, pull, misfit = likelihood(samples, np.clip(zenith, samples.low, samples.high), inside)
-    return Sums.of(u1, u2, u3, share, root * pull, root**2 * misfit)
+        information, pull, misfit = likelihood(samples, np.clip(zenith, samples.low, samples.high), inside)
+    return Sums.of(u1, u2, u3, information, root * pull, root**2 * misfit)
 
 
 def _within(part: Doubles) -> Doubles:

@@ -76,11 +76,12 @@ Expected expect(const Direction at, const Place place, const Wall wall, const Sa
     // The intersection of the reflected ray with the wall, and the light there.
     const F facing = sx * bx + sy * by + bz, twice = facing + facing;
     const F rx = twice * bx - sx, ry = twice * by - sy, rz = twice * bz - 1.0f, flat = rx * rx + ry * ry;
-    const F room = radius * radius - px * px - py * py, along = px * rx + py * ry;
-    const F square = along * along + flat * room, per_leave = inverse_roots(square);
-    const F way = room / (along + square * per_leave), mx = px + way * rx, my = py + way * ry, h = pz + way * rz;
+    const F power = radius * radius - px * px - py * py, along = px * rx + py * ry;
+    const F square = along * along + flat * power, per_leave = inverse_roots(square);
+    const F distance = power / (along + square * per_leave);
+    const F mx = px + distance * rx, my = py + distance * ry, h = pz + distance * rz;
     const F far = h * h + radius * radius, per_far = inverse_roots(far), per_both = 1.0f / (far * per_far + radius);
-    const F q = h * per_both, least_q = GREATER(q, (F)wall.is[NEAREST]), held = LESSER(least_q, (F)wall.is[FURTHEST]);
+    const F q = h * per_both, above_nearest = GREATER(q, (F)wall.is[NEAREST]), held = LESSER(above_nearest, (F)wall.is[FURTHEST]);
     const F place_q = (held - wall.is[MIDDLE]) * wall.is[PER_Q];
     MAP curve = wall.is + INVERSE + wall.inverse_length;
     F level = curve[wall.curve_length - 1], steep = 0.0f;
@@ -95,25 +96,26 @@ Expected expect(const Direction at, const Place place, const Wall wall, const Sa
     const float lamp_x = wall.is[LAMP_X], lamp_y = wall.is[LAMP_Y];
     const F lamp = 1.0f + lamp_x * mx + lamp_y * my, by_height = lamp * steep * (radius * per_far * per_both);
     const F further = (level * (lamp_x * rx + lamp_y * ry) + by_height * rz) * per_leave;
-    const F gx = way * (level * lamp_x - further * mx), gy = way * (level * lamp_y - further * my), gz = way * by_height;
+    const F gx = distance * (level * lamp_x - further * mx), gy = distance * (level * lamp_y - further * my);
+    const F gz = distance * by_height;
     const F pull_n = gx * bx + gy * by + gz * bz;
     const F vx = 2.0f * (facing * gx + pull_n * sx), vy = 2.0f * (facing * gy + pull_n * sy);
     const F vz = 2.0f * (facing * gz + pull_n), flat_v = vx * c + vy * s;
     const F back = flat_v * cos_tilt - vz * sin_tilt - flat_v;
     const F wx = vx + c * back, wy = vy + s * back, wz = flat_v * sin_tilt + vz * cos_tilt;
-    Expected found;
-    found.light = lamp * level;
-    found.u1 = root * (at.ct * (at.cp * wx + at.sp * wy) - at.st * wz);
-    found.u2 = root * (at.cp * wy - at.sp * wx);
-    found.u3 = root * (flat_v * bz - vz * out_n);
+    Expected expected;
+    expected.light = lamp * level;
+    expected.u1 = root * (at.ct * (at.cp * wx + at.sp * wy) - at.st * wz);
+    expected.u2 = root * (at.cp * wy - at.sp * wx);
+    expected.u3 = root * (flat_v * bz - vz * out_n);
 
     // Whether the rays deflected up and down by the scatter also meet the wall: by the sines of the angles to
     // its edges.
-    const F below = wall.is[RIM] - h, over = wall.is[RIM] - pz, apart = way * way * flat;
+    const F below = wall.is[RIM] - h, over = wall.is[RIM] - pz, apart = distance * distance * flat;
     const F turned = wall.is[SCATTER] * (sx * sx + sy * sy + 1.0f);
-    found.inside = (q == held) & (below >= 0.0f) & (h >= 0.0f)
+    expected.inside = (q == held) & (below >= 0.0f) & (h >= 0.0f)
         & (flat * below * below >= turned * (apart + over * over)) & (flat * h * h >= turned * (apart + pz * pz));
-    return found;
+    return expected;
 }
 
 // The mean light corresponds to a height on the wall; the wave gives the azimuth, and thus the distance to
@@ -128,15 +130,15 @@ Direction begin_at(const Samples of, const F mean, const Place place, const Wall
         x += entry(of, IN_COSINE, k) * deviation;
         y += entry(of, IN_SINE, k) * deviation;
     }
-    const F most = LESSER(mean, (F)wall.is[LIGHTEST]), light = GREATER(most, (F)wall.is[DARKEST]);
+    const F limited = LESSER(mean, (F)wall.is[LIGHTEST]), light = GREATER(limited, (F)wall.is[DARKEST]);
     for (int i = wall.inverse_length - 2; i >= 0; --i) q = q * light + inverse[i];
     q = q < nearest ? (F)nearest : q;
     q = q > furthest ? (F)furthest : q;
-    const F swing = x * x + y * y;
-    const I swings = swing > 0.0f;
-    const F per_swing = wall.is[SENSE] * inverse_roots(swings ? swing : (F)1.0f);
-    x = swings ? x * per_swing : (F)1.0f;
-    y = swings ? y * per_swing : (F)0.0f;
+    const F square = x * x + y * y;
+    const I modulated = square > 0.0f;
+    const F per_amplitude = wall.is[SENSE] * inverse_roots(modulated ? square : (F)1.0f);
+    x = modulated ? x * per_amplitude : (F)1.0f;
+    y = modulated ? y * per_amplitude : (F)0.0f;
     const F along = place.x * x + place.y * y;
     const F out = roots(along * along + radius * radius - place.x * place.x - place.y * place.y) - along;
     const F rise = 2.0f * radius * q / (1.0f - q * q) - place.z, per_ray = inverse_roots(out * out + rise * rise);
@@ -151,11 +153,11 @@ Sums look(const Direction at, const Samples of, const Place place, const Wall wa
     Sums sums = {0};
     for (int k = 0; k < of.count; ++k) {
         const F light = zenith_of(of, raw_of(of, k)), off = off_wave(of, k, light, wave);
-        const Expected seen = expect(at, place, wall, of, k);
-        const F error = entry(of, ROOT_WEIGHT, k) * (light - seen.light);
-        add(&sums, seen.u1, seen.u2, seen.u3, 1.0f, error, error * error);
+        const Expected expected = expect(at, place, wall, of, k);
+        const F error = entry(of, ROOT_WEIGHT, k) * (light - expected.light);
+        add(&sums, expected.u1, expected.u2, expected.u3, 1.0f, error, error * error);
         sums.waves += off * off;
-        sums.within += seen.inside & 1;
+        sums.within += expected.inside & 1;
     }
     return sums;
 }
@@ -166,10 +168,11 @@ Sums look_closely(const Direction at, const Samples of, const Place place, const
     Sums sums = {0};
     for (int k = 0; k < of.count; ++k) {
         const F raw = raw_of(of, k);
-        const Expected seen = expect(at, place, wall, of, k);
+        const Expected expected = expect(at, place, wall, of, k);
         add_closely(
-            &sums, of, k, raw, seen.light, seen.inside, seen.inside, error_of_one, seen.u1, seen.u2, seen.u3);
-        sums.within += seen.inside & whole_of(raw) & 1;
+            &sums, of, k, raw, expected.light, expected.inside, expected.inside, error_of_one, expected.u1, expected.u2,
+            expected.u3);
+        sums.within += expected.inside & whole_of(raw) & 1;
     }
     return sums;
 }
@@ -183,21 +186,21 @@ __kernel void normals_wall(
     for (int p = first; p < end; p += LANES) {
         const Samples of = SAMPLES((F)wall.is[DARKEST], (F)wall.is[LIGHTEST]);
         const Place place = place_of(wall, SCALE(2), SCALE(3), SCALE(4));
-        const Known known = survey(of, noise);
-        const Direction begin = begin_at(of, zenith_of(of, known.level), place, wall);
-        Direction found = begin;
+        const Summary summary = survey(of, noise);
+        const Direction begin = begin_at(of, zenith_of(of, summary.level), place, wall);
+        Direction normal = begin;
         Sums sums;
         for (int number = 0; number < STEPS; ++number) {
-            sums = look(found, of, place, wall, known.wave);
-            found = step(found, sums);
+            sums = look(normal, of, place, wall, summary.wave);
+            normal = step(normal, sums);
         }
         const F waves = sums.waves;
         // Too few informative samples give no result, whatever the steps.
-        const I irregular = ((known.usable < count) | (sums.within < count)) & (known.usable >= LEAST);
+        const I irregular = ((summary.usable < count) | (sums.within < count)) & (summary.usable >= LEAST);
         if (any_of(irregular)) {
             Direction at = begin;
             for (int more = 0; more < MORE; ++more) {
-                const Sums closer = look_closely(at, of, place, wall, known.error_of_one);
+                const Sums closer = look_closely(at, of, place, wall, summary.error_of_one);
                 sums = blend_sums(sums, closer, irregular);
                 const Direction before = at;
                 at = step(at, closer);
@@ -205,11 +208,11 @@ __kernel void normals_wall(
                 const F y = at.st * at.sp - before.st * before.sp;
                 if (!any_of(irregular & (along * along + x * x + y * y > SETTLED))) break;
             }
-            found = blend(found, at, irregular);
+            normal = blend(normal, at, irregular);
         }
-        const I usable = LESSER(known.usable, sums.within), at_rest = found.st < limits.rest;
+        const I usable = LESSER(summary.usable, sums.within), at_rest = normal.st < limits.rest;
         const F model = limits.model * (1.0f / count) * sums.m11;
-        conclude(maps, p, turns, found, sums, known.error_of_one, count, usable, at_rest, limits, model);
-        if (!bare) keep_wave(maps, p, turns, of, known.wave, waves);
+        conclude(maps, p, turns, normal, sums, summary.error_of_one, count, usable, at_rest, limits, model);
+        if (!bare) keep_wave(maps, p, turns, of, summary.wave, waves);
     }
 }

@@ -99,8 +99,8 @@ def normals_wall(
     irregular = (irregular | (within.sum(axis=0) < len(frames))) & (samples.usable >= _LEAST)
     at = beginning
     for _ in range(MORE if irregular.any() else 0):
-        closer, there = _look(at, samples, turn, scale, wall, tilt, closely=True)
-        sums, within = closer.where(irregular, sums), np.where(irregular, there, within)
+        closer, closer_within = _look(at, samples, turn, scale, wall, tilt, closely=True)
+        sums, within = closer.where(irregular, sums), np.where(irregular, closer_within, within)
         at = step(at, closer)
     normal = np.where(irregular[:, np.newaxis], at, normal)
     whole = ~(samples.missing | samples.under | samples.over)
@@ -112,16 +112,16 @@ def normals_wall(
 
 def _start(samples: Samples, scale: Doubles, wall: Wall) -> Doubles:
     """Return the directions given by the mean light and the wave, (n, 3)."""
-    known = np.maximum((~samples.missing).sum(axis=0), 1)
+    present = np.maximum((~samples.missing).sum(axis=0), 1)
     zeniths = np.where(samples.missing, 0.0, samples.zenith)
-    mean = zeniths.sum(axis=0) / known
+    mean = zeniths.sum(axis=0) / present
     q = np.polynomial.polynomial.polyval(np.clip(mean, *wall.ends), wall.inverse)
     q = np.clip(q, *wall.reach)
     deviation = np.where(samples.missing, 0.0, samples.zenith - mean)
     cosine, sine = wall.sense * (samples.turn[4:] @ deviation)
-    swing = np.hypot(cosine, sine)
+    amplitude = np.hypot(cosine, sine)
     east, north = np.where(
-        swing > 0, np.stack([cosine, sine]) / np.where(swing > 0, swing, 1), [[1.0], [0.0]]
+        amplitude > 0, np.stack([cosine, sine]) / np.where(amplitude > 0, amplitude, 1), [[1.0], [0.0]]
     )
     _, _, x, y, z = scale
     radius = wall.geometry[0]
@@ -149,19 +149,19 @@ def _look(
     u1, u2 = root * (back * along).sum(axis=2), root * (back * across).sum(axis=2)
     u3 = root * np.einsum("kni,kij,nj->kn", slopes, tilting, normal)
     error = samples.zenith - level
-    share, pull, misfit = np.ones_like(error), error, error**2
+    information, pull, misfit = np.ones_like(error), error, error**2
     if closely:
-        share, pull, misfit = likelihood(samples, level, within)
+        information, pull, misfit = likelihood(samples, level, within)
         misfit = np.where(within, misfit, 0.0)
-    return Sums.of(u1, u2, u3, share, root * pull, root**2 * misfit), within
+    return Sums.of(u1, u2, u3, information, root * pull, root**2 * misfit), within
 
 
 def _rotations(turn: Doubles, tilt: float) -> tuple[Doubles, Doubles]:
     """Return rotations to the body's frame at each phase, (N, 3, 3), and their derivatives by the tilt."""
     cosine, sine = turn[:2]
-    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
-    out = np.stack([cosine, sine, zero], axis=1)
-    up = np.stack([zero, zero, one], axis=1)
+    zeros, ones = np.zeros_like(cosine), np.ones_like(cosine)
+    out = np.stack([cosine, sine, zeros], axis=1)
+    up = np.stack([zeros, zeros, ones], axis=1)
     flat, steep = (np.einsum("ki,kj->kij", axis, axis) for axis in (out, up))
     swap = np.einsum("ki,kj->kij", out, up) - np.einsum("ki,kj->kij", up, out)
     turning = np.eye(3) + (math.cos(tilt) - 1) * (flat + steep) + math.sin(tilt) * swap

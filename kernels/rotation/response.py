@@ -1,10 +1,10 @@
 """The brightness of a mirror inside a lit cylinder: the formula of `mirrorskin.io.WallResponse`.
 
 A line of sight s is reflected at the normal n and meets the wall of radius R at height h; P is the position
-of the mirror and room = R^2 - P^2 ::
+of the mirror and power = R^2 - P^2 the power of this point ::
 
-    r = s - 2 (s . n) n    A = Px rx + Py ry    c = sqrt(A^2 + (rx^2 + ry^2) room)    way = room / (A + c)
-    m = (P + way r) / R across the axis    h = z + way rz    q = h / (R + sqrt(h^2 + R^2))
+    r = s - 2 (s . n) n    A = Px rx + Py ry    c = sqrt(A^2 + (rx^2 + ry^2) power)    d = power / (A + c)
+    m = (P + d r) / R across the axis    h = z + d rz    q = h / (R + sqrt(h^2 + R^2))
 
 q is the tangent of half the elevation at which the centre sees that height: 0 at the horizon, and the zenith
 of a mirror at the centre that shows it is pi/4 - atan(q). The light is ::
@@ -34,7 +34,7 @@ class Ray(NamedTuple):
 
     direction: Doubles  # (3, ...): a unit vector, away from the mirror
     at: Doubles  # (2, ...): its intersection with the wall, across the axis, as a share of the radius
-    way: Doubles  # from the mirror to the wall, mm
+    distance: Doubles  # from the mirror to the wall, mm
     cosine: Doubles  # to the wall's normal, times the radius
     height: Doubles  # of the intersection, mm
 
@@ -75,9 +75,9 @@ def light_slopes(place: ArrayLike, normals: ArrayLike, geometry: Sequence[float]
     by_height = (1 - q**2) ** 2 / (2 * geometry[0] * (1 + q**2))
     by_height *= lamp_light(ray, lamps) * steepness
     by_lamps = light * np.reshape(np.asarray(lamps, np.float64) / geometry[0], (2, *[1] * q.ndim))
-    # The intersection of a ray that turns by dr moves by way (dr - r (R at . dr) / c).
+    # The intersection of a ray that turns by dr moves by distance (dr - r (R at . dr) / c).
     along = ((by_lamps * ray.direction[:2]).sum(axis=0) + by_height * ray.direction[2]) / ray.cosine
-    by_ray = ray.way * np.stack([*(by_lamps - along * geometry[0] * ray.at), by_height])
+    by_ray = ray.distance * np.stack([*(by_lamps - along * geometry[0] * ray.at), by_height])
     facing, pull = (sight * normal).sum(axis=0), (by_ray * normal).sum(axis=0)
     return np.asarray(np.moveaxis(-2 * (facing * by_ray + pull * sight), 0, -1))
 
@@ -116,12 +116,12 @@ def follow(point: Doubles, sight: Doubles, normal: Doubles, radius: float, close
     """
     x, y, z = point
     ray = sight - 2 * (sight * normal).sum(axis=0) * normal
-    room, along = np.maximum(radius**2 - x**2 - y**2, closest), x * ray[0] + y * ray[1]
+    power, along = np.maximum(radius**2 - x**2 - y**2, closest), x * ray[0] + y * ray[1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        cosine = np.sqrt(along**2 + (ray[0] ** 2 + ray[1] ** 2 + _LEVEL) * room)
-        way = room / (along + cosine)
-        at, height = np.stack([x + way * ray[0], y + way * ray[1]]) / radius, z + way * ray[2]
-        return Ray(ray, at, way, cosine, height)
+        cosine = np.sqrt(along**2 + (ray[0] ** 2 + ray[1] ** 2 + _LEVEL) * power)
+        distance = power / (along + cosine)
+        at, height = np.stack([x + distance * ray[0], y + distance * ray[1]]) / radius, z + distance * ray[2]
+        return Ray(ray, at, distance, cosine, height)
 
 
 def half_tangent(height: Doubles, radius: float) -> Doubles:
@@ -154,7 +154,7 @@ def _meets_wall(ray: Ray, z: Doubles, geometry: Sequence[float]) -> NDArray[np.b
     out = np.hypot(ray.direction[0], ray.direction[1])
     with np.errstate(divide="ignore", invalid="ignore"):
         rise = ray.direction[2] / out
-        upper = z + ray.way * out * (rise + turned) / (1 - rise * turned)
-        lower = z + ray.way * out * (rise - turned) / (1 + rise * turned)
+        upper = z + ray.distance * out * (rise + turned) / (1 - rise * turned)
+        lower = z + ray.distance * out * (rise - turned) / (1 + rise * turned)
         meets = (rise * turned < 1) & (rise * turned > -1)
         return np.asarray(meets & (upper <= geometry[1]) & (lower >= 0))

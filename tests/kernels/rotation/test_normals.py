@@ -82,14 +82,14 @@ class Answers:
         table[:, :count] = turn.table
         if scale.ndim == 2:
             scale = np.pad(scale, [(0, 0), (0, self.stride - self.pixels)], constant_values=np.nan)
-        still = turn.limits.still - (turn.tilt if method == "exact" else 0)
+        lowest = turn.limits.lowest_tilt - (turn.tilt if method == "exact" else 0)
         reals = (
             np.cos(turn.tilt),
             np.sin(turn.tilt),
             *turn.noise,
             *turn.limits[:2],
-            still,
-            turn.limits.most - (turn.tilt if method == "exact" else 0),
+            lowest,
+            turn.limits.highest_tilt - (turn.tilt if method == "exact" else 0),
             turn.limits.rest,
         )
         per_pixel = int(scale.ndim == 2)
