@@ -120,21 +120,25 @@ class Focus(Operation):
 
     def _excess(self, misfit: NDArray[Any]) -> NDArray[np.float32]:
         """Return the variance of log S in excess of noise: the median, or more where curves fit less well."""
-        known = np.isfinite(misfit)
-        usual = max(0.0, float(np.median(misfit[known]))) if known.any() else np.nan
+        fitted = np.isfinite(misfit)
+        usual = max(0.0, float(np.median(misfit[fitted]))) if fitted.any() else np.nan
         around = _mean_around(misfit, self.radius // 2)
         unusual = (
-            around > usual + _UNUSUAL * mad_sigma(around[known].astype(np.float64)) if known.any() else False
+            around > usual + _UNUSUAL * mad_sigma(around[fitted].astype(np.float64))
+            if fitted.any()
+            else False
         )
         return np.where(unusual, around, np.float32(usual))
 
 
 def _mean_around(values: NDArray[Any], reach: int) -> NDArray[np.float32]:
     """Return the means of the values that are numbers, over ``reach`` pixels on each side; 0 of none."""
-    known = np.isfinite(values)
+    finite = np.isfinite(values)
     size = 2 * reach + 1, 2 * reach + 1
-    total, share = (cv2.blur(part.astype(np.float32), size) for part in (np.where(known, values, 0), known))
-    return np.asarray(np.divide(total, share, out=np.zeros_like(total), where=share > 0))
+    total, weight = (
+        cv2.blur(part.astype(np.float32), size) for part in (np.where(finite, values, 0), finite)
+    )
+    return np.asarray(np.divide(total, weight, out=np.zeros_like(total), where=weight > 0))
 
 
 def _off_centre(

@@ -61,20 +61,20 @@ def find_travel_jump(
     places = (travel[sharpest + around] - travel[sharpest]) / step
     weights = signal**2 / (2 * freedom * variance + 4 * signal)
     values = np.log(signal / signal[reach])
-    usual = _left(values, weights, places)
-    found = []
+    usual = _residual(values, weights, places)
+    candidates = []
     for shift in _SHIFTS:
         moved = {
-            j: _left(values, weights, places + shift * (around >= j)) for j in range(1 - reach, reach + 1)
+            j: _residual(values, weights, places + shift * (around >= j)) for j in range(1 - reach, reach + 1)
         }
         for frame in range(reach, len(travel) - reach):
             pixels = {j: sharpest == frame - j for j in moved}
-            number = sum(int(np.count_nonzero(one)) for one in pixels.values())
-            before = sum(float(np.sum(usual[one])) for one in pixels.values())
-            after = sum(float(np.sum(moved[j][one])) for j, one in pixels.items())
+            number = sum(int(np.count_nonzero(selected)) for selected in pixels.values())
+            before = sum(float(np.sum(usual[selected])) for selected in pixels.values())
+            after = sum(float(np.sum(moved[j][selected])) for j, selected in pixels.items())
             if number >= _FEWEST and before > 0:
-                found.append((after / before, frame, shift))
-    ratio, frame, shift = min(found, default=(1.0, 0, 0))
+                candidates.append((after / before, frame, shift))
+    ratio, frame, shift = min(candidates, default=(1.0, 0, 0))
     if ratio > _BETTER:
         return None
     frames = "a frame" if abs(shift) == 1 else f"{shift} frames"
@@ -87,7 +87,7 @@ def find_travel_jump(
     )
 
 
-def _left(values: Doubles, weights: Doubles, places: Doubles) -> Doubles:
+def _residual(values: Doubles, weights: Doubles, places: Doubles) -> Doubles:
     """Return the weighted squares that parabolas through the values, (n, pixels), leave at each pixel."""
     columns = np.stack([np.ones_like(places), places, places**2])
     matrix = np.einsum("ikp,jkp,kp->pij", columns, columns, weights)

@@ -98,22 +98,25 @@ class Fringes(CorrelationOperation):
         sums, weights = self._frame_sums(), np.concatenate(self._weights)
         used, fit = sums.solve(), sums.maps
         freedom = np.count_nonzero(used) - 3
-        seen = math.nan  # noise estimated from the residuals of the half with more modulation
+        residual_noise = math.nan  # noise estimated from the residuals of the half with more modulation
         if freedom > 0:
             parts = [fit.view(name) for name in ("cosine_part", "sine_part", "residual")]
             cosine, sine, residual = thinned_maps(parts)
             square = cosine * cosine + sine * sine
-            seen = noise_of_residual(residual[square >= np.median(square[np.isfinite(square)])], freedom)
+            residual_noise = noise_of_residual(
+                residual[square >= np.median(square[np.isfinite(square)])], freedom
+            )
         elif self._noise is None:
             raise InputError("3 frames leave no residual to estimate the noise from: specify noise, counts")
-        noise = np.asarray(seen if self._noise is None else self._noise, np.float32)
+        noise = np.asarray(residual_noise if self._noise is None else self._noise, np.float32)
         matrix = fit_matrix(self.positions_so_far("phase")[used], weights[used])
         (cc, cs), (_, ss) = ((matrix @ (matrix / weights[used]).T)[1:, 1:]).tolist()
         # sin p = sine / modulation, likewise the cosine; without modulation there is no error bound. Samples
         # do not follow a cosine where the residual is too large, as at a hot pixel or a moving reflection.
         fit.run(
-            "fringes_phase", source="fringes", noise=PerPixel(noise), noise_step=noise.ndim // 2, seen=seen,
-            misfit=_MISFIT, cosine_variance=cc, covariance=cs, sine_variance=ss,
+            "fringes_phase", source="fringes", noise=PerPixel(noise), noise_step=noise.ndim // 2,
+            residual_noise=residual_noise, misfit=_MISFIT, cosine_variance=cc, covariance=cs,
+            sine_variance=ss,
         )  # fmt: skip
         add_blur(fit, "phase_sigma", ["cosine_part", "sine_part"], "modulation")
         maps = dict(zip(_ANSWERS, fit.take(*_ANSWERS), strict=True))
@@ -208,7 +211,7 @@ def unwrap_frequencies(fringes: Sequence[Maps], frequency: ArrayLike, *, start: 
         raise InputError(
             f"frequency has shape {rate.shape}: one is needed for each of {len(fringes)} fringes"
         )
-    results = _results({f"fringes[{number}]": one for number, one in enumerate(fringes)}, "phase")
+    results = _results({f"fringes[{number}]": result for number, result in enumerate(fringes)}, "phase")
     pairs = [_phase_of(result, name) for name, result in results.items()]
     phases, sigmas = zip(*pairs, strict=True)
     if len({phase.shape for phase in phases}) > 1:
@@ -282,8 +285,8 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
     risk, border_risk = np.zeros(shape), np.zeros(shape)
     border = np.full(shape, -1, np.int32)
     false_border = ndtr(-(1 - _UNCLEAR) * contrast / np.sqrt(variance))
-    for left, distance in zip(range(len(frames), 0, -1), np.abs(above), strict=True):
-        other = stripe ^ (1 << left) - 1  # if this bit is wrong, all later ones are
+    for bits_left, distance in zip(range(len(frames), 0, -1), np.abs(above), strict=True):
+        other = stripe ^ (1 << bits_left) - 1  # if this bit is wrong, all later ones are
         far, wrong = np.abs(other - stripe) > 1, expit(-2 * contrast * distance / variance)
         unclear = ~far & (distance < _UNCLEAR * contrast)
         border = np.where(unclear, np.maximum(stripe, other), border)
@@ -376,12 +379,12 @@ def _phase_of(fringes: Result, name: str) -> tuple[Doubles, Doubles]:
 
 def _maps_of(result: Result, name: str, *quantities: str) -> tuple[Doubles, Doubles]:
     """Return two maps of one size, (H, W), float64."""
-    missing = [one for one in quantities if one not in result]
+    missing = [quantity for quantity in quantities if quantity not in result]
     if missing:
         raise InputError(
             f"{name} has no {' and no '.join(missing)}: maps {' and '.join(quantities)} are needed"
         )
-    first, second = (np.asarray(result[one], np.float64) for one in quantities)
+    first, second = (np.asarray(result[quantity], np.float64) for quantity in quantities)
     if first.ndim != 2 or second.shape != first.shape:
         shapes = f"{quantities[0]} {first.shape} and {quantities[1]} {second.shape}"
         raise InputError(f"{name} has {shapes}: (H, W) of both is needed")
@@ -418,8 +421,8 @@ def _unwrapped(
     order = np.nan_to_num(np.rint((whole - wrapped) / _TURN)).astype(np.int32)
     with np.errstate(over="ignore"):
         error = sigma.astype(np.float32)
-    known = np.isfinite(whole) & np.isfinite(error)
-    phase, error, wrong = (np.where(known, one, np.nan) for one in (whole, error, risk))
+    valid = np.isfinite(whole) & np.isfinite(error)
+    phase, error, wrong = (np.where(valid, values, np.nan) for values in (whole, error, risk))
     maps = {"phase": phase, "phase_sigma": error.astype(np.float32), "order": order}
     return Result(maps, risk=_probability(wrong), process=process, declarations=_UNWRAPPED)
 
@@ -430,8 +433,8 @@ def _probability(sum_of_risks: Doubles) -> NDArray[np.float32]:
 
 def _map(values: ArrayLike, shape: tuple[int, ...], name: str) -> Doubles:
     """Return a number or a map of this shape as float64."""
-    found = np.asarray(values, np.float64)
-    if found.shape not in ((), shape) or (name == "noise" and np.any(found < 0)):
-        wrong = "is below 0" if found.shape in ((), shape) else f"has shape {found.shape}"
+    array = np.asarray(values, np.float64)
+    if array.shape not in ((), shape) or (name == "noise" and np.any(array < 0)):
+        wrong = "is below 0" if array.shape in ((), shape) else f"has shape {array.shape}"
         raise InputError(f"{name} {wrong}: counts are needed, one number or a map {shape}")
-    return found
+    return array

@@ -173,8 +173,8 @@ class PhotometricStereo(Operation):
 
     def _check_lights(self, frames: int, right: bool) -> None:
         if not right:
-            given = 0 if self._lights is None else len(self._lights)
-            raise InputError(f"light has {given} vectors: one is needed for each of {frames} frames")
+            count = 0 if self._lights is None else len(self._lights)
+            raise InputError(f"light has {count} vectors: one is needed for each of {frames} frames")
 
     def result(self) -> dict[str, Any]:
         """Return normals and albedo of the frames so far; in the end there must be one for each lamp."""
@@ -249,13 +249,13 @@ def _power(light: Doubles, lamps: Doubles) -> float:
         return 1.0
     axes = np.linalg.qr(lamps)[0]
     fitted = axes @ (axes.T @ light)
-    light, fitted = (one[:, np.all(fitted > 0, axis=0)] for one in (light, fitted))
+    light, fitted = (part[:, np.all(fitted > 0, axis=0)] for part in (light, fitted))
     if light.shape[1] < _FEWEST:
         return 1.0
     bent = fitted * np.log(fitted / np.mean(fitted, axis=0))
     bent -= axes @ (axes.T @ bent)
-    left = light - axes @ (axes.T @ light)
-    size, pull = np.sum(bent**2, axis=0), np.sum(bent * left, axis=0)
+    residual = light - axes @ (axes.T @ light)
+    size, pull = np.sum(bent**2, axis=0), np.sum(bent * residual, axis=0)
     excess = float(np.sum(pull) / np.sum(size))
     error = float(np.sqrt(np.sum((pull - excess * size) ** 2)) / np.sum(size))
     return 1 + excess if abs(excess) > max(_CLEAR * error, _POWER) else 1.0
@@ -274,7 +274,7 @@ def _vectors(light: ArrayLike) -> Doubles:
 
 def _map(name: str, values: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Return counts, a number or a map."""
-    found = np.asarray(as_array(name, values), np.float32)
-    if found.shape not in ((), shape):
-        raise InputError(f"{name} has shape {found.shape}: one number or a map {shape} is needed")
-    return found
+    array = np.asarray(as_array(name, values), np.float32)
+    if array.shape not in ((), shape):
+        raise InputError(f"{name} has shape {array.shape}: one number or a map {shape} is needed")
+    return array

@@ -56,8 +56,8 @@ __kernel void blur_add(
     for (int base = low; base < end; base += width) {
         const int row = base / columns, column = base % columns;
         width = min(min(STRIP, end - base), columns - column);
-        float total[STRIP], known[STRIP];
-        for (int i = 0; i < width; ++i) total[i] = known[i] = 0;
+        float total[STRIP], count[STRIP];
+        for (int i = 0; i < width; ++i) total[i] = count[i] = 0;
         for (int y = max(row - reach, 0); y <= min(row + reach, rows - 1); ++y)
             for (int x = -reach; x <= reach; ++x) {
                 MAP other = bend + (size_t)y * columns + column + x;
@@ -65,11 +65,11 @@ __kernel void blur_add(
                 for (int i = max(0, -column - x); i < last; ++i) {
                     const int usable = other[i] < INFINITY;
                     total[i] += usable ? other[i] : 0;
-                    known[i] += usable ? 1 : 0;
+                    count[i] += usable ? 1 : 0;
                 }
             }
         for (int i = 0; i < width; ++i) {
-            const float mean = known[i] > 0 ? total[i] / known[i] : 0, before = sigma[base + i];
+            const float mean = count[i] > 0 ? total[i] / count[i] : 0, before = sigma[base + i];
             sigma[base + i] = sqrt(before * before + factor * factor * mean);
         }
     }

@@ -37,9 +37,9 @@ def blur_add(bend: Array, reach: int, factor: float, sigma: Array) -> None:
     the border; ``factor`` is half of the variance of the point spread, pixels^2.
     """
     size, border = (2 * reach + 1, 2 * reach + 1), reach
-    known = np.isfinite(bend)
+    finite = np.isfinite(bend)
     total, count = (
         sliding_window_view(np.pad(part.astype(np.float64), border), size).sum((2, 3))
-        for part in (np.where(known, bend, 0), known)
+        for part in (np.where(finite, bend, 0), finite)
     )
     sigma[:] = np.sqrt(sigma**2 + factor**2 * total / np.maximum(count, 1))

@@ -91,21 +91,21 @@ def focus_fit(radius: int, reach: int, variance: float, least_contrast: float, l
         across = (weight * value * second).sum(axis=0) / bent
         scale, points = unit / (2 * across), (weight > 0).sum(axis=0)
         vertex = mean + skew / 2 - along / (2 * across)
-        found = (points > 2) & (top > least_contrast * variance * np.sqrt(2 * freedom))
-        found &= np.where(across < 0, across**2 * bent, 0) > least_curvature**2 * variance
+        has_peak = (points > 2) & (top > least_contrast * variance * np.sqrt(2 * freedom))
+        has_peak &= np.where(across < 0, across**2 * bent, 0) > least_curvature**2 * variance
         residual = (weight * (value - level - along * first - across * second) ** 2).sum(axis=0)
         free = total - (weight**2 * (1 / total + first**2 / norm + second**2 / bent)).sum(axis=0)
         degrees = points - 3.0
         excess = (residual / (1 - 2 / (9 * degrees)) ** 3 - degrees * variance) / free
-        misfit[:] = np.where(found & (points > 3) & (free > 0), excess, np.nan)
+        misfit[:] = np.where(has_peak & (points > 3) & (free > 0), excess, np.nan)
         neighbours = place[reach - 1 : reach + 2]
-        found &= (neighbours.min(axis=0) < vertex) & (vertex < neighbours.max(axis=0))
-        status[:] = np.where(found, 1, 2)
+        has_peak &= (neighbours.min(axis=0) < vertex) & (vertex < neighbours.max(axis=0))
+        status[:] = np.where(has_peak, 1, 2)
         status[(best == 0) | (best == len(travel) - 1)] = 3
         status[~np.isfinite(top)] = 0
-        found = status == 1
-        height[:] = np.where(found, -(travel[best] + unit * vertex), np.nan)
-        spread[:] = np.where(found, (1 / norm + (along / across) ** 2 / bent) * scale**2, np.nan)
+        has_peak = status == 1
+        height[:] = np.where(has_peak, -(travel[best] + unit * vertex), np.nan)
+        spread[:] = np.where(has_peak, (1 / norm + (along / across) ** 2 / bent) * scale**2, np.nan)
         moves = (weight**2 * (first / norm - along / across * second / bent) ** 2).sum(axis=0)
         gain[:] = moves * scale**2
         sharpness[:] = np.sqrt(np.where(top < 0, 0, top) / np.maximum(freedom, 1))

@@ -40,19 +40,19 @@ def lambert_add(
         the residual sum of squares, and the number of usable samples
     """
     light = frames.astype(np.float32) - darks
-    seen = (light > shadow) & (frames < bright)
-    rows = np.concatenate([np.broadcast_to(lights[:, None], (*seen.shape, 3)), light[..., None]], axis=2)
+    usable = (light > shadow) & (frames < bright)
+    rows = np.concatenate([np.broadcast_to(lights[:, None], (*usable.shape, 3)), light[..., None]], axis=2)
     before = np.zeros((frames.shape[1], 4, 4))
     before[(slice(None), *_DIAGONAL)] = np.sqrt(triangle[[0, 1, 2, 9]].T)
     before[(slice(None), *_ABOVE)] = triangle[3:9].T * before[:, _ABOVE[0], _ABOVE[0]]
-    lit = np.where(seen.T[..., None], rows.swapaxes(0, 1), 0)
+    lit = np.where(usable.T[..., None], rows.swapaxes(0, 1), 0)
     after: Array = np.linalg.qr(np.concatenate([before, lit], axis=1)).R
     pivots = after[:, _ABOVE[0], _ABOVE[0]]
     triangle[[0, 1, 2, 9]] = after[(slice(None), *_DIAGONAL)].T ** 2
     triangle[3:9] = np.divide(
         after[(slice(None), *_ABOVE)], pivots, out=np.zeros_like(pivots), where=pivots != 0
     ).T
-    triangle[10] += seen.sum(axis=0)
+    triangle[10] += usable.sum(axis=0)
 
 
 def lambert_normals(triangle: Array, normals: Array, normals_sigma: Array, albedo: Array,

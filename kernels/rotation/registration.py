@@ -103,9 +103,9 @@ def registration_resample(
         for x in range(4):
             value += weights_y[y] * weights_x[x] * padded[north - 1 + y + BORDER, west - 1 + x + BORDER]
     registered[:] = offset + gain * value
-    known = ~np.isnan(registered)
-    noise[0] += np.where(known, np.sum(weights_x**2, axis=0) * np.sum(weights_y**2, axis=0), 0)
-    noise[1] += known
+    valid = ~np.isnan(registered)
+    noise[0] += np.where(valid, np.sum(weights_x**2, axis=0) * np.sum(weights_y**2, axis=0), 0)
+    noise[1] += valid
 
 
 def _split(

@@ -478,13 +478,13 @@ def _(noise):
     return values | {"shape": (1, pixels), "macros": {"FRAME": "uchar"}}
 
 
-@case("fringes_phase", {"noise": (1, 1100), "seen": (2.5, np.nan)}, rtol=3e-6, atol=1e-7)
-def _(noise, seen):
+@case("fringes_phase", {"noise": (1, 1100), "residual_noise": (2.5, np.nan)}, rtol=3e-6, atol=1e-7)
+def _(noise, residual_noise):
     rng, pixels = np.random.default_rng(0), 1100
     values = {name: rng.normal(0, 50, pixels) for name in ("cosine_part", "sine_part")}
     values |= {"residual": rng.uniform(0, 15, pixels), "noise": rng.uniform(1, 3, noise)}
     values["cosine_part"][:5], values["sine_part"][:5] = [0, 7, -7, 0, np.nan], [0, 0, 0, -7, 3]
-    numbers = {"noise_step": int(noise > 1), "seen": seen, "misfit": 4.0}
+    numbers = {"noise_step": int(noise > 1), "residual_noise": residual_noise, "misfit": 4.0}
     numbers |= {"cosine_variance": 0.2, "covariance": 0.05, "sine_variance": 0.3}
     return values | numbers | {"shape": (1, pixels)}
 
