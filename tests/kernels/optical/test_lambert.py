@@ -15,10 +15,9 @@ def test_the_triangle_holds_the_normal_equations():
     for first in (0, 4):
         part = slice(first, first + 5 if first else 4)
         lambert_add(FRAMES[part], LIGHTS[part], np.array([3.0]), 10.0, 255.0, triangle)
-    upper = np.zeros((4, 4))
-    upper[np.triu_indices(4)] = triangle[:10, 7]
-    upper[3, 3] **= 0.5
+    squares, above = triangle[[0, 1, 2, 9], 7], np.eye(4)
+    above[[0, 0, 1, 0, 1, 2], [1, 2, 2, 3, 3, 3]] = triangle[3:9, 7]  # divided by the diagonal
     unclipped = (FRAMES[:, 7] > 13) & (FRAMES[:, 7] < 255)
     rows = np.column_stack([LIGHTS, FRAMES[:, 7] - 3.0])[unclipped]
-    np.testing.assert_allclose(upper.T @ upper, rows.T @ rows, atol=1e-8)
+    np.testing.assert_allclose((above.T * squares) @ above, rows.T @ rows, atol=1e-8)
     assert triangle[10, 7] == unclipped.sum()
