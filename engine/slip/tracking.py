@@ -201,7 +201,7 @@ class _Level:
             "difference": (2, *with_halo),
             "field": self.rest.shape,
             "answer": (AFFINE + 3, *self.grid),
-            "inverse": (PARAMETERS, PARAMETERS, *self.grid),
+            "inverse": (*self.grid, PARAMETERS, PARAMETERS),
             "summary": (4, *self.grid),
         }
         self._maps = {

@@ -41,24 +41,6 @@ float fraction_of(const FRAME sample, const float dark, const float gain)
     return (SATURATED(sample) & ((fraction - light) * gain < 0)) ? light : fraction;
 }
 
-#define LIMITED(value, low, high) LESSER(GREATER(value, low), high)
-
-// Round to even in a way that vectorises: above 2^23 a float is an integer. For values below 2^22.
-int round_even(const float value)
-{
-    return as_int(value + 12582912.0f) - as_int(12582912.0f);
-}
-
-// Of x <= 0, within 2e-7 of 1.
-float exponential(const float x)
-{
-    const float limited = GREATER(x, -80.0f);
-    const int power = round_even(limited * M_LOG2E_F);
-    const float r = (limited - power * 0.693145752f) - power * 1.42860677e-6f;
-    const float sum = 1 + r * (1 + r * (1 / 2.0f + r * (1 / 6.0f + r * (1 / 24.0f + r * (1 / 120.0f + r * (1 / 720.0f))))));
-    return sum * as_float((power + 127) << 23);
-}
-
 int excess_of_noise(const float quiet, const float gain)
 {
     return convert_int_rte(fmin(quiet * gain * gain, 1000.0f) * UNIT);

@@ -154,8 +154,6 @@ __kernel void displacement_planes(
     const float node##1 = 1 - (part) + bend_##node * (2 - 3 * (part)); \
     const float node##2 = (part) + bend_##node * (3 * (part) - 1);
 
-#define DOWN(node) (y0 * at[up + (node)] + y1 * at[here + (node)] + y2 * at[low + (node)] + y3 * at[lowest + (node)])
-
 __kernel void displacement_warp(
     const int rows, const int columns, const int node_rows, const int node_columns, const int step, const float start,
     const int halo, MAP coefficients, MAP planes, MAP field, OUT difference)
@@ -208,21 +206,27 @@ __kernel void displacement_pixels(
     OUT out = pixels + (size_t)line * columns * parts;
     SPLIT(row, node_rows, y, part_y)
     KEYS(y, part_y, node_rows)
-    const int up = max(y - 1, 0) * node_columns, low = min(y + 1, node_rows - 1) * node_columns;
-    const int lowest = min(y + 2, node_rows - 1) * node_columns, here = y * node_columns;
-    for (int column = first; column < end; ++column) {
-        SPLIT(column, node_columns, x, part_x)
-        KEYS(x, part_x, node_columns)
-        const int previous = max(x - 1, 0), right = min(x + 1, node_columns - 1);
-        const int farthest = min(x + 2, node_columns - 1);
-        for (int k = 0; k < parts; ++k) {
-            MAP at = nodes + (number * parts + k) * node_rows * node_columns;
-            float value = x0 * DOWN(previous) + x1 * DOWN(x) + x2 * DOWN(right) + x3 * DOWN(farthest);
-            if (!(value - value == 0)) {
-                value = (1 - part_x) * ((1 - part_y) * at[here + x] + part_y * at[low + x])
-                    + part_x * ((1 - part_y) * at[here + right] + part_y * at[low + right]);
-            }
-            out[column * parts + k] = logarithms ? exp(value) : value;
+    const int up = GREATER(y - 1, 0) * node_columns, low = LESSER(y + 1, node_rows - 1) * node_columns;
+    const int lowest = LESSER(y + 2, node_rows - 1) * node_columns, here = y * node_columns;
+    SPLIT(first, node_columns, west, part_west)
+    SPLIT(end - 1, node_columns, east, part_east)
+    const int begin = GREATER(west - 1, 0), last = LESSER(east + 2, node_columns - 1);
+    for (int k = 0; k < parts; ++k) {
+        MAP at = nodes + (number * parts + k) * node_rows * node_columns;
+        float cubic[TILE + 4], linear[TILE + 4];  // at the row, of each column of nodes
+        for (int i = begin; i <= last; ++i) {
+            cubic[i - begin] = y0 * at[up + i] + y1 * at[here + i] + y2 * at[low + i] + y3 * at[lowest + i];
+            linear[i - begin] = (1 - part_y) * at[here + i] + part_y * at[low + i];
+        }
+        for (int column = first; column < end; ++column) {
+            SPLIT(column, node_columns, x, part)
+            KEYS(x, part, node_columns)
+            const int previous = GREATER(x - 1, 0) - begin, next = LESSER(x + 1, node_columns - 1) - begin;
+            const int farthest = LESSER(x + 2, node_columns - 1) - begin, nearest = x - begin;
+            const float value = x0 * cubic[previous] + x1 * cubic[nearest] + x2 * cubic[next] + x3 * cubic[farthest];
+            const float plain = (1 - part) * linear[nearest] + part * linear[next];
+            const float chosen = value - value == 0 ? value : plain;
+            out[column * parts + k] = logarithms ? exponential(chosen) : chosen;
         }
     }
 }
@@ -287,7 +291,7 @@ __kernel void displacement_solve(
 
     for (int k = 0; k < PARAMETERS; ++k) {
         float coefficient = 0;
-        for (int l = 0; l < PARAMETERS; ++l) coefficient += inverse[(k * PARAMETERS + l) * nodes + node] * sums[l];
+        for (int l = 0; l < PARAMETERS; ++l) coefficient += inverse[(node * PARAMETERS + k) * PARAMETERS + l] * sums[l];
         squares -= coefficient * sums[k];
         if (k < AFFINE) answer[k * nodes + node] = coefficient + (k == 0 ? right : k == 1 ? down : 0);
         if (k == PARAMETERS - 1) answer[AFFINE * nodes + node] = 1 - coefficient;
@@ -366,7 +370,7 @@ __kernel void displacement_normals(
     const int usable = invert(normal);
     for (int k = 0; k < PARAMETERS; ++k)
         for (int l = 0; l < PARAMETERS; ++l)
-            inverse[(k * PARAMETERS + l) * nodes + node] = usable ? normal[k][l] : NAN;
+            inverse[(node * PARAMETERS + k) * PARAMETERS + l] = usable ? normal[k][l] : NAN;
     summary[node] = usable ? normal[0][0] : NAN;
     summary[nodes + node] = usable ? normal[1][0] : NAN;
     summary[2 * nodes + node] = usable ? normal[1][1] : NAN;

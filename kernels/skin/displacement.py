@@ -236,11 +236,11 @@ def displacement_normals(
     Parameters
     ----------
     step, first, window, planes : as of ``displacement_solve``
-    inverse : (10, 10, rows, columns); NaN where the matrix is singular within rounding: a column is 0 or not
+    inverse : (rows, columns, 10, 10); NaN where the matrix is singular within rounding: a column is 0 or not
         finite, or after scaling the diagonal to 1 the Frobenius norm of the inverse exceeds 1e5
     summary : (4, rows, columns), elements 00, 10 and 11 of the inverse, and number of samples in the window
     """
-    node_rows, node_columns = inverse.shape[2:]
+    node_rows, node_columns = inverse.shape[:2]
     for row in range(node_rows):
         columns = basis(windows(planes, row, step, first, window, node_columns), window)
         normal = columns.transpose(0, 2, 1) @ columns
@@ -255,8 +255,8 @@ def displacement_normals(
         usable &= np.sum(inverted**2, axis=(1, 2)) < MOST**2
         inverted /= scale[:, :, None] * scale[:, None, :]
         inverted[~usable] = np.nan
-        inverse[:, :, row] = inverted.transpose(1, 2, 0)
-    summary[:3] = inverse[[0, 1, 1], [0, 0, 1]]
+        inverse[row] = inverted
+    summary[:3] = np.moveaxis(inverse[..., [0, 1, 1], [0, 0, 1]], -1, 0)
 
 
 def displacement_solve(
@@ -275,7 +275,7 @@ def displacement_solve(
     ----------
     step, first, window : distance between nodes, start of the first window, side of a window; pixels
     planes, difference, field : as of ``displacement_warp``
-    inverse : (10, 10, nodes), as of ``displacement_normals``
+    inverse : (nodes, 10, 10), as of ``displacement_normals``
     answer : (9, nodes): displacement to the right and down, pixels; derivatives of the first and of the
         second to the right and down, per half window; gain; residual sum of squares; and sum of the variances
         of the differences for noise of variance 1
@@ -288,7 +288,7 @@ def displacement_solve(
         centre = field[:, row].astype(np.float64)
         residual = residual - columns[..., 0] * centre[0][:, None] - columns[..., 1] * centre[1][:, None]
         sums = np.einsum("npk,np->kn", columns, residual)
-        solution = np.einsum("kln,ln->kn", inverse[..., here].astype(np.float64), sums)
+        solution = np.einsum("nkl,ln->kn", inverse[here].astype(np.float64), sums)
         answer[:AFFINE, here] = solution[:AFFINE]
         answer[:2, here] += centre
         answer[AFFINE, here] = 1 - solution[-1]

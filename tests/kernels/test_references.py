@@ -228,7 +228,7 @@ def _():
 @case("displacement_solve", per=lambda device, values: math.prod(GRID), **CLOSE)
 def _():
     (_, padded, texture), rng, count = textures(), np.random.default_rng(2), math.prod(GRID)
-    inverse = rng.normal(0, 1e-4, (displacement.PARAMETERS, displacement.PARAMETERS, count))
+    inverse = rng.normal(0, 1e-4, (count, displacement.PARAMETERS, displacement.PARAMETERS))
     arrays = {"difference": np.zeros((2, *texture["planes"].shape[1:])), "answer": np.zeros((9, count))}
     start = FIRST + (WINDOW - 1) / 2
     maps = texture["planes"], texture["field"], arrays["difference"]
@@ -259,10 +259,11 @@ def by_plane(atol, correlations=False):
     """Return a check relative to the largest value of each plane, or of matrices to their diagonal."""
 
     def check(actual, expected, values):
-        scale = np.maximum(np.nanmax(np.abs(expected), axis=(-2, -1), keepdims=True), 1e-9)
         if correlations:  # those of windows with hardly any texture lose digits in float32
-            diagonal = np.sqrt(expected[range(len(expected)), range(len(expected))])
-            scale = diagonal * diagonal[:, np.newaxis]
+            diagonal = np.sqrt(np.einsum("...kk->...k", expected))
+            scale = diagonal[..., np.newaxis] * diagonal[..., np.newaxis, :]
+        else:
+            scale = np.maximum(np.nanmax(np.abs(expected), axis=(-2, -1), keepdims=True), 1e-9)
         np.testing.assert_allclose(actual / scale, expected / scale, rtol=2e-3, atol=atol)
 
     return check
@@ -299,7 +300,7 @@ def _(dtype):
     arrays = (values[name] for name in ("frame", "coefficients", "sums", "counts", "planes", "difference"))
     displacement.displacement_planes(HALO, WINDOW, *arrays)
     size = displacement.PARAMETERS
-    answers = {"inverse": np.zeros((size, size, *GRID)), "summary": np.zeros((4, *GRID))}
+    answers = {"inverse": np.zeros((*GRID, size, size)), "summary": np.zeros((4, *GRID))}
     return (
         NODES
         | answers
