@@ -97,9 +97,9 @@ def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
         case.count,
     )
     noise = math.hypot(noise, 1 / math.sqrt(12))
-    operation = LiveRun(source, Rotation(window_frames=STEPS, noise=noise, device=device))
-    ran = _run(source, operation)
-    best, height = operation.result().height, ran.last.height
+    live_run = LiveRun(source, Rotation(window_frames=STEPS, noise=noise, device=device))
+    ran = _run(source, live_run)
+    best, height = live_run.result().height, ran.last.height
     assert best is not None
     assert height is not None
     off = (height - best)[np.isfinite(best)].astype(np.float64)

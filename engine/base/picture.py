@@ -198,7 +198,9 @@ class Picture:
         return self.bands[0].device.from_host(name, values, values.dtype)
 
     def view(self, name: str) -> AnyArray:
-        """Return a map, (H, W), as a view on the host if the device shares its memory, else on the device."""
+        """Return a map, (H, W): on the device, or a view on the host if they share memory, or a copy of bands."""
+        if len(self.bands) > 1:
+            return self.read(name)[0]
         array = self.array(name)
         return np.from_dlpack(cast(Any, array)) if array.device.info.shares_memory else array
 

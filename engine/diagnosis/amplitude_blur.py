@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.base.device_arrays import AnyArray, on_host
+from mirrorskin.engine.base.device_arrays import AnyArray
 from mirrorskin.engine.base.frames import take_places
 from mirrorskin.engine.base.picture import Picture
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, fit_clipped
+from mirrorskin.kernels.optical import blur
 
 GRID_LINES = 48
 """Lines of pixels along a side that are used."""
@@ -40,24 +41,24 @@ def add_blur(maps: Picture, sigma: str, vectors: Sequence[str], strength: str) -
     variance = find_blur([maps.view(name) for name in vectors], maps.view(strength))
     if variance == 0:
         return
-    parts, spread = [maps.array(name) for name in vectors], maps.array(sigma)
+    reach, factor = max(1, round(2 * math.sqrt(variance))), variance / 2
+    if len(maps.bands) > 1:  # the picture does not fit on one device
+        (spread, *parts) = maps.read(sigma, *vectors)
+        blur.blur_add(blur.blur_bend(parts[0], parts[-1], reach), reach, factor, spread)
+        maps.fill(sigma, spread)
+        return
+    arrays, spread = [maps.array(name) for name in vectors], maps.array(sigma)
     device, (rows, columns) = spread.device, spread.shape
-    tile, count = device.layout.tile, 3 if len(parts) == 1 else 2
+    tile, count = device.layout.tile, 3 if len(arrays) == 1 else 2
     bend = device.array("bend", spread.shape, np.float32, zeroed=False)
-    sizes: dict[str, Any] = {
-        "rows": rows,
-        "columns": columns,
-        "reach": max(1, round(2 * math.sqrt(variance))),
-    }
 
     def launch(name: str, planes: int, **arguments: Any) -> None:
         kernel = device.kernel("blur", name, TILE=tile, PARTS=count)
-        kernel(-(-rows * columns // tile), moved=planes * spread.nbytes, bend=bend, **sizes, **arguments)
+        sizes = {"rows": rows, "columns": columns, "reach": reach, "moved": planes * spread.nbytes}
+        kernel(-(-rows * columns // tile), bend=bend, **sizes, **arguments)
 
-    launch("blur_bend", count + 1, first=parts[0], second=parts[-1])
-    launch("blur_add", 3, factor=variance / 2, sigma=spread)
-    if len(maps.bands) > 1:
-        maps.fill(sigma, on_host(spread))
+    launch("blur_bend", count + 1, first=arrays[0], second=arrays[-1])
+    launch("blur_add", 3, factor=factor, sigma=spread)
 
 
 def find_blur(vectors: Sequence[AnyArray], strength: AnyArray) -> float:

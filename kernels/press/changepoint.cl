@@ -273,7 +273,7 @@ answer_t hypothesis(
 }
 
 // Mean and variance over all hypotheses by weight, and the least misfit in squared sigmas. The sums are of crossings
-// relative to that of a likely hypothesis.
+// relative to that of the most likely hypothesis.
 float3 weigh(const samples_t *samples, const query_t query)
 {
     const ends_t ends = ends_of(samples, query.noise);
@@ -299,18 +299,15 @@ float3 weigh(const samples_t *samples, const query_t query)
             if (bent > enough) fits &= ~(1u << begin);
             if (answer.misfit > enough) continue;
             const float cost = answer.misfit * scale;
-            const float lesser = exponential(-0.5f * fabs(cost - best)), kept = cost < best ? lesser : 1;
-            const float relative_weight = cost < best ? answer.prior : answer.prior * lesser;
-            float away = answer.crossing - likely;
-            if (relative_weight > weight * kept) {
-                square += away * (away * weight - 2 * sum);
-                sum -= away * weight;
-                likely = answer.crossing;
-                away = 0;
-            }
+            const int better = cost < best;
+            const float lesser = exponential(-0.5f * fabs(cost - best)), kept = better ? lesser : 1;
+            const float relative_weight = better ? answer.prior : answer.prior * lesser;
+            const float gap = answer.crossing - likely, shift = better ? gap : 0, away = gap - shift;
+            square = (square + shift * (shift * weight - 2 * sum)) * kept;
+            square += relative_weight * (answer.variance + away * away);
+            sum = (sum - shift * weight) * kept + relative_weight * away;
             weight = weight * kept + relative_weight;
-            sum = sum * kept + relative_weight * away;
-            square = square * kept + relative_weight * (answer.variance + away * away);
+            likely += shift;
             best = LESSER(best, cost);
             enough = LESSER(enough, (best + NEGLIGIBLE) / scale);
         }
