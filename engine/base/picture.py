@@ -198,7 +198,7 @@ class Picture:
         return self.bands[0].device.from_host(name, values, values.dtype)
 
     def view(self, name: str) -> AnyArray:
-        """Return a map, (H, W): on the device, or a view on the host if they share memory, or a copy of bands."""
+        """Return a map: on the device, on the host if they share memory, or a copy if it is in bands."""
         if len(self.bands) > 1:
             return self.read(name)[0]
         array = self.array(name)

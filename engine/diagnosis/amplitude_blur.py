@@ -43,9 +43,9 @@ def add_blur(maps: Picture, sigma: str, vectors: Sequence[str], strength: str) -
         return
     reach, factor = max(1, round(2 * math.sqrt(variance))), variance / 2
     if len(maps.bands) > 1:  # the picture does not fit on one device
-        (spread, *parts) = maps.read(sigma, *vectors)
-        blur.blur_add(blur.blur_bend(parts[0], parts[-1], reach), reach, factor, spread)
-        maps.fill(sigma, spread)
+        deviation, *parts = maps.read(sigma, *vectors)
+        blur.blur_add(blur.blur_bend(parts[0], parts[-1], reach), reach, factor, deviation)
+        maps.fill(sigma, deviation)
         return
     arrays, spread = [maps.array(name) for name in vectors], maps.array(sigma)
     device, (rows, columns) = spread.device, spread.shape

@@ -59,11 +59,14 @@ ON_FRAMES = {
         *(engine.estimate_normals, TURNS, PHASE, SENSOR | {"frame_weights": np.arange(FRAMES) != 3}),
         set(),
     ),
-    "fringes": (engine.optical.fit_fringes, TURNS, PHASE, {}, set()),
+    "fringes": (
+        *(engine.optical.fit_fringes, TURNS, PHASE, {}),
+        {"phase", "phase_sigma", "mean", "modulation", "residual"},
+    ),
     "focus": (engine.optical.find_focus, PRESS, TRAVEL, {"noise": 2.0}, {"height", "status", "sharpness"}),
     "lamps": (
         *(engine.optical.photometric_stereo, TURNS, PHASE, {"zenith": 0.7}),
-        {"normals", "albedo", "residual", "samples"},
+        {"normals", "albedo", "residual", "samples", "normals_sigma", "albedo_sigma"},
     ),
 }
 INTEGRATED = {
