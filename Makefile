@@ -1,10 +1,10 @@
-# make [demo|test|test-all|test-older|test-lowest|test-browser|test-cameras|test-hardware|docs|package|lint|types|fuzz|bench|accuracy|portability|gpu-check|gpu|gpu-wheels|clean]; each installs what it needs in .venv first.
+# make [demo|test|test-all|test-older|test-lowest|test-browser|test-cameras|test-hardware|docs|package|lint|types|fuzz|bench|bench-check|accuracy|portability|gpu-check|gpu|gpu-wheels|clean]; each installs what it needs in .venv first.
 # PYTHON=/path/to/python3.12 chooses the interpreter (3.11 or newer).
 
 SHELL := /bin/sh
 .SHELLFLAGS := -ec
 .ONESHELL:
-.PHONY: demo test test-all test-older test-lowest test-browser test-cameras test-hardware docs package lint types fuzz bench accuracy portability gpu-check gpu gpu-wheels clean
+.PHONY: demo test test-all test-older test-lowest test-browser test-cameras test-hardware docs package lint types fuzz bench bench-check accuracy portability gpu-check gpu gpu-wheels clean
 
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
@@ -109,6 +109,11 @@ fuzz: $(READY)
 # The suite of the developers; 'mirrorskin bench' rates a device in half a minute.
 bench: $(READY)
 	@$(BIN)/python bench/run.py run
+
+# Fails if a function takes more than twice as long as in the stored run, relative to what a user would write instead.
+bench-check: $(READY)
+	@$(BIN)/python -m pip install --quiet 'numba>=0.61'
+	@$(BIN)/python bench/run.py check bench/results/peers-xeon-2-cores.json
 
 # The tables of docs/accuracy.md, from stored results; MEASURE='normals ramps' measures these first.
 accuracy: $(READY)

@@ -23,6 +23,7 @@ from mirrorskin.bench.suite import (
     normals,
     onset,
     paths,
+    peers,
     pose,
     report,
     robust,
@@ -35,7 +36,21 @@ from mirrorskin.io import InputError, check_output
 from mirrorskin.io.storage.atomic import write_new
 from mirrorskin.kernels.device import open_device
 
-_MODULES = operations, calls, onset, normals, correlation, integration, robust, twin, paths, batch, live, pose
+_MODULES = (
+    operations,
+    calls,
+    onset,
+    normals,
+    correlation,
+    integration,
+    robust,
+    twin,
+    paths,
+    batch,
+    live,
+    pose,
+    peers,
+)
 CASES: Cases = {name: run for module in _MODULES for name, run in module.CASES.items()}
 _FILE = click.Path(path_type=Path)
 
@@ -92,6 +107,21 @@ def run_cases(
 def compare_runs(before: Path, after: Path) -> None:
     """Compare the times of two runs with the variation between rounds."""
     click.echo(compare.as_text(open_run(before), open_run(after)))
+
+
+@main.command("check")
+@click.argument("before", type=_FILE, metavar="RUN.json")
+@click.option("--factor", default=2.0, show_default=True, help="Allowed growth of a ratio.")
+@click.option("--device", metavar="NAME", help="A device listed by 'mirrorskin devices'.")
+def check_ratios(before: Path, factor: float, device: str | None) -> None:
+    """Fail if a ratio of processor times, ours to a peer's, has grown since a run of the 'peers-*' cases."""
+    opened, earlier = open_device(device), {case.name: case for case in open_run(before).cases}
+    cases = {name: CASES[name](opened, False) for name in choose(["peers-*"])}
+    for name, case in cases.items():
+        compared = ", ".join(f"{ratio:.2f} times {peer}" for peer, ratio in peers.ratios(case).items())
+        click.echo(f"{name}: {compared}")
+    if lines := peers.regressions(earlier, cases, factor):
+        raise DisagreementError("\n".join(lines))
 
 
 @main.command("report")

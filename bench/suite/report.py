@@ -13,13 +13,24 @@ from mirrorskin.bench.suite import glance
 from mirrorskin.cli.commands.bench.records import Case, Row, Run, as_ms, as_percent
 from mirrorskin.cli.commands.bench.timing import FIRST, OURS
 
-HEAD = ("work", "ms", "quartiles", "kernels", "copies", "GB/s", "frames/s", "of limit", "kernels")
+HEAD = (
+    "work",
+    "ms",
+    "quartiles",
+    "processor",
+    "kernels",
+    "copies",
+    "GB/s",
+    "frames/s",
+    "of limit",
+    "kernels",
+)
 TARGET_HEAD = ("target", "bound", "measured", "met")
 
 LEGEND = (
-    "ms: median by the host's clock, from the call to its return; kernels and copies: as reported by "
-    "the device. of limit: bandwidth divided by the bandwidth of the first row, by the clock; then "
-    "the same for kernels alone. Bytes of input and output are counted once."
+    "ms: median by the host's clock, from the call to its return; processor: time of all threads, ms; "
+    "kernels and copies: as reported by the device. of limit: bandwidth divided by the bandwidth of the "
+    "first row, by the clock; then the same for kernels alone. Bytes of input and output are counted once."
 )
 
 _ABOUT = (
@@ -154,7 +165,7 @@ def _runs(runs: Mapping[Path, Run]) -> str:
     """List the machines, the runs and the versions."""
     lines = []
     for machine in dict.fromkeys(run.machine for run in runs.values()):
-        lines.append(f"- {machine}:")
+        lines.append(_wrap(f"{machine}:", "- "))
         for path, run in runs.items():
             if run.machine == machine:
                 quick = "; made with `--quick`: its times are not representative" if run.quick else ""
@@ -175,7 +186,7 @@ def _topic(
     parts = []
     for name, machine in machines.items():
         if mine := describe(machine):
-            parts += [*([f"**{name}**"] if len(machines) > 1 else []), *mine]
+            parts += [*([_wrap(f"**{name}**")] if len(machines) > 1 else []), *mine]
     return [f"## {title}", _wrap(about), *parts] if parts else []
 
 
@@ -275,6 +286,7 @@ def _cells(case: Case, row: Row) -> list[str]:
         row.name,
         as_ms(wall.median),
         f"{as_ms(wall.lower)}-{as_ms(wall.upper)}",
+        as_ms(row.processor) if row.processor else "",
         as_ms(row.kernel) if "kernel" in row.device else "",
         as_ms(sum(copies)) if copies else "",
         f"{row.bandwidth / 1e9:.2f}" if row.bytes else "",

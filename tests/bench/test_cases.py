@@ -43,7 +43,7 @@ def check_case(name, path):
     path.write_bytes(run.as_json())
     assert open_run(path) == run
     assert not case.targets
-    if case.rows and case.rows[0].is_limit:
+    if case.rows and case.rows[0].is_limit and name != "limits":
         assert all(row.bytes for row in case.rows)
 
 

@@ -58,6 +58,8 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     name : str
     wall : Timing
         By the host's clock, from the call to its return.
+    processor : float
+        Median seconds of processor time of all threads in a call; 0 if not measured.
     bytes, frames, operations : int
         What one call moves (input and output, each once), its frames and its multiply-adds; 0 if not counted.
     device : dict of Timing
@@ -70,6 +72,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     wall: Timing
+    processor: float = 0.0
     bytes: int = 0
     frames: int = 0
     operations: int = 0

@@ -38,6 +38,7 @@ class Work:
 @dataclass(frozen=True)
 class _Turn:
     wall: float
+    processor: float
     records: list[Record]
     result: object = None
 
@@ -73,16 +74,16 @@ def take_turns(
                 work.before()
                 time.sleep(_PAUSE)
                 turn = _turn(work, profile)
-                mine.append(_Turn(turn.wall, turn.records))
+                mine.append(_Turn(turn.wall, turn.processor, turn.records))
     return {name: _row(name, works[name], mine, *first[name]) for name, mine in turns.items()}
 
 
 def _turn(work: Work, profile: Profile) -> _Turn:
     profile.clear()
-    start = time.perf_counter()
+    used, start = time.process_time(), time.perf_counter()
     result = work.call()
-    wall = time.perf_counter() - start
-    return _Turn(wall, profile.records(), result)
+    wall, used = time.perf_counter() - start, time.process_time() - used
+    return _Turn(wall, used, profile.records(), result)
 
 
 def _row(name: str, work: Work, turns: list[_Turn], first: float, compiling: float) -> Row:
@@ -92,6 +93,7 @@ def _row(name: str, work: Work, turns: list[_Turn], first: float, compiling: flo
     return Row(
         name=name,
         wall=Timing.of([turn.wall for turn in turns]),
+        processor=float(np.median([turn.processor for turn in turns])),
         bytes=work.bytes,
         frames=work.frames,
         operations=work.operations,

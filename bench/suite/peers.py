@@ -1,0 +1,368 @@
+"""Functions beside what a user would write instead, with Numba, OpenCV or pyamg: processor and wall time."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin import engine
+from mirrorskin.bench.suite.harness import Cases, agree, check_memory, missing
+from mirrorskin.cli.commands.bench.records import Case, Row, Target
+from mirrorskin.cli.commands.bench.timing import OURS, ROUNDS, Work, take_turns
+from mirrorskin.kernels.device import Device
+
+Maps = dict[str, NDArray[Any]]
+
+LESS_WORK = "less work"
+"""Part of the name of a peer that computes less than the function."""
+
+_LARGE, _QUICK = (1024, 1024), (64, 96)
+_NOISE = 1.5  # counts
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """A function on its input, and its peers by name.
+
+    Attributes
+    ----------
+    call : callable
+        The function; ``maps`` names the maps of its result that the peers compute, too.
+    peers : mapping of callable
+        They return these maps.
+    bounds : mapping of float
+        Largest aim of the ratio of processor times, ours to the peer's.
+    near : mapping of float
+        Largest difference of a map from the peer's.
+    """
+
+    title: str
+    call: Callable[[], Any]
+    peers: Mapping[str, Callable[[], Maps]]
+    bounds: Mapping[str, float]
+    absent: dict[str, str] = field(default_factory=dict)
+    near: Mapping[str, float] = field(default_factory=dict)
+
+
+def run_peers(
+    name: str, make: Callable[[tuple[int, int], Device], _Compared], device: Device, quick: bool
+) -> Case:
+    """Time a function and its peers in turns, after checking that their maps agree."""
+    shape = _QUICK if quick else _LARGE
+    check_memory(name, 600 * math.prod(shape))
+    compared = make(shape, device)
+
+    def check(results: dict[str, Any]) -> None:
+        for peer in compared.peers:
+            maps = {key: np.asarray(getattr(results[OURS], key)) for key in compared.near}
+            theirs = {key: results[peer][key] for key in compared.near if key in results[peer]}
+            agree(peer, maps, theirs, compared.near)
+
+    works = {OURS: Work(compared.call), **{peer: Work(work) for peer, work in compared.peers.items()}}
+    rows = take_turns(works, 1 if quick else ROUNDS, device.profile, check)
+    targets = () if quick else tuple(_targets(rows, compared.bounds))
+    return Case(name, compared.title, list(rows.values()), dict(compared.absent), targets=targets)
+
+
+def ratios(case: Case) -> dict[str, float]:
+    """Return the ratio of processor times, ours to each peer's."""
+    rows = {row.name: row for row in case.rows}
+    return {
+        name: rows[OURS].processor / row.processor
+        for name, row in rows.items()
+        if name != OURS and row.processor > 0
+    }
+
+
+def regressions(before: Mapping[str, Case], after: Mapping[str, Case], factor: float) -> list[str]:
+    """Return a line for each ratio that is more than ``factor`` times what it was."""
+    return [
+        f"{name}: {ratio:.2f} times the processor time of {peer}, {factor:g} times {was:.2f} are allowed"
+        for name, case in after.items()
+        if name in before
+        for peer, ratio in ratios(case).items()
+        if ratio > factor * (was := ratios(before[name]).get(peer, math.inf))
+    ]
+
+
+def _targets(rows: Mapping[str, Row], bounds: Mapping[str, float]) -> list[Target]:
+    mine = rows[OURS]
+    targets = []
+    for peer, bound in bounds.items():
+        if peer in rows:
+            theirs = rows[peer]
+            ratio, wall = mine.processor / theirs.processor, mine.wall.median / theirs.wall.median
+            value = (
+                f"{ratio:.2f} times ({1e3 * mine.processor:.0f} against {1e3 * theirs.processor:.0f} ms),"
+                f" by the clock {wall:.2f}"
+            )
+            limit = f"at most {bound:g} times the processor time of {peer}"
+            targets.append(Target(OURS, limit, value, ratio <= bound))
+    return targets
+
+
+def _waves(shape: tuple[int, int], size: float) -> NDArray[np.float64]:
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    return np.asarray(size * np.sin(x / 60) * np.cos(y / 75))
+
+
+def _counts(values: NDArray[np.float64], generator: np.random.Generator) -> NDArray[np.uint8]:
+    noisy = values + generator.normal(0, _NOISE, values.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def _photometric(shape: tuple[int, int], device: Device) -> _Compared:
+    generator, azimuth, zenith = np.random.default_rng(0), np.arange(16) * np.pi / 8, 0.6
+    height = _waves(shape, 8.0)
+    down, right = np.gradient(height)
+    normals = np.stack([-right, down, np.ones(shape)], -1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    across = np.sin(zenith)
+    lamps = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), np.full(16, np.cos(zenith))], 1)
+    frames = np.stack([_counts(20 + 180 * np.maximum(normals @ lamp, 0), generator) for lamp in lamps])
+    options: dict[str, Any] = {"dark": 20, "shadow": 4 * _NOISE, "noise": _NOISE, "device": device}
+    call = functools.partial(engine.optical.photometric_stereo, frames, azimuth, zenith=zenith, **options)
+    absent = missing("numba")
+
+    def numba() -> Maps:
+        maps = [np.empty((*shape, 3), np.float32), *(np.empty(shape, np.float32) for _ in range(4))]
+        _numba_photometric()(
+            frames, lamps.astype(np.float32), np.float32(20), np.float32(4 * _NOISE), np.float32(255), *maps
+        )
+        normals, albedo, residual, normals_sigma, albedo_sigma = maps
+        return {"normals": normals, "albedo": albedo, "residual": residual} | {
+            "normals_sigma": np.float32(_NOISE) * normals_sigma,
+            "albedo_sigma": np.float32(_NOISE) * albedo_sigma,
+        }
+
+    return _Compared(
+        f"normals and albedo by 16 lamps, {shape[0]} x {shape[1]} uint8",
+        call,
+        {} if absent else {"Numba": numba},
+        {"Numba": 1.3},
+        absent,
+        {"normals": 1e-4, "albedo": 0.02},
+    )
+
+
+def _fringes(shape: tuple[int, int], device: Device) -> _Compared:
+    generator, shift = np.random.default_rng(0), np.arange(16) * np.pi / 8
+    phase = _waves(shape, 3.0)
+    frames = np.stack([_counts(120 + 80 * np.cos(phase - step), generator) for step in shift])
+    call = functools.partial(engine.optical.fit_fringes, frames, shift, device=device)
+    absent = missing("numba")
+
+    def numba() -> Maps:
+        names = "mean", "phase", "modulation", "residual", "phase_sigma"
+        maps = [np.empty(shape, np.float32) for _ in names]
+        _numba_fringes()(frames, *(wave(shift).astype(np.float32) for wave in (np.cos, np.sin)), *maps)
+        maps[-1] *= np.float32(np.median(maps[3].ravel()[::16]))
+        return dict(zip(names, maps, strict=True))
+
+    return _Compared(
+        f"phase of fringes of 16 shifts, {shape[0]} x {shape[1]} uint8",
+        call,
+        {} if absent else {"Numba": numba},
+        {"Numba": 1.2},
+        absent,
+        {"mean": 0.01, "modulation": 0.01},
+    )
+
+
+def _focus(shape: tuple[int, int], device: Device) -> _Compared:
+    import cv2
+
+    generator, travel, radius = np.random.default_rng(0), 0.05 * np.arange(64), 4
+    height, texture = _waves(shape, 0.3), generator.normal(0, 1, shape)
+    contrast = [1 / (1 + ((at - 1.6 - height) / 0.3) ** 2) for at in travel]
+    frames = np.stack([_counts(127 + 38 * texture * part, generator) for part in contrast])
+    call = functools.partial(
+        engine.optical.find_focus, frames, travel, noise=_NOISE, radius=radius, device=device
+    )
+
+    def opencv() -> Maps:
+        size, volume = (2 * radius + 1,) * 2, np.empty(frames.shape, np.float32)
+        for frame, variance in zip(frames, volume, strict=True):
+            samples = frame.astype(np.float32)
+            mean = cv2.boxFilter(samples, -1, size)
+            variance[:] = cv2.sqrBoxFilter(samples, -1, size) - mean * mean
+        best = np.clip(volume.argmax(0), 1, len(frames) - 2)
+        row, column = np.ogrid[: shape[0], : shape[1]]
+        before, peak, after = (np.log(volume[best + step, row, column]) for step in (-1, 0, 1))
+        shift = (before - after) / (2 * (before - 2 * peak + after))
+        return {"height": -(travel[best] + shift * (travel[1] - travel[0]))}
+
+    return _Compared(
+        f"height by focus of 64 frames, {shape[0]} x {shape[1]} uint8",
+        call,
+        {f"OpenCV and NumPy, {LESS_WORK} (no sigma)": opencv},
+        {f"OpenCV and NumPy, {LESS_WORK} (no sigma)": 0.5},
+    )
+
+
+def _displacement(shape: tuple[int, int], device: Device) -> _Compared:
+    import cv2
+
+    generator, border = np.random.default_rng(0), 8
+    size = (shape[0] + 2 * border, shape[1] + 2 * border)
+    texture = np.asarray(cv2.GaussianBlur(generator.normal(0, 1, size), (0, 0), 2.0), np.float64)
+    texture /= texture.std()
+    columns = slice(border, border + shape[1])
+    frames = np.stack(
+        [
+            _counts(120 + 30 * texture[border + step : border + step + shape[0], columns], generator)
+            for step in range(3)
+        ]
+    )
+    call = functools.partial(engine.slip.find_displacement, frames[0], frames[1:], 0.05, device=device)
+
+    def opencv() -> Maps:
+        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        start = np.zeros((*shape, 2), np.float32)
+        return {"flow": np.stack([flow.calc(frames[0], frame, start.copy()) for frame in frames[1:]])}
+
+    return _Compared(
+        f"displacement of two frames from a third, {shape[0]} x {shape[1]} uint8",
+        call,
+        {f"OpenCV DIS, {LESS_WORK} (no sigma)": opencv},
+        {f"OpenCV DIS, {LESS_WORK} (no sigma)": 1.0},
+    )
+
+
+def _change_point(shape: tuple[int, int], device: Device) -> _Compared:
+    generator, travel = np.random.default_rng(0), 0.05 * np.arange(64)
+    height = _waves(shape, 0.5)
+    edges = [1 / (1 + np.exp((height + 1.6 - at) / 0.03)) for at in travel]
+    frames = np.stack([_counts(20 + 180 * edge, generator) for edge in edges])
+    call = functools.partial(
+        engine.find_change_point, frames, travel, dark=20, bright=200, noise=_NOISE, device=device
+    )
+    absent = missing("numba")
+
+    def numba() -> Maps:
+        frame = np.empty(shape, np.int32)
+        _numba_step()(frames, np.float32(20), np.float32(1 / 180), frame)
+        return {"frame": frame}
+
+    peer = f"Numba, {LESS_WORK} (steps only, no sigma)"
+    return _Compared(
+        f"change-points of 64 frames, {shape[0]} x {shape[1]} uint8",
+        call,
+        {} if absent else {peer: numba},
+        {},
+        absent,
+    )
+
+
+_FUNCTIONS: dict[str, Callable[[tuple[int, int], Device], _Compared]] = {
+    "photometric": _photometric,
+    "fringes": _fringes,
+    "focus": _focus,
+    "displacement": _displacement,
+    "change-point": _change_point,
+}
+CASES: Cases = {
+    f"peers-{name}": functools.partial(run_peers, f"peers-{name}", make) for name, make in _FUNCTIONS.items()
+}
+
+
+@functools.cache
+def _numba_photometric() -> Any:
+    """Compile normal equations of each pixel, and their solution by cofactors."""
+    import numba
+
+    def fit(frames, lamps, dark, shadow, bright, normals, albedo, residual, normals_sigma, albedo_sigma):  # type: ignore[no-untyped-def]
+        count, rows, columns = frames.shape
+        for row in range(rows):
+            for column in range(columns):
+                a = b = c = d = e = f = u = v = w = square = np.float32(0)
+                used = 0
+                for t in range(count):
+                    sample = np.float32(frames[t, row, column])
+                    light = sample - dark
+                    if light > shadow and sample < bright:
+                        x, y, z = lamps[t, 0], lamps[t, 1], lamps[t, 2]
+                        a += x * x
+                        b += x * y
+                        c += x * z
+                        d += y * y
+                        e += y * z
+                        f += z * z
+                        u += x * light
+                        v += y * light
+                        w += z * light
+                        square += light * light
+                        used += 1
+                c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+                c11, c12, c22 = a * f - c * c, b * c - a * e, a * d - b * b
+                scale = np.float32(1) / (a * c00 + b * c01 + c * c02)
+                x = (c00 * u + c01 * v + c02 * w) * scale
+                y = (c01 * u + c11 * v + c12 * w) * scale
+                z = (c02 * u + c12 * v + c22 * w) * scale
+                length = np.sqrt(x * x + y * y + z * z)
+                left = max(square - (x * u + y * v + z * w), np.float32(0))
+                residual[row, column] = np.sqrt(left / max(used - 3, 1))
+                x, y, z = x / length, y / length, z / length
+                normals[row, column, 0], normals[row, column, 1], normals[row, column, 2] = x, y, z
+                albedo[row, column] = length
+                radial = x * (c00 * x + c01 * y + c02 * z) + y * (c01 * x + c11 * y + c12 * z)
+                radial = (radial + z * (c02 * x + c12 * y + c22 * z)) * scale
+                whole = (c00 + c11 + c22) * scale
+                normals_sigma[row, column] = np.sqrt(max(whole - radial, np.float32(0))) / length
+                albedo_sigma[row, column] = np.sqrt(radial)
+
+    return numba.njit(fit, fastmath=True)
+
+
+@functools.cache
+def _numba_fringes() -> Any:
+    """Compile the sums of each row, and phase, modulation, residual and sigma of evenly spaced shifts."""
+    import numba
+
+    def fit(frames, cosines, sines, mean, phase, modulation, residual, sigma):  # type: ignore[no-untyped-def]
+        count, rows, columns = frames.shape
+        for row in range(rows):
+            total, along = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+            across, square = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+            for t in range(count):
+                for column in range(columns):
+                    sample = np.float32(frames[t, row, column])
+                    total[column] += sample
+                    along[column] += sample * cosines[t]
+                    across[column] += sample * sines[t]
+                    square[column] += sample * sample
+            for column in range(columns):
+                c, s = 2 * along[column] / count, 2 * across[column] / count
+                level, size = total[column] / count, np.sqrt(c * c + s * s)
+                left = square[column] - count * level * level - count * size * size / 2
+                mean[row, column], phase[row, column], modulation[row, column] = level, np.arctan2(s, c), size
+                residual[row, column] = np.sqrt(max(left, np.float32(0)) / (count - 3))
+                sigma[row, column] = np.sqrt(np.float32(2) / count) / size
+
+    return numba.njit(fit, fastmath=True)
+
+
+@functools.cache
+def _numba_step() -> Any:
+    """Compile the most likely step of each pixel, by cumulative sums."""
+    import numba
+
+    def find(frames, dark, gain, frame):  # type: ignore[no-untyped-def]
+        count, rows, columns = frames.shape
+        for row in range(rows):
+            for column in range(columns):
+                total = best = np.float32(0)
+                step = 0
+                for t in range(count):
+                    total += np.float32(0.5) - (np.float32(frames[t, row, column]) - dark) * gain
+                    if total > best:
+                        best, step = total, t + 1
+                frame[row, column] = step
+
+    return numba.njit(find, fastmath=True)
