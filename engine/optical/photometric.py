@@ -152,7 +152,6 @@ class PhotometricStereo(Operation):
         self.saturation = top if self.bright is None else self.bright
         self._maps = Picture(self, "lambert", _PLANES)
         self._maps.fill("darks", _map("dark", 0.0 if self.dark is None else self.dark, shape))
-        self._maps.fill("triangle", 0)
 
     def push(self, frames: NDArray[Any], *, phase: ArrayLike | None = None) -> None:
         """Process the next frames, (n, H, W), and the azimuth of each lamp, (n,) radians."""

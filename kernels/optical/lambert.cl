@@ -27,7 +27,7 @@
 
 __kernel void lambert_add(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride, MAP lights, MAP darks,
-    const float shadow, const float bright, OUT triangle)
+    const int first, const float shadow, const float bright, OUT triangle)
 {
     const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
     const size_t plane = stride;
@@ -36,15 +36,20 @@ __kernel void lambert_add(
         // Squares of the diagonal, what is above it by rows, the right-hand side, residual sum, number of samples.
         float size[3][BLOCK], above[3][BLOCK], right[3][BLOCK], residual[BLOCK], samples[BLOCK], dark[BLOCK];
         for (int k = 0; k < 3; ++k)
+            for (int i = 0; i < width; ++i) size[k][i] = above[k][i] = right[k][i] = 0;
+        for (int i = 0; i < width; ++i) residual[i] = samples[i] = 0;
+        for (int i = 0; i < width; ++i) dark[i] = darks[base + i];
+        if (first > 0) {
+            for (int k = 0; k < 3; ++k)
+                for (int i = 0, p = base; i < width; ++i, ++p) {
+                    size[k][i] = STATE(k);
+                    above[k][i] = STATE(3 + k);
+                    right[k][i] = STATE(6 + k);
+                }
             for (int i = 0, p = base; i < width; ++i, ++p) {
-                size[k][i] = STATE(k);
-                above[k][i] = STATE(3 + k);
-                right[k][i] = STATE(6 + k);
+                residual[i] = STATE(9);
+                samples[i] = STATE(10);
             }
-        for (int i = 0, p = base; i < width; ++i, ++p) {
-            residual[i] = STATE(9);
-            samples[i] = STATE(10);
-            dark[i] = darks[p];
         }
         for (int t = 0; t < count; ++t) {
             const float light_x = lights[3 * t], light_y = lights[3 * t + 1], light_z = lights[3 * t + 2];

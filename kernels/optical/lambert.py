@@ -24,7 +24,7 @@ _ABOVE: Any = np.array([0, 0, 1, 0, 1, 2]), np.array([1, 2, 2, 3, 3, 3])
 
 
 def lambert_add(
-    frames: Array, lights: Array, darks: Array, shadow: float, bright: float, triangle: Array
+    frames: Array, lights: Array, darks: Array, first: int, shadow: float, bright: float, triangle: Array
 ) -> None:
     """Add frames; the triangle is updated in place.
 
@@ -33,12 +33,15 @@ def lambert_add(
     frames : (n, P), uint8, uint16 or float32
     lights : (n, 3)
     darks : (P,), counts without light, which are subtracted
+    first : number of the first of the frames; before frame 0, the triangle is undefined
     shadow : lower limit of usable samples (exclusive), counts above dark
     bright : upper limit of usable samples (exclusive), counts
-    triangle : (11, P), at first 0. Planes 0 to 2 are the squares of the diagonal of R; 3 to 5 its elements
+    triangle : (11, P). Planes 0 to 2 are the squares of the diagonal of R; 3 to 5 its elements
         above the diagonal, each divided by that of its row, and 6 to 8 the last column of these rows. Then
         the residual sum of squares, and the number of usable samples
     """
+    if first == 0:
+        triangle[:] = 0
     light = frames.astype(np.float32) - darks
     usable = (light > shadow) & (frames < bright)
     rows = np.concatenate([np.broadcast_to(lights[:, None], (*usable.shape, 3)), light[..., None]], axis=2)

@@ -429,17 +429,18 @@ def triangles(actual, expected, values):
     np.testing.assert_array_equal(actual[10], expected[10])
 
 
-@case("lambert_add", DTYPES, checks={"triangle": triangles})
-def _(dtype):
+@case("lambert_add", DTYPES | {"first": (0, 2)}, checks={"triangle": triangles})
+def _(dtype, first):
     rng, pixels = np.random.default_rng(0), 1100
     frames = (rng.integers(0, 256, (9, pixels)) * (200 if dtype == "uint16" else 1)).astype(dtype)
     if dtype == "float32":
         frames[3, 8] = np.nan
     darks = rng.uniform(0, 9, pixels).astype(np.float32)
     values = {"darks": darks, "shadow": 10.0, "bright": float(frames[0].max())}
-    triangle, lights = np.zeros((11, pixels)), rng.normal(size=(9, 3))
-    lambert.lambert_add(frames[:2], lights[:2], **values, triangle=triangle)
-    values |= {"frames": frames[2:], "lights": lights[2:], "triangle": triangle}
+    triangle, lights = np.full((11, pixels), np.nan), rng.normal(size=(9, 3))
+    if first:
+        lambert.lambert_add(frames[:first], lights[:first], **values, first=0, triangle=triangle)
+    values |= {"frames": frames[first:], "lights": lights[first:], "first": first, "triangle": triangle}
     return values | {"shape": (1, pixels), "stride": pixels}
 
 
@@ -458,7 +459,7 @@ def _():
     lit = (rng.random((9, pixels)) < 0.85) & (np.arange(pixels) % 7 > np.arange(9)[:, None] - 5)
     frames = np.where(lit, lights @ normals * 50 + 300 + rng.normal(size=lit.shape), 0)
     triangle = np.zeros((11, pixels))
-    lambert.lambert_add(frames, lights, np.array([0.0]), 10.0, 1e6, triangle)
+    lambert.lambert_add(frames, lights, np.array([0.0]), 0, 10.0, 1e6, triangle)
     triangle[:, 0], triangle[7, 1] = 0, 0  # without any lamp, and with two
     answers = {name: np.zeros(pixels) for name in SOLVED} | {"normals": np.zeros((pixels, 3))}
     answers |= {"samples": np.zeros(pixels, np.int32), "triangle": triangle}
