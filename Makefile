@@ -15,8 +15,10 @@ READY := .venv/.ready
 TESTS := -m pytest --numprocesses auto --dist loadfile --ignore tests/browser
 PYTEST := $(BIN)/python $(TESTS)
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
-# Modules are compiled when they are imported, which few are; setuptools warns of every editable installation.
-INSTALL := PYTHONWARNINGS=ignore $(PIP) install --no-compile --editable
+# Modules are compiled when they are imported, which few are, or here where Python must not write what it compiles.
+# setuptools warns of every editable installation.
+COMPILE := $(if $(PYTHONDONTWRITEBYTECODE),--compile,--no-compile)
+INSTALL := PYTHONWARNINGS=ignore $(PIP) install $(COMPILE) --editable
 LOWEST := build/lowest
 
 demo: $(DEMO)
@@ -169,6 +171,7 @@ $(DEMO): pyproject.toml
 	    echo 'adding a linker for OpenCL kernels: this machine has none that works (100 MB)'
 	    $(INSTALL) '.[linker]'
 	}
+	$(if $(PYTHONDONTWRITEBYTECODE),$(BIN)/python -m compileall -q $(PACKAGES))
 	touch $@
 
 $(READY): $(DEMO)
