@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,15 @@ from mirrorskin import engine
 from mirrorskin.bench.suite.harness import Cases, agree, check_memory, missing
 from mirrorskin.cli.commands.bench.records import Case, Row, Target
 from mirrorskin.cli.commands.bench.timing import OURS, ROUNDS, Work, take_turns
+from mirrorskin.evaluation.scenes.inputs import (
+    PIXEL,
+    SCALES,
+    STEPS,
+    TILT,
+    fill_turns,
+    phases,
+    turn_noise,
+)
 from mirrorskin.kernels.device import Device
 
 Maps = dict[str, NDArray[Any]]
@@ -260,12 +270,78 @@ def _change_point(shape: tuple[int, int], device: Device) -> _Compared:
     )
 
 
+def _normals(shape: tuple[int, int], device: Device) -> _Compared:
+    frames, phase, (offset, gain, _) = np.empty((STEPS, *shape), np.uint8), phases(STEPS), SCALES["uint8"]
+    fill_turns(frames)
+    noise = turn_noise(frames.dtype)
+    options: dict[str, Any] = {"tilt": TILT, "zenith_gain": gain, "zenith_offset": offset, "noise": noise}
+    call = functools.partial(engine.estimate_normals, frames, phase, device=device, **options)
+    absent = missing("numba")
+
+    def numba() -> Maps:
+        maps = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
+        waves = (wave(phase).astype(np.float32) for wave in (np.cos, np.sin))
+        _numba_normals()(frames, *waves, np.float32(offset), np.float32(gain), np.float32(noise), *maps)
+        return dict(zip(("normals", "normals_sigma"), maps, strict=True))
+
+    peer = f"Numba, {LESS_WORK} (linear, sigma without the zenith's error)"
+    title = f"normals of a turn of {STEPS} frames, {shape[0]} x {shape[1]} uint8"
+    return _Compared(title, call, {} if absent else {peer: numba}, {}, absent)
+
+
+def _fuse(shape: tuple[int, int], device: Device) -> _Compared:
+    shape = min(shape[0], 512), min(shape[1], 512)
+    generator, height, phase = np.random.default_rng(0), _waves(shape, 0.2), phases(STEPS)
+    travel, (offset, gain, _) = 0.05 * np.arange(16), SCALES["uint8"]
+    rise = [1 / (1 + np.exp((height + 0.4 - at) / 0.02)) for at in travel]
+    press = np.stack([_counts(20 + 180 * part, generator) for part in rise])
+    down, right = (part / PIXEL for part in np.gradient(-height))  # depth, as travel is
+    up = 1 / np.sqrt(1 + down**2 + right**2)
+    leaning = np.cos(TILT) - np.sin(TILT) * (
+        down * np.sin(phase)[:, None, None] - right * np.cos(phase)[:, None, None]
+    )
+    turn = _counts(offset + gain * np.arccos(np.clip(leaning * up, -1, 1)), generator)
+    onset = engine.find_onset(press, travel, dark=20, bright=200, device=device)
+    options: dict[str, Any] = {"tilt": TILT, "zenith_gain": gain, "zenith_offset": offset, "noise": _NOISE}
+    normals = engine.estimate_normals(turn, phase, device=device, **options)
+    absent = missing("pyamg")
+
+    def pyamg() -> Maps:
+        from scipy.sparse import diags_array, eye_array, kron
+
+        x, y, z = np.moveaxis(np.asarray(normals.normals, np.float64), -1, 0)
+        usable = np.isfinite(x) & (z > 0.1)
+        slopes = [np.where(usable, part / np.where(usable, z, 1), 0) for part in (-x, y)]
+        weight = np.where(usable, 1 / np.where(usable, normals.normals_sigma, 1).astype(np.float64) ** 2, 0)
+        known = np.isfinite(onset.height) & np.isfinite(onset.height_sigma)
+        height = np.where(known, onset.height, 0)
+        certain = np.where(known, 1 / np.where(known, onset.height_sigma, 1).astype(np.float64) ** 2, 1e-6)
+        matrix, right = diags_array(certain.ravel()), (certain * height).ravel()
+        for axis, slope in ((1, slopes[0]), (0, slopes[1])):
+            size = shape[axis]
+            step = diags_array([-1 / PIXEL, 1 / PIXEL], offsets=[0, 1], shape=(size - 1, size))
+            across = kron(eye_array(shape[0]), step) if axis else kron(step, eye_array(shape[1]))
+            first = np.s_[:, :-1] if axis else np.s_[:-1]
+            between = diags_array(weight[first].ravel())
+            matrix = matrix + across.T @ between @ across
+            right = right + across.T @ (between @ slope[first].ravel())
+        solver = import_module("pyamg").smoothed_aggregation_solver(matrix.tocsr())
+        return {"height": solver.solve(right, tol=1e-5, accel="cg").reshape(shape)}
+
+    peer = f"pyamg, {LESS_WORK} (no sigma, no intervals)"
+    title = f"one surface of a press of 16 and a turn of {STEPS} frames, {shape[0]} x {shape[1]}"
+    call = functools.partial(engine.fuse, onset, normals, PIXEL, device=device)
+    return _Compared(title, call, {} if absent else {peer: pyamg}, {}, absent)
+
+
 _FUNCTIONS: dict[str, Callable[[tuple[int, int], Device], _Compared]] = {
     "photometric": _photometric,
     "fringes": _fringes,
     "focus": _focus,
     "displacement": _displacement,
     "change-point": _change_point,
+    "normals": _normals,
+    "fuse": _fuse,
 }
 CASES: Cases = {
     f"peers-{name}": functools.partial(run_peers, f"peers-{name}", make) for name, make in _FUNCTIONS.items()
@@ -344,6 +420,33 @@ def _numba_fringes() -> Any:
                 mean[row, column], phase[row, column], modulation[row, column] = level, np.arctan2(s, c), size
                 residual[row, column] = np.sqrt(max(left, np.float32(0)) / (count - 3))
                 sigma[row, column] = np.sqrt(np.float32(2) / count) / size
+
+    return numba.njit(fit, fastmath=True)
+
+
+@functools.cache
+def _numba_normals() -> Any:
+    """Compile the mean and the wave of each pixel, whose phase is the azimuth, and normals by the mean."""
+    import numba
+
+    def fit(frames, cosines, sines, offset, gain, noise, normals, sigma):  # type: ignore[no-untyped-def]
+        count, rows, columns = frames.shape
+        for row in range(rows):
+            total, along = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+            across = np.zeros(columns, np.float32)
+            for t in range(count):
+                for column in range(columns):
+                    sample = np.float32(frames[t, row, column])
+                    total[column] += sample
+                    along[column] += sample * cosines[t]
+                    across[column] += sample * sines[t]
+            for column in range(columns):
+                c, s = 2 * along[column] / count, 2 * across[column] / count
+                size, zenith = np.sqrt(c * c + s * s), (total[column] / count - offset) / gain
+                part = np.sin(zenith)
+                normals[row, column, 0], normals[row, column, 1] = part * c / size, part * s / size
+                normals[row, column, 2] = np.cos(zenith)
+                sigma[row, column] = noise * np.sqrt(np.float32(2) / count) / size * part
 
     return numba.njit(fit, fastmath=True)
 
