@@ -77,10 +77,8 @@ def test_nodes_are_joined_by_straight_lines():
 def test_a_displacement_is_found_from_the_columns_of_its_window():
     planes = planes_of(SPECKLE.frame(SHAPE, 0, 0))
     columns = basis(windows(planes, 4, STEP, FIRST + HALO, WINDOW, GRID[1]), WINDOW)
-    inverse = np.full((PARAMETERS, PARAMETERS, math.prod(GRID)), np.nan)
-    inverse[:, :, 4 * GRID[1] : 5 * GRID[1]] = np.linalg.inv(columns.transpose(0, 2, 1) @ columns).transpose(
-        1, 2, 0
-    )
+    inverse = np.full((math.prod(GRID), PARAMETERS, PARAMETERS), np.nan)
+    inverse[4 * GRID[1] : 5 * GRID[1]] = np.linalg.inv(columns.transpose(0, 2, 1) @ columns)
     difference, answer = np.zeros((2, *planes.shape[1:])), np.empty((9, math.prod(GRID)))
     difference[0] = 0.7 * planes[1] - 0.2 * planes[2] + np.where(np.isnan(planes[0]), 0, 3) + 0.1 * planes[3]
     field = np.zeros((2, *GRID))
