@@ -89,8 +89,8 @@ noiseless = Camera(np.dtype(np.uint16), noise=0.0)
 twin, frames = simulate("sphere", Vertical(1.0 + SWING * np.array([-0.5, 0.5])), camera=noiseless, **contact)
 lit = (frames - twin.header.dark.astype(float)) / (twin.header.bright - twin.header.dark)
 growth = float(np.sum(lit[1] - lit[0])) * (FIELD / SIZE) ** 2 / SWING
-error = (dithered.process["area_growth"], dithered.process["area_growth_sigma"])
-print(f"lit area: grows by {error[0]:.3f} ± {error[1]:.3f} mm² for each mm of travel, true {growth:.3f}")
+measured, deviation = dithered.process["area_growth"], dithered.process["area_growth_sigma"]
+print(f"lit area: grows by {measured:.3f} ± {deviation:.3f} mm² for each mm of travel, true {growth:.3f}")
 
 # The strokes: height after each, hysteresis, and errors divided by their standard deviations.
 figure, axes = plt.subplots(2, 3, figsize=(15, 8), layout="constrained")
