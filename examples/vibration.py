@@ -89,8 +89,8 @@ noiseless = Camera(np.dtype(np.uint16), noise=0.0)
 twin, frames = simulate("sphere", Vertical(1.0 + SWING * np.array([-0.5, 0.5])), camera=noiseless, **contact)
 lit = (frames - twin.header.dark.astype(float)) / (twin.header.bright - twin.header.dark)
 growth = float(np.sum(lit[1] - lit[0])) * (FIELD / SIZE) ** 2 / SWING
-measured, deviation = dithered.process["area_growth"], dithered.process["area_growth_sigma"]
-print(f"lit area: grows by {measured:.3f} ± {deviation:.3f} mm² for each mm of travel, true {growth:.3f}")
+grown, grown_sigma = dithered.process["area_growth"], dithered.process["area_growth_sigma"]
+print(f"lit area: grows by {grown:.3f} ± {grown_sigma:.3f} mm² for each mm of travel, true {growth:.3f}")
 
 # The strokes: height after each, hysteresis, and errors divided by their standard deviations.
 figure, axes = plt.subplots(2, 3, figsize=(15, 8), layout="constrained")
@@ -127,7 +127,7 @@ panel.legend()
 # The maps of rocking and dither.
 measured = np.where(rocked.contact == 1, rocked.slope, np.nan)
 largest = np.nanpercentile(dithered.growth, 99.5)
-area = f"dither: {error[0]:.2f} mm²/mm, true {growth:.2f}"
+area = f"dither: {grown:.2f} mm²/mm, true {growth:.2f}"
 for panel, values, label, title, limit in (
     (axes[1, 0], measured, "slope", "rocking: slope along one direction", np.nanmax(np.abs(slope))),
     (axes[1, 1], error, "error of the slope", f"its error: RMS {rms(error):.3f}", 4 * rms(error)),
