@@ -57,7 +57,7 @@ class ArrayRecording(Recording):
         Properties, such as ``pixel_size``, ``tilt``, ``press``, ``pivot`` and ``dark``: those of ``Header``.
     motion : str, optional
         By default the motion of the given position.
-    region, wanted
+    region, frame_range
         The part of the picture; the first frame, and the end of the frames.
     name : str
         Name of the array in messages.

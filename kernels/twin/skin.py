@@ -75,7 +75,7 @@ def skin_flakes(
     Parameters
     ----------
     shift, place_x, place_y, along_x, along_y, twist : see `skin_displacement`
-    seen : (2, H, W), offset along x and y from a pixel to the point that it sees, mm
+    visible : (2, H, W), offset along x and y from a pixel to the point that it sees, mm
     flakes : (`FLAKES`, `FLAKES`), coefficients by x and y, 0 or 1, periodic
     cell_x, cell_y, part_x, part_y : (W,) and (H,), position among the coefficients of the skin that was at
         each pixel at the press: integer part, and remainder

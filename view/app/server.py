@@ -51,7 +51,7 @@ class AppServer:
         0 for any free one.
     lifetime : int
         Milliseconds after which a page that was closed, or lost its connection, is forgotten.
-    most : int
+    page_limit : int
         Number of open pages; further ones are refused.
 
     Attributes
