@@ -211,8 +211,8 @@ def noisy_slopes(shape: Shape, seed: int = 0) -> Floats:
 def drifting_slopes(shape: Shape, count: int, fraction: float) -> list[Floats]:
     """Return noisy slopes of `count` frames on a circle, with equal changes between consecutive frames.
 
-    The root mean square of a change is `share` times the root mean square of the slopes: half of it is in the
-    surface, half in the noise.
+    The root mean square of a change is `fraction` times the root mean square of the slopes: half of it is in
+    the surface, half in the noise.
     """
     middle = noisy_slopes(shape)
     axes = []

@@ -112,7 +112,7 @@ def cap(radius: float) -> Shape:
 def ball_on_plane(radius: float, lift: float, base: float = 1.0) -> Shape:
     """Return a ball's cap that stands above a level plane: side 1, which jumps to side 0.
 
-    `foot` is the cap's radius as a share of the ball's, `lift` the height of its rim above the plane. Of
+    `base` is the cap's radius as a share of the ball's, `lift` the height of its rim above the plane. Of
     the lift, normals tell nothing: it lies on all of the rim.
     """
     ball = cap(radius)

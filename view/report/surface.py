@@ -105,7 +105,7 @@ class Grid:
 
 
 def sample(result: Result, limit: int = MOST) -> Grid:
-    """Average over blocks of pixels, so that each side has at most ``most`` samples.
+    """Average over blocks of pixels, so that each side has at most ``limit`` samples.
 
     Only the rectangle that contains all heights is used. A block with heights at less than half of its pixels
     is a hole. In a block with several pieces, or with measured and filled pixels, only pixels of the median
