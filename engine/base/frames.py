@@ -94,26 +94,17 @@ def thin_out(frames: AnyArray) -> NDArray[np.float64]:
 
 def thinned(frames: AnyArray) -> NDArray[Any]:
     """Return the frames thinned out by `thin_out`, in their own type."""
-    samples: NDArray[Any]
-    *count, rows, columns = frames.shape
-    step, pixels = thinning((rows, columns)), rows * columns
-    if isinstance(frames, Array):
-        samples = take_samples(frames, 0, (pixels, 0, step), (math.prod(count), 1, -(-pixels // step)))
-        return samples.reshape(*count, -1)
-    samples = frames.reshape(*count, -1)[..., ::step]
-    return samples
+    return thinned_together([frames])[0]
 
 
-def thinned_maps(maps: Sequence[AnyArray]) -> list[NDArray[Any]]:
-    """Return maps of one size, (H, W), thinned out; those on a device are waited for once."""
-    if not isinstance(maps[0], Array):
-        return [thinned(values) for values in maps]
-    step, pixels = thinning(maps[0].shape), math.prod(maps[0].shape)
-    shape = 1, 1, -(-pixels // step)
-    return [
-        samples.ravel()
-        for samples in take_grids(*(Grid(array, 0, (pixels, 0, step), shape) for array in maps))
-    ]
+def thinned_together(arrays: Sequence[AnyArray]) -> list[NDArray[Any]]:
+    """Return arrays, (..., H, W), thinned out: all on the host, or on a device, which is waited for once."""
+    grids = []
+    for *count, rows, columns in (array.shape for array in arrays):
+        step, pixels = thinning((rows, columns)), rows * columns
+        grids.append(((pixels, 0, step), (math.prod(count), 1, -(-pixels // step))))
+    samples = take_grids(*(Grid(array, 0, *grid) for array, grid in zip(arrays, grids, strict=True)))
+    return [values.reshape(*array.shape[:-2], -1) for array, values in zip(arrays, samples, strict=True)]
 
 
 def take_grid(frames: AnyArray, grid: FrameSamples) -> NDArray[Any]:
