@@ -11,9 +11,6 @@
 #define CHUNK (STRIP < 64 ? STRIP : 64)
 #define WIDEST 50
 
-// Sums of squares of differences from the middle lose no digits.
-#define CONTRAST(sum, square, count) ((square) - (sum) * (sum) / (count))
-
 #define CHOSEN(mask, yes, no) (((mask) & (yes)) | (~(mask) & (no)))
 
 // Updates the peaks of some pixels, from `place` on, by their contrast in frame t. Loops over copies vectorise.
@@ -38,11 +35,11 @@ __attribute__((always_inline)) void update(
     for (int i = 0; i < size; ++i) best[place + i] = CHOSEN(better[i], t, where[i]);
     for (int k = 1; k <= reach; ++k) {
         OUT earlier = recent + (t - k + (k > t ? reach : 0)) % reach * plane + place;
-        const int none = as_int(NAN), missing = -(k > t);
-        for (int i = 0; i < size; ++i) last[i] = as_int(earlier[i]);
+        const int none = as_int(NAN);
+        for (int i = 0; i < size; ++i) last[i] = k > t ? none : as_int(earlier[i]);
         for (int i = 0; i < size; ++i) before[i] = as_int(top[place + i - k * plane]);
         for (int i = 0; i < size; ++i) after[i] = as_int(top[place + i + k * plane]);
-        for (int i = 0; i < size; ++i) before[i] = CHOSEN(better[i], CHOSEN(missing, none, last[i]), before[i]);
+        for (int i = 0; i < size; ++i) before[i] = CHOSEN(better[i], last[i], before[i]);
         for (int i = 0; i < size; ++i) after[i] = CHOSEN(better[i], none, CHOSEN(-(since[i] == k), now[i], after[i]));
         for (int i = 0; i < size; ++i) top[place + i - k * plane] = as_float(before[i]);
         for (int i = 0; i < size; ++i) top[place + i + k * plane] = as_float(after[i]);
@@ -62,7 +59,8 @@ void remember(
     for (int i = 0; i < width; ++i) now[i] = sharp[i];
 }
 
-#if TILE > 1 && BITS < 32
+#define MOVING_SUMS (TILE > 1 && BITS < 32)
+#if MOVING_SUMS
 // Sums along columns move down row by row, and their sums along rows to the right, in integers.
 #if BITS == 8
 typedef int Sum;
@@ -100,7 +98,7 @@ __kernel void focus_scan(
             int wide[STRIP];
             for (int i = 0; i < width; ++i)
                 wide[i] = LESSER(base + i + radius, columns - 1) - GREATER(base + i - radius, 0) + 1;
-#if TILE > 1 && BITS < 32
+#if MOVING_SUMS
             Sum sums[STRIP + 2 * WIDEST + 1], squares[STRIP + 2 * WIDEST + 1];
             const int leftmost = max(base - radius, 0), used = min(base + width + radius, columns) - leftmost;
             const int start = leftmost - (base - radius);
@@ -111,8 +109,8 @@ __kernel void focus_scan(
             for (int row = row_low; row < row_end; ++row) {
                 const int top = max(row - radius, 0), bottom = min(row + radius, rows - 1);
                 __global const FRAME *restrict middle = frame + (size_t)row * columns + base;
-                float sharp[STRIP], sum[STRIP], square[STRIP];
-#if TILE > 1 && BITS < 32
+                float sharp[STRIP], sum[STRIP], square[STRIP];  // of differences from the middle, which lose no digits
+#if MOVING_SUMS
                 if (row + radius < rows)
                     add_row(frame + (size_t)(row + radius) * columns + leftmost, used, 1, sums + start, squares + start);
                 if (row - radius > 0 && row > row_low)
@@ -146,7 +144,10 @@ __kernel void focus_scan(
                         }
                     }
 #endif
-                for (int i = 0; i < width; ++i) sharp[i] = CONTRAST(sum[i], square[i], (bottom - top + 1) * wide[i]);
+                for (int i = 0; i < width; ++i) {
+                    const float size = (bottom - top + 1) * wide[i];
+                    sharp[i] = square[i] - sum[i] * sum[i] / size;
+                }
                 remember(sharp, row * columns + base, width, stride, t, reach, best, peak, recent);
             }
         }
