@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import engine
+from mirrorskin.bench.suite.correlation import fit_with_numba
 from mirrorskin.bench.suite.harness import Cases, agree, check_memory, missing
 from mirrorskin.cli.commands.bench.records import Case, Row, Target
 from mirrorskin.cli.commands.bench.timing import OURS, ROUNDS, Work, take_turns
@@ -169,11 +170,12 @@ def _fringes(shape: tuple[int, int], device: Device) -> _Compared:
     absent = missing("numba")
 
     def numba() -> Maps:
-        names = "mean", "phase", "modulation", "residual", "phase_sigma"
+        mean, cosine, sine, residual = fit_with_numba(frames, shift)
+        deviation = np.median(residual.ravel()[::16]) * math.sqrt(2 / len(shift))
+        names = "phase", "modulation", "phase_sigma"
         maps = [np.empty(shape, np.float32) for _ in names]
-        _numba_fringes()(frames, *(wave(shift).astype(np.float32) for wave in (np.cos, np.sin)), *maps)
-        maps[-1] *= np.float32(np.median(maps[3].ravel()[::16]))
-        return dict(zip(names, maps, strict=True))
+        _numba_phase()(cosine, sine, np.float32(deviation), *maps)
+        return {"mean": mean, "residual": residual, **dict(zip(names, maps, strict=True))}
 
     return _Compared(
         f"phase of fringes of 16 shifts, {shape[0]} x {shape[1]} uint8",
@@ -279,9 +281,10 @@ def _normals(shape: tuple[int, int], device: Device) -> _Compared:
     absent = missing("numba")
 
     def numba() -> Maps:
+        mean, cosine, sine, _ = fit_with_numba(frames, phase)
         maps = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
-        waves = (wave(phase).astype(np.float32) for wave in (np.cos, np.sin))
-        _numba_normals()(frames, *waves, np.float32(offset), np.float32(gain), np.float32(noise), *maps)
+        numbers = map(np.float32, (offset, gain, noise * math.sqrt(2 / len(phase))))
+        _numba_directions()(mean, cosine, sine, *numbers, *maps)
         return dict(zip(("normals", "normals_sigma"), maps, strict=True))
 
     peer = f"Numba, {LESS_WORK} (linear, sigma without the zenith's error)"
@@ -397,58 +400,37 @@ def _numba_photometric() -> Any:
 
 
 @functools.cache
-def _numba_fringes() -> Any:
-    """Compile the sums of each row, and phase, modulation, residual and sigma of evenly spaced shifts."""
+def _numba_phase() -> Any:
+    """Compile phase, modulation and sigma of a wave."""
     import numba
 
-    def fit(frames, cosines, sines, mean, phase, modulation, residual, sigma):  # type: ignore[no-untyped-def]
-        count, rows, columns = frames.shape
-        for row in range(rows):
-            total, along = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-            across, square = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-            for t in range(count):
-                for column in range(columns):
-                    sample = np.float32(frames[t, row, column])
-                    total[column] += sample
-                    along[column] += sample * cosines[t]
-                    across[column] += sample * sines[t]
-                    square[column] += sample * sample
-            for column in range(columns):
-                c, s = 2 * along[column] / count, 2 * across[column] / count
-                level, size = total[column] / count, np.sqrt(c * c + s * s)
-                left = square[column] - count * level * level - count * size * size / 2
-                mean[row, column], phase[row, column], modulation[row, column] = level, np.arctan2(s, c), size
-                residual[row, column] = np.sqrt(max(left, np.float32(0)) / (count - 3))
-                sigma[row, column] = np.sqrt(np.float32(2) / count) / size
+    def derive(cosine, sine, deviation, phase, modulation, sigma):  # type: ignore[no-untyped-def]
+        for row in range(cosine.shape[0]):
+            for column in range(cosine.shape[1]):
+                c, s = cosine[row, column], sine[row, column]
+                size = np.sqrt(c * c + s * s)
+                phase[row, column], modulation[row, column] = np.arctan2(s, c), size
+                sigma[row, column] = deviation / size
 
-    return numba.njit(fit, fastmath=True)
+    return numba.njit(derive, fastmath=True)
 
 
 @functools.cache
-def _numba_normals() -> Any:
-    """Compile the mean and the wave of each pixel, whose phase is the azimuth, and normals by the mean."""
+def _numba_directions() -> Any:
+    """Compile normals and their sigma by the mean, which shows the zenith, and by the wave's direction."""
     import numba
 
-    def fit(frames, cosines, sines, offset, gain, noise, normals, sigma):  # type: ignore[no-untyped-def]
-        count, rows, columns = frames.shape
-        for row in range(rows):
-            total, along = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-            across = np.zeros(columns, np.float32)
-            for t in range(count):
-                for column in range(columns):
-                    sample = np.float32(frames[t, row, column])
-                    total[column] += sample
-                    along[column] += sample * cosines[t]
-                    across[column] += sample * sines[t]
-            for column in range(columns):
-                c, s = 2 * along[column] / count, 2 * across[column] / count
-                size, zenith = np.sqrt(c * c + s * s), (total[column] / count - offset) / gain
+    def derive(mean, cosine, sine, offset, gain, deviation, normals, sigma):  # type: ignore[no-untyped-def]
+        for row in range(mean.shape[0]):
+            for column in range(mean.shape[1]):
+                c, s = cosine[row, column], sine[row, column]
+                size, zenith = np.sqrt(c * c + s * s), (mean[row, column] - offset) / gain
                 part = np.sin(zenith)
                 normals[row, column, 0], normals[row, column, 1] = part * c / size, part * s / size
                 normals[row, column, 2] = np.cos(zenith)
-                sigma[row, column] = noise * np.sqrt(np.float32(2) / count) / size * part
+                sigma[row, column] = deviation / size * part
 
-    return numba.njit(fit, fastmath=True)
+    return numba.njit(derive, fastmath=True)
 
 
 @functools.cache
