@@ -35,6 +35,7 @@ LESS_WORK = "less work"
 
 _LARGE, _QUICK = (1024, 1024), (64, 96)
 _NOISE = 1.5  # counts
+_COMPILED: dict[str, Any] = {"fastmath": True, "error_model": "numpy"}  # options of Numba: 1 / 0 is no error
 
 
 @dataclass(frozen=True)
@@ -396,7 +397,7 @@ def _numba_photometric() -> Any:
                 normals_sigma[row, column] = np.sqrt(max(whole - radial, np.float32(0))) / length
                 albedo_sigma[row, column] = np.sqrt(radial)
 
-    return numba.njit(fit, fastmath=True)
+    return numba.njit(fit, **_COMPILED)
 
 
 @functools.cache
@@ -412,7 +413,7 @@ def _numba_phase() -> Any:
                 phase[row, column], modulation[row, column] = np.arctan2(s, c), size
                 sigma[row, column] = deviation / size
 
-    return numba.njit(derive, fastmath=True)
+    return numba.njit(derive, **_COMPILED)
 
 
 @functools.cache
@@ -430,7 +431,7 @@ def _numba_directions() -> Any:
                 normals[row, column, 2] = np.cos(zenith)
                 sigma[row, column] = deviation / size * part
 
-    return numba.njit(derive, fastmath=True)
+    return numba.njit(derive, **_COMPILED)
 
 
 @functools.cache
@@ -450,4 +451,4 @@ def _numba_step() -> Any:
                         best, step = total, t + 1
                 frame[row, column] = step
 
-    return numba.njit(find, fastmath=True)
+    return numba.njit(find, **_COMPILED)
