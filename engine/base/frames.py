@@ -89,21 +89,25 @@ def thinning(shape: tuple[int, ...]) -> int:
 
 def thin_out(frames: AnyArray) -> NDArray[np.float64]:
     """Return evenly spaced samples of one frame or several, enough to estimate the noise within 0.5 %."""
-    return thinned(frames).astype(np.float64)
+    [samples] = thinned(frames)
+    return samples.astype(np.float64)
 
 
-def thinned(frames: AnyArray) -> NDArray[Any]:
-    """Return the frames thinned out by `thin_out`, in their own type."""
-    return thinned_together([frames])[0]
+def thinned(*arrays: AnyArray) -> list[NDArray[Any]]:
+    """Return arrays, (..., H, W), thinned out by `thin_out`, in their own types.
 
-
-def thinned_together(arrays: Sequence[AnyArray]) -> list[NDArray[Any]]:
-    """Return arrays, (..., H, W), thinned out: all on the host, or on a device, which is waited for once."""
-    grids = []
-    for *count, rows, columns in (array.shape for array in arrays):
+    All are on the host, or all on one device, which is waited for once.
+    """
+    samples, grids = [], []
+    for array in arrays:
+        *count, rows, columns = array.shape
         step, pixels = thinning((rows, columns)), rows * columns
-        grids.append(((pixels, 0, step), (math.prod(count), 1, -(-pixels // step))))
-    samples = take_grids(*(Grid(array, 0, *grid) for array, grid in zip(arrays, grids, strict=True)))
+        if isinstance(array, Array):
+            grids.append(Grid(array, 0, (pixels, 0, step), (math.prod(count), 1, -(-pixels // step))))
+        else:
+            samples.append(array.reshape(*count, -1)[..., ::step])
+    if grids:
+        samples = take_grids(*grids)
     return [values.reshape(*array.shape[:-2], -1) for array, values in zip(arrays, samples, strict=True)]
 
 

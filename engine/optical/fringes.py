@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, ndtr
 
-from mirrorskin.engine.base.frames import noise_of_residual, thinned_together
+from mirrorskin.engine.base.frames import noise_of_residual, thinned
 from mirrorskin.engine.base.functions import phase_function
 from mirrorskin.engine.base.inputs import Maps, as_result
 from mirrorskin.engine.base.options import option
@@ -100,8 +100,8 @@ class Fringes(CorrelationOperation):
         freedom = np.count_nonzero(used) - 3
         residual_noise = math.nan  # noise estimated from the residuals of the half with more modulation
         if freedom > 0:
-            parts = [fit.view(name) for name in ("cosine_part", "sine_part", "residual")]
-            cosine, sine, residual = thinned_together(parts)
+            parts = map(fit.view, ("cosine_part", "sine_part", "residual"))
+            cosine, sine, residual = thinned(*parts)
             square = cosine * cosine + sine * sine
             residual_noise = noise_of_residual(
                 residual[square >= np.median(square[np.isfinite(square)])], freedom

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.base.frames import noise_of_residual, thinned_together
+from mirrorskin.engine.base.frames import noise_of_residual, thinned
 from mirrorskin.engine.base.functions import optional_phase_function
 from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.options import option
@@ -182,7 +182,7 @@ class PhotometricStereo(Operation):
         self._maps.run("lambert_normals")
         noise = self._noise
         if noise is None:
-            residual, samples = thinned_together([self._maps.view(name) for name in ("residual", "samples")])
+            residual, samples = thinned(self._maps.view("residual"), self._maps.view("samples"))
             noise = np.asarray(noise_of_residual(residual, samples - 3), np.float32)
         self._maps.run(
             "lambert_scale", noise=PerPixel(noise), noise_step=noise.ndim // 2, limits=_limits(self.count)

@@ -259,7 +259,7 @@ class NormalsOperation(SensorOptions, Operation):
         """Add a turn to the maps."""
         frames = self._open[turn]
         if self._model is None:
-            self._model = self._kernel.estimate_model(thinned(frames), fit)
+            self._model = self._kernel.estimate_model(thinned(frames)[0], fit)
         self._turns += 1
         self._frames += len(frames)
         self._kernel.run(self._maps, frames, fit, self._model, 1 if self.per_turn else self._turns)
@@ -418,7 +418,7 @@ class Normals(NormalsOperation):
             turn, *others = self._turns_in(self._phase)
             fit = self._fit_of(self._phase[turn], self._weights[turn], first=True)
             if fit is not None and others:
-                self._model = self._kernel.estimate_model(thinned(self._stack[turn]), fit)
+                self._model = self._kernel.estimate_model(thinned(self._stack[turn])[0], fit)
         return None if self._model is None else self._model.tilt
 
     @property

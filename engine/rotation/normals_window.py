@@ -58,7 +58,7 @@ class NormalWindow:
                 self._sums.push(frames[part], phase[part], np.ones(len(frames[part])))
                 self.count += len(frames[part])
             if self.is_full and self._model is None:
-                self._model = self._kernel.estimate_model(thinned(self._sums.frames()), self._fit())
+                self._model = self._kernel.estimate_model(thinned(self._sums.frames())[0], self._fit())
 
     def estimate(self, bare: bool = True) -> None:
         """Enqueue the estimate of the window's normals, which writes to the maps.

@@ -44,15 +44,15 @@ def test_library_run(recordings, levels):
         with io.open_recording(recordings / "press.h5") as recording:
             engine.run(recording, engine.Onset(**levels))
 
-    assert_few(run, 384, 51)
+    assert_few(run, 385, 51)
 
 
 @pytest.mark.parametrize(
     ("line", "functions", "files"),
     [
-        ("reconstruct press.h5", 549, 69),
-        ("reconstruct turn.h5", 709, 89),
-        ("fuse press.h5 turn.h5", 871, 105),
+        ("reconstruct press.h5", 551, 69),
+        ("reconstruct turn.h5", 711, 89),
+        ("fuse press.h5 turn.h5", 873, 105),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):
