@@ -15,7 +15,7 @@ from mirrorskin.engine.base.device_arrays import AnyArray, on_host
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import C_TYPES, Device
-from mirrorskin.kernels.skin.displacement import AFFINE, MARGIN, PARAMETERS
+from mirrorskin.kernels.skin.displacement import AFFINE, MARGIN, PACKED, PARAMETERS
 
 ITERATIONS = 8
 """Largest number of iterations; 2 are needed with a good start."""
@@ -27,10 +27,8 @@ _MIN_CONVERGED = 0.5  # minimum share of windows that are found
 _MIN_CONTRAST = 0.5  # minimum contrast of the same texture, relative to the reference
 _CONVERGED_FRACTION = 0.98  # share of the nodes that must converge; windows with little texture never do
 _LAST_CHANGE = 0.03  # pixels: the linearisation error is then below 0.001 pixels
-_MAX_CHANGE = 1.5  # maximum change in one iteration, pixels
-_KERNEL = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16  # smoothing of the field over nodes
 _FIELD_WEIGHT = 0.01  # weight of the previous field, relative to that of the median node
-_TILE = 4096  # pixels per work-item on a CPU
+_TILE, _NODES = 4096, 16  # pixels and nodes per work-item on a CPU
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +184,7 @@ class _Level:
         self._device, self._window, self.step = device, window, step
         self._frame_type = C_TYPES[reference.dtype.name]
         self._top = int(np.iinfo(reference.dtype).max) if reference.dtype.kind == "u" else 0
-        self._tile = _TILE if device.layout.tile > 1 else 1
+        self._tile, self._nodes = (_TILE, _NODES) if device.layout.tile > 1 else (1, 1)
         self.shape: tuple[int, int] = reference.shape
         rows, columns = self.shape
         self._first, self._halo = (step - window) // 2, 2 * window + 8
@@ -199,9 +197,9 @@ class _Level:
             **dict.fromkeys(("padded", "half", "coefficients"), padded),
             "planes": (4, *with_halo),
             "difference": (2, *with_halo),
-            "field": self.rest.shape,
+            **dict.fromkeys(("field", "next_field"), self.rest.shape),
             "answer": (AFFINE + 3, *self.grid),
-            "inverse": (*self.grid, PARAMETERS, PARAMETERS),
+            "inverse": (self._items, PACKED, self._nodes),
             "summary": (4, *self.grid),
         }
         self._maps = {
@@ -214,8 +212,10 @@ class _Level:
         # Information about the displacement, with all other parameters free.
         self.information: NDArray[Any] = invert_symmetric(variances)
         self.usable: NDArray[np.bool_] = np.isfinite(self.information[0])
-        self._trust = np.nan_to_num(1 / (variances[0] + variances[2]))
-        self._trust += 1e-9 * self._trust.max() + np.finfo(float).tiny
+        trust = np.nan_to_num(1 / (variances[0] + variances[2]))
+        trust = trust / (trust.max() or 1.0) + 1e-9
+        self._hold = _FIELD_WEIGHT * float(np.median(trust))
+        self._maps["trust"] = device.from_host("trust", trust)
 
     def _measure_reference(self, reference: AnyArray) -> None:
         """Compute the reference's planes, and the inverse normal matrix of each node."""
@@ -235,9 +235,12 @@ class _Level:
             **{name: maps[name] for name in ("coefficients", "planes", "difference")},
         )
         results = {name: maps[name] for name in ("planes", "inverse", "summary")}
-        self._launch(
-            "normals", math.prod(self.grid), **self._sizes, first=self._first + self._halo, **results
-        )
+        self._launch("normals", self._items, **self._sizes, **results)
+
+    @property
+    def _items(self) -> int:
+        """Number of work-items for the windows of all nodes."""
+        return self.grid[0] * math.ceil(self.grid[1] / self._nodes)
 
     def to_pixels(self, values: Doubles, logarithms: bool, on_device: bool) -> AnyArray:
         """Return values, or their exponentials, (rows, columns) or ([T,] rows, columns, n), at all pixels."""
@@ -263,7 +266,6 @@ class _Level:
             "pixels",
             count * rows * math.ceil(columns / self._tile),
             **sizes,
-            start=self.start,
             count=count,
             parts=parts,
             logarithms=logarithms,
@@ -277,7 +279,7 @@ class _Level:
         """Sizes of the picture, of the nodes, and of the halo, as arguments of kernels."""
         (rows, columns), (node_rows, node_columns) = self.shape, self.grid
         sizes = {"rows": rows, "columns": columns, "node_rows": node_rows, "node_columns": node_columns}
-        return sizes | {"step": self.step, "halo": self._halo}
+        return sizes | {"halo": self._halo}
 
     @cached_property
     def _frame(self) -> Array:
@@ -290,10 +292,11 @@ class _Level:
         placed = frame if isinstance(frame, Array) else self._frame
         if placed is not frame:
             placed.write(frame)
-        width = columns + 2 * MARGIN
-        pixels = width * (rows + 2 * MARGIN)
-        items = math.ceil(pixels / self._tile)
+        height, width = maps["padded"].shape
+        pixels = width * height
+        items = height * math.ceil(width / self._tile)
         self._launch("pad", items, rows=rows, columns=columns, frame=placed, padded=maps["padded"])
+        items = math.ceil(pixels / self._tile)
         for step, source, filtered in ((1, "padded", "half"), (width, "half", "coefficients")):
             self._launch(
                 "filter", items, pixels=pixels, step=step, source=maps[source], filtered=maps[filtered]
@@ -303,11 +306,15 @@ class _Level:
     def follow(self, frame: AnyArray, field: Doubles) -> tuple[NodeField, Doubles]:
         """Return the displacement of a frame, starting from a field, and the final field."""
         self._fit_spline(frame)
+        maps = self._maps
+        maps["field"].write(field)
         for _ in range(ITERATIONS):
-            answer = self._solve(field)
-            last, field = field, self._next_field(field, answer[:AFFINE])
+            self._solve()
+            last, field = field, maps["next_field"].read()
             if np.mean(np.abs(field - last) < _LAST_CHANGE) > _CONVERGED_FRACTION:
                 break
+            maps["field"], maps["next_field"] = maps["next_field"], maps["field"]
+        answer = maps["answer"].read().astype(np.float64)
         moved = answer[:2]
         gain, squares, variances = answer[AFFINE:]
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -317,41 +324,22 @@ class _Level:
             converged = (np.abs(moved - last).max(axis=0) < 0.5) & (gain > _MIN_CONTRAST)
         return NodeField(moved, variance, converged), field
 
-    def _solve(self, field: Doubles) -> Doubles:
-        """Warp the frame back by a field, and solve all windows."""
+    def _solve(self) -> None:
+        """Warp the frame back by the field, solve all windows, and compute the next field."""
         maps, (rows, columns), sizes = self._maps, self.shape, self._sizes
-        maps["field"].write(field)
         shared = {name: maps[name] for name in ("planes", "field", "difference")}
         items = rows * math.ceil(columns / self._tile)
-        self._launch("warp", items, **sizes, **shared, start=self.start, coefficients=maps["coefficients"])
-        arrays = {"inverse": maps["inverse"], "answer": maps["answer"]}
-        first = self._first + self._halo
-        self._launch("solve", math.prod(self.grid), **sizes, **shared, first=first, **arrays)
-        return maps["answer"].read().astype(np.float64)
-
-    def _next_field(self, field: Doubles, affine: Doubles) -> Doubles:
-        """Return the field of all windows, each weighted by how well its movement is determined.
-
-        Each window predicts the displacement of its neighbours, (6, rows, columns), so that an affine field
-        remains affine and continues where windows leave the picture. Far from all windows, the field is kept.
-        """
-        finite = np.isfinite(affine[0])
-        weight = np.where(finite, self._trust, 0.0)
-        hold = _FIELD_WEIGHT * np.median(self._trust)
-        y, x = np.meshgrid(*(2 * self.step / self._window * np.arange(n) for n in self.grid), indexing="ij")
-        total = self._over_nodes(weight) + hold
-        parts = []
-        for coarse, centre, right, down in zip(field, affine[:2], affine[2::2], affine[3::2], strict=True):
-            step = np.clip(np.nan_to_num(centre - coarse), -_MAX_CHANGE, _MAX_CHANGE)
-            along_x, along_y = (weight * np.clip(np.nan_to_num(part), -1, 1) for part in (right, down))
-            here = weight * (coarse + step) - along_x * x - along_y * y
-            position = self._over_nodes(along_x) * x + self._over_nodes(along_y) * y
-            parts.append((self._over_nodes(here) + position + hold * coarse) / total)
-        return np.stack(parts)
-
-    def _over_nodes(self, values: Doubles) -> Doubles:
-        smooth = cv2.sepFilter2D(values, cv2.CV_64F, _KERNEL, _KERNEL, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(smooth, np.float64)
+        self._launch("warp", items, **sizes, **shared, coefficients=maps["coefficients"])
+        self._launch("solve", self._items, **sizes, **shared, inverse=maps["inverse"], answer=maps["answer"])
+        node_rows, node_columns = self.grid
+        self._launch(
+            "field",
+            node_rows * math.ceil(node_columns / self._tile),
+            node_rows=node_rows,
+            node_columns=node_columns,
+            hold=self._hold,
+            **{name: maps[name] for name in ("trust", "answer", "field", "next_field")},
+        )
 
     def at_nodes(self, field: Doubles, level: _Level, scale: float) -> Doubles:
         """Return a field of another level at the nodes of this one, whose pixels are larger by a scale."""
@@ -366,7 +354,8 @@ class _Level:
         return np.stack(parts)
 
     def _launch(self, name: str, items: int, **arguments: Any) -> None:
-        macros: dict[str, str | int] = {"FRAME": self._frame_type, "WINDOW": self._window, "TILE": self._tile}
+        macros: dict[str, str | int] = {"FRAME": self._frame_type, "WINDOW": self._window, "STEP": self.step}
+        macros |= {"TILE": self._tile, "NODES": self._nodes}
         if self._top:
             macros["TOP"] = self._top
         moved = sum(array.nbytes for array in arguments.values() if isinstance(array, Array))

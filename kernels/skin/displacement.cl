@@ -3,32 +3,64 @@
 //
 // FRAME   type of a sample
 // TILE    pixels of one work-item: 1 on a GPU, many on a CPU
+// NODES   adjacent nodes of a row of one work-item: 1 on a GPU, a multiple of 8 on a CPU
 // WINDOW  pixels of a window's side
+// STEP    pixels from a node to the next one
 // TOP     value of a saturated sample; undefined for floats
 //
-// The sums of a window are kept for each of its columns, and added at the end: on a CPU the columns of a chunk are
-// the lanes of a vector, and the order of additions does not change.
+// The windows of adjacent nodes overlap. What is summed is therefore summed over the columns of windows first, from
+// which the sums of all windows of a work-item are computed.
 
 #pragma OPENCL FP_CONTRACT OFF
 
 #include "common.clh"
 
+#if NODES > 1
+#define LANES 8  // columns, pixels or nodes processed together
+#else
+#define LANES 1
+#endif
+#include "lanes.clh"
+
+typedef F __attribute__((aligned(4))) Loose;  // unaligned
+#define LOAD(from) (*(__global const Loose *)(from))
+#define STORE(to, values) (*(__global Loose *)(to) = (values))
+#define KEPT(from) (*(const Loose *)(from))
+#define LANE(values, i) (((float *)&(values))[i])
+#define PLACE_OF(values, i) (((const int *)&(values))[i])
+#if LANES > 1
+#define NUMBERS (I)(0, 1, 2, 3, 4, 5, 6, 7)
+#else
+#define NUMBERS 0
+#endif
+
+#define FOUR(from) (*(__global const Four *)(from))
+typedef float4 __attribute__((aligned(4))) Four;  // unaligned
+
 #define TAPS 8
 #define MARGIN (TAPS + 4)
 #define PARAMETERS 10
 #define AFFINE 6  // number of affine parameters
+#define PACKED (PARAMETERS * (PARAMETERS + 1) / 2)  // elements of a symmetric matrix
 #define MOST 1e5f  // maximum magnitude of an inverse matrix
+
+#define STRIP (TILE < 256 ? TILE : 256)  // pixels of a row that are processed together
+
+// Positions beyond an end are mirrored.
+#define MIRROR(place, length) \
+    ((place) < 0 ? -(place) : (place) < (length) ? (place) : 2 * ((length) - 1) - (place))
 
 __kernel void displacement_pad(const int rows, const int columns, __global const FRAME *restrict frame, OUT padded)
 {
-    const int width = columns + 2 * MARGIN, pixels = width * (rows + 2 * MARGIN);
-    const int first = get_global_id(0) * TILE, end = min(first + TILE, pixels);
-    for (int p = first; p < end; ++p) {
-        int row = abs(p / width - MARGIN), column = abs(p % width - MARGIN);
-        row = row < rows ? row : 2 * (rows - 1) - row;
-        column = column < columns ? column : 2 * (columns - 1) - column;
-        padded[p] = frame[row * columns + column];
-    }
+    const int width = columns + 2 * MARGIN, pieces = (width + TILE - 1) / TILE, line = get_global_id(0) / pieces;
+    if (line >= rows + 2 * MARGIN) return;
+    int x = (get_global_id(0) - line * pieces) * TILE;
+    const int end = min(x + TILE, width), row = MIRROR(line - MARGIN, rows);
+    __global const FRAME *restrict samples = frame + row * columns;
+    OUT out = padded + line * width;
+    for (; x < min(end, MARGIN); ++x) out[x] = samples[MARGIN - x];
+    for (; x < min(end, MARGIN + columns); ++x) out[x] = samples[x - MARGIN];
+    for (; x < end; ++x) out[x] = samples[MIRROR(x - MARGIN, columns)];
 }
 
 // sqrt(3) times the powers of the spline's pole, sqrt(3) - 2.
@@ -51,10 +83,6 @@ __kernel void displacement_filter(const int pixels, const int step, MAP source, 
 #define KNOWN(sample) ((sample) - (sample) == 0)
 #endif
 
-// Positions beyond an end are mirrored.
-#define MIRROR(place, length) \
-    ((place) < 0 ? -(place) : (place) < (length) ? (place) : 2 * ((length) - 1) - (place))
-
 #define FIRST_OF_MEAN (-(WINDOW / 2))
 
 __kernel void displacement_across(
@@ -64,16 +92,22 @@ __kernel void displacement_across(
     if (row >= rows) return;
     const int first = (get_global_id(0) - row * pieces) * TILE, end = min(first + TILE, columns);
     __global const FRAME *restrict samples = frame + row * columns;
-    for (int column = first; column < end; ++column) {
-        float sum = 0, count = 0;
-        for (int k = FIRST_OF_MEAN; k < FIRST_OF_MEAN + WINDOW; ++k) {
-            const FRAME sample = samples[MIRROR(column + k, columns)];
+    for (int base = first; base < end; base += STRIP) {
+        const int size = min(STRIP, end - base);
+        float value[STRIP + WINDOW], known[STRIP + WINDOW], sum[STRIP], count[STRIP];
+        for (int i = 0; i < size + WINDOW - 1; ++i) {
+            const FRAME sample = samples[MIRROR(base + i + FIRST_OF_MEAN, columns)];
             const int defined = KNOWN(sample);
-            sum += defined ? (float)sample : 0;
-            count += defined;
+            value[i] = defined ? (float)sample : 0;
+            known[i] = defined;
         }
-        sums[row * columns + column] = sum;
-        counts[row * columns + column] = count;
+        for (int i = 0; i < size; ++i) sum[i] = count[i] = 0;
+        for (int k = 0; k < WINDOW; ++k) {
+            for (int i = 0; i < size; ++i) sum[i] += value[i + k];
+            for (int i = 0; i < size; ++i) count[i] += known[i + k];
+        }
+        for (int i = 0; i < size; ++i) sums[row * columns + base + i] = sum[i];
+        for (int i = 0; i < size; ++i) counts[row * columns + base + i] = count[i];
     }
 }
 
@@ -89,36 +123,43 @@ __kernel void displacement_planes(
     if (y >= height) return;
     const int row = y - halo, stride = columns + 2 * MARGIN;
     const int first = (get_global_id(0) - y * pieces) * TILE, end = min(first + TILE, width);
-    for (int x = first; x < end; ++x) {
-        const int column = x - halo, p = y * width + x;
-        float value = NAN, along_x = 0, along_y = 0, texture = 0;
-        if (row >= 0 && row < rows && column >= 0 && column < columns) {
-            const FRAME sample = frame[row * columns + column];
-            if (KNOWN(sample)) {
-                value = sample;
-                MAP at = coefficients + (row + MARGIN) * stride + column + MARGIN;
-                along_x = (BESIDES(at - stride) + 4 * BESIDES(at) + BESIDES(at + stride)) * (1.0f / 12);
-                along_y = (ABOVES(at - 1) + 4 * ABOVES(at) + ABOVES(at + 1)) * (1.0f / 12);
-                float sum = 0, count = 0;
-                for (int k = FIRST_OF_MEAN; k < FIRST_OF_MEAN + WINDOW; ++k) {
-                    const int other = MIRROR(row + k, rows) * columns + column;
-                    sum += sums[other];
-                    count += counts[other];
-                }
-                texture = value - sum / count;
-            }
+    OUT out = planes + y * width;
+    OUT out_x = out + plane;
+    OUT out_y = out_x + plane;
+    OUT texture = out_y + plane;
+    for (int x = first; x < end; ++x) out[x] = NAN;
+    for (int x = first; x < end; ++x) out_x[x] = out_y[x] = texture[x] = 0;
+    for (int x = first; x < end; ++x) difference[y * width + x] = difference[plane + y * width + x] = 0;
+    if (row < 0 || row >= rows) return;
+    for (int base = max(first - halo, 0); base < min(end - halo, columns); base += STRIP) {
+        const int size = min(STRIP, min(end - halo, columns) - base);
+        float sum[STRIP], count[STRIP];
+        for (int i = 0; i < size; ++i) sum[i] = count[i] = 0;
+        for (int k = FIRST_OF_MEAN; k < FIRST_OF_MEAN + WINDOW; ++k) {
+            const int other = MIRROR(row + k, rows) * columns + base;
+            for (int i = 0; i < size; ++i) sum[i] += sums[other + i];
+            for (int i = 0; i < size; ++i) count[i] += counts[other + i];
         }
-        planes[p] = value;
-        planes[plane + p] = along_x;
-        planes[2 * plane + p] = along_y;
-        planes[3 * plane + p] = texture;
-        difference[p] = difference[plane + p] = 0;
+        __global const FRAME *restrict samples = frame + row * columns + base;
+        MAP at = coefficients + (row + MARGIN) * stride + base + MARGIN;
+        const int x = base + halo;
+        for (int i = 0; i < size; ++i) {
+            const FRAME sample = samples[i];
+            const int defined = KNOWN(sample);
+            const float along_x = (BESIDES(at + i - stride) + 4 * BESIDES(at + i) + BESIDES(at + i + stride)) * (1.0f / 12);
+            const float along_y = (ABOVES(at + i - 1) + 4 * ABOVES(at + i) + ABOVES(at + i + 1)) * (1.0f / 12);
+            const float mean = sum[i] / count[i];
+            out[x + i] = defined ? (float)sample : NAN;
+            out_x[x + i] = defined ? along_x : 0;
+            out_y[x + i] = defined ? along_y : 0;
+            texture[x + i] = defined ? sample - mean : 0;
+        }
     }
 }
 
 // Weights of the coefficients at -1, 0, 1 and 2, for a position from 0 to 1.
 #define CUBIC(w, part) { \
-    const float rest = 1 - (part); \
+    const F rest = 1 - (part); \
     w##0 = rest * rest * rest * (1.0f / 6); \
     w##1 = 2.0f / 3 - 0.5f * (part) * (part) * (2 - (part)); \
     w##2 = 2.0f / 3 - 0.5f * rest * rest * (2 - rest); \
@@ -135,243 +176,485 @@ __kernel void displacement_planes(
 #define CORRELATION2 0.679491924f
 #define CORRELATION3 -0.239782972f
 
-#define LINE(at, w) (w##0 * (at)[0] + w##1 * (at)[1] + w##2 * (at)[2] + w##3 * (at)[3])
+#define LINE(at, w) (w##0 * LOAD(at) + w##1 * LOAD((at) + 1) + w##2 * LOAD((at) + 2) + w##3 * LOAD((at) + 3))
 
-// The node before a pixel, and the fraction of the way to the next one.
-#define SPLIT(pixel, nodes, node, part) \
-    float part = ((pixel) - start) / step; \
-    part = part > 0 ? part : 0; \
-    part = part < (nodes) - 1 ? part : (nodes) - 1; \
-    int node = (int)part; \
-    node = node < (nodes) - 2 ? node : (nodes) - 2; \
-    node = node > 0 ? node : 0; \
-    part -= node;
+// The first node is in the middle of a window that starts at FIRST: at a pixel, or LAG before one, which is OFFSET.
+#define FIRST ((STEP - WINDOW - ((STEP - WINDOW) & 1)) / 2)
+#define OFFSET (FIRST + WINDOW / 2)
+#define LAG (WINDOW % 2 ? 0.0f : 0.5f)
+#define NODE_OF(pixel) (((pixel) - OFFSET + STEP) / STEP - 1)  // the node before it; -1 before the first one
 
-// Weights of the nodes at -1, 0, 1 and 2: Keys' cubic, linear in the last interval at each end.
-#define KEYS(node, part, nodes) \
-    const float bend_##node = node > 0 && node < (nodes) - 2 ? (part) * (1 - (part)) / 2 : 0; \
-    const float node##0 = -bend_##node * (1 - (part)), node##3 = -bend_##node * (part); \
-    const float node##1 = 1 - (part) + bend_##node * (2 - 3 * (part)); \
-    const float node##2 = (part) + bend_##node * (3 * (part) - 1);
+// Executes a statement for the pixels from `low` to `high` between the node and the next one. Pixel i is the
+// fraction `part` of the way to the next one.
+#define BETWEEN_NODES(node, low, high, ...)                                                          \
+    {                                                                                                \
+        const int start = OFFSET + (node) * STEP;                                                    \
+        if (start >= (low) && start + STEP <= (high))                                                \
+            for (int k = 0; k < STEP; ++k) {                                                         \
+                const int i = start + k;                                                             \
+                const float part = (k + LAG) * (1.0f / STEP);                                        \
+                __VA_ARGS__                                                                          \
+            }                                                                                        \
+        else                                                                                         \
+            for (int i = GREATER(start, low); i < LESSER(start + STEP, high); ++i) {                 \
+                const float part = (i - start + LAG) * (1.0f / STEP);                                \
+                __VA_ARGS__                                                                          \
+            }                                                                                        \
+    }
+
+#define SPAN ((STRIP + STEP - 1) / STEP + 2)  // nodes around a strip
+
+// The fraction of the way from a node to the next one, of a row.
+#define ROW_PART(row, node) (((row) - OFFSET - (node) * STEP + LAG) * (1.0f / STEP))
 
 __kernel void displacement_warp(
-    const int rows, const int columns, const int node_rows, const int node_columns, const int step, const float start,
-    const int halo, MAP coefficients, MAP planes, MAP field, OUT difference)
+    const int rows, const int columns, const int node_rows, const int node_columns, const int halo, MAP coefficients,
+    MAP planes, MAP field, OUT difference)
 {
     const int pieces = (columns + TILE - 1) / TILE, row = get_global_id(0) / pieces;
     if (row >= rows) return;
     const int first = (get_global_id(0) - row * pieces) * TILE, end = min(first + TILE, columns);
     const int width = columns + 2 * halo, plane = width * (rows + 2 * halo), stride = columns + 2 * MARGIN;
-    const int nodes = node_rows * node_columns;
-    SPLIT(row, node_rows, node_row, part_row)
-    MAP upper = field + node_row * node_columns;
-    MAP lower = upper + (node_rows > 1 ? node_columns : 0);
-    for (int column = first; column < end; ++column) {
-        SPLIT(column, node_columns, node, part)
-        const int next = node + (node_columns > 1);
-        const float right = (1 - part) * ((1 - part_row) * upper[node] + part_row * lower[node])
-            + part * ((1 - part_row) * upper[next] + part_row * lower[next]);
-        const float down = (1 - part) * ((1 - part_row) * upper[nodes + node] + part_row * lower[nodes + node])
-            + part * ((1 - part_row) * upper[nodes + next] + part_row * lower[nodes + next]);
-        float x = column + right, y = row + down;
-        const int inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1);
-        x = inside ? x : 0;
-        y = inside ? y : 0;
-        const int west = (int)x, north = (int)y;
-        x -= west;
-        y -= north;
-        float x0, x1, x2, x3, y0, y1, y2, y3;
-        CUBIC(x, x)
-        CUBIC(y, y)
-        MAP at = coefficients + (north - 1 + MARGIN) * stride + west - 1 + MARGIN;
-        const float value = y0 * LINE(at, x) + y1 * LINE(at + stride, x) + y2 * LINE(at + 2 * stride, x)
-            + y3 * LINE(at + 3 * stride, x);
-        const int p = (row + halo) * width + column + halo;
-        const float counts = planes[p];
-        const int measured = counts - counts == 0;
-        const float deviation = counts - value + planes[plane + p] * right + planes[2 * plane + p] * down;
-        difference[p] = measured ? (inside ? deviation : NAN) : 0;
-        difference[plane + p] = measured ? 1 + NOISE_GAIN(x) * NOISE_GAIN(y) : 0;
+    const int nodes = node_rows * node_columns, node_row = NODE_OF(row);
+    const float part_row = ROW_PART(row, node_row);
+    MAP upper = field + LIMITED(node_row, 0, node_rows - 1) * node_columns;
+    MAP lower = field + LIMITED(node_row + 1, 0, node_rows - 1) * node_columns;
+    for (int base = first; base < end; base += STRIP) {
+        const int limit = min(base + STRIP, end), node = NODE_OF(base), last = NODE_OF(limit - 1);
+        float right[STRIP + LANES], down[STRIP + LANES], right_of[SPAN + 1], down_of[SPAN + 1];
+        for (int n = node; n <= last + 1; ++n) {
+            const int k = LIMITED(n, 0, node_columns - 1);
+            right_of[n - node] = (1 - part_row) * upper[k] + part_row * lower[k];
+            down_of[n - node] = (1 - part_row) * upper[nodes + k] + part_row * lower[nodes + k];
+        }
+        for (int n = node; n <= last; ++n)
+            BETWEEN_NODES(n, base, limit,
+                right[i - base] = (1 - part) * right_of[n - node] + part * right_of[n - node + 1];
+                down[i - base] = (1 - part) * down_of[n - node] + part * down_of[n - node + 1];)
+        for (int i = limit - base; i < STRIP + LANES; ++i) right[i] = down[i] = 0;
+        for (int column = base; column < limit; column += LANES) {
+            const F to_right = KEPT(right + column - base), to_down = KEPT(down + column - base);
+            F x = CONVERT(column + NUMBERS, F) + to_right, y = row + to_down;
+            const I inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1);
+            x = inside ? x : 0;
+            y = inside ? y : 0;
+            const I west = CONVERT(x, I), north = CONVERT(y, I);
+            x -= CONVERT(west, F);
+            y -= CONVERT(north, F);
+            F x0, x1, x2, x3, y0, y1, y2, y3, value;
+            CUBIC(x, x)
+            CUBIC(y, y)
+            const I place = (north - 1 + MARGIN) * stride + west - 1 + MARGIN;
+            const int begin = PLACE_OF(place, 0);
+            if (!any_of(place != begin + NUMBERS)) {  // neighbours go to neighbours
+                MAP at = coefficients + begin;
+                value = y0 * LINE(at, x) + y1 * LINE(at + stride, x) + y2 * LINE(at + 2 * stride, x)
+                    + y3 * LINE(at + 3 * stride, x);
+            } else {
+                for (int i = 0; i < LANES; ++i) {
+                    MAP at = coefficients + PLACE_OF(place, i);
+                    const float4 line = LANE(y0, i) * FOUR(at) + LANE(y1, i) * FOUR(at + stride)
+                        + LANE(y2, i) * FOUR(at + 2 * stride) + LANE(y3, i) * FOUR(at + 3 * stride);
+                    LANE(value, i) = LANE(x0, i) * line.x + LANE(x1, i) * line.y + LANE(x2, i) * line.z + LANE(x3, i) * line.w;
+                }
+            }
+            const int p = (row + halo) * width + column + halo;
+            const F counts = LOAD(planes + p), along_x = LOAD(planes + plane + p), along_y = LOAD(planes + 2 * plane + p);
+            const I measured = counts - counts == 0;
+            const F deviation = counts - value + along_x * to_right + along_y * to_down;
+            const F differs = measured ? (inside ? deviation : (F)NAN) : 0;
+            const F variance = measured ? 1 + NOISE_GAIN(x) * NOISE_GAIN(y) : 0;
+            if (column + LANES <= limit) {
+                STORE(difference + p, differs);
+                STORE(difference + plane + p, variance);
+            } else {
+                for (int i = 0; i < limit - column; ++i) difference[p + i] = LANE(differs, i);
+                for (int i = 0; i < limit - column; ++i) difference[plane + p + i] = LANE(variance, i);
+            }
+        }
     }
 }
 
+// Keys' cubic from the nodes at -1, 0, 1 and 2 in addition to the straight line from 0 to 1.
+#define BEND(part, a, b, c, d) \
+    ((part) * (1 - (part)) / 2 * ((2 - 3 * (part)) * (b) - (1 - (part)) * (a) + (3 * (part) - 1) * (c) - (part) * (d)))
+
 __kernel void displacement_pixels(
-    const int rows, const int columns, const int node_rows, const int node_columns, const int step, const float start,
-    const int count, const int parts, const int logarithms, MAP nodes, OUT pixels)
+    const int rows, const int columns, const int node_rows, const int node_columns, const int count, const int parts,
+    const int logarithms, MAP nodes, OUT pixels)
 {
     const int pieces = (columns + TILE - 1) / TILE, line = get_global_id(0) / pieces;
     const int number = line / rows, row = line - number * rows;
     if (number >= count) return;
     const int first = (get_global_id(0) - line * pieces) * TILE, end = min(first + TILE, columns);
-    OUT out = pixels + (size_t)line * columns * parts;
-    SPLIT(row, node_rows, y, part_y)
-    KEYS(y, part_y, node_rows)
-    const int up = GREATER(y - 1, 0) * node_columns, low = LESSER(y + 1, node_rows - 1) * node_columns;
-    const int lowest = LESSER(y + 2, node_rows - 1) * node_columns, here = y * node_columns;
-    SPLIT(first, node_columns, west, part_west)
-    SPLIT(end - 1, node_columns, east, part_east)
-    const int begin = GREATER(west - 1, 0), last = LESSER(east + 2, node_columns - 1);
-    for (int k = 0; k < parts; ++k) {
-        MAP at = nodes + (number * parts + k) * node_rows * node_columns;
-        float cubic[TILE + 4], linear[TILE + 4];  // at the row, of each column of nodes
-        for (int i = begin; i <= last; ++i) {
-            cubic[i - begin] = y0 * at[up + i] + y1 * at[here + i] + y2 * at[low + i] + y3 * at[lowest + i];
-            linear[i - begin] = (1 - part_y) * at[here + i] + part_y * at[low + i];
+    // Positions before the first node and after the last one have its value.
+    const int before = LIMITED(NODE_OF(row), 0, GREATER(node_rows - 2, 0));
+    const float y = LIMITED(ROW_PART(row, before), 0, LESSER(node_rows - 1, 1));
+    const int inner = before > 0 && before < node_rows - 2, most = GREATER(node_columns - 2, 0);
+    const int here = before * node_columns, low = LESSER(before + 1, node_rows - 1) * node_columns;
+    const int up = GREATER(before - 1, 0) * node_columns, lowest = LESSER(before + 2, node_rows - 1) * node_columns;
+    for (int base = first; base < end; base += STRIP) {
+        const int limit = min(base + STRIP, end), node = NODE_OF(base), last = NODE_OF(limit - 1);
+        const int from = LIMITED(node, 0, most) - 1, to = LIMITED(last, 0, most) + 2;
+        OUT out = pixels + ((size_t)line * columns + base) * parts;
+        float values[2][STRIP];
+        for (int k = 0; k < parts; ++k) {
+            MAP at = nodes + (size_t)(number * parts + k) * node_rows * node_columns;
+            float cubic[SPAN + 2], linear[SPAN + 2];  // at the row, of each column of nodes
+            for (int n = from; n <= to; ++n) {
+                const int i = LIMITED(n, 0, node_columns - 1);
+                const float straight = (1 - y) * at[here + i] + y * at[low + i];
+                const float bend = BEND(y, at[up + i], at[here + i], at[low + i], at[lowest + i]);
+                linear[n - from] = straight;
+                cubic[n - from] = straight + (inner ? bend : 0 * bend);
+            }
+            float *restrict written = values[k & 1];
+            for (int n = node; n <= last; ++n) {
+                const int west = LIMITED(n, 0, most) - from;
+                const float a = cubic[west - 1], d = cubic[west + 2];
+                float b = cubic[west], c = cubic[west + 1];
+                const float all = a + b + c + d;
+                const int finite = all - all == 0;
+                if (finite && n > 0 && n < most)
+                    BETWEEN_NODES(n, base, limit, written[i - base] = (1 - part) * b + part * c + BEND(part, a, b, c, d);)
+                else {
+                    b = finite ? b : linear[west];
+                    c = finite ? c : linear[west + 1];
+                    const float from_west = n > most ? c + 0 * b : b, from_east = n < 0 ? b + 0 * c : c;
+                    BETWEEN_NODES(n, base, limit, written[i - base] = (1 - part) * from_west + part * from_east;)
+                }
+            }
+            if (logarithms)
+                for (int i = 0; i < limit - base; ++i) written[i] = exponential(written[i]);
+            if (parts != 2)
+                for (int i = 0; i < limit - base; ++i) out[i * parts + k] = written[i];
         }
-        for (int column = first; column < end; ++column) {
-            SPLIT(column, node_columns, x, part)
-            KEYS(x, part, node_columns)
-            const int previous = GREATER(x - 1, 0) - begin, next = LESSER(x + 1, node_columns - 1) - begin;
-            const int farthest = LESSER(x + 2, node_columns - 1) - begin, nearest = x - begin;
-            const float value = x0 * cubic[previous] + x1 * cubic[nearest] + x2 * cubic[next] + x3 * cubic[farthest];
-            const float plain = (1 - part) * linear[nearest] + part * linear[next];
-            const float chosen = value - value == 0 ? value : plain;
-            out[column * parts + k] = logarithms ? exponential(chosen) : chosen;
-        }
+        if (parts == 2)
+            for (int i = 0; i < limit - base; ++i) {
+                out[2 * i] = values[0][i];
+                out[2 * i + 1] = values[1][i];
+            }
     }
 }
 
-#define LANES (TILE > 1 ? 8 : 1)  // columns of a window processed together
-
+// Position from the centre of a window, in halves of it.
 #define PLACE(i) ((2 * (i) - (WINDOW - 1)) * (1.0f / WINDOW))
 
-#define CLEAR(sum) for (int i = 0; i < LANES; ++i) sum[i] = 0;
+// Sums over columns of windows are kept for all columns of a work-item, or for one at a time if it has one node. Those
+// of adjacent nodes are adjacent.
+#if NODES > 1
+#define WIDTH (((NODES - 1) * STEP + WINDOW + LANES - 1) / LANES * LANES)
+#define SLOTS ((WIDTH - 1) / STEP + 1)
+typedef float Column[STEP][SLOTS];
+#define COLUMNS_OF_NODE(base) for (int k = 0; k < WINDOW; ++k)
+#define KEEP(sums, column, values) \
+    for (int lane = 0; lane < LANES; ++lane) sums[((column) + lane) % STEP][((column) + lane) / STEP] = LANE(values, lane);
+#define OF_NODES(sums, node, k) KEPT(&sums[(k) % STEP][(k) / STEP + (node)])
+#else
+#define WIDTH 1
+typedef float Column;
+#define COLUMNS_OF_NODE(base) for (int k = base; k <= base; ++k)
+#define KEEP(sums, column, values) sums = values;
+#define OF_NODES(sums, node, k) sums
+#endif
+
+#define GROUPS (NODES / LANES)  // of nodes of a work-item, which are processed together
 
 __kernel void displacement_solve(
-    const int rows, const int columns, const int node_rows, const int node_columns, const int step, const int first,
-    const int halo, MAP planes, MAP difference, MAP field, MAP inverse, OUT answer)
+    const int rows, const int columns, const int node_rows, const int node_columns, const int halo, MAP planes,
+    MAP difference, MAP field, MAP inverse, OUT answer)
 {
-    const int nodes = node_rows * node_columns, node = get_global_id(0);
-    if (node >= nodes) return;
-    const int width = columns + 2 * halo, plane = width * (rows + 2 * halo);
-    const int corner = (first + node / node_columns * step) * width + first + node % node_columns * step;
-    const float right = field[node], down = field[nodes + node];
+    const int pieces = (node_columns + NODES - 1) / NODES, item = get_global_id(0), node_row = item / pieces;
+    if (node_row >= node_rows) return;
+    const int node = (item - node_row * pieces) * NODES, last = min(node + NODES, node_columns) - 1;
+    const int width = columns + 2 * halo, plane = width * (rows + 2 * halo), nodes = node_rows * node_columns;
+    const int corner = (halo + FIRST + node_row * STEP) * width + halo + FIRST + node * STEP;
 
-    float sums[PARAMETERS] = {0}, squares = 0, variances = 0;
-    for (int chunk = 0; chunk < WINDOW; chunk += LANES) {
-        float x[LANES], y[LANES], x_down[LANES], y_down[LANES], level[LANES], level_down[LANES], gain[LANES];
-        float square[LANES], variance[LANES];
-        CLEAR(x) CLEAR(y) CLEAR(x_down) CLEAR(y_down) CLEAR(level) CLEAR(level_down) CLEAR(gain) CLEAR(square)
-        CLEAR(variance)
-        for (int j = 0; j < WINDOW; ++j) {
-            MAP at = planes + corner + j * width + chunk;
-            MAP differs = difference + corner + j * width + chunk;
-            const float below = PLACE(j);
-            for (int i = 0; i < LANES; ++i) {
-                const float along_x = at[plane + i], along_y = at[2 * plane + i];
-                const float residual = differs[i] - along_x * right - along_y * down;
-                x[i] += along_x * residual;
-                y[i] += along_y * residual;
-                x_down[i] += along_x * residual * below;
-                y_down[i] += along_y * residual * below;
-                level[i] += residual;
-                level_down[i] += residual * below;
-                gain[i] += at[3 * plane + i] * residual;
-                square[i] += residual * residual;
-                variance[i] += differs[plane + i];
+    // Solved for is the deviation from a field that is linear along the row.
+    MAP along = field + node_row * node_columns;
+    const float right = along[node], down = along[nodes + node], pixels = GREATER(last - node, 1) * STEP;
+    const float right_slope = (along[last] - right) / pixels, down_slope = (along[nodes + last] - down) / pixels;
+
+    F sums[GROUPS][PARAMETERS + 2];
+    for (int g = 0; g < GROUPS; ++g)
+        for (int k = 0; k < PARAMETERS + 2; ++k) sums[g][k] = 0;
+    const int extent = (last - node) * STEP + WINDOW;
+    for (int base = 0; base < extent; base += WIDTH) {
+        Column of_x, of_y, of_x_down, of_y_down, of_level, of_level_down, of_gain, of_square, of_variance;
+        for (int column = base; column < min(base + WIDTH, extent); column += LANES) {
+            const F place = CONVERT(column + NUMBERS, F) - (WINDOW - 1) / 2.0f;
+            const F to_right = right + right_slope * place, to_down = down + down_slope * place;
+            F x = 0, y = 0, x_down = 0, y_down = 0, level = 0, level_down = 0, gain = 0, square = 0, variance = 0;
+            for (int j = 0; j < WINDOW; ++j) {
+                MAP at = planes + corner + j * width + column;
+                MAP differs = difference + corner + j * width + column;
+                const float below = PLACE(j);
+                const F along_x = LOAD(at + plane), along_y = LOAD(at + 2 * plane);
+                const F residual = LOAD(differs) - along_x * to_right - along_y * to_down;
+                const F x_part = along_x * residual, y_part = along_y * residual;
+                x += x_part;
+                y += y_part;
+                x_down += x_part * below;
+                y_down += y_part * below;
+                level += residual;
+                level_down += residual * below;
+                gain += LOAD(at + 3 * plane) * residual;
+                square += residual * residual;
+                variance += LOAD(differs + plane);
             }
+            KEEP(of_x, column, x)
+            KEEP(of_y, column, y)
+            KEEP(of_x_down, column, x_down)
+            KEEP(of_y_down, column, y_down)
+            KEEP(of_level, column, level)
+            KEEP(of_level_down, column, level_down)
+            KEEP(of_gain, column, gain)
+            KEEP(of_square, column, square)
+            KEEP(of_variance, column, variance)
         }
-        const int count = WINDOW - chunk < LANES ? WINDOW - chunk : LANES;
-        for (int i = 0; i < count; ++i) {
-            const float across = PLACE(chunk + i);
-            sums[0] += x[i];
-            sums[1] += y[i];
-            sums[2] += x[i] * across;
-            sums[3] += x_down[i];
-            sums[4] += y[i] * across;
-            sums[5] += y_down[i];
-            sums[6] += level[i];
-            sums[7] += level[i] * across;
-            sums[8] += level_down[i];
-            sums[9] += gain[i];
-            squares += square[i];
-            variances += variance[i];
+        for (int g = 0; g < GROUPS; ++g) {
+            F s0 = sums[g][0], s1 = sums[g][1], s2 = sums[g][2], s3 = sums[g][3], s4 = sums[g][4], s5 = sums[g][5];
+            F s6 = sums[g][6], s7 = sums[g][7], s8 = sums[g][8], s9 = sums[g][9], s10 = sums[g][10], s11 = sums[g][11];
+            COLUMNS_OF_NODE(base) {
+                const float across = PLACE(k);
+                const F x = OF_NODES(of_x, g * LANES, k), y = OF_NODES(of_y, g * LANES, k);
+                const F level = OF_NODES(of_level, g * LANES, k);
+                s0 += x;
+                s1 += y;
+                s2 += x * across;
+                s3 += OF_NODES(of_x_down, g * LANES, k);
+                s4 += y * across;
+                s5 += OF_NODES(of_y_down, g * LANES, k);
+                s6 += level;
+                s7 += level * across;
+                s8 += OF_NODES(of_level_down, g * LANES, k);
+                s9 += OF_NODES(of_gain, g * LANES, k);
+                s10 += OF_NODES(of_square, g * LANES, k);
+                s11 += OF_NODES(of_variance, g * LANES, k);
+            }
+            const F all[] = {s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11};
+            for (int k = 0; k < PARAMETERS + 2; ++k) sums[g][k] = all[k];
         }
     }
 
-    for (int k = 0; k < PARAMETERS; ++k) {
-        float coefficient = 0;
-        for (int l = 0; l < PARAMETERS; ++l) coefficient += inverse[(node * PARAMETERS + k) * PARAMETERS + l] * sums[l];
-        squares -= coefficient * sums[k];
-        if (k < AFFINE) answer[k * nodes + node] = coefficient + (k == 0 ? right : k == 1 ? down : 0);
-        if (k == PARAMETERS - 1) answer[AFFINE * nodes + node] = 1 - coefficient;
+    for (int g = 0; g < GROUPS; ++g) {
+        const int first = node + g * LANES, count = min(LANES, last + 1 - first);
+        MAP packed = inverse + ((size_t)item * PACKED * GROUPS + g) * LANES;
+        const F place = CONVERT(g * LANES + NUMBERS, F) * STEP;
+        F solved[PARAMETERS], squares = sums[g][PARAMETERS];
+        for (int k = 0; k < PARAMETERS; ++k) solved[k] = 0;
+        for (int k = 0; k < PARAMETERS; ++k)
+            for (int l = 0; l <= k; ++l) {
+                const F element = LOAD(packed);
+                packed += NODES;
+                solved[k] += element * sums[g][l];
+                if (l < k) solved[l] += element * sums[g][k];
+            }
+        for (int k = 0; k < PARAMETERS; ++k) squares -= solved[k] * sums[g][k];
+        solved[0] += right + right_slope * place;
+        solved[1] += down + down_slope * place;
+        solved[2] += right_slope * (WINDOW / 2.0f);
+        solved[4] += down_slope * (WINDOW / 2.0f);
+        solved[AFFINE] = 1 - solved[PARAMETERS - 1];
+        solved[AFFINE + 1] = squares;
+        solved[AFFINE + 2] = sums[g][PARAMETERS + 1];
+        OUT out = answer + node_row * node_columns + first;
+        for (int k = 0; k < AFFINE + 3; ++k)
+            for (int i = 0; i < count; ++i) out[k * nodes + i] = LANE(solved[k], i);
     }
-    answer[(AFFINE + 1) * nodes + node] = squares;
-    answer[(AFFINE + 2) * nodes + node] = variances;
 }
 
-// Inverts a matrix, given by its lower triangle, in place, after scaling its diagonal to 1 (Cholesky).
-// Returns whether this is possible within rounding.
-int invert(float normal[PARAMETERS][PARAMETERS])
+// Within rounding.
+F exact_inverse_roots(const F x)
 {
-    float scale[PARAMETERS];
+    const F y = inverse_roots(x);
+    return y * (1.5f - 0.5f * x * y * y);
+}
+
+// Inverts matrices, given by their lower triangles, in place, after scaling their diagonals to 1 (Cholesky).
+// Returns for which of them this is possible within rounding.
+I invert(F normal[PARAMETERS][PARAMETERS])
+{
+    F scale[PARAMETERS];
+    I usable = (I)0 == 0;
     for (int k = 0; k < PARAMETERS; ++k) {
-        const float square = normal[k][k];
-        if (!(square > 0 && square < INFINITY)) return 0;
-        scale[k] = inverse_root(square);
+        const F square = normal[k][k];
+        usable &= (square > 0) & (square < INFINITY);
+        scale[k] = exact_inverse_roots(square);
     }
     // The triangle L of A = L L', with the inverse of its diagonal.
     for (int k = 0; k < PARAMETERS; ++k) {
         for (int l = 0; l <= k; ++l) {
-            float sum = k == l ? 1 : normal[k][l] * scale[k] * scale[l];
+            F sum = k == l ? (F)1 : normal[k][l] * scale[k] * scale[l];
             for (int m = 0; m < l; ++m) sum -= normal[k][m] * normal[l][m];
-            if (k == l && !(sum > 0)) return 0;
-            normal[k][l] = k == l ? inverse_root(sum) : sum * normal[l][l];
+            if (k == l) usable &= sum > 0;
+            normal[k][l] = k == l ? exact_inverse_roots(sum) : sum * normal[l][l];
         }
     }
     // Its inverse, by columns.
     for (int l = 0; l < PARAMETERS; ++l) {
         for (int k = l + 1; k < PARAMETERS; ++k) {
-            float sum = 0;
+            F sum = 0;
             for (int m = l; m < k; ++m) sum -= normal[k][m] * normal[m][l];
             normal[k][l] = sum * normal[k][k];
         }
     }
-    float squares = 0;
+    F squares = 0;
     for (int k = 0; k < PARAMETERS; ++k) {
         for (int l = 0; l <= k; ++l) {
-            float sum = 0;
+            F sum = 0;
             for (int m = k; m < PARAMETERS; ++m) sum += normal[m][k] * normal[m][l];
             squares += (k == l ? 1 : 2) * sum * sum;
             normal[l][k] = sum;  // above the diagonal; later sums do not need it on the diagonal
         }
     }
     for (int k = 0; k < PARAMETERS; ++k)
-        for (int l = 0; l <= k; ++l) normal[k][l] = normal[l][k] = normal[l][k] * scale[k] * scale[l];
-    return squares < MOST * MOST;
+        for (int l = 0; l <= k; ++l) normal[k][l] = normal[l][k] * scale[k] * scale[l];
+    return usable & (squares < MOST * MOST);
 }
 
-__kernel void displacement_normals(
-    const int rows, const int columns, const int node_rows, const int node_columns, const int step, const int first,
-    const int halo, MAP planes, OUT inverse, OUT summary)
-{
-    const int nodes = node_rows * node_columns, node = get_global_id(0);
-    if (node >= nodes) return;
-    const int width = columns + 2 * halo, plane = width * (rows + 2 * halo);
-    MAP corner = planes + (first + node / node_columns * step) * width + first + node % node_columns * step;
-    float normal[PARAMETERS][PARAMETERS];
-    for (int k = 0; k < PARAMETERS; ++k)
-        for (int l = 0; l < PARAMETERS; ++l) normal[k][l] = 0;
-    for (int j = 0; j < WINDOW; ++j) {
-        for (int i = 0; i < WINDOW; ++i) {
-            MAP at = corner + j * width + i;
-            const float x = at[plane], y = at[2 * plane], defined = at[0] - at[0] == 0;
-            const float across = PLACE(i), below = PLACE(j);
-            const float column[PARAMETERS] = {x, y, x * across, x * below, y * across, y * below, defined,
-                defined * across, defined * below, at[3 * plane]};
-            #pragma unroll
-            for (int k = 0; k < PARAMETERS; ++k) {
-                #pragma unroll
-                for (int l = 0; l <= k; ++l) normal[k][l] += column[k] * column[l];
-            }
-        }
+// A column of the design matrix is a derivative of the reference, its texture or a constant, the factor, times powers of
+// the distances from the centre. The moments of a product of two factors are its sums times products of such powers.
+enum { XX, XY, YY, X, Y, DEFINED, X_TEXTURE, Y_TEXTURE, TEXTURE, SQUARE, FACTORS };
+enum { ONE, BELOW, BELOW_2, ACROSS, BOTH, ACROSS_2, MOMENTS };
+
+#define ADD_PRODUCTS(first, second, third, f)                                                                \
+    {                                                                                                        \
+        F a = 0, b = 0, c = 0, a_below = 0, b_below = 0, c_below = 0, a_below_2 = 0, b_below_2 = 0, c_below_2 = 0; \
+        for (int j = 0; j < WINDOW; ++j) {                                                                   \
+            MAP at = corner + j * width + column;                                                            \
+            const F along_x = LOAD(at + plane), along_y = LOAD(at + 2 * plane), texture = LOAD(at + 3 * plane); \
+            const F counts = LOAD(at), defined = counts - counts == 0 ? (F)1 : (F)0;                         \
+            const F one = first, two = second, three = third;                                                \
+            const float below = PLACE(j), below_2 = below * below;                                           \
+            a += one;                                                                                        \
+            b += two;                                                                                        \
+            c += three;                                                                                      \
+            a_below += one * below;                                                                          \
+            b_below += two * below;                                                                          \
+            c_below += three * below;                                                                        \
+            a_below_2 += one * below_2;                                                                      \
+            b_below_2 += two * below_2;                                                                      \
+            c_below_2 += three * below_2;                                                                    \
+        }                                                                                                    \
+        const F all[3][3] = {{a, a_below, a_below_2}, {b, b_below, b_below_2}, {c, c_below, c_below_2}};     \
+        for (int n = 0; n < 3; ++n)                                                                          \
+            for (int m = 0; m < 3; ++m) KEEP(kept[(f) + n][m], column, all[n][m])                            \
     }
-    summary[3 * nodes + node] = normal[AFFINE][AFFINE];
-    const int usable = invert(normal);
-    for (int k = 0; k < PARAMETERS; ++k)
-        for (int l = 0; l < PARAMETERS; ++l)
-            inverse[(node * PARAMETERS + k) * PARAMETERS + l] = usable ? normal[k][l] : NAN;
-    summary[node] = usable ? normal[0][0] : NAN;
-    summary[nodes + node] = usable ? normal[1][0] : NAN;
-    summary[2 * nodes + node] = usable ? normal[1][1] : NAN;
+
+__kernel void displacement_normals(
+    const int rows, const int columns, const int node_rows, const int node_columns, const int halo, MAP planes, OUT inverse,
+    OUT summary)
+{
+    const int pieces = (node_columns + NODES - 1) / NODES, item = get_global_id(0), node_row = item / pieces;
+    if (node_row >= node_rows) return;
+    const int node = (item - node_row * pieces) * NODES, last = min(node + NODES, node_columns) - 1;
+    const int width = columns + 2 * halo, plane = width * (rows + 2 * halo), nodes = node_rows * node_columns;
+    MAP corner = planes + (halo + FIRST + node_row * STEP) * width + halo + FIRST + node * STEP;
+    F sums[GROUPS][FACTORS][MOMENTS];
+    for (int g = 0; g < GROUPS; ++g)
+        for (int f = 0; f < FACTORS; ++f)
+            for (int k = 0; k < MOMENTS; ++k) sums[g][f][k] = 0;
+    const int extent = (last - node) * STEP + WINDOW;
+    for (int base = 0; base < extent; base += WIDTH) {
+        Column kept[FACTORS][3];
+        for (int column = base; column < min(base + WIDTH, extent); column += LANES) {
+            // A part of the products at a time, for their sums to stay in registers.
+            ADD_PRODUCTS(along_x * along_x, along_x * along_y, along_y * along_y, XX)
+            ADD_PRODUCTS(along_x, along_y, defined, X)
+            ADD_PRODUCTS(along_x * texture, along_y * texture, texture, X_TEXTURE)
+            F square = 0;
+            for (int j = 0; j < WINDOW; ++j) {
+                const F texture = LOAD(corner + 3 * plane + j * width + column);
+                square += texture * texture;
+            }
+            KEEP(kept[SQUARE][0], column, square)
+        }
+        for (int g = 0; g < GROUPS; ++g)
+            for (int f = 0; f < FACTORS; ++f) {
+                F one = sums[g][f][ONE], below = sums[g][f][BELOW], below_2 = sums[g][f][BELOW_2];
+                F across = sums[g][f][ACROSS], both = sums[g][f][BOTH], across_2 = sums[g][f][ACROSS_2];
+                COLUMNS_OF_NODE(base) {
+                    const float place = PLACE(k);
+                    const F value = OF_NODES(kept[f][0], g * LANES, k);
+                    one += value;
+                    if (f == SQUARE) continue;
+                    const F moment = OF_NODES(kept[f][1], g * LANES, k);
+                    across += value * place;
+                    below += moment;
+                    if (f >= X_TEXTURE) continue;
+                    across_2 += value * place * place;
+                    both += moment * place;
+                    below_2 += OF_NODES(kept[f][2], g * LANES, k);
+                }
+                const F all[] = {one, below, below_2, across, both, across_2};
+                for (int k = 0; k < MOMENTS; ++k) sums[g][f][k] = all[k];
+            }
+    }
+    for (int g = 0; g < GROUPS; ++g) {
+        // Of the columns of the design matrix: the factor, and the moment of its product with one that has no powers.
+        const int factor[PARAMETERS] = {0, 1, 0, 0, 1, 1, 2, 2, 2, 3};
+        const int power[PARAMETERS] = {ONE, ONE, ACROSS, BELOW, ACROSS, BELOW, ONE, ACROSS, BELOW, ONE};
+        const int product[4][4] = {{XX, XY, X, X_TEXTURE}, {XY, YY, Y, Y_TEXTURE}, {X, Y, DEFINED, TEXTURE}, {X_TEXTURE, Y_TEXTURE, TEXTURE, SQUARE}};
+        F normal[PARAMETERS][PARAMETERS];
+        for (int k = 0; k < PARAMETERS; ++k)
+            for (int l = 0; l <= k; ++l) {
+                const int p = power[k], q = power[l];
+                const int moment = p == ONE ? q : q == ONE ? p : p != q ? BOTH : p == ACROSS ? ACROSS_2 : BELOW_2;
+                normal[k][l] = sums[g][product[factor[k]][factor[l]]][moment];
+            }
+        const F samples = normal[AFFINE][AFFINE];
+        const I usable = invert(normal);
+        OUT packed = inverse + ((size_t)item * PACKED * GROUPS + g) * LANES;
+        for (int k = 0; k < PARAMETERS; ++k)
+            for (int l = 0; l <= k; ++l) {
+                normal[k][l] = usable ? normal[k][l] : (F)NAN;
+                STORE(packed, normal[k][l]);
+                packed += NODES;
+            }
+        const int first = node + g * LANES, count = min(LANES, last + 1 - first);
+        const F some[] = {normal[0][0], normal[1][0], normal[1][1], samples};
+        for (int k = 0; k < 4; ++k)
+            for (int i = 0; i < count; ++i) summary[k * nodes + node_row * node_columns + first + i] = LANE(some[k], i);
+    }
+}
+
+#define REACH 2  // nodes on either side whose windows predict the displacement of a node
+#define MOST_CHANGE 1.5f
+
+__kernel void displacement_field(
+    const int node_rows, const int node_columns, const float hold, MAP trust, MAP answer, MAP field, OUT next_field)
+{
+    const int pieces = (node_columns + TILE - 1) / TILE, row = get_global_id(0) / pieces, nodes = node_rows * node_columns;
+    if (row >= node_rows) return;
+    const int first = (get_global_id(0) - row * pieces) * TILE, end = min(first + TILE, node_columns);
+    const float binomial[2 * REACH + 1] = {1.0f / 16, 4.0f / 16, 6.0f / 16, 4.0f / 16, 1.0f / 16};
+    for (int node = first; node < end; node += STRIP) {
+        const int size = min(STRIP, end - node), here = row * node_columns + node;
+        float total[STRIP], right[STRIP], down[STRIP];
+        for (int i = 0; i < size; ++i) total[i] = hold;
+        for (int i = 0; i < size; ++i) right[i] = hold * field[here + i];
+        for (int i = 0; i < size; ++i) down[i] = hold * field[nodes + here + i];
+        for (int j = GREATER(-REACH, -row); j <= LESSER(REACH, node_rows - 1 - row); ++j)
+            for (int k = -REACH; k <= REACH; ++k) {
+                const float share = binomial[j + REACH] * binomial[k + REACH];
+                const float below = -j * (2.0f * STEP / WINDOW), across = -k * (2.0f * STEP / WINDOW);
+                const int low = GREATER(0, -node - k), high = LESSER(size, node_columns - node - k);
+                const int other = here + j * node_columns + k;
+                for (int i = low; i < high; ++i) {
+                    const float to_right = answer[other + i], to_down = answer[nodes + other + i];
+                    const int finite = to_right - to_right == 0;
+                    const float weight = finite ? share * trust[other + i] : 0;
+                    const float from_right = field[other + i], from_down = field[nodes + other + i];
+                    const float step_right = LIMITED(finite ? to_right - from_right : 0, -MOST_CHANGE, MOST_CHANGE);
+                    const float step_down = LIMITED(finite ? to_down - from_down : 0, -MOST_CHANGE, MOST_CHANGE);
+#define SLOPE(n) LIMITED(finite ? answer[(n) * nodes + other + i] : 0, -1, 1)
+                    total[i] += weight;
+                    right[i] += weight * (from_right + step_right + SLOPE(2) * across + SLOPE(3) * below);
+                    down[i] += weight * (from_down + step_down + SLOPE(4) * across + SLOPE(5) * below);
+                }
+            }
+        for (int i = 0; i < size; ++i) next_field[here + i] = right[i] / total[i];
+        for (int i = 0; i < size; ++i) next_field[nodes + here + i] = down[i] / total[i];
+    }
 }

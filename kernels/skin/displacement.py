@@ -29,6 +29,10 @@ MARGIN = TAPS + 4
 """Mirrored samples around a padded frame; the outer ones have no coefficient."""
 PARAMETERS, AFFINE = 10, 6
 """Number of parameters of a window, and of those that describe its motion."""
+PACKED = PARAMETERS * (PARAMETERS + 1) // 2
+"""Elements of a symmetric matrix of the parameters: those of its lower triangle, by rows."""
+MAX_CHANGE = 1.5
+"""Maximum change of the field in one iteration, pixels."""
 MOST = 1e5
 """Maximum norm of the inverse of a normal matrix whose diagonal is scaled to 1."""
 
@@ -228,6 +232,30 @@ def basis(planes: NDArray[np.float64], window: int) -> NDArray[np.float64]:
     return np.stack([*columns, defined, defined * x, defined * y, texture], axis=-1)
 
 
+def pack(matrices: Array, packed: Array) -> None:
+    """Write symmetric matrices of nodes, (rows, columns, 10, 10), as work-items of several nodes use them.
+
+    ``packed``, (n, 55, nodes), has the lower triangles, by rows, of the nodes of a work-item, which are
+    adjacent in a row. The last work-item of a row may have nodes beyond its end; they are unchanged.
+    """
+    nodes = packed.shape[-1]
+    triangles = matrices[..., *np.tril_indices(PARAMETERS)]
+    by_row = packed.reshape(len(matrices), -1, PACKED, nodes)
+    for first in range(0, matrices.shape[1], nodes):
+        part = triangles[:, first : first + nodes]
+        by_row[:, first // nodes, :, : part.shape[1]] = np.swapaxes(part, 1, 2)
+
+
+def unpack(packed: Array, rows: int, columns: int) -> NDArray[np.float64]:
+    """Return the matrices, (rows, columns, 10, 10), that `pack` has packed."""
+    by_row = packed.astype(np.float64).reshape(rows, -1, PACKED, packed.shape[-1])
+    triangles = np.swapaxes(by_row, 2, 3).reshape(rows, -1, PACKED)[:, :columns]
+    matrices = np.empty((rows, columns, PARAMETERS, PARAMETERS))
+    row, column = np.tril_indices(PARAMETERS)
+    matrices[..., row, column] = matrices[..., column, row] = triangles
+    return matrices
+
+
 def displacement_normals(
     step: int, first: int, window: int, planes: Array, inverse: Array, summary: Array
 ) -> None:
@@ -236,11 +264,12 @@ def displacement_normals(
     Parameters
     ----------
     step, first, window, planes : as of ``displacement_solve``
-    inverse : (rows, columns, 10, 10); NaN where the matrix is singular within rounding: a column is 0 or not
+    inverse : packed, see `pack`; NaN where the matrix is singular within rounding: a column is 0 or not
         finite, or after scaling the diagonal to 1 the Frobenius norm of the inverse exceeds 1e5
     summary : (4, rows, columns), elements 00, 10 and 11 of the inverse, and number of samples in the window
     """
-    node_rows, node_columns = inverse.shape[:2]
+    node_rows, node_columns = summary.shape[1:]
+    matrices = np.empty((node_rows, node_columns, PARAMETERS, PARAMETERS))
     for row in range(node_rows):
         columns = basis(windows(planes, row, step, first, window, node_columns), window)
         normal = columns.transpose(0, 2, 1) @ columns
@@ -255,8 +284,9 @@ def displacement_normals(
         usable &= np.sum(inverted**2, axis=(1, 2)) < MOST**2
         inverted /= scale[:, :, None] * scale[:, None, :]
         inverted[~usable] = np.nan
-        inverse[row] = inverted
-    summary[:3] = np.moveaxis(inverse[..., [0, 1, 1], [0, 0, 1]], -1, 0)
+        matrices[row] = inverted
+    pack(matrices, inverse)
+    summary[:3] = np.moveaxis(matrices[..., [0, 1, 1], [0, 0, 1]], -1, 0)
 
 
 def displacement_solve(
@@ -275,12 +305,13 @@ def displacement_solve(
     ----------
     step, first, window : distance between nodes, start of the first window, side of a window; pixels
     planes, difference, field : as of ``displacement_warp``
-    inverse : (nodes, 10, 10), as of ``displacement_normals``
+    inverse : as of ``displacement_normals``
     answer : (9, nodes): displacement to the right and down, pixels; derivatives of the first and of the
         second to the right and down, per half window; gain; residual sum of squares; and sum of the variances
         of the differences for noise of variance 1
     """
     node_rows, node_columns = field.shape[1:]
+    matrices = unpack(inverse, node_rows, node_columns)
     for row in range(node_rows):
         here = np.s_[row * node_columns : (row + 1) * node_columns]
         columns = basis(windows(planes, row, step, first, window, node_columns), window)
@@ -288,9 +319,48 @@ def displacement_solve(
         centre = field[:, row].astype(np.float64)
         residual = residual - columns[..., 0] * centre[0][:, None] - columns[..., 1] * centre[1][:, None]
         sums = np.einsum("npk,np->kn", columns, residual)
-        solution = np.einsum("nkl,ln->kn", inverse[here].astype(np.float64), sums)
+        solution = np.einsum("nkl,ln->kn", matrices[row], sums)
         answer[:AFFINE, here] = solution[:AFFINE]
         answer[:2, here] += centre
         answer[AFFINE, here] = 1 - solution[-1]
         answer[AFFINE + 1, here] = np.sum(residual**2, axis=1) - np.sum(solution * sums, axis=0)
         answer[AFFINE + 2, here] = np.sum(variance, axis=1)
+
+
+def displacement_field(
+    step: int, window: int, hold: float, trust: Array, answer: Array, field: Array, next_field: Array
+) -> None:
+    """Write the field of all windows, each weighted by how well its displacement is determined.
+
+    Each window predicts the displacement of its neighbours, so that an affine field remains affine and
+    continues where windows leave the picture. Far from all windows, the field is kept.
+
+    Parameters
+    ----------
+    step, window : distance between nodes, side of a window; pixels
+    hold : weight of the previous field
+    trust : (rows, columns), weights of the windows; those without an answer have no weight
+    answer, field : as of ``displacement_solve``
+    next_field : (2, rows, columns), displacement to the right and down, pixels. It changes by at most
+        ``MAX_CHANGE``, and derivatives of at most 1 per half window are used
+    """
+    rows, columns = trust.shape
+    parts = answer[:AFFINE].reshape(AFFINE, rows, columns).astype(np.float64)
+    weight = np.where(np.isfinite(parts[0]), trust, 0.0)
+    parts = np.where(np.isfinite(parts[0]), parts, 0.0)
+    y, x = np.meshgrid(*(2 * step / window * np.arange(n) for n in (rows, columns)), indexing="ij")
+    total = _over_nodes(weight) + hold
+    for n in range(2):
+        coarse, (along_x, along_y) = field[n].astype(np.float64), np.clip(parts[2 + 2 * n : 4 + 2 * n], -1, 1)
+        change = np.where(weight > 0, np.clip(parts[n] - coarse, -MAX_CHANGE, MAX_CHANGE), 0.0)
+        here = _over_nodes(weight * (coarse + change - along_x * x - along_y * y)) + hold * coarse
+        next_field[n] = (here + _over_nodes(weight * along_x) * x + _over_nodes(weight * along_y) * y) / total
+
+
+def _over_nodes(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the binomial mean over 5 by 5 nodes; nodes that do not exist count as 0."""
+    for axis in (0, 1):
+        padded = np.pad(values, [(2, 2) if k == axis else (0, 0) for k in range(2)])
+        around = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=axis)
+        values = around @ (np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16)
+    return values

@@ -182,7 +182,8 @@ def _(shape, dtype):
 
 PICTURE, STEP, WINDOW, GRID = (34, 45), 4, 11, (9, 12)
 FIRST, HALO, MARGIN = (STEP - WINDOW) // 2, 2 * WINDOW + 8, displacement.MARGIN
-NODES = {"node_rows": GRID[0], "node_columns": GRID[1], "step": STEP, "halo": HALO, "shape": PICTURE}
+GRID_SIZE = {"node_rows": GRID[0], "node_columns": GRID[1], "step": STEP}
+SIZES, ITEMS = GRID_SIZE | {"halo": HALO, "shape": PICTURE}, {"nodes": (1, 8, 16)}
 COEFFICIENTS = np.s_[displacement.TAPS : -displacement.TAPS, displacement.TAPS : -displacement.TAPS]
 TEXTURE, CLOSE = Speckle(3), {"rtol": 1e-4, "atol": 3e-6}
 
@@ -198,13 +199,36 @@ def textures(dtype="float32"):
     rest = [np.pad(np.where(lost, 0, part), HALO) for part in (right, down, first - first.mean())]
     planes = np.stack([np.pad(np.where(lost, np.nan, first), HALO, constant_values=np.nan), *rest])
     field = np.array([2.0, -1.0])[:, None, None] + np.random.default_rng(1).normal(0, 0.4, (2, *GRID))
-    return frame, padded, {"planes": planes, "field": field, "macros": {"FRAME": "float", "WINDOW": WINDOW}}
+    return frame, padded, {"planes": planes, "field": field, "macros": displaced()}
 
 
-@case("displacement_pad", DTYPES, per=lambda device, values: -(-values["padded"].size // device.layout.tile))
+def displaced(nodes=8, frame="float"):
+    """Return the macros of the kernels, for work-items of some nodes."""
+    return {"FRAME": frame, "WINDOW": WINDOW, "STEP": STEP, "NODES": nodes}
+
+
+def packed(matrices, nodes):
+    """Return matrices, (rows, columns, 10, 10), as work-items of some nodes use them."""
+    rows, columns = matrices.shape[:2]
+    items = np.zeros((rows * -(-columns // nodes), displacement.PACKED, nodes))
+    displacement.pack(matrices, items)
+    return items
+
+
+def node_items(device, values):
+    return len(values["inverse"])
+
+
+def padded_rows(device, values):
+    rows, columns = values["padded"].shape
+    return rows * -(-columns // device.layout.tile)
+
+
+@case("displacement_pad", DTYPES, per=padded_rows)
 def _(dtype):
     frame, padded, _ = textures(dtype)
-    return {"frame": frame, "padded": 0 * padded, "shape": PICTURE, "macros": {"WINDOW": WINDOW}}
+    macros = displaced(frame=C_TYPES[dtype])
+    return {"frame": frame, "padded": 0 * padded, "shape": PICTURE, "macros": macros}
 
 
 @case(
@@ -218,22 +242,45 @@ def _(step):
     return arrays | {"macros": values["macros"]}
 
 
-@case("displacement_warp", per="whole row", **CLOSE)
-def _():
+@case("displacement_warp", {"lanes": (1, 8), "smooth": (0, 1)}, per="whole row", **CLOSE)
+def _(lanes, smooth):
     _, padded, values = textures()
+    if smooth:  # neighbours of a pixel are displaced to neighbours
+        values["field"][0] = np.linspace(2.2, 2.6, GRID[1])
     difference, start = np.zeros((2, *values["planes"].shape[1:])), FIRST + (WINDOW - 1) / 2
-    return NODES | values | {"start": start, "coefficients": padded, "difference": difference}
+    arrays = {"start": start, "coefficients": padded, "difference": difference}
+    return SIZES | values | arrays | {"macros": displaced(lanes)}
 
 
-@case("displacement_solve", per=lambda device, values: math.prod(GRID), **CLOSE)
-def _():
-    (_, padded, texture), rng, count = textures(), np.random.default_rng(2), math.prod(GRID)
-    inverse = rng.normal(0, 1e-4, (count, displacement.PARAMETERS, displacement.PARAMETERS))
+@case("displacement_solve", ITEMS, per=node_items, **CLOSE)
+def _(nodes):
+    (_, padded, texture), count = textures(), math.prod(GRID)
+    inverse = packed(np.zeros((*GRID, displacement.PARAMETERS, displacement.PARAMETERS)), nodes)
+    displacement.displacement_normals(
+        STEP, FIRST + HALO, WINDOW, texture["planes"], inverse, np.zeros((4, *GRID))
+    )
     arrays = {"difference": np.zeros((2, *texture["planes"].shape[1:])), "answer": np.zeros((9, count))}
     start = FIRST + (WINDOW - 1) / 2
     maps = texture["planes"], texture["field"], arrays["difference"]
     displacement.displacement_warp(STEP, start, HALO, padded, *maps)
-    return NODES | texture | arrays | {"first": FIRST + HALO, "window": WINDOW, "inverse": inverse}
+    values = {"first": FIRST + HALO, "window": WINDOW, "macros": displaced(nodes)}
+    return SIZES | texture | arrays | values | {"inverse": inverse}
+
+
+@case("displacement_field", {"grid": (GRID, (1, 3), (40, 300))}, per="whole row", **CLOSE)
+def _(grid):
+    rng = np.random.default_rng(4)
+    answer = rng.normal(0, 1, (9, *grid))
+    answer[:, grid[0] // 2, grid[1] // 2] = np.nan
+    field, trust = answer[:2] + rng.normal(0, 1, (2, *grid)), rng.uniform(0, 1, grid)
+    values = {"hold": 0.01, "window": WINDOW, "step": STEP, "node_rows": grid[0], "node_columns": grid[1]}
+    arrays = {
+        "trust": trust,
+        "answer": answer,
+        "field": np.nan_to_num(field),
+        "next_field": np.zeros((2, *grid)),
+    }
+    return values | arrays | {"shape": grid, "macros": displaced()}
 
 
 def measured(dtype):
@@ -251,8 +298,12 @@ def measured(dtype):
     wide = PICTURE[0] + 2 * HALO, PICTURE[1] + 2 * HALO
     values = named("frame coefficients sums counts", frame, coefficients, *np.full((2, *PICTURE), np.nan))
     values |= named("planes difference", np.full((4, *wide), np.nan), np.full((2, *wide), np.nan))
-    values |= {"window": WINDOW, "halo": HALO, "shape": PICTURE, "macros": {"WINDOW": WINDOW, **top}}
-    return values | {"macros": values["macros"] | {"FRAME": C_TYPES[dtype]}}
+    return values | {
+        "window": WINDOW,
+        "halo": HALO,
+        "shape": PICTURE,
+        "macros": displaced(frame=C_TYPES[dtype]) | top,
+    }
 
 
 def by_plane(atol, correlations=False):
@@ -260,6 +311,7 @@ def by_plane(atol, correlations=False):
 
     def check(actual, expected, values):
         if correlations:  # those of windows with hardly any texture lose digits in float32
+            actual, expected = (displacement.unpack(packed, *GRID) for packed in (actual, expected))
             diagonal = np.sqrt(np.einsum("...kk->...k", expected))
             scale = diagonal[..., np.newaxis] * diagonal[..., np.newaxis, :]
         else:
@@ -291,37 +343,33 @@ def _(dtype):
 
 
 @case(
-    "displacement_normals", DTYPES, per=lambda device, values: math.prod(GRID),
+    "displacement_normals", DTYPES | ITEMS, per=node_items,
     checks=MEASURED | {"inverse": by_plane(3e-4, correlations=True)},
 )  # fmt: skip
-def _(dtype):
+def _(dtype, nodes):
     values = measured(dtype)
     displacement.displacement_across(WINDOW, values["frame"], values["sums"], values["counts"])
     arrays = (values[name] for name in ("frame", "coefficients", "sums", "counts", "planes", "difference"))
     displacement.displacement_planes(HALO, WINDOW, *arrays)
     size = displacement.PARAMETERS
-    answers = {"inverse": np.zeros((*GRID, size, size)), "summary": np.zeros((4, *GRID))}
-    return (
-        NODES
-        | answers
-        | {"planes": values["planes"], "first": FIRST + HALO, "window": WINDOW, "macros": values["macros"]}
-    )
+    answers = {"inverse": packed(np.zeros((*GRID, size, size)), nodes), "summary": np.zeros((4, *GRID))}
+    given = {"planes": values["planes"], "first": FIRST + HALO, "window": WINDOW}
+    return SIZES | answers | given | {"macros": values["macros"] | {"NODES": nodes}}
 
 
-PIXELWISE = {"grid": (GRID, (1, 12), (9, 2)), "logarithms": (0, 1)}
+PIXELWISE = {"grid": (GRID, (1, 12), (9, 2)), "logarithms": (0, 1), "parts": (1, 2)}
 
 
 @case(
     "displacement_pixels", PIXELWISE, rtol=2e-5, atol=1e-6,
     per=lambda device, values: 3 * PICTURE[0] * -(-PICTURE[1] // device.layout.tile),
 )  # fmt: skip
-def _(grid, logarithms):
-    nodes = np.random.default_rng(3).normal(0, 1, (3, 2, *grid)).astype(np.float32)
+def _(grid, logarithms, parts):
+    nodes = np.random.default_rng(3).normal(0, 1, (3, parts, *grid)).astype(np.float32)
     nodes[1, :, 0, 1] = np.nan
     sizes = {"node_rows": grid[0], "node_columns": grid[1], "step": STEP, "start": FIRST + (WINDOW - 1) / 2}
-    arrays = {"nodes": nodes, "pixels": np.zeros((3, *PICTURE, 2), np.float32), "shape": PICTURE}
-    macros = {"FRAME": "uchar", "WINDOW": WINDOW}
-    return sizes | arrays | {"count": 3, "parts": 2, "logarithms": logarithms, "macros": macros}
+    arrays = {"nodes": nodes, "pixels": np.zeros((3, *PICTURE, parts), np.float32), "shape": PICTURE}
+    return sizes | arrays | {"count": 3, "parts": parts, "logarithms": logarithms, "macros": displaced()}
 
 
 # --- Exposure

@@ -11,6 +11,7 @@ from speckle import Speckle
 
 from mirrorskin.kernels.skin.displacement import (
     MARGIN,
+    PACKED,
     PARAMETERS,
     basis,
     cubic,
@@ -20,6 +21,7 @@ from mirrorskin.kernels.skin.displacement import (
     displacement_solve,
     interpolate_nodes,
     noise_gain,
+    pack,
     windows,
 )
 
@@ -77,8 +79,10 @@ def test_nodes_are_joined_by_straight_lines():
 def test_a_displacement_is_found_from_the_columns_of_its_window():
     planes = planes_of(SPECKLE.frame(SHAPE, 0, 0))
     columns = basis(windows(planes, 4, STEP, FIRST + HALO, WINDOW, GRID[1]), WINDOW)
-    inverse = np.full((math.prod(GRID), PARAMETERS, PARAMETERS), np.nan)
-    inverse[4 * GRID[1] : 5 * GRID[1]] = np.linalg.inv(columns.transpose(0, 2, 1) @ columns)
+    matrices = np.full((*GRID, PARAMETERS, PARAMETERS), np.nan)
+    matrices[4] = np.linalg.inv(columns.transpose(0, 2, 1) @ columns)
+    inverse = np.full((math.prod(GRID), PACKED, 1), np.nan)
+    pack(matrices, inverse)
     difference, answer = np.zeros((2, *planes.shape[1:])), np.empty((9, math.prod(GRID)))
     difference[0] = 0.7 * planes[1] - 0.2 * planes[2] + np.where(np.isnan(planes[0]), 0, 3) + 0.1 * planes[3]
     field = np.zeros((2, *GRID))
