@@ -15,7 +15,7 @@ from mirrorskin.io.base.samples import convert_samples, frame_dtype
 from mirrorskin.io.base.types import FRAME_DTYPES
 from mirrorskin.io.watch.traces import FrameSamples
 from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.numerics.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import mad_sigma, median
 from mirrorskin.kernels.numerics.samples import Grid, take_grids, take_samples
 
 SAMPLES = 65536
@@ -91,6 +91,13 @@ def thin_out(frames: AnyArray) -> NDArray[np.float64]:
     """Return evenly spaced samples of one frame or several, enough to estimate the noise within 0.5 %."""
     [samples] = thinned(frames)
     return samples.astype(np.float64)
+
+
+def typical_value(values: AnyArray) -> float:
+    """Return the median of evenly spaced values of a map that are numbers; 0 if none is."""
+    [samples] = thinned(values)
+    finite = samples[np.isfinite(samples)]
+    return float(median(finite)) if finite.size else 0.0
 
 
 def thinned(*arrays: AnyArray) -> list[NDArray[Any]]:

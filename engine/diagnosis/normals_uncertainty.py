@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.device_arrays import AnyArray, stored_map
-from mirrorskin.engine.base.frames import QUANTUM, take_places, thin_out
+from mirrorskin.engine.base.frames import QUANTUM, take_places, typical_value
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.curl import AzimuthBias, find_azimuth_bias
 from mirrorskin.engine.diagnosis.registration import Registered
@@ -111,7 +111,7 @@ class ResponseUncertainty(Step):
         if noise is None or slope is None or frames is None or tilt is None:  # of a class with its own result
             return result
         cosine, sine = (stored_map(context.computed, name) for name in ("cosine", "sine"))
-        base = noise**2 - slope * _median(mean)
+        base = noise**2 - (slope * typical_value(mean) if slope > 0 else 0.0)
         modulation = find_modulation_effects(
             normals,
             mean,
@@ -153,13 +153,6 @@ def _with_share_of_zenith(result: Result, fraction: float) -> Result:
     return result.assign(
         normals_sigma=lambda: np.hypot(result.normals_sigma, np.float32(fraction) * result.zenith)
     )
-
-
-def _median(values: AnyArray) -> float:
-    """Return the median of some of the values that are numbers; 0 if none is."""
-    some = thin_out(values)
-    some = some[np.isfinite(some)]
-    return float(np.median(some)) if some.size else 0.0
 
 
 def _uneven(modulation: ModulationEffects) -> Iterator[Finding]:

@@ -82,20 +82,16 @@ def find_modulation_effects(
     down, right = range(_REACH, rows - _REACH, thin), range(_REACH, columns - _REACH, thin)
     places = (0, 0), (0, _REACH), (0, -_REACH), (-_REACH, 0), (_REACH, 0)
     scale = np.broadcast_to(np.abs(np.asarray(zenith_gain, np.float64)), usable.shape)
-    used, scales = take_places([usable, scale], down, right, places)
-    vectors, means, cosines, sines = take_places([normals, mean, cosine, sine], down, right, places)
-
-    def look(place: int) -> tuple[Doubles, ...]:
-        """Return zenith, its sine's direction and the ratio of the swing, NaN where it is not usable."""
-        x, y, z = vectors[place].astype(np.float64)
-        flat, amplitude = np.hypot(x, y), np.hypot(cosines[place], sines[place])
-        zenith = np.where(
-            (used[place] > 0) & (flat > math.sin(_MIN_ZENITH * tilt)), np.arctan2(flat, z), np.nan
-        )
-        return zenith, x / flat, y / flat, amplitude / (scales[place] * _expected(zenith, tilt))
-
+    used, scales = map(np.stack, take_places([usable, scale], down, right, places))
+    vectors, means, *amplitudes = take_places([normals, mean, cosine, sine], down, right, places)
+    x, y, z = np.stack(vectors, axis=1, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        middle, east, west, north, south = map(look, range(len(places)))
+        flat, amplitude = np.hypot(x, y), np.hypot(*map(np.stack, amplitudes))
+        steep = (used > 0) & (flat > math.sin(_MIN_ZENITH * tilt))
+        angle = np.where(steep, np.arctan2(flat, z), np.nan)
+        ratio = amplitude / (scales * _expected(angle, tilt))
+        # Of each place: zenith, its sine's direction and the ratio of the swing, NaN where it is not usable.
+        middle, east, west, north, south = zip(angle, x / flat, y / flat, ratio, strict=True)
         apart = 2 * _REACH
         pairs = (east, west), (north, south)
         turning = np.sum(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.device_arrays import AnyArray, on_host
-from mirrorskin.engine.base.frames import thin_out, thinned
+from mirrorskin.engine.base.frames import thinned, typical_value
 from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.correlation.design_matrix import (
@@ -270,9 +270,7 @@ class NormalsOperation(SensorOptions, Operation):
 def normals_result(maps: list[Any], model: TurnModel, turns: int, frames: int) -> Result:
     """Return the maps of the kernel, in the order of `MAPS`, as a result."""
     normals, sigma, contact, mean, cosine, sine, residual = maps
-    samples = thin_out(mean)
-    finite = samples[np.isfinite(samples)]
-    level = np.median(finite) if finite.size else 0.0
+    level = typical_value(mean) if model.noise.slope > 0 else 0.0
     process: dict[str, ProcessValue] = {
         "noise": float(model.noise.at(level)),
         "shot_noise": model.noise.slope,

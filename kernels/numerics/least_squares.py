@@ -68,7 +68,7 @@ def median(values: NDArray[Any]) -> Any:
 
 def mad_sigma(residuals: Doubles) -> float:
     """Return the standard deviation of residuals about 0, from their median magnitude; 0 without any."""
-    return float(np.median(np.abs(residuals))) / _MEDIAN if residuals.size else 0.0
+    return float(median(np.abs(residuals))) / _MEDIAN if residuals.size else 0.0
 
 
 # --- losses -------------------------------------------------------------------------------------------------
@@ -278,11 +278,12 @@ def fit_clipped(
         columns, values = columns / noise[:, np.newaxis], values / noise
     kept = np.full(len(values), True)
     for _ in range(_CLIPS):
-        matrix = gram(columns[kept])
+        used = columns.compress(kept, axis=0)
+        matrix = gram(used)
         if np.linalg.cond(matrix) > condition:
             return None
         inverted: Doubles = np.asarray(np.linalg.inv(matrix), np.float64)
-        parameters: Doubles = inverted @ np.einsum("ni,n->i", columns[kept], values[kept])
+        parameters: Doubles = inverted @ np.einsum("ni,n->i", used, values.compress(kept))
         residuals: Doubles = np.asarray(values - np.einsum("ni,i->n", columns, parameters))
         before, kept = kept, np.abs(residuals) <= OUTLYING * max(mad_sigma(residuals), _LEAST_SPREAD)
         if np.array_equal(before, kept):
