@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -22,8 +21,7 @@ from mirrorskin.io.base.types import FRAME_DTYPES
 from mirrorskin.io.model.maps import TABLE, PressStatus, ReleaseStatus, status_of
 from mirrorskin.io.model.positions import check_travel
 from mirrorskin.io.watch.traces import FrameSamples
-from mirrorskin.kernels.array import Array
-from mirrorskin.kernels.press.onset import DARK, complement
+from mirrorskin.kernels.press.onset import complement, onset_levels, onset_near, onset_sure
 
 if TYPE_CHECKING:
     from mirrorskin.engine.press.onset import ThresholdOperation
@@ -150,8 +148,7 @@ class EventMaps(NamedTuple):
     """The event at each pixel: height and its sigma, status, and number of the first frame after it.
 
     Heights, mm, are NaN unless the status is 1 (see `mirrorskin.io.model.maps.PressStatus` and
-    ``ReleaseStatus``); frames are -1 without an event. They are NumPy arrays, or on the device; the frame
-    is then a function that returns it.
+    ``ReleaseStatus``); frames are -1 without an event. They are NumPy arrays, or on the device.
     """
 
     height: Any
@@ -184,23 +181,32 @@ class Crossing:
         self._dark_from_frames = self._release or operation.dark is None
         self._marked_noise: float | None = None
         self._threshold = 1 - threshold if self._release else threshold
+        dark, bright = reference_maps(operation.dark, operation.bright, shape, dtype)
+        alike = dark.ndim == bright.ndim == 0 and not (self._subframe and self._dark_from_frames)
         planes = {
-            "levels": Planes(2, np.float32),  # counts at the threshold, and of the dark plateau
-            "thresholds": Planes(3, dtype),  # least sample that is light, not clearly dark, near
             "frames_left": Planes(1, f"u{dtype.itemsize}"),  # frames until the pixel is finished
             "times": Planes(3, np.int32),  # start of the run; last frames that were clearly dark, not near
             "answers": Planes(2, np.float32),  # height and sigma
             "status": Planes(1, np.uint8),
             **({"samples": Planes(5, dtype)} if self._subframe else {}),  # those around an open run
         }
-        self._maps = Picture(operation, "onset", planes, tile=_TILE)
-        dark, bright = reference_maps(operation.dark, operation.bright, shape, dtype)
+        if not alike:
+            planes |= {
+                "levels": Planes(2, np.float32),  # counts at the threshold, and of the dark plateau
+                "thresholds": Planes(3, dtype),  # least sample that is light, not clearly dark, near
+            }
+        variant = {"RELEASE": self._release, "SUBFRAME": self._subframe, "ALIKE": alike}
+        macros = {name: int(value) for name, value in variant.items()}
+        self._maps = Picture(operation, "onset", planes, tile=_TILE, **macros)
         fraction = threshold - _ROUNDING
+        self._levels: tuple[NDArray[Any], ...] | None = None  # if alike: level, dark plateau, least light
+        if alike:
+            self._levels = onset_levels(bright, dark, fraction, dtype, self._release)
+            return
         coarse = float(np.float32(fraction))
         self._maps.run(
-            "onset_levels", release=self._release, fraction=coarse, fraction_rest=fraction - coarse,
-            darks=PerPixel(dark), dark_step=dark.ndim // 2, brights=PerPixel(bright),
-            bright_step=bright.ndim // 2,
+            "onset_levels", fraction=coarse, fraction_rest=fraction - coarse, darks=PerPixel(dark),
+            dark_step=dark.ndim // 2, brights=PerPixel(bright), bright_step=bright.ndim // 2,
         )  # fmt: skip
 
     def push(self, frames: AnyArray, travel: ArrayLike) -> None:
@@ -214,13 +220,19 @@ class Crossing:
         steps = np.diff(more, prepend=last if first else more[:1])
         self._travel_table[:, first:count] = more, steps, more - self.travel[0]
         self._noise.look(frames)
-        if self._subframe:
-            self._set_plateaus(frames[0] if first == 0 else None)
         noise = self._noise.value or 0.0  # not needed for a single frame, which is assumed to be dark
+        arguments: dict[str, Any] = {}
+        if self._levels is not None:
+            level, plateau, least = self._levels
+            sure = onset_sure(level, least, _DARK_Z_SCORE * noise)
+            near = onset_near(level, plateau, sure)
+            arguments["levels"] = np.array([level, plateau], np.float32)
+            arguments["thresholds"] = np.array([least, sure, near], least.dtype)
+        elif self._subframe:
+            self._set_plateaus(frames[0] if first == 0 else None)
         light = _PLATEAU_Z_SCORE * np.sqrt(2) * noise  # the plateau is a sample itself
         dark = light if self._dark_from_frames else _PLATEAU_Z_SCORE * noise
-        arguments: dict[str, Any] = {"noise": noise, "dark_tolerance": dark, "light_tolerance": light}
-        arguments |= {"hold": self._hold, "release": self._release, "subframe": self._subframe}
+        arguments |= {"noise": noise, "dark_tolerance": dark, "light_tolerance": light, "hold": self._hold}
         arguments["threshold"] = self._threshold  # as a share of the way from the plateau before the event
         arguments |= {"travel": self._travel_table, "row_length": self._travel_table.shape[1]}
         arguments |= {} if self._subframe else {"samples": None}
@@ -239,9 +251,7 @@ class Crossing:
     def event_maps(self, on_host: bool = True) -> EventMaps:
         """Return the maps of the frames so far, on the device if frames are, unless ``on_host``."""
         parts = ("answers", 0), ("answers", 1), "status", "times"
-        height, sigma, status, times = self._maps.take(*parts, on_host=on_host)
-        frame = partial(_first_light, times) if isinstance(times, Array) else _first_light(times)
-        return EventMaps(height, sigma, status, frame)
+        return EventMaps(*self._maps.take(*parts, on_host=on_host))
 
     def reset(self, noise: float | None = None) -> None:
         """Prepare for another press with the same references and, if given, the same noise, counts."""
@@ -254,9 +264,3 @@ class Crossing:
     def noise(self) -> float:
         """Standard deviation of a sample, given or estimated, counts; 0 before the second frame."""
         return self._noise.value or 0.0
-
-
-def _first_light(times: Any) -> NDArray[np.int32]:
-    """Return the first frame after the event, -1 without one, from the state of the search."""
-    frame: NDArray[np.int32] = np.asarray(times)
-    return np.maximum(frame, DARK, out=frame)

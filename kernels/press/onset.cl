@@ -2,28 +2,28 @@
 //
 // FRAME    type of a sample; BITS, its width
 // TILE     pixels of one work-item: 1 on a GPU, many on a CPU
-//
-// For the end of the light state (`release` = 1) samples are complemented, which exchanges dark and light.
+// RELEASE  1: samples are complemented, which exchanges dark and light, to find the end of the light state
+// SUBFRAME 0: the height is that of the paper's equation 4, at the frame of the onset itself
+// ALIKE    1: the planes of `levels` and `thresholds` have one element, for all pixels
 //
 // A map is a plane of `stride` pixels; only the first `pixels` are in the picture:
 //
 // levels       counts at which a pixel turns light, NaN if it cannot; counts of its dark plateau
 // thresholds   the smallest light sample; the smallest that is not certainly dark; the smallest near the level
 // frames_left  number of frames after which a pixel is decided if all are light, at most MOST
-// times        frame at which the run started; the last certainly dark frame and the last frame not near the level,
-//              before an incomplete run, or before now if the last sample is near the level
+// times        frame at which the run started, -1 without one; the last certainly dark frame and the last frame not
+//              near the level, before an incomplete run, or before now if the last sample is near the level
 // samples      the last sample; those before, at and after the onset of an incomplete run; the sample after the last
 //              one that was not near the level
 // answers      height; sigma: as if no frame followed
-// status       0 invalid input, 1 onset, 2 never light, 3 light at start (`release`: 2 dark at start, 3 light to the
+// status       0 invalid input, 1 onset, 2 never light, 3 light at start (RELEASE: 2 dark at start, 3 light to the
 //              end)
 // travel       has planes of `row_length` frames: travel; the step to it; travel since the first frame
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
 
-#define DARK -1
-#define INVALID -2
+#define DARK -1  // also of a pixel with invalid input, which is decided: `frames_left` is 0
 #define BENT 1.5f  // onset.py
 #define CLEAR_RISE 34  // standard deviations: a quarter of it is 8.5, which noise does not reach
 
@@ -39,13 +39,22 @@ typedef uint Count;
 #define MOST (BITS == 8 ? 255 : 65535)
 #define NONE ((Count)~0u)
 #define SPAN 64  // frames that are counted before anything else is examined
+#define NEVER (2 + RELEASE)  // status without an onset
+
+#if ALIKE
+#define OF(p) 0
+#define PLANE 1
+#else
+#define OF(p) (p)
+#define PLANE stride
+#endif
 
 #if BITS == 32
-#define SEE(x) as_float(as_uint(x) ^ ((uint)release << 31))
+#define SEE(x) (RELEASE ? -(x) : (x))
 #define BROKEN(x) ((as_uint(x) & 0x7f800000u) == 0x7f800000u)
 #define LEAST(a, b) ((a) < (b) || (b) != (b) ? (a) : (b))
 #else
-#define SEE(x) ((FRAME)((x) ^ (FRAME)-release))
+#define SEE(x) ((FRAME)(RELEASE ? ~(x) : (x)))
 #define BROKEN(x) 0
 #define LEAST(a, b) LESSER(a, b)
 #endif
@@ -71,7 +80,7 @@ float level_between(const float dark, const float bright, const float fraction, 
 // Converts bright and dark, maps of step 1 or single numbers of step 0, to level and dark, and computes the
 // smallest light sample.
 __kernel void onset_levels(
-    const int pixels, const int stride, const int release, const float fraction, const float fraction_rest, MAP brights,
+    const int pixels, const int stride, const float fraction, const float fraction_rest, MAP brights,
     const int bright_step, MAP darks, const int dark_step, OUT levels, __global FRAME *restrict thresholds)
 {
     const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base);
@@ -86,16 +95,16 @@ __kernel void onset_levels(
         const int usable = (range > 0) & (range - range == 0);  // the last condition: finite
         const float between = level_between(dark, bright, fraction, fraction_rest), level = usable ? between : NAN;
 #if BITS == 32
-        thresholds[base + p] = release ? next_up(-level) : level;
-        levels[base + p] = release ? -level : level;
-        low[p] = release ? -bright : dark;
+        thresholds[base + p] = RELEASE ? next_up(-level) : level;
+        levels[base + p] = RELEASE ? -level : level;
+        low[p] = RELEASE ? -bright : dark;
 #else
         // Rounded up; a saturated sample is light. A pixel that is never dark has no release.
         const float top = NONE, bound = level > 0 ? (level < top ? level : top) : usable ? 0 : top;
         const int whole = (int)bound, reached = whole + (whole < bound);
-        thresholds[base + p] = release ? (FRAME)(NONE - reached + 1) : (FRAME)reached;
-        levels[base + p] = release ? (reached > 0 ? top - level : NAN) : level;
-        low[p] = release ? top - bright : dark;
+        thresholds[base + p] = RELEASE ? (FRAME)(NONE - reached + 1) : (FRAME)reached;
+        levels[base + p] = RELEASE ? (reached > 0 ? top - level : NAN) : level;
+        low[p] = RELEASE ? top - bright : dark;
 #endif
     }
     const FRAME first_threshold = thresholds[base];
@@ -143,8 +152,8 @@ __kernel void onset_sure(
 // The last frame below `bound`, from frame `from` of a pixel's `series` backwards; the very first counts as
 // dark. The series starts with frame `first`; `last` is the sample before it, and `previous` the result there.
 int last_below(
-    __global const FRAME *series, const int from, const int pixels, const int first, const int release,
-    const FRAME bound, const FRAME last, const int previous)
+    __global const FRAME *series, const int from, const int pixels, const int first, const FRAME bound,
+    const FRAME last, const int previous)
 {
     for (int k = from; k >= first && k > 0; --k)
         if (SEE(series[(size_t)(k - first) * pixels]) < bound) return k;
@@ -186,8 +195,8 @@ float2 answer(
 #define LOOK_BACK(p, from) \
     { \
         const FRAME last = first > 0 ? SEE(lasts[p]) : 0; \
-        darks[p] = last_below(frames + (p), from, pixels, first, release, dark_limits[p], last, darks[p]); \
-        last_fars[p] = last_below(frames + (p), darks[p], pixels, first, release, near_limits[p], last, last_fars[p]); \
+        darks[p] = last_below(frames + (p), from, pixels, first, dark_limits[OF(p)], last, darks[p]); \
+        last_fars[p] = last_below(frames + (p), darks[p], pixels, first, near_limits[OF(p)], last, last_fars[p]); \
         const int next = last_fars[p] + 1 - first; \
         if (next >= 0 && next <= from - first) first_rises[p] = SEE(frames[(size_t)next * pixels + (p)]); \
     }
@@ -198,14 +207,14 @@ float2 answer(
 #if BITS == 32
 #define TAKE(i) \
     sample = SEE(group[(size_t)(i) * pixels + p]); \
-    again = (end_of_run > clock##i) & (sample < light[p]); \
+    again = (end_of_run > clock##i) & (sample < LIGHT(p)); \
     bad[p] |= (end_of_run > clock##i) & BROKEN(sample); \
     end_of_run = again ? next##i : end_of_run;
 #else
 #define LACK(a, b) ((a) > (b) ? (a) - (b) : 0)
 #define TAKE(i) \
     sample = SEE(group[(size_t)(i) * pixels + p]); \
-    again = LESSER((Count)LACK(light[p], sample), (Count)LACK(end_of_run, clock##i)); \
+    again = LESSER((Count)LACK(LIGHT(p), sample), (Count)LACK(end_of_run, clock##i)); \
     end_of_run = again ? next##i : end_of_run;
 #endif
 // Read from an array: compilers widen computed values to 32 bits.
@@ -227,19 +236,17 @@ float2 answer(
 #define EIGHT(each) each(0) each(1) each(2) each(3) each(4) each(5) each(6) each(7)
 #define SIXTEEN(each) EIGHT(each) each(8) each(9) each(10) each(11) each(12) each(13) each(14) each(15)
 
-// Processes frames `first` to `first + count` of a press. Without `subframe` the height is that of the
-// paper's equation 4, at the frame of the onset itself, and there are no `samples`.
+// Processes frames `first` to `first + count` of a press. Without SUBFRAME there are no `samples`.
 __kernel void onset_scan(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride, const int first,
-    const int hold, const int release, const int subframe, const float threshold,
-    __global const FRAME *restrict thresholds, __global Count *restrict frames_left, __global int *restrict times,
-    MAP levels, MAP travel, const int row_length,
+    const int hold, const float threshold, __global const FRAME *restrict thresholds,
+    __global Count *restrict frames_left, __global int *restrict times, MAP levels, MAP travel, const int row_length,
     const float noise, const float dark_tolerance, const float light_tolerance, __global FRAME *restrict samples,
     OUT answers, __global uchar *restrict status)
 {
-    const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base), never = 2 + release;
+    const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base);
     // Frames after an onset until it is final.
-    const int needed = subframe && hold < 3 ? 3 : hold, after = needed - hold;
+    const int needed = SUBFRAME && hold < 3 ? 3 : hold, after = needed - hold;
     const Count whole = LESSER(needed, MOST);
     // counted frames of a run: beyond this it cannot be confirmed within SPAN
     const Count unconfirmed = LESSER(hold, 2 * SPAN);
@@ -247,35 +254,41 @@ __kernel void onset_scan(
     Count clock[SPAN + 1];
     for (int t = 0; t <= SPAN; ++t) clock[t] = t;
 #endif
+#if ALIKE
+    const FRAME light = thresholds[0];
+#define LIGHT(p) light
+#else
     FRAME light[TILE];
-    Count remain[TILE];
     for (int p = 0; p < width; ++p) light[p] = thresholds[base + p];
+#define LIGHT(p) light[p]
+#endif
+    Count remain[TILE];
     if (first > 0)
         for (int p = 0; p < width; ++p) remain[p] = frames_left[base + p];
     else {
         for (int p = 0; p < width; ++p) {
-            const float level = levels[base + p];
+            const float level = levels[OF(base + p)];
             const int usable = level == level;
             remain[p] = usable ? whole : 0;
-            times[base + p] = usable ? DARK : INVALID;
-            status[base + p] = usable ? never : 0;
+            status[base + p] = usable ? NEVER : 0;
         }
+        for (int p = 0; p < width; ++p) times[base + p] = DARK;
         for (int p = 0; p < width; ++p) answers[base + p] = NAN;
         for (int p = 0; p < width; ++p) answers[stride + base + p] = NAN;
     }
     frames += base;
     times += base;
-    levels += base;
+    levels += OF(base);
     answers += base;
     status += base;
     __global int *restrict darks = times + stride, *restrict last_fars = darks + stride;
-    __global const FRAME *restrict dark_limits = thresholds + stride + base;
-    __global const FRAME *restrict near_limits = dark_limits + stride;
+    __global const FRAME *restrict dark_limits = thresholds + PLANE + OF(base);
+    __global const FRAME *restrict near_limits = dark_limits + PLANE;
     __global FRAME *restrict lasts = samples + base, *restrict lows = lasts + stride, *restrict highs = lows + stride,
                    *restrict laters = highs + stride, *restrict first_rises = laters + stride;
-    if (first == 0 && subframe)
+    if (first == 0 && SUBFRAME)
         for (int p = 0; p < width; ++p) darks[p] = last_fars[p] = 0;
-    if (first < 2 && first + count > 1 && subframe)
+    if (first < 2 && first + count > 1 && SUBFRAME)
         for (int p = 0; p < width; ++p) first_rises[p] = SEE(frames[(size_t)(1 - first) * pixels + p]);
 
     for (int start = 0; start < count; start += SPAN) {
@@ -318,19 +331,19 @@ __kernel void onset_scan(
                 const int start_of_run = times[p], unbroken = start_of_run >= 0 ? start_of_run : now;
                 const int broken = bad[p], began = held[p] - unconfirmed;
                 const int run = began <= 0 ? unbroken : began == length ? DARK : now + began;
-                const int begin = remain[p] == 0 ? start_of_run : broken ? INVALID : run, rest = needed - (end - begin);
-                const int lacks = begin == DARK ? needed : begin == INVALID || rest < 0 ? 0 : rest;
+                const int begin = remain[p] == 0 ? start_of_run : broken ? DARK : run, rest = needed - (end - begin);
+                const int lacks = remain[p] == 0 || broken ? 0 : begin == DARK ? needed : rest < 0 ? 0 : rest;
                 before[p - low] = remain[p];
                 times[p] = begin;
                 remain[p] = lacks < MOST ? lacks : MOST;
             }
-            if (!subframe) {
+            if (!SUBFRAME) {
                 for (int p = low; p < high; ++p) {
                     const int begin = times[p], frame = begin < 1 ? 1 : begin;
                     const float height = -travel[frame], step = travel[row_length + frame], size = step < 0 ? -step : step;
                     answers[p] = begin > 0 ? height : NAN;
                     answers[stride + p] = begin > 0 ? size * 0.577350269f : NAN;  // over sqrt(3)
-                    status[p] = begin > 0 ? 1 : begin == 0 ? 3 - release : begin == DARK ? never : 0;
+                    status[p] = begin > 0 ? 1 : begin == 0 ? 3 - RELEASE : remain[p] > 0 ? NEVER : 0;
                 }
                 continue;
             }
@@ -373,7 +386,7 @@ __kernel void onset_scan(
                 unclear_travel[p - low] = 0;
                 frame[p - low] = times[p] < 1 ? 1 : times[p];
                 jumped[p - low] = 0;
-                waits[p - low] = (before[p - low] > 0) & (times[p] > 0) & !(dim[p - low] < near_limits[p]);
+                waits[p - low] = (before[p - low] > 0) & (times[p] > 0) & !(dim[p - low] < near_limits[OF(p)]);
                 unsure |= waits[p - low];
             }
             if (unsure) {
@@ -381,7 +394,7 @@ __kernel void onset_scan(
                 for (int p = low, i = 0; p < high; ++p, ++i) second[i] = span[(long)(start + at[i] > 1 ? at[i] - 2 : 0) * pixels + p];
                 for (int p = low, i = 0; p < high; ++p, ++i) {
                     const FRAME sample = dim[i], earlier = SEE(second[i]), first_rise = first_rises[p];
-                    const FRAME dark_limit = dark_limits[p], near_limit = near_limits[p];
+                    const FRAME dark_limit = dark_limits[OF(p)], near_limit = near_limits[OF(p)];
                     const int begin = times[p], dark = darks[p], last_far = last_fars[p];
                     const int new = waits[i] & (begin >= now);
                     const int next = new & (start + at[i] > 1) & (earlier < near_limit);
@@ -398,7 +411,7 @@ __kernel void onset_scan(
                     const int begin = times[p], kept = waits[i], from = kept ? begin - 1 : 0, dark = kept ? darks[p] : 0;
                     waited[i] = kept ? begin - dark : 1;
                     unclear_travel[i] = travel[2 * row_length + from] - travel[2 * row_length + dark];
-                    const float to_level = levels[p] - levels[stride + p];
+                    const float to_level = levels[OF(p)] - levels[PLANE + OF(p)];
                     const float light = later[i], first_rise = first_rises[p];
                     const int rises = first_rise >= light - to_level * 0.125f;
                     jumped[i] = kept & rises & (last_fars[p] + 1 < begin) & (to_level >= CLEAR_RISE * noise);
@@ -411,11 +424,11 @@ __kernel void onset_scan(
             for (int p = low, i = 0; p < high; ++p, ++i) {
                 const int begin = times[p];
                 const float2 crossing = answer(dim[i], bright[i], later[i], waited[i], unclear_travel[i],
-                                               travel[frame[i] - 1], travel[row_length + frame[i]], levels[p],
-                                               levels[stride + p], threshold, noise, dark_tolerance,
+                                               travel[frame[i] - 1], travel[row_length + frame[i]], levels[OF(p)],
+                                               levels[PLANE + OF(p)], threshold, noise, dark_tolerance,
                                                light_tolerance, jumped[i]);
                 const float height = answers[p], spread = rough_inverse_root(crossing.y);
-                const uchar was = status[p], is = begin > 0 ? 1 : begin == 0 ? 3 - release : begin == DARK ? never : 0;
+                const uchar was = status[p], is = begin > 0 ? 1 : begin == 0 ? 3 - RELEASE : remain[p] > 0 ? NEVER : 0;
                 answers[p] = before[i] == 0 ? height : begin > 0 ? crossing.x : NAN;
                 sigma[i] = before[i] == 0 ? sigma[i] : begin > 0 ? crossing.y * spread : NAN;
                 status[p] = before[i] == 0 ? was : is;
@@ -424,11 +437,11 @@ __kernel void onset_scan(
             for (int p = low; p < high && running; ++p) {
                 const int begin = times[p], dark = darks[p], last_far = last_fars[p];
                 const FRAME first_rise = first_rises[p];
-                const int rises = (begin > 0) & (dim[p - low] < near_limits[p]);
+                const int rises = (begin > 0) & (dim[p - low] < near_limits[OF(p)]);
                 lows[p] = dim[p - low];
                 highs[p] = bright[p - low];
                 laters[p] = later[p - low];
-                darks[p] = ((begin > 0) & (dim[p - low] < dark_limits[p])) ? begin - 1 : dark;
+                darks[p] = ((begin > 0) & (dim[p - low] < dark_limits[OF(p)])) ? begin - 1 : dark;
                 last_fars[p] = rises ? begin - 1 : last_far;
                 first_rises[p] = rises ? bright[p - low] : first_rise;
             }
@@ -436,15 +449,15 @@ __kernel void onset_scan(
     }
 
     for (int p = 0; p < width; ++p) frames_left[base + p] = remain[p];
-    if (!subframe) return;
+    if (!SUBFRAME) return;
     // If the last sample is near the level, the next block cannot determine how long it has been.
     __global const FRAME *restrict final = frames + (size_t)(count - 1) * pixels;
     for (int low = 0, high; low < width; low = high) {
         high = min(low + CHUNK, width);
         int unsure = 0;
-        for (int p = low; p < high; ++p) unsure |= (remain[p] == whole) & !(SEE(final[p]) < near_limits[p]);
+        for (int p = low; p < high; ++p) unsure |= (remain[p] == whole) & !(SEE(final[p]) < near_limits[OF(p)]);
         for (int p = low; p < high && unsure; ++p)
-            if (times[p] == DARK && SEE(final[p]) >= near_limits[p]) LOOK_BACK(p, first + count - 1)
+            if (times[p] == DARK && SEE(final[p]) >= near_limits[OF(p)]) LOOK_BACK(p, first + count - 1)
     }
     for (int p = 0; p < width; ++p) lasts[p] = final[p];
 }
