@@ -322,10 +322,10 @@ class Run(ThreadSafe):
         if operation.passes == 2 and (not operation._second_pass or operation.count != self._expected):
             raise InputError(f"{type(operation).__name__} needs the same frames twice")
         one_reading = self._better_operation() is not None if self._read_once is None else self._read_once
-        operation.ended = ended
+        watch, operation.ended = self._watch, ended
+        findings = () if watch is None else watch.findings()  # while the device computes
         computed = as_result(operation, operation.result(), copied=not ended)
         source = cast("Source", self._source)
-        watch = self._watch
         samples, time = (None, None) if watch is None else (watch.samples, watch.series.get("time"))
         first = 0 if plan.frames is None else plan.frames.start
         context = Context(source, operation, cast("Source", self._stream), first, samples, time, computed)
@@ -338,7 +338,6 @@ class Run(ThreadSafe):
             context.earlier[type(step)] = result
             if all(result.name_of(quantity) for quantity in step.needs):
                 result = step.apply(result, context)
-        findings = () if watch is None else watch.findings()
         kinds, usual = operation.corrected_kinds, operation.usual_findings
         reported = (_as_corrected(finding, kinds) for finding in findings if finding.kind not in usual)
         result = with_findings(result, *([_ONE_READING] if one_reading else []), *reported)

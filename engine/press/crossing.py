@@ -195,9 +195,10 @@ class Crossing:
                 "levels": Planes(2, np.float32),  # counts at the threshold, and of the dark plateau
                 "thresholds": Planes(3, dtype),  # least sample that is light, not clearly dark, near
             }
-        variant = {"RELEASE": self._release, "SUBFRAME": self._subframe, "ALIKE": alike}
-        macros = {name: int(value) for name, value in variant.items()}
-        self._maps = Picture(operation, "onset", planes, tile=_TILE, **macros)
+        self._maps = Picture(
+            operation, "onset", planes, tile=_TILE, RELEASE=int(self._release),
+            SUBFRAME=int(self._subframe), ALIKE=int(alike),
+        )  # fmt: skip
         fraction = threshold - _ROUNDING
         self._levels: tuple[NDArray[Any], ...] | None = None  # if alike: level, dark plateau, least light
         if alike:

@@ -139,8 +139,9 @@ def taken_from(values: Mapping[str, Any]) -> Fitted:
     >>> taken_from({"noise": 1.5, "turns": "all", "program": "mirrorskin"}).values()
     {'noise': 1.5}
     """
+    declared = parameters(Fitted)
     return Fitted(
-        **{name: _as_declared(values.get(name), parameter) for name, parameter in parameters(Fitted).items()}
+        **{name: _as_declared(value, declared[name]) for name, value in values.items() if name in declared}
     )
 
 

@@ -31,13 +31,13 @@ HOLE[:, 30, 40] = np.nan
 MAPS_OF_A_FIT = {"mean", "cosine", "sine", "residual"}
 
 ON_FRAMES = {
-    "onset": (engine.find_onset, PRESS, TRAVEL, LEVELS, {"height", "height_sigma", "status"}),
+    "onset": (engine.find_onset, PRESS, TRAVEL, LEVELS, {"height", "height_sigma", "status", "frame"}),
     "levels of scatter": (
         engine.find_onset,
         PRESS,
         TRAVEL,
         LEVELS | {"dark_sigma": 1.0},
-        {"height", "status"},
+        {"height", "status", "frame"},
     ),
     "change point": (engine.find_change_point, PRESS, TRAVEL, LEVELS, {"height"}),
     "change point, no levels": (engine.find_change_point, PRESS, TRAVEL, {}, {"height"}),
