@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, Union
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.base.device_arrays import as_any_array
 from mirrorskin.io import Fitted, InputError, Result, open_result, pixel_axes
 from mirrorskin.io.base.arguments import as_array, check_pixel_size
 from mirrorskin.io.model.fitted import taken_from
@@ -128,6 +127,8 @@ def _of_mapping(maps: Mapping[Any, Any], name: str) -> Result:
 
     Those that `mirrorskin.io.Fitted` declares, such as ``tilt``, are in its ``fitted``, too.
     """
+    from mirrorskin.engine.base.device_arrays import as_any_array  # imports OpenCL, which files do not need
+
     fields = {key: value for key, value in maps.items() if key in FIELDS and value is not None}
     for axis in fields.keys() & {"x", "y"}:
         fields[axis] = np.asarray(as_array(f"{name}[{axis!r}]", fields[axis], "mm"), np.float64)

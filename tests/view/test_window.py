@@ -27,7 +27,7 @@ def test_without_windows_there_is_no_screen():
 @pytest.mark.parametrize("name", ["tkagg", "QtAgg"])
 def test_a_means_to_open_windows_is_a_screen(monkeypatch, name):
     asked = []
-    monkeypatch.setattr(matplotlib, "get_backend", lambda: name)
+    monkeypatch.setattr(matplotlib, "get_backend", lambda **_: name)
     monkeypatch.setattr(pyplot, "switch_backend", asked.append)
     assert window.has_screen()
     assert asked == [name]
@@ -38,6 +38,7 @@ def test_a_means_that_fails_here_is_not_a_screen(monkeypatch):
     def refuse(name):
         raise ImportError(f"cannot load {name}: headless")
 
+    monkeypatch.setattr(matplotlib, "get_backend", lambda **_: "tkagg")
     monkeypatch.setattr(pyplot, "switch_backend", refuse)
     assert not window.has_screen()
 

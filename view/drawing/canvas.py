@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
@@ -215,20 +217,26 @@ def round_length(length: float, up: bool = False) -> float:
 
 
 _SCREEN = 1600, 900  # largest size of a window in pixels
+_DISPLAYS = "DISPLAY", "WAYLAND_DISPLAY"  # variables of screens of Linux
 
 
 def has_screen() -> bool:
     """Return whether Matplotlib can open windows, also considering ``MPLBACKEND``."""
     check_drawing()
     import matplotlib
-    from matplotlib import pyplot
     from matplotlib.backends.registry import BackendFilter, backend_registry
+
+    opens = backend_registry.list_builtin(BackendFilter.INTERACTIVE)  # type: ignore[no-untyped-call]
+    chosen = matplotlib.get_backend(auto_select=False)
+    has_display = sys.platform != "linux" or any(map(os.environ.get, _DISPLAYS))
+    if not has_display if chosen is None else chosen.lower() not in opens:
+        return False  # as pyplot would find, which takes long to import
+    from matplotlib import pyplot
 
     try:
         pyplot.switch_backend(matplotlib.get_backend())
     except ImportError:  # the requested backend is not installed
         return False
-    opens = backend_registry.list_builtin(BackendFilter.INTERACTIVE)  # type: ignore[no-untyped-call]
     return matplotlib.get_backend().lower() in opens
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,6 +58,8 @@ def grey(values: NDArray[Any], low: float, high: float) -> Colours:
 
 def height_colours(values: NDArray[Any], low: float, high: float) -> Colours:
     """Return colours from violet at ``low`` to yellow at ``high``; undefined values have their own colour."""
+    import cv2
+
     shades = cv2.applyColorMap(grey(values, low, high), cv2.COLORMAP_VIRIDIS)
     colours = np.asarray(cv2.cvtColor(shades, cv2.COLOR_BGR2RGB), np.uint8)
     colours[np.isnan(values)] = MISSING_RGB

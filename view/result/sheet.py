@@ -115,7 +115,8 @@ def lay_out(axes: Axes, sheet: Sheet) -> None:
 
 def entitle(axes: Axes, title: str, note: str = "") -> None:
     """Add a title to a panel, and a note in smaller letters below it."""
-    axes.set_title(title, loc="left", fontsize=TITLE, weight="bold", pad=18, parse_math=False)
+    # Without y, Matplotlib measures all tick labels to place the title.
+    axes.set_title(title, loc="left", y=1.0, fontsize=TITLE, weight="bold", pad=18, parse_math=False)
     axes.set_anchor("NW")  # aligns the titles of a row
     axes.annotate(
         note,
