@@ -29,7 +29,13 @@ MEMORY_LIMIT = 256_000_000
 
 _MOST_PIXELS = 2**30  # kernels index the pixels of two planes with an int
 _LINE = 64  # bytes of the longest word that a kernel loads at once
-_PIECE = 64_000_000  # bytes that are copied to discrete memory at once: enough for the full transfer rate
+_RESERVED = (
+    64_000_000  # bytes of frames for which discrete memory is reserved: enough for the full transfer rate
+)
+_PIECE = (
+    512_000_000  # most bytes of frames in discrete memory; each launch also moves the state of all pixels
+)
+_STEP = 16  # frames: long pieces are multiples of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +142,7 @@ class Band:
         self._buffers = (
             [] if device.info.shares_memory else _frame_buffers(device, self.length, min_frames, shape, dtype)
         )
+        self._longest = _PIECE // (self.pixels * dtype.itemsize) // _STEP * _STEP  # frames in one piece
         self._borrowed: BorrowedBuffer | None = None
         self._only = True  # whether the picture has no other bands
         self._blank = set(maps)  # maps that are uninitialised
@@ -244,10 +251,21 @@ class Band:
 
     def _copy(self, frames: NDArray[Any], start: int) -> Staged:
         """Start to copy frames to one of two buffers on the device, while kernels process the other."""
+        self._grow(min(len(frames), self._longest, self._most))
         self._buffers.reverse()
         part = frames[: self._buffers[0].shape[0]]
         self._buffers[0].write(part)
         return Staged(self._buffers[0], slice(start, start + len(part)))
+
+    def _grow(self, length: int) -> None:
+        """Replace the buffers for frames by longer ones, if this is the only band and there is memory."""
+        if not self._only or length <= len(self._buffers[0]):
+            return
+        shape = length, *self._shape
+        try:
+            self._buffers = [self.device.array("frames", shape, self._dtype, zeroed=False) for _ in range(2)]
+        except DeviceMemoryError:
+            self._longest = len(self._buffers[0])
 
     def _park(self) -> None:
         for name, array in self.maps.items():
@@ -363,7 +381,7 @@ def _frame_buffers(
     device: Device, length: int, min_frames: int, shape: tuple[int, int], dtype: np.dtype[Any]
 ) -> list[Array]:
     """Allocate two buffers for frames on a device, up to a length; one if two do not fit."""
-    length = max(min_frames, min(length, _PIECE // (math.prod(shape) * dtype.itemsize)))
+    length = max(min_frames, min(length, _RESERVED // (math.prod(shape) * dtype.itemsize)))
     places: list[Array] = []
     while len(places) < 2:
         try:

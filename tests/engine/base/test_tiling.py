@@ -6,6 +6,7 @@ from bare import find_onset, ready
 from presses import assert_equal, random_press
 
 from mirrorskin.engine import Onset
+from mirrorskin.engine.base import tiling
 from mirrorskin.io import Block
 from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.array import BorrowedBuffer
@@ -57,6 +58,19 @@ def test_the_room_of_a_picture_in_bands_holds_many_frames(small_device):
     search.push(search.staging_buffer[:30], travel=TRAVEL)
     small_device.max_allocation = 10**9
     assert_equal(search.result(), find_onset(FRAMES, TRAVEL, dark=20, bright=220, device=small_device))
+
+
+def test_many_frames_are_copied_to_a_device_in_multiples_of_16(device, monkeypatch):
+    monkeypatch.setattr(tiling, "_RESERVED", 4 * FRAMES[0].nbytes)
+    monkeypatch.setattr(tiling, "_PIECE", 29 * FRAMES[0].nbytes)
+    search = ready(Onset(dark=20, bright=220, device=device), FRAMES, TRAVEL)
+    band = search.operation._picture.bands[0]
+    assert [staged.count for staged in band.stage(FRAMES)] == (
+        [30] if device.info.shares_memory else [16, 14]
+    )
+    search.push(FRAMES, travel=TRAVEL)
+    monkeypatch.undo()
+    assert_equal(search.result(), find_onset(FRAMES, TRAVEL, dark=20, bright=220, device=device))
 
 
 def lent(frames, offset):
