@@ -154,26 +154,18 @@ def find_zenith_bias(
     with a free height of each part; their covariance is from the scatter of the parts, within which errors
     are correlated.
     """
-    dz_dx, dz_dy = (values.astype(np.float64) for values in (slopes.dz_dx, slopes.dz_dy))
-    steepness = np.hypot(dz_dx, dz_dy)
-    rise = 1 + steepness**2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        factors = (
-            np.where(steepness > 0, rise * np.arctan(steepness) / steepness, 0.0),
-            np.where(steepness > _MIN_SLOPE, rise / steepness, 0.0),
-        )
-    parts = []
-    for slope, size, turned in ((dz_dx, pixel_size[0], False), (-dz_dy, pixel_size[1], True)):
-        maps = [slope * size, *(factor * slope * size for factor in factors), slopes.defined, height, weight]
-        parts += _parts([values.T for values in maps] if turned else maps)
-    if len(parts) < _MIN_PARTS:
+    maps = [slopes.dz_dx, slopes.dz_dy, slopes.defined, height, weight]
+    matrices, rights = zip(
+        _parts(maps, 0, pixel_size[0]), _parts([values.T for values in maps], 1, -pixel_size[1]), strict=True
+    )
+    matrices, rights = np.concatenate(matrices), np.concatenate(rights)
+    if len(matrices) < _MIN_PARTS:
         return None
-    matrix = np.sum([normal for normal, _ in parts], axis=0)
-    right = np.sum([values for _, values in parts], axis=0)
+    matrix, right = matrices.sum(axis=0), rights.sum(axis=0)
     if np.linalg.cond(matrix) > 1e12:
         return None
     error = np.linalg.solve(matrix, right)
-    scatter = np.stack([values - normal @ error for normal, values in parts])
+    scatter = rights - matrices @ error
     inverse = np.linalg.inv(matrix)
     covariance = inverse @ (scatter.T @ scatter) @ inverse
     chi2 = float(error @ np.linalg.solve(covariance, error))
@@ -183,29 +175,44 @@ def find_zenith_bias(
     return ZenithBias(gain, offset)
 
 
-def _parts(maps: Sequence[NDArray[Any]]) -> list[tuple[Doubles, Doubles]]:
-    """Return the normal equations of parts of rows: of errors that raise the slopes, less a common height."""
-    slope, by_gain, by_offset, defined, height, weight = maps
-    rows = slope.shape[0]
-    parts = []
+def _parts(maps: Sequence[NDArray[Any]], along: int, size: float) -> tuple[Doubles, Doubles]:
+    """Return the normal equations of n parts of rows: of errors that raise the slopes, less a common height.
+
+    These are matrices, (n, 2, 2), and right-hand sides, (n, 2). Slopes along rows are the first or the second
+    of the maps; ``size`` is the distance of pixels along rows, mm, with the sign of the slope.
+    """
+    rows = maps[0].shape[0]
     step = max(_MIN_LINE_DISTANCE, -(-rows // _MAX_LINES))
-    for row in range(step // 2, rows, step):
-        ends = np.flatnonzero(np.diff(defined[row].astype(np.int8), prepend=0, append=0))
-        for start, end in zip(ends[::2], ends[1::2], strict=True):
-            for first in range(start, end, _MAX_PART):
-                part = row, slice(first, min(first + _MAX_PART, end))
-                used = weight[part]
-                if len(used) < _MIN_PART or np.count_nonzero(used) < _WITH_HEIGHT:
-                    continue
-                values = np.stack([by_gain[part], by_offset[part], slope[part]])
-                sums = np.zeros(values.shape)
-                np.cumsum((values[:, 1:] + values[:, :-1]) / 2, axis=1, out=sums[:, 1:])
-                # Slopes that contain the error rise by too much: heights less sums are minus its sums.
-                sums[2] -= np.where(used > 0, height[part], 0.0)
-                sums -= (sums @ used / used.sum())[:, np.newaxis]
-                normal = (sums * used) @ sums.T
-                parts.append((normal[:2, :2], normal[:2, 2]))
-    return parts
+    dz_dx, dz_dy, defined, height, weight = (
+        np.pad(values[step // 2 :: step], ((0, 0), (0, _MAX_PART))).ravel().astype(np.float64)
+        for values in maps
+    )
+    ends = np.flatnonzero(np.diff(defined, prepend=0, append=0)).reshape(-1, 2)
+    count = -(-np.diff(ends)[:, 0] // _MAX_PART)
+    place = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    start = np.repeat(ends[:, 0], count) + _MAX_PART * place
+    length = np.minimum(np.repeat(ends[:, 1], count) - start, _MAX_PART)
+    inside = np.arange(_MAX_PART) < length[:, np.newaxis]
+    at = start[:, np.newaxis] + np.arange(_MAX_PART)
+    used = np.where(inside, weight[at], 0.0)
+    enough = (length >= _MIN_PART) & (np.count_nonzero(used, axis=1) >= _WITH_HEIGHT)
+    used, inside, at = used[enough], inside[enough], at[enough]
+
+    dz_dx, dz_dy = (np.where(inside, values[at], 0.0) for values in (dz_dx, dz_dy))
+    steepness = np.hypot(dz_dx, dz_dy)
+    rise = 1 + steepness**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_gain = np.where(steepness > 0, rise * np.arctan(steepness) / steepness, 0.0)
+        by_offset = np.where(steepness > _MIN_SLOPE, rise / steepness, 0.0)
+    slope = (dz_dx, dz_dy)[along] * size
+    values = np.stack([by_gain * slope, by_offset * slope, slope])
+    sums = np.zeros(values.shape)
+    np.cumsum((values[..., 1:] + values[..., :-1]) / 2, axis=-1, out=sums[..., 1:])
+    # Slopes that contain the error rise by too much: heights less sums are minus its sums.
+    sums[2] -= np.where(used > 0, height[at], 0.0)
+    sums -= (np.sum(sums * used, axis=-1) / used.sum(axis=-1))[..., np.newaxis]
+    normal = np.einsum("ank,bnk->nab", sums[:2] * used, sums)
+    return normal[..., :2], normal[..., 2]
 
 
 def _cells(values: NDArray[Any]) -> Doubles:

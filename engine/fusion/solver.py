@@ -288,11 +288,16 @@ def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> t
 
 def _medians(values: Doubles, label: NDArray[np.integer], count: int) -> Doubles:
     """Return the median of each label's values, 0 without any."""
-    ordered = np.append(values[np.lexsort((values, label))], 0.0)
     members = np.bincount(label, minlength=count)
-    first = np.cumsum(members) - members
-    middles = (ordered[first + (members - 1) // 2 * (members > 0)] + ordered[first + members // 2]) / 2
-    return np.where(members, middles, 0.0)
+    largest = int(np.argmax(members))
+    others = label != largest  # few, as a rule: they are sorted
+    ordered = np.append(values[others][np.lexsort((values[others], label[others]))], 0.0)
+    sizes = np.where(np.arange(count) == largest, 0, members)
+    first = np.cumsum(sizes) - sizes
+    middles = (ordered[first + (sizes - 1) // 2 * (sizes > 0)] + ordered[first + sizes // 2]) / 2
+    medians = np.where(sizes, middles, 0.0)
+    medians[largest] = np.median(values[~others])
+    return medians
 
 
 def _share_used(error: Doubles, half: Doubles, height: Doubles) -> float:
