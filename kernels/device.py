@@ -49,6 +49,7 @@ _FOLDER = Path(__file__).parent
 _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
 _numbers = itertools.count()  # of buffers that were arguments of kernels
+_UNSET = object()  # no value of an argument
 _opened: WeakSet[Device] = WeakSet()
 _left_out: set[cl.Device] = set()  # devices that failed and were replaced by others
 _KINDS = ("gpu", "cpu", "other")  # in the order of preference
@@ -589,7 +590,8 @@ class Kernel:
         self._signature = [(name, converter(name, type_name)) for name, type_name in signature]
         self.arguments: tuple[str, ...] = tuple(name for name, _ in signature)
         self._names = frozenset(self.arguments)
-        self._set: list[object] = [...] * len(signature)  # the current value of each argument
+        self._set = [_UNSET] * len(signature)  # the current value of each argument
+        self._given = [_UNSET] * len(signature)  # the number that was converted to it
         self.group: int = _group_of(kernel, device.context.devices[0], device.layout.group)
 
     def __call__(
@@ -620,17 +622,21 @@ class Kernel:
         TypeError
             An argument is missing, unknown, or not a number where one is needed.
         """
-        args = self._in_order(arguments)
+        if arguments.keys() != self._names:
+            missing = [name for name in self.arguments if name not in arguments]
+            unknown = [name for name in arguments if name not in self._names]
+            raise TypeError(
+                f"{self.name}: missing: {missing}; unknown: {unknown}; it takes {[*self.arguments]}"
+            )
         group = self.group
         size = -(-items // group) * group
-        arrays = [arg for arg in args if isinstance(arg, Operand)]
-        complete = cl.command_execution_status.COMPLETE
         try:
             with self._device._launching:  # because a kernel object stores the arguments until it is enqueued
-                for place, arg in enumerate(args):
-                    self._put(place, arg)
+                arrays = self._bind(arguments)
                 copies = [array.arrived for array in arrays if array.arrived is not None]
-                copies = [copy for copy in copies if copy.command_execution_status != complete]
+                if copies:
+                    complete = cl.command_execution_status.COMPLETE
+                    copies = [copy for copy in copies if copy.command_execution_status != complete]
                 with self._device.enqueuing:
                     event = cl.enqueue_nd_range_kernel(
                         self._device.queue, self._kernel, (size,), (group,), (first_item,), wait_for=copies
@@ -641,41 +647,41 @@ class Kernel:
         except cl.Error as error:
             raise device_error(self._device, f"run {self.name}", error) from error
 
-    def _put(self, place: int, value: Any) -> None:
-        """Set an argument, unless it has this value already: setting it takes longer than a launch."""
-        key: object = value
-        if isinstance(value, Operand):
-            value = value.buffer
-            # Not id(): a new buffer may have the id of a deleted one.
-            key = value.__dict__.setdefault("number", next(_numbers))
-        elif value is not None:
-            key = value.tobytes()  # 0 and -0 are equal
-        if key != self._set[place]:
-            self._set[place] = ...
-            self._kernel.set_arg(place, value)
-            self._set[place] = key
+    def _bind(self, arguments: dict[str, Any]) -> list[Operand]:
+        """Set the arguments that are not as in the last launch, and return the arrays.
 
-    def _in_order(self, arguments: dict[str, Any]) -> tuple[Any, ...]:
-        """Return arguments in the source's order, numbers in its types."""
-        if arguments.keys() != self._names:
-            missing = [name for name in self.arguments if name not in arguments]
-            unknown = [name for name in arguments if name not in self._names]
-            raise TypeError(
-                f"{self.name}: missing: {missing}; unknown: {unknown}; it takes {[*self.arguments]}"
-            )
-        values = []
-        for name, convert in self._signature:
-            value = arguments[name]
-            if convert is None:
-                if not (value is None or isinstance(value, Operand)):
-                    raise TypeError(f"{self.name}: {name} must be an array of the device, not {value!r}")
-            else:
+        Setting all of them takes longer than a launch.
+        """
+        arrays: list[Operand] = []
+        for place, (name, convert) in enumerate(self._signature):
+            given = arguments[name]
+            if convert is not None:
+                # The same number needs no conversion; an array of no dimension may have changed.
+                if given is self._given[place] and not isinstance(given, np.ndarray):
+                    continue
+                self._given[place] = _UNSET
                 try:
-                    value = convert(value)
+                    value = convert(given)
                 except (TypeError, OverflowError) as error:
-                    raise TypeError(f"{self.name}: {name} cannot be {value!r}: {error}") from error
-            values.append(value)
-        return tuple(values)
+                    raise TypeError(f"{self.name}: {name} cannot be {given!r}: {error}") from error
+                key = value.tobytes()  # 0 and -0 are equal
+            elif isinstance(given, Operand):
+                arrays.append(given)
+                value = given.buffer
+                key = value.__dict__.get("number")
+                if key is None:  # not id(): a new buffer may have the id of a deleted one
+                    key = value.__dict__["number"] = next(_numbers)
+            elif given is None:
+                value = key = None
+            else:
+                raise TypeError(f"{self.name}: {name} must be an array of the device, not {given!r}")
+            if key != self._set[place]:
+                self._set[place] = _UNSET
+                self._kernel.set_arg(place, value)
+                self._set[place] = key
+            if convert is not None:
+                self._given[place] = given
+        return arrays
 
 
 def _group_of(kernel: cl.Kernel, device: cl.Device, desired: int) -> int:

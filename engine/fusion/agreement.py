@@ -155,10 +155,8 @@ def find_zenith_bias(
     are correlated.
     """
     maps = [slopes.dz_dx, slopes.dz_dy, slopes.defined, height, weight]
-    matrices, rights = zip(
-        _parts(maps, 0, pixel_size[0]), _parts([values.T for values in maps], 1, -pixel_size[1]), strict=True
-    )
-    matrices, rights = np.concatenate(matrices), np.concatenate(rights)
+    parts = _parts(maps, 0, pixel_size[0]), _parts([values.T for values in maps], 1, -pixel_size[1])
+    matrices, rights = (np.concatenate(values) for values in zip(*parts, strict=True))
     if len(matrices) < _MIN_PARTS:
         return None
     matrix, right = matrices.sum(axis=0), rights.sum(axis=0)

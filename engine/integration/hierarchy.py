@@ -94,6 +94,7 @@ class Hierarchy:
 
     def __init__(self, shape: tuple[int, int], anchored: bool, device: Device) -> None:
         self.device, self.anchored = device, anchored
+        self._kernels: dict[tuple[str, int, int, bool], Kernel] = {}
         self.levels: list[Level] = cut_levels(shape)
         self.nodes: int = self.levels[-1].end + _BEYOND
         places = [[*level.place.values()] for level in self.levels]
@@ -181,6 +182,12 @@ class Hierarchy:
 
         ``once``: for levels that are visited once, where a GPU does one more step per half cycle.
         """
+        kernel = self._kernels.get((name, links, lanes, once))
+        if kernel is None:
+            kernel = self._kernels[name, links, lanes, once] = self._build_kernel(name, links, lanes, once)
+        return kernel
+
+    def _build_kernel(self, name: str, links: int, lanes: int, once: bool) -> Kernel:
         width = 8 if self.device.layout.tile > 1 and lanes == 1 else 1
         macros = {"ANCHORED": int(self.anchored), "LINKS": links, "PART": part_of(self.device)}
         macros |= {"ROWS": tile_rows(self.device, lanes), "COLUMNS": tile_columns(self.device, lanes)}

@@ -127,8 +127,8 @@ class Multigrid:
             solver.copy("release", solver.cycle.x, height, batch)
         return height
 
-    def follow(self, links: Links, *, deep: bool) -> Array:
-        """Do one step from the last heights towards those of a similar graph.
+    def follow(self, links: Links, *, deep: bool, start: Array | None = None) -> Array:
+        """Do one step from the last heights, or from ``start``, (H, W), towards those of a similar graph.
 
         The step minimises the energy in the plane of the preconditioned residual and the last step. It is a
         conjugate gradient step if the graph is unchanged, and never increases the error. The step is only
@@ -137,8 +137,12 @@ class Multigrid:
         """
         h, solver = self._hierarchy, self._alone
         cycle = solver.cycle
+        self._links = links
         h.follow(links, deep=deep)
         cycle.follow(deep=deep)
+        if start is not None:
+            solver.copy("admit", solver.x, start)
+            solver.p.fill()
         solver.started = True
         solver.copy("admit", solver.source, links.source)
         solver.find_residual()

@@ -29,10 +29,8 @@ _BROKEN = 6.0
 """k r^2 (see ``mirrorskin.kernels.integration.breaks``) above which a link crosses a discontinuity."""
 
 _SCALES = 16.0, 8.0, 4.0, 2.0, 1.0  # tolerated misfits of a link, in 1 / sqrt(2 k)
-_MAX_STEPS = 4  # at a scale
-_MIN_DECREASE = 0.02  # relative decrease of broken links from which on steps continue
-_LOOSE = 0.001  # residual of a step's solution
-_CYCLES = 10  # maximum number of cycles of a step
+_STEPS = 3  # at a scale
+_LOOSE, _CYCLES = 0.001, 10  # residual and maximum number of cycles of the first solution of a search
 
 _MAX_SQUARE = 1e4  # k r^2 above which a link is cut for a step, because tiny weights cannot be solved
 _AGAIN = 3  # largest number of additional solutions at the end
@@ -53,7 +51,7 @@ class Robust:
     flags: Flags  # (H, W), uint8: the flags without broken links, and without links between parts
     edges: Flags  # (H, W), uint8: 1 on both sides of a discontinuity
     doubt: Floats  # (H, W): variance of heights about the mean of their component because of breaks, mm^2
-    iterations: int  # number of solutions
+    iterations: int  # number of solutions and steps
     residual: float  # of the last solution
     converged: bool  # whether all steps were done, and the last residual is within the tolerance
 
@@ -99,12 +97,12 @@ def solve_robust(
         return search.conclude(search.descend(first), flags, tolerance, plain, components)
     best = search.descend()
     if search.contradicted and not search.late():
-        local, broken = best.read(), search.link(best)
+        local, broken = best.read(), search.broken(best)
         search.trust(*_WIDE)
         best = search.descend()
         search.trust(*_LOCAL)
         best = search.descend(best)
-        if search.link(best) >= broken:
+        if search.broken(best) >= broken:
             best = links.device.from_host("first", local)
     return search.conclude(best, flags, tolerance, plain, components)
 
@@ -160,23 +158,24 @@ class _Search:
 
         From given heights, only the last scales are used.
         """
-        scales: tuple[float, ...] = _SCALES[2:]
+        scales: tuple[float, ...] = _SCALES[3:]
         if heights is None:
             self.link(self._held, math.inf)
-            heights, scales = self._solve(None, _LOOSE).height, _SCALES
+            heights, scales = self._solve(None, _LOOSE, _CYCLES).height, _SCALES
+        start: Array | None = heights
         for scale in scales:
-            broken = math.inf
-            for _ in range(_MAX_STEPS):
+            for step in range(_STEPS):
                 if self.late():
                     return heights
-                before, broken = broken, self.link(heights, scale)
-                if broken > (1 - _MIN_DECREASE) * before:
-                    break
-                heights = self._solve(heights, _LOOSE).height
+                self.link(heights, scale)
+                links = self._current()
+                if step == 0:
+                    self._solver.rebuild(links)
+                heights, start = self._solver.follow(links, deep=False, start=start), None
         return heights
 
-    def link(self, heights: Array, scale: float = 1.0, cap: float = math.inf) -> float:
-        """Compute the weights of links from the misfit of heights; return the number of broken links."""
+    def link(self, heights: Array, scale: float = 1.0, cap: float = math.inf) -> None:
+        """Compute the weights of links from the misfit of heights."""
         names = "weight_x", "weight_y", "rise_x", "rise_y", "right", "down", "source"
         numbers = {
             "sharpness": self._sharpness / scale**2,
@@ -186,16 +185,22 @@ class _Search:
         maps = {**{name: self._maps[name] for name in names}, **self._slopes}
         maps |= {"held": self._held, "heights": heights, "sums": self._sums}
         self._run("links", **maps, **self._size, **numbers)
+
+    def broken(self, heights: Array) -> float:
+        """Return the number of links that heights break."""
+        self.link(heights)
         return float(self._sums.read().sum(dtype=np.float64))
 
-    def _solve(self, start: Array | None, tolerance: float) -> Solution:
-        """Solve for the weights of the last `link`."""
+    def _current(self) -> Links:
+        """Return the graph with the weights of the last `link`."""
         right, down, source = (self._maps[name] for name in ("right", "down", "source"))
-        links = Links(self._links.device, self._shape, right, down, self._links.anchor, source)
-        self._solver.rebuild(links)
         self._steps += 1
-        self.last = links
-        limit = _CYCLES if tolerance == _LOOSE else 100
+        self.last = Links(self._links.device, self._shape, right, down, self._links.anchor, source)
+        return self.last
+
+    def _solve(self, start: Array | None, tolerance: float, limit: int = 100) -> Solution:
+        """Solve for the weights of the last `link`."""
+        self._solver.rebuild(self._current())
         return self._solver.solve(start, tolerance=tolerance, limit=limit, deadline=self._deadline)
 
     def conclude(
