@@ -169,9 +169,10 @@ class Texture:
         mean, half = (first + last) / 2, (first - last) / 2
         smallest = mean - spurious - np.sqrt(half**2 + mixed**2)  # smaller eigenvalue
         textured = smallest >= np.maximum(spurious, np.finfo(float).tiny)
-        inverse = 2 * variance * invert_symmetric(level.information)
-        covariance = np.where(textured, inverse[[0, 1, 1, 2]], np.nan)
-        covariance = np.moveaxis(covariance, 0, -1).reshape(*level.grid, 2, 2)
+        inverse = np.where(textured, 2 * variance, np.nan) * invert_symmetric(level.information)
+        covariance = np.empty((*level.grid, 2, 2))
+        covariance[..., 0, 0], covariance[..., 1, 1] = inverse[0], inverse[2]
+        covariance[..., 0, 1] = covariance[..., 1, 0] = inverse[1]
         return cls(covariance, textured, level.usable, variance, float(np.sqrt(usual)))
 
     def refuse_clear(self, name: str) -> None:
@@ -220,15 +221,15 @@ def bending_variance(displacement: Doubles, variance: Doubles, step: int, window
     apart = max(1, round(window / step))
     laplacian = np.zeros(displacement.shape)
     for axis in (0, 1):
-        if displacement.shape[axis] > 2 * apart:
-            n = displacement.shape[axis]
-            before, here, after = (
-                displacement.take(np.arange(k, n - 2 * apart + k), axis) for k in (0, apart, 2 * apart)
-            )
-            inside = [(apart, apart) if k == axis else (0, 0) for k in range(3)]
-            laplacian += np.pad(before - 2 * here + after, inside, mode="edge")
-    filled = [fill_with_nearest(part) for part in np.moveaxis(laplacian, -1, 0)]
-    bias = np.stack(filled, axis=-1) * (window / (apart * step)) ** 2 / 24
+        sums, values = (np.moveaxis(part, axis, 0) for part in (laplacian, displacement))
+        if len(values) > 2 * apart:
+            second = values[: -2 * apart] + values[2 * apart :]
+            second -= 2 * values[apart:-apart]
+            sums[apart:-apart] += second
+            sums[:apart] += second[0]
+            sums[-apart:] += second[-1]
+    bias = np.stack([fill_with_nearest(part) for part in np.moveaxis(laplacian, -1, 0)], axis=-1)
+    bias *= (window / (apart * step)) ** 2 / 24
     return np.asarray(np.fmax(bias**2 - _LAPLACIAN_NOISE * variance, 0))
 
 

@@ -126,7 +126,7 @@ class Tracker:
             ranks = np.maximum(ranks, ranks.take(np.arange(1, ranks.shape[axis] + 1), axis, mode="clip"))
         worst = np.argsort(rank).astype(np.uint8)[ranks]
         rows, columns = (place.astype(int) for place in self._places())
-        return worst.take(rows, 1).take(columns, 2)
+        return worst.take(columns, 2).take(rows, 1)
 
     def nearest(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return at all pixels the value of the nearest node, (rows, columns)."""

@@ -642,16 +642,20 @@ __kernel void displacement_field(
                 const int low = GREATER(0, -node - k), high = LESSER(size, node_columns - node - k);
                 const int other = here + j * node_columns + k;
                 for (int i = low; i < high; ++i) {
-                    const float to_right = answer[other + i], to_down = answer[nodes + other + i];
-                    const int finite = to_right - to_right == 0;
-                    const float weight = finite ? share * trust[other + i] : 0;
+                    MAP at = answer + other + i;
+                    const float to_right = at[0], to_down = at[nodes], trusted = trust[other + i];
+                    const float right_x = at[2 * nodes], right_y = at[3 * nodes];
+                    const float down_x = at[4 * nodes], down_y = at[5 * nodes];
                     const float from_right = field[other + i], from_down = field[nodes + other + i];
-                    const float step_right = LIMITED(finite ? to_right - from_right : 0, -MOST_CHANGE, MOST_CHANGE);
-                    const float step_down = LIMITED(finite ? to_down - from_down : 0, -MOST_CHANGE, MOST_CHANGE);
-#define SLOPE(n) LIMITED(finite ? answer[(n) * nodes + other + i] : 0, -1, 1)
+                    const float weight = to_right - to_right == 0 ? share * trusted : 0;
+                    const float new_right = from_right + LIMITED(to_right - from_right, -MOST_CHANGE, MOST_CHANGE)
+                        + LIMITED(right_x, -1, 1) * across + LIMITED(right_y, -1, 1) * below;
+                    const float new_down = from_down + LIMITED(to_down - from_down, -MOST_CHANGE, MOST_CHANGE)
+                        + LIMITED(down_x, -1, 1) * across + LIMITED(down_y, -1, 1) * below;
+                    // NaN is limited to a number, which has no weight.
                     total[i] += weight;
-                    right[i] += weight * (from_right + step_right + SLOPE(2) * across + SLOPE(3) * below);
-                    down[i] += weight * (from_down + step_down + SLOPE(4) * across + SLOPE(5) * below);
+                    right[i] += weight * new_right;
+                    down[i] += weight * new_down;
                 }
             }
         for (int i = 0; i < size; ++i) next_field[here + i] = right[i] / total[i];
