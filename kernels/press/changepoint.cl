@@ -291,8 +291,8 @@ float3 weigh(const samples_t *samples, const query_t query)
         while (first < samples->high && ends.square[first] - ends.fitted[first] > enough) ++first;
         if (length > 2) fits &= fits >> 1;
         const int per_level = length < 2;  // these need a sample on each level
-        const int end = min(last, samples->high - per_level - length);
-        for (int begin = max(samples->low + per_level, first - length); begin <= end; ++begin) {
+        const int end = LESSER(last, samples->high - per_level - length);
+        for (int begin = GREATER(samples->low + per_level, first - length); begin <= end; ++begin) {
             if (!(fits >> begin & 1)) continue;
             float bent = 0;
             const answer_t answer = hypothesis(samples, query, &ends, begin, length, enough, &bent);
@@ -300,7 +300,9 @@ float3 weigh(const samples_t *samples, const query_t query)
             if (answer.misfit > enough) continue;
             const float cost = answer.misfit * scale;
             const int better = cost < best;
-            const float lesser = exponential(-0.5f * fabs(cost - best)), kept = better ? lesser : 1;
+            // A negligible weight is 0. Otherwise the sums become denormal numbers, which are slow.
+            const float apart = better ? best - cost : cost - best;
+            const float lesser = apart > NEGLIGIBLE ? 0 : exponential(-0.5f * apart), kept = better ? lesser : 1;
             const float relative_weight = better ? answer.prior : answer.prior * lesser;
             const float gap = answer.crossing - likely, shift = better ? gap : 0, away = gap - shift;
             square = (square + shift * (shift * weight - 2 * sum)) * kept;
@@ -365,7 +367,7 @@ void gather(
     for (int i = 0; i < SLOTS; ++i) {
         int value = i >= samples->low && i < samples->high ? values[i] : 0;
         if (i > samples->low && i < samples->high - 1) {
-            const int low = min(values[i - 1], values[i + 1]), high = max(values[i - 1], values[i + 1]);
+            const int low = LESSER(values[i - 1], values[i + 1]), high = GREATER(values[i - 1], values[i + 1]);
             value = value > high + limit ? high : value < low - limit ? low : value;
         }
         samples->values[i + 1] = samples->values[i] + value;
