@@ -113,6 +113,12 @@ class Picture:
         """Array in which the next frames may be written before they are pushed, (n, H, W)."""
         return staging_buffer_of(self.bands, self._length)
 
+    def release_frames(self) -> None:
+        """Free the staging buffers."""
+        vars(self).pop("staging_buffer", None)
+        for band in self.bands:
+            band.release_frames()
+
     def fill(self, name: str, values: ArrayLike, plane: int | None = None) -> None:
         """Set a map, or one of its planes, to a number or to a map, (H, W), or (H, W, n) of vectors."""
         values = np.asarray(values)

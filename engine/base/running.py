@@ -325,6 +325,8 @@ class Run(ThreadSafe):
         watch, operation.ended = self._watch, ended
         findings = () if watch is None else watch.findings()  # while the device computes
         computed = as_result(operation, operation.result(), copied=not ended)
+        if ended:
+            operation._release_frames()
         source = cast("Source", self._source)
         samples, time = (None, None) if watch is None else (watch.samples, watch.series.get("time"))
         first = 0 if plan.frames is None else plan.frames.start

@@ -197,6 +197,7 @@ def _fill(
         result[box][hole] = smooth[hole]
         filled[box] |= hole
         unfilled[box][hole] = 0
+    del labels  # a map that the membranes need no more
     _fill_with_membranes(field, valid, unfilled, result)
     filled |= unfilled
     holes = filled > 0

@@ -115,7 +115,8 @@ class HoleFilling(Step):
         travel = context.positions("travel")
         above = None
         if self.event == "onset":  # pixels that are light at the start were touched before
-            above = np.where(result.status == PressStatus.LIGHT_AT_START, -travel[0], np.nan)
+            touched = result.status == PressStatus.LIGHT_AT_START
+            above = np.where(touched, np.float32(-travel[0]), np.float32(np.nan))
         height, filled = fill_holes(
             result.height, result.height_sigma, pixel_size, above=above, deepest=-float(np.max(travel))
         )

@@ -3,8 +3,11 @@
 import subprocess
 import sys
 import textwrap
+import weakref
 
 import numpy as np
+
+from mirrorskin import engine
 
 BLOCK = 8_000_000
 
@@ -53,3 +56,14 @@ def test_peak_memory_is_two_blocks_and_the_maps(tmp_path):
     maps = pixels * 80  # the state, the maps of the answer, and the float64 ones that thresholds are made of
     assert grown < 2 * BLOCK + maps
     assert count * pixels > 2 * (2 * BLOCK + maps)  # the whole stack would not have fitted
+
+
+def test_memory_of_frames_is_free_when_the_maps_are_completed():
+    run = engine.Run(engine.Onset(dark=0, bright=255, noise=1.0))
+    frames = np.full((5, 40, 50), 255, np.uint8) * (np.arange(5) > 2)[:, np.newaxis, np.newaxis]
+    run.push(frames.astype(np.uint8), travel=np.arange(5.0))
+    staging_buffer = weakref.ref(run.staging_buffer)
+    assert run.result().height.shape == (40, 50)
+    assert staging_buffer() is not None  # more frames may follow
+    run.result(ended=True)
+    assert staging_buffer() is None
