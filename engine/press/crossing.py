@@ -227,8 +227,14 @@ class Crossing:
             level, plateau, least = self._levels
             sure = onset_sure(level, least, _DARK_Z_SCORE * noise)
             near = onset_near(level, plateau, sure)
-            arguments["levels"] = np.array([level, plateau], np.float32)
-            arguments["thresholds"] = np.array([least, sure, near], least.dtype)
+            numbers = {
+                "level": level,
+                "plateau": plateau,
+                "light": least,
+                "dark_limit": sure,
+                "near_limit": near,
+            }
+            arguments = {f"{name}_of_all": value.item() for name, value in numbers.items()}
         elif self._subframe:
             self._set_plateaus(frames[0] if first == 0 else None)
         light = _PLATEAU_Z_SCORE * np.sqrt(2) * noise  # the plateau is a sample itself

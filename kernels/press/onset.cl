@@ -4,7 +4,7 @@
 // TILE     pixels of one work-item: 1 on a GPU, many on a CPU
 // RELEASE  1: samples are complemented, which exchanges dark and light, to find the end of the light state
 // SUBFRAME 0: the height is that of the paper's equation 4, at the frame of the onset itself
-// ALIKE    1: the planes of `levels` and `thresholds` have one element, for all pixels
+// ALIKE    1: numbers for all pixels take the place of `levels` and `thresholds`
 //
 // A map is a plane of `stride` pixels; only the first `pixels` are in the picture:
 //
@@ -42,11 +42,20 @@ typedef uint Count;
 #define NEVER (2 + RELEASE)  // status without an onset
 
 #if ALIKE
-#define OF(p) 0
-#define PLANE 1
+#define LEVELS const float level_of_all, const float plateau_of_all, const FRAME light_of_all, \
+    const FRAME dark_limit_of_all, const FRAME near_limit_of_all
+#define LEVEL(p) level_of_all
+#define PLATEAU(p) plateau_of_all
+#define LIGHT(p) light_of_all
+#define DARK_LIMIT(p) dark_limit_of_all
+#define NEAR_LIMIT(p) near_limit_of_all
 #else
-#define OF(p) (p)
-#define PLANE stride
+#define LEVELS MAP levels, __global const FRAME *restrict thresholds
+#define LEVEL(p) levels[base + (p)]
+#define PLATEAU(p) levels[stride + base + (p)]
+#define LIGHT(p) light[p]
+#define DARK_LIMIT(p) thresholds[stride + base + (p)]
+#define NEAR_LIMIT(p) thresholds[2 * stride + base + (p)]
 #endif
 
 #if BITS == 32
@@ -195,8 +204,8 @@ float2 answer(
 #define LOOK_BACK(p, from) \
     { \
         const FRAME last = first > 0 ? SEE(lasts[p]) : 0; \
-        darks[p] = last_below(frames + (p), from, pixels, first, dark_limits[OF(p)], last, darks[p]); \
-        last_fars[p] = last_below(frames + (p), darks[p], pixels, first, near_limits[OF(p)], last, last_fars[p]); \
+        darks[p] = last_below(frames + (p), from, pixels, first, DARK_LIMIT(p), last, darks[p]); \
+        last_fars[p] = last_below(frames + (p), darks[p], pixels, first, NEAR_LIMIT(p), last, last_fars[p]); \
         const int next = last_fars[p] + 1 - first; \
         if (next >= 0 && next <= from - first) first_rises[p] = SEE(frames[(size_t)next * pixels + (p)]); \
     }
@@ -239,8 +248,8 @@ float2 answer(
 // Processes frames `first` to `first + count` of a press. Without SUBFRAME there are no `samples`.
 __kernel void onset_scan(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride, const int first,
-    const int hold, const float threshold, __global const FRAME *restrict thresholds,
-    __global Count *restrict frames_left, __global int *restrict times, MAP levels, MAP travel, const int row_length,
+    const int hold, const float threshold, LEVELS, __global Count *restrict frames_left,
+    __global int *restrict times, MAP travel, const int row_length,
     const float noise, const float dark_tolerance, const float light_tolerance, __global FRAME *restrict samples,
     OUT answers, __global uchar *restrict status)
 {
@@ -254,20 +263,16 @@ __kernel void onset_scan(
     Count clock[SPAN + 1];
     for (int t = 0; t <= SPAN; ++t) clock[t] = t;
 #endif
-#if ALIKE
-    const FRAME light = thresholds[0];
-#define LIGHT(p) light
-#else
+#if !ALIKE
     FRAME light[TILE];
     for (int p = 0; p < width; ++p) light[p] = thresholds[base + p];
-#define LIGHT(p) light[p]
 #endif
     Count remain[TILE];
     if (first > 0)
         for (int p = 0; p < width; ++p) remain[p] = frames_left[base + p];
     else {
         for (int p = 0; p < width; ++p) {
-            const float level = levels[OF(base + p)];
+            const float level = LEVEL(p);
             const int usable = level == level;
             remain[p] = usable ? whole : 0;
             status[base + p] = usable ? NEVER : 0;
@@ -278,12 +283,9 @@ __kernel void onset_scan(
     }
     frames += base;
     times += base;
-    levels += OF(base);
     answers += base;
     status += base;
     __global int *restrict darks = times + stride, *restrict last_fars = darks + stride;
-    __global const FRAME *restrict dark_limits = thresholds + PLANE + OF(base);
-    __global const FRAME *restrict near_limits = dark_limits + PLANE;
     __global FRAME *restrict lasts = samples + base, *restrict lows = lasts + stride, *restrict highs = lows + stride,
                    *restrict laters = highs + stride, *restrict first_rises = laters + stride;
     if (first == 0 && SUBFRAME)
@@ -386,7 +388,7 @@ __kernel void onset_scan(
                 unclear_travel[p - low] = 0;
                 frame[p - low] = times[p] < 1 ? 1 : times[p];
                 jumped[p - low] = 0;
-                waits[p - low] = (before[p - low] > 0) & (times[p] > 0) & !(dim[p - low] < near_limits[OF(p)]);
+                waits[p - low] = (before[p - low] > 0) & (times[p] > 0) & !(dim[p - low] < NEAR_LIMIT(p));
                 unsure |= waits[p - low];
             }
             if (unsure) {
@@ -394,7 +396,7 @@ __kernel void onset_scan(
                 for (int p = low, i = 0; p < high; ++p, ++i) second[i] = span[(long)(start + at[i] > 1 ? at[i] - 2 : 0) * pixels + p];
                 for (int p = low, i = 0; p < high; ++p, ++i) {
                     const FRAME sample = dim[i], earlier = SEE(second[i]), first_rise = first_rises[p];
-                    const FRAME dark_limit = dark_limits[OF(p)], near_limit = near_limits[OF(p)];
+                    const FRAME dark_limit = DARK_LIMIT(p), near_limit = NEAR_LIMIT(p);
                     const int begin = times[p], dark = darks[p], last_far = last_fars[p];
                     const int new = waits[i] & (begin >= now);
                     const int next = new & (start + at[i] > 1) & (earlier < near_limit);
@@ -411,7 +413,7 @@ __kernel void onset_scan(
                     const int begin = times[p], kept = waits[i], from = kept ? begin - 1 : 0, dark = kept ? darks[p] : 0;
                     waited[i] = kept ? begin - dark : 1;
                     unclear_travel[i] = travel[2 * row_length + from] - travel[2 * row_length + dark];
-                    const float to_level = levels[OF(p)] - levels[PLANE + OF(p)];
+                    const float to_level = LEVEL(p) - PLATEAU(p);
                     const float light = later[i], first_rise = first_rises[p];
                     const int rises = first_rise >= light - to_level * 0.125f;
                     jumped[i] = kept & rises & (last_fars[p] + 1 < begin) & (to_level >= CLEAR_RISE * noise);
@@ -424,8 +426,8 @@ __kernel void onset_scan(
             for (int p = low, i = 0; p < high; ++p, ++i) {
                 const int begin = times[p];
                 const float2 crossing = answer(dim[i], bright[i], later[i], waited[i], unclear_travel[i],
-                                               travel[frame[i] - 1], travel[row_length + frame[i]], levels[OF(p)],
-                                               levels[PLANE + OF(p)], threshold, noise, dark_tolerance,
+                                               travel[frame[i] - 1], travel[row_length + frame[i]], LEVEL(p),
+                                               PLATEAU(p), threshold, noise, dark_tolerance,
                                                light_tolerance, jumped[i]);
                 const float height = answers[p], spread = rough_inverse_root(crossing.y);
                 const uchar was = status[p], is = begin > 0 ? 1 : begin == 0 ? 3 - RELEASE : remain[p] > 0 ? NEVER : 0;
@@ -437,11 +439,11 @@ __kernel void onset_scan(
             for (int p = low; p < high && running; ++p) {
                 const int begin = times[p], dark = darks[p], last_far = last_fars[p];
                 const FRAME first_rise = first_rises[p];
-                const int rises = (begin > 0) & (dim[p - low] < near_limits[OF(p)]);
+                const int rises = (begin > 0) & (dim[p - low] < NEAR_LIMIT(p));
                 lows[p] = dim[p - low];
                 highs[p] = bright[p - low];
                 laters[p] = later[p - low];
-                darks[p] = ((begin > 0) & (dim[p - low] < dark_limits[OF(p)])) ? begin - 1 : dark;
+                darks[p] = ((begin > 0) & (dim[p - low] < DARK_LIMIT(p))) ? begin - 1 : dark;
                 last_fars[p] = rises ? begin - 1 : last_far;
                 first_rises[p] = rises ? bright[p - low] : first_rise;
             }
@@ -455,9 +457,9 @@ __kernel void onset_scan(
     for (int low = 0, high; low < width; low = high) {
         high = min(low + CHUNK, width);
         int unsure = 0;
-        for (int p = low; p < high; ++p) unsure |= (remain[p] == whole) & !(SEE(final[p]) < near_limits[OF(p)]);
+        for (int p = low; p < high; ++p) unsure |= (remain[p] == whole) & !(SEE(final[p]) < NEAR_LIMIT(p));
         for (int p = low; p < high && unsure; ++p)
-            if (times[p] == DARK && SEE(final[p]) >= near_limits[OF(p)]) LOOK_BACK(p, first + count - 1)
+            if (times[p] == DARK && SEE(final[p]) >= NEAR_LIMIT(p)) LOOK_BACK(p, first + count - 1)
     }
     for (int p = 0; p < width; ++p) lasts[p] = final[p];
 }
