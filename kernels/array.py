@@ -245,6 +245,11 @@ class Array:
         self._give_back()
         self._is_parked = True
 
+    def reshape(self, shape: tuple[int, ...]) -> None:
+        """Give the same elements another shape."""
+        self.shape = shape
+        vars(self).pop("_host", None)
+
     @_wrap_cl_errors
     def copy_region(self, start: int, shape: tuple[int, ...]) -> Array:
         """Return a copy, on the device, of the elements from index ``start`` on, with another shape."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from numbers import Real
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -98,6 +98,15 @@ def stored_map(result: Result, quantity: str) -> AnyArray:
     """Return a map of a result where it is: on a device, or on the host."""
     stored = result.on_device(quantity)
     return getattr(result, quantity) if stored is None else stored
+
+
+def viewed(array: AnyArray) -> AnyArray:
+    """Return an array of a device that shares the host's memory as an array on the host; others unchanged.
+
+    It is not a copy: use it before kernels use the array.
+    """
+    shared = isinstance(array, Array) and array.device.info.shares_memory
+    return np.from_dlpack(cast(Any, array)) if shared else array
 
 
 def on_host(value: Any) -> Any:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mirrorskin.engine.base.device_arrays import AnyArray, as_any_array
+from mirrorskin.engine.base.device_arrays import AnyArray, as_any_array, viewed
 from mirrorskin.io import InputError
 from mirrorskin.io.base.samples import convert_samples, frame_dtype
 from mirrorskin.io.base.types import FRAME_DTYPES
@@ -106,7 +106,7 @@ def thinned(*arrays: AnyArray) -> list[NDArray[Any]]:
     All are on the host, or all on one device, which is waited for once.
     """
     samples, grids = [], []
-    for array in arrays:
+    for array in map(viewed, arrays):
         *count, rows, columns = array.shape
         step, pixels = thinning((rows, columns)), rows * columns
         if isinstance(array, Array):
@@ -120,10 +120,9 @@ def thinned(*arrays: AnyArray) -> list[NDArray[Any]]:
 
 def take_grid(frames: AnyArray, grid: FrameSamples) -> NDArray[Any]:
     """Return a copy of the samples of frames, (n, H, W), on the host or a device, at the pixels of a grid."""
+    frames = viewed(frames)
     if not isinstance(frames, Array):
         return grid.of_frames(frames)
-    if frames.device.info.shares_memory:
-        return grid.of_frames(np.from_dlpack(cast(Any, frames)))
     rows, columns = grid.rows, grid.columns
     count, height, width = frames.shape
     down, step = (int(pixels[1] - pixels[0]) if len(pixels) > 1 else 0 for pixels in (rows, columns))
@@ -136,6 +135,7 @@ def take_neighbours(values: AnyArray, grid: FrameSamples) -> list[NDArray[Any]]:
 
     At the border of the map, a pixel is next to itself.
     """
+    values = viewed(values)
     height, width = values.shape
     rows, columns = grid.rows, grid.columns
     at_border = 0 in (rows[0], columns[0]) or rows[-1] == height - 1 or columns[-1] == width - 1
@@ -160,6 +160,7 @@ def take_places(
 
     They are (rows, columns) or (components, rows, columns), and only views if the maps are on the host.
     """
+    maps = [viewed(values) for values in maps]
     if any(isinstance(values, np.ndarray) for values in maps):
         parts = [
             tuple(slice(each[0] + by, each[-1] + by + 1, each.step) for each, by in moved)

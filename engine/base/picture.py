@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 from weakref import proxy
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from mirrorskin.engine.base.device_arrays import viewed
 from mirrorskin.engine.base.tiling import (
     Band,
     Planes,
@@ -187,10 +188,11 @@ class Picture:
 
         When the operation has ended, they may not be copies, and are uninitialised afterwards.
         """
+        keep = not self._operation.ended
         if on_host or not self._operation._on_device:
-            return self._fetch(parts, keep=not self._operation.ended)
+            return self._fetch(parts, keep)
         (band,) = self.bands
-        return [band.copy_map(*_named(part)) for part in parts]
+        return [band.take_map(*_named(part), keep) for part in parts]
 
     def read(self, *parts: Part) -> list[NDArray[Any]]:
         """Return copies of maps, or of planes of them, on the host."""
@@ -207,8 +209,7 @@ class Picture:
         """Return a map: on the device, on the host if they share memory, or a copy if it is in bands."""
         if len(self.bands) > 1:
             return self.read(name)[0]
-        array = self.array(name)
-        return np.from_dlpack(cast(Any, array)) if array.device.info.shares_memory else array
+        return viewed(self.array(name))
 
     def _fetch(self, parts: Sequence[Part], keep: bool) -> list[NDArray[Any]]:
         chosen, planes = [_named(part) for part in parts], dict[str, list[int]]()

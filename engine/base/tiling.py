@@ -181,11 +181,20 @@ class Band:
             values = values[plane, : self.pixels].reshape(*self._shape, *values.shape[2:])
         return values[self.usable]
 
-    def copy_map(self, name: str, plane: int = 0) -> Array:
-        """Return a copy on the device of a map, (rows, W), or of one of several planes."""
+    def take_map(self, name: str, plane: int, keep: bool) -> Array:
+        """Return a map, (rows, W), or one of several planes, on the device.
+
+        It is a copy if the map is to ``keep``, or has padding or other planes. Otherwise the map is
+        uninitialised afterwards.
+        """
         array = self.maps[name]
         vector = array.shape[2:]
-        return array.copy_region(plane * self.stride * math.prod(vector), (*self._shape, *vector))
+        shape = *self._shape, *vector
+        if keep or math.prod(shape) != math.prod(array.shape):
+            return array.copy_region(plane * self.stride * math.prod(vector), shape)
+        del self.maps[name]
+        array.reshape(shape)
+        return array
 
     def fetch(self, parts: Mapping[str, int | slice], keep: Collection[str] = ()) -> list[NDArray[Any]]:
         """Wait once, and return planes or rows of maps, (count, stride) or (rows, W).

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.base.device_arrays import AnyArray, stored_map
+from mirrorskin.engine.base.device_arrays import AnyArray, stored_map, viewed
 from mirrorskin.engine.base.frames import QUANTUM, take_places, typical_value
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.curl import AzimuthBias, find_azimuth_bias
@@ -81,7 +81,7 @@ class PhaseUncertainty(Step):
         if several:
             return result
         size = context.source.header.pixel_size or (1.0, 1.0)
-        error = find_azimuth_bias(normals, result.contact, size)
+        error = find_azimuth_bias(normals, _contact(result), size)
         if error is None:
             return result
         normals = error.remove(result.normals)
@@ -117,7 +117,7 @@ class ResponseUncertainty(Step):
             mean,
             cosine,
             sine,
-            result.contact,
+            _contact(result),
             cast("ArrayLike", operation.zenith_gain),
             tilt,
             CountNoise(base / frames, slope / frames, QUANTUM**2 / frames),
@@ -153,6 +153,12 @@ def _with_share_of_zenith(result: Result, fraction: float) -> Result:
     return result.assign(
         normals_sigma=lambda: np.hypot(result.normals_sigma, np.float32(fraction) * result.zenith)
     )
+
+
+def _contact(result: Result) -> NDArray[np.uint8]:
+    """Return the map of contact on the host, as a copy only if devices do not share its memory."""
+    contact = viewed(stored_map(result, "contact"))
+    return contact if isinstance(contact, np.ndarray) else result.contact
 
 
 def _uneven(modulation: ModulationEffects) -> Iterator[Finding]:
