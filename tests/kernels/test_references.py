@@ -202,7 +202,7 @@ def textures(dtype="float32"):
     return frame, padded, {"planes": planes, "field": field, "macros": displaced()}
 
 
-def displaced(nodes=8, frame="float"):
+def displaced(nodes=16, frame="float"):
     """Return the macros of the kernels, for work-items of some nodes."""
     return {"FRAME": frame, "WINDOW": WINDOW, "STEP": STEP, "NODES": nodes}
 
@@ -242,14 +242,14 @@ def _(step):
     return arrays | {"macros": values["macros"]}
 
 
-@case("displacement_warp", {"lanes": (1, 8), "smooth": (0, 1)}, per="whole row", **CLOSE)
-def _(lanes, smooth):
+@case("displacement_warp", {"nodes": (1, 16), "smooth": (0, 1)}, per="whole row", **CLOSE)
+def _(nodes, smooth):
     _, padded, values = textures()
     if smooth:  # neighbours of a pixel are displaced to neighbours
-        values["field"][0] = np.linspace(2.2, 2.6, GRID[1])
+        values["field"][:] = np.linspace([2.2, -1.6], [2.6, -1.3], GRID[1]).T[:, np.newaxis]
     difference, start = np.zeros((2, *values["planes"].shape[1:])), FIRST + (WINDOW - 1) / 2
     arrays = {"start": start, "coefficients": padded, "difference": difference}
-    return SIZES | values | arrays | {"macros": displaced(lanes)}
+    return SIZES | values | arrays | {"macros": displaced(nodes)}
 
 
 @case("displacement_solve", ITEMS, per=node_items, **CLOSE)
@@ -353,8 +353,8 @@ def _(dtype, nodes):
     displacement.displacement_planes(HALO, WINDOW, *arrays)
     size = displacement.PARAMETERS
     answers = {"inverse": packed(np.zeros((*GRID, size, size)), nodes), "summary": np.zeros((4, *GRID))}
-    given = {"planes": values["planes"], "first": FIRST + HALO, "window": WINDOW}
-    return SIZES | answers | given | {"macros": values["macros"] | {"NODES": nodes}}
+    given = {"planes": values["planes"], "first": FIRST + HALO, "window": WINDOW, "macros": displaced(nodes)}
+    return SIZES | answers | given
 
 
 PIXELWISE = {"grid": (GRID, (1, 12), (9, 2)), "logarithms": (0, 1), "parts": (1, 2)}
