@@ -278,10 +278,16 @@ def fit_paraboloids(height: Doubles, weight: Doubles, places: NDArray[np.bool_],
     Heights are in mm; weights are inverse variances, 0 without a height. ``width`` is the standard deviation
     of the window, pixels.
     """
+    reach = math.ceil(_REACH * width)
+    used = (np.flatnonzero(places.any(axis=axis)) for axis in (1, 0))
+    box = tuple(
+        slice(max(at[0] - reach, 0), at[-1] + reach + 1) if at.size else slice(None) for at in used
+    )  # of all windows
+    height, weight, places = height[box], weight[box], places[box]
     valid = weight > 0
     datum = float(np.average(height[valid], weights=weight[valid])) if valid.any() else 0.0
     relative = np.where(valid, height - datum, 0.0)
-    window = _Window(places, width)
+    window = _Window(places, width, reach)
     powers = [(i, j) for i, j in product(range(5), repeat=2) if i + j <= 4]
     moments = window.sums(weight, powers)
     right = np.stack(list(window.sums(weight * relative, list(_TERMS)).values()), axis=-1)
@@ -306,9 +312,8 @@ def fit_paraboloids(height: Doubles, weight: Doubles, places: NDArray[np.bool_],
 class _Window:
     """Moments over a Gaussian window around some pixels, with offsets in widths of the window."""
 
-    def __init__(self, places: NDArray[np.bool_], width: float) -> None:
+    def __init__(self, places: NDArray[np.bool_], width: float, reach: int) -> None:
         self._places = places
-        reach = math.ceil(_REACH * width)
         offset = np.arange(-reach, reach + 1.0)
         self._kernels = [np.exp(-((offset / width) ** 2) / 2) * offset**power for power in range(5)]
         self._one = np.ones(1)
