@@ -1,4 +1,4 @@
-"""Whole calls: functions on arrays without peers, and commands and imports in new processes."""
+"""Whole calls: functions on arrays of several sizes, and commands and imports in new processes."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ import numpy as np
 
 from mirrorskin import engine
 from mirrorskin.bench.suite.files import new_folder
-from mirrorskin.bench.suite.harness import Cases, check_memory, time_call
+from mirrorskin.bench.suite.harness import Cases, check_memory
 from mirrorskin.cli.commands.bench.records import Case, Row, Target, Timing
 from mirrorskin.cli.commands.bench.timing import OURS, ROUNDS, Work, take_turns
 from mirrorskin.evaluation.scenes.inputs import (
     LEVELS,
-    PIXEL,
     SCALES,
     STEPS,
     TILT,
@@ -30,10 +29,7 @@ from mirrorskin.evaluation.scenes.inputs import (
     fill_press,
     fill_turns,
     phases,
-    press_noise,
-    roof,
     travel_of,
-    turn_noise,
 )
 from mirrorskin.io import MirrorskinWarning, Recorder
 from mirrorskin.io.files.arrays import ArrayRecording
@@ -53,58 +49,6 @@ _FIELD = 12.0  # side of its picture, mm
 _ROUNDS = 7
 _WITHIN = {"reconstruct press": 0.5, "reconstruct turn": 0.5, "fuse": 1.5}  # limits of commands, seconds
 _KINDS = "upload", "kernel", "download"
-
-Call = tuple[Callable[[], object], int, int]
-"""A call, the bytes that it moves, and its frames."""
-
-
-def _change_point(shape: Shape, device: Device) -> Call:
-    frames = np.empty((_PRESS, *shape), np.uint8)
-    fill_press(frames)
-    dark, bright = LEVELS[_BYTE.name]
-    options: dict[str, Any] = {"dark": dark, "bright": bright, "noise": press_noise(_BYTE), "device": device}
-    return partial(engine.find_change_point, frames, travel_of(_PRESS), **options), frames.nbytes, _PRESS
-
-
-def _edges(shape: Shape, device: Device) -> Call:
-    maps = roof(shape)
-    return partial(engine.find_edges, *maps, device=device), sum(array.nbytes for array in maps), 0
-
-
-def _fuse(shape: Shape, device: Device) -> Call:
-    frames, turns = (np.empty((count, *shape), np.uint8) for count in (_PRESS, STEPS))
-    fill_press(frames)
-    fill_turns(turns)
-    offset, gain, _ = SCALES[_BYTE.name]
-    dark, bright = LEVELS[_BYTE.name]
-    onset = engine.find_onset(frames, travel_of(_PRESS), dark=dark, bright=bright, device=device)
-    options: dict[str, Any] = {
-        "tilt": TILT,
-        "zenith_gain": gain,
-        "zenith_offset": offset,
-        "noise": turn_noise(_BYTE),
-    }
-    normals = engine.estimate_normals(turns, phases(STEPS), device=device, **options)
-    moved = (4 + 3 * 4) * math.prod(shape)  # heights and normals
-    return partial(engine.fuse, onset, normals, PIXEL, device=device), moved, 0
-
-
-_FUNCTIONS = {
-    "change-point": (f"change-points between known levels of {_PRESS} x {{}} uint8", _change_point),
-    "edges": ("edges of normals of {}", _edges),
-    "fuse": (f"one surface of a press of {_PRESS} and a turn of {STEPS} x {{}}", _fuse),
-}
-
-
-def run_function(function: str, device: Device, quick: bool) -> Case:
-    """Time a function of the engine."""
-    shape, name = _QUICK if quick else _HD, f"call-{function}"
-    check_memory(name, (_WORKING + 2 * _PRESS) * math.prod(shape))
-    title, make = _FUNCTIONS[function]
-    call, moved, frames = make(shape, device)
-    return time_call(
-        name, title.format(f"{shape[0]} x {shape[1]}"), call, moved, device, quick, frames=frames
-    )
 
 
 def run_sizes(device: Device, quick: bool) -> Case:
@@ -219,7 +163,6 @@ def _time_process(name: str, command: list[str], rounds: int, output: Path | Non
 
 
 CASES: Cases = {
-    **{f"call-{function}": partial(run_function, function) for function in _FUNCTIONS},
     "call-sizes": run_sizes,
     "call-commands": run_commands,
     "call-import": run_import,

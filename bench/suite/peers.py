@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft as scipy_fft
 
 from mirrorskin import engine
 from mirrorskin.bench.suite.correlation import fit_with_numba
@@ -24,7 +25,9 @@ from mirrorskin.evaluation.scenes.inputs import (
     TILT,
     fill_turns,
     phases,
+    roof,
     turn_noise,
+    wavy_dome,
 )
 from mirrorskin.kernels.device import Device
 
@@ -35,6 +38,8 @@ LESS_WORK = "less work"
 
 _LARGE, _QUICK = (1024, 1024), (64, 96)
 _NOISE = 1.5  # counts
+_PER_UNIT = 8000  # counts of a vector of length 1, for OpenCV
+_GAP = 1e-4  # largest gap in contact, as a share of the travel
 _COMPILED: dict[str, Any] = {"fastmath": True, "error_model": "numpy"}  # options of Numba: 1 / 0 is no error
 
 
@@ -338,6 +343,96 @@ def _fuse(shape: tuple[int, int], device: Device) -> _Compared:
     return _Compared(title, call, {} if absent else {peer: pyamg}, {}, absent)
 
 
+def _edges(shape: tuple[int, int], device: Device) -> _Compared:
+    import cv2
+
+    normals, sigma, contact = roof(shape)
+    jump, least = (round(_PER_UNIT * math.radians(degrees)) for degrees in (10, 4))
+
+    def opencv() -> Maps:
+        counts = np.rint(_PER_UNIT * normals[..., :2]).astype(np.int16)
+        changes = [np.gradient(counts[..., part], axis=axis) for axis in (1, 0) for part in (0, 1)]
+        across, down = (np.rint(changes[at] + changes[at + 1]).astype(np.int16) for at in (0, 2))
+        return {"edges": cv2.Canny(across, down, least, jump, L2gradient=True)}
+
+    return _Compared(
+        f"edges of normals of {shape[0]} x {shape[1]}",
+        functools.partial(engine.find_edges, normals, sigma, contact, device=device),
+        {f"OpenCV, {LESS_WORK} (one threshold for all, no contact)": opencv},
+        {},
+    )
+
+
+def _pose(shape: tuple[int, int], device: Device) -> _Compared:
+    import cv2
+
+    shape = min(shape[0], 240), min(shape[1], 320)
+    first, second = (
+        wavy_dome(shape, *place, seed) for seed, place in enumerate([(0, 0, 0), (0.05, 0, 0.02)])
+    )
+
+    def opencv() -> Maps:
+        clouds = []
+        for result in (first, second):
+            x, y = np.meshgrid(np.asarray(result.x), np.asarray(result.y))
+            points = np.stack([x, y, np.asarray(result.height)], -1)
+            clouds.append(np.concatenate([points, np.asarray(result.normals)], -1).reshape(-1, 6))
+        cloud, target = (np.ascontiguousarray(points, np.float32) for points in clouds)
+        nearest: Any = cv2.ppf_match_3d_ICP(100)  # type: ignore[attr-defined]
+        return {"motion": nearest.registerModelToScene(cloud, target)[2]}
+
+    return _Compared(
+        f"motion between two results of {shape[0]} x {shape[1]}",
+        functools.partial(engine.pose.estimate_pose, first, second, device=device),
+        {f"OpenCV ICP, {LESS_WORK} (no covariance)": opencv},
+        {},
+    )
+
+
+def _force(shape: tuple[int, int], _: Device) -> _Compared:
+    shape = min(shape[0], 240), min(shape[1], 320)
+    y, x = ((np.arange(size) - size / 2) * PIXEL for size in shape)
+    radius = 0.5 * PIXEL * min(shape)
+    ball = -(x**2 + y[:, np.newaxis] ** 2) / (2 * radius)
+    travel, modulus, wide = 0.05 * radius, 0.1, [scipy_fft.next_fast_len(2 * size) for size in shape]
+
+    def scipy() -> Maps:
+        """Polonsky and Keer's conjugate gradients with a discrete convolution of Boussinesq's cones."""
+        down, right = (np.minimum(np.arange(size), size - np.arange(size)) * PIXEL for size in wide)
+        distance = np.hypot(right, down[:, np.newaxis])
+        distance[0, 0] = PIXEL / (4 * math.log(1 + math.sqrt(2)))
+        spread = scipy_fft.rfft2(PIXEL**2 / (math.pi * distance))
+        inside = tuple(slice(size) for size in shape)
+
+        def moved(pressure: NDArray[Any]) -> NDArray[Any]:
+            filtered = scipy_fft.irfft2(scipy_fft.rfft2(pressure, wide) * spread, wide)
+            return np.asarray(filtered[inside])
+
+        target = ball + travel
+        pressure = np.where(target > 0, target, 0.0)
+        direction, before, keep = np.zeros(shape), 1.0, 0.0
+        while True:
+            gap, touches = moved(pressure) - target, pressure > 0
+            square = float(np.sum(gap[touches] ** 2))
+            direction = np.where(touches, gap + keep * square / before * direction, 0.0)
+            change = moved(direction)
+            step = float(np.sum((gap * direction)[touches]) / np.sum((change * direction)[touches]))
+            pressure = np.maximum(pressure - step * direction, 0.0)
+            joined = (pressure == 0) & (gap < 0)
+            pressure[joined] -= step * gap[joined]
+            keep, before = float(not joined.any()), square
+            if not joined.any() and float(np.abs(gap[pressure > 0]).max()) < _GAP * travel:
+                return {"pressure": 4 / 3 * modulus * pressure}
+
+    return _Compared(
+        f"force of a ball of {shape[0]} x {shape[1]}",
+        functools.partial(engine.force.find_force, ball, travel, PIXEL, modulus),
+        {f"SciPy, {LESS_WORK} (no sigma)": scipy},
+        {},
+        near={"pressure": 0.02 * modulus},
+    )
+
+
 _FUNCTIONS: dict[str, Callable[[tuple[int, int], Device], _Compared]] = {
     "photometric": _photometric,
     "fringes": _fringes,
@@ -346,6 +441,9 @@ _FUNCTIONS: dict[str, Callable[[tuple[int, int], Device], _Compared]] = {
     "change-point": _change_point,
     "normals": _normals,
     "fuse": _fuse,
+    "edges": _edges,
+    "pose": _pose,
+    "force": _force,
 }
 CASES: Cases = {
     f"peers-{name}": functools.partial(run_peers, f"peers-{name}", make) for name, make in _FUNCTIONS.items()

@@ -19,7 +19,7 @@ QUICK = (
     "full-uint8",
     "correlate-uint8",
     "normals-uint8",
-    "call-edges",
+    "peers-edges",
     "integrate-mask",
     "integrate-live",
     "integrate-many",
@@ -60,7 +60,7 @@ def test_every_other_case_runs_at_a_tiny_size(name, tmp_path):
 
 
 def test_a_call_has_its_kernels_and_the_first_call():
-    case = program.CASES["call-edges"](open_device(), True)
+    case = program.CASES["normals-uint8"](open_device(), True)
     again, first = [row for row in case.rows if not row.is_limit]
     assert set(again.kernels) == set(again.moved) != set()
     assert (again.name, first.name) == (OURS, FIRST)
