@@ -428,8 +428,11 @@ class Configured:
         }
 
     def with_options(self, **options: Any) -> Self:
-        """Return an object of the same class in which some options differ."""
-        return type(self)(**{**self.option_values(), **options})
+        """Return an object of the same class with other values of some options; this one if none differs."""
+        values = self.option_values()
+        if all(name in values and values[name] is value for name, value in options.items()):
+            return self
+        return type(self)(**{**values, **options})
 
     def shared_options(self, kind: type[Configured]) -> dict[str, Any]:
         """Return the values of the options that another class also has."""

@@ -331,7 +331,7 @@ class Run(ThreadSafe):
         samples, time = (None, None) if watch is None else (watch.samples, watch.series.get("time"))
         first = 0 if plan.frames is None else plan.frames.start
         context = Context(source, operation, cast("Source", self._stream), first, samples, time, computed)
-        result = computed.assign(dict.fromkeys(plan.omit))
+        result = computed.assign(dict.fromkeys(plan.omit)) if plan.omit else computed
         used = {"frames": operation.count} | ({"first_frame": first} if plan.frames is not None else {})
         result = result.with_process(merged(used, plan.process, result.process, process or {}))
         result = attach_provenance(result, source, operation.opened_devices, dict(result.process))

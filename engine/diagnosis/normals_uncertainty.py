@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.base.device_arrays import AnyArray, stored_map, viewed
+from mirrorskin.engine.base.device_arrays import AnyArray, stored_map
 from mirrorskin.engine.base.frames import QUANTUM, take_places, typical_value
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.curl import AzimuthBias, find_azimuth_bias
@@ -26,7 +26,7 @@ from mirrorskin.kernels.rotation.normals import azimuth_of
 if TYPE_CHECKING:
     from mirrorskin.engine.rotation.normals import Normals
 
-_PARTS, _POINTS = 8, 128  # of the extent of the normals: distance between slopes; slopes along a side
+_PARTS, _POINTS = 8, 64  # of the extent of the normals: distance between slopes; slopes along a side
 _GRID = 64  # points along a side that show this extent
 _MIN_POINTS, _MIN_CORRELATION = 100, 0.1  # points, and their correlation, that decide
 _REACH = 5  # pixels: size of the neighbourhood whose loss of contact affects a registered sample
@@ -81,7 +81,7 @@ class PhaseUncertainty(Step):
         if several:
             return result
         size = context.source.header.pixel_size or (1.0, 1.0)
-        error = find_azimuth_bias(normals, _contact(result), size)
+        error = find_azimuth_bias(normals, result.contact, size)
         if error is None:
             return result
         normals = error.remove(result.normals)
@@ -117,7 +117,7 @@ class ResponseUncertainty(Step):
             mean,
             cosine,
             sine,
-            _contact(result),
+            result.contact,
             cast("ArrayLike", operation.zenith_gain),
             tilt,
             CountNoise(base / frames, slope / frames, QUANTUM**2 / frames),
@@ -153,12 +153,6 @@ def _with_share_of_zenith(result: Result, fraction: float) -> Result:
     return result.assign(
         normals_sigma=lambda: np.hypot(result.normals_sigma, np.float32(fraction) * result.zenith)
     )
-
-
-def _contact(result: Result) -> NDArray[np.uint8]:
-    """Return the map of contact on the host, as a copy only if devices do not share its memory."""
-    contact = viewed(stored_map(result, "contact"))
-    return contact if isinstance(contact, np.ndarray) else result.contact
 
 
 def _uneven(modulation: ModulationEffects) -> Iterator[Finding]:

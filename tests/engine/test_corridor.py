@@ -52,7 +52,7 @@ def test_library_run(recordings, levels):
     [
         ("reconstruct press.h5", 551, 69),
         ("reconstruct turn.h5", 711, 89),
-        ("fuse press.h5 turn.h5", 873, 105),
+        ("fuse press.h5 turn.h5", 874, 105),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):
