@@ -272,6 +272,8 @@ answer_t hypothesis(
     return answer;
 }
 
+#define LOWEST_BIT(bits) (31 - (int)clz((bits) & -(bits)))
+
 // Mean and variance over all hypotheses by weight, and the least misfit in squared sigmas. The sums are of crossings
 // relative to that of the most likely hypothesis.
 float3 weigh(const samples_t *samples, const query_t query)
@@ -285,15 +287,17 @@ float3 weigh(const samples_t *samples, const query_t query)
     // The misfit of each part grows with the part. Hence the dark part ends at `last` or before, the light part
     // begins at `first` or later, and a line can fit only where both lines that are shorter by a sample fit.
     int last = samples->high, first = samples->low;
-    uint fits = ~0u;  // a bit for each first slot of a line
+    uint fits = ~0u << samples->low;  // a bit for each first slot of a line
     for (int length = 0; length <= SLOTS; ++length) {
         while (last > samples->low && ends.before[last] > enough) --last;
         while (first < samples->high && ends.square[first] - ends.fitted[first] > enough) ++first;
         if (length > 2) fits &= fits >> 1;
         const int per_level = length < 2;  // these need a sample on each level
-        const int end = LESSER(last, samples->high - per_level - length);
-        for (int begin = GREATER(samples->low + per_level, first - length); begin <= end; ++begin) {
-            if (!(fits >> begin & 1)) continue;
+        const int begin_low = GREATER(samples->low + per_level, first - length);
+        const int begin_high = LESSER(last, samples->high - per_level - length);
+        uint candidates = begin_low > begin_high ? 0 : (fits >> begin_low << begin_low) & ((2u << begin_high) - 1);
+        for (; candidates; candidates &= candidates - 1) {
+            const int begin = LOWEST_BIT(candidates);
             float bent = 0;
             const answer_t answer = hypothesis(samples, query, &ends, begin, length, enough, &bent);
             if (bent > enough) fits &= ~(1u << begin);
@@ -313,6 +317,7 @@ float3 weigh(const samples_t *samples, const query_t query)
             best = LESSER(best, cost);
             enough = LESSER(enough, (best + NEGLIGIBLE) / scale);
         }
+        if (length > 1 && !(fits & ((2u << last) - 1))) break;  // no longer line can fit
     }
     const float mean = sum / weight;
     return (float3)(likely + mean, GREATER(square / weight - mean * mean, 0), best);
