@@ -23,6 +23,7 @@
 #define RAMP (1 / 5.0f)
 #define PLATEAU 3
 #define BENT 1.5f
+#define SAME_TIME 1e-4f
 
 // Hypotheses whose misfit exceeds the least one by this many squared sigmas have negligible weight.
 #define NEGLIGIBLE 40
@@ -304,9 +305,9 @@ float3 weigh(const samples_t *samples, const query_t query)
             if (answer.misfit > enough) continue;
             const float cost = answer.misfit * scale;
             const int better = cost < best;
-            // A negligible weight is 0. Otherwise the sums become denormal numbers, which are slow.
+            // A tiny weight is 0. Otherwise the sums become denormal numbers, which are slow.
             const float apart = better ? best - cost : cost - best;
-            const float lesser = apart > NEGLIGIBLE ? 0 : exponential(-0.5f * apart), kept = better ? lesser : 1;
+            const float lesser = apart > 2 * NEGLIGIBLE ? 0 : exponential(-0.5f * apart), kept = better ? lesser : 1;
             const float relative_weight = better ? answer.prior : answer.prior * lesser;
             const float gap = answer.crossing - likely, shift = better ? gap : 0, away = gap - shift;
             square = (square + shift * (shift * weight - 2 * sum)) * kept;
@@ -323,14 +324,18 @@ float3 weigh(const samples_t *samples, const query_t query)
     return (float3)(likely + mean, GREATER(square / weight - mean * mean, 0), best);
 }
 
+#define SAMPLE(slot) ((samples->values[(slot) + 1] - samples->values[slot]) / STEP)
+
 // The variance of a crossing between two samples in transition if the edge is blurred by a lens, in excess of
 // the noise.
 float variance_of_blur(const samples_t *samples, const query_t query, const float crossing)
 {
-    const int frame = (int)floor(crossing), slot = frame + REACH;
+    const float level = query.level;
+    const int nearest = round_even(crossing), later = SAMPLE(LIMITED(nearest + REACH, 0, SLOTS - 1)) >= level;
+    const int at_sample = LESSER(crossing - nearest, nearest - crossing) > -SAME_TIME;
+    const int frame = at_sample ? nearest - later : (int)floor(crossing), slot = frame + REACH;
     if (slot < samples->low || slot + 1 >= samples->high) return 0;
-    const float low = (samples->values[slot + 1] - samples->values[slot]) / STEP;
-    const float high = (samples->values[slot + 2] - samples->values[slot + 1]) / STEP, level = query.level;
+    const float low = SAMPLE(slot), high = SAMPLE(slot + 1);
     const float margin = PLATEAU * query.noise;
     if (low < margin || low >= level || high < level || high > 1 - margin) return 0;
     // The quantile of a share is proportional to v + BENT v^3, with v = share - 1/2.

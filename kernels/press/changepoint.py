@@ -36,6 +36,7 @@ SPIKE = 8  # a sample that exceeds both neighbours by this many sigmas is a spik
 DOUBT = 2  # tolerated misfit of the best hypothesis, in times of the expected one
 SPREAD = 0.3  # standard deviation of a pixel's own levels about the given ones, as a share of that range
 PLATEAU = 3  # sigmas within which a sample is on a level
+SAME_TIME = 1e-4  # frames; a crossing that close to a sample is at the sample
 # prior odds of one frame in transition and of a ramp, relative to a sudden change
 SINGLE, RAMP = 1 / 3, 1 / 5
 
@@ -343,7 +344,13 @@ def _ramp(
 
 def _variance_of_blur(samples: _Samples, noise: Floats, level: float, crossing: Floats) -> Floats:
     """Return the variance of the crossing of an edge blurred by a lens, in excess of the noise."""
-    frame = np.floor(crossing).astype(np.intp)
+    # If a sample is at the crossing, the level determines whether it is the earlier or the later one.
+    nearest = np.rint(crossing).astype(np.intp)
+    at = np.clip(nearest + REACH, samples.low, samples.high - 1)
+    later = samples.total(at, at + 1)[0] >= level
+    frame = np.where(np.abs(crossing - nearest) < SAME_TIME, nearest - later, np.floor(crossing)).astype(
+        np.intp
+    )
     slot = np.clip(frame + REACH, samples.low, samples.high - 2)
     low, high = (samples.total(slot + side, slot + side + 1)[0] for side in (0, 1))
     under_way = (slot == frame + REACH) & (low < level) & (high >= level)
