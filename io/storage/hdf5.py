@@ -187,10 +187,8 @@ class Hdf5File(Closing):
     def packing(self, node: h5py.Dataset) -> Packing | None:
         """Return the packing of a dataset from its attributes; None if values are stored unpacked."""
         with translate_os_errors(lambda: self.where(node)):
-            if not h5py.h5a.get_num_attrs(node.id):
-                return None
-        values = {name: self.attribute_values(node, name) for name in ATTRIBUTES}
-        stated = {name: value for name, value in values.items() if value is not None}
+            present = [name for name in ATTRIBUTES if h5py.h5a.exists(node.id, name.encode())]
+        stated = {name: value for name in present if (value := self.attribute_values(node, name)) is not None}
         if "_Unsigned" in stated:
             stated["_Unsigned"] = first_value(stated["_Unsigned"])
         return packing_of(stated, node.id.dtype, self.where(node)) if stated else None
