@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,21 +130,32 @@ class Autocorrelation:
     def __init__(self, measured: Mask, pixel_size: tuple[float, float]) -> None:
         from scipy import fft
 
-        self._known, self._size = measured, pixel_size
-        self._shape = tuple(fft.next_fast_len(2 * count, real=True) for count in measured.shape)
-        pairs = self._correlate(measured.astype(np.float64))
+        self._size = pixel_size
+        # The largest lag is half the size, and the period must not bring longer ones there.
+        self._half = tuple(count // 2 for count in measured.shape)
+        self._shape = tuple(
+            fft.next_fast_len(count + half + 1, real=True)
+            for count, half in zip(measured.shape, self._half, strict=True)
+        )
+        pairs = self._correlate(measured)
         self._counted = pairs > _MIN_OVERLAP * np.count_nonzero(measured)
         self._pairs = np.maximum(pairs, 1.0)
 
-    def _correlate(self, values: Doubles) -> Doubles:
+    def _correlate(self, values: NDArray[Any]) -> Doubles:
+        """Return the sums of products by lag, from minus to plus half the size."""
         from scipy import fft
 
-        wave = fft.rfft2(values.astype(np.float32), self._shape)
-        return np.asarray(fft.irfft2(wave.real**2 + wave.imag**2, self._shape))
+        wave = np.asarray(fft.rfft2(values.astype(np.float32), self._shape)).view(np.float32)
+        wave *= wave
+        products = fft.irfft2(wave[:, ::2] + wave[:, 1::2], self._shape)
+        rows, columns = self._half
+        products = np.concatenate([products[-rows:] if rows else products[:0], products[: rows + 1]])
+        left = products[:, -columns:] if columns else products[:, :0]
+        return np.concatenate([left, products[:, : columns + 1]], axis=1)
 
     def of(self, values: Doubles) -> Doubles:
-        """Return the mean products of the values by lag, as they come from the Fourier transform."""
-        return np.asarray(self._correlate(np.where(self._known, values, 0.0)) / self._pairs)
+        """Return the mean products by lag, with the lag 0 in the middle, of values that are 0 in holes."""
+        return np.asarray(self._correlate(values) / self._pairs)
 
     def lengths(self, correlation: Doubles) -> dict[str, float]:
         """Return Sal and Str: the shortest decay to 0.2, and its ratio to the longest one.
@@ -152,13 +164,10 @@ class Autocorrelation:
         """
         from scipy import ndimage
 
-        if not correlation[0, 0] > 0:
+        rows, columns = self._half
+        variance = correlation[rows, columns]
+        if not variance > 0:
             return {"Sal": math.nan, "Str": math.nan}
-        rows, columns = (count // 2 for count in self._known.shape)
-        window = np.roll(correlation / correlation[0, 0], (rows, columns), (0, 1))
-        counted = np.roll(self._counted, (rows, columns), (0, 1))
-        window = window[: 2 * rows + 1, : 2 * columns + 1]
-        counted = counted[: 2 * rows + 1, : 2 * columns + 1]
         angle = np.arange(_DIRECTIONS) * (math.pi / _DIRECTIONS)
         width, height = self._size
         unit = min(width, height) * _STEP
@@ -169,7 +178,9 @@ class Autocorrelation:
                 columns + np.multiply.outer(np.cos(angle), distance) / width,
             ]
         )
-        along = ndimage.map_coordinates(np.where(counted, window, np.nan), at, order=1, cval=np.nan)
+        along = ndimage.map_coordinates(
+            np.where(self._counted, correlation / variance, np.nan), at, order=1, cval=np.nan
+        )
         below = along < _DECAY
         outside = np.isnan(along)
         ends = np.argmax(below | outside, axis=1)

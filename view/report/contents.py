@@ -48,6 +48,7 @@ class Group:
 def contents_of(result: Result, name: str, section: Ends | None, turn: int | None) -> dict[str, Any]:
     """Return the variables of the page template."""
     parameters, provenance = split_process(result.process)
+    numbers = numbers_of(result, section)  # it needs much memory, which is free again for the pictures
     contents = {
         "title": name if turn is None else f"{name}, turn {turn}",
         "summary": sentence(str(summarise(result))),
@@ -55,7 +56,7 @@ def contents_of(result: Result, name: str, section: Ends | None, turn: int | Non
         "warnings": [sentence(text) for text in warnings_in(result.process)],
         **surface_of(result),
         "pictures": pictures_of(result, name, section),
-        "numbers": numbers_of(result, section),
+        "numbers": numbers,
         "parameters": _groups(parameters),
         "provenance": _groups(provenance),
         "calibration": _calibration_of(result),
@@ -235,11 +236,10 @@ class Picture:
 
 def pictures_of(result: Result, name: str, section: Ends | None) -> list[Picture]:
     """Draw all figures of a result."""
-    from mirrorskin.view.result import figures_of, pixels_of
+    from mirrorskin.view.result.figures import each_figure, pixels_of
 
-    figures = figures_of(result, name=name, section=section)
     pictures = []
-    for which, figure in figures.items():
+    for which, figure in each_figure(result, name=name, section=section):
         pixels = pixels_of(_untitled(figure), round(FINENESS * figure.get_figwidth()))
         pictures.append(_picture(*picture_texts(result, which), pixels))
     return pictures

@@ -77,9 +77,16 @@ def figures_of(
         Matplotlib is not installed, the result has several turns or none of the requested maps, or a section
         cannot be placed.
     """
+    return dict(each_figure(result, name=name, section=section, maps=maps))
+
+
+def each_figure(
+    result: Result, *, name: str, section: Ends | None = None, maps: Sequence[str] | None = None
+) -> Iterator[tuple[str, Figure]]:
+    """Yield the name and the figure of each map, each only when it is needed; see `figures_of`."""
     sheet = sheet_of(result)
-    panels = _chosen(sheet, name, section, maps)
-    return {panel.name: _figure(sheet, [panel], name) for panel in panels}
+    for panel in _chosen(sheet, name, section, maps):
+        yield panel.name, _figure(sheet, [panel], name)
 
 
 def overview(
