@@ -249,10 +249,12 @@ class Run(ThreadSafe):
         names = (*operation.positions, "frame_weights") if operation._weighted else operation.positions
         series = {name: getattr(block, name, None) for name in names}
         frames = block.frames if operation.for_device else on_host(block.frames)
-        samples = None if watch is None else take_grid(frames, watch.samples)  # before frames are moved
+        # Frames may be moved, unless they stay valid: then they are looked at while the device computes.
+        later = block.stays_valid and not isinstance(frames, Array)
+        samples = None if watch is None or later else take_grid(frames, watch.samples)
         self._push(frames, {k: v for k, v in series.items() if v is not None}, block.stays_valid)
         if watch is not None:
-            watch.push(block, samples)
+            watch.push(block, take_grid(frames, watch.samples) if samples is None else samples)
 
     def _push(self, frames: Any, series: Mapping[str, Any], stay_valid: bool) -> None:
         operation = self.operation
