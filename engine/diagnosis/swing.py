@@ -153,7 +153,8 @@ def _fit(ratio: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Modul
     fit, inverse, residual, kept = result
     covariance = inverse * max(1.0, float(np.mean(residual[kept] ** 2)))
 
-    products = gram(columns[kept])
+    used = columns.compress(kept, axis=0)
+    products = gram(used)
     sums, number = products[0], products[0, 0]  # the first column is 1
 
     def effect(chosen: slice) -> float:
@@ -164,14 +165,18 @@ def _fit(ratio: Doubles, columns: Doubles, noise: Doubles, gain: float) -> Modul
         unexplained = square - float(mixed @ np.linalg.solve(products[np.ix_(others, others)], mixed))
         alone = unexplained > _MIN_UNEXPLAINED * (square - float(part @ sums[chosen]) ** 2 / number)
         chi2 = float(part @ np.linalg.solve(covariance[chosen, chosen], part))
-        extent = float(np.ptp(np.percentile(columns[kept, chosen] @ part, [5, 95]))) / abs(float(fit[0]))
-        return extent if alone and chi2 > len(part) * CLEAR_Z_SCORE**2 else 0.0
+        if not (alone and chi2 > len(part) * CLEAR_Z_SCORE**2):
+            return 0.0
+        return float(np.ptp(np.percentile(used[:, chosen] @ part, [5, 95]))) / abs(float(fit[0]))
 
-    turning = columns[kept, 1]
-    deciding = float(np.sum(turning**2)) ** 2 / float(np.sum(turning**4))  # pixels
+    def turns_widely() -> bool:
+        """Return whether azimuths turn at enough pixels to show a blur."""
+        square = used[:, 1] ** 2
+        deciding = float(np.sum(square)) ** 2 / float(np.sum(square**2))  # pixels
+        return deciding > _MIN_DECIDING_PIXELS and float(np.percentile(used[:, 1], 95)) > _MIN_TURNING
+
     spread = math.sqrt(-2 * min(float(fit[1]), 0.0))
-    widely = deciding > _MIN_DECIDING_PIXELS and float(np.percentile(turning, 95)) > _MIN_TURNING
-    blurs = spread > MIN_BLUR and widely and effect(slice(1, 2)) > 0
+    blurs = spread > MIN_BLUR and turns_widely() and effect(slice(1, 2)) > 0
     response, light = (
         extent if extent > _MIN_RANGE else 0.0 for extent in (effect(slice(3, 4)), effect(slice(4, 9)))
     )
