@@ -50,17 +50,24 @@ typedef float4 __attribute__((aligned(4))) Four;  // unaligned
 #define MIRROR(place, length) \
     ((place) < 0 ? -(place) : (place) < (length) ? (place) : 2 * ((length) - 1) - (place))
 
+// The same as often as necessary: a margin may be wider than a picture.
+int reflected(const int place, const int length)
+{
+    const int period = 2 * length - 2, rest = (place < 0 ? -place : place) % period;
+    return rest < length ? rest : period - rest;
+}
+
 __kernel void displacement_pad(const int rows, const int columns, __global const FRAME *restrict frame, OUT padded)
 {
     const int width = columns + 2 * MARGIN, pieces = (width + TILE - 1) / TILE, line = get_global_id(0) / pieces;
     if (line >= rows + 2 * MARGIN) return;
     int x = (get_global_id(0) - line * pieces) * TILE;
-    const int end = min(x + TILE, width), row = MIRROR(line - MARGIN, rows);
+    const int end = min(x + TILE, width), row = reflected(line - MARGIN, rows);
     __global const FRAME *restrict samples = frame + row * columns;
     OUT out = padded + line * width;
-    for (; x < min(end, MARGIN); ++x) out[x] = samples[MARGIN - x];
+    for (; x < min(end, MARGIN); ++x) out[x] = samples[reflected(x - MARGIN, columns)];
     for (; x < min(end, MARGIN + columns); ++x) out[x] = samples[x - MARGIN];
-    for (; x < end; ++x) out[x] = samples[MIRROR(x - MARGIN, columns)];
+    for (; x < end; ++x) out[x] = samples[reflected(x - MARGIN, columns)];
 }
 
 // sqrt(3) times the powers of the spline's pole, sqrt(3) - 2.
@@ -178,27 +185,27 @@ __kernel void displacement_planes(
 
 #define LINE(at, w) (w##0 * LOAD(at) + w##1 * LOAD((at) + 1) + w##2 * LOAD((at) + 2) + w##3 * LOAD((at) + 3))
 
-// The first node is in the middle of a window that starts at FIRST: at a pixel, or LAG before one, which is OFFSET.
+// The window of the first node starts at the pixel FIRST. The node is at its centre, LAG before the pixel OFFSET.
 #define FIRST ((STEP - WINDOW - ((STEP - WINDOW) & 1)) / 2)
 #define OFFSET (FIRST + WINDOW / 2)
 #define LAG (WINDOW % 2 ? 0.0f : 0.5f)
 #define NODE_OF(pixel) (((pixel) - OFFSET + STEP) / STEP - 1)  // the node before it; -1 before the first one
 
-// Executes a statement for the pixels from `low` to `high` between the node and the next one. Pixel i is the
+// Executes statements for the pixels from `low` to `high` between the node and the next one. Pixel i is the
 // fraction `part` of the way to the next one.
-#define BETWEEN_NODES(node, low, high, ...)                                                          \
+#define BETWEEN_NODES(node, low, high, statements)                                                   \
     {                                                                                                \
         const int start = OFFSET + (node) * STEP;                                                    \
         if (start >= (low) && start + STEP <= (high))                                                \
             for (int k = 0; k < STEP; ++k) {                                                         \
                 const int i = start + k;                                                             \
                 const float part = (k + LAG) * (1.0f / STEP);                                        \
-                __VA_ARGS__                                                                          \
+                statements                                                                           \
             }                                                                                        \
         else                                                                                         \
             for (int i = GREATER(start, low); i < LESSER(start + STEP, high); ++i) {                 \
                 const float part = (i - start + LAG) * (1.0f / STEP);                                \
-                __VA_ARGS__                                                                          \
+                statements                                                                           \
             }                                                                                        \
     }
 

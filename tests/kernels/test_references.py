@@ -224,11 +224,11 @@ def padded_rows(device, values):
     return rows * -(-columns // device.layout.tile)
 
 
-@case("displacement_pad", DTYPES, per=padded_rows)
-def _(dtype):
-    frame, padded, _ = textures(dtype)
-    macros = displaced(frame=C_TYPES[dtype])
-    return {"frame": frame, "padded": 0 * padded, "shape": PICTURE, "macros": macros}
+@case("displacement_pad", DTYPES | {"shape": (PICTURE, (6, 9))}, per=padded_rows)
+def _(dtype, shape):
+    frame = textures(dtype)[0][: shape[0], : shape[1]]
+    padded, macros = np.zeros([size + 2 * MARGIN for size in shape]), displaced(frame=C_TYPES[dtype])
+    return {"frame": frame, "padded": padded, "shape": shape, "macros": macros}
 
 
 @case(
