@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from shown import ball, panel
 
 from mirrorskin import io
+from mirrorskin.view.drawing.canvas import draw_image, figure_pixels
 from mirrorskin.view.result import figures_of, overview, pixels_of
 
 PRESS = ("height", "height_sigma", "status", "filled", "x", "y")
@@ -163,3 +164,18 @@ def test_warnings_are_below_the_summary():
     doubtful = ball().assign(process={"warnings": "frame 3: lost"})
     texts = [text.get_text() for text in overview(doubtful, name="a.h5").texts]
     assert texts[-1] == "Warning: frame 3: lost"
+
+
+@pytest.mark.parametrize("kind", ["numbers", "colours"])
+def test_a_map_larger_than_its_picture_is_thinned_out_only_to_be_drawn(kind):
+    ramp = np.broadcast_to(np.linspace(0, 250, 1000), (800, 1000))
+    values = ramp if kind == "numbers" else np.stack([ramp.astype(np.uint8)] * 3, axis=-1)
+    style = (
+        {"cmap": "gray", "vmin": 0, "vmax": 255} if kind == "numbers" else {"interpolation": "antialiased"}
+    )
+    figure = Figure(figsize=(2, 2))
+    picture = draw_image(figure.add_axes((0, 0, 1, 1)), values, aspect="auto", **style)
+    drawn = figure_pixels(figure, 100)
+    assert picture.get_array().shape == values.shape
+    expected = np.linspace(0, 250, 200)
+    np.testing.assert_allclose(drawn[100, 5:-5, 0], expected[5:-5], atol=3)

@@ -7,6 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
@@ -40,6 +41,7 @@ BESIDE: Mapping[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5),
 
 _ROUND = 1, 2, 5, 10
 _DPI = 110  # pixels per inch in files
+_ENLARGED = 1.2  # by what the layout may make axes larger than they were
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 """Suffixes of files that figures are written to: pixels, or lines and texts."""
@@ -112,10 +114,40 @@ def figure_pixels(figure: Figure, dpi: float) -> NDArray[np.uint8]:
     _print_texts_as_they_are(figure)
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _thinned_out(figure):
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         canvas.draw()  # type: ignore[no-untyped-call]  # once; savefig draws twice
     return np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
+
+
+@contextmanager
+def _thinned_out(figure: Figure) -> Iterator[None]:
+    """Thin out maps with twice as many pixels as are drawn: Matplotlib takes long to resample large ones."""
+    whole = []
+    for axes in figure.axes:
+        box = axes.get_position()
+        width, height = (
+            max(1.0, _ENLARGED * n) for n in (box.width * figure.bbox.width, box.height * figure.bbox.height)
+        )
+        for image in axes.images:
+            values: Any = image.get_array()
+            rows, columns = values.shape[:2]
+            step = int(min(rows // height, columns // width))
+            if step < 2:
+                continue
+            whole.append((image, values))
+            if values.ndim == 2:  # numbers, of which one for each pixel is drawn
+                image.set_data(values[step // 2 :: step, step // 2 :: step])
+            else:
+                import cv2
+
+                size = -(-columns // step), -(-rows // step)
+                image.set_data(cv2.resize(np.asarray(values), size, interpolation=cv2.INTER_AREA))
+    try:
+        yield
+    finally:
+        for image, values in whole:
+            image.set_data(values)
 
 
 def _print_texts_as_they_are(figure: Figure) -> None:
