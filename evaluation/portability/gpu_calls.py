@@ -57,14 +57,17 @@ def placed(values: Any, device: Device) -> Any:
     return device.from_host("given", values, values.dtype)
 
 
-def calls(shape: Shape, device: Device, frames: int = 64) -> Iterator[tuple[str, Call]]:
-    """Give the calls by name; the arrays of a call are made when it is asked for."""
+def calls(shape: Shape, device: Device, frames: int = 64, divisor: int = 1) -> Iterator[tuple[str, Call]]:
+    """Give the calls by name; the arrays of a call are made when it is asked for.
+
+    Calls of a size of their own have rows and columns divided by ``divisor``.
+    """
     yield from presses(shape, device, frames)
     yield from rotations(shape, device)
     yield from surfaces(shape, device)
     yield "find_edges", partial(engine.find_edges, *roof(shape), device=device)
     if math.prod(shape) <= math.prod(MEGAPIXEL):
-        yield from others(shape, device)
+        yield from others(shape, device, divisor)
 
 
 def presses(shape: Shape, device: Device, frames: int) -> Iterator[tuple[str, Call]]:
@@ -153,14 +156,16 @@ def pressed_and_turned(shape: Shape) -> tuple[dict[str, Any], dict[str, Any]]:
     return first, second
 
 
-def others(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
+def others(shape: Shape, device: Device, divisor: int = 1) -> Iterator[tuple[str, Call]]:
     """Give what is measured at one size only."""
-    half = 512, 512
+    half, quarter, small, vga = (
+        (rows // divisor, columns // divisor) for rows, columns in ((512, 512), (256, 256), (240, 320), VGA)
+    )
     heights, normals = pressed_and_turned(half)
     yield "fuse, 512 x 512", partial(engine.fuse, heights, normals, PIXEL, device=device)
     maps = [{name: placed(values, device) for name, values in part.items()} for part in (heights, normals)]
     yield "fuse, 512 x 512, maps on the device", partial(engine.fuse, maps[0], maps[1], PIXEL)
-    heap = SCENES["leaves"]((256, 256))
+    heap = SCENES["leaves"](quarter)
     steep: dict[str, Any] = {"normals": heap.normals, "mask": heap.mask, "pixel_size": heap.pixel_size}
     robustly = partial(engine.integrate, **steep, robust=True, device=device)
     yield "integrate robustly, 256 x 256", robustly
@@ -175,18 +180,18 @@ def others(shape: Shape, device: Device) -> Iterator[tuple[str, Call]]:
         "find_displacement, 3 frames on the device",
         lambda: engine.slip.find_displacement(pictures[0], pictures[1], PIXEL),
     )
-    first, second = (wavy_dome((240, 320), 0.05 * n, 0.03 * n, 0.02 * n, n) for n in (0, 1))
+    first, second = (wavy_dome(small, 0.05 * n, 0.03 * n, 0.02 * n, n) for n in (0, 1))
     yield "estimate_pose, 240 x 320", lambda: engine.pose.estimate_pose(first, second, device=device)
     results = [
         result.assign({name: placed(values, device) for name, values in result.maps().items()})
         for result in (first, second)
     ]
     yield "estimate_pose, 240 x 320 on the device", lambda: engine.pose.estimate_pose(results[0], results[1])
-    yield "live press, one frame of VGA", live_press(device)
-    yield "live rotation, one frame of VGA", live_rotation(device)
-    steps = cycle(drifting_slopes(VGA, 16, 0.01))
-    integrator = engine.Integrator(VGA, PIXEL, device=device)
-    mask = blob_mask(VGA)
+    yield "live press, one frame of VGA", live_press(vga, device)
+    yield "live rotation, one frame of VGA", live_rotation(vga, device)
+    steps = cycle(drifting_slopes(vga, 16, 0.01))
+    integrator = engine.Integrator(vga, PIXEL, device=device)
+    mask = blob_mask(vga)
 
     def follow() -> object:
         integrator.push(*next(steps), mask=mask)
@@ -204,12 +209,12 @@ class Memory:
         self.header, self.motion, self.shape, self.dtype = header, header.motion, shape, np.dtype(np.uint8)
 
 
-def live_press(device: Device) -> Call:
+def live_press(shape: Shape, device: Device) -> Call:
     """Return a call that pushes one frame and asks for the maps."""
     count = 256
-    frames = np.empty((count, *VGA), np.uint8)
+    frames = np.empty((count, *shape), np.uint8)
     fill_press(frames)
-    dark, bright = (np.full(VGA, level, np.float32) for level in (DARK, BRIGHT))
+    dark, bright = (np.full(shape, level, np.float32) for level in (DARK, BRIGHT))
     header = Header("vertical", pixel_size=(PIXEL, PIXEL), dark=dark, bright=bright)
     source: Any = Memory(header, frames.shape)
     live = LiveRun(source, engine.Press(device=device))
@@ -224,15 +229,15 @@ def live_press(device: Device) -> Call:
     return push
 
 
-def live_rotation(device: Device) -> Call:
+def live_rotation(shape: Shape, device: Device) -> Call:
     """Return a call that pushes one frame, and asks for normals and heights."""
-    frames = np.empty((8, *VGA), np.uint8)
+    frames = np.empty((8, *shape), np.uint8)
     fill_turns(frames)
     offset, gain = (np.asarray(float(value)) for value in (OFFSET, GAIN))
     header = Header(
         "axial", pixel_size=(PIXEL, PIXEL), tilt=TILT, press=1.0, zenith_gain=gain, zenith_offset=offset
     )
-    source: Any = Memory(header, (256, *VGA))
+    source: Any = Memory(header, (256, *shape))
     live = LiveRun(source, engine.Rotation(window_frames=8, device=device))
     numbers = iter(range(256))
 

@@ -39,12 +39,3 @@ def test_what_rises_is_printed_in_a_line():
     assert list(gpu_counts.complaints("integrate", more, row)) == [
         f"integrate: launches {row['launches'] + 1}, and the table has {row['launches']}"
     ]
-
-
-@pytest.mark.parametrize(
-    ("items", "moved", "seconds"),
-    [(1 << 20, 4 << 20, 4 * 2**20 / 2.4e12), (64, 64 * 16384 * 4, 16384 * 0.5e-6)],
-    ids=["as long as the memory takes", "as long as one work-item reads"],
-)
-def test_a_kernel_takes_as_long_as_what_limits_it(items, moved, seconds):
-    assert gpu_counts.seconds_of(items, moved) == pytest.approx(seconds)
