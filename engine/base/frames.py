@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -142,7 +143,7 @@ def take_neighbours(values: AnyArray, grid: FrameSamples) -> list[NDArray[Any]]:
     if isinstance(values, Array) and not at_border:
         down, step = (int(pixels[1] - pixels[0]) for pixels in (rows, columns))
         first, shape = int(rows[0] * width + columns[0]), (3, len(rows), len(columns))
-        across, along = take_grids(
+        [across], [along] = take_grids(
             *(Grid(values, first - apart, (apart, down * width, step), shape) for apart in (1, width))
         )
         return [across[1], across[0], across[2], along[0], along[2]]
@@ -175,10 +176,11 @@ def take_places(
         width, components = values.shape[1], math.prod(values.shape[2:])
         steps = 1, components * width * rows.step, components * columns.step
         shape = components, len(rows), len(columns)
-        for down, right in places:
-            first = components * ((rows[0] + down) * width + columns[0] + right)
-            grids.append(Grid(values, first, steps, shape))
-    samples = iter(take_grids(*grids))
+        firsts = [components * ((rows[0] + down) * width + columns[0] + right) for down, right in places]
+        for first, second in zip_longest(firsts[::2], firsts[1::2]):  # two places in a launch
+            pair = (1, 0) if second is None else (2, second - first)
+            grids.append(Grid(values, first, steps, shape, *pair))
+    samples = (part for parts in take_grids(*grids) for part in parts)
     return [[next(samples) if values.ndim == 3 else next(samples)[0] for _ in places] for values in maps]
 
 

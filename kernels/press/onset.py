@@ -97,7 +97,8 @@ def onset_scan(frames: Array, first: int, hold: int, light: Array, dark_limit: A
     first : number of the block's first frame in the stack
     hold : number of consecutive light frames that confirm an onset
     light, dark_limit, near_limit : (P,), smallest samples that are light, not certainly dark, near the level
-    onset : (P,), first frame of the run; ``DARK`` without a run, ``INVALID`` after a NaN sample
+    onset : (P,), first frame of the run; ``DARK`` without a run, ``INVALID`` after a NaN sample, for which
+        the kernel stores ``DARK`` and that no frame is left
     last_dark : (P,), last certainly dark frame before the run; the first frame counts as dark. The
         kernel stores it only where it is not the last frame before the run
     last_far : (P,), last frame before the run that was not near the level, stored like ``last_dark``

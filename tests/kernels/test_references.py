@@ -578,13 +578,15 @@ def _(shape):
 
 
 @case(
-    "samples_take", DTYPES, per=lambda _, values: math.prod(values[key] for key in ("lines", "rows", "count"))
+    "samples_take",
+    DTYPES,
+    per=lambda _, values: math.prod(values[key] for key in ("places", "lines", "rows", "count")),
 )
 def _(dtype):
     values = np.random.default_rng(0).normal(100, 20, (40, 50)).astype(dtype)
     macros = {"VALUE": C_TYPES[dtype]}
     return {"values": values, "macros": macros} | named(
-        "lines rows count first apart down step", 5, 3, 12, 52, 400, 100, 4
+        "places lines rows count first between apart down step", 2, 4, 3, 12, 252, -103, 400, 100, 4
     )
 
 
