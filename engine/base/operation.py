@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
@@ -21,7 +20,6 @@ from mirrorskin.io.base.arguments import unknown_argument
 from mirrorskin.io.base.types import Motion
 from mirrorskin.io.model.result import check_maps
 from mirrorskin.io.watch.traces import FrameSamples
-from mirrorskin.kernels import memory
 from mirrorskin.kernels.device import Choice, Device, open_devices
 
 if TYPE_CHECKING:
@@ -34,7 +32,6 @@ COMPONENTS = {"displacement": (2,), "pose": (4,)}
 """Shapes of positions of a frame that are not single numbers."""
 _WEIGHTS = "frame_weights"  # the keyword of push that is not a position of the body
 _ANSWERS = "result", "preview"
-_MOST_CACHED = 2**26  # bytes of frames whose memory is cached for the next run
 _SIMPLE_TYPES = ("bool", "float", "int", "str")  # annotations of options, not of maps
 
 
@@ -347,14 +344,6 @@ class Operation(OnDevice):
         if buffer is None:
             buffer = vars(self)["_staging_buffer"] = np.empty((self.frames_at_once, *self.shape), self.dtype)
         return cast("NDArray[Any]", buffer)
-
-    def _release_frames(self) -> None:
-        """Free the memory of frames, since no more follow; the steps need it for maps."""
-        vars(self).pop("_staging_buffer", None)
-        if self._picture is not None:
-            self._picture.release_frames()
-        if self.frames_at_once * math.prod(self.shape) * self.dtype.itemsize > _MOST_CACHED:
-            memory.free()
 
 
 def _check_class(cls: type[Operation]) -> None:

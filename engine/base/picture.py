@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +22,7 @@ from mirrorskin.engine.base.tiling import (
     split_into_bands,
     staging_buffer_of,
 )
+from mirrorskin.kernels import memory
 from mirrorskin.kernels.device import C_TYPES, Device
 from mirrorskin.kernels.embedded import vector_width
 
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
     from mirrorskin.engine.base.device_arrays import AnyArray
     from mirrorskin.engine.base.operation import Operation
     from mirrorskin.kernels.array import Array
+
+_MOST_CACHED = 2**26  # bytes of frames whose memory is cached for the next run
 
 Part: TypeAlias = "str | tuple[str, int]"
 """A map, or one of its planes."""
@@ -115,10 +119,12 @@ class Picture:
         return staging_buffer_of(self.bands, self._length)
 
     def release_frames(self) -> None:
-        """Free the staging buffers."""
+        """Free the memory of frames, since no more follow: large buffers are not kept for the next run."""
         vars(self).pop("staging_buffer", None)
         for band in self.bands:
             band.release_frames()
+        if self._length * math.prod(self._shape) * self._itemsize > _MOST_CACHED:
+            memory.free()
 
     def fill(self, name: str, values: ArrayLike, plane: int | None = None) -> None:
         """Set a map, or one of its planes, to a number or to a map, (H, W), or (H, W, n) of vectors."""

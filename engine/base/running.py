@@ -327,8 +327,10 @@ class Run(ThreadSafe):
         watch, operation.ended = self._watch, ended
         findings = () if watch is None else watch.findings()  # while the device computes
         computed = as_result(operation, operation.result(), copied=not ended)
-        if ended:
-            operation._release_frames()
+        if ended:  # the steps need the memory of frames for maps
+            vars(operation).pop("_staging_buffer", None)
+            if operation._picture is not None:
+                operation._picture.release_frames()
         source = cast("Source", self._source)
         samples, time = (None, None) if watch is None else (watch.samples, watch.series.get("time"))
         first = 0 if plan.frames is None else plan.frames.start

@@ -36,7 +36,6 @@ _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # a fil
 
 
 _TEXT = h5py.string_dtype()
-_TEXT_TYPE = h5py.h5t.py_create(_TEXT, logical=True)
 _UNDATED, _WITH_GROUPS = h5py.h5p.create(h5py.h5p.DATASET_CREATE), h5py.h5p.create(h5py.h5p.LINK_CREATE)
 _UNDATED.set_obj_track_times(False)
 _WITH_GROUPS.set_create_intermediate_group(True)
@@ -361,30 +360,18 @@ def write_item(root: h5py.Group, item: Item) -> None:
         root[item.name] = h5py.SoftLink(item.values)
         return
     if item.values is None:
-        node = root.require_group(item.name).id
-    else:
-        values = np.asarray(item.values, order="C")
-        kind, space = _stored_type(values.dtype), _space(values.shape)
-        node = h5py.h5d.create(root.id, item.name.encode(), kind, space, _UNDATED, _WITH_GROUPS)
-        if values.size:
-            node.write(h5py.h5s.ALL, h5py.h5s.ALL, values, kind)
+        root.require_group(item.name).attrs.update(item.attributes)
+        return
+    values = np.asarray(item.values, order="C")
+    kind, space = h5py.h5t.py_create(values.dtype, logical=True), h5py.h5s.create_simple(values.shape)
+    node = h5py.h5d.create(root.id, item.name.encode(), kind, space, _UNDATED, _WITH_GROUPS)
+    if values.size:
+        node.write(h5py.h5s.ALL, h5py.h5s.ALL, values, kind)
     for name, value in item.attributes.items():
         # Variable-length texts, as expected by programs that read NeXus, such as silx.
-        is_text = isinstance(value, str) or (isinstance(value, list) and isinstance((*value, 0)[0], str))
-        stored = np.asarray(value, _TEXT if is_text else None)
-        kind, space = _stored_type(stored.dtype), _space(stored.shape)
+        stored = np.asarray(value, _TEXT if isinstance(value, str) else None)
+        kind, space = h5py.h5t.py_create(stored.dtype, logical=True), h5py.h5s.create_simple(stored.shape)
         h5py.h5a.create(node, name.encode(), kind, space).write(stored)
-
-
-_space = functools.lru_cache(64)(h5py.h5s.create_simple)
-_number_type = functools.lru_cache(64)(functools.partial(h5py.h5t.py_create, logical=True))
-
-
-def _stored_type(dtype: np.dtype[Any]) -> h5py.h5t.TypeID:
-    """Return the type in a file; texts of any length, and numbers, have a common one in all files."""
-    if dtype is _TEXT:
-        return _TEXT_TYPE
-    return _number_type(dtype) if dtype.kind in "iuf" else h5py.h5t.py_create(dtype, logical=True)
 
 
 def write_file(path: Path, items: Iterable[Item], replaces: Replaces = "derived") -> None:
