@@ -50,9 +50,9 @@ def test_library_run(recordings, levels):
 @pytest.mark.parametrize(
     ("line", "functions", "files"),
     [
-        ("reconstruct press.h5", 551, 69),
+        ("reconstruct press.h5", 553, 69),
         ("reconstruct turn.h5", 711, 89),
-        ("fuse press.h5 turn.h5", 874, 105),
+        ("fuse press.h5 turn.h5", 877, 105),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):
