@@ -182,6 +182,7 @@ def compile_for(
     *words, library = target
     output = folder / library
     command = [clang, *CLANG, *words, "-Xclang", "-mlink-builtin-bitcode", "-Xclang", str(BITCODE / library)]
+    command += ["-I", str(ROOT / "kernels")]
     process = subprocess.run(
         [*command, "-S", "-o", str(output), *options, str(path)], capture_output=True, text=True
     )
