@@ -32,6 +32,7 @@ MAPS = {
 _RANK = np.array([1, 0, 2, 3], np.uint8)  # rank of a status: a pixel has the highest of its nodes
 _MOST_STEP = 64  # maximum distance of nodes, pixels
 _CORRELATED_SAMPLES = 4  # samples over which residuals are correlated
+_LEAST_VARIANCE = 1e-4  # of samples of a window, relative to the median
 _LAPLACIAN_NOISE = 4 * 20 / 24**2  # noise of the squared bias (two standard deviations) per variance
 _LEAST_TEXTURED = 0.1  # minimum share of windows with texture; edges of light on a clear sheet may reach it
 
@@ -163,7 +164,9 @@ class Texture:
         level = tracker.finest
         variances = variance[np.isfinite(variance)] if noise is None else np.array([noise**2])
         usual = float(np.median(variances)) if variances.size else np.nan
-        variance = np.where(np.isfinite(variance) & (noise is None), variance, usual)
+        variance = np.where(
+            np.isfinite(variance) & (noise is None), np.maximum(variance, _LEAST_VARIANCE * usual), usual
+        )
         spurious = GRADIENT_NOISE * variance * level.measured
         first, mixed, last = level.information
         mean, half = (first + last) / 2, (first - last) / 2

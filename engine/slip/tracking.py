@@ -320,7 +320,8 @@ class _Level:
         with np.errstate(invalid="ignore", divide="ignore"):
             # The reference's noise is multiplied by the gain.
             variances += (gain**2 - 1) * self.measured
-            variance = squares / (variances * (1 - PARAMETERS / self.measured))
+            # By rounding, the sum of squares of a frame without noise may be below 0.
+            variance = np.maximum(squares, 0) / (variances * (1 - PARAMETERS / self.measured))
             converged = (np.abs(moved - last).max(axis=0) < 0.5) & (gain > _MIN_CONTRAST)
         return NodeField(moved, variance, converged), field
 
