@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -121,9 +120,7 @@ class Picture:
     def release_frames(self) -> None:
         """Free the memory of frames, since no more follow: large buffers are not kept for the next run."""
         vars(self).pop("staging_buffer", None)
-        for band in self.bands:
-            band.release_frames()
-        if self._length * math.prod(self._shape) * self._itemsize > _MOST_CACHED:
+        if sum(band.release_frames() for band in self.bands) > _MOST_CACHED:
             memory.free()
 
     def fill(self, name: str, values: ArrayLike, plane: int | None = None) -> None:

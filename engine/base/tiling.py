@@ -154,10 +154,11 @@ class Band:
         buffer = memory.take(nbytes + SLACK, zeroed=False)[:nbytes]
         return buffer.view(self._dtype).reshape(self.length, *self._shape)
 
-    def release_frames(self) -> None:
-        """Free the staging buffer."""
+    def release_frames(self) -> int:
+        """Free the staging buffer; return its bytes."""
         self._borrowed = None
-        vars(self).pop("staging_buffer", None)
+        buffer = vars(self).pop("staging_buffer", None)
+        return 0 if buffer is None else int(buffer.nbytes)
 
     def share_device(self) -> None:
         """Free the device's memory for other bands while this one is not used."""
