@@ -15,7 +15,7 @@ from mirrorskin.bench.suite.harness import Cases, agree, check_memory, missing, 
 from mirrorskin.cli.commands.bench.records import THREADS, Case
 from mirrorskin.cli.commands.bench.timing import OURS
 from mirrorskin.engine import find_onset
-from mirrorskin.engine.base.frames import estimate_noise, reference_maps, thin_out
+from mirrorskin.engine.base.frames import estimate_noise, reference_maps, thinned
 from mirrorskin.evaluation.scenes.inputs import (
     LEVELS,
     StackName,
@@ -131,7 +131,8 @@ def _peers(
     libraries: dict[str, Library] = {"NumPy": _numpy, "OpenCV": _opencv}
     if "torch" not in absent and not full:  # heights would be computed by NumPy, as for OpenCV
         libraries["PyTorch"] = _torch
-    noise = estimate_noise(thin_out(frames[0]), thin_out(frames[1]), True)
+    first, second = thinned(frames[:2])[0].astype(np.float64)
+    noise = estimate_noise(first, second, True)
     run = _heights if full else _onsets
     works: dict[str, Callable[[], object]] = {
         name: functools.partial(run, _TILES[name], library, frames, travel, levels, noise)

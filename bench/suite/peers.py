@@ -367,9 +367,7 @@ def _pose(shape: tuple[int, int], device: Device) -> _Compared:
     import cv2
 
     shape = min(shape[0], 240), min(shape[1], 320)
-    first, second = (
-        wavy_dome(shape, *place, seed) for seed, place in enumerate([(0, 0, 0), (0.05, 0, 0.02)])
-    )
+    first, second = wavy_dome(shape, 0, 0, 0, seed=0), wavy_dome(shape, 0.05, 0, 0.02, seed=1)
 
     def opencv() -> Maps:
         clouds = []

@@ -78,7 +78,7 @@ class Noise:
         """Use the next frames, (n, H, W), if they are among the first two."""
         if self.value is not None:
             return
-        self._samples += [*thin_out(frames[: 2 - len(self._samples)])]
+        self._samples += [*thinned(frames[: 2 - len(self._samples)])[0].astype(np.float64)]
         if len(self._samples) == 2:
             self.value = estimate_noise(self._samples[0], self._samples[1], self._integer)
 
@@ -86,12 +86,6 @@ class Noise:
 def thinning(shape: tuple[int, ...]) -> int:
     """Return n such that every n-th pixel of a frame gives enough samples."""
     return max(1, math.prod(shape) // SAMPLES)
-
-
-def thin_out(frames: AnyArray) -> NDArray[np.float64]:
-    """Return evenly spaced samples of one frame or several, enough to estimate the noise within 0.5 %."""
-    [samples] = thinned(frames)
-    return samples.astype(np.float64)
 
 
 def typical_value(values: AnyArray) -> float:
@@ -102,9 +96,9 @@ def typical_value(values: AnyArray) -> float:
 
 
 def thinned(*arrays: AnyArray) -> list[NDArray[Any]]:
-    """Return arrays, (..., H, W), thinned out by `thin_out`, in their own types.
+    """Return evenly spaced samples of arrays, (..., H, W), enough to estimate the noise within 0.5 %.
 
-    All are on the host, or all on one device, which is waited for once.
+    All arrays are on the host, or all on one device, which is waited for once.
     """
     samples, grids = [], []
     for array in map(viewed, arrays):

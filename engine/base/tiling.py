@@ -29,12 +29,8 @@ MEMORY_LIMIT = 256_000_000
 
 _MOST_PIXELS = 2**30  # kernels index the pixels of two planes with an int
 _LINE = 64  # bytes of the longest word that a kernel loads at once
-_RESERVED = (
-    64_000_000  # bytes of frames for which discrete memory is reserved: enough for the full transfer rate
-)
-_PIECE = (
-    512_000_000  # most bytes of frames in discrete memory; each launch also moves the state of all pixels
-)
+_RESERVED = 64_000_000  # bytes of frames with reserved discrete memory: enough for the full transfer rate
+_PIECE = 512_000_000  # most bytes of frames in discrete memory: each launch also moves the pixels' state
 _STEP = 16  # frames: long pieces are multiples of it
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.base.frames import estimate_noise, thin_out
+from mirrorskin.engine.base.frames import estimate_noise, thinned
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.blur import first_travel
@@ -161,7 +161,7 @@ def estimate_levels(
     lowest, deepest = (frames.start + int(number) for number in (np.argmin(part), np.argmax(part)))
     neighbour = lowest + (1 if lowest + 1 < frames.stop else -1)
     pictures = _pictures(source, lowest, neighbour, deepest)
-    samples = np.stack([thin_out(picture) for picture in pictures])
+    samples = np.stack(thinned(*pictures), dtype=np.float64)
     first, second, last = samples[:, np.isfinite(samples).all(axis=0)]
     integer = pictures[0].dtype.kind == "u"
     rise = last - first

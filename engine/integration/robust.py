@@ -161,7 +161,7 @@ class _Search:
         scales: tuple[float, ...] = _SCALES[3:]
         if heights is None:
             self.link(self._held, math.inf)
-            heights, scales = self._solve(None, _LOOSE, _CYCLES).height, _SCALES
+            heights, scales = self._solve(None, tolerance=_LOOSE, limit=_CYCLES).height, _SCALES
         start: Array | None = heights
         for scale in scales:
             for step in range(_STEPS):
@@ -198,10 +198,10 @@ class _Search:
         self.last = Links(self._links.device, self._shape, right, down, self._links.anchor, source)
         return self.last
 
-    def _solve(self, start: Array | None, tolerance: float, limit: int = 100) -> Solution:
+    def _solve(self, start: Array | None, **goal: Any) -> Solution:
         """Solve for the weights of the last `link`."""
         self._solver.rebuild(self._current())
-        return self._solver.solve(start, tolerance=tolerance, limit=limit, deadline=self._deadline)
+        return self._solver.solve(start, deadline=self._deadline, **goal)
 
     def conclude(
         self, heights: Array, flags: Flags, tolerance: float, plain: Floats, components: Components
@@ -211,7 +211,7 @@ class _Search:
         self.link(heights)
         right, down = self._confidence()
         self.link(heights, cap=_BROKEN)
-        last = self._solve(heights, tolerance)
+        last = self._solve(heights, tolerance=tolerance)
         for _ in range(_AGAIN):  # a restart recomputes the residual, whose rounding errors stop the iteration
             if last.converged or self.late():
                 break

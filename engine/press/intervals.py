@@ -224,17 +224,8 @@ def normal_distribution(x: Doubles) -> Doubles:
 def _distribution(x: Doubles, bell: Doubles) -> Doubles:
     """Return the distribution function at x, given exp(-x^2 / 2)."""
     distance = np.abs(x)
-    tail: Doubles = bell * _polynomial(_ABOVE, distance) / _polynomial(_BELOW, distance)
+    tail: Doubles = bell * np.polyval(_ABOVE, distance) / np.polyval(_BELOW, distance)
     return np.where(x > 0, 1 - tail, tail)
-
-
-def _polynomial(coefficients: tuple[float, ...], x: Doubles) -> Doubles:
-    """Return the values of a polynomial, as `numpy.polyval`, in one array."""
-    value = np.full(x.shape, coefficients[0])
-    for coefficient in coefficients[1:]:
-        value *= x
-        value += coefficient
-    return value
 
 
 def _lowest(function: Callable[[float], float], low: float, high: float) -> float:

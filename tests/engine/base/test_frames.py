@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine
-from mirrorskin.engine.base.frames import SAMPLES, estimate_noise, thin_out
+from mirrorskin.engine.base.frames import SAMPLES, estimate_noise, thinned
 from mirrorskin.io import InputError
 
 RANDOM = np.random.default_rng(0)
@@ -38,10 +38,10 @@ def test_samples_that_are_no_numbers_are_left_out():
 
 def test_samples_are_taken_from_all_over_the_frame():
     frame = np.arange(10 * SAMPLES, dtype=np.float32).reshape(10, SAMPLES)
-    samples = thin_out(frame)
+    [samples] = thinned(frame)
     assert SAMPLES <= len(samples) < 2 * SAMPLES
     assert samples[-1] > 0.99 * frame.max()
-    assert len(thin_out(frame[:1, :9])) == 9
+    assert len(thinned(frame[:1, :9])[0]) == 9
 
 
 @pytest.mark.parametrize("dtype", ["?", "i1", "i2", ">u2", "i8", "f2", "f8"])
