@@ -328,14 +328,15 @@ class _Ring(NamedTuple):
     high: Doubles
 
 
-def _distance(inside: Mask, spacing: tuple[float, float]) -> Floats:
+def _distance(inside: Mask, spacing: tuple[float, float]) -> Doubles:
     """Return the distance of each pixel in a region to the nearest pixel outside."""
     finest = min(spacing)
     down, across = (round(length * step / finest) for length, step in zip(inside.shape, spacing, strict=True))
     even = cv2.resize(inside.view(np.uint8), (across, down), interpolation=cv2.INTER_NEAREST)
     distance = cv2.distanceTransform(even, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    back = cv2.resize(distance, inside.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    return np.asarray(back * np.float32(finest), np.float32)
+    back = np.asarray(cv2.resize(distance, inside.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float64)
+    # OpenCV's square roots depend on where arrays are in memory; squared distances are whole numbers.
+    return np.sqrt(np.rint(back * back)) * finest
 
 
 def _thinned(box: Box, strides: tuple[int, int]) -> Box:

@@ -41,6 +41,16 @@ def inside(height, slope):
     return np.isfinite(height) & (slope <= DARK_SLOPE)
 
 
+def test_a_fill_does_not_depend_on_where_arrays_are_in_memory():
+    height, slope = cap((161, 161), 5, (0.37, 0.2), pixel=0.045)
+    holed, sigma = terraces(height, slope, 0.1)
+    filled, kept = set(), []
+    for size in range(40):
+        kept.append(np.empty(1000 + 2 * size))
+        filled.add(fill_holes(holed, sigma, 0.045)[0].tobytes())
+    assert len(filled) == 1
+
+
 @pytest.mark.parametrize(
     ("radius", "step", "error"), [(3, 0.01, 0.005), (10, 0.01, 0.008), (5, 0.1, 0.012), (10, 0.1, 0.020)]
 )
