@@ -167,8 +167,9 @@ def rows() -> dict[str, list[str]]:
         declared = {name: prop for name, prop in PROPERTIES.items() if prop.of == table}
         for name, prop in declared.items():
             layout.append(f"| `.../{group}/{name}` * | number | {prop.unit} | {prop.text} |\n")
-            limits = f"{prop.unit}, {prop.within[0]:g} to {prop.within[1]:g}"
-            keys.append(f"| `{name}` | {limits} | {prop.text}; {prop.use} | unknown |\n")
+            limits = f"{prop.unit}, {prop.within[0]:g} to {prop.within[1]:g}".removeprefix(", ")
+            default = "unknown" if prop.default is None else f"{prop.default:g}"
+            keys.append(f"| `{name}` | {limits} | {prop.text}; {prop.use} | {default} |\n")
     return {"formats.md": layout, "rig.md": keys}
 
 

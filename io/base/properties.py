@@ -36,6 +36,8 @@ class Property:
         Value in the template.
     in_steps : bool
         Whether it holds for captures in steps, too.
+    default : float, optional
+        Value if it is not stated, of a camera and a stage that nobody characterised.
     """
 
     of: Literal["stage", "camera"]
@@ -47,11 +49,12 @@ class Property:
     within: tuple[float, float]
     example: str
     in_steps: bool = True
+    default: float | None = None
 
     @property
     def needed(self) -> str:
         """Valid values in the rig file."""
-        return f"a {self.kind} from {self.within[0]:g} to {self.within[1]:g} {self.unit}"
+        return f"a {self.kind} from {self.within[0]:g} to {self.within[1]:g} {self.unit}".rstrip()
 
     def line(self, name: str) -> str:
         """Return its line in the template of the rig file."""

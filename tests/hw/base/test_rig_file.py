@@ -26,6 +26,7 @@ from mirrorskin.hw.base.rig_file import (
 )
 from mirrorskin.hw.base.stage import Limits
 from mirrorskin.io import InputError
+from mirrorskin.io.base.types import PROPERTIES
 
 DOCS = Path(__file__).parents[3] / "docs" / "rig.md"
 
@@ -42,6 +43,8 @@ report_rate = 10
 silence = 0.25
 press = 2
 travel_sigma = 0.002
+tilt_sigma = 0.003
+phase_sigma = 0.004
 pivot = [0, 1, -10.5]
 
 [stage.travel]
@@ -112,6 +115,15 @@ stall = 0.2
 trigger = "spindle"
 trigger_input = "Line2"
 line_time = 2e-5
+gamma_sigma = 0.01
+frame_gain_sigma = 0.002
+drift_sigma = 0.003
+lag_sigma = 0.004
+pixel_gain_sigma = 0.005
+uneven_light_sigma = 0.006
+blur_sigma = 0.07
+zenith_gain_sigma = 0.008
+zenith_offset_sigma = 0.9
 pixel_size = [0.03, 0.04]
 dark = 12
 bright = 4000.5
@@ -493,4 +505,5 @@ def test_the_template_has_all_keys_with_their_defaults(rig, tmp_path):
         assert {field.encode_name for field in structs.fields(model)} == set(tables[table]), table
     axes = {name: structs.replace(axis, steps=250.0) for name, axis in plain.stage.axes.items()}
     axes |= {name: getattr(rig(whole).stage, name) for name in ("x", "y", "twist")}
-    assert rig(whole).stage == structs.replace(plain.stage, pivot=(0.0, 0.0, 0.0), travel_sigma=0.002, **axes)
+    stated = {name: float(prop.example) for name, prop in PROPERTIES.items() if prop.of == "stage"}
+    assert rig(whole).stage == structs.replace(plain.stage, pivot=(0.0, 0.0, 0.0), **stated, **axes)
