@@ -6,14 +6,17 @@ and turned into counts by a sensor with shot noise and read noise.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
+from typing import Any
 
 import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dctn, idctn
 from scipy.ndimage import gaussian_filter1d
 
 Floats = NDArray[np.float64]
@@ -24,7 +27,9 @@ POINTS = 4  # along each side of a pixel
 DARK, SPAN = 20.0, 200.0  # counts of 8 bits: without light, and from there to full light
 ELECTRONS = 200.0  # a count of 8 bits
 READ_NOISE = 1.2  # counts of 8 bits
+HOTTEST = 60.0  # counts of 8 bits: the highest dark level of a hot pixel
 _CAMERA = 7  # seed of what stays the same from recording to recording
+_BLOCK, _GROUP, _QUANTUM = 8, 12, 6.0  # pixels; frames; counts of 8 bits: of the codec without a container
 
 
 @dataclass(frozen=True)
@@ -63,9 +68,29 @@ class Fault:
     stray : float
         Share of the light of a frame that is spread over the whole frame.
     codec : str
-        "jpeg" (quality 90) or "mpeg" (MPEG-4) if frames are compressed.
+        "jpeg" (quality 90) or "mpeg" (MPEG-4) if frames are compressed, "dct" if nothing says so.
     shutter : float
         Steps from the first row's exposure to the last row's.
+    lag : float
+        Share of the frame before that a frame shows.
+    lamp : float
+        Change of light at the left and right borders, as a share, as the lamp moves to the right.
+    wave : float
+        Amplitude of one wave of light per turn, or per press, as a share.
+    fading : float
+        Loss of light over the recording, as a share.
+    electrons, read_noise : float
+        Electrons of a count of 8 bits; standard deviation without light, counts of 8 bits.
+    dark_pattern : float
+        Standard deviation of each pixel's dark level, counts of 8 bits.
+    hot_pixels : float
+        Share of the pixels whose dark level is up to `HOTTEST` counts higher.
+    tilt, light, offset, turned : float
+        What nobody measured: the tilt and the light over what is stated; the dark level and the phase minus
+        what is stated, counts of 8 bits and radians.
+    usual : bool
+        Whether the recording has the deviations that are usual of a camera that nobody characterised, which
+        are drawn for each recording: see `drawn`.
     """
 
     name: str
@@ -86,11 +111,75 @@ class Fault:
     stray: float = 0.0
     codec: str = ""
     shutter: float = 0.0
+    lag: float = 0.0
+    lamp: float = 0.0
+    wave: float = 0.0
+    fading: float = 0.0
+    electrons: float = ELECTRONS
+    read_noise: float = READ_NOISE
+    dark_pattern: float = 0.0
+    hot_pixels: float = 0.0
+    tilt: float = 1.0
+    light: float = 1.0
+    offset: float = 0.0
+    turned: float = 0.0
+    usual: bool = False
 
     @property
     def scale(self) -> float:
         """Counts for a count of 8 bits."""
         return float(2**self.bits - 1) / 255
+
+    def drawn(self, seed: int) -> Fault:
+        """Return the fault with the usual deviations of one recording, if it has any."""
+        if not self.usual:
+            return self
+        generator = np.random.default_rng([seed, _CAMERA])
+        draws: dict[str, Any] = {
+            name: center + sigma * generator.normal() for name, (center, sigma) in USUAL.items()
+        }
+        for name in ("blur", "lag", "vignetting"):
+            draws[name] = abs(draws[name])
+        return replace(self, usual=False, flicker=0.005, **draws)
+
+
+def combined(*faults: Fault, name: str = "") -> Fault:
+    """Return a fault with all that goes wrong in some; the last counts where two are of one kind."""
+    plain = Fault("")
+    values = {
+        field.name: getattr(fault, field.name)
+        for fault in faults
+        for field in fields(Fault)
+        if field.name != "name" and getattr(fault, field.name) != getattr(plain, field.name)
+    }
+    return replace(plain, **values, name=name or " + ".join(fault.name for fault in faults))
+
+
+USUAL: dict[str, tuple[float, float]] = {
+    "gamma": (1.0, 0.02),
+    "fading": (0.0, 0.005),
+    "blur": (0.3, 0.3),
+    "lag": (0.0, 0.01),
+    "vignetting": (0.0, 0.02),
+    "tilt": (1.0, 0.01),
+    "light": (1.0, 0.01),
+    "offset": (0.0, 0.5),
+    "turned": (0.0, np.radians(0.3)),
+}
+"""Means and standard deviations of a machine-vision camera that nobody characterised."""
+
+SENSORS: dict[str, Fault] = {
+    "small pixels": Fault(
+        "small pixels", electrons=40, read_noise=0.15, gain=0.01, dark_pattern=0.5, hot_pixels=5e-4
+    ),
+    "machine vision": Fault(
+        "machine vision", electrons=120, read_noise=0.1, gain=0.01, dark_pattern=0.2, hot_pixels=2e-4
+    ),
+    "scientific": Fault(
+        "scientific", bits=12, electrons=300, read_noise=0.02, gain=0.01, dark_pattern=0.05, hot_pixels=1e-4
+    ),
+}
+"""Sensors as data sheets after EMVA 1288 describe them, full wells of 10 000, 30 000 and 75 000 electrons."""
 
 
 FAULTS = (
@@ -116,6 +205,26 @@ FAULTS = (
     Fault("JPEG 90", codec="jpeg"),
     Fault("MPEG-4", codec="mpeg"),
 )
+MORE_FAULTS = (
+    Fault("lag 7 %", lag=0.07),
+    Fault("moving lamp", lamp=0.02),
+    Fault("wave 1 %", wave=0.01),
+    Fault("fading 3 %", fading=0.03),
+    Fault("codec, not stated", codec="dct"),
+    Fault("usual deviations", usual=True),
+)
+_MODERATE = (
+    Fault("blur", blur=0.7),
+    Fault("gamma", gamma=0.95),
+    Fault("fading", fading=0.02),
+    Fault("flicker", flicker=0.01),
+    Fault("jitter", jitter=0.05),
+    Fault("saturation", exposure=1.25),
+    Fault("vignetting", vignetting=0.05),
+    Fault("lag", lag=0.04),
+    Fault("codec", codec="dct"),
+)
+PAIRS = tuple(combined(*pair) for pair in itertools.combinations(_MODERATE, 2))
 
 
 def points(shape: tuple[int, int], pixel_size: float) -> tuple[Floats, Floats]:
@@ -134,8 +243,14 @@ def centres(shape: tuple[int, int], pixel_size: float) -> tuple[Floats, Floats]:
     return x[np.newaxis, :], y[:, np.newaxis]
 
 
-def record(light: Light, positions: Floats, fault: Fault, seed: int) -> NDArray[np.unsignedinteger]:
-    """Return the frames of a scene, (T, H, W), at positions, (T,), that are what the user believes."""
+def record(
+    light: Light, positions: Floats, fault: Fault, seed: int, *, period: int | None = None
+) -> NDArray[np.unsignedinteger]:
+    """Return the frames of a scene, (T, H, W), at positions, (T,), that are what the user believes.
+
+    ``period`` is the number of frames of a turn, by default all.
+    """
+    fault = fault.drawn(seed)
     generator = np.random.default_rng(seed)
     middle, step = len(positions) // 2, float(np.median(np.diff(positions)))
     true = positions.copy()
@@ -147,10 +262,11 @@ def record(light: Light, positions: Floats, fault: Fault, seed: int) -> NDArray[
     frames = [_share(light, position, step, fault) for position in true]
     shares = np.stack(frames)
     flicker = 1 + fault.flicker * generator.normal(size=len(true))
+    gain = flicker * _brightness(len(true), period, fault)
+    shares = shares * _pixels(shares.shape[1:], fault)[0] * gain[:, np.newaxis, np.newaxis]
+    mean_counts = _expose(_smear(shares, fault), fault, generator)
     drift = fault.drift * np.linspace(0, 1, len(true))
-    pixels = 1 + fault.gain * np.random.default_rng(_CAMERA).normal(size=shares.shape[1:])
-    mean_lightcounts = _expose(shares * pixels * flicker[:, np.newaxis, np.newaxis], fault, generator)
-    counts = _sample(mean_lightcounts + drift[:, np.newaxis, np.newaxis], fault, generator)
+    counts = _sample(mean_counts + drift[:, np.newaxis, np.newaxis], fault, generator)
     if fault.duplicated:
         counts[middle] = counts[middle - 1]
     return _compress(counts, fault)
@@ -158,14 +274,45 @@ def record(light: Light, positions: Floats, fault: Fault, seed: int) -> NDArray[
 
 def references(shape: tuple[int, int], fault: Fault, seed: int) -> tuple[Floats, Floats]:
     """Return the levels without and with full light, counts: means of 16 frames of the same camera."""
-    steady = replace(fault, flicker=0.0, drift=0.0, jitter=0.0, dropped=False, duplicated=False, hot=0.0)
-    steady = replace(steady, outliers=0.0, codec="")
+    steady = replace(fault.drawn(seed), flicker=0.0, drift=0.0, jitter=0.0, dropped=False, duplicated=False)
+    steady = replace(steady, hot=0.0, outliers=0.0, codec="", lag=0.0, lamp=0.0, wave=0.0, fading=0.0)
     rows, columns = (POINTS * size for size in shape)
     dark, bright = (
         record(lambda _: np.full((1, rows, columns), level), np.arange(16.0), steady, seed).mean(axis=0)  # noqa: B023
         for level in (0.0, 1.0)
     )
     return dark, bright
+
+
+def _brightness(count: int, period: int | None, fault: Fault) -> Floats:
+    """Return the brightness of the lamp in each frame, over its mean."""
+    turn = 2 * np.pi * np.arange(count) / (period or count)
+    lamp: Floats = (1 + fault.wave * np.cos(turn - 0.7)) * (1 - fault.fading * np.linspace(0, 1, count))
+    return lamp * fault.light
+
+
+def _pixels(shape: tuple[int, ...], fault: Fault) -> tuple[Floats, Floats]:
+    """Return the gain of each pixel, and its dark level above the mean, counts of 8 bits."""
+    generator = np.random.default_rng(_CAMERA)
+    gain = 1 + fault.gain * generator.normal(size=shape)
+    dark = fault.dark_pattern * generator.normal(size=shape)
+    hot = generator.random(shape) < fault.hot_pixels
+    return gain, dark + HOTTEST * hot * generator.random(shape)
+
+
+def _smear(shares: Floats, fault: Fault) -> Floats:
+    """Return light with that of the frame before, and with a lamp that moves to the right."""
+    if fault.lamp:
+        along = np.linspace(-1, 1, shares.shape[2])
+        shares = shares * (
+            1 + fault.lamp * np.linspace(-1, 1, len(shares))[:, np.newaxis, np.newaxis] * along
+        )
+    if fault.lag:
+        before = shares[0]
+        shares = shares.copy()
+        for frame in shares:
+            frame[:] = before = (1 - fault.lag) * frame + fault.lag * before
+    return shares
 
 
 def _share(light: Light, position: float, step: float, fault: Fault) -> Floats:
@@ -189,8 +336,9 @@ def _expose(shares: Floats, fault: Fault, generator: np.random.Generator) -> Flo
     """Return counts of 8 bits, without limits."""
     full = fault.exposure * SPAN
     light = np.maximum(shares, 0) ** fault.gamma
-    electrons = generator.poisson(light * full * ELECTRONS)
-    return DARK + electrons / ELECTRONS + generator.normal(0, READ_NOISE, shares.shape)
+    electrons = generator.poisson(light * full * fault.electrons)
+    dark = DARK + fault.offset + _pixels(shares.shape[1:], fault)[1]
+    return dark + electrons / fault.electrons + generator.normal(0, fault.read_noise, shares.shape)
 
 
 def _sample(counts: Floats, fault: Fault, generator: np.random.Generator) -> NDArray[np.unsignedinteger]:
@@ -210,7 +358,32 @@ def _compress(frames: NDArray[np.unsignedinteger], fault: Fault) -> NDArray[np.u
         return np.stack([np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE), np.uint8) for jpeg in stored])
     if fault.codec == "mpeg":
         return _filmed(frames)
+    if fault.codec == "dct":
+        return _quantized(frames, _QUANTUM * fault.scale)
     return frames
+
+
+def _quantized(frames: NDArray[np.unsignedinteger], quantum: float) -> NDArray[np.unsignedinteger]:
+    """Return frames as a codec stores them that predicts each from the one before, without motion.
+
+    Cosines of blocks of 8 x 8 pixels are rounded to multiples of a number; each twelfth frame is whole.
+    """
+    top = np.iinfo(frames.dtype).max if frames.dtype == np.uint8 else frames.max()
+    decoded, before = np.empty_like(frames), np.zeros(frames.shape[1:])
+    for number, frame in enumerate(frames):
+        if number % _GROUP == 0:
+            before = np.zeros(frames.shape[1:])
+        blocks = _as_blocks(frame - before)
+        cosines = dctn(blocks, axes=(2, 3), norm="ortho")
+        blocks = idctn(quantum * np.rint(cosines / quantum), axes=(2, 3), norm="ortho")
+        before = np.clip(np.rint(before + blocks.transpose(0, 2, 1, 3).reshape(frame.shape)), 0, top)
+        decoded[number] = before
+    return decoded
+
+
+def _as_blocks(picture: Floats) -> Floats:
+    rows, columns = (size // _BLOCK for size in picture.shape)
+    return picture.reshape(rows, _BLOCK, columns, _BLOCK).transpose(0, 2, 1, 3)
 
 
 def _filmed(frames: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
