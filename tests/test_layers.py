@@ -79,7 +79,6 @@ SMALL = {
     "kernels/errors.py": "other packages import it alone",
     "kernels/layout.py": "tests choose a layout without the device",
     "kernels/optical/fringes.py": "it belongs to fringes.cl",
-    "kernels/rotation/facing.py": "it belongs to facing.cl",
 }
 """Why a module has less than 40 lines; a command may."""
 

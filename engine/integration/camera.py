@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import InputError
+from mirrorskin.kernels.rotation.facing import mean_variances
 
 Box = tuple[slice, slice]
 """Rows and columns of a part of a picture."""
@@ -41,7 +42,7 @@ def _find_ends(count: int, answered: Callable[[slice], Mask]) -> slice:
 
 
 Slopes = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]
-"""Slopes along x and y, and their weight, (H, W); None if all weights are equal."""
+"""Slopes along x and y, (H, W), and the squared cosine to the line of sight; None without normals."""
 
 EDGE_ON = 1e-4  # squared cosine of the angle between normal and line of sight, up to which there is no slope
 
@@ -112,23 +113,61 @@ class Camera:
 
 
 def find_slopes(normals: NDArray[Any], camera: Camera | None, box: Box) -> Slopes:
-    """Return slopes along x and y within a box, and their weights for equally noisy normals.
+    """Return slopes along x and y within a box, and the squared cosine between normal and line of sight.
 
     Without a camera: the slopes of the height, -n_x / n_z and -n_y / n_z.
     With one: the slopes of the logarithm of the depth, per pixel size at depth 1. A step along x changes the
     point Z r by Z (r d(ln Z) + dr), to which n is perpendicular; so the slopes are n_x / (n . v) and
-    n_y / (n . v) with v = -r. The weight is (n . v)^2 of the unit normal, because its errors are divided by
-    n . v. Slopes are NaN where the surface faces away or is seen edge-on, and without a finite normal.
+    n_y / (n . v) with v = -r. Slopes are NaN where the surface faces away or is seen edge-on, and without a
+    finite normal; the squared cosine is 1 there.
     """
     with np.errstate(all="ignore"):
         x, y, z = (np.asarray(normals[(*box, axis)], np.float32) for axis in range(3))
         facing = z.copy()
         if camera is not None:
-            across, up = camera.sight((normals.shape[0], normals.shape[1]))
-            facing += x * across[box[1]] + y * up[box[0]]
+            across, up = sight_within(camera, (normals.shape[0], normals.shape[1]), box)
+            facing += x * across + y * up
         square = x * x + y * y + z * z
         weight = np.square(facing) / square
         undefined = ~((facing > 0) & (weight > EDGE_ON))
         facing[undefined], weight[undefined] = np.nan, 1
         factor = np.reciprocal(facing if camera is not None else -facing)
         return x * factor, y * factor, weight
+
+
+def sight_within(
+    camera: Camera | None, shape: tuple[int, int], box: Box
+) -> tuple[NDArray[np.float32] | np.float32, NDArray[np.float32] | np.float32]:
+    """Return x and y of vectors (x, y, 1) to the camera from the pixels of a box."""
+    if camera is None:
+        return np.float32(0), np.float32(0)
+    across, up = camera.sight(shape)
+    return across[box[1]], up[box[0]]
+
+
+def weigh_slopes(
+    slopes: tuple[NDArray[np.float32], NDArray[np.float32]],
+    variances: list[NDArray[np.float32]],
+    sight: tuple[Any, Any],
+    defined: Mask,
+) -> tuple[list[NDArray[np.float32]], list[NDArray[np.float32]]]:
+    """Return slopes without the bias by noise, and the factors of their weights.
+
+    ``variances`` are those of unit normals, of one or both slopes; 0 without a bias. The slope p along x is
+    n_x / (n . v); see `find_slopes`. An error d of the unit normal changes it by d . (e_x - p v) / (n . v),
+    so its weight has the factor (n . v)^2 / |e_x - p v|^2, along y with q and e_y; without a camera ::
+
+        1 / ((1 + p^2) (1 + p^2 + q^2)),    1 / ((1 + q^2) (1 + p^2 + q^2))
+
+    Noise of variance s^2 makes n . v as often smaller as larger, but its reciprocal larger in the mean: the
+    slope p (1 + s^2 |v|^2 / (n . v)^2) - s^2 v_x / (n . v)^2 is expected. All factors are means; see
+    `mean_variances`.
+    """
+    x, y = sight
+    *along, slant = mean_variances(*slopes, sight, defined)
+    unbiased = [
+        (slope + noise * v * slant) / (1 + noise * (1 + x * x + y * y) * slant)
+        for slope, noise, v in zip(slopes, (variances[0], variances[-1]), sight, strict=True)
+    ]
+    factors = [np.reciprocal(variance).astype(np.float32) for variance in along]
+    return [slope.astype(np.float32) for slope in unbiased], factors

@@ -17,12 +17,15 @@ from mirrorskin.engine.integration.validation import (
     as_marks,
     check_one_source,
     median_weight,
+    noise_variance,
     split_weights,
 )
 from mirrorskin.io import InputError
 from mirrorskin.io.base.arguments import check_pixel_size
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.numerics.samples import take_samples
+
+_CHUNK = 256  # columns of a work-item on a CPU; see facing.cl
 
 
 def check_device_inputs(
@@ -46,17 +49,21 @@ def check_device_inputs(
     shape = maps[0].shape[:2]
     weight, _ = split_weights("slope_weights", slope_weights, shape)
     planes: list[Array] = []
+    marks = as_marks("mask", mask, shape)
     if normals is not None:
         maps, planes = _find_slopes(normals, weight)
+        if slope_weights is not None:
+            maps, planes = _weigh_slopes(maps[0], maps[1], weight, marks)
     return Inputs(
         # Arrays on a device instead of NumPy's: solvers copy neither to nor from the host.
         dz_dx=cast(Floats, maps[0]),
         dz_dy=cast(Floats, maps[1]),
         pixel_size=check_pixel_size(pixel_size),
-        mask=as_marks("mask", mask, shape),
+        mask=marks,
         edges=as_marks("edges", edges, shape),
         weight_x=cast(Floats, planes[0]) if planes else None,
-        typical_weight=_clip(planes[0]) if planes else weight,
+        weight_y=cast(Floats, planes[1]) if len(planes) > 1 else None,
+        typical_weight=_clip(planes) if planes else weight,
         weights_given=slope_weights is not None,
         picture=shape,
     )
@@ -75,14 +82,29 @@ def _find_slopes(normals: Array, weight: float) -> tuple[list[Array], list[Array
     return [x, y], [weights]
 
 
-def _clip(weights: Array) -> float:
-    """Clip weights to the range that can be solved, and return their median."""
-    typical = median_weight([sample_evenly(weights)])
-    device, pixels = weights.device, math.prod(weights.shape)
-    device.kernel("facing", "facing_clip")(
-        -(-pixels // device.layout.tile), pixels=pixels, lowest=typical * LEAST, highest=typical * MOST,
-        weight=weights, moved=2 * weights.nbytes,
+def _weigh_slopes(dz_dx: Array, dz_dy: Array, weight: float, mask: Any) -> tuple[list[Array], list[Array]]:
+    """Return slopes without the bias by noise, and their weights; see `camera.weigh_slopes`."""
+    device, (rows, columns) = dz_dx.device, dz_dx.shape
+    names = "unbiased_x", "unbiased_y", "weight_x", "weight_y"
+    maps: dict[str, Any] = {name: device.array(name, dz_dx.shape, np.float32, zeroed=False) for name in names}
+    marks: dict[str, Any] = {} if mask is None else {"mask": device.share("mask", mask)}
+    device.kernel("facing", "facing_weigh", MASK=len(marks))(
+        rows * -(-columns // min(device.layout.tile, _CHUNK)), rows=rows, columns=columns, dz_dx=dz_dx,
+        dz_dy=dz_dy, variance=noise_variance(weight), unit=weight, **marks, **maps, moved=6 * dz_dx.nbytes,
     )  # fmt: skip
+    x, y, *weights = maps.values()
+    return [x, y], weights
+
+
+def _clip(planes: list[Array]) -> float:
+    """Clip maps of weights to the range that can be solved, and return their median."""
+    typical = median_weight([sample_evenly(weights) for weights in planes])
+    for weights in planes:
+        device, pixels = weights.device, math.prod(weights.shape)
+        device.kernel("facing", "facing_clip")(
+            -(-pixels // device.layout.tile), pixels=pixels, lowest=typical * LEAST, highest=typical * MOST,
+            weight=weights, moved=2 * weights.nbytes,
+        )  # fmt: skip
     return typical
 
 

@@ -101,10 +101,11 @@ def integrate(
         0 where no height is wanted.
     slope_weights : array_like, scalar, (H, W) or (2, H, W), optional
         Inverse variances of the slopes, or of dz_dx and of dz_dy; 0 where undefined. With ``normals``,
-        inverse variances of unit normals, 1/rad^2; the weight of a slope is that times (n . v)^2, with
-        v = (0, 0, 1) without a camera. By default all slopes have the same noise, which is estimated from the
-        misfit for ``height_sigma``. Weights are clipped to 1e-4 to 1e3 times the median; values that are 0 in
-        float32 count as 0.
+        inverse variances of unit normals, 1/rad^2: the variances of slopes follow from them, and the bias of
+        noise is removed from the slopes if the median of the standard deviations is at most 0.1 rad; see
+        "Heights from slopes" in the documentation. By default all slopes, or normals, have the same noise,
+        which is estimated from the misfit for ``height_sigma``. Weights are clipped to 1e-4 to 1e3 times the
+        median; values that are 0 in float32 count as 0.
     edges : array_like, (H, W), optional
         Nonzero at pixels where the surface is discontinuous. Such a pixel keeps only one link, to the
         neighbour off the edge with the most similar slopes, so that it does not connect both sides.

@@ -10,7 +10,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.integration.camera import Box, Camera, Mask, Slopes, find_box, find_slopes
+from mirrorskin.engine.integration.camera import (
+    Box,
+    Camera,
+    Mask,
+    Slopes,
+    find_box,
+    find_slopes,
+    sight_within,
+    weigh_slopes,
+)
 from mirrorskin.io import InputError
 from mirrorskin.io.base.arguments import check_pixel_size
 
@@ -20,6 +29,8 @@ Flags = NDArray[np.uint8]
 LEAST, MOST = 1e-4, 1e3
 """Range of the weights of slopes, relative to the median, that can be solved in float32."""
 
+MOST_NOISE = 0.1**2
+"""Variance of normals, radians^2, above which a typical weight cannot be the inverse of one."""
 _LARGEST_HEIGHT_WEIGHT = 1e4  # relative to the weight of a link; larger weights are clipped
 SAMPLES = 65536
 """Number of pixels from which the median weight is computed."""
@@ -48,6 +59,8 @@ class Inputs:
     datum: float = 0.0  # subtracted from the known heights, mm
     # (H, W), float32: squared cosine between normal and line of sight; None: it follows from the slopes.
     steep: Floats | None = None
+    # (H, W), float32: factors of the weights of both slopes, because they are from normals, if not applied.
+    slant_factors: tuple[Floats, ...] = ()
     picture: tuple[int, int] = (0, 0)  # rows and columns of the whole picture
     box: Box = (slice(None), slice(None))  # part of the picture covered by the maps
     lost: int = 0  # wanted pixels outside the box
@@ -76,16 +89,14 @@ class Inputs:
 
     def weighted(self) -> Inputs:
         """Return inputs whose slopes have the weights of equally noisy normals."""
-        if self.steep is None:
+        if not self.slant_factors:
             return self
         given_planes = [plane for plane in (self.weight_x, self.weight_y) if plane is not None]
-        planes = [self.steep * plane for plane in given_planes] or [
-            np.float32(self.typical_weight) * self.steep
-        ]
+        planes = _multiplied(self.slant_factors, self.typical_weight, given_planes)
         typical = _median(planes)
         planes = [_clipped(plane, typical * LEAST, typical * MOST) for plane in planes]
         second = planes[1] if len(planes) > 1 else None
-        return replace(self, weight_x=planes[0], weight_y=second, typical_weight=typical)
+        return replace(self, weight_x=planes[0], weight_y=second, typical_weight=typical, slant_factors=())
 
     @property
     def weight(self) -> float:
@@ -132,8 +143,11 @@ def check_inputs(
     marks, cuts = (None if flags is None else flags[box] for flags in (marks, cuts))
     planes, height_planes = ([plane[box] for plane in maps] for maps in (planes, height_planes))
     x, y, steep = slopes(box)
-    if steep is not None and not robust:
-        planes = [steep * plane for plane in planes] or [np.float32(weight) * steep]
+    factors: tuple[Floats, ...] = () if steep is None else (steep,)
+    if steep is not None and slope_weights is not None:
+        x, y, factors = _weigh(x, y, sight_within(camera, shape, box), marks, weight, planes)
+    if factors and not robust:
+        planes, factors = _multiplied(factors, weight, planes), ()
     typical = _median(planes) if planes else weight
     relative_heights, datum = None, 0.0
     if heights is not None and height_weight:
@@ -162,6 +176,7 @@ def check_inputs(
         typical_weight=typical,
         weights_given=slope_weights is not None,
         steep=steep,
+        slant_factors=factors,
         known_heights=relative_heights,
         known_height_weights=height_planes[0] if height_planes and relative_heights is not None else None,
         known_height_weight=min(height_weight, largest),
@@ -170,6 +185,34 @@ def check_inputs(
         box=box,
         lost=lost,
     )
+
+
+def _multiplied(factors: tuple[Floats, ...], weight: float, planes: list[Floats]) -> list[Floats]:
+    """Return the products of weights, a number or maps, with factors of one or both slopes."""
+    count = max(len(factors), len(planes), 1)
+    each = [planes[min(k, len(planes) - 1)] if planes else np.float32(weight) for k in range(count)]
+    return [factors[min(k, len(factors) - 1)] * each[k] for k in range(count)]
+
+
+def _weigh(
+    x: Floats, y: Floats, sight: tuple[Any, Any], mask: Flags | None, weight: float, planes: list[Floats]
+) -> tuple[Floats, Floats, tuple[Floats, ...]]:
+    """Return slopes of normals without their bias, and the factors of their weights; see `weigh_slopes`."""
+    defined = np.isfinite(x) & np.isfinite(y) & (True if mask is None else mask != 0)
+    for plane in planes:
+        defined &= plane > 0
+    variance = noise_variance(median_weight(planes) if planes else weight)
+    variances = [
+        np.divide(1, plane, out=np.zeros_like(plane), where=plane > 0) if variance else plane * 0
+        for plane in planes
+    ] or [np.full(x.shape, variance, np.float32)]
+    (x, y), factors = weigh_slopes((x, y), [np.minimum(v, MOST_NOISE) for v in variances], sight, defined)
+    return x, y, tuple(factors)
+
+
+def noise_variance(weight: float) -> float:
+    """Return the variance of normals of a weight; 0 if that is too small to be an inverse variance."""
+    return 1 / weight if weight * MOST_NOISE >= 1 else 0.0
 
 
 def check_one_source(dz_dx: Any, dz_dy: Any, normals: Any) -> None:

@@ -74,7 +74,7 @@ def weigh(
     fraction, turned = _unsure(flat_limit, flat, variance)
     along = fraction * variance * steep**2 + flat * steep * turned**2 / 2
     across = (1 - fraction) * variance * steep
-    x, y = (_sum_around(values) + _TINY for values in (squares_x, squares_y))
+    x, y = (sum_around(values) + _TINY for values in (squares_x, squares_y))
     east = np.clip(0.5 + (x / (x + y) - 0.5) * np.exp(2 * turned), 0, 1)
     variances = east * along + (1 - east) * across, (1 - east) * along + east * across
     weight_x, weight_y = (np.where(valid, np.clip(1 / values, *bounds), 0) for values in variances)
@@ -89,7 +89,7 @@ def _unsure(flat_limit: float, flat: Array, variance: Array) -> tuple[Array, Arr
     )
 
 
-def _sum_around(values: Array) -> Array:
+def sum_around(values: Array) -> Array:
     """Return the sums over squares of 5 x 5 pixels, 0 beyond the picture."""
     rows, columns = values.shape
     wide, size = np.pad(values, _WINDOW_REACH), 2 * _WINDOW_REACH + 1

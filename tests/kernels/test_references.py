@@ -571,6 +571,16 @@ def _(shape):
     return {"normals": normals, "edge_on": 1e-4, "unit": 2.5, "shape": shape}
 
 
+@case("facing_weigh", SHAPES | {"masked": (0, 1)}, per="row", rtol=1e-5, atol=1e-6)
+def _(shape, masked):
+    rng = np.random.default_rng(shape[1])
+    dz_dx, dz_dy = rng.normal(size=(2, *shape))
+    dz_dx[rng.random(shape) < 0.2] = np.nan
+    mask = {"mask": (rng.random(shape) < 0.7).astype(np.uint8)} if masked else {}
+    slopes = {"dz_dx": dz_dx, "dz_dy": dz_dy, "variance": 0.01, "unit": 100.0, "shape": shape}
+    return slopes | mask | {"macros": {"MASK": masked}}
+
+
 @case("facing_clip", SHAPES, returns="weight")
 def _(shape):
     weight = np.random.default_rng(shape[1]).normal(1, 2, shape)

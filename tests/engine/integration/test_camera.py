@@ -89,6 +89,46 @@ def test_sigma_is_that_of_the_depth(device):
     np.testing.assert_allclose(np.sqrt(np.mean(spread**2)), np.nanmean(surfaces[0].height_sigma), rtol=0.3)
 
 
+def chi2_of_noisy_plane(normal, noise, camera, put, **options):
+    """Return the mean square of errors over standard deviations of a plane, over 8 draws of the noise."""
+    shape, focal, point = (64, 64), (200.0, 160.0), (40.0, 20.0)
+    vector = np.array(normal) / np.linalg.norm(normal)
+    truth, normals = plane(vector, 300.0, shape=shape, focal=focal, point=point)
+    row, column = np.indices(shape)
+    seen_by = {"camera": engine.integration.Camera(focal, point)}
+    if not camera:
+        truth, seen_by = (vector[1] * row - vector[0] * column) / vector[2], {"pixel_size": 1.0}
+    chi2 = []
+    for seed in range(8):
+        noisy = normals + noise * np.random.default_rng(seed).standard_normal(normals.shape)
+        surface = engine.integrate(normals=put(noisy), slope_weights=noise**-2, **seen_by, **options)
+        relative = surface.height_sigma / surface.height if camera else surface.height_sigma
+        error = np.log(surface.height / truth) if camera else surface.height - truth
+        chi2.append(np.mean(((error - error.mean()) / relative) ** 2))
+    return np.mean(chi2)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.05])
+@pytest.mark.parametrize("camera", [False, True])
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.6, 1.7, 1.0)])
+def test_sigma_is_that_of_slopes_from_noisy_normals(device, normal, camera, noise):
+    if camera and normal[1] > 1:
+        normal = (0.6, 1.2, 1.0)  # not edge-on at the border
+    chi2 = chi2_of_noisy_plane(normal, noise, camera, np.asarray, device=device)
+    assert 0.8 < chi2 < 1.3
+    if not camera:
+        put = lambda normals: device.from_host("normals", normals)  # noqa: E731
+        assert chi2_of_noisy_plane(normal, noise, camera, put) == pytest.approx(chi2, rel=1e-3)
+        assert 0.3 < chi2_of_noisy_plane(normal, noise, camera, np.asarray, robust=True, device=device) < 2
+
+
+def test_weights_of_normals_that_are_no_inverse_variances_leave_slopes_as_they_are(device):
+    _, normals = plane((0.5, 0.0, 1.0), 300.0)
+    asked = {"normals": normals, "pixel_size": 1.0, "device": device}
+    surfaces = [engine.integrate(**asked, slope_weights=weight) for weight in (1.0, 1e12)]
+    np.testing.assert_allclose(surfaces[0].height, surfaces[1].height, atol=1e-4)
+
+
 @pytest.mark.filterwarnings("error")
 def test_without_a_camera_lines_of_sight_are_parallel(device):
     x, y = np.random.default_rng(4).normal(0, 0.4, (2, *SHAPE)).astype(np.float32)
