@@ -93,8 +93,8 @@ def _common_shares(result: Result) -> Iterator[float]:
         cosine = result.normals[..., 2].astype(np.float64)
         error = light_sigma(result.normals, fitted.light_variance) / cosine**2
         finite = np.isfinite(error) & (True if result.contact is None else result.contact > 0)
-        steepness = np.sqrt(1 / cosine[finite] ** 2 - 1)
-        yield math.sqrt(float(np.mean(error[finite] ** 2) / np.mean(steepness**2)))
+        steepness = 1 / cosine[finite] ** 2 - 1  # square of the slope; rounded, it may be just below 0
+        yield math.sqrt(float(np.mean(error[finite] ** 2) / np.mean(steepness)))
     if fitted.swing_range is not None:
         yield fitted.swing_range
 

@@ -170,9 +170,11 @@ def measure(place: Place) -> Outcome:
         answer = answers(under_sheet(place.thing, place.sheet), fault_of(place), place.seed)
     except (InputError, NotConverged) as error:
         return Outcome(place, Cell(math.nan, math.nan, 0.0, 0.0, True), math.nan, f"{_FAILED}{error}", "")
-    sigma = inside(answer.sigma)
+    sigma, cell = inside(answer.sigma), judge(answer)
+    if cell.kept == 0 and np.isfinite(inside(answer.error)).any():
+        return Outcome(place, replace(cell, warned=True), math.nan, f"{_FAILED}no standard deviations", "")
     median = float(np.median(sigma[np.isfinite(sigma)])) if np.isfinite(sigma).any() else math.nan
-    return Outcome(place, judge(answer), median, answer.warnings, answer.notes)
+    return Outcome(place, cell, median, answer.warnings, answer.notes)
 
 
 def _measure_all(places: Sequence[Place]) -> list[Outcome]:
@@ -285,11 +287,11 @@ def false_alarms(count: int) -> str:
             f" {cautious} over-cautious"
         )
         kinds = Counter(
-            (outcome.place.thing, outcome.place.sheet, outcome.place.sensor, outcome.place.door, text[:90])
+            f"{outcome.place.thing}, {outcome.place.sheet:g} px: {text[:80]}"
             for outcome in warned
             for text in outcome.warnings.split("; ")
         )
-        lines += [f"  {number} x {' '.join(map(str, kind))}" for kind, number in kinds.most_common()]
+        lines += [f"  {number} x {kind}" for kind, number in kinds.most_common()]
     return "\n".join(lines)
 
 

@@ -136,3 +136,9 @@ def test_a_cell_is_measured_with_its_sensor_and_fault():
     outcome = measure(place)
     assert outcome.cell.kept > 0.9
     assert outcome.cell.error < 0.05
+
+
+def test_heights_of_a_flat_field_have_standard_deviations():
+    """A normal along the axis is a rounding error too long."""
+    (place,) = places(["coin"], ["flicker 2 %"], ["heights2"], sheets=[0.5], sensors=["machine vision"])
+    assert measure(place).cell.kept > 0.9
