@@ -182,6 +182,7 @@ def _opened(frames: Any, positions: dict[str, Any], header: dict[str, Any], faul
 @_recorded
 def pressed(surface: Surface, step: float, fault: Fault, seed: int) -> ArrayRecording:
     """Return a press."""
+    fault = fault.drawn(seed)
     travel = np.arange(*surface.travel, step)
     frames = record(touched(surface), travel, fault, seed)
     dark, bright = references(surface.shape, fault, seed + 1)
@@ -218,7 +219,7 @@ def zenith_scale(fault: Fault) -> dict[str, Any]:
 
 def noise_of(fault: Fault) -> float:
     """Return the standard deviation of a sample, as a user would state it, counts."""
-    return math.hypot(fault.read_noise, 0.8) * fault.scale
+    return math.hypot(fault.read_noise, math.sqrt(128 / fault.electrons)) * fault.scale
 
 
 # --- Answers -------------------------------------------------------------------------------------------

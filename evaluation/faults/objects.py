@@ -19,8 +19,9 @@ from mirrorskin.evaluation.faults.estimators import PIXEL, Surface
 
 SHAPE = 64, 96  # pixels
 SHEETS = 0.5, 2.0  # standard deviations of the Gaussian, pixels
-MARGIN = 0.15  # mm: a press starts and ends so far above and below the sheet
+MARGINS = 0.2, 0.3  # mm: a press starts so far above the sheet, and ends so far below
 _AROUND = 12  # pixels around the picture that the sheet is computed from
+_LEVEL = 0.3  # mm: travel at which the highest point is touched
 _MARKS = 30  # grinding marks of the scratched plate
 
 
@@ -137,7 +138,9 @@ def smoothed(name: str, heights: Callable[[Floats, Floats], Floats], sheet: floa
     centers = [(_AROUND + np.arange(size) + 0.5) * POINTS - 0.5 for size in SHAPE]
     at = np.meshgrid(*centers, indexing="ij")
     true = np.stack([map_coordinates(values, at, order=3) for values in maps])
-    top = fine[0].max() + 0.3
+    top = fine[0].max() + _LEVEL
     fine[0] -= top
     true[0] -= top
-    return Surface(f"{name}, {sheet:g} px", fine, true, (0.3 - MARGIN, MARGIN - float(fine[0].min())))
+    return Surface(
+        f"{name}, {sheet:g} px", fine, true, (_LEVEL - MARGINS[0], MARGINS[1] - float(fine[0].min()))
+    )
