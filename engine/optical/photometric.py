@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,22 +13,23 @@ from mirrorskin.engine.base.functions import optional_phase_function
 from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.picture import PerFrame, PerPixel, Picture
-from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.base.tiling import Planes
 from mirrorskin.engine.diagnosis.amplitude_blur import add_blur
-from mirrorskin.io import InputError, Map, Result
+from mirrorskin.engine.optical.lamp_errors import CELLS, LampErrors, LampFit, find_lamp_errors
+from mirrorskin.io import InputError, Map
 from mirrorskin.io.base.arguments import as_array
-from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.io.base.types import FRAME_DTYPES
 from mirrorskin.io.model.maps import TABLE
 from mirrorskin.io.model.positions import check_phase
+from mirrorskin.io.watch.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
 
 if TYPE_CHECKING:
     from mirrorskin.io import Source
 
 
-_FEWEST, _CLEAR, _POWER = 64, 6.0, 0.03  # pixels, standard errors, and change of the power that decide
+_FEWEST, _PILED = 64, 3  # samples at the end of the scale, and times those just below it
+_NEAR_END = 0.005  # from there to the end, share of it
 _BEYOND = 4.0  # standard deviations of a residual that noise does not explain
 _PLANES: Mapping[str, Any] = {
     "darks": np.float32,
@@ -38,29 +39,6 @@ _PLANES: Mapping[str, Any] = {
     "samples": np.int32,
 }
 _ANSWERS = "normals", "albedo", "residual", "samples", "normals_sigma", "albedo_sigma"
-
-
-class ResponseLinearity(Step):
-    """Warn if the brightness is not proportional to the light."""
-
-    def apply(self, result: Result, context: Context) -> Result:
-        """Return the result; its process has the warning, if another power of the light fits better."""
-        operation, samples = cast("PhotometricStereo", context.operation), context.samples
-        if samples is None:
-            return result
-        values, dark = samples.values, np.asarray(0.0 if operation.dark is None else operation.dark)
-        level = dark if dark.ndim == 0 else samples.of_map(dark).ravel()
-        light = values.reshape(len(values), -1).astype(np.float64) - level
-        lamps = operation.lights(0, len(light), context.positions("phase"))
-        lit = np.all((light > max(operation.shadow, 0.0)) & (light < operation.saturation - level), axis=0)
-        power = _power(light[:, lit], lamps)
-        if power == 1:
-            return result
-        text = (
-            f"the brightness is not proportional to the light, but to its power {power:.2g}, as with gamma"
-            " (or gloss), so normals are wrong by more than their sigma: use a camera with a linear response"
-        )
-        return with_findings(result, Finding("response", text))
 
 
 class PhotometricStereo(Operation):
@@ -81,8 +59,12 @@ class PhotometricStereo(Operation):
     """
 
     dtypes = FRAME_DTYPES
-    checks = (ResponseLinearity,)
+    checks = (LampErrors,)
     for_device = True
+
+    lamp_fit: LampFit | None = None
+    """Errors of light and response of the last result, if samples of the frames show them."""
+    _samples: FrameSamples | None = None
 
     light: ArrayLike | None = option(
         default=None,
@@ -108,7 +90,7 @@ class PhotometricStereo(Operation):
         unit="counts",
         above=0,
         help="brightness from which on a sample is saturated, and left out",
-        shown_default="the greatest value of an integer type",
+        shown_default="the greatest value of an integer type, or that at which samples pile up",
     )
     shadow: float = option(
         default=0.0,
@@ -158,6 +140,22 @@ class PhotometricStereo(Operation):
         lights = PerFrame(self.lights(self.count, len(frames), phase))
         self._maps.scan("lambert_add", frames, lights=lights, shadow=self.shadow, bright=self.saturation)
 
+    def after_last_frame(self, samples: FrameSamples) -> Self | None:
+        """Return the operation that leaves out samples at the end of the scale, if it is not the type's."""
+        self._samples, values = samples, samples.values
+        finite = values[np.isfinite(values)]
+        top = float(finite.max()) if finite.size else np.inf
+        if self.bright is not None or top >= self.saturation:
+            return None
+        at_top = np.count_nonzero(values == top, axis=(1, 2))
+        below = np.count_nonzero((values < top) & (values > top - _NEAR_END * abs(top)))
+        cut_off = at_top.sum() >= max(_FEWEST, _PILED * below) and np.count_nonzero(at_top) > 1
+        if not cut_off:
+            return None
+        better = self.with_options(bright=top)
+        better._samples = samples
+        return better
+
     def lights(self, first: int, count: int, phase: ArrayLike | None) -> Doubles:
         """Return the vectors towards the lamps of some frames, (n, 3), by their azimuths if needed."""
         if self._lights is not None:
@@ -187,9 +185,32 @@ class PhotometricStereo(Operation):
         self._maps.run(
             "lambert_scale", noise=PerPixel(noise), noise_step=noise.ndim // 2, limits=_limits(self.count)
         )
+        self.lamp_fit = self._find_lamp_errors()
+        if self.lamp_fit is not None and self.lamp_fit.significant:
+            usual = float(noise) if noise.ndim == 0 else self.lamp_fit.noise
+            self._maps.run(
+                "lambert_widen",
+                tables=self.lamp_fit.tables(self.shadow),
+                cells=CELLS,
+                noise=self.lamp_fit.noise,
+                usual=usual,
+            )
         add_blur(self._maps, "normals_sigma", ["normals"], "albedo")
         maps = dict(zip(_ANSWERS, self._maps.take(*_ANSWERS), strict=True))
         return maps if noise.ndim or np.isnan(noise) else maps | {"noise": float(noise)}
+
+    def _find_lamp_errors(self) -> LampFit | None:
+        """Return the errors of light and response that samples of all frames show."""
+        samples = self._samples
+        if samples is None:
+            return None
+        values, dark = samples.values, np.asarray(0.0 if self.dark is None else self.dark)
+        level = dark if dark.ndim == 0 else samples.of_map(dark).ravel()
+        light = values.reshape(len(values), -1).astype(np.float64) - level
+        limits = max(self.shadow, 0.0), self.saturation - level
+        usable = (light > limits[0]) & (light < limits[1])
+        lamps = self.lights(0, len(light), self.positions_so_far("phase"))
+        return find_lamp_errors(light, usable, lamps, limits)
 
 
 photometric_stereo = optional_phase_function(
@@ -236,28 +257,6 @@ def _limits(frames: int) -> NDArray[np.float32]:
     limits = ((1 - spread + _BEYOND * np.sqrt(spread)) ** 1.5).astype(np.float32)
     limits[0] = np.inf
     return limits
-
-
-def _power(light: Doubles, lamps: Doubles) -> float:
-    """Return the power of the light to which brightness is proportional; 1 if that is not contradicted.
-
-    With the light x = albedo (normal . lamp), x^g is x + (g - 1) x log x to first order. ``light``, (T, n),
-    is brightness less dark, ``lamps`` are vectors, (T, 3).
-    """
-    if light.shape[1] < _FEWEST or len(lamps) < 5:
-        return 1.0
-    axes = np.linalg.qr(lamps)[0]
-    fitted = axes @ (axes.T @ light)
-    light, fitted = (part[:, np.all(fitted > 0, axis=0)] for part in (light, fitted))
-    if light.shape[1] < _FEWEST:
-        return 1.0
-    bent = fitted * np.log(fitted / np.mean(fitted, axis=0))
-    bent -= axes @ (axes.T @ bent)
-    residual = light - axes @ (axes.T @ light)
-    size, pull = np.sum(bent**2, axis=0), np.sum(bent * residual, axis=0)
-    excess = float(np.sum(pull) / np.sum(size))
-    error = float(np.sqrt(np.sum((pull - excess * size) ** 2)) / np.sum(size))
-    return 1 + excess if abs(excess) > max(_CLEAR * error, _POWER) else 1.0
 
 
 def _vectors(light: ArrayLike) -> Doubles:

@@ -134,3 +134,23 @@ __kernel void lambert_scale(
         albedo_sigma[p] *= scale;
     }
 }
+
+__kernel void lambert_widen(
+    const int pixels, MAP normals, MAP albedo, MAP tables, const int cells, const float noise, const float usual,
+    OUT normals_sigma, OUT albedo_sigma)
+{
+    const int low = get_global_id(0) * TILE, end = min(pixels, low + TILE), side = cells + 1, size = side * side;
+    for (int p = low; p < end; ++p) {
+        const float length = albedo[p], inverse = 1 / length;
+        if (!(length > 0)) continue;
+        const int row = (normals[3 * p] + 1) * (0.5f * cells) + 0.5f;
+        const int column = (normals[3 * p + 1] + 1) * (0.5f * cells) + 0.5f;
+        MAP cell = tables + clamp(row, 0, cells) * side + clamp(column, 0, cells);
+        const float ratio = (noise * noise + cell[6 * size]) / (usual * usual), factor = GREATER(ratio, 1);
+        const float normal = cell[0] + (cell[size] + cell[2 * size] * inverse) * inverse;
+        const float radial = cell[3 * size] + (cell[4 * size] + cell[5 * size] * inverse) * inverse;
+        const float first = normals_sigma[p], second = albedo_sigma[p];
+        normals_sigma[p] = sqrt(first * first * factor + GREATER(normal, 0));
+        albedo_sigma[p] = sqrt(second * second * factor + GREATER(radial, 0) * length * length);
+    }
+}

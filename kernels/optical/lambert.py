@@ -111,3 +111,26 @@ def lambert_scale(residual: Array, samples: Array, noise: Array, limits: Array, 
         scale = noise * np.where(ratio > limits[np.maximum(samples - 3, 0)], ratio, 1)
     normals_sigma *= scale
     albedo_sigma *= scale
+
+
+def lambert_widen(normals: Array, albedo: Array, tables: Array, cells: int, noise: float, usual: float,
+                  normals_sigma: Array, albedo_sigma: Array) -> None:  # fmt: skip
+    """Add the variance of errors of the light, which depends on normal and albedo, to standard deviations.
+
+    Parameters
+    ----------
+    normals, albedo, normals_sigma, albedo_sigma : as of `lambert_normals`
+    tables : (7, (cells + 1)^2), by the normal's x and y from -1 to 1. With the albedo r, a + b / r + c / r^2
+        is the variance of the normal for planes 0 to 2, and that of the albedo over r^2 for planes 3 to 5;
+        plane 6 is the variance of what the light does not explain, counts^2
+    noise : standard deviation of a sample without errors of the light
+    usual : standard deviation of a sample that is in the standard deviations
+    """
+    known = albedo > 0
+    x, y, _ = normals[known].T
+    row, column = (((part + 1) * (0.5 * cells) + 0.5).astype(int).clip(0, cells) for part in (x, y))
+    *parts, misfit = tables.reshape(7, cells + 1, cells + 1)[:, row, column]
+    factor, length = np.maximum((noise**2 + misfit) / usual**2, 1), albedo[known]
+    normal, radial = (np.maximum(a + (b + c / length) / length, 0) for a, b, c in (parts[:3], parts[3:]))
+    normals_sigma[known] = np.sqrt(normals_sigma[known] ** 2 * factor + normal)
+    albedo_sigma[known] = np.sqrt(albedo_sigma[known] ** 2 * factor + radial * length**2)

@@ -528,6 +528,19 @@ def _(noise):
     return values | {"shape": (1, pixels), "macros": {"FRAME": "uchar"}}
 
 
+@case("lambert_widen", rtol=3e-6)
+def _():
+    rng, pixels, cells = np.random.default_rng(0), 1100, 8
+    normals = rng.normal(size=(pixels, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    values = {"normals": normals, "albedo": rng.uniform(50, 100, pixels)}
+    values |= {name: rng.uniform(0, 1, pixels) for name in ("normals_sigma", "albedo_sigma")}
+    tables = rng.uniform(-0.1, 1, (7, (cells + 1) ** 2))
+    values["albedo"][:3], values["normals"][:3] = np.nan, np.nan
+    values |= {"tables": tables, "cells": cells, "noise": 1.2, "usual": 1.4}
+    return values | {"shape": (1, pixels), "macros": {"FRAME": "uchar"}}
+
+
 @case("fringes_phase", {"noise": (1, 1100), "residual_noise": (2.5, np.nan)}, rtol=3e-6, atol=1e-7)
 def _(noise, residual_noise):
     rng, pixels = np.random.default_rng(0), 1100
