@@ -17,7 +17,7 @@ from mirrorskin.cli.commands.bench.records import Run, open_run
 from mirrorskin.evaluation import bounds, ramps, robust, sample_fusion
 from mirrorskin.evaluation.base.tables import Table, replace_part
 from mirrorskin.evaluation.calibration import report
-from mirrorskin.evaluation.faults import matrix
+from mirrorskin.evaluation.faults import hard, matrix
 from mirrorskin.evaluation.scenes import rotations
 from mirrorskin.kernels.device import open_device
 
@@ -71,7 +71,8 @@ def with_tables(page: str) -> str:
     run = open_run(_BOUNDS)
     page = replace_part(page, "bounds", _as_summary(run))
     page = replace_part(page, "all bounds", _as_table(run))
-    return replace_part(page, "faults", matrix.as_summary())
+    page = replace_part(page, "faults", matrix.as_summary())
+    return replace_part(page, "hard surfaces", hard.as_summary())
 
 
 def _as_summary(run: Run) -> str:

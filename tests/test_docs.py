@@ -57,7 +57,7 @@ SOURCES = [
 ]
 OTHER_OPTIONS = {  # of developers' scripts, of other programs, and of a user's operation
     *("--freeze", "--only", "--gpus", "--group-add", "--list-formats-ext", "--memory-limit"),
-    *("--no-deps", "--now", "--lean", "--travel-offset"),
+    *("--no-deps", "--now", "--lean", "--travel-offset", "--false-alarms"),
 }
 CLASSES = ("light.py", "first_light.py")  # of the page about operations, the first block and the last
 

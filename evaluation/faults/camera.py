@@ -68,7 +68,8 @@ class Fault:
     stray : float
         Share of the light of a frame that is spread over the whole frame.
     codec : str
-        "jpeg" (quality 90) or "mpeg" (MPEG-4) if frames are compressed, "dct" if nothing says so.
+        "jpeg" (quality 90) or "mpeg" (MPEG-4) if frames are compressed, "mpeg array" or "dct" if nothing
+        says so.
     shutter : float
         Steps from the first row's exposure to the last row's.
     lag : float
@@ -129,6 +130,11 @@ class Fault:
     def scale(self) -> float:
         """Counts for a count of 8 bits."""
         return float(2**self.bits - 1) / 255
+
+    @property
+    def stated_codec(self) -> str:
+        """The compression that a source of the frames states."""
+        return self.codec if self.codec in ("jpeg", "mpeg") else ""
 
     def drawn(self, seed: int) -> Fault:
         """Return the fault with the usual deviations of one recording, if it has any."""
@@ -210,8 +216,9 @@ MORE_FAULTS = (
     Fault("moving lamp", lamp=0.02),
     Fault("wave 1 %", wave=0.01),
     Fault("fading 3 %", fading=0.03),
-    Fault("codec, not stated", codec="dct"),
+    Fault("unstated codec", codec="dct"),
     Fault("usual deviations", usual=True),
+    Fault("unstated MPEG-4", codec="mpeg array"),
 )
 _MODERATE = (
     Fault("blur", blur=0.7),
@@ -356,7 +363,7 @@ def _compress(frames: NDArray[np.unsignedinteger], fault: Fault) -> NDArray[np.u
         quality = [cv2.IMWRITE_JPEG_QUALITY, 90]
         stored = [cv2.imencode(".jpg", frame, quality)[1] for frame in frames]
         return np.stack([np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE), np.uint8) for jpeg in stored])
-    if fault.codec == "mpeg":
+    if fault.codec in ("mpeg", "mpeg array"):
         return _filmed(frames)
     if fault.codec == "dct":
         return _quantized(frames, _QUANTUM * fault.scale)

@@ -174,8 +174,8 @@ def _focused(surface: Surface) -> Light:
 def _opened(frames: Any, positions: dict[str, Any], header: dict[str, Any], fault: Fault) -> ArrayRecording:
     """Return frames as a source, which says that they were compressed, as that of a file does."""
     source = ArrayRecording(frames, positions, header)
-    if fault.codec in ("jpeg", "mpeg"):
-        source.findings = (lossy(fault.codec),)
+    if fault.stated_codec:
+        source.findings = (lossy(fault.stated_codec),)
     return source
 
 

@@ -13,18 +13,22 @@ import itertools
 import json
 import math
 import multiprocessing
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mirrorskin.engine.base.errors import NotConverged
+from mirrorskin.evaluation.base.tables import Table, replace_part
 from mirrorskin.evaluation.faults.camera import FAULTS, MORE_FAULTS, PAIRS, SENSORS, Fault, combined
 from mirrorskin.evaluation.faults.estimators import ARRAYS, RECORDINGS, applies
 from mirrorskin.evaluation.faults.judge import CAUTIOUS, REASON, Cell, inside, judge
+from mirrorskin.evaluation.faults.matrix import PAGE, digits
 from mirrorskin.evaluation.faults.objects import CHOSEN, HELD_OUT, OBJECTS, SHEETS, under_sheet
 from mirrorskin.io.base.types import InputError
 
@@ -51,6 +55,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "recordings": tuple(DOORS),
     "arrays": tuple(f"array-{door}" for door, name in DOORS.items() if name in ARRAYS),
 }
+_LONG = {**DOORS} | {f"array-{door}": f"{name}, function on arrays" for door, name in DOORS.items()}
 ALL_FAULTS = {fault.name: fault for fault in (*FAULTS, *MORE_FAULTS, *PAIRS)}
 USUAL_DOORS = "press20", "heights"
 USUAL_FAULTS = (
@@ -61,9 +66,15 @@ USUAL_FAULTS = (
     "flicker 2 %",
     "jitter 0.1 steps",
     "vignetting 10 %",
-    *(fault.name for fault in MORE_FAULTS),
+    "lag 7 %",
+    "moving lamp",
+    "wave 1 %",
+    "fading 3 %",
+    "unstated codec",
+    "usual deviations",
 )
 _PROCESSES = 2
+_STORED = Path(__file__).with_suffix(".json")
 _FAILED = "failed: "  # before the text of an error, in place of warnings
 
 
@@ -153,13 +164,14 @@ def places(
         for a_sheet, a_sensor in itertools.product(sheets or (usual[1],), sensors or (usual[0],))
         for door in doors
         if applies(DOORS[door.removeprefix("array-")], ALL_FAULTS[fault])
+        and not (door.startswith("array-") and (ALL_FAULTS[fault].stated or ALL_FAULTS[fault].stated_codec))
     ]
 
 
 def fault_of(place: Place) -> Fault:
     """Return the fault of a cell with the sensor's noise; a video holds 8 bits."""
     fault = combined(SENSORS[place.sensor], ALL_FAULTS[place.fault])
-    return replace(fault, bits=8) if fault.codec in ("jpeg", "mpeg") else fault
+    return replace(fault, bits=8) if fault.codec not in ("", "dct") else fault
 
 
 def _seed(place: Place) -> int:
@@ -240,8 +252,10 @@ def totals(outcomes: Sequence[Outcome]) -> str:
             "failed": sum(one.failed for one in part),
         }
         said = ", ".join(f"{count:3} {kind}" for kind, count in counts.items())
-        alarms = sum(one.cell.warned for one in plain)
-        lines.append(f"{name:9} {len(part):4} cells: {said}; {alarms} of {len(plain)} without a fault warned")
+        alarm_count = sum(one.cell.warned for one in plain)
+        lines.append(
+            f"{name:9} {len(part):4} cells: {said}; {alarm_count} of {len(plain)} without a fault warned"
+        )
     return "\n".join(lines)
 
 
@@ -252,8 +266,10 @@ def save(outcomes: Sequence[Outcome], path: Path) -> None:
 
 def load(path: Path) -> list[Outcome]:
     """Return stored outcomes."""
-    stored = json.loads(path.read_text(encoding="utf-8"))
-    return [Outcome(**{**one, "place": Place(**one["place"]), "cell": Cell(**one["cell"])}) for one in stored]
+    content = json.loads(path.read_text(encoding="utf-8"))
+    return [
+        Outcome(**{**one, "place": Place(**one["place"]), "cell": Cell(**one["cell"])}) for one in content
+    ]
 
 
 def compared(old: Sequence[Outcome], new: Sequence[Outcome]) -> str:
@@ -272,32 +288,131 @@ def compared(old: Sequence[Outcome], new: Sequence[Outcome]) -> str:
 # --- False alarms --------------------------------------------------------------------------------------
 
 
-def false_alarms(count: int) -> str:
-    """Return the warnings of so many presses and turns without a fault, over objects, sheets and sensors."""
-    doors = {"presses": GROUPS["press"], "turns": ("heights", "heights2")}
-    lines = []
-    for name, some in doors.items():
-        every = itertools.cycle(itertools.product(OBJECTS, SHEETS, SENSORS, some))
-        asked = [
-            Place(door, thing, sheet, sensor, "none", 100 + number)
-            for number, (thing, sheet, sensor, door) in zip(range(count), every, strict=False)
-        ]
-        outcomes = list(measured(asked))
-        warned = [outcome for outcome in outcomes if outcome.cell.warned]
-        lies = sum(outcome.lies for outcome in outcomes)
-        cautious = sum(outcome.cautious for outcome in outcomes)
-        share = 100 * len(warned) / len(outcomes)
-        lines.append(
-            f"{name}: {len(warned)} of {len(outcomes)} warned ({share:.1f} %), {lies} lie,"
-            f" {cautious} over-cautious"
+def without_fault(count: int) -> dict[str, list[Outcome]]:
+    """Return so many presses and turns without a fault, over objects, sheets and sensors."""
+    doors = {"presses": GROUPS["press"], "rotations": ("heights", "heights2")}
+    every = {
+        name: itertools.cycle(itertools.product(OBJECTS, SHEETS, SENSORS, some))
+        for name, some in doors.items()
+    }
+    return {
+        name: list(
+            measured(
+                Place(door, thing, sheet, sensor, "none", 100 + number)
+                for number, (thing, sheet, sensor, door) in zip(range(count), cells, strict=False)
+            )
         )
-        kinds = Counter(
-            f"{outcome.place.thing}, {outcome.place.sheet:g} px: {text[:80]}"
-            for outcome in warned
-            for text in outcome.warnings.split("; ")
-        )
-        lines += [f"  {number} x {kind}" for kind, number in kinds.most_common()]
-    return "\n".join(lines)
+        for name, cells in every.items()
+    }
+
+
+def alarms(outcomes: Sequence[Outcome]) -> str:
+    """Return the warnings of recordings without a fault, by their objects."""
+    warned = [outcome for outcome in outcomes if outcome.cell.warned]
+    lies, cautious = (
+        sum(which) for which in zip(*((one.lies, one.cautious) for one in outcomes), strict=True)
+    )
+    kinds = Counter(
+        f"{outcome.place.thing}, {outcome.place.sheet:g} px: {re.sub('[-0-9.]+', 'N', text)[:80]}"
+        for outcome in warned
+        for text in outcome.warnings.split("; ")
+    )
+    head = f"{len(warned)} of {len(outcomes)} warned, {lies} lie, {cautious} over-cautious"
+    return "\n".join([head, *(f"  {number} x {kind}" for kind, number in kinds.most_common())])
+
+
+# --- What is stored ------------------------------------------------------------------------------------
+
+
+def stored() -> dict[str, Any]:
+    """Return the stored chi^2 and marks, by door, fault and object, and the counts of false alarms."""
+    if not _STORED.exists():
+        return {"cells": {}, "without a fault": {}}
+    return dict(json.loads(_STORED.read_text(encoding="utf-8")))
+
+
+def freeze(outcomes: Sequence[Outcome], plain: Mapping[str, Sequence[Outcome]] | None = None) -> None:
+    """Store cells, and the counts of recordings without a fault, and write the page.
+
+    SystemExit if a cell lies that did not.
+    """
+    content = stored()
+    cells, worse = content["cells"], []
+    for outcome in outcomes:
+        place = outcome.place
+        row = cells.setdefault(place.door, {}).setdefault(place.fault, {})
+        if outcome.lies and not row.get(place.thing, "*").endswith("*"):
+            worse.append(str(outcome))
+        row[place.thing] = f"{outcome.cell.chi2:.3g}{outcome.mark.strip()}"
+    if worse:
+        raise SystemExit("not stored, as these became wrong:\n" + "\n".join(worse))
+    for name, some in (plain or {}).items():
+        content["without a fault"][name] = [len(some), sum(outcome.cell.warned for outcome in some)]
+    lines = [
+        f"  {json.dumps(door)}: {{\n"
+        + ",\n".join(f"   {json.dumps(fault)}: {json.dumps(row)}" for fault, row in rows.items())
+        + "\n  }"
+        for door, rows in cells.items()
+    ]
+    alarms_text = json.dumps(content["without a fault"])
+    text = '{\n "cells": {\n' + ",\n".join(lines) + '\n },\n "without a fault": ' + alarms_text + "\n}\n"
+    _STORED.write_text(text, encoding="utf-8")
+    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+def with_tables(page: str) -> str:
+    """Return the text of the page with the stored cells in its tables."""
+    content = stored()
+    page = replace_part(page, "hard totals", _counts(content["cells"]))
+    for door in USUAL_DOORS:
+        rows = content["cells"][door]
+        shown = [(fault, *(_shown(rows[fault][name]) for name in OBJECTS)) for fault in USUAL_FAULTS]
+        page = replace_part(page, f"hard {door}", Table("", ("fault", *OBJECTS), shown).as_markdown())
+    alarms_text = "; ".join(
+        f"{warned} of {count} {name} have a warning"
+        for name, (count, warned) in content["without a fault"].items()
+    )
+    return replace_part(page, "hard false alarms", f"Without a fault, {alarms_text}.\n")
+
+
+def as_summary() -> str:
+    """Return the number of cells, and of those that lie."""
+    rows = [row for faults in stored()["cells"].values() for row in faults.values()]
+    chosen, held_out = (_tally(rows, things) for things in (CHOSEN, HELD_OUT))
+    return (
+        f"On hard surfaces, {chosen['lies']} of {chosen['cells']} have one on the objects that methods are\n"
+        f"chosen on, {held_out['lies']} of {held_out['cells']} on others.\n"
+    )
+
+
+def _tally(rows: Iterable[Mapping[str, str]], things: Iterable[str]) -> dict[str, int]:
+    cells = [row[name] for row in rows for name in things if name in row]
+    kinds = {"lies": "*", "over-cautious": "~", "warned": "w", "errors": "x"}
+    return {"cells": len(cells)} | {
+        kind: sum(cell.endswith(mark) for cell in cells) for kind, mark in kinds.items()
+    }
+
+
+def _counts(cells: Mapping[str, Mapping[str, Mapping[str, str]]]) -> str:
+    """Return a table of counts by door, of single faults and of pairs."""
+    halves, pairs = {"chosen": CHOSEN, "held out": HELD_OUT}, {fault.name for fault in PAIRS}
+    rows: list[tuple[str, ...]] = []
+    for door, name in _LONG.items():
+        for kind in ("", ", pairs"):
+            of_kind = [row for fault, row in cells.get(door, {}).items() if (fault in pairs) is bool(kind)]
+            tallies = [_tally(of_kind, things) for things in halves.values()]
+            if of_kind:
+                rows.append((name + kind, *("; ".join(map(str, tally.values())) for tally in tallies)))
+    return Table("", ("estimator", *halves), rows).as_markdown()
+
+
+def _shown(cell: str) -> str:
+    """Return chi^2 as the other matrix shows it: bold if it is too large and nothing is said."""
+    value, mark = cell.rstrip("*~wx"), cell[-1]
+    if mark == "x":
+        return "error"
+    text = digits(float(value))
+    return {"*": f"**{text}**", "~": f"*{text}*", "w": f"{text}, warned"}.get(mark, text)
 
 
 def main() -> None:
@@ -306,17 +421,22 @@ def main() -> None:
     names = {"objects": OBJECTS, "sheets": SHEETS, "sensors": SENSORS}
     for option, known in names.items():
         parser.add_argument(f"--{option}", help=f"of {', '.join(map(str, known))}; by commas")
-    parser.add_argument("--faults", help="names, by commas; or 'all', 'single', 'pairs'")
+    parser.add_argument("--faults", help="names or parts of them, by commas; or 'all', 'single', 'pairs'")
     parser.add_argument("--doors", help=f"of {', '.join([*GROUPS, *DOORS])}, array-...; by commas")
     parser.add_argument("--seeds", type=int, default=1, help="number of recordings of each cell")
     parser.add_argument("-o", type=Path, metavar="FILE.json", help="store the cells")
     parser.add_argument("--compare", type=Path, metavar="OLD.json", help="print what has changed")
     parser.add_argument("--false-alarms", type=int, metavar="N", help="presses and turns without a fault")
+    parser.add_argument("--freeze", action="store_true", help="store the cells, and write the page")
     parser.add_argument("--processes", type=int, default=_PROCESSES)
     parser.add_argument("-v", action="store_true", help="print all cells with their warnings")
     asked = parser.parse_args()
     if asked.false_alarms:
-        print(false_alarms(asked.false_alarms))
+        plain = without_fault(asked.false_alarms)
+        for name, some in plain.items():
+            print(name, alarms(some))
+        if asked.freeze:
+            freeze([], plain)
         return
     faults = {
         "all": list(ALL_FAULTS),
@@ -326,7 +446,7 @@ def main() -> None:
     doors = _names(asked.doors) or list(USUAL_DOORS)
     chosen = places(
         _names(asked.objects) or OBJECTS,
-        faults.get(asked.faults) or _names(asked.faults) or USUAL_FAULTS,
+        faults.get(asked.faults) or _faults(asked.faults) or USUAL_FAULTS,
         list(itertools.chain.from_iterable(GROUPS.get(door, (door,)) for door in doors)),
         sheets=[float(sheet) for sheet in _names(asked.sheets)],
         sensors=_names(asked.sensors),
@@ -340,6 +460,18 @@ def main() -> None:
         print("", compared(load(asked.compare), outcomes), sep="\n")
     if asked.o:
         save(outcomes, asked.o)
+    if asked.freeze:
+        freeze(outcomes)
+
+
+def _faults(text: str | None) -> list[str]:
+    """Return the faults with these names, or with a part of one in theirs."""
+    return [
+        name
+        for part in _names(text)
+        for name in ([part] if part in ALL_FAULTS else ALL_FAULTS)
+        if part in name
+    ]
 
 
 def _names(text: str | None) -> list[str]:

@@ -74,6 +74,11 @@ class Cell:
             self.warned or (self.chi2 <= 0.8 * LIMITS[0] and self.beyond <= LIMITS[1] / 2)
         )
 
+    @property
+    def clearly_wrong(self) -> bool:
+        """Whether a cell is so far beyond the limits that rounding on another device does not change it."""
+        return not self.honest and (self.chi2 > 1.25 * LIMITS[0] or self.beyond > 1.5 * LIMITS[1])
+
 
 def judge(answer: Answer, usual: float = 1.0) -> Cell:
     """Return the cell of an answer; ``usual`` is the RMS error without a fault."""

@@ -229,7 +229,7 @@ def _about_functions() -> str:
     names = [name for name in cells if any(name == other for other, _ in only)]
     faults = [fault.name for fault in FAULTS if any(fault.name == other for _, other in only)]
     rows = [
-        [fault, *(_digits(cells[name][fault]["chi2"]) if (name, fault) in only else "" for name in names)]
+        [fault, *(digits(cells[name][fault]["chi2"]) if (name, fault) in only else "" for name in names)]
         for fault in faults
     ]
     bold = "The table contains the cells that are bold for the function on arrays only.\n"
@@ -243,15 +243,16 @@ def _shown(cells: Mapping[str, Any], opened: Mapping[str, list[str]], estimator:
         return ""
     if cell["chi2"] is None:
         return "no answer"
-    text = f"{_digits(cell['error'])}; {_digits(cell['chi2'])}"
+    text = f"{digits(cell['error'])}; {digits(cell['chi2'])}"
     if cell["first"] is not None and not 0.5 < cell["chi2"] / cell["first"] < 2:
-        text += f" (was {_digits(cell['first'])})"
+        text += f" (was {digits(cell['first'])})"
     if fault in opened[estimator]:
         return f"**{text}**"
     return f"{text}, warned" if cell["warned"] else text
 
 
-def _digits(value: float) -> str:
+def digits(value: float) -> str:
+    """Return a number with two digits, at least."""
     return f"{value:.0f}" if value >= 100 else f"{value:.2g}" if value < 1 or value >= 10 else f"{value:.1f}"
 
 
