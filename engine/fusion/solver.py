@@ -175,6 +175,7 @@ class FusionSolver:
             known_heights=np.where(weight > 0, height, np.nan),
             known_height_weights=weight,
             robust=self._robust,
+            slope_correlation=0.0,  # `_scatter` compares slopes and stated errors
             device=self._device,
             **options,
         )

@@ -17,6 +17,7 @@ from mirrorskin.engine.integration.device_inputs import sample_evenly
 from mirrorskin.engine.integration.surface import explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
 from mirrorskin.io import Fitted, Result
+from mirrorskin.io.base.findings import findings_of, in_process
 from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
@@ -224,7 +225,10 @@ def describe_integration(surfaces: Sequence[Result]) -> dict[str, ProcessValue]:
     if not surfaces:
         return {}
     each = [surface.fitted for surface in surfaces]
+    found = [finding for surface in surfaces for finding in findings_of("heights", surface.process)]
+    notes = in_process([replace(finding, warning=False) for finding in found], {})
     return {
+        **notes,
         "integration": each[0].integration or "",
         "integration_iterations": max(surface.integration_iterations or 0 for surface in each),
         "integration_residual": max(surface.integration_residual or 0.0 for surface in each),

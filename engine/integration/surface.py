@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -25,7 +26,7 @@ from mirrorskin.engine.integration.height_variance import JOINED, expected_misfi
 from mirrorskin.engine.integration.multigrid import Multigrid, Solution
 from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
-from mirrorskin.engine.integration.slope_errors import correlation_of
+from mirrorskin.engine.integration.slope_errors import correlation_of, draw_errors
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.types import ProcessValue
@@ -38,6 +39,7 @@ Method = Literal["direct", "multigrid", "robust"]
 _NO_NOTE: dict[str, ProcessValue] = {}
 _UNEVEN = 2.0  # ratio of the weights of horizontal and vertical links above which they count as uneven
 _PLAIN = 3e-3  # residual of the surface without breaks, with which one with breaks is compared
+_DRAWS, _DRAWN = 4, 1e-2  # number of drawn surfaces, and residual of their solution
 _GOAL = 1e-4  # residual to stop at if there is a deadline, but no tolerance
 
 
@@ -63,7 +65,7 @@ class IntegrationOptions(OnDevice):
         within=(0, None),
         help="distance in pixels at which the correlation of the slopes' errors is 1/e; 0 if they are "
         "independent. It increases ``height_sigma``",
-        shown_default="0 with weights and for slopes on a device, otherwise estimated from their curl",
+        shown_default="estimated from their curl, with which stated weights are compared as well",
     )
     slope_gain_sigma: float = option(
         default=0.0,
@@ -292,7 +294,8 @@ class SurfaceSolver:
         height = self._levelling.level(whole, relief.height, relief.planes, inputs.datum, on_device)
         sigma, note = None, _NO_NOTE
         if options.sigma:
-            factor, note = correlation_of(inputs, options.slope_correlation)
+            respond = partial(self._respond, inputs, components) if relief.flags is None else None
+            factor, note = correlation_of(inputs, options.slope_correlation, respond)
             sigma = self._find_sigma(inputs, relief, components, factor)
         return _as_result(
             height,
@@ -329,19 +332,37 @@ class SurfaceSolver:
             self._multigrid.rebuild(relief.links, strength=JOINED)
             sigma = self._multigrid.deviation(self._graph.flags, uneven=False)
         else:
-            assert self._multigrid is not None
-            if self._cache.sigma is None:
-                self._cache.sigma = self._unit_sigma(self._multigrid, inputs, components)
-            sigma = self._cache.sigma
+            sigma = self._unit_sigma(inputs)
         sigma = sigma * np.float32(factor**0.5)
         return sigma if relief.doubt is None else np.sqrt(np.square(sigma) + relief.doubt)
 
-    def _unit_sigma(self, solver: Multigrid, inputs: Inputs, components: Components) -> Floats:
-        ends = self._link_weights(inputs)
-        uneven = inputs.weight_x is not None or max(ends) > _UNEVEN * min(ends)
-        if uneven:
-            self._cache.built = False  # other levels are built
-        return solver.deviation(self._graph.flags, uneven)
+    def _unit_sigma(self, inputs: Inputs) -> Floats:
+        """Return the standard deviation of heights if the weights are inverse variances."""
+        if self._cache.sigma is None:
+            assert self._multigrid is not None
+            ends = self._link_weights(inputs)
+            uneven = inputs.weight_x is not None or max(ends) > _UNEVEN * min(ends)
+            if uneven:
+                self._cache.built = False  # other levels are built
+            self._cache.sigma = self._multigrid.deviation(self._graph.flags, uneven)
+        return self._cache.sigma
+
+    def _respond(self, inputs: Inputs, components: Components, length: float) -> float:
+        """Return the variance of heights if errors are correlated over a length, over that if they are not.
+
+        It is the mean of draws: what correlated errors add depends on what is missing. Without stated
+        weights, it is relative to the misfit.
+        """
+        errors = draw_errors(inputs, length, _DRAWS)
+        relief = self._find_several(errors, IntegrationOptions(tolerance=_DRAWN))
+        heights = self._levelling.level(components, relief.height, relief.planes)
+        misfit = 1.0 if inputs.weights_given else self._excess(errors, relief, components)
+        self._graph.set_slopes(inputs.each()[0])
+        variance = np.square(self._unit_sigma(inputs)) * np.float32(self._graph.scale)
+        counted = np.isfinite(heights) & (variance > 0)
+        scaled = np.divide(np.square(heights), variance, out=np.zeros_like(heights), where=counted)
+        factor = float(np.mean(scaled, where=counted)) if counted.any() else 1.0
+        return factor if inputs.weights_given else factor / misfit
 
     def _excess(self, inputs: Inputs, relief: _Relief, components: Components) -> float:
         """Return the misfit over that expected for noise of variance 1; NaN without loops of links."""

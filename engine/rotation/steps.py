@@ -17,6 +17,7 @@ from mirrorskin.engine.integration.normals_to_height import (
 )
 from mirrorskin.engine.rotation.edges import find_edges
 from mirrorskin.io import Result
+from mirrorskin.io.base.findings import merged
 
 _NO_PIXEL_SIZE = "none: the recording has no pixel size"
 _SLOPES = "dz_dx", "dz_dy", "dz_dx_weight", "dz_dy_weight"  # maps of `SlopeMaps`
@@ -67,7 +68,7 @@ class Integration(Step):
         )
         if surface.edges is not None and result.edges is not None:
             surface = surface.assign(edges=result.edges | surface.edges)
-        process = {**result.process, **surface.process}
+        process = merged(result.process, surface.process)
         return result.assign(surface, process=process, fitted=result.fitted | surface.fitted)
 
 

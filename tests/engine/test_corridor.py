@@ -51,7 +51,7 @@ def test_library_run(recordings, levels):
     ("line", "functions", "files"),
     [
         ("reconstruct press.h5", 553, 69),
-        ("reconstruct turn.h5", 711, 89),
+        ("reconstruct turn.h5", 719, 89),
         ("fuse press.h5 turn.h5", 877, 105),
     ],
 )

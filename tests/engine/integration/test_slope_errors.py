@@ -25,7 +25,10 @@ def scores(slopes, **options):
     """Return errors of heights over their standard deviations."""
     surface = engine.integrate(*slopes, 1.0, **options)
     error = surface.height - HEIGHT
-    return (error - np.nanmean(error)) / surface.height_sigma
+    for number in range(surface.component.max() + 1):
+        part = surface.component == number
+        error[part] = error[part] - error[part].mean() if np.count_nonzero(part) > 4 else np.nan
+    return error / np.where(np.isfinite(error), surface.height_sigma, 1)
 
 
 def is_honest(values):
@@ -107,3 +110,47 @@ def test_sigma_of_oblique_grooves_is_about_the_error_at_their_creases(angle):
     surface = engine.integrate(*slopes, 0.05)
     error = np.std(surface.height - height)
     assert error / 3 < np.median(surface.height_sigma) < 3 * error
+
+
+CORRIDORS = (np.indices(SHAPE) % 12 < 3).any(axis=0)
+SCATTERED = np.random.default_rng(0).random(SHAPE) > 0.3
+HALF = np.random.default_rng(0).random(SHAPE) > 0.5
+
+
+@pytest.mark.parametrize("weight", [None, NOISE**-2, 4 * NOISE**-2], ids=["none", "true", "too large"])
+@pytest.mark.parametrize(
+    "mask", [None, SCATTERED, HALF, CORRIDORS], ids=["full", "70 %", "50 %", "corridors"]
+)
+@pytest.mark.parametrize("reach", [0, 1, 2, 4])
+def test_sigma_is_true_whatever_is_missing_and_stated(reach, mask, weight):
+    chi2 = [
+        np.nanmean(scores(SLOPES + noise(reach, seed), mask=mask, slope_weights=weight) ** 2)
+        for seed in range(4)
+    ]
+    assert 0.3 < np.mean(chi2) < 2
+
+
+def test_understated_errors_are_reported_once():
+    slopes = SLOPES + noise(0)
+    surfaces = [engine.integrate(*slopes, 1.0, slope_weights=factor / NOISE**2) for factor in (0.2, 1, 4)]
+    assert [surface.process.get("warnings", "")[:36] for surface in surfaces] == [
+        "",
+        "",
+        "slopes contradict each other more th",
+    ]
+    np.testing.assert_allclose(surfaces[2].height_sigma, surfaces[1].height_sigma, rtol=0.05)
+    assert np.mean(surfaces[0].height_sigma) > 2 * np.mean(surfaces[1].height_sigma)
+
+
+def test_slopes_on_the_device_are_examined_as_well(device):
+    slopes = (SLOPES + noise(2)).astype(np.float32)
+    expected = engine.integrate(*slopes, 1.0, mask=SCATTERED, slope_weights=NOISE**-2, device=device)
+    placed = [device.from_host("slope", slope) for slope in slopes]
+    surface = engine.integrate(*placed, 1.0, mask=SCATTERED, slope_weights=NOISE**-2)
+    assert surface.process["slope_correlation"] == expected.process["slope_correlation"]
+    np.testing.assert_allclose(surface.height_sigma, expected.height_sigma, rtol=1e-4)
+
+
+def test_too_few_slopes_to_show_a_correlation_are_noted():
+    surface = engine.integrate(*(SLOPES + noise(0))[:, :6, :7], 1.0)
+    assert "assumed to be independent" in surface.process["notes"]
