@@ -33,6 +33,11 @@ def _thread(x: Floats, y: Floats) -> Floats:
     return np.asarray(np.sqrt(144 - y**2) - 12 - slope * flank)
 
 
+def _tilted(x: Floats, y: Floats) -> Floats:
+    """Return a plate that is tilted by 1.4 degrees, so that its pixels do not all turn light in one frame."""
+    return np.asarray(0.02 * x + 0.015 * y)
+
+
 def _twill(x: Floats, y: Floats) -> Floats:
     """Return a cloth of threads of 0.25 mm, each over two and under two, one further in each row."""
     width, wave = 0.25, 0.035
@@ -43,7 +48,7 @@ def _twill(x: Floats, y: Floats) -> Floats:
         return up + 0.06 * (np.sqrt(np.maximum(1 - (2 * across - 1) ** 2, 0)) - 1)
 
     one, other = yarn(x / width - warp, y / width, warp), yarn(y / width - weft, x / width, weft + 2)
-    return np.asarray(np.maximum(one, other))
+    return np.asarray(np.maximum(one, other) + _tilted(x, y))
 
 
 def _dimples(x: Floats, y: Floats) -> Floats:
@@ -73,7 +78,7 @@ def _coin(x: Floats, y: Floats) -> Floats:
     along = (angle - step * np.rint(angle / step)) * 4.95
     bead = np.sqrt(np.maximum(0.175**2 - along**2 - (radius - 4.95) ** 2, 0)) * 0.6
     relief = 0.05 * np.tanh(6 * np.sin(2.2 * x + 1.5) * np.cos(2.6 * y)) * (radius < 4.6)
-    return np.asarray(rim + groove + bead + relief)
+    return np.asarray(rim + groove + bead + relief + _tilted(x, y))
 
 
 def _scratch(x: Floats, y: Floats) -> Floats:
@@ -104,7 +109,8 @@ def _print(x: Floats, y: Floats) -> Floats:
     there = dots[row % 64, column % 64] & (column % 6 != 0) & (row % 8 != 0)
     distance = np.hypot(x - column * pitch, y - row * pitch)
     dot = 0.1 * np.clip((radius - distance) / 0.05, 0, 1) * there
-    return np.asarray(dot + 0.004 * np.sin(2 * np.pi * x / 1.7) * np.sin(2 * np.pi * y / 2.3))
+    paper = 0.004 * np.sin(2 * np.pi * x / 1.7) * np.sin(2 * np.pi * y / 2.3)
+    return np.asarray(dot + paper + _tilted(x, y))
 
 
 CHOSEN: Mapping[str, Callable[[Floats, Floats], Floats]] = {
