@@ -17,6 +17,9 @@ from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.selection import Span
 from mirrorskin.io.base.types import Closing, Floats, InputError
 
+LOSSY = "lossy compression"
+"""Kind of the finding of `lossy`."""
+
 
 class FrameReader(Closing, ABC):
     """Frames of a file, which are read when they are used.
@@ -122,7 +125,7 @@ def lost_frames(lost: NDArray[np.int32]) -> tuple[Finding, ...]:
 def lossy(how: str) -> Finding:
     """Return the finding for frames with lossy compression."""
     return Finding(
-        "lossy compression",
+        LOSSY,
         f"the frames are compressed with a loss ({how}): brightness and noise are not those of the camera,"
         " and standard deviations are too small; record without compression, or with a lossless one",
     )

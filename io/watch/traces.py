@@ -33,6 +33,12 @@ _OUTLIERS, _FLASH = 0.003, 0.2  # tolerated share of outliers; share in a frame 
 _NOISY = 0.3  # share of the pixels that differ between frames because of noise
 _AS_ONE = 0.5  # mean direction of the pixels' phases above which all respond alike
 _HARMONICS = 3  # number of harmonics of the phase that describe the brightness of a pixel
+_PATCH = (64, 96)  # rows and columns in the middle of frames that may show a compression
+_PATCH_FRAMES, _PAIRS = 128, 8  # first frames whose patch is kept; pairs of them that are compared
+_BLOCK = 8  # pixels of a block of JPEG and of video codecs
+_BLOCKY = (1.02, 5.0), (1.08, 8.0)  # ratio and z-score of steps at borders, in both directions or in one
+_NO_STEP, _OF_FRAMES = 0.02, 0.4  # steps of frames over other differences; steps of changes over these
+_PATTERNS, _REPEATED = 2, 0.45  # that a scene repeats, and their share in its steps
 _THIN = 4  # an axis shorter than both others by this factor may be in the wrong place
 
 
@@ -67,7 +73,12 @@ class FrameSamples:
         cuts = [slice((n - 1) % step // 2, None, step) for n, step in zip(shape[1:], steps, strict=True)]
         self._grid = (slice(None), *cuts)
         self.rows, self.columns = (np.arange(n)[part] for n, part in zip(shape[1:], cuts, strict=True))
+        self._patch = tuple(
+            slice(max(0, n - size) // 2, max(0, n - size) // 2 + size)
+            for n, size in zip(shape[1:], _PATCH, strict=True)
+        )
         self._parts: list[NDArray[Any]] = []
+        self._patches: list[NDArray[Any]] = []
         self.count = 0
 
     @classmethod
@@ -83,6 +94,8 @@ class FrameSamples:
 
     def of_frames(self, frames: NDArray[Any]) -> NDArray[Any]:
         """Return a copy of the samples of frames, (n, H, W), at the pixels of the grid."""
+        if self.count < _PATCH_FRAMES:
+            self._patches.append(frames[: _PATCH_FRAMES - self.count, *self._patch].copy())
         return frames[self._grid].copy()
 
     def push_samples(self, values: NDArray[Any]) -> None:
@@ -113,6 +126,79 @@ class FrameSamples:
         if len(self._parts) > 1:
             self._parts = [np.concatenate(self._parts)]
         return self._parts[0]
+
+    def compression(self) -> bool:
+        """Return whether the changes of neighbouring pixels show blocks of a compression with a loss.
+
+        A codec treats blocks of 8 x 8 pixels, or of a multiple, each for itself, so that their noise changes
+        in steps from block to block. Third differences of the change between two frames, across the border
+        of two pixels, are larger at every eighth border then. A pattern of this period on the object has
+        steps in each frame, which are larger than their changes, or changes that repeat.
+        """
+        pairs = [(patch[:-1], patch[1:]) for patch in self._patches if len(patch) > 1]
+        single = [patch[0] for patch in self._patches if len(patch) == 1]
+        pairs += [(np.stack(single[:-1]), np.stack(single[1:]))] if len(single) > 1 else []
+        if not pairs or min(self._patches[0].shape[1:]) < 3 * _BLOCK:
+            return False
+        before, after = (
+            np.concatenate(part) if len(part) > 1 else part[0] for part in zip(*pairs, strict=True)
+        )
+        chosen = np.unique(np.linspace(0, len(before) - 1, _PAIRS).astype(int))
+        first, change = (part[chosen].astype(np.float32) for part in (before, after))
+        change -= first
+        if not np.isfinite(change).all():
+            return False
+        blocky = [_blocky(change, first), _blocky(change.swapaxes(1, 2), first.swapaxes(1, 2))]
+        (both, clear), (one, clearer) = _BLOCKY
+        return all(ratio > both and score > clear for ratio, score in blocky) or (
+            any(ratio > one and score > clearer for ratio, score in blocky)
+            and all(ratio > 0 for ratio, _ in blocky)
+        )
+
+
+def _blocky(change: Samples, frames: Samples) -> tuple[float, float]:
+    """Return the ratio of steps across the borders of blocks to others, and its excess in standard errors.
+
+    Borders are those between columns of a change between frames, (n, H, W). The ratio is 0 if nothing
+    changes; it is 1, and the excess 0, if the scene explains it.
+    """
+    middle = change[..., 1:-2] - change[..., 2:-1]
+    signed = change[..., 3:] - change[..., :-3] + 3 * middle
+    whole = signed.shape[-1] // _BLOCK * _BLOCK
+    signed = signed[..., :whole].reshape(-1, whole // _BLOCK, _BLOCK)
+    steps = np.sqrt(np.abs(signed))
+    mean = float(steps.mean())
+    if mean == 0:
+        return 0.0, 0.0
+    np.minimum(steps, 2 * mean, out=steps)  # a few large changes, as at the edge of contact, do not decide
+    series = steps.mean(axis=1)
+    places = series.mean(axis=0)
+    border = int(np.argmax(places))
+    others = [(border + apart) % _BLOCK for apart in (2, 4, 6)]  # as large in pictures that were enlarged
+    other = others[int(np.argmax(places[others]))]
+    excess = series[:, border] - series[:, other]
+    error = float(np.std(excess)) / math.sqrt(len(excess)) + 1e-9
+    ratio, score = float(places[border] / max(places[other], 0.01)), float(excess.mean()) / error
+    if score < _BLOCKY[0][1]:
+        return ratio, score
+    here = frames[..., 3:] - frames[..., :-3] + 3 * (frames[..., 1:-2] - frames[..., 2:-1])
+    in_frames = np.sqrt(np.abs(here[..., :whole])).reshape(-1, whole // _BLOCK, _BLOCK).mean(axis=(0, 1))
+    scene = in_frames[border] - in_frames[other]
+    patterns = np.copysign(steps, signed)
+    repeated, usual = (_repeated(patterns[..., place], len(change)) for place in (border, other))
+    if scene > max(_NO_STEP * in_frames[other], float(excess.mean()) / _OF_FRAMES):
+        return 1.0, 0.0
+    return (1.0, 0.0) if repeated > max(_REPEATED, usual + _REPEATED / 3) else (ratio, score)
+
+
+def _repeated(steps: Samples, frames: int) -> float:
+    """Return the share of the two commonest patterns in the steps of each change; 0 if few have steps."""
+    rows = steps.reshape(frames, -1)
+    sizes = np.linalg.norm(rows, axis=1, keepdims=True)
+    rows = rows[sizes[:, 0] > 0] / sizes[sizes[:, 0] > 0]
+    if len(rows) <= 2 * _PATTERNS:
+        return 0.0
+    return float(np.linalg.eigvalsh(np.einsum("in,jn->ij", rows, rows))[-_PATTERNS:].sum()) / len(rows)
 
 
 def named_frames(numbers: Sequence[int] | NDArray[np.intp]) -> str:

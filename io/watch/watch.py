@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.base.checksums import UNVERIFIED_PARTS
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.types import Block, Floats, Source
+from mirrorskin.io.model.frames import LOSSY, lossy
 from mirrorskin.io.watch.traces import FrameSamples, Traces, named_frames
 
 FIELD = (0.05, 200.0)
@@ -117,8 +118,11 @@ class FrameChecker:
         source = self._source
         dropped = getattr(source, "dropped", None)
         lost = self._lost if dropped is None else int(np.sum(dropped))
+        known = getattr(source, "findings", ())
+        undeclared = self.samples.compression() and all(finding.kind != LOSSY for finding in known)
         return (
-            *getattr(source, "findings", ()),
+            *known,
+            *([lossy("blocks of 8 x 8 pixels")] if undeclared else []),
             *_geometry(source, series, field_limits, travel_limits),
             *_order(source, series, lost),
             *traces.findings(source.shape, self._moved, self._phased),

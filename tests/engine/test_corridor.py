@@ -44,7 +44,7 @@ def test_library_run(recordings, levels):
         with io.open_recording(recordings / "press.h5") as recording:
             engine.run(recording, engine.Onset(**levels))
 
-    assert_few(run, 385, 52)
+    assert_few(run, 386, 52)
 
 
 @pytest.mark.parametrize(

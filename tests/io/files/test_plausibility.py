@@ -1,5 +1,6 @@
 """The plausibility report: it contains an expert's doubts about the numbers, and no others."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -230,6 +231,34 @@ def test_what_was_found_at_an_import_stays_in_the_recording(tmp_path):
     with io.open_recording(tmp_path / "rec.h5") as recording:
         assert recording.findings == source.findings
     assert io.describe(tmp_path / "rec.h5")["finding: lossy"] == "the frames were compressed"
+
+
+def as_jpeg(frames, quality):
+    settings = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    encoded = [cv2.imencode(".jpg", frame, settings)[1] for frame in frames]
+    return np.stack([np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)) for jpeg in encoded])
+
+
+SQUARES = 0.5 + 0.5 * (np.add.outer(np.arange(60) // 8, np.arange(80) // 8) % 2)
+LIT = {"a press": (pressed, "travel", TRAVEL), "a turn": (turned, "phase", PHASE)}
+
+
+@pytest.mark.parametrize("quality", [75, 90, 95])
+@pytest.mark.parametrize("part", [np.s_[:], np.s_[:, 3:, 5:]], ids=["whole", "cropped"])
+@pytest.mark.parametrize(("light", "name", "positions"), LIT.values(), ids=LIT)
+def test_frames_of_an_array_that_were_jpeg_have_a_finding(light, name, positions, part, quality):
+    frames = as_jpeg(noisy(light(), 1.4), quality)[part]
+    assert "lossy compression" in kinds(found(frames, **{name: positions}))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.4, 1.4, 4.0])
+@pytest.mark.parametrize(("light", "name", "positions"), LIT.values(), ids=LIT)
+def test_frames_that_were_not_compressed_have_no_such_finding(light, name, positions, noise):
+    frames = noisy(light(), noise)
+    twice = frames.repeat(2, axis=1).repeat(2, axis=2)
+    binned = frames.reshape(len(frames), 30, 2, 40, 2).mean(axis=(2, 4)).astype(np.uint8)
+    for each in (frames, noisy(light() * SQUARES, noise), twice, binned, frames // 8 * 8):
+        assert "lossy compression" not in kinds(found(each, **{name: positions}))
 
 
 def test_few_pixels_contain_no_information():
