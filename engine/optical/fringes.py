@@ -44,6 +44,8 @@ _WHOLE_FIELD = 1 + 1e-6  # fringes over the field, up to which a phase is absolu
 _LEAST_SIGMA = 1e-12  # radians
 _ANSWERS = "phase", "phase_sigma", "mean", "modulation", "residual"
 _MISFIT = 4.0  # standard deviations of noise: maximum residual of samples that follow a cosine of the shift
+_NO_STRIPE = -2
+_ISOLATED_RISK = 0.5  # of a number that no neighbours have
 _UNCLEAR = 0.5  # distance of a bit from the threshold, RMS distances, below which the pixel is on a border
 
 
@@ -239,7 +241,8 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
     """Read the number of a pixel's stripe from pictures of a reflected binary (Gray) code.
 
     With c the RMS distance from the threshold over the pictures, minus the noise, a bit at the distance d is
-    wrong with probability 1 / (1 + exp(2 c d / noise^2)).
+    wrong with probability 1 / (1 + exp(2 c d / noise^2)). A pixel whose number differs from those of all
+    neighbours but one by more than 1, as because of a hot sample, is wrong with a probability of 0.5 or more.
 
     Parameters
     ----------
@@ -292,6 +295,7 @@ def decode_gray(frames: NDArray[Any], threshold: ArrayLike, *, noise: ArrayLike)
         border = np.where(unclear, np.maximum(stripe, other), border)
         risk += wrong * far
         border_risk += (wrong * ~unclear + false_border) * ~far
+    risk = np.where(_isolated(stripe), np.maximum(risk, _ISOLATED_RISK), risk)  # as of a hot sample
     return Result(
         stripe=stripe,
         risk=_probability(risk),
@@ -365,6 +369,17 @@ def unwrap_gray(fringes: Maps, stripes: Maps, *, width: float = np.pi, start: fl
     whole = _nearest(wrapped, guess)
     error = (np.pi - np.abs(whole - guess)) / np.maximum(errors, 1e-12)
     return _unwrapped(wrapped, whole, errors, wrong + ndtr(-error), results)
+
+
+def _isolated(stripe: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Return the pixels with five neighbours or more of which one at most has the number, within 1."""
+    wide, (rows, columns) = np.pad(stripe, 1, constant_values=_NO_STRIPE), stripe.shape
+    alike, known = np.zeros(stripe.shape, np.uint8), np.zeros(stripe.shape, np.uint8)
+    for down, right in np.ndindex(3, 3):
+        other = wide[down : down + rows, right : right + columns]
+        alike += np.abs(other - stripe) <= 1
+        known += other != _NO_STRIPE
+    return (alike <= 2) & (known > 5)  # with itself
 
 
 def _results(inputs: Mapping[str, Maps], quantity: str) -> dict[str, Result]:

@@ -46,6 +46,7 @@ _SMOOTH = 0.15  # standard deviation over which the misfit is averaged, in compo
 _LEAK = 3.0  # variance of a misfit that looks like a normal, over that of its quadratic part
 _COLUMNS = 3  # of the equations before those of gains: offset, drift, gamma
 _UNIFORM = 2.0  # largest spread of a uniform albedo, standard errors
+_POWERS = 0.3, 3.0  # of the light, that a response may have
 _CLEARER = 1.02  # least ratio of the spreads of albedos by two explanations
 _SIDE_Z_SCORE = 2.0  # standard errors from which on a side of the picture shows stray light
 
@@ -107,7 +108,13 @@ class LampFit:
         clear = np.abs(error) > CLEAR_Z_SCORE * sigma
         light = self.light
         power = 1 + float(error[2])
-        if clear[2] and abs(power - 1) > _POWER:
+        if clear[2] and not _POWERS[0] < power < _POWERS[1]:
+            yield Finding(
+                "not matt",
+                "the brightness is not that of a matt surface under these lamps: are their directions and"
+                " dark as stated?",
+            )
+        elif clear[2] and abs(power - 1) > _POWER:
             yield Finding(
                 "response",
                 f"the brightness is not proportional to the light, but to its power {power:.3g}, as with"

@@ -166,6 +166,14 @@ def _records(result: Result, grid: Grid, device: Device, curved: bool) -> Array:
     rows, columns = shape = shape_of(result, result.name_of("height") or "")
     pixels, (_, _, step_x, step_y) = rows * columns, grid
     height, normals = map_of("height", np.float32), map_of("normals", np.float32, 3)
+    sigma = map_of("height_sigma", np.float32)
+    for _ in range(2 if sigma is not None else 0):  # the second time, next to spikes
+        clean = device.array("clean", shape, np.float32, zeroed=False)
+        _run(
+            device, "pose_spikes", rows, columns,
+            height=height, height_sigma=sigma, clean=clean, moved=12 * pixels,
+        )  # fmt: skip
+        height = clean
     gradient = None
     if normals is None:
         gradient = device.array("gradient", (*shape, 2), np.float32, zeroed=False)
@@ -177,7 +185,7 @@ def _records(result: Result, grid: Grid, device: Device, curved: bool) -> Array:
     apart = result.component is not None and unknown is not None and np.any(unknown)
     maps: dict[str, Any] = {
         "height": height,
-        "height_sigma": map_of("height_sigma", np.float32),
+        "height_sigma": sigma,
         "component": map_of("component", np.int32) if apart else None,
         "offset_unknown": device.from_host("offset_unknown", unknown, np.uint8) if apart else None,
         "normals": normals,

@@ -18,6 +18,7 @@ from mirrorskin.io.base.findings import findings_of
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 
+_MAX_CHI_SQUARE = 4.0  # chi square above which the motion has a note
 _MAX_UNDETERMINED = 1e-3  # component of an undetermined direction above which the parameter is undetermined
 _EQUAL_TOLERANCE = 0.01  # directions that differ by less are equal
 
@@ -173,7 +174,14 @@ def estimate_pose(
     fit = PairFit(before, after, opened)
     pose = pose_of(fit, *fit.solve(None if start is None else start.motion))
     findings = [finding for name, result in results.items() for finding in findings_of(name, result.process)]
-    return replace(pose, notes=tuple(finding.text for finding in findings))
+    notes = tuple(finding.text for finding in findings)
+    if pose.chi_square > _MAX_CHI_SQUARE:
+        text = (
+            f"the maps differ by {pose.chi_square**0.5:.2g} times their standard deviations, as with outliers"
+            " or an object that changed: the motion may be wrong by more than its sigma"
+        )
+        notes = (*notes, text)
+    return replace(pose, notes=notes)
 
 
 def pose_of(fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose:

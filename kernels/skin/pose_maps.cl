@@ -18,6 +18,7 @@
 #define SHARPEST 1e-10f
 #define VAGUE 100.0f
 #define STEEPEST 0.17f
+#define SPIKE 8.0f
 #define NUMBERS 8
 #define SUMMARY 6
 
@@ -82,6 +83,36 @@ INLINE int is_near_border(
             if (contact) is_left_out |= contact[y * columns + x] == 0;
         }
     return is_left_out;
+}
+
+INLINE float height_at(MAP height, const int rows, const int columns, const int row, const int column)
+{
+    return row >= 0 && column >= 0 && row < rows && column < columns ? height[row * columns + column] : NAN;
+}
+
+// Copies heights; NAN for spikes, which are far from their neighbours along all known lines, and from their cubic.
+__kernel void pose_spikes(const int rows, const int columns, MAP height, MAP height_sigma, OUT clean)
+{
+    const int down[4] = {0, 1, 1, 1}, right[4] = {1, 0, 1, -1};
+    EACH_PIXEL {
+        const int row = p / columns, column = p % columns;
+        const float limit = SPIKE * height_sigma[p], here = height[p];
+        const int is_at_border = row == 0 || column == 0 || row == rows - 1 || column == columns - 1;
+        int lines = 0, far = 0;
+        for (int i = 0; i < 4; ++i) {
+            const int y = down[i], x = right[i];
+            const float near = height_at(height, rows, columns, row - y, column - x) + height_at(height, rows, columns, row + y, column + x);
+            const float bend = fabs(here - 0.5f * near);
+            if (!(bend > limit)) {
+                lines += bend == bend;
+                continue;
+            }
+            const float wide = height_at(height, rows, columns, row - 2 * y, column - 2 * x) + height_at(height, rows, columns, row + 2 * y, column + 2 * x);
+            ++lines;
+            far += !(fabs(here - (4 * near - wide) / 6) < 0.5f * bend);
+        }
+        clean[p] = lines > !is_at_border && far == lines ? NAN : here;
+    }
 }
 
 __kernel void pose_records(

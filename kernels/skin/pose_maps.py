@@ -22,6 +22,8 @@ SHARPEST = 1e-10
 """Smallest variance of a normal or height, radians^2 or mm^2; interpolation between pixels errs by more."""
 SUMMARY, STRIP = 6, 16
 """Length of the record of a strip in `pose_summary`, and number of its pixels."""
+SPIKE = 8.0
+"""Least difference of a spike from the means of opposite neighbours, on all four lines, sigmas."""
 AROUND = 2  # pixels around edges and the border of contact that are excluded; reach of a gradient
 _MIN_PIXELS = 7  # minimum number of pixels of a gradient
 _SINGULAR = 1e-3  # relative determinant of a singular arrangement of them
@@ -53,6 +55,33 @@ def pose_gradient(step_x: float, step_y: float, values: Array, gradient: Array) 
         good = (count >= _MIN_PIXELS) & (area > _SINGULAR * count**2)
         gradient[..., 0] = np.where(good, (yy * xz - xy * yz) / area / step_x, np.nan)
         gradient[..., 1] = np.where(good, -(xx * yz - xy * xz) / area / step_y, np.nan)
+
+
+def pose_spikes(height: Array, height_sigma: Array, clean: Array) -> None:
+    """Copy heights, and write NaN instead of spikes.
+
+    A spike differs from the means of opposite neighbours by `SPIKE` sigmas, on all of the four lines through
+    it whose neighbours are valid, two or more (one at the border); and from the cubic of four neighbours, if
+    they are valid, by half as much, as a curved surface does not.
+    """
+    wide, (rows, columns) = np.pad(height, 2, constant_values=np.nan), height.shape
+
+    def both(down: int, right: int) -> Array:
+        ahead, back = (
+            wide[2 + k * down : 2 + k * down + rows, 2 + k * right : 2 + k * right + columns] for k in (1, -1)
+        )
+        return np.asarray(ahead + back)
+
+    steps = (0, 1), (1, 0), (1, 1), (1, -1)
+    near = np.array([both(*step) for step in steps])
+    far = np.array([both(2 * down, 2 * right) for down, right in steps])
+    with np.errstate(invalid="ignore"):
+        bends, rests = np.abs(height - near / 2), np.abs(height - (4 * near - far) / 6)
+        lines, high = np.isfinite(bends), (bends > SPIKE * height_sigma) & ~(rests < bends / 2)
+        spikes = np.all(high | ~lines, axis=0)
+    needed = np.full((rows, columns), 1)
+    needed[1:-1, 1:-1] = 2
+    clean[...] = np.where(spikes & (lines.sum(axis=0) >= needed), np.nan, height)
 
 
 def pose_records(

@@ -715,6 +715,13 @@ NONE_BUT_HEIGHTS = dict.fromkeys(
 )
 
 
+@case("pose_spikes", MAPS)
+def _(shape):
+    rng, height = np.random.default_rng(3), waves(shape, 0.2)[..., 3]
+    height = height + (rng.random(shape) < 0.1) * rng.uniform(0.1, 1, shape)
+    return {"height": height, "height_sigma": np.full(shape, 0.01), "clean": np.zeros(shape), "shape": shape}
+
+
 @case("pose_records", MAPS | {"maps": ("heights", "normals", "all")})
 def _(shape, maps):
     rng, records = np.random.default_rng(3), waves(shape, 0.2)

@@ -39,6 +39,7 @@ def test_several_devices_have_the_answer_of_one(devices, name):
     assert_same(case.whole([1, 7, 20], device=devices), case.whole(device=devices[0]))
 
 
+@pytest.mark.filterwarnings("ignore:.*matt surface:mirrorskin.io.MirrorskinWarning")  # a turn, as of lamps
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.function])
 def test_functions_on_arrays_take_several_devices(devices, name):
     case = CASES[name]

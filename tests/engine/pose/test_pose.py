@@ -103,6 +103,26 @@ def test_heights_alone_are_enough() -> None:
     assert np.abs(error_of(pose, vector, shift)).max() < 0.005
 
 
+def test_outliers_on_one_side_are_left_out_or_noted() -> None:
+    chi_squares = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        vector, shift = draw(rng)
+        results = []
+        for motion in ((), (vector, shift)):
+            heights = sampled(bumpy, *motion, rng=rng, shape=(60, 80)).assign(
+                normals=None, normals_sigma=None
+            )
+            high = (rng.random(heights.height.shape) < 0.01) * rng.uniform(0.05, 0.5, heights.height.shape)
+            results.append(heights.assign(height=(heights.height + high).astype(np.float32)))
+        pose = engine.pose.estimate_pose(*results)
+        error = error_of(pose, vector, shift)
+        if not pose.notes:
+            chi_squares.append(error @ np.linalg.solve(pose.covariance, error) / 6)
+    assert len(chi_squares) >= 6
+    assert np.mean(chi_squares) < 2
+
+
 @pytest.mark.parametrize("sigma", [1e-6, 1e-12, 1e-30])
 def test_maps_without_noise_have_a_pose_and_a_covariance(sigma: float) -> None:
     rng = np.random.default_rng(5)
