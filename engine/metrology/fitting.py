@@ -20,6 +20,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.metrology.noise import covariance_of
 from mirrorskin.engine.metrology.quantity import Quantity, micrometres
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics import least_squares
@@ -81,9 +82,18 @@ class PointCloud:
     points: Doubles  # (3, n), float64: millimetres
     sigma: Doubles  # (n,), float64: standard deviations of their heights, mm; all NaN where there are none
     where: Mask  # (H, W), bool: which pixels they are
+    pixel_size: tuple[float, float]  # millimetres
+    noise_length: float  # millimetres over which errors of heights are correlated
 
     @classmethod
-    def of(cls, height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None) -> PointCloud:
+    def of(
+        cls,
+        height: ArrayLike,
+        x: ArrayLike,
+        y: ArrayLike,
+        sigma: ArrayLike | None,
+        noise_length: float = 0.0,
+    ) -> PointCloud:
         """Return the points of a height map, which is NaN where undefined; see `fit_plane`."""
         z = np.asarray(height, np.float64)
         where = np.isfinite(z)
@@ -92,7 +102,9 @@ class PointCloud:
         across, up = np.meshgrid(np.asarray(x, np.float64), np.asarray(y, np.float64))
         points = np.stack([across[where], up[where], z[where]])
         sigmas = np.full(points.shape[1], np.nan) if sigma is None else np.asarray(sigma, np.float64)[where]
-        return cls(points, sigmas, where)
+        sizes = [abs(float(np.mean(np.diff(axis)))) if np.size(axis) > 1 else 0.0 for axis in (x, y)]
+        size = sizes[0] or sizes[1] or 1.0, sizes[1] or sizes[0] or 1.0
+        return cls(points, sigmas, where, size, noise_length)
 
     @property
     def common_sigma(self) -> float:
@@ -132,7 +144,34 @@ class PointCloud:
             steepness = form.jacobian(points, parameters)[form.lift]
             claimed = float(np.sum(weight * (sigma * steepness) ** 2))
         birge = float(np.sqrt(gram[-1, -1] / claimed)) if claimed > 0 else np.nan
-        return Fit(parameters, covariance(gram, parameters.size, weight.size, claimed), kept, birge)
+        spread = covariance(gram, parameters.size, weight.size, claimed)
+        if self.noise_length > 0 and claimed > 0:
+            spread = at_least(spread, self._predicted(form, points, weight, parameters, kept))
+        return Fit(parameters, spread, kept, birge)
+
+    def _predicted(
+        self, form: Form, points: Doubles, weight: Doubles, parameters: Doubles, kept: Mask
+    ) -> Doubles:
+        """Return the covariance of parameters that the correlated errors of heights cause."""
+        rows = form.jacobian(points, parameters)
+        influence = (
+            np.linalg.pinv((rows * weight) @ rows.T, hermitian=True) @ (rows * weight) * rows[form.lift]
+        )
+        places = np.zeros_like(self.where)
+        places[self.where] = kept
+        maps = np.zeros((parameters.size, *self.where.shape))
+        maps[:, places] = influence
+        sigma = np.zeros(self.where.shape)
+        sigma[self.where] = self.sigma
+        return covariance_of(maps, sigma, places, self.pixel_size, self.noise_length)
+
+
+def at_least(spread: Doubles, predicted: Doubles) -> Doubles:
+    """Return a covariance whose variances are at least those of another one."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.sqrt(np.fmax(1.0, np.diag(predicted) / np.diag(spread)))
+    factor = np.where(np.isfinite(factor), factor, 1.0)
+    return np.asarray(spread * np.multiply.outer(factor, factor))
 
 
 def find_uncertain(sigma: Doubles, measured: Mask) -> Mask:

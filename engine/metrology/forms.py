@@ -58,19 +58,28 @@ class Plane:
         }
 
 
-def fit_plane(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None = None) -> Plane:
+def fit_plane(
+    height: ArrayLike,
+    x: ArrayLike,
+    y: ArrayLike,
+    sigma: ArrayLike | None = None,
+    *,
+    noise_length: float = 0.0,
+) -> Plane:
     """Fit a plane to a height map, (H, W) mm with NaN where undefined, by least squares.
 
     Pixel centres are at ``x``, (W,), and ``y``, (H,), mm. ``sigma``, (H, W) mm, are the heights' standard
     deviations, which determine weights as in `PointCloud.fit`. Uncertainties are from `covariance`. The mean
-    standard deviation is added to that of the height, because heights may have a common error.
+    standard deviation is added to that of the height, because heights may have a common error. If errors of
+    heights are correlated over a ``noise_length``, mm, infinity for integrated slopes, uncertainties are at
+    least those that follow from ``sigma``; see `mirrorskin.engine.measure`.
 
     Examples
     --------
     >>> round(fit_plane([[0, 1], [0, 1]], x=[0, 1], y=[1, 0]).tilt.value, 6)
     45.0
     """
-    cloud, form = PointCloud.of(height, x, y, sigma), _PlaneForm()
+    cloud, form = PointCloud.of(height, x, y, sigma, noise_length), _PlaneForm()
     fit = cloud.fit(form) if cloud.sigma.size >= 3 else None
     if fit is None:
         raise InputError("no plane fits: at least three pixels that are not in one line are needed")
@@ -151,7 +160,14 @@ class Sphere:
         }
 
 
-def fit_sphere(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike | None = None) -> Sphere:
+def fit_sphere(
+    height: ArrayLike,
+    x: ArrayLike,
+    y: ArrayLike,
+    sigma: ArrayLike | None = None,
+    *,
+    noise_length: float = 0.0,
+) -> Sphere:
     """Fit a sphere to a height map by least squares of the distances from it; see `fit_plane`.
 
     Examples
@@ -161,7 +177,7 @@ def fit_sphere(height: ArrayLike, x: ArrayLike, y: ArrayLike, sigma: ArrayLike |
     >>> round(fit_sphere(np.sqrt(25 - x**2 - x[:, None] ** 2), x, -x).radius.value, 6)
     5.0
     """
-    cloud = PointCloud.of(height, x, y, sigma)
+    cloud = PointCloud.of(height, x, y, sigma, noise_length)
     form = _SphereForm.of(cloud.points)
     fit = None if form is None else cloud.fit(form)
     if form is None or fit is None:

@@ -154,7 +154,7 @@ def measure(
     budget: dict[str, dict[str, float]] = {}
     quantities |= _texture(patch, form_removed, (s_filter, l_filter), notes, budget)
     if section is not None:
-        quantities |= _section(comparable, section, notes)
+        quantities |= _section(comparable, section, patch.noise_length, notes)
         quantities |= _profile(patch, form_removed, comparable, section, l_filter, notes, budget)
     lens = None if maps.calibration is None else maps.calibration.lens
     scale = 0.0 if lens is None else lens.scale_sigma
@@ -315,23 +315,25 @@ def _fit(patch: Patch, form: FormName | None) -> Plane | Sphere | None:
     """Fit a form; by default the sphere if its residual is much smaller, otherwise the plane, if any fits."""
     cloud = patch.height, patch.x, patch.y, patch.sigma
     if form == "plane":
-        return fit_plane(*cloud)
+        return fit_plane(*cloud, noise_length=patch.noise_length)
     if form == "sphere":
-        return fit_sphere(*cloud)
+        return fit_sphere(*cloud, noise_length=patch.noise_length)
     if form == "none":
         return None
     plane: Plane | None = None
     with suppress(InputError):
-        plane = fit_plane(*cloud)
-        sphere = fit_sphere(*cloud)
+        plane = fit_plane(*cloud, noise_length=patch.noise_length)
+        sphere = fit_sphere(*cloud, noise_length=patch.noise_length)
         if sphere.rms.value < _MUCH_BETTER * plane.rms.value:
             return sphere
     return plane
 
 
-def _section(result: Result, ends: tuple[Point, Point], notes: list[str]) -> dict[str, Quantity]:
+def _section(
+    result: Result, ends: tuple[Point, Point], noise_length: float, notes: list[str]
+) -> dict[str, Quantity]:
     """Return the quantities of a section, and of a step if there is one."""
-    profile = cut(result, *ends)
+    profile = cut(result.with_fitted(height_correlation=noise_length), *ends)
     quantities = along(profile)
     ends_known = np.isfinite(profile.height[[0, -1]]) & ~profile.filled[[0, -1]]
     if not ends_known.all():

@@ -7,18 +7,22 @@ press; that of integrated slopes for L = infinity.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.integration.height_variance import find_rectangle_variance
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
 
 _PERIODIC_MARGIN = 4.0  # correlation lengths between the map and its periodic continuation
 _LARGEST = 2  # times the size of the map: the periodic picture where the correlation is longer
+# Distance in pixels at which (ln d) / (2 pi) is 0 in the structure function of heights from slopes on a grid.
+_GRID = math.exp(-np.euler_gamma) / 2**1.5
 _SEED = 20  # realisations are the same in each call
 
 
@@ -92,3 +96,63 @@ def _relative_gain(measured: Mask, gain: Doubles, shape: tuple[int, int]) -> flo
     covariance = np.sum(fft.irfft2(np.abs(wave) ** 2 * gain**2, shape)[0, 0])
     relative = float(covariance) / np.count_nonzero(measured) ** 2
     return 1 / math.sqrt(max(1 - relative, 1e-6))
+
+
+def covariance_of(
+    functionals: Doubles, sigma: Doubles, measured: Mask, pixel_size: tuple[float, float], length: float
+) -> Doubles:
+    """Return the covariance, (k, k), of linear functionals, (k, H, W), of errors of heights.
+
+    They are correlated over a length above 0, mm. Errors of integrated slopes are those in a rectangle with
+    free borders, scaled to ``sigma``.
+    """
+    from scipy import fft
+
+    weighted = np.where(measured, functionals * np.where(measured, sigma, 0.0), 0.0)
+    if math.isinf(length):
+        variance, power = _free_errors(measured.shape, pixel_size)
+        weighted = weighted / np.sqrt(variance)
+        means = weighted.sum(axis=(1, 2)) / np.count_nonzero(measured)
+        weighted -= means[:, np.newaxis, np.newaxis] * measured
+        waves = fft.dctn(weighted, axes=(1, 2), norm="ortho") * np.sqrt(power)
+    else:
+        gain, shape = _gain(measured.shape, pixel_size, length)
+        waves = fft.irfft2(fft.rfft2(weighted, shape) * gain, shape)
+    flat = waves.reshape(len(waves), -1)
+    return np.asarray(flat @ flat.T)
+
+
+def _free_errors(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> tuple[Doubles, Doubles]:
+    """Return the variance of heights in a rectangle for slopes of variance 1, and that of cosine waves."""
+    rows, columns = shape
+    weights = 1 / pixel_size[0] ** 2, 1 / pixel_size[1] ** 2
+    up, across = (4 * np.sin(np.pi * np.arange(n) / (2 * n)) ** 2 for n in (rows, columns))
+    total = np.add.outer(weights[1] * up, weights[0] * across)
+    total[0, 0] = np.inf
+    return find_rectangle_variance((rows, columns), weights, 0.0).astype(np.float64), 1 / total
+
+
+def correlation(
+    distance: Doubles, shape: tuple[int, int], pixel_size: tuple[float, float], length: float
+) -> Doubles:
+    """Return the correlation of two errors of heights at distances, mm, in a picture of so many pixels.
+
+    With an infinite length only differences of heights are known, and the correlation is about their mean: it
+    is 1 - g(d) / g, with g(d) = ln(d / e) / (2 pi) half the mean square of differences on a grid of pixels
+    for links of variance 1, and g the mean variance. With a length L it is K0(d / L) / K0(e / L).
+    """
+    from scipy.special import k0
+
+    if not length > 0:
+        return np.asarray(distance == 0, np.float64)
+    least = _GRID * math.sqrt(pixel_size[0] * pixel_size[1])
+    far = np.maximum(distance, least)
+    if math.isinf(length):
+        return np.asarray(1 - np.log(far / least) / (2 * math.pi * _mean_variance(*shape)))
+    return np.asarray(k0(far / length) / k0(least / length))
+
+
+@functools.cache
+def _mean_variance(rows: int, columns: int) -> float:
+    """Return the mean variance of heights from slopes about their mean, for links of variance 1."""
+    return float(find_rectangle_variance((rows, columns), (1.0, 1.0), 0.0).mean())

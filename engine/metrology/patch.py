@@ -96,14 +96,14 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
         pixel_size=pixel_size,
         absolute=absolute,
         place=part,
-        noise_length=_noise_length(result),
+        noise_length=noise_length(result),
         of_press=result.fitted.event is not None,
         notes=(*left_out, *notes),
     )
     return patch, result.assign(height=np.where(measured, height, np.float32(np.nan)))
 
 
-def _noise_length(result: Result) -> float:
+def noise_length(result: Result) -> float:
     """Return the length over which errors of heights are correlated, mm; 0 for independent ones."""
     fitted = result.fitted
     if fitted.height_correlation is not None:

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.inputs import Maps, as_result, spacing
 from mirrorskin.engine.base.resample import SamplePoints
-from mirrorskin.engine.metrology.fitting import covariance
-from mirrorskin.engine.metrology.patch import heights_of
+from mirrorskin.engine.metrology.fitting import at_least, covariance
+from mirrorskin.engine.metrology.noise import correlation
+from mirrorskin.engine.metrology.patch import heights_of, noise_length
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.base.arguments import as_array, checked
@@ -48,6 +49,8 @@ class Section:
         Millimetres, or pixels if their size is unknown.
     notes : tuple of str
         Warnings and notes of the result.
+    correlation : ndarray, (n,), float64, or None
+        Correlation of the errors of two heights at each distance; None if errors are independent.
     """
 
     distance: Doubles
@@ -58,6 +61,7 @@ class Section:
     filled: Mask
     unit: str = "mm"
     notes: tuple[str, ...] = ()
+    correlation: Doubles | None = None
 
 
 def as_point(name: str, value: Any) -> Point:
@@ -131,7 +135,10 @@ def section(
     column, row_of = (along[0] - x[0]) / size[0], (y[0] - along[1]) / size[1]
     values = _between(maps, height, SamplePoints.at(column, row_of, (height.shape[0], height.shape[1])))
     notes = tuple(finding.text for finding in findings_of("result", maps.process))
-    return Section(distance, along[0], along[1], *values, unit, notes)
+    related, length = None, noise_length(maps)
+    if length > 0 and maps.height_sigma is not None:
+        related = correlation(distance, (height.shape[0], height.shape[1]), size, length)
+    return Section(distance, along[0], along[1], *values, unit, notes, related)
 
 
 def section_columns(result: Result, ends: tuple[Point, Point] | None = None) -> dict[str, NDArray[Any]]:
@@ -251,7 +258,8 @@ def step_height(section: Section) -> StepHeight:
 
     The step is where two parallel lines fit the measured samples before and after it best. Then the nearest
     third of either side is ignored, and the lines are fitted again: the height of the step is their
-    orthogonal distance. Uncertainties are from `covariance`, with curves of either side as smooth shapes.
+    orthogonal distance. Uncertainties are from `covariance`, with curves of either side as smooth shapes, and
+    at least those that follow from correlated errors of heights.
 
     Examples
     --------
@@ -274,6 +282,12 @@ def step_height(section: Section) -> StepHeight:
     kept = (distance <= before) | (distance >= after)
     x, z = distance[kept] - place, height[kept]
     parameters, spread, rest = _lines(x, z)
+    if section.correlation is not None:
+        number = np.flatnonzero(measured)[kept]
+        related = section.correlation[np.abs(np.subtract.outer(number, number))]
+        errors = np.nan_to_num(section.sigma[number])
+        influence = np.linalg.pinv(_line_rows(x).T) * errors
+        spread = at_least(spread, influence @ related @ influence.T)
     cubic = np.vander(x / np.abs(x).max(), 4)
     coefficients, *_ = np.linalg.lstsq(cubic, z, rcond=None)
     if np.sum((z - coefficients @ cubic.T) ** 2) < rest:
@@ -314,14 +328,19 @@ def _lines(x: Doubles, z: Doubles) -> tuple[Doubles, Doubles, float]:
 
     Return offset, slope and step, their covariance, and the sum of squares of the residual.
     """
-    up = (x > 0).astype(np.float64)
-    rows = np.stack([np.ones_like(x), x, up])
+    rows = _line_rows(x)
+    up = rows[2]
     parameters, *_ = np.linalg.lstsq(rows.T, z, rcond=None)
     t = x / np.abs(x).max()
     shapes = np.stack([up * t, t**2, up * t**2, t**3, up * t**3])
     columns = np.concatenate([rows, shapes, [z - parameters @ rows]])
     gram = columns @ columns.T
     return np.asarray(parameters), covariance(gram, len(rows), z.size), float(gram[-1, -1])
+
+
+def _line_rows(x: Doubles) -> Doubles:
+    """Return the derivatives of two parallel lines, (3, n), with respect to offset, slope and step."""
+    return np.stack([np.ones_like(x), x, (x > 0).astype(np.float64)])
 
 
 def along(section: Section) -> dict[str, Quantity]:

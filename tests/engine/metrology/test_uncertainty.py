@@ -171,3 +171,53 @@ def test_parameters_scale_with_the_pixel_size_as_declared():
         if parameter.value and np.isfinite(parameter.value):
             power = PARAMETERS[name].pixel_power
             assert wide[name].value / parameter.value == pytest.approx(1.01**power, rel=1e-3), name
+
+
+def integrated(height, slopes, seed, mask):
+    noise = 0.02 * np.random.default_rng([seed, 7]).standard_normal(slopes.shape)
+    return engine.integrate(*(slopes + noise), 0.05, mask=mask)
+
+
+@pytest.mark.parametrize("round_mask", [False, True])
+@pytest.mark.parametrize("name", ["step", "plane"])
+def test_chi_square_of_forms_and_steps_of_integrated_slopes_is_about_one(name, round_mask):
+    x, y = places((64, 96), (1.0, 1.0))
+    mask = np.hypot(x / 47, y / 31) < 1 if round_mask else None
+    rise = 4 / (1 + np.exp(-(x - 3) / 2)) if name == "step" else 0 * x
+    height = 0.05 * (0.05 * x - 0.03 * y + rise)
+    slopes = np.stack([0.05 + rise * (1 - rise / 4) / 2, -0.03 + 0 * x])
+    true = {"plane tilt": np.degrees(np.arctan(np.hypot(0.05, 0.03))), "step height": None}
+    pulled: dict[str, list[float]] = {}
+    for seed in range(24):
+        surface = integrated(height, slopes, seed, mask)
+        if name == "plane":
+            plane = engine.metrology.fit_plane(
+                surface.height, surface.x, surface.y, surface.height_sigma, noise_length=np.inf
+            )
+            pulled.setdefault("tilt", []).append((plane.tilt.value - true["plane tilt"]) / plane.tilt.sigma)
+        else:
+            ends = (-2.2, 0.0), (2.2, 0.0)
+            exact = surface.assign(height=(height + 0 * surface.height).astype(np.float32))
+            steps = [
+                engine.metrology.step_height(engine.metrology.section(maps, *ends))
+                for maps in (surface, exact)
+            ]
+            for part in ("height", "slope"):
+                one, other = (getattr(step, part) for step in steps)
+                pulled.setdefault(part, []).append((one.value - other.value) / one.sigma)
+    for part, values in pulled.items():
+        assert 0.4 < np.mean(np.square(values)) < 1.7, part
+
+
+def test_measure_and_functions_have_the_same_uncertainty():
+    x, y = places((64, 96), (1.0, 1.0))
+    slopes = np.stack([0.05 + 0 * x, -0.03 + 0 * x])
+    surface = integrated(0.05 * (0.05 * x - 0.03 * y), slopes, 0, None)
+    plane = engine.metrology.fit_plane(
+        surface.height, surface.x, surface.y, surface.height_sigma, noise_length=np.inf
+    )
+    assert engine.measure(surface, form="plane").quantities["plane tilt"].sigma == plane.tilt.sigma
+    assert (
+        engine.measure(surface, form="plane", noise_length=0).quantities["plane tilt"].sigma
+        < plane.tilt.sigma
+    )
