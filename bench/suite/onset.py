@@ -25,7 +25,15 @@ from mirrorskin.evaluation.scenes.inputs import (
     travel_of,
 )
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.press.onset import BENT, DARK, onset_heights, onset_levels, onset_near, onset_sure
+from mirrorskin.kernels.press.onset import (
+    BENT,
+    DARK,
+    NEAR_PLATEAU,
+    onset_heights,
+    onset_levels,
+    onset_near,
+    onset_sure,
+)
 
 Maps = dict[str, NDArray[Any]]
 Flags = NDArray[np.uint8]
@@ -358,27 +366,31 @@ def _numba_scan(hold: int, *, whole: bool) -> Any:  # noqa: C901  # to compile
         last = len(frames) - 1
         after = np.fmin(frames[min(start + 1, last), pixel], frames[min(start + 2, last), pixel])
         sudden_step = _PLATEAU * noise * math.sqrt(2)
-        from_dark, to_light = low <= dark + _PLATEAU * noise, high >= after - sudden_step
         step = high - low
-        sudden = from_dark and to_light
+        from_dark = 2 - (low - dark) / max(_PLATEAU * noise, NEAR_PLATEAU * step)
+        to_light = 2 - (after - high) / max(sudden_step, NEAR_PLATEAU * step)
+        from_dark, to_light = min(max(from_dark, 0.0), 1.0), min(max(to_light, 0.0), 1.0)
         jumped = (
             last_dark + 1 < start and frames[last_dark + 1, pixel] >= after - rise / 8 and rise >= 34 * noise
         )
         end = last_dark + 1 if jumped else start
-        from_dark, to_light = from_dark or low <= dark + step / 8, to_light or high >= after - step / 8
         fraction = (min(np.float64(level), high) - low) / step
         width = travel[end] - travel[end - 1]
         first, second, middle = (low - dark) / span - 0.5, (high - dark) / span - 0.5, _THRESHOLD - 0.5
         both = first * first + first * second + second * second
         off = fraction * BENT * (middle - second) * (middle + first + second) / (1 + BENT * both)
-        noisy = noise * math.sqrt(fraction * fraction + (1 - fraction) * (1 - fraction)) / step
-        line = width * math.sqrt(noisy * noisy + off * off)
+        rest = 1 - fraction
+        line = (noise / step) ** 2 * (fraction * fraction + rest * rest) + off * off
+        edge = (
+            from_dark * (1 - to_light) * rest * rest + to_light * (1 - from_dark) * fraction * fraction
+        ) / 6
+        sudden = from_dark * to_light
+        if jumped:
+            sudden, edge = 1.0, 0.0
+        spread = width * math.sqrt((1 - sudden) * line + edge / 6 + sudden / 12)
         hovers = not jumped and (step <= sudden_step or (start - 2 - below) * step > 2.5 * sudden_step)
-        interval = (travel[start] - travel[below] if hovers else width) / math.sqrt(12)
-        spread = math.sqrt(line * line + interval * interval) if from_dark or to_light else line
-        sudden = sudden or jumped
-        height = -(travel[end - 1] + width * (0.5 if sudden else fraction))
-        return height, interval if sudden or hovers else spread
+        height = -(travel[end - 1] + width * (fraction + sudden * (0.5 - fraction)))
+        return height, (travel[start] - travel[below]) / math.sqrt(12) if hovers else spread
 
     def onsets(frames, light, onset):  # type: ignore[no-untyped-def]
         for tile in numba.prange(-(-len(onset) // _NUMBA_TILE)):

@@ -21,7 +21,6 @@ from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.base.running import Progress, Run, run_over
 from mirrorskin.engine.base.steps import Context, Step, undistorted
 from mirrorskin.engine.base.tiling import MEMORY_LIMIT
-from mirrorskin.engine.diagnosis.blur import PIXEL, LensBlur
 from mirrorskin.engine.fusion.solver import AbsoluteHeights, FusionSolver
 from mirrorskin.engine.integration.normals_to_height import (
     Slopes,
@@ -30,6 +29,7 @@ from mirrorskin.engine.integration.normals_to_height import (
     slopes_of,
 )
 from mirrorskin.engine.press.intervals import heights_as_intervals, stored_heights_as_intervals
+from mirrorskin.engine.press.nuisances import PIXEL, Edges, Nuisances, footprint_of
 from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.rotation.response import wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, at_poses
@@ -394,7 +394,7 @@ class _Evidence(Step):
     Slopes determine how far a lens that blurs has moved each height, but they are blurred as well.
     """
 
-    blur: float | None = LensBlur.blur
+    blur: float | None = Nuisances.blur
 
     def apply(self, result: Result, context: Context) -> Result:
         """Return the result unchanged."""
@@ -405,8 +405,8 @@ class _Evidence(Step):
         # Checks and steps, such as the correction for the elastomer, move heights and change their sigma.
         larger = result.height_sigma * (between / sigma)
         self.heights = AbsoluteHeights.of(result.height + (middle - height), larger)
-        footprint = LensBlur(blur=self.blur).footprint(result, context)
-        self.footprint = footprint.variance if footprint is not None and footprint.clear else PIXEL
+        footprint = footprint_of(Edges.of(result, context), context.source.header, self.blur)
+        self.footprint = footprint.variance if footprint.clear else PIXEL
         return result
 
 

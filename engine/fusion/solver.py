@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.diagnosis.blur import PIXEL
 from mirrorskin.engine.fusion.agreement import (
     Disagreement,
     ZenithBias,
@@ -21,6 +20,7 @@ from mirrorskin.engine.integration.arrays import integrate_arrays
 from mirrorskin.engine.integration.normals_to_height import Slopes
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.intervals import estimate_interval_scatter, fit_paraboloids, interval_evidence
+from mirrorskin.engine.press.nuisances import PIXEL
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.arguments import check_pixel_size
 from mirrorskin.io.base.types import ProcessValue

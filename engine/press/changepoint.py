@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from mirrorskin.engine.base.frames import Noise, reference_pair
 from mirrorskin.engine.base.functions import travel_function
 from mirrorskin.engine.base.picture import Picture
-from mirrorskin.engine.diagnosis.blur import PixelBlur
-from mirrorskin.engine.diagnosis.brightness_levels import LevelUncertainty
 from mirrorskin.engine.diagnosis.position_uncertainty import PositionUncertainty
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Event, PressOperation
+from mirrorskin.engine.press.nuisances import Nuisances
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import InputError, Result
@@ -41,7 +40,7 @@ class ChangePoint(PressOperation):
     array([[ 3, -1]], dtype=int32)
     """
 
-    checks = NoAnswer, PositionUncertainty, RollingShutter, PixelBlur, LevelUncertainty
+    checks = NoAnswer, PositionUncertainty, RollingShutter, Nuisances
 
     threshold: float = Onset.threshold
     event: Event = Onset.event

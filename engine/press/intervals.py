@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.kernels.array_types import Doubles
 
-_USUAL_RANGE = 0.9, 1.5  # range of the sigma of a height between two frames, in sigmas of the interval
+_MAX_SIGMA = 1.5  # greatest sigma of a height between two frames, in sigmas of the interval
+_LEAST_SIGMA = 0.4  # least one over the distance to the nearer frame: docs/method/press.md, "Sub-frame onset"
 _ROUNDED = 1e-3  # error of a height by its rounding, as a share of an interval
 _LEAST_EXACT, _SHARED_BY = 0.25, 4  # least share of heights that are a middle; samples that show one
 _ADJOIN = 0.6  # least distance of the middles of intervals, in their widths by sigma
@@ -63,7 +64,7 @@ def heights_as_intervals(height: Doubles, sigma: Doubles, travel: Doubles) -> In
     Where light from neighbours reaches a pixel, a sample near the threshold moves the height off the middle
     by up to a quarter of the interval, although its error is still the error of the interval. These shifts
     differ at both ends of an interval, so an interval around such a height would shift the surface. Heights
-    whose sigma differs from the sigma of the interval are unchanged.
+    whose sigma is that of samples on an edge are unchanged, and those whose sigma is larger.
 
     Parameters
     ----------
@@ -119,7 +120,8 @@ def _between_frames(
     earlier = -np.nan_to_num(height) - np.sign(travel[-1] - travel[0]) * _ROUNDED * np.min(np.diff(ends))
     place = np.clip(np.searchsorted(ends, earlier), 1, ends.size - 1)
     usual = (ends[place] - ends[place - 1]) / math.sqrt(12)
-    between = (sigma > _USUAL_RANGE[0] * usual) & (sigma < _USUAL_RANGE[1] * usual)
+    nearer = np.minimum(np.abs(height + ends[place - 1]), np.abs(height + ends[place]))
+    between = (sigma > _LEAST_SIGMA * nearer) & (sigma < _MAX_SIGMA * usual)
     between &= (-height >= ends[0]) & (-height <= ends[-1])
     return -(ends[place] + ends[place - 1]) / 2, usual, between
 

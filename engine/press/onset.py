@@ -10,14 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.functions import travel_function
 from mirrorskin.engine.base.options import option
-from mirrorskin.engine.diagnosis.blur import LensBlur
-from mirrorskin.engine.diagnosis.brightness_levels import (
-    EstimatedLevelNote,
-    LevelUncertainty,
-    with_estimated_levels,
-)
+from mirrorskin.engine.diagnosis.brightness_levels import EstimatedLevelNote, with_estimated_levels
 from mirrorskin.engine.diagnosis.position_uncertainty import PositionUncertainty
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, Event, EventMaps, PressOperation
+from mirrorskin.engine.press.nuisances import Nuisances
 from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import Result
 
@@ -28,7 +24,7 @@ if TYPE_CHECKING:
 class ThresholdOperation(PressOperation):
     """Base of operations that search for one event at one or several thresholds."""
 
-    checks = NoAnswer, PositionUncertainty, RollingShutter, LensBlur, LevelUncertainty, EstimatedLevelNote
+    checks = NoAnswer, PositionUncertainty, RollingShutter, Nuisances, EstimatedLevelNote
 
     subframe: bool = option(
         default=True,
@@ -39,10 +35,10 @@ class ThresholdOperation(PressOperation):
         help="event to find: dark to light while travel increases, or light to dark while it decreases",
     )
 
-    dark_sigma: float = LevelUncertainty.dark_sigma
-    bright_sigma: float = LevelUncertainty.bright_sigma
+    dark_sigma: float = Nuisances.dark_sigma
+    bright_sigma: float = Nuisances.bright_sigma
     line_time: float | None = RollingShutter.line_time
-    blur: float | None = LensBlur.blur
+    blur: float | None = Nuisances.blur
 
     def configured_for(self, source: Source) -> Self:
         """Return the operation with levels and travel error of the source, or estimated from its frames."""

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.device_arrays import on_host
-from mirrorskin.engine.diagnosis.blur import StatedBlur
 from mirrorskin.engine.diagnosis.brightness_levels import EstimatedLevelNote, with_estimated_levels
 from mirrorskin.engine.press.crossing import EVENT_MAPS, Crossing, Event, EventMaps, PressOperation
+from mirrorskin.engine.press.nuisances import Nuisances
 from mirrorskin.engine.press.onset import Onset
 from mirrorskin.engine.press.steps import NoAnswer, RollingShutter
 from mirrorskin.io import Result
@@ -48,7 +48,7 @@ class Strokes(PressOperation):
     (8, True)
     """
 
-    checks = NoAnswer, RollingShutter, StatedBlur, EstimatedLevelNote
+    checks = NoAnswer, RollingShutter, Nuisances, EstimatedLevelNote
 
     threshold: float = Onset.threshold
     subframe: bool = Onset.subframe

@@ -25,6 +25,7 @@
 
 #define DARK -1  // also of a pixel with invalid input, which is decided: `frames_left` is 0
 #define BENT 1.5f  // onset.py
+#define NEAR_PLATEAU 0.06f  // onset.py
 #define CLEAR_RISE 34  // standard deviations: a quarter of it is 8.5, which noise does not reach
 
 // As wide as a sample, so that both have vectors of the same length.
@@ -178,23 +179,25 @@ float2 answer(
     const float dark_tolerance, const float light_tolerance, const int jumped)
 {
     const float rise = high - low, steepness = 1 / rise;
-    const int from_dark = low <= dark + dark_tolerance, to_light = high >= after - light_tolerance;
     const int waits = (rise <= light_tolerance) | ((waited - 2) * rise > 2.5f * light_tolerance);
-    const int hovered = waits & !jumped, sudden = (from_dark & to_light) | jumped, look = !(sudden | hovered);
-    const float near = 0.125f * rise;
-    const int at_plateau = (low <= dark + near) | (high >= after - near), guess = from_dark | to_light | at_plateau | hovered | jumped;
+    const int hovered = waits & !jumped;
+    const float dark_range = GREATER(dark_tolerance, NEAR_PLATEAU * rise), light_range = GREATER(light_tolerance, NEAR_PLATEAU * rise);
+    const float from_dark = LIMITED(2 - (low - dark) / dark_range, 0, 1);
+    const float to_light = LIMITED(2 - (after - high) / light_range, 0, 1), both_plateaus = from_dark * to_light;
+    const float sudden = jumped ? 1 : both_plateaus;
     const float raised = level > low ? level : low, clamped = raised < high ? raised : high;
-    const float crossed = (clamped - low) * steepness, rest = 1 - crossed;
-    const float fraction = sudden ? 0.5f : crossed;
-    const float slope = step * noise * steepness, width = step + (hovered ? unclear_travel : 0);
+    const float crossed = (clamped - low) * steepness, rest = 1 - crossed, fraction = crossed + sudden * (0.5f - crossed);
+    const float slope = step * noise * steepness, width = step + unclear_travel;
     // With the quantile of a normal distribution in place of the fraction: v + BENT v^3, v = fraction - 1/2.
     const float to_level = level - dark, per_count = to_level > 0 ? threshold / to_level : 0, middle = threshold - 0.5f;
     const float below = (low - dark) * per_count - 0.5f, above = (high - dark) * per_count - 0.5f;
     const float both = below * below + below * above + above * above;
     const float off = step * crossed * BENT * (middle - above) * (middle + below + above) / (1 + BENT * both);
-    const float from_noise = slope * slope * (crossed * crossed + rest * rest) + off * off;
-    const float from_interval = width * width / 12;
-    return (float2)(-(from + step * fraction), (look ? from_noise : 0) + (guess ? from_interval : 0));
+    const float from_edge = slope * slope * (crossed * crossed + rest * rest) + off * off;
+    const float on_plateau = from_dark * rest * rest + to_light * crossed * crossed;
+    const float from_shape = step * step * (on_plateau - both_plateaus * (rest * rest + crossed * crossed)) / 6;
+    const float known = (1 - sudden) * from_edge + (jumped ? 0 : from_shape) + sudden * step * step / 12;
+    return (float2)(-(from + step * fraction), hovered ? width * width / 12 : known);
 }
 
 // --- Frame by frame -----------------------------------------------------------------------------------------------

@@ -22,6 +22,8 @@ DARK = -1
 INVALID = -2
 BENT = 1.5
 """Coefficient of the normal quantile of a share v + 1/2: v + BENT v^3, within a tenth from 0.1 to 0.9."""
+NEAR_PLATEAU = 0.06
+"""Share of a step within which light of neighbours may move a sample off its plateau."""
 _CLEAR_RISE = 34  # standard deviations: a quarter of it is 8.5, which noise does not reach
 
 
@@ -138,9 +140,15 @@ def onset_heights(onset: Array, last_dark: Array, last_far: Array, first_rise: A
 
     The crossing is between the frame before the onset and the onset. If both samples are on the pixel's
     plateaus, only that interval is known: its middle is the unbiased estimate, and its half-width over
-    sqrt(3) the standard deviation. Otherwise the samples determine the crossing as accurately as the noise
-    allows if both are in transition. A sample on a plateau does not show when the change started or ended, so
-    if one of them is on a plateau, the variance of the interval is added.
+    sqrt(3) the standard deviation. If both are in transition, they determine the crossing as accurately as
+    the noise allows. If one of them is in transition, linear interpolation assumes the longest edge that
+    leaves the other one on its plateau. An edge is more likely to be sampled the longer it is. Its length is
+    then two thirds of the longest, and the error of the crossing has the mean square 1/6 of the square of the
+    distance from the sample in transition.
+
+    A sample is on its plateau within the tolerance, but also within the share ``NEAR_PLATEAU`` of the step,
+    because neighbours contribute light. From there to twice as much, the weight of that case falls from 1 to
+    0, so that heights and standard deviations are continuous.
 
     Brightness rises linearly where a slope crosses a pixel, and like the integral of a normal distribution
     behind a lens that blurs: the difference of the two crossings is added to the standard deviation of a
@@ -150,8 +158,7 @@ def onset_heights(onset: Array, last_dark: Array, last_far: Array, first_rise: A
     noise, or it stays near the level for longer than its step takes. The crossing may then be anywhere since
     the last frame in which the pixel was certainly dark. There is one exception: if a pixel rises to its
     light plateau in one step, and the plateau is so near the level that noise delays the onset, the crossing
-    is in that step. A sample that differs from its plateau by less than an eighth of the step is treated as
-    on the plateau, because neighbours contribute light.
+    is in that step.
 
     Without `subframe` the height is that of the paper's equation 4, at the onset itself, whose error is half
     a step on average and up to a whole one.
@@ -177,7 +184,6 @@ def onset_heights(onset: Array, last_dark: Array, last_far: Array, first_rise: A
 
     low, high = before[has_onset].astype(np.float64), at[has_onset].astype(np.float64)
     settled = np.where(start + 1 < len(travel), after[has_onset], high)
-    from_dark, to_light = low <= dark[has_onset] + dark_tolerance, high >= settled - light_tolerance
     step = high - low
     rise = level[has_onset] - dark[has_onset]
     jumped = (
@@ -185,24 +191,27 @@ def onset_heights(onset: Array, last_dark: Array, last_far: Array, first_rise: A
         & (first_rise[has_onset] >= settled - rise / 8)
         & (rise >= _CLEAR_RISE * noise)
     )
-    at_plateau = (low <= dark[has_onset] + step / 8) | (high >= settled - step / 8)
-    sudden, under_way = from_dark & to_light | jumped, ~(from_dark | to_light | at_plateau)
+    from_dark, to_light = (
+        np.clip(2 - away / np.maximum(tolerance, NEAR_PLATEAU * step), 0, 1)
+        for away, tolerance in ((low - dark[has_onset], dark_tolerance), (settled - high, light_tolerance))
+    )
+    sudden = np.where(jumped, 1, from_dark * to_light)
     end = np.where(jumped, last_far[has_onset] + 1, start)
     width = travel[end] - travel[end - 1]
 
     crossed = (np.clip(level[has_onset], low, high) - low) / step
+    rest = 1 - crossed
     per_count = np.divide(threshold, rise, out=np.zeros_like(low), where=rise > 0)
     first, second = ((part - dark[has_onset]) * per_count - 0.5 for part in (low, high))
     middle, both = threshold - 0.5, first**2 + first * second + second**2
     # Minus the crossing of the quantile z(v) = v + BENT v^3: (z(middle) - z(first)) / (z(second) - z(first)).
     off = crossed * BENT * (middle - second) * (middle + first + second) / (1 + BENT * both)
-    from_noise = np.abs(width) * np.hypot(noise * np.hypot(crossed, 1 - crossed) / step, off)
+    from_edge = (noise / step) ** 2 * (crossed**2 + rest**2) + off**2
+    from_shape = (from_dark * (1 - to_light) * rest**2 + to_light * (1 - from_dark) * crossed**2) / 6
+    variance = width**2 * ((1 - sudden) * from_edge + np.where(jumped, 0, from_shape) + sudden / 12)
     hovered = (step <= light_tolerance) | ((start - 2 - last_dark[has_onset]) * step > 2.5 * light_tolerance)
     hovered &= ~jumped
-    interval = np.abs(np.where(hovered, travel[start] - travel[last_dark[has_onset]], width))
-    from_interval = interval / 2 / np.sqrt(3)
-    height[has_onset] = -(travel[end - 1] + width * np.where(sudden, 0.5, crossed))
-    sigma[has_onset] = np.select(
-        [sudden | hovered, under_way], [from_interval, from_noise], np.hypot(from_noise, from_interval)
-    )
+    unclear = travel[start] - travel[last_dark[has_onset]]
+    height[has_onset] = -(travel[end - 1] + width * (crossed + sudden * (0.5 - crossed)))
+    sigma[has_onset] = np.where(hovered, np.abs(unclear) / np.sqrt(12), np.sqrt(variance))
     return height, sigma, status

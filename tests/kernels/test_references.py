@@ -928,6 +928,18 @@ def _(wall):
     return maps | numbers | sizes | {"macros": macros}
 
 
+FACTORS = {"across": 0.02, "along": 0.01, "shape_factor": 0.004, "twice": 0.01, "reach": 2.0}
+
+
+@case("relief_sigma", axes=SHAPES | {"missing": (0.0, 0.2)}, per="row", rtol=2e-5)
+def _(shape, missing):
+    rng = np.random.default_rng(shape[1])
+    height, sigma = rng.normal(0, 0.1, shape), rng.uniform(0.001, 0.01, shape)
+    height[rng.random(shape) < missing] = np.nan
+    maps = {"height": height, "sigma": sigma, "shape": shape}
+    return maps | FACTORS | {"per_slope": 1e-3, "offset": 1e-5}
+
+
 @pytest.mark.parametrize(("name", "function", "chosen", "options"), CASES)
 def test_a_kernel_computes_its_reference(device, name, function, chosen, options):
     with np.errstate(invalid="ignore"):

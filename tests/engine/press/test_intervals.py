@@ -160,7 +160,7 @@ def test_the_normal_distribution_is_scipys():
 def test_a_height_of_a_pixel_lit_by_its_neighbours_goes_to_the_middle_of_its_frames():
     travel, usual = np.array([0.2, 0.3, 0.5]), 0.1 / np.sqrt(12)
     height = np.array([-0.22, -0.3 + 1e-9, -0.41, -0.22, -0.22, np.nan])
-    sigma = np.array([usual, usual, 2.1 * usual, usual / 2, 4 * usual, np.nan])
+    sigma = np.array([usual, usual, 2.1 * usual, usual / 9, 4 * usual, np.nan])
     result = heights_as_intervals(height, sigma, travel)
     assert result.middle == pytest.approx([-0.25, -0.25, -0.4, -0.22, -0.22, np.nan], nan_ok=True)
-    assert result.sigma == pytest.approx([usual, usual, 2 * usual, usual / 2, 4 * usual, np.nan], nan_ok=True)
+    assert result.sigma == pytest.approx([usual, usual, 2 * usual, usual / 9, 4 * usual, np.nan], nan_ok=True)

@@ -236,7 +236,7 @@ def test_a_plateau_that_noise_takes_below_its_level_began_in_the_step_that_led_t
 def test_a_sample_that_is_lit_by_its_neighbours_does_not_show_when_the_change_began(device):
     frames = np.array([20.0, 20, 38, 190, 200, 200], np.float32).reshape(-1, 1, 1)
     onset = find_onset(frames, 0.1 * np.arange(6), dark=20.0, bright=220.0, noise=1.0, device=device)
-    assert onset.height_sigma.item() == pytest.approx(0.1 / math.sqrt(12), rel=0.05)
+    assert 0.02 < onset.height_sigma.item() < 0.1 / math.sqrt(12)  # by interpolation, 0.0005
 
 
 @pytest.mark.filterwarnings("ignore:find_onset. no height")
