@@ -105,7 +105,9 @@ class Nuisances(Step):
         if footprint.clear:
             process = {**result.process, "blur": round(math.sqrt(footprint.variance - PIXEL), 2)}
             found = found.assign(process=process, fitted=replace(result.fitted, footprint=footprint.variance))
-        return with_findings(found, *_findings(errors, lag if clear_lag else 0.0))
+        if clear_lag or any(errors):
+            found = with_findings(found, *_findings(errors, lag if clear_lag else 0.0))
+        return found
 
     def _share(self, context: Context) -> float:
         """Return the uncertainty of the level at the threshold, before the frames, as a share of the rise."""
