@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from mirrorskin.cli.commands.bench.records import Case, Run, Target, describe_run
 from mirrorskin.engine import (
     ChangePoint,
+    Onset,
     estimate_normals,
-    find_onset,
     fuse,
     integrate,
 )
@@ -60,7 +60,8 @@ def _sudden(kind: str, shape: tuple[int, int], device: Device, slack: float) -> 
     """Return targets of changes between two frames."""
     place = np.random.default_rng(1).uniform(2, _FRAMES - 2, shape)
     frames, options = _changes(kind, place, 0.0)
-    onset = find_onset(frames, **options, noise=_press_noise(kind), device=device)
+    travel = options.pop("travel")
+    onset = run_unchecked(Onset(**options, noise=_press_noise(kind), device=device), frames, travel=travel)
     first = np.ceil(place)
     error = _frame_error(onset, place) * np.sqrt(12)
     sigma = float(np.mean(onset.height_sigma)) / _STEP * np.sqrt(12)
@@ -77,8 +78,8 @@ def _ramps(kind: str, shape: tuple[int, int], device: Device, slack: float) -> l
     place = np.random.default_rng(2).uniform(2 + lasts, _FRAMES - 2 - lasts, shape)
     frames, options = _changes(kind, place, lasts)
     noise = _press_noise(kind)
-    onset = find_onset(frames, **options, noise=noise, device=device)
-    travel = options.pop("travel")
+    travel = options.pop("travel")  # not checked: pixels are unrelated, and show no surface
+    onset = run_unchecked(Onset(**options, noise=noise, device=device), frames, travel=travel)
     change = run_unchecked(ChangePoint(**options, noise=noise, device=device), frames, travel=travel)
     fraction = np.ceil(place) - place  # share of the interval after the crossing
     span = _LEVELS[kind][1] - _LEVELS[kind][0]
