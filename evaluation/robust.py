@@ -14,7 +14,7 @@ from mirrorskin import engine
 from mirrorskin.cli.commands.bench.records import Case
 from mirrorskin.evaluation.base.tables import at_most
 from mirrorskin.evaluation.bilateral import integrate_bilaterally
-from mirrorskin.evaluation.scenes import depth, figures
+from mirrorskin.evaluation.scenes import depth, figures, occlusions
 from mirrorskin.kernels.device import Device
 
 PLAIN, PEER = "plain", "Cao et al."
@@ -53,6 +53,18 @@ def run_robust(device: Device, quick: bool) -> Case:
         )
         targets.append(at_most(f"figures {group}: worst of errors, of {PLAIN}", float(worst), _WORSE))
         targets.append(at_most(f"figures {group}: median chi^2", float(chi2), 2.0))
+    for group, scenes in (("developed on", occlusions.DEVELOPED_ON), ("held out", occlusions.HELD_OUT)):
+        made = [make(shape) for make in list(scenes.values())[: 1 if quick else None]]
+        errors = np.array([_errors(scene, device) for scene in made])
+        to_plain, to_peer = errors[:, 0] / errors[:, 1], errors[:, 0] / errors[:, 2]
+        notes.append(
+            f"occlusions {group}, errors over those of {PLAIN}: median {np.median(to_plain):.2f}, worst"
+            f" {to_plain.max():.2f}; over those of {PEER}: median {np.median(to_peer):.2f}, worst"
+            f" {to_peer.max():.2f}"
+        )
+        targets.append(
+            at_most(f"occlusions {group}: worst of errors, of {PLAIN}", float(to_plain.max()), _WORSE)
+        )
     title = f"heights of {len(ratios)} scenes with hidden parts; {' x '.join(map(str, shape))} float64"
     return Case("accuracy-robust", title, [], {}, tuple(notes), () if quick else tuple(targets))
 

@@ -15,6 +15,7 @@ from mirrorskin.kernels.array_types import Doubles
 _HOLDS = 1e-3  # confidence of a link that holds two pixels together
 _BORDER = 3e-4  # least confidence of all links of a part to another, over the square root of its pixels
 _FRAGMENT = 25  # pixels below which a part is none
+_BREAK = 12  # connected pixels of edges that are a break; outliers of normals mark fewer
 _PRIOR = 3e-4  # confidence of the plain surface about the height of a component
 
 Ties = tuple[NDArray[np.intp], NDArray[np.intp], Doubles]
@@ -88,6 +89,16 @@ def _are_best_of_fragments(ties: Ties, sizes: NDArray[np.intp]) -> NDArray[np.bo
     joins = np.zeros(len(first), bool)
     joins[best[(sizes < _FRAGMENT) & (best >= 0)]] = True
     return joins
+
+
+def has_breaks(edges: NDArray[np.uint8]) -> bool:
+    """Return whether pixels of edges, (H, W), are connected as those of a break are."""
+    import cv2
+
+    if not edges.any():
+        return False
+    _, _, stats, _ = cv2.connectedComponentsWithStats(edges, connectivity=8)
+    return bool(stats[1:, cv2.CC_STAT_AREA].max() >= _BREAK)
 
 
 def find_doubt(difference: Floats, labels: Labels) -> Floats:

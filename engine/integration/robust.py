@@ -23,6 +23,7 @@ from mirrorskin.engine.integration.parts import (
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.integration.breaks import DOWN, RIGHT
+from mirrorskin.kernels.integration.slopes import sum_around
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _BROKEN = 6.0
@@ -33,6 +34,7 @@ _STEPS = 3  # at a scale
 _LOOSE, _CYCLES = 0.001, 10  # residual and maximum number of cycles of the first solution of a search
 
 _MAX_SQUARE = 1e4  # k r^2 above which a link is cut for a step, because tiny weights cannot be solved
+_ROUNDED = 1e-4  # residual that rounding may leave where weights differ by orders of magnitude
 _AGAIN = 3  # largest number of additional solutions at the end
 _MIN_NOISE = 0.03  # smallest standard deviation of slopes
 _CLEAR_Z_SCORE = 3.0  # standard deviations of the curl's noise up to which there is no contradiction
@@ -53,7 +55,7 @@ class Robust:
     doubt: Floats  # (H, W): variance of heights about the mean of their component because of breaks, mm^2
     iterations: int  # number of solutions and steps
     residual: float  # of the last solution
-    converged: bool  # whether all steps were done, and the last residual is within the tolerance
+    converged: bool  # whether all steps were done, and the last residual is within tolerance or rounding
 
 
 def solve_robust(
@@ -241,7 +243,7 @@ class _Search:
             doubt=doubt,
             iterations=self._steps,
             residual=last.residual,
-            converged=complete and last.converged,
+            converged=complete and (last.converged or last.residual <= _ROUNDED),
         )
 
     def _confidence(self) -> tuple[Floats, Floats]:
@@ -261,14 +263,21 @@ class _Search:
         return confidences[0], confidences[1]
 
     def _find_slopes(self, inputs: Inputs, plane: Plane) -> tuple[dict[str, Array], Array]:
-        """Return slopes relative to the plane, to the right and down, and the normals' cosines."""
+        """Return slopes relative to the plane, to the right and down, and the normals' cosines.
+
+        The variance 1 / cosine^2 is a mean over 5 x 5 pixels: confidences that depended on the noise of the
+        pixel itself would flatten noisy slopes.
+        """
         x, y = inputs.dz_dx, inputs.dz_dy
         defined = np.isfinite(x) & np.isfinite(y)
         x, y = np.where(defined, x, np.float32(0)), np.where(defined, y, np.float32(0))
         steep = 1 / (1 + x * x + y * y) if inputs.steep is None else inputs.steep
         slopes = {"slope_x": x - np.float32(plane[0]), "slope_y": np.float32(plane[1]) - y}
         maps = {name: self._given(name, slope) for name, slope in slopes.items()}
-        return maps, self._given("cosine", np.sqrt(steep))
+        wanted = defined if inputs.mask is None else defined & (inputs.mask != 0)
+        slant = sum_around(np.where(wanted, 1 / steep, 0).astype(np.float32))
+        count = sum_around(wanted.astype(np.float32))
+        return maps, self._given("cosine", np.sqrt(np.where(wanted, count / np.maximum(slant, 1), 1)))
 
     def _find_held(self, inputs: Inputs, plane: Plane) -> Array:
         """Return the right side of known heights: weight times height above the plane."""

@@ -24,11 +24,13 @@ from mirrorskin.engine.integration.graph import (
 )
 from mirrorskin.engine.integration.height_variance import JOINED, expected_misfit
 from mirrorskin.engine.integration.multigrid import Multigrid, Solution
+from mirrorskin.engine.integration.parts import has_breaks
 from mirrorskin.engine.integration.rectangle import Rectangle, seems_full
 from mirrorskin.engine.integration.robust import solve_robust
 from mirrorskin.engine.integration.slope_errors import correlation_of, draw_errors
 from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.io import InputError, Result
+from mirrorskin.io.base.findings import Finding, in_process
 from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.device import Device
@@ -39,6 +41,11 @@ Method = Literal["direct", "multigrid", "robust"]
 _NO_NOTE: dict[str, ProcessValue] = {}
 _UNEVEN = 2.0  # ratio of the weights of horizontal and vertical links above which they count as uneven
 _PLAIN = 3e-3  # residual of the surface without breaks, with which one with breaks is compared
+_BREAKS = Finding(
+    "breaks of the surface",
+    "the surface has breaks, and slopes do not show a step whose sides have equal slopes: heights across"
+    " breaks may be wrong by more than height_sigma; compare heights within parts, or give known heights",
+)
 _DRAWS, _DRAWN = 4, 1e-2  # number of drawn surfaces, and residual of their solution
 _GOAL = 1e-4  # residual to stop at if there is a deadline, but no tolerance
 
@@ -292,11 +299,13 @@ class SurfaceSolver:
             components = find_components(relief.flags, True)
         on_device = isinstance(inputs.dz_dx, Array)
         height = self._levelling.level(whole, relief.height, relief.planes, inputs.datum, on_device)
-        sigma, note = None, _NO_NOTE
+        sigma, note = None, dict(_NO_NOTE)
         if options.sigma:
             respond = partial(self._respond, inputs, components) if relief.flags is None else None
             factor, note = correlation_of(inputs, options.slope_correlation, respond)
             sigma = self._find_sigma(inputs, relief, components, factor)
+        if relief.edges is not None and (components.count > whole.count or has_breaks(relief.edges)):
+            note |= in_process([_BREAKS], note)
         return _as_result(
             height,
             sigma,

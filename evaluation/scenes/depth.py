@@ -55,7 +55,7 @@ class Scene(NamedTuple):
         return total / len(piece)
 
 
-def _see(shape: Shape, surfaces: Sequence[Surface], noise: float = 0.0, *, ragged: bool = False) -> Scene:
+def see(shape: Shape, surfaces: Sequence[Surface], noise: float = 0.0, *, ragged: bool = False) -> Scene:
     """Return the scene of surfaces; `ragged` removes patches of the mask along its border."""
     rows, columns = shape
     pixel = SPAN / min(shape)
@@ -130,11 +130,12 @@ def _pieces(height: Map, normals: Map, number: NDArray[np.int_], pixel: float) -
     return piece.reshape(height.shape)
 
 
-def _plane(along: float, up: float) -> Surface:
+def plane(along: float, up: float) -> Surface:
+    """Return a plane through the origin with slopes along x and y."""
     return lambda x, y: along * x + up * y
 
 
-def _ellipsoid(centre: Sequence[float], radii: Sequence[float], axes: Map) -> Surface:
+def ellipsoid(centre: Sequence[float], radii: Sequence[float], axes: Map) -> Surface:
     """Return the visible half of an ellipsoid with the given axes, (3, 3)."""
     form = axes @ np.diag(1 / np.square(radii)) @ axes.T
 
@@ -149,7 +150,7 @@ def _ellipsoid(centre: Sequence[float], radii: Sequence[float], axes: Map) -> Su
 
 def ball(shape: Shape) -> Scene:
     """Return a ball in front of an inclined wall, which it does not touch."""
-    return _see(shape, [_plane(0.2, -0.1), _ellipsoid((5, -3, 45), (28, 28, 28), np.eye(3))])
+    return see(shape, [plane(0.2, -0.1), ellipsoid((5, -3, 45), (28, 28, 28), np.eye(3))])
 
 
 def torus(shape: Shape) -> Scene:
@@ -158,7 +159,7 @@ def torus(shape: Shape) -> Scene:
     def ring(x: Map, y: Map) -> Map:
         return np.asarray(3 + 0.35 * x + np.sqrt(11**2 - (np.hypot(x, y) - 28) ** 2))
 
-    return _see(shape, [_plane(0.0, 0.1), ring])
+    return see(shape, [plane(0.0, 0.1), ring])
 
 
 def stairs(shape: Shape) -> Scene:
@@ -168,7 +169,7 @@ def stairs(shape: Shape) -> Scene:
         inside = (np.abs(x) < 30 - 3 * number) & (y > 9 * number - 30) & (y < 9 * number - 12)
         return np.where(inside, 5.0 * number + 0.3 * (y + 30 - 9 * number) + 0.1 * x, np.nan)
 
-    return _see(shape, [_plane(0.05, 0.0), *(partial(step, number) for number in range(1, 6))])
+    return see(shape, [plane(0.05, 0.0), *(partial(step, number) for number in range(1, 6))])
 
 
 def leaves(shape: Shape) -> Scene:
@@ -182,11 +183,11 @@ def leaves(shape: Shape) -> Scene:
         height = 2 + np.tan(np.radians(rise)) * v - 0.03 * u * u - 0.012 * v * v
         return np.where((u / wide) ** 2 + (v / long - 1) ** 2 < 1, height, np.nan)
 
-    surfaces = [_plane(0.1, 0.05)]
+    surfaces = [plane(0.1, 0.05)]
     for place in (np.indices((5, 5)).reshape(2, -1).T - 2) * 19.0:
         numbers = generator.uniform((5, 9, 25, 0, -4, -4), (8, 13, 50, 360, 4, 4))
         surfaces.append(partial(leaf, numbers + np.array([0, 0, 0, 0, *place])))
-    return _see(shape, surfaces)
+    return see(shape, surfaces)
 
 
 def folds(shape: Shape, noise: float = NOISE) -> Scene:
@@ -201,18 +202,18 @@ def folds(shape: Shape, noise: float = NOISE) -> Scene:
         hem = 60 - 22 * number - y + 6 * np.sin(x / 9 + phase) if number else body
         return np.where(np.minimum(body, hem) >= 0, height, np.nan)
 
-    return _see(shape, [partial(layer, number) for number in range(4)], noise, ragged=True)
+    return see(shape, [partial(layer, number) for number in range(4)], noise, ragged=True)
 
 
 def heap(number: int, shape: Shape) -> Scene:
     """Return a random heap of ellipsoids, with or without a ground; noisy and torn if ``number`` is odd."""
     generator = np.random.default_rng(number)
-    surfaces: list[Surface] = [_plane(*generator.uniform(-0.3, 0.3, 2))] if number % 3 else []
+    surfaces: list[Surface] = [plane(*generator.uniform(-0.3, 0.3, 2))] if number % 3 else []
     for _ in range(generator.integers(8, 20)):
         centre, radii = generator.uniform((-38, -38, -5), (38, 38, 30)), generator.uniform(6, 22, 3)
         axes = np.linalg.qr(generator.normal(size=(3, 3)))[0]
-        surfaces.append(_ellipsoid([*centre], [*radii], axes))
-    return _see(shape, surfaces, NOISE if number % 2 else 0.0, ragged=bool(number % 2))
+        surfaces.append(ellipsoid([*centre], [*radii], axes))
+    return see(shape, surfaces, NOISE if number % 2 else 0.0, ragged=bool(number % 2))
 
 
 SCENES: dict[str, Callable[..., Scene]] = {

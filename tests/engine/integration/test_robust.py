@@ -177,3 +177,31 @@ def test_a_tear_is_marked():
     marked = robust_surface("torn sheet").edges[:, middle].any(axis=1)
     assert torn.sum() > 25
     assert marked[torn].mean() >= 0.95
+
+
+@pytest.mark.parametrize("slope", [(0.6, 0.2), (1.7, 0.0)])
+def test_a_noisy_plane_is_not_flattened(slope):
+    row, column = np.indices((64, 64))
+    height = slope[0] * column - slope[1] * row
+    normals = np.array([-slope[0], -slope[1], 1]) / np.sqrt(1 + slope[0] ** 2 + slope[1] ** 2)
+    noisy = normals + 0.03 * np.random.default_rng(0).standard_normal((64, 64, 3))
+    errors = [
+        np.std(
+            engine.integrate(normals=noisy, pixel_size=1.0, slope_weights=0.03**-2, **options).height - height
+        )
+        for options in ({}, {"robust": True})
+    ]
+    assert errors[1] < 1.3 * errors[0]
+
+
+def test_breaks_are_reported_and_noise_is_not():
+    row, column = np.indices((64, 64)) - 31.5
+    noise = 0.02 * np.random.default_rng(0).standard_normal((2, 64, 64))
+    ball = np.hypot(row, column) < 20
+    steep = np.sqrt(np.where(ball, 20.5**2 - row**2 - column**2, 1))
+    slopes = np.where(ball, np.stack([-column, row]) / steep, 0.3)
+    surfaces = [engine.integrate(*(maps + noise), 1.0, robust=True) for maps in (slopes, 0 * slopes)]
+    assert ["the surface has breaks" in surface.process.get("warnings", "") for surface in surfaces] == [
+        True,
+        False,
+    ]
