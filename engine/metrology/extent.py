@@ -20,6 +20,8 @@ Mask = NDArray[np.bool_]
 _REACH = 3  # pixels on either side of the highest one to which a paraboloid is fitted
 _MIN_PIXELS = 20  # of these 49 pixels that must have a height
 _NEAR = 3.0  # standard deviations above the lowest pixel, up to which others count as candidates
+_OF_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
+_COMMON_BORDER = 0.1  # share of the border's error with the same sign everywhere
 _UNIFORM = 1 / math.sqrt(3)  # standard deviation of a uniform distribution between -1 and 1
 
 
@@ -107,8 +109,13 @@ def rim(patch: Patch) -> Quantity | None:
     outermost &= patch.measured
     if not outermost.any():
         return None
-    sigma = np.nan if patch.sigma is None else float(np.median(patch.sigma[outermost]))
+    pixels = int(np.count_nonzero(outermost))
+    sigma = min(_OF_MEDIAN * patch.error_of_sum(outermost) / pixels, _median_sigma(patch, outermost))
     return Quantity(float(np.median(patch.height[outermost])), sigma, "mm")
+
+
+def _median_sigma(patch: Patch, chosen: Mask) -> float:
+    return np.nan if patch.sigma is None else float(np.median(patch.sigma[chosen]))
 
 
 def border(mask: Mask, *, ends: bool = False) -> Mask:
@@ -177,10 +184,11 @@ def _lowest(patch: Patch) -> Quantity:
 def areas(patch: Patch) -> dict[str, Quantity]:
     """Return the projected areas with a height and in contact, and the area of the surface in contact, mm2.
 
-    The end of contact is known within half a pixel, with the same sign everywhere: so the border is
-    uncertain by half a pixel's width in total; it is unknown if all of it is the picture's border. Without a
-    map of contact, a press is in contact where it has a height, and the name says so if part of it was
-    filled; other heights have no contact. The surface area of a pixel is its area over the normal's z.
+    The end of contact is known within half a pixel, independently in each pixel of the border, but for a
+    tenth of that which has the same sign everywhere; it is unknown if all of it is the picture's border.
+    Without a map of contact, a press is in contact where it has a height, and the name says so if part of
+    it was filled; other heights have no contact. The surface area of a pixel is its area over the
+    normal's z.
     """
     filled = np.isfinite(patch.filled)
     quantities = {"measured area": _area(patch, patch.measured)}
@@ -204,12 +212,12 @@ def areas(patch: Patch) -> dict[str, Quantity]:
 def volume(patch: Patch, level: float, level_sigma: float, name: str) -> dict[str, Quantity]:
     """Return the volume between the surface and a plane at a level, mm, in mm3; negative below the plane.
 
-    Errors of heights are assumed to be fully correlated, the worst case: their standard deviations add up.
+    Errors of heights are partly independent, and partly common: see `Patch.error_of_sum`.
     """
     above = patch.height - level
     value = patch.pixel_area * float(np.nansum(above))
-    errors = float(np.sum(patch.sigmas())) + level_sigma * np.count_nonzero(patch.measured)
-    edge = 0.5 * _UNIFORM * float(np.sum(abs(above[border(patch.measured)])))
+    errors = math.hypot(patch.error_of_sum(), level_sigma * np.count_nonzero(patch.measured))
+    edge = _error_of_border(above[border(patch.measured)])
     quantities = {name: Quantity(value, patch.pixel_area * math.hypot(errors, edge), "mm3")}
     if np.isfinite(patch.filled).any():
         filled = patch.pixel_area * float(np.nansum(patch.filled - level))
@@ -217,15 +225,21 @@ def volume(patch: Patch, level: float, level_sigma: float, name: str) -> dict[st
     return quantities
 
 
+def _error_of_border(values: Doubles) -> float:
+    """Return the standard deviation of a sum because its border, with values (n,), is known to a pixel."""
+    independent = math.sqrt(float(np.sum(values**2)))
+    return 0.5 * _UNIFORM * math.hypot(independent, _COMMON_BORDER * float(np.sum(np.abs(values))))
+
+
 def _area(patch: Patch, mask: Mask) -> Quantity:
-    edge = 0.5 * _UNIFORM * int(np.count_nonzero(border(mask)))
+    edge = _error_of_border(np.ones(np.count_nonzero(border(mask))))
     return Quantity(patch.pixel_area * int(np.count_nonzero(mask)), patch.pixel_area * edge, "mm2")
 
 
 def _surface(patch: Patch, measured: Mask, secant: Doubles) -> Quantity:
     """Return the sum of secants. Errors of the zenith change them by the tangent, fully correlated."""
     value = float(np.sum(secant[measured]))
-    edge = 0.5 * _UNIFORM * float(np.sum(secant[border(measured)]))
+    edge = _error_of_border(secant[border(measured)])
     errors = np.nan
     if patch.normals_sigma is not None:
         tangent = np.sqrt(np.maximum(secant**2 - 1, 0))

@@ -14,6 +14,7 @@ missing variance is counted as absorbed.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.metrology.noise import covariance_of
+from mirrorskin.engine.metrology.patch import independent_share, step_share
 from mirrorskin.engine.metrology.quantity import Quantity, micrometres
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics import least_squares
@@ -39,6 +41,7 @@ _FIRST_POINTS = 65536  # number of points for the first fit
 _CHUNK = 16384  # points per block, whose derivatives fit into the processor's cache
 _NOTHING = 1e-300  # avoids a division by 0
 _ROUNDING = 1e-9  # relative to the points' extent: smaller distances count as 0; also for squared lengths
+_OWN_SHAPE = 1e-3  # least squared length of a shape beside the form, relative to the whole shape
 _UNCERTAIN = 5.0  # times the median standard deviation, above which a height counts as uncertain
 _OVERSTATED = 0.1  # share of the predicted variance that may be missing because predictions are not exact
 
@@ -83,7 +86,9 @@ class PointCloud:
     sigma: Doubles  # (n,), float64: standard deviations of their heights, mm; all NaN where there are none
     where: Mask  # (H, W), bool: which pixels they are
     pixel_size: tuple[float, float]  # millimetres
-    noise_length: float  # millimetres over which errors of heights are correlated
+    noise_length: float | None  # millimetres over which errors of heights are correlated; None: unknown
+    share: float = 1.0  # of the variance that is common, or as smooth as a form
+    independent: bool = False  # whether the rest is independent
 
     @classmethod
     def of(
@@ -92,7 +97,7 @@ class PointCloud:
         x: ArrayLike,
         y: ArrayLike,
         sigma: ArrayLike | None,
-        noise_length: float = 0.0,
+        noise_length: float | None = None,
     ) -> PointCloud:
         """Return the points of a height map, which is NaN where undefined; see `fit_plane`."""
         z = np.asarray(height, np.float64)
@@ -104,12 +109,16 @@ class PointCloud:
         sigmas = np.full(points.shape[1], np.nan) if sigma is None else np.asarray(sigma, np.float64)[where]
         sizes = [abs(float(np.mean(np.diff(axis)))) if np.size(axis) > 1 else 0.0 for axis in (x, y)]
         size = sizes[0] or sizes[1] or 1.0, sizes[1] or sizes[0] or 1.0
-        return cls(points, sigmas, where, size, noise_length)
+        if sigma is None or noise_length != 0:
+            return cls(points, sigmas, where, size, noise_length)
+        common = 1 - independent_share(z, np.asarray(sigma, np.float64))
+        share = common * step_share(points[2], sigmas)
+        return cls(points, sigmas, where, size, noise_length, share, True)
 
     @property
     def common_sigma(self) -> float:
-        """Mean standard deviation, mm, as the size of a common error of all heights; 0 if unknown."""
-        return float(np.nan_to_num(np.mean(self.sigma)))
+        """Common error of all heights, mm: a share of the mean standard deviation; 0 if unknown."""
+        return math.sqrt(self.share) * float(np.nan_to_num(np.mean(self.sigma)))
 
     def residual(self, distance: Doubles) -> tuple[Doubles, Quantity]:
         """Return the points' distances from a form, (n,), mm, as a map, and their root mean square."""
@@ -144,8 +153,10 @@ class PointCloud:
             steepness = form.jacobian(points, parameters)[form.lift]
             claimed = float(np.sum(weight * (sigma * steepness) ** 2))
         birge = float(np.sqrt(gram[-1, -1] / claimed)) if claimed > 0 else np.nan
-        spread = covariance(gram, parameters.size, weight.size, claimed)
-        if self.noise_length > 0 and claimed > 0:
+        spread = covariance(gram, parameters.size, weight.size, 0.0 if self.independent else claimed)
+        if self.independent:
+            spread = spread + _of_smooth_errors(gram, parameters.size, self.share * claimed)
+        elif self.noise_length and claimed > 0:
             spread = at_least(spread, self._predicted(form, points, weight, parameters, kept))
         return Fit(parameters, spread, kept, birge)
 
@@ -163,6 +174,7 @@ class PointCloud:
         maps[:, places] = influence
         sigma = np.zeros(self.where.shape)
         sigma[self.where] = self.sigma
+        assert self.noise_length is not None
         return covariance_of(maps, sigma, places, self.pixel_size, self.noise_length)
 
 
@@ -306,6 +318,13 @@ def covariance(gram: Doubles, parameters: int, count: int, claimed: float = 0.0)
     return np.asarray((variance + absorbed) * inverse / np.multiply.outer(lengths, lengths))
 
 
+def _of_smooth_errors(gram: Doubles, parameters: int, smooth: float) -> Doubles:
+    """Return the covariance, (k, k), because of smooth errors with a weighted sum of squares."""
+    lengths = np.sqrt(np.diag(gram)[:parameters])
+    normal = gram[:parameters, :parameters] / np.multiply.outer(lengths, lengths)
+    return np.asarray(smooth / parameters * _inverse(normal) / np.multiply.outer(lengths, lengths))
+
+
 def _inverse(normal: Doubles) -> Doubles:
     """Return the pseudoinverse of normal equations with columns of length 1."""
     lengths, directions = np.linalg.eigh(normal)
@@ -316,7 +335,7 @@ def _inverse(normal: Doubles) -> Doubles:
 def _variance(rest: Doubles, freedom: int) -> float:
     """Return the variance of the amplitudes of smooth shapes, or of a pixel's error if that is larger."""
     lengths, directions = np.linalg.eigh(rest[:-1, :-1])
-    real = lengths > _ROUNDING
+    real = lengths > _OWN_SHAPE
     white = max(float(rest[-1, -1]), 0.0)
     free = min(int(np.count_nonzero(real)), freedom)
     if free < 3:

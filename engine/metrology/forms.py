@@ -64,7 +64,7 @@ def fit_plane(
     y: ArrayLike,
     sigma: ArrayLike | None = None,
     *,
-    noise_length: float = 0.0,
+    noise_length: float | None = None,
 ) -> Plane:
     """Fit a plane to a height map, (H, W) mm with NaN where undefined, by least squares.
 
@@ -72,7 +72,8 @@ def fit_plane(
     deviations, which determine weights as in `PointCloud.fit`. Uncertainties are from `covariance`. The mean
     standard deviation is added to that of the height, because heights may have a common error. If errors of
     heights are correlated over a ``noise_length``, mm, infinity for integrated slopes, uncertainties are at
-    least those that follow from ``sigma``; see `mirrorskin.engine.measure`.
+    least those that follow from ``sigma``; see `mirrorskin.engine.measure`. Of independent errors, of length
+    0, only a share is common.
 
     Examples
     --------
@@ -166,7 +167,7 @@ def fit_sphere(
     y: ArrayLike,
     sigma: ArrayLike | None = None,
     *,
-    noise_length: float = 0.0,
+    noise_length: float | None = None,
 ) -> Sphere:
     """Fit a sphere to a height map by least squares of the distances from it; see `fit_plane`.
 

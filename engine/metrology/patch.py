@@ -15,6 +15,10 @@ from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
 
+_HIGH, _UPPER = 0.95, 0.85  # quantiles of heights at the upper end of their range, for a mean and a median
+_OF_SECOND_DIFFERENCES = 6.0  # standard deviation of second differences along both axes, of noise of 1
+_MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variate
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:
@@ -51,6 +55,51 @@ class Patch:
         """Return the standard deviations of the measured heights, (n,), mm; NaN if unknown."""
         measured = self.measured
         return np.full(np.count_nonzero(measured), np.nan) if self.sigma is None else self.sigma[measured]
+
+    def error_of_sum(self, chosen: Mask | None = None) -> float:
+        """Return the standard deviation of the sum of measured heights, mm, of all pixels or of chosen ones.
+
+        Errors that are correlated over a length are shared by the pixels within it. Those that a press has
+        because of its steps are the same at equal heights; over many steps they cancel, but for half a step
+        at the ends of the range.
+        """
+        measured = self.measured if chosen is None else self.measured & chosen
+        if self.sigma is None:
+            return math.nan
+        sigma = self.sigma[measured]
+        total = float(np.sum(sigma))
+        if math.isinf(self.noise_length):
+            return total
+        alike = 1 + 2 * math.pi * self.noise_length**2 / self.pixel_area
+        # Chosen pixels may be of one height, such as those of the rim.
+        common = 1 - independent_share(self.height, self.sigma) if chosen is None else 1.0
+        share = math.sqrt(common) * step_share(
+            self.height[measured], sigma, _HIGH if chosen is None else _UPPER
+        )
+        return min(math.hypot(math.sqrt(alike * float(np.sum(sigma**2))), share * total), total)
+
+
+def step_share(height: Doubles, sigma: Doubles, high: float = _HIGH) -> float:
+    """Return half a step over the range of heights, (n,) mm, at most 1; a step is up to sqrt(12) sigmas.
+
+    The range is that between a ``high`` quantile and the low one.
+    """
+    step = math.sqrt(12) * float(np.mean(sigma)) if sigma.size else 0.0
+    extent = float(np.subtract(*np.quantile(height, [high, 1 - high]))) if height.size else 0.0
+    return 1.0 if 2 * extent <= step else step / (2 * extent)
+
+
+def independent_share(height: Doubles, sigma: Doubles) -> float:
+    """Return the share of the variance of heights, (H, W) mm, that is independent from pixel to pixel.
+
+    Second differences along both axes show it, as surfaces hardly have any.
+    """
+    if min(height.shape) < 3:
+        return 1.0
+    bend = np.diff(np.diff(height, 2, axis=0), 2, axis=1) / _OF_SECOND_DIFFERENCES
+    ratio = (bend / sigma[1:-1, 1:-1]) ** 2
+    known = ratio[np.isfinite(ratio)]
+    return min(1.0, float(np.median(known)) / _MEDIAN_SQUARE) if known.size else 1.0
 
 
 def heights_of(result: Result) -> NDArray[np.float32]:

@@ -15,11 +15,12 @@ from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.picture import Picture
 from mirrorskin.engine.base.tiling import Planes
 from mirrorskin.engine.diagnosis.footprint import with_curvature
-from mirrorskin.engine.optical.focus_travel import TravelJump
+from mirrorskin.engine.optical.focus_travel import CurveShape, TravelJump, common_shape, curves_of
 from mirrorskin.io import InputError, Map
 from mirrorskin.io.base.types import FRAME_DTYPES
 from mirrorskin.io.model.maps import TABLE, FocusStatus, status_of
 from mirrorskin.io.model.positions import check_strokes
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _TILE = 16384  # pixels of a work-item on a CPU: some rows, whose sums along columns it moves down
@@ -108,7 +109,10 @@ class Focus(Operation):
         )  # fmt: skip
         status, *floats = self._maps.take("status", *_FLOATS)
         height, sharpness, spread, gain, misfit = map(np.asarray, floats)
-        sigma = np.sqrt(np.float32(variance) * spread + self._excess(misfit) * gain)
+        shape = self._shape(travel, unit)
+        sigma = np.sqrt(np.float32(variance) * spread + self._excess(misfit, shape) * gain)
+        if shape is not None:
+            sigma = np.hypot(sigma, np.float32(shape.bias))
         # The window shows the mean of its heights, which is not that of its middle on a curved surface.
         footprint = ((2 * self.radius + 1) ** 2 - 1) / 12
         off_centre = _off_centre(height, sigma, sharpness, footprint)
@@ -118,17 +122,30 @@ class Focus(Operation):
         sigma = sigma / np.maximum(peaks, _LEAST_SHARE) ** 2
         return {"height": floats[0], "height_sigma": sigma, "status": status, "sharpness": floats[1]}
 
-    def _excess(self, misfit: NDArray[Any]) -> NDArray[np.float32]:
-        """Return the variance of log S in excess of noise: the median, or more where curves fit less well."""
+    def _excess(self, misfit: NDArray[Any], shape: CurveShape | None) -> NDArray[np.float32]:
+        """Return the variance of log S in excess of noise: the median, or more where curves fit less well.
+
+        What all curves have in common is subtracted.
+        """
         fitted = np.isfinite(misfit)
         usual = max(0.0, float(np.median(misfit[fitted]))) if fitted.any() else np.nan
+        common = 0.0 if shape is None else max(0.0, usual - shape.excess)
         around = _mean_around(misfit, self.radius // 2)
         unusual = (
             around > usual + _UNUSUAL * mad_sigma(around[fitted].astype(np.float64))
             if fitted.any()
             else False
         )
-        return np.where(unusual, around, np.float32(usual))
+        return np.where(unusual, around, np.float32(usual)) - np.float32(common)
+
+    def _shape(self, travel: Doubles, unit: float) -> CurveShape | None:
+        """Return what the curves of sharpness have in common; None if too few pixels show it."""
+        freedom = (2 * self.radius + 1) ** 2 - 1
+        assert self.noise is not None
+        if self.reach < 2 or not 0 < self.noise < _LARGEST:
+            return None
+        curves = curves_of(*self.peaks(), travel, unit, freedom, self.noise**2)
+        return None if curves is None else common_shape(*curves, self.noise**2, unit)
 
 
 def _mean_around(values: NDArray[Any], reach: int) -> NDArray[np.float32]:
@@ -171,14 +188,16 @@ find_focus = travel_function(
     """Find the travel at which each pixel's surroundings are sharpest (shape from focus).
 
     Sharpness S is the sum of squares of a window's samples about their mean, N - 1 times their variance,
-    minus the contribution (N - 1) noise^2 of noise. A Gaussian is fitted to the peak and its neighbours, that
-    is, a parabola through log S (Nayar and Nakagawa 1994), weighted by the inverse of the variance of log S,
-    noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error follows from these
-    and from the median misfit of such curves in the picture, or that in the window if it is unusual. Where
-    the surface is curved, half of the window's variance, ((2 radius + 1)^2 - 1) / 12 square pixels, times its
-    second derivatives is added; where it is inclined and the texture uneven, that variance times its slope
-    and the slope of log S. The sum is divided by the square of the share of the window's pixels that have a
-    peak. With ``reach=1``, which fits three samples exactly, it is unknown: NaN.
+    minus the contribution (N - 1) noise^2 of noise. A Gaussian is fitted to the peak and its neighbours,
+    that is, a parabola through log S (Nayar and Nakagawa 1994), weighted by the inverse of the variance
+    of log S, noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error
+    follows from these and from the median misfit of such curves in the picture, or that in the window if
+    it is unusual; what all curves have in common in the fourth order is no misfit, but its effect on the
+    peaks is added. Where the surface is curved, half of the window's variance, ((2 radius + 1)^2 - 1) /
+    12 square pixels, times its second derivatives is added; where it is inclined and the texture uneven,
+    that variance times its slope and the slope of log S. The sum is divided by the square of the share of
+    the window's pixels that have a peak. With ``reach=1``, which fits three samples exactly, it is
+    unknown: NaN.
 
     Returns
     -------

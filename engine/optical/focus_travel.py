@@ -6,7 +6,7 @@ there, it is one if later frames have travelled a step further.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ _LINES, _FEWEST = 64, 64  # lines of pixels along a side that are used; least nu
 _SHIFTS = 1, -1, 2  # steps of the travel by which later frames may be wrong
 _BETTER = 0.25  # largest ratio of the squares of residuals with and without a jump
 _CONTRAST = 5.0  # least contrast of a peak above that of noise, in standard errors
+_MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variate
 _LARGEST = 1e18  # noise whose square a float32 holds
 
 
@@ -47,20 +48,13 @@ def find_travel_jump(
     ``peak``, (2 reach + 1, H, W), is the contrast in the frames around the sharpest one of each pixel,
     ``best``, (H, W); it is ``freedom`` times ``variance`` by noise alone.
     """
-    reach, thin = len(peak) // 2, max(1, min(best.shape) // _LINES)
-    signal = peak[:, ::thin, ::thin].reshape(len(peak), -1).astype(np.float64) - freedom * variance
-    sharpest = best[::thin, ::thin].ravel()
-    enough = _CONTRAST * variance * np.sqrt(2 * freedom)
-    whole = np.isfinite(signal).all(axis=0) & (signal > 0).all(axis=0) & (signal[reach] > enough)
-    whole &= (sharpest >= reach) & (sharpest < len(travel) - reach)
+    reach = len(peak) // 2
     step = float(np.median(np.diff(travel))) if len(travel) > 1 else 0.0
-    if reach < 2 or step == 0 or np.count_nonzero(whole) < _FEWEST:
+    curves = curves_of(peak, best, travel, step, freedom, variance)
+    if curves is None:
         return None
-    signal, sharpest = signal[:, whole], sharpest[whole]
+    values, weights, places, sharpest = curves
     around = np.arange(-reach, reach + 1)[:, np.newaxis]
-    places = (travel[sharpest + around] - travel[sharpest]) / step
-    weights = signal**2 / (2 * freedom * variance + 4 * signal)
-    values = np.log(signal / signal[reach])
     usual = _residual(values, weights, places)
     candidates = []
     for shift in _SHIFTS:
@@ -87,11 +81,88 @@ def find_travel_jump(
     )
 
 
-def _residual(values: Doubles, weights: Doubles, places: Doubles) -> Doubles:
-    """Return the weighted squares that parabolas through the values, (n, pixels), leave at each pixel."""
+def curves_of(
+    peak: NDArray[Any], best: NDArray[Any], travel: Doubles, unit: float, freedom: int, variance: float
+) -> tuple[Doubles, Doubles, Doubles, NDArray[Any]] | None:
+    """Return log S, its weights and places in ``unit``, (2 reach + 1, n), and the sharpest frames, (n,).
+
+    They are those of a grid of pixels whose curves are whole; None if these are few.
+    """
+    reach, thin = len(peak) // 2, max(1, min(best.shape) // _LINES)
+    signal = peak[:, ::thin, ::thin].reshape(len(peak), -1).astype(np.float64) - freedom * variance
+    sharpest = best[::thin, ::thin].ravel()
+    enough = _CONTRAST * variance * np.sqrt(2 * freedom)
+    whole = np.isfinite(signal).all(axis=0) & (signal > 0).all(axis=0) & (signal[reach] > enough)
+    whole &= (sharpest >= reach) & (sharpest < len(travel) - reach)
+    if reach < 2 or unit == 0 or np.count_nonzero(whole) < _FEWEST:
+        return None
+    signal, sharpest = signal[:, whole], sharpest[whole]
+    around = np.arange(-reach, reach + 1)[:, np.newaxis]
+    places = (travel[sharpest + around] - travel[sharpest]) / unit
+    return np.log(signal / signal[reach]), signal**2 / (2 * freedom * variance + 4 * signal), places, sharpest
+
+
+class CurveShape(NamedTuple):
+    """How the curves of sharpness differ from Gaussians in common.
+
+    Attributes
+    ----------
+    bias : float
+        RMS error of the peaks, mm, because of the fourth order.
+    excess : float
+        Variance of log S in excess of noise that the fourth order does not explain.
+    """
+
+    bias: float
+    excess: float
+
+
+def common_shape(
+    values: Doubles, weights: Doubles, places: Doubles, sharpest: NDArray[Any], variance: float, unit: float
+) -> CurveShape | None:
+    """Return the fourth order that curves, as of `curves_of`, have in common.
+
+    A lens that is symmetric about its focus has a curve -w^2 + k w^4 + ... of w, the distance from the peak
+    over the width, with the same k everywhere. It is not scatter, and hardly moves the peaks.
+    """
+    fit, left = _parabolas(values, weights, places)
+    peaked = fit[:, 2] < 0
+    if np.count_nonzero(peaked) < _FEWEST:
+        return None
+    fit, left, values, weights, places = (
+        fit[peaked], left[:, peaked], values[:, peaked], weights[:, peaked], places[:, peaked]
+    )  # fmt: skip
+    vertex = -fit[:, 1] / (2 * fit[:, 2])
+    fourth = ((places - vertex) ** 2 * fit[:, 2]) ** 2
+    _, apparent = _parabolas(fourth, weights, places)
+    total = np.sum(weights, axis=0)
+    common = float(
+        np.median(np.sum(weights * apparent * left, axis=0) / np.sum(weights * apparent**2, axis=0))
+    )
+    true, _ = _parabolas(values - common * fourth, weights, places)
+    bias = vertex + true[:, 1] / (2 * true[:, 2])
+    left = left - common * apparent
+    degrees = len(values) - 3.0
+    columns = np.stack([np.ones_like(places), places, places**2])
+    matrix = np.einsum("ikp,jkp,kp->pij", columns, columns, weights)
+    square = np.einsum("ikp,jkp,kp->pij", columns, columns, weights**2)
+    free = total - np.trace(np.linalg.solve(matrix, square), axis1=1, axis2=2)
+    excess = (np.sum(weights * left**2, axis=0) / (1 - 2 / (9 * degrees)) ** 3 - degrees * variance) / free
+    return CurveShape(
+        float(np.sqrt(np.median(bias**2) / _MEDIAN_SQUARE)) * abs(unit), max(0.0, float(np.median(excess)))
+    )
+
+
+def _parabolas(values: Doubles, weights: Doubles, places: Doubles) -> tuple[Doubles, Doubles]:
+    """Return the coefficients of parabolas through values, (n, 3), and the residuals, (k, n)."""
     columns = np.stack([np.ones_like(places), places, places**2])
     matrix = np.einsum("ikp,jkp,kp->pij", columns, columns, weights)
     matrix += 1e-9 * np.trace(matrix, axis1=1, axis2=2)[:, np.newaxis, np.newaxis] * np.eye(3)  # equal places
     right = np.einsum("ikp,kp,kp->pi", columns, weights, values)
     fit = np.linalg.solve(matrix, right[..., np.newaxis])[..., 0]
-    return np.asarray(np.einsum("kp,kp->p", weights, (values - np.einsum("ikp,pi->kp", columns, fit)) ** 2))
+    return fit, values - np.einsum("ikp,pi->kp", columns, fit)
+
+
+def _residual(values: Doubles, weights: Doubles, places: Doubles) -> Doubles:
+    """Return the weighted squares that parabolas through the values, (n, pixels), leave at each pixel."""
+    return np.asarray(np.sum(weights * _parabolas(values, weights, places)[1] ** 2, axis=0))

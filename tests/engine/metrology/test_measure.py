@@ -71,20 +71,46 @@ def test_a_map_of_contact_gives_the_contact_area(ball):
     contact = (x**2 + y**2 < 4).astype(np.uint8)
     quantities = engine.measure(ball.assign(contact=contact)).quantities
     assert quantities["contact area"].value == pytest.approx(4 * np.pi, rel=1e-3)
-    # Half a pixel all around, to one side.
-    assert quantities["contact area"].sigma == pytest.approx(4 * np.pi * 0.015 / np.sqrt(3), rel=0.15)
+    # Half a pixel all around: a tenth of it to one side, and independently in each pixel of the border.
+    border = 4 * np.pi / 0.03
+    edge = 0.5 * 0.03**2 / np.sqrt(3) * np.hypot(np.sqrt(border), 0.1 * border)
+    assert quantities["contact area"].sigma == pytest.approx(edge, rel=0.15)
     assert quantities["measured area"].value == pytest.approx(np.pi * WIDTH**2, rel=1e-3)
 
 
-def test_uncertainties_of_volumes_are_those_of_correlated_errors(ball):
+def test_uncertainties_of_volumes_are_those_of_their_errors(ball):
     sure, unsure = (engine.measure(result_of(ball.height, SIZE, sigma=s)).quantities for s in (1e-6, 0.01))
     name = "volume below rest plane"
-    edge = 2 * np.pi * WIDTH * 0.015 / np.sqrt(3) * SAG
+    border = 2 * np.pi * WIDTH / 0.03
+    edge = 0.5 * 0.03**2 / np.sqrt(3) * np.hypot(np.sqrt(border), 0.1 * border) * SAG
     area = sure["measured area"].value
     assert sure[name].sigma == pytest.approx(edge, rel=0.15)
-    assert unsure[name].sigma == pytest.approx(np.hypot(sure[name].sigma, 0.01 * area), rel=1e-3)
+    assert sure[name].sigma < unsure[name].sigma < 0.1 * np.hypot(sure[name].sigma, 0.01 * area)
+    slopes = engine.measure(result_of(ball.height, SIZE, sigma=0.01), noise_length=np.inf).quantities
+    assert slopes[name].sigma == pytest.approx(np.hypot(sure[name].sigma, 0.01 * area), rel=1e-3)
     lifted = engine.measure(result_of(ball.height + 0.01, SIZE, sigma=0.01)).quantities
     assert lifted[name].value == pytest.approx(unsure[name].value - 0.01 * area)
+
+
+@pytest.mark.parametrize("step", [0.0, 0.01])
+def test_uncertainties_of_sums_and_forms_are_their_scatter(step):
+    """Heights of a cap with independent noise, and of a press in steps of the travel."""
+    clean, size, errors = cap((61, 61), (0.05, 0.05), RADIUS, 1.4), (0.05, 0.05), []
+    sigma = max(0.003, step / np.sqrt(12))
+    names = "sphere radius", "volume below rest plane", "rim height"
+    true = engine.measure(result_of(clean, size, sigma=1e-6)).quantities
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        heights = clean + (rng.normal(0, 0.003, clean.shape) if step == 0 else 0.0)
+        if step:
+            start = rng.uniform(0, step)
+            heights = step * np.round((heights - start) / step) + start
+        measured = engine.measure(result_of(heights, size, sigma=sigma)).quantities
+        errors.append([(measured[name].value - true[name].value, measured[name].sigma) for name in names])
+    error, stated = np.moveaxis(errors, 2, 0)
+    ratio = np.sqrt(np.mean(stated**2, axis=0) / np.mean(error**2, axis=0))
+    # The error of the border is in that of the volume, but not in this scatter; a rim may be of one step.
+    assert np.all((ratio > 0.7) & (ratio < [2.5, 9, 7])), ratio
 
 
 def test_the_highest_point_is_not_the_one_with_the_largest_error():

@@ -185,3 +185,21 @@ def test_a_lost_frame_is_found_by_the_peaks(steps, words):
 
 def test_travel_that_is_measured_may_jump():
     assert "peaks" not in focus_frames(jumped(1), jumped(1)).process.get("warnings", "")
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.05])
+def test_a_curve_that_is_no_gaussian_is_no_scatter(slope):
+    """The texture has waves of all lengths, so that the logarithm of its contrast is no parabola."""
+    ratios = []
+    for seed in range(3):
+        sharpest = 4.2 + slope * (np.arange(SHAPE[1]) - SHAPE[1] / 2)
+        frames = textured(
+            sharpest=sharpest,
+            seed=seed,
+            waves=lambda generator: generator.uniform(0.05, 0.3, 200),
+            contrast=20,
+        )
+        result = find_focus(noisy(frames, 1.0, seed), TRAVEL, noise=1.0)
+        inside = np.s_[8:-8, 8:-8]
+        ratios.append(((result.height + sharpest) / result.height_sigma)[inside])
+    assert 0.15 < np.nanmean(np.square(ratios)) < 2
