@@ -123,17 +123,8 @@ class Outcome:
     @property
     def mark(self) -> str:
         """One character of what is wrong."""
-        return (
-            "x"
-            if self.failed
-            else "*"
-            if self.lies
-            else "~"
-            if self.cautious
-            else "w"
-            if self.cell.warned
-            else " "
-        )
+        marks = {"x": self.failed, "*": self.lies, "~": self.cautious, "w": self.cell.warned}
+        return next((mark for mark, applies_here in marks.items() if applies_here), " ")
 
     def __str__(self) -> str:
         place, said = self.place, f"  [{self.warnings}]" if self.warnings else ""
