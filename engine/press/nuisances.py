@@ -90,7 +90,9 @@ class Nuisances(Step):
         errors, slow = (0.0, 0.0), 0.0
         widening = math.sqrt(1 + 2 * math.pi * max(footprint.variance - PIXEL, 0.0))
         if edges is not None:
-            errors, slow, lag = edges.level_errors(), edges.slow(), edges.lag(lag, widening)
+            errors, lag = edges.level_errors(), edges.lag(lag, widening)
+            if any(errors) or self.dark_sigma or self.bright_sigma:  # otherwise it changes hardly anything
+                slow = edges.slow()
         step = abs(float(np.median(np.diff(context.positions("travel")))))
         share = math.hypot(self._share(context), *(error / math.sqrt(2) for error in errors))
         added = _Added(

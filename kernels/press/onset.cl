@@ -172,8 +172,8 @@ int last_below(
 
 // Height and variance of a pixel, see onset.py. Everything is computed and then selected, so that it
 // vectorises. `jumped` means that `from` and `step` describe the step in which the pixel rose to its plateau,
-// not the onset.
-float2 answer(
+// not the onset. Compilers do not inline a function of this size, nor vectorise a loop that calls one.
+__attribute__((always_inline)) float2 answer(
     const float low, const float high, const float after, const float waited, const float unclear_travel,
     const float from, const float step, const float level, const float dark, const float threshold, const float noise,
     const float dark_tolerance, const float light_tolerance, const int jumped)

@@ -7,8 +7,7 @@
 #include "common.clh"
 
 #define ACROSS (TILE < 256 ? TILE : 256)  // columns of one work-item
-#define DOWN 8  // rows of one work-item
-#define MISSING -1  // a bend without a height
+#define DOWN 16  // rows of one work-item
 
 #define OR_MIDDLE(x) ((x) == (x) ? (x) : middle)
 
@@ -46,22 +45,18 @@ __kernel void relief_sigma(
             const float spread = reach * steep * steep, near = spread * spread / (spread * spread + square * square + 1e-36f);
             const float both = GREATER(2 * level * steep, 0);
             const float bend = along * level * level + (across * near + shape_factor) * steep * steep + twice * near * both;
-            bends[r][p] = middle == middle ? bend : MISSING;
+            bends[r][p] = middle == middle ? bend : 0;
             slopes[r][p] = per_slope * square;
         }
     }
     for (int r = 0; r < count; ++r) {
         const size_t first = (size_t)(top + r) * columns + base;
         const float *upper = bends[r], *own = bends[r + 1] + 1, *lower = bends[r + 2], *slope = slopes[r + 1] + 1;
-        float sums[ACROSS + 2], present[ACROSS + 2];  // of three rows
-        for (int p = 0; p < width + 2; ++p) {
-            const float above = upper[p], inner = own[p - 1], below = lower[p];
-            sums[p] = GREATER(above, 0) + GREATER(inner, 0) + GREATER(below, 0);
-            present[p] = (above >= 0 ? 1.0f : 0.0f) + (inner >= 0 ? 1.0f : 0.0f) + (below >= 0 ? 1.0f : 0.0f);
-        }
+        float sums[ACROSS + 2];  // of three rows
+        for (int p = 0; p < width + 2; ++p) sums[p] = upper[p] + own[p - 1] + lower[p];
         for (int p = 0; p < width; ++p) {
-            const float here = present[p] + present[p + 1] + present[p + 2], sum = sums[p] + sums[p + 1] + sums[p + 2];
-            const float mean = sum / GREATER(here, 1), bend = GREATER(own[p], mean), before = sigma[first + p];
+            const float mean = (sums[p] + sums[p + 1] + sums[p + 2]) * (1 / 9.0f), bend = GREATER(own[p], mean);
+            const float before = sigma[first + p];
             sums[p] = before * before + bend + slope[p] + offset;
         }
         for (int p = 0; p < width; ++p) combined[first + p] = sums[p] * rough_inverse_root(sums[p]);  // faster alone

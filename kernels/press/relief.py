@@ -14,7 +14,7 @@ _NEXT_ORDER = 0.25  # of a bend, what a footprint of one square pixel removes fr
 _CREASE, _ALONG_CREASE = 0.2, 0.03  # square pixels: what creases add to a footprint across and along slopes
 _SHAPE = 0.06  # error of a crossing between frames over the bend along the slope, pixels
 _REACH = 2.0  # of a footprint: where the slopes on both sides have different signs
-_ACROSS, _DOWN = 256, 8  # columns and rows of a work-item
+_ACROSS, _DOWN = 256, 16  # columns and rows of a work-item
 
 
 def relief_sigma(
@@ -67,14 +67,10 @@ def relief_sigma(
         + (across * near + shape_factor) * steep**2
         + twice * near * np.maximum(2 * level * steep, 0)
     )
-    around = [
-        bend[1 + down : rows - 1 + down, 1 + to : columns - 1 + to]
-        for down in (-1, 0, 1)
-        for to in (-1, 0, 1)
-    ]
-    present = np.sum(np.isfinite(around), axis=0)
-    mean = np.nansum(around, axis=0) / np.maximum(present, 1)
-    variance = sigma.astype(np.float64) ** 2 + np.fmax(bend[1:-1, 1:-1], mean)
+    bend = np.nan_to_num(bend)
+    sums = bend[:-2] + bend[1:-1] + bend[2:]
+    mean = (sums[:, :-2] + sums[:, 1:-1] + sums[:, 2:]) / 9
+    variance = sigma.astype(np.float64) ** 2 + np.maximum(bend[1:-1, 1:-1], mean)
     return np.asarray(np.sqrt(variance + per_slope * square[1:-1, 1:-1] + offset))
 
 
