@@ -55,8 +55,8 @@ class Nuisances(Step):
     """Add to the standard deviation of heights what is uncertain about camera, lens and light.
 
     Each nuisance has a prior, see `mirrorskin.io.Header.prior`. Frames narrow it where they show it: levels
-    on plateaus, the footprint of a pixel by steep and flat edges, lag by sudden ones. See "One model of
-    nuisances" in docs/method/press.md.
+    on plateaus, the footprint of a pixel by steep and flat edges, lag by sudden ones. See the documentation,
+    "One model of nuisances".
     """
 
     needs = ("height", "height_sigma")

@@ -26,7 +26,7 @@ def check_score(words: list[str], comment: str = "") -> None:
         measured = heights[kind.lower()]
         assert measured == pytest.approx(float(stated), abs=0.6 * 10.0 ** -len(digits)), (name, kind)
     result = io.open_result(name)
-    assert np.nanmax(result.height) < 0.001, f"{name}: heights above the rest plane"
+    assert np.nanmax(result.height) < 0.01, f"{name}: heights above the rest plane"  # a fill is a guess
     assert heights["coverage"] > 0.5
     if result.normals is not None:  # heights and normals, fused
         assert heights["rms"] < FUSED

@@ -31,7 +31,7 @@ HOLE[:, 30, 40] = np.nan
 MAPS_OF_A_FIT = {"mean", "cosine", "sine", "residual"}
 
 ON_FRAMES = {
-    "onset": (engine.find_onset, PRESS, TRAVEL, LEVELS, {"height", "height_sigma", "status", "frame"}),
+    "onset": (engine.find_onset, PRESS, TRAVEL, LEVELS, {"height", "status", "frame"}),
     "levels of scatter": (
         engine.find_onset,
         PRESS,
