@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -245,12 +246,10 @@ _NUMBERS = _bin_numbers()
 
 def _covariances(curl: NDArray[np.float32], valid: NDArray[np.bool_]) -> tuple[Doubles, Doubles]:
     """Return for each bin of `_bin_numbers` the mean product of two corners, and the number of pairs."""
-    from scipy import fft
-
-    shape = [fft.next_fast_len(n + _REACH, real=True) for n in curl.shape]
+    shape = [cv2.getOptimalDFTSize(n + _REACH) for n in curl.shape]
     sums = []
     for values in (curl, valid.astype(np.float32)):
-        power = fft.irfft2(np.abs(fft.rfft2(values, shape)) ** 2, shape)
+        power = np.fft.irfft2(np.abs(np.fft.rfft2(values, shape)) ** 2, shape)
         shifts = [np.arange(1 - _REACH, _REACH) % n for n in shape]
         inside = [np.abs(np.arange(1 - _REACH, _REACH)) < n for n in curl.shape]
         total = np.where(inside[0][:, np.newaxis] & inside[1], power[np.ix_(*shifts)], 0.0)

@@ -14,7 +14,6 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.integration.height_variance import find_rectangle_variance
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
@@ -124,6 +123,8 @@ def covariance_of(
 
 def _free_errors(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> tuple[Doubles, Doubles]:
     """Return the variance of heights in a rectangle for slopes of variance 1, and that of cosine waves."""
+    from mirrorskin.engine.integration.height_variance import find_rectangle_variance
+
     rows, columns = shape
     weights = 1 / pixel_size[0] ** 2, 1 / pixel_size[1] ** 2
     up, across = (4 * np.sin(np.pi * np.arange(n) / (2 * n)) ** 2 for n in (rows, columns))
@@ -155,4 +156,6 @@ def correlation(
 @functools.cache
 def _mean_variance(rows: int, columns: int) -> float:
     """Return the mean variance of heights from slopes about their mean, for links of variance 1."""
+    from mirrorskin.engine.integration.height_variance import find_rectangle_variance
+
     return float(find_rectangle_variance((rows, columns), (1.0, 1.0), 0.0).mean())

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 GAMMA, FRAME_GAIN, OFFSET = 0.02, 0.005, 0.5 / 255
 """Standard deviations of gamma and of a frame's gain; of the offset and its drift, as shares of the light."""
-CELLS = 20
+CELLS = 18
 """Number of cells of a table over the normal's x, and y, from -1 to 1."""
 
 _MIN_PIXELS, _MIN_LAMPS = 64, 5  # that decide

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +50,11 @@ def reconstruct(*words, name="turn.h5"):
     return io.open_result("out.h5"), ended
 
 
+def without_note(said):
+    """Return what was said but for the note of 8 bits, whose errors are not those of independent noise."""
+    return re.sub(r"turn\.h5: heights: slopes contradict each other [^\n]*\n", "", said)
+
+
 def errors(result):
     """Return the angles between the normals and the true ones, degrees."""
     return np.degrees(between(result.normals, direction(ZENITH, AZIMUTH)))
@@ -57,7 +63,7 @@ def errors(result):
 def test_a_rotation_becomes_normals_that_are_scored():
     turn()
     ended = run("reconstruct turn.h5")
-    assert (ended.code, ended.said) == (0, "")
+    assert (ended.code, without_note(ended.said)) == (0, "")
     result = io.open_result("turn-result.h5")
     assert ended.out.startswith("turn-result.h5: normals at 99 of 99 pixels, zenith from ")
     lowest, highest = result.height.min(), result.height.max()
@@ -104,7 +110,7 @@ def test_without_a_pixel_size_there_are_no_heights_and_a_line_states_the_reason(
     assert ended.out.startswith("out.h5: normals at 99 of 99 pixels, zenith from ")
     assert not {"height", "height_sigma", "component"} & set(result.maps())
     without_file, ended = reconstruct("--pixel-size", "0.1mm")
-    assert ended.said == ""
+    assert without_note(ended.said) == ""
     assert np.isfinite(without_file.height).all()
 
 

