@@ -206,7 +206,7 @@ class Edges:
         rise = float(np.nanmedian(rises)) if np.isfinite(rises).any() else 0.0
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = (values - dark) / (bright - dark)
-        noise = (operation.used_noise or 0.0) / rise if rise > 0 else math.inf
+        noise = (result.fitted.noise or 0.0) / rise if rise > 0 else math.inf
         return cls(shares, travel, heights, noise)
 
     def reached(self, level: float) -> Doubles:
