@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -49,8 +51,9 @@ class Section:
         Millimetres, or pixels if their size is unknown.
     notes : tuple of str
         Warnings and notes of the result.
-    correlation : ndarray, (n,), float64, or None
-        Correlation of the errors of two heights at each distance; None if errors are independent.
+    correlation : callable or None
+        Returns the correlation of the errors of two heights at each distance, (n,), float64, which only
+        steps need; None if errors are independent.
     """
 
     distance: Doubles
@@ -61,7 +64,7 @@ class Section:
     filled: Mask
     unit: str = "mm"
     notes: tuple[str, ...] = ()
-    correlation: Doubles | None = None
+    correlation: Callable[[], Doubles] | None = None
 
 
 def as_point(name: str, value: Any) -> Point:
@@ -137,7 +140,7 @@ def section(
     notes = tuple(finding.text for finding in findings_of("result", maps.process))
     related, length = None, noise_length(maps)
     if length > 0 and maps.height_sigma is not None:
-        related = correlation(distance, (height.shape[0], height.shape[1]), size, length)
+        related = partial(correlation, distance, (height.shape[0], height.shape[1]), size, length)
     return Section(distance, along[0], along[1], *values, unit, notes, related)
 
 
@@ -284,7 +287,7 @@ def step_height(section: Section) -> StepHeight:
     parameters, spread, rest = _lines(x, z)
     if section.correlation is not None:
         number = np.flatnonzero(measured)[kept]
-        related = section.correlation[np.abs(np.subtract.outer(number, number))]
+        related = section.correlation()[np.abs(np.subtract.outer(number, number))]
         errors = np.nan_to_num(section.sigma[number])
         influence = np.linalg.pinv(_line_rows(x).T) * errors
         spread = at_least(spread, influence @ related @ influence.T)
