@@ -12,12 +12,12 @@ from mirrorskin.engine.base.inputs import spacing
 from mirrorskin.io import InputError, Region, Result
 from mirrorskin.io.model.result import select_turn
 from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE
 
 Mask = NDArray[np.bool_]
 
 _HIGH, _UPPER = 0.95, 0.85  # quantiles of heights at the upper end of their range, for a mean and a median
 _OF_SECOND_DIFFERENCES = 6.0  # standard deviation of second differences along both axes, of noise of 1
-_MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +99,7 @@ def independent_share(height: Doubles, sigma: Doubles) -> float:
     bend = np.diff(np.diff(height, 2, axis=0), 2, axis=1) / _OF_SECOND_DIFFERENCES
     ratio = (bend / sigma[1:-1, 1:-1]) ** 2
     known = ratio[np.isfinite(ratio)]
-    return min(1.0, float(np.median(known)) / _MEDIAN_SQUARE) if known.size else 1.0
+    return min(1.0, float(np.median(known)) / MEDIAN_SQUARE) if known.size else 1.0
 
 
 def heights_of(result: Result) -> NDArray[np.float32]:

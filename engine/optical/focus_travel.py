@@ -15,6 +15,7 @@ from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.io import Result
 from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE
 
 if TYPE_CHECKING:
     from mirrorskin.engine.optical.focus import Focus
@@ -23,7 +24,6 @@ _LINES, _FEWEST = 64, 64  # lines of pixels along a side that are used; least nu
 _SHIFTS = 1, -1, 2  # steps of the travel by which later frames may be wrong
 _BETTER = 0.25  # largest ratio of the squares of residuals with and without a jump
 _CONTRAST = 5.0  # least contrast of a peak above that of noise, in standard errors
-_MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variate
 _LARGEST = 1e18  # noise whose square a float32 holds
 
 
@@ -149,7 +149,7 @@ def common_shape(
     free = total - np.trace(np.linalg.solve(matrix, square), axis1=1, axis2=2)
     excess = (np.sum(weights * left**2, axis=0) / (1 - 2 / (9 * degrees)) ** 3 - degrees * variance) / free
     return CurveShape(
-        float(np.sqrt(np.median(bias**2) / _MEDIAN_SQUARE)) * abs(unit), max(0.0, float(np.median(excess)))
+        float(np.sqrt(np.median(bias**2) / MEDIAN_SQUARE)) * abs(unit), max(0.0, float(np.median(excess)))
     )
 
 

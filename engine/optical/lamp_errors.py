@@ -20,7 +20,7 @@ from mirrorskin.engine.base.device_arrays import stored_map
 from mirrorskin.engine.base.frames import noise_of_residual, take_places
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.amplitude_blur import GRID_LINES, find_blur
-from mirrorskin.io import Result
+from mirrorskin.io import Header, Result
 from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, fit_clipped, gram, mad_sigma
@@ -28,8 +28,10 @@ from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, fit_clipped
 if TYPE_CHECKING:
     from mirrorskin.engine.optical.photometric import PhotometricStereo
 
-GAMMA, FRAME_GAIN, OFFSET = 0.02, 0.005, 0.5 / 255
-"""Standard deviations of gamma and of a frame's gain; of the offset and its drift, as shares of the light."""
+GAMMA, FRAME_GAIN = (Header("axial").prior(name) for name in ("gamma_sigma", "frame_gain_sigma"))
+"""Standard deviations of gamma, and of a frame's gain."""
+OFFSET = 0.5 / 255
+"""Standard deviation of the offset and of its drift, as a share of the light."""
 CELLS = 18
 """Number of cells of a table over the normal's x, and y, from -1 to 1."""
 

@@ -236,6 +236,8 @@ def _scale(matrix: Doubles) -> Doubles:
 
 # --- linear fits without outliers ---------------------------------------------------------------------------
 
+MEDIAN_SQUARE = 0.455
+"""Median of the square of a standard normal variate."""
 CLEAR_Z_SCORE = 6.0
 """Standard errors from which on an effect that a clipped fit determines is reported."""
 OUTLYING = 4.0
