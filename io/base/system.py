@@ -113,10 +113,19 @@ def read_regular(path: Path, remedy: str = "", limit: int = MAX_UNPACKED_BYTES) 
 def read_text(path: Path, remedy: str = "") -> str:
     """Read a text file: UTF-8, or UTF-16 after a byte-order mark, which is not part of the text."""
     data = read_regular(path, remedy, MAX_TEXT_BYTES)
+    is_marked = data.startswith((BOM_UTF16_LE, BOM_UTF16_BE))
+    end = remedy and f"; {remedy}"
     try:
-        return data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
+        text = data.decode("utf-16" if is_marked else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not text in UTF-8{remedy and f'; {remedy}'}") from error
+        line, byte = data.count(b"\n", 0, error.start) + 1, data[error.start]
+        raise InputError(
+            f"{path} is not text in UTF-8: line {line} contains the byte 0x{byte:02x}. Save it in UTF-8, as"
+            f" Excel's 'CSV UTF-8' is{end}"
+        ) from error
+    if "\0" in text:
+        raise InputError(f"{path} is not text in UTF-8: it contains bytes of 0. Save it in UTF-8{end}")
+    return text
 
 
 def check_unpacked(size: int, what: str, remedy: str, limit: int = MAX_UNPACKED_BYTES) -> None:

@@ -31,7 +31,7 @@ PICTURE = Format(
 
 PICTURE_SUFFIXES = (*PICTURE.suffixes, *TIFF.suffixes)
 
-_DTYPES = tuple(dtype.name for dtype in FRAME_DTYPES)
+_DTYPES = (*(dtype.name for dtype in FRAME_DTYPES), "float16")
 _PNG_MARK = b"\x89PNG\r\n\x1a\n"
 _PNG_HEAD = 33  # bytes of the signature and the first chunk; the pixel size may follow
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
@@ -76,7 +76,8 @@ def decode_picture(path: Path, dtypes: Sequence[str] = _DTYPES) -> Picture:
     with TiffFrames(path, None, None, dtypes) as tiff:
         if tiff.shape[0] != 1:
             raise InputError(f"{path} contains several pages, and one is needed: save each page as a picture")
-        return Picture(tiff.page(0), tiff.findings)
+        samples = tiff.page(0)
+        return Picture(samples.astype(np.float32) if samples.dtype == np.float16 else samples, tiff.findings)
 
 
 def decode_bytes(data: bytes, name: str) -> Picture:

@@ -31,7 +31,7 @@ TIFF = Format(
 
 
 _REMEDY = "copy it again, or save it again"
-_DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
+_DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64")
 _MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _KINDS = ("frame", "imagej", "multipage", "ome", "shaped", "sis", "tiled", "uniform", "virtual")
 """Kinds of TIFF whose metadata are read; the metadata of others may name other files."""
@@ -43,6 +43,7 @@ _WHITE_IS_ZERO, _BLACK_IS_ZERO, _PALETTE = 0, 1, 3  # photometric interpretation
 _PLAIN = tuple(dtype.name for dtype in FRAME_DTYPES)  # types accepted for colour samples as well
 _DECODED = {1, 5, 6, 7, 8, 32773, 32946}  # compressions: none, LZW, JPEG, deflate, PackBits
 _NONE, _LOSSY = 1, {6: "JPEG", 7: "JPEG", 34892: "JPEG"}  # compressions
+_FLOATING = 3  # predictor: the bytes of floating-point samples are reordered
 _SEPARATE = 2  # planar configuration: one plane per colour
 _MICROMETRE = ("micron", "um", "\\u00B5m")  # as ImageJ writes it
 # Tags of a page that describe the packing of its samples: type and number.
@@ -159,6 +160,8 @@ class TiffFrames(WholeFrames):
         if page.compression not in _DECODED:
             kind = getattr(page.compression, "name", page.compression)
             raise InputError(f"{name} is compressed by {kind}: save it with LZW or deflate, or uncompressed")
+        if dtype == "float16" and page.predictor == _FLOATING:
+            raise InputError(f"{name} is {dtype}, compressed with a predictor: save it uncompressed")
         self.dtype, rows, columns = np.dtype(dtype), page.imagelength, page.imagewidth
         size = rows * columns * page.samplesperpixel * self.dtype.itemsize
         packed = 0 if page.compression == _NONE else min(sum(page.databytecounts), self._file.filehandle.size)
@@ -249,6 +252,8 @@ class TiffFrames(WholeFrames):
                 self._file.filehandle.seek(offset)
                 segments.append(self._file.filehandle.read(count))
             decoded.append(decode(self._packed(segments, 1 if planar else self._page.samplesperpixel), name))
+        if self.dtype == np.float16 and decoded[0].dtype == np.uint16:
+            decoded = [plane.view(np.float16) for plane in decoded]
         if decoded[0].dtype != self.dtype:
             raise InputError(f"{name} is compressed, and of type {self.dtype}: save it uncompressed")
         return np.stack(decoded[2::-1] + decoded[3:], axis=-1) if planar else decoded[0]
@@ -264,7 +269,7 @@ class TiffFrames(WholeFrames):
             262: ("H", [int(page.photometric) if samples > 1 else 1]),
             277: ("H", [samples]),
             284: ("H", [1]),
-            339: ("H", [int(page.sampleformat)] * samples),
+            339: ("H", [1 if self.dtype == np.float16 else int(page.sampleformat)] * samples),
         }
         for code, kind in _PACKING.items():
             if code in page.tags:

@@ -106,7 +106,7 @@ def test_the_travel_of_a_real_stage_places_heights():
         ),
         (
             ["ball.npy", "--travel", "ball.npz"],
-            "ball.npz is not text in UTF-8; write one length",
+            "ball.npz is not text in UTF-8: line 1 contains the byte",
         ),
         (["ball.npy", "--travel", "t.txt"], "t.txt lists 2 travels for 12 frames: one a frame is needed"),
         (["ball.npy", "--travel", "t.txt", *STEPS], "Remove --travel-step and --travel-start"),

@@ -54,7 +54,11 @@ def test_another_number_of_phases_than_of_frames_is_refused(tmp_path):
         (b"1e999deg", ", line 1: 1e999deg: the number is too large; write e.g. 2.5deg"),
         (b"", " lists no phases: write one angle a frame in it, such as 178.1deg"),
         (b"# 10deg\n", " lists no phases: write one angle a frame in it, such as 178.1deg"),
-        (b"\x89HDF\r\n\xff", " is not text in UTF-8; write one angle a frame in it, such as 178.1deg"),
+        (
+            b"\x89HDF\r\n\xff",
+            " is not text in UTF-8: line 1 contains the byte 0x89. Save it in UTF-8, as Excel's"
+            " 'CSV UTF-8' is; write one angle a frame in it, such as 178.1deg",
+        ),
         (None, " cannot be read: No such file or directory; write one angle a frame in it, such as 178.1deg"),
     ],
 )

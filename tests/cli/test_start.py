@@ -73,3 +73,10 @@ def test_a_command_compiles_no_program_that_was_compiled_before(folder, monkeypa
     monkeypatch.chdir(folder)
     command = [sys.executable, "-c", COMPILED, "fuse", "press.h5", "turn.h5", "-o", "again.h5"]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "0\n"
+
+
+def test_the_package_runs_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "mirrorskin", "--version"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.split()[0], done.stderr) == (0, "mirrorskin", "")
+    wrong = subprocess.run([sys.executable, "-m", "mirrorskin", "chekc"], capture_output=True, text=True)
+    assert (wrong.returncode, wrong.stderr.split(":")[0]) == (2, "mirrorskin")

@@ -88,6 +88,12 @@ def test_what_does_not_state_one_travel_of_each_frame_is_refused(tmp_path, text,
     assert message in str(caught.value)
 
 
+@pytest.mark.parametrize("encoding", ["latin-1", "cp1252", "utf-16-be", "mac-roman"])
+def test_another_encoding_is_refused_with_the_one_that_is_expected(tmp_path, encoding):
+    with pytest.raises(InputError, match=r"is not text in UTF-8: .* Save it in UTF-8"):
+        read(tmp_path, "frame;travel [\u00b5m]\n0;0\n1;50", encoding)
+
+
 def test_a_heading_without_unit_has_none():
     assert unit_of("s", "length", "here") == ""
     assert unit_of("travel", "length", "here") == ""

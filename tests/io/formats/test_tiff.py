@@ -74,6 +74,18 @@ def test_float32_comes_back_exactly(tmp_path):
         np.testing.assert_array_equal(source.read(np.empty(source.shape, source.dtype)).frames, frames)
 
 
+@pytest.mark.parametrize("options", [PLAIN, {"compression": "zlib"}, {"byteorder": ">"}], ids=str)
+def test_float16_is_read_as_float32(tmp_path, options):
+    frames = (stack(5) / 7).astype(np.float16)
+    actual, _ = frames_of(write(tmp_path / "a.tif", frames, **options))
+    assert actual.dtype == np.float32
+    np.testing.assert_array_equal(actual, frames)
+    for number, frame in enumerate(frames):
+        write(tmp_path / f"frame{number}.tif", frame, **options)
+    (tmp_path / "a.tif").unlink()
+    np.testing.assert_array_equal(frames_of(tmp_path)[0], frames)
+
+
 @pytest.mark.parametrize("dtype", ["int8", "int16", "uint32", "int32", "float64"])
 def test_other_types_are_converted_where_that_is_exact(tmp_path, dtype):
     frames = stack(5, BITS8) // 2
