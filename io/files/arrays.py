@@ -39,6 +39,7 @@ from mirrorskin.io.storage.stack import RawFrames
 _KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are not frames
 _NEEDED = "travel (--travel-step or --travel), phase (--phase-step or --phases)"
 _HASH_INTERVAL, _HASH_LENGTH = 4 << 20, 4 << 10  # bytes: of each 4 MiB of frames, the first 4 KiB are hashed
+_NPY_MARK = b"\x93NUMPY"
 _HEAD_BYTES = 1 << 14  # bytes read for the header of a member: NumPy accepts at most 10 000 characters
 _UNPACKED_BYTES = 1 << 20  # bytes unpacked at a time
 
@@ -337,6 +338,22 @@ def _open_frames(path: Path) -> NDArray[Any] | RawFrames:
         return RawFrames(os.dup(file.fileno()), head.size, (frames, rows, columns), head.dtype)
 
 
+def _rest_of(path: Path) -> tuple[Finding, ...]:
+    """Return the finding about what follows the array in a ``.npy`` file, which is not read."""
+    if path.suffix.lower() != ".npy":
+        return ()
+    with open_regular(path) as file:
+        head, size = _number_head(file), os.fstat(file.fileno()).st_size
+        rest = size - head.size - head.nbytes
+        file.seek(head.size + head.nbytes)
+        again = file.read(len(_NPY_MARK)) == _NPY_MARK
+    if not rest:
+        return ()
+    what = "another array follows, as of several numpy.save" if again else f"{rest} bytes follow"
+    text = f"its header states {_describe(head)}, and {what}: only the first array is read; join them in one"
+    return (Finding("number of frames", text),)
+
+
 def _number_head(file: BufferedReader) -> _Head:
     """Read the header of an array of numbers that is complete."""
     head, size = _read_head(file), os.fstat(file.fileno()).st_size
@@ -415,6 +432,7 @@ def open_stack(
                 check_regular(path)
                 files = {path: state_of(path.stat())}
                 frames, arrays = _open_array(path, dataset, memory_limit)
+                rest = _rest_of(path)
             held: dict[str, Any] = {**arrays}
         else:
             if not form.has_positions:  # fail before decoding if there are none
@@ -423,7 +441,7 @@ def open_stack(
             frames = opening.enter_context(open_reader(path, form, **options))
             with translate_os_errors(str(path)):
                 files = {file: state_of(file.stat()) for file in frames.files}
-            held = {**frames.positions, **frames.header}
+            held, rest = {**frames.positions, **frames.header}, ()
         kept = {name: value for name, value in positions.items() if value is not None}
         series = kept or {name: value for name, value in held.items() if name in POSITIONS.values()}
         stated = held.pop("motion", motion)
@@ -436,6 +454,7 @@ def open_stack(
         properties = {name: value for name, value in held.items() if name not in POSITIONS.values()}
         header = properties | {name: value for name, value in header.items() if value is not None}
         recording = ArrayRecording(frames, series, header, motion, region, frame_range, str(path), files)
+        recording.findings += rest
         opening.pop_all()  # the recording closes the file from now on
     return recording
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -19,7 +18,14 @@ from mirrorskin.io.base.system import check_regular, open_regular
 from mirrorskin.io.base.types import FRAME_DTYPES, InputError
 from mirrorskin.io.formats.colour_table import ColourTable
 from mirrorskin.io.formats.registry import Format
-from mirrorskin.io.model.frames import CONVERTED_COLOUR, WholeFrames, lossy
+from mirrorskin.io.formats.tiff_pages import (
+    compare_pages,
+    described_pages,
+    in_one_piece,
+    pictures_in,
+    pixel_size,
+)
+from mirrorskin.io.model.frames import CONVERTED_COLOUR, WholeFrames, lossy, lost_frames
 
 TIFF = Format(
     name="TIFF",
@@ -36,6 +42,8 @@ _MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _KINDS = ("frame", "imagej", "multipage", "ome", "shaped", "sis", "tiled", "uniform", "virtual")
 """Kinds of TIFF whose metadata are read; the metadata of others may name other files."""
 
+_DESCRIBED = ("imagej", "ome", "shaped")  # kinds whose metadata state the number of pages
+
 _FRAME_AXES = "TZIQ"  # time, depth, and pages in order
 _COLOURS = 4  # maximum number of channels that can be colours of one picture; more are frames
 _FORMATS = {1: "uint", 2: "int", 3: "float"}  # sample formats (TIFF 6.0, section 19)
@@ -45,7 +53,6 @@ _DECODED = {1, 5, 6, 7, 8, 32773, 32946}  # compressions: none, LZW, JPEG, defla
 _NONE, _LOSSY = 1, {6: "JPEG", 7: "JPEG", 34892: "JPEG"}  # compressions
 _FLOATING = 3  # predictor: the bytes of floating-point samples are reordered
 _SEPARATE = 2  # planar configuration: one plane per colour
-_MICROMETRE = ("micron", "um", "\\u00B5m")  # as ImageJ writes it
 # Tags of a page that describe the packing of its samples: type and number.
 _PACKING = {266: "H", 317: "H", 322: "I", 323: "I", 278: "I"}
 _JPEG_TABLES, _SUBSAMPLING, _ORIENTATION = 347, 530, 274
@@ -88,15 +95,12 @@ class TiffFrames(WholeFrames):
                 shaped = bool(series) and all(part.kind == "shaped" for part in series)
                 if shaped and len(series) > 1 and dataset is None:
                     plain = opening.enter_context(_open(path, "shaped"))
-                    if sum(map(_frames_in, series)) == sum(map(_frames_in, plain.series)):  # were appended
+                    if sum(map(pictures_in, series)) == sum(map(pictures_in, plain.series)):  # were appended
                         self._file, series = plain, list(plain.series)
-                elif shaped and sum(len(part.pages) for part in series) < len(self._file.pages):
-                    raise InputError(f"{path} has pages that its metadata do not describe: save it again")
-                complete = bool(series) and self._ends()
-                if self._file.is_imagej:  # without the samples that its metadata state, it is a plain TIFF
-                    complete = complete and series[0].kind == "imagej"
-                if not complete:
+                if not series or not self._ends():
                     raise self._damaged()
+                self._metadata = self._file
+                series = self._compare_pages(series, opening)
                 self._take(_chosen(path, series, dataset), dtypes)
             except InputError:
                 raise
@@ -109,6 +113,34 @@ class TiffFrames(WholeFrames):
     def close(self) -> None:
         """Close the file."""
         self._close()
+
+    def _compare_pages(self, series: list[Any], opening: ExitStack) -> list[Any]:
+        """Return the series of the metadata, or that of all pages if the metadata state another number.
+
+        The finding for another number is stored.
+        """
+        path, pages = self._path, self._file.pages
+        described = described_pages(self._file, path)
+        alone = any(in_one_piece(part, pages) for part in series)
+        if alone and len(pages) > len(series):
+            raise InputError(f"{path} has pages that its metadata do not describe: save it again")
+        if described is None or alone or described.frames == len(pages):
+            return series
+        if described.by == "ImageJ" and len(pages) == 1:  # its pictures follow each other, as far as they go
+            present = max(0, self._file.filehandle.size - pages[0].dataoffsets[0]) // pages[0].nbytes
+            raise self._damaged(f" ({described.frames} pictures are stated, and {present} are present)")
+        if series[0].kind == "ome" and any(page is None for page in series[0].pages):
+            finding = compare_pages(described, sum(page is not None for page in series[0].pages), path)
+        else:
+            plain = opening.enter_context(_open(path, *_DESCRIBED))
+            alike = [part for part in plain.series if part.keyframe.shape == series[0].keyframe.shape]
+            if len(alike) != 1:
+                return series
+            finding = compare_pages(described, pictures_in(alike[0]), path)
+            if finding is not None:
+                self._file, series = plain, alike
+        self.findings = () if finding is None else (finding,)
+        return series
 
     def frames(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
         """Decode frames."""
@@ -132,11 +164,11 @@ class TiffFrames(WholeFrames):
             samples = ~samples
         return _upright(samples, self._orientation)
 
-    def _damaged(self) -> InputError:
+    def _damaged(self, how: str = "") -> InputError:
         with open_regular(self._path) as unread:
             is_tiff = unread.read(4) in _MARKS
         wrong = "is damaged or cut off" if is_tiff else "is not a TIFF"
-        return InputError(f"{self._path} {wrong}: {_REMEDY}")
+        return InputError(f"{self._path} {wrong}{how}: {_REMEDY}")
 
     def _ends(self) -> bool:
         """Return whether the chain of pages ends; it does not in a truncated file."""
@@ -168,6 +200,8 @@ class TiffFrames(WholeFrames):
         where, samples = f"{name} (page {page.index + 1})", page.samplesperpixel
         check_picture(where, columns, rows, self.dtype.itemsize, samples, packed, copies=1)
         self._numbers, self._colour = _numbers(name, series, self._channel)
+        if None in series.pages:
+            self._leave_out(np.array([page is not None for page in series.pages])[self._numbers])
         self._orientation = _orientation(page)
         turned = self._orientation > _LAST_UPRIGHT
         self.shape = (len(self._numbers), *((columns, rows) if turned else (rows, columns)))
@@ -180,7 +214,15 @@ class TiffFrames(WholeFrames):
                 f"{name}: white is zero, but samples are {self.dtype}: save them with black as zero"
             )
         self._table = _table(name, page) if page.photometric == _PALETTE else None
-        self.findings = tuple(self._find(series))
+        self.findings += tuple(self._find(series))
+
+    def _leave_out(self, present: NDArray[np.bool_]) -> None:
+        """Leave out frames that the file does not contain, and count those before each of the others."""
+        places = np.flatnonzero(present)
+        if not places.size:
+            raise self._damaged()
+        self.lost = (np.diff(places, prepend=-1) - 1).astype(np.int32)
+        self._numbers, self.findings = self._numbers[places], (*self.findings, *lost_frames(self.lost))
 
     def _check_complete(self) -> None:
         """Check that the file contains the samples of all frames."""
@@ -215,7 +257,7 @@ class TiffFrames(WholeFrames):
         if "C" in series.axes and series.axes[0] == "C":
             text = f"{self.shape[0]} channels are read as frames"
             yield Finding("channels", text, warning=False)
-        pixel = _pixel_size(self._file)
+        pixel = pixel_size(self._metadata)
         if pixel:
             text = f"the file states pixels of {pixel}: give --pixel-size if this is their size at the sheet"
             yield Finding("pixel size", text, warning=False)
@@ -292,11 +334,6 @@ def _open(path: Path, *without: str) -> Any:
     others = (tifffile.TIFF.FILE_FLAGS - {*_KINDS}) | {*without}
     flags: dict[str, Any] = {f"is_{kind}": False for kind in others}
     return tifffile.TiffFile(path, _multifile=False, **flags)
-
-
-def _frames_in(series: Any) -> int:
-    """Return the number of pictures in a series."""
-    return int(series.size) // max(1, int(series.keyframe.size))
 
 
 def _write(
@@ -391,22 +428,6 @@ def _table(name: str, page: Any) -> ColourTable:
     """Return the colour table of a page."""
     colours = (np.asarray(page.colormap).T >> 8).astype(np.uint8)  # of 16 bits
     return ColourTable(name, colours, np.dtype(f"u{page.bitspersample // 8}"))
-
-
-def _pixel_size(file: Any) -> str:
-    """Return the pixel size in the metadata of ImageJ or OME, as text."""
-    if file.is_ome and file.ome_metadata:
-        pixel_sizes = re.findall('PhysicalSize([XY])="([0-9.eE+-]{1,20})"', file.ome_metadata)
-        sizes, unit = dict(pixel_sizes), re.search('PhysicalSizeXUnit="([^"]{1,9})"', file.ome_metadata)
-        if {"X", "Y"} <= sizes.keys():
-            return f"{sizes['X']} x {sizes['Y']} {unit[1] if unit else 'µm'}"
-    if file.is_imagej and file.imagej_metadata:
-        name = str(file.imagej_metadata.get("unit", ""))
-        tags = [file.pages.first.tags.get(code) for code in (282, 283)]
-        if name not in ("", "pixel", "pixels") and all(tag is not None and tag.value[0] for tag in tags):
-            x, y = (tag.value[1] / tag.value[0] for tag in tags)
-            return f"{x:.4g} x {y:.4g} {'µm' if name in _MICROMETRE else name}"
-    return ""
 
 
 @contextmanager

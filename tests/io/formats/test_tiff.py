@@ -368,3 +368,132 @@ def test_no_other_file_is_opened(tmp_path):
 def test_a_stack_is_described_without_positions(tmp_path):
     facts = describe(write(tmp_path / "a.tif", stack(5), imagej=True, truncate=True))
     assert facts["frames"] == "5 of 9 x 7, uint16"
+
+
+def ome(planes="<TiffData/>", **sizes):
+    """Return a description as OME has it, of pages of `SHAPE`."""
+    stated = {"SizeX": SHAPE[1], "SizeY": SHAPE[0], "SizeC": 1, "SizeZ": 1, "SizeT": 1} | sizes
+    text = " ".join(f'{name}="{value}"' for name, value in stated.items())
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>'
+        '<OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06"><Image ID="Image:0">'
+        f'<Pixels ID="Pixels:0" DimensionOrder="XYCZT" Type="uint16" {text}>'
+        f'<Channel ID="Channel:0:0" SamplesPerPixel="1"/>{planes}</Pixels></Image></OME>'
+    )
+
+
+def imagej(images, **axes):
+    return "\n".join(["ImageJ=1.53k", f"images={images}", *(f"{name}={n}" for name, n in axes.items()), ""])
+
+
+def stated(count):
+    """Return descriptions of other programs that state a number of pages."""
+    shape = ", ".join(map(str, (count, *SHAPE)))
+    return {
+        "ImageJ": imagej(count, frames=count),
+        "ImageJ, slices": imagej(count, slices=count),
+        "OME": ome(SizeT=count),
+        "OME, planes": ome(f'<TiffData IFD="0" PlaneCount="{count}"/>', SizeZ=count),
+        "tifffile": f'{{"shape": [{shape}]}}',
+    }
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "zlib"}, {"contiguous": False}], ids=str)
+@pytest.mark.parametrize("program", stated(1))
+def test_more_pages_than_the_metadata_state_are_read_with_a_warning(tmp_path, program, options):
+    path = tmp_path / "a.ome.tif"
+    write(path, stack(8), description=stated(5)[program], **PLAIN, **options)
+    actual, source = frames_of(path)
+    np.testing.assert_array_equal(actual, stack(8))
+    if program != "tifffile":  # whose reader ignores such a description
+        ((kind, text, warning),) = [(part.kind, part.text, part.warning) for part in source.findings]
+        assert (kind, warning) == ("number of pages", True)
+        assert "state 5 pictures, and it contains 8: all are read" in text
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "zlib"}], ids=str)
+@pytest.mark.parametrize("program", stated(1))
+def test_fewer_pages_than_the_metadata_state_are_read_with_a_warning(tmp_path, program, options):
+    path = write(tmp_path / "a.ome.tif", stack(8), description=stated(12)[program], **PLAIN, **options)
+    actual, source = frames_of(path)
+    np.testing.assert_array_equal(actual, stack(8))
+    ((text, warning),) = [(part.text, part.warning) for part in source.findings]
+    assert warning
+    assert "state 12 pictures, and it contains 8: these are read" in text
+    assert source.travel.tolist() == pytest.approx([0.1 * number for number in range(8)])
+
+
+@pytest.mark.parametrize("count", [5, 12])
+def test_sizes_that_disagree_among_themselves_do_not_hide_pages(tmp_path, count):
+    path = write(tmp_path / "a.tif", stack(8), description=imagej(8, frames=count), **PLAIN)
+    np.testing.assert_array_equal(frames_of(path)[0], stack(8))
+
+
+@pytest.mark.parametrize(
+    "description", [imagej(12, frames=6, channels=2), ome(SizeT=6, SizeC=2)], ids=["ImageJ", "OME"]
+)
+def test_pages_of_several_channels_that_are_not_all_there_are_refused(tmp_path, description):
+    path = write(tmp_path / "a.ome.tif", stack(8), description=description, **PLAIN)
+    with pytest.raises(
+        InputError, match=r"state 12 pictures, and it contains 8: their order along the axes T, C"
+    ):
+        opened(path)
+
+
+def test_pictures_in_one_piece_that_is_too_short_are_counted(tmp_path):
+    path = write(tmp_path / "a.tif", stack(20), imagej=True, truncate=True, metadata={"axes": "TYX"})
+    path.write_bytes(path.read_bytes()[: -5 * stack(1).nbytes])
+    with pytest.raises(
+        InputError, match=r"cut off \(20 pictures are stated, and 1[45] are present\): copy it again"
+    ):
+        opened(path)
+
+
+def test_planes_that_were_never_written_are_lost_frames(tmp_path):
+    planes = [number for number in range(8) if number not in (3, 4)]
+    listed = "".join(f'<TiffData IFD="{k}" FirstT="{n}" PlaneCount="1"/>' for k, n in enumerate(planes))
+    path = write(tmp_path / "a.ome.tif", stack(8)[planes], description=ome(listed, SizeT=9), **PLAIN)
+    with opened(path) as source:
+        actual = [source.frame(number) for number in range(6)]
+    np.testing.assert_array_equal(actual, stack(8)[planes])
+    assert source.travel.tolist() == pytest.approx([0.1 * number for number in planes])
+    assert {part.kind for part in source.findings} == {"number of pages", "lost frames"}
+
+
+def test_one_file_of_several_is_reported_as_a_part(tmp_path):
+    listed = "".join(
+        f'<TiffData IFD="{n % 4}" FirstT="{n}" PlaneCount="1">'
+        f'<UUID FileName="{name}.ome.tif">urn:uuid:{name}</UUID></TiffData>'
+        for n in range(8)
+        for name in ["ab"[n // 4]]
+    )
+    for part, name in zip((stack(8)[:4], stack(8)[4:]), "ab", strict=True):
+        write(tmp_path / f"{name}.ome.tif", part, description=ome(listed, SizeT=8), **PLAIN)
+    actual, source = frames_of(tmp_path / "a.ome.tif")
+    np.testing.assert_array_equal(actual, stack(8)[:4])
+    ((text, warning),) = [(part.text, part.warning) for part in source.findings]
+    assert warning
+    assert "state 8 pictures, and it contains 4; others are in b.ome.tif" in text
+
+
+@pytest.mark.parametrize(
+    ("sizes", "axis"), [({"SizeT": 4}, "C"), ({"SizeT": 8}, "C"), ({"SizeC": 2, "SizeT": 3}, "T")], ids=str
+)
+def test_planes_beyond_the_stated_size_are_refused(tmp_path, sizes, axis):
+    planes = "".join(
+        f'<TiffData IFD="{n}" FirstC="{n % 2}" FirstT="{n // 2}" PlaneCount="1"/>' for n in range(8)
+    )
+    path = write(tmp_path / "a.ome.tif", stack(8), description=ome(planes, **sizes), **PLAIN)
+    with pytest.raises(
+        InputError, match=rf"of the 8 planes .* have a {axis} beyond the size, such as First{axis}="
+    ):
+        opened(path)
+
+
+def test_a_stack_with_a_thumbnail_is_read_without_it(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.ome.tif") as file:
+        file.write(stack(5), photometric="minisblack", description=ome(SizeT=5), **PLAIN)
+        file.write(stack(1)[0, :3, :4], photometric="minisblack", **PLAIN)
+    actual, source = frames_of(tmp_path / "a.ome.tif")
+    np.testing.assert_array_equal(actual, stack(5))
+    assert source.findings == ()
