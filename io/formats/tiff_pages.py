@@ -149,9 +149,9 @@ def compare_pages(described: Described, present: int, path: Path) -> Finding | N
             " the pictures that there are"
         )
     if present > described.frames:
-        return Finding("number of pages", f"{stated}: all are read, in their order")
+        return Finding("number of frames", f"{stated}: all are read, in their order")
     remedy = "join the files" if others else "if that is too few, copy or record it again"
-    return Finding("number of pages", f"{stated}: these are read; {remedy}")
+    return Finding("number of frames", f"{stated}: these are read; {remedy}")
 
 
 def pixel_size(file: Any) -> str:

@@ -407,7 +407,7 @@ def test_more_pages_than_the_metadata_state_are_read_with_a_warning(tmp_path, pr
     np.testing.assert_array_equal(actual, stack(8))
     if program != "tifffile":  # whose reader ignores such a description
         ((kind, text, warning),) = [(part.kind, part.text, part.warning) for part in source.findings]
-        assert (kind, warning) == ("number of pages", True)
+        assert (kind, warning) == ("number of frames", True)
         assert "state 5 pictures, and it contains 8: all are read" in text
 
 
@@ -457,7 +457,7 @@ def test_planes_that_were_never_written_are_lost_frames(tmp_path):
         actual = [source.frame(number) for number in range(6)]
     np.testing.assert_array_equal(actual, stack(8)[planes])
     assert source.travel.tolist() == pytest.approx([0.1 * number for number in planes])
-    assert {part.kind for part in source.findings} == {"number of pages", "lost frames"}
+    assert {part.kind for part in source.findings} == {"number of frames", "lost frames"}
 
 
 def test_one_file_of_several_is_reported_as_a_part(tmp_path):
