@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
-from mirrorskin.cli.stack import read_travel
+from mirrorskin.cli.stack import read_phases, read_travel
 from mirrorskin.cli.table import read_table, unit_of
 from mirrorskin.io import InputError
 
@@ -86,6 +88,71 @@ def test_what_does_not_state_one_travel_of_each_frame_is_refused(tmp_path, text,
     with pytest.raises(InputError) as caught:
         read(tmp_path, text)
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "frame,travel,unit\n0,0,um\n1,50,um\n2,0.1,mm",
+        "frame;Unit;travel\n0;\u00b5m;0\n1;\u00b5m;50\n2;\u00b5m;100",
+        "frame,travel,travel unit,force,force unit\n0,0,um,1,N\n1,50,um,2,N\n2,100,um,3,N",
+        "# travel in um\nframe,travel\n0,0\n1,50\n2,100",
+        "# units: um\ntravel\n0\n50\n100",
+        "# All lengths are in micrometers.\n# of the stage\nframe,travel\n0,0\n1,50\n2,100",
+        "# time in ms, travel in um, pixel size in nm\nframe,travel\n0,0\n1,50\n2,100",
+        "# through the lens of 5 mm\n# Unit = um\ntravel\n0\n50\n100",
+        "# lens of 5 mm, 0.3 um pixels\nframe,travel\n0,0\n1,0.05\n2,0.1",
+        "# pixel size in um\nframe,travel [mm]\n0,0\n1,0.05\n2,0.1",
+        "# pixel size in um\nframe,travel\n0,0mm\n1,50um\n2,0.1mm",
+        "Position log\nUnits: um\nframe\ttravel\n0\t0\n1\t50\n2\t100",
+        "frame,travel\n-,um\n0,0\n1,50\n2,100",
+        "frame\ttravel\n[]\t[um]\n0\t0\n1\t50\n2\t100",
+        "travel\num\n0\n50\n100",
+        "travel in micrometers\n0\n50\n100",
+        "Travel (in \u00b5m)\n0\n50\n100",
+        "travel_micrometres\n0\n50\n100",
+        "frame,travel in um from contact\n0,0\n1,50\n2,100",
+        "travel (um, relative)\n0\n50\n100",
+    ],
+)
+def test_a_unit_that_is_stated_elsewhere_is_obeyed(tmp_path, text):
+    assert read(tmp_path, text) == pytest.approx(TRAVEL, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "frame,travel [mm],unit\n0,0,um\n1,50,um",
+            "states several units, 'mm' ('travel [mm]') and 'um' ('um')",
+        ),
+        ("frame,travel [mm]\n-,um\n0,0\n1,50", "states several units, 'mm' ('travel [mm]') and 'um' ('um')"),
+        (
+            "frame,travel,unit\n0,0,um\n1,50,steps",
+            "line 3: states the unit 'steps': steps is not a known unit",
+        ),
+        ("frame,travel,unit\n0,0,s\n1,50,s", "line 2: states the unit 's': seconds are not a length"),
+        ("travel in degrees\n0\n1", "states the unit 'degrees': degrees are not a length"),
+        (
+            "# pixel size in um\nframe,travel\n0,0\n1,50",
+            "'pixel size in um' states the unit 'um', but not of which numbers: write travel [um] or",
+        ),
+        ("# lengths in um\n# positions in mm\ntravel\n0\n50", "states several units, 'um'"),
+    ],
+)
+def test_units_that_contradict_each_other_or_may_be_of_others_are_refused(tmp_path, text, message):
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, text)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["# phases in degrees\nframe,phase\n0,0\n1,90", "phase\ndeg\n0\n90", "phase in degrees\n0\n90"]
+)
+def test_the_unit_of_phases_is_stated_elsewhere_too(tmp_path, text):
+    path = tmp_path / "phases.csv"
+    path.write_text(text)
+    assert read_phases(path).values == pytest.approx((0.0, math.pi / 2))
 
 
 @pytest.mark.parametrize("encoding", ["latin-1", "cp1252", "utf-16-be", "mac-roman"])

@@ -85,14 +85,16 @@ def _table(path: Path) -> dict[str, float]:
     from mirrorskin.io.base.text import shortened
 
     read = table.read_table(path, _REMEDY)
-    unit = table.unit_of(read.heading[1], "force", str(path)) if len(read.heading) == 2 else ""
+    has_units = read.columns == len(read.heading) == 3 and "unit" in read.heading[2].lower()
+    column = 1 if read.columns > 1 else 0
+    units = table.row_units(path, read, column, "force", {"force", "load", "weight", "reading"}, "N")
     forces = {}
-    for row in read.rows:
+    for row, unit in zip(read.rows, units, strict=True):
         line = shortened(",".join(row.cells))
-        if len(row.cells) != 2:
+        if len(row.cells) != 2 + has_units:
             raise InputError(f"{row.where} {line!r} is not a recording and a force: {_REMEDY}")
-        name, text = row.cells
-        forces[Path(name).name] = force(text if text[-1:].isalpha() else f"{text}{unit or 'N'}", row.where)
+        name, text = row.cells[:2]
+        forces[Path(name).name] = force(text if text[-1:].isalpha() else f"{text}{unit}", row.where)
     return forces
 
 

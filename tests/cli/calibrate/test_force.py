@@ -45,6 +45,19 @@ def here(folder, tmp_path):
     io.save_calibration(io.Calibration(camera, gel=GEL), "cal.h5")
 
 
+def test_the_unit_of_the_scale_is_stated_elsewhere_too(folder):
+    presses = [f"press-{number}.h5" for number in range(3)]
+    for name, text in {
+        "column.csv": "recording,force,unit\n"
+        + "".join(f"{press},{1000 * force},mN\n" for press, force in zip(presses, folder[1], strict=True)),
+        "remark.csv": "# forces in mN\nrecording,force\n"
+        + "".join(f"{press},{1000 * force}\n" for press, force in zip(presses, folder[1], strict=True)),
+    }.items():
+        Path(name).write_text(text)
+        done("calibrate force", *presses, "--readings", name, "-o", "cal.h5")
+        assert io.open_calibration("cal.h5").stiffness.modulus == pytest.approx(MODULUS, rel=0.03)
+
+
 def test_presses_and_a_scale_become_a_modulus_that_reconstruct_uses(folder):
     presses = [f"press-{number}.h5" for number in range(3)]
     ended = done("calibrate force", *presses, "--readings", "scale.csv", "-o", "cal.h5")
