@@ -9,6 +9,7 @@ SHELL := /bin/sh
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$python" && break; done)
 PACKAGES := $(patsubst %/__init__.py,%,$(wildcard */__init__.py))
+MODULES := $(filter-out setup.py,$(wildcard *.py)) py.typed $(PACKAGES)
 BIN := .venv/bin
 DEMO := .venv/.demo
 READY := .venv/.ready
@@ -20,6 +21,12 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 COMPILE := $(if $(PYTHONDONTWRITEBYTECODE),--compile,--no-compile)
 INSTALL := PYTHONWARNINGS=ignore $(PIP) install $(COMPILE) --editable
 LOWEST := build/lowest
+# mypy and editors do not follow an editable install; they do follow links.
+define LINK
+site=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+mkdir -p "$$site/mirrorskin"
+for name in $(MODULES); do ln -sfn "$$PWD/$$name" "$$site/mirrorskin/$$name"; done
+endef
 
 demo: $(DEMO)
 	@$(BIN)/mirrorskin demo -o demo --overwrite
@@ -99,7 +106,8 @@ lint: $(READY)
 
 # From tests: at the top, mypy takes our io for the standard library's.
 types: $(READY)
-	@cd tests
+	@$(LINK)
+	cd tests
 	../$(BIN)/mypy --strict --no-error-summary --config-file ../pyproject.toml $(PACKAGES:%=-p mirrorskin.%)
 
 # Damaged files and replies, MINUTES of them; what is neither read nor refused in one line is kept.
@@ -177,10 +185,7 @@ $(DEMO): pyproject.toml
 $(READY): $(DEMO)
 	@echo 'adding to .venv what tests and checks need (once, a minute or two)'
 	$(INSTALL) '.[dev]'
-	# mypy and editors do not follow an editable install; they do follow links.
-	site=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
-	mkdir -p "$$site/mirrorskin"
-	for name in __init__.py py.typed $(PACKAGES); do ln -sfn "$$PWD/$$name" "$$site/mirrorskin/$$name"; done
+	$(LINK)
 	touch $@
 
 # What only some need comes with the first of them.

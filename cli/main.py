@@ -74,6 +74,7 @@ def _common(
     from mirrorskin.cli.output import printable
 
     _check_address_space()
+    _limit_threads()
     _OneLine.debug = debug
     handler = logging.StreamHandler()
     handler.setFormatter(_Formatter("%(message)s"))
@@ -96,6 +97,14 @@ class _Formatter(logging.Formatter):
         from mirrorskin.cli.output import printable
 
         return printable(super().formatMessage(record))
+
+
+def _limit_threads() -> None:
+    """Let PoCL use the processors that this process may use, rather than all of the machine."""
+    from mirrorskin.processors import POCL_THREADS, usable_cores
+
+    if (cores := usable_cores()) < (os.cpu_count() or 1):
+        os.environ.setdefault(POCL_THREADS, str(cores))
 
 
 def _check_address_space() -> None:

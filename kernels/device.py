@@ -733,7 +733,7 @@ def _describe(device: cl.Device) -> DeviceInfo:
         max_allocation=device.max_mem_alloc_size,
         shares_memory=bool(device.host_unified_memory),
         float64="cl_khr_fp64" in device.extensions,
-        note=embedded.note(device.driver_version) if _is_pocl(device) else "",
+        note=embedded.note(device.driver_version, device.max_compute_units) if _is_pocl(device) else "",
     )
 
 

@@ -29,6 +29,7 @@ import pyopencl as cl
 from mirrorskin.kernels.disk_cache import keep, recall
 from mirrorskin.kernels.errors import DeviceError
 from mirrorskin.kernels.processor_name import NAME_FUNCTION, PATCHABLE, VARIABLE, ensure_name, look_up
+from mirrorskin.processors import POCL_THREADS, usable_cores
 
 _log = logging.getLogger("mirrorskin.kernels")
 
@@ -72,7 +73,7 @@ def prepare() -> None:
 def compiler() -> object:
     """Return the processor and settings on which PoCL's programs depend, once prepared."""
     settings = [item for item in os.environ.items() if item[0].startswith("POCL_")]
-    return _processor, sorted(item for item in settings if item[0] != "POCL_CACHE_DIR")
+    return _processor, sorted(item for item in settings if item[0] not in ("POCL_CACHE_DIR", POCL_THREADS))
 
 
 def vector_width(device: cl.Device) -> int:
@@ -83,11 +84,18 @@ def vector_width(device: cl.Device) -> int:
     return min(width, 8)
 
 
-def note(driver: str) -> str:
-    """Return a note for users of the embedded device, from the driver's version; mostly empty."""
-    if not (_patched and driver.startswith(PATCHABLE)):
-        return ""
-    return f"compiles for {_processor}: its function {NAME_FUNCTION} is patched in memory"
+def note(driver: str, threads: int = 1) -> str:
+    """Return a note for users of the embedded device, from the driver's version and threads; mostly empty."""
+    notes = []
+    if threads > (cores := usable_cores()):
+        allowed = f"{cores} processor{'s' if cores > 1 else ''}"
+        notes.append(
+            f"has {threads} threads, and this process may use {allowed}: set {POCL_THREADS}={cores} before"
+            " the first use of OpenCL"
+        )
+    if _patched and driver.startswith(PATCHABLE):
+        notes.append(f"compiles for {_processor}: its function {NAME_FUNCTION} is patched in memory")
+    return "; ".join(notes)
 
 
 @functools.cache
@@ -156,11 +164,9 @@ def _shows_pocl() -> bool:
 
 def _check_threads() -> None:
     """Raise DeviceError for a number of threads with which PoCL would end the process."""
-    threads = os.environ.get("POCL_MAX_PTHREAD_COUNT", "1")
+    threads = os.environ.get(POCL_THREADS, "1")
     if not threads.isdecimal() or int(threads) < 1:
-        raise DeviceError(
-            f"POCL_MAX_PTHREAD_COUNT is {threads!r}: a whole number above 0 is needed; unset it"
-        )
+        raise DeviceError(f"{POCL_THREADS} is {threads!r}: a whole number above 0 is needed; unset it")
 
 
 def _named_in(list_: Path) -> str:

@@ -21,7 +21,7 @@ _PACKAGES = "numpy", "scipy", "h5py", "hdf5plugin", "opencv-contrib-python-headl
 
 def command(as_json: options.Json = False) -> None:
     """Show the device, versions, extras and caches of this installation, for reports of faults."""
-    from mirrorskin.io.base.system import usable_cores
+    from mirrorskin.processors import usable_cores
 
     facts = {
         "mirrorskin": metadata.version("mirrorskin"),

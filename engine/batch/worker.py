@@ -18,9 +18,9 @@ from distributed import WorkerPlugin, get_worker
 
 from mirrorskin.engine.batch.jobs import Job, Plan
 from mirrorskin.engine.batch.work import Outcome, keep_memory, run_job
-from mirrorskin.io.base.system import usable_cores
 from mirrorskin.kernels.device import Device, list_devices, open_device
 from mirrorskin.kernels.errors import DeviceError
+from mirrorskin.processors import POCL_THREADS, usable_cores
 
 RESOURCE = "mirrorskin"
 """Dask resource: an enlisted worker has one and each job needs one, so that a worker runs one job at a time.
@@ -93,7 +93,8 @@ def take_share(workers: int) -> Share:
     number, held = _take_number()
     cores = usable_cores()
     threads = max(1, cores // workers + (number < cores % workers))
-    os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", str(threads))
+    if os.environ.get(POCL_THREADS, str(cores)) == str(cores):  # the command line states those of all workers
+        os.environ[POCL_THREADS] = str(threads)
     gpus = [str(index) for index, device in enumerate(list_devices()) if device.kind == "gpu"]
     choice = None if "PYOPENCL_CTX" in os.environ or not gpus else gpus[number % len(gpus)]
     return Share(open_device(choice), threads, held)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.samples import Reader
 from mirrorskin.io.base.selection import Span
-from mirrorskin.io.base.system import usable_cores
 from mirrorskin.io.base.types import InputError
+from mirrorskin.processors import usable_cores
 
 try:  # eight times as fast as zlib, and the same numbers
     from isal.isal_zlib import crc32 as crc32

@@ -138,13 +138,6 @@ class _HasDescriptor(Protocol):
     def fileno(self) -> int: ...
 
 
-def usable_cores() -> int:
-    """Return the number of processor cores that this process may use."""
-    if sys.platform == "linux":
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def check_writable_system() -> None:
     """Raise InputError on a system where files cannot be written safely."""
     if sys.platform == "win32":

@@ -25,11 +25,12 @@ from numpy.typing import NDArray
 from mirrorskin.io.base.checksums import Verifier
 from mirrorskin.io.base.samples import DecodedFrames, Decoding, Reader
 from mirrorskin.io.base.selection import FrameLabel, Region, Span
-from mirrorskin.io.base.system import reserve_space, translate_os_errors, usable_cores
+from mirrorskin.io.base.system import reserve_space, translate_os_errors
 from mirrorskin.io.base.types import Closing, InputError
 from mirrorskin.io.model.frames import FrameReader
 from mirrorskin.io.storage.chunks import Chunks, find_codecs
 from mirrorskin.io.storage.zarr import ZarrFrames
+from mirrorskin.processors import usable_cores
 
 _log = logging.getLogger("mirrorskin.io")
 

@@ -16,8 +16,9 @@ import msgspec
 import numpy as np
 
 from mirrorskin.io import InputError
-from mirrorskin.io.base.system import read_text, usable_cores
+from mirrorskin.io.base.system import read_text
 from mirrorskin.kernels.device import Device
+from mirrorskin.processors import usable_cores
 
 THREADS = usable_cores()
 

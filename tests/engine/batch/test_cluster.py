@@ -291,7 +291,7 @@ def test_the_cores_of_a_machine_are_divided(workers, expected, machine, monkeypa
     machine("cpu")
     shares = []
     for _ in range(workers):
-        monkeypatch.delenv("POCL_MAX_PTHREAD_COUNT", raising=False)
+        monkeypatch.setenv("POCL_MAX_PTHREAD_COUNT", "7")  # by the command line that starts them
         shares.append(worker.take_share(workers))
         assert os.environ["POCL_MAX_PTHREAD_COUNT"] == str(shares[-1].cores)
     assert [part.cores for part in shares] == expected
