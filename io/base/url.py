@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import suppress
 from pathlib import Path, PosixPath
 
 ZARR_SUFFIX = ".zarr"
+_ROOTS = ("zarr.json", ".zgroup", ".zarray")
 _SCHEME = re.compile("([a-z][a-z0-9+.-]+):/+")
 
 
@@ -49,6 +51,13 @@ def path_of(text: str | os.PathLike[str]) -> Path:
 
 
 def is_zarr(path: str | Path) -> bool:
-    """Return whether a path is a Zarr store: an address, ``NAME.zarr``, or a zipped ``NAME.zarr.zip``."""
+    """Return whether a path is a Zarr store: an address, ``NAME.zarr``, or a zipped ``NAME.zarr.zip``.
+
+    A folder of another name is one if it contains the document of a group or an array.
+    """
     local = path_of(path)
-    return isinstance(local, Url) or local.name.lower().endswith((ZARR_SUFFIX, f"{ZARR_SUFFIX}.zip"))
+    if isinstance(local, Url) or local.name.lower().endswith((ZARR_SUFFIX, f"{ZARR_SUFFIX}.zip")):
+        return True
+    with suppress(OSError):  # reported when it is opened
+        return any((local / name).is_file() for name in _ROOTS)
+    return False

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.base.arguments import as_array, as_pixel_size, unknown_argument
+from mirrorskin.io.base.content import identified
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.samples import DecodedFrames, Decoding
 from mirrorskin.io.base.selection import Region
@@ -246,6 +247,9 @@ def _errors_named(path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # a damaged header is parsed as Python, which raises errors of many types
         text = " ".join(str(error).split())
+        kind = identified(path) if path.is_file() else ""
+        if kind and (path.suffix.lower() == ".npy" or not zipfile.is_zipfile(path)):
+            raise InputError(f"{path} is not a NumPy array, but {kind}") from error
         raise InputError(
             f"{path} is not a NumPy array of numbers ({text}): write it with numpy.save"
         ) from error

@@ -29,7 +29,7 @@ from mirrorskin.io.base.types import (
 )
 from mirrorskin.io.base.url import path_of
 from mirrorskin.io.files.recording import Recording, cut_out
-from mirrorskin.io.formats.registry import format_of_frames, holds_arrays
+from mirrorskin.io.formats.registry import format_of_frames, formats_listed, holds_arrays
 from mirrorskin.io.model.coordinates import Coordinates, read_coordinates
 from mirrorskin.io.model.positions import Positions, along
 from mirrorskin.io.storage.hdf5 import Hdf5File
@@ -154,7 +154,8 @@ def open_recording(
             verify,
         )
     with ExitStack() as opening:
-        file = opening.enter_context(open_file(path, memory_limit))
+        with formats_listed():
+            file = opening.enter_context(open_file(path, memory_limit))
         ours = file.marked(MARK)
         file.check_layout(MARK)
         stack, state, decoding = _find_stack(file, dataset, ours)

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.opencv import to_grey
+from mirrorskin.io.base.text import shortened
 from mirrorskin.io.base.types import InputError
 from mirrorskin.io.formats.pictures import PICTURE_SUFFIXES, decode_picture
-from mirrorskin.io.formats.registry import Format
+from mirrorskin.io.formats.registry import Format, has_frames
 from mirrorskin.io.model.frames import WholeFrames, lost_frames
 
 PICTURES = Format(
@@ -86,6 +87,11 @@ def _find_sequence(folder: Path) -> tuple[NDArray[np.int64], tuple[Path, ...], t
         decimals = _longest(_families(pictures, f"{_DECIMAL}|{_WHOLE}"))
         rivals = decimals if len(decimals) == 1 else rivals
     if not rivals:
+        if stacks := [file.name for file in sorted(folder.iterdir()) if has_frames(file)]:
+            names = shortened(", ".join(stacks), 100)
+            raise InputError(
+                f"{folder} is a folder without numbered pictures, but with {names}: name the file"
+            )
         kinds = "PNG, TIFF, BMP, PGM or JPEG"
         raise InputError(
             f"{folder} is a folder without numbered pictures ({kinds}): name them frame1.png, frame2.png, ..."

@@ -8,6 +8,7 @@ import re
 import struct
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from io import BufferedReader
 from pathlib import Path
@@ -18,20 +19,35 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.base.arguments import check_path, checked
 from mirrorskin.io.base.checksums import REMEDY, crc32
+from mirrorskin.io.base.content import CONVERT_BAG, identified, packed_by
+from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.opencv import is_coloured, to_grey
-from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, check_unpacked, open_regular, translate_os_errors
+from mirrorskin.io.base.system import (
+    MAX_UNPACKED_BYTES,
+    check_unpacked,
+    open_regular,
+    read_text,
+    translate_os_errors,
+)
 from mirrorskin.io.base.text import one_line
 from mirrorskin.io.base.types import MOTIONS, PROPERTIES, Block, Closing, Floats, Header, InputError
 from mirrorskin.io.formats.pictures import Picture, decode_bytes
-from mirrorskin.io.formats.registry import Format
+from mirrorskin.io.formats.registry import Format, marks_folder
 from mirrorskin.io.formats.surface import check_heights, points_of
-from mirrorskin.io.model.frames import CONVERTED_COLOUR, WholeFrames, lost_frames
+from mirrorskin.io.model.frames import (
+    CONVERTED_COLOUR,
+    FrameReader,
+    JoinedFrames,
+    WholeFrames,
+    lost_frames,
+    part_of_several,
+)
 from mirrorskin.io.model.result import Result
 from mirrorskin.io.storage.atomic import MAKE_ROOM, new_file
 from mirrorskin.io.storage.existing import SURFACE_TOPIC
 
 if TYPE_CHECKING:
-    from mcap.records import Chunk, ChunkIndex, Message
+    from mcap.records import Channel, Chunk, ChunkIndex, Message
     from mcap_ros2.writer import Writer
 
     from mirrorskin.io.files.recording import Recording
@@ -40,7 +56,8 @@ MCAP = Format(
     name="MCAP",
     suffixes=(".mcap",),
     source="MCAP",
-    reader="MessageFrames",
+    reader="open_messages",
+    folder_mark=("metadata.yaml", b"rosbag2_bagfile_information"),
     takes=("dataset", "channel", "verify"),
     content="ROS 2 messages",
     encoder="save_messages",
@@ -81,6 +98,8 @@ _INSTALL = "MCAP needs packages that are not installed: pip install 'mirrorskin[
 
 _NUMBERS = ("tilt", "press", *PROPERTIES)  # numbers of a recording, in the metadata
 _NOTES, _MOST_NOTES = "mirrorskin", 8  # name of the metadata; maximum number of its records to read
+# The names in the list of a bag's metadata, of YAML; its other entries have another form.
+_BAG_FILES = re.compile(r"^ *relative_file_paths:[ \t]*\n((?: *- *[^\n:]+\n?)+)", re.MULTILINE)
 _NUMERAL = re.compile(r"[-+]?[0-9]+\.?[0-9]*(?:[eE][-+]?[0-9]+)?")
 _QUOTED_MAX = 100  # characters quoted of an error message of a package
 _COPIES = 6  # of a chunk with one image that exist at the same time: packed, unpacked, message, image, frame
@@ -367,6 +386,42 @@ def _stamp(text: str) -> int:
     return 0
 
 
+def open_messages(
+    path: Path, dataset: str | None = None, channel: int | None = None, verify: bool = True
+) -> FrameReader:
+    """Open the images of one topic of a ROS 2 MCAP file, or of all files of a bag's folder.
+
+    A file that is one of several in a bag has a finding.
+    """
+    if not path.is_dir():
+        frames = MessageFrames(path, dataset, channel, verify)
+        names = [file.name for file in _files_of_bag(path.parent)] if marks_folder(MCAP, path.parent) else []
+        if len(names) > 1 and path.name in names:
+            frames.findings += (part_of_several(path.name, names, f"the folder {path.parent}"),)
+        return frames
+    files = _files_of_bag(path)
+    if not files:
+        others = sorted(file for file in path.iterdir() if file.is_file())
+        kind = next((f", but {text}" for file in others if (text := identified(file))), "")
+        raise InputError(f"{path} is the folder of a bag without .mcap{kind}")
+    if missing := next((file for file in files if not file.is_file()), None):
+        raise InputError(f"{missing} is missing, which the bag's metadata list: copy it there")
+    with ExitStack() as opening:
+        parts = [opening.enter_context(MessageFrames(file, dataset, channel, verify)) for file in files]
+        whole = parts[0] if len(parts) == 1 else JoinedFrames(parts)
+        opening.pop_all()  # the reader closes the files from now on
+    return whole
+
+
+def _files_of_bag(folder: Path) -> list[Path]:
+    """Return the MCAP files of a bag, in the order of its ``metadata.yaml``, or those that are there."""
+    text = read_text(folder / MCAP.folder_mark[0])
+    listed = _BAG_FILES.search(text)
+    names = [] if listed is None else [name.strip(" -'\"") for name in listed[1].split("\n")]
+    files = [folder / Path(name).name for name in names if name.lower().endswith(".mcap")]
+    return files or sorted(file for file in folder.glob("*.mcap") if file.is_file())
+
+
 class MessageFrames(WholeFrames):
     """The images of one topic of a ROS 2 MCAP file.
 
@@ -412,10 +467,17 @@ class MessageFrames(WholeFrames):
             ),
             None,
         )
+        self.start = int(stamps.times[order][0])
         self.lost = _lost(stamps.numbers[order])
         self.positions = dict(self._numbers(count))
         self.header = dict(self._properties(frame.shape))
         findings = [finding for finding in first.findings if channel is None or finding.kind != "colour"]
+        listed = sum(n for number, n in self._summary.counts.items() if self._is_of(number, self._topic))
+        if listed not in (0, count):
+            text = (
+                f"its index lists {listed} messages of {self._topic}, and it contains {count}: these are read"
+            )
+            findings.append(Finding("number of frames", text))
         self.findings = (*lost_frames(self.lost), *findings)
 
     def frames(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -449,6 +511,12 @@ class MessageFrames(WholeFrames):
             return next(iter(topics))
         if topic in topics:
             return str(topic)
+        if not topics and self._summary.others:
+            raise InputError(
+                f"{self._path} has messages of the encoding {', '.join(sorted(self._summary.others))}, and"
+                f" none of ROS 2 (cdr): convert a bag of ROS 1 with {CONVERT_BAG.format('NAME.bag')}, and"
+                " others to sensor_msgs/msg/Image"
+            )
         names = ", ".join(sorted(topics)) or "none"
         wrong = "name one with --dataset" if topic is None else f"{topic} is not one of them"
         raise InputError(f"{self._path}: its topics of images are {names}: {wrong}")
@@ -492,6 +560,12 @@ class MessageFrames(WholeFrames):
                     (record.log_time, record.sequence, _stamp_in(record.data))
                     for record in self._stored(topic)
                 ]
+                packed = packed_by(next(iter(self._stored(topic))).data) if stamps else ""
+            if packed:
+                raise InputError(
+                    f"{self._path}: each message is compressed by {packed}, which is not supported: convert"
+                    f" the bag with {CONVERT_BAG.format(self._path.parent)}"
+                )
             self._known[topic] = _Stamps(*np.array(stamps, np.uint64).reshape(-1, 3).T)
         return self._known[topic]
 
@@ -503,6 +577,11 @@ class MessageFrames(WholeFrames):
         decoders = {name: _decoder(name) for name in _MESSAGES}
         for message in stored:
             yield decoders[self._summary.channels[message.channel_id].kind](message.data)
+
+    def _is_of(self, number: int, topic: str) -> bool:
+        """Return whether a channel has messages of a topic that are read."""
+        channel = self._summary.channels.get(number)
+        return channel is not None and channel.topic == topic and bool(channel.kind)
 
     def _hold(self, topic: str) -> Iterator[Message]:
         """Yield all messages of a topic, if they fit into memory."""
@@ -517,11 +596,7 @@ class MessageFrames(WholeFrames):
         """Yield the messages of a topic in the order of storage."""
         from mcap.records import Chunk, Message
 
-        channels = {
-            number
-            for number, channel in self._summary.channels.items()
-            if channel.topic == topic and channel.kind
-        }
+        channels = {number for number in self._summary.channels if self._is_of(number, topic)}
         total = count = 0
         with open_regular(self._path) as file:
             limit = max(MAX_UNPACKED_BYTES, _MOST_PACKED * os.fstat(file.fileno()).st_size)
@@ -556,6 +631,8 @@ class MessageFrames(WholeFrames):
     def _index_start(self, file: BufferedReader) -> int:
         """Return where the index starts, from the end of a file with the first bytes of MCAP."""
         if file.read(len(_MAGIC)) != _MAGIC:
+            if kind := identified(self._path):
+                raise InputError(f"{self._path} is not an MCAP file, but {kind}")
             raise ValueError("its first bytes are not those of MCAP")
         file.seek(-_FOOTER.size, os.SEEK_END)
         code, _, start, *_ = _FOOTER.unpack(file.read(_FOOTER.size))
@@ -566,20 +643,21 @@ class MessageFrames(WholeFrames):
     def _read_summary(self) -> _Summary:
         """Read the channels and chunks from the file's index."""
         try:
-            from mcap.records import Channel, ChunkIndex, Metadata, MetadataIndex, Schema
+            from mcap.records import Channel, ChunkIndex, Metadata, MetadataIndex, Schema, Statistics
             from mcap.stream_reader import StreamReader
         except ImportError as error:
             raise InputError(_INSTALL) from error
         schemas: dict[int, str] = {}
-        summary, notes = _Summary({}, [], {}), list[int]()
+        summary, notes = _Summary({}, [], {}, {}, set()), list[int]()
         with self._errors_named(), open_regular(self._path) as file:
             file.seek(self._index_start(file))
             for record in StreamReader(file, skip_magic=True, emit_chunks=True).records:
                 if isinstance(record, Schema):
                     schemas[record.id] = record.name
-                elif isinstance(record, Channel) and record.message_encoding == "cdr":
-                    kind = schemas.get(record.schema_id, "")
-                    summary.channels[record.id] = _Channel(record.topic, kind if kind in _MESSAGES else "")
+                elif isinstance(record, Channel):
+                    summary.take_channel(record, schemas.get(record.schema_id, ""))
+                elif isinstance(record, Statistics):
+                    summary.counts.update(record.channel_message_counts)
                 elif isinstance(record, ChunkIndex):
                     summary.chunks.append(record)
                 elif isinstance(record, MetadataIndex) and record.name == _NOTES:
@@ -620,6 +698,15 @@ class _Summary(NamedTuple):
     channels: dict[int, _Channel]
     chunks: list[ChunkIndex]
     notes: dict[str, str]  # metadata of this program
+    counts: dict[int, int]  # messages of each channel, by the index
+    others: set[str]  # encodings of messages that are not read
+
+    def take_channel(self, channel: Channel, kind: str) -> None:
+        """Add a channel, whose messages are of a kind."""
+        if channel.message_encoding == "cdr":
+            self.channels[channel.id] = _Channel(channel.topic, kind if kind in _MESSAGES else "")
+        else:
+            self.others.add(one_line(channel.message_encoding))
 
 
 def _unpack(chunk: Chunk) -> bytes:

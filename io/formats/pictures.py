@@ -18,7 +18,7 @@ from mirrorskin.io.base.system import check_regular, read_regular
 from mirrorskin.io.base.types import FRAME_DTYPES, InputError
 from mirrorskin.io.formats.colour_table import ColourTable
 from mirrorskin.io.formats.registry import Format
-from mirrorskin.io.formats.tiff import TIFF, TiffFrames
+from mirrorskin.io.formats.tiff import TIFF, TIFF_MARKS, TiffFrames
 from mirrorskin.io.model.frames import CONVERTED_COLOUR, lossy
 from mirrorskin.io.storage.atomic import write_new
 
@@ -72,7 +72,10 @@ def decode_picture(path: Path, dtypes: Sequence[str] = _DTYPES) -> Picture:
     to 255; others are returned unchanged, whatever the number of bits in use.
     """
     if path.suffix.lower() not in TIFF.suffixes:
-        return decode_bytes(read_regular(path), str(path))
+        data = read_regular(path)
+        if data[:4] not in TIFF_MARKS:
+            return decode_bytes(data, str(path))
+        del data
     with TiffFrames(path, None, None, dtypes) as tiff:
         if tiff.shape[0] != 1:
             raise InputError(f"{path} contains several pages, and one is needed: save each page as a picture")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -30,6 +31,7 @@ FOLDER = "/"
 _HERE = Path(__file__).parent
 _OURS = (".h5", ".hdf5", ".nxs", ".mat", ".zarr", "")  # for which no package is asked
 _NUMPY = (".npy", ".npz")
+_MARK_BYTES = 4096  # bytes of a file in which a mark is looked for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +49,9 @@ class Format:
     reader : str
         Name of the class that reads its frames, a `FrameReader`, in the module of the declaration. Its
         arguments are the path, and by name those of ``takes``.
+    folder_mark : (str, bytes)
+        Name of a file that shows that a folder is of this format, and a text at its start; ("", b"") if no
+        folder is.
     has_positions : bool
         Whether files may contain positions or times of the frames.
     takes : tuple of str
@@ -81,6 +86,7 @@ class Format:
     suffixes: tuple[str, ...]
     source: str = ""
     reader: str = ""
+    folder_mark: tuple[str, bytes] = ("", b"")
     has_positions: bool = True
     takes: tuple[str, ...] = ()
     content: str = ""
@@ -135,16 +141,37 @@ def format_of_frames(path: Path) -> Format | None:
     """Return the format of a path with frames of another program; None for HDF5, Zarr and arrays."""
     if is_zarr(path):
         return None
-    try:
-        suffix = FOLDER if path.is_dir() else path.suffix.lower()
-    except OSError:  # reported when it is opened
-        suffix = path.suffix.lower()
+    suffix = path.suffix.lower()
+    with suppress(OSError):  # reported when it is opened
+        if path.is_dir():
+            suffix = FOLDER
+            if form := next((form for form in _built_in() if marks_folder(form, path)), None):
+                return form
     return None if suffix in _NUMPY else _named(suffix, "reader")
+
+
+def marks_folder(form: Format, folder: Path) -> bool:
+    """Return whether a folder contains the file that shows that it is of a format."""
+    name, text = form.folder_mark
+    if not name or not (folder / name).is_file():
+        return False
+    with (folder / name).open("rb") as file:
+        return text in file.read(_MARK_BYTES)
 
 
 def holds_arrays(path: Path) -> bool:
     """Return whether a path is a file of NumPy."""
     return not is_zarr(path) and path.suffix.lower() in _NUMPY and not path.is_dir()
+
+
+def has_frames(path: Path) -> bool:
+    """Return whether a file may contain a stack of frames, by its suffix."""
+    form = format_of_frames(path)
+    return (
+        is_zarr(path)
+        or holds_arrays(path)
+        or (form.source != "" if form else path.suffix.lower() in _OURS[:-1])
+    )
 
 
 def is_of_others(path: Path) -> bool:
@@ -168,6 +195,18 @@ def sources() -> str:
     others = sorted((form.source for form in formats(installed=False) if form.source), key=len)
     listed = ["HDF5", "Zarr", "NPY", "NPZ", *others]
     return ", ".join([*listed[:-1], f"or {listed[-1]}"])
+
+
+@contextmanager
+def formats_listed() -> Iterator[None]:
+    """Add the sources of frames to the error for a file of an unknown format."""
+    from mirrorskin.io.base.content import UnknownContentError
+    from mirrorskin.io.base.types import InputError
+
+    try:
+        yield
+    except UnknownContentError as error:
+        raise InputError(f"{error}; frames are read from {sources()}") from None
 
 
 def export_format(suffix: str) -> Format | None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.base.content import identified
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.opencv import check_picture, decode, is_coloured, to_grey
 from mirrorskin.io.base.system import check_regular, open_regular
@@ -38,7 +39,9 @@ TIFF = Format(
 
 _REMEDY = "copy it again, or save it again"
 _DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64")
-_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+"""First bytes of TIFF and BigTIFF."""
+
 _KINDS = ("frame", "imagej", "multipage", "ome", "shaped", "sis", "tiled", "uniform", "virtual")
 """Kinds of TIFF whose metadata are read; the metadata of others may name other files."""
 
@@ -166,7 +169,9 @@ class TiffFrames(WholeFrames):
 
     def _damaged(self, how: str = "") -> InputError:
         with open_regular(self._path) as unread:
-            is_tiff = unread.read(4) in _MARKS
+            is_tiff = unread.read(4) in TIFF_MARKS
+        if not is_tiff and (kind := identified(self._path)):
+            return InputError(f"{self._path} is not a TIFF, but {kind}")
         wrong = "is damaged or cut off" if is_tiff else "is not a TIFF"
         return InputError(f"{self._path} {wrong}{how}: {_REMEDY}")
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.base.content import identified
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.opencv import is_coloured, look_up, rows_of, to_grey
 from mirrorskin.io.base.selection import Span
@@ -48,6 +49,7 @@ VIDEO = Format(
         ".3gp",
         ".3g2",
         ".mj2",
+        ".y4m",
     ),
     source="a video (AVI, MP4, MOV, MKV)",
     reader="VideoFrames",
@@ -61,7 +63,7 @@ VIDEO = Format(
 # the file are read, and the frames that players omit are counted.
 _OPTIONS = {
     "protocol_whitelist": "file",
-    "format_whitelist": "avi,mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,mpeg,mpegts,asf,flv,ogg,nut",
+    "format_whitelist": "avi,mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,mpeg,mpegts,asf,flv,ogg,nut,yuv4mpegpipe",
 }
 _DECODER_FRAMES = 10  # frames that a decoder and its packets take at the same time, measured with H.264
 _CONVERTED_BYTES = 6  # bytes per pixel of the colours, luma and frame made of one
@@ -188,7 +190,9 @@ class VideoFrames(WholeFrames):
         return container, stream
 
     def _not_a_video(self) -> InputError:
-        return InputError(f"{self._path} cannot be opened as a video: it is damaged, cut off, or not a video")
+        kind = identified(self._path)
+        wrong = f"it is {kind}" if kind else "it is damaged, cut off, or not a video"
+        return InputError(f"{self._path} cannot be opened as a video: {wrong}")
 
     def _choose(self, container: InputContainer) -> VideoStream:
         """Return the requested stream of frames, or the only one."""

@@ -17,6 +17,9 @@ from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.selection import Span
 from mirrorskin.io.base.types import Closing, Floats, InputError
 
+LOST = "lost frames"
+"""Kind of the finding of `lost_frames`."""
+
 LOSSY = "lossy compression"
 """Kind of the finding of `lossy`."""
 
@@ -34,6 +37,8 @@ class FrameReader(Closing, ABC):
         How the frames are read, as text.
     time : ndarray, (T,), float64, or None
         Time stamps in seconds, relative to the first frame.
+    start : int or None
+        Time of the first frame in nanoseconds, of a clock that the parts of a recording share.
     lost : ndarray, (T,), int32, or None
         Frames lost before each frame.
     positions : mapping
@@ -55,6 +60,7 @@ class FrameReader(Closing, ABC):
     scratch_bytes: int = 0
     files: tuple[Path, ...] = ()
     time: Floats | None = None
+    start: int | None = None
     lost: NDArray[np.int32] | None = None
     positions: Mapping[str, Floats] = MappingProxyType({})
     header: Mapping[str, Any] = MappingProxyType({})
@@ -104,6 +110,72 @@ class WholeFrames(FrameReader):
                 del frame  # before the next frame is decoded
 
 
+class JoinedFrames(WholeFrames):
+    """The frames of several readers, one after the other, as of a recording that was written in parts.
+
+    Parameters
+    ----------
+    parts : sequence of WholeFrames
+        They have frames of the same size and type, and are closed with this object.
+    """
+
+    def __init__(self, parts: Sequence[WholeFrames]) -> None:
+        self._parts, first = parts, parts[0]
+        self._ends = np.cumsum([part.shape[0] for part in parts])
+        for part in parts:
+            if part.shape[1:] != first.shape[1:] or part.dtype != first.dtype:
+                raise InputError(
+                    f"{part.files[0]} has frames of {kind_of(part.shape[1:], part.dtype)}, but"
+                    f" {first.files[0]} of {kind_of(first.shape[1:], first.dtype)}: read them one by one"
+                )
+        self.shape, self.dtype = (int(self._ends[-1]), *first.shape[1:]), first.dtype
+        self.how, self.header = f"{first.how}, {len(parts)} parts", first.header
+        self.files = tuple(dict.fromkeys(file for part in parts for file in part.files))
+        self.time = _joined_times(parts)
+        self.positions = {
+            name: np.concatenate([part.positions[name] for part in parts])
+            for name in first.positions
+            if all(name in part.positions for part in parts)
+        }
+        lost = [np.zeros(part.shape[0], np.int32) if part.lost is None else part.lost for part in parts]
+        self.lost = None if all(part.lost is None for part in parts) else np.concatenate(lost)
+        found = dict.fromkeys(finding for part in parts for finding in part.findings)
+        self.findings = tuple(finding for finding in found if finding.kind != LOST)
+        self.findings += () if self.lost is None else lost_frames(self.lost)
+
+    def frames(self, start: int, stop: int) -> Iterator[tuple[str, NDArray[Any]]]:
+        """Decode frames of the parts that contain them."""
+        for part, end in zip(self._parts, self._ends.tolist(), strict=True):
+            first = end - part.shape[0]
+            if start < end and stop > first:
+                yield from part.frames(max(start, first) - first, min(stop, end) - first)
+
+    def close(self) -> None:
+        """Close all parts."""
+        for part in self._parts:
+            part.close()
+
+
+def _joined_times(parts: Sequence[FrameReader]) -> Floats | None:
+    """Return the times of the frames of all parts; None if they are unknown, or do not rise."""
+    times = []
+    for part in parts:
+        if part.time is None or part.start is None or parts[0].start is None:
+            return None
+        times.append(part.time + (part.start - parts[0].start) / 1e9)
+    joined = np.concatenate(times)
+    return joined if bool(np.all(np.diff(joined) > 0)) else None
+
+
+def part_of_several(name: str, names: Sequence[str], whole: str) -> Finding:
+    """Return the finding for a part of a recording that is read alone; ``whole`` is to be named instead."""
+    return Finding(
+        "part",
+        f"{name} is one of {len(names)} parts, {names[0]} to {names[-1]}, and only its frames are read: name"
+        f" {whole} to read all",
+    )
+
+
 def kind_of(shape: Sequence[int], dtype: np.dtype[Any]) -> str:
     """Return the size and the type of a picture as text."""
     return f"{shape[1]} x {shape[0]} {dtype.name}"
@@ -119,7 +191,7 @@ def lost_frames(lost: NDArray[np.int32]) -> tuple[Finding, ...]:
         f"{count} {'frame is' if count == 1 else 'frames are'} missing, before"
         f" {'frame' if len(gaps) == 1 else 'frames'} {before}; even steps of travel or phase count them"
     )
-    return (Finding("lost frames", text),)
+    return (Finding(LOST, text),)
 
 
 def lossy(how: str) -> Finding:

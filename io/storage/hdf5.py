@@ -15,8 +15,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.base.content import UnknownContentError, identified
 from mirrorskin.io.base.samples import ATTRIBUTES, Packing, packing_of
-from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, is_flagged, open_regular, translate_os_errors
+from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, is_flagged, translate_os_errors
 from mirrorskin.io.base.types import Closing, InputError, ProcessValue
 from mirrorskin.io.base.units import conversion_factor
 from mirrorskin.io.storage.chunks import Chunks, find_codecs
@@ -35,7 +36,6 @@ _LINKS_DEEP = 16
 _MOST_STEPS = 100_000  # maximum number of links, and of sources of virtual datasets, to follow
 _GROUPS_DEEP = 64
 _SCALES = b"DIMENSION_LIST"  # attribute with references to the scales of each axis
-_MATLAB_5 = b"MATLAB 5.0 MAT-file"
 _LEAST_FILE = 512  # minimum size of an HDF5 file with a dataset, bytes
 _MOST_OBJECTS = 20_000  # groups and datasets in a file
 _MOST_NAMES = 10_000  # members of a group that is read as a whole
@@ -442,19 +442,10 @@ def _open_file(path: Path, real: str) -> h5py.File:
                 return h5py.File(real, "r", swmr=True, locking=False)
         if h5py.is_hdf5(path):
             raise
-        with open_regular(path) as file:
-            start = file.read(len(_MATLAB_5))
-        if start == _MATLAB_5:
-            raise InputError(
-                f"{path} is a file of MATLAB before version 7.3: write it with save(..., '-v7.3')"
-            ) from None
-        if start[:3] == b"CDF":
-            raise InputError(
-                f"{path} is a netCDF file of version 3, which is not HDF5: convert it with 'nccopy -k nc4'"
-            ) from None
-        raise InputError(
-            f"{path} is not an HDF5 file; other formats have suffixes such as .avi, .tif and .npy"
-        ) from None
+        kind = identified(path)
+        if kind:
+            raise InputError(f"{path} is {kind}") from None
+        raise UnknownContentError(f"{path} is not an HDF5 file") from None
 
 
 _HEAP = re.compile(rb"GCOL\x01\0\0\0")  # signature, version and reserved bytes of a heap

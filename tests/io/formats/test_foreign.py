@@ -357,7 +357,8 @@ def test_what_is_not_a_file_of_frames_is_refused(tmp_path):
     refused("/dev/null", "is not a regular file")
     refused(
         tmp_path / "text.h5",
-        "is not an HDF5 file; other formats have suffixes such as .avi, .tif and .npy",
+        "is not an HDF5 file; frames are read from HDF5, Zarr, NPY, NPZ, MCAP, TIFF, a video .AVI, MP4, .*,"
+        " or a folder of numbered pictures",
     )
 
 
