@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -74,7 +75,11 @@ _INSTALL = "videos need mirrorskin[video]: pip install 'mirrorskin[video]'"
 _KEPT = 256_000_000  # bytes of decoded frames that are kept in memory, by default
 _QUOTED_MAX = 100  # characters quoted of an error message
 _DEEP = re.compile(r"(gray|yuva?4\d\dp)(9|10|12|14|16)(le|be)")  # formats whose first plane is the luma
-_FULL_RANGE = 2  # AVCOL_RANGE_JPEG
+_RANGES = {1: "limited", 2: "full"}  # AVCOL_RANGE_MPEG and AVCOL_RANGE_JPEG
+_DARK, _BRIGHT = 16, 235  # ends of the limited range
+_BEYOND = 1e-3  # share of samples beyond the limited range, from which the range is full; a codec overshoots
+_SPS = re.compile(rb"\x67|\x27|\x47")  # head of a sequence parameter set of H.264
+_WITH_CHROMA_FORMAT = {44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244}  # H.264, 7.3.2.1.1
 _MOST_LOST = 1 << 30  # maximum number of frames lost between two frames
 _GREY_COUNTS = 8  # largest difference between the colours of a grey frame, after a lossy compression
 _LOSSLESS_PROFILES = ("High 4:4:4 Predictive",)  # lossless profiles of codecs that are otherwise lossy
@@ -94,10 +99,13 @@ def load_av(path: Path) -> ModuleType:
 class VideoFrames(WholeFrames):
     """The frames of a video as grey samples of the displayed picture.
 
-    8-bit luma is returned in full range, 0 to 255, and samples of more bits as stored, in uint16. Colours of
-    RGB become grey as in ``to_grey``. The rotation stored in the file is applied. ``time`` is the time stamp
-    of each frame relative to the first; if these do not increase, it is computed from the frame rate. In an
-    AVI, whose rate is constant, a jump of the time stamps is a gap of lost frames.
+    8-bit luma of limited range, 16 to 235, is stretched to full range, 0 to 255. If the file does not
+    state the range, it is full for grey video, and limited for the luma of colours; and it is full if a
+    thousandth of the samples is beyond the limited range, whatever is stated. Samples of more bits are
+    returned as stored, in uint16. Colours of RGB become grey as in ``to_grey``. The rotation stored in
+    the file is applied. ``time`` is the time stamp of each frame relative to the first; if these do not
+    increase, it is computed from the frame rate. In an AVI, whose rate is constant, a jump of the time
+    stamps is a gap of lost frames.
 
     The file is decoded when it is opened: containers do not state the number of their frames reliably.
     Frames that fit into ``memory_limit`` are kept; otherwise they are decoded again.
@@ -124,6 +132,7 @@ class VideoFrames(WholeFrames):
         self._path, self.files, self._wanted, self._channel = path, (path,), dataset, channel
         self._next, self._kept, self._closed = 0, list[NDArray[Any]](), False
         self._container: InputContainer | None = None
+        self._is_limited = False
         try:
             self._survey(memory_limit or _KEPT)
         except BaseException:
@@ -243,7 +252,7 @@ class VideoFrames(WholeFrames):
         self._container, stream = self._open(_ALL_FRAMES)
         self.how = f"by FFmpeg ({stream.codec.canonical_name}, {stream.codec_context.pix_fmt})"
         stamps, ends, size, name = list[float](), 0.0, 0, str(self._path)
-        keeps = True
+        keeps, beyond, looked_at = True, 0, False
         for number, frame in enumerate(self._decode(self._container, stream)):
             base = float(frame.time_base or 0)
             stamps.append(np.nan if frame.pts is None else frame.pts * base)
@@ -252,6 +261,11 @@ class VideoFrames(WholeFrames):
                 first = self._samples(frame, name)
                 self.shape, self.dtype = (0, *first.shape), first.dtype
                 self.findings = tuple(self._find(stream, frame))
+                stated, is_grey = self._range(stream, frame)
+                looked_at = stated is not None and stated != "full"
+            if looked_at:
+                samples = self._samples(frame, name)
+                beyond += int(np.count_nonzero(samples < _DARK) + np.count_nonzero(samples > _BRIGHT))
             if keeps:
                 self._kept.append(self._checked(frame, number))
                 size += first.nbytes
@@ -260,6 +274,14 @@ class VideoFrames(WholeFrames):
         if not stamps:
             raise InputError(f"{name} has no frames that can be decoded")
         self.shape = (len(stamps), *self.shape[1:])
+        if stated is not None:
+            is_full = (
+                stated == "full" or (stated == "" and is_grey) or beyond > _BEYOND * math.prod(self.shape)
+            )
+            self._is_limited = not is_full
+            self.findings += tuple(_range_findings(stated, is_full, is_grey))
+            if self._is_limited:
+                self._kept = [look_up(_FULL, samples) for samples in self._kept]
         rate = float(stream.average_rate or 0)
         seconds = np.array(stamps)
         self.time, self.lost = times(seconds, rate), None
@@ -341,11 +363,59 @@ class VideoFrames(WholeFrames):
         if self._channel is None and _shows_colour(frame, name):
             yield CONVERTED_COLOUR
 
+    def _range(self, stream: VideoStream, frame: VideoFrame) -> tuple[str | None, bool]:
+        """Return the stated range, and whether the video is grey; None if samples are not luma of 8 bits."""
+        kind = frame.format
+        parts = [part for part in kind.components if not part.is_alpha]
+        is_luma = parts[0].is_luma and (self._channel is None or len(parts) < 3)
+        if not is_luma or kind.has_palette or kind.is_bayer or max(part.bits for part in parts) != 8:
+            return None, False
+        if kind.name.startswith("yuvj"):
+            return "full", False
+        is_grey = len(parts) == 1 or (stream.codec.canonical_name == "h264" and self._is_grey_h264(stream))
+        return _RANGES.get(int(frame.color_range), ""), is_grey
+
+    def _is_grey_h264(self, stream: VideoStream) -> bool:
+        """Return whether H.264 has no chroma, which FFmpeg decodes as colours without saturation."""
+        head = bytes(stream.codec_context.extradata or b"")
+        if not head:
+            container, other = self._open({})
+            with container:
+                head = next((bytes(packet) for packet in container.demux(other) if packet.size), b"")
+        return any(_chroma_format(head[match.end() :]) == 0 for match in _SPS.finditer(head[:4096]))
+
     def _samples(self, frame: VideoFrame, name: str) -> NDArray[Any]:
         """Return a frame as grey samples of the displayed picture."""
-        return np.ascontiguousarray(
-            _upright(frame, to_grey(_stored(frame, name, self._channel), name, self._channel))
-        )
+        grey = to_grey(_stored(frame, name, self._channel), name, self._channel)
+        return np.ascontiguousarray(_upright(frame, look_up(_FULL, grey) if self._is_limited else grey))
+
+
+def _range_findings(stated: str, is_full: bool, is_grey: bool) -> Iterator[Finding]:
+    """Yield a note if the range of samples is not stated, or is contradicted by them."""
+    as_read = "as stored" if is_full else f"stretched from {_DARK} to {_BRIGHT} to 0 to 255"
+    contradicted = is_full and stated != "full" and not (is_grey and not stated)
+    if contradicted:
+        claim = f"the range is stated as {stated}" if stated else "the range of brightness is not stated"
+        text = f"{claim}, but samples are beyond {_DARK} to {_BRIGHT}: they are read {as_read}"
+        yield Finding("range of brightness", text, warning=False)
+    elif not stated:
+        kind = "grey" if is_grey else "luma"
+        text = f"the range of brightness is not stated: {kind} is read {as_read}"
+        yield Finding("range of brightness", text, warning=False)
+
+
+def _chroma_format(data: bytes) -> int:
+    """Return chroma_format_idc of a sequence parameter set of H.264, without its head; 1 by default."""
+    if len(data) < 4 or data[0] not in _WITH_CHROMA_FORMAT:
+        return 1
+    bits = "".join(f"{byte:08b}" for byte in data[3:12])
+    for number in range(2):  # seq_parameter_set_id and chroma_format_idc, Exp-Golomb codes
+        zeros = len(bits) - len(bits.lstrip("0"))
+        value = int(bits[zeros : 2 * zeros + 1] or "0", 2) - 1
+        if number:
+            return value
+        bits = bits[2 * zeros + 1 :]
+    return 1
 
 
 def _shows_colour(frame: VideoFrame, name: str) -> bool:
@@ -390,10 +460,8 @@ def _luma(frame: VideoFrame, bits: int) -> NDArray[Any]:
         return _plane(frame, 0, np.dtype(f"{order}u2"))
     if len(kind.components) == 1:
         return _plane(frame if bits == 8 else frame.reformat(format="gray"), 0, np.dtype("u1"))
-    full = kind.name.startswith("yuvj") or frame.color_range == _FULL_RANGE or kind.name[:2] == "ya"
     plane = frame if kind.is_planar else frame.reformat(format="gray" if kind.name[:2] == "ya" else "yuv444p")
-    luma = _plane(plane, 0, np.dtype("u1"))
-    return luma if full else look_up(_FULL, luma)
+    return _plane(plane, 0, np.dtype("u1"))
 
 
 def _plane(frame: VideoFrame, number: int, dtype: np.dtype[Any]) -> NDArray[Any]:

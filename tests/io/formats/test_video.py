@@ -236,7 +236,7 @@ def test_all_frames_are_read_whatever_an_edit_list_leaves_out(tmp_path, suffix, 
 
 def test_a_video_without_edit_list_has_none_reported(tmp_path):
     _, source = frames_of(film(tmp_path / "a.mp4", "mpeg4", "yuv420p", GREY))
-    assert [finding.kind for finding in source.findings] == ["lossy compression"]
+    assert [finding.kind for finding in source.findings if finding.warning] == ["lossy compression"]
 
 
 @pytest.mark.parametrize(
@@ -304,7 +304,7 @@ def test_formats_without_loss_give_the_grey_of_the_frames(tmp_path, codec, pixel
     # Limited range has 220 of 256 levels.
     assert np.abs(actual.astype(int) - GREY).max() <= (1 if pixels[0] in "yn" else 0)
     assert source.dtype == np.uint8
-    assert source.findings == ()
+    assert [finding for finding in source.findings if finding.warning] == []
 
 
 @pytest.mark.parametrize(
@@ -313,7 +313,94 @@ def test_formats_without_loss_give_the_grey_of_the_frames(tmp_path, codec, pixel
 )
 def test_no_loss_is_reported_where_there_is_none(tmp_path, codec, pixels, options):
     _, source = frames_of(film(tmp_path / "a.mkv", codec, pixels, GREY, **options))
-    assert source.findings == ()
+    assert [finding for finding in source.findings if finding.warning] == []
+
+
+PRESSED = np.clip(GREY, 20, 206)
+PRESSED[:, 0, :2] = 13  # of noise
+FULL, LIMITED = 2, 1  # AVCOL_RANGE_JPEG and AVCOL_RANGE_MPEG
+STRETCHED = np.clip(np.rint((PRESSED - 16.0) * 255 / 219), 0, 255).astype(int)
+
+
+def in_range(path, codec, pixels, frames, stated=None, **options):
+    """Write luma as it is, in a format of luma, whatever range is stated."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=int(RATE), options=options)
+        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:], pixels
+        if stated is not None:
+            stream.codec_context.color_range = stated
+        for number, luma in enumerate(frames):
+            picture = av.VideoFrame(stream.width, stream.height, pixels)
+            for plane, value in zip(picture.planes, (None, 128, 128), strict=False):
+                samples = np.full((plane.height, plane.line_size), value or 0, np.uint8)
+                if value is None:
+                    samples[:, : plane.width] = luma
+                plane.update(samples.tobytes())
+            picture.pts, picture.time_base = number, Fraction(1, int(RATE))
+            if stated is not None:
+                picture.color_range = stated
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    return path
+
+
+GREY_CODECS = {
+    "x264": ("libx264", "gray", {"qp": "0"}),
+    "x265": ("libx265", "gray", {"x265-params": "lossless=1:log-level=none"}),
+    "ffv1": ("ffv1", "gray", {}),
+    "x264 of colours": ("libx264", "yuv420p", {"qp": "0"}),
+    "ffv1 of colours": ("ffv1", "yuv420p", {}),
+}
+
+
+@pytest.mark.parametrize("suffix", [".mkv", ".avi", ".mp4"])
+@pytest.mark.parametrize(
+    ("name", "stated", "expected", "noted"),
+    [
+        ("x264", None, PRESSED, True),
+        ("x264", FULL, PRESSED, False),
+        ("x264", LIMITED, STRETCHED, False),
+        ("x265", LIMITED, STRETCHED, False),
+        ("x265", FULL, PRESSED, False),
+        ("ffv1", None, PRESSED, True),
+        ("x264 of colours", None, STRETCHED, True),
+        ("x264 of colours", LIMITED, STRETCHED, False),
+        ("x264 of colours", FULL, PRESSED, False),
+        ("ffv1 of colours", None, STRETCHED, True),
+    ],
+)
+def test_the_range_of_luma_is_the_one_that_is_stated(tmp_path, name, stated, expected, noted, suffix):
+    codec, pixels, options = GREY_CODECS[name]
+    if suffix == ".avi" and codec == "libx265":
+        pytest.skip("an AVI contains no HEVC")
+    if suffix != ".mkv" and codec == "libx264" and stated == LIMITED:
+        pytest.skip("x264 states the full range only, and other containers state none")
+    options = dict(options)
+    if codec == "libx265":
+        options["x265-params"] += f":range={'full' if stated == FULL else 'limited'}"
+    path = in_range(tmp_path / f"a{suffix}", codec, pixels, PRESSED, stated, **options)
+    actual, source = frames_of(path)
+    np.testing.assert_allclose(actual.astype(int), expected, atol=0.51)
+    notes = [finding for finding in source.findings if finding.kind == "range of brightness"]
+    assert [finding.warning for finding in notes] == [False] * noted
+
+
+@pytest.mark.parametrize("stated", [None, LIMITED])
+@pytest.mark.parametrize("end", [5, 250])
+def test_samples_beyond_the_limited_range_contradict_it(tmp_path, stated, end):
+    frames = PRESSED.copy()
+    frames[:, 20:] = end
+    path = in_range(tmp_path / "a.mkv", "libx264", "yuv420p", frames, stated, qp="0")
+    actual, source = frames_of(path, memory_limit=1)
+    np.testing.assert_array_equal(actual, frames)
+    (note,) = [finding for finding in source.findings if finding.kind == "range of brightness"]
+    assert "but samples are beyond 16 to 235: they are read as stored" in note.text
+    assert note.warning is False
+
+
+def test_frames_that_are_decoded_again_have_the_same_range(tmp_path):
+    path = in_range(tmp_path / "a.mkv", "libx264", "yuv420p", PRESSED, LIMITED, qp="0")
+    np.testing.assert_array_equal(frames_of(path, memory_limit=1)[0], frames_of(path)[0])
 
 
 @pytest.mark.parametrize(
@@ -322,7 +409,8 @@ def test_no_loss_is_reported_where_there_is_none(tmp_path, codec, pixels, option
 )
 def test_a_loss_is_reported(tmp_path, codec, pixels, suffix):
     _, source = frames_of(film(tmp_path / f"a{suffix}", codec, pixels, GREY))
-    assert [(finding.kind, finding.warning) for finding in source.findings] == [("lossy compression", True)]
+    kinds = [(finding.kind, finding.warning) for finding in source.findings if finding.warning]
+    assert kinds == [("lossy compression", True)]
 
 
 def test_few_bits_are_reported(tmp_path):
