@@ -59,5 +59,7 @@ def is_zarr(path: str | Path) -> bool:
     if isinstance(local, Url) or local.name.lower().endswith((ZARR_SUFFIX, f"{ZARR_SUFFIX}.zip")):
         return True
     with suppress(OSError):  # reported when it is opened
-        return any((local / name).is_file() for name in _ROOTS)
+        for name in _ROOTS:
+            if (local / name).is_file():
+                return True
     return False

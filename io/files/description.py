@@ -15,7 +15,7 @@ from mirrorskin.io.files.arrays import list_arrays
 from mirrorskin.io.files.opening import open_recording
 from mirrorskin.io.files.recording import Recording
 from mirrorskin.io.files.result_file import open_result
-from mirrorskin.io.formats.registry import format_of_frames, formats_listed, holds_arrays, open_reader
+from mirrorskin.io.formats.registry import format_of_frames, holds_arrays, open_reader
 from mirrorskin.io.model.calibration import PARTS, Calibration
 from mirrorskin.io.model.frames import FrameReader
 from mirrorskin.io.model.result import Result
@@ -54,7 +54,7 @@ def describe(path: str | Path, *, dataset: str | None = None, channel: int | Non
     if form is not None:
         with open_reader(path, form, dataset=dataset, channel=channel, verify=False) as frames:
             return _frames(form.name, frames)
-    with formats_listed(), open_file(path) as file:
+    with open_file(path) as file:
         ours, result = file.marked(MARK), file.marked(RESULT_MARK)
         calibration = file.marked(CALIBRATION_MARK)
         stacks = {} if ours or result or calibration else file.stacks()

@@ -19,6 +19,7 @@ from mirrorskin.io.base.arguments import (
     in_unit,
 )
 from mirrorskin.io.base.checksums import UNVERIFIED, UNVERIFIED_PARTS
+from mirrorskin.io.base.content import UnknownContentError
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.samples import Decoding, frame_dtype, order_of
 from mirrorskin.io.base.selection import Region
@@ -29,7 +30,7 @@ from mirrorskin.io.base.types import (
 )
 from mirrorskin.io.base.url import path_of
 from mirrorskin.io.files.recording import Recording, cut_out
-from mirrorskin.io.formats.registry import format_of_frames, formats_listed, holds_arrays
+from mirrorskin.io.formats.registry import format_of_frames, holds_arrays, sources
 from mirrorskin.io.model.coordinates import Coordinates, read_coordinates
 from mirrorskin.io.model.positions import Positions, along
 from mirrorskin.io.storage.hdf5 import Hdf5File
@@ -154,8 +155,10 @@ def open_recording(
             verify,
         )
     with ExitStack() as opening:
-        with formats_listed():
+        try:
             file = opening.enter_context(open_file(path, memory_limit))
+        except UnknownContentError as error:
+            raise InputError(f"{error}; frames are read from {sources()}") from None
         ours = file.marked(MARK)
         file.check_layout(MARK)
         stack, state, decoding = _find_stack(file, dataset, ours)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -195,18 +195,6 @@ def sources() -> str:
     others = sorted((form.source for form in formats(installed=False) if form.source), key=len)
     listed = ["HDF5", "Zarr", "NPY", "NPZ", *others]
     return ", ".join([*listed[:-1], f"or {listed[-1]}"])
-
-
-@contextmanager
-def formats_listed() -> Iterator[None]:
-    """Add the sources of frames to the error for a file of an unknown format."""
-    from mirrorskin.io.base.content import UnknownContentError
-    from mirrorskin.io.base.types import InputError
-
-    try:
-        yield
-    except UnknownContentError as error:
-        raise InputError(f"{error}; frames are read from {sources()}") from None
 
 
 def export_format(suffix: str) -> Format | None:
