@@ -25,11 +25,11 @@ from mirrorskin.engine.calibration.sources import check_one_camera, read_blocks
 from mirrorskin.io import Block, InputError, References, Source
 from mirrorskin.io.base.types import Floats
 from mirrorskin.io.model.calibration import DEAD, HOT, SATURATED
+from mirrorskin.io.watch.saturation import scale_top
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
 _CHUNK = 8_000_000  # bytes of float64 samples that are processed at a time
 _MEMORY = 256_000_000  # bytes of frames of a rolled ball that are kept in memory
-_BITS = 8  # minimum number of bits of a camera
 _UNSTEADY = 0.1  # noise above which the light is unsteady, as a share of full light
 _MOST_HOT = 0.05  # maximum share of hot pixels
 
@@ -211,20 +211,6 @@ def _length(sources: Sequence[Source]) -> int:
 def _scale_top_of(highest: Floats, integer: bool) -> float | None:
     finite = highest[np.isfinite(highest)]
     return scale_top(float(finite.max()), integer) if finite.size else None
-
-
-def scale_top(highest: float, integer: bool) -> float | None:
-    """Return the largest sample if it is the top of a camera's scale, else None.
-
-    The top is 1 for floats. For integers it is eight or more binary ones followed by any number of zeros, as
-    for a 12-bit camera in 16-bit frames.
-    """
-    if highest == 1 and not integer:
-        return highest
-    if highest < 2**_BITS - 1 or highest % 1 or highest >= 2**32:
-        return None
-    ones = int(highest) // (int(highest) & -int(highest))
-    return highest if ones & (ones + 1) == 0 and ones >= 2**_BITS - 1 else None
 
 
 def _rolled_level(sources: Sequence[Source], dark: Level, reader: _Reader) -> Level:

@@ -24,6 +24,7 @@ from mirrorskin.engine.calibration.wall_model import (
     predict,
 )
 from mirrorskin.io import InputError, Precession, References, Source, pixel_axes
+from mirrorskin.io.watch.saturation import scale_top
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics import least_squares
 
@@ -179,10 +180,10 @@ def _clipped_counts(frames: NDArray[Any]) -> NDArray[Any]:
     """Return the counts at which samples may be clipped: 0, and the full scale."""
     if frames.dtype.kind == "f":
         return np.empty(0, frames.dtype)
-    most_frames = int(frames.max())
+    top = scale_top(float(frames.max()), integer=True)
     ends = [0, int(np.iinfo(frames.dtype).max)]
-    if most_frames & (most_frames + 1) == 0 and np.count_nonzero(frames == most_frames) >= _CLIPPED:
-        ends.append(most_frames)
+    if top is not None and np.count_nonzero(frames == top) >= _CLIPPED:
+        ends.append(int(top))
     return np.array(ends, frames.dtype)
 
 

@@ -20,6 +20,7 @@ from mirrorskin.hw.base.stage import Limits, Position, Report, Stage
 from mirrorskin.hw.rig.rig import longest_wait, open_camera, open_stage
 from mirrorskin.hw.rig.trigger import Trigger
 from mirrorskin.io import InputError
+from mirrorskin.io.watch.saturation import scale_top
 
 Verdict = Literal["ok", "warning", "failed"]
 
@@ -343,8 +344,9 @@ def _brightness(picture: NDArray[Any]) -> CheckResult:
             "camera", "brightness", "NaN", "warning", "no pixel has a value; check camera.dtype"
         )
     low, middle, high = (float(value) for value in np.percentile(finite, (0, 50, 100)))
-    top = np.iinfo(picture.dtype).max if picture.dtype.kind == "u" else np.inf
-    saturated, dark = float(np.mean(picture >= top)), float(np.mean(picture <= 0))
+    top = scale_top(high, picture.dtype.kind == "u")
+    saturated = 0.0 if top is None else float(np.mean(picture >= top))
+    dark = float(np.mean(picture <= 0))
     value = f"{low:g} to {high:g}, median {middle:g}; {saturated:.2%} saturated, {dark:.2%} black"
     remedy = ""
     if saturated > _SATURATED_MAX:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.types import Floats, Motion
 from mirrorskin.io.watch.phase_check import PhaseCheck, swing_of
+from mirrorskin.io.watch.saturation import REACHED, scale_ends
 
 _SIDE = 24  # pixels of the grid along each side
 _SAMPLES_MAX = 1 << 22  # number of samples above which the grid becomes coarser
@@ -22,7 +23,6 @@ _MAD = 1.4826  # standard deviation over median absolute deviation, of a normal 
 _RESPONSE_MIN = 10.0  # minimum change of a pixel that is a response, standard deviations of the noise
 _FEW = 0.05  # share of pixels below which their common behaviour is ignored
 _MOST_OF = 0.8  # share of pixels that must agree
-_CLIPPED = 0.1  # tolerated share of responding pixels that reach the end of the scale
 _FLICKER, _DRIFT = 0.01, 2.0  # tolerated flicker, share of the light; tolerated drift, counts of 8 bits
 _PARTS = 10  # of a press, in which its dark level is compared
 _DARK, _DARK_PIXELS = 0.25, 0.25  # brightest dark pixel, share of the span; fewest dark pixels, share
@@ -262,10 +262,12 @@ class Traces:
         yield from self._axes(shape)
         if self._share > _FEW:
             yield from self._press() if self._motion == "vertical" else self._turn()
-        if (clipped := self._clipped) > _CLIPPED:
+        if (clipped := self._clipped) > REACHED:
+            ends = self._ends[np.isfinite(self._ends)]
+            end = f", {ends[0]:.6g}" if np.ptp(ends) == 0 else ""
             yield Finding(
                 "cut off",
-                f"{_percent(clipped)} of the pixels reach the end of the scale: shorten the exposure",
+                f"{_percent(clipped)} of the pixels reach the end of the scale{end}: shorten the exposure",
             )
         if (flicker := self._flicker) is not None and flicker[0] > max(_FLICKER, 5 * flicker[1]):
             yield Finding(
@@ -294,16 +296,14 @@ class Traces:
         lower = f", the lowest {idle} of them 0" if idle else ""
         return f" ({int(high).bit_length()} bits in use{lower})"
 
-    def _end(self) -> float:
-        """Return the end of the scale, for the smallest common number of bits that represents all counts."""
-        if not self._integer:
-            return math.inf
-        bits = next(bits for bits in (8, 10, 12, 14, 16) if self._highest.max() < 2**bits)
-        return float(2**bits - 1)
+    @functools.cached_property
+    def _ends(self) -> NDArray[np.float32]:
+        """The end of the scale at each pixel; infinite if unknown."""
+        return scale_ends(self._stored, self._counts)
 
     @functools.cached_property
     def _clipped(self) -> float:
-        return float(np.mean(self._highest >= self._end()))
+        return float(np.mean(self._highest >= self._ends))
 
     def _harmonics(self) -> Floats | None:
         """Return the brightness as fitted by harmonics of the phase, (T, n); None without a fit."""
@@ -332,7 +332,7 @@ class Traces:
     def _repeated(self) -> Iterator[Finding]:
         """Yield a finding for frames identical to the preceding one, if other frames differ everywhere."""
         counts = self._counts
-        inside = (counts[1:] > 0) & (counts[1:] < self._end())  # where noise is not clipped
+        inside = (counts[1:] > 0) & (counts[1:] < self._ends)  # where noise is not clipped
         differ = np.count_nonzero((counts[1:] != counts[:-1]) & inside, axis=1)
         again = np.flatnonzero((differ == 0) & (inside.sum(axis=1) >= _PIXELS_MIN)) + 1
         if len(again) and np.median(differ) > _NOISY * counts.shape[1]:

@@ -201,3 +201,29 @@ def test_warnings_of_an_own_operation_are_issued_and_in_the_process():
     with pytest.warns(io.MirrorskinWarning, match=f"^Suspicious: {LOST}$"):
         result = engine.run(np.ones((4, 3, 3)), Suspicious)
     assert result.process["warnings"] == LOST
+
+
+SHIFTS = {"12 bits": 0, "12 in the upper bits": 4}
+
+
+@pytest.mark.parametrize("shift", SHIFTS.values(), ids=SHIFTS)
+def test_saturation_is_reported_through_every_door(shift, tmp_path):
+    travel = 0.05 * np.arange(30)
+    above = (travel[:, np.newaxis, np.newaxis] - 0.3 - (X**2 + Y**2) / 8) / 0.08
+    light = 200 + 6500 / (1 + np.exp(-above))
+    frames = np.clip(light, 0, 4095).astype(np.uint16) << shift
+    np.save(tmp_path / "press.npy", frames)
+    opening = {"motion": "vertical", "travel": io.Steps(0.05), "pixel_size": (PIXEL, PIXEL)}
+    text = f"of the pixels reach the end of the scale, {4095 << shift}: shorten the exposure"
+    with pytest.warns(io.MirrorskinWarning, match=text):
+        engine.find_onset(frames, travel)
+    assert [finding.kind for finding in io.check(tmp_path / "press.npy", **opening).findings] == ["cut off"]
+    with (
+        io.open_recording(tmp_path / "press.npy", **opening) as source,
+        pytest.warns(io.MirrorskinWarning, match=text),
+    ):
+        assert text in engine.reconstruct(source).process["warnings"]
+    run = engine.Run(engine.press.Onset())
+    for frame, position in zip(frames, travel, strict=True):
+        run.push(frame[np.newaxis], travel=[position])
+    assert text in run.result(ended=True).process["warnings"]

@@ -28,6 +28,7 @@ from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import PlannedScan
 from mirrorskin.hw.rig.sweep import make_scan
+from mirrorskin.io.watch.saturation import scale_top
 
 State = Literal["disconnected", "connecting", "ready", "moving"]
 
@@ -308,5 +309,6 @@ def judge(frame: NDArray[Any], bins: int = 64) -> Judged:
     full_scale = float(np.iinfo(frame.dtype).max) if frame.dtype.kind == "u" else float(np.nanmax(frame))
     values = np.nan_to_num(frame.astype(np.float32))
     counts, edges = np.histogram(values, bins, (0.0, max(full_scale, 1e-9)))
-    saturated = float(np.mean(values >= full_scale)) if frame.dtype.kind == "u" else 0.0
+    top = scale_top(float(values.max()), frame.dtype.kind == "u")
+    saturated = 0.0 if top is None else float(np.mean(values >= top))
     return Judged(saturated, float(cv2.Laplacian(values, cv2.CV_32F).std()), counts, edges)

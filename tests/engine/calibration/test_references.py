@@ -6,7 +6,8 @@ from reference_frames import SCALES, TOPS, expose, pixels, rolled, source
 
 from mirrorskin import io
 from mirrorskin.engine.calibration import references as module
-from mirrorskin.engine.calibration.references import measure_references, scale_top
+from mirrorskin.engine.calibration.references import measure_references
+from mirrorskin.io.watch.saturation import scale_top
 
 NOISE = 1.5
 

@@ -301,10 +301,12 @@ def test_lost_frames_and_reconnections_are_reported():
     assert film(Camera(reconnects=1))["frames"].verdict == "warning"
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_too_much_light_is_reported(dtype):
+@pytest.mark.parametrize(
+    ("dtype", "top"), [(np.uint8, 255), (np.uint16, 65535), (np.uint16, 4095), (np.uint16, 1023 << 6)]
+)
+def test_too_much_light_is_reported(dtype, top):
     picture = np.arange(35, dtype=dtype).reshape(5, 7)
-    picture[0, 0] = np.iinfo(dtype).max
+    picture[0, 0] = top
     actual = film(Camera(picture))["brightness"]
     assert actual.verdict == "warning"
     assert "2.86% saturated" in actual.found

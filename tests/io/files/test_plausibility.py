@@ -207,6 +207,85 @@ def test_light_beyond_the_scale_is_found():
     assert kinds(found(noisy(1.6 * pressed()))) == ["cut off"]
 
 
+def rising(amplitude, noise=0.0, width=0.08):
+    """Brightness of a press of 12 bits that rises smoothly, before it is cut off."""
+    above = (TRAVEL[:, np.newaxis, np.newaxis] - gap()) / width
+    light = 200 + amplitude / (1 + np.exp(-np.clip(above, -500, 500)))
+    return light + np.random.default_rng(4).normal(0, noise, light.shape)
+
+
+def stored(light, top=4095):
+    return np.clip(np.rint(light), 0, top).astype(np.uint16)
+
+
+def corrected(light, dark_noise=20.0, flat_noise=0.05):
+    """Samples less a dark frame, over a flat one: each pixel has an end of its own."""
+    generator = np.random.default_rng(5)
+    dark = generator.normal(150, dark_noise, SHAPE)
+    return ((light - dark) / (1 + flat_noise * generator.normal(size=SHAPE))).astype(np.float32)
+
+
+PACKINGS = {
+    "12 bits": lambda light: stored(light),
+    "12 in the upper bits": lambda light: stored(light) << 4,
+    "10 in the upper bits": lambda light: stored(light) >> 2 << 6,
+    "14 in the upper bits": lambda light: stored(light) << 2 << 2,
+    "12 bits, scaled": lambda light: (stored(light) / 4095).astype(np.float32),
+    "12 bits, of a sensor that is full before": lambda light: stored(light, 3800),
+    "8 bits, of a sensor that is full before": lambda light: (stored(light, 3800) >> 4).astype(np.uint8),
+    "scaled, of a sensor that is full before": lambda light: (stored(light, 3800) * 0.01).astype(np.float32),
+}
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0, 12.0])
+@pytest.mark.parametrize("pack", PACKINGS.values(), ids=PACKINGS)
+def test_saturated_samples_are_found_whatever_their_end(pack, noise):
+    report = found(pack(rising(6500, noise)))
+    assert kinds(report) == ["cut off"]
+    assert report.facts["cut off"] == "100 % of the pixels reach the end of the scale"
+    assert "cut off" not in kinds(found(pack(rising(3000, noise))))
+
+
+@pytest.mark.parametrize("noise", [2.0, 12.0])
+@pytest.mark.parametrize("flat_noise", [0.0, 0.05])
+def test_saturated_samples_are_found_after_a_correction_of_each_pixel(noise, flat_noise):
+    assert "cut off" in kinds(found(corrected(stored(rising(6500, noise)), flat_noise=flat_noise)))
+    assert "cut off" not in kinds(found(corrected(stored(rising(3000, noise)), flat_noise=flat_noise)))
+
+
+@pytest.mark.parametrize("width", [0.002, 0.01, 0.03, 0.08, 0.2])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_frames_without_noise_that_reach_their_light_are_not_saturated(width, dtype):
+    scale = 1 / 16 if dtype is np.uint8 else 1.0
+    light = (
+        np.rint(scale * rising(3000, width=width)) if dtype is not np.float32 else rising(3000, width=width)
+    )
+    assert "cut off" not in kinds(found(light.astype(dtype)))
+    assert "cut off" not in kinds(found((light / light.max()).astype(np.float32)))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_an_edge_of_brightness_itself_is_not_saturation(noise):
+    assert "cut off" not in kinds(found(noisy(pressed(), noise)))
+    assert "cut off" not in kinds(found(noisy(np.where(pressed() > 100, 180, 20), noise)))
+
+
+@pytest.mark.parametrize(
+    ("pack", "expected"),
+    [
+        (lambda light: np.clip(light, 0, 1023).astype(np.uint16) << 6, True),
+        (lambda light: np.clip(light, 0, 700), True),
+        (lambda light: light, False),
+        (lambda light: light.astype(np.uint16) << 4, False),
+    ],
+)
+def test_saturation_of_a_rotation_is_found(pack, expected):
+    light = np.rint(noisy(turned(), 1.0).astype(float) * 8)
+    samples = pack(light)
+    samples = samples if samples.dtype == np.uint16 else samples.astype(np.float32)
+    assert ("cut off" in kinds(found(samples, phase=PHASE))) is expected
+
+
 @pytest.mark.parametrize("level", [20.0, 200.0])
 def test_frames_that_never_change_are_found(level):
     assert kinds(found(noisy(np.full((30, *SHAPE), level)))) == ["no response"]
