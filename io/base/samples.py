@@ -211,7 +211,7 @@ class Reader(Protocol):
 
 @dataclass(frozen=True)
 class Decoding:
-    """Conversion of a stored array of three axes to frames.
+    """Conversion of a stored array of three axes or more to frames.
 
     Attributes
     ----------
@@ -219,6 +219,8 @@ class Decoding:
         Type of the stored samples, in the byte order of this machine.
     order : (int, int, int)
         Numbers of the stored axes for frames, rows and columns.
+    fixed : mapping
+        The index along each of the other axes, by the number of the axis.
     packing : Packing or None
     names : tuple of str
         Names of the stored axes; empty if unknown.
@@ -234,6 +236,7 @@ class Decoding:
     names: tuple[str, ...] = ()
     where: str = "the stack"
     matlab: bool = False
+    fixed: Mapping[int, int] = field(default_factory=dict)
     dtype: np.dtype[Any] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -245,7 +248,15 @@ class Decoding:
     @property
     def plain(self) -> bool:
         """Whether the stored array can be used as frames without conversion."""
-        return self.order == (0, 1, 2) and self.packing is None and self.dtype == self.stored
+        return (
+            not self.fixed and self.order == (0, 1, 2) and self.packing is None and self.dtype == self.stored
+        )
+
+    @property
+    def turned(self) -> tuple[int, ...]:
+        """The order of frames, rows and columns among the stored axes that are not fixed."""
+        kept = sorted(self.order)
+        return tuple(kept.index(axis) for axis in self.order)
 
     def shape(self, stored: Sequence[int]) -> tuple[int, int, int]:
         """Return frames, rows and columns of a stored shape."""
@@ -256,7 +267,15 @@ class Decoding:
     def findings(self) -> tuple[Finding, ...]:
         """The conversions."""
         problems = []
-        if self.order != (0, 1, 2):
+        if self.fixed:
+            places = [
+                f"{self.names[axis] if self.names else f'axis {axis}'} = {index}"
+                for axis, index in sorted(self.fixed.items())
+            ]
+            problems.append(
+                Finding("order of axes", f"{self.where}: the frames at {', '.join(places)} are read", False)
+            )
+        if self.order != (0, 1, 2) and self.turned != (0, 1, 2):
             shown = "the order of MATLAB" if self.matlab else f"the dimensions ({', '.join(self.names)})"
             axes = (
                 "third, first, second" if self.matlab else ", ".join(self.names[axis] for axis in self.order)
@@ -289,27 +308,31 @@ class DecodedFrames(Closing):
         self.shape, self.dtype = decoding.shape(shape), decoding.dtype
         self.chunk = decoding.shape(reader.chunk)
         self.length = self.chunk[0]
-        row, rows = math.prod(shape[1:]) * decoding.stored.itemsize, int(reader.chunk[0])
+        self._axis = min(decoding.order)  # the first one that is not fixed
+        row = math.prod(decoding.shape(shape)) // shape[self._axis] * decoding.stored.itemsize
+        rows = int(reader.chunk[self._axis])
         self._rows = max(1, _DECODED_BYTES // (row * rows)) * rows
         self.scratch_bytes: int = reader.scratch_bytes + self._rows * row
 
     def fetch(self, spans: Sequence[Span], out: NDArray[Any]) -> None:
         """Write frames, some rows and columns of each, into ``out``."""
-        order = self._decoding.order
-        stored: list[Span] = [(0, 0)] * 3
-        for axis, span in zip(order, spans, strict=True):
-            stored[axis] = span
-        first_axis, (start, stop) = order.index(0), stored[0]
+        order, fixed, axis = self._decoding.order, self._decoding.fixed, self._axis
+        stored: dict[int, Span] = {number: (index, index + 1) for number, index in fixed.items()}
+        stored |= dict(zip(order, spans, strict=True))
+        along = order.index(axis)
+        start, stop = stored[axis]
         at = start
         while at < stop:
             end = min(stop, (at // self._rows + 1) * self._rows)
-            spans_here = [(at, end), *stored[1:]]
+            here = stored | {axis: (at, end)}
+            spans_here = [here[number] for number in sorted(here)]
             values = np.empty([last - first for first, last in spans_here], self._decoding.stored)
             self._reader.fetch(spans_here, values)
             part = [slice(None)] * 3
-            part[first_axis] = slice(at - start, end - start)
-            first = at if first_axis == 0 else spans[0][0]
-            self._decoding.decode(values.transpose(order), first, out[*part])
+            part[along] = slice(at - start, end - start)
+            first = at if along == 0 else spans[0][0]
+            frames = values.squeeze(tuple(fixed)).transpose(self._decoding.turned)
+            self._decoding.decode(frames, first, out[*part])
             at = end
 
     def close(self) -> None:
@@ -324,6 +347,72 @@ _FRAMES = {
     *("travel", "phase", "displacement", "twist"),
 }
 _COLOURS = {"c", "channel", "channels", "band", "bands", "rgb", "colour", "color"}
+
+
+def frame_axes(
+    shape: Sequence[int], names: Sequence[str], channel: int | None, where: str
+) -> tuple[tuple[int, int, int], dict[int, int]]:
+    """Return the axes that are frames, rows and columns, and the index along each of the others.
+
+    An axis of channels is read at ``channel``; other axes are left out if their length is 1.
+
+    Parameters
+    ----------
+    shape : sequence of int
+    names : sequence of str
+        Names of the axes; empty if they are unknown.
+    channel : int, optional
+    where : str
+        Begins messages.
+
+    Raises
+    ------
+    InputError
+        The axes are no stack of frames, or the channel is missing or does not exist.
+
+    Examples
+    --------
+    >>> frame_axes((40, 2, 48, 64), ("t", "c", "y", "x"), 1, "stack")
+    ((0, 2, 3), {1: 1})
+    >>> frame_axes((1, 40, 48, 64), (), None, "stack")
+    ((1, 2, 3), {0: 0})
+    """
+    kinds = [_kind_of(name) for name in names] if names else [""] * len(shape)
+    fixed: dict[int, int] = {}
+    colours = [axis for axis, kind in enumerate(kinds) if kind == "colours"] if len(shape) > 3 else []
+    if len(colours) == 1 and (shape[colours[0]] > 1 or channel is not None):
+        fixed[colours[0]] = _checked_channel(channel, shape[colours[0]], where)
+    elif channel is not None:
+        raise InputError(f"{where} has no axis of channels: leave --channel out")
+    spare = [
+        axis
+        for axis, length in enumerate(shape)
+        if length == 1 and kinds[axis] not in ("rows", "columns") and axis not in fixed
+    ]
+    excess = len(shape) - len(fixed) - 3
+    # An axis of frames is left out last.
+    spare.sort(key=lambda axis: (kinds[axis] == "frames", -axis))
+    if excess < 0 or len(spare) < excess or (not names and len(spare) > excess > 0):
+        shown = f" and the dimensions ({', '.join(names)})" if names else ""
+        raise InputError(
+            f"{where} has shape {tuple(shape)}{shown}: a stack of frames, (T, H, W), is needed, and other"
+            " axes of length 1"
+        )
+    fixed |= dict.fromkeys(spare[:excess], 0)
+    kept = [axis for axis in range(len(shape)) if axis not in fixed]
+    order = order_of([names[axis] for axis in kept], where) if names else (0, 1, 2)
+    frames, rows, columns = (kept[number] for number in order)
+    return (frames, rows, columns), fixed
+
+
+def _checked_channel(channel: int | None, count: int, where: str) -> int:
+    """Return the channel; InputError if there are several and none is chosen, or the one does not exist."""
+    if channel is None or not 0 <= channel < count:
+        chosen = "" if channel is None else f", and none is number {channel}"
+        raise InputError(
+            f"{where} has {count} channels{chosen}: --channel 0 to {count - 1} takes one of them"
+        )
+    return channel
 
 
 def order_of(names: Sequence[str], where: str) -> tuple[int, int, int]:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.io.base.arguments import as_array, as_pixel_size, unknown_argument
 from mirrorskin.io.base.content import identified
 from mirrorskin.io.base.findings import Finding
-from mirrorskin.io.base.samples import DecodedFrames, Decoding
+from mirrorskin.io.base.samples import DecodedFrames, Decoding, frame_axes
 from mirrorskin.io.base.selection import Region
 from mirrorskin.io.base.system import (
     MAX_UNPACKED_BYTES,
@@ -93,6 +93,8 @@ class ArrayRecording(Recording):
         _check_names(name, positions, header)
         frames = frames if isinstance(frames, FrameReader) else as_array("frames", frames)
         reader = frames if isinstance(frames, FrameReader) else None
+        if isinstance(frames, np.ndarray) and frames.ndim > 3:
+            frames = frames.squeeze(tuple(frame_axes(frames.shape, (), None, name)[1]))
         if reader is not None and reader.shape[0] < 2:
             hints = "".join(f". {finding.text}" for finding in reader.findings if finding.warning)
             raise InputError(f"{name} contains {reader.shape[0]} frame: a stack has at least 2{hints}")
@@ -336,9 +338,10 @@ def _open_frames(path: Path) -> NDArray[Any] | RawFrames:
     """Open the array of numbers in a ``.npy`` file as frames; they are read when they are used."""
     with open_regular(path) as file:
         head = _number_head(file)
-        if head.fortran_order or len(head.shape) != 3:
+        if head.fortran_order or len(head.shape) < 3:
             return _read_values(file, head)
-        frames, rows, columns = head.shape
+        axes, _ = frame_axes(head.shape, (), None, str(path))
+        frames, rows, columns = (head.shape[axis] for axis in axes)
         return RawFrames(os.dup(file.fileno()), head.size, (frames, rows, columns), head.dtype)
 
 

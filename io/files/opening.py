@@ -21,7 +21,7 @@ from mirrorskin.io.base.arguments import (
 from mirrorskin.io.base.checksums import UNVERIFIED, UNVERIFIED_PARTS
 from mirrorskin.io.base.content import UnknownContentError
 from mirrorskin.io.base.findings import Finding
-from mirrorskin.io.base.samples import Decoding, frame_dtype, order_of
+from mirrorskin.io.base.samples import Decoding, frame_axes, frame_dtype
 from mirrorskin.io.base.selection import Region
 from mirrorskin.io.base.system import translate_os_errors
 from mirrorskin.io.base.types import (
@@ -89,7 +89,8 @@ def open_recording(
         Name of the stack, of an archive's array or of a topic, or number of a TIFF's series or a video's
         stream; required if the file was not written by mirrorskin and contains several.
     channel : int, optional
-        Channel of a TIFF with several, or colour (0 red, 1 green, 2 blue); by default colours become luma.
+        Channel of a TIFF or an array with several, or colour (0 red, 1 green, 2 blue); by default colours
+        become luma.
     motion : str, optional
         Motion, if the file does not contain it; it must not contradict the file.
     travel, phase, tilt, pixel_size
@@ -131,8 +132,8 @@ def open_recording(
     """
     path = path_of(path)
     form = format_of_frames(path)
-    if channel is not None and form is None:
-        raise InputError(f"{path}: only pictures, videos and MCAP files have channels: leave --channel out")
+    if channel is not None and holds_arrays(path):
+        raise InputError(f"{path}: an array of NumPy has no channels: leave --channel out")
     if form is not None or holds_arrays(path):
         from mirrorskin.io.files.arrays import open_stack
 
@@ -161,7 +162,7 @@ def open_recording(
             raise InputError(f"{error}; frames are read from {sources()}") from None
         ours = file.marked(MARK)
         file.check_layout(MARK)
-        stack, state, decoding = _find_stack(file, dataset, ours)
+        stack, state, decoding = _find_stack(file, dataset, ours, channel)
         shape = (state.count, *decoding.shape(stack.shape)[1:])
         selection = cut_out(str(path), shape, frames, region)
         coordinates = Coordinates() if ours else read_coordinates(file, stack, decoding)
@@ -231,7 +232,7 @@ def _expected(
 
 
 def _find_stack(
-    file: Hdf5File, dataset: str | None, ours: bool
+    file: Hdf5File, dataset: str | None, ours: bool, channel: int | None = None
 ) -> tuple[h5py.Dataset, RecordingState, Decoding]:
     """Return the stack of frames, its state and its decoding; InputError if it cannot be read."""
     if dataset is None:
@@ -242,10 +243,12 @@ def _find_stack(
         raise InputError(f"{where} is not a dataset: name one with --dataset")
     with translate_os_errors(where):
         shape = stack.shape
-    if shape is None or len(shape) != 3:
-        raise InputError(f"{where} has shape {shape}: a stack of frames, (T, H, W), is needed")
     ours = ours and stack == file.find(STACK)
-    decoding = _decoding(file, stack, ours, where)
+    if shape is None or (ours and len(shape) != 3):
+        raise InputError(f"{where} has shape {shape}: a stack of frames, (T, H, W), is needed")
+    if ours and channel is not None:
+        raise InputError(f"{where}: a recording has no channels: leave --channel out")
+    decoding = _decoding(file, stack, ours, where, channel)
     count, *picture = decoding.shape(shape)
     if 0 in picture:
         raise InputError(f"{where} has shape {shape}: its frames have no pixels; record it again")
@@ -257,7 +260,7 @@ def _find_stack(
     return stack, state, decoding
 
 
-def _decoding(file: Hdf5File, stack: h5py.Dataset, ours: bool, where: str) -> Decoding:
+def _decoding(file: Hdf5File, stack: h5py.Dataset, ours: bool, where: str, channel: int | None) -> Decoding:
     """Return how frames are decoded from the stored values, according to attributes and axes of the stack."""
     with translate_os_errors(where):
         dtype = stack.dtype.newbyteorder("=")
@@ -265,12 +268,12 @@ def _decoding(file: Hdf5File, stack: h5py.Dataset, ours: bool, where: str) -> De
     packing = file.packing(stack)
     if ours:
         return Decoding(dtype, packing=packing, where=where)
-    if file.attribute_values(stack, "MATLAB_class") is not None:
+    if file.attribute_values(stack, "MATLAB_class") is not None and stack.ndim == 3:
         # MATLAB stores the axes in the opposite order, and a stack of pictures is (H, W, T) there.
         return Decoding(dtype, (0, 2, 1), packing, where=where, matlab=True)
     names = file.dimensions(stack)
-    order = order_of(names, where) if names else (0, 1, 2)
-    return Decoding(dtype, order, packing, names, where)
+    order, fixed = frame_axes(stack.shape, names, channel, where)
+    return Decoding(dtype, order, packing, names, where, fixed=fixed)
 
 
 def is_recording(path: str | Path) -> bool:

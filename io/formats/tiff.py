@@ -199,12 +199,16 @@ class TiffFrames(WholeFrames):
             raise InputError(f"{name} is compressed by {kind}: save it with LZW or deflate, or uncompressed")
         if dtype == "float16" and page.predictor == _FLOATING:
             raise InputError(f"{name} is {dtype}, compressed with a predictor: save it uncompressed")
-        self.dtype, rows, columns = np.dtype(dtype), page.imagelength, page.imagewidth
+        self.dtype, lines = np.dtype(dtype), _frames_in_lines(series)
+        rows, columns = self._picture = lines[1:] if lines else (page.imagelength, page.imagewidth)
         size = rows * columns * page.samplesperpixel * self.dtype.itemsize
         packed = 0 if page.compression == _NONE else min(sum(page.databytecounts), self._file.filehandle.size)
         where, samples = f"{name} (page {page.index + 1})", page.samplesperpixel
         check_picture(where, columns, rows, self.dtype.itemsize, samples, packed, copies=1)
-        self._numbers, self._colour = _numbers(name, series, self._channel)
+        if lines:
+            self._numbers, self._colour = np.arange(lines[0], dtype=np.intp), self._channel
+        else:
+            self._numbers, self._colour = _numbers(name, series, self._channel)
         if None in series.pages:
             self._leave_out(np.array([page is not None for page in series.pages])[self._numbers])
         self._orientation = _orientation(page)
@@ -269,7 +273,7 @@ class TiffFrames(WholeFrames):
 
     def _stored(self, index: int, name: str) -> NDArray[Any]:
         """Return the samples of a page, (H, W) or (H, W, channels): blue, green, red, opacity."""
-        page, rows, columns = self._page, self._page.imagelength, self._page.imagewidth
+        page, (rows, columns) = self._page, self._picture
         samples = page.samplesperpixel
         planar = samples > 1 and page.planarconfig == _SEPARATE
         shape = (samples, rows, columns) if planar else (rows, columns, samples)
@@ -387,18 +391,28 @@ def _describe(series: Any) -> str:
     return f"{' x '.join(map(str, series.shape))} {series.dtype} ({series.axes})"
 
 
+def _frames_in_lines(series: Any) -> tuple[int, int, int] | None:
+    """Return frames, rows and columns if each page is one line of a frame, because of axes of length 1."""
+    page, shape = series.keyframe, [length for length in series.shape if length != 1]
+    line = 1 in (page.imagelength, page.imagewidth) and page.samplesperpixel == 1
+    if not line or series.dataoffset is None or len(shape) != 3 or series.kind != "shaped":
+        return None
+    frames, rows, columns = shape
+    return frames, rows, columns
+
+
 def _numbers(name: str, series: Any, channel: int | None) -> tuple[NDArray[np.intp], int | None]:
     """Return the pages of a series that are frames, in order, and the colour to read from each."""
     inner = len(series.keyframe.shape)  # axes within a page: rows, columns, and perhaps colours
     axes, shape = series.axes, series.shape
-    if axes.endswith("S") and not series.keyframe.axes.endswith("S") and shape[-1] == 1:
+    if shape[-1] == 1 and axes[-1] not in series.keyframe.axes:
         axes, shape = axes[:-1], shape[:-1]
     axes, shape = axes[: len(axes) - inner], shape[: len(shape) - inner]
     pages = np.arange(int(np.prod(shape, dtype=np.int64)), dtype=np.intp).reshape(shape)
     long = {axis: length for axis, length in zip(axes, shape, strict=True) if length > 1}
-    of_frames = [axis for axis in long if axis in _FRAME_AXES]
+    of_frames = [axis for axis, length in zip(axes, shape, strict=True) if length > 1 and axis in _FRAME_AXES]
     if len(of_frames) > 1 or set(long) - {*_FRAME_AXES, "C"}:
-        sizes = " x ".join(f"{length} {axis}" for axis, length in long.items())
+        sizes = " x ".join(f"{n} {axis}" for axis, n in zip(axes, shape, strict=True) if n > 1)
         raise InputError(
             f"{name} has the axes {series.axes} ({sizes}), but frames have one order: save one of them"
         )

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.base.findings import Finding
+from mirrorskin.io.base.text import one_line, shortened
 from mirrorskin.io.base.types import Floats, Motion
 from mirrorskin.io.base.units import Kind, in_base
 
 if TYPE_CHECKING:
     from mirrorskin.io.base.samples import Decoding
-    from mirrorskin.io.storage.hdf5 import Hdf5File
+    from mirrorskin.io.storage.hdf5 import Hdf5File, Spacing
 
 _SERIES: dict[Kind, str] = {"time": "time", "length": "travel", "angle": "phase"}
 _MOTIONS: dict[str, Motion] = {"travel": "vertical", "phase": "axial"}
@@ -53,14 +54,17 @@ def read_coordinates(file: Hdf5File, stack: h5py.Dataset, decoding: Decoding) ->
         group = str(stack.name).rpartition("/")[0]
         shape = decoding.shape(stack.shape)
         names = [decoding.names[axis] for axis in decoding.order]
+        spacing = file.spacing(stack)
         axes = [
-            _axis(file, f"{group}/{name}", count) if name else None
+            _evenly_spaced(spacing[name], count) if name in spacing else _axis(file, f"{group}/{name}", count)
             for name, count in zip(names, shape, strict=True)
         ]
         if axes[0] is not None:
             _take_series(coordinates, names[0], *axes[0], decoding.where)
         steps = [
-            _step(coordinates, name, direction, axis, decoding.where)
+            _stated_step(coordinates, name, spacing[name], decoding.where)
+            if name in spacing
+            else _step(coordinates, name, direction, axis, decoding.where)
             for name, direction, axis in zip(names[1:], (-1, 1), axes[1:], strict=True)
         ]
         if steps[0] and steps[1]:
@@ -80,20 +84,48 @@ def read_coordinates(file: Hdf5File, stack: h5py.Dataset, decoding: Decoding) ->
 
 def _axis(file: Hdf5File, name: str, count: int) -> tuple[Kind, Floats] | None:
     """Return the kind of a coordinate and its values in the base unit; None if there is none with a unit."""
-    node = file.find(name)
+    node = None if name.endswith("/") else file.find(name)
     if not isinstance(node, h5py.Dataset) or node.shape != (count,) or node.dtype.kind not in "iuf":
         return None
     unit = str(file.attribute(name, "units") or "")
     since = _SINCE.fullmatch(unit)
-    unit = since[1] if since else unit
+    known = _kind_of(since[1] if since else unit)
+    if known is None:
+        return None
+    values = file.read(node, (count,)).astype(np.float64) * known[1]
+    return known[0], values - values[0] if since else values
+
+
+def _evenly_spaced(spacing: Spacing, count: int) -> tuple[Kind, Floats] | None:
+    """Return the kind of evenly spaced coordinates and their values in the base unit, if they have one."""
+    known = _kind_of(spacing.unit)
+    if known is None or not spacing.step:
+        return None
+    values = spacing.first + spacing.step * np.arange(count, dtype=np.float64)
+    return known[0], values * known[1]
+
+
+def _stated_step(coordinates: Coordinates, name: str, spacing: Spacing, where: str) -> float | None:
+    """Return the stated distance of rows or columns, mm; a note if its unit is no length."""
+    known = _kind_of(spacing.unit)
+    if known is not None and known[0] == "length":
+        return abs(spacing.step) * known[1]
+    if spacing.step != 1:
+        unit = f"the unit {shortened(one_line(spacing.unit))!r}" if spacing.unit else "no unit"
+        text = f"{where}: the spacing of {name}, {spacing.step:g} with {unit}, is not used: give --pixel-size"
+        coordinates.findings.append(Finding("pixel size", text, warning=False))
+    return None
+
+
+def _kind_of(unit: str) -> tuple[Kind, float] | None:
+    """Return the kind of coordinates with a unit, and the factor to the base unit; None if it is unknown."""
     for kind in _SERIES:
         try:
             factor = in_base(unit, kind) if unit else 0.0
         except ValueError:
             continue
         if factor:
-            values = file.read(node, (count,)).astype(np.float64) * factor
-            return kind, values - values[0] if since else values
+            return kind, factor
     return None
 
 

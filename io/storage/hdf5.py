@@ -6,10 +6,10 @@ import math
 import os
 import re
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from typing import Any, BinaryIO, NamedTuple, TypeAlias
 
 import h5py
 import numpy as np
@@ -33,12 +33,21 @@ bytes as its own size, and ``memory_limit`` raises the limit.
 """
 
 _LINKS_DEEP = 16
+_MOST_AXES = 6  # of a stack of frames, with those of length 1
 _MOST_STEPS = 100_000  # maximum number of links, and of sources of virtual datasets, to follow
 _GROUPS_DEEP = 64
 _SCALES = b"DIMENSION_LIST"  # attribute with references to the scales of each axis
 _LEAST_FILE = 512  # minimum size of an HDF5 file with a dataset, bytes
 _MOST_OBJECTS = 20_000  # groups and datasets in a file
 _MOST_NAMES = 10_000  # members of a group that is read as a whole
+
+
+class Spacing(NamedTuple):
+    """Evenly spaced coordinates of an axis: the unit, the step, and the first one."""
+
+    unit: str
+    step: float
+    first: float
 
 
 class Hdf5File(Closing):
@@ -133,14 +142,18 @@ class Hdf5File(Closing):
             yield from walk_objects(self.root, str(self.path))
 
     def stacks(self) -> dict[str, str]:
-        """Return the three-dimensional datasets of the file itself, with their sizes and types."""
+        """Return the datasets of the file itself that may be stacks of frames, with their sizes and types."""
         with translate_os_errors(str(self.path)):
-            names = {
-                name: f"{' x '.join(map(str, node.shape))} {node.dtype}"
+            found = {
+                name: node
                 for name, node in self.objects()
-                if isinstance(node, h5py.Dataset) and node.ndim == 3
+                if isinstance(node, h5py.Dataset) and _may_be_stack(node.shape)
             }
-        return dict(sorted(names.items()))
+            exact = {name: node for name, node in found.items() if node.ndim == 3}
+            return {
+                name: f"{' x '.join(map(str, node.shape))} {node.dtype}"
+                for name, node in sorted((exact or found).items())
+            }
 
     def check_frames(self, stack: h5py.Dataset, count: int) -> None:
         """Raise InputError for frames that HDF5 cannot read, or would replace by fill values."""
@@ -230,6 +243,10 @@ class Hdf5File(Closing):
         references = [entries[0] if len(entries) else None for entries in lists]
         names = [h5py.h5r.get_name(reference, node.id) if reference else None for reference in references]
         return tuple((name or b"").decode(errors="replace").rpartition("/")[2] for name in names)
+
+    def spacing(self, node: h5py.Dataset) -> Mapping[str, Spacing]:
+        """Return the spacing along axes that have no coordinates, by their names: none in HDF5."""
+        return {}
 
     def load(self, node: h5py.Dataset, rows: int | None = None) -> NDArray[Any]:
         """Read a dataset, or its first rows, if it is completely stored and within `VALUES_LIMIT`.
@@ -578,6 +595,13 @@ def check_storage(
             f"{file.where(dataset)} claims {claimed} {unit} and its file contains {held}: it was cut short; "
             "copy it again"
         )
+
+
+def _may_be_stack(shape: Shape | None) -> bool:
+    """Return whether an array has three axes, not counting others of length 1."""
+    return shape is not None and (
+        len(shape) == 3 or (3 < len(shape) <= _MOST_AXES and sum(length != 1 for length in shape) == 3)
+    )
 
 
 def chunks_of(dataset: h5py.Dataset) -> list[h5py.h5d.StoreInfo]:

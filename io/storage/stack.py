@@ -99,8 +99,10 @@ class Hdf5Frames(Closing):
 
     scratch_bytes: int
 
-    def __init__(self, dataset: h5py.Dataset, why: str) -> None:
-        self.chunk: tuple[int, ...] = dataset.chunks or (1, *dataset.shape[1:])
+    def __init__(self, dataset: h5py.Dataset, why: str, axis: int = 0) -> None:
+        whole = list(dataset.shape)
+        whole[axis if dataset.ndim > 3 else 0] = 1  # one frame
+        self.chunk: tuple[int, ...] = dataset.chunks or tuple(whole)
         self.length = self.chunk[0]
         self.scratch_bytes = math.prod(self.chunk) * dataset.dtype.itemsize
         self.how: str = f"through HDF5 ({why})"
@@ -142,7 +144,8 @@ class Stack:
         self._first, self._end = int(numbers[0]), int(numbers[-1]) + 1
         with translate_os_errors(f"{path}: {dataset.name}"):
             first = count if decoding.order[0] == 0 else int(dataset.shape[0])
-            reader: Reader = frames or _open(dataset, self._place, first, self._limit, threads)
+            axis = decoding.order[0]
+            reader: Reader = frames or _open(dataset, self._place, first, self._limit, threads, axis)
             self._frames = reader if decoding.plain else DecodedFrames(reader, decoding, dataset.shape)
             self._file = None if frames else dataset.file
             self._size = 0 if frames else os.fstat(dataset.file.id.get_vfd_handle()).st_size
@@ -237,21 +240,23 @@ class Stack:
 
 
 def _open(
-    dataset: h5py.Dataset, place: FrameLabel, count: int, limit: int, threads: int | None
+    dataset: h5py.Dataset, place: FrameLabel, count: int, limit: int, threads: int | None, axis: int
 ) -> RawFrames | Chunks | Hdf5Frames:
     """Open the frames: directly if they are contiguous, otherwise by chunks, otherwise through HDF5."""
     if why := _why_only_hdf5(dataset):
-        return Hdf5Frames(dataset, why)
+        return Hdf5Frames(dataset, why, axis)
     if dataset.chunks:
         codecs = find_codecs(dataset.id)
         if isinstance(codecs, str):
-            return Hdf5Frames(dataset, codecs)
+            return Hdf5Frames(dataset, codecs, axis)
         # The number of threads is limited so that a quarter of the memory suffices for them.
         count = max(1, limit // (4 * math.prod(dataset.chunks) * dataset.dtype.itemsize))
         return Chunks(dataset.id, codecs, place.name, min(threads or usable_cores(), count))
     offset = dataset.id.get_offset()
     if offset is None:
-        return Hdf5Frames(dataset, "in its header")
+        return Hdf5Frames(dataset, "in its header", axis)
+    if dataset.ndim > 3:
+        return Hdf5Frames(dataset, "several axes", axis)
     # A duplicate of HDF5's descriptor would keep the lock as long as it is open.
     file = os.open(dataset.file.filename, os.O_RDONLY | os.O_CLOEXEC)
     frames = RawFrames(file, offset, (count, *dataset.shape[1:]), dataset.dtype)

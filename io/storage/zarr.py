@@ -30,8 +30,9 @@ from mirrorskin.io.base.types import Closing, InputError
 from mirrorskin.io.base.url import Url, is_zarr, path_of
 from mirrorskin.io.storage.atomic import MAKE_ROOM, fixed_text
 from mirrorskin.io.storage.fingerprint import State, state_of
-from mirrorskin.io.storage.hdf5 import VALUES_LIMIT, Hdf5File, Shape
+from mirrorskin.io.storage.hdf5 import VALUES_LIMIT, Hdf5File, Shape, Spacing
 from mirrorskin.io.storage.layout import CHECKSUM, STACK
+from mirrorskin.io.storage.ome_zarr import levels_of
 from mirrorskin.io.storage.zarr_metadata import (
     METADATA,
     ArrayMetadata,
@@ -128,6 +129,7 @@ class ZarrFile(Hdf5File):
             root = h5py.File(os.urandom(8).hex(), "w", **memory)
             super().__init__(path, memory_limit, opening.enter_context(root))
             self._lay_out(groups)
+            self._levels = levels_of(groups)
             self._ours = any(name.startswith("mirrorskin_") for name in groups.get("/entry", {}))
             if self._ours:
                 self._read_early()
@@ -211,11 +213,26 @@ class ZarrFile(Hdf5File):
 
     def dimensions(self, node: h5py.Dataset) -> tuple[str, ...]:
         """Return the names of the axes of an array, "" for an axis without; empty if there are none."""
-        array = self.arrays[str(node.name)]
+        array, level = self.arrays[str(node.name)], self._levels.get(str(node.name))
+        if level is not None and len(level.axes) == node.ndim:
+            return level.axes
         names = array.document.get("dimension_names", array.attributes.get("_ARRAY_DIMENSIONS"))
         if not isinstance(names, list) or len(names) != node.ndim:
             return ()
         return tuple(name if isinstance(name, str) else "" for name in names)
+
+    def stacks(self) -> dict[str, str]:
+        """Return the arrays that may be stacks: of the pictures of OME, those of the highest resolution."""
+        first = [name for name, level in self._levels.items() if level.number == 0 and name in self.arrays]
+        if not first:
+            return super().stacks()
+        arrays = {name: self.arrays[name] for name in first}
+        return {name: f"{' x '.join(map(str, array.shape))} {array.dtype}" for name, array in arrays.items()}
+
+    def spacing(self, node: h5py.Dataset) -> Mapping[str, Spacing]:
+        """Return the spacing along the axes of a picture of OME."""
+        level = self._levels.get(str(node.name))
+        return {} if level is None or len(level.axes) != node.ndim else level.spacing
 
     def frames(self, stack: h5py.Dataset) -> ZarrFrames:
         """Return the object that reads the frames."""

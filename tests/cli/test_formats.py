@@ -146,7 +146,7 @@ def test_arrays_have_no_channels(tmp_path, monkeypatch, frames, name):
     monkeypatch.chdir(tmp_path)
     np.save("ball.npy", frames)
     record(ball((12, 16), (0.4, 0.4), TRAVEL), "ball.h5")
-    refused("have channels: leave --channel out", "reconstruct", name, *STEPS, "--channel", 1)
+    refused("has no channels: leave --channel out", "reconstruct", name, *STEPS, "--channel", 1)
 
 
 def test_time_stamps_of_an_import_stay_in_the_recording(tmp_path, monkeypatch, frames):

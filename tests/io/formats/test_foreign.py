@@ -255,14 +255,14 @@ def test_links_that_go_round_are_refused(path, tmp_path):
 def test_a_name_that_is_not_a_stack_is_refused(path):
     with h5py.File(path, "w") as file:
         file["group/x"], file["flat"], file["empty"] = STACK, STACK[0], h5py.Empty("u1")
-        file["four"], file["type"] = STACK[None], np.dtype("u1")
+        file["four"], file["type"] = STACK[None].repeat(2, 0), np.dtype("u1")
     refused(path, r"there is no nothing: name the stack with --dataset", dataset="nothing")
     refused(path, r"there is no flat/x: name", dataset="flat/x")
     refused(path, r"/group is not a dataset: name one with --dataset", dataset="group")
     refused(path, r"/ is not a dataset: name one", dataset="/")
     refused(path, r"/type is not a dataset: name one", dataset="type")
     refused(path, r"/flat has shape \(5, 7\): a stack of frames, \(T, H, W\), is needed", dataset="flat")
-    refused(path, r"/four has shape \(1, 8, 5, 7\)", dataset="four")
+    refused(path, r"/four has shape \(2, 8, 5, 7\)", dataset="four")
     refused(path, r"/empty has shape None", dataset="empty")
 
 
