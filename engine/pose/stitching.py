@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,11 +20,12 @@ from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
 from mirrorskin.io import InputError, Result, select_turn
-from mirrorskin.io.base.findings import carried
+from mirrorskin.io.base.findings import Finding, carried, with_findings
 from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.io.model.maps import StitchStatus, status_of
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE
 from mirrorskin.kernels.skin.pose_maps import SHARPEST
 
 _MIN_COMMON = 0.2  # smallest share of the smaller map's pixels that two touches must have in common
@@ -32,6 +34,7 @@ _POSE_ITERATIONS, _NEWTON_STEPS = 5, 8  # steps for the poses, and for a height 
 _LEVELLINGS = 3  # iterations for a touch of unknown offset, because positions of pixels depend on the height
 _DISAGREEMENT_Z_SCORE = 4.0  # sigmas between a touch and the mean above which they disagree
 _LARGEST = 1 << 28  # largest number of pixels of the stitched surface
+_OF_SECOND_DIFFERENCES = 6.0  # standard deviation of second differences along both axes, of noise of 1
 _UNFIT = 1e-9  # smallest information of a direction, relative to the largest
 
 
@@ -74,7 +77,8 @@ def stitch(
     ----------
     results : sequence of Result, mapping, xarray.Dataset or path
         Two or more, each with heights, the maps for `estimate_pose`, and an overlap with an earlier one.
-        An unknown offset of heights is determined from the overlap.
+        An unknown offset of heights is determined from the overlap. Where heights have no standard
+        deviations, as those of another program's surface, their noise is estimated, with a warning.
     pixel_size : float or (float, float), optional
         Millimetres along x and y; by default that of the results.
     names : sequence of str, optional
@@ -115,11 +119,9 @@ def stitch(
     ]
     opened = open_device(device)
     maps = []
+    relative = bool(np.any(touches[0].offset_unknown)) if touches[0].offset_unknown is not None else False
+    touches = [_comparable(touch, name) for touch, name in zip(touches, names, strict=True)]
     for touch, name in zip(touches, names, strict=True):
-        if touch.height_sigma is None:
-            raise InputError(
-                f"{name} has no height_sigma, which is needed to merge heights: reconstruct it again"
-            )
         try:
             maps.append(PoseMap.of(touch, pixel_size, opened))
         except InputError as error:
@@ -127,9 +129,38 @@ def stitch(
     graph = _Graph(maps, names, opened)
     poses = graph.solve()
     merged = _merged(touches, maps, poses, names)
+    if relative and merged.offset_unknown is None:
+        piece = np.where(np.isfinite(merged.height), 0, -1).astype(np.int32)
+        merged = merged.assign(component=piece, offset_unknown=np.ones(1, np.uint8))
     inherited = carried({}, **{str(name): touch.process for name, touch in zip(names, touches, strict=True)})
     merged = merged.assign(process={**merged.process, **inherited})
     return Stitch(merged, tuple(poses), len(graph.links))
+
+
+def _comparable(touch: Result, name: str) -> Result:
+    """Return a touch with what a surface file lacks: the noise of its heights, which it shows.
+
+    Its heights count although their zero is arbitrary: the pose contains the offset.
+    """
+    if touch.height_sigma is not None:
+        return touch
+    height = touch.height
+    if height is None or touch.normals is not None or min(height.shape) < 3:
+        raise InputError(
+            f"{name} has no height_sigma, which is needed to merge heights: reconstruct it again"
+        )
+    bend = np.diff(np.diff(height.astype(np.float64), 2, axis=0), 2, axis=1) / _OF_SECOND_DIFFERENCES
+    bend = bend[np.isfinite(bend)]
+    rounding = float(np.finfo(np.float32).eps * np.nanmax(np.abs(height)))
+    noise = max(math.sqrt(float(np.median(bend**2)) / MEDIAN_SQUARE) if bend.size else 0.0, rounding)
+    text = (
+        f"no standard deviations of heights: a noise of {noise:.2g} mm is estimated from second differences,"
+        " without errors that neighbours share"
+    )
+    sigma = np.where(np.isfinite(height), np.float32(noise), np.float32(np.nan))
+    if touch.offset_unknown is not None and touch.offset_unknown.size == 1:
+        touch = touch.assign(component=None, offset_unknown=None)
+    return with_findings(touch.assign(height_sigma=sigma), Finding("no sigma", text))
 
 
 class _Graph:
