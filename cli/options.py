@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.io.formats.registry import surfaces
 
 
 class MotionName(StrEnum):
@@ -51,7 +52,7 @@ def result_option(default: str) -> Option:
     return Option("--output", "-o", metavar="RES.h5", help=text, show_default=default)
 
 
-ResultFile = Annotated[Path, Argument(metavar="RES.h5", help="Result to take.")]
+ResultFile = Annotated[Path, Argument(metavar="RES.h5", help=f"Result to take, or a surface: {surfaces()}.")]
 Turn = Annotated[
     int | None,
     Option(metavar="N", min=0, help="Of a result of each turn: which one, from 0."),

@@ -9,11 +9,16 @@ from mirrorskin.cli import options
 from mirrorskin.cli.groups import Argument, Option
 from mirrorskin.cli.output import print_fields, print_json
 from mirrorskin.cli.stack import CHOICE, FORMATS
+from mirrorskin.io.formats.registry import surfaces
 
 
 def command(
     file: Annotated[
-        Path, Argument(metavar="FILE", help=f"Recording, result, calibration or frames: {FORMATS}.")
+        Path,
+        Argument(
+            metavar="FILE",
+            help=f"Recording, result, calibration, a surface ({surfaces()}) or frames: {FORMATS}.",
+        ),
     ],
     verify: Annotated[
         bool, Option("--verify", help="Read all frames, and compare them with their checksums.")

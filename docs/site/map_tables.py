@@ -87,6 +87,18 @@ def tables() -> dict[str, dict[str, str]]:
                 ["suffix", "content", "unit, and where it is stated", "holes", "filled heights", "opens in"],
                 _rows_of_exports(),
             ),
+            "surfaces of other programs": as_table(
+                [
+                    "surfaces of other programs",
+                    "what is read",
+                    "unit",
+                    "holes",
+                    "position",
+                    "what is refused",
+                    "extra",
+                ],
+                (_surface(form) for form in formats(installed=False) if form.decoder),
+            ),
         },
         "stages.md": {
             "`firmware`": as_table(["`firmware`", "controller", "scans"], map(_stage, built_in(STAGES)))
@@ -107,6 +119,10 @@ def _reader(form: Format) -> list[str]:
     suffixes = ", ".join(f"`{suffix}`" for suffix in form.suffixes if suffix != FOLDER)
     options = ", ".join(f"`--{name}`" for name in form.takes if name in ("dataset", "channel"))
     return [form.source, suffixes, options, f"`mirrorskin[{form.extra}]`" if form.extra else ""]
+
+
+def _surface(form: Format) -> list[str]:
+    return [*form.decoded, f"`mirrorskin[{form.extra}]`" if form.extra else ""]
 
 
 def _rows_of_exports() -> list[list[str]]:

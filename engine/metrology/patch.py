@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.base.inputs import spacing
 from mirrorskin.io import InputError, Region, Result
-from mirrorskin.io.model.result import select_turn
+from mirrorskin.io.model.result import select_turn, zero_of_relative
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE
 
@@ -187,7 +187,7 @@ def _comparable(result: Result, measured: Mask, part: tuple[slice, slice]) -> tu
         note = f"components left out, whose height is only relative: {lost}"
         return measured & ~relative, True, [note] if lost else []
     labels, counts = np.unique(component[inside], return_counts=True)
-    notes = ["heights are relative: their mean is 0"]
+    notes = [f"heights are relative: {zero_of_relative(result)}"]
     if labels.size > 1:
         measured = measured & (component == labels[np.argmax(counts)])
         notes.append(f"only the largest of {labels.size} components is measured: their offsets are unknown")

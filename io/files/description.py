@@ -15,7 +15,7 @@ from mirrorskin.io.files.arrays import list_arrays
 from mirrorskin.io.files.opening import open_recording
 from mirrorskin.io.files.recording import Recording
 from mirrorskin.io.files.result_file import open_result
-from mirrorskin.io.formats.registry import format_of_frames, holds_arrays, open_reader
+from mirrorskin.io.formats.registry import format_of_frames, format_of_surface, holds_arrays, open_reader
 from mirrorskin.io.model.calibration import PARTS, Calibration
 from mirrorskin.io.model.frames import FrameReader
 from mirrorskin.io.model.result import Result
@@ -26,7 +26,7 @@ from mirrorskin.io.storage.zarr import open_file
 
 
 def describe(path: str | Path, *, dataset: str | None = None, channel: int | None = None) -> dict[str, str]:
-    """Describe a file: a recording, a result, a calibration, or frames of another program.
+    """Describe a file: a recording, a result, a calibration, or frames or a surface of another program.
 
     ``dataset`` and ``channel`` choose frames as in ``open_recording``.
 
@@ -47,6 +47,7 @@ def describe(path: str | Path, *, dataset: str | None = None, channel: int | Non
     """
     path = path_of(path)
     form = format_of_frames(path)
+    surface = None if form else format_of_surface(path)
     if (dataset, channel) != (None, None) and form is None:
         raise InputError(f"{path}: all stacks of such a file are listed: leave --dataset and --channel out")
     if holds_arrays(path):
@@ -54,6 +55,8 @@ def describe(path: str | Path, *, dataset: str | None = None, channel: int | Non
     if form is not None:
         with open_reader(path, form, dataset=dataset, channel=channel, verify=False) as frames:
             return _frames(form.name, frames)
+    if surface is not None:
+        return _result(open_result(path)) | {"kind": f"surface, {surface.name}"}
     with open_file(path) as file:
         ours, result = file.marked(MARK), file.marked(RESULT_MARK)
         calibration = file.marked(CALIBRATION_MARK)

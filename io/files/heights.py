@@ -1,4 +1,4 @@
-"""Heights in a file: those of a result, or the true ones of a simulation."""
+"""Heights in a file: those of a result or a surface, or the true ones of a simulation."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from mirrorskin.io.base.url import path_of
 from mirrorskin.io.files.opening import open_recording
 from mirrorskin.io.files.recording import Recording
 from mirrorskin.io.files.result_file import open_result
+from mirrorskin.io.formats.registry import format_of_surface
 from mirrorskin.io.model.result import absolute_heights
 from mirrorskin.io.storage.layout import (
     MARK,
@@ -23,7 +24,7 @@ from mirrorskin.io.storage.zarr import open_file
 
 
 def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[np.float32]:
-    """Read the heights of a result, or the true heights of a simulated recording.
+    """Read the heights of a result or a surface, or the true heights of a simulated recording.
 
     Parameters
     ----------
@@ -47,8 +48,10 @@ def open_heights(path: str | Path, source: Recording | None = None) -> NDArray[n
     (480, 640)
     """
     path = path_of(path)
-    with open_file(path) as file:
-        ours = file.marked(MARK)
+    ours = False
+    if format_of_surface(path) is None:
+        with open_file(path) as file:
+            ours = file.marked(MARK)
     if ours:
         with open_recording(path) as recording:
             height, part = None if recording.truth is None else recording.truth.height, None

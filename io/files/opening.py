@@ -30,7 +30,12 @@ from mirrorskin.io.base.types import (
 )
 from mirrorskin.io.base.url import path_of
 from mirrorskin.io.files.recording import Recording, cut_out
-from mirrorskin.io.formats.registry import format_of_frames, holds_arrays, sources
+from mirrorskin.io.formats.registry import (
+    format_of_frames,
+    format_of_surface,
+    holds_arrays,
+    sources,
+)
 from mirrorskin.io.model.coordinates import Coordinates, read_coordinates
 from mirrorskin.io.model.positions import Positions, along
 from mirrorskin.io.storage.hdf5 import Hdf5File
@@ -158,8 +163,13 @@ def open_recording(
     with ExitStack() as opening:
         try:
             file = opening.enter_context(open_file(path, memory_limit))
-        except UnknownContentError as error:
-            raise InputError(f"{error}; frames are read from {sources()}") from None
+        except InputError as error:
+            if format_of_surface(path) is not None:
+                text = "holds a surface, not frames: 'measure', 'view' and 'export' take it"
+                raise InputError(f"{path} {text}") from None
+            if isinstance(error, UnknownContentError):
+                raise InputError(f"{error}; frames are read from {sources()}") from None
+            raise
         ours = file.marked(MARK)
         file.check_layout(MARK)
         stack, state, decoding = _find_stack(file, dataset, ours, channel)
@@ -283,7 +293,9 @@ def is_recording(path: str | Path) -> bool:
 
 
 def is_result(path: str | Path) -> bool:
-    """Return whether an HDF5 or Zarr file is a result written by mirrorskin."""
+    """Return whether a file is a result written by mirrorskin, or a surface of another program."""
+    if format_of_surface(path_of(path)) is not None:
+        return True
     with open_file(path) as file:
         return file.marked(RESULT_MARK)
 

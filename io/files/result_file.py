@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.base.arguments import check_flag, check_kind, check_path, checked
-from mirrorskin.io.base.system import translate_os_errors
+from mirrorskin.io.base.system import read_regular, translate_os_errors
 from mirrorskin.io.base.types import InputError, ProcessValue
 from mirrorskin.io.base.url import ZARR_SUFFIX, is_zarr, path_of
-from mirrorskin.io.formats.registry import Format, export_format
+from mirrorskin.io.formats.registry import Format, export_format, format_of_surface, missing_package
 from mirrorskin.io.model.fitted import Fitted
 from mirrorskin.io.model.maps import (
     SIGMA,
@@ -161,18 +161,24 @@ def _plot(result: Result) -> dict[str, Any]:
 
 @checked(path=check_path)
 def open_result(path: str | Path) -> Result:
-    """Read a result.
+    """Read a result, or the heights in a surface of another program, such as X3P, SUR or GSF.
+
+    The heights of another program are relative: the sheet at rest is not known. Positions are those of the
+    file if it states any, otherwise they are from the picture's centre.
 
     Raises
     ------
     InputError
-        The file does not exist, is not a result, or is damaged.
+        The file does not exist, is neither a result nor a surface, or is damaged.
 
     Examples
     --------
     >>> open_result("press-result.h5").height.shape  # doctest: +SKIP
     (480, 640)
     """
+    form = format_of_surface(path_of(path))
+    if form is not None:
+        return _surface(path_of(path), form)
     with _opened(path_of(path)) as file:
         stored, declarations = _find_maps(file)
         maps: dict[str, Any] = {}
@@ -197,11 +203,26 @@ def open_result(path: str | Path) -> Result:
         return Result(maps, **others, calibration=carried_by(file), declarations=declarations)
 
 
+def _surface(path: Path, form: Format) -> Result:
+    """Return the surface in a file of another program."""
+    content = read_regular(path)
+    if missing := missing_package(form):
+        raise InputError(f"{path} needs {missing}")
+    try:
+        surface: Result = form.load(form.decoder)(content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return surface.assign(process={"format": form.name, **surface.process})
+
+
 def open_process(path: str | Path, *names: str) -> dict[str, ProcessValue]:
     """Read the provenance of a result, or some values of it; its maps are checked, but not read.
 
     Missing values are left out. See ``open_result``.
     """
+    if format_of_surface(path_of(path)) is not None:
+        process = open_result(path).process
+        return {name: process[name] for name in names or process if name in process}
     with _opened(path_of(path)) as file:
         for node, shape in _find_maps(file)[0].values():
             if getattr(node, "shape", None) != shape:

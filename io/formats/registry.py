@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -68,16 +69,24 @@ class Format:
         Whether heights in millimetres are needed to export it.
     writes_itself : bool
         Whether the encoder writes the file.
+    decoder : str
+        Name of the function that returns the `Result` of a file, in the module of the declaration. Its
+        argument is the content of the file, bytes.
+    signatures : tuple of bytes
+        First bytes of the files that the decoder reads, by which they are recognised whatever their suffix.
     of_recordings : bool
         Whether the encoder takes a recording, too.
     recorder : str
         Name of the class that writes frames while they come, in the module of the declaration; "" if none
         does. See `mirrorskin.io.formats.mcap.GrowingMessages`.
     package, extra : str
-        Package that exporting it needs, and the extra of mirrorskin that installs what it needs.
+        Package that its encoder and decoder need, and the extra of mirrorskin that installs it.
     exported : tuple of tuples of str
         Rows of the table of exports in the documentation: suffix and option, content, unit and where it is
         stated, holes, filled heights, programs that open it.
+    decoded : tuple of str
+        Row of the table of surfaces in the documentation: suffix, content that is read, unit and where it is
+        stated, holes, position, what is refused.
     module : str
         Module of the declaration; it is set when the format is found.
     """
@@ -94,11 +103,14 @@ class Format:
     options: tuple[str, ...] = ()
     needs_heights: bool = True
     writes_itself: bool = False
+    decoder: str = ""
+    signatures: tuple[bytes, ...] = ()
     of_recordings: bool = False
     recorder: str = ""
     package: str = ""
     extra: str = ""
     exported: tuple[tuple[str, ...], ...] = ()
+    decoded: tuple[str, ...] = ()
     module: str = ""
 
     def load(self, name: str) -> Any:
@@ -159,6 +171,25 @@ def marks_folder(form: Format, folder: Path) -> bool:
         return text in file.read(_MARK_BYTES)
 
 
+def format_of_surface(path: Path) -> Format | None:
+    """Return the format of a file with a surface of another program, by its content or its suffix."""
+    if is_zarr(path):
+        return None
+    try:
+        with path.open("rb") if path.is_file() else BytesIO() as file:
+            head = file.read(_MARK_BYTES)
+    except OSError:  # reported when it is opened
+        head = b""
+    by_content = (form for form in _built_in() if form.decoder and head.startswith(form.signatures))
+    return next(by_content, None) or _named(path.suffix.lower(), "decoder")
+
+
+def surfaces() -> str:
+    """Return the names of the surfaces of other programs that are read, for help texts: "X3P, SUR or GSF"."""
+    *names, last = (form.name for form in formats(installed=False) if form.decoder)
+    return f"{', '.join(names)} or {last}"
+
+
 def holds_arrays(path: Path) -> bool:
     """Return whether a path is a file of NumPy."""
     return not is_zarr(path) and path.suffix.lower() in _NUMPY and not path.is_dir()
@@ -175,7 +206,7 @@ def has_frames(path: Path) -> bool:
 
 
 def is_of_others(path: Path) -> bool:
-    """Return whether a path is neither HDF5 nor Zarr, by its suffix or as a folder."""
+    """Return whether a path has frames in neither HDF5 nor Zarr, by its suffix or as a folder."""
     return holds_arrays(path) or format_of_frames(path) is not None
 
 
@@ -227,7 +258,7 @@ def contents() -> str:
 
 
 def missing_package(form: Format) -> str:
-    """Return what is missing to export a format, with the remedy; "" if nothing is."""
+    """Return what is missing to export or read a format, with the remedy; "" if nothing is."""
     if not form.package or find_spec(form.package) is not None:
         return ""
     remedy = f"mirrorskin[{form.extra}]" if form.extra else form.package

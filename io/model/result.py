@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 
 _UNKNOWN = Fitted()
+_CENTRED = 0.01  # largest mean of a piece, over the range of its heights, that counts as 0
 _FEW_GAPS = 16  # maximum number of gaps between codes that are searched one by one
 
 
@@ -467,6 +468,26 @@ def absolute_heights(result: Result) -> NDArray[np.float32] | None:
     if height is None or piece is None or unknown is None or not unknown.any():
         return height
     return np.where((piece >= 0) & (unknown[piece] == 0), height, np.float32(np.nan))
+
+
+def zero_of_relative(result: Result) -> str:
+    """Return what is 0 in pieces with an unknown offset, for notes: their mean, or nothing in particular.
+
+    Examples
+    --------
+    >>> piece = {"component": np.zeros((1, 2), np.int32), "offset_unknown": np.ones(1, np.uint8)}
+    >>> zero_of_relative(Result(piece, height=np.float32([[-1, 1]])))
+    'their mean is 0'
+    >>> zero_of_relative(Result(piece, height=np.float32([[9, 11]])))  # of another program
+    'their zero is arbitrary'
+    """
+    height, piece, unknown = result.height, result.component, result.offset_unknown
+    if height is not None and piece is not None and unknown is not None:
+        for number in np.flatnonzero(unknown)[:1]:
+            heights = height[(piece == number) & np.isfinite(height)].astype(np.float64)
+            if heights.size and abs(np.mean(heights)) > _CENTRED * np.ptp(heights):
+                return "their zero is arbitrary"
+    return "their mean is 0"
 
 
 def display_order(result: Result) -> list[str]:

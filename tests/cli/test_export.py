@@ -127,7 +127,7 @@ def test_a_filled_height_is_marked_in_a_cross_section():
     [
         (
             "-o first.npz -o a.off",
-            "a.off: .off is not a supported format: name a file that ends with one of .png .tif .tiff .mcap",
+            "a.off: .off is not a supported format: name a file that ends with one of .sur .gsf .png .tif",
         ),
         ("-o ball-result.h5", "ball-result.h5 is the input, or part of it: name another output with -o"),
         ("-o first.npz -o no/a.ply", "no/a.ply: there is no folder no: make it first"),

@@ -142,7 +142,7 @@ def _make_recordings(folder: Path) -> None:
         assert ended.code in (0, 1), ended.said  # 1: there is a result, without an answer
     io.save_calibration(a_calibration(), folder / "calibration.h5")
     result = folder / "vertical-result.h5"
-    for suffix in (".ply", ".stl", ".zarr", ".npz"):
+    for suffix in (".ply", ".stl", ".zarr", ".npz", ".x3p", ".sur", ".gsf"):
         _do(run("export", result, "-o", folder / f"result{suffix}"))
     for suffix in (".mcap", ".zarr"):
         _do(run("export", folder / "vertical-raw.h5", "-o", folder / f"recording{suffix}"))
@@ -379,6 +379,7 @@ COMMANDS: dict[str, list[Commands]] = {
     ".h5": [_of_hdf5],
     ".zarr": [_of_hdf5],
     ".zip": [_of_hdf5],
+    **{key: [_of_hdf5] for key in (".x3p", ".sur", ".gsf")},
     ".mcap": [_of_frames],
     ".npz": [_of_frames],
     ".npy": [_of_frames, _of_objects, _of_tables],
@@ -431,6 +432,7 @@ def _readers(suffix: str) -> list[Callable[[Any], object]]:
         ".h5": stores,
         ".zarr": stores,
         ".zip": stores,
+        **{key: [io.describe, io.open_heights, io.open_result, show] for key in (".x3p", ".sur", ".gsf")},
         ".toml": [load_rig, lambda path: read_settings(Path(path), 1 << 28)],
         ".csv": [lambda path: read_phases(Path(path)), lambda path: read_travel(Path(path))],
         ".npy": [lambda path: load_height_map(path, (0.1, 0.1))],

@@ -16,6 +16,7 @@ from mirrorskin.engine.metrology import Quantity
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.findings import warnings_in
 from mirrorskin.io.base.opencv import encode
+from mirrorskin.io.model.result import zero_of_relative
 from mirrorskin.view.report.surface import surface_data
 from mirrorskin.view.report.words import PIXELS, UNITS, Rows, map_rows, picture_texts, split_process
 
@@ -90,11 +91,11 @@ def _relative(result: Result) -> list[str]:
     if unknown is None or not unknown.any():
         return []
     if unknown.size == 1:
-        return ["The height is relative: its absolute offset is unknown, and its mean is set to 0."]
+        return [f"The height is relative: its absolute offset is unknown; {zero_of_relative(result)}."]
     count = "all" if unknown.all() else f"{np.count_nonzero(unknown)} of"
     return [
         f"The heights of {count} {unknown.size} pieces are relative: the offset of each "
-        "is unknown, and its mean is set to 0."
+        f"is unknown; {zero_of_relative(result)}."
     ]
 
 

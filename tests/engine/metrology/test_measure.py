@@ -215,7 +215,7 @@ def test_components_whose_height_is_relative_are_not_compared_with_others():
     assert "components left out, whose height is only relative: 1" in second.notes
     assert largest.quantities["measured area"].value == pytest.approx(1.2)
     assert "volume below rest plane" not in largest.quantities
-    assert largest.notes[0] == "heights are relative: their mean is 0"
+    assert largest.notes[0] == "heights are relative: their zero is arbitrary"
     assert largest.notes[1].startswith("only the largest of 2 components")
 
 

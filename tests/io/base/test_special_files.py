@@ -28,6 +28,8 @@ COMMANDS = {
     "ball.stl": (*PRESS, "--object"),
     "ball.ply": (*PRESS, "--object"),
     "ball.obj": (*PRESS, "--object"),
+    "scan.x3p": ("measure",),
+    "scan.sur": ("info",),
     "heights.npy": (*PRESS, "--object"),
     "heights.png": (*PRESS, "--object"),
     "heights.tif": (*PRESS, "--object"),

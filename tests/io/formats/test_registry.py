@@ -141,13 +141,13 @@ def test_without_the_file_of_a_format_others_are_read():
 
 def test_every_declaration_names_what_its_module_contains():
     for form in registry.formats(installed=False):
-        names = [name for name in (form.reader, form.encoder, form.recorder) if name]
+        names = [name for name in (form.reader, form.encoder, form.decoder, form.recorder) if name]
         assert names
         assert all(callable(form.load(name)) for name in names)
 
 
 def test_no_two_formats_have_the_same_use_of_a_suffix():
-    for use in ("reader", "encoder"):
+    for use in ("reader", "encoder", "decoder"):
         suffixes = [
             suffix
             for form in registry.formats(installed=False)
