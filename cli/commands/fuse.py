@@ -79,12 +79,12 @@ def command(
 def _open(path: Path, place: Motion, stack: StackOptions, limit: int) -> Recording:
     """Open a recording; the command line determines the motion of a file in another layout."""
     from mirrorskin import io
-    from mirrorskin.io.formats.registry import is_of_others
+    from mirrorskin.io.formats.registry import format_of_surface, is_of_others
     from mirrorskin.io.storage.layout import MARK
     from mirrorskin.io.storage.zarr import open_file
 
     ours = False
-    if not is_of_others(path):
+    if not is_of_others(path) and format_of_surface(path) is None:
         with open_file(path) as file:
             ours = file.marked(MARK)
     mine: Any = {**stack, "dataset": None, "channel": None} if ours else {**stack, "motion": place}

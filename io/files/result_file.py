@@ -209,7 +209,8 @@ def _surface(path: Path, form: Format) -> Result:
     if missing := missing_package(form):
         raise InputError(f"{path} needs {missing}")
     try:
-        surface: Result = form.load(form.decoder)(content)
+        with np.errstate(over="ignore", invalid="ignore"):  # heights that are not finite are none
+            surface: Result = form.load(form.decoder)(content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return surface.assign(process={"format": form.name, **surface.process})

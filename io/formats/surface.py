@@ -28,6 +28,7 @@ _FROM_PROCESS = {SOURCE: "source", DATE: "date", "turn": "turn"}
 _OURS, _AT_REST, _BETWEEN = "exported by mirrorskin", "from the sheet at rest", "; "
 _NOTES = SOURCE, DATE, "turn", SOFTWARE, "warnings", "heights", "filled"  # as `notes_of` names them
 _BYTES = 24  # memory for a point while it is read: as stored, as float64, and as its map
+_FARTHEST = 1e9  # mm, beyond which a height is none
 _LARGE_OFFSET = 1e3  # times the range of heights, beyond which float32 does not resolve them
 
 
@@ -168,6 +169,10 @@ def result_of_surface(
         raise InputError("no point of the surface is valid: save one with heights")
     findings = list(findings)
     lowest, highest = float(np.min(height[finite])), float(np.max(height[finite]))
+    if max(-lowest, highest) > _FARTHEST:
+        raise InputError(
+            f"its heights are from {lowest:g} to {highest:g} mm: its unit or its values are wrong"
+        )
     if abs(lowest) > _LARGE_OFFSET * (highest - lowest) > 0:
         height = height - lowest
         findings.append(Finding("surface file", f"heights are above z = {lowest:.9g} mm of the file", False))

@@ -117,7 +117,8 @@ def test_a_surface_is_described(suffix):
 @pytest.mark.parametrize("suffix", EXPORTED)
 def test_a_surface_is_not_taken_for_frames(suffix):
     io.export_result(press(), f"a{suffix}")
-    refused("holds a surface, not frames", f"check a{suffix}")
+    for line in ("check a{}", "fuse a{} a{} -o b.h5", "reconstruct a{} -o b.h5"):
+        refused("holds a surface, not frames", line.format(suffix, suffix))
 
 
 @OBLONG
@@ -556,6 +557,11 @@ def test_a_surface_without_valid_points_is_refused(suffix):
     else:
         write_gwy(__0__data=field(nothing))
     refused("no point of the surface is valid", f"measure a{suffix}")
+
+
+def test_absurd_heights_are_refused():
+    write_x3p(height=1e20 * HEIGHT)
+    refused("its heights are from 1e+17 to 1.2e+18 mm", "measure a.x3p")
 
 
 def test_a_missing_package_is_one_line(monkeypatch):
