@@ -29,7 +29,7 @@ from mirrorskin.io.base.system import (
     translate_os_errors,
 )
 from mirrorskin.io.base.types import FRAME_DTYPES, MOTIONS, Block, Header, InputError, Motion, block_memory
-from mirrorskin.io.files.recording import Recording, cut_out
+from mirrorskin.io.files.recording import Recording, cut_out, unwritten_frames
 from mirrorskin.io.formats.registry import Format, open_reader
 from mirrorskin.io.model.frames import FrameReader, WholeFrames
 from mirrorskin.io.model.positions import Positions, along, check_finite
@@ -152,6 +152,7 @@ class ArrayRecording(Recording):
             self.left_out, self.findings = reader.left_out, (*reader.findings, *decoding.findings)
         self.storage = reader.how if isinstance(reader, WholeFrames) else "one piece"
         self._next, self._hash = 0, ""
+        self._random_access = reader is None or reader.random_access
         if self.twist is not None and (extent := float(np.ptp(self.twist))) > math.pi:
             text = f"the twist spans {extent:.4g} rad, more than half a turn: is it in degrees?"
             self.findings = (*self.findings, Finding("twist", text))
@@ -226,6 +227,11 @@ class ArrayRecording(Recording):
     def how(self) -> str:
         """How the frames are read."""
         return "in place" if isinstance(self._frames, np.ndarray) else self._frames.how
+
+    @property
+    def random_access(self) -> bool:
+        """Whether a frame is read without others."""
+        return self._random_access
 
     @property
     def modified(self) -> str:
@@ -461,7 +467,7 @@ def open_stack(
         properties = {name: value for name, value in held.items() if name not in POSITIONS.values()}
         header = properties | {name: value for name, value in header.items() if value is not None}
         recording = ArrayRecording(frames, series, header, motion, region, frame_range, str(path), files)
-        recording.findings += rest
+        recording.findings += (*rest, *unwritten_frames(recording))
         opening.pop_all()  # the recording closes the file from now on
     return recording
 

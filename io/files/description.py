@@ -21,6 +21,7 @@ from mirrorskin.io.model.frames import FrameReader
 from mirrorskin.io.model.result import Result
 from mirrorskin.io.storage.calibration_file import MARK as CALIBRATION_MARK
 from mirrorskin.io.storage.calibration_file import open_calibration
+from mirrorskin.io.storage.hdf5 import Hdf5File
 from mirrorskin.io.storage.layout import MARK, RESULT_MARK
 from mirrorskin.io.storage.zarr import open_file
 
@@ -60,7 +61,7 @@ def describe(path: str | Path, *, dataset: str | None = None, channel: int | Non
     with open_file(path) as file:
         ours, result = file.marked(MARK), file.marked(RESULT_MARK)
         calibration = file.marked(CALIBRATION_MARK)
-        stacks = {} if ours or result or calibration else file.stacks()
+        stacks = {} if ours or result or calibration else file.stacks() or _linked(file)
     if calibration:
         return {"kind": "calibration", **_calibration(open_calibration(path))}
     if ours:
@@ -70,6 +71,12 @@ def describe(path: str | Path, *, dataset: str | None = None, channel: int | Non
         return _result(open_result(path))
     container = "Zarr" if is_zarr(path) else "HDF5 file"
     return {"kind": f"{container} of another layout", "stacks": str(len(stacks)), **stacks}
+
+
+def _linked(file: Hdf5File) -> dict[str, str]:
+    """Return the stacks that links of a file lead to, with their sizes and types."""
+    linked = file.linked_stacks().items()
+    return {name: f"{' x '.join(map(str, node.shape))} {node.dtype} (a link)" for name, node in linked}
 
 
 def _frames(kind: str, frames: FrameReader) -> dict[str, str]:

@@ -21,16 +21,17 @@ from mirrorskin.io.base.arguments import (
 from mirrorskin.io.base.checksums import UNVERIFIED, UNVERIFIED_PARTS
 from mirrorskin.io.base.content import UnknownContentError
 from mirrorskin.io.base.findings import Finding
-from mirrorskin.io.base.samples import Decoding, frame_axes, frame_dtype
 from mirrorskin.io.base.selection import Region
-from mirrorskin.io.base.system import translate_os_errors
 from mirrorskin.io.base.types import (
     InputError,
     Motion,
 )
 from mirrorskin.io.base.url import path_of
-from mirrorskin.io.files.recording import Recording, cut_out
+from mirrorskin.io.files.parts import PARTS
+from mirrorskin.io.files.recording import Recording, cut_out, unwritten_frames
+from mirrorskin.io.files.stacks import find_stack, names_of_stack, part_findings
 from mirrorskin.io.formats.registry import (
+    Format,
     format_of_frames,
     format_of_surface,
     holds_arrays,
@@ -48,7 +49,6 @@ from mirrorskin.io.storage.layout import (
     RecordingState,
     as_series,
     read_checksums,
-    read_state,
 )
 from mirrorskin.io.storage.stack import Stack
 from mirrorskin.io.storage.zarr import ZarrFile, open_file
@@ -139,7 +139,8 @@ def open_recording(
     form = format_of_frames(path)
     if channel is not None and holds_arrays(path):
         raise InputError(f"{path}: an array of NumPy has no channels: leave --channel out")
-    if form is not None or holds_arrays(path):
+
+    def open_other(form: Format | None) -> Recording:
         from mirrorskin.io.files.arrays import open_stack
 
         if live:
@@ -147,32 +148,22 @@ def open_recording(
         properties = {"tilt": tilt, "pixel_size": pixel_size}
         where = {"travel": travel, "phase": phase}
         part = region, frames
-        return open_stack(
-            path,
-            form,
-            dataset,
-            channel,
-            where,
-            properties,
-            motion,
-            *part,
-            memory_limit,
-            override_motion,
-            verify,
-        )
+        chosen = dataset, channel, where, properties, motion
+        return open_stack(path, form, *chosen, *part, memory_limit, override_motion, verify)
+
+    if form is not None or holds_arrays(path):
+        return open_other(form)
     with ExitStack() as opening:
         try:
             file = opening.enter_context(open_file(path, memory_limit))
         except InputError as error:
-            if format_of_surface(path) is not None:
-                text = "holds a surface, not frames: 'measure', 'view' and 'export' take it"
-                raise InputError(f"{path} {text}") from None
-            if isinstance(error, UnknownContentError):
-                raise InputError(f"{error}; frames are read from {sources()}") from None
-            raise
+            raise _explained(path, error) from None
         ours = file.marked(MARK)
         file.check_layout(MARK)
-        stack, state, decoding = _find_stack(file, dataset, ours, channel)
+        names = [dataset or STACK] if ours else names_of_stack(file, dataset)
+        if len(names) > 1:
+            return open_other(PARTS)
+        stack, state, decoding, found = find_stack(file, names[0], ours, channel, frames, memory_limit)
         shape = (state.count, *decoding.shape(stack.shape)[1:])
         selection = cut_out(str(path), shape, frames, region)
         coordinates = Coordinates() if ours else read_coordinates(file, stack, decoding)
@@ -203,9 +194,20 @@ def open_recording(
         recording = Recording(
             file, stack, frames_of, selection, header, positions, layout, state, shape, live
         )
-        recording.findings += (*decoding.findings, *coordinates.findings, *notes)
+        if not ours:
+            found += (*part_findings(file, names[0]), *unwritten_frames(recording))
+        recording.findings += (*found, *decoding.findings, *coordinates.findings, *notes)
         opening.pop_all()  # the recording closes the file from now on
     return recording
+
+
+def _explained(path: Path, error: InputError) -> InputError:
+    """Return the error for a file that cannot be opened as HDF5 or Zarr, with what is read instead."""
+    if format_of_surface(path) is not None:
+        return InputError(f"{path} holds a surface, not frames: 'measure', 'view' and 'export' take it")
+    if isinstance(error, UnknownContentError):
+        return InputError(f"{error}; frames are read from {sources()}")
+    return error
 
 
 def _used(
@@ -241,51 +243,6 @@ def _expected(
     return read_checksums(file, node, state), ()
 
 
-def _find_stack(
-    file: Hdf5File, dataset: str | None, ours: bool, channel: int | None = None
-) -> tuple[h5py.Dataset, RecordingState, Decoding]:
-    """Return the stack of frames, its state and its decoding; InputError if it cannot be read."""
-    if dataset is None:
-        dataset = STACK if ours else _only_stack(file)
-    stack = file.follow(dataset, "name the stack with --dataset")
-    where = file.where(stack)
-    if not isinstance(stack, h5py.Dataset):
-        raise InputError(f"{where} is not a dataset: name one with --dataset")
-    with translate_os_errors(where):
-        shape = stack.shape
-    ours = ours and stack == file.find(STACK)
-    if shape is None or (ours and len(shape) != 3):
-        raise InputError(f"{where} has shape {shape}: a stack of frames, (T, H, W), is needed")
-    if ours and channel is not None:
-        raise InputError(f"{where}: a recording has no channels: leave --channel out")
-    decoding = _decoding(file, stack, ours, where, channel)
-    count, *picture = decoding.shape(shape)
-    if 0 in picture:
-        raise InputError(f"{where} has shape {shape}: its frames have no pixels; record it again")
-    state = read_state(file, ours, stack, count)
-    if state.count < 2:
-        frames = f"{state.count} frame{'' if state.count == 1 else 's'}"
-        raise InputError(f"{where} contains {frames}: at least 2 are needed; record more")
-    file.check_frames(stack, state.count if decoding.order[0] == 0 else shape[0])
-    return stack, state, decoding
-
-
-def _decoding(file: Hdf5File, stack: h5py.Dataset, ours: bool, where: str, channel: int | None) -> Decoding:
-    """Return how frames are decoded from the stored values, according to attributes and axes of the stack."""
-    with translate_os_errors(where):
-        dtype = stack.dtype.newbyteorder("=")
-    frame_dtype(dtype, where)
-    packing = file.packing(stack)
-    if ours:
-        return Decoding(dtype, packing=packing, where=where)
-    if file.attribute_values(stack, "MATLAB_class") is not None and stack.ndim == 3:
-        # MATLAB stores the axes in the opposite order, and a stack of pictures is (H, W, T) there.
-        return Decoding(dtype, (0, 2, 1), packing, where=where, matlab=True)
-    names = file.dimensions(stack)
-    order, fixed = frame_axes(stack.shape, names, channel, where)
-    return Decoding(dtype, order, packing, names, where, fixed=fixed)
-
-
 def is_recording(path: str | Path) -> bool:
     """Return whether an HDF5 or Zarr file is a recording written by mirrorskin."""
     with open_file(path) as file:
@@ -298,19 +255,3 @@ def is_result(path: str | Path) -> bool:
         return True
     with open_file(path) as file:
         return file.marked(RESULT_MARK)
-
-
-def _only_stack(file: Hdf5File) -> str:
-    if file.marked(RESULT_MARK):
-        raise InputError(f"{file.path} is a result: give the recording that it was made from")
-    names = list(file.stacks())
-    if not names:
-        raise InputError(
-            f"{file.path} contains no stack of frames (T, H, W): if a link leads to one, name it with "
-            "--dataset"
-        )
-    if len(names) > 1:
-        raise InputError(
-            f"{file.path} contains {len(names)} stacks, {', '.join(names[:5])}: choose with --dataset"
-        )
-    return names[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import functools
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +25,7 @@ from mirrorskin.io.base.types import (
     block_memory,
 )
 from mirrorskin.io.model.calibration import Calibration
+from mirrorskin.io.model.frames import is_blank
 from mirrorskin.io.storage.calibration_file import carried_by
 from mirrorskin.io.storage.fingerprint import check_unchanged, fingerprint, modified, origins
 from mirrorskin.io.storage.hdf5 import Hdf5File
@@ -228,6 +230,11 @@ class Recording(Closing):
         """Time of the last change of the files, as ISO 8601; empty for an address."""
         return modified(self._origins) if self._origins else ""
 
+    @property
+    def random_access(self) -> bool:
+        """Whether a frame is read without others."""
+        return self._stack.random_access
+
     def close(self) -> None:
         """Close the file; frames that were returned without a copy remain valid."""
         self._closed = True
@@ -253,3 +260,21 @@ def cut_out(
     region = region or Region.whole(shape[1:])
     region.check(shape[1:], name)
     return Selection((start, stop), region)
+
+
+def unwritten_frames(recording: Recording) -> tuple[Finding, ...]:
+    """Return the finding for the last frames of a recording if they are blank, and the first is not."""
+    count = recording.shape[0]
+    if (
+        not recording.random_access
+        or not is_blank(recording.frame(count - 1))
+        or is_blank(recording.frame(0))
+    ):
+        return ()
+    first = bisect.bisect_left(range(count), True, key=lambda number: is_blank(recording.frame(number)))
+    start = recording.first_frame
+    text = (
+        f"the last {count - first} frames contain only zeros, as if they had never been written: --frames"
+        f" {start}:{start + first} leaves them out"
+    )
+    return (Finding("number of frames", text),)

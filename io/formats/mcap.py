@@ -408,7 +408,7 @@ def open_messages(
         raise InputError(f"{missing} is missing, which the bag's metadata list: copy it there")
     with ExitStack() as opening:
         parts = [opening.enter_context(MessageFrames(file, dataset, channel, verify)) for file in files]
-        whole = parts[0] if len(parts) == 1 else JoinedFrames(parts)
+        whole = parts[0] if len(parts) == 1 else JoinedFrames(parts, list(map(str, files)))
         opening.pop_all()  # the reader closes the files from now on
     return whole
 

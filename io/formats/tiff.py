@@ -81,6 +81,7 @@ class TiffFrames(WholeFrames):
     """
 
     how = "page by page"
+    random_access = True
 
     def __init__(
         self,

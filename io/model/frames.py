@@ -45,6 +45,8 @@ class FrameReader(Closing, ABC):
         The positions in the file; names as in `Block`.
     header : mapping
         The properties in the file; names as in `Header`.
+    random_access : bool
+        Whether any frame is read without those before it.
     left_out : tuple of str
         Files of a folder that are not frames.
     findings : tuple of Finding
@@ -64,6 +66,7 @@ class FrameReader(Closing, ABC):
     lost: NDArray[np.int32] | None = None
     positions: Mapping[str, Floats] = MappingProxyType({})
     header: Mapping[str, Any] = MappingProxyType({})
+    random_access: bool = False
     left_out: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 
@@ -117,16 +120,19 @@ class JoinedFrames(WholeFrames):
     ----------
     parts : sequence of WholeFrames
         They have frames of the same size and type, and are closed with this object.
+    names : sequence of str
+        The names of the parts, for messages.
     """
 
-    def __init__(self, parts: Sequence[WholeFrames]) -> None:
+    def __init__(self, parts: Sequence[WholeFrames], names: Sequence[str]) -> None:
         self._parts, first = parts, parts[0]
+        self.random_access = all(part.random_access for part in parts)
         self._ends = np.cumsum([part.shape[0] for part in parts])
-        for part in parts:
+        for part, name in zip(parts, names, strict=True):
             if part.shape[1:] != first.shape[1:] or part.dtype != first.dtype:
                 raise InputError(
-                    f"{part.files[0]} has frames of {kind_of(part.shape[1:], part.dtype)}, but"
-                    f" {first.files[0]} of {kind_of(first.shape[1:], first.dtype)}: read them one by one"
+                    f"{name} has frames of {kind_of(part.shape[1:], part.dtype)}, but {names[0]} of"
+                    f" {kind_of(first.shape[1:], first.dtype)}: read them one by one"
                 )
         self.shape, self.dtype = (int(self._ends[-1]), *first.shape[1:]), first.dtype
         self.how, self.header = f"{first.how}, {len(parts)} parts", first.header
@@ -174,6 +180,11 @@ def part_of_several(name: str, names: Sequence[str], whole: str) -> Finding:
         f"{name} is one of {len(names)} parts, {names[0]} to {names[-1]}, and only its frames are read: name"
         f" {whole} to read all",
     )
+
+
+def is_blank(frame: NDArray[Any]) -> bool:
+    """Return whether a frame contains only zeros, or only NaN, as one that was never written."""
+    return not np.any(frame) or (frame.dtype.kind == "f" and bool(np.isnan(frame).all()))
 
 
 def kind_of(shape: Sequence[int], dtype: np.dtype[Any]) -> str:

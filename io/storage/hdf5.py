@@ -6,10 +6,10 @@ import math
 import os
 import re
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TypeAlias
+from typing import Any, BinaryIO, NamedTuple, TypeAlias, TypeGuard
 
 import h5py
 import numpy as np
@@ -144,20 +144,51 @@ class Hdf5File(Closing):
     def stacks(self) -> dict[str, str]:
         """Return the datasets of the file itself that may be stacks of frames, with their sizes and types."""
         with translate_os_errors(str(self.path)):
-            found = {
-                name: node
-                for name, node in self.objects()
-                if isinstance(node, h5py.Dataset) and _may_be_stack(node.shape)
-            }
+            found = {name: node for name, node in self.objects() if _is_stack(node)}
             exact = {name: node for name, node in found.items() if node.ndim == 3}
             return {
                 name: f"{' x '.join(map(str, node.shape))} {node.dtype}"
                 for name, node in sorted((exact or found).items())
             }
 
-    def check_frames(self, stack: h5py.Dataset, count: int) -> None:
+    def linked_stacks(self) -> dict[str, h5py.Dataset]:
+        """Return the datasets that may be stacks and that soft or external links lead to, each once."""
+        found: dict[str, h5py.Dataset] = {}
+        with translate_os_errors(str(self.path)):
+            groups = {"": self.root} | {name: node for name, node in self.objects() if _is_group(node)}
+            for group, node in groups.items():
+                for name in self.names(group or "/"):
+                    if self.is_link(group or "/", name):
+                        target = self.walk(node, name)
+                        if _is_stack(target) and target not in found.values():
+                            found[f"{group}/{name}"] = target
+        return dict(sorted(found.items()))
+
+    def is_link(self, group: str, name: str) -> bool:
+        """Return whether a member of a group is a soft or external link."""
+        node = self.find(group)
+        with translate_os_errors(f"{self.path}: {group}"):
+            encoded = name.encode(errors="surrogateescape")
+            if not isinstance(node, h5py.Group) or not node.id.links.exists(encoded):
+                return False
+            return bool(node.id.links.get_info(encoded).type != h5py.h5l.TYPE_HARD)
+
+    def written(self, stack: h5py.Dataset, axis: int) -> tuple[int, int, Sequence[int]]:
+        """Return the length of chunks along an axis, their number, and which of them are there completely."""
+        count = int(stack.shape[axis])
+        if not stack.chunks or stack.is_virtual:
+            return max(1, count), 1, range(1)
+        grid = [-(-n // c) for n, c in zip(stack.shape, stack.chunks, strict=True)]
+        length, needed = stack.chunks[axis], math.prod(grid) // max(1, grid[axis])
+        if stack.id.get_num_chunks() >= math.prod(grid):
+            return length, grid[axis], range(grid[axis])
+        places = [chunk.chunk_offset[axis] // length for chunk in chunks_of(stack)]
+        present, counts = np.unique(np.array(places, np.int64), return_counts=True)
+        return length, grid[axis], present[(counts >= needed) & (present < grid[axis])].tolist()
+
+    def check_frames(self, stack: h5py.Dataset, count: int, axis: int = 0) -> None:
         """Raise InputError for frames that HDF5 cannot read, or would replace by fill values."""
-        check_storage(self, stack, frames=count)
+        check_storage(self, stack, frames=count, axis=axis)
 
     def storage(self, stack: h5py.Dataset) -> str:
         """Return a description of how a stack is stored."""
@@ -569,16 +600,24 @@ _VIRTUAL_DEEP = 4
 
 
 def check_storage(
-    file: Hdf5File, dataset: h5py.Dataset, depth: int = 0, frames: int | None = None, values: bool = False
+    file: Hdf5File,
+    dataset: h5py.Dataset,
+    depth: int = 0,
+    frames: int | None = None,
+    values: bool = False,
+    axis: int = 0,
 ) -> None:
-    """Raise InputError for a dataset that HDF5 cannot read, or would replace by fill values."""
+    """Raise InputError for a dataset that HDF5 cannot read, or would replace by fill values.
+
+    Of a stack, only the first ``frames`` along an axis are needed.
+    """
     if depth > _VIRTUAL_DEEP:
         where = file.where(dataset)
         raise InputError(f"{where}: virtual datasets are nested too deeply; copy the frames into one dataset")
     with translate_os_errors(lambda: file.where(dataset)):
         shape, offset = dataset.id.shape, dataset.id.get_offset()
         if frames is not None:
-            shape = (frames, *shape[1:])
+            shape = (*shape[:axis], frames, *shape[axis + 1 :])
         claimed, unit = math.prod(shape) * dataset.id.dtype.itemsize, "bytes"
         if offset is not None:
             held = h5py.h5i.get_file_id(dataset.id).get_filesize() - offset
@@ -591,10 +630,22 @@ def check_storage(
         else:
             held = _bytes_held(file, dataset, depth, values)
     if held < claimed:
+        where = file.where(dataset)
+        if not held:
+            raise InputError(
+                f"{where} claims {claimed} {unit} and its file contains none: it was never written"
+            )
         raise InputError(
-            f"{file.where(dataset)} claims {claimed} {unit} and its file contains {held}: it was cut short; "
-            "copy it again"
+            f"{where} claims {claimed} {unit} and its file contains {held}: it was cut short; copy it again"
         )
+
+
+def _is_group(node: Node) -> bool:
+    return isinstance(node, h5py.Group)
+
+
+def _is_stack(node: Node | None) -> TypeGuard[h5py.Dataset]:
+    return isinstance(node, h5py.Dataset) and _may_be_stack(node.shape)
 
 
 def _may_be_stack(shape: Shape | None) -> bool:

@@ -48,6 +48,7 @@ class RawFrames(FrameReader):
     """Contiguous frames at an offset of a file, which is closed when the object is deleted at the latest."""
 
     how = "directly"
+    random_access = True
 
     def __init__(self, file: int, offset: int, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> None:
         self.shape, self.dtype, self._file, self._offset = shape, dtype, file, offset
@@ -159,6 +160,11 @@ class Stack:
     def how(self) -> str:
         """Return how frames are read, as text."""
         return self._how or self._frames.how
+
+    @property
+    def random_access(self) -> bool:
+        """Whether a frame is read without others."""
+        return self._frames.how.startswith(RawFrames.how)
 
     def read(self, start: int, out: NDArray[Any]) -> NDArray[Any]:
         """Read frames into ``out``, at most as many as it holds, and return them."""

@@ -7,6 +7,7 @@ in the same way. Values are read from the store when they are needed.
 from __future__ import annotations
 
 import base64
+import bisect
 import errno
 import hashlib
 import json
@@ -191,7 +192,37 @@ class ZarrFile(Hdf5File):
         values = self._decode(name, rows) if early is None else early.result().copy()
         return values if early is None or rows is None else values[:rows]
 
-    def check_frames(self, stack: h5py.Dataset, count: int) -> None:
+    def written(self, stack: h5py.Dataset, axis: int) -> tuple[int, int, Sequence[int]]:
+        """Return the length of chunks along an axis, their number, and which of them are in the store.
+
+        Those before the last one that is there are looked at when they are read.
+        """
+        from zarr.core.sync import sync
+
+        stored, where = self.arrays[str(stack.name)], self.where(stack)
+        length, slabs = stored.chunks[axis], -(-stored.shape[axis] // stored.chunks[axis])
+
+        def is_there(slab: int) -> bool:
+            return bool(sync(self._store.exists(self._key_of_last(str(stack.name), axis, slab))))
+
+        with errors_named(where):
+            if not slabs or is_there(slabs - 1):
+                return length, slabs, range(slabs)
+            last = bisect.bisect_left(range(slabs), True, key=lambda slab: not is_there(slab))
+        return length, slabs, range(last)
+
+    def _key_of_last(self, name: str, axis: int, slab: int) -> str:
+        """Return the key of the last chunk of an array whose place along an axis is given."""
+        stored, array = self.arrays[name], self._array(name)
+        place = [(n - 1) // piece for n, piece in zip(stored.shape, stored.chunks, strict=True)]
+        place[axis] = slab
+        return f"{stored.path}/{array.metadata.encode_chunk_key(tuple(place))}".lstrip("/")
+
+    def linked_stacks(self) -> dict[str, h5py.Dataset]:
+        """Return no datasets: Zarr has no links."""
+        return {}
+
+    def check_frames(self, stack: h5py.Dataset, count: int, axis: int = 0) -> None:
         """Raise InputError for missing frames, and for chunks that are too large for memory."""
         name = str(stack.name)
         stored, where = self.arrays[name], self.where(stack)
@@ -204,8 +235,7 @@ class ZarrFile(Hdf5File):
                 raise InputError(
                     f"{where} is in chunks of {size / 1e6:.3g} MB: raise --memory, or write smaller ones"
                 )
-            last = ((n - 1) // piece for n, piece in zip(stored.shape, stored.chunks, strict=True))
-            key = f"{stored.path}/{array.metadata.encode_chunk_key(tuple(last))}".lstrip("/")
+            key = self._key_of_last(name, axis, (count - 1) // stored.chunks[axis])
             if not sync(self._store.exists(key)):
                 raise MissingChunkError(
                     f"its last chunk, {key}, is missing: copy it again, or write empty ones, too"
