@@ -26,6 +26,7 @@ _NOISY, _FINE = 0.5, 4.0  # noise in steps of the samples from which it is seen,
 _DARK = 0.05  # share of a pixel's range
 _SMOOTH = 0.03  # share of steps with another sign than the one before, below which there is no noise
 _ALTERNATING = 0.5  # share of differences with another sign than the one before, above which they are noise
+_LIGHT, _MOST = 0.9, 0.5  # share of a pixel's range; share of its samples above it that are at its end
 _NEAR_NOISE = 4.0  # distance from a pixel's end within which noise would spread its samples, sigmas
 _NEAR, _NEXT = 1 / 16, 1 / 4  # distances from the end that are compared, share of the span
 _PARTS, _SPREAD = 12, 6.0  # of the further distance; least number of them that contain samples
@@ -73,7 +74,9 @@ def scale_ends(stored: NDArray[Any], counts: NDArray[np.float32]) -> NDArray[np.
         return ends
     common = float(np.mean(highest == top)) > REACHED
     at_end = np.count_nonzero(counts == highest, axis=0)
-    stuck = at_end >= _STUCK
+    lowest = counts.min(axis=0)
+    light = np.count_nonzero(counts >= lowest + _LIGHT * (highest - lowest), axis=0)
+    stuck = (at_end >= _STUCK) & (at_end > _MOST * light)
     if not common and np.mean(stuck) <= REACHED:
         return ends
     step = _step_of(stored if stored.dtype.kind == "u" else counts)
@@ -90,8 +93,8 @@ def scale_ends(stored: NDArray[Any], counts: NDArray[np.float32]) -> NDArray[np.
         return ends
     if noise > 0 and noise >= 2 * _NOISY * step:
         near = np.count_nonzero((counts < highest) & (counts >= highest - _NEAR_NOISE * noise), axis=0)
-        stuck = at_end >= (_STUCK if noise >= _FINE * step else _STUCK_COARSE)
-        stuck &= (at_end > _PILED * near) & (highest - counts.min(axis=0) > 2 * _NEAR_NOISE * noise)
+        stuck &= at_end >= (_STUCK if noise >= _FINE * step else _STUCK_COARSE)
+        stuck &= (at_end > _PILED * near) & (highest - lowest > 2 * _NEAR_NOISE * noise)
         if np.mean(stuck) > REACHED:
             ends[stuck] = highest[stuck]
     return ends

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.types import Floats, Motion
+from mirrorskin.io.watch import axes
 from mirrorskin.io.watch.phase_check import PhaseCheck, swing_of
 from mirrorskin.io.watch.saturation import REACHED, scale_ends
 
@@ -22,6 +23,7 @@ _QUANTUM = 1 / math.sqrt(12)  # standard deviation of rounding, counts
 _MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 _RESPONSE_MIN = 10.0  # minimum change of a pixel that is a response, standard deviations of the noise
 _FEW = 0.05  # share of pixels below which their common behaviour is ignored
+_CLEARLY = 0.9  # share of pixels that rise, from which frames are those of a press
 _MOST_OF = 0.8  # share of pixels that must agree
 _FLICKER, _DRIFT = 0.01, 2.0  # tolerated flicker, share of the light; tolerated drift, counts of 8 bits
 _PARTS = 10  # of a press, in which its dark level is compared
@@ -259,8 +261,9 @@ class Traces:
                 "no response", "the brightness changes at no pixel: was there light, and did the body move?"
             )
             return
-        yield from self._axes(shape)
-        if self._share > _FEW:
+        order = list(self._axes(shape))
+        yield from order
+        if self._share > _FEW and not order:
             yield from self._press() if self._motion == "vertical" else self._turn()
         if (clipped := self._clipped) > REACHED:
             ends = self._ends[np.isfinite(self._ends)]
@@ -375,10 +378,9 @@ class Traces:
         over_time = samples.mean(axis=(1, 2))
         along = samples.mean(axis=(0, 1 if shape[2] == thin else 2))
         if np.nanvar(along) > 4 * np.nanvar(over_time):
-            yield Finding(
-                "axes",
+            yield axes.finding(
                 f"{shape[0]} frames of {shape[2]} x {shape[1]} pixels, whose light changes along their"
-                f" {thin} pixels rather than over time: is the order of the axes (T, H, W)?",
+                f" {thin} pixels rather than over time"
             )
 
     def _press(self) -> Iterator[Finding]:
@@ -392,17 +394,16 @@ class Traces:
             )
         travel = self._series["travel"]
         rises, falls = self._changes(self._of_responding, np.sign(travel[-1] - travel[0]))
-        if falls > _MOST_OF * (rises + falls) and falls > 0.2:
+        is_press = rises > _CLEARLY or axes.changes_once(self._of_responding) >= axes.CHANGES_ONCE
+        if not is_press and (axis := axes.axis_of_press(self._pictures, self._response)):
+            yield axes.finding(f"brightness changes once along the {axis} of the pictures, and not over time")
+        elif falls > _MOST_OF * (rises + falls) and falls > 0.2:
+            axis = axes.axis_of_press(self._pictures, self._response)
             yield Finding(
                 "reversed",
                 f"brightness falls with travel at {_percent(falls)} of the pixels that respond: are the"
-                " frames reversed, or is it a release (--event release)?",
-            )
-        elif rises + falls < 1 - _MOST_OF and (axis := self._rising_axis()):
-            yield Finding(
-                "axes",
-                f"brightness rises along the {axis} of the pictures rather than over time: is the order of"
-                " the axes (T, H, W)?",
+                " frames reversed, or is it a release (--event release)"
+                f"{', or is the order of the axes not (T, H, W)' if axis else ''}?",
             )
         elif rises + falls < 1 - _MOST_OF:
             yield Finding(
@@ -437,16 +438,6 @@ class Traces:
         change *= direction / np.ptp(counts, axis=0)
         return float(np.mean(change > 0.5)), float(np.mean(change < -0.5))
 
-    def _rising_axis(self) -> str:
-        """Return the axis of the pictures along which brightness changes as in a press; "" if none."""
-        samples = self._pictures
-        for axis, name in ((2, "rows"), (1, "columns")):
-            series = np.moveaxis(samples, axis, 0).reshape(samples.shape[axis], -1)
-            series = series[:, np.ptp(series, axis=0) > self._response]
-            if series.shape[1] >= _PIXELS_MIN and max(self._changes(series)) > _MOST_OF:
-                return name
-        return ""
-
     def _turn(self) -> Iterator[Finding]:
         phase = self._series.get("phase")
         if self._motion != "axial" or phase is None or len(phase) < 5:
@@ -458,7 +449,11 @@ class Traces:
             return
         counts, extent = self._of_responding, self._range[self._responding]
         jump = float(np.median(np.abs(counts[last] - counts[0]) / extent))
-        if jump > 0.5:
+        apart = axes.ends_apart(self._counts) > axes.STAYS_AWAY
+        apart = apart and axes.changes_once(counts) < axes.CHANGES_ONCE  # otherwise it is a press
+        if apart and (axis := axes.axis_of_turn(self._pictures)):
+            yield axes.finding(f"brightness returns along the {axis} of the pictures, and not over time")
+        elif jump > 0.5:
             yield Finding(
                 "not a rotation",
                 f"brightness does not return after a whole turn: half of the pixels that respond end"

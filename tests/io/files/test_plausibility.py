@@ -105,10 +105,50 @@ def test_axes_in_the_order_of_matlab_are_found():
     assert "axes" in kinds(found(stack, travel=STEP * np.arange(len(stack))))
 
 
-@pytest.mark.parametrize("order", [(1, 2, 0), (2, 1, 0), (1, 0, 2)])
-def test_other_orders_of_the_axes_of_a_press_are_found(order):
-    stack = np.transpose(noisy(pressed()), order)
+ORDERS = [(1, 2, 0), (1, 0, 2), (2, 1, 0), (2, 0, 1)]
+
+
+def off_centre(shape=(40, 48, 64), noise=1.0):
+    """Frames of a press on a bowl whose centre is not in the middle, which reaches all sides."""
+    x, y = io.pixel_axes(shape[1:], (3.2 / shape[2], 2.4 / shape[1]))
+    depth = (x - 0.4) ** 2 / 4 + (y[:, np.newaxis] + 0.2) ** 2 / 2 + 0.3
+    above = (1.95 * np.linspace(0, 1, shape[0])[:, np.newaxis, np.newaxis] - depth) / 0.01
+    return noisy(20 + 180 / (1 + np.exp(-np.clip(above, -500, 500))), noise)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(
+    "frames",
+    [noisy(pressed()), off_centre(), off_centre(noise=0.0), off_centre((60, 120, 160)), off_centre()[::-1]],
+    ids=["ball", "off-centre", "without noise", "large", "release"],
+)
+def test_other_orders_of_the_axes_of_a_press_are_found(frames, order):
+    stack = np.transpose(frames, order)
     assert kinds(found(stack, travel=STEP * np.arange(len(stack)))) == ["axes"]
+
+
+@pytest.mark.parametrize("frames", [off_centre(), off_centre(noise=0.0), off_centre((60, 120, 160))])
+@pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1)])
+def test_the_order_of_the_axes_of_a_press_is_recognised(frames, order):
+    stack = np.transpose(frames, order)
+    assert kinds(found(stack, travel=STEP * np.arange(len(stack)))) == []
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("frames", [8, 24, 48])
+def test_other_orders_of_the_axes_of_a_turn_are_found(frames, order):
+    stack = np.transpose(noisy(turned(2 * np.pi * np.arange(frames) / frames)), order)
+    assert "axes" in kinds(found(stack, phase=2 * np.pi * np.arange(len(stack)) / len(stack)))
+
+
+def test_a_wedge_in_reverse_order_may_have_other_axes():
+    """Brightness of a wedge changes once along its slope, too."""
+    depth = 0.2 + 0.1 * np.arange(SHAPE[1]) * np.ones((SHAPE[0], 1)) / 8
+    above = (TRAVEL[:, np.newaxis, np.newaxis] - depth) / 0.04
+    wedge = noisy(20 + 160 * np.clip(above + 0.5, 0, 1))
+    assert kinds(found(wedge)) == []
+    (finding,) = found(wedge[::-1].copy()).findings
+    assert finding.text.endswith("(--event release), or is the order of the axes not (T, H, W)?")
 
 
 def test_a_frame_that_is_there_twice_is_found():
