@@ -20,6 +20,7 @@ from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.engine.diagnosis.swing import ModulationEffects, find_modulation_effects
 from mirrorskin.io import Result
 from mirrorskin.io.base.findings import Finding, with_findings
+from mirrorskin.io.watch.mirrored import MIRRORED
 from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, mad_sigma
 from mirrorskin.kernels.rotation.normals import azimuth_of
 
@@ -72,12 +73,7 @@ class PhaseUncertainty(Step):
         normals = stored_map(result, "normals")
         several = normals.ndim == 4
         if _mirrored(normals[0] if several else normals):
-            finding = Finding(
-                "mirrored",
-                "the slopes fit together better with the phases reversed: do phases count counter-clockwise"
-                " in the picture?",
-            )
-            return with_findings(result, finding)
+            return with_findings(result, MIRRORED)
         if several:
             return result
         size = context.source.header.pixel_size or (1.0, 1.0)

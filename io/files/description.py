@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io.base.findings import Finding
+from mirrorskin.io.base.text import course
 from mirrorskin.io.base.types import PROPERTIES, InputError
 from mirrorskin.io.base.url import is_zarr, path_of
 from mirrorskin.io.files.arrays import list_arrays
@@ -158,8 +159,7 @@ def _counts(values: NDArray[np.floating] | None, unit: str) -> str:
 def _range(name: str, values: NDArray[np.float64] | None, unit: str) -> dict[str, str]:
     if values is None:
         return {}
-    turn = [np.max(values)] if np.max(values) > max(values[0], values[-1]) else []
-    return {name: f"{' to '.join(f'{value:g}' for value in (values[0], *turn, values[-1]))} {unit}"}
+    return {name: f"{' to '.join(f'{value:g}' for value in course(values.tolist()))} {unit}"}
 
 
 def _result(result: Result) -> dict[str, str]:

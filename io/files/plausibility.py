@@ -66,7 +66,7 @@ def check(
 
 def _watched(source: Source, progress: Callable[[int], None] | None) -> FrameChecker:
     """Return what all frames of a source show, and rewind it before and after, if possible."""
-    checker = FrameChecker(source)
+    checker = FrameChecker(source, alone=True)
     if source.rewindable:
         source.rewind()
     size = math.prod(source.shape[1:]) * source.dtype.itemsize

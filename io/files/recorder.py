@@ -249,7 +249,7 @@ class Recorder(TeeSource[Source]):
 
     def drain(self, progress: Callable[[int], None] | None = None) -> CheckReport:
         """Write all frames, and return their check; ``progress`` is called with the number so far."""
-        watch = FrameChecker(self.source)
+        watch = FrameChecker(self.source, alone=True)
         length = max(1, _BLOCK // (self.shape[1] * self.shape[2] * self.dtype.itemsize))
         buffer = np.empty((min(length, self.shape[0]), *self.shape[1:]), self.dtype)
         while (block := self.read(buffer)) is not None:

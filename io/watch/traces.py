@@ -449,7 +449,9 @@ class Traces:
             return
         counts, extent = self._of_responding, self._range[self._responding]
         jump = float(np.median(np.abs(counts[last] - counts[0]) / extent))
-        apart = axes.ends_apart(self._counts) > axes.STAYS_AWAY
+        # A precession whose tilt changes does not return.
+        same_tilt = "axes" not in self._series and np.ptp(self._series.get("tilt", np.zeros(1))) == 0
+        apart = same_tilt and axes.ends_apart(self._counts) > axes.STAYS_AWAY
         apart = apart and axes.changes_once(counts) < axes.CHANGES_ONCE  # otherwise it is a press
         if apart and (axis := axes.axis_of_turn(self._pictures)):
             yield axes.finding(f"brightness returns along the {axis} of the pictures, and not over time")

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.base.checksums import UNVERIFIED_PARTS
 from mirrorskin.io.base.findings import Finding
+from mirrorskin.io.base.text import course
 from mirrorskin.io.base.types import Block, Floats, Source
 from mirrorskin.io.model.frames import LOSSY, lossy
+from mirrorskin.io.watch.mirrored import MIRRORED, TurnMoments
 from mirrorskin.io.watch.traces import FrameSamples, Traces, named_frames
 
 FIELD = (0.05, 200.0)
@@ -23,6 +25,10 @@ TRAVEL = (0.005, 20.0)
 
 _EVEN = 1e-3  # relative difference up to which steps of a position are even
 _GAP = 1.5  # time between two frames above which frames are missing, in intervals
+
+_RESPONDS = 0.3  # least change of a pixel that becomes light, share of the span
+_SLOPES, _SLOPES_MIN = 6, 32  # parts of a side over which slopes are computed; their least number
+_STEEPEST = 3.0  # typical slope that a press can have
 
 Limits = tuple[float, float]
 
@@ -61,12 +67,22 @@ class FrameChecker:
     """Collects samples and positions of the frames of a source while they are read.
 
     ``moved``: whether the brightness must respond to the motion. ``phased``: whether it must fit the phases.
+    ``alone``: whether no operation looks at the slopes of the frames, on the host.
     """
 
-    def __init__(self, source: Source, moved: bool = True, phased: bool = True) -> None:
+    def __init__(
+        self, source: Source, moved: bool = True, phased: bool = True, *, alone: bool = False
+    ) -> None:
         self._source, self._moved, self._phased = source, moved, phased
+        self._turn = TurnMoments(source.shape) if alone and source.motion == "axial" else None
         self.samples = FrameSamples(source.shape)
-        self._series: dict[str, list[Floats]] = {"time": [], "travel": [], "phase": [], "axes": []}
+        self._series: dict[str, list[Floats]] = {
+            "time": [],
+            "travel": [],
+            "phase": [],
+            "tilt": [],
+            "axes": [],
+        }
         self._lost = 0
 
     def push(self, block: Block, samples: NDArray[Any] | None = None) -> None:
@@ -76,6 +92,8 @@ class FrameChecker:
         else:
             self.samples.push_samples(samples)
         self._lost += block.dropped
+        if self._turn is not None:
+            self._turn.push(block)
         for name, parts in self._series.items():
             values = getattr(block, name)
             if values is not None:
@@ -87,7 +105,12 @@ class FrameChecker:
         source = self._source
         facts = {"frames": f"{self.samples.count} of {source.shape[2]} x {source.shape[1]}, {source.dtype}"}
         facts |= _facts(source, series, traces)
-        return CheckReport(source.name, facts, self._findings(series, traces, field_limits, travel_limits))
+        findings = self._findings(series, traces, field_limits, travel_limits)
+        header, order = source.header, any(finding.kind in ("axes", "phases") for finding in findings)
+        if self._turn is not None and not order:
+            mirrored = self._turn.is_mirrored(header.zenith_offset, header.zenith_gain)
+            findings += (MIRRORED,) * mirrored
+        return CheckReport(source.name, facts, findings)
 
     def findings(self) -> tuple[Finding, ...]:
         """Return the findings about the frames so far, for a result, which states their region itself."""
@@ -120,10 +143,11 @@ class FrameChecker:
         lost = self._lost if dropped is None else int(np.sum(dropped))
         known = getattr(source, "findings", ())
         undeclared = self.samples.compression() and all(finding.kind != LOSSY for finding in known)
+        lengths = tuple(_geometry(source, series, field_limits, travel_limits))
         return (
             *known,
             *([lossy("blocks of 8 x 8 pixels")] if undeclared else []),
-            *_geometry(source, series, field_limits, travel_limits),
+            *(lengths or _slopes(source, series, self.samples)),
             *_order(source, series, lost),
             *traces.findings(source.shape, self._moved, self._phased),
         )
@@ -148,7 +172,7 @@ def _facts(source: Source, series: Mapping[str, Floats], traces: Traces) -> dict
 
 def _range_of(values: Floats, unit: str) -> str:
     steps = np.abs(np.diff(values))
-    text = f"{values[0]:.4g} to {values[-1]:.4g} {unit}"
+    text = f"{' to '.join(f'{value:.4g}' for value in course(values.tolist()))} {unit}"
     if not len(steps):
         return text
     even = np.ptp(steps) <= _EVEN * max(float(np.max(steps)), 1e-12)
@@ -183,6 +207,45 @@ def _geometry(
     phase = series.get("phase")
     if phase is not None and len(phase) > 2 and (step := float(np.median(np.abs(np.diff(phase))))) > math.pi:
         yield Finding("phases", f"phases step by {step:.4g} rad from frame to frame: are they in degrees?")
+
+
+def _slopes(source: Source, series: Mapping[str, Floats], samples: FrameSamples) -> Iterator[Finding]:
+    """Yield a finding if a press is as deep as is impossible on its field: most slopes are too steep.
+
+    Heights are roughly those of the frames in which pixels become light, on the grid of samples.
+    """
+    size, travel = source.header.pixel_size, series.get("travel")
+    if size is None or travel is None or source.motion != "vertical" or len(travel) < 3:
+        return
+    direction = np.sign(travel[-1] - travel[0])
+    if direction == 0 or np.any(np.diff(travel) * direction < 0):
+        return
+    order = slice(None, None, int(direction))
+    counts, depths = samples.values[order].astype(np.float32), travel[order]
+    lowest, highest = counts.min(axis=0), counts.max(axis=0)
+    responds = highest - lowest > _RESPONDS * float(np.max(highest) - np.min(lowest))
+    light = counts > (lowest + highest) / 2
+    onset = np.argmax(light, axis=0)
+    height = np.where(responds & (onset > 0) & light[-1], depths[onset], np.nan)
+    apart = [max(1, length // _SLOPES) for length in height.shape]
+    sides = [
+        step * float(axis[1] - axis[0]) * pixel
+        for step, axis, pixel in zip(apart, (samples.rows, samples.columns), size[::-1], strict=True)
+        if len(axis) > step
+    ]
+    if len(sides) < 2:
+        return
+    down, across = apart
+    here = height[:-down, :-across]
+    slope = np.hypot((height[down:, :-across] - here) / sides[0], (height[:-down, across:] - here) / sides[1])
+    slope = slope[np.isfinite(slope)]
+    if len(slope) >= _SLOPES_MIN and (typical := float(np.median(slope))) > _STEEPEST:
+        extent, angle = float(np.ptp(travel)), math.degrees(math.atan(typical))
+        yield Finding(
+            "steep slopes",
+            f"a travel of {extent:.4g} mm and pixels of {size[0]:.4g} x {size[1]:.4g} mm make slopes of"
+            f" {angle:.0f} degrees typical, which no sheet follows: are both in mm?",
+        )
 
 
 def _from_to(limits: Limits) -> str:

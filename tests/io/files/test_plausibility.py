@@ -75,6 +75,105 @@ def test_the_limits_can_be_chosen():
     assert kinds(found(frames, pixel_size=size, travel=1000 * TRAVEL, where=large)) == []
 
 
+def onto(depth, travel, noise=1.0):
+    """Frames of a press onto an object at some depth below the sheet, mm."""
+    above = (travel[:, np.newaxis, np.newaxis] - depth) / 0.02
+    return noisy(20 + 160 / (1 + np.exp(-np.clip(above, -500, 500))), noise)
+
+
+def coordinates():
+    x, y = io.pixel_axes(SHAPE, (PIXEL, PIXEL))
+    return x, y[:, np.newaxis]
+
+
+X, Y = coordinates()
+OBJECTS = {
+    "bowl": (X**2 + Y**2) / 8,
+    "cone": 0.6 * np.hypot(X, Y),
+    "waves": 0.7 + 0.5 * np.sin(X) * np.cos(Y),
+}
+
+
+@pytest.mark.parametrize("depth", OBJECTS.values(), ids=OBJECTS)
+@pytest.mark.parametrize("noise", [0.0, 3.0])
+def test_a_travel_that_is_implausible_on_its_field_is_found(depth, noise):
+    frames = onto(depth, TRAVEL, noise)
+    assert kinds(found(frames)) == []
+    for where in ({"travel": 10 * TRAVEL}, {"pixel_size": (PIXEL / 10, PIXEL / 10), "travel": TRAVEL}):
+        (finding,) = found(frames, **where).findings
+        assert finding.kind == "steep slopes"
+        assert "degrees typical, which no sheet follows: are both in mm?" in finding.text
+    assert kinds(found(frames[::-1].copy(), travel=10 * TRAVEL[::-1])) == ["steep slopes"]
+
+
+@pytest.mark.parametrize(
+    "depth", [0 * X + 0 * Y + 0.5, 0.2 + 0.5 * (X > 0) + 0 * Y, 0.01 * (X**2 + Y**2) + 0.3]
+)
+def test_a_flat_object_shows_nothing_of_the_units(depth):
+    assert kinds(found(onto(depth, TRAVEL), travel=10 * TRAVEL)) == []
+
+
+def test_slopes_without_a_pixel_size_are_unknown():
+    assert kinds(found(onto(OBJECTS["bowl"], TRAVEL), travel=10 * TRAVEL, pixel_size=None)) == []
+
+
+@pytest.mark.parametrize(
+    ("travel", "expected"),
+    [
+        (TRAVEL, "0 to 1.45 mm, 0.05 mm a frame"),
+        (TRAVEL[::-1], "1.45 to 0 mm, 0.05 mm a frame"),
+        (np.concatenate([TRAVEL[::2], TRAVEL[1::2][::-1]]), "0 to 1.45 to 0.05 mm, about 0.1 mm a frame"),
+        (np.abs(TRAVEL - 0.5), "0.5 to 0 to 0.95 mm, 0.05 mm a frame"),
+    ],
+    ids=["press", "release", "stroke", "release and press"],
+)
+def test_the_range_of_the_travel_is_that_of_all_frames(travel, expected):
+    assert found(noisy(pressed()), travel=travel).facts["travel"] == expected
+
+
+def turn_on(slope_x, slope_y, phase=PHASE, noise=1.0):
+    """Frames of a rotation, of which the zenith and azimuth of slopes determine mean and phase."""
+    steep, azimuth = np.hypot(slope_x, slope_y), np.arctan2(slope_y, slope_x)
+    return noisy(60 + 80 * np.arctan(steep) + 15 * np.cos(phase[:, np.newaxis, np.newaxis] - azimuth), noise)
+
+
+SURFACES = {
+    "saddle": (Y + 0 * X + 0.03, X + 0 * Y + 0.02),
+    "cone": (0.5 * X / np.hypot(X, Y), 0.5 * Y / np.hypot(X, Y)),
+    "waves": (np.cos(X + Y), np.cos(X + Y) + 0.3),
+}
+SCALE = {"zenith_offset": 60.0, "zenith_gain": 80.0}
+
+
+DIRECTIONS = {"slopes": SCALE, "directions": {}}
+
+
+def turned_kinds(frames, sign, header):
+    from mirrorskin.io.files.arrays import ArrayRecording
+
+    return kinds(io.check(ArrayRecording(frames, {"phase": sign * PHASE}, header)))
+
+
+@pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.parametrize("known", DIRECTIONS)
+def test_a_reversed_turn_is_found(name, known):
+    frames, header = turn_on(*SURFACES[name]), {"pixel_size": (PIXEL, PIXEL), **DIRECTIONS[known]}
+    unknown = (name, known) == ("waves", "directions")
+    assert turned_kinds(frames, 1, header) == []
+    assert turned_kinds(frames, -1, header) == ([] if unknown else ["mirrored"])
+
+
+FLAT = 0 * X + 0 * Y
+
+
+@pytest.mark.parametrize(
+    "slopes", [(FLAT + 0.3, FLAT + 0.2), (FLAT + np.cos(X), FLAT + 0.1)], ids=["plane", "ridges"]
+)
+def test_a_surface_in_a_mirror_may_be_another_surface(slopes):
+    header = {"pixel_size": (PIXEL, PIXEL), **SCALE}
+    assert [turned_kinds(turn_on(*slopes), sign, header) for sign in (1, -1)] == [[], []]
+
+
 def test_phases_in_degrees_are_found():
     assert kinds(found(noisy(turned()), phase=np.degrees(PHASE)))[0] == "phases"
 
