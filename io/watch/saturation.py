@@ -18,7 +18,7 @@ from mirrorskin.io.base.types import Floats
 REACHED = 0.1
 """Tolerated share of pixels that reach the end of the scale."""
 
-_BITS = (8, 10, 12, 14, 16)  # of cameras
+_FULL = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 16))  # highest samples of cameras
 _FEWEST = 64  # samples at least of a pile, and for other estimates
 _PILED = 3.0  # samples at the end over those just below it, from which they are a pile
 _STUCK, _STUCK_COARSE = 4, 6  # samples of a pixel at its own end; if noise is coarser than a quarter of steps
@@ -26,6 +26,7 @@ _NOISY, _FINE = 0.5, 4.0  # noise in steps of the samples from which it is seen,
 _DARK = 0.05  # share of a pixel's range
 _SMOOTH = 0.03  # share of steps with another sign than the one before, below which there is no noise
 _ALTERNATING = 0.5  # share of differences with another sign than the one before, above which they are noise
+_COARSE = 1024  # samples below which noise is a few steps
 _LIGHT, _MOST = 0.9, 0.5  # share of a pixel's range; share of its samples above it that are at its end
 _NEAR_NOISE = 4.0  # distance from a pixel's end within which noise would spread its samples, sigmas
 _NEAR, _NEXT = 1 / 16, 1 / 4  # distances from the end that are compared, share of the span
@@ -50,10 +51,10 @@ def scale_top(highest: float, integer: bool) -> float | None:
     """
     if highest == 1 and not integer:
         return highest
-    if highest < 2 ** _BITS[0] - 1 or highest % 1 or highest >= 2**32:
+    if highest < _FULL[0] or highest % 1 or highest >= 2**32:
         return None
     ones = int(highest) // (int(highest) & -int(highest))
-    return highest if ones & (ones + 1) == 0 and ones >= 2 ** _BITS[0] - 1 else None
+    return highest if ones & (ones + 1) == 0 and ones >= _FULL[0] else None
 
 
 def scale_ends(stored: NDArray[Any], counts: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -69,14 +70,15 @@ def scale_ends(stored: NDArray[Any], counts: NDArray[np.float32]) -> NDArray[np.
     highest = counts.max(axis=0)
     top = highest.max()
     ends = np.full(len(highest), np.inf, np.float32)
-    if stored.dtype.kind == "u" and int(top) in _full_scales(1):
+    if stored.dtype.kind == "u" and float(top) in _FULL:
         ends[:] = top
         return ends
     common = float(np.mean(highest == top)) > REACHED
     at_end = np.count_nonzero(counts == highest, axis=0)
     lowest = counts.min(axis=0)
     light = np.count_nonzero(counts >= lowest + _LIGHT * (highest - lowest), axis=0)
-    stuck = (at_end >= _STUCK) & (at_end > _MOST * light)
+    coarse = stored.dtype.kind == "u" and top < _COARSE
+    stuck = (at_end >= (_STUCK_COARSE if coarse else _STUCK)) & (at_end > _MOST * light)
     if not common and np.mean(stuck) <= REACHED:
         return ends
     step = _step_of(stored if stored.dtype.kind == "u" else counts)
@@ -100,10 +102,6 @@ def scale_ends(stored: NDArray[Any], counts: NDArray[np.float32]) -> NDArray[np.
     return ends
 
 
-def _full_scales(step: float) -> set[int]:
-    return {round(step * (2**bits - 1)) for bits in _BITS}
-
-
 def _step_of(samples: NDArray[Any]) -> float:
     """Return the step between the levels of samples; about 0 if they are continuous."""
     if samples.dtype.kind == "u":
@@ -115,15 +113,15 @@ def _step_of(samples: NDArray[Any]) -> float:
 def _is_full_scale(counts: NDArray[np.float32], step: float, top: float, integer: bool) -> bool:
     """Return whether the highest sample is the last of 2^n levels, in the upper bits or after a division."""
     if integer:
-        return step > 1 and int(top) in _full_scales(step)
+        return step > 1 and top / step in _FULL
     if top <= 0 or step <= 0:
         return False
     part = counts.reshape(-1)[:: max(1, counts.size >> 16)].astype(np.float64)
-    for full in sorted(_full_scales(1)):
+    for full in _FULL:
         levels = part * (full / top)
         whole = np.rint(levels)
         if np.max(np.abs(levels - whole)) < _QUANTIZED:
-            return full // int(np.gcd.reduce(whole.astype(np.int64))) in _full_scales(1)
+            return full // int(np.gcd.reduce(whole.astype(np.int64))) in _FULL
     return False
 
 
@@ -135,26 +133,21 @@ def _noise_of(counts: NDArray[np.float32], highest: NDArray[np.float32]) -> floa
     """
     lowest = counts.min(axis=0)
     inside = (counts < highest) & (counts > lowest.min())
-    dark = inside & (counts < lowest + _DARK * (highest - lowest))
-    return min(filter(None, (_noise_where(counts, used) for used in (inside, dark))), default=0.0)
-
-
-def _noise_where(counts: NDArray[np.float32], inside: NDArray[np.bool_]) -> float:
-    estimates, differences = list[float](), counts
-    for order in range(1, min(4, len(counts) - 1)):
-        differences = np.diff(differences, axis=0)
-        inside = inside[1:] & inside[:-1]
-        turns = (differences[1:] * differences[:-1])[inside[1:] & inside[:-1]]
-        turns = turns[turns != 0]
-        if turns.size < _FEWEST:
-            break
-        alternating = np.mean(turns < 0)
-        if order == 1 and alternating < _SMOOTH:
-            return 0.0  # higher differences of a step alternate, too
-        if alternating > _ALTERNATING:
-            spread = math.sqrt(math.comb(2 * order, order))
-            estimates.append(_MAD * float(np.median(np.abs(differences[inside]))) / spread)
-    return min(estimates, default=0.0)
+    least = math.inf
+    for used in (inside, inside & (counts < lowest + _DARK * (highest - lowest))):
+        differences = counts
+        for order in range(1, min(4, len(counts) - 1)):
+            differences, used = np.diff(differences, axis=0), used[1:] & used[:-1]
+            turns = (differences[1:] * differences[:-1])[used[1:] & used[:-1]]
+            turns = turns[turns != 0]
+            alternating = np.mean(turns < 0) if turns.size >= _FEWEST else 0.0
+            if order == 1 and alternating < _SMOOTH:
+                break  # higher differences of a step alternate, too
+            if alternating > _ALTERNATING:
+                spread = math.sqrt(math.comb(2 * order, order))
+                noise = _MAD * float(np.median(np.abs(differences[used]))) / spread
+                least = min(least, noise) if noise > 0 else least
+    return least if least < math.inf else 0.0
 
 
 def _is_pile(counts: NDArray[np.float32], top: float, step: float, noise: float) -> bool:

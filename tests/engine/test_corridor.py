@@ -44,15 +44,15 @@ def test_library_run(recordings, levels):
         with io.open_recording(recordings / "press.h5") as recording:
             engine.run(recording, engine.Onset(**levels))
 
-    assert_few(run, 389, 52)
+    assert_few(run, 391, 55)
 
 
 @pytest.mark.parametrize(
     ("line", "functions", "files"),
     [
-        ("reconstruct press.h5", 558, 70),
-        ("reconstruct turn.h5", 719, 89),
-        ("fuse press.h5 turn.h5", 880, 106),
+        ("reconstruct press.h5", 562, 73),
+        ("reconstruct turn.h5", 723, 93),
+        ("fuse press.h5 turn.h5", 885, 110),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):

@@ -29,6 +29,13 @@ def run(*words, **variables):
     return ended.stdout
 
 
+@pytest.fixture(autouse=True)
+def _forgotten():
+    processors._limit.cache_clear()
+    yield
+    processors._limit.cache_clear()
+
+
 @several
 def test_the_command_line_gives_pocl_the_processors_that_it_may_use():
     devices = json.loads(run("-m", "mirrorskin", "devices", "--json"))["devices"]
