@@ -50,7 +50,6 @@ class FolderFrames(WholeFrames):
     """
 
     how = "picture by picture"
-    random_access = True
 
     def __init__(self, folder: Path, channel: int | None = None) -> None:
         numbers, self.files, self.left_out = _find_sequence(folder)

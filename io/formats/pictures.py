@@ -17,6 +17,7 @@ from mirrorskin.io.base.opencv import check_picture, decode, encode, is_coloured
 from mirrorskin.io.base.system import check_regular, read_regular
 from mirrorskin.io.base.types import FRAME_DTYPES, InputError
 from mirrorskin.io.formats.colour_table import ColourTable
+from mirrorskin.io.formats.loss import loss_of_jpeg
 from mirrorskin.io.formats.registry import Format
 from mirrorskin.io.formats.tiff import TIFF, TIFF_MARKS, TiffFrames
 from mirrorskin.io.model.frames import CONVERTED_COLOUR, lossy
@@ -88,7 +89,7 @@ def decode_bytes(data: bytes, name: str) -> Picture:
     if data[:8] == _PNG_MARK:
         picture = _decode_png(data, name)
     elif data[:2] == _JPEG_MARK:
-        picture = Picture(_decode_jpeg(data, name), (lossy("JPEG"),))
+        picture = Picture(_decode_jpeg(data, name), (lossy("JPEG"),) if loss_of_jpeg(data) else ())
     elif data[:2] == b"BM":
         picture = _decode_bmp(data, name)
     elif data[:2] == b"P5":

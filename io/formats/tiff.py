@@ -18,6 +18,7 @@ from mirrorskin.io.base.opencv import check_picture, decode, is_coloured, to_gre
 from mirrorskin.io.base.system import check_regular, open_regular
 from mirrorskin.io.base.types import FRAME_DTYPES, InputError
 from mirrorskin.io.formats.colour_table import ColourTable
+from mirrorskin.io.formats.loss import loss_of_jpeg
 from mirrorskin.io.formats.registry import Format
 from mirrorskin.io.formats.tiff_pages import (
     compare_pages,
@@ -249,7 +250,7 @@ class TiffFrames(WholeFrames):
 
     def _find(self, series: Any) -> Iterator[Finding]:
         page = self._page
-        if page.compression in _LOSSY:
+        if page.compression in _LOSSY and loss_of_jpeg(self._first_segment()):
             yield lossy(_LOSSY[page.compression])
         if self._inverted:
             text = "white is zero: samples are inverted, so that more light is more counts"
@@ -271,6 +272,12 @@ class TiffFrames(WholeFrames):
         if pixel:
             text = f"the file states pixels of {pixel}: give --pixel-size if this is their size at the sheet"
             yield Finding("pixel size", text, warning=False)
+
+    def _first_segment(self) -> bytes:
+        """Return the first strip or tile of the first frame, packed."""
+        page = self._pages[int(self._numbers[0])]
+        self._file.filehandle.seek(page.dataoffsets[0])
+        return bytes(self._file.filehandle.read(page.databytecounts[0]))
 
     def _stored(self, index: int, name: str) -> NDArray[Any]:
         """Return the samples of a page, (H, W) or (H, W, channels): blue, green, red, opacity."""

@@ -21,8 +21,9 @@ from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, check_regular, check_u
 from mirrorskin.io.base.text import one_line
 from mirrorskin.io.base.types import Floats, InputError
 from mirrorskin.io.formats.colour_table import ColourTable
+from mirrorskin.io.formats.loss import READERS, loss_of
 from mirrorskin.io.formats.registry import Format
-from mirrorskin.io.model.frames import CONVERTED_COLOUR, WholeFrames, lossy, lost_frames
+from mirrorskin.io.model.frames import CONVERTED_COLOUR, WholeFrames, lossy, lost_frames, maybe_lossy
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -73,6 +74,7 @@ _LIMIT = {"max_pixels": str(MAX_UNPACKED_BYTES // (_DECODER_FRAMES + _CONVERTED_
 _ALL_FRAMES = {"ignore_editlist": "1"}
 _INSTALL = "videos need mirrorskin[video]: pip install 'mirrorskin[video]'"
 _KEPT = 256_000_000  # bytes of decoded frames that are kept in memory, by default
+_HEAD_BYTES = 1 << 16  # bytes of a packet in which its headers are
 _QUOTED_MAX = 100  # characters quoted of an error message
 _DEEP = re.compile(r"(gray|yuva?4\d\dp)(9|10|12|14|16)(le|be)")  # formats whose first plane is the luma
 _RANGES = {1: "limited", 2: "full"}  # AVCOL_RANGE_MPEG and AVCOL_RANGE_JPEG
@@ -82,7 +84,6 @@ _SPS = re.compile(rb"\x67|\x27|\x47")  # head of a sequence parameter set of H.2
 _WITH_CHROMA_FORMAT = {44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244}  # H.264, 7.3.2.1.1
 _MOST_LOST = 1 << 30  # maximum number of frames lost between two frames
 _GREY_COUNTS = 8  # largest difference between the colours of a grey frame, after a lossy compression
-_LOSSLESS_PROFILES = ("High 4:4:4 Predictive",)  # lossless profiles of codecs that are otherwise lossy
 # Table that converts 8-bit luma of limited range, 16 to 235, to full range.
 _FULL = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
 
@@ -132,6 +133,7 @@ class VideoFrames(WholeFrames):
         self._path, self.files, self._wanted, self._channel = path, (path,), dataset, channel
         self._next, self._kept, self._closed = 0, list[NDArray[Any]](), False
         self._container: InputContainer | None = None
+        self._head = b""  # start of the first packet
         self._is_limited = False
         try:
             self._survey(memory_limit or _KEPT)
@@ -227,6 +229,7 @@ class VideoFrames(WholeFrames):
             for packet in container.demux(stream):
                 if packet.is_corrupt:
                     raise ValueError("it is incomplete")
+                self._head = self._head or bytes(packet)[:_HEAD_BYTES]
                 for frame in packet.decode():
                     if frame.is_corrupt:
                         raise ValueError("it is damaged")
@@ -344,9 +347,8 @@ class VideoFrames(WholeFrames):
             return max(0, sum(1 for packet in container.demux(stream) if packet.size) - shown)
 
     def _find(self, stream: VideoStream, frame: VideoFrame) -> Iterator[Finding]:
-        name, codec = str(self._path), stream.codec
-        if codec.lossy and not (codec.lossless and stream.codec_context.profile in _LOSSLESS_PROFILES):
-            yield lossy(codec.canonical_name)
+        name = str(self._path)
+        yield from self._loss(stream)
         if frame.interlaced_frame:
             text = "a frame has two fields of different times, in alternate rows: record progressive frames"
             yield Finding("interlaced", text)
@@ -383,6 +385,17 @@ class VideoFrames(WholeFrames):
             with container:
                 head = next((bytes(packet) for packet in container.demux(other) if packet.size), b"")
         return any(_chroma_format(head[match.end() :]) == 0 for match in _SPS.finditer(head[:4096]))
+
+    def _loss(self, stream: VideoStream) -> Iterator[Finding]:
+        """Yield the finding for a compression that has a loss, or may have one."""
+        codec = stream.codec
+        if not codec.lossy:
+            return
+        loss = loss_of(codec.canonical_name, bytes(stream.codec_context.extradata or b""), self._head)
+        if loss is None or (loss and codec.lossless and codec.canonical_name not in READERS):
+            yield maybe_lossy(codec.canonical_name, warning=loss is not None)
+        elif loss:
+            yield lossy(codec.canonical_name)
 
     def _samples(self, frame: VideoFrame, name: str) -> NDArray[Any]:
         """Return a frame as grey samples of the displayed picture."""

@@ -214,6 +214,16 @@ def lossy(how: str) -> Finding:
     )
 
 
+def maybe_lossy(how: str, warning: bool) -> Finding:
+    """Return the finding for a compression that may have a loss; a note if it is probably lossless."""
+    return Finding(
+        LOSSY,
+        f"the frames may be compressed with a loss ({how}), which the file does not show: if they are,"
+        " standard deviations are too small",
+        warning,
+    )
+
+
 CONVERTED_COLOUR = Finding(
     "colour",
     "colours are read as grey (luma); --channel 0, 1 or 2 takes red, green or blue",

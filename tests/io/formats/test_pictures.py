@@ -2,6 +2,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from fractions import Fraction
 
 import cv2
 import numpy as np
@@ -432,3 +433,16 @@ for path in sys.argv[1:]:
     ended = subprocess.run(arguments, capture_output=True, text=True, check=True)
     assert ended.stdout.split() == ["read", "refused", "refused"]
     assert ended.stderr == ""
+
+
+def test_a_jpeg_without_loss_has_no_finding(tmp_path):
+    """A JPEG with a predictor, from FFmpeg's encoder."""
+    av = pytest.importorskip("av")
+    frames = np.random.default_rng(0).integers(0, 256, (3, 8, 12), np.uint8)
+    encoder = av.CodecContext.create("ljpeg", "w")
+    encoder.width, encoder.height, encoder.pix_fmt, encoder.time_base = 12, 8, "yuvj444p", Fraction(1, 10)
+    for number, frame in enumerate(frames):
+        grey = av.VideoFrame.from_ndarray(frame, format="gray").reformat(format="yuvj444p")
+        (tmp_path / f"{number}.jpg").write_bytes(bytes(encoder.encode(grey)[0]))
+    with open_recording(tmp_path, motion="vertical", travel=Steps(0.1)) as source:
+        assert not any(finding.kind == "lossy compression" for finding in source.findings)

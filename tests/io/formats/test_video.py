@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mirrorskin.io import InputError, Region, Source, Steps, open_recording
+from mirrorskin.io.formats.loss import loss_of
 from mirrorskin.io.formats.video import times
 
 SHAPE = (48, 64)
@@ -411,6 +412,57 @@ def test_a_loss_is_reported(tmp_path, codec, pixels, suffix):
     _, source = frames_of(film(tmp_path / f"a{suffix}", codec, pixels, GREY))
     kinds = [(finding.kind, finding.warning) for finding in source.findings if finding.warning]
     assert kinds == [("lossy compression", True)]
+
+
+NO_LOSS = {"x265-params": "lossless=1:log-level=none"}
+LOSS = {"x265-params": "log-level=none"}
+
+
+@pytest.mark.parametrize(
+    ("codec", "pixels", "options", "suffix", "reported"),
+    [
+        ("libx265", "gray", NO_LOSS, ".mkv", [False]),
+        ("libx265", "gray", NO_LOSS, ".mp4", [False]),
+        ("libx265", "gray", NO_LOSS, ".ts", [False]),
+        ("libx265", "gray", LOSS, ".mkv", [True]),
+        ("libx265", "gray", LOSS, ".ts", [True]),
+        ("libx264", "gray", {"qp": "0"}, ".avi", []),
+        ("libx264", "yuv444p", {"qp": "0"}, ".ts", []),
+        ("libx264", "yuv444p", {}, ".mkv", [True]),  # of a profile that may be lossless
+        ("jpeg2000", "gray", {"pred": "dwt53"}, ".mov", [False]),
+        ("jpeg2000", "gray", {"pred": "dwt53"}, ".avi", [False]),
+        ("jpeg2000", "gray", {"pred": "dwt97int"}, ".mov", [True]),
+        ("ljpeg", "yuvj420p", {}, ".avi", []),
+        ("jpegls", "gray", {}, ".avi", []),
+        ("libvpx-vp9", "yuv420p", {"lossless": "1"}, ".webm", [False]),
+        ("libvpx-vp9", "yuv444p", {"lossless": "1"}, ".mkv", [False]),
+        ("libvpx-vp9", "yuv420p", {}, ".webm", [True]),
+    ],
+)
+def test_a_loss_is_that_of_the_stream_and_not_of_its_codec(
+    tmp_path, codec, pixels, options, suffix, reported
+):
+    path = film(tmp_path / f"a{suffix}", codec, pixels, GREY, **options)
+    _, source = frames_of(path)
+    findings = [finding for finding in source.findings if finding.kind == "lossy compression"]
+    assert [finding.warning for finding in findings] == reported
+    assert all(finding.warning or "may be compressed with a loss" in finding.text for finding in findings)
+
+
+HEADS = (
+    *(b"", b"\1", b"\0\0\1\x67\x64", b"\0\0\1\x44"),
+    *(b"\xff\xd8\xff\xc3", b"\xff\x4f\xff\x51\xff\x52"),
+)
+
+
+@pytest.mark.parametrize("codec", ["h264", "hevc", "vp9", "jpeg2000", "mjpeg", "jpegls"])
+def test_streams_that_cannot_be_understood_have_a_loss(codec):
+    rng = np.random.default_rng(0)
+    for length in (0, 1, 5, 40, 200):
+        data = rng.integers(0, 256, length, np.uint8).tobytes()
+        for head in HEADS:
+            assert loss_of(codec, head + data, head + data) in (True, False, None)
+    assert loss_of(codec, b"", b"") is True
 
 
 def test_few_bits_are_reported(tmp_path):
