@@ -52,7 +52,7 @@ def turn(phases=8):
 
 def test_a_recording_of_another_program_needs_no_more_than_the_page_lists(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    source = ball((20, 24), 0.3, TRAVEL)
+    source = ball((200, 240), 0.03, TRAVEL)
     frames = source.read(np.empty(source.shape, source.dtype)).frames
     exec(examples("formats.md")[0], {"frames": frames, "travel": TRAVEL})
     with io.open_recording("press.h5") as recording:

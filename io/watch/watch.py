@@ -29,6 +29,7 @@ _GAP = 1.5  # time between two frames above which frames are missing, in interva
 _RESPONDS = 0.3  # least change of a pixel that becomes light, share of the span
 _SLOPES, _SLOPES_MIN = 6, 32  # parts of a side over which slopes are computed; their least number
 _STEEPEST = 3.0  # typical slope that a press can have
+_SURFACE = 0.5  # largest squared step between neighbours, as a share of that between any two: 1 is chance
 
 Limits = tuple[float, float]
 
@@ -214,7 +215,8 @@ def _geometry(
 def _slopes(source: Source, series: Mapping[str, Floats], samples: FrameSamples) -> Iterator[Finding]:
     """Yield a finding if a press is as deep as is impossible on its field: most slopes are too steep.
 
-    Heights are roughly those of the frames in which pixels become light, on the grid of samples.
+    Heights are roughly those of the frames in which pixels become light, on the grid of samples. Where
+    neighbours agree no more than other pixels, there is no surface whose slopes show the units.
     """
     size, travel = source.header.pixel_size, series.get("travel")
     if size is None or travel is None or source.motion != "vertical" or len(travel) < 3:
@@ -229,6 +231,10 @@ def _slopes(source: Source, series: Mapping[str, Floats], samples: FrameSamples)
     light = counts > (lowest + highest) / 2
     onset = np.argmax(light, axis=0)
     height = np.where(responds & (onset > 0) & light[-1], depths[onset], np.nan)
+    steps = np.concatenate([np.diff(height, axis=axis).ravel() for axis in (0, 1)])
+    known, steps = height[np.isfinite(height)], steps[np.isfinite(steps)]
+    if len(steps) < _SLOPES_MIN or np.mean(steps**2) > _SURFACE * 2 * np.var(known):
+        return
     apart = [max(1, length // _SLOPES) for length in height.shape]
     sides = [
         step * float(axis[1] - axis[0]) * pixel

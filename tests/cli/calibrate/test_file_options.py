@@ -169,7 +169,7 @@ def test_the_calibration_is_not_overwritten():
 @pytest.fixture
 def fake(clock, monkeypatch):
     """A rig whose file is read and which is opened without hardware; its own references are wrong."""
-    rig_options = {"pixel_size": (0.05, 0.05), "delay": 0.0, "rate": 60.0, "name": "left", "bright": 255.0}
+    rig_options = {"pixel_size": (0.2, 0.2), "delay": 0.0, "rate": 60.0, "name": "left", "bright": 255.0}
 
     monkeypatch.setattr(file, "load_rig", lambda path: settings(SHAPE, **rig_options))
     monkeypatch.setattr(

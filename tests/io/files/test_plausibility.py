@@ -113,6 +113,11 @@ def test_a_flat_object_shows_nothing_of_the_units(depth):
     assert kinds(found(onto(depth, TRAVEL), travel=10 * TRAVEL)) == []
 
 
+def test_heights_of_neighbours_that_do_not_agree_show_nothing_of_the_units():
+    depth = np.random.default_rng(2).uniform(0.1, 1.3, SHAPE)
+    assert kinds(found(onto(depth, TRAVEL), travel=10 * TRAVEL)) == []
+
+
 def test_slopes_without_a_pixel_size_are_unknown():
     assert kinds(found(onto(OBJECTS["bowl"], TRAVEL), travel=10 * TRAVEL, pixel_size=None)) == []
 
