@@ -267,8 +267,8 @@ def unwritten_frames(recording: Recording) -> tuple[Finding, ...]:
     count = recording.shape[0]
     if (
         not recording.random_access
+        or is_blank(recording.frame(0))  # before the last: an error names the first frame that has it
         or not is_blank(recording.frame(count - 1))
-        or is_blank(recording.frame(0))
     ):
         return ()
     first = bisect.bisect_left(range(count), True, key=lambda number: is_blank(recording.frame(number)))

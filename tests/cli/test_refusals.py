@@ -40,9 +40,14 @@ def claims_too_much(path):
         file.create_dataset("frames", (10**6, 1000, 1000), "u1")
 
 
-def claims_chunks_it_lacks(path):
-    with h5py.File(path, "w") as file:
-        file.create_dataset("frames", (10**6, 1000, 1000), "u1", chunks=(1, 1000, 1000))[0] = 1
+def claims_chunks_it_lacks(*written):
+    def make(path):
+        with h5py.File(path, "w") as file:
+            stack = file.create_dataset("frames", (10**6, 1000, 1000), "u1", chunks=(1, 1000, 1000))
+            for number in written:
+                stack[number] = 1
+
+    return make
 
 
 def unknown_filter(path):
@@ -124,7 +129,12 @@ CASES = {
     "a link to nothing": (external_link("nothing.h5"), [*GIVEN, "--dataset", "frames"], "nothing.h5"),
     "a link out of the folder": (external_link("/etc/passwd"), [*GIVEN, "--dataset", "frames"], "out of"),
     "a claim beyond the file": (claims_too_much, GIVEN, "claims"),
-    "chunks that are not there": (claims_chunks_it_lacks, GIVEN, "claims"),
+    "chunks that are not there": (
+        claims_chunks_it_lacks(0, 9),
+        GIVEN,
+        "frames 1 to 8 of 1000000 were never written",
+    ),
+    "one chunk that is there": (claims_chunks_it_lacks(0), GIVEN, "contains 1 frame: at least 2"),
 }
 
 
