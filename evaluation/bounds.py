@@ -26,7 +26,7 @@ from mirrorskin.engine import (
 from mirrorskin.evaluation.base.sources import run_unchecked
 from mirrorskin.evaluation.base.tables import at_most, within
 from mirrorskin.evaluation.scenes import rotations
-from mirrorskin.io import Result
+from mirrorskin.io import Header, Result
 from mirrorskin.kernels.device import Device, open_device
 
 Doubles = NDArray[np.float64]
@@ -152,7 +152,8 @@ def run_normals(device: Device, quick: bool) -> Case:
 
 def _normals(frames: NDArray[Any], setup: rotations.Setup, device: Device) -> Result:
     scale = {"zenith_gain": setup.slope, "zenith_offset": setup.offset, "noise": setup.spread}
-    options: dict[str, Any] = {"tilt": setup.tilt, **scale, "device": device}
+    exact = {"blur": 0.0, "header": Header("axial", **rotations.EXACT)}  # neighbours are no neighbours
+    options: dict[str, Any] = {"tilt": setup.tilt, **scale, **exact, "device": device}
     return estimate_normals(frames, np.array(setup.phase), **options)
 
 

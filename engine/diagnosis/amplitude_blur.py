@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.base.device_arrays import AnyArray
+from mirrorskin.engine.base.device_arrays import AnyArray, on_host
 from mirrorskin.engine.base.frames import take_places
 from mirrorskin.engine.base.picture import Picture
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, fit_clipped
 from mirrorskin.kernels.optical import blur
 
@@ -41,24 +43,83 @@ def add_blur(maps: Picture, sigma: str, vectors: Sequence[str], strength: str) -
     variance = find_blur([maps.view(name) for name in vectors], maps.view(strength))
     if variance == 0:
         return
-    reach, factor = max(1, round(2 * math.sqrt(variance))), variance / 2
     if len(maps.bands) > 1:  # the picture does not fit on one device
         deviation, *parts = maps.read(sigma, *vectors)
-        blur.blur_add(blur.blur_bend(parts[0], parts[-1], reach), reach, factor, deviation)
+        reach, factor = _reach(variance), variance / 2
+        bend = blur.blur_bend(parts[0], parts[-1], reach)
+        blur.blur_add(parts[0], bend, reach, factor, 0.0, 0.0, 0.0, deviation)
         maps.fill(sigma, deviation)
         return
-    arrays, spread = [maps.array(name) for name in vectors], maps.array(sigma)
-    device, (rows, columns) = spread.device, spread.shape
+    _add([maps.array(name) for name in vectors], maps.array(sigma), variance)
+
+
+def with_bend(
+    vectors: AnyArray,
+    sigma: AnyArray,
+    variance: float,
+    noise: float,
+    common: tuple[float, float],
+    device: Device,
+) -> AnyArray:
+    """Return standard deviations of unit vectors, (H, W), with the error because of a point spread.
+
+    They are where ``sigma`` is.
+
+    Parameters
+    ----------
+    vectors : array, (H, W, 3)
+    sigma : array, (H, W)
+    variance : float
+        Of the point spread, square pixels; 0 adds nothing.
+    noise : float
+        Variance of the vectors' Laplacian because of noise, relative to that of a vector.
+    common : (float, float)
+        Coefficients a and b of a variance to add, a + b sin(zenith)^2.
+    device : Device
+    """
+    if isinstance(sigma, Array) and isinstance(vectors, Array):
+        spread = sigma.copy_region(0, sigma.shape)
+        _add([vectors], spread, variance, noise, common)
+        return spread
+    sigma, vectors = (on_host(values) for values in (sigma, vectors))
+    rows, columns = sigma.shape
+    around = 2 * _reach(variance)
+    most = device.max_allocation // (vectors.itemsize * vectors.shape[-1] * columns)  # rows at once
+    step, changed = rows if most >= rows else max(1, most - 2 * around), np.empty_like(sigma)
+    for first in range(0, rows, step):
+        start = max(0, first - around)
+        part = slice(start, min(rows, first + step + around))
+        spread = device.from_host("normals_sigma", sigma[part], np.float32)
+        _add([device.from_host("normals", vectors[part], np.float32)], spread, variance, noise, common)
+        changed[first : first + step] = spread.read()[first - start :][:step]
+    return changed
+
+
+def _reach(variance: float) -> int:
+    """Return the distance of the pixels whose directions are compared."""
+    return max(1, round(2 * math.sqrt(variance)))
+
+
+def _add(
+    arrays: Sequence[Array],
+    spread: Array,
+    variance: float,
+    noise: float = 0.0,
+    common: tuple[float, float] = (0.0, 0.0),
+) -> None:
+    """Add the error of directions to their standard deviations on a device, (H, W)."""
+    device, (rows, columns), reach = spread.device, spread.shape, _reach(variance)
     tile, count = device.layout.tile, 3 if len(arrays) == 1 else 2
     bend = device.array("bend", spread.shape, np.float32, zeroed=False)
+    base, rise = common
 
     def launch(name: str, planes: int, **arguments: Any) -> None:
         kernel = device.kernel("blur", name, TILE=tile, PARTS=count)
         sizes = {"rows": rows, "columns": columns, "reach": reach, "moved": planes * spread.nbytes}
-        kernel(-(-rows * columns // tile), bend=bend, **sizes, **arguments)
+        kernel(-(-rows * columns // tile), first=arrays[0], bend=bend, **sizes, **arguments)
 
-    launch("blur_bend", count + 1, first=arrays[0], second=arrays[-1])
-    launch("blur_add", 3, factor=factor, sigma=spread)
+    launch("blur_bend", count + 1, second=arrays[-1])
+    launch("blur_add", count + 3, factor=variance / 2, noise=noise, base=base, rise=rise, sigma=spread)
 
 
 def find_blur(vectors: Sequence[AnyArray], strength: AnyArray) -> float:

@@ -8,6 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+PIXEL = 1 / 12
+"""Variance of a pixel's area, square pixels."""
+
+LEAST_BLUR = 0.3
+"""Pixels: the blur of a lens at best, see `mirrorskin.io.Header.blur_sigma`."""
+
 _AT_ONCE = 64  # rows processed at once
 
 

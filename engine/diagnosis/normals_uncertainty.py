@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mirrorskin.engine.base.device_arrays import AnyArray, stored_map
+from mirrorskin.engine.base.device_arrays import AnyArray, on_host, stored_map
 from mirrorskin.engine.base.frames import QUANTUM, take_places, typical_value
 from mirrorskin.engine.base.steps import Context, Step
+from mirrorskin.engine.diagnosis.amplitude_blur import with_bend
 from mirrorskin.engine.diagnosis.curl import AzimuthBias, find_azimuth_bias
 from mirrorskin.engine.diagnosis.registration import Registered
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.engine.diagnosis.swing import ModulationEffects, find_modulation_effects
+from mirrorskin.engine.diagnosis.turn_nuisances import TurnNuisances
 from mirrorskin.io import Result
 from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.io.watch.mirrored import MIRRORED
@@ -25,11 +27,13 @@ from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, mad_sigma
 from mirrorskin.kernels.rotation.normals import azimuth_of
 
 if TYPE_CHECKING:
-    from mirrorskin.engine.rotation.normals import Normals
+    from mirrorskin.engine.rotation.normals import Normals, NormalsOperation
 
 _PARTS, _POINTS = 8, 64  # of the extent of the normals: distance between slopes; slopes along a side
 _GRID = 64  # points along a side that show this extent
 _MIN_POINTS, _MIN_CORRELATION = 100, 0.1  # points, and their correlation, that decide
+_MAX_CORRELATION = 0.05  # of neighbours: greatest one of a mirrored surface
+_BEND_NOISE = 20.0  # variance of a sum of four neighbours less four times the middle, of a variance of 1
 _REACH = 5  # pixels: size of the neighbourhood whose loss of contact affects a registered sample
 
 
@@ -90,8 +94,9 @@ class PhaseUncertainty(Step):
 class ResponseUncertainty(Step):
     """Compare the swing of the brightness with what tilt and gain predict.
 
-    Gains of pixels and uneven light are added to the errors, and noted; a response that is not as stated and
-    blur are warnings: see `mirrorskin.engine.diagnosis.swing`. A calibrated response is not judged.
+    Gains of pixels are added to the errors, and noted; the area that a pixel sees is used. Blur, and a
+    response that is not linear, are warnings: see `mirrorskin.engine.diagnosis.swing`. A calibrated response
+    is not judged.
     """
 
     needs = ("normals", "normals_sigma", "zenith", "mean", "modulation", "contact")
@@ -122,26 +127,73 @@ class ResponseUncertainty(Step):
             result = _with_share_of_zenith(result, modulation.gain).with_fitted(
                 pixel_gain_sigma=modulation.gain
             )
-        if (fraction := max(modulation.response, modulation.light)) > 0:
-            result = result.with_fitted(swing_range=fraction)
+        if modulation.area > 0 and operation.blur is None:
+            result = result.assign(fitted=replace(result.fitted, footprint=modulation.area))
         return with_findings(result, *_uneven(modulation))
 
 
-class SystematicUncertainty(Step):
-    """Add errors of the response, which are common to neighbours, to those of normals.
+class NuisanceUncertainty(Step):
+    """Add to the errors of normals what is uncertain of camera, light and stage.
 
-    They are the standard errors of a calibrated response, or the range of the swing of a linear one that does
-    not fit to it, as a share of zeniths.
+    Where the surface is bent, the area that a pixel sees does not show the normal in its middle. What is
+    wrong with the brightness of all pixels together, as far as the frames do not show it, is as uncertain as
+    the header states, or as that of a camera and a stage that nobody characterised: see
+    `mirrorskin.engine.diagnosis.turn_nuisances`. A note names it.
     """
 
-    needs = ("normals_sigma", "zenith")
+    needs = ("normals", "normals_sigma")
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result with other ``normals_sigma``, and with the errors that all have in common."""
+        operation = cast("NormalsOperation", context.operation)
+        footprint = max(operation.footprint, result.fitted.footprint or 0.0)
+        found = operation.nuisances_of(context.samples)
+        if not footprint and found is None:
+            return result
+        common = (0.0, 0.0) if found is None else found.variance
+        normals, sigma = (stored_map(result, name) for name in ("normals", "normals_sigma"))
+        several = normals.ndim == 4
+
+        def changed() -> AnyArray:
+            turns = zip(normals, sigma, strict=True) if several else [(normals, sigma)]
+            maps = [with_bend(*turn, footprint, _BEND_NOISE, common, operation.device) for turn in turns]
+            return np.stack(list(map(on_host, maps))) if several else maps[0]
+
+        fitted = replace(result.fitted, footprint=footprint or None)
+        if found is not None:
+            modes = tuple(found.modes.ravel().tolist())
+            fitted = replace(fitted, light_variance=found.variance, common_errors=modes)
+        on_device = result.on_device("normals_sigma") is not None
+        result = result.assign(normals_sigma=changed() if on_device else changed, fitted=fitted)
+        return result if found is None else with_findings(result, *_common(found))
+
+
+class SystematicUncertainty(Step):
+    """Add the standard errors of a calibrated response, which neighbours have in common."""
+
+    needs = ("normals_sigma",)
 
     def apply(self, result: Result, context: Context) -> Result:
         """Return the result with other ``normals_sigma``, if the response has errors."""
-        response, fraction = cast("Normals", context.operation).response, result.fitted.swing_range
-        if response is not None:
-            return result.assign(normals_sigma=np.hypot(result.normals_sigma, response.sigma))
-        return result if fraction is None else _with_share_of_zenith(result, fraction)
+        response = cast("Normals", context.operation).response
+        if response is None:
+            return result
+        return result.assign(normals_sigma=np.hypot(result.normals_sigma, response.sigma))
+
+
+def _common(found: TurnNuisances) -> Iterator[Finding]:
+    """Yield what is said of errors that all pixels have in common."""
+    if found.is_odd:
+        side = "below" if found.gamma < 0 else "above"
+        yield Finding(
+            "gamma",
+            f"the brightness is not proportional to the light, as with a gamma {side} 1: normals and heights"
+            " may be wrong by more than their sigma. Set the camera's gamma to 1, or calibrate the zenith",
+        )
+    if found.unknown:
+        names = ", ".join(found.unknown)
+        text = f"not identifiable on this object: {names}; the errors include it"
+        yield Finding("not identifiable", text, False)
 
 
 def _with_share_of_zenith(result: Result, fraction: float) -> Result:
@@ -155,26 +207,19 @@ def _uneven(modulation: ModulationEffects) -> Iterator[Finding]:
     if modulation.gain > 0:
         text = f"the gains of pixels differ by {100 * modulation.gain:.2g} %, which is part of the errors"
         yield Finding("pixel gains", text, False)
-    causes = []
-    if modulation.response > 0:
-        causes.append(f"differs by {100 * modulation.response:.2g} % from zenith to zenith, as with gamma")
-    if modulation.light > 0:
-        light = f"differs by {100 * modulation.light:.2g} % from place to place, as in uneven light"
-        if modulation.response > 0 or modulation.blur > 0:
-            causes.append(light)
-        else:
-            text = (
-                f"the swing of the brightness {light} (or points move in the picture); the errors include it"
-            )
-            yield Finding("swing", text, False)
     if modulation.blur > 0:
-        causes.append(f"is weak at tops and edges, as if a lens blurs by {modulation.blur:.2g} pixels")
-    if causes:
         yield Finding(
             "swing",
-            f"the brightness does not swing as tilt and gain predict: its swing {' and '.join(causes)} (or"
-            " points move in the picture), so normals and heights may be wrong by more than their sigma."
-            " Calibrate the zenith, focus, or register (--heights)",
+            "the brightness does not swing as tilt and gain predict: its swing is weak at tops and edges,"
+            f" as if a lens blurs by {modulation.blur:.2g} pixels (or points move in the picture), so normals"
+            " and heights may be wrong by more than their sigma. Focus, or register (--heights)",
+        )
+    if modulation.response > 0:
+        yield Finding(
+            "swing",
+            f"the swing of the brightness differs by {100 * modulation.response:.2g} % from zenith to zenith,"
+            " as with a gamma other than 1, so normals and heights may be wrong by more than their sigma:"
+            " calibrate the zenith",
         )
 
 
@@ -201,24 +246,34 @@ def _mirrored(normals: AnyArray) -> bool:
     rows, columns = (range(0, length, step) for length in shape)
     [[(*_, z)]] = take_places([normals], rows, columns, [(0, 0)])
     extent = step * math.isqrt(int(np.count_nonzero(np.isfinite(z))))
-    reach, thin = max(1, extent // _PARTS), max(1, extent // _POINTS)
-    rows, columns = (range(0, length - reach, thin) for length in shape)
+    thin = max(1, extent // _POINTS)
+    far, near = (_correlation(normals, reach, thin) for reach in (max(2, extent // _PARTS), 2))
+    # Relief finer than the distance of far points has any correlation there.
+    return far < -_MIN_CORRELATION and near < _MAX_CORRELATION
+
+
+def _correlation(normals: AnyArray, reach: int, thin: int) -> float:
+    """Return the correlation of dp/dy and dq/dx over a distance; 0 if it is not clear.
+
+    They are from different pixels around one place, because the noise of a pixel's slopes is correlated.
+    """
+    rows, columns = (range(0, length - reach, thin) for length in normals.shape[:2])
     if not (rows and columns):
-        return False
-    ((here, across, down),) = take_places([normals], rows, columns, ((0, 0), (0, reach), (reach, 0)))
-    here, across, down = (values.astype(np.float64) for values in (here, across, down))
+        return 0.0
+    half = reach // 2
+    (points,) = take_places([normals], rows, columns, [(0, half), (reach, half), (half, 0), (half, reach)])
+    above, below, left, right = (values.astype(np.float64) for values in points)
     with np.errstate(divide="ignore", invalid="ignore"):
-        dp_dy = down[0] / down[2] - here[0] / here[2]  # y points up
-        dq_dx = here[1] / here[2] - across[1] / across[2]
+        dp_dy = below[0] / below[2] - above[0] / above[2]  # y points up
+        dq_dx = left[1] / left[2] - right[1] / right[2]
     defined = np.isfinite(dp_dy) & np.isfinite(dq_dx)
     if np.count_nonzero(defined) < _MIN_POINTS:
-        return False
+        return 0.0
     dp_dy, dq_dx = (_clip_outliers(values[defined]) for values in (dp_dy, dq_dx))
     product = dp_dy * dq_dx
-    clear = -float(np.mean(product)) > CLEAR_Z_SCORE * float(np.std(product)) / math.sqrt(len(product))
-    return clear and bool(
-        -np.sum(product) >= _MIN_CORRELATION * math.sqrt(np.sum(dp_dy**2) * np.sum(dq_dx**2))
-    )
+    if abs(float(np.mean(product))) <= CLEAR_Z_SCORE * float(np.std(product)) / math.sqrt(len(product)):
+        return 0.0
+    return float(np.sum(product) / math.sqrt(np.sum(dp_dy**2) * np.sum(dq_dx**2)))
 
 
 def _clip_outliers(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,10 +3,10 @@
 The mean of a pixel's brightness determines the zenith; how much it swings follows from the slope of the
 response there. Three errors change the swing, each in its own way:
 
-- a response that is not as stated (gamma): it depends on the zenith, and uneven light (vignetting): on the
-  place in the picture;
 - gains of pixels: it differs from pixel to pixel, in excess of noise;
-- blur: it is smaller where the azimuth changes from pixel to pixel.
+- blur: it is smaller where the azimuth changes from pixel to pixel;
+- a response that is not linear: it depends on the zenith. A little of it, and uneven light, are nuisances
+  of `mirrorskin.engine.diagnosis.turn_nuisances`.
 
 Points that move in the picture while the body leans change it where the surface is curved; a sphere shows
 nothing of all this, as its zenith, its place and its curvature change together.
@@ -24,19 +24,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.device_arrays import AnyArray
 from mirrorskin.engine.base.frames import take_places
-from mirrorskin.engine.diagnosis.amplitude_blur import GRID_LINES, MIN_BLUR, MIN_PIXELS
+from mirrorskin.engine.diagnosis.amplitude_blur import GRID_LINES, MIN_PIXELS
+from mirrorskin.engine.diagnosis.footprint import PIXEL
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, OUTLYING, fit_clipped, gram, mad_sigma
 
 _MIN_ZENITH = 3.0  # tilts, from which on the zenith and the swing are independent
-_REACH = 2  # pixels between the middle and its neighbours
+_REACH = 1  # pixels between the middle and its neighbours
 _GAIN_Z_SCORE = 5.0  # standard errors from which on the scatter of gains is reported
-_MIN_RANGE = 0.03  # least range of the swing, as a share of it, that is a response or uneven light
+_MIN_BLUR = 0.8  # pixels: least standard deviation of a blur that is more than a larger area of a pixel
 _MIN_UNEXPLAINED = 0.25  # least share of an effect's variance that the others do not explain
 _ERROR_RATIO = 1.25  # ratio of that error to that of independent values
 _MIN_DECIDING_PIXELS = 100  # that show a blur: a tip does not
 _MIN_TURNING = 0.02  # square of the turning of azimuths, 1/pixel^2
+_MAX_TURNING = 0.05  # the same, of pixels that show a response: a pixel's area does not change their swing
+_AREA_ITERATIONS = 4
+_MOST_TURNED = 0.2  # square of the angle by which azimuths turn over an area: its effect is proportional
+_TURNING, _ZENITH = 1, 3  # numbers of the columns of a fit
+_MIN_RANGE = 0.05  # least range of the swing, as a share of it, that is a response
 _MIN_GAIN = 0.01  # least standard deviation of the gains of pixels
 
 
@@ -46,18 +52,20 @@ class ModulationEffects:
 
     Attributes
     ----------
-    response, light : float
-        Range of the swing, as a share of it, over the zeniths and over the places of the picture.
     gain : float
         Standard deviation of the gains of pixels.
+    area : float
+        Variance of the area that a pixel sees, square pixels.
     blur : float
-        Standard deviation of the point spread, pixels.
+        Standard deviation of the lens's point spread, pixels, if it is a large one.
+    response : float
+        Range over the picture of the swing that changes with the zenith, relative to the swing.
     """
 
-    response: float = 0.0
-    light: float = 0.0
     gain: float = 0.0
+    area: float = 0.0
     blur: float = 0.0
+    response: float = 0.0
 
 
 def find_modulation_effects(
@@ -114,7 +122,10 @@ def find_modulation_effects(
         np.ones_like(x), turning[finite], bending[finite], zenith[finite] - np.mean(zenith[finite]),
         x, y, x * x, x * y, y * y,
     ], axis=1)  # fmt: skip
-    return _fit(middle[3][finite], columns_of, np.hypot(noise, gain), gain)
+    given = middle[3][finite], columns_of, np.hypot(noise, gain)
+    area = _area(*given)
+    blur = math.sqrt(max(area - PIXEL, 0.0))
+    return ModulationEffects(gain, area, blur if blur > _MIN_BLUR else 0.0, _response(*given))
 
 
 def _expected(zenith: Doubles, tilt: float) -> Doubles:
@@ -145,39 +156,58 @@ def _gain(rough: Doubles, noise: Doubles) -> float:
     )
 
 
-def _fit(ratio: Doubles, columns: Doubles, noise: Doubles, gain: float) -> ModulationEffects:
-    """Fit the effects to the ratio of the swing to the expected one."""
-    result = fit_clipped(columns, ratio, noise)
-    if result is None:
-        return ModulationEffects(gain=gain)
-    fit, inverse, residual, kept = result
-    covariance = inverse * max(1.0, float(np.mean(residual[kept] ** 2)))
+class _Fit:
+    """Effects on the ratio of the swing to the expected one: factors of columns."""
 
-    used = columns.compress(kept, axis=0)
-    products = gram(used)
-    sums, number = products[0], products[0, 0]  # the first column is 1
+    def __init__(self, ratio: Doubles, columns: Doubles, noise: Doubles) -> None:
+        result = fit_clipped(columns, ratio, noise) if len(ratio) >= MIN_PIXELS else None
+        self._covariance: Doubles | None = None
+        if result is None:
+            return
+        self.factors, inverse, residual, kept = result
+        self._covariance = inverse * max(1.0, float(np.mean(residual[kept] ** 2)))
+        self.used = columns.compress(kept, axis=0)
+        self._products = gram(self.used)
 
-    def effect(chosen: slice) -> float:
-        """Return the range of an effect if it is significant, and not that of another one."""
-        part, others = fit[chosen], np.delete(np.arange(len(fit)), np.r_[chosen])
-        mixed = part @ products[chosen, others]
-        square = float(part @ products[chosen, chosen] @ part)
+    def has(self, number: int) -> bool:
+        """Return whether the effect of a column is significant, and not that of others."""
+        if self._covariance is None:
+            return False
+        products, others = self._products, np.delete(np.arange(len(self.factors)), number)
+        sums, count = products[0], products[0, 0]  # the first column is 1
+        square, mixed = products[number, number], products[number, others]
         unexplained = square - float(mixed @ np.linalg.solve(products[np.ix_(others, others)], mixed))
-        alone = unexplained > _MIN_UNEXPLAINED * (square - float(part @ sums[chosen]) ** 2 / number)
-        chi2 = float(part @ np.linalg.solve(covariance[chosen, chosen], part))
-        if not (alone and chi2 > len(part) * CLEAR_Z_SCORE**2):
-            return 0.0
-        return float(np.ptp(np.percentile(used[:, chosen] @ part, [5, 95]))) / abs(float(fit[0]))
+        alone = unexplained > _MIN_UNEXPLAINED * (square - float(sums[number]) ** 2 / count)
+        error = math.sqrt(self._covariance[number, number])
+        return bool(alone and abs(float(self.factors[number])) > CLEAR_Z_SCORE * error)
 
-    def turns_widely() -> bool:
-        """Return whether azimuths turn at enough pixels to show a blur."""
-        square = used[:, 1] ** 2
-        deciding = float(np.sum(square)) ** 2 / float(np.sum(square**2))  # pixels
-        return deciding > _MIN_DECIDING_PIXELS and float(np.percentile(used[:, 1], 95)) > _MIN_TURNING
 
-    spread = math.sqrt(-2 * min(float(fit[1]), 0.0))
-    blurs = spread > MIN_BLUR and turns_widely() and effect(slice(1, 2)) > 0
-    response, light = (
-        extent if extent > _MIN_RANGE else 0.0 for extent in (effect(slice(3, 4)), effect(slice(4, 9)))
-    )
-    return ModulationEffects(response, light, gain, spread if blurs else 0.0)
+def _area(ratio: Doubles, columns: Doubles, noise: Doubles) -> float:
+    """Return the variance of the area that a pixel sees; 0 if azimuths turn at too few pixels to show it.
+
+    The swing is proportional to the square of the turning only where an area is small compared with the
+    distance over which azimuths turn, as far as such pixels show it.
+    """
+    area, chosen = 0.0, np.ones(len(ratio), bool)
+    for _ in range(_AREA_ITERATIONS):
+        fit = _Fit(ratio[chosen], columns[chosen], noise[chosen])
+        if not fit.has(_TURNING):
+            break
+        turning = fit.used[:, _TURNING]
+        deciding = float(np.sum(turning**2)) ** 2 / float(np.sum(turning**4))  # pixels
+        if deciding < _MIN_DECIDING_PIXELS or float(np.percentile(turning, 95)) < _MIN_TURNING:
+            break
+        area = max(-2 * float(fit.factors[_TURNING]), 0.0)
+        chosen = columns[:, _TURNING] * area < _MOST_TURNED
+    return area
+
+
+def _response(ratio: Doubles, columns: Doubles, noise: Doubles) -> float:
+    """Return the range of the swing that changes with the zenith, where the surface is hardly bent."""
+    mild = columns[:, _TURNING] < _MAX_TURNING
+    fit = _Fit(ratio[mild], columns[mild], noise[mild])
+    if not fit.has(_ZENITH):
+        return 0.0
+    low, high = np.percentile(fit.used[:, _ZENITH], (5, 95))
+    extent = abs(float(fit.factors[_ZENITH])) * float(high - low)
+    return extent if extent > _MIN_RANGE else 0.0

@@ -21,6 +21,7 @@ from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.base.running import Progress, Run, run_over
 from mirrorskin.engine.base.steps import Context, Step, undistorted
 from mirrorskin.engine.base.tiling import MEMORY_LIMIT
+from mirrorskin.engine.diagnosis.footprint import PIXEL
 from mirrorskin.engine.fusion.solver import AbsoluteHeights, FusionSolver
 from mirrorskin.engine.integration.normals_to_height import (
     Slopes,
@@ -29,7 +30,7 @@ from mirrorskin.engine.integration.normals_to_height import (
     slopes_of,
 )
 from mirrorskin.engine.press.intervals import heights_as_intervals, stored_heights_as_intervals
-from mirrorskin.engine.press.nuisances import PIXEL, Edges, Nuisances, footprint_of
+from mirrorskin.engine.press.nuisances import Edges, Nuisances, footprint_of
 from mirrorskin.engine.press.press import Press
 from mirrorskin.engine.rotation.response import wall_response_of
 from mirrorskin.engine.rotation.rotation import Rotation, at_poses
@@ -255,7 +256,7 @@ def _fuse_maps(
         )
     slopes = _slopes_of_maps(normal_maps, selected, moved)
     opened = device_of_maps(device, height_maps, normal_maps)
-    footprint = height_maps.fitted.footprint or PIXEL
+    footprint = max(height_maps.fitted.footprint or PIXEL, normal_maps.fitted.footprint or PIXEL)
     solver = FusionSolver(absolute, size, robust, opened, footprint, doubtful=moved > 0)
     surface = solver.filled(solver.surface(slopes))
     x, y = pixel_axes(selected.shape, size)
@@ -342,6 +343,7 @@ def _fuse_sources(
         registered = turn.with_options(heights=before) if register else turn
         processed = vertical.shape[0] + number * axial.shape[0]
         turned, slopes = _rotate(registered, axial, _after(progress, processed))
+        solver.footprint = max(taken.footprint, turned.fitted.footprint or PIXEL)
         # The first of several surfaces is rarely the last one, so its sigma is not needed.
         surface = solver.surface(slopes, sigma=number > 0 or passes == 1)
         assert turned.fitted.tilt is not None

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mirrorskin.engine.diagnosis.footprint import PIXEL
 from mirrorskin.engine.fusion.agreement import (
     Disagreement,
     ZenithBias,
@@ -20,7 +21,6 @@ from mirrorskin.engine.integration.arrays import integrate_arrays
 from mirrorskin.engine.integration.normals_to_height import Slopes
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.intervals import estimate_interval_scatter, fit_paraboloids, interval_evidence
-from mirrorskin.engine.press.nuisances import PIXEL
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.arguments import check_pixel_size
 from mirrorskin.io.base.types import ProcessValue
@@ -100,7 +100,7 @@ class FusionSolver:
         doubtful: bool = False,
     ) -> None:
         self._press, self._pixel_size = press, check_pixel_size(pixel_size)
-        self._robust, self._device, self._footprint = robust, device, footprint
+        self._robust, self._device, self.footprint = robust, device, footprint
         self._doubtful = doubtful
         self._near: Result | None = None
         self._zenith_bias, self._disagreement = ZenithBias(), Disagreement()
@@ -158,7 +158,7 @@ class FusionSolver:
         if surface.height_sigma is not None:
             self._scatter = _scatter(surface.height, slopes, self._pixel_size)
             surface = surface.assign(height_sigma=surface.height_sigma * np.float32(self._scatter))
-            surface = _add_error_of_averaging(_set_sigma_of_lone_pixels(surface, weight), self._footprint)
+            surface = _add_error_of_averaging(_set_sigma_of_lone_pixels(surface, weight), self.footprint)
         return surface, disagreement
 
     def filled(self, surface: Result) -> Result:

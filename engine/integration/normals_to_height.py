@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.base.errors import NotConverged
-from mirrorskin.engine.diagnosis.frame_light import light_sigma
+from mirrorskin.engine.diagnosis.footprint import with_curvature
+from mirrorskin.engine.diagnosis.turn_nuisances import TERMS, light_sigma
 from mirrorskin.engine.integration.arrays import integrate_arrays
+from mirrorskin.engine.integration.common_errors import common_variance
 from mirrorskin.engine.integration.device_inputs import sample_evenly
 from mirrorskin.engine.integration.surface import explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
@@ -56,15 +58,21 @@ def integrate_result(
 ) -> Result:
     """Return the heights that fit the normals of a result, with the errors that all have in common.
 
-    Errors of slopes that are common to all pixels, such as those of the light of a frame, change slopes, and
-    with them heights, by about the same share everywhere. For ``noise_gain`` see `separate_errors`.
+    These are the modes of `mirrorskin.engine.diagnosis.turn_nuisances`. For ``noise_gain`` see
+    `separate_errors`.
     """
     separate, independent_sigma = separate_errors(result, noise_gain)
     surface = integrate_normals(separate, independent_sigma, pixel_size, robust=robust, device=device)
-    for fraction in _common_shares(result):
-        sigma = np.hypot(surface.height_sigma, np.float32(fraction) * surface.height)
-        surface = surface.assign(height_sigma=sigma)
-    return surface
+    fitted, sigma = result.fitted, np.array(surface.height_sigma)
+    turns = [()] if sigma.ndim == 2 else [(number,) for number in range(len(sigma))]
+    for turn in turns:
+        if fitted.common_errors is not None:
+            modes = np.reshape(fitted.common_errors, (-1, 2, TERMS))
+            variance = common_variance(result.normals[turn], surface.component[turn], modes, pixel_size)
+            sigma[turn] = np.sqrt(sigma[turn] ** 2 + variance)
+        if fitted.footprint is not None:
+            sigma[turn] = with_curvature(surface.height[turn], sigma[turn], fitted.footprint)
+    return surface.assign(height_sigma=sigma)
 
 
 def separate_errors(result: Result, noise_gain: Floats | None = None) -> tuple[Result, Floats]:
@@ -75,8 +83,6 @@ def separate_errors(result: Result, noise_gain: Floats | None = None) -> tuple[R
     samples; by default the mean one, if frames were registered.
     """
     fitted, sigma = result.fitted, np.asarray(result.normals_sigma, np.float32)
-    if fitted.swing_range is not None:
-        sigma = _without(sigma, np.float32(fitted.swing_range) * result.zenith)
     independent = sigma
     if fitted.light_variance is not None:
         independent = _without(sigma, light_sigma(result.normals, fitted.light_variance))
@@ -85,19 +91,6 @@ def separate_errors(result: Result, noise_gain: Floats | None = None) -> tuple[R
     elif fitted.registered:
         independent = independent / np.float32(MEAN_NOISE_GAIN)
     return result.assign(normals_sigma=sigma), independent
-
-
-def _common_shares(result: Result) -> Iterator[float]:
-    """Yield by which shares all heights may be wrong together."""
-    fitted = result.fitted
-    if fitted.light_variance is not None:
-        cosine = result.normals[..., 2].astype(np.float64)
-        error = light_sigma(result.normals, fitted.light_variance) / cosine**2
-        finite = np.isfinite(error) & (True if result.contact is None else result.contact > 0)
-        steepness = 1 / cosine[finite] ** 2 - 1  # square of the slope; rounded, it may be just below 0
-        yield math.sqrt(float(np.mean(error[finite] ** 2) / np.mean(steepness)))
-    if fitted.swing_range is not None:
-        yield fitted.swing_range
 
 
 def slopes_of(

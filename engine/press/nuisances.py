@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.device_arrays import device_of_maps, operand_of
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.steps import Context, Step
+from mirrorskin.engine.diagnosis.footprint import LEAST_BLUR, PIXEL
 from mirrorskin.io import Header, Result
 from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.io.model.result import shape_of
@@ -23,10 +24,6 @@ from mirrorskin.kernels.press.relief import add_relief
 if TYPE_CHECKING:
     from mirrorskin.engine.press.crossing import PressOperation
 
-PIXEL = 1 / 12
-"""Variance of a pixel's area, square pixels."""
-
-_LEAST_BLUR = 0.3  # pixels: the blur of a lens at best, see `Header.blur_sigma`
 _BLURS = np.linspace(0.0, 4.0, 81)  # pixels: those whose probability is computed
 _OUT_OF_FOCUS = 3e-4  # probability of a lens that is not as assumed, whose blur may be any of these
 _QUANTILES = 0.16, 0.84  # of the rise, two standard deviations of a blurred edge apart
@@ -304,7 +301,7 @@ def footprint_of(edges: Edges | None, header: Header, stated: float | None) -> F
     if stated is not None:
         return Footprint(stated**2 + PIXEL if stated else 0.0, bool(stated))
     variance, error = (PIXEL, math.inf) if edges is None else edges.variance()
-    away = (_BLURS - _LEAST_BLUR) / max(header.prior("blur_sigma"), 1e-3)
+    away = (_BLURS - LEAST_BLUR) / max(header.prior("blur_sigma"), 1e-3)
     density = np.exp(-0.5 * away**2)
     density = density / np.sum(density) + _OUT_OF_FOCUS / len(_BLURS)
     clear = variance - PIXEL > _BLUR_Z_SCORE * error

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.functions import ABOUT_WEIGHTS, function_of
 from mirrorskin.engine.base.operation import Operation
-from mirrorskin.engine.diagnosis.normals_uncertainty import PhaseUncertainty
+from mirrorskin.engine.diagnosis.normals_uncertainty import NuisanceUncertainty, PhaseUncertainty
 from mirrorskin.engine.rotation.normals import Normals, NormalsOperation, normals_result
 from mirrorskin.engine.rotation.normals_kernel import MAPS, SLOPE_MAPS, NormalKernel, TurnModel
 from mirrorskin.engine.rotation.poses import PoseFit, check_poses, even_windows, pose_fit, rocks
@@ -49,7 +49,7 @@ class MovingNormals(NormalsOperation):
     (4, -0.55)
     """
 
-    checks = (PhaseUncertainty,)
+    checks = PhaseUncertainty, NuisanceUncertainty
 
     status = status_of(PoseStatus)
     slope = TABLE["slope"]

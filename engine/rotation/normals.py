@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -23,13 +22,15 @@ from mirrorskin.engine.correlation.design_matrix import (
     split_into_turns,
     turn_fit,
 )
-from mirrorskin.engine.diagnosis.frame_light import FrameLight, find_frame_light, light_sigma
+from mirrorskin.engine.diagnosis.footprint import LEAST_BLUR, PIXEL
 from mirrorskin.engine.diagnosis.normals_uncertainty import (
+    NuisanceUncertainty,
     PhaseUncertainty,
     RegistrationUncertainty,
     ResponseUncertainty,
     SystematicUncertainty,
 )
+from mirrorskin.engine.diagnosis.turn_nuisances import Grid, Scale, TurnNuisances, find_nuisances, shift_of
 from mirrorskin.engine.rotation.normals_kernel import (
     MAPS,
     NormalKernel,
@@ -42,7 +43,7 @@ from mirrorskin.engine.rotation.poses import PoseFit
 from mirrorskin.engine.rotation.response import Response, initial_response, wall_response_of
 from mirrorskin.engine.rotation.scale import check_gain
 from mirrorskin.engine.rotation.tilt import check_tilt
-from mirrorskin.io import InputError, Result
+from mirrorskin.io import Header, InputError, Result
 from mirrorskin.io.base.types import FRAME_DTYPES, ProcessValue
 from mirrorskin.io.model.maps import TABLE
 from mirrorskin.io.model.positions import check_phase
@@ -79,6 +80,20 @@ class NormalsOperation(SensorOptions, Operation):
         help="return each turn alone, in maps with a leading axis, instead of the mean over turns",
     )
 
+    blur: float | None = option(
+        default=None,
+        within=(0, 100),
+        help="standard deviation of the lens's point spread, pixels, which makes normals of bent surfaces"
+        " less certain; 0 adds nothing",
+        shown_default="0.3, and what the recording states of it",
+    )
+    header: Header | None = option(
+        default=None,
+        help="uncertainties of camera and stage",
+        shown_default="that of the recording",
+        python_only=True,
+    )
+
     normals = TABLE["normals"]
     zenith = TABLE["zenith"]
     azimuth = TABLE["azimuth"]
@@ -102,7 +117,8 @@ class NormalsOperation(SensorOptions, Operation):
         """Return the operation with the source's values of options that are not given."""
         names = "zenith_gain", "zenith_offset", "dark", "bright"
         return self.with_options(
-            **{name: getattr(source.header, name) for name in names if getattr(self, name) is None}
+            header=source.header if self.header is None else self.header,
+            **{name: getattr(source.header, name) for name in names if getattr(self, name) is None},
         )
 
     def _make_kernel(self, shape: tuple[int, int]) -> NormalKernel:
@@ -193,6 +209,22 @@ class NormalsOperation(SensorOptions, Operation):
         else:
             maps = self._maps.take(*self._kernel_maps, on_host=self._stack is None)
         return self._as_result(maps, self._model)
+
+    @property
+    def footprint(self) -> float:
+        """Variance of the area that a pixel sees, square pixels; 0 if it adds nothing."""
+        if self.blur is not None:
+            return float(self.blur**2 + PIXEL) if self.blur else 0.0
+        return PIXEL + LEAST_BLUR**2 + self.stated.prior("blur_sigma") ** 2
+
+    @property
+    def stated(self) -> Header:
+        """What is stated of camera and stage."""
+        return Header("axial") if self.header is None else self.header
+
+    def nuisances_of(self, samples: FrameSamples | None) -> TurnNuisances | None:
+        """Return what may be wrong with the brightness of all pixels; None if nothing is known of it."""
+        return None
 
     def _as_result(self, maps: list[NDArray[Any]], model: TurnModel) -> Result:
         return normals_result(maps, model, self._turns, self._frames)
@@ -316,7 +348,13 @@ class Normals(NormalsOperation):
     1
     """
 
-    checks = RegistrationUncertainty, PhaseUncertainty, ResponseUncertainty, SystematicUncertainty
+    checks = (
+        RegistrationUncertainty,
+        PhaseUncertainty,
+        ResponseUncertainty,
+        NuisanceUncertainty,
+        SystematicUncertainty,
+    )
 
     tilt: float | Literal["estimate"] | None = option(
         default=None,
@@ -342,10 +380,10 @@ class Normals(NormalsOperation):
         " and tilt are estimated from the first of these turns",
         shown_default="all turns",
     )
-    frame_light: FrameLight | None = option(
+    nuisances: TurnNuisances | None = option(
         default=None,
-        help="light of each frame, which is not steady: frames are corrected for it",
-        shown_default="found in all frames, which are then pushed again",
+        help="what was wrong with the brightness of all frames, which are corrected for it",
+        shown_default="found in all frames, which are then pushed again if it matters",
         python_only=True,
     )
 
@@ -371,6 +409,7 @@ class Normals(NormalsOperation):
     def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Prepare for frames of a shape and type."""
         self._has_weights = False
+        self._found: TurnNuisances | None = None
         if self.window_frames is None:
             super().start(shape, dtype)
         else:
@@ -392,24 +431,57 @@ class Normals(NormalsOperation):
         return super().staging_buffer if self.window_frames is None else self._window.maps.staging_buffer
 
     def after_last_frame(self, samples: FrameSamples) -> Self | None:
-        """Return the operation that corrects the light of each frame, if it is not steady."""
-        alone = self.per_turn or self.window_frames is not None or self.response is not None
-        if alone or self._has_weights or self.zenith_gain is None or self.frame_light is not None:
+        """Return the operation that corrects what is wrong with the brightness, if that matters."""
+        alone = self.per_turn or self.window_frames is not None
+        if self._has_weights or alone or self.nuisances is not None:
             return None
-        tilt = self._tilt_of_frames()
+        self._found = found = self._find_nuisances(samples)
+        return self.with_options(nuisances=found) if found is not None and found.worth_removing else None
+
+    def nuisances_of(self, samples: FrameSamples | None) -> TurnNuisances | None:
+        """Return what was corrected, or what may be wrong with the brightness of the frames of a result."""
+        if self.nuisances is not None or samples is None:
+            return self.nuisances
+        return self._find_nuisances(samples) if self._found is None else self._found
+
+    def _find_nuisances(self, samples: FrameSamples) -> TurnNuisances | None:
+        """Return the nuisances of the frames, or of one turn; None with a calibrated response."""
+        known = self.response is None and self.zenith_gain is not None
+        tilt = self._tilt_of_frames() if known else None
         if tilt is None:
             return None
+        phase, part = self.positions_so_far("phase"), slice(None)
+        if self.window_frames is not None:
+            part = slice(len(phase) - self.window.length, None)
+        elif self.per_turn:
+            part = split_into_turns(phase)[0]
         maps = self.zenith_gain, self.zenith_offset, self.dark
         scale = [np.asarray(0.0 if values is None else values, np.float64) for values in maps]
         at_grid = [values if values.ndim == 0 else samples.of_map(values).ravel() for values in scale]
-        values = samples.values
-        light = find_frame_light(
-            values.reshape(len(values), -1), self.positions_so_far("phase"), tilt, *at_grid
+        full = None
+        if self.bright is not None:
+            full = float(np.nanmedian(np.asarray(self.bright, np.float64) - scale[2]))
+        values = samples.values[part]
+        return find_nuisances(
+            values.reshape(len(values), -1),
+            phase[part],
+            tilt,
+            Scale(at_grid[0], at_grid[1], at_grid[2], full),
+            Grid(samples.rows, samples.columns, self.shape, shift_of(self.stated, tilt)),
+            self.stated,
+            informed=not self._has_weights,
         )
-        return None if light is None else self.with_options(frame_light=light)
+
+    def _as_result(self, maps: list[NDArray[Any]], model: TurnModel) -> Result:
+        result = super()._as_result(maps, model)
+        if self.nuisances is None:
+            return result
+        return result.assign(process={**result.process, **self.nuisances.process})
 
     def _tilt_of_frames(self) -> float | None:
         """Return the tilt, if it is given, or can be estimated from a turn that another one follows."""
+        if self.window_frames is not None:
+            return self.window.model.tilt
         if not isinstance(self.tilt, str):
             return None if self.tilt is None else float(np.asarray(self.tilt))
         if self._model is None and self._stack is not None:
@@ -422,23 +494,13 @@ class Normals(NormalsOperation):
     @property
     def corrected_kinds(self) -> tuple[str, ...]:
         """Kinds of findings about frames that are corrected."""
-        return () if self.frame_light is None else self.frame_light.kinds
+        return () if self.nuisances is None else tuple(self.nuisances.process)
 
     def apply_correction(self, frames: NDArray[Any], first: int) -> NDArray[Any]:
-        """Return frames in steady light."""
-        assert self.frame_light is not None
-        return self.frame_light.remove(frames, first, 0.0 if self.dark is None else self.dark)
-
-    def _as_result(self, maps: list[NDArray[Any]], model: TurnModel) -> Result:
-        result = super()._as_result(maps, model)
-        light = self.frame_light
-        if light is None:
-            return result
-        return result.assign(
-            normals_sigma=np.hypot(result.normals_sigma, light_sigma(result.normals, light.variance)),
-            process={**result.process, **light.process},
-            fitted=replace(result.fitted, light_variance=light.variance),
-        )
+        """Return frames without what is wrong with their brightness."""
+        assert self.nuisances is not None
+        base, dark = (0.0 if values is None else values for values in (self.zenith_offset, self.dark))
+        return self.nuisances.remove(frames, first, dark, base)
 
     def push(self, frames: NDArray[Any], *, phase: ArrayLike, frame_weights: ArrayLike | None = None) -> None:
         """Process the next frames, (n, H, W), the phase of each, (n,) radians, and their weights, (n,)."""

@@ -100,6 +100,7 @@ class Rotation(Method):
     dark: ArrayLike | None = Normals.dark
     bright: ArrayLike | None = Normals.bright
     noise: float | None = Normals.noise
+    blur: float | None = Normals.blur
     robust: bool = Integration.robust
 
     def check_options(self) -> None:

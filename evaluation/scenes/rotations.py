@@ -21,6 +21,7 @@ from scipy.special import erfc
 from mirrorskin.engine import Normals, Run
 from mirrorskin.engine.base.operation import Plan
 from mirrorskin.io import Result
+from mirrorskin.io.base.types import PROPERTIES
 
 Map = NDArray[np.float64]
 
@@ -138,11 +139,15 @@ def expose(normals: Map, setup: Setup, seed: int) -> NDArray[np.generic]:
     return np.clip(counts, *setup.range).astype(setup.dtype)
 
 
+EXACT: dict[str, Any] = {name: 0.0 for name, prop in PROPERTIES.items() if prop.default is not None}
+"""What a header states if nothing is uncertain."""
+
+
 def estimate(
     frames: NDArray[np.generic], phase: ArrayLike, frame_weights: ArrayLike | None = None, **options: Any
 ) -> Result:
     """Return the normals of frames that show no surface, whose neighbours are no neighbours: unchecked."""
-    run = Run(Plan(Normals(**options), checked=False))
+    run = Run(Plan(Normals(**{"blur": 0.0, **options}), checked=False))
     run.push(frames, phase=phase, frame_weights=frame_weights)
     return run.result()
 

@@ -37,7 +37,7 @@ class Property:
     in_steps : bool
         Whether it holds for captures in steps, too.
     default : float, optional
-        Value if it is not stated, of a camera that nobody characterised.
+        Value if it is not stated, of a camera and a stage that nobody characterised.
     """
 
     of: Literal["stage", "camera"]

@@ -94,13 +94,13 @@ class Block:
         return np.column_stack([body_axes(self.phase, self.tilt), travel])
 
 
-def _prior(default: float, text: str, unit: str = "", *, example: str, most: float = 1.0) -> Any:
+def _prior(of: str, default: float, text: str, unit: str = "", *, example: str, most: float = 1.0) -> Any:
     """Declare the standard deviation of something that frames may not show; see `Header.prior`."""
     return stated(
-        of="camera",
+        of=of,
         unit=unit,
         text=f"standard deviation of {text}",
-        use="what the frames do not show of it is in the standard deviations of the heights of a press",
+        use="what the frames do not show of it is in the standard deviations of maps",
         short=f"{unit}: standard deviation of {text}".removeprefix(": "),
         kind="standard deviation",
         within=(0.0, most),
@@ -168,20 +168,38 @@ class Header:
         example="15e-6",
         in_steps=False,
     )
-    gamma_sigma: float | None = _prior(0.02, "the camera's gamma about 1", example="0.005")
-    frame_gain_sigma: float | None = _prior(0.005, "the light of a frame, as a share of it", example="0.001")
+    gamma_sigma: float | None = _prior("camera", 0.02, "the camera's gamma about 1", example="0.005")
+    frame_gain_sigma: float | None = _prior(
+        "camera", 0.005, "the light of a frame, as a share of it", example="0.001"
+    )
     drift_sigma: float | None = _prior(
-        0.005, "the change of the light over a recording, as a share of it", example="0.001"
+        "camera", 0.005, "the change of the light over a recording, as a share of it", example="0.001"
     )
     lag_sigma: float | None = _prior(
-        0.01, "the share of a frame that the next one still shows", example="0.002"
+        "camera", 0.01, "the share of a frame that the next one still shows", example="0.002"
+    )
+    pixel_gain_sigma: float | None = _prior(
+        "camera", 0.01, "the gain of a pixel, as a share of it", example="0.005"
+    )
+    uneven_light_sigma: float | None = _prior(
+        "camera", 0.02, "the light over the picture without references, as a share of it", example="0.01"
     )
     blur_sigma: float | None = _prior(
-        0.3, "the lens's blur, which is 0.3 pixels at best", "pixels", example="0.1", most=10.0
+        "camera", 0.3, "the lens's blur, which is 0.3 pixels at best", "pixels", example="0.1", most=10.0
+    )
+    zenith_gain_sigma: float | None = _prior(
+        "camera", 0.01, "the zenith gain, as a share of it", example="0.003"
+    )
+    zenith_offset_sigma: float | None = _prior(
+        "camera", 0.5, "the zenith offset", "counts", example="0.1", most=1000.0
+    )
+    tilt_sigma: float | None = _prior("stage", 0.01, "the tilt, as a share of it", example="0.002")
+    phase_sigma: float | None = _prior(
+        "stage", 0.0052, "the phase that all frames have in common", "rad", example="0.001"
     )
 
     def prior(self, name: str) -> float:
-        """Return a stated number, or the default of a camera that nobody characterised.
+        """Return a stated number, or the default of a camera and a stage that nobody characterised.
 
         Examples
         --------

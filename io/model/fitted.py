@@ -33,15 +33,19 @@ class Fitted:
     pixel_gain_sigma: float | None = parameter(
         "relative standard deviation of the gains of pixels, which is part of `normals_sigma`", default=None
     )
-    swing_range: float | None = parameter(
-        "range of the swing of the brightness, as a share, that a linear response does not explain",
-        default=None,
-    )
     light_variance: tuple[float, float] | None = parameter(
-        "variance a + b sin(zenith)^2 of the normals because of the light of frames, which is part of"
-        " `normals_sigma`: a and b",
+        "variance a + b sin(zenith)^2 of the normals because of errors that all pixels have in common, which"
+        " is part of `normals_sigma`: a and b",
         "rad^2",
         default=None,
+    )
+    common_errors: tuple[float, ...] | None = parameter(
+        "modes of these errors: of each, along the meridian and across it, the factors of 25 functions of the"
+        ' normal and of the place (see the documentation, "Normals from a rotation")',
+        "rad",
+        shape=("n",),
+        default=None,
+        valid=lambda factors: len(factors) % 50 == 0 and bool(np.isfinite(factors).all()),
     )
     slope_direction: float | None = parameter(
         "direction of `slope`, counter-clockwise from x", "rad", default=None
@@ -161,7 +165,9 @@ def _as_declared_tuple(values: Sequence[Any], declared: Parameter) -> tuple[Any,
     """Return several values in their declared type, or None if they have another one."""
     numbers = declared.kind == "numbers"
     fits = all(type(item) in ((int, float) if numbers else (int,)) for item in values)
-    fits &= declared.kind.endswith("s") and declared.shape[0] in (len(values), "T")
+    fits &= declared.kind.endswith("s") and (
+        isinstance(declared.shape[0], str) or declared.shape[0] == len(values)
+    )
     if not fits or (declared.valid is not None and not declared.valid(values)):
         return None
     return tuple(map(float, values)) if numbers else tuple(values)

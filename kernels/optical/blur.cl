@@ -49,13 +49,14 @@ __kernel void blur_bend(
 }
 
 __kernel void blur_add(
-    const int rows, const int columns, MAP bend, const int reach, const float factor, OUT sigma)
+    const int rows, const int columns, MAP first, MAP bend, const int reach, const float factor,
+    const float noise, const float base, const float rise, OUT sigma)
 {
     const int pixels = rows * columns, low = get_global_id(0) * TILE, end = min(pixels, low + TILE);
     int width;
-    for (int base = low; base < end; base += width) {
-        const int row = base / columns, column = base % columns;
-        width = min(min(STRIP, end - base), columns - column);
+    for (int at = low; at < end; at += width) {
+        const int row = at / columns, column = at % columns;
+        width = min(min(STRIP, end - at), columns - column);
         float total[STRIP], count[STRIP];
         for (int i = 0; i < width; ++i) total[i] = count[i] = 0;
         for (int y = max(row - reach, 0); y <= min(row + reach, rows - 1); ++y)
@@ -69,8 +70,11 @@ __kernel void blur_add(
                 }
             }
         for (int i = 0; i < width; ++i) {
-            const float mean = count[i] > 0 ? total[i] / count[i] : 0, before = sigma[base + i];
-            sigma[base + i] = sqrt(before * before + factor * factor * mean);
+            const float mean = count[i] > 0 ? total[i] / count[i] : 0, before = sigma[at + i];
+            const float clear = GREATER(mean - noise * before * before, 0);
+            const float upright = PART_Z(at + i), more = base + rise * GREATER(1 - upright * upright, 0);
+            const float bent = factor * factor * (clear == clear ? clear : 0);
+            sigma[at + i] = sqrt(before * before + bent + more);
         }
     }
 }

@@ -30,11 +30,15 @@ def blur_bend(first: Array, second: Array, reach: int) -> Array:
     return np.maximum(across, 0)
 
 
-def blur_add(bend: Array, reach: int, factor: float, sigma: Array) -> None:
+def blur_add(
+    first: Array, bend: Array, reach: int, factor: float, noise: float, base: float, rise: float, sigma: Array
+) -> None:
     """Add the mean error of the pixels around each pixel to standard deviations, (H, W), in place.
 
     The mean is over windows of 2 ``reach`` + 1 pixels, without pixels whose ``bend`` is NaN and those beyond
-    the border; ``factor`` is half of the variance of the point spread, pixels^2.
+    the border; ``factor`` is half of the variance of the point spread, pixels^2, and ``noise`` the variance
+    of the bend because of noise, relative to that of a direction. A variance ``base`` is added, too, and
+    ``rise`` times the square of the sine of the zenith of unit vectors ``first``, (H, W, 3).
     """
     size, border = (2 * reach + 1, 2 * reach + 1), reach
     finite = np.isfinite(bend)
@@ -42,4 +46,7 @@ def blur_add(bend: Array, reach: int, factor: float, sigma: Array) -> None:
         sliding_window_view(np.pad(part.astype(np.float64), border), size).sum((2, 3))
         for part in (np.where(finite, bend, 0), finite)
     )
-    sigma[:] = np.sqrt(sigma**2 + factor**2 * total / np.maximum(count, 1))
+    upright = first[..., 2].astype(np.float64) if first.ndim == 3 else np.zeros(bend.shape)
+    clear = np.fmax(total / np.maximum(count, 1) - noise * sigma.astype(np.float64) ** 2, 0)
+    more = base + rise * np.maximum(1 - upright**2, 0)
+    sigma[:] = np.sqrt(sigma**2 + factor**2 * clear + more)

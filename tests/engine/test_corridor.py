@@ -51,8 +51,8 @@ def test_library_run(recordings, levels):
     ("line", "functions", "files"),
     [
         ("reconstruct press.h5", 562, 73),
-        ("reconstruct turn.h5", 723, 93),
-        ("fuse press.h5 turn.h5", 885, 110),
+        ("reconstruct turn.h5", 764, 96),
+        ("fuse press.h5 turn.h5", 930, 111),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):

@@ -140,9 +140,10 @@ def test_motions_and_stitched_touches_do_not_read_the_process(bare):
     first, right = results()["fused"], results()["fused"].assign(x=results()["fused"].x + 0.3)
     actual, expected = (engine.pose.stitch(pair) for pair in ((bare(first), bare(right)), (first, right)))
     assert_equal(actual.result, expected.result)
-    assert [str(pose) for pose in actual.poses] == [str(pose) for pose in expected.poses]
+    actual, expected = ([str(replace(pose, notes=())) for pose in each.poses] for each in (actual, expected))
+    assert actual == expected
     pairs = (bare(first), bare(right)), (first, right)
-    actual, expected = (engine.pose.estimate_pose(*pair) for pair in pairs)
+    actual, expected = (replace(engine.pose.estimate_pose(*pair), notes=()) for pair in pairs)
     assert str(actual) == str(expected)
 
 

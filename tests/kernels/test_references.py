@@ -566,11 +566,22 @@ def _(parts, reach):
     }
 
 
-@case("blur_add", {"reach": (1, 3)}, rtol=2e-6)
-def _(reach):
-    bend, sigma = np.random.default_rng(0).uniform(0, 1, (2, 11, 130))
+@case("blur_add", {"parts": (2, 3), "reach": (1, 3), "noise": (0.0, 0.5)}, rtol=2e-6)
+def _(parts, reach, noise):
+    bend, sigma, *vectors = np.random.default_rng(0).uniform(0, 1, (5, 11, 130))
     bend[3, 7] = bend[0, 0] = np.nan
-    return {"bend": bend, "reach": reach, "factor": 0.8, "sigma": sigma, "shape": bend.shape}
+    return {
+        "first": vectors[0] if parts == 2 else np.stack(vectors, axis=-1),
+        "bend": bend,
+        "reach": reach,
+        "factor": 0.8,
+        "noise": noise,
+        "base": 0.1,
+        "rise": 0.2,
+        "sigma": sigma,
+        "shape": bend.shape,
+        "macros": {"PARTS": parts},
+    }
 
 
 # --- Slopes and samples of arrays on a device

@@ -26,7 +26,7 @@ def rotation(path: Path, seed: int = 0) -> Path:
     """Write a turn of 5 x 7 pixels that all lean a little to one side or another."""
     azimuth = np.random.default_rng(seed).uniform(-np.pi, np.pi, (5, 7))
     wave = 120 + 9 * np.cos(PHASE[:, None, None] - azimuth)
-    header = io.Header("axial", pixel_size=PIXEL, tilt=0.04, zenith_gain=np.float64(200.0))
+    header = io.Header("axial", pixel_size=PIXEL, tilt=0.045, zenith_gain=np.float64(200.0))
     return record(MadeUp(np.rint(wave).astype(np.uint8), header, phase=PHASE), path)
 
 

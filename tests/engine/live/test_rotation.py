@@ -12,21 +12,23 @@ from mirrorskin.engine.integration.normals_to_height import find_slopes
 from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
 from mirrorskin.engine.live import LiveRun, Loop
 from mirrorskin.engine.rotation.last_turn import choose_window
+from mirrorskin.evaluation.scenes import rotations
 from mirrorskin.evaluation.scenes.inputs import SCALES, TILT
-from mirrorskin.io import InputError, open_result, save_result
+from mirrorskin.io import Header, InputError, open_result, save_result
 from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 SHAPE, WINDOW = (24, 40, 52), 8
 PHASE = phases(SHAPE[0])
 OFFSET, GAIN, NOISE = SCALES["uint8"]
 LAST = slice(-WINDOW, None)
-KNOWN = {"tilt": TILT, "zenith_gain": GAIN, "zenith_offset": OFFSET, "noise": NOISE}
+KNOWN = {"tilt": TILT, "zenith_gain": GAIN, "zenith_offset": OFFSET, "noise": NOISE, "blur": 0.0}
+OFFLINE = {**KNOWN, "header": Header("axial", **rotations.EXACT)}
 
 
 def make(device=None, frames=None, header=None, **options):
     frames = turn_frames(SHAPE) if frames is None else frames
     source = paced(frames, header or turn_header(), PHASE)
-    options = {"window_frames": WINDOW, "noise": NOISE, **options}
+    options = {"window_frames": WINDOW, "noise": NOISE, "blur": 0.0, **options}
     return frames, LiveRun(source, Rotation(device=device, **options))
 
 
@@ -55,7 +57,7 @@ def test_an_update_is_of_the_last_turn(device):
     updates = feed(live, frames, [1] * SHAPE[0])
     assert not any(updates[: WINDOW - 1])
     last = updates[-1]
-    exact = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN, device=device)
+    exact = estimate_normals(frames[LAST], PHASE[LAST], **OFFLINE, device=device)
     np.testing.assert_array_equal(last["normals"], exact.normals)
     np.testing.assert_array_equal(last["contact"], exact.contact)
     assert last["contact_area"] == pytest.approx(np.count_nonzero(exact.contact) * PIXEL**2)
@@ -67,7 +69,7 @@ def test_heights_follow_those_that_fit_best(device):
     updates = feed(live, frames, [1] * SHAPE[0])
     for update, stop in [(updates[WINDOW - 1], WINDOW), (updates[-1], SHAPE[0])]:
         turn = slice(stop - WINDOW, stop)
-        normals = estimate_normals(frames[turn], PHASE[turn], **KNOWN)
+        normals = estimate_normals(frames[turn], PHASE[turn], **OFFLINE)
         best = best_heights(normals)
         np.testing.assert_array_equal(np.isnan(update["height"]), np.isnan(best))
         off = (update["height"] - best)[np.isfinite(best)]
@@ -86,7 +88,7 @@ def test_heights_that_take_long_hold_up_no_normals(monkeypatch):
         assert update["height"] is before
     assert update["height_lag"] == SHAPE[0] - WINDOW
     np.testing.assert_array_equal(
-        update["normals"], estimate_normals(frames[LAST], PHASE[LAST], **KNOWN).normals
+        update["normals"], estimate_normals(frames[LAST], PHASE[LAST], **OFFLINE).normals
     )
     go_on.set()
     live.maps()
@@ -117,10 +119,11 @@ def test_the_result_is_whole_and_stores_its_provenance(tmp_path):
     correlate = Run(Correlate(window_frames=WINDOW))
     correlate.push(frames, phase=PHASE)
     np.testing.assert_array_equal(result.cosine, correlate.result().cosine)
+    exact = estimate_normals(frames[LAST], PHASE[LAST], **OFFLINE)
+    np.testing.assert_array_equal(result.edges, edges_of(exact))
     normals = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN)
     np.testing.assert_array_equal(result.normals, normals.normals)
-    np.testing.assert_array_equal(result.edges, edges_of(normals))
-    np.testing.assert_allclose(result.height, best_heights(normals), atol=1e-6)
+    np.testing.assert_allclose(result.height, integrate(normals, pixel_size=PIXEL).height, atol=1e-6)
     assert (result.process["window_frames"], result.process["live"]) == (WINDOW, True)
     assert result.process["tilt"] == pytest.approx(TILT)
 
@@ -133,7 +136,7 @@ def test_edges_are_drawn_in_the_time_that_is_left(device):
         live.idle_work(0.05)
         if "edges" in live.maps():
             break
-    normals = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN, device=device)
+    normals = estimate_normals(frames[LAST], PHASE[LAST], **OFFLINE, device=device)
     exact = edges_of(normals, device)
     np.testing.assert_array_equal(live.maps()["edges"], exact)
     assert exact.any()
@@ -144,7 +147,7 @@ def test_a_sudden_change_is_followed_within_some_frames():
     frames[: SHAPE[0] // 2] = frames[: SHAPE[0] // 2, :, ::-1]
     _, live = make(frames=frames)
     update = feed(live, frames, [1] * SHAPE[0])[-1]
-    normals = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN)
+    normals = estimate_normals(frames[LAST], PHASE[LAST], **OFFLINE)
     best = best_heights(normals)
     off = (update["height"] - best)[np.isfinite(best)]
     assert np.sqrt(np.mean(off**2)) < 0.02 * np.ptp(best[np.isfinite(best)])
@@ -184,7 +187,7 @@ def test_a_whole_run_uses_each_frame():
     live = LiveRun(source, Rotation(window_frames=WINDOW, noise=NOISE))
     status = Loop(source, live).run()
     assert (status.used, status.updates) == (SHAPE[0], SHAPE[0])
-    exact = estimate_normals(frames[LAST], PHASE[LAST], **KNOWN)
+    exact = estimate_normals(frames[LAST], PHASE[LAST], **OFFLINE)
     np.testing.assert_array_equal(live.result().normals, exact.normals)
 
 

@@ -10,8 +10,9 @@ from mirrorskin import engine
 from mirrorskin.engine import Normals, estimate_normals
 from mirrorskin.evaluation.scenes import rotations
 from mirrorskin.evaluation.scenes.rotations import EIGHTHS, TILT, Setup
-from mirrorskin.io import InputError
+from mirrorskin.io import Header, InputError
 
+EXACT = Header("axial", **rotations.EXACT)
 SETUP = Setup(gain=60.0, noise=20.0, offset=150.0, dtype="uint16")
 SHAPE = (5, 7)
 MAPS = ("normals", "normals_sigma", "contact", "mean", "cosine", "sine", "residual")
@@ -37,6 +38,8 @@ def options_of(setup=SETUP, **options):
         "zenith_gain": setup.slope,
         "zenith_offset": setup.offset,
         "noise": setup.spread,
+        "blur": 0.0,  # neighbours are no neighbours
+        "header": EXACT,
         **options,
     }
 

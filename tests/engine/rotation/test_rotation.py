@@ -26,6 +26,7 @@ HEADER = io.Header(
     pivot=(0.0, 0.0, 0.0),
     zenith_gain=np.array(SETUP.slope),
     zenith_offset=np.array(SETUP.offset),
+    **rotations.EXACT,
 )
 NO_GAIN = replace(HEADER, zenith_gain=None, zenith_offset=None)
 X, Y = np.meshgrid(np.linspace(-1, 1, SHAPE[1]), np.linspace(1, -1, SHAPE[0]))
@@ -48,7 +49,7 @@ def source(header=HEADER, **changes):
 
 
 def reconstruct(header=HEADER, **options):
-    return engine.reconstruct(source(header), **options)
+    return engine.reconstruct(source(header), **{"blur": 0.0, **options})
 
 
 def errors(result):
@@ -93,7 +94,7 @@ def test_each_turn_may_be_returned_alone():
     noise = mean.process["noise"]
     for turn in range(TURNS):
         part = slice(8 * turn, 8 * turn + 8)
-        alone = engine.reconstruct(source(frames=frames()[part], phase=PHASE[part]), noise=noise)
+        alone = engine.reconstruct(source(frames=frames()[part], phase=PHASE[part]), noise=noise, blur=0.0)
         away = rotations.between(result.normals[turn].astype(float), alone.normals.astype(float))
         assert np.median(away / alone.normals_sigma) < 0.05
     assert np.median(mean.normals_sigma / result.normals_sigma[0]) == pytest.approx(3**-0.5, rel=0.02)
@@ -236,10 +237,12 @@ def test_registered_frames_of_the_twin_have_true_errors(camera):
     )
     noise = None if camera else float(np.hypot(1, 12**-0.5))
     truth, results = twin.truth, []
+    frames = twin.read(np.empty(twin.shape, twin.dtype)).frames
+    header = replace(twin.header, **rotations.EXACT)
     true = rotations.direction(truth.zenith, truth.azimuth)
     for heights in (truth.height, None):
-        twin.rewind()
-        result = engine.reconstruct(twin, heights=heights, noise=noise)
+        known = MadeUp(frames, header, phase=np.array(EIGHTHS))
+        result = engine.reconstruct(known, heights=heights, noise=noise)
         error, zenith = rotations.between(result.normals.astype(float), true), np.degrees(truth.zenith)
         # Next to the top and the rim, brightness has kinks.
         smooth = (result.contact > 0) & (truth.contact > 0) & (zenith > 8) & (zenith < 29)
@@ -278,7 +281,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(case):
 
 def test_operations_run_over_a_source_with_its_properties():
     result = engine.run(source(), engine.Normals)
-    options = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset}
+    options = {"tilt": TILT, "zenith_gain": SETUP.slope, "zenith_offset": SETUP.offset, "header": HEADER}
     alike(result, engine.estimate_normals(frames(), PHASE, **options))
     assert (result.process["operation"], result.process["tilt"]) == ("Normals", TILT)
     assert (result.process["zenith_gain"], result.process["turns"]) == (SETUP.slope, TURNS)
@@ -327,7 +330,7 @@ def test_steps_may_follow_any_operation():
 
 def test_slopes_may_be_kept_instead_of_heights():
     recording = source(OF_A_SURFACE)
-    plan = engine.Rotation(noise=20.0).slope_plan(recording)
+    plan = engine.Rotation(noise=20.0, blur=0.0).slope_plan(recording)
     result, slopes = take_slopes(engine.Run(plan, recording).complete())
     whole = reconstruct(OF_A_SURFACE, noise=20.0)
     assert set(whole) - set(result) == {"height", "height_sigma", "component", "offset_unknown"}

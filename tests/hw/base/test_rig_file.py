@@ -43,6 +43,8 @@ report_rate = 10
 silence = 0.25
 press = 2
 travel_sigma = 0.002
+tilt_sigma = 0.003
+phase_sigma = 0.004
 pivot = [0, 1, -10.5]
 
 [stage.travel]
@@ -117,7 +119,11 @@ gamma_sigma = 0.01
 frame_gain_sigma = 0.002
 drift_sigma = 0.003
 lag_sigma = 0.004
+pixel_gain_sigma = 0.005
+uneven_light_sigma = 0.006
 blur_sigma = 0.07
+zenith_gain_sigma = 0.008
+zenith_offset_sigma = 0.9
 pixel_size = [0.03, 0.04]
 dark = 12
 bright = 4000.5

@@ -57,7 +57,7 @@ def test_kernel_and_reference_agree(device, name, dtype, pressed):
     frames, pose = made_frames(POSES[name], dtype, pressed=pressed)
     weights = np.random.default_rng(1).uniform(0.5, 2, COUNT)
     operation = engine.rotation.MovingNormals(
-        zenith_gain=GAINS[dtype], zenith_offset=OFFSET, noise=NOISE, device=device
+        zenith_gain=GAINS[dtype], zenith_offset=OFFSET, noise=NOISE, blur=0.0, device=device
     )
     run = engine.Run(operation)
     run.push(frames[:, np.newaxis], pose=pose, frame_weights=weights)

@@ -1,0 +1,655 @@
+"""What may be wrong with the brightness of a rotation: all of it at once, with priors.
+
+The model of a sample in frame t, at a pixel with the normal n, is ::
+
+    y = dark + (1 + g_t) (1 + u) R (l / R)^(1 + c) + o_t,    l = base + z + (1 + r) gain angle(n, t) - dark,
+
+with gains g and offsets o of the frames, uneven light u, a quadratic of the place without its mean, the
+camera's gamma 1 + c, an error r of the zenith gain and z of the zenith offset. The angle between normal and
+axis contains an error of the tilt and of the phase, and a frame may show a share of the one before (lag). R
+is full light. The normals of a grid of pixels are fitted together with these nuisances, each of which has a
+prior (`mirrorskin.io.Header.prior`). What the pixels do not determine stays as uncertain as its prior.
+
+The covariance of the nuisances becomes that of normals, as a few *modes*: errors that all pixels have in
+common, each a function of the normal and of the place. A slope that is wrong everywhere in the same way
+changes heights by much more than errors that differ from pixel to pixel.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mirrorskin.engine.correlation.design_matrix import basis
+from mirrorskin.engine.diagnosis.residual_noise import valid
+from mirrorskin.io import Header
+from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.numerics.least_squares import gram
+
+_MIN_PIXELS, _MOST_PIXELS, _MIN_FRAMES, _MAX_FRAMES = 16, 192, 4, 128
+_STEEP, _UPRIGHT = 3.0, math.radians(80)  # range of zeniths that tell: minimum in tilts, and maximum
+_LEVEL = 1.5  # tilts: least zenith at which errors are evaluated
+_SWING = 0.75, 1.33  # range of the amplitude of the zenith of a usable pixel, in tilts
+_LEAST_LIGHT = 0.05  # share of full light of a usable sample: next to its dark end, a pattern is not linear
+_OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
+_MAX_MISFIT = 4.0  # variance of residuals, relative to that of two waves a pixel, of a model that fits
+_LEAST_NOISE = 0.3  # counts of 8 bits: rounding
+_ITERATIONS = 3
+_GLOBALS = ("gamma", "zenith_gain", "zenith_offset", "tilt", "phase", "lag")
+_UNEVEN = 5  # terms of uneven light
+_SWINGS = 0.03, 0.03, 0.03, *(0.01,) * _UNEVEN  # of the swing by zenith and place: a pixel has an area
+_SHIFTS = 3  # terms of the movement of points in the picture, by zenith
+_UNKNOWN_SHIFT = 1.0  # pixels
+_SWINGING = len(_SWINGS) + _SHIFTS
+_LEAST_SPREAD = 0.05  # radians: least standard deviation of zeniths that counts as one
+TERMS = 25
+"""Number of functions that a mode is a sum of; see `_functions`."""
+_NOISE = 1.5  # variance of noise that is taken from the scatter of normals, relative to the expected one
+_WAVE = 1.5  # light that changes with the phase, relative to that of a frame
+_OFFSETS = 0.5  # offsets of frames, and their drift, relative to that of the zenith
+_WIDEST = 100.0  # most by which the variance of a prior grows
+_FLOOR = 1e-14  # least share of a prior's variance, so that one of 0 can be inverted
+_MOST_MODES, _SMALL_MODE = 6, 1e-3  # modes that are kept, and least share of the largest one
+_CONDITION = 1e-5  # least singular value, relative to the largest one, of their fit
+_CLEAR = 2.0  # standard deviations of what remains: least effect that is corrected
+_WORTH = 0.2  # standard deviations of the pixels' own errors: the same
+_RELEVANT = 0.05  # standard deviations of the pixels' own errors: least effect of an unknown nuisance
+_ODD_GAMMA, _LEAST_GAMMA = 2.5, 0.01  # least difference of gamma from 1: in prior deviations, and at all
+_CLEAR_SWING = 3.0  # standard deviations: least swing that falls with the zenith
+_SMALL_GAIN, _SMALL_OFFSET = 0.005, 1.0  # least flicker, and drift in counts of 8 bits, that has a name
+
+
+class Grid(NamedTuple):
+    """Where the samples are: their rows and columns, and the shape of the picture.
+
+    ``shift`` is by how much points may move in the picture while the body leans, pixels.
+    """
+
+    rows: NDArray[np.integer[Any]]
+    columns: NDArray[np.integer[Any]]
+    shape: tuple[int, int]
+    shift: float
+
+    def places(self) -> tuple[Doubles, Doubles]:
+        """Return the places of the pixels, (n,), x to the right and y up, from -1 to 1."""
+        (rows, columns), down, across = self.shape, self.rows, self.columns
+        y, x = np.meshgrid(
+            1 - 2 * down / max(1, rows - 1), 2 * across / max(1, columns - 1) - 1, indexing="ij"
+        )
+        return x.ravel(), y.ravel()
+
+    def rise(self, zenith: Doubles, azimuth: Doubles) -> Doubles:
+        """Return how much zeniths, (n,), grow along their azimuth, radians per pixel; 0 where unknown."""
+        lengths, rise = (len(self.rows), len(self.columns)), np.zeros(len(zenith))
+        if min(lengths) < 2:
+            return rise
+        downwards, to_the_right = np.gradient(zenith.reshape(lengths), self.rows, self.columns)
+        rise = to_the_right.ravel() * np.cos(azimuth) - downwards.ravel() * np.sin(azimuth)
+        return np.where(np.isfinite(rise), rise, 0.0)
+
+
+def shift_of(header: Header, tilt: float) -> float:
+    """Return by how much points may move in the picture while the body leans about its pivot, pixels."""
+    pivot, press, size = header.pivot, header.press, header.pixel_size
+    if pivot is None or press is None or size is None:
+        return _UNKNOWN_SHIFT
+    return float(tilt * abs(press - pivot[2]) / min(size))
+
+
+class Scale(NamedTuple):
+    """How counts depend on the zenith at some pixels: each a number or (n,), counts."""
+
+    gain: ArrayLike  # per radian
+    base: ArrayLike  # at zenith 0
+    dark: ArrayLike
+    bright: float | None  # full light; None: the brightest sample
+
+
+@dataclass(frozen=True, slots=True)
+class TurnNuisances:
+    """Estimated nuisances of a rotation, and the errors of normals that remain.
+
+    Attributes
+    ----------
+    gain, offset : ndarray, (T,), float64
+        Light of each frame divided by the usual one, and its offset, counts.
+    gamma, zenith_gain, zenith_offset : float
+        Estimates of c, r and z.
+    uneven : ndarray, (5,), float64
+        Factors of x, y, x^2, xy, y^2, with x and y from -1 to 1.
+    full, count : float
+        Full light R, and a count of 8 bits, counts.
+    modes : ndarray, (M, 2, 25), float64
+        Errors of normals along the meridian and across it; see `mode_errors`.
+    variance : (float, float)
+        Coefficients a and b of the modes' variance, a + b sin(zenith)^2, radians^2.
+    worth_removing : bool
+        Whether the estimates are clear, and not small compared with the pixels' own errors.
+    unknown : tuple of str
+        Names of the nuisances that this object shows hardly better than their priors, the largest first.
+    is_odd : bool
+        Whether gamma differs from 1 by more than its prior, and the swing by zenith does not contradict it,
+        or shows it alone.
+    """
+
+    gain: Doubles
+    offset: Doubles
+    gamma: float
+    zenith_gain: float
+    zenith_offset: float
+    uneven: Doubles
+    full: float
+    count: float
+    modes: Doubles
+    variance: tuple[float, float]
+    worth_removing: bool
+    unknown: tuple[str, ...]
+    is_odd: bool
+
+    def remove(
+        self, frames: NDArray[Any], first: int, dark: ArrayLike, base: ArrayLike
+    ) -> NDArray[np.float32]:
+        """Return frames, (n, H, W), from number ``first`` on, as they were meant to be; NaN where clipped."""
+        part = slice(first, first + len(frames))
+        gain, offset = (values[part, np.newaxis, np.newaxis] for values in (self.gain, self.offset))
+        low, start = np.asarray(dark, np.float64), np.asarray(base, np.float64)
+        light = (frames - offset - low) / gain
+        if self.uneven.any():
+            rows, columns = frames.shape[1:]
+            y, x = np.ix_(np.linspace(1, -1, rows), np.linspace(-1, 1, columns))
+            light /= 1 + np.tensordot(self.uneven, np.stack([t + 0 * x * y for t in _places(x, y)]), 1)
+        if self.gamma:
+            light = self.full * np.maximum(light / self.full, 0) ** (1 / (1 + self.gamma))
+        steady = start + (light + low - start - self.zenith_offset) / (1 + self.zenith_gain)
+        return np.where(valid(frames), steady, np.nan).astype(np.float32)
+
+    @property
+    def process(self) -> dict[str, str]:
+        """Entries of a result's process about the correction."""
+        flicker, drift = float(np.std(self.gain)), _range(self.offset)
+        sizes = {
+            "flicker": (flicker > _SMALL_GAIN, f"{100 * flicker:.2g} %"),
+            "drift": (drift > _SMALL_OFFSET * self.count, f"{drift:.2g} counts"),
+        }
+        return {name: f"{size}, corrected" for name, (large, size) in sizes.items() if large}
+
+
+def mode_errors(modes: Doubles, normals: NDArray[np.floating], x: Doubles, y: Doubles) -> Doubles:
+    """Return the errors of normals, (n, 3), along the meridian and across it, (M, 2, n) radians.
+
+    ``x`` and ``y``, (n,), are places in the picture, from -1 to 1.
+    """
+    flat = np.hypot(normals[:, 0], normals[:, 1]).astype(np.float64)
+    zenith = np.arctan2(flat, normals[:, 2])
+    safe = np.maximum(flat, 1e-12)
+    return np.asarray(modes @ _functions(zenith, normals[:, 0] / safe, normals[:, 1] / safe, x, y))
+
+
+def light_sigma(normals: NDArray[np.floating], variance: tuple[float, float]) -> NDArray[np.float32]:
+    """Return the standard deviation of normals, (..., 3), by modes; see `TurnNuisances.variance`."""
+    base, rise = variance
+    sine = 1 - normals[..., 2].astype(np.float64) ** 2
+    return np.asarray(np.sqrt(np.maximum(base + rise * sine, 0)), np.float32)
+
+
+def find_nuisances(
+    samples: NDArray[Any],
+    phase: Doubles,
+    tilt: float,
+    scale: Scale,
+    grid: Grid,
+    header: Header,
+    informed: bool = True,
+) -> TurnNuisances | None:
+    """Return the nuisances of a rotation; None if there are too few frames, or no valid pixels.
+
+    If too few pixels follow the model, as on a plate, everything stays as uncertain as its prior.
+
+    Parameters
+    ----------
+    samples : ndarray, (T, n)
+        Counts at a grid of pixels.
+    phase : ndarray, (T,)
+        Radians.
+    tilt : float
+        Half-angle of the precession, radians.
+    scale : Scale
+    grid : Grid
+        Where the pixels are, row by row.
+    header : Header
+        Priors, or the standard deviations that it states.
+    informed : bool
+        Whether the samples are used, or the priors alone.
+    """
+    count = len(samples)
+    if not _MIN_FRAMES <= count <= _MAX_FRAMES or count != len(phase):
+        return None
+    whole = valid(samples).all(axis=0)
+    numbers = [np.broadcast_to(np.asarray(values, np.float64), whole.shape) for values in scale[:3]]
+    whole &= np.isfinite(numbers).all(axis=0) & (numbers[0] != 0)
+    if not whole.any():
+        return None
+    counts, (x, y) = samples[:, whole].astype(np.float64), (values[whole] for values in grid.places())
+    gain, base, dark = (values[whole] for values in numbers)
+    # Not by lstsq: the threads that it starts for many pixels wait for those of OpenCL.
+    wave = np.linalg.pinv(basis(phase)) @ ((counts - base) / gain)
+    seen = np.full((3, len(whole)), np.nan)
+    seen[:, whole] = wave
+    rise = grid.rise(seen[0], np.arctan2(seen[2], seen[1]))[whole]
+    swing = np.hypot(wave[1], wave[2]) / tilt
+    faces = (wave[0] > -tilt) & (wave[0] < _UPRIGHT)
+    usable = faces & (wave[0] > _STEEP * tilt) & (swing > _SWING[0]) & (swing < _SWING[1])
+    full = max(float(np.max(counts - dark)) if scale.bright is None else scale.bright, 1e-9)
+    usable &= np.min(counts - dark, axis=0) > _LEAST_LIGHT * full
+    priors = _Priors.of(header, phase, np.ndim(scale.gain) > 0, counts, grid.shift)
+
+    def fit_to(part: NDArray[np.bool_]) -> _Fit:
+        return _Fit(
+            counts[:, part], phase, tilt, gain[part], base[part], dark[part], wave[:, part],
+            (x[part], y[part]), rise[part], full, priors,
+        )  # fmt: skip
+
+    usable, faces = (_thinned(part) for part in (usable, faces))
+    try:
+        return _found(fit_to, usable, faces, wave, tilt, informed)
+    except np.linalg.LinAlgError:  # a tilt or a gain that no sensor has
+        return None
+
+
+def _found(
+    fit_to: Callable[[NDArray[np.bool_]], _Fit],
+    usable: NDArray[np.bool_],
+    faces: NDArray[np.bool_],
+    wave: Doubles,
+    tilt: float,
+    informed: bool,
+) -> TurnNuisances | None:
+    """Return the nuisances by usable pixels, or else, by those that face the camera, from priors alone."""
+    fit = fit_to(usable) if informed and np.count_nonzero(usable) >= _MIN_PIXELS else None
+    for _ in range(0 if fit is None else _ITERATIONS):
+        assert fit is not None
+        fit.keep(fit.misfit < _OUTLIER_RATIO * max(float(np.median(fit.misfit)), fit.floor))
+        if fit.pixels < _MIN_PIXELS:
+            break
+        fit.improve()
+        fit.widen()
+    if fit is not None and fit.pixels >= _MIN_PIXELS and fit.follows_model():
+        return fit.nuisances()
+    if not faces.any():
+        return None
+    wave[0] = np.maximum(wave[0], _LEVEL * tilt)  # the model has no derivatives of level surfaces
+    return fit_to(faces).nuisances(informed=False)
+
+
+def _thinned(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return every n-th of the chosen pixels, at most `_MOST_PIXELS`."""
+    numbers = np.flatnonzero(chosen)
+    thinned = np.zeros_like(chosen)
+    thinned[numbers[:: max(1, -(-len(numbers) // _MOST_PIXELS))]] = True
+    return thinned
+
+
+@dataclass(frozen=True, slots=True)
+class _Priors:
+    """Covariance of the nuisances: the gains of T frames, their offsets, `_GLOBALS`, and uneven light."""
+
+    covariance: Doubles
+
+    @classmethod
+    def of(cls, header: Header, phase: Doubles, has_map: bool, counts: Doubles, shift: float) -> _Priors:
+        """Return the priors of a header; uneven light is known if the zenith gain is a map.
+
+        The light of a frame may differ by chance, may drift, and may change with the phase: what moves with
+        the body reflects it.
+        """
+        frames = len(phase)
+        ramp = np.linspace(-0.5, 0.5, frames)
+        wave = basis(phase)[:, 1:]
+        count = max(1.0, float(np.ptp(counts)) / 255)  # a count of 8 bits
+        offset = header.prior("zenith_offset_sigma")
+        if header.zenith_offset_sigma is None:
+            offset *= count
+        blocks = [
+            header.prior("frame_gain_sigma") ** 2 * (np.eye(frames) + _WAVE**2 * wave @ wave.T)
+            + header.prior("drift_sigma") ** 2 * np.outer(ramp, ramp),
+            (_OFFSETS * offset) ** 2 * (np.eye(frames) + np.outer(ramp, ramp)),
+        ]
+        uneven = 0.0 if has_map else header.prior("uneven_light_sigma")
+        numbers = [header.prior(f"{name}_sigma") for name in _GLOBALS]
+        numbers[_GLOBALS.index("zenith_offset")] = offset
+        swings = [*_SWINGS, *[shift] * _SHIFTS]
+        size = 2 * frames + len(numbers) + _UNEVEN + len(swings)
+        covariance = np.zeros((size, size))
+        covariance[:frames, :frames], covariance[frames : 2 * frames, frames : 2 * frames] = blocks
+        ends = np.square([*numbers, *[uneven] * _UNEVEN, *swings])
+        covariance[2 * frames :, 2 * frames :] = np.diag(ends)
+        diagonal = np.einsum("ii->i", covariance)
+        diagonal += _FLOOR * max(float(diagonal.max()), 1.0) * (diagonal == 0)
+        return cls(covariance)
+
+
+class _Equations(NamedTuple):
+    """Inverses of the normals' matrices, their products with the nuisances', these' own, and the noise."""
+
+    inverses: Doubles
+    through: Doubles
+    own: Doubles
+    noise: float
+
+
+class _Fit:
+    """Gauss-Newton fit of normals of pixels, and of the nuisances."""
+
+    def __init__(
+        self, counts: Doubles, phase: Doubles, tilt: float, gain: Doubles, base: Doubles, dark: Doubles,
+        wave: Doubles, places: tuple[Doubles, Doubles], rise: Doubles, full: float, priors: _Priors,
+    ) -> None:  # fmt: skip
+        self._counts, self._phase, self._tilt, self._full = counts, phase[:, np.newaxis], tilt, full
+        self._gain, self._base, self._dark = gain, base, dark
+        self._zenith, self._azimuth = wave[0].copy(), np.arctan2(wave[2], wave[1])
+        (self._x, self._y), self._rise = places, rise
+        self._stated, self._priors = priors.covariance, priors.covariance.copy()
+        self._precision = np.linalg.inv(priors.covariance)
+        self._scales: dict[int, float] = {}  # of the variances of nuisances, by group
+        self._values = np.zeros(len(priors.covariance))
+        self._count = max(1.0, float(np.ptp(counts)) / 255)
+        self.floor = _LEAST_NOISE * self._count
+        self._look()
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return len(self._zenith)
+
+    @property
+    def misfit(self) -> Doubles:
+        """RMS residual of each pixel, counts."""
+        return np.asarray(np.sqrt(np.mean(self._left**2, axis=0)))
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Exclude the other pixels."""
+        if chosen.all():
+            return
+        for name in ("_gain", "_base", "_dark", "_zenith", "_azimuth", "_x", "_y", "_rise"):
+            setattr(self, name, getattr(self, name)[chosen])
+        self._counts = self._counts[:, chosen]
+        self._look()
+
+    def _look(self) -> None:
+        """Compute the residuals, and their derivatives by normals, (2, T, n), and nuisances, (K, T, n).
+
+        Derivatives are those at normals without noise, as far as it can be told: to pixels of a plane, noise
+        gives many directions, which seem to determine what the plane does not show.
+        """
+        self._equations: _Equations | None = None
+        self._left, normal, *_ = self._parts(self._zenith, self._azimuth)
+        self._clear = self._without_noise(normal)
+        _, self._by_normal, self._by_gain, self._by_rest = self._parts(*self._clear)
+
+    def _without_noise(self, by_normal: Doubles) -> tuple[Doubles, Doubles]:
+        """Return zeniths and azimuths whose scatter along each axis is that of the normals without noise."""
+        if self.pixels < _MIN_PIXELS:
+            return self._zenith, self._azimuth
+        noise = self._noise
+        variance = np.einsum("ati,bti->iab", by_normal, by_normal)
+        variance[:, [0, 1], [0, 1]] *= 1 + 1e-12
+        variance = noise * np.linalg.inv(variance)
+        sine, turn = np.sin(self._zenith), np.stack([np.cos(self._azimuth), np.sin(self._azimuth)])
+        flat = sine * turn
+        across = np.stack([-turn[1], turn[0]])
+        axes = np.stack([np.cos(self._zenith) * turn, across])  # (meridian or across it, x or y, n)
+        own = np.median(np.einsum("api,iab,bqi->ipq", axes, variance, axes), axis=0)
+        middle = np.median(flat, axis=1, keepdims=True)
+        scatter, directions = np.linalg.eigh(np.cov(flat))
+        of_noise = np.einsum("pk,pq,qk->k", directions, own, directions)
+        kept = np.sqrt(np.maximum(1 - _NOISE * of_noise / np.maximum(scatter, 1e-30), 0))
+        flat = middle + directions @ (kept[:, np.newaxis] * (directions.T @ (flat - middle)))
+        return np.arcsin(np.minimum(np.hypot(*flat), 1.0)), np.arctan2(flat[1], flat[0])
+
+    @property
+    def _noise(self) -> float:
+        """Variance of a sample."""
+        freedom = max(1, self._left.size - 2 * self.pixels - 2 * len(self._counts))
+        return max(float(np.sum(self._left**2)) / freedom, self.floor**2)
+
+    def _parts(self, zenith: Doubles, azimuth: Doubles) -> tuple[Doubles, Doubles, Doubles, Doubles]:
+        """Return the residuals for normals, and their derivatives by normals, gains and other nuisances."""
+        frames = len(self._counts)
+        gains, offsets = self._values[:frames, np.newaxis], self._values[frames : 2 * frames, np.newaxis]
+        gamma, gain, offset, tilt, phase, lag = self._values[2 * frames :][: len(_GLOBALS)]
+        uneven, swings = np.split(self._values[2 * frames + len(_GLOBALS) :], [_UNEVEN])
+        sine, cosine = np.sin(zenith), np.cos(zenith)
+        half = self._tilt * (1 + tilt)
+        lean, upright = math.sin(half), math.cos(half)
+        turned = azimuth - self._phase - phase
+        along = cosine * upright - sine * lean * np.cos(turned)
+        angle = np.arccos(np.clip(along, -1, 1))
+        down = np.maximum(np.sin(angle), 1e-9)
+        by_zenith = (sine * upright + cosine * lean * np.cos(turned)) / down
+        by_azimuth = -lean * np.sin(turned) / down  # for a rotation of the normal by an angle
+        by_tilt = (cosine * lean + sine * upright * np.cos(turned)) / down * self._tilt
+        places = np.stack(_places(self._x, self._y))
+        steepness = self._zenith - np.mean(self._zenith)
+        steepness /= max(float(np.std(steepness)), _LEAST_SPREAD)
+        powers = np.stack([np.ones_like(steepness), steepness, steepness**2])
+        patterns = np.concatenate([powers, places, powers * self._rise / self._tilt])
+        swing = angle - np.mean(angle, axis=0)
+        angle = angle + (swings @ patterns) * swing
+        linear = np.maximum(
+            self._base + offset + (1 + gain) * self._gain * angle - self._dark, 1e-6 * self._full
+        )
+        ratio = linear / self._full
+        light = self._full * ratio ** (1 + gamma)
+        share = (1 + gains) * (1 + uneven @ places)
+        shown = share * light
+        before = np.concatenate([shown[:1], shown[:-1]])
+        left = self._counts - self._dark - shown - offsets - lag * (before - shown)
+        steep = share * (1 + gamma) * ratio**gamma  # counts of the frame per count of linear light
+        by_angle = steep * (1 + gain) * self._gain
+        by_normal = np.stack([by_angle * by_zenith, by_angle * by_azimuth])
+        by_gain = (1 + uneven @ places) * light
+        by_rest = np.stack([
+            shown * np.log(ratio), steep * self._gain * angle, steep, by_angle * by_tilt,
+            -by_angle * by_azimuth * sine, before - shown, *((1 + gains) * light * places[:, np.newaxis]),
+            *(by_angle * swing * patterns[:, np.newaxis]),
+        ])  # fmt: skip
+        return left, by_normal, by_gain, by_rest
+
+    def _normal_equations(self) -> _Equations:
+        """Return what the samples say of the nuisances at the present normals."""
+        if self._equations is None:
+            self._equations = self._make_equations()
+        return self._equations
+
+    def _make_equations(self) -> _Equations:
+        frames, count = self._counts.shape
+        noise = self._noise
+        normal, gain, rest = self._by_normal, self._by_gain, self._by_rest
+        matrices = np.einsum("ati,bti->iab", normal, normal)
+        matrices[:, [0, 1], [0, 1]] += 1e-12 * np.trace(matrices, axis1=1, axis2=2)[:, np.newaxis]
+        inverses = np.linalg.inv(matrices)
+        size = len(self._values)
+        cross = np.empty((count, 2, size))
+        cross[:, :, :frames] = np.moveaxis(normal * gain, 2, 0)
+        cross[:, :, frames : 2 * frames] = np.moveaxis(normal, 2, 0)
+        cross[:, :, 2 * frames :] = np.einsum("ati,kti->iak", normal, rest)
+        through = inverses @ cross
+        own = np.zeros((size, size))
+        at = np.arange(frames)
+        own[at, at] = np.sum(gain**2, axis=1)
+        own[at, frames + at] = own[frames + at, at] = np.sum(gain, axis=1)
+        own[frames + at, frames + at] = count
+        own[2 * frames :, :frames] = np.einsum("kti,ti->kt", rest, gain)
+        own[2 * frames :, frames : 2 * frames] = np.sum(rest, axis=2)
+        own[: 2 * frames, 2 * frames :] = own[2 * frames :, : 2 * frames].T
+        lines = rest.reshape(len(rest), -1)
+        own[2 * frames :, 2 * frames :] = gram(lines.T)
+        # Not by products of matrices: the threads that they start wait for those of OpenCL.
+        own -= np.einsum("nk,nl->kl", cross.reshape(-1, size), through.reshape(-1, size))
+        return _Equations(inverses, through, own, noise)
+
+    def improve(self) -> None:
+        """Do one step."""
+        inverses, through, own, noise = self._normal_equations()
+        push = np.einsum("ati,ti->ia", self._by_normal, self._left)
+        pull = np.concatenate([
+            np.sum(self._by_gain * self._left, axis=1),
+            np.sum(self._left, axis=1),
+            np.einsum("kti,ti->k", self._by_rest, self._left),
+        ])  # fmt: skip
+        pull -= np.einsum("iak,ia->k", through, push)
+        pull -= noise * (self._precision @ self._values)
+        step = np.linalg.solve(own + noise * self._precision, pull)
+        turn = np.einsum("iab,ib->ia", inverses, push) - through @ step
+        self._values += step
+        self._zenith += turn[:, 0]
+        self._azimuth += turn[:, 1] / np.maximum(np.sin(self._zenith), 1e-3)
+        self._look()
+
+    def widen(self) -> None:
+        """Widen the priors of gains, of offsets, of swings and of the rest as far as the pixels show more.
+
+        The scale is that of greatest evidence (MacKay 1992): the sum of squares of estimates, relative to the
+        prior, over the number of those that the pixels determine.
+        """
+        _, _, own, noise = self._normal_equations()
+        covariance, frames = np.linalg.inv(own / noise + self._precision), len(self._counts)
+        ends = 0, frames, 2 * frames, len(own) - _SWINGING, len(own)
+        for part in itertools.starmap(slice, itertools.pairwise(ends)):
+            prior = np.linalg.inv(self._stated[part, part])
+            scale = self._scales.get(part.start, 1.0)
+            determined = len(prior) - float(np.sum(prior * covariance[part, part])) / scale
+            size = float(self._values[part] @ prior @ self._values[part])
+            if determined > 1:
+                self._scales[part.start] = scale = min(max(1.0, size / determined), _WIDEST)
+            self._priors[part, part] = scale * self._stated[part, part]
+            self._precision[part, part] = prior / scale
+
+    def follows_model(self) -> bool:
+        """Return whether samples differ from the model hardly more than from any two waves a pixel."""
+        phase = self._phase[:, 0]
+        waves = np.linalg.qr(np.concatenate([basis(phase), basis(2 * phase)[:, 1:]], axis=1))[0]
+        if len(phase) <= waves.shape[1] + 1:
+            return True
+        left = self._counts - waves @ (waves.T @ self._counts)
+        noise = float(np.median(np.sum(left**2, axis=0))) / (len(phase) - waves.shape[1])
+        misfit = float(np.median(np.sum(self._left**2, axis=0))) / max(1, len(phase) - 2)
+        return bool(misfit < _MAX_MISFIT * max(noise, self.floor**2))
+
+    def nuisances(self, informed: bool = True) -> TurnNuisances:
+        """Return the estimates, and what remains; unless ``informed``, only the priors are used."""
+        inverses, through, own, noise = self._normal_equations()
+        if not informed:
+            own = np.zeros_like(own)
+        covariance = np.linalg.inv(own / noise + self._precision)
+        covariance = (covariance + covariance.T) / 2
+        frames, values = self._counts.shape[0], self._values
+        removable = np.ones(len(values), bool)
+        removable[2 * frames + _GLOBALS.index("tilt") : 2 * frames + len(_GLOBALS)] = False
+        removable[-_SWINGING:] = False
+        effect = through @ np.where(removable, values, 0.0)  # (n, 2)
+        own_error = math.sqrt(noise * float(np.median(np.trace(inverses, axis1=1, axis2=2))))
+        # The swing of a pixel's area is that of a bent surface, whose errors are the pixels' own.
+        named = slice(0, len(values) - _SWINGING)
+        common = through[:, :, named] @ _root(covariance[named, named])
+        size = math.sqrt(float(np.mean(np.sum(effect**2, axis=1))))
+        products = gram(through.reshape(-1, len(values)))
+        both = np.ix_(removable, removable)
+        spread = math.sqrt(max(float(np.sum(products[both] * covariance[both])) / len(through), 0.0))
+        worth = size > max(_CLEAR * spread, _WORTH * own_error)
+        kept = (np.where(removable, 0.0, values) if worth else values)[named]
+        errors = np.concatenate([common, (through[:, :, named] @ kept)[:, :, np.newaxis]], axis=2)
+        modes, variance = self._modes(errors)
+        gains, offsets = values[:frames], values[frames : 2 * frames]
+        gamma, gain, offset = values[2 * frames :][:3]
+        uneven = values[2 * frames + len(_GLOBALS) :][:_UNEVEN]
+        return TurnNuisances(
+            1 + gains, offsets.copy(), float(gamma), float(gain), float(offset),
+            uneven.copy(), self._full, self._count, modes, variance, worth,
+            self._unknown(products, covariance, own_error), self._is_odd(covariance),
+        )  # fmt: skip
+
+    def _modes(self, errors: Doubles) -> tuple[Doubles, tuple[float, float]]:
+        """Return the largest modes of errors, (n, 2, k), and their variance by the zenith."""
+        count, _, kinds = errors.shape
+        lines = errors.reshape(-1, kinds)
+        squares, directions = np.linalg.eigh(gram(lines))
+        kept = squares > max(_SMALL_MODE * squares[-1], 0.0)
+        kept[:-_MOST_MODES] = False
+        parts = np.einsum("nk,km->nm", lines, directions[:, kept]).reshape(count, 2, -1)
+        zenith, azimuth = self._clear
+        functions = _functions(zenith, np.cos(azimuth), np.sin(azimuth), self._x, self._y)
+        values, vectors = np.linalg.eigh(gram(functions.T))
+        inverse = np.where(values > _CONDITION**2 * values[-1], 1 / np.maximum(values, 1e-300), 0.0)
+        inverted = np.einsum("pq,q,rq->pr", vectors, inverse, vectors)
+        modes = np.einsum("nam,pn,pr->amr", parts, functions, inverted, optimize=True)  # (2, M, terms)
+        total = np.sum(lines**2, axis=1).reshape(count, 2).sum(axis=1)
+        sine = np.sin(zenith) ** 2
+        if np.ptp(sine) > 1e-6:
+            rise, base = np.polyfit(sine, total, 1)
+        else:
+            rise, base = float(np.mean(total) / np.mean(sine)), 0.0
+        if base < 0 or rise < 0:
+            rise, base = float(np.mean(total) / np.mean(sine)), 0.0
+        return np.ascontiguousarray(np.moveaxis(modes, 1, 0)), (float(base), float(rise))
+
+    def _is_odd(self, covariance: Doubles) -> bool:
+        """Return whether gamma differs from 1, and the swing by zenith does not contradict it."""
+        gamma, steepness = 2 * len(self._counts), len(self._values) - _SWINGING + 1
+        value, swing = self._values[gamma], self._values[steepness]
+        error = math.sqrt(covariance[steepness, steepness])
+        least = max(_ODD_GAMMA * math.sqrt(self._stated[gamma, gamma]), _LEAST_GAMMA)
+        if abs(value) > least and not (value * swing < 0 and abs(swing) > _CLEAR * error):
+            return True
+        # An area makes swings larger on steep surfaces, as they are less bent than tops: never smaller.
+        return bool(value < 0 and swing < -_CLEAR_SWING * error)
+
+    def _unknown(self, products: Doubles, covariance: Doubles, own_error: float) -> tuple[str, ...]:
+        """Return the names of nuisances that the object shows hardly better than their priors."""
+        frames = self._counts.shape[0]
+        parts = {"light of the frames": slice(0, frames), "dark level": slice(frames, 2 * frames)}
+        for number, name in enumerate(_GLOBALS):
+            parts[name.replace("_", " ")] = slice(2 * frames + number, 2 * frames + number + 1)
+        parts["uneven light"] = slice(2 * frames + len(_GLOBALS), len(self._values) - _SWINGING)
+        sizes = {}
+        for name, part in parts.items():
+            before = float(np.sum(products[part, part] * self._priors[part, part]))
+            after = float(np.sum(products[part, part] * covariance[part, part]))
+            if after > max(before / 4, self.pixels * (_RELEVANT * own_error) ** 2):
+                sizes[name] = after
+        largest = max(sizes.values(), default=0.0)
+        ordered = sorted(sizes, key=lambda name: -sizes[name])
+        return tuple(name for name in ordered if sizes[name] > largest / 4)
+
+
+def _root(covariance: Doubles) -> Doubles:
+    """Return a matrix whose product with its transpose is a covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
+
+
+def _places(x: Doubles, y: Doubles) -> Sequence[Doubles]:
+    """Return the terms of uneven light, each with a mean of 0 over the picture."""
+    return x, y, x * x - 1 / 3, x * y, y * y - 1 / 3
+
+
+def _functions(zenith: Doubles, cosine: Doubles, sine: Doubles, x: Doubles, y: Doubles) -> Doubles:
+    """Return the functions of zenith, azimuth and place that modes are sums of, (25, n)."""
+    one = np.ones_like(zenith)
+    powers = one, zenith, zenith**2
+    turns = one, cosine, sine, cosine**2 - sine**2, 2 * cosine * sine
+    terms = [power * turn for power in powers for turn in turns]
+    terms += [power * place for power in powers[:2] for place in _places(x, y)]
+    return np.stack(terms)
+
+
+def _range(offset: Doubles) -> float:
+    """Return the range of smoothed offsets."""
+    parts = [float(np.mean(part)) for part in np.array_split(offset, 4)]
+    return max(parts) - min(parts)
