@@ -1,4 +1,4 @@
-"""Flicker and drift of a rotation are found and removed, in renderings independent of the twin."""
+"""What is wrong with the light of a rotation is removed, or part of the errors; independent renderings."""
 
 import numpy as np
 import pytest
@@ -109,3 +109,37 @@ def test_a_response_that_is_not_as_stated_is_no_flicker():
     phase = {"phase": np.array(SETUP.phase)}
     result = engine.reconstruct(ArrayRecording(counts.clip(0, 255).astype(np.uint8), phase, header))
     assert {"flicker", "drift"} & set(result.process) == set()
+
+
+Y, X = np.mgrid[(SIZE - 1) / 2 : -SIZE / 2 : -1, -(SIZE - 1) / 2 : SIZE / 2 : 1] * PIXEL
+SURFACES = {
+    "plane": (0.4 * X, 0.4 + 0 * X, 0 * X),
+    "roof": (-0.45 * np.abs(X) + 0.25 * Y, -0.45 * np.sign(X), 0.25 + 0 * X),
+    "cone": (-0.6 * np.hypot(X, Y), -0.6 * X / np.hypot(X, Y), -0.6 * Y / np.hypot(X, Y)),
+}
+PHASE = np.array(SETUP.phase)
+LIGHT = {
+    "a wave": (1 + 0.01 * np.cos(PHASE - 1), STEADY[1]),
+    "fading": (np.linspace(1, 0.98, COUNT), STEADY[1]),
+    "a dark level that drifts": (STEADY[0], np.linspace(0, 1.5, COUNT)),
+    "brighter light": (1.01 * STEADY[0], STEADY[1]),
+}
+
+
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
+@pytest.mark.parametrize("light", LIGHT)
+@pytest.mark.parametrize("surface", SURFACES)
+def test_heights_include_what_a_surface_of_one_slope_does_not_show_of_the_light(surface, light):
+    height, *slope = SURFACES[surface]
+    normals = np.stack([-slope[0], -slope[1], np.ones_like(height)], axis=-1)
+    source = turn(normals / np.linalg.norm(normals, axis=-1, keepdims=True), *LIGHT[light], seed=1)
+    result = engine.integrate(engine.reconstruct(source, blur=0.0), pixel_size=PIXEL)
+    error = (result.height - height)[2:-2, 2:-2]
+    error -= np.mean(error)
+    assert np.mean((error / result.height_sigma[2:-2, 2:-2]) ** 2) < 2
+
+
+def test_a_note_names_what_a_plate_does_not_show():
+    notes = reconstruct(plate(), *STEADY).process["notes"]
+    assert "not identifiable on this object" in notes
+    assert "light of the frames" in notes
