@@ -186,11 +186,11 @@ def _area(ratio: Doubles, columns: Doubles, noise: Doubles) -> float:
     """Return the variance of the area that a pixel sees; 0 if azimuths turn at too few pixels to show it.
 
     The swing is proportional to the square of the turning only where an area is small compared with the
-    distance over which azimuths turn, as far as such pixels show it.
+    distance over which azimuths turn: other pixels have a smaller weight.
     """
-    area, chosen = 0.0, np.ones(len(ratio), bool)
+    area, turned = 0.0, columns[:, _TURNING]
     for _ in range(_AREA_ITERATIONS):
-        fit = _Fit(ratio[chosen], columns[chosen], noise[chosen])
+        fit = _Fit(ratio, columns, noise * (1 + (area * turned / _MOST_TURNED) ** 2))
         if not fit.has(_TURNING):
             break
         turning = fit.used[:, _TURNING]
@@ -198,7 +198,6 @@ def _area(ratio: Doubles, columns: Doubles, noise: Doubles) -> float:
         if deciding < _MIN_DECIDING_PIXELS or float(np.percentile(turning, 95)) < _MIN_TURNING:
             break
         area = max(-2 * float(fit.factors[_TURNING]), 0.0)
-        chosen = columns[:, _TURNING] * area < _MOST_TURNED
     return area
 
 

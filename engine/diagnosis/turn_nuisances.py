@@ -605,6 +605,7 @@ class _Fit:
         value, swing = self._values[gamma], self._values[steepness]
         error = math.sqrt(covariance[steepness, steepness])
         least = max(_ODD_GAMMA * math.sqrt(self._stated[gamma, gamma]), _LEAST_GAMMA)
+        least = max(least, _CLEAR * math.sqrt(covariance[gamma, gamma]))
         if abs(value) > least and not (value * swing < 0 and abs(swing) > _CLEAR * error):
             return True
         # An area makes swings larger on steep surfaces, as they are less bent than tops: never smaller.

@@ -219,7 +219,7 @@ def live_press() -> Answer:
 @case(FITTED, **RECONSTRUCTED)
 def live_rotation() -> Answer:
     source = turn_source(3)
-    live = LiveRun(source, engine.Rotation(window_frames=8, noise=20.0))
+    live = LiveRun(source, engine.Rotation(window_frames=8, noise=20.0, blur=0.0))
     updates = {}
     series = {"time": 0.01 * np.arange(24), "phase": source.series["phase"]}
     for number, block in enumerate(blocks(source.frames, [1, 7, 1, 4, 8], **series)):
