@@ -101,11 +101,11 @@ class Picture:
     ) -> None:
         self._operation: Operation = proxy(operation)  # which owns it: memory is free with the last reference
         self._source, self._kinds, self._tile = source, maps, tile
-        self.shape, self._length = operation.shape, max(whole, operation.frames_at_once)
+        self._shape, self._length = operation.shape, max(whole, operation.frames_at_once)
         devices, dtype, self._itemsize = operation.devices, operation.dtype, operation.dtype.itemsize
         self._macros: dict[str, str | int] = {"FRAME": C_TYPES[dtype.name], "BITS": 8 * self._itemsize}
         self._macros |= macros
-        self.bands = split_into_bands(devices, self.shape, dtype, maps, self._length, whole, around)
+        self.bands = split_into_bands(devices, self._shape, dtype, maps, self._length, whole, around)
         self._constants = {
             device: {name: _copied(device, name, values) for name, values in (constants or {}).items()}
             for device in {band.device for band in self.bands}
@@ -127,7 +127,7 @@ class Picture:
         """Set a map, or one of its planes, to a number or to a map, (H, W), or (H, W, n) of vectors."""
         values = np.asarray(values)
         for band in self.bands:
-            band.write(name, np.broadcast_to(values, (*self.shape, *values.shape[2:]))[band.rows], plane)
+            band.write(name, np.broadcast_to(values, (*self._shape, *values.shape[2:]))[band.rows], plane)
 
     def run(self, kernel: str, *, source: str | Path | None = None, **arguments: Any) -> None:
         """Launch a kernel, perhaps of another source, for all pixels."""
@@ -254,7 +254,7 @@ class Picture:
         moved = sum(array.nbytes for array in available.values()) if whole else 0
         available |= self._constants[device]
         available |= {"pixels": band.pixels, "rows": band.rows.stop - band.rows.start}
-        available |= {"columns": self.shape[1], "stride": band.stride, "each": band.stride}
+        available |= {"columns": self._shape[1], "stride": band.stride, "each": band.stride}
         if scanned is not None:
             available |= scanned
             moved += scanned["count"] * band.pixels * self._itemsize

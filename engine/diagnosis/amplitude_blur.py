@@ -28,9 +28,8 @@ GRID_LINES = 48
 """Lines of pixels along a side that are used."""
 MIN_PIXELS = 400
 """Least number of pixels that determine a blur."""
-MIN_BLUR = 0.4
-"""Least standard deviation of a point spread that is reported, pixels."""
 
+_MIN_BLUR = 0.4  # pixels: least standard deviation of a point spread that is reported
 _SIDE_Z_SCORE = 2.0  # standard errors from which on the blur of a side of the picture is one
 
 
@@ -151,7 +150,7 @@ def find_blur(vectors: Sequence[AnyArray], strength: AnyArray) -> float:
     turning, values = turning[usable], np.log(level[usable])
     terms = np.stack([turning, np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     variance, error = _fit(terms, values)
-    if not variance > max(CLEAR_Z_SCORE * error, MIN_BLUR**2):
+    if not variance > max(CLEAR_Z_SCORE * error, _MIN_BLUR**2):
         return 0.0
     # Reflectance that changes with the place may look like blur somewhere, but not on all sides.
     sides = (_fit(terms[half], values[half]) for half in (x < 0, x >= 0, y < 0, y >= 0))

@@ -129,7 +129,7 @@ class ResponseUncertainty(Step):
             )
         if modulation.area > 0 and operation.blur is None:
             result = result.assign(fitted=replace(result.fitted, footprint=modulation.area))
-        return with_findings(result, *_uneven(modulation))
+        return with_findings(result, *_of_swing(modulation))
 
 
 class NuisanceUncertainty(Step):
@@ -151,10 +151,10 @@ class NuisanceUncertainty(Step):
         if not footprint and found is None:
             return result
         common = (0.0, 0.0) if found is None else found.variance
-        normals, sigma = (stored_map(result, name) for name in ("normals", "normals_sigma"))
-        several = normals.ndim == 4
 
         def changed() -> AnyArray:
+            normals, sigma = (stored_map(result, name) for name in ("normals", "normals_sigma"))
+            several = normals.ndim == 4
             turns = zip(normals, sigma, strict=True) if several else [(normals, sigma)]
             maps = [with_bend(*turn, footprint, _BEND_NOISE, common, operation.device) for turn in turns]
             return np.stack(list(map(on_host, maps))) if several else maps[0]
@@ -164,8 +164,8 @@ class NuisanceUncertainty(Step):
             modes = tuple(found.modes.ravel().tolist())
             fitted = replace(fitted, light_variance=found.variance, common_errors=modes)
         on_device = result.on_device("normals_sigma") is not None
-        result = result.assign(normals_sigma=changed() if on_device else changed, fitted=fitted)
-        return result if found is None else with_findings(result, *_common(found))
+        with_errors = result.assign(normals_sigma=changed() if on_device else changed, fitted=fitted)
+        return with_errors if found is None else with_findings(with_errors, *_common(found))
 
 
 class SystematicUncertainty(Step):
@@ -203,7 +203,7 @@ def _with_share_of_zenith(result: Result, fraction: float) -> Result:
     )
 
 
-def _uneven(modulation: ModulationEffects) -> Iterator[Finding]:
+def _of_swing(modulation: ModulationEffects) -> Iterator[Finding]:
     if modulation.gain > 0:
         text = f"the gains of pixels differ by {100 * modulation.gain:.2g} %, which is part of the errors"
         yield Finding("pixel gains", text, False)

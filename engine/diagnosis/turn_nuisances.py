@@ -65,6 +65,11 @@ _CLEAR_SWING = 3.0  # standard deviations: least swing that falls with the zenit
 _SMALL_GAIN, _SMALL_OFFSET = 0.005, 1.0  # least flicker, and drift in counts of 8 bits, that has a name
 
 
+def picture_axes(shape: tuple[int, int]) -> tuple[Doubles, Doubles]:
+    """Return x of the columns and y of the rows of a picture, from -1 to 1, with y up."""
+    return np.linspace(-1, 1, shape[1]), np.linspace(1, -1, shape[0])
+
+
 class Grid(NamedTuple):
     """Where the samples are: their rows and columns, and the shape of the picture.
 
@@ -78,17 +83,15 @@ class Grid(NamedTuple):
 
     def places(self) -> tuple[Doubles, Doubles]:
         """Return the places of the pixels, (n,), x to the right and y up, from -1 to 1."""
-        (rows, columns), down, across = self.shape, self.rows, self.columns
-        y, x = np.meshgrid(
-            1 - 2 * down / max(1, rows - 1), 2 * across / max(1, columns - 1) - 1, indexing="ij"
-        )
+        x, y = picture_axes(self.shape)
+        x, y = np.meshgrid(x[self.columns], y[self.rows])
         return x.ravel(), y.ravel()
 
     def rise(self, zenith: Doubles, azimuth: Doubles) -> Doubles:
         """Return how much zeniths, (n,), grow along their azimuth, radians per pixel; 0 where unknown."""
-        lengths, rise = (len(self.rows), len(self.columns)), np.zeros(len(zenith))
+        lengths = len(self.rows), len(self.columns)
         if min(lengths) < 2:
-            return rise
+            return np.zeros(len(zenith))
         downwards, to_the_right = np.gradient(zenith.reshape(lengths), self.rows, self.columns)
         rise = to_the_right.ravel() * np.cos(azimuth) - downwards.ravel() * np.sin(azimuth)
         return np.where(np.isfinite(rise), rise, 0.0)
@@ -161,9 +164,9 @@ class TurnNuisances:
         low, start = np.asarray(dark, np.float64), np.asarray(base, np.float64)
         light = (frames - offset - low) / gain
         if self.uneven.any():
-            rows, columns = frames.shape[1:]
-            y, x = np.ix_(np.linspace(1, -1, rows), np.linspace(-1, 1, columns))
-            light /= 1 + np.tensordot(self.uneven, np.stack([t + 0 * x * y for t in _places(x, y)]), 1)
+            x, y = picture_axes((frames.shape[1], frames.shape[2]))
+            terms = _places(x, y[:, np.newaxis])
+            light /= 1 + sum(factor * term for factor, term in zip(self.uneven, terms, strict=True))
         if self.gamma:
             light = self.full * np.maximum(light / self.full, 0) ** (1 / (1 + self.gamma))
         steady = start + (light + low - start - self.zenith_offset) / (1 + self.zenith_gain)
@@ -247,7 +250,7 @@ def find_nuisances(
     usable = faces & (wave[0] > _STEEP * tilt) & (swing > _SWING[0]) & (swing < _SWING[1])
     full = max(float(np.max(counts - dark)) if scale.bright is None else scale.bright, 1e-9)
     usable &= np.min(counts - dark, axis=0) > _LEAST_LIGHT * full
-    priors = _Priors.of(header, phase, np.ndim(scale.gain) > 0, counts, grid.shift)
+    priors = _priors_of(header, phase, np.ndim(scale.gain) > 0, counts, grid.shift)
 
     def fit_to(part: NDArray[np.bool_]) -> _Fit:
         return _Fit(
@@ -295,43 +298,36 @@ def _thinned(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return thinned
 
 
-@dataclass(frozen=True, slots=True)
-class _Priors:
-    """Covariance of the nuisances: the gains of T frames, their offsets, `_GLOBALS`, and uneven light."""
+def _priors_of(header: Header, phase: Doubles, has_map: bool, counts: Doubles, shift: float) -> Doubles:
+    """Return the covariance of the nuisances: gains of T frames, offsets, `_GLOBALS`, uneven light, swings.
 
-    covariance: Doubles
-
-    @classmethod
-    def of(cls, header: Header, phase: Doubles, has_map: bool, counts: Doubles, shift: float) -> _Priors:
-        """Return the priors of a header; uneven light is known if the zenith gain is a map.
-
-        The light of a frame may differ by chance, may drift, and may change with the phase: what moves with
-        the body reflects it.
-        """
-        frames = len(phase)
-        ramp = np.linspace(-0.5, 0.5, frames)
-        wave = basis(phase)[:, 1:]
-        count = max(1.0, float(np.ptp(counts)) / 255)  # a count of 8 bits
-        offset = header.prior("zenith_offset_sigma")
-        if header.zenith_offset_sigma is None:
-            offset *= count
-        blocks = [
-            header.prior("frame_gain_sigma") ** 2 * (np.eye(frames) + _WAVE**2 * wave @ wave.T)
-            + header.prior("drift_sigma") ** 2 * np.outer(ramp, ramp),
-            (_OFFSETS * offset) ** 2 * (np.eye(frames) + np.outer(ramp, ramp)),
-        ]
-        uneven = 0.0 if has_map else header.prior("uneven_light_sigma")
-        numbers = [header.prior(f"{name}_sigma") for name in _GLOBALS]
-        numbers[_GLOBALS.index("zenith_offset")] = offset
-        swings = [*_SWINGS, *[shift] * _SHIFTS]
-        size = 2 * frames + len(numbers) + _UNEVEN + len(swings)
-        covariance = np.zeros((size, size))
-        covariance[:frames, :frames], covariance[frames : 2 * frames, frames : 2 * frames] = blocks
-        ends = np.square([*numbers, *[uneven] * _UNEVEN, *swings])
-        covariance[2 * frames :, 2 * frames :] = np.diag(ends)
-        diagonal = np.einsum("ii->i", covariance)
-        diagonal += _FLOOR * max(float(diagonal.max()), 1.0) * (diagonal == 0)
-        return cls(covariance)
+    Uneven light is known if the zenith gain is a map. The light of a frame may differ by chance, may drift,
+    and may change with the phase: what moves with the body reflects it.
+    """
+    frames = len(phase)
+    ramp = np.linspace(-0.5, 0.5, frames)
+    wave = basis(phase)[:, 1:]
+    count = max(1.0, float(np.ptp(counts)) / 255)  # a count of 8 bits
+    offset = header.prior("zenith_offset_sigma")
+    if header.zenith_offset_sigma is None:
+        offset *= count
+    blocks = [
+        header.prior("frame_gain_sigma") ** 2 * (np.eye(frames) + _WAVE**2 * wave @ wave.T)
+        + header.prior("drift_sigma") ** 2 * np.outer(ramp, ramp),
+        (_OFFSETS * offset) ** 2 * (np.eye(frames) + np.outer(ramp, ramp)),
+    ]
+    uneven = 0.0 if has_map else header.prior("uneven_light_sigma")
+    numbers = [header.prior(f"{name}_sigma") for name in _GLOBALS]
+    numbers[_GLOBALS.index("zenith_offset")] = offset
+    swings = [*_SWINGS, *[shift] * _SHIFTS]
+    size = 2 * frames + len(numbers) + _UNEVEN + len(swings)
+    covariance = np.zeros((size, size))
+    covariance[:frames, :frames], covariance[frames : 2 * frames, frames : 2 * frames] = blocks
+    ends = np.square([*numbers, *[uneven] * _UNEVEN, *swings])
+    covariance[2 * frames :, 2 * frames :] = np.diag(ends)
+    diagonal = np.einsum("ii->i", covariance)
+    diagonal += _FLOOR * max(float(diagonal.max()), 1.0) * (diagonal == 0)
+    return covariance
 
 
 class _Equations(NamedTuple):
@@ -348,16 +344,17 @@ class _Fit:
 
     def __init__(
         self, counts: Doubles, phase: Doubles, tilt: float, gain: Doubles, base: Doubles, dark: Doubles,
-        wave: Doubles, places: tuple[Doubles, Doubles], rise: Doubles, full: float, priors: _Priors,
+        wave: Doubles, places: tuple[Doubles, Doubles], rise: Doubles, full: float, priors: Doubles,
     ) -> None:  # fmt: skip
         self._counts, self._phase, self._tilt, self._full = counts, phase[:, np.newaxis], tilt, full
         self._gain, self._base, self._dark = gain, base, dark
         self._zenith, self._azimuth = wave[0].copy(), np.arctan2(wave[2], wave[1])
         (self._x, self._y), self._rise = places, rise
-        self._stated, self._priors = priors.covariance, priors.covariance.copy()
-        self._precision = np.linalg.inv(priors.covariance)
+        self._stated, self._priors = priors, priors.copy()
+        self._stated_precision = np.linalg.inv(priors)
+        self._precision = self._stated_precision.copy()
         self._scales: dict[int, float] = {}  # of the variances of nuisances, by group
-        self._values = np.zeros(len(priors.covariance))
+        self._values = np.zeros(len(priors))
         self._count = max(1.0, float(np.ptp(counts)) / 255)
         self.floor = _LEAST_NOISE * self._count
         self._look()
@@ -522,7 +519,7 @@ class _Fit:
         covariance, frames = np.linalg.inv(own / noise + self._precision), len(self._counts)
         ends = 0, frames, 2 * frames, len(own) - _SWINGING, len(own)
         for part in itertools.starmap(slice, itertools.pairwise(ends)):
-            prior = np.linalg.inv(self._stated[part, part])
+            prior = self._stated_precision[part, part]  # of a group, which others do not depend on
             scale = self._scales.get(part.start, 1.0)
             determined = len(prior) - float(np.sum(prior * covariance[part, part])) / scale
             size = float(self._values[part] @ prior @ self._values[part])

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.diagnosis.turn_nuisances import mode_errors
+from mirrorskin.engine.diagnosis.turn_nuisances import mode_errors, picture_axes
 from mirrorskin.kernels.array_types import Doubles
 
 _SIDE = 32  # most points of the grid along a side
@@ -43,10 +43,8 @@ def common_variance(
     if not used.any():
         return np.zeros(shape, np.float32)
     rows, columns = labels.shape
-    across, up = (
-        np.broadcast_to(axis, shape)[cut][used]
-        for axis in np.ix_(np.linspace(1, -1, shape[0]), np.linspace(-1, 1, shape[1]))[::-1]
-    )
+    x, y = picture_axes((shape[0], shape[1]))
+    across, up = (axis[used] for axis in np.meshgrid(x[cut[1]], y[cut[0]]))
     slopes = np.zeros((2, len(modes), rows, columns))
     slopes[:, :, used] = _slopes(mode_errors(modes, vectors[used], across, up), vectors[used])
     heights = _integrate(slopes, used, (step * pixel_size[0], step * pixel_size[1]))

@@ -63,11 +63,13 @@ def integrate_result(
     """
     separate, independent_sigma = separate_errors(result, noise_gain)
     surface = integrate_normals(separate, independent_sigma, pixel_size, robust=robust, device=device)
-    fitted, sigma = result.fitted, np.array(surface.height_sigma)
+    fitted = result.fitted
+    if fitted.common_errors is None and fitted.footprint is None:
+        return surface
+    sigma, modes = np.array(surface.height_sigma), np.reshape(fitted.common_errors or (), (-1, 2, TERMS))
     turns = [()] if sigma.ndim == 2 else [(number,) for number in range(len(sigma))]
     for turn in turns:
-        if fitted.common_errors is not None:
-            modes = np.reshape(fitted.common_errors, (-1, 2, TERMS))
+        if modes.size:
             variance = common_variance(result.normals[turn], surface.component[turn], modes, pixel_size)
             sigma[turn] = np.sqrt(sigma[turn] ** 2 + variance)
         if fitted.footprint is not None:

@@ -12,12 +12,11 @@ from mirrorskin.engine.base.inputs import spacing
 from mirrorskin.io import InputError, Region, Result
 from mirrorskin.io.model.result import select_turn, zero_of_relative
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE
+from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE, second_differences
 
 Mask = NDArray[np.bool_]
 
 _HIGH, _UPPER = 0.95, 0.85  # quantiles of heights at the upper end of their range, for a mean and a median
-_OF_SECOND_DIFFERENCES = 6.0  # standard deviation of second differences along both axes, of noise of 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,8 +95,7 @@ def independent_share(height: Doubles, sigma: Doubles) -> float:
     """
     if min(height.shape) < 3:
         return 1.0
-    bend = np.diff(np.diff(height, 2, axis=0), 2, axis=1) / _OF_SECOND_DIFFERENCES
-    ratio = (bend / sigma[1:-1, 1:-1]) ** 2
+    ratio = (second_differences(height) / sigma[1:-1, 1:-1]) ** 2
     known = ratio[np.isfinite(ratio)]
     return min(1.0, float(np.median(known)) / MEDIAN_SQUARE) if known.size else 1.0
 

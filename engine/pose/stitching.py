@@ -25,7 +25,7 @@ from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.io.model.maps import StitchStatus, status_of
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
-from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE
+from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE, second_differences
 from mirrorskin.kernels.skin.pose_maps import SHARPEST
 
 _MIN_COMMON = 0.2  # smallest share of the smaller map's pixels that two touches must have in common
@@ -34,7 +34,6 @@ _POSE_ITERATIONS, _NEWTON_STEPS = 5, 8  # steps for the poses, and for a height 
 _LEVELLINGS = 3  # iterations for a touch of unknown offset, because positions of pixels depend on the height
 _DISAGREEMENT_Z_SCORE = 4.0  # sigmas between a touch and the mean above which they disagree
 _LARGEST = 1 << 28  # largest number of pixels of the stitched surface
-_OF_SECOND_DIFFERENCES = 6.0  # standard deviation of second differences along both axes, of noise of 1
 _UNFIT = 1e-9  # smallest information of a direction, relative to the largest
 
 
@@ -149,7 +148,7 @@ def _comparable(touch: Result, name: str) -> Result:
         raise InputError(
             f"{name} has no height_sigma, which is needed to merge heights: reconstruct it again"
         )
-    bend = np.diff(np.diff(height.astype(np.float64), 2, axis=0), 2, axis=1) / _OF_SECOND_DIFFERENCES
+    bend = second_differences(height.astype(np.float64))
     bend = bend[np.isfinite(bend)]
     rounding = float(np.finfo(np.float32).eps * np.nanmax(np.abs(height)))
     noise = max(math.sqrt(float(np.median(bend**2)) / MEDIAN_SQUARE) if bend.size else 0.0, rounding)

@@ -41,6 +41,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.kernels.array_types import Doubles
 
 _MEDIAN = 0.6744897501960817  # median magnitude of a standard normal variate
+_OF_SECOND_DIFFERENCES = 6.0  # standard deviation of second differences along both axes, of noise of 1
 _SAMPLES = 4096  # values that show where a median is
 _COST_TOLERANCE = 1e-8  # relative decrease of the cost that ends the iteration
 _MAX_STEPS = 100  # maximum number of steps
@@ -69,6 +70,11 @@ def median(values: NDArray[Any]) -> Any:
 def mad_sigma(residuals: Doubles) -> float:
     """Return the standard deviation of residuals about 0, from their median magnitude; 0 without any."""
     return float(median(np.abs(residuals))) / _MEDIAN if residuals.size else 0.0
+
+
+def second_differences(values: Doubles) -> Doubles:
+    """Return second differences along both axes, (H - 2, W - 2), as large as independent errors of values."""
+    return np.diff(np.diff(values, 2, axis=0), 2, axis=1) / _OF_SECOND_DIFFERENCES
 
 
 # --- losses -------------------------------------------------------------------------------------------------
