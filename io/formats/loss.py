@@ -96,13 +96,27 @@ def _of_h264(extradata: bytes, packet: bytes) -> bool:
         if unit[0] & 31 == _SPS:
             if unit[1] not in _HIGH_PROFILES:
                 return True
-            bits = _Bits(unit[4:])
-            bits.golomb()
-            if bits.golomb() == 3:  # chroma format
+            chroma, bits = _chroma_of(unit[1:])
+            if chroma == 3:
                 bits.take()
             bits.golomb(), bits.golomb()  # depths
             return not bits.take()
     return True
+
+
+def chroma_of_h264(parameters: bytes) -> int:
+    """Return chroma_format_idc of a sequence parameter set of H.264, without its head; 1 by default."""
+    try:
+        return _chroma_of(parameters)[0] if parameters[0] in _HIGH_PROFILES else 1
+    except IndexError:  # it is cut short
+        return 1
+
+
+def _chroma_of(parameters: bytes) -> tuple[int, _Bits]:
+    """Return the chroma format of a set of a high profile, and the bits after it."""
+    bits = _Bits(parameters[3:])
+    bits.golomb()
+    return bits.golomb(), bits
 
 
 def _of_hevc(extradata: bytes, packet: bytes) -> bool | None:

@@ -21,7 +21,7 @@ from mirrorskin.io.base.system import MAX_UNPACKED_BYTES, check_regular, check_u
 from mirrorskin.io.base.text import one_line
 from mirrorskin.io.base.types import Floats, InputError
 from mirrorskin.io.formats.colour_table import ColourTable
-from mirrorskin.io.formats.loss import READERS, loss_of
+from mirrorskin.io.formats.loss import READERS, chroma_of_h264, loss_of
 from mirrorskin.io.formats.registry import Format
 from mirrorskin.io.model.frames import CONVERTED_COLOUR, WholeFrames, lossy, lost_frames, maybe_lossy
 
@@ -81,7 +81,7 @@ _RANGES = {1: "limited", 2: "full"}  # AVCOL_RANGE_MPEG and AVCOL_RANGE_JPEG
 _DARK, _BRIGHT = 16, 235  # ends of the limited range
 _BEYOND = 1e-3  # share of samples beyond the limited range, from which the range is full; a codec overshoots
 _SPS = re.compile(rb"\x67|\x27|\x47")  # head of a sequence parameter set of H.264
-_WITH_CHROMA_FORMAT = {44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244}  # H.264, 7.3.2.1.1
+_SPS_BYTES = 12  # of such a set, after its head, that contain the chroma format
 _MOST_LOST = 1 << 30  # maximum number of frames lost between two frames
 _GREY_COUNTS = 8  # largest difference between the colours of a grey frame, after a lossy compression
 # Table that converts 8-bit luma of limited range, 16 to 235, to full range.
@@ -266,11 +266,12 @@ class VideoFrames(WholeFrames):
                 self.findings = tuple(self._find(stream, frame))
                 stated, is_grey = self._range(stream, frame)
                 looked_at = stated is not None and stated != "full"
+            if keeps or looked_at:
+                samples = self._checked(frame, number) if keeps else self._samples(frame, name)
             if looked_at:
-                samples = self._samples(frame, name)
                 beyond += int(np.count_nonzero(samples < _DARK) + np.count_nonzero(samples > _BRIGHT))
             if keeps:
-                self._kept.append(self._checked(frame, number))
+                self._kept.append(samples)
                 size += first.nbytes
                 keeps = size <= limit
                 self._kept = self._kept if keeps else []
@@ -278,13 +279,7 @@ class VideoFrames(WholeFrames):
             raise InputError(f"{name} has no frames that can be decoded")
         self.shape = (len(stamps), *self.shape[1:])
         if stated is not None:
-            is_full = (
-                stated == "full" or (stated == "" and is_grey) or beyond > _BEYOND * math.prod(self.shape)
-            )
-            self._is_limited = not is_full
-            self.findings += tuple(_range_findings(stated, is_full, is_grey))
-            if self._is_limited:
-                self._kept = [look_up(_FULL, samples) for samples in self._kept]
+            self._settle_range(stated, is_grey, beyond)
         rate = float(stream.average_rate or 0)
         seconds = np.array(stamps)
         self.time, self.lost = times(seconds, rate), None
@@ -304,6 +299,14 @@ class VideoFrames(WholeFrames):
             self.findings += (Finding("edit list", text),)
         self._container.close()
         self._container = None
+
+    def _settle_range(self, stated: str, is_grey: bool, beyond: int) -> None:
+        """Decide on the range of luma from what is stated and the samples beyond the limited range."""
+        is_full = stated == "full" or (stated == "" and is_grey) or beyond > _BEYOND * math.prod(self.shape)
+        self._is_limited = not is_full
+        self.findings += tuple(_range_findings(stated, is_full, is_grey))
+        if self._is_limited:
+            self._kept = [look_up(_FULL, samples) for samples in self._kept]
 
     def _checked(self, frame: VideoFrame, number: int) -> NDArray[Any]:
         """Return the samples of a frame, which has the size and type of the first."""
@@ -379,12 +382,9 @@ class VideoFrames(WholeFrames):
 
     def _is_grey_h264(self, stream: VideoStream) -> bool:
         """Return whether H.264 has no chroma, which FFmpeg decodes as colours without saturation."""
-        head = bytes(stream.codec_context.extradata or b"")
-        if not head:
-            container, other = self._open({})
-            with container:
-                head = next((bytes(packet) for packet in container.demux(other) if packet.size), b"")
-        return any(_chroma_format(head[match.end() :]) == 0 for match in _SPS.finditer(head[:4096]))
+        head = bytes(stream.codec_context.extradata or b"") or self._head
+        sets = (head[match.end() : match.end() + _SPS_BYTES] for match in _SPS.finditer(head[:4096]))
+        return any(chroma_of_h264(parameters) == 0 for parameters in sets)
 
     def _loss(self, stream: VideoStream) -> Iterator[Finding]:
         """Yield the finding for a compression that has a loss, or may have one."""
@@ -415,20 +415,6 @@ def _range_findings(stated: str, is_full: bool, is_grey: bool) -> Iterator[Findi
         kind = "grey" if is_grey else "luma"
         text = f"the range of brightness is not stated: {kind} is read {as_read}"
         yield Finding("range of brightness", text, warning=False)
-
-
-def _chroma_format(data: bytes) -> int:
-    """Return chroma_format_idc of a sequence parameter set of H.264, without its head; 1 by default."""
-    if len(data) < 4 or data[0] not in _WITH_CHROMA_FORMAT:
-        return 1
-    bits = "".join(f"{byte:08b}" for byte in data[3:12])
-    for number in range(2):  # seq_parameter_set_id and chroma_format_idc, Exp-Golomb codes
-        zeros = len(bits) - len(bits.lstrip("0"))
-        value = int(bits[zeros : 2 * zeros + 1] or "0", 2) - 1
-        if number:
-            return value
-        bits = bits[2 * zeros + 1 :]
-    return 1
 
 
 def _shows_colour(frame: VideoFrame, name: str) -> bool:
