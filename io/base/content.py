@@ -8,6 +8,9 @@ from typing import NamedTuple
 from mirrorskin.io.base.system import open_regular
 from mirrorskin.io.base.types import InputError
 
+TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+"""First bytes of TIFF and BigTIFF."""
+
 _HEAD_BYTES = 64
 
 
@@ -30,7 +33,7 @@ class _Kind(NamedTuple):
 # In remedies that are not suffixes, "{}" is replaced by the path, and "{folder}" by its folder.
 _KINDS = (
     _Kind(0, b"\x89HDF\r\n\x1a\n", "an HDF5 file", ".h5"),
-    *(_Kind(0, mark, "a TIFF", ".tif") for mark in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
+    *(_Kind(0, mark, "a TIFF", ".tif") for mark in TIFF_MARKS),
     _Kind(0, b"\x89PNG\r\n\x1a\n", "a PNG", ".png"),
     _Kind(0, b"\xff\xd8\xff", "a JPEG", ".jpg"),
     _Kind(0, b"P5\n", "a PGM", ".pgm"),

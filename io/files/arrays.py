@@ -40,7 +40,6 @@ from mirrorskin.io.storage.stack import RawFrames
 _KNOWN = {*POSITIONS.values(), "dark", "bright"}  # arrays of an archive that are not frames
 _NEEDED = "travel (--travel-step or --travel), phase (--phase-step or --phases)"
 _HASH_INTERVAL, _HASH_LENGTH = 4 << 20, 4 << 10  # bytes: of each 4 MiB of frames, the first 4 KiB are hashed
-_NPY_MARK = b"\x93NUMPY"
 _HEAD_BYTES = 1 << 14  # bytes read for the header of a member: NumPy accepts at most 10 000 characters
 _UNPACKED_BYTES = 1 << 20  # bytes unpacked at a time
 
@@ -359,7 +358,8 @@ def _rest_of(path: Path) -> tuple[Finding, ...]:
         head, size = _number_head(file), os.fstat(file.fileno()).st_size
         rest = size - head.size - head.nbytes
         file.seek(head.size + head.nbytes)
-        again = file.read(len(_NPY_MARK)) == _NPY_MARK
+        mark = np.lib.format.MAGIC_PREFIX
+        again = file.read(len(mark)) == mark
     if not rest:
         return ()
     what = "another array follows, as of several numpy.save" if again else f"{rest} bytes follow"

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.io.base.content import TIFF_MARKS
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.opencv import check_picture, decode, encode, is_coloured, to_grey
 from mirrorskin.io.base.system import check_regular, read_regular
@@ -19,7 +20,7 @@ from mirrorskin.io.base.types import FRAME_DTYPES, InputError
 from mirrorskin.io.formats.colour_table import ColourTable
 from mirrorskin.io.formats.loss import loss_of_jpeg
 from mirrorskin.io.formats.registry import Format
-from mirrorskin.io.formats.tiff import TIFF, TIFF_MARKS, TiffFrames
+from mirrorskin.io.formats.tiff import TIFF, TiffFrames
 from mirrorskin.io.model.frames import CONVERTED_COLOUR, lossy
 from mirrorskin.io.storage.atomic import write_new
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.base.content import identified
+from mirrorskin.io.base.content import TIFF_MARKS, identified
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.opencv import check_picture, decode, is_coloured, to_grey
 from mirrorskin.io.base.system import check_regular, open_regular
@@ -40,9 +40,6 @@ TIFF = Format(
 
 _REMEDY = "copy it again, or save it again"
 _DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64")
-TIFF_MARKS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-"""First bytes of TIFF and BigTIFF."""
-
 _KINDS = ("frame", "imagej", "multipage", "ome", "shaped", "sis", "tiled", "uniform", "virtual")
 """Kinds of TIFF whose metadata are read; the metadata of others may name other files."""
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.types import Block, Floats
+from mirrorskin.io.watch.saturation import MAD
 
 MIRRORED = Finding(
     "mirrored",
@@ -27,7 +28,6 @@ _USUAL = 0.25  # least amplitude, share of the median
 _CONDITION = 10.0  # most of the fit of a turn: phases on one axis show no direction
 _STEEPEST = 1.4  # zenith, radians
 _LIMIT = 3.0  # of outliers, standard deviations
-_MAD = 1.4826
 
 
 class TurnMoments:
@@ -109,5 +109,5 @@ class TurnMoments:
 
 
 def _without_outliers(values: Floats) -> Floats:
-    limit = _LIMIT * _MAD * float(np.median(np.abs(values - np.median(values))))
+    limit = _LIMIT * MAD * float(np.median(np.abs(values - np.median(values))))
     return np.clip(values, -limit, limit) if limit > 0 else values

@@ -35,7 +35,8 @@ _APPROACHED = 0.5  # ratio of their samples from which the end is approached; ev
 _EDGE = 0.02  # share of samples at the lowest one, from which brightness may start with an edge
 _QUANTIZED = 0.05  # deviation from whole numbers, steps
 
-_MAD = 1.4826
+MAD = 1.4826
+"""Standard deviation over median absolute deviation, of a normal distribution."""
 
 
 def scale_top(highest: float, integer: bool) -> float | None:
@@ -145,7 +146,7 @@ def _noise_of(counts: NDArray[np.float32], highest: NDArray[np.float32]) -> floa
                 break  # higher differences of a step alternate, too
             if alternating > _ALTERNATING:
                 spread = math.sqrt(math.comb(2 * order, order))
-                noise = _MAD * float(np.median(np.abs(differences[used]))) / spread
+                noise = MAD * float(np.median(np.abs(differences[used]))) / spread
                 least = min(least, noise) if noise > 0 else least
     return least if least < math.inf else 0.0
 

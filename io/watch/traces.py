@@ -14,13 +14,12 @@ from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.types import Floats, Motion
 from mirrorskin.io.watch import axes
 from mirrorskin.io.watch.phase_check import PhaseCheck, swing_of
-from mirrorskin.io.watch.saturation import REACHED, scale_ends
+from mirrorskin.io.watch.saturation import MAD, REACHED, scale_ends
 
 _SIDE = 24  # pixels of the grid along each side
 _SAMPLES_MAX = 1 << 22  # number of samples above which the grid becomes coarser
 _PIXELS_MIN = 64  # minimum number of pixels for findings
 _QUANTUM = 1 / math.sqrt(12)  # standard deviation of rounding, counts
-_MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 _RESPONSE_MIN = 10.0  # minimum change of a pixel that is a response, standard deviations of the noise
 _FEW = 0.05  # share of pixels below which their common behaviour is ignored
 _CLEARLY = 0.9  # share of pixels that rise, from which frames are those of a press
@@ -324,12 +323,12 @@ class Traces:
     def _noise(self) -> float:
         """Return an estimate of the standard deviation of a sample, from the smallest changes."""
         steps = np.diff(self._counts, axis=0)
-        estimates = [_MAD * float(np.median(_medians(np.abs(steps)))) / math.sqrt(2)]
+        estimates = [MAD * float(np.median(_medians(np.abs(steps)))) / math.sqrt(2)]
         if self._fit is not None:
             residual = np.abs(self._counts - self._fit)
-            estimates.append(_MAD * float(np.median(residual)))
+            estimates.append(MAD * float(np.median(residual)))
             if len(steps) > 1:
-                estimates.append(_MAD * float(np.median(np.abs(np.diff(steps, axis=0)))) / math.sqrt(6))
+                estimates.append(MAD * float(np.median(np.abs(np.diff(steps, axis=0)))) / math.sqrt(6))
         return max(min(estimates), _QUANTUM if self._integer else 0.0)
 
     def _repeated(self) -> Iterator[Finding]:
@@ -521,7 +520,7 @@ class Traces:
         start = counts[: len(parts[0]) + len(parts[1])].compress(dark[2], axis=1)
         if start.shape[1] < _PIXELS_MIN:
             return None
-        noise = _MAD / math.sqrt(2) * float(np.median(np.abs(np.diff(start, axis=0))))
+        noise = MAD / math.sqrt(2) * float(np.median(np.abs(np.diff(start, axis=0))))
         noise = max(noise, _QUANTUM if self._integer else 0.0)
         levels, error = [0.0], 0.0
         for part, mean, used in zip(parts[1:-1], means[1:-1], dark[2:], strict=True):
@@ -530,7 +529,7 @@ class Traces:
                 break
             rise = (mean - means[0])[used]
             common = float(np.median(rise))
-            spread = _MAD * float(np.median(np.abs(rise - common)))
+            spread = MAD * float(np.median(np.abs(rise - common)))
             by_noise = noise * math.sqrt(1 / len(parts[0]) + 1 / len(part))
             levels.append(common if common**2 > _COMMON**2 * (spread**2 - by_noise**2) else 0.0)
             error = max(error, _OF_MEDIAN * by_noise / math.sqrt(pixels))
