@@ -56,6 +56,8 @@ _OFFSETS = 0.5  # offsets of frames, and their drift, relative to that of the ze
 _WIDEST = 100.0  # most by which the variance of a prior grows
 _FLOOR = 1e-14  # least share of a prior's variance, so that one of 0 can be inverted
 _MOST_MODES, _SMALL_MODE = 6, 1e-3  # modes that are kept, and least share of the largest one
+_POWERS = 4  # of the matrix of modes, until its largest ones are separate from the others
+_ROUNDING = 1e-12  # share of a variance that rounding may make negative
 _CONDITION = 1e-5  # least singular value, relative to the largest one, of their fit
 _CLEAR = 2.0  # standard deviations of what remains: least effect that is corrected
 _WORTH = 0.2  # standard deviations of the pixels' own errors: the same
@@ -385,9 +387,10 @@ class _Fit:
         gives many directions, which seem to determine what the plane does not show.
         """
         self._equations: _Equations | None = None
-        self._left, normal, *_ = self._parts(self._zenith, self._azimuth)
+        self._left, normal, _ = self._parts(self._zenith, self._azimuth)
         self._clear = self._without_noise(normal)
-        _, self._by_normal, self._by_gain, self._by_rest = self._parts(*self._clear)
+        _, self._by_normal, by_nuisances = self._parts(*self._clear)
+        self._by_gain, self._by_rest = by_nuisances()
 
     def _without_noise(self, by_normal: Doubles) -> tuple[Doubles, Doubles]:
         """Return zeniths and azimuths whose scatter along each axis is that of the normals without noise."""
@@ -415,8 +418,13 @@ class _Fit:
         freedom = max(1, self._left.size - 2 * self.pixels - 2 * len(self._counts))
         return max(float(np.sum(self._left**2)) / freedom, self.floor**2)
 
-    def _parts(self, zenith: Doubles, azimuth: Doubles) -> tuple[Doubles, Doubles, Doubles, Doubles]:
-        """Return the residuals for normals, and their derivatives by normals, gains and other nuisances."""
+    def _parts(
+        self, zenith: Doubles, azimuth: Doubles
+    ) -> tuple[Doubles, Doubles, Callable[[], tuple[Doubles, Doubles]]]:
+        """Return the residuals for normals, and their derivatives by normals; a call returns others.
+
+        These are the derivatives by gains, and by the other nuisances.
+        """
         frames = len(self._counts)
         gains, offsets = self._values[:frames, np.newaxis], self._values[frames : 2 * frames, np.newaxis]
         gamma, gain, offset, tilt, phase, lag = self._values[2 * frames :][: len(_GLOBALS)]
@@ -430,7 +438,6 @@ class _Fit:
         down = np.maximum(np.sin(angle), 1e-9)
         by_zenith = (sine * upright + cosine * lean * np.cos(turned)) / down
         by_azimuth = -lean * np.sin(turned) / down  # for a rotation of the normal by an angle
-        by_tilt = (cosine * lean + sine * upright * np.cos(turned)) / down * self._tilt
         places = np.stack(_places(self._x, self._y))
         steepness = self._zenith - np.mean(self._zenith)
         steepness /= max(float(np.std(steepness)), _LEAST_SPREAD)
@@ -450,13 +457,17 @@ class _Fit:
         steep = share * (1 + gamma) * ratio**gamma  # counts of the frame per count of linear light
         by_angle = steep * (1 + gain) * self._gain
         by_normal = np.stack([by_angle * by_zenith, by_angle * by_azimuth])
-        by_gain = (1 + uneven @ places) * light
-        by_rest = np.stack([
-            shown * np.log(ratio), steep * self._gain * angle, steep, by_angle * by_tilt,
-            -by_angle * by_azimuth * sine, before - shown, *((1 + gains) * light * places[:, np.newaxis]),
-            *(by_angle * swing * patterns[:, np.newaxis]),
-        ])  # fmt: skip
-        return left, by_normal, by_gain, by_rest
+
+        def by_nuisances() -> tuple[Doubles, Doubles]:
+            by_tilt = (cosine * lean + sine * upright * np.cos(turned)) / down * self._tilt
+            by_rest = np.stack([
+                shown * np.log(ratio), steep * self._gain * angle, steep, by_angle * by_tilt,
+                -by_angle * by_azimuth * sine, before - shown, *((1 + gains) * light * places[:, np.newaxis]),
+                *(by_angle * swing * patterns[:, np.newaxis]),
+            ])  # fmt: skip
+            return (1 + uneven @ places) * light, by_rest
+
+        return left, by_normal, by_nuisances
 
     def _normal_equations(self) -> _Equations:
         """Return what the samples say of the nuisances at the present normals."""
@@ -576,7 +587,7 @@ class _Fit:
         """Return the largest modes of errors, (n, 2, k), and their variance by the zenith."""
         count, _, kinds = errors.shape
         lines = errors.reshape(-1, kinds)
-        squares, directions = np.linalg.eigh(gram(lines))
+        squares, directions = _largest(gram(lines))
         kept = squares > max(_SMALL_MODE * squares[-1], 0.0)
         kept[:-_MOST_MODES] = False
         parts = np.einsum("nk,km->nm", lines, directions[:, kept]).reshape(count, 2, -1)
@@ -628,8 +639,23 @@ class _Fit:
 
 def _root(covariance: Doubles) -> Doubles:
     """Return a matrix whose product with its transpose is a covariance."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
+    sizes = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    scaled = covariance / np.multiply.outer(sizes, sizes) + _ROUNDING * np.eye(len(sizes))
+    return np.asarray(sizes[:, np.newaxis] * np.linalg.cholesky(scaled))
+
+
+def _largest(square: Doubles) -> tuple[Doubles, Doubles]:
+    """Return the largest eigenvalues of a matrix, in ascending order, and their vectors, by powers of it.
+
+    `numpy.linalg.eigh` of more than 32 rows starts threads, which wait for those of OpenCL.
+    """
+    kept = np.argsort(-np.diag(square))[: 2 * _MOST_MODES]
+    vectors = square[:, kept]
+    for _ in range(_POWERS):
+        vectors = square @ np.linalg.qr(vectors)[0]
+    axes = np.linalg.qr(vectors)[0]
+    values, turned = np.linalg.eigh(axes.T @ square @ axes)
+    return values, axes @ turned
 
 
 def _places(x: Doubles, y: Doubles) -> Sequence[Doubles]:

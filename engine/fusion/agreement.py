@@ -100,7 +100,8 @@ def find_disagreement(
     clear = chi2 > 1 + _CLEAR_Z_SCORE * math.sqrt(2 / count)
     mean = first[enough] / total[enough]
     square = np.sum(firm * error**2) / np.sum(firm) if clear else np.average(mean**2, weights=total[enough])
-    rms = math.sqrt(float(square))
+    chance = 0.0 if clear else count / float(np.sum(total[enough]))
+    rms = math.sqrt(max(float(square) - chance, 0.0))
     return Disagreement(
         chi2, clear, rms, find_zenith_bias(slopes, height, firm, pixel_size) if clear else None
     )

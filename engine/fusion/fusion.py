@@ -258,6 +258,7 @@ def _fuse_maps(
     opened = device_of_maps(device, height_maps, normal_maps)
     footprint = max(height_maps.fitted.footprint or PIXEL, normal_maps.fitted.footprint or PIXEL)
     solver = FusionSolver(absolute, size, robust, opened, footprint, doubtful=moved > 0)
+    solver.modes = normal_maps.fitted.common_errors or ()
     surface = solver.filled(solver.surface(slopes))
     x, y = pixel_axes(selected.shape, size)
     if height_maps.x is not None and height_maps.y is not None:
@@ -344,6 +345,7 @@ def _fuse_sources(
         processed = vertical.shape[0] + number * axial.shape[0]
         turned, slopes = _rotate(registered, axial, _after(progress, processed))
         solver.footprint = max(taken.footprint, turned.fitted.footprint or PIXEL)
+        solver.modes = turned.fitted.common_errors or ()
         # The first of several surfaces is rarely the last one, so its sigma is not needed.
         surface = solver.surface(slopes, sigma=number > 0 or passes == 1)
         assert turned.fitted.tilt is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -18,6 +19,7 @@ from mirrorskin.engine.fusion.agreement import (
     find_disagreement,
 )
 from mirrorskin.engine.integration.arrays import integrate_arrays
+from mirrorskin.engine.integration.common_errors import find_common_errors
 from mirrorskin.engine.integration.normals_to_height import Slopes
 from mirrorskin.engine.press.holes import fill_holes
 from mirrorskin.engine.press.intervals import estimate_interval_scatter, fit_paraboloids, interval_evidence
@@ -87,7 +89,8 @@ class FusionSolver:
     Later slopes, of the same frames after another registration, are integrated in one pass: the last surface
     replaces the first two. `surface` raises InputError without any height or slope, and NotConverged if the
     integration does not converge. If slopes are ``doubtful``, as those of frames that were not registered,
-    their difference from the heights is part of ``height_sigma`` even if chance explains it.
+    their difference from the heights is part of ``height_sigma`` even if chance explains it. ``modes`` are
+    the errors that all slopes have in common; see `mirrorskin.engine.integration.common_errors`.
     """
 
     def __init__(
@@ -102,6 +105,7 @@ class FusionSolver:
         self._press, self._pixel_size = press, check_pixel_size(pixel_size)
         self._robust, self._device, self.footprint = robust, device, footprint
         self._doubtful = doubtful
+        self.modes: Sequence[float] = ()
         self._near: Result | None = None
         self._zenith_bias, self._disagreement = ZenithBias(), Disagreement()
         self._correlation, self._scatter = 0.0, 1.0
@@ -151,13 +155,26 @@ class FusionSolver:
             near = self._solve(extended, press.height, press.weight, **first)
         height, weight = _use_intervals(near, press, slopes)
         surface = self._solve(extended, height, weight, initial_heights=near.height, sigma=sigma)
+        common = find_common_errors(
+            (slopes.dz_dx, slopes.dz_dy),
+            surface.component >= 0,
+            self.modes,
+            self._pixel_size,
+            (*extended.weights, weight),
+            np.where(weight > 0, surface.height - height, 0.0),
+        )
+        if common.mode is not None:
+            slopes, extended = (each.without(common.mode, slopes.defined) for each in (slopes, extended))
+            at: dict[str, Any] = {"initial_heights": surface.height, "sigma": sigma}
+            surface = self._solve(extended, height, weight, **at)
         # Outliers are not part of the surface, but may count in the next call.
         self._near = near.assign(height=np.where(surface.component < 0, near.height, surface.height))
         disagreement = find_disagreement(surface.height, height, weight, slopes, self._pixel_size)
         self._correlation = _correlation_length(extended, weight)
         if surface.height_sigma is not None:
             self._scatter = _scatter(surface.height, slopes, self._pixel_size)
-            surface = surface.assign(height_sigma=surface.height_sigma * np.float32(self._scatter))
+            total = (surface.height_sigma * np.float32(self._scatter)) ** 2 + common.variance()
+            surface = surface.assign(height_sigma=np.sqrt(total))
             surface = _add_error_of_averaging(_set_sigma_of_lone_pixels(surface, weight), self.footprint)
         return surface, disagreement
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.diagnosis.footprint import with_curvature
-from mirrorskin.engine.diagnosis.turn_nuisances import TERMS, light_sigma
+from mirrorskin.engine.diagnosis.turn_nuisances import light_sigma, picture_axes
 from mirrorskin.engine.integration.arrays import integrate_arrays
-from mirrorskin.engine.integration.common_errors import common_variance
+from mirrorskin.engine.integration.common_errors import common_variance, mode_slopes, normals_of_slopes
 from mirrorskin.engine.integration.device_inputs import sample_evenly
 from mirrorskin.engine.integration.surface import explain
 from mirrorskin.engine.integration.validation import LEAST, MOST
@@ -22,6 +22,7 @@ from mirrorskin.io import Fitted, Result
 from mirrorskin.io.base.findings import findings_of, in_process
 from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.kernels.array import Array
+from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.integration.slopes import find, weigh
 from mirrorskin.kernels.rotation.registration import MEAN_NOISE_GAIN
@@ -47,6 +48,17 @@ class Slopes:
         """Where there are slopes, (H, W)."""
         return np.asarray(self.weights[0] > 0)
 
+    def without(self, mode: Doubles, wrong: NDArray[np.bool_]) -> Slopes:
+        """Return slopes without an error of normals, where these are wrong; see `find_common_errors`."""
+        normals = normals_of_slopes(self.dz_dx[wrong], self.dz_dy[wrong])
+        x, y = np.meshgrid(*picture_axes((wrong.shape[0], wrong.shape[1])))
+        dz_dx, dz_dy = self.dz_dx.copy(), self.dz_dy.copy()
+        for slope, (error,) in zip(
+            (dz_dx, dz_dy), mode_slopes(mode[np.newaxis], normals, x[wrong], y[wrong]), strict=True
+        ):
+            slope[wrong] -= error
+        return replace(self, dz_dx=dz_dx, dz_dy=dz_dy)
+
 
 def integrate_result(
     result: Result,
@@ -66,10 +78,10 @@ def integrate_result(
     fitted = result.fitted
     if fitted.common_errors is None and fitted.footprint is None:
         return surface
-    sigma, modes = np.array(surface.height_sigma), np.reshape(fitted.common_errors or (), (-1, 2, TERMS))
+    sigma, modes = np.array(surface.height_sigma), fitted.common_errors
     turns = [()] if sigma.ndim == 2 else [(number,) for number in range(len(sigma))]
     for turn in turns:
-        if modes.size:
+        if modes:
             variance = common_variance(result.normals[turn], surface.component[turn], modes, pixel_size)
             sigma[turn] = np.sqrt(sigma[turn] ** 2 + variance)
         if fitted.footprint is not None:

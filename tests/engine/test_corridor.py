@@ -52,7 +52,7 @@ def test_library_run(recordings, levels):
     [
         ("reconstruct press.h5", 562, 73),
         ("reconstruct turn.h5", 764, 96),
-        ("fuse press.h5 turn.h5", 930, 111),
+        ("fuse press.h5 turn.h5", 940, 112),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):
