@@ -18,7 +18,7 @@ from click.shell_completion import CompletionItem
 if TYPE_CHECKING:
     from mirrorskin.io import Motion
 
-_WRITTEN = {"--output", "--record"}  # options of files to write; other paths are read
+_WRITTEN = {"--output", "--record", "--chart"}  # options of files to write; other paths are read
 MOTIONS: tuple[Motion, ...] = ("vertical", "axial", "horizontal", "twist")
 _COMMON = ("calibration", "memory", "device", "as_json")  # options that follow the declared ones in help
 _NOUNS = {"vertical": "press", "axial": "rotation", "horizontal": "slide", "rock": "rocking motion"}

@@ -34,8 +34,11 @@ _Frame = tuple[Doubles, Doubles]
 _DAMPING = 1e-9  # damping of the first step; forms are nearly linear in their parameters
 _CONVERGED = 1e-12  # maximum relative decrease of the sum of squares by the last step
 _SINGULAR = 1e-14  # minimum eigenvalue of normal equations with columns of length 1
-_FAR = 5.0  # standard deviations, estimated from the median distance, beyond which points are outliers
-_FEW = 0.15  # maximum share of outliers or uncertain points; if there are more, they belong to the surface
+FAR = 5.0
+"""Standard deviations, estimated from the median distance, beyond which points are outliers."""
+FEW = 0.15
+"""Maximum share of outliers or uncertain points; if there are more, they belong to the surface."""
+
 _PASSES = 5  # maximum number of updates of the outliers
 _FIRST_POINTS = 65536  # number of points for the first fit
 _CHUNK = 16384  # points per block, whose derivatives fit into the processor's cache
@@ -49,8 +52,13 @@ _OVERSTATED = 0.1  # share of the predicted variance that may be missing because
 class Form(Protocol):
     """A surface with k parameters that can be fitted."""
 
-    lift: int
-    """Index of the parameter that moves it along z."""
+    @property
+    def lift(self) -> int:
+        """Index of the parameter that moves it along z."""
+
+    @property
+    def degree(self) -> int:
+        """Degree of the polynomials of x and y that it takes up; 1 for a sphere, too."""
 
     def start(self) -> Doubles:
         """Return first parameters, (k,)."""
@@ -67,7 +75,7 @@ class Fit(NamedTuple):
 
     parameters: Doubles  # (k,), float64
     covariance: Doubles  # (k, k), float64: NaN if there are too few points
-    kept: Mask  # (n,), bool: False for outliers
+    kept: Mask  # (n,), bool: False for outliers, which only a robust fit leaves out
     # Birge's ratio: root mean square of the weighted residuals over that expected from standard deviations;
     # much larger than 1 if the surface does not have this form. NaN without standard deviations.
     birge: float
@@ -127,12 +135,12 @@ class PointCloud:
         noise = np.sqrt(np.mean(self.sigma**2))
         return residual, micrometres(float(np.sqrt(np.mean(distance**2))), float(noise))
 
-    def fit(self, form: Form) -> Fit | None:
+    def fit(self, form: Form, *, robust: bool = True) -> Fit | None:
         """Fit a form; None if the points do not determine it.
 
-        Distances have inverse-variance weights, capped at the median weight. Outliers are ignored: points
-        beyond five standard deviations, estimated from the median of the weighted distances, if they are at
-        most 15 %. If there are more, they belong to the surface, and all points count.
+        Distances have inverse-variance weights, capped at the median weight. A ``robust`` fit ignores
+        outliers: points beyond five standard deviations, estimated from the median of the weighted distances,
+        if they are at most 15 %. If there are more, they belong to the surface, and all points count.
         """
         points, sigma = self.points, self.sigma
         weight = _weights(sigma)
@@ -140,13 +148,23 @@ class PointCloud:
         step = max(
             1, weight.size // _FIRST_POINTS
         )  # the first fit takes most steps, with a subset of the points
-        first = _fit_robustly(form, points[:, ::step], weight[::step], form.start(), rounding)
-        final = None if first is None else _fit_without_outliers(form, points, weight, first, rounding)
-        if final is None:
+        few = points[:, ::step], weight[::step]
+        first = (_fit_robustly if robust else _minimise)(form, *few, form.start(), rounding)
+        if first is None:
             return None
-        parameters, kept = final
-        if not kept.all():
-            points, weight, sigma = points[:, kept], weight[kept], sigma[kept]
+        if robust:
+            final = _fit_without_outliers(form, points, weight, first, rounding)
+            if final is None:
+                return None
+            parameters, kept = final
+        else:
+            minimum = _minimise(form, points, weight, first, rounding)
+            if minimum is None:
+                return None
+            parameters, kept = minimum, _near(form, points, weight, minimum, rounding)
+        used = kept if robust else np.ones_like(kept)
+        if not used.all():
+            points, weight, sigma = points[:, used], weight[used], sigma[used]
         gram = _gram(form, points, weight, parameters, _frame(points))
         claimed = 0.0
         if np.isfinite(sigma[0]):
@@ -157,7 +175,7 @@ class PointCloud:
         if self.independent:
             spread = spread + _of_smooth_errors(gram, parameters.size, self.share * claimed)
         elif self.noise_length and claimed > 0:
-            spread = at_least(spread, self._predicted(form, points, weight, parameters, kept))
+            spread = at_least(spread, self._predicted(form, points, weight, parameters, used))
         return Fit(parameters, spread, kept, birge)
 
     def _predicted(
@@ -192,7 +210,7 @@ def find_uncertain(sigma: Doubles, measured: Mask) -> Mask:
     Their errors would determine the highest and the lowest point. If there are more, none is excluded.
     """
     uncertain = measured & (sigma > _UNCERTAIN * np.median(sigma[measured]))
-    return np.asarray(uncertain & (np.count_nonzero(uncertain) <= _FEW * np.count_nonzero(measured)))
+    return np.asarray(uncertain & (np.count_nonzero(uncertain) <= FEW * np.count_nonzero(measured)))
 
 
 def _fit_robustly(
@@ -216,10 +234,7 @@ def _fit_without_outliers(
     """Fit without outliers until these no longer change; return the parameters and the points used."""
     kept = np.zeros(weight.size, bool)
     for _ in range(_PASSES):
-        misfit = form.distance(points, parameters) * np.sqrt(weight)
-        near = np.abs(misfit) <= _FAR * max(mad_sigma(misfit), rounding)
-        if np.count_nonzero(~near) > _FEW * near.size:
-            near[:] = True
+        near = _near(form, points, weight, parameters, rounding)
         if np.array_equal(kept, near):
             break
         kept = near
@@ -229,6 +244,15 @@ def _fit_without_outliers(
             return None
         parameters = minimum
     return parameters, kept
+
+
+def _near(form: Form, points: Doubles, weight: Doubles, parameters: Doubles, rounding: float) -> Mask:
+    """Return which points, (n,), are no outliers; all if too many would be."""
+    misfit = form.distance(points, parameters) * np.sqrt(weight)
+    near = np.abs(misfit) <= FAR * max(mad_sigma(misfit), rounding)
+    if np.count_nonzero(~near) > FEW * near.size:
+        near[:] = True
+    return near
 
 
 def _weights(sigma: Doubles) -> Doubles:
@@ -276,7 +300,7 @@ def _gram(
     total: Doubles | float = 0.0
     for start in range(0, weight.size, _CHUNK):
         part = points[:, start : start + _CHUNK]
-        shapes = [] if frame is None else _shapes(part, frame)
+        shapes = [] if frame is None else _shapes(part, frame, form.degree)
         rows = np.stack([*form.jacobian(part, parameters), *shapes, form.distance(part, parameters)])
         rows *= np.sqrt(weight[start : start + _CHUNK])
         total = total + rows @ rows.T
@@ -289,12 +313,16 @@ def _frame(points: Doubles) -> _Frame:
     return (low + high) / 2, np.maximum((high - low) / 2, _NOTHING)
 
 
-def _shapes(points: Doubles, frame: _Frame) -> list[Doubles]:
-    """Return the quadratic and cubic monomials of x and y, (n,) each, scaled to -1 to 1."""
+def _shapes(points: Doubles, frame: _Frame, degree: int) -> list[Doubles]:
+    """Return the monomials of x and y, (n,) each, of the next two degrees, scaled to -1 to 1."""
     (x_middle, y_middle), (x_reach, y_reach) = frame
     x, y = (points[0] - x_middle) / x_reach, (points[1] - y_middle) / y_reach
-    xx, xy, yy = x * x, x * y, y * y
-    return [xx, xy, yy, xx * x, xx * y, yy * x, yy * y]
+    return [term for power in (degree + 1, degree + 2) for term in monomials(x, y, power)]
+
+
+def monomials(x: Doubles, y: Doubles, degree: int) -> list[Doubles]:
+    """Return the products of x and y of a degree, from the highest power of x to that of y."""
+    return [np.asarray(x ** (degree - power) * y**power) for power in range(degree + 1)]
 
 
 def covariance(gram: Doubles, parameters: int, count: int, claimed: float = 0.0) -> Doubles:

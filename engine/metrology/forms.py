@@ -1,4 +1,4 @@
-"""Planes and spheres through height maps."""
+"""Planes, spheres and polynomials through height maps."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mirrorskin.engine.metrology.fitting import PointCloud
+from mirrorskin.engine.metrology.fitting import PointCloud, monomials
 from mirrorskin.engine.metrology.quantity import Quantity, degrees
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array_types import Doubles
+
+MAX_DEGREE = 4
+"""Highest degree of polynomials."""
 
 _LEVEL = 1e-12  # slope below which a plane counts as level
 _ANY_ANGLE = math.pi / math.sqrt(3)  # standard deviation of a uniformly distributed angle, radians
@@ -35,7 +38,7 @@ class Plane:
     residual : ndarray, (H, W), float64
         Distances from the plane, mm, positive on the camera's side; NaN without a height.
     outliers : int
-        Number of ignored pixels.
+        Number of outliers, which a robust fit ignores.
     birge : float
         Residual over that predicted by the standard deviations; see `Fit`.
     """
@@ -65,6 +68,7 @@ def fit_plane(
     sigma: ArrayLike | None = None,
     *,
     noise_length: float | None = None,
+    robust: bool = False,
 ) -> Plane:
     """Fit a plane to a height map, (H, W) mm with NaN where undefined, by least squares.
 
@@ -73,7 +77,7 @@ def fit_plane(
     standard deviation is added to that of the height, because heights may have a common error. If errors of
     heights are correlated over a ``noise_length``, mm, infinity for integrated slopes, uncertainties are at
     least those that follow from ``sigma``; see `mirrorskin.engine.measure`. Of independent errors, of length
-    0, only a share is common.
+    0, only a share is common. All points count, unless the fit is ``robust``: see `PointCloud.fit`.
 
     Examples
     --------
@@ -81,7 +85,7 @@ def fit_plane(
     45.0
     """
     cloud, form = PointCloud.of(height, x, y, sigma, noise_length), _PlaneForm()
-    fit = cloud.fit(form) if cloud.sigma.size >= 3 else None
+    fit = cloud.fit(form, robust=robust) if cloud.sigma.size >= 3 else None
     if fit is None:
         raise InputError("no plane fits: at least three pixels that are not in one line are needed")
     offset, p, q = fit.parameters
@@ -106,7 +110,7 @@ def fit_plane(
 class _PlaneForm:
     """Planes with the parameters offset and slopes along x and y; distances are along z, as errors are."""
 
-    lift = 0
+    lift, degree = 0, 1
 
     def start(self) -> Doubles:
         return np.zeros(3)
@@ -119,6 +123,118 @@ class _PlaneForm:
     def jacobian(self, points: Doubles, parameters: Doubles) -> Doubles:
         x, y, _ = points
         return np.stack([-np.ones_like(x), -x, -y])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Polynomial:
+    """The polynomial of x and y that fits a height map.
+
+    Attributes
+    ----------
+    degree : int
+    rms : Quantity
+        Root mean square of the residual, outliers included, µm.
+    range : Quantity
+        Height of its highest point over its lowest one on the measured pixels, mm.
+    residual : ndarray, (H, W), float64
+        Distances from it along z, mm; NaN without a height.
+    shapes, errors : list of ndarray, (H, W), float64
+        Its terms without the constant; and its errors, mm, each of one standard uncertainty and independent.
+    outliers, birge
+        See `Plane`.
+    """
+
+    degree: int
+    rms: Quantity
+    range: Quantity
+    residual: Doubles
+    shapes: list[Doubles]
+    errors: list[Doubles]
+    outliers: int
+    birge: float
+
+    def quantities(self) -> dict[str, Quantity]:
+        """Return its quantities by name."""
+        return {"polynomial height range": self.range, "polynomial residual RMS": self.rms}
+
+
+def fit_polynomial(
+    height: ArrayLike,
+    x: ArrayLike,
+    y: ArrayLike,
+    sigma: ArrayLike | None = None,
+    *,
+    degree: int,
+    noise_length: float | None = None,
+    robust: bool = False,
+) -> Polynomial:
+    """Fit a polynomial with all products of x and y up to a degree, 1 to 4; see `fit_plane`.
+
+    Examples
+    --------
+    >>> x = np.linspace(-1, 1, 9)
+    >>> bowl = fit_polynomial(x**2 + 2 * x[:, None] ** 4, x, -x, degree=4)
+    >>> round(bowl.range.value, 6), round(bowl.rms.value, 6)
+    (3.0, 0.0)
+    """
+    if degree not in range(1, MAX_DEGREE + 1):
+        raise InputError(f"degree {degree}: a whole number from 1 to {MAX_DEGREE} is needed")
+    cloud = PointCloud.of(height, x, y, sigma, noise_length)
+    form = _PolynomialForm.of(cloud.points, degree)
+    count = form.start().size
+    fit = cloud.fit(form, robust=robust) if cloud.sigma.size >= count else None
+    if fit is None:
+        raise InputError(
+            f"no polynomial of degree {degree} fits: at least {count} pixels are needed, in an area"
+        )
+    distance = form.distance(cloud.points, fit.parameters)
+    residual, rms = cloud.residual(distance)
+    fitted = cloud.points[2] - distance
+    lowest, highest = int(np.argmin(fitted)), int(np.argmax(fitted))
+    at = form.jacobian(cloud.points[:, [lowest, highest]], fit.parameters)
+    across, up = np.meshgrid(np.asarray(x, np.float64), np.asarray(y, np.float64))
+    every = np.stack([across.ravel(), up.ravel(), 0 * up.ravel()])
+    terms = -form.jacobian(every, fit.parameters).reshape(count, *up.shape)
+    variances, directions = np.linalg.eigh(np.nan_to_num(fit.covariance))
+    errors = (directions * np.sqrt(np.maximum(variances, 0))).T @ terms.reshape(count, -1)
+    return Polynomial(
+        degree=degree,
+        rms=rms,
+        range=Quantity(float(fitted[highest] - fitted[lowest]), fit.sigma(*(at[:, 1] - at[:, 0])), "mm"),
+        residual=residual,
+        shapes=list(terms[1:]),
+        errors=list(errors.reshape(terms.shape)),
+        outliers=int(np.count_nonzero(~fit.kept)),
+        birge=fit.birge,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _PolynomialForm:
+    """Polynomials of a degree; distances are along z. Places are scaled to -1 to 1."""
+
+    degree: int
+    middle: Doubles  # (2,), mm
+    reach: Doubles
+    lift: int = 0
+
+    @classmethod
+    def of(cls, points: Doubles, degree: int) -> _PolynomialForm:
+        """Scale by the extent of the points."""
+        if not points.shape[1]:
+            return cls(degree, np.zeros(2), np.ones(2))
+        low, high = points[:2].min(axis=1), points[:2].max(axis=1)
+        return cls(degree, (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0))
+
+    def start(self) -> Doubles:
+        return np.zeros((self.degree + 1) * (self.degree + 2) // 2)
+
+    def distance(self, points: Doubles, parameters: Doubles) -> Doubles:
+        return np.asarray(points[2] + parameters @ self.jacobian(points, parameters))
+
+    def jacobian(self, points: Doubles, parameters: Doubles) -> Doubles:
+        x, y = (points[:2] - self.middle[:, np.newaxis]) / self.reach[:, np.newaxis]
+        return -np.stack([term for power in range(self.degree + 1) for term in monomials(x, y, power)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,8 +284,11 @@ def fit_sphere(
     sigma: ArrayLike | None = None,
     *,
     noise_length: float | None = None,
+    robust: bool = True,
 ) -> Sphere:
     """Fit a sphere to a height map by least squares of the distances from it; see `fit_plane`.
+
+    By default the fit is robust.
 
     Examples
     --------
@@ -180,7 +299,7 @@ def fit_sphere(
     """
     cloud = PointCloud.of(height, x, y, sigma, noise_length)
     form = _SphereForm.of(cloud.points)
-    fit = None if form is None else cloud.fit(form)
+    fit = None if form is None else cloud.fit(form, robust=robust)
     if form is None or fit is None:
         raise InputError("no sphere fits: a curved surface of at least four pixels is needed")
     x_centre, y_centre, z_centre, radius = map(float, fit.parameters)
@@ -208,6 +327,7 @@ class _SphereForm:
     side: int
     first: Doubles
     lift: int = 2
+    degree: int = 1
 
     @classmethod
     def of(cls, points: Doubles) -> _SphereForm | None:

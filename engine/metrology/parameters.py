@@ -42,7 +42,7 @@ class Parameter:
 
 
 _HEIGHT, _SPATIAL, _HYBRID = "texture: height", "texture: spatial", "texture: hybrid"
-_FUNCTIONAL, _VOLUME, _LINE = "texture: material ratio", "texture: volume", "profile"
+FUNCTIONAL, VOLUME, _LINE = "texture: material ratio", "texture: volume", "profile"
 
 PARAMETERS: dict[str, Parameter] = {
     "Sa": Parameter(_HEIGHT, "µm", "arithmetical mean height"),
@@ -57,15 +57,15 @@ PARAMETERS: dict[str, Parameter] = {
     "Std": Parameter(_SPATIAL, "deg", "texture direction", noise="plain"),
     "Sdq": Parameter(_HYBRID, "", "root mean square gradient", pixel_power=-1),
     "Sdr": Parameter(_HYBRID, "%", "developed interfacial area ratio", noise="plain", pixel_power=-2),
-    "Sk": Parameter(_FUNCTIONAL, "µm", "core height"),
-    "Spk": Parameter(_FUNCTIONAL, "µm", "reduced peak height", noise="extreme"),
-    "Svk": Parameter(_FUNCTIONAL, "µm", "reduced dale height", noise="extreme"),
-    "Smr1": Parameter(_FUNCTIONAL, "%", "material ratio of the hills", noise="ratio"),
-    "Smr2": Parameter(_FUNCTIONAL, "%", "material ratio above the dales", noise="ratio"),
-    "Vmp": Parameter(_VOLUME, "ml/m2", "peak material volume", noise="extreme"),
-    "Vmc": Parameter(_VOLUME, "ml/m2", "core material volume"),
-    "Vvc": Parameter(_VOLUME, "ml/m2", "core void volume"),
-    "Vvv": Parameter(_VOLUME, "ml/m2", "dale void volume", noise="extreme"),
+    "Sk": Parameter(FUNCTIONAL, "µm", "core height"),
+    "Spk": Parameter(FUNCTIONAL, "µm", "reduced peak height", noise="extreme"),
+    "Svk": Parameter(FUNCTIONAL, "µm", "reduced dale height", noise="extreme"),
+    "Smr1": Parameter(FUNCTIONAL, "%", "material ratio of the hills", noise="ratio"),
+    "Smr2": Parameter(FUNCTIONAL, "%", "material ratio above the dales", noise="ratio"),
+    "Vmp": Parameter(VOLUME, "ml/m2", "peak material volume", noise="extreme"),
+    "Vmc": Parameter(VOLUME, "ml/m2", "core material volume"),
+    "Vvc": Parameter(VOLUME, "ml/m2", "core void volume"),
+    "Vvv": Parameter(VOLUME, "ml/m2", "dale void volume", noise="extreme"),
 }
 """Areal parameters by name."""
 

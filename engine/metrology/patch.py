@@ -108,11 +108,12 @@ def heights_of(result: Result) -> NDArray[np.float32]:
     return height
 
 
-def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Result]:
+def patch_of(result: Result, region: Region | None = None, kept: Mask | None = None) -> tuple[Patch, Result]:
     """Cut out a region; also return the result without the heights that cannot be compared with those in it.
 
-    Only measured heights with a finite standard deviation count. Components with relative heights cannot be
-    compared with others: they are omitted if others are absolute; if none is, only the largest is used.
+    ``kept``, (H, W), are the pixels to measure, by default all. Only measured heights with a finite standard
+    deviation count. Components with relative heights cannot be compared with others: they are omitted if
+    others are absolute; if none is, only the largest is used.
     """
     height = heights_of(result)
     if result.height_sigma is not None and not np.isfinite(result.height_sigma).any():
@@ -126,10 +127,15 @@ def patch_of(result: Result, region: Region | None = None) -> tuple[Patch, Resul
     part = region.slices
     filled = np.zeros(height.shape, bool) if result.filled is None else result.filled != 0
     measured, notes = _known(result, height, filled)
+    if kept is not None:
+        notes += [f"pixels left out by a mask: {np.count_nonzero(measured[part] & ~kept[part])}"]
+        measured = measured & kept
     measured, absolute, left_out = _comparable(result, measured, part)
     if not np.any(measured[part] & ~filled[part]):
         raise InputError("no height was measured there: choose another region, or another result")
     contact = measured if result.contact is None else result.contact != 0
+    if kept is not None:
+        contact = contact & kept
     patch = Patch(
         height=np.where(measured & ~filled, height, np.nan)[part].astype(np.float64),
         filled=np.where(measured & filled, height, np.nan)[part].astype(np.float64),

@@ -9,12 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.metrology.parameters import PARAMETERS
+from mirrorskin.engine.metrology.parameters import FUNCTIONAL, PARAMETERS, VOLUME
+from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.kernels.array_types import Doubles
 
 Evaluate = Callable[[Doubles], dict[str, float]]
 
-NOISE, NOISE_BIAS = "noise, random", "noise, systematic"
+NOISE, NOISE_BIAS, EDGES = "noise, random", "noise, systematic", "filter edges"
 """Contributions to an uncertainty."""
 
 HOPELESS = 0.6
@@ -23,6 +24,15 @@ HOPELESS = 0.6
 ANY_DIRECTION = 180 / math.sqrt(12)
 """Standard deviation of a uniformly distributed direction, degrees."""
 
+LEVEL = 0.1
+"""Relative uncertainty of standard deviations, whose squares are right within a fifth."""
+
+_CLEAR = 2.0  # standard uncertainties by which Sq^2 exceeds that of the noise if there is a texture
+_CLEAN_EXTREME = 1.3  # factor on the change of squares of extremes
+_EXTRAPOLATED = 0.4  # relative uncertainty of the change of extremes
+_SHAPE_LEVEL = 0.3  # that of skewness and kurtosis, which contain higher powers of the noise
+# Factors on uncertainties of values without noise, for a chi-square of about 1 (test_uncertainty.py).
+_WIDER, _WIDER_CURVE = 1.15, 1.3  # that of extremes, and of the material ratio curve
 # Factor on the extrapolated change of extremes and material ratios, which is steep where noise is small;
 # chosen for a chi-square of about 1 (tests/engine/metrology/test_uncertainty.py).
 _EXTREME = 1.8
@@ -42,15 +52,18 @@ class NoiseChanges:
         Share of the noise in the mean square of the texture.
     random, bias : dict of str to float
         Standard deviation and mean change of each parameter, in its unit; NaN if unknown.
-    square_spread : float
-        Standard deviation of Sq^2, µm^2.
+    clean : dict of str to (float, float)
+        Estimate of each parameter without noise, and its standard uncertainty; NaN if unknown.
+    significant : bool
+        Whether Sq^2 exceeds that of the noise by more than two standard uncertainties.
     """
 
     level: float
     noise_ratio: float
     random: dict[str, float] = field(default_factory=dict)
     bias: dict[str, float] = field(default_factory=dict)
-    square_spread: float = 0.0
+    clean: dict[str, tuple[float, float]] = field(default_factory=dict)
+    significant: bool = True
 
 
 def add_noise(
@@ -77,14 +90,69 @@ def add_noise(
     for name, numbers in drawn.items():
         changes.random[name] = _spread(name, np.array(numbers))
         changes.bias[name] = _bias(name, values[name], np.array(numbers), changes.noise_ratio)
-    changes.square_spread = float(np.std(np.array(drawn[root]) ** 2, ddof=1))
+        changes.clean[name] = _without_noise(name, values[name], np.array(numbers), changes)
+    spread = float(np.std(np.array(drawn[root]) ** 2, ddof=1))
+    square, uncertainty = whole**2 - level**2, math.hypot(spread, 2 * LEVEL * level**2)
+    changes.clean[root] = _root(square, uncertainty)
+    changes.significant = square > _CLEAR * uncertainty
     return changes
+
+
+def with_clean(
+    parameters: Mapping[str, Quantity], budget: Mapping[str, Mapping[str, float]], noise: NoiseChanges
+) -> dict[str, Quantity]:
+    """Return parameters with the Sq of the noise, and with those without noise, which have the same budget.
+
+    The contributions of the noise to the latter are replaced.
+    """
+    quantities: dict[str, Quantity] = {}
+    for name, quantity in parameters.items():
+        quantities[name] = quantity
+        if name == "Sq":
+            quantities["Sq of noise"] = Quantity(noise.level, LEVEL * noise.level, "µm")
+        value, spread = noise.clean[name]
+        if math.isfinite(value) and math.isfinite(spread):
+            others = (part for cause, part in budget[name].items() if cause not in (NOISE, NOISE_BIAS))
+            quantities[f"{name} without noise"] = Quantity(value, math.hypot(spread, *others), quantity.unit)
+    return quantities
+
+
+def _root(square: float, error: float) -> tuple[float, float]:
+    """Return the root of a square, at least 0, and its uncertainty from that of the square."""
+    value = math.sqrt(max(square, 0.0))
+    return value, math.sqrt(value**2 + error) - value
+
+
+def _without_noise(name: str, value: float, drawn: Doubles, changes: NoiseChanges) -> tuple[float, float]:
+    """Return a parameter less what noise changes it by, and its standard uncertainty.
+
+    Material ratios and directions have none. The uncertainty contains the random error, which the surface's
+    smaller share makes larger; that of the level of the noise; and a share of the change for its
+    extrapolation.
+    """
+    kind = PARAMETERS[name].noise
+    drawn = drawn[np.isfinite(drawn)]
+    if drawn.size < 2 or not math.isfinite(value) or kind == "ratio" or name == "Std":
+        return math.nan, math.nan
+    if kind in ("amplitude", "extreme"):
+        squares, extreme = drawn**2, kind == "extreme"
+        excess = max(float(np.mean(squares)) - value**2, 0.0) * (_CLEAN_EXTREME if extreme else 1.0)
+        share = _EXTRAPOLATED if extreme else 2 * LEVEL
+        on_curve = extreme or PARAMETERS[name].group in (FUNCTIONAL, VOLUME)
+        error = math.hypot(float(np.std(squares, ddof=1)), share * excess)
+        return _root(value**2 - excess, (_WIDER_CURVE if on_curve else _WIDER) * error)
+    bias, random = changes.bias[name], changes.random[name]
+    rest = max(1 - changes.noise_ratio, 1 - HOPELESS)
+    share = 2 * LEVEL if kind == "plain" else _SHAPE_LEVEL
+    return value - bias, _WIDER * math.hypot(random / rest, share * bias)
 
 
 def _spread(name: str, drawn: Doubles) -> float:
     """Return the standard deviation of a parameter; of the direction, around the circle."""
     if name != "Std":
-        return float(np.std(drawn, ddof=1))
+        # Some realisations may have no value, such as that of a spacing.
+        known = drawn[np.isfinite(drawn)]
+        return float(np.std(known, ddof=1)) if 2 * known.size > drawn.size else math.nan
     mean = abs(np.mean(np.exp(2j * np.radians(drawn))))
     return min(math.degrees(math.sqrt(max(-2 * math.log(mean), 0.0)) / 2), ANY_DIRECTION)
 
@@ -93,6 +161,9 @@ def _bias(name: str, value: float, drawn: Doubles, noise_ratio: float) -> float:
     """Return the mean change by the noise that the texture has."""
     if name == "Std":
         return 0.0
+    drawn = drawn[np.isfinite(drawn)]
+    if not drawn.size:
+        return math.nan
     kind, mean = PARAMETERS[name].noise, float(np.mean(drawn))
     if kind in ("amplitude", "extreme"):
         bias = value - math.sqrt(max(2 * value**2 - float(np.mean(drawn**2)), 0.0))
@@ -117,8 +188,10 @@ def change(evaluate: Evaluate, texture: Doubles, errors: Sequence[Doubles]) -> d
     for error in errors:
         above, below = evaluate(texture + error), evaluate(texture - error)
         for name, value in above.items():
-            difference = value - below[name]
-            if name == "Std":
-                difference = (difference + 90) % 180 - 90
-            squares[name] = squares.get(name, 0.0) + (difference / 2) ** 2
+            squares[name] = squares.get(name, 0.0) + (difference(name, value, below[name]) / 2) ** 2
     return {name: math.sqrt(square) for name, square in squares.items()}
+
+
+def difference(name: str, value: float, other: float) -> float:
+    """Return the difference of two values of a parameter; of the direction, around the circle."""
+    return (value - other + 90) % 180 - 90 if name == "Std" else value - other

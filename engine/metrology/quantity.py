@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 _ROUNDING = 1e-12  # relative uncertainty that is explained by rounding
 
@@ -30,6 +30,10 @@ class Quantity:
     value: float
     sigma: float
     unit: str
+
+    def expanded(self, coverage: float) -> Quantity:
+        """Return the quantity with its uncertainty multiplied by a coverage factor."""
+        return replace(self, sigma=coverage * self.sigma)
 
     def __str__(self) -> str:
         return f"{self._number()} {self.unit}".strip()

@@ -1,10 +1,10 @@
-"""Cross-sections of height maps: lengths, slope, and the height of a step as ISO 5436-1 has it."""
+"""Cross-sections of height maps, also averaged: lengths, slope, steps and grooves (ISO 5436-1, 25178-70)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,10 +15,10 @@ from mirrorskin.engine.base.inputs import Maps, as_result, spacing
 from mirrorskin.engine.base.resample import SamplePoints
 from mirrorskin.engine.metrology.fitting import at_least, covariance
 from mirrorskin.engine.metrology.noise import correlation
-from mirrorskin.engine.metrology.patch import heights_of, noise_length
+from mirrorskin.engine.metrology.patch import heights_of, independent_share, noise_length
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.io import InputError, Result, pixel_axes
-from mirrorskin.io.base.arguments import as_array, checked
+from mirrorskin.io.base.arguments import as_array, check_number, checked, in_unit
 from mirrorskin.io.base.findings import findings_of
 from mirrorskin.kernels.array_types import Doubles
 
@@ -29,6 +29,8 @@ _ROUNDING = 1e-6  # share of a pixel that is neglected
 _LEVEL = 0.01  # share of the range of heights within which points are as high as the highest one
 _WINDOW = 3  # pixels per side of the median filter that removes spikes
 _MIN_SAMPLES = 4  # smallest number of samples on either side of a step
+_LEAST_SHARED = 1e-4  # smallest share of the variance that the mean of parallel profiles keeps
+_CLEAR_DEPTH = 8.0  # smallest depth of a groove, in root mean squares of what it leaves of the section
 _LEFT_OUT = 1 / 3  # share of either side that is ignored next to the step, which may be rounded or a ramp
 
 
@@ -54,6 +56,8 @@ class Section:
     correlation : callable or None
         Returns the correlation of the errors of two heights at each distance, (n,), float64, which only
         steps need; None if errors are independent.
+    common : ndarray, (n,), float64, or None
+        Part of ``sigma``, mm, of the mean of several profiles that equal heights have in common.
     """
 
     distance: Doubles
@@ -65,6 +69,7 @@ class Section:
     unit: str = "mm"
     notes: tuple[str, ...] = ()
     correlation: Callable[[], Doubles] | None = None
+    common: Doubles | None = None
 
 
 def as_point(name: str, value: Any) -> Point:
@@ -76,12 +81,13 @@ def as_point(name: str, value: Any) -> Point:
     return x, y
 
 
-@checked(start=as_point, end=as_point)
+@checked(start=as_point, end=as_point, width=in_unit("mm", check_number))
 def section(
     result: Maps,
     start: Point | None = None,
     end: Point | None = None,
     *,
+    width: float = 0.0,
     pixel_size: ArrayLike | None = None,
 ) -> Section:
     """Cut through the height map of a result.
@@ -94,6 +100,9 @@ def section(
         Millimetres from the picture's centre, x to the right and y up. By default the row of the highest
         point, measured or filled, after a 3 x 3 median filter against spikes, from left to right. On a flat
         top, the row in its middle.
+    width : float
+        Extent across the line, mm, over which heights are averaged: the mean of parallel profiles, a pixel
+        apart. A sample is undefined if fewer than half of them are measured there.
     pixel_size : float or (float, float), optional
         Millimetres along x and y; by default that of the result.
 
@@ -136,12 +145,60 @@ def section(
         _check_near((start, end), x, y, size)
     along, distance = _samples(start, end, size)
     column, row_of = (along[0] - x[0]) / size[0], (y[0] - along[1]) / size[1]
-    values = _between(maps, height, SamplePoints.at(column, row_of, (height.shape[0], height.shape[1])))
+    shape = height.shape[0], height.shape[1]
     notes = tuple(finding.text for finding in findings_of("result", maps.process))
-    related, length = None, noise_length(maps)
+    length = noise_length(maps)
+    related = None
     if length > 0 and maps.height_sigma is not None:
-        related = partial(correlation, distance, (height.shape[0], height.shape[1]), size, length)
-    return Section(distance, along[0], along[1], *values, unit, notes, related)
+        related = partial(correlation, distance, shape, size, length)
+    across = np.subtract(end, start)[::-1] * (-1, 1)
+    reach = math.hypot(*(across / size))  # in pixels
+    count = round(width / math.hypot(*across) * reach) if reach > 0 else 0
+    if count < 2:
+        values = _between(maps, height, SamplePoints.at(column, row_of, shape))
+        return Section(distance, along[0], along[1], *values, unit, notes, related)
+    offsets = np.linspace(-0.5, 0.5, count) * width * (1 - 1 / count)
+    shifts = np.multiply.outer(offsets, across / math.hypot(*across) / size)
+    lines = [
+        _between(maps, height, SamplePoints.at(column + right, row_of - up, shape)) for right, up in shifts
+    ]
+    mean, sigma, filled = _averaged(lines)
+    common = np.zeros_like(sigma)
+    if related is not None:
+        apart = np.abs(np.subtract.outer(offsets, offsets))
+        shared = float(np.mean(correlation(apart, shape, size, length)))
+        sigma = sigma * math.sqrt(max(shared, _LEAST_SHARED))
+        related = partial(_averaged_correlation, distance, offsets, shape, size, length)
+    elif maps.height_sigma is not None:
+        alone = independent_share(height.astype(np.float64), maps.height_sigma.astype(np.float64))
+        common = sigma * math.sqrt(1 - alone)
+        sigma = np.hypot(sigma * math.sqrt(alone / count), common)
+    return Section(distance, along[0], along[1], mean, sigma, filled, unit, notes, related, common)
+
+
+def _averaged(lines: Sequence[tuple[Doubles, Doubles, Mask]]) -> tuple[Doubles, Doubles, Mask]:
+    """Return the mean of the measured heights of parallel profiles, the mean sigma, and what is filled."""
+    heights, sigmas, filled = (np.stack(values) for values in zip(*lines, strict=True))
+    measured = np.isfinite(heights) & ~filled
+    # If fewer than half were measured, filled heights count, too.
+    some = np.count_nonzero(measured, axis=0) * 2 >= len(lines)
+    counts = np.where(some, measured, np.isfinite(heights))
+    number = np.count_nonzero(counts, axis=0)
+    valid = number * 2 >= len(lines)
+    divisor = np.where(valid, number, 1)
+    mean, sigma = (np.sum(np.where(counts, values, 0.0), axis=0) / divisor for values in (heights, sigmas))
+    return np.where(valid, mean, np.nan), np.where(valid & some, sigma, np.nan), valid & ~some
+
+
+def _averaged_correlation(
+    distance: Doubles, offsets: Doubles, shape: tuple[int, int], size: tuple[float, float], length: float
+) -> Doubles:
+    """Return the correlation of means over parallel profiles at each distance, (n,)."""
+    lag = np.arange(offsets.size)
+    share = np.where(lag > 0, 2.0, 1.0) * (offsets.size - lag) / offsets.size**2
+    apart = np.hypot.outer(distance, lag * (offsets[1] - offsets[0]))
+    shared = correlation(apart, shape, size, length) @ share
+    return np.asarray(shared / max(float(shared[0]), _LEAST_SHARED))
 
 
 def section_columns(result: Result, ends: tuple[Point, Point] | None = None) -> dict[str, NDArray[Any]]:
@@ -271,37 +328,135 @@ def step_height(section: Section) -> StepHeight:
     >>> round(step_height(stair).height.value, 6)
     0.2
     """
-    measured = _measured(section)
-    distance, height = section.distance[measured], section.height[measured]
-    if distance.size < 2 * _MIN_SAMPLES:
-        raise InputError(
-            f"a step needs at least {2 * _MIN_SAMPLES} measured samples along the section: cut elsewhere"
-        )
-    split = _split(distance, height)
+    levels = _Levels.of(section, "step")
+    distance = levels.distance
+    split, _ = _split(distance, levels.height)
     place = (distance[split - 1] + distance[split]) / 2
     half = (distance[split] - distance[split - 1]) / 2
     before = distance[split - 1] - _LEFT_OUT * (distance[split - 1] - distance[0])
     after = distance[split] + _LEFT_OUT * (distance[-1] - distance[split])
     kept = (distance <= before) | (distance >= after)
-    x, z = distance[kept] - place, height[kept]
-    parameters, spread, rest = _lines(x, z)
-    if section.correlation is not None:
-        number = np.flatnonzero(measured)[kept]
-        related = section.correlation()[np.abs(np.subtract.outer(number, number))]
-        errors = np.nan_to_num(section.sigma[number])
-        influence = np.linalg.pinv(_line_rows(x).T) * errors
-        spread = at_least(spread, influence @ related @ influence.T)
-    cubic = np.vander(x / np.abs(x).max(), 4)
-    coefficients, *_ = np.linalg.lstsq(cubic, z, rcond=None)
-    if np.sum((z - coefficients @ cubic.T) ** 2) < rest:
-        raise InputError("there is no step along the section: a smooth curve fits it better than two levels")
-    slope, rise = float(parameters[1]), float(parameters[2])
-    across = math.sqrt(1 + slope**2)
-    return StepHeight(
-        Quantity(rise / across, math.sqrt(spread[2, 2]) / across, "mm"),
-        Quantity(float(place), float(half) / math.sqrt(3), "mm"),
-        Quantity(math.degrees(math.atan(slope)), math.degrees(math.sqrt(spread[1, 1]) / across**2), "deg"),
+    height, slope = levels.fit(kept, distance > place, place)
+    return StepHeight(height, Quantity(float(place), float(half) / math.sqrt(3), "mm"), slope)
+
+
+@dataclass(frozen=True, slots=True)
+class Groove:
+    """A groove, or a ridge, along a section, as ISO 5436-1 (type A1) has it.
+
+    Attributes
+    ----------
+    depth : Quantity
+        Distance of its bottom from the surface on both sides, mm; negative for a ridge.
+    width : Quantity
+        Between its walls, mm.
+    place : Quantity
+        Distance of its middle from the section's start, mm.
+    slope : Quantity
+        Of surface and bottom, degrees; positive upwards.
+    """
+
+    depth: Quantity
+    width: Quantity
+    place: Quantity
+    slope: Quantity
+
+
+def groove(section: Section) -> Groove:
+    """Measure the groove along a section in millimetres.
+
+    Its walls are where two lines, of the surface and of a parallel bottom, fit the measured samples best.
+    Then they are fitted again, to the middle third of the bottom, and to the surface on either side from a
+    third of the width from the wall to one width from it. Uncertainties are those of `step_height`.
+
+    Examples
+    --------
+    >>> s = 0.1 * np.arange(30)
+    >>> slot = Section(s, s, 0 * s, -0.2 * (abs(s - 1.45) < 0.5), 0 * s, s < 0)
+    >>> round(groove(slot).depth.value, 6), round(groove(slot).width.value, 6)
+    (0.2, 1.0)
+    """
+    levels = _Levels.of(section, "groove")
+    distance = levels.distance
+    (first, end), rest = _walls(distance, levels.height)
+    if rest >= _split(distance, levels.height)[1]:
+        raise InputError("there is no groove along the section: a step fits it better")
+    walls = [(distance[at - 1] + distance[at]) / 2 for at in (first, end)]
+    width, middle = walls[1] - walls[0], (walls[0] + walls[1]) / 2
+    away = np.abs(distance - middle)
+    inside = away <= width / 6
+    kept = inside | ((away >= width * (0.5 + _LEFT_OUT)) & (away <= 1.5 * width))
+    if (
+        min(
+            np.count_nonzero(inside),
+            *(np.count_nonzero(kept & (s * (distance - middle) > width / 2)) for s in (-1, 1)),
+        )
+        < 2
+    ):
+        raise InputError(
+            "the groove has too few samples, or the section too little of its sides: cut elsewhere"
+        )
+    height, slope = levels.fit(kept, inside, middle)
+    if abs(height.value) < _CLEAR_DEPTH * math.sqrt(rest / distance.size):
+        raise InputError("there is no groove along the section: nothing exceeds the unevenness beside it")
+    step = float(np.median(np.diff(distance)))
+    wall = step / math.sqrt(12)
+    return Groove(
+        replace(height, value=-height.value),
+        Quantity(float(width), math.sqrt(2) * wall, "mm"),
+        Quantity(float(middle), wall / math.sqrt(2), "mm"),
+        slope,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Levels:
+    """The measured samples of a section, on two levels."""
+
+    section: Section
+    measured: Mask
+    distance: Doubles
+    height: Doubles
+    what: str
+
+    @classmethod
+    def of(cls, section: Section, what: str) -> _Levels:
+        measured = _measured(section)
+        if np.count_nonzero(measured) < 2 * _MIN_SAMPLES:
+            raise InputError(
+                f"a {what} needs at least {2 * _MIN_SAMPLES} measured samples along the section:"
+                " cut elsewhere"
+            )
+        return cls(section, measured, section.distance[measured], section.height[measured], what)
+
+    def fit(self, kept: Mask, upper: Mask, place: float) -> tuple[Quantity, Quantity]:
+        """Return the height of the second level above the first one, mm, and the slope of both."""
+        x, z, up = self.distance[kept] - place, self.height[kept], upper[kept].astype(np.float64)
+        parameters, spread, rest = _lines(x, z, up)
+        section = self.section
+        number = np.flatnonzero(self.measured)[kept]
+        if section.correlation is not None:
+            related = section.correlation()[np.abs(np.subtract.outer(number, number))]
+            errors = np.nan_to_num(section.sigma[number])
+            influence = np.linalg.pinv(_line_rows(x, up).T) * errors
+            spread = at_least(spread, influence @ related @ influence.T)
+        common = 0.0
+        if section.common is not None:  # independent of each other on both levels
+            common = math.sqrt(2) * float(np.mean(np.nan_to_num(section.common[number])))
+        cubic = np.vander(x / np.abs(x).max(), 4)
+        coefficients, *_ = np.linalg.lstsq(cubic, z, rcond=None)
+        if np.sum((z - coefficients @ cubic.T) ** 2) < rest:
+            raise InputError(
+                f"there is no {self.what} along the section: a smooth curve fits it better than two levels"
+            )
+        slope, rise = float(parameters[1]), float(parameters[2])
+        across = math.sqrt(1 + slope**2)
+        return (
+            Quantity(rise / across, math.hypot(math.sqrt(spread[2, 2]), common) / across, "mm"),
+            Quantity(
+                math.degrees(math.atan(slope)), math.degrees(math.sqrt(spread[1, 1]) / across**2), "deg"
+            ),
+        )
 
 
 def _measured(section: Section) -> Mask:
@@ -311,28 +466,53 @@ def _measured(section: Section) -> Mask:
     return np.isfinite(section.height) & ~section.filled
 
 
-def _split(distance: Doubles, height: Doubles) -> int:
-    """Return the number of the first sample after the step: where two parallel lines fit best."""
-    x = distance - np.mean(distance)
-    x /= np.linalg.norm(x)
-    residual = height - np.mean(height)
-    residual = residual - x * (x @ residual)
+def _split(distance: Doubles, height: Doubles) -> tuple[int, float]:
+    """Return the number of the first sample after the step, and the sum of squares that it leaves.
+
+    The step is where two parallel lines fit best.
+    """
+    x, residual = _without_line(distance, height)
     # The part of a step before each sample that a line does not fit: its squared length, and its projection.
     count = height.size
     after = count - np.arange(count)
     tail_sum = np.cumsum(x[::-1])[::-1]
     length = after * (count - after) / count - tail_sum**2
     gain = np.cumsum(residual[::-1])[::-1] ** 2 / np.where(length > 0, length, np.inf)
-    return _MIN_SAMPLES + int(np.argmax(gain[_MIN_SAMPLES : count - _MIN_SAMPLES + 1]))
+    split = _MIN_SAMPLES + int(np.argmax(gain[_MIN_SAMPLES : count - _MIN_SAMPLES + 1]))
+    return split, float(residual @ residual - gain[split])
 
 
-def _lines(x: Doubles, z: Doubles) -> tuple[Doubles, Doubles, float]:
-    """Fit parallel lines to samples before and after 0.
+def _walls(distance: Doubles, height: Doubles) -> tuple[tuple[int, int], float]:
+    """Return the numbers of the first sample in the groove and after it, and the sum of squares left."""
+    x, residual = _without_line(distance, height)
+    count = height.size
+    sums, places = (np.concatenate([[0.0], np.cumsum(values)]) for values in (residual, x))
+    best, at, least = -1.0, (0, 0), 2
+    for first in range(least, count - 2 * least + 1):
+        end = np.arange(first + least, count - least + 1)
+        inside = end - first
+        length = inside * (count - inside) / count - (places[end] - places[first]) ** 2
+        gain = (sums[end] - sums[first]) ** 2 / np.where(length > 0, length, np.inf)
+        highest = int(np.argmax(gain))
+        if gain[highest] > best:
+            best, at = float(gain[highest]), (first, int(end[highest]))
+    return at, float(residual @ residual - best)
+
+
+def _without_line(distance: Doubles, height: Doubles) -> tuple[Doubles, Doubles]:
+    """Return places of length 1 about their mean, and heights without their line."""
+    x = distance - np.mean(distance)
+    x = x / np.linalg.norm(x)
+    residual = height - np.mean(height)
+    return x, residual - x * (x @ residual)
+
+
+def _lines(x: Doubles, z: Doubles, up: Doubles) -> tuple[Doubles, Doubles, float]:
+    """Fit parallel lines to samples on two levels, the second one where ``up`` is 1.
 
     Return offset, slope and step, their covariance, and the sum of squares of the residual.
     """
-    rows = _line_rows(x)
-    up = rows[2]
+    rows = _line_rows(x, up)
     parameters, *_ = np.linalg.lstsq(rows.T, z, rcond=None)
     t = x / np.abs(x).max()
     shapes = np.stack([up * t, t**2, up * t**2, t**3, up * t**3])
@@ -341,9 +521,9 @@ def _lines(x: Doubles, z: Doubles) -> tuple[Doubles, Doubles, float]:
     return np.asarray(parameters), covariance(gram, len(rows), z.size), float(gram[-1, -1])
 
 
-def _line_rows(x: Doubles) -> Doubles:
+def _line_rows(x: Doubles, up: Doubles) -> Doubles:
     """Return the derivatives of two parallel lines, (3, n), with respect to offset, slope and step."""
-    return np.stack([np.ones_like(x), x, (x > 0).astype(np.float64)])
+    return np.stack([np.ones_like(x), x, up])
 
 
 def along(section: Section) -> dict[str, Quantity]:

@@ -16,28 +16,35 @@ from mirrorskin.engine.metrology.noise import realisations
 from mirrorskin.engine.metrology.parameters import PARAMETERS
 from mirrorskin.engine.metrology.propagation import (
     ANY_DIRECTION,
+    EDGES,
     HOPELESS,
+    LEVEL,
     NOISE,
     NOISE_BIAS,
     NoiseChanges,
     add_noise,
     change,
+    difference,
+    with_clean,
 )
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
-EDGES, FORM, DIRECTION = "filter edges", "form", "no direction"
+FORM, DIRECTION = "form", "no direction"
 """Contributions to an uncertainty, besides those of the noise."""
+
+SMOOTH = "the texture cannot be distinguished from a smooth one"
+"""What a note says if the texture may be noise alone."""
 
 DRAWS = 24
 """Realisations of the noise; half as many for maps with many pixels."""
 
 _MAX_DRAWN_PIXELS = 500_000  # pixels
 _CORRELATED = 8  # realisations from which the autocorrelation of the noise is computed
-_UNIFORM = 1 / math.sqrt(3)  # standard deviation of a uniform distribution between -1 and 1
-_LEVEL = 0.1  # relative uncertainty of standard deviations, whose squares are right within a fifth
+# Factors on the change by the filters' ends, for a chi-square of about 1 (test_uncertainty.py).
+_EDGE_FACTORS = {"Sal": 1.8}
 _DOMINATES = 0.5  # share of Sq^2 that is noise, from which on noise determines the parameters
 _ISOTROPIC = 0.5  # texture aspect ratio above which a texture has no direction
 
@@ -50,7 +57,8 @@ class Roughness:
     ----------
     parameters : dict of str to Quantity
         By name, as in `PARAMETERS`; also "Sq of noise", the Sq of a perfect surface that is measured and
-        filtered in the same way, and "Sq without noise", the square root of the difference of the squares.
+        filtered in the same way, and each parameter "without noise", such as "Sq without noise", the square
+        root of the difference of the squares.
     budget : dict of str to dict of str to float
         Contributions to the standard uncertainty of each parameter, in its unit.
     pixels, left_out, uncertain : int
@@ -58,6 +66,9 @@ class Roughness:
         are ignored because their standard deviation is much larger than that of others.
     notes : list of str
         What the noise does to the parameters.
+    smooth : bool
+        Whether the texture may be noise alone: Sq^2 exceeds that of the noise by less than two standard
+        uncertainties.
     """
 
     parameters: dict[str, Quantity]
@@ -66,6 +77,7 @@ class Roughness:
     left_out: int
     uncertain: int
     notes: list[str] = field(default_factory=list)
+    smooth: bool = False
 
     @property
     def sa(self) -> Quantity:
@@ -103,8 +115,8 @@ def roughness(
     pixel_size : (float, float)
         Along x and y, mm.
     s_filter, l_filter : float, optional
-        Nesting indices, mm, of the Gaussian filters (ISO 16610-61) that remove shorter, and longer waves. A
-        pixel is left out if more than a twentieth of a filter's weight is on holes or outside the picture.
+        Nesting indices, mm, of the Gaussian filters (ISO 16610-61) that remove shorter, and longer waves. At
+        ends and holes they are regression filters (ISO 16610-71); see `Gaussian`.
     sigma : array_like, (H, W), optional
         Standard deviations of the heights, mm.
     noise_length : float, optional
@@ -149,7 +161,7 @@ def roughness(
     if np.isfinite(spread[chain.measured]).all():
         noise = _noise_changes(chain, evaluate, texture, values, (spread, pixel_size, noise_length))
     systematic = {
-        EDGES: change(evaluate, texture, chain.edge_errors(height)),
+        EDGES: _edge_changes(chain, evaluate, height, values),
         FORM: change(evaluate, texture, [chain.filtered(error) for error in form_errors]),
     }
     parameters, budget = {}, {}
@@ -163,7 +175,7 @@ def roughness(
         parameters[name] = Quantity(value, spread_of, PARAMETERS[name].unit)
         budget[name] = parts
     if noise is not None:
-        parameters = _with_noise(parameters, noise)
+        parameters = with_clean(parameters, budget, noise)
     return Roughness(
         parameters,
         budget,
@@ -171,6 +183,7 @@ def roughness(
         int(np.count_nonzero(chain.measured & ~chain.kept)),
         int(np.count_nonzero(uncertain)),
         [] if noise is None else _notes(parameters, noise),
+        noise is not None and not noise.significant,
     )
 
 
@@ -230,22 +243,18 @@ class _Chain:
             filters.append(gaussian)
         return cls(measured, kept, filters[0], filters[1], FormRemoval(measured, form))
 
-    def filtered(self, height: Doubles) -> Doubles:
+    def filtered(self, height: Doubles, *, level: bool = False) -> Doubles:
         """Return the waves between both filters, with the mean 0, (H, W); 0 where left out."""
         if self.short is not None:
-            height = self.short.long_waves(height)
+            height = self.short.long_waves(height, level=level)
         if self.long is not None:
-            height = height - self.long.long_waves(height)
+            height = height - self.long.long_waves(height, level=level)
         return np.where(self.kept, height - np.mean(height[self.kept]), 0.0)
 
-    def edge_errors(self, height: Doubles) -> list[Doubles]:
-        """Return the error, (H, W), by the weight that the L-filter misses at edges and holes."""
-        if self.long is None:
-            return []
-        height = height if self.short is None else self.short.long_waves(height)
-        waves = self.long.long_waves(height)[self.kept]
-        errors = np.where(self.kept, (1 - self.long.weight) * np.std(waves) * _UNIFORM, 0.0)
-        return [np.where(self.kept, errors - np.mean(errors[self.kept]), 0.0)]
+    @property
+    def filters(self) -> bool:
+        """Whether there is any filter."""
+        return self.short is not None or self.long is not None
 
 
 class _Evaluation:
@@ -264,6 +273,22 @@ class _Evaluation:
         parameters |= self.correlation.lengths(self.correlation.of(texture))
         parameters["Std"] = self._spectrum.direction(texture)
         return {name: parameters[name] for name in PARAMETERS if name in parameters}
+
+
+def _edge_changes(
+    chain: _Chain, evaluate: _Evaluation, height: Doubles, values: Mapping[str, float]
+) -> dict[str, float]:
+    """Return by how much parameters depend on how the filters continue at ends and holes.
+
+    Planes take up too much there, and means too little: values with a surface that continues are between.
+    """
+    if not chain.filters:
+        return {}
+    other = evaluate(chain.filtered(height, level=True))
+    return {
+        name: _EDGE_FACTORS.get(name, 1.0) * abs(difference(name, other[name], value))
+        for name, value in values.items()
+    }
 
 
 def _noise_changes(
@@ -291,22 +316,10 @@ def _noise_changes(
     cleaned = correlation.lengths(correlation.of(texture) - total)
     rest = max(1 - changes.noise_ratio, 1 - HOPELESS)
     for name, value in cleaned.items():  # the random error is larger relative to what is left
-        changes.bias[name] = math.hypot(values[name] - value, changes.random[name] * math.sqrt(rest**-2 - 1))
+        bias, random = values[name] - value, changes.random[name]
+        changes.bias[name] = math.hypot(bias, random * math.sqrt(rest**-2 - 1))
+        changes.clean[name] = value, math.hypot(random / rest, 2 * LEVEL * bias)
     return changes
-
-
-def _with_noise(parameters: dict[str, Quantity], noise: NoiseChanges) -> dict[str, Quantity]:
-    """Add the Sq of the noise, and that without it."""
-    quantities: dict[str, Quantity] = {}
-    for name, quantity in parameters.items():
-        quantities[name] = quantity
-        if name == "Sq":
-            square = quantity.value**2 - noise.level**2
-            value = math.sqrt(max(square, 0.0))
-            error = math.hypot(noise.square_spread, 2 * _LEVEL * noise.level**2)
-            quantities["Sq of noise"] = Quantity(noise.level, _LEVEL * noise.level, "µm")
-            quantities["Sq without noise"] = Quantity(value, math.sqrt(value**2 + error) - value, "µm")
-    return quantities
 
 
 def _notes(parameters: Mapping[str, Quantity], noise: NoiseChanges) -> list[str]:
@@ -315,9 +328,11 @@ def _notes(parameters: Mapping[str, Quantity], noise: NoiseChanges) -> list[str]
     levels = f"Sq is {measured:.3g} µm, and that of the noise {level:.3g} µm"
     if level > measured:
         return [
-            f"{levels}: the surface cannot be distinguished from a smooth one. Standard deviations of heights"
+            f"{levels}: {SMOOTH}. Standard deviations of heights"
             " are too large here, or describe errors that neighbours share"
         ]
+    if not noise.significant:
+        return [f"{levels}: {SMOOTH}"]
     if level**2 > _DOMINATES * measured**2:
-        return [f"{levels}: noise determines the texture parameters; 'Sq without noise' is the surface's own"]
+        return [f"{levels}: noise determines the texture; values 'without noise' are the surface's own"]
     return []

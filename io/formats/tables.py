@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
@@ -88,12 +88,13 @@ NPZ = Format(
 )
 
 
+_FORMULA = tuple("=+-@\t\r")
 _POINT_UNITS = dict.fromkeys(("x", "y", "z", "sigma"), "mm")  # columns of points; the others have no unit
 
 
 def save_table(
     path: str | Path,
-    columns: Mapping[str, NDArray[Any]],
+    columns: Mapping[str, NDArray[Any] | Sequence[str]],
     units: Mapping[str, str],
     notes: Mapping[str, str],
 ) -> None:
@@ -105,7 +106,7 @@ def save_table(
     Parameters
     ----------
     path : str or Path
-    columns : mapping of ndarray, (n,)
+    columns : mapping of ndarray, (n,), or sequence of str
         Columns by name.
     units : mapping of str
         Units of the columns that have one.
@@ -125,7 +126,9 @@ def save_table(
     write_new(Path(path), [_table(columns, units, notes)])
 
 
-def _table(columns: Mapping[str, NDArray[Any]], units: Mapping[str, str], notes: Mapping[str, str]) -> bytes:
+def _table(
+    columns: Mapping[str, NDArray[Any] | Sequence[str]], units: Mapping[str, str], notes: Mapping[str, str]
+) -> bytes:
     """Return the text of a table, see `save_table`."""
     text = _commented(notes)
     table = csv.writer(text, lineterminator="\n")
@@ -142,8 +145,15 @@ def _commented(notes: Mapping[str, str]) -> StringIO:
     return text
 
 
-def _cells(values: NDArray[Any]) -> Iterator[str]:
-    """Yield numbers with the precision of float32, and an empty text for NaN."""
+def _cells(values: NDArray[Any] | Sequence[str]) -> Iterator[str]:
+    """Yield numbers with the precision of float32, an empty text for NaN, and texts on one line.
+
+    Texts that a spreadsheet would take for a formula begin with an apostrophe.
+    """
+    if not isinstance(values, np.ndarray):
+        for text in values:
+            yield f"'{one_line(text)}" if text[:1] in _FORMULA else one_line(text)
+        return
     for value in values.tolist():
         yield "" if math.isnan(value) else f"{value:.9g}"
 

@@ -6,7 +6,7 @@ from height_maps import cap, places
 from scipy import ndimage
 
 from mirrorskin import io
-from mirrorskin.engine.metrology import fit_plane, fit_sphere
+from mirrorskin.engine.metrology import fit_plane, fit_polynomial, fit_sphere
 
 SHAPE, SIZE = (39, 51), (0.11, 0.13)
 NAN = np.nan
@@ -55,10 +55,52 @@ def test_a_plane_is_found_exactly():
 def test_distances_from_a_plane_are_at_right_angles_to_it():
     height = leaning()
     height[5, 7] += 0.02
-    plane = fit_plane(height, *axes())
+    plane = fit_plane(height, *axes(), robust=True)
     assert plane.outliers == 1
     assert plane.residual[5, 7] == pytest.approx(0.02 * np.cos(np.arctan(0.5)))
     assert np.count_nonzero(abs(plane.residual) > 1e-9) == 1
+
+
+def test_a_plane_is_that_of_least_squares_unless_it_is_robust():
+    height = leaning() + np.random.default_rng(2).normal(0, 0.001, SHAPE)
+    height[3:6, 40:45] += 0.5
+    x, y = places(SHAPE, SIZE)
+    rows = np.stack([np.ones(x.size), x.ravel(), y.ravel()], axis=1)
+    (_, p, q), *_ = np.linalg.lstsq(rows, height.ravel())
+    plain, robust = (fit_plane(height, *axes(), robust=robust) for robust in (False, True))
+    assert plain.tilt.value == pytest.approx(np.degrees(np.arctan(np.hypot(p, q))), rel=1e-9)
+    assert robust.tilt.value == pytest.approx(np.degrees(np.arctan(0.5)), rel=1e-4)
+    assert plain.outliers == robust.outliers == 15
+    assert abs(plain.tilt.value - robust.tilt.value) < 3 * plain.tilt.sigma
+
+
+@pytest.mark.parametrize("degree", [2, 3, 4])
+def test_a_polynomial_is_found_exactly_and_leaves_what_is_of_a_higher_degree(degree):
+    x, y = places(SHAPE, SIZE)
+    height = 2 + 0.1 * x - 0.02 * x * y + 0.03 * x**degree - 0.01 * x * y ** (degree - 1)
+    found = fit_polynomial(height, *axes(), degree=degree)
+    assert found.rms.value == pytest.approx(0, abs=1e-6)
+    assert found.range.value == pytest.approx(np.ptp(height), rel=1e-9)
+    more = fit_polynomial(height + 0.01 * np.sin(40 * x), *axes(), degree=degree)
+    assert more.rms.value == pytest.approx(10 / np.sqrt(2), rel=0.05)
+    with pytest.raises(io.InputError, match="no polynomial"):
+        fit_polynomial(height[:1], *io.pixel_axes((1, SHAPE[1]), SIZE), degree=degree)
+
+
+@pytest.mark.parametrize("degree", [2, 4])
+@pytest.mark.parametrize("kind", ["white", "alike", "integrated"])
+def test_uncertainties_of_a_polynomial_cover_what_went_wrong(kind, degree):
+    rng, (x, y) = np.random.default_rng(3), places(SHAPE, SIZE)
+    true = 0.05 * x + 0.02 * x**2 - 0.01 * x * y
+    range_, field = [], []
+    for _ in range(30):
+        height = true + 0.001 * noise(SHAPE, kind, rng)
+        found = fit_polynomial(height, *axes(), np.full(SHAPE, 0.001), degree=degree)
+        range_.append(((found.range.value - np.ptp(true)) / found.range.sigma) ** 2)
+        variance = sum(error**2 for error in found.errors)
+        field.append(np.mean((height - found.residual - true) ** 2) / np.mean(variance))
+    assert 0.3 < np.mean(range_) < 2
+    assert 0.3 < np.mean(field) < 2
 
 
 def test_a_level_plane_falls_nowhere():

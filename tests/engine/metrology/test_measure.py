@@ -184,7 +184,7 @@ def test_roughness_is_that_from_the_form(ball):
     filtered = engine.measure(result_of(ball.height + wave, SIZE), l_filter=0.4)
     assert filtered.quantities["Sq"].value == pytest.approx(measured["Sq"] * (1 - 0.5**4), rel=0.02)
     assert any("L-filter 0.4 mm" in note for note in filtered.notes)
-    assert any(note.startswith("pixels left out of texture") for note in filtered.notes)
+    assert not any(note.startswith("pixels left out of texture") for note in filtered.notes)
 
 
 def test_a_region_is_measured_alone(ball):

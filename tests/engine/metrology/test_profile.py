@@ -52,8 +52,24 @@ def test_holes_end_a_stretch_in_which_spacings_are_counted():
     assert values(heights)["PSm"] == pytest.approx(0.5, rel=1e-3)
 
 
-def test_without_two_rises_there_is_no_spacing():
+def test_without_a_peak_there_is_no_spacing():
     assert np.isnan(values(wave(length=50.0))["PSm"])
+
+
+def test_falls_count_in_the_spacing_and_half_an_element_is_doubled_with_its_uncertainty():
+    x = STEP * np.arange(160)
+    noise = [2e-5 * np.random.default_rng(seed).standard_normal(160) for seed in range(24)]
+    for phase in np.linspace(0, 6, 13):
+        parameters, _ = profile_parameters(0.002 * np.sin(2 * np.pi * x / 1.1 + phase), STEP, errors=noise)
+        spacing = parameters["PSm"]
+        assert spacing.value == pytest.approx(1.1, rel=0.35)
+        assert abs(spacing.value - 1.1) < 2 * spacing.sigma + 0.02
+
+
+def test_an_s_filter_removes_short_waves_of_a_profile():
+    heights = wave() + wave(length=0.03, amplitude=0.001)
+    assert values(heights, s_filter=0.12)["Pz"] == pytest.approx(4, rel=0.05)
+    assert values(heights, s_filter=0.12, l_filter=2.0)["Rz"] == pytest.approx(4, rel=0.1)
 
 
 def test_too_few_samples_are_refused():

@@ -1,11 +1,13 @@
 """Cross-sections, and steps, lengths and slopes along them, in closed form."""
 
+import contextlib
+
 import numpy as np
 import pytest
 from height_maps import cap, places, result_of
 
 from mirrorskin import engine, io
-from mirrorskin.engine.metrology import section, step_height
+from mirrorskin.engine.metrology import Section, groove, section, step_height
 
 SIZE = (0.1, 0.25)
 SHAPE = (21, 33)
@@ -197,3 +199,76 @@ def test_a_section_without_heights_is_refused():
     height = np.where(places(LONG, FINE)[0] < 0, 1.0, NAN)
     with pytest.raises(io.InputError, match="fewer than two measured heights"):
         measured(height, ((1.0, 0.0), (2.0, 0.0)))
+
+
+def waves_of(length, rng, shape, size):
+    """Return errors that are correlated over a length, as those of heights and slopes are."""
+    if not length:
+        return rng.standard_normal(shape)
+    rows, columns = (np.fft.fftfreq(2 * count) for count in shape)
+    power = (2 * np.sin(np.pi * rows[:, None])) ** 2 + (2 * np.sin(np.pi * columns)) ** 2
+    power = 1 / (power + (size[0] / length) ** 2)
+    field = np.fft.ifft2(np.fft.fft2(rng.standard_normal(power.shape)) * np.sqrt(power)).real
+    return field[: shape[0], : shape[1]] / np.sqrt(power.mean())
+
+
+@pytest.mark.parametrize("length", [0.0, 0.08])
+@pytest.mark.parametrize("width", [0.0, 0.2, 1.5])
+def test_steps_and_grooves_of_averaged_profiles_are_as_sure_as_they_say(length, width):
+    shape, size = (90, 160), (0.02, 0.02)
+    x, _ = places(shape, size)
+    forms = {"groove": 0.01 * x - 0.02 * (np.abs(x) < 0.3), "step": 0.01 * x + 0.02 * (x > 0.1)}
+    pulls: dict[str, list[float]] = {}
+    for seed in range(24):
+        error = 0.001 * waves_of(length, np.random.default_rng(seed), shape, size)
+        for name, height in forms.items():
+            result = result_of(height + error, size, sigma=0.001, fitted=io.Fitted(height_correlation=length))
+            line = section(result, (-1.2, 0.1), (1.2, 0.1), width=width)
+            if name == "groove":
+                slot = groove(line)
+                assert slot.width.value == pytest.approx(0.6, abs=0.03)
+                assert slot.place.value == pytest.approx(1.2, abs=0.03)
+                rise, slope = slot.depth, slot.slope
+            else:
+                stair = step_height(line)
+                rise, slope = stair.height, stair.slope
+            pulls.setdefault(name, []).append((rise.value - 0.02 * np.cos(np.arctan(0.01))) / rise.sigma)
+            pulls.setdefault("slope", []).append((slope.value - np.degrees(np.arctan(0.01))) / slope.sigma)
+    chi2 = {name: float(np.mean(np.square(values))) for name, values in pulls.items()}
+    assert all(0.25 < value < 2 for value in chi2.values()), chi2
+
+
+def test_a_groove_is_that_of_the_standard():
+    # A round bottom and rounded walls: only the middle third, and the sides from a third of the width, count.
+    t = 0.01 * np.arange(400)
+    away = np.abs(t - 2.0)
+    walls = np.clip((0.5 - away) / 0.1 + 0.5, 0, 1)
+    slot = groove(Section(t, t, 0 * t, 0.3 - 0.1 * walls + 0.02 * t, 0 * t, t < 0))
+    assert slot.depth.value == pytest.approx(0.1 * np.cos(np.arctan(0.02)), rel=1e-6)
+    assert slot.width.value == pytest.approx(1.0, abs=0.02)
+    ridge = groove(Section(t, t, 0 * t, 0.1 * walls, 0 * t, t < 0))
+    assert ridge.depth.value == pytest.approx(-0.1)
+
+
+def test_what_is_uneven_has_no_groove():
+    rng, found = np.random.default_rng(3), 0
+    t = 0.02 * np.arange(200)
+    for _ in range(40):
+        white = np.convolve(rng.standard_normal(400), np.exp(-(np.linspace(-2, 2, 31) ** 2)), "same")[:200]
+        with contextlib.suppress(io.InputError):
+            groove(Section(t, t, 0 * t, white, 0 * t + 0.01, t < 0))
+            found += 1
+    assert found == 0
+    with pytest.raises(io.InputError, match="a step fits it better"):
+        groove(Section(t, t, 0 * t, 0.1 * (t > 2.0), 0 * t, t < 0))
+
+
+def test_an_averaged_section_is_the_mean_of_parallel_ones():
+    x, y = places((61, 81), (0.1, 0.2))
+    height = 0.3 * x + 0.1 * y**2
+    result = result_of(height, (0.1, 0.2))
+    line = section(result, (-2.0, 1.0), (2.0, 1.0), width=2.0)
+    offsets = np.linspace(-0.9, 0.9, 10)
+    for place, mean in zip(line.x, line.height, strict=True):
+        lines = [section(result, (place, 1 + o), (place + 0.1, 1 + o)).height[0] for o in offsets]
+        assert mean == pytest.approx(np.mean(lines), abs=1e-6)

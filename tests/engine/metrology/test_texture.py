@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from height_maps import places
+from scipy import ndimage
 
 from mirrorskin import io
 from mirrorskin.engine.metrology import roughness
+from mirrorskin.engine.metrology.filters import Gaussian
 
 NAN = np.nan
 
@@ -42,10 +44,43 @@ def test_the_filter_has_the_transmission_of_the_standard(transmission, upright):
     if upright:
         height, size = np.ascontiguousarray(height.T), (0.02, 0.02)
     cutoff = 0.4 / transmission
-    result = roughness(height, size, l_filter=cutoff)
+    chain = Gaussian.of(np.ones(height.shape, bool), size, cutoff)
+    inside = chain.weight > 0.9999
     passed = 1 - np.exp(-np.log(2) / transmission**2)
-    assert result.sz.value == pytest.approx(10 * passed, rel=2e-3)
-    assert 0 < result.left_out < height.size / 2
+    assert np.ptp((height - chain.long_waves(height))[inside]) == pytest.approx(0.01 * passed, rel=2e-3)
+    assert roughness(height, size, l_filter=cutoff).left_out == 0
+
+
+def test_a_filter_keeps_planes_at_ends_and_holes():
+    x, y = places((60, 80), (0.02, 0.03))
+    measured = (np.hypot(x, y) < 0.85) & (np.hypot(x - 0.3, y) > 0.2)
+    plane = np.where(measured, 7.0 + 0.3 * x - 0.2 * y, NAN)
+    for level, tolerance in ((False, 1e-6), (True, np.inf)):
+        smooth = Gaussian.of(measured, (0.03, 0.02), 0.5).long_waves(plane, level=level)
+        assert np.abs(smooth - plane)[measured].max() < tolerance
+
+
+@pytest.mark.parametrize("round_field", [False, True])
+@pytest.mark.parametrize("cutoff", [0.3, 0.8])
+def test_the_whole_field_counts_and_its_edges_are_as_uncertain_as_they_are(cutoff, round_field):
+    size, chi2 = (0.01, 0.01), {}
+    x, y = places((120, 160), size)
+    measured = (np.hypot(x / 0.78, y / 0.58) < 1) if round_field else np.ones(x.shape, bool)
+    for seed in range(8):
+        white = np.random.default_rng(seed).standard_normal((2, 360, 400))
+        large = ndimage.gaussian_filter(white[0], 3, mode="wrap")
+        large += 12 * ndimage.gaussian_filter(white[1], 12, mode="wrap")
+        large *= 1e-3 / large.std()
+        waves = Gaussian.of(np.ones(large.shape, bool), size, cutoff).long_waves(large)
+        field = slice(120, 240), slice(120, 280)
+        true = roughness(np.where(measured, (large - waves)[field], NAN), size).parameters
+        found = roughness(np.where(measured, large[field], NAN), size, l_filter=cutoff)
+        assert found.left_out == 0
+        for name in ("Sa", "Sq", "Sk", "Vmc", "Sal"):
+            error = found.parameters[name].value - true[name].value
+            chi2.setdefault(name, []).append((error / found.budget[name]["filter edges"]) ** 2)
+    medians = {name: np.median(values) for name, values in chi2.items()}
+    assert all(0.1 < value < 2.5 for value in medians.values()), medians
 
 
 def test_the_filter_takes_sizes_along_x_and_y_for_what_they_are():
