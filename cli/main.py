@@ -52,7 +52,7 @@ PURPOSES = {
     "batch": "Reconstruct many recordings.",
     "app": "Show recordings and results in the browser: click, change options, measure, save.",
     "view": "Show the maps of a result, a section and a histogram of heights.",
-    "measure": "Measure a height map: heights, areas, volumes, plane or sphere, texture, profiles, steps.",
+    "measure": "Measure height maps: heights, areas, volumes, forms, texture, profiles, steps, grooves.",
     "report": "Write a page with pictures, numbers and the surface.",
     "export": "Write a result as meshes, points, surface files, pictures, tables or arrays.",
     "score": "Compare a result with the ground truth of a simulation.",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.groups import Argument, ExistingPath, Option
 from mirrorskin.cli.output import print_json, print_table, printable
 from mirrorskin.cli.stack import STACK
 from mirrorskin.io.formats.registry import surfaces
@@ -128,6 +128,7 @@ def command(
     **chosen: Annotated[Any, STACK.only("region")],
 ) -> None:
     """Measure height maps: heights, areas, volumes, forms, texture, profiles, steps, grooves."""
+    paths = _paths(results)
     from mirrorskin import engine, io
     from mirrorskin.cli import quantity
 
@@ -148,7 +149,6 @@ def command(
         "section_width": length(section_width, "--section-width") or 0.0,
         "noise_length": length(noise_length, "--noise-length"),
     }
-    paths = _paths(results)
     if len(paths) > 1 or output or allowed or chart:
         table = engine.metrology.table(_Opened(paths, turn), limits=allowed, **how)
         _report_table(table, expanded, as_json)
@@ -197,16 +197,16 @@ def _write_table(table: Table, output: Path | None, chart: Path | None) -> None:
 
 
 def _paths(words: list[str]) -> list[Path]:
-    """Return the files that words or patterns name."""
-    from mirrorskin.io import InputError
-
+    """Return the files and addresses that words or patterns name."""
     paths: list[Path] = []
     for word in words:
         if os.path.lexists(word) or not glob.has_magic(word):
-            paths.append(Path(word))
+            paths.append(ExistingPath().convert(word, None, None))
             continue
         matches = sorted(glob.glob(word, recursive=True))  # noqa: PTH207  # paths may be absolute
         if not matches:
+            from mirrorskin.io import InputError
+
             raise InputError(f"{word}: no file matches. Name results")
         paths += map(Path, matches)
     return paths

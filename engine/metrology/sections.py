@@ -417,7 +417,6 @@ class _Levels:
     measured: Mask
     distance: Doubles
     height: Doubles
-    what: str
 
     @classmethod
     def of(cls, section: Section, what: str) -> _Levels:
@@ -427,7 +426,7 @@ class _Levels:
                 f"a {what} needs at least {2 * _MIN_SAMPLES} measured samples along the section:"
                 " cut elsewhere"
             )
-        return cls(section, measured, section.distance[measured], section.height[measured], what)
+        return cls(section, measured, section.distance[measured], section.height[measured])
 
     def fit(self, kept: Mask, upper: Mask, place: float) -> tuple[Quantity, Quantity]:
         """Return the height of the second level above the first one, mm, and the slope of both."""
@@ -447,7 +446,7 @@ class _Levels:
         coefficients, *_ = np.linalg.lstsq(cubic, z, rcond=None)
         if np.sum((z - coefficients @ cubic.T) ** 2) < rest:
             raise InputError(
-                f"there is no {self.what} along the section: a smooth curve fits it better than two levels"
+                "there is no step along the section: a smooth curve fits it better than two levels"
             )
         slope, rise = float(parameters[1]), float(parameters[2])
         across = math.sqrt(1 + slope**2)

@@ -59,8 +59,10 @@ def test_everything_is_measured_alike(kind, tmp_path):
     assert actual.notes == expected.notes
     for name, quantity in expected.quantities.items():
         same = actual.quantities[name]
-        assert same.value == pytest.approx(quantity.value, rel=1e-5, abs=1e-9, nan_ok=True), name
-        assert same.sigma == pytest.approx(quantity.sigma, rel=1e-5, abs=1e-9, nan_ok=True), name
+        # Without the noise, differences of two larger numbers are left.
+        close = 1e-3 if name.endswith("without noise") else 1e-5
+        assert same.value == pytest.approx(quantity.value, rel=close, abs=1e-9, nan_ok=True), name
+        assert same.sigma == pytest.approx(quantity.sigma, rel=close, abs=1e-9, nan_ok=True), name
     np.testing.assert_allclose(
         section(as_kind(result, kind, tmp_path), *ends).height, section(result, *ends).height, rtol=1e-6
     )
