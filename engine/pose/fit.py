@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
+from mirrorskin.engine.pose.correlation import SIDE, Relief, starts, turned_starts, working_pixel
 from mirrorskin.engine.pose.maps import PoseMap, coarser
 from mirrorskin.engine.pose.motion import STILL, Motion, cross_matrix
 from mirrorskin.io import InputError
@@ -23,6 +24,8 @@ from mirrorskin.kernels.skin.pose import BLOCK, PARTS
 
 FEWEST_SHARED = 20
 """Smallest number of pixels that two maps must share."""
+MIN_COMMON = 0.2
+"""Smallest share of the smaller map's pixels that two maps must share to be compared."""
 
 _UPPER = np.zeros((6, 6), np.intp)  # index of each element of a symmetric matrix in the upper triangle
 _UPPER[np.triu_indices(6)] = _UPPER.T[np.triu_indices(6)] = np.arange(21)
@@ -33,8 +36,12 @@ _COARSEST = 24  # pixels along the shorter side of the coarsest maps
 _MAX_STEPS, _LAST_STEP = 40, 1e-2  # maximum number of steps; step, in standard deviations, that ends them
 _BLOCKS = 100  # weight, in blocks, of the covariance of independent errors
 _POOR = 2.0  # typical chi square above which other starts are tried
-_ANGLES, _SHIFTS, _TRIED = 24, 13, 6  # starts of the search: rotations, shifts per axis, and number refined
-_REACH, _MIN_COMMON = 0.8, 0.2  # maximum shift relative to the map's extent; minimum share of common pixels
+_ANGLES, _SHIFTS, _TRIED = 24, 13, 6  # starts of the grid: rotations, shifts per axis, and number refined
+_REACH = 0.8  # maximum shift relative to the map's extent
+_FINAL_STEPS = 200  # maximum number of steps at the chosen motion: they are short where pixels are coarse
+_BETTER = 0.95  # chi square, relative to that of starts that are preferred, below which other ones are taken
+_OTHER = 3.0  # pixels by which motions differ
+_GOOD = 1.3  # typical chi square below which no further start is tried
 _NONE = np.zeros((6, 0))
 _MAX_STEP = 0.35  # longest step, relative to the object's size
 
@@ -174,30 +181,65 @@ class PairFit:
     def solve(self, start: Motion | None = None, near: bool = False) -> tuple[Motion, Equations, Doubles]:
         """Return the motion, its equations, and the directions that they do not determine.
 
-        Without a start, the identity and a grid of motions are tried. A ``near`` start needs no coarse maps.
+        Without a start, the identity is tried, then a search. A ``near`` start needs no coarse maps.
         """
         levels = [self] if near else self._levels()
         motion, typical = self._descend(levels, start or STILL)
-        if start is None and not typical < _POOR:
-            other, other_typical = self._descend(levels, levels[-1].search())
+        for searched, guesses in self._searches() if start is None and not typical < _POOR else ():
+            other, other_typical, _ = self._best_of(searched, guesses)
             if other_typical < typical:
-                motion = start = other
+                motion, typical, start, levels = other, other_typical, other, searched
+            if typical < _POOR:
+                break
         if motion is None:
             raise InputError("the two maps share too few pixels: give a start, or results that overlap")
+        return self._determined(levels, motion, start or STILL)
+
+    def solve_from(self, far: Sequence[Motion], near: Sequence[Motion]) -> tuple[Motion, Equations, Doubles]:
+        """Return what `solve` does for the best of some starts: refined from coarse maps, or as precise."""
+        coarse, fine = self._levels(), self._levels(working_pixel((self.first, self.second), SIDE))
+        solutions = [
+            (*self._best_of(levels, starts), levels) for levels, starts in ((coarse, far), (fine, near))
+        ]
+        better = len(far) == 0 or not solutions[0][1] * _BETTER < solutions[1][1]
+        motion, _, start, levels = solutions[int(better)]
+        if motion is None:
+            raise InputError("the two maps share too few pixels: give a start, or results that overlap")
+        return self._determined(levels, self.refine(motion, steps=_FINAL_STEPS) or motion, start)
+
+    def rival(self, motion: Motion, starts: Sequence[Motion]) -> Motion | None:
+        """Return a motion refined from some starts that fits about as well as one from which it differs."""
+        levels = self._levels(working_pixel((self.first, self.second), SIDE))
+        middle, pixel = self.first.extent.middle, max(self.first.grid[2:])
+        limit = self.equations(motion).typical / _BETTER
+        for start in starts:
+            other, typical = self._descend(levels, start)
+            if other is None or typical > limit or not self.shares_enough(other):
+                continue
+            if np.linalg.norm(other.apply(middle) - motion.apply(middle)) > _OTHER * pixel:
+                return other
+        return None
+
+    def _determined(
+        self, levels: list[PairFit], motion: Motion, start: Motion
+    ) -> tuple[Motion, Equations, Doubles]:
+        """Return a motion, as its start along undetermined directions, and what `solve` returns."""
         now = self.equations(motion, unbiased=True)
         free = now.free()
         if free.shape[1] == 6:
             raise InputError("the maps determine no motion: the surface is too plain for its noise")
         if free.shape[1]:
-            motion = self._descend(levels, start or STILL, free)[0] or motion
+            motion = self._descend(levels, start, free)[0] or motion
             now = self.equations(motion, unbiased=True)
         return motion, now, free
 
-    def _levels(self) -> list[PairFit]:
-        """Return the maps from fine to coarse."""
+    def _levels(self, coarsest: float = math.inf) -> list[PairFit]:
+        """Return the maps from fine to coarse, with pixels of at most ``coarsest`` mm."""
         levels = [self]
         for first, second in coarser([self.first, self.second], _COARSEST):
             if min(first.extent.pixels, second.extent.pixels) < FEWEST_SHARED:
+                break
+            if max(first.grid[2:]) > 1.5 * coarsest:
                 break
             levels.append(PairFit(first, second, self.device))
         return levels
@@ -212,14 +254,45 @@ class PairFit:
                 motion = level.refine(motion, free)
         return motion, math.inf if motion is None else self.equations(motion).typical
 
-    def search(self) -> Motion | None:
-        """Return the best motion from a grid of rotations about z and shifts."""
+    def _searches(self) -> Iterator[tuple[list[PairFit], list[Motion]]]:
+        """Yield starts without a guess, the fastest first, and the maps by which to refine them."""
+        pixel = working_pixel((self.first, self.second), SIDE)
+        levels = self._levels(pixel)
+        first, second = (Relief.of(map_, pixel) for map_ in (self.first, self.second))
+        yield levels, [start.motion for start in starts(first, second, MIN_COMMON)]
+        coarse = self._levels()
+        yield coarse, coarse[-1]._from_grid()
+        yield levels, [start.motion for start in turned_starts(self.first, self.second, MIN_COMMON)]
+
+    def _best_of(
+        self, levels: list[PairFit], starts: Sequence[Motion]
+    ) -> tuple[Motion | None, float, Motion]:
+        """Refine motions from some starts; return the best, its typical chi square, and its start."""
+        best, lowest, origin = None, math.inf, STILL
+        for start in starts:
+            motion, typical = self._descend(levels, start)
+            if motion is not None and typical < lowest and self.shares_enough(motion):
+                best, lowest, origin = motion, typical, start
+            if lowest < _GOOD:
+                break
+        return best, lowest, origin
+
+    def shares_enough(self, motion: Motion) -> bool:
+        """Return whether the maps share a fifth of the smaller one's pixels."""
+        fewest = min(self.first.extent.pixels, self.second.extent.pixels)
+        return self.equations(motion).pixels > MIN_COMMON * fewest
+
+    def _from_grid(self) -> list[Motion]:
+        """Return the best motions of a grid of rotations about z and shifts, after a step of Gauss-Newton.
+
+        It finds smooth forms, which differ by little from pixel to pixel, where a correlation has no peak.
+        """
         candidates: list[tuple[float, Motion]] = []
         scale = _scale_of(self.second.extent.size)
-        for starts in self._starts():
-            sums = self._sums(starts).sum(axis=1, dtype=np.float64)
+        for grid in self._grid():
+            sums = self._sums(grid).sum(axis=1, dtype=np.float64)
             upper, right, chi, compared, heights, normals = _split(sums)
-            overlap = np.maximum(heights, normals)[:, 0] > _MIN_COMMON * self.first.extent.pixels
+            overlap = np.maximum(heights, normals)[:, 0] > MIN_COMMON * self.first.extent.pixels
             matrix, slope = _symmetric(upper[overlap], scale), right[overlap] * scale
             matrix += (
                 _MIN_INFORMATION
@@ -229,18 +302,11 @@ class PairFit:
             )
             gain = np.vecdot(slope, np.linalg.solve(matrix, slope[..., np.newaxis])[..., 0])
             merit = (chi[overlap, 0] - gain) / np.maximum(compared[overlap, 0], 1e-9)
-            candidates += zip(merit, itertools.compress(starts, overlap), strict=True)
+            candidates += zip(merit, itertools.compress(grid, overlap), strict=True)
         candidates.sort(key=lambda candidate: candidate[0])
-        best, lowest = None, math.inf
-        for _, start in candidates[:_TRIED]:
-            motion = self.refine(start)
-            if motion is not None:
-                now = self.equations(motion)
-                if now.pixels > _MIN_COMMON * self.first.extent.pixels and now.typical < lowest:
-                    best, lowest = motion, now.typical
-        return best
+        return [motion for _, motion in candidates[:_TRIED]]
 
-    def _starts(self) -> Iterator[list[Motion]]:
+    def _grid(self) -> Iterator[list[Motion]]:
         """Yield the motions with each rotation."""
         extent, shifts = np.ptp(self.first.points, axis=0), np.linspace(-_REACH, _REACH, _SHIFTS)
         for angle in np.linspace(0, 2 * math.pi, _ANGLES, endpoint=False):
@@ -250,9 +316,9 @@ class PairFit:
                 Motion(turn, middle + np.array([along, up, 0]) * extent) for along in shifts for up in shifts
             ]
 
-    def refine(self, motion: Motion, free: Doubles = _NONE) -> Motion | None:
+    def refine(self, motion: Motion, free: Doubles = _NONE, steps: int = _MAX_STEPS) -> Motion | None:
         """Refine a motion until steps outside of the free directions are small; None without overlap."""
-        for _ in range(_MAX_STEPS):
+        for _ in range(steps):
             now = self.equations(motion, unbiased=not free.size)
             if now.pixels < FEWEST_SHARED:
                 return None

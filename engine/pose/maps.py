@@ -74,10 +74,20 @@ class PoseMap:
     extent: Extent
 
     @classmethod
-    def of(cls, result: Result, pixel_size: ArrayLike | None, device: Device, curved: bool = True) -> PoseMap:
-        """Return the map of a result; without ``curved`` the second derivatives are 0."""
+    def of(
+        cls,
+        result: Result,
+        pixel_size: ArrayLike | None,
+        device: Device,
+        curved: bool = True,
+        spiky: bool = True,
+    ) -> PoseMap:
+        """Return the map of a result; without ``curved`` the second derivatives are 0.
+
+        Spikes are left out, unless ``spiky`` is False.
+        """
         grid = _grid(result, pixel_size)
-        records = _records(result, grid, device, curved)
+        records = _records(result, grid, device, curved, spiky)
         (extent,) = _extents([(records, grid)])
         if not extent.compared:
             raise InputError(
@@ -157,7 +167,7 @@ def _grid(result: Result, pixel_size: ArrayLike | None) -> Grid:
     return float(x[0]), float(y[0]), float(x[1] - x[0]), float(y[0] - y[1])
 
 
-def _records(result: Result, grid: Grid, device: Device, curved: bool) -> Array:
+def _records(result: Result, grid: Grid, device: Device, curved: bool, spiky: bool) -> Array:
     """Return the records of a result's maps on a device."""
 
     def map_of(quantity: str, dtype: DTypeLike, *components: int) -> Operand | None:
@@ -167,7 +177,7 @@ def _records(result: Result, grid: Grid, device: Device, curved: bool) -> Array:
     pixels, (_, _, step_x, step_y) = rows * columns, grid
     height, normals = map_of("height", np.float32), map_of("normals", np.float32, 3)
     sigma = map_of("height_sigma", np.float32)
-    for _ in range(2 if sigma is not None else 0):  # the second time, next to spikes
+    for _ in range(2 if spiky and sigma is not None else 0):  # the second time, next to spikes
         clean = device.array("clean", shape, np.float32, zeroed=False)
         _run(
             device, "pose_spikes", rows, columns,

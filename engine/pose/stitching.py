@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Sequence
@@ -10,17 +11,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from mirrorskin.engine.base.inputs import Maps, as_result
 from mirrorskin.engine.base.provenance import signature
-from mirrorskin.engine.base.resample import SamplePoints
-from mirrorskin.engine.pose.fit import PairFit
+from mirrorskin.engine.base.resample import SamplePoints, fill_with_nearest
 from mirrorskin.engine.pose.maps import PoseMap
-from mirrorskin.engine.pose.motion import STILL, Motion
-from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
+from mirrorskin.engine.pose.motion import Motion
+from mirrorskin.engine.pose.pose import Pose
+from mirrorskin.engine.pose.pose_graph import PoseGraph, Poses, part
 from mirrorskin.io import InputError, Result, select_turn
-from mirrorskin.io.base.findings import Finding, carried, with_findings
+from mirrorskin.io.base.findings import Finding, carried, in_process, with_findings
 from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.io.model.maps import StitchStatus, status_of
 from mirrorskin.kernels.array_types import Doubles
@@ -28,13 +28,14 @@ from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE, second_differences
 from mirrorskin.kernels.skin.pose_maps import SHARPEST
 
-_MIN_COMMON = 0.2  # smallest share of the smaller map's pixels that two touches must have in common
-_MAX_CHI2 = 4.0  # largest chi square of a link between two touches
-_POSE_ITERATIONS, _NEWTON_STEPS = 5, 8  # steps for the poses, and for a height along z
-_LEVELLINGS = 3  # iterations for a touch of unknown offset, because positions of pixels depend on the height
+_NEWTON_STEPS, _LAST_STEP = 8, 1e-9  # steps for a height along z, and the step, mm, that ends them
+_LEVELLINGS = 3  # iterations for touches of unknown offset, because positions of pixels depend on the height
 _DISAGREEMENT_Z_SCORE = 4.0  # sigmas between a touch and the mean above which they disagree
+_ALONE = 1 - 1e-6  # share of the weight above which a touch is the only one
+_SAME_NOISE = 0.7, 1.4  # chi square of touches whose noise is that of their second differences
+_MAX_DIFFERING = 0.02  # share of pixels with several touches that differ, above which there is a warning
+_MAX_SPIKES = 0.9  # share of pixels that must remain without spikes
 _LARGEST = 1 << 28  # largest number of pixels of the stitched surface
-_UNFIT = 1e-9  # smallest information of a direction, relative to the largest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,24 +63,30 @@ def stitch(
     results: Sequence[Maps],
     pixel_size: ArrayLike | None = None,
     *,
+    offsets: ArrayLike | None = None,
     names: Sequence[str] | None = None,
     device: str | Device | None = None,
 ) -> Stitch:
     """Merge the maps of several touches of one object into one larger surface.
 
-    The motion from each touch to the next is estimated by `mirrorskin.engine.pose.estimate_pose`, then the
-    motions between all others that share a fifth of their pixels. The poses are a least-squares fit to all
-    motions, weighted by their covariances (a pose graph: Lu and Milios, Autonomous Robots 4, 1997). Heights
-    of all touches are then resampled to the pixels of the first, and merged by inverse-variance weighting.
+    The touches may be in any order. The motions between pairs that share a fifth of their pixels or more are
+    estimated as in `mirrorskin.engine.pose.estimate_pose`, with starts from the correlation of their heights.
+    The poses are a least-squares fit to all motions, weighted by their covariances (a pose graph: Lu and
+    Milios, Autonomous Robots 4, 1997), so that loops of touches close. Heights of all touches are then
+    resampled to the pixels of the first, and merged by inverse-variance weighting.
 
     Parameters
     ----------
     results : sequence of Result, mapping, xarray.Dataset or path
-        Two or more, each with heights, the maps for `estimate_pose`, and an overlap with an earlier one.
-        An unknown offset of heights is determined from the overlap. Where heights have no standard
+        Two or more, each with heights, the maps for `estimate_pose`, and an overlap with another one.
+        Unknown offsets of heights are determined from all overlaps together. Where heights have no standard
         deviations, as those of another program's surface, their noise is estimated, with a warning.
     pixel_size : float or (float, float), optional
         Millimetres along x and y; by default that of the results.
+    offsets : array_like, (2,) or (n - 1, 2), optional
+        Position of the centre of each field, mm along x and y, relative to the field before it: one pair for
+        all, or one for each field after the first. They may be wrong by a tenth of the field. By default,
+        positions are searched.
     names : sequence of str, optional
         Names of the results in messages, by default their paths or numbers.
     device : str or Device, optional
@@ -88,7 +95,7 @@ def stitch(
     Raises
     ------
     mirrorskin.io.InputError
-        Fewer than two results, one that does not overlap earlier ones, or maps that `estimate_pose` refuses.
+        Fewer than two results, one that does not overlap the others, or maps that `estimate_pose` refuses.
 
     Examples
     --------
@@ -116,24 +123,43 @@ def stitch(
     touches = [
         select_turn(as_result(result, name), None) for result, name in zip(results, names, strict=True)
     ]
+    places = None if offsets is None else _each_offset(offsets, len(results))
     opened = open_device(device)
-    maps = []
     relative = bool(np.any(touches[0].offset_unknown)) if touches[0].offset_unknown is not None else False
+    bare = [touch.height_sigma is None for touch in touches]
     touches = [_comparable(touch, name) for touch, name in zip(touches, names, strict=True)]
+    maps = []
     for touch, name in zip(touches, names, strict=True):
         try:
-            maps.append(PoseMap.of(touch, pixel_size, opened))
+            maps.append(_map_of(touch, pixel_size, opened))
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
-    graph = _Graph(maps, names, opened)
-    poses = graph.solve()
-    merged = _merged(touches, maps, poses, names)
+    graph = PoseGraph(maps, names, opened, places)
+    found = graph.solve()
+    touches = [
+        _with_noise(touch, graph.differences(number)) if is_bare else touch
+        for number, (touch, is_bare) in enumerate(zip(touches, bare, strict=True))
+    ]
+    merged = with_findings(_merged(touches, maps, found, names), *found.findings)
     if relative and merged.offset_unknown is None:
         piece = np.where(np.isfinite(merged.height), 0, -1).astype(np.int32)
         merged = merged.assign(component=piece, offset_unknown=np.ones(1, np.uint8))
     inherited = carried({}, **{str(name): touch.process for name, touch in zip(names, touches, strict=True)})
     merged = merged.assign(process={**merged.process, **inherited})
-    return Stitch(merged, tuple(poses), len(graph.links))
+    return Stitch(merged, found.poses, len(graph.links))
+
+
+def _each_offset(offsets: ArrayLike, count: int) -> list[tuple[float, float]]:
+    """Return the offset of each touch after the first."""
+    try:
+        pairs = np.asarray(offsets, np.float64).reshape(-1, 2)
+    except (TypeError, ValueError):
+        pairs = np.zeros((0, 2))
+    if len(pairs) not in (1, count - 1) or not np.isfinite(pairs).all():
+        raise InputError(
+            f"offsets {offsets!r:.60}: give x and y in mm, once or {count - 1} times for {count} results"
+        )
+    return [(float(x), float(y)) for x, y in np.broadcast_to(pairs, (count - 1, 2))]
 
 
 def _comparable(touch: Result, name: str) -> Result:
@@ -152,129 +178,33 @@ def _comparable(touch: Result, name: str) -> Result:
     bend = bend[np.isfinite(bend)]
     rounding = float(np.finfo(np.float32).eps * np.nanmax(np.abs(height)))
     noise = max(math.sqrt(float(np.median(bend**2)) / MEDIAN_SQUARE) if bend.size else 0.0, rounding)
-    text = (
-        f"no standard deviations of heights: a noise of {noise:.2g} mm is estimated from second differences,"
-        " without errors that neighbours share"
-    )
     sigma = np.where(np.isfinite(height), np.float32(noise), np.float32(np.nan))
     if touch.offset_unknown is not None and touch.offset_unknown.size == 1:
         touch = touch.assign(component=None, offset_unknown=None)
+    return touch.assign(height_sigma=sigma)
+
+
+def _with_noise(touch: Result, chi_square: float) -> Result:
+    """Return a touch of estimated noise with a warning, and with the noise by which touches differ.
+
+    The second differences of a rough surface are not of noise alone.
+    """
+    assert touch.height_sigma is not None
+    source, sigma = "second differences", touch.height_sigma
+    if not _SAME_NOISE[0] < chi_square < _SAME_NOISE[1]:
+        source, sigma = "the differences of overlapping results", sigma * np.float32(math.sqrt(chi_square))
+    text = (
+        f"no standard deviations of heights: a noise of {np.nanmax(sigma):.2g} mm is estimated from {source},"
+        " without errors that neighbours share"
+    )
     return with_findings(touch.assign(height_sigma=sigma), Finding("no sigma", text))
 
 
-class _Graph:
-    """A pose graph: touches, and the motions between pairs of them."""
-
-    def __init__(self, maps: Sequence[PoseMap], names: Sequence[str], device: Device) -> None:
-        self._maps, self._device = maps, device
-        self.links: dict[tuple[int, int], Pose] = {}
-        self._motions = [STILL]
-        for new in range(1, len(maps)):
-            self._join(new, names)
-        for first in range(len(maps)):
-            for second in range(first + 1, len(maps)):
-                if (first, second) not in self.links:
-                    self._compare(first, second)
-
-    def _join(self, new: int, names: Sequence[str]) -> None:
-        """Link a touch to the latest earlier one with enough overlap."""
-        for old in range(new - 1, -1, -1):
-            fit = PairFit(self._maps[old], self._maps[new], self._device)
-            try:
-                pose = pose_of(fit, *fit.solve())
-            except InputError:
-                continue
-            if self._is_link(pose, old, new):
-                self.links[old, new] = pose
-                self._motions.append(self._motions[old].then(pose.motion))
-                return
-        raise InputError(f"{names[new]} shares too little with those before it: give results that overlap")
-
-    def _compare(self, first: int, second: int) -> None:
-        """Link two touches if they overlap at their current poses, and agree there."""
-        start = self._motions[first].inverse().then(self._motions[second])
-        fit = PairFit(self._maps[first], self._maps[second], self._device)
-        if fit.equations(start).pixels < _MIN_COMMON * self._smaller(first, second):
-            return
-        try:
-            pose = pose_of(fit, *fit.solve(start, near=True))
-        except InputError:
-            return
-        if self._is_link(pose, first, second):
-            self.links[first, second] = pose
-
-    def _smaller(self, *numbers: int) -> int:
-        return min(self._maps[number].extent.pixels for number in numbers)
-
-    def _is_link(self, pose: Pose, first: int, second: int) -> bool:
-        return pose.chi_square < _MAX_CHI2 and pose.pixels >= _MIN_COMMON * self._smaller(first, second)
-
-    def solve(self) -> list[Pose]:
-        """Return the motion from the first touch to each, by least squares over all links."""
-        count, motions = 6 * (len(self._maps) - 1), self._motions
-        for _ in range(_POSE_ITERATIONS):
-            normal, gradient = np.zeros((count, count)), np.zeros(count)
-            for (first, second), link in self.links.items():
-                between = motions[first].inverse().then(motions[second])
-                error = link.motion.inverse().then(between)
-                rest = np.concatenate([Rotation.from_matrix(error.turn).as_rotvec(), error.shift])
-                weight = _information(link)
-                parts = {first: -between.adjoint(), second: np.eye(6)}
-                for i, jacobian_i in parts.items():
-                    for k, jacobian in parts.items():
-                        if i and k:
-                            normal[_part(i), _part(k)] += jacobian_i.T @ weight @ jacobian
-                    if i:
-                        gradient[_part(i)] -= jacobian_i.T @ weight @ rest
-            covariance = np.linalg.pinv(normal, _UNFIT, hermitian=True)
-            step = (covariance @ gradient).reshape(-1, 6)
-            steps = zip(motions[1:], step, strict=True)
-            motions = [STILL, *(motion.small_step(d, np.zeros(3)) for motion, d in steps)]
-        poses = [IDENTITY]
-        for number, motion in enumerate(motions[1:], 1):
-            link = next(pose for (_, second), pose in self.links.items() if second == number)
-            poses.append(
-                replace(
-                    link,
-                    rotation=np.asarray(Rotation.from_matrix(motion.turn).as_rotvec()),
-                    translation=motion.shift,
-                    covariance=np.asarray(covariance[_part(number), _part(number)], np.float64),
-                )
-            )
-        return poses
-
-
-def _part(number: int) -> slice:
-    return slice(6 * number - 6, 6 * number)
-
-
-def _information(pose: Pose) -> Doubles:
-    """Return the inverse of a pose's covariance, 0 along undetermined directions."""
-    variance = np.diag(pose.covariance)
-    lengths = np.sqrt(np.where(variance > _UNFIT**2 * variance.max(), variance, 1.0))
-    scaled = pose.covariance / np.outer(lengths, lengths)
-    return np.asarray(np.linalg.pinv(scaled, _UNFIT, hermitian=True) / np.outer(lengths, lengths))
-
-
-def _merged(
-    touches: Sequence[Result], maps: Sequence[PoseMap], poses: Sequence[Pose], names: Sequence[str]
-) -> Result:
-    """Resample all touches to the pixels of the first, and merge them by inverse-variance weighting."""
-    x, y = _axes(maps, poses)
-    shape = len(y), len(x)
-    if shape[0] * shape[1] > _LARGEST:
-        raise InputError(f"the whole would have {shape[1]} x {shape[0]} pixels: give results that overlap")
-    sums = _Sums(shape)
-    with_normals = all(touch.normals is not None and touch.normals_sigma is not None for touch in touches)
-    unknown = touches[0].offset_unknown is not None and bool(np.any(touches[0].offset_unknown))
-    placed: list[_Moved] = []
-    for touch, map_, pose in zip(touches, maps, poses, strict=True):
-        relative = unknown or (touch.offset_unknown is not None and bool(touch.offset_unknown.any()))
-        before = sums if relative and placed else None
-        moved = _Moved.of(touch, map_, pose, x, y, with_normals, before)
-        sums.add(moved)
-        placed.append(moved)
-    return sums.result(placed, x, y, poses, names, unknown)
+def _map_of(touch: Result, pixel_size: ArrayLike | None, device: Device) -> PoseMap:
+    """Return the map of a touch; a surface on which much would be spikes is rough, and keeps them."""
+    clean = PoseMap.of(touch, pixel_size, device)
+    rough = PoseMap.of(touch, pixel_size, device, spiky=False)
+    return clean if clean.extent.pixels > _MAX_SPIKES * rough.extent.pixels else rough
 
 
 def _axes(maps: Sequence[PoseMap], poses: Sequence[Pose]) -> tuple[Doubles, Doubles]:
@@ -290,11 +220,25 @@ def _axes(maps: Sequence[PoseMap], poses: Sequence[Pose]) -> tuple[Doubles, Doub
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Moved:
-    """A touch at the pixels of the first one: (H, W), NaN without a height."""
+    """A touch at the pixels of the first one that it covers: (h, w), NaN without a height.
 
+    Attributes
+    ----------
+    rows, columns : slice
+        Where it is in the whole.
+    height, variance : ndarray, (h, w)
+        Heights, and the variance of their own errors.
+    lever : ndarray, (h, w, 6), float32
+        Change of the heights per change of the pose.
+    contact : ndarray, (h, w), bool
+    normals, normal_variance : ndarray or None
+    """
+
+    rows: slice
+    columns: slice
     height: Doubles
-    variance: Doubles  # including that of the pose and of a determined offset
-    common: Doubles  # variance of errors common to all pixels: of the pose and the offset
+    variance: Doubles
+    lever: NDArray[np.float32]
     contact: NDArray[np.bool_]
     normals: Doubles | None
     normal_variance: Doubles | None
@@ -308,45 +252,40 @@ class _Moved:
         x: Doubles,
         y: Doubles,
         with_normals: bool,
-        before: _Sums | None,
+        level: float,
     ) -> _Moved:
-        """Move a touch; an unknown offset is determined from earlier touches."""
+        """Move a touch, and raise it by ``level``."""
         assert touch.height is not None
         x0, y0, step_x, step_y = map_.grid
         height = np.asarray(touch.height, np.float32).copy()
         if touch.filled is not None:
             height[touch.filled != 0] = np.nan
-        across, up = (part.ravel() for part in np.meshgrid(x, y))
-        motion, size = pose.motion, (len(y), len(x))
+        back = pose.inverse().apply(map_.points)
+        rows = _covering(np.sort((y[0] - back[:, 1]) / step_y), len(y))
+        columns = _covering(np.sort((back[:, 0] - x[0]) / step_x), len(x))
+        across, up = (part.ravel() for part in np.meshgrid(x[columns], y[rows]))
+        size = rows.stop - rows.start, columns.stop - columns.start
+        motion = Motion(pose.motion.turn, pose.motion.shift - [0.0, 0.0, level * pose.motion.turn[2, 2]])
+        above = np.full(across.shape, float(np.nanmedian(back[:, 2])))
+        for _ in range(_NEWTON_STEPS):
+            place = motion.apply(np.stack([across, up, above], axis=-1))
+            points = SamplePoints.at((place[:, 0] - x0) / step_x, (y0 - place[:, 1]) / step_y, height.shape)
+            surface = points.interpolate(height).astype(np.float64)
+            here = np.nan_to_num(surface - place[:, 2])
+            above = above + here / motion.turn[2, 2]
+            if np.abs(here).max() < _LAST_STEP:
+                break
         down, right = np.gradient(height)
         slopes = right / step_x, -down / step_y
-        above = np.full(across.shape, float(np.nanmedian(pose.inverse().apply(map_.points)[:, 2])))
-        level, middle, of_level = 0.0, np.zeros(6), 0.0
-        for _ in range(1 if before is None else _LEVELLINGS):
-            motion = Motion(motion.turn, motion.shift - [0.0, 0.0, level * motion.turn[2, 2]])
-            for _ in range(_NEWTON_STEPS):
-                place = motion.apply(np.stack([across, up, above], axis=-1))
-                points = SamplePoints.at(
-                    (place[:, 0] - x0) / step_x, (y0 - place[:, 1]) / step_y, height.shape
-                )
-                surface = points.interpolate(height).astype(np.float64)
-                here = np.nan_to_num(surface - place[:, 2])
-                above = above + here / motion.turn[2, 2]
-            p, q = (np.nan_to_num(points.interpolate(np.asarray(slope, np.float32))) for slope in slopes)
-            upright = np.stack([-p, -q, np.ones_like(p)], axis=-1)
-            steep = upright @ motion.turn[:, 2]  # change of the surface's distance per change of z
-            lever = np.concatenate([np.cross(place, upright), upright], axis=-1) / steep[:, np.newaxis]
-            touch_variance = (
-                points.interpolate(_variance_of(touch).astype(np.float32)).astype(np.float64) / steep**2
-            )
-            if before is not None:
-                heights = np.where(np.isfinite(surface), above, np.nan)
-                level, middle, of_level = before.level(heights, touch_variance, lever)
-            if not np.isfinite(level):
-                break
-        lever -= middle  # levelling removes the mean effect of the pose's error
-        common = np.einsum("ni,ij,nj->n", lever, pose.covariance, lever) + of_level
-        above, variance = above + level, touch_variance + common
+        p, q = (points.interpolate(fill_with_nearest(np.asarray(slope, np.float32))) for slope in slopes)
+        p, q = np.nan_to_num(p), np.nan_to_num(q)
+        upright = np.stack([-p, -q, np.ones_like(p)], axis=-1)
+        steep = upright @ motion.turn[:, 2]  # change of the surface's distance per change of z
+        lever = np.concatenate([np.cross(place, upright), upright], axis=-1) / steep[:, np.newaxis]
+        variance = points.interpolate(_variance_of(touch).astype(np.float32)).astype(np.float64) / steep**2
+        # Without one of the four pixels around, a height is that of a place up to half a pixel away.
+        away = 1 - np.einsum("kn,kn->n", points.shares, np.isfinite(height.ravel()[points.pixels]))
+        variance += away**2 * ((p * step_x) ** 2 + (q * step_y) ** 2) / steep**2
         answered = np.isfinite(surface) & np.isfinite(variance)
         touched = np.isfinite(touch.height) if touch.contact is None else touch.contact != 0
         contact = points.nearest_values(touched, False) & points.inside
@@ -358,13 +297,37 @@ class _Moved:
             square = points.interpolate(np.asarray(touch.normals_sigma, np.float32)).astype(np.float64) ** 2
             normals, square = normals.reshape(*size, 3), square.reshape(size)
         return cls(
+            rows,
+            columns,
             np.where(answered, above, np.nan).reshape(size),
             np.where(answered, variance, np.nan).reshape(size),
-            np.where(answered, common, np.nan).reshape(size),
+            lever.astype(np.float32).reshape(*size, 6),
             contact.reshape(size),
             normals,
             square,
         )
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Where it is in the whole."""
+        return self.rows, self.columns
+
+    def shared(self, other: _Moved) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
+        """Return the pixels that two touches cover, as slices of each; None without any."""
+        mine, theirs = [], []
+        for a, b in zip(self.window, other.window, strict=True):
+            start, stop = max(a.start, b.start), min(a.stop, b.stop)
+            if start >= stop:
+                return None
+            mine.append(slice(start - a.start, stop - a.start))
+            theirs.append(slice(start - b.start, stop - b.start))
+        return (mine[0], mine[1]), (theirs[0], theirs[1])
+
+
+def _covering(places: Doubles, length: int) -> slice:
+    """Return the pixels around sorted places, of ``length`` pixels."""
+    start = max(int(np.floor(places[0])) - 1, 0)
+    return slice(start, max(min(int(np.ceil(places[-1])) + 2, length), start + 1))
 
 
 def _variance_of(touch: Result) -> Doubles:
@@ -373,98 +336,212 @@ def _variance_of(touch: Result) -> Doubles:
     return np.where(sigma > 0, np.maximum(sigma**2, SHARPEST), np.nan)
 
 
-class _Sums:
-    """Sums over touches, pixel by pixel."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _CommonErrors:
+    """Covariances of what is wrong with all heights of a touch: its pose, and its determined offset.
 
-    def __init__(self, shape: tuple[int, int]) -> None:
-        self._weight, self._height, self._common = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        self._normal_weight, self._normals = np.zeros(shape), np.zeros((*shape, 3))
-        self._contact = np.zeros(shape, bool)
+    The offset's error is a linear function of the errors of all poses, ``by_poses``, and of noise.
 
-    def add(self, moved: _Moved) -> None:
-        finite = np.isfinite(moved.height)
-        weight = np.where(finite, 1 / moved.variance, 0.0)
-        self._weight += weight
-        self._height += weight * np.nan_to_num(moved.height)
-        self._common += weight * np.nan_to_num(moved.common)
-        self._contact |= moved.contact
-        if moved.normals is not None and moved.normal_variance is not None:
-            defined = np.isfinite(moved.normals).all(axis=-1) & (moved.normal_variance > 0)
-            weight = np.where(defined, 1 / np.where(defined, moved.normal_variance, 1.0), 0.0)
-            self._normal_weight += weight
-            self._normals += weight[..., np.newaxis] * np.nan_to_num(moved.normals)
+    Attributes
+    ----------
+    poses : ndarray, (6 n, 6 n)
+    crossed : ndarray, (6 n, n)
+        Covariances of poses and offsets.
+    offsets : ndarray, (n, n)
+    """
 
-    def mean(self) -> Doubles:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(self._height / self._weight)
+    poses: Doubles
+    crossed: Doubles
+    offsets: Doubles
 
-    def level(self, height: Doubles, variance: Doubles, lever: Doubles) -> tuple[float, Doubles, float]:
-        """Return the offset of heights, (n,), to earlier ones, its mean lever, and its variance.
+    def between(self, i: int, lever: Any, k: int, other_lever: Any) -> Doubles:
+        """Return the covariances of the heights of touches i and k at the same pixels, (h, w)."""
+        mine, theirs = part(i), part(k)
+        poses = np.einsum("...a,ab,...b->...", lever, self.poses[mine, theirs], other_lever)
+        both = lever @ self.crossed[mine, k] + other_lever @ self.crossed[theirs, i]
+        return np.asarray(poses + both + self.offsets[i, k])
 
-        Errors of pixels are independent. Errors of the poses, which are common to pixels, are not averaged
-        out; with several touches, their weighted mean is an upper bound. All values are NaN without common
-        pixels.
-        """
-        off = self.mean().ravel() - height
-        shared = np.isfinite(off) & np.isfinite(variance)
-        if not shared.any():
-            return np.nan, np.zeros(6), np.nan
-        before = self._weight.ravel()[shared]
-        weight = 1 / (variance[shared] + 1 / before)
-        total = float(weight.sum())
-        common = float(weight @ (self._common.ravel()[shared] / before)) / total
-        middle = np.asarray(weight @ lever[shared] / total)
-        return float(weight @ off[shared]) / total, middle, 1 / total + common
 
-    def result(
-        self,
-        placed: Sequence[_Moved],
-        x: Doubles,
-        y: Doubles,
-        poses: Sequence[Pose],
-        names: Sequence[str],
-        unknown: bool,
-    ) -> Result:
-        height = self.mean()
-        with np.errstate(divide="ignore"):
-            sigma = 1 / np.sqrt(self._weight)
-        apart, spread = np.zeros(height.shape), np.zeros(height.shape)
-        for moved in placed:
-            off = np.nan_to_num(moved.height - height)
-            apart = np.fmax(apart, off**2 / np.where(np.isfinite(moved.variance), moved.variance, 1.0))
-            spread += np.where(np.isfinite(moved.variance), off**2 / moved.variance, 0.0)
-        covered = self._weight > 0
-        differs = covered & (apart > _DISAGREEMENT_Z_SCORE**2)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            sigma = np.where(differs, np.maximum(sigma, np.sqrt(spread / self._weight)), sigma)
-        status = np.where(
-            differs,
-            StitchStatus.INCONSISTENT,
-            np.where(covered, StitchStatus.CONSISTENT, StitchStatus.NO_HEIGHT),
-        ).astype(np.uint8)
-        maps: dict[str, Any] = {}
-        if self._normal_weight.any():
-            with np.errstate(invalid="ignore", divide="ignore"):
-                normals = self._normals / np.linalg.norm(self._normals, axis=-1, keepdims=True)
-                spread = 1 / np.sqrt(self._normal_weight)
-            maps["normals"] = normals.astype(np.float32)
-            maps["normals_sigma"] = np.where(self._normal_weight > 0, spread, np.nan).astype(np.float32)
-        if unknown:
-            maps["component"] = np.where(covered, 0, -1).astype(np.int32)
-            maps["offset_unknown"] = np.ones(1, np.uint8)
-        process: dict[str, ProcessValue] = {**signature(), "method": "stitch", "touches": len(placed)}
-        for number, (name, pose) in enumerate(zip(names, poses, strict=True)):
-            process[f"touch_{number}"] = str(name)
-            parts = ", ".join(f"{part:.6g}" for part in (*pose.rotation, *pose.translation))
-            process[f"pose_{number}"] = f"{parts} (rad, mm)"
-        return Result(
-            height=np.where(covered, height, np.nan).astype(np.float32),
-            height_sigma=np.where(covered, sigma, np.nan).astype(np.float32),
-            status=status,
-            contact=self._contact.astype(np.uint8),
-            x=x,
-            y=y,
-            process=process,
-            declarations={"status": status_of(StitchStatus)},
-            **maps,
+def _levels(
+    placed: Sequence[_Moved], relative: Sequence[bool], covariance: Doubles
+) -> tuple[Doubles, _CommonErrors]:
+    """Return offsets, (n,), by which touches of unknown offset agree best with the others, and errors."""
+    count = len(placed)
+    normal, gradient, by_poses = np.zeros((count, count)), np.zeros(count), np.zeros((count, 6 * count))
+    for i, k in itertools.combinations(range(count), 2):
+        common = placed[i].shared(placed[k]) if relative[i] or relative[k] else None
+        if common is None:
+            continue
+        mine, theirs = common
+        off = placed[k].height[theirs] - placed[i].height[mine]
+        both = np.isfinite(off)
+        weight = 1 / (placed[i].variance[mine] + placed[k].variance[theirs])[both]
+        total, difference = float(weight.sum()), float(weight @ off[both])
+        for here, sign in ((i, 1.0), (k, -1.0)):
+            normal[here, here] += total
+            gradient[here] += sign * difference
+            by_poses[here, part(k)] += sign * (weight @ placed[k].lever[theirs][both])
+            by_poses[here, part(i)] -= sign * (weight @ placed[i].lever[mine][both])
+        normal[i, k] -= total
+        normal[k, i] -= total
+    free = np.flatnonzero(relative)
+    inverse = np.zeros((count, count))
+    inverse[np.ix_(free, free)] = np.linalg.pinv(normal[np.ix_(free, free)], hermitian=True)
+    by_poses = inverse @ by_poses
+    crossed = covariance @ by_poses.T
+    return inverse @ gradient, _CommonErrors(covariance, crossed, by_poses @ crossed + inverse)
+
+
+def _merged(touches: Sequence[Result], maps: Sequence[PoseMap], found: Poses, names: Sequence[str]) -> Result:
+    """Resample all touches to the pixels of the first, and merge them by inverse-variance weighting."""
+    poses = found.poses
+    x, y = _axes(maps, poses)
+    shape = len(y), len(x)
+    if shape[0] * shape[1] > _LARGEST:
+        raise InputError(f"the whole would have {shape[1]} x {shape[0]} pixels: give results that overlap")
+    with_normals = all(touch.normals is not None and touch.normals_sigma is not None for touch in touches)
+    offsets = [touch.offset_unknown for touch in touches]
+    relative = [offset is not None and bool(np.any(offset)) for offset in offsets]
+    unknown = relative[0]
+    free = [number > 0 and (unknown or is_relative) for number, is_relative in enumerate(relative)]
+    levels = np.zeros(len(touches))
+    for _ in range(_LEVELLINGS if any(free) else 1):
+        placed = [
+            _Moved.of(touch, map_, pose, x, y, with_normals, float(level))
+            for touch, map_, pose, level in zip(touches, maps, poses, levels, strict=True)
+        ]
+        change, common = _levels(placed, free, found.covariance)
+        levels = levels + change
+    placed = [replace(moved, height=moved.height + step) for moved, step in zip(placed, change, strict=True)]
+    height, sigma, status = _mean_heights(placed, common, shape)
+    covered = status != StitchStatus.NO_HEIGHT
+    maps_of_result: dict[str, Any] = {}
+    if with_normals:
+        normals, normals_sigma = _mean_normals(placed, poses, found.covariance, shape)
+        maps_of_result = {"normals": normals, "normals_sigma": normals_sigma}
+    if unknown:
+        maps_of_result["component"] = np.where(covered, 0, -1).astype(np.int32)
+        maps_of_result["offset_unknown"] = np.ones(1, np.uint8)
+    contact = np.zeros(shape, np.uint8)
+    for moved in placed:
+        contact[moved.window] |= moved.contact
+    several = np.zeros(shape, np.uint8)
+    for moved in placed:
+        several[moved.window] += np.isfinite(moved.height)
+    process: dict[str, ProcessValue] = {**signature(), "method": "stitch", "touches": len(placed)}
+    differing = (
+        float(np.mean(status[several > 1] == StitchStatus.INCONSISTENT)) if np.any(several > 1) else 0.0
+    )
+    if differing > _MAX_DIFFERING:
+        text = (
+            f"results differ by more than {_DISAGREEMENT_Z_SCORE:g} sigmas in {differing:.1%} of the pixels"
+            " that several of them show: a motion is wrong (state --offset), the object changed, or errors"
+            " exceed their sigmas"
         )
+        process |= in_process([Finding("differing results", text)], process)
+    for number, (name, pose) in enumerate(zip(names, poses, strict=True)):
+        process[f"touch_{number}"] = str(name)
+        parts = ", ".join(f"{part:.6g}" for part in (*pose.rotation, *pose.translation))
+        process[f"pose_{number}"] = f"{parts} (rad, mm)"
+    if np.isfinite(found.loop_chi_square):
+        process["loop_chi_square"] = found.loop_chi_square
+    return Result(
+        height=height.astype(np.float32),
+        height_sigma=sigma.astype(np.float32),
+        status=status,
+        contact=contact,
+        x=x,
+        y=y,
+        process=process,
+        declarations={"status": status_of(StitchStatus)},
+        **maps_of_result,
+    )
+
+
+def _mean_heights(
+    placed: Sequence[_Moved], common: _CommonErrors, shape: tuple[int, int]
+) -> tuple[Doubles, Doubles, NDArray[np.uint8]]:
+    """Return the means of heights, weighted by their own variances, their sigma, and their status."""
+    weight, height = np.zeros(shape), np.zeros(shape)
+    for moved in placed:
+        finite = np.isfinite(moved.height)
+        weight[moved.window] += np.where(finite, 1 / moved.variance, 0.0)
+        height[moved.window] += np.where(finite, moved.height / moved.variance, 0.0)
+    covered = weight > 0
+    height = np.where(covered, height / np.where(covered, weight, 1.0), np.nan)
+    shares = [
+        np.where(
+            np.isfinite(moved.height),
+            1 / (moved.variance * np.where(covered, weight, 1.0)[moved.window]),
+            0.0,
+        )
+        for moved in placed
+    ]
+    with_mean = []  # covariances of each touch's common errors with those of the mean
+    shared = np.zeros(shape)  # variances of the mean's common errors
+    for i, moved in enumerate(placed):
+        covariance = np.zeros(moved.height.shape)
+        for k, other in enumerate(placed):
+            both = moved.shared(other)
+            if both is not None:
+                mine, theirs = both
+                covariance[mine] += shares[k][theirs] * common.between(
+                    i, moved.lever[mine], k, other.lever[theirs]
+                )
+        with_mean.append(covariance)
+        shared[moved.window] += shares[i] * covariance
+    own = np.where(covered, 1 / np.where(covered, weight, 1.0), np.nan)
+    variance = own + np.maximum(shared, 0.0)
+    apart, spread = np.zeros(shape), np.zeros(shape)
+    for i, moved in enumerate(placed):
+        off = np.nan_to_num(moved.height - height[moved.window]) ** 2
+        expected = common.between(i, moved.lever, i, moved.lever) - 2 * with_mean[i] + shared[moved.window]
+        expected = np.maximum(expected, 0.0) + moved.variance * (1 - shares[i])
+        several = np.isfinite(expected) & (shares[i] < _ALONE)
+        ratio = np.where(several, off / np.where(several, expected, 1.0), 0.0)
+        apart[moved.window] = np.maximum(apart[moved.window], ratio)
+        spread[moved.window] += shares[i] * off
+    differs = covered & (apart > _DISAGREEMENT_Z_SCORE**2)
+    variance = np.where(differs, np.maximum(variance, spread), variance)
+    status = np.where(
+        differs,
+        StitchStatus.INCONSISTENT,
+        np.where(covered, StitchStatus.CONSISTENT, StitchStatus.NO_HEIGHT),
+    )
+    return height, np.sqrt(variance), status.astype(np.uint8)
+
+
+def _mean_normals(
+    placed: Sequence[_Moved], poses: Sequence[Pose], covariance: Doubles, shape: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the means of normals, weighted by their own variances, and their sigma."""
+    weight, normals, common = np.zeros(shape), np.zeros((*shape, 3)), np.zeros(shape)
+    each = []
+    for moved in placed:
+        assert moved.normals is not None
+        assert moved.normal_variance is not None
+        defined = np.isfinite(moved.normals).all(axis=-1) & (moved.normal_variance > 0)
+        each.append(np.where(defined, 1 / np.where(defined, moved.normal_variance, 1.0), 0.0))
+        weight[moved.window] += each[-1]
+        normals[moved.window] += each[-1][..., np.newaxis] * np.nan_to_num(moved.normals)
+    covered = weight > 0
+    weight = np.where(covered, weight, np.nan)
+    with np.errstate(invalid="ignore"):
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    for i, k in itertools.product(range(len(placed)), repeat=2):
+        both = placed[i].shared(placed[k])
+        if both is None:
+            continue
+        # A rotation by d changes a normal n by d x n, whose mean square is tr(C) - n' C n.
+        turns = poses[i].motion.turn, poses[k].motion.turn
+        turned = turns[0].T @ covariance[part(i), part(k)][:3, :3] @ turns[1]
+        (rows, columns), (mine, theirs) = placed[i].window, both
+        here = (
+            slice(rows.start + mine[0].start, rows.start + mine[0].stop),
+            slice(columns.start + mine[1].start, columns.start + mine[1].stop),
+        )
+        n = normals[here]
+        square = np.trace(turned) - np.einsum("...a,ab,...b->...", n, turned, n)
+        common[here] += np.nan_to_num(each[i][mine] * each[k][theirs] * square / weight[here] ** 2)
+    sigma = np.sqrt(1 / weight + np.maximum(common, 0.0))
+    return normals.astype(np.float32), sigma.astype(np.float32)

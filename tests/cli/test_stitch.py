@@ -25,6 +25,13 @@ def test_touches_become_a_result_that_is_wider(names):
     assert whole.process["touch_1"] == "touch-1.h5"
 
 
+def test_a_stated_offset_is_used(names):
+    done("stitch", *names, "--offset", "1.2mm,0mm", "-o", "whole.h5")
+    assert io.open_result("whole.h5").height.shape[1] == pytest.approx(80 + 1.2 / 0.05, abs=4)
+    refused("check --offset", "stitch", *names, "--offset=-3mm,0mm", "-o", "other.h5")
+    refused("--offset", "stitch", *names, "--offset", "1.2", "-o", "other.h5")
+
+
 def hills(x, y):
     """Steep nearly everywhere, as the sensor sees no level ground; mm."""
     waves = 0.12 * np.sin(2 * x + 0.3) * np.cos(1.7 * y) + 0.08 * np.sin(2.1 * y + 1.3 * x)

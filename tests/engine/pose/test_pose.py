@@ -208,7 +208,8 @@ def refusals() -> dict[str, tuple[io.Result, io.Result, str]]:
     unsure = good.assign(height_sigma=None, normals_sigma=None)
     odd = good.assign(normals_sigma=good.normals_sigma[:5])
     nowhere = good.assign(x=None, y=None)
-    far = good.assign(x=good.x + 100)
+    small = sampled(bumpy, rng=rng, shape=(4, 4))
+    far = small.assign(x=small.x + 100)
     return {
         "no height": (no_height, good, "needs heights"),
         "no sigma": (good, unsure, "with a sigma"),

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from moved_surfaces import bumpy, sampled
+from moved_surfaces import bumpy, error_of, sampled
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
 
 from mirrorskin import engine, io
 
@@ -143,3 +145,142 @@ def test_heights_without_sigma_are_refused_by_name():
     )
     with pytest.raises(io.InputError, match=r"two\.h5 has no height_sigma"):
         engine.pose.stitch([first, bare], names=["one.h5", "two.h5"])
+
+
+def rough(seed, correlation=3.0, step=0.0, shape=(200, 400)):
+    """Return a random surface of Sq 4 um, (H, W), mm, with a step of some height near its middle."""
+    height = gaussian_filter(np.random.default_rng(seed).normal(size=shape), correlation, mode="wrap")
+    height *= 0.004 / height.std()
+    height[:, shape[1] // 2 - 20 :] += step
+    return height
+
+
+def cut(surface, at, rng, *, size=(200, 240), sigma=3e-4, pixel=0.01):
+    """Return a field of a surface, its first column at ``at``, with noise."""
+    part = surface[: size[0], at : at + size[1]] + rng.normal(0, sigma, size)
+    x, y = io.pixel_axes(size, (pixel, pixel))
+    noise = np.full(size, sigma, np.float32)
+    return io.Result(height=part.astype(np.float32), height_sigma=noise, x=x, y=y)
+
+
+def chi_square(pose, vector, shift):
+    error = error_of(pose, vector, shift)
+    return error @ np.linalg.solve(pose.covariance, error) / 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [0.0, 0.05])
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("along", [2, 5, 10, 20, 40, 60, 80, 100, 120])
+def test_fields_of_rough_surfaces_are_found_at_any_shift(step, seed, along):
+    rng, surface = np.random.default_rng(seed + 100), rough(seed, step=step)
+    pose = engine.pose.stitch([cut(surface, at, rng) for at in (0, along)]).poses[1]
+    np.testing.assert_allclose(pose.translation[:2], (-0.01 * along, 0), atol=1e-3)
+
+
+@pytest.mark.parametrize("correlation", [0.3, 1.0, 3.0])
+def test_small_fields_of_rough_surfaces_are_found_within_their_sigma(correlation):
+    rng, surface = np.random.default_rng(0), rough(2, correlation)
+    fields = [cut(surface, at, rng, size=(70, 80)) for at in (0, 37)]
+    pose = engine.pose.stitch(fields).poses[1]
+    assert chi_square(pose, np.zeros(3), np.array([-0.37, 0, 0])) < 3
+
+
+def test_a_turned_field_of_a_rough_surface_is_found():
+    rng, surface = np.random.default_rng(0), rough(2)
+    first, second = (cut(surface, at, rng, size=(90, 90)) for at in (0, 25))
+    half_turned = second.assign(height=second.height[::-1, ::-1].copy())
+    pose = engine.pose.stitch([first, half_turned]).poses[1]
+    assert abs(pose.rotation[2]) == pytest.approx(np.pi, abs=1e-3)
+    np.testing.assert_allclose(pose.translation[:2], (0.25, 0), atol=1e-3)
+
+
+def test_the_noise_of_a_rough_surface_is_that_by_which_fields_differ():
+    rng, surface = np.random.default_rng(0), rough(2, 0.3)
+    fields = [cut(surface, at, rng, size=(70, 80)).assign(height_sigma=None) for at in (0, 37)]
+    result = engine.pose.stitch(fields).result
+    assert np.nanmedian(result.height_sigma[:, :30]) == pytest.approx(3e-4, rel=0.15)  # one field
+    assert "is estimated from the differences of overlapping results" in result.process["warnings"]
+
+
+def tiles(rows, columns, seed, shape=(40, 50), pixel=0.05, overlap=0.35):
+    """Return fields of a wavy surface by rows, moved a little, and their true motions and form."""
+    rng = np.random.default_rng(seed)
+    waves, phases = rng.normal(0, 5.2, (40, 2)), rng.uniform(0, 2 * np.pi, 40)
+
+    def form(x, y):
+        angles = [(u, v, u * x + v * y + phase) for (u, v), phase in zip(waves, phases, strict=True)]
+        parts = [(np.sin(angle), u * np.cos(angle), v * np.cos(angle)) for u, v, angle in angles]
+        return tuple(0.004 * np.sqrt(2 / 40) * sum(values) for values in zip(*parts, strict=True))
+
+    results, motions = [], []
+    for row in range(rows):
+        for column in range(columns):
+            first = not row and not column
+            vector = (not first) * rng.normal(0, (0.003, 0.003, 0.01))
+            place = np.array([column * shape[1], -row * shape[0], 0]) * pixel * (1 - overlap)
+            place[:2] += (not first) * rng.normal(0, pixel, 2)
+            shift = -Rotation.from_rotvec(vector).apply(place) + [0, 0, (not first) * rng.normal(0, 0.02)]
+            field = sampled(form, vector, shift, rng=rng, shape=shape, height_sigma=3e-4)
+            results.append(field.assign(normals=None, normals_sigma=None))
+            motions.append((vector, shift))
+    return results, motions, form
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "offsets"),
+    [(1, 12, None), (1, 12, (50 * 0.05 * 0.65, 0)), pytest.param(4, 5, None, marks=pytest.mark.slow)],
+)
+def test_many_fields_become_one_surface_within_its_sigma(rows, columns, offsets):
+    results, motions, form = tiles(rows, columns, 1)
+    whole = engine.pose.stitch(results, offsets=offsets)
+    assert whole.links >= rows * (columns - 1) + columns * (rows - 1)
+    squares = [
+        chi_square(pose, *motion) for pose, motion in zip(whole.poses, motions, strict=True) if pose.pixels
+    ]
+    assert 0.3 < np.mean(squares) < 2
+    result = whole.result
+    error = result.height - form(*np.meshgrid(result.x, result.y))[0]
+    assert 0.1 < np.nanmean((error / result.height_sigma) ** 2) < 2
+    assert np.mean(result.status == 2) < 0.01
+
+
+def test_the_order_of_fields_does_not_matter():
+    results, motions, _ = tiles(1, 4, 3)
+    order = [0, 2, 3, 1]  # the second shares nothing with the first
+    poses = engine.pose.stitch([results[number] for number in order]).poses
+    for number, pose in zip(order[1:], poses[1:], strict=True):
+        assert chi_square(pose, *motions[number]) < 3
+
+
+def test_a_refusal_says_what_was_tried():
+    rng = np.random.default_rng(0)
+    fields = [cut(rough(seed), 0, rng, size=(50, 60)) for seed in (1, 2)]
+    with pytest.raises(io.InputError, match=r"shifted by the peaks .* rotations about z; at best .* sigmas"):
+        engine.pose.stitch(fields)
+    with pytest.raises(io.InputError, match=r"within 10% of the field .* check --offset"):
+        engine.pose.stitch(fields, offsets=(0.2, 0.0))
+
+
+def test_a_surface_that_repeats_itself_has_a_warning_unless_its_offset_is_stated():
+    rng, (row, column) = np.random.default_rng(0), np.indices((80, 200))
+    surface = 0.004 * np.sin(2 * np.pi * column / 25) * np.cos(2 * np.pi * row / 25)
+    fields = [cut(surface, at, rng, size=(80, 100)) for at in (0, 40)]
+    assert "state --offset" in engine.pose.stitch(fields).result.process["warnings"]
+    stated = engine.pose.stitch(fields, offsets=(0.42, 0.01))
+    np.testing.assert_allclose(stated.poses[1].translation[:2], (-0.4, 0), atol=1e-3)
+    assert "warnings" not in stated.result.process
+
+
+def test_a_plain_surface_is_where_it_is_stated_with_a_warning():
+    rng = np.random.default_rng(0)
+    fields = [cut(np.zeros((60, 100)), 0, rng, size=(60, 80)) for _ in range(2)]
+    whole = engine.pose.stitch(fields, offsets=(0.3, 0.0))
+    np.testing.assert_allclose(whole.poses[1].translation[:2], (-0.3, 0), atol=1e-6)
+    assert "do not determine all of the motion of result 1" in whole.result.process["warnings"]
+
+
+@pytest.mark.parametrize("offsets", [(1.0,), [(1.0, 0.0)] * 3, (np.nan, 0.0), "here"])
+def test_offsets_that_are_no_positions_are_refused(offsets):
+    with pytest.raises(io.InputError, match="once or 1 times"):
+        engine.pose.stitch(touches(moves=MOVES[:2]), offsets=offsets)
