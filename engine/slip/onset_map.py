@@ -21,7 +21,8 @@ _WIDE = 5  # number of initial steps in which departures begin gradually
 _MAX_FINE_NODES = 1000  # number of nodes above which a quarter of them is fitted first, to save time
 _LAST_CHANGE = 1e-6  # change of an onset, relative to the path, that ends the steps
 _NEAR = 0.01  # change of an onset, relative to the path, below which steps reuse earlier equations
-_MAX_CHANGE = 0.08  # maximum change of an onset in a step, relative to the path
+_MAX_GROWTH = 1.0  # maximum change of the growth's logarithm in a step
+_SHARES = 1.0, 0.5, 0.25, 0.125, 0.06  # of a step that are tried, until one lowers the cost
 _LOCKING = 0.05  # prior sigma of the bias of displacements towards halves of a pixel, pixels
 _POWER_SIGMA = 0.1  # standard deviation of the power; those of slides and twists differ by twice that
 _INDEPENDENT_DISTANCE = 9  # distance of nodes above which errors of onsets are independent
@@ -49,6 +50,42 @@ class Expected:
 
 
 @dataclass(frozen=True, slots=True)
+class Locking:
+    """Bias of displacements towards halves of a pixel, which depends on the displacement itself.
+
+    It is computed from the fitted departure: computed from the measured one, it would contain its noise, and
+    explain it where the body moves by whole pixels.
+
+    Attributes
+    ----------
+    rest : ndarray, (2, T, rows, columns), float64
+        Displacement of skin that sticks, along x and y, pixels.
+    back : ndarray, (2, rows, columns), float64
+        By how much the skin is displaced less where it lags by 1 mm, pixels.
+    size : ndarray, (2,), float64
+        Sides of a pixel, mm.
+    """
+
+    rest: Doubles
+    back: Doubles
+    size: Doubles
+
+    def part(self, nodes: Any) -> Locking:
+        """Return the locking of some of the nodes."""
+        return Locking(self.rest[nodes], self.back[nodes], self.size)
+
+    def of(self, departure: Doubles) -> tuple[Doubles, Doubles]:
+        """Return the changes of departures, mm, for an amplitude of one pixel along x, and along y.
+
+        The second array, of the same shape (2, T, rows, columns), is their derivative by the departure.
+        """
+        place = 2 * np.pi * (self.rest - departure * self.back[:, None])
+        unit = self.back * self.size[:, None, None]  # component of the lag along an axis
+        changes = -unit * self.size[:, None, None]
+        return changes[:, None] * np.sin(place), 2 * np.pi * unit[:, None] ** 2 * np.cos(place)
+
+
+@dataclass(frozen=True, slots=True)
 class OnsetMap:
     """Onsets of departure, and their standard deviations, (rows, columns), in the unit of the path.
 
@@ -67,7 +104,7 @@ def fit_onsets(
     window: float,
     radius: float,
     expected: Expected,
-    locking: Doubles,
+    locking: Locking,
 ) -> OnsetMap:
     """Fit ``growth (distance - onset)^power``, zero before the onset, to departures blurred by windows.
 
@@ -86,7 +123,7 @@ def fit_onsets(
     window : side of the window over which a departure is averaged, nodes
     radius : radius of a disc as large as the contact, nodes
     expected : prior knowledge of the motion
-    locking : (2, T, rows, columns), mm, change of departures for an amplitude of one pixel along x, or y
+    locking : bias of the displacements
     """
     fit = _fit(departure, sigma, distance, window, radius, expected, locking)
     length = float(distance[-1])
@@ -108,6 +145,20 @@ class _Fit(NamedTuple):
     shift: Doubles
 
 
+class _Evaluated(NamedTuple):
+    """The model at a point: scaled growth, half width of the blur, derivatives, residual, pull of the prior.
+
+    ``columns`` are the derivatives for both maps, ``locks`` those for the locking.
+    """
+
+    growth: Doubles
+    half: Doubles
+    columns: Doubles
+    locks: Doubles
+    residual: Doubles
+    pull: Doubles
+
+
 def _fit(
     departure: Doubles,
     sigma: Doubles,
@@ -115,7 +166,7 @@ def _fit(
     window: float,
     radius: float,
     expected: Expected,
-    locking: Doubles,
+    locking: Locking,
 ) -> _Fit | None:
     """Return the best fit; None without a departure. For many nodes, every second one is fitted first."""
     power = expected.power
@@ -123,7 +174,6 @@ def _fit(
     scale = np.divide(1.0, sigma, out=np.zeros(sigma.shape), where=measured)
     data = _whitened(np.where(measured, departure * scale, 0.0))
     times = (distance / distance[-1])[:, None, None]
-    locks = _whitened(np.where(measured, locking * scale, 0.0))
     second, third = (_bending(measured.shape, order) for order in (2, 3))
     onset_stiff = third * (radius**3 / expected.onset_bend) ** 2
     stiff = sparse.block_diag([onset_stiff, second * (radius**2 / expected.growth_bend) ** 2], format="csc")
@@ -132,7 +182,9 @@ def _fit(
     coarse, number = None, 0
     if measured.size > _MAX_FINE_NODES:
         half = np.s_[..., ::2, ::2]
-        coarse = _fit(departure[half], sigma[half], distance, window / 2, radius / 2, expected, locking[half])
+        coarse = _fit(
+            departure[half], sigma[half], distance, window / 2, radius / 2, expected, locking.part(half)
+        )
     if coarse is not None:
         onset, log_growth = (_finer(values, measured.shape) for values in (coarse.onset, coarse.log_growth))
         lock, number = coarse.lock, _WIDE
@@ -142,29 +194,47 @@ def _fit(
             return None
         onset, usual = first
         log_growth, lock = np.full_like(onset, math.log(usual)), np.zeros(2)
-    moved = np.inf
-    while True:
+
+    def evaluate(maps: Doubles, lock: Doubles, number: int) -> tuple[float, _Evaluated]:
+        """Return the cost of maps, (2, rows, columns), and of a locking, and what the next step needs."""
+        onset, log_growth = maps
         half = np.hypot(*np.gradient(onset)) * window / 2
         half = np.maximum(half, max(0.5, 2.0 - 0.5 * number) / len(distance))  # wider at first
-        growth = np.exp(log_growth) * scale
-        shape, rate = (_whitened(growth * part) for part in _blurred(times - onset, half, power))
-        columns = np.stack([-rate, shape])
+        growth = np.exp(log_growth)
+        lag, rate = (growth * part for part in _blurred(times - onset, half, power))
+        changes, derivatives = (part * (number >= _WIDE) for part in locking.of(lag))
+        kept = scale * (1 + np.tensordot(lock, derivatives, 1))
+        locks = _whitened(scale * changes)
+        residual = data - _whitened(scale * lag) - np.tensordot(lock, locks, 1)
+        columns = _whitened(kept * np.stack([-rate, lag]))
+        bent = stiff @ maps.ravel()
+        cost = np.sum(residual**2) + bent @ maps.ravel() + lock @ lock / _LOCKING**2
+        return float(cost), _Evaluated(growth * kept, half, columns, locks, residual, -bent)
+
+    maps, moved = np.stack([onset, log_growth]), np.inf
+    while True:
+        cost, here = evaluate(maps, lock, number)
         # Close to the answer, the equations of an earlier step lead to the same one.
         ends = number == _MAX_STEPS or (number >= _WIDE and moved < _LAST_CHANGE)
         if ends or number < _WIDE or moved > _NEAR:
-            system = _Normal(columns, locks, prior)
+            system = _Normal(here.columns, here.locks, prior)
         if ends:
             break
-        off = np.stack([onset, log_growth]).ravel()
-        residual = data - shape - np.tensordot(lock, locks, 1)
-        step, more = system.solve(columns, residual, -(stiff @ off), -lock / _LOCKING**2)
-        change = np.clip(step[0], -_MAX_CHANGE, _MAX_CHANGE)
-        onset, log_growth, lock = onset + change, log_growth + np.clip(step[1], -0.3, 0.3), lock + more
+        step, more = system.solve(here.columns, here.residual, here.pull, -lock / _LOCKING**2)
+        # The whole step is shortened: the maps would bend if it were shortened at some nodes.
+        longest = min(1.0, _MAX_GROWTH / float(np.abs(step[1][measured]).max(initial=1e-30)))
+        shares = (longest * part for part in _SHARES)
+        share = next(
+            (part for part in shares if evaluate(maps + part * step, lock + part * more, number)[0] < cost),
+            0.0,
+        )
+        maps, lock = maps + share * step, lock + share * more
         # Others, which no frame shows, never settle.
-        moved = float(np.abs(change[measured & (onset < 1.0)]).max(initial=0.0))
+        moved = share * float(np.abs(step[0][measured & (maps[0] < 1.0)]).max(initial=0.0))
         number += 1
-    other = _whitened(growth * _blurred(times - onset, half, power + _POWER_SIGMA)[0])
-    return _Fit(onset, log_growth, lock, system, system.solve(columns, other - shape)[0][0])
+    other = _whitened(here.growth * _blurred(times - maps[0], here.half, power + _POWER_SIGMA)[0])
+    shift = system.solve(here.columns, other - here.columns[1])[0][0]
+    return _Fit(maps[0], maps[1], lock, system, shift)
 
 
 def _finer(values: Doubles, shape: tuple[int, ...]) -> Doubles:

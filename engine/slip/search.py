@@ -24,7 +24,7 @@ from mirrorskin.engine.slip.displacement import (
     misfit,
     node_status,
 )
-from mirrorskin.engine.slip.onset_map import Expected, OnsetMap, fit_onsets
+from mirrorskin.engine.slip.onset_map import Expected, Locking, OnsetMap, fit_onsets
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
 from mirrorskin.io import Calibrated, InputError, Map, Recording, Result, pixel_axes
 from mirrorskin.io.base.arguments import check_pixel_size
@@ -45,10 +45,8 @@ _EXPECTED = {  # see docs/method/slip.md
 }
 # An estimated contact is too wide: at its rim, windows of a slide contain free skin.
 _BEND_ESTIMATED = {"horizontal": 64.0, "twist": 24.0}
-_RIM, _ENOUGH = (
-    1.5,
-    0.25,
-)  # windows from its rim that are left out, and least share of the nodes that are left
+_RIM, _ENOUGH = 0.5, 0.25  # windows left out at that rim, and least share of the nodes that are left
+_ROUNDS = 2  # fits with an estimated contact: the first shows where free skin only followed the object
 _MIN_FOLLOWING = 0.5  # minimum displacement of skin in contact, as a share of the object's
 _LEAST_STUCK = 4  # minimum number of nodes for the centre and the angle of a twist
 _REST_TOLERANCE = 1e-9  # motion, relative to the body's path, up to which it is at rest
@@ -237,11 +235,13 @@ class SlipOnset(Operation):
         if course.distance[course.forward - 1] <= 0:
             raise InputError("the body does not move in these frames: take some along a slide or a twist")
         touched = self._touched(tracker, course, departure)
-        drawn = np.sin(2 * np.pi * moved / self._scale) * self._scale  # to halves of a pixel, amplitude 1
-        onsets = self._fit(tracker, course, departure, sigma, touched, drawn)
-        contact = self._contact
+        contact, followed = self._contact, touched
+        for _ in range(_ROUNDS if contact is None else 1):
+            onsets = self._fit(tracker, course, departure, sigma, touched)
+            if contact is None:
+                touched = touched & (onsets.onset > 0)
         if contact is None:
-            contact = (tracker.to_pixels(touched.astype(np.float64)) > 0.5) & (
+            contact = (tracker.to_pixels(followed.astype(np.float64)) > 0.5) & (
                 tracker.to_pixels(onsets.onset) > 0
             )
         status, onset = self._pixels(tracker, codes, onsets, contact, course.end)
@@ -320,7 +320,6 @@ class SlipOnset(Operation):
         departure: Doubles,
         sigma: Doubles,
         touched: NDArray[np.bool_],
-        drawn: Doubles,
     ) -> OnsetMap:
         """Fit the onsets of the nodes in contact, in a box around them; elsewhere they are NaN."""
         onset, spread = np.full(touched.shape, np.nan), np.full(touched.shape, np.nan)
@@ -335,7 +334,6 @@ class SlipOnset(Operation):
             if self._contact is None:
                 expected = replace(expected, onset_bend=_BEND_ESTIMATED[self.motion])
             lock_sigma = np.where(self._inside(touched), overlap * sigma, np.nan)
-            locking = -np.nan_to_num(course.along(drawn * np.identity(2)[:, None, None, None]))
             fit = fit_onsets(
                 departure[: course.forward, *box],
                 lock_sigma[box],
@@ -343,7 +341,7 @@ class SlipOnset(Operation):
                 self.window_size / self.window_step,
                 radius,
                 expected,
-                locking[:, : course.forward, *box],
+                course.locking(np.array(self._size)).part(np.s_[..., *box]),
             )
             onset[box], spread[box] = fit.onset, fit.sigma
         return OnsetMap(onset, spread)
@@ -351,7 +349,7 @@ class SlipOnset(Operation):
     def _inside(self, touched: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return the nodes of a contact whose windows contain no free skin: all, if the contact is given.
 
-        An estimated contact is too wide by about a window. All nodes are returned if few would be left.
+        All nodes of an estimated contact are returned if few would be left.
         """
         if self._contact is not None:
             return touched
@@ -443,6 +441,11 @@ class _Course:
     def along(self, moved: Doubles) -> Doubles:
         """Return the components of displacements, (..., rows, columns, 2), along the object's."""
         return np.asarray(np.sum(moved * self._unit, axis=-1))
+
+    def locking(self, size: Doubles) -> Locking:
+        """Return the bias of displacements with pixels of a size, (2,) mm, before the body turns back."""
+        rest = np.stack([self._object(frame) for frame in range(self.forward)]) / size
+        return Locking(np.moveaxis(rest, -1, 0), np.moveaxis(self._unit / size, -1, 0), size)
 
     def departures(self, moved: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
         """Return the lag of nodes behind the object, along its displacement, and its sigma."""
