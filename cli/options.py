@@ -83,7 +83,7 @@ Contact = Annotated[
     Option(
         metavar="RES.h5",
         help="a press's result, where the skin touches.",
-        show_default="estimated, too wide",
+        show_default="estimated",
         motions=("horizontal", "twist"),
     ),
 ]

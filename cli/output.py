@@ -185,7 +185,7 @@ def report_unverified(recording: Recording) -> None:
 def report_contact(name: str, process: Mapping[str, object]) -> None:
     """Print a warning if the contact of a slide or a twist is wider than that of the skin."""
     widened = {
-        "estimated": "the contact is estimated and too wide, and so is slip;"
+        "estimated": "the contact is estimated from the movement of the skin;"
         " give --contact, a press's result",
         "given, by light": "the contact given is where a press saw light, which runs ahead of the skin;"
         " reconstruct that press with the calibration of a gel and --modulus",

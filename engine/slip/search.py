@@ -43,7 +43,7 @@ _EXPECTED = {  # see docs/method/slip.md
     "horizontal": Expected(power=1.6, onset_bend=12.0, growth_bend=32.0),
     "twist": Expected(power=1.4, onset_bend=24.0, growth_bend=4.0),
 }
-# An estimated contact is too wide: at its rim, windows of a slide contain free skin.
+# At the rim of an estimated contact, windows of a slide contain free skin.
 _BEND_ESTIMATED = {"horizontal": 64.0, "twist": 24.0}
 _RIM, _ENOUGH = 0.5, 0.25  # windows left out at that rim, and least share of the nodes that are left
 _ROUNDS = 2  # fits with an estimated contact: the first shows where free skin only followed the object
@@ -87,7 +87,7 @@ class SlipOnset(Operation):
         help="where the skin touches the object in the first frame: the result of a press, or a map that is"
         " not 0 there. With a pressure, this is the contact; with heights only, the area of light, which is"
         " ahead of an elastic contact",
-        shown_default="where the skin followed the object by half of its movement, 2 to 9 % too wide",
+        shown_default="where the skin followed the object and did not slip from the start",
     )
     per_frame: bool = option(
         default=False, help="return the displacement in each frame, not only in the last"
