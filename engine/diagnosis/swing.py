@@ -30,7 +30,7 @@ from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, OUTLYING, fit_clipped, gram, mad_sigma
 
-_MIN_ZENITH = 3.0  # tilts, from which on the zenith and the swing are independent
+_MIN_ZENITH = 1.5  # tilts, from which on the zenith and the swing are independent
 _REACH = 1  # pixels between the middle and its neighbours
 _GAIN_Z_SCORE = 5.0  # standard errors from which on the scatter of gains is reported
 _MIN_BLUR = 0.8  # pixels: least standard deviation of a blur that is more than a larger area of a pixel

@@ -63,7 +63,7 @@ _CLEAR = 2.0  # standard deviations of what remains: least effect that is correc
 _WORTH = 0.2  # standard deviations of the pixels' own errors: the same
 _RELEVANT = 0.05  # standard deviations of the pixels' own errors: least effect of an unknown nuisance
 _ODD_GAMMA, _LEAST_GAMMA = 2.5, 0.01  # least difference of gamma from 1: in prior deviations, and at all
-_CLEAR_SWING = 3.0  # standard deviations: least swing that falls with the zenith
+_CLEAR_SWING = 3.5  # standard deviations: least swing that falls with the zenith
 _SMALL_GAIN, _SMALL_OFFSET = 0.005, 1.0  # least flicker, and drift in counts of 8 bits, that has a name
 
 
