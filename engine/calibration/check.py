@@ -21,6 +21,7 @@ from mirrorskin.kernels.rotation.response import sight_slopes
 
 _MIN_PIXELS_OF_CELL = 20  # minimum number of pixels with errors in a cell
 _MIN_PIXELS_OF_BALL = 100  # minimum number of pixels of the ball
+_MAX_EXCESS = 1.5  # RMS over the expected one above which a note is given
 _CONTACT_MARGIN = 2  # pixels: width of the excluded margin of the contact
 _CENTRE_ITERATIONS = 3  # iterations of the ball's centre, which depends slightly on its depth
 
@@ -99,6 +100,12 @@ class Check:
         """Return the reasons for missing numbers in the table."""
         both = self.before, self.after
         maps = {name: [when[name] for when in both if name in when] for name in self.after}
+        excess = [
+            f"{name} {worst:.1f} times"
+            for name, each in maps.items()
+            for worst in [max(errors.whole.rms / errors.expected for errors in each[-1:])]
+            if worst > _MAX_EXCESS
+        ]
         unknown = [
             name for name, each in maps.items() if all(math.isnan(error_map.expected) for error_map in each)
         ]
@@ -108,6 +115,11 @@ class Check:
             if any(np.isnan(error_map.cells.rms).all() for error_map in each)
         ]
         notes = []
+        if excess:
+            notes.append(
+                f"rms exceeds what is expected: {', '.join(excess)}; the calibration has errors that"
+                " neighbouring pixels share, which standard deviations of single pixels do not show"
+            )
         if unknown:
             notes.append(f"expected: results contain no standard deviation of {' or '.join(unknown)} alone")
         if few:
@@ -256,10 +268,10 @@ def _normal_errors(result: Result, truth: list[Doubles], cells: int) -> dict[str
     lean, turn = result["zenith"] - zenith, np.arctan2(np.sin(difference), np.cos(difference))
     sine = np.sqrt(np.sin(result["zenith"]) * np.sin(zenith))
     angle = 2 * np.arcsin(np.sqrt(np.sin(lean / 2) ** 2 + (sine * np.sin(turn / 2)) ** 2))  # haversines
-    sigma = None if result.normals_sigma is None else np.degrees(result.normals_sigma)
+    lean_sigma, turn_sigma, sigma = _sigmas(result)
     errors = {
-        "zenith": _errors(np.degrees(lean), "deg", cells),
-        "azimuth": _errors(np.degrees(turn), "deg", cells),
+        "zenith": _errors(np.degrees(lean), "deg", cells, lean_sigma),
+        "azimuth": _errors(np.degrees(turn), "deg", cells, turn_sigma),
         "normal": _errors(np.degrees(angle), "deg", cells, sigma),
     }
     _check_enough(errors["zenith"].whole.pixels)
@@ -270,6 +282,23 @@ def _normal_errors(result: Result, truth: list[Doubles], cells: int) -> dict[str
             error[component] -= np.nanmean(error[component])
         errors["height"] = _errors(error, "mm", cells, result.height_sigma)
     return errors
+
+
+def _sigmas(result: Result) -> list[NDArray[np.float32] | None]:
+    """Return standard deviations, degrees, of zenith, azimuth and normals; None if unknown.
+
+    Brightness of N frames shows the zenith by its mean, and the azimuth by a cosine whose amplitude is the
+    tilt d. Of the variance of a normal, d^2 / (2 sin^2 zenith) is therefore along the meridian.
+    """
+    sigma, tilt = result.normals_sigma, result.fitted.tilt
+    if sigma is None:
+        return [None, None, None]
+    degrees = np.degrees(sigma)
+    if tilt is None:
+        return [None, None, degrees]
+    sine, flat = np.sin(result["zenith"]), math.sin(tilt)
+    along = flat**2 / 2 / np.maximum(sine, flat) ** 2
+    return [degrees * np.sqrt(along), degrees * np.sqrt(1 - along) / np.maximum(sine, flat), degrees]
 
 
 def _check_enough(pixels: Any, what: str = "could be judged") -> None:

@@ -150,3 +150,13 @@ def test_the_page_of_the_twin_shows_what_the_demo_prints(tmp_path):
         else:  # other processors round differently
             last_digit = 10.0 ** -len((number[1] or ".")[1:])
             assert float(word) == pytest.approx(float(expected), rel=0.01, abs=1.01 * last_digit)
+
+
+@pytest.mark.slow
+def test_the_pictures_of_the_documentation_are_those_that_the_demo_draws(tmp_path):
+    pictures = Path(__file__).parents[2] / "docs" / "images"
+    done("demo -o", tmp_path / "demo")
+    for name in FIGURES:
+        drawn, shown = (cv2.imread(str(folder / f"{name}.png")) for folder in (tmp_path / "demo", pictures))
+        assert drawn.shape == shown.shape, name
+        assert np.abs(drawn.astype(int) - shown).mean() < 0.3, f"{name}: copy that of 'make demo'"

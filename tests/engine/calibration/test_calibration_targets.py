@@ -85,6 +85,8 @@ def test_a_check_reports_the_residual_on_a_ball_that_was_not_used(calibration):
     assert float(after["zenith"].whole.rms) < 0.3
     assert float(before["zenith"].whole.rms) > 2 * float(after["zenith"].whole.rms)
     assert abs(float(after["azimuth"].whole.bias)) < 0.5
+    for name in ("zenith", "azimuth", "normal"):
+        assert 0.5 < float(after[name].whole.rms) / after[name].expected < 1.5, name
     assert float(after["height"].whole.rms) < 0.01 < float(before["height"].whole.rms)
     assert int(after["zenith"].whole.pixels) > 1000
     assert [row[:2] for row in result.table()][:2] == [["zenith", "before"], ["zenith", "after"]]
