@@ -91,7 +91,7 @@ def make_folder(folder: Path, parents: bool = False) -> None:
     except OSError as error:
         raise InputError(
             f"{folder}: the folder cannot be created: {error.strerror}. Choose another with -o"
-        ) from error
+        ) from None
 
 
 def printable(value: object) -> str:

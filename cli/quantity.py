@@ -174,7 +174,7 @@ def _scaled(
     try:
         factor = in_base(unit, kind)
     except ValueError as error:
-        raise _error(text, option, shortened(str(error), 100), example) from error
+        raise _error(text, option, shortened(str(error), 100), example) from None
     value = number / factor if per_unit else number * factor
     if not math.isfinite(value):
         raise _error(text, option, "the number is too large", example)

@@ -139,7 +139,7 @@ def kept(recorder: StreamRecorder | None) -> Iterator[None]:
     except (HardwareError, InputError) as error:
         if recorder is None or not recorder.count or recorder.state == COMPLETE:
             raise
-        raise HardwareError(f"{error}; {_remains(recorder)}") from error
+        raise HardwareError(f"{error}; {_remains(recorder)}") from None
     except (KeyboardInterrupt, SystemExit):
         if recorder is not None and recorder.count:
             click.echo(_remains(recorder), err=True)

@@ -35,7 +35,7 @@ def read_settings(path: Path | None, memory_limit: int) -> Plan:
         try:
             kinds = {"operation": load_operation(operation)}
         except InputError as error:
-            raise InputError(f"{path}: operation.class: {error}") from error
+            raise InputError(f"{path}: operation.class: {error}") from None
     stack = [(term.name, _stack_type(term) | None, None) for term in STACK.without("phases").terms]
     tables: dict[str, type[Struct]] = {"stack": defstruct("stack", stack, frozen=True, rename="kebab")}
     tables |= {name: _table(name, kind) for name, kind in kinds.items()}
@@ -135,7 +135,7 @@ def _options(values: Mapping[str, Any], kind: type[Any], where: str) -> dict[str
     try:
         chosen: dict[str, Any] = kind(**values_read).written()
     except InputError as error:
-        raise InputError(f"{where}{_with_key(str(error), kind)}") from error
+        raise InputError(f"{where}{_with_key(str(error), kind)}") from None
     return {name: chosen[name] for name in values_read}
 
 
@@ -159,7 +159,7 @@ def _opening(values: dict[str, Any], where: str) -> dict[str, Any]:
         try:
             check_tilt(options["tilt"])
         except InputError as error:
-            raise InputError(f"{where}tilt: {error}") from error
+            raise InputError(f"{where}tilt: {error}") from None
     if min(options.get("pixel_size", (1.0,))) <= 0:
         raise InputError(f'{where}pixel-size: a length above 0 is needed; write e.g. "0.03mm"')
     return dict(options)

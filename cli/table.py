@@ -284,7 +284,7 @@ def unit_of(heading: str, kind: Kind, where: str) -> str:
             raise InputError(
                 f"{where} states the unit {shortened(unit)!r}: {shortened(str(error), 110)}; "
                 f"write a unit of {kind}, such as [{BASE[kind]}]"
-            ) from error
+            ) from None
     return unit
 
 

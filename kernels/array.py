@@ -61,7 +61,7 @@ def _wrap_cl_errors(
                 with waiting:
                     return work(array, *args, **kwargs)
             except cl.Error as error:
-                raise device_error(array.device, f"hold or copy {array.name}", error) from error
+                raise device_error(array.device, f"hold or copy {array.name}", error) from None
 
     return locked
 
@@ -408,7 +408,7 @@ def adopt(device: Device, name: str, values: pyopencl.array.Array) -> Array:
                 wait_for=after,
             )
     except cl.Error as error:
-        raise device_error(device, f"copy {name}", error) from error
+        raise device_error(device, f"copy {name}", error) from None
     device.profile.watch("copy", name, array.arrived, array.nbytes)
     values.add_event(array.arrived)
     array.last_use = None
@@ -437,7 +437,7 @@ def fetch(parts: Sequence[tuple[Array, int | slice]], keep: Sequence[bool] = ())
                     after.append(array.latest)
             device.transfers.download(device, reads, device.queue, after)
     except cl.Error as error:
-        raise device_error(device, f"copy {', '.join(array.name for array, _ in parts)}", error) from error
+        raise device_error(device, f"copy {', '.join(array.name for array, _ in parts)}", error) from None
     for (array, _), kept in zip(parts, keep, strict=True):
         if not kept:
             array.park(keep=False)
@@ -527,7 +527,7 @@ def _naming(device: Device, name: str, nbytes: int) -> Iterator[None]:
         yield
     except cl.Error as error:
         if error.code not in _NO_ROOM:
-            raise device_error(device, f"hold {name}", error) from error
+            raise device_error(device, f"hold {name}", error) from None
         raise DeviceMemoryError(_no_room(device, name, nbytes)) from error
 
 

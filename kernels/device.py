@@ -258,7 +258,7 @@ class Device:
             self.context: cl.Context = cl.Context([device])
             self.queue, self.copies = _queues(self.context)
         except cl.Error as error:
-            raise device_error(self, "be used", error) from error
+            raise device_error(self, "be used", error) from None
         self._programs: dict[tuple[str | Path, tuple[str, ...]], _Program] = {}
         self._lock = threading.Lock()
         self._launching = threading.Lock()
@@ -424,14 +424,14 @@ class Device:
             self.transfers.free(self)
             self.pool.free()
         except cl.Error as error:
-            raise device_error(self, "release memory", error) from error
+            raise device_error(self, "release memory", error) from None
 
     def flush(self) -> None:
         """Submit the enqueued commands to the device, without waiting."""
         try:
             self.queue.flush()
         except cl.Error as error:
-            raise device_error(self, "start its work", error) from error
+            raise device_error(self, "start its work", error) from None
 
     def finish(self) -> None:
         """Wait until all enqueued commands are done."""
@@ -439,7 +439,7 @@ class Device:
             with self.profile.waiting_for("queue"):
                 self.queue.finish()
         except cl.Error as error:
-            raise device_error(self, "finish its work", error) from error
+            raise device_error(self, "finish its work", error) from None
 
     def _make_kernel(self, file: str | Path, name: str, options: tuple[str, ...]) -> Kernel:
         try:
@@ -461,7 +461,7 @@ class Device:
             problem = f"pyopencl cannot write its cache ({error})"
             raise DeviceError(f"{problem}; set XDG_CACHE_HOME to a writable folder") from error
         except cl.Error as error:
-            raise device_error(self, f"compile {name}", error) from error
+            raise device_error(self, f"compile {name}", error) from None
 
     def _program(self, file: str | Path, options: tuple[str, ...], more: str = "") -> _Program:
         with self._lock:
@@ -476,7 +476,7 @@ class Device:
             text = str(file) if written else path.read_text(encoding="utf-8")
             source = _with_includes(path.name, text) + more
         except OSError as error:
-            raise DeviceError(f"the kernel {path} cannot be read ({error}); reinstall mirrorskin") from error
+            raise DeviceError(f"the kernel {path} cannot be read ({error}); reinstall mirrorskin") from None
         start = time.perf_counter()
         try:
             with _without_build_logs, waiting:
@@ -485,7 +485,7 @@ class Device:
             cause = embedded.why_no_kernel(_is_pocl(self.context.devices[0]))
             raise DeviceError(
                 _explain_build(path, source, str(error), self.info) + (f" ({cause})" if cause else "")
-            ) from error
+            ) from None
         self.profile.add("compile", path.stem, time.perf_counter() - start)
         return program
 
@@ -645,7 +645,7 @@ class Kernel:
                     array.last_use = event
             self._device.profile.watch("kernel", self.name, event, moved)
         except cl.Error as error:
-            raise device_error(self._device, f"run {self.name}", error) from error
+            raise device_error(self._device, f"run {self.name}", error) from None
 
     def _bind(self, arguments: dict[str, Any]) -> list[Operand]:
         """Set the arguments that are not as in the last launch, and return the arrays.
@@ -663,7 +663,7 @@ class Kernel:
                 try:
                     value = convert(given)
                 except (TypeError, OverflowError) as error:
-                    raise TypeError(f"{self.name}: {name} cannot be {given!r}: {error}") from error
+                    raise TypeError(f"{self.name}: {name} cannot be {given!r}: {error}") from None
                 key = value.tobytes()  # 0 and -0 are equal
             elif isinstance(given, Operand):
                 arrays.append(given)
@@ -776,7 +776,7 @@ def _default(devices: list[cl.Device]) -> list[cl.Device]:
             return [cl.create_some_context(interactive=False).devices[0]]
         except (cl.Error, RuntimeError, ValueError, IndexError) as error:
             named = os.environ["PYOPENCL_CTX"]
-            raise UnknownDeviceError(f"PYOPENCL_CTX={named!r} matches no device: {error}") from error
+            raise UnknownDeviceError(f"PYOPENCL_CTX={named!r} matches no device: {error}") from None
     return _best_first(devices)
 
 

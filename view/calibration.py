@@ -303,7 +303,7 @@ def calibration_figures(calibration: Calibration, folder: Path) -> list[Path]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder} cannot be created: {error.strerror}; name another with -o") from error
+        raise InputError(f"{folder} cannot be created: {error.strerror}; name another with -o") from None
     written = []
     for name, part in calibration.parts().items():
         path = folder / f"{part.command}.png"

@@ -241,6 +241,9 @@ def _report(outcomes: Sequence[Outcome], folder: Path, seconds: float, as_json: 
     speed = f"{size / 1e9:.3g} GB in {seconds:.3g} s, {size / 1e9 / seconds:.3g} GB/s"
     recordings = "1 recording" if len(outcomes) == 1 else f"{len(outcomes)} recordings"
     click.echo(f"{printable(str(folder))}: {recordings}: {counts}; {speed}")
+    warned = sum(outcome.warned for outcome in outcomes)
+    if warned:
+        click.echo(f"with warnings: {warned} of {states['done']}; --strict makes them failures")
 
 
 def _fields(outcome: Outcome) -> dict[str, Any]:

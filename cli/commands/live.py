@@ -152,6 +152,8 @@ class _Live:
                     self._save()
                 except InputError as lacking:  # why it ended matters more
                     click.echo(f"no result: {lacking}", err=True)
+            elif self._values["output"] is not None:
+                click.echo("no result: it ended before a frame was used", err=True)
             raise
         assert self._loop is not None
         click.echo(f"{name}: {summary(self._loop.status)}")

@@ -352,7 +352,7 @@ def _check_class(cls: type[Operation]) -> None:
     try:
         check_maps(cls.maps)
     except InputError as error:
-        raise InputError(f"{name}: {error}") from error
+        raise InputError(f"{name}: {error}") from None
     for map_name in cls.maps:
         if map_name in cls.options:
             raise InputError(f"{name}: {map_name} is an option and a map. Rename one of them")

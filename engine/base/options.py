@@ -500,7 +500,7 @@ def _declared(cls: type) -> Iterator[tuple[str, Option]]:
             annotation = None if declared.kind else _evaluated(cls, annotations.get(name))
             yield name, declared.settled(name, annotation)
         except InputError as error:
-            raise InputError(f"{cls.__name__}: {error}") from error
+            raise InputError(f"{cls.__name__}: {error}") from None
 
 
 def _evaluated(cls: type, annotation: Any) -> Any:
@@ -534,7 +534,7 @@ def _take_default(cls: type, name: str) -> bool:
     try:
         setattr(cls, name, declared.with_default(values[0]))
     except InputError as error:
-        raise InputError(f"{cls.__name__}: {error}") from error
+        raise InputError(f"{cls.__name__}: {error}") from None
     return True
 
 

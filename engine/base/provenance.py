@@ -136,4 +136,4 @@ def naming(source: Source) -> Iterator[None]:
     except (io.InputError, NotConverged) as error:
         if source.name in str(error) or not getattr(source, "names_errors", True):
             raise
-        raise type(error)(f"{source.name}: {error}") from error
+        raise type(error)(f"{source.name}: {error}") from None

@@ -444,7 +444,7 @@ def as_result(operation: Operation, returned: Any, copied: bool) -> Result:
     try:
         return result_of(maps, operation.shape, process, declared).with_process(process)
     except InputError as error:
-        raise InputError(f"{kind}.result(): {error}") from error
+        raise InputError(f"{kind}.result(): {error}") from None
 
 
 def _copied(result: Result) -> Result:
@@ -468,7 +468,7 @@ def as_preview(operation: Operation, shown: Mapping[str, Any]) -> Result:
     try:
         return result_of(declared_values, operation.shape, {}, declared)
     except InputError as error:
-        raise InputError(f"{type(operation).__name__}.preview(): {error}") from error
+        raise InputError(f"{type(operation).__name__}.preview(): {error}") from None
 
 
 def _is_rounded(value: Any, option_value: Any) -> bool:

@@ -18,7 +18,7 @@ from mirrorskin.engine.base.device_arrays import AnyArray, as_any_array, on_host
 from mirrorskin.engine.base.operation import Operation
 from mirrorskin.io import Block, Header, InputError, Motion, Source
 from mirrorskin.io.base.arguments import as_array, check_pixel_size
-from mirrorskin.io.base.samples import convert_samples, frame_dtype
+from mirrorskin.io.base.samples import COLOURED, convert_samples, frame_dtype, is_coloured_shape
 from mirrorskin.io.base.types import Closing, Floats, block_memory
 from mirrorskin.io.storage.layout import POSITIONS, as_series
 from mirrorskin.kernels.array import Array
@@ -238,7 +238,8 @@ def _checked(array: AnyArray) -> AnyArray:
     if array.ndim == 2 and 0 not in array.shape:
         raise InputError(f"frames are {array.dtype} {array.shape}: for a single frame, pass frame[None]")
     if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "uif":
-        raise InputError(f"frames are {array.dtype} {array.shape}: numbers (n, H, W) are needed")
+        needed = COLOURED if is_coloured_shape(array.shape) else "numbers (n, H, W) are needed"
+        raise InputError(f"frames are {array.dtype} {array.shape}: {needed}")
     return array
 
 

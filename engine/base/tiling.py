@@ -368,7 +368,7 @@ def _run_on_device(bands: Sequence[Band], work: Callable[[Band], T], stop: Event
             values.append(work(band))
     except DeviceError as error:
         stop.set()
-        raise type(error)(f"device {bands[0].device.number}: {error}") from error
+        raise type(error)(f"device {bands[0].device.number}: {error}") from None
     except BaseException:
         stop.set()
         raise

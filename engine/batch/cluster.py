@@ -183,7 +183,7 @@ class _Batch:
         try:
             return call(callback_timeout=timeout)
         except (OSError, ClosedClientError) as error:
-            raise self._lost("does not answer" if isinstance(error, TimeoutError) else "was lost") from error
+            raise self._lost("does not answer" if isinstance(error, TimeoutError) else "was lost") from None
 
     def _lost(self, problem: str) -> InputError:
         remedy = "check that it runs and start the batch again, which continues where it stopped"
@@ -195,9 +195,9 @@ def _connect(address: str | None, workers: int | None) -> Iterator[Any]:
     """Connect to a scheduler; without an address, start a local cluster for the batch."""
     try:
         import distributed
-    except ImportError as error:
+    except ImportError:
         install = "pip install 'mirrorskin[cluster]'"
-        raise InputError(f"a cluster needs Dask, which is not installed: {install}") from error
+        raise InputError(f"a cluster needs Dask, which is not installed: {install}") from None
     with ExitStack() as stack:
         stack.enter_context(_quiet())
         if address is None:

@@ -43,6 +43,7 @@ class Outcome:
     bytes: int = 0  # size of the reconstructed frames, uncompressed
     device: str = ""  # title of the device
     motion: str = ""  # motion of the recording, if it could be opened
+    warned: bool = False  # whether the result, computed now, has warnings
 
 
 def find_settled(job: Job, plan: Plan) -> Outcome | None:
@@ -111,6 +112,7 @@ def _compute(
         message="; ".join(filter(None, (str(summarise(result)), notes, warnings))),
         bytes=math.prod(source.shape) * source.dtype.itemsize,
         device=opened.info.title,
+        warned=bool(warnings),
     )
 
 

@@ -133,7 +133,7 @@ def stitch(
         try:
             maps.append(_map_of(touch, pixel_size, opened))
         except InputError as error:
-            raise InputError(f"{name}: {error}") from error
+            raise InputError(f"{name}: {error}") from None
     graph = PoseGraph(maps, names, opened, places)
     found = graph.solve()
     touches = [

@@ -475,7 +475,7 @@ def _read_contact(
         return *_contact_of(result, shape), carried({}, contact=result.process)
     except InputError as error:
         path = os.fspath(contact) if isinstance(contact, str | os.PathLike) else ""
-        raise (error if path in str(error) else InputError(f"{path}: {error}")) from error
+        raise (error if path in str(error) else InputError(f"{path}: {error}")) from None
 
 
 def _contact_of(result: Result, shape: tuple[int, int]) -> tuple[NDArray[np.bool_], str]:

@@ -70,7 +70,7 @@ def _read(path: Path, where: str) -> NDArray[Any]:
         check_regular(path, "name an array or a picture relative to the rig file, or leave it out")
         return read_array(path) if path.suffix.lower() == ".npy" else read_picture(path)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {error}") from None
 
 
 def _check_fits(counts: NDArray[Any], path: str, camera: CameraSettings, where: str) -> None:

@@ -128,7 +128,7 @@ class GenicamCamera(ReopenedCamera):
             opened = aravis.Camera.new(matching[0] if matching else camera_name)
         except self._failure as error:
             available = f"; available: {', '.join(sorted(devices))}" if devices else "; none was found"
-            raise InputError(f"{self.name} cannot be opened: {error.message}{available}") from error
+            raise InputError(f"{self.name} cannot be opened: {error.message}{available}") from None
         if opened.is_gv_device() and not opened.get_device().is_controller():
             raise InputError(
                 f"{self.name} is used by another program: close that program, and wait some seconds"
@@ -234,5 +234,5 @@ def load_aravis() -> tuple[Any, Any]:
     except (ImportError, ValueError) as error:
         raise InputError(
             f"GenICam cameras need Aravis, which is not installed ({error}); {_REMEDY}"
-        ) from error
+        ) from None
     return Aravis, GLib.Error

@@ -216,7 +216,7 @@ class Capture:
             if self._jpeg:
                 picture = _decode(picture) if success else None
         except cv2.error as error:
-            raise InputError(f"{self._source.name}: a picture cannot be decoded: {error.err}") from error
+            raise InputError(f"{self._source.name}: a picture cannot be decoded: {error.err}") from None
         if not success or picture is None:
             raise InputError(f"{self._source.name}: a picture cannot be decoded: check camera.fourcc")
         if picture is not out:

@@ -247,7 +247,8 @@ def longest_wait(settings: CameraSettings, period: float) -> float:
 def _paused(seconds: float) -> HardwareError:
     return HardwareError(
         f"this program was paused for {seconds:.2f} s while the stage moved, so it was stopped: "
-        "the times of the frames are unknown; avoid pauses, and end other programs"
+        "the times of the frames are unknown. End other programs, or move in steps (--step or"
+        " --phase-step), which a pause does not disturb"
     )
 
 
@@ -298,12 +299,12 @@ def _open(
         raise InputError(
             f"{driver}(settings) failed: {error}; a {what} class takes one argument, the"
             f" {type(settings).__name__}"
-        ) from error
+        ) from None
     try:
         device = device_class(settings, **options)
     except OSError as error:  # includes SerialException
         source = "stage.port" if what == "stage" else "camera.source"
-        raise InputError(f"{driver}: cannot be opened: {error}; check {source}") from error
+        raise InputError(f"{driver}: cannot be opened: {error}; check {source}") from None
     lacking = [name for name in vars(protocol) if name[0] != "_" and not hasattr(device, name)]
     if lacking:
         if hasattr(device, "close"):

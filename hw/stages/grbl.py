@@ -300,7 +300,7 @@ class GrblStage(Closing):
                 link.ask(_PREPARE, timeout)
             link.until(lambda: link.rests or link.locked or None, timeout, "report")
         except HardwareError as error:
-            raise InputError(str(error)) from error
+            raise InputError(str(error)) from None
         link.begin()
         return controller
 

@@ -55,9 +55,7 @@ def open_port(url: str, baud: int, name: str) -> serial.Serial:
         port.open()
     except (OSError, ValueError) as error:
         remedy = _REMEDIES.get(getattr(error, "errno", None) or 0)
-        raise InputError(
-            f"{name}: {remedy or f'cannot be opened ({error}); correct the rig file'}"
-        ) from error
+        raise InputError(f"{name}: {remedy or f'cannot be opened ({error}); correct the rig file'}") from None
     return port
 
 

@@ -193,7 +193,7 @@ def _factor(name: str, stated: Any, unit: str) -> float:
     try:
         return ratio(stated.decode(errors="replace") if isinstance(stated, bytes) else str(stated), unit)
     except InputError as error:
-        raise InputError(f"{name}: {error}") from error
+        raise InputError(f"{name}: {error}") from None
 
 
 def _is_simple(value: Any) -> bool:

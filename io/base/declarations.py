@@ -49,7 +49,7 @@ def installed(group: str, what: str, name: str = "") -> Iterator[tuple[EntryPoin
             raise InputError(
                 f"the {what} {point.name} of an installed package cannot be loaded: {error}; repair or"
                 " uninstall the package"
-            ) from error
+            ) from None
         yield point, value
 
 
@@ -59,4 +59,4 @@ def _read(file: Path) -> str:
     except OSError as error:
         from mirrorskin.io.base.types import InputError
 
-        raise InputError(f"{file} cannot be read ({error}); reinstall mirrorskin") from error
+        raise InputError(f"{file} cannot be read ({error}); reinstall mirrorskin") from None

@@ -57,7 +57,7 @@ def load_class(name: str | type, group: str = "") -> Callable[..., Any]:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # an import of the module itself failed
-        raise InputError(f"{name}: there is no {place} in {folder.resolve()}, nor installed") from error
+        raise InputError(f"{name}: there is no {place} in {folder.resolve()}, nor installed") from None
     value: Any = loaded
     for part in kind.split("."):
         value = getattr(value, part, None)

@@ -394,6 +394,8 @@ def frame_axes(
     spare.sort(key=lambda axis: (kinds[axis] == "frames", -axis))
     if excess < 0 or len(spare) < excess or (not names and len(spare) > excess > 0):
         shown = f" and the dimensions ({', '.join(names)})" if names else ""
+        if not names and is_coloured_shape(shape):
+            raise InputError(f"{where} has shape {tuple(shape)}: {COLOURED}")
         raise InputError(
             f"{where} has shape {tuple(shape)}{shown}: a stack of frames, (T, H, W), is needed, and other"
             " axes of length 1"
@@ -403,6 +405,21 @@ def frame_axes(
     order = order_of([names[axis] for axis in kept], where) if names else (0, 1, 2)
     frames, rows, columns = (kept[number] for number in order)
     return (frames, rows, columns), fixed
+
+
+COLOURED = "the last axis is one of colours. Convert the frames to grey, or take one colour, frames[..., 1]"
+"""What to do with an array of coloured frames."""
+
+
+def is_coloured_shape(shape: Sequence[int]) -> bool:
+    """Return whether a shape is that of frames, (T, H, W, 3), with red, green and blue, or also alpha.
+
+    Examples
+    --------
+    >>> is_coloured_shape((8, 48, 64, 3)), is_coloured_shape((8, 48, 64))
+    (True, False)
+    """
+    return len(shape) > 3 and shape[-1] in (3, 4)
 
 
 def _checked_channel(channel: int | None, count: int, where: str) -> int:

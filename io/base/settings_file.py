@@ -52,7 +52,7 @@ def load_toml(path: str | Path, model: type[_Model], remedy: str) -> _Model:
             raise InputError(
                 f"{path}, line {line}: {written}: write the number with a decimal point, {number}"
             ) from error
-        raise InputError(f"{path} is not TOML: {error}; correct it there") from error
+        raise InputError(f"{path} is not TOML: {error}; correct it there") from None
     return _table(tables, model, str(path), "")
 
 
@@ -92,7 +92,7 @@ def _table(values: Any, model: type[_Model], where: str, name: str) -> _Model:
     try:
         return model(**arguments)
     except ValueError as error:
-        raise InputError(f"{where}: {f'[{name}] ' if name else ''}{error}") from error
+        raise InputError(f"{where}: {f'[{name}] ' if name else ''}{error}") from None
 
 
 def _value(value: Any, kind: Any, where: str, key: str) -> Any:

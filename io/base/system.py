@@ -73,7 +73,7 @@ def check_regular(path: Path, remedy: str = "") -> None:
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError) as error:  # ValueError: the name contains a null byte
-        raise InputError(f"{path} cannot be read: {getattr(error, 'strerror', error)}{remedy}") from error
+        raise InputError(f"{path} cannot be read: {getattr(error, 'strerror', error)}{remedy}") from None
     if stat.S_ISDIR(mode):
         raise InputError(f"{path} cannot be read: {os.strerror(errno.EISDIR)}{remedy}")
     if not stat.S_ISREG(mode):
@@ -95,7 +95,7 @@ def open_regular(path: Path, remedy: str = "") -> BufferedReader:
     try:
         return _BoundedReader(FileIO(path))
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}{remedy and f'; {remedy}'}") from error
+        raise InputError(f"{path} cannot be read: {error.strerror}{remedy and f'; {remedy}'}") from None
 
 
 def read_regular(path: Path, remedy: str = "", limit: int = MAX_UNPACKED_BYTES) -> bytes:
@@ -107,7 +107,7 @@ def read_regular(path: Path, remedy: str = "", limit: int = MAX_UNPACKED_BYTES) 
         try:
             return file.read(limit)
         except OSError as error:
-            raise InputError(f"{path} cannot be read: {error.strerror}{remedy and f'; {remedy}'}") from error
+            raise InputError(f"{path} cannot be read: {error.strerror}{remedy and f'; {remedy}'}") from None
 
 
 def read_text(path: Path, remedy: str = "") -> str:

@@ -35,7 +35,14 @@ from mirrorskin.io.model.maps import (
     status_of,
 )
 from mirrorskin.io.model.result import Result, map_shape, size_of_maps
-from mirrorskin.io.storage.atomic import Item, check_output, fixed_text, process_items, write_file
+from mirrorskin.io.storage.atomic import (
+    Item,
+    check_hdf5_name,
+    check_output,
+    fixed_text,
+    process_items,
+    write_file,
+)
 from mirrorskin.io.storage.calibration_file import (
     CARRIED,
     calibration_items,
@@ -212,7 +219,7 @@ def _surface(path: Path, form: Format) -> Result:
         with np.errstate(over="ignore", invalid="ignore"):  # heights that are not finite are none
             surface: Result = form.load(form.decoder)(content)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise InputError(f"{path}: {error}") from None
     return surface.assign(process={"format": form.name, **surface.process})
 
 
@@ -274,7 +281,7 @@ def _find_maps(file: Hdf5File) -> tuple[Found, dict[str, Map]]:
     try:
         check_declarations(declarations)
     except InputError as error:
-        raise InputError(f"{file.path}: {error}") from error
+        raise InputError(f"{file.path}: {error}") from None
     return _shaped(file, nodes, declarations), declarations
 
 
@@ -381,3 +388,4 @@ def _check_format(path: Path) -> None:
         command = _OTHER_FORMATS.get(suffix, "export")
         then = f", then 'mirrorskin {command}' makes .{suffix} of it" if command else ""
         raise InputError(f"{path}: a result is HDF5 (.h5) or Zarr (.zarr): write it so{then}")
+    check_hdf5_name(path)

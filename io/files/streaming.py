@@ -36,6 +36,7 @@ from mirrorskin.io.model.calibration import Calibration
 from mirrorskin.io.storage.atomic import (
     MAKE_ROOM,
     VERSIONS,
+    check_hdf5_name,
     check_output,
     link_new,
     new_part,
@@ -168,6 +169,8 @@ class StreamRecorder(TeeSource[LiveSource]):
                 raise InputError(
                     f"{path}: an {form.name} file cannot contain a calibration; record to a file .h5"
                 )
+        if self._messages is None:
+            check_hdf5_name(self.path)
         self._queue: queue.SimpleQueue[Block | _Mark | _Maps | _End] = queue.SimpleQueue()
         self._backlog, self._lock = 0, threading.Lock()
         self._error: BaseException | None = None

@@ -88,7 +88,7 @@ def export_result(
         try:
             parts, holds = encode(result, **options)
         except InputError as error:
-            raise InputError(f"{path}: {error}") from error
+            raise InputError(f"{path}: {error}") from None
         write_new(path, parts)
     unknown = result.offset_unknown
     heights = form.needs_heights and map_name in ("", result.name_of("height"))

@@ -80,7 +80,7 @@ def _find_sequence(folder: Path) -> tuple[NDArray[np.int64], tuple[Path, ...], t
     try:
         files = sorted(file for file in folder.iterdir() if file.is_file())
     except OSError as error:
-        raise InputError(f"{folder} cannot be read: {error.strerror}") from error
+        raise InputError(f"{folder} cannot be read: {error.strerror}") from None
     pictures = [file for file in files if file.suffix.lower() in PICTURE_SUFFIXES and file.name[0] != "."]
     rivals = _longest(_families(pictures, _WHOLE))
     if len(rivals) > 1:  # names such as z0.95.png and z1.00.png differ in both parts of the number

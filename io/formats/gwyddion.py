@@ -166,7 +166,7 @@ def decode_gwy(content: bytes) -> Result:
     try:
         channels = _object(content, 4, [_MOST])
     except (struct.error, UnicodeDecodeError, ValueError) as error:
-        raise InputError(f"it is damaged or cut short ({one_line(error)[:80]}): copy it again") from error
+        raise InputError(f"it is damaged or cut short ({one_line(error)[:80]}): copy it again") from None
     found, others = _heights_in(channels)
     if len(found) != 1:
         names = ", ".join(_title(channels, number) for number in found[:5]) or "none"

@@ -143,8 +143,8 @@ def load_writer() -> type[Writer]:
     """Return the class that writes messages; InputError if it is not installed."""
     try:
         from mcap_ros2.writer import Writer
-    except ImportError as error:
-        raise InputError(_INSTALL) from error
+    except ImportError:
+        raise InputError(_INSTALL) from None
     return Writer
 
 
@@ -645,8 +645,8 @@ class MessageFrames(WholeFrames):
         try:
             from mcap.records import Channel, ChunkIndex, Metadata, MetadataIndex, Schema, Statistics
             from mcap.stream_reader import StreamReader
-        except ImportError as error:
-            raise InputError(_INSTALL) from error
+        except ImportError:
+            raise InputError(_INSTALL) from None
         schemas: dict[int, str] = {}
         summary, notes = _Summary({}, [], {}, {}, set()), list[int]()
         with self._errors_named(), open_regular(self._path) as file:

@@ -107,7 +107,7 @@ class TiffFrames(WholeFrames):
             except InputError:
                 raise
             except OSError as error:
-                raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
+                raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
             except Exception as error:  # of many types
                 raise self._damaged() from error
             self._close = opening.pop_all().close  # the file stays open until `close`

@@ -92,8 +92,8 @@ def load_av(path: Path) -> ModuleType:
     """Return PyAV; InputError if it is not installed."""
     try:
         import av
-    except ImportError as error:
-        raise InputError(f"{path}: {_INSTALL}") from error
+    except ImportError:
+        raise InputError(f"{path}: {_INSTALL}") from None
     return av
 
 

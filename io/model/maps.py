@@ -124,7 +124,7 @@ class Map(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields
             try:
                 msgspec.structs.force_setattr(self, name, msgspec.convert(value, kind))
             except msgspec.ValidationError as error:
-                raise InputError(_type_problem(name, kind, value, error)) from error
+                raise InputError(_type_problem(name, kind, value, error)) from None
         if not self.dtype:
             msgspec.structs.force_setattr(self, "dtype", "uint8" if self.codes else "float32")
         problem = next((text for check in _CHECKS for text in check(self)), None)

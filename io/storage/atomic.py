@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import functools
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -65,6 +66,8 @@ def check_output(path: Path, *keep: Path | None, replaces: Replaces = "derived")
     >>> check_output(Path("result.h5"), Path("press.h5"))  # doctest: +SKIP
     """
     check_writable_system()
+    if replaces == "calibration":
+        check_hdf5_name(path)
     with translate_os_errors(f"{path} cannot be written", "choose another place with -o"):
         if is_zarr(path):
             raise InputError(f"{path}: this is written as HDF5: name a local file, .h5, with -o")
@@ -83,6 +86,19 @@ def check_output(path: Path, *keep: Path | None, replaces: Replaces = "derived")
             pass
 
 
+def check_hdf5_name(path: Path) -> None:
+    """Raise InputError if the suffix of a file to be written as HDF5 is that of another kind of file.
+
+    Examples
+    --------
+    >>> check_hdf5_name(Path("press.h5")), check_hdf5_name(Path("press.2026-05-01"))
+    (None, None)
+    """
+    suffix = path.suffix.lower()
+    if _ENDING.fullmatch(suffix) and suffix not in _HDF5:
+        raise InputError(f"{path}: this is written as HDF5. Name it {path.stem}.h5")
+
+
 def _check_existing(path: Path, replaces: Replaces) -> None:
     """Raise InputError if a file is being written, or may not be replaced."""
     if is_locked(path) and not _readable(path):
@@ -98,6 +114,10 @@ def is_locked(path: Path) -> bool:
         except OSError:  # or the file system does not support locks
             return True
     return False
+
+
+_HDF5 = (".h5", ".hdf5", ".hdf", ".he5", ".nxs", ".cxi")
+_ENDING = re.compile(r"\.[a-z]{1,5}[0-9]?")  # what names of files usually end in
 
 
 class NewHdf5(Closing):
@@ -233,7 +253,8 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_hdf5(path: Path, replaces: Replaces = "derived") -> Iterator[NewHdf5]:
-    """Write an HDF5 file like ``new_file``."""
+    """Write an HDF5 file like ``new_file``; InputError for the suffix of another kind of file."""
+    check_hdf5_name(path)
     with new_file(path, replaces) as descriptor:
         with translate_os_errors(f"{path} could not be written", MAKE_ROOM):
             new = NewHdf5(path, descriptor)

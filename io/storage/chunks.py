@@ -133,7 +133,12 @@ def find_codecs(dataset: h5py.h5d.DatasetID) -> list[Codec] | str:
     for code, _, values, name in filters:
         try:
             codecs.append(_MAKERS[code](values))
-        except (OSError, AttributeError, LookupError):  # a missing or different library, or an unknown filter
+        except (
+            ImportError,
+            OSError,
+            AttributeError,
+            LookupError,
+        ):  # no such library or filter
             return name.decode(errors="replace").split(";")[0].strip() or str(code)
     codes = [code for code, *_ in filters]
     if codes and codes[-1] == h5py.h5z.FILTER_FLETCHER32:
@@ -186,7 +191,7 @@ def _deflate(_values: tuple[int, ...]) -> Codec:
         try:
             unpacked = stream.decompress(packed.data, out.size + 1)
         except zlib.error as error:
-            raise ValueError(f"({error})") from error
+            raise ValueError(f"({error})") from None
         if not stream.eof:
             raise ValueError("(the chunk is too short, or too long)")
         _check(len(unpacked), out.size)

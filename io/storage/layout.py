@@ -216,7 +216,7 @@ class Layout:
         try:
             return msgspec.json.decode(text, type=tuple[Finding, ...]) if text else ()
         except msgspec.DecodeError as error:
-            raise InputError(f"{self._file.path}: {FINDINGS} is damaged ({error}): import again") from error
+            raise InputError(f"{self._file.path}: {FINDINGS} is damaged ({error}): import again") from None
 
     def truth(self) -> Truth | None:
         """Read the truth of a simulation, if there is one."""

@@ -273,5 +273,5 @@ def _free_port(port: int) -> int:
         try:
             probe.bind((HERE, port))
         except (OSError, OverflowError) as error:
-            raise InputError(f"port {port} cannot be used ({error}): choose another with --port") from error
+            raise InputError(f"port {port} cannot be used ({error}): choose another with --port") from None
         return int(probe.getsockname()[1])

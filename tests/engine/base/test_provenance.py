@@ -41,7 +41,7 @@ def test_errors_name_their_source_once_and_others_pass():
         with pytest.raises(io.InputError) as caught, naming(Source()):
             raise io.InputError(message)
         assert str(caught.value) == named
-        assert str(caught.value.__cause__ or caught.value) == message
+        assert str(caught.value.__context__ or caught.value) == message
     with pytest.raises(ZeroDivisionError), naming(Source()):
         raise ZeroDivisionError
 
