@@ -15,7 +15,9 @@ from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker, invert_symmetric
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.base.arguments import check_count, check_number, check_pixel_size, checked, in_unit
+from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.io.model.maps import TABLE, DisplacementStatus, status_of
+from mirrorskin.io.watch.saturation import MAD
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
@@ -34,6 +36,9 @@ _MOST_STEP = 64  # maximum distance of nodes, pixels
 _CORRELATED_SAMPLES = 4  # samples over which residuals are correlated
 _LEAST_VARIANCE = 1e-4  # of samples of a window, relative to the median
 _LAPLACIAN_NOISE = 4 * 20 / 24**2  # noise of the squared bias (two standard deviations) per variance
+_LEAST_WINDOWS = 20  # for an estimate of their scatter
+_MEDIAN_NOISE = 2.3  # standard deviation of the median of n squares, times sqrt(n), relative to their mean
+_SCATTERED = 2.5  # excess of the variance above which there is a finding
 _LEAST_TEXTURED = 0.1  # minimum share of windows with texture; edges of light on a clear sheet may reach it
 
 
@@ -121,6 +126,8 @@ def find_displacement(
     sigma = np.sqrt(np.einsum("yxii->yxi", texture.covariance)) * size
     nodes = [_at_nodes(tracker, field, texture, window_size, sigma, size) for field in fields]
     displacement, sigma, status = (np.stack(part) for part in zip(*nodes, strict=True))
+    excess = excess_scatter(displacement, sigma, window_step, window_size)
+    sigma *= math.sqrt(excess)
     on_device = isinstance(frames, Array)
     maps = {
         "displacement": tracker.to_pixels(displacement, on_device),
@@ -128,7 +135,8 @@ def find_displacement(
         "status": tracker.worst_at_pixels(status, _RANK),
     }
     x, y = pixel_axes(frames.shape[1:], size)
-    return Result(maps, x=x, y=y, declarations=MAPS).with_fitted(noise=texture.noise)
+    result = Result(maps, x=x, y=y, declarations=MAPS).with_fitted(noise=texture.noise)
+    return with_findings(result, *([_scattered(excess)] if excess > _SCATTERED else []))
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,6 +242,43 @@ def bending_variance(displacement: Doubles, variance: Doubles, step: int, window
     bias = np.stack([fill_with_nearest(part) for part in np.moveaxis(laplacian, -1, 0)], axis=-1)
     bias *= (window / (apart * step)) ** 2 / 24
     return np.asarray(np.fmax(bias**2 - _LAPLACIAN_NOISE * variance, 0))
+
+
+def excess_scatter(displacement: Doubles, sigma: Doubles, step: int, window: int) -> float:
+    """Return the variance of displacements, (T, rows, columns, 2), over that which is stated; at least 1.
+
+    It is computed from third differences of windows that do not overlap, which smooth movement hardly
+    changes. The residuals in a window do not show errors that are correlated there, as those of a codec.
+    """
+    apart = max(1, math.ceil(window / step))
+    places = [k * apart for k in range(4)]
+    ratios = []
+    for axis in (1, 2):
+        count = displacement.shape[axis] - 3 * apart
+        if count > 0:
+            third, variance = (
+                np.tensordot(
+                    weights, np.stack([part.take(range(k, k + count), axis) for k in places]), axes=1
+                )
+                for part, weights in ((displacement, (1, -3, 3, -1)), (sigma**2, (1, 9, 9, 1)))
+            )
+            ratios.append(np.ravel(third**2 / variance))
+    ratio = np.concatenate(ratios) if ratios else np.empty(0)
+    ratio = ratio[np.isfinite(ratio)]
+    windows = len(ratio) / apart**2  # that are independent
+    if windows < _LEAST_WINDOWS:
+        return 1.0
+    return max(1.0, MAD**2 * float(np.median(ratio)) - _MEDIAN_NOISE / math.sqrt(windows))
+
+
+def _scattered(excess: float) -> Finding:
+    """Return the finding that displacements of windows scatter more than noise explains."""
+    return Finding(
+        "scatter",
+        f"displacements of neighbouring windows differ by {math.sqrt(excess):.2g} times what noise explains,"
+        " as with lossy compression, or texture finer than two pixels: standard deviations are enlarged, but"
+        " errors that windows have in common are unknown",
+    )
 
 
 def node_status(field: NodeField, texture: Texture) -> NDArray[np.uint8]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from speckle import Speckle
@@ -107,6 +108,40 @@ def test_a_long_displacement_in_one_step_is_found(far):
     assert np.mean(np.abs(displaced - far * PIXEL[0]) < 0.01) > 0.95
     assert np.isnan(slip.displacement[0, :, -int(far) :]).all()
     assert (slip.status[0, :, -int(far) :] == 0).all()
+
+
+def as_jpeg(frame, quality):
+    encoded = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_sigma_counts_errors_that_are_correlated_within_windows(seed):
+    texture = Speckle(seed)
+    shifts = [(0.37 * k, -0.21 * k) for k in range(5)]
+    frames = np.stack([texture.frame(SHAPE, *shift, 1.5, k).round() for k, shift in enumerate(shifts)])
+    true = np.stack([in_mm(*np.float64(shift)) for shift in shifts[1:]])[:, None, None]
+
+    def squares(frames):
+        slip = find_displacement(frames[0], frames[1:], PIXEL)
+        assert "neighbouring windows" not in slip.process.get("warnings", "")
+        return np.mean(((slip.displacement - true)[INSIDE] / slip.displacement_sigma[INSIDE]) ** 2)
+
+    frames = frames.clip(0, 255).astype(np.uint8)
+    assert squares(frames) == pytest.approx(1, abs=0.2)
+    lossy = np.stack([as_jpeg(frame, 75) for frame in frames])
+    assert squares(lossy) == pytest.approx(1, abs=0.2)  # 1.4 with the residuals alone
+
+
+def test_displacements_that_scatter_far_more_than_noise_explains_have_a_warning():
+    noise = np.random.default_rng(3).normal(0, 12, (4, *SHAPE))
+    frames = np.stack(
+        [SPECKLE.frame(SHAPE, 0.3 * k, 0) + cv2.GaussianBlur(noise[k], (0, 0), 1.5) for k in range(4)]
+    )
+    slip = find_displacement(frames[0], frames[1:], PIXEL)
+    assert "neighbouring windows differ by" in slip.process["warnings"]
+    error = (slip.displacement - in_mm(0.3 * np.arange(1, 4), np.zeros(3))[:, None, None])[INSIDE]
+    assert np.mean((error / slip.displacement_sigma[INSIDE]) ** 2) == pytest.approx(1, abs=0.3)
 
 
 def test_another_gain_and_offset_of_brightness_change_nothing():
