@@ -8,6 +8,8 @@ import runpy
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from commands import done
 
@@ -173,4 +175,14 @@ def test_a_script_of_the_examples_runs_and_prints_what_is_true(name, monkeypatch
         monkeypatch.setattr(sys, "argv", ["own_camera.py", "press.avi"])
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
     (SLOW | QUICK)[name](capsys.readouterr().out)
-    assert list(tmp_path.glob("*.png")) or name in ("own_camera", "steepest_rise")
+    drawn = list(tmp_path.glob("*.png"))
+    assert drawn or name in ("own_camera", "steepest_rise")
+    for picture in drawn if name in SLOW else ():
+        check_shown(picture, f"sensors-{picture.name}" if name == "sensors" else picture.name)
+
+
+def check_shown(drawn, name):
+    """Compare a picture with that of the documentation."""
+    picture, shown = (cv2.imread(str(path)) for path in (drawn, ROOT / "docs" / "images" / name))
+    assert picture.shape == shown.shape, name
+    assert np.abs(picture.astype(int) - shown).mean() < 0.3, f"docs/images/{name}: copy what the script draws"
