@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -55,15 +56,16 @@ def command(
 ) -> None:
     """Show recordings and results in the browser: click, change options, measure, save. Ctrl-C ends it.
 
-    It listens on this machine only, at an address that contains a secret.
+    The page opens files of the folder in which it is started, and files that are dropped on it. It listens on
+    this machine only, at an address that contains a secret.
     """
-    from mirrorskin import io
     from mirrorskin.view.app.server import AppServer, StopServer, check_app
 
     check_app()
-    if not files and rig is None:
-        raise io.InputError("nothing to show: name a recording or a result, or a rig with --rig RIG.toml")
-    openings = [_opening(path, calibration, device, operation, dict(chosen)) for path in files or ()]
+    openings = [
+        _opening(path, calibration, device, operation, dict(chosen), read=number == 0)
+        for number, path in enumerate(files or ())
+    ]
     with ExitStack() as stack:
         control = None
         if rig is not None:
@@ -79,7 +81,11 @@ def command(
         from mirrorskin.view.app.page import pages
 
         lifetime = {} if control is None else {"lifetime": _LIFETIME}
-        server = AppServer(pages(files or (), openings, control), port or 0, **lifetime)
+        drops = Path(
+            stack.enter_context(TemporaryDirectory(prefix="mirrorskin-", ignore_cleanup_errors=True))
+        )
+        page = pages(files or (), openings, control, Path.cwd(), drops)
+        server = AppServer(page, port or 0, drops=drops, **lifetime)
         click.echo(server.address)
         try:
             with _ended_by_signals(server.stop):
@@ -114,14 +120,23 @@ def _ended_by_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 
 def _opening(
-    path: Path, calibration: Path | None, device: str | None, operation: str | None, chosen: dict[str, Any]
+    path: Path,
+    calibration: Path | None,
+    device: str | None,
+    operation: str | None,
+    chosen: dict[str, Any],
+    read: bool,
 ) -> Opening:
-    """Return how to open a file; it is opened once, so that faults are reported first."""
+    """Return how to open a file; it is opened once, so that faults are reported first.
+
+    Of several results, the first one is read, and each of the others when it is chosen.
+    """
     from mirrorskin import io
     from mirrorskin.view.app.session import Opening, holds_result
 
     if holds_result(path):
-        io.open_result(path)
+        if read:
+            io.open_result(path)
         return Opening()
     values = dict(chosen)
     stack: dict[str, Any] = {**stack_options(chosen)}

@@ -4,19 +4,33 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from commands import done
 
-from mirrorskin import io
+from mirrorskin import engine, io
 from mirrorskin.engine.metrology import Quantity
 
 PATIENCE = 60.0  # seconds
 SCREENSHOTS = os.environ.get("MIRRORSKIN_SCREENSHOTS")  # a folder to keep pictures of the pages in
 SIZE = {"width": 1440, "height": 900}
+CANVASES = """count => {
+    const canvases = root => [...root.querySelectorAll("*")].flatMap(
+        element => [element, ...(element.shadowRoot ? canvases(element.shadowRoot) : [])])
+    const shown = canvases(document).filter(
+        element => element.classList.contains("bk-Canvas") && element.checkVisibility())
+    return shown.length === count
+}"""
+DROP = """bytes => {
+    const data = new DataTransfer()
+    data.items.add(new File([new Uint8Array(bytes)], "dropped.h5"))
+    window.dispatchEvent(new DragEvent("drop", {dataTransfer: data, bubbles: true, cancelable: true}))
+}"""
 BESIDE = 0.68, 0.5  # a place in the picture where the ball is touched, shares of its width and height
 
 
@@ -27,13 +41,20 @@ def press(tmp_path_factory):
     return path
 
 
+@contextmanager
+def serving(*files):
+    """Run the application in a separate process; yield this and the address."""
+    command = [sys.executable, "-m", "mirrorskin.cli.main", "app", *map(str, files), "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        yield server, server.stdout.readline().strip()
+        server.kill()
+
+
 @pytest.fixture(scope="module")
 def address(press):
-    """The address of the application, in a separate process."""
-    command = [sys.executable, "-m", "mirrorskin.cli.main", "app", str(press), "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
-        yield server.stdout.readline().strip()
-        server.terminate()
+    """The address of the application."""
+    with serving(press) as (_, place):
+        yield place
 
 
 class Page:
@@ -61,7 +82,7 @@ class Page:
 
     def click(self, across, down):
         """Click at a place of the frame."""
-        box = self.page.locator(".bk-Canvas").first.bounding_box()
+        box = self.page.locator(".bk-Canvas:visible").first.bounding_box()
         self.page.mouse.click(box["x"] + across * box["width"], box["y"] + down * box["height"])
 
     def fact(self, name):
@@ -133,17 +154,55 @@ def test_the_command_is_copied(opened):
 
 def test_the_previous_result_is_shown_next_to_the_new_one(opened):
     opened.show("Result")
-    opened.page.get_by_text("After a change of an option").wait_for()
+    opened.page.get_by_text("highest point", exact=True).wait_for()
+    assert opened.page.locator(".bk-Canvas:visible").count() == 2
     opened.set_threshold(0.4)
-    opened.page.get_by_text("After a change of an option").wait_for(state="detached")
-    assert opened.page.locator(".bk-Canvas").count() == 3
+    opened.page.wait_for_function(CANVASES, arg=3)
     opened.keep("app-result")
+
+
+def test_an_option_beyond_its_limits_says_why_next_to_the_field(opened):
+    opened.set_threshold(1.7)
+    note = opened.page.get_by_text("threshold 1.7: a share from 0 to 1 is needed, such as 0.5")
+    note.wait_for()
+    field = opened.page.get_by_label("Threshold (share)").bounding_box()
+    assert 0 < note.bounding_box()["y"] - field["y"] < 100
+    opened.set_threshold(0.5)
+    note.wait_for(state="hidden")
+
+
+def test_a_file_that_is_dropped_on_the_page_opens(opened, press, tmp_path):
+    done("reconstruct", press, "-o", tmp_path / "dropped.h5")
+    opened.page.evaluate(DROP, list((tmp_path / "dropped.h5").read_bytes()))
+    opened.page.get_by_text("dropped.h5; height at").wait_for()
+    with opened.page.expect_download() as download:
+        opened.page.get_by_text("Save measures.csv").click()
+    download.value.save_as(tmp_path / "measures.csv")
+    first = engine.measure(io.open_result(tmp_path / "dropped.h5")).quantities["highest point"]
+    assert f"highest point,{first.value!r},{first.sigma!r},mm" in (tmp_path / "measures.csv").read_text()
+
+
+def test_measures_are_copied(opened):
+    opened.show("Result")
+    opened.page.get_by_text("highest point", exact=True).wait_for()
+    opened.page.get_by_text("Copy measures").click()
+    opened.page.wait_for_function("async () => (await navigator.clipboard.readText()).includes('Sq\\t')")
+
+
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_program_that_does_not_answer_is_shown(browser, press, ending):
+    with serving(press) as (server, address):
+        page = Page(browser, address)
+        server.send_signal(ending)
+        page.page.get_by_text("The program does not answer.").wait_for()
+        assert page.page.evaluate("() => document.getElementById('body').inert")
+        page.context.close()
 
 
 def test_a_section_is_drawn_by_dragging(opened):
     opened.show("Result")
     opened.page.get_by_text("highest point", exact=True).wait_for()
-    box = opened.page.locator(".bk-Canvas").first.bounding_box()
+    box = opened.page.locator(".bk-Canvas:visible").first.bounding_box()
     places = [
         (box["x"] + fraction * box["width"], box["y"] + 0.4 * box["height"]) for fraction in (0.3, 0.5, 0.6)
     ]
@@ -160,7 +219,7 @@ def test_a_region_is_measured_by_dragging(opened):
     opened.page.get_by_text("Draw a region to measure").click()
     whole = opened.page.get_by_text("Measures of the whole map")
     whole.wait_for()
-    box = opened.page.locator(".bk-Canvas").first.bounding_box()
+    box = opened.page.locator(".bk-Canvas:visible").first.bounding_box()
     opened.page.mouse.move(box["x"] + 0.35 * box["width"], box["y"] + 0.3 * box["height"])
     opened.page.mouse.down()
     opened.page.mouse.move(box["x"] + 0.55 * box["width"], box["y"] + 0.6 * box["height"], steps=5)
@@ -175,15 +234,13 @@ def test_the_surface_is_drawn(opened):
     opened.keep("app-surface")
 
 
+@pytest.mark.parametrize("width", [800, SIZE["width"]])
 @pytest.mark.parametrize("tab", ["Recording", "Result", "Surface", "Save and copy"])
-def test_nothing_needs_to_be_scrolled(opened, tab):
+def test_nothing_needs_to_be_scrolled_sideways(opened, tab, width):
+    opened.page.set_viewport_size({"width": width, "height": SIZE["height"]})
     opened.show(tab)
     opened.page.wait_for_load_state("networkidle")
-    high, wide = opened.page.evaluate(
-        "() => [document.scrollingElement.scrollHeight, document.scrollingElement.scrollWidth]"
-    )
-    assert high <= SIZE["height"]
-    assert wide <= SIZE["width"]
+    assert opened.page.evaluate("() => document.scrollingElement.scrollWidth") <= width
 
 
 def test_it_asks_no_other_machine_and_complains_of_nothing(opened, address):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import signal
 import subprocess
 import sys
 import time
@@ -29,19 +31,28 @@ def rig_file(tmp_path):
 
 
 @pytest.fixture
-def opened(browser, rig_file):
-    """The page of the rig, connected, in a context of its own."""
+def server(rig_file):
+    """The application with the rig, in another process."""
     command = [*MIRRORSKIN, "app", "--rig", str(rig_file), "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
-        context = browser.new_context(viewport={"width": 1440, "height": 900})
-        context.set_default_timeout(1000 * PATIENCE)
-        page = context.new_page()
-        page.goto(server.stdout.readline().strip())
-        page.locator("button", has_text="Connect").click()
-        page.get_by_text("ready, the stage rests").wait_for()
-        yield page
-        context.close()
-        server.terminate()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        yield process
+        process.kill()
+
+
+@pytest.fixture
+def opened(browser, server):
+    """The page of the rig, connected, in a context of its own."""
+    context = browser.new_context(viewport={"width": 1440, "height": 900})
+    context.set_default_timeout(1000 * PATIENCE)
+    page = context.new_page()
+    page.goto(server.stdout.readline().strip())
+    page.locator("button", has_text="Connect").click()
+    page.get_by_text("ready, the stage rests").wait_for()
+    yield page
+    context.close()
+    server.send_signal(signal.SIGCONT)
+    server.terminate()
+    server.wait(PATIENCE)
 
 
 def run(page, speed):
@@ -93,3 +104,52 @@ def test_closing_the_page_ends_a_run(opened, rig_file):
     report = released(rig_file)
     assert report.state in ("idle", "alarm")
     assert report.position.travel < 1.4  # the press to 1.5 mm would have taken half a minute
+
+
+FIRST = """() => {
+    const banner = document.getElementById("lost")
+    new MutationObserver(() => { window.first ??= banner.textContent }).observe(banner, {childList: true})
+}"""
+
+
+# Nothing but STOP can be used; what the program had sent before may still arrive.
+OFF = '''() => ["head", "body", "stop"].map(part => document.getElementById(part).inert).join()
+    === "true,true,false"'''
+
+
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_dead_program_is_shown_and_a_failed_stop_says_what_to_do(opened, server, ending):
+    assert opened.locator("#lost").is_hidden()
+    opened.evaluate(FIRST)
+    server.send_signal(ending)
+    opened.locator("#lost").wait_for(state="visible")
+    opened.wait_for_function(OFF)
+    age = re.search(r"does not answer. What is shown is (\d) s old", opened.evaluate("() => window.first"))
+    assert int(age[1]) <= 2
+    opened.get_by_text("STOP", exact=True).click()
+    failed = opened.locator("#unstopped", has_text="STOP failed: the program does not answer.")
+    failed.wait_for()
+    assert "emergency switch" in failed.inner_text()
+
+
+def test_a_program_that_answers_again_can_be_used_again(opened, server):
+    server.send_signal(signal.SIGSTOP)
+    opened.locator("#lost").wait_for(state="visible")
+    server.send_signal(signal.SIGCONT)
+    opened.locator("#lost").wait_for(state="hidden")
+    assert not opened.evaluate("() => document.getElementById('body').inert")
+
+
+NUMBER = "() => [...Bokeh.documents[0].all_models].find(model => model.data?.number).data.number[0]"
+BUSY = """() => {
+    const end = performance.now() + 4000
+    while (performance.now() < end);
+    return new Promise(done => setTimeout(done, 100))
+}"""
+
+
+def test_pictures_do_not_queue_while_the_browser_is_busy(opened):
+    """While the browser draws nothing for 4 s, 2 pictures at most are sent, not 26."""
+    before = opened.evaluate(NUMBER)
+    opened.evaluate(BUSY)
+    assert opened.evaluate(NUMBER) - before <= 4

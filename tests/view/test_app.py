@@ -6,6 +6,7 @@ import numpy as np
 import panel as pn
 import param
 import pytest
+from commands import refused
 from shown import ball
 from stacks import record
 
@@ -14,7 +15,8 @@ from mirrorskin.io.model.maps import TABLE
 from mirrorskin.twin import Axial, Twin, Vertical
 from mirrorskin.view.app import App, Opening
 from mirrorskin.view.app.options import read, widget_of
-from mirrorskin.view.app.picture import show_map
+from mirrorskin.view.app.picture import Picture, Shown, show_map
+from mirrorskin.view.app.result import ResultPane, as_text
 from mirrorskin.view.app.save import SavePane
 from mirrorskin.view.app.session import Session
 from mirrorskin.view.app.trace import trace_of
@@ -95,12 +97,12 @@ def test_a_refused_option_shows_the_reason_and_keeps_the_result(app):
     first = app.session.now
     app.options.widgets["noise"].value = "-1"
     assert app.session.now is first
-    assert "a number in counts of at least 0 is needed" in app.options.problem.object
+    assert "a number in counts of at least 0 is needed" in app.options.notes["noise"].object
 
 
 def test_a_text_that_is_not_a_number_is_refused(app):
     app.options.widgets["noise"].value = "much"
-    assert "noise much" in app.options.problem.object
+    assert "noise much" in app.options.notes["noise"].object
 
 
 def test_another_operation_has_its_own_options(app):
@@ -191,7 +193,148 @@ def test_a_section_is_where_it_was_drawn(app):
     app.result._drawn("section", (-2.0, 0.5), (2.0, 0.5))
     x = app.result.section.sources["now"].data["x"]
     assert x[-1] == pytest.approx(4.0)
-    assert app.result._dragging.line.data["y"].tolist() == [0.5, 0.5]
+    assert [y.tolist() for y in app.result._lines.data["y"]] == [[0.5, 0.5]]
+
+
+def test_several_sections_are_drawn_and_removed(app):
+    app.result._drawn("section", (-2.0, 0.5), (2.0, 0.5))
+    app.result._drawn("section", (0.0, -2.0), (0.0, 2.0))
+    assert app.session.ends == ((-2.0, 0.5), (2.0, 0.5))
+    assert app.result.section.sources["section 2"].data["x"][-1] == pytest.approx(4.0, abs=0.2)
+    app.result.uncut.param.trigger("clicks")
+    assert app.session.sections == [((-2.0, 0.5), (2.0, 0.5))]
+    assert len(app.result.section.sources["section 2"].data["x"]) == 0
+
+
+def test_dust_is_left_out_of_the_measures(app):
+    square = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+    app.result._drawn("mask", *square)
+    result = app.session.now.result
+    x, y = np.meshgrid(result.x, result.y)
+    clean = result.assign(height=np.where((abs(x) < 1) & (abs(y) < 1), np.nan, result.height))
+    expected = engine.measure(clean).quantities["highest point"]
+    assert str(expected) in app.result.measures.object
+    assert "without one area of dust" in app.result.measures.object
+    app.result.unmask.param.trigger("clicks")
+    assert app.session.masks == []
+
+
+def test_an_option_beyond_its_limits_is_refused_with_the_message_of_the_command_line(
+    app, press, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    first = app.session.now
+    app.options.widgets["threshold"].value = 1.7
+    assert app.session.now is first
+    message = app.options.notes["threshold"].object
+    assert refused("threshold 1.7", "reconstruct", press, "--threshold", "1.7", "-o", "x.h5")
+    assert "threshold 1.7: a share from 0 to 1 is needed, such as 0.5" in message
+    app.options.widgets["threshold"].value = 0.5
+    assert not app.options.notes["threshold"].visible
+
+
+def test_changes_are_undone_and_repeated_without_computing_again(app):
+    first = app.session.now
+    app.options.widgets["threshold"].value = 0.3
+    second = app.session.now
+    app.options.undo.param.trigger("clicks")
+    assert app.session.now is first
+    assert app.options.widgets["threshold"].value == 0.5
+    assert app.session.before is second
+    app.options.redo.param.trigger("clicks")
+    assert app.session.now is second
+    assert app.options.redo.disabled
+
+
+def test_what_does_not_belong_to_the_options_is_grey(press):
+    waiting = []
+    session = Session(press, run=lambda work, then: waiting.append((work, then)))
+    _compute(waiting)
+    pane = ResultPane(session)
+    _compute(waiting)
+    assert pane._body.styles["opacity"] == pane.measures.styles["opacity"] == "1"
+    session.choose("threshold", 0.3)
+    assert pane._body.styles["opacity"] != "1"
+    work, then = waiting.pop(0)
+    then(work())  # the map is there, its measures are not
+    assert pane._body.styles["opacity"] == "1"
+    assert pane.measures.styles["opacity"] != "1"
+    _compute(waiting)
+    assert pane.measures.styles["opacity"] == "1"
+    session.close()
+
+
+def test_colours_are_chosen_for_each_map(app):
+    app.result.palette.value, app.result.low.value, app.result.high.value = "gray", -1.0, -0.5
+    picture = app.result._pictures["now"]
+    assert (picture.mapper.low, picture.mapper.high) == (-1.0, -0.5)
+    assert picture.mapper.palette[0] == "#000000"
+    app.result.map.value = "height_sigma"
+    assert app.result.palette.value == ""
+    app.result.map.value = "height"
+    assert app.result.low.value == -1.0
+
+
+def test_measures_are_a_table_for_other_programs(app):
+    quantity, value, sigma, unit = as_text(app.result._measured, ",").splitlines()[1].split(",")
+    expected = app.result._measured.quantities["highest point"]
+    assert (quantity, unit) == ("highest point", "mm")
+    assert (float(value), float(sigma)) == (expected.value, expected.sigma)
+
+
+def test_another_file_is_compared(press, tmp_path):
+    with io.open_recording(press) as recording:
+        io.save_result(engine.reconstruct(recording, threshold=0.3), tmp_path / "other.h5")
+    app = App(press, tmp_path / "other.h5")
+    app.result.other.value = 1
+    assert app.session.compared.label == "other.h5, stored result"
+    shown = app.result._pictures["before"].source.data["image"][0]
+    np.testing.assert_array_equal(shown, io.open_result(tmp_path / "other.h5").height)
+    app.close()
+
+
+def test_a_pixel_is_chosen_with_the_keyboard(app):
+    app.recording.row.value = TOUCHED[0]
+    app.recording.column.value = TOUCHED[1]
+    assert app.session.pixel == TOUCHED
+    assert "Travel at the onset" in app.recording.facts.object
+
+
+def test_files_of_a_folder_are_opened_from_the_page(press, tmp_path):
+    io.save_result(ball(), tmp_path / "ball.h5")
+    (tmp_path / "notes.txt").write_text("no surface")
+    app = App(folder=tmp_path)
+    assert app.session is None
+    assert app.files.names.options == ["ball.h5"]
+    app.files.names.value = "ball.h5"
+    app.files.open.param.trigger("clicks")
+    assert app.session.name == "ball.h5"
+
+
+@pytest.mark.parametrize("place", ["../ball.h5", "/etc/passwd", "a/../ball.h5", "none/ball.h5"])
+def test_only_what_was_dropped_is_opened_as_such(tmp_path, place):
+    io.save_result(ball(), tmp_path / "ball.h5")
+    (tmp_path / "drops").mkdir()
+    app = App(folder=tmp_path, drops=tmp_path / "drops")
+    app.files.dropped.value = place
+    assert app.session is None
+
+
+def test_a_large_picture_is_sent_as_a_screen_has_pixels():
+    picture = Picture((0.0, 4.0, 0.0, 3.0), "mm")
+    values = np.arange(3000 * 4000, dtype=np.float32).reshape(3000, 4000)
+    picture.show(Shown(values, "", "", palette=["#000000"]))
+    data = picture.source.data
+    assert data["image"][0].shape == (750, 1000)
+    assert (data["x"], data["dw"], data["dh"]) == ([0.0], [4.0], [3.0])
+    picture.figure.x_range.update(start=1.0, end=1.4)
+    picture.figure.y_range.update(start=1.0, end=1.3)
+    picture._look_again(None)
+    data = picture.source.data
+    row, column = round((3.0 - data["y"][0] - data["dh"][0]) * 1000), round(data["x"][0] * 1000)
+    shape = data["image"][0].shape
+    np.testing.assert_array_equal(data["image"][0], values[row:, column:][: shape[0], : shape[1]])
+    assert data["x"][0] <= 1.0 < 1.4 <= data["x"][0] + data["dw"][0]
 
 
 def test_measures_are_those_of_the_region_that_was_drawn(app):

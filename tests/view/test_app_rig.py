@@ -8,6 +8,7 @@ import pytest
 from simulated import simulate
 
 from mirrorskin import engine, io
+from mirrorskin.hw.rig.plans import HorizontalPlan, RockPlan, TwistPlan
 from mirrorskin.hw.stages.grbl import GrblStage
 from mirrorskin.twin.emulator.rig import EmulatedRig
 from mirrorskin.view.app import App
@@ -308,6 +309,31 @@ def test_stop_is_at_the_head_whatever_the_page_shows(emulated, tmp_path):
     app.add("a result", io.Result(height=np.zeros((8, 9), np.float32)))
     assert app.session is not None
     assert app.rig.stop in app.view[0]
+
+
+@pytest.mark.parametrize(
+    ("motion", "plan"),
+    [
+        ("slide", HorizontalPlan(1.0, 0.5, 0.0, speed=0.2, wait=0.5)),
+        ("twist", TwistPlan(1.0, np.radians(10.0), speed=np.radians(4.0), wait=0.5)),
+        ("rocking", RockPlan(1.0, np.radians(2.5), 0.0, speed=np.radians(2.0))),
+    ],
+)
+def test_other_motions_are_run_from_the_page(ready, monkeypatch, motion, plan):
+    asked = []
+    monkeypatch.setattr(ready.control, "run", lambda plan, record: asked.append(plan))
+    pane = RigPane(ready.control, lambda name, source: None)
+    pane.motion.value = motion
+    pane.start.param.trigger("clicks")
+    assert asked == [plan]
+
+
+def test_a_slide_is_run_and_has_a_result(ready):
+    ready.control.run(HorizontalPlan(1.0, 0.3, speed=0.5))
+    ready.until(lambda: ready.control.result is not None or ready.control.problem != "")
+    assert ready.control.problem == ""
+    pane = RigPane(ready.control, lambda name, source: None)
+    assert "Frames used" in pane.run.object
 
 
 def test_an_impossible_plan_is_refused(ready):

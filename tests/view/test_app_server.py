@@ -335,3 +335,13 @@ def test_a_post_to_another_address_stops_nothing(stopper):
     address, asked = stopper
     assert post(address.rpartition("/")[0] + "/other") == 404
     assert asked == []
+
+
+def test_a_stop_that_fails_is_answered_with_the_reason():
+    def stop():
+        raise InputError("the stage does not answer")
+
+    with closing(StopServer(stop)) as server, pytest.raises(urllib.error.HTTPError) as failed:
+        urllib.request.urlopen(urllib.request.Request(server.address, method="POST"), timeout=PATIENCE)
+    assert failed.value.code == 500
+    assert failed.value.read() == b"the stage does not answer"

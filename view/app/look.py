@@ -12,9 +12,6 @@ import panel as pn
 STYLE = resources.files("mirrorskin.view.app").joinpath("page.css").read_text("utf-8")
 """The style of texts."""
 
-TALL = 900 - 70
-"""Height of the page below its head, in a window of 1440 x 900."""
-
 
 def text(content: str = "", **settings: Any) -> Any:
     """Return a pane with HTML in the style of the application."""
@@ -36,18 +33,20 @@ def problem(content: str) -> str:
     return f'<p class="problem">{escape(content)}</p>' if content else ""
 
 
-def table(rows: Mapping[str, str], height: int | None = None) -> str:
-    """Return names and values as a table, which is scrolled if it is higher than a number of pixels."""
+def table(rows: Mapping[str, str]) -> str:
+    """Return names and values as a table."""
     cells = "".join(
         f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows.items()
     )
-    style = "" if height is None else f' class="scroll" style="max-height:{height}px"'
-    return f"<div{style}><table>{cells}</table></div>"
+    return f"<table>{cells}</table>"
 
 
 def plain_axes(figure: Any) -> None:
     """Set the letters of a figure of Bokeh as those of the page."""
     figure.toolbar.logo = None
+    figure.border_fill_color = None  # the page's, light or dark
+    if figure.background_fill_color == "#ffffff":
+        figure.background_fill_color = None
     figure.title.text_font_size = "14px"
     for axis in (figure.xaxis, figure.yaxis):
         axis.axis_label_text_font_style = "normal"

@@ -10,11 +10,10 @@ import panel as pn
 
 from mirrorskin.engine.base.options import Option, plain
 from mirrorskin.io import InputError
-from mirrorskin.view.app.look import TALL, problem, text
+from mirrorskin.view.app.look import problem, text
 from mirrorskin.view.app.session import Session
 
 _WIDTH = 262
-_ANY = 2**31 - 1  # a limit that stands for none
 _DEGREES = {"rad": "deg"}  # units that people write instead of the declared one
 _STEPS = 100  # of a slider
 _FILE = re.compile(r"\.[A-Za-z]\w*$")  # the end of the name of a file
@@ -28,11 +27,14 @@ class OptionsPane:
     operation : Select
     widgets : dict of str to Widget
         The field of each option by name.
+    notes : dict of str to HTML
+        Why the text of a field is not used, next to it, by name.
     """
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self.widgets: dict[str, Any] = {}
+        self.notes: dict[str, Any] = {}
         self.operation = pn.widgets.Select(
             label="Operation",
             options=session.operations(),
@@ -43,43 +45,60 @@ class OptionsPane:
         self._first, self._more = pn.Column(margin=0), pn.Column(margin=(0, -10))
         self.problem = text(width=_WIDTH)
         self.reset = pn.widgets.Button(label="Reset all options", width=_WIDTH)
-        self.operation.param.watch(lambda event: session.choose_operation(event.new), "value")
+        self.undo = pn.widgets.Button(label="Undo", width=_WIDTH // 2 - 10)
+        self.redo = pn.widgets.Button(label="Redo", width=_WIDTH // 2 - 10)
+        self.operation.param.watch(lambda event: self._choose_operation(event.new), "value")
         self.reset.on_click(lambda _: session.choose_operation(session.kind_name))
+        self.undo.on_click(lambda _: session.undo())
+        self.redo.on_click(lambda _: session.redo())
         session.watch("operation", callback=self._build)
-        session.watch("problem", callback=lambda: self._say(session.problem))
+        session.watch("problem", "result", callback=self._say)
         self._build()
-        self._say(session.problem)
+        self._say()
         more = pn.Card(self._more, title="More options", collapsed=True, width=_WIDTH, margin=(8, 10))
         self.view = pn.Column(
             self.operation,
             self.problem,
+            pn.Row(self.undo, self.redo),
             self._first,
             more,
             self.reset,
-            width=_WIDTH + 40,
-            height=TALL,
-            scroll=True,
+            width=_WIDTH + 20,
         )
 
     def _build(self) -> None:
         """Make the widgets of the operation: those with a value first, then those that may be left out."""
-        self.widgets = {}
+        self.widgets, self.notes = {}, {}
+        kind = self._session.kind_name
+        if self.operation.value != kind:
+            self.operation.value = kind
         parts: dict[bool, list[Any]] = {True: [], False: []}
         for name, option in self._session.options().items():
             field, shown = widget_of(option, self._session.value(name))
             field.param.watch(lambda event, name=name: self._changed(name, event.new), "value")
-            self.widgets[name] = field
-            parts[option.default is not None].append(shown)
+            self.widgets[name], self.notes[name] = field, text(width=_WIDTH, visible=False)
+            parts[option.default is not None].append(pn.Column(shown, self.notes[name], margin=0))
         self._first[:], self._more[:] = parts[True], parts[False]
+
+    def _choose_operation(self, name: str) -> None:
+        if name != self._session.kind_name:
+            self._session.choose_operation(name)
 
     def _changed(self, name: str, value: Any) -> None:
         try:
             self._session.choose(name, read(self._session.kind.options[name], value))
         except InputError as error:
-            self._say(str(error))
+            self._session.refuse(name, str(error))
 
-    def _say(self, what: str) -> None:
-        self.problem.object = problem(what)
+    def _say(self) -> None:
+        """Show what is wrong next to the field that it is about, whose name messages begin with."""
+        session = self._session
+        about = session.problem.partition(" ")[0]
+        self.problem.object = "" if about in self.notes else problem(session.problem)
+        for name, note in self.notes.items():
+            why = session.refused.get(name) or (session.problem if name == about else "")
+            note.object, note.visible = problem(why), bool(why)
+        self.undo.disabled, self.redo.disabled = not session.can_undo, not session.can_redo
 
 
 def widget_of(option: Option, value: Any) -> tuple[Any, Any]:
@@ -100,12 +119,12 @@ def widget_of(option: Option, value: Any) -> tuple[Any, Any]:
         return field, field
     low, high = option.within
     if option.kind == "integer" and option.default is not None:
-        end = high if high is not None and high < _ANY else None
-        field = widgets.IntInput(label=titled, value=value, start=low, end=end, **settings)
+        # Without limits, so that a number beyond them is refused with the reason.
+        field = widgets.IntInput(label=titled, value=value, **settings)
         return field, field
     if option.kind == "number" and option.default is not None and low is not None and high is not None:
         step = (high - low) / _STEPS
-        field = widgets.FloatInput(label=titled, value=value, start=low, end=high, step=step, **settings)
+        field = widgets.FloatInput(label=titled, value=value, step=step, **settings)
         slider = widgets.FloatSlider(
             label="",
             start=low,
@@ -117,12 +136,17 @@ def widget_of(option: Option, value: Any) -> tuple[Any, Any]:
             margin=(0, 10),
         )
         slider.param.watch(lambda event: field.param.update(value=event.new), "value_throttled")
-        field.param.watch(lambda event: slider.param.update(value=event.new), "value")
+        field.param.watch(lambda event: _follow(slider, event.new), "value")
         return field, pn.Column(field, slider, margin=0)
     field = widgets.TextInput(
         label=titled, value=written(option, value), placeholder=option.shown_default or "none", **settings
     )
     return field, field
+
+
+def _follow(slider: Any, value: float | None) -> None:
+    if value is not None and slider.start <= value <= slider.end:
+        slider.value = value
 
 
 def described(option: Option) -> str:

@@ -5,21 +5,26 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import replace
 from html import escape
+from importlib import resources
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import panel as pn
+from panel.io.resources import LOCAL_DIST
 
 from mirrorskin import io
 from mirrorskin.engine.base.summary import summarise
 from mirrorskin.io.base.findings import warnings_in
-from mirrorskin.view.app.look import text
+from mirrorskin.view.app.files import FilesPane
+from mirrorskin.view.app.look import hint, problem, text
 from mirrorskin.view.app.options import OptionsPane
 from mirrorskin.view.app.recording import RecordingPane
 from mirrorskin.view.app.result import ResultPane
 from mirrorskin.view.app.save import SavePane
-from mirrorskin.view.app.session import Opening, Run, Session, T, run_now
+from mirrorskin.view.app.session import Computed, Opening, Run, Session, T, run_now
 from mirrorskin.view.app.surface import SurfacePane
 
 if TYPE_CHECKING:
@@ -28,6 +33,12 @@ if TYPE_CHECKING:
 
 Shown = str | Path | io.Recording | io.Result
 
+PULSE = 250
+"""Milliseconds from one sign of life to the next."""
+
+_KEPT = 600_000_000  # bytes of results of the list that are kept to be compared
+_TABS = ".bk-tab.bk-active { color: inherit; background: transparent; }"
+_SIDE = 290  # width of the list and the options
 _RIG = -1  # the choice of the rig, among numbers of files
 
 
@@ -42,6 +53,10 @@ class App:
         How recordings are opened, and the device.
     rig : RigControl, optional
         A rig to drive.
+    folder : Path, optional
+        A folder whose files can be opened from the page.
+    drops : Path, optional
+        Where the server puts files that are dropped on the page.
 
     Attributes
     ----------
@@ -68,20 +83,31 @@ class App:
         *sources: Shown,
         opening: Opening | Sequence[Opening] | None = None,
         rig: RigControl | None = None,
+        folder: Path | None = None,
+        drops: Path | None = None,
     ) -> None:
-        if not sources and rig is None:
+        if not sources and rig is None and folder is None:
             raise io.InputError("the application needs a recording, a result or a rig: name a file")
         pn.extension(inline=True)  # in a notebook, no other machine is asked for scripts
         opened = opening or Opening()
         openings = [opened] * len(sources) if isinstance(opened, Opening) else [*opened]
+        self._closed = Event()
         self._worker = ThreadPoolExecutor(1, "mirrorskin-page") if _is_served() else None
-        self._run = run_now if self._worker is None else _in_thread(self._worker, pn.state.curdoc)
+        self._run = (
+            run_now if self._worker is None else _in_thread(self._worker, pn.state.curdoc, self._closed)
+        )
         self._sources = [*zip(sources, openings, strict=True)]
+        self._computed: dict[int, Computed] = {}  # results of the list, the least recently used one first
+        self._opening = 0  # counts what is opened
         self.session: Session | None = None
         self.rig: RigPane | None = None
         self.recording: RecordingPane | None = None
         self.options: OptionsPane | None = None
-        names = {_name_of(source, number): number for number, source in enumerate(sources)}
+        self.result: ResultPane | None = None
+        names: dict[str, int] = {}
+        for number, source in enumerate(sources):
+            name = _name_of(source, number)
+            names[f"{name} ({number + 1})" if name in names else name] = number
         stop: list[Any] = []
         if rig is not None:
             from mirrorskin.view.app.rig import REFRESH, RigPane
@@ -90,64 +116,146 @@ class App:
             names = {f"rig {rig.settings.name}": _RIG, **names}
             stop = [self.rig.stop]
             if self._worker is not None:
-                pn.state.add_periodic_callback(self.rig.refresh, REFRESH)
-        self.choice = pn.widgets.Select(
-            options=names, width=280, label="", value=next(iter(names.values())), visible=len(names) > 1
-        )
+                pn.state.add_periodic_callback(self.rig.refresh_when_drawn, REFRESH)
+        self.choice = pn.widgets.Select(label="Recordings and results", size=2, width=_SIDE - 20)
+        self._offer(names)
+        self.choice.value = next(iter(names.values()), None)
         self.choice.param.watch(lambda _: self._open(), "value")
+        self.files = FilesPane(folder, drops, self.add) if folder is not None else None
+        files = pn.Card(
+            *([self.files.view] if self.files else []), title="Open a file", collapsed=bool(names),
+            width=_SIDE - 20, visible=folder is not None, margin=(8, 10),
+        )  # fmt: skip
         self._about = text(sizing_mode="stretch_width", margin=(9, 10))
-        self._body = pn.Row(sizing_mode="stretch_width")
-        self._open()
-        head = pn.Row(
-            *stop,
-            text("<h1>mirrorskin</h1>", width=120),
-            self.choice,
-            self._about,
+        self._part = pn.Column(margin=0)  # the options of what is shown
+        self._main = pn.Column(styles={"flex": "1 1 400px", "min-width": "0"})
+        self.body = pn.FlexBox(
+            pn.Column(self.choice, files, self._part, width=_SIDE),
+            self._main,
+            align_items="flex-start",
             sizing_mode="stretch_width",
-            styles={"position": "sticky", "top": "0", "z-index": "10", "background": "white"},
         )
-        self.view = pn.Column(head, self._body, sizing_mode="stretch_width")
+        self._open()
+        self._pulse = text("0", visible=False, tags=["pulse"])  # the page is off if it stops
+        if self._worker is not None:
+            # What is added to the page later is styled by this server, too, not by Panel's in the internet.
+            pn.state.curdoc.template_variables["dist_url"] = LOCAL_DIST
+            pn.state.add_periodic_callback(self._beat, PULSE)
+        title = text("<h1>mirrorskin</h1>", width=120)
+        self.head = pn.Row(title, self._about, self._pulse, sizing_mode="stretch_width")
+        self.view = pn.Column(pn.Row(*stop, self.head), self.body, sizing_mode="stretch_width")
+
+    def _offer(self, names: dict[str, int]) -> None:
+        """Offer recordings and results by name."""
+        self.choice.options, self.choice.visible = names, len(names) > 1
+        self.choice.size = min(max(len(names), 2), 8)
 
     def add(self, name: str, source: Shown) -> None:
         """Show another recording or result, which can be chosen from then on."""
         self._sources.append((source, Opening()))
         number = len(self._sources) - 1
-        self.choice.options = {**self.choice.options, f"{name} ({number + 1})": number}
-        self.choice.visible = True
+        taken, before = name in self.choice.options, self._opening
+        self._offer({**self.choice.options, f"{name} ({number + 1})" if taken else name: number})
         self.choice.value = number
+        if self._opening == before:  # it is chosen already
+            self._open()
 
     def _open(self) -> None:
         """Show the chosen file, or the rig."""
+        self._opening += 1
         if self.session is not None:
             self.session.close()
-            self.session = self.recording = self.options = None
-        number = self.choice.value
-        if number == _RIG:
+            self.session = self.recording = self.options = self.result = None
+        opening, number = self._opening, self.choice.value
+        self._part[:] = []
+        if number is None:
+            self._main[:] = [text(hint("Choose a file on the left, or drop one on the page."))]
+        elif number == _RIG:
             assert self.rig is not None
-            self._body[:] = [self.rig.view]
-            self._describe()
-            return
+            self._main[:] = [self.rig.view]
+            self.rig.begin_showing()
+        else:
+            self._main[:] = [text(f'<p class="hint"><i class="busy"></i>{escape(self._name(number))}</p>')]
+            self._run(lambda: self._session_of(number), lambda session: self._show(opening, number, session))
+        self._describe()
+
+    def _name(self, number: int) -> str:
+        return next((name for name, at in self.choice.options.items() if at == number), "")
+
+    def _session_of(self, number: int) -> Session | io.InputError:
+        """Open a file; the work of a thread."""
         source, opening = self._sources[number]
-        session = Session(source, opening, self._run)
+        try:
+            return Session(source, opening, self._run)
+        except io.InputError as error:
+            return error
+
+    def _show(self, opening: int, number: int, session: Session | io.InputError) -> None:
+        """Show what was opened, unless something else has been chosen meanwhile."""
+        if isinstance(session, io.InputError):
+            if self._worker is None:
+                raise session
+            if opening == self._opening:
+                self._main[:] = [text(problem(str(session)))]
+            return
+        if opening != self._opening:
+            session.close()
+            return
         self.session = session
         session.watch("result", "problem", callback=self._describe)
+        session.watch("result", callback=lambda: self._keep(number, session.now))
         tabs: list[tuple[str, Any]] = []
-        side: list[Any] = []
         if session.whole is not None:
             self.options = OptionsPane(session)
             self.recording = RecordingPane(session)
             tabs.append(("Recording", self.recording.view))
-            side = [self.options.view]
-        self.result, self.surface, self.save = ResultPane(session), SurfacePane(session), SavePane(session)
+            self._part[:] = [self.options.view]
+        self.result = ResultPane(session, lambda: self._others(number), self._take)
+        self.surface, self.save = SurfacePane(session), SavePane(session)
         tabs += [
             ("Result", self.result.view),
             ("Surface", self.surface.view),
             ("Save and copy", self.save.view),
         ]
-        self.tabs = pn.Tabs(*tabs, sizing_mode="stretch_width", dynamic=True)
+        self.tabs = pn.Tabs(*tabs, sizing_mode="stretch_width", stylesheets=[_TABS])
         self.surface.shown_in(self.tabs, len(tabs) - 2)
-        self._body[:] = [*side, self.tabs]
+        self._main[:] = [self.tabs]
+        self._keep(number, session.now)
         self._describe()
+
+    def _others(self, chosen: int) -> dict[str, int]:
+        """Return the recordings and results that the chosen one can be compared with."""
+        return {name: number for name, number in self.choice.options.items() if number not in (_RIG, chosen)}
+
+    def _keep(self, number: int, computed: Computed | None) -> None:
+        """Keep a result to compare others with, and not more than fit into a limited memory."""
+        self._computed.pop(number, None)
+        if computed is not None:
+            self._computed[number] = computed
+        while len(self._computed) > 1 and sum(kept.size for kept in self._computed.values()) > _KEPT:
+            self._computed.pop(next(iter(self._computed)))
+
+    def _take(self, number: int, then: Callable[[Computed], object]) -> None:
+        """Call a function with a result of the list, which is read or computed if that is necessary."""
+        session = self.session
+
+        def read() -> Computed | None:
+            if number in self._computed:
+                return self._computed[number]
+            source, opening = self._sources[number]
+            try:
+                other = Session(source, opening)
+            except io.InputError:
+                return None
+            other.close()
+            return other.now
+
+        def show(computed: Computed | None) -> None:
+            if computed is not None and session is self.session:
+                self._keep(number, computed)
+                then(replace(computed, label=f"{self._name(number)}, {computed.label}"))
+
+        self._run(read, show)
 
     def _describe(self) -> None:
         """Say in the head what is shown."""
@@ -155,19 +263,20 @@ class App:
         if session is None:
             self._about.object = ""
             return
-        parts = [] if self.choice.visible else [session.name]
+        parts = [session.name]
         if session.whole is not None:
             count, rows, columns = session.whole.shape
             parts.append(f"{session.whole.motion} motion, {count} frames of {columns} x {rows}")
         if session.computing:
-            parts.append("the result is being computed")
+            parts.insert(0, "the result is being computed")
         messages: Sequence[str] = ()
         if session.now is not None:
             messages = warnings_in(session.now.result.process)
             parts.append(str(summarise(session.now.result)))
             if session.now.seconds:
                 parts.append(f"computed in {session.now.seconds:.2f} s")
-        lines = [f'<p class="about">{escape("; ".join(parts))}</p>']
+        busy = '<i class="busy"></i>' if session.computing else ""
+        lines = [f'<p class="about">{busy}{escape("; ".join(parts))}</p>']
         lines += [f'<p class="warning">{escape(message)}</p>' for message in messages]
         self._about.object = "".join(lines)
 
@@ -179,8 +288,29 @@ class App:
         """Close the files."""
         if self.session is not None:
             self.session.close()
+        self._closed.set()
         if self._worker is not None:
             self._worker.shutdown(wait=False)
+
+    def page(self) -> Any:
+        """Return the page for a window of its own."""
+        places = {"head": self.head, "body": self.body}
+        if self.rig is not None:
+            places["stop"] = self.rig.stop
+        page = pn.Template(_file("page.html"))
+        page.add_variable("style", _file("window.css"))
+        page.add_variable("script", _file("page.js"))
+        page.add_variable("stoppable", self.rig is not None)
+        for name, place in places.items():
+            page.add_panel(name, place)
+        return page
+
+    def _beat(self) -> None:
+        self._pulse.object = str(int(self._pulse.object) + 1)
+
+
+def _file(name: str) -> str:
+    return resources.files("mirrorskin.view.app").joinpath(name).read_text("utf-8")
 
 
 def _is_served() -> bool:
@@ -188,12 +318,14 @@ def _is_served() -> bool:
     return pn.state.curdoc is not None and pn.state.curdoc.session_context is not None
 
 
-def _in_thread(worker: Executor, document: Any) -> Run:
+def _in_thread(worker: Executor, document: Any, closed: Event) -> Run:
     """Return a way to compute in a thread, so that the server answers meanwhile, and to show the result."""
 
     def run(work: Callable[[], T], then: Callable[[T], object], /) -> None:
         def compute() -> None:
             result = work()
+            if closed.is_set():
+                return
             document.add_next_tick_callback(lambda: then(result))
 
         worker.submit(compute).add_done_callback(Future.result)  # an error is logged
@@ -203,20 +335,27 @@ def _in_thread(worker: Executor, document: Any) -> Run:
 
 def _name_of(source: Shown, number: int) -> str:
     if isinstance(source, str | Path):
-        return str(source)
+        return Path(source).name
     return source.name if isinstance(source, io.Recording) else f"result {number + 1}"
 
 
 def pages(
-    sources: Sequence[Path], openings: Sequence[Opening], rig: RigControl | None = None
+    sources: Sequence[Path],
+    openings: Sequence[Opening],
+    rig: RigControl | None = None,
+    folder: Path | None = None,
+    drops: Path | None = None,
 ) -> Callable[[], Any]:
-    """Return a function that makes a page; when the last page is closed, the rig is stopped."""
+    """Return a function that makes a page; when the last page is closed, the rig is stopped.
+
+    The page opens files of a folder, and of one where the server puts what is dropped on the page.
+    """
     opened: list[App] = []
     # Pages show them; threads cannot change filters for themselves.
     warnings.simplefilter("ignore", io.MirrorskinWarning)
 
     def page() -> Any:
-        app = App(*sources, opening=openings, rig=rig)
+        app = App(*sources, opening=openings, rig=rig, folder=folder, drops=drops)
         opened.append(app)
 
         def close(_: Any) -> None:
@@ -226,6 +365,6 @@ def pages(
                 rig.close()
 
         pn.state.on_session_destroyed(close)
-        return app.view
+        return app.page()
 
     return page

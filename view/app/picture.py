@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import base64
 import functools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from bokeh.events import PanEnd, PanStart
+from bokeh.events import PanEnd, PanStart, RangesUpdate
 from bokeh.models import (
     BoxAnnotation,
     ColorBar,
@@ -40,6 +40,7 @@ Edges = tuple[float, float, float, float]
 Point = tuple[float, float]
 
 _SHADES = 256
+_PIXELS = 1200  # of a side of what is sent, at most
 _CHANGE_SHOWN = 99.5  # percentile of the magnitude at the ends of the colours of a change
 _READ = "@value0{custom}"
 _OPAQUE = 255
@@ -154,6 +155,18 @@ def show_map(sheet: Sheet, name: str, like: Shown | None = None) -> Shown:
         scale.logarithmic,
         readings=readings,
     )
+
+
+def recoloured(shown: Shown, palette: str, low: float | None, high: float | None) -> Shown:
+    """Return a drawing of numbers with another colour map, and other ends of it, where given."""
+    if not shown.palette or shown.legend or shown.values.dtype.kind != "f":
+        return shown
+    low, high = shown.low if low is None else low, shown.high if high is None else high
+    if not low < high:
+        return shown
+    return replace(
+        shown, palette=palette_of(palette) if palette else shown.palette, low=low, high=high
+    )  # fmt: skip
 
 
 def show_change(now: Shown, before: Shown) -> Shown:
@@ -285,17 +298,27 @@ class Picture:
         self.figure.toolbar.active_scroll = wheel
         self.figure.grid.visible = False
         self.figure.xaxis.axis_label, self.figure.yaxis.axis_label = f"x ({unit})", f"y ({unit})"
-        self.source = ColumnDataSource(data={"image": [np.full((1, 1), np.nan, np.float32)]})
-        self.marks = ColumnDataSource(data={"image": [np.zeros((1, 1), np.uint32)]})
+        edges = {"x": [left], "y": [bottom], "dw": [right - left], "dh": [top - bottom]}
+        self.source = ColumnDataSource(data={"image": [np.full((1, 1), np.nan, np.float32)], **edges})
+        self.marks = ColumnDataSource(data={"image": [np.zeros((1, 1), np.uint32)], **edges})
         self.mapper = LinearColorMapper(palette=["#000000", "#ffffff"], nan_color=hex_of(MISSING_RGB))
         self.logarithmic = LogColorMapper(palette=["#000000"], low=1, high=10, nan_color=hex_of(MISSING_RGB))
-        where = {"x": left, "y": bottom, "dw": right - left, "dh": top - bottom, "origin": "top_left"}
+        where = {"x": "x", "y": "y", "dw": "dw", "dh": "dh", "origin": "top_left"}
+        self._shown: Shown | None = None
+        self._drawn_marks: NDArray[np.uint32] | None = None
         self._plain = self.figure.image("image", source=self.source, color_mapper=self.mapper, **where)
         self._log = self.figure.image("image", source=self.source, color_mapper=self.logarithmic, **where)
         self._rgba = self.figure.image_rgba("image", source=self.source, **where)
         self._marks = self.figure.image_rgba("image", source=self.marks, **where)
         self._bars = [
-            ColorBar(color_mapper=mapper, width=14, padding=0, margin=8, major_label_text_font_size="12px")
+            ColorBar(
+                color_mapper=mapper,
+                background_fill_color=None,
+                width=14,
+                padding=0,
+                margin=8,
+                major_label_text_font_size="12px",
+            )
             for mapper in (self.mapper, self.logarithmic)
         ]
         if bar:
@@ -305,6 +328,7 @@ class Picture:
             item.visible = False
         self.hover = HoverTool(renderers=[self._plain], tooltips=[])
         self.figure.add_tools(self.hover)
+        self.figure.on_event(RangesUpdate, self._look_again)
 
     def show(self, shown: Shown, marks: NDArray[np.uint32] | None = None, about: str = "") -> None:
         """Draw a map, and marks above it; the title has the unit of the map, and a text about it."""
@@ -319,12 +343,8 @@ class Picture:
             mapper.update(palette=[*shown.palette], low=shown.low, high=shown.high)
         for bar, renderer in zip(self._bars, (self._plain, self._log), strict=True):
             bar.visible = renderer.visible and not shown.legend
-        self.source.data = {
-            "image": [shown.values],
-            **{name: [v] for name, v in shown.readings.columns.items()},
-        }
-        empty = np.zeros(shown.values.shape, np.uint32)
-        self.marks.data = {"image": [empty if marks is None else marks]}
+        self._shown, self._drawn_marks = shown, marks
+        self._send()
         read = shown.readings
         formats = {
             f"@{name}": CustomJSHover(args={"unit": unit}, code=_NUMBER) for name, unit in read.units.items()
@@ -333,6 +353,55 @@ class Picture:
             words = {str(code): text for code, text in codes.items()}
             formats[column] = CustomJSHover(args={"words": words}, code=_WORD)
         self.hover.update(renderers=[drawn], tooltips=[*read.tooltips], formatters=formats)
+
+    def _send(self) -> None:
+        """Send the pixels that are in view, no more of them than a screen has."""
+        shown, marks = self._shown, self._drawn_marks
+        assert shown is not None
+        window, edges = self._window(shown.values.shape)
+        self.source.data = {
+            "image": [shown.values[window]],
+            **{name: [values[window]] for name, values in shown.readings.columns.items()},
+            **edges,
+        }
+        empty = np.zeros((1, 1), np.uint32)
+        self.marks.data = {"image": [empty if marks is None else marks[window]], **edges}
+
+    def _window(self, shape: tuple[int, ...]) -> tuple[tuple[slice, slice], dict[str, list[float]]]:
+        """Return rows and columns to send, and where they are."""
+        left, right, bottom, top = self.place
+        rows, columns = shape[:2]
+        across, down = (right - left) / columns, (top - bottom) / rows
+        ranges = self.figure.x_range, self.figure.y_range
+        if max(rows, columns) <= _PIXELS:
+            ends = (0, rows), (0, columns)
+        else:
+            ends = (
+                _between((top - ranges[1].end) / down, (top - ranges[1].start) / down, rows),
+                _between((ranges[0].start - left) / across, (ranges[0].end - left) / across, columns),
+            )
+        step = max(1, -(-max(end - first for first, end in ends) // _PIXELS))
+        window = slice(*ends[0], step), slice(*ends[1], step)
+        counts = [-(-(end - first) // step) * step for first, end in ends]
+        edges = {
+            "x": left + ends[1][0] * across,
+            "y": top - (ends[0][0] + counts[0]) * down,
+            "dw": counts[1] * across,
+            "dh": counts[0] * down,
+        }
+        return window, {name: [edge] for name, edge in edges.items()}
+
+    def _look_again(self, _: Any) -> None:
+        """Send what came into view."""
+        if self._shown is not None and max(self._shown.values.shape[:2]) > _PIXELS:
+            self._send()
+
+
+def _between(low: float, high: float, count: int) -> tuple[int, int]:
+    """Return the pixels from one place to another, with a margin, of a number of pixels."""
+    margin = 0.25 * (high - low)
+    first = max(0, min(count - 1, int(low - margin)))
+    return first, max(first + 1, min(count, int(high + margin) + 1))
 
 
 def _frame(place: Edges, size: tuple[int, int], bar: bool) -> dict[str, Any]:
@@ -358,17 +427,21 @@ def show_frame(frame: NDArray[Any], title: str, automatic: bool) -> Shown:
         low, high = apart(*span(frame.astype(np.float32)))
     else:
         low, high = (0.0, float(np.iinfo(frame.dtype).max)) if frame.dtype.kind == "u" else (0.0, 1.0)
-    columns = {"counts": frame.astype(np.float32)}
-    tooltips = [("x, y", "$x{0.000}, $y{0.000}"), ("Brightness", "@counts{0.0} counts")]
+    tooltips = [("x, y", "$x{0.000}, $y{0.000}"), ("Brightness", "@image counts")]
+    values = frame if frame.dtype in (np.uint8, np.uint16) else frame.astype(np.float32)
     return Shown(
-        frame.astype(np.float32), title, "", "Brightness (counts)", palette_of("gray"), low, high,
-        readings=Readings(columns, tooltips),
+        values, title, "", "Brightness (counts)", palette_of("gray"), low, high,
+        readings=Readings(tooltips=tooltips),
     )  # fmt: skip
 
 
 _RUBBER = """
 const at = [cb_obj.x, cb_obj.y]
-if (cb_obj.event_name == "panstart") origin.data = {x: [at[0]], y: [at[1]]}
+const ended = cb_obj.event_name == "panend"
+if (cb_obj.event_name == "panstart") {
+  origin.data = {x: [at[0]], y: [at[1]]}
+  figure.lasso = {x: [], y: []}
+}
 const from = [origin.data.x[0], origin.data.y[0]]
 const mode = modes.data.mode[0]
 if (mode == "move") {
@@ -378,10 +451,15 @@ if (mode == "move") {
   }
 } else if (mode == "section") {
   line.data = {x: [from[0], at[0]], y: [from[1], at[1]]}
+} else if (mode == "mask") {
+  figure.lasso.x.push(at[0]), figure.lasso.y.push(at[1])
+  const {x, y} = figure.lasso
+  if (ended) lasso.data = {x, y}
+  else line.setv({data: {x: [...x], y: [...y]}}, {sync: false})
 } else if (mode == "region") {
   const [left, right] = [Math.min(from[0], at[0]), Math.max(from[0], at[0])]
   const [bottom, top] = [Math.min(from[1], at[1]), Math.max(from[1], at[1])]
-  box.setv({left, right, bottom, top, visible: true})
+  for (const drawn of [halo, box]) drawn.setv({left, right, bottom, top, visible: true})
 }
 """
 
@@ -393,48 +471,60 @@ class Dragging:
     ----------
     picture : Picture
     drawn : callable
-        Called with the mode, and x and y of start and end.
-    mode : {"section", "region", "move"}
+        Called with the mode, and x and y of start and end; of a mask, of each corner.
+    mode : {"section", "region", "mask", "move"}
     """
 
-    def __init__(
-        self, picture: Picture, drawn: Callable[[str, Point, Point], None], mode: str = "region"
-    ) -> None:
+    def __init__(self, picture: Picture, drawn: Callable[..., None], mode: str = "region") -> None:
         self._drawn, self._start = drawn, (0.0, 0.0)
         self._modes = ColumnDataSource(data={"mode": [mode]})
         self.line = ColumnDataSource(data={"x": [], "y": []})
+        self.lasso = ColumnDataSource(data={"x": [], "y": []})
         plot = picture.figure
         for width, colour in ((4, "white"), (1.5, "black")):
             plot.line("x", "y", source=self.line, line_width=width, line_color=colour)
+        # Black on white is visible on all colours, to all eyes.
+        self.halo = BoxAnnotation(fill_alpha=0, line_color="white", line_width=5, visible=False)
         self.box = BoxAnnotation(
-            fill_alpha=0, line_color="#d55e00", line_width=2.5, line_dash="dashed", visible=False
+            fill_alpha=0, line_color="black", line_width=2.5, line_dash="dashed", visible=False
         )
+        plot.add_layout(self.halo)
         plot.add_layout(self.box)
         origin = ColumnDataSource(data={"x": [0.0], "y": [0.0]})
-        rubber = CustomJS(
-            args={"origin": origin, "modes": self._modes, "line": self.line, "box": self.box, "figure": plot},
-            code=_RUBBER,
-        )
-        plot.js_on_event("panstart", rubber)
-        plot.js_on_event("pan", rubber)
+        used = {"line": self.line, "lasso": self.lasso, "halo": self.halo, "box": self.box}
+        rubber = CustomJS(args={"origin": origin, "modes": self._modes, "figure": plot, **used}, code=_RUBBER)
+        for event in ("panstart", "pan", "panend"):
+            plot.js_on_event(event, rubber)
         plot.on_event(PanStart, self._started)
         plot.on_event(PanEnd, self._ended)
+        self.lasso.on_change("data", lambda attr, old, new: self._masked())
 
     @property
     def mode(self) -> str:
-        """What is drawn: "section", "region", or "move"."""
+        """What is drawn: "section", "region", "mask", or "move"."""
         return str(self._modes.data["mode"][0])
 
     @mode.setter
     def mode(self, mode: str) -> None:
         self._modes.data = {"mode": [mode]}
 
+    def outline(self, edges: Mapping[str, float] | None) -> None:
+        """Draw the outline of a region; None for no region."""
+        for drawn in (self.halo, self.box):
+            drawn.visible = edges is not None
+            drawn.update(**(edges or {}))
+
     def _started(self, event: Any) -> None:
         self._start = event.x, event.y
 
     def _ended(self, event: Any) -> None:
-        if self.mode != "move":
+        if self.mode in ("section", "region"):
             self._drawn(self.mode, self._start, (event.x, event.y))
+
+    def _masked(self) -> None:
+        corners = list(zip(self.lasso.data["x"], self.lasso.data["y"], strict=True))
+        if len(corners) > 2:
+            self._drawn("mask", *corners)
 
 
 def pixel_at(place: Edges, shape: tuple[int, int], x: float, y: float) -> tuple[float, float]:

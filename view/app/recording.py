@@ -26,8 +26,8 @@ from mirrorskin.view.app.session import Session
 from mirrorskin.view.app.trace import Trace, trace_of
 from mirrorskin.view.drawing.canvas import extent
 
-_PICTURE = 480, 520  # largest size, CSS pixels
-_GRAPH = 515, 330
+_PICTURE = 400, 440  # largest size, CSS pixels
+_GRAPH = 480, 330
 _COLOURS = {"Dark": "#56606b", "Threshold": "#d55e00", "Bright": "#8a6d00"}
 _LINE, _FIT = "#0072b2", "#d55e00"
 _HINT = "Click a pixel to see its brightness. Drag to draw the region that is used."
@@ -66,6 +66,11 @@ class RecordingPane:
             disabled=not session.can_cut,
         )
         self.whole = pn.widgets.Button(label="Use the whole picture", width=180, disabled=True)
+        self._follows = False  # whether the fields show what was clicked
+        self.row = pn.widgets.IntInput(label="Row", start=0, end=rows - 1, width=90)
+        self.column = pn.widgets.IntInput(label="Column", start=0, end=columns - 1, width=90)
+        for field in (self.row, self.column):
+            field.param.watch(lambda _: self._type_pixel(), "value")
         self.graph = _Graph()
         self.facts = text(width=_GRAPH[0])
         self.frame.param.watch(lambda _: self._show_frame(), "value")
@@ -77,14 +82,20 @@ class RecordingPane:
         self._show_frame()
         self._show_part()
         self._show_pixel()
-        self.view = pn.Row(
+        self.view = pn.FlexBox(
             pn.Column(
                 self.frame,
                 pn.pane.Bokeh(self.picture.figure),
                 pn.Row(self.automatic, self.whole),
                 text(hint(_HINT)),
             ),
-            pn.Column(self.frames, pn.pane.Bokeh(self.graph.figure), self.facts, width=_GRAPH[0] + 20),
+            pn.Column(
+                self.frames,
+                pn.Row(self.row, self.column),
+                pn.pane.Bokeh(self.graph.figure),
+                self.facts,
+                width=_GRAPH[0] + 20,
+            ),
         )
 
     def _show_frame(self) -> None:
@@ -112,6 +123,11 @@ class RecordingPane:
         row, column = pixel_at(self._place, self._shape, event.x, event.y)
         self._session.point_at(math.floor(row), math.floor(column))
 
+    def _type_pixel(self) -> None:
+        """Choose the pixel of the fields, without a pointer."""
+        if not self._follows:
+            self._session.point_at(self.row.value or 0, self.column.value or 0)
+
     def _drawn(self, _: str, start: Point, end: Point) -> None:
         """Use the rectangle that was drawn."""
         region = region_between(self._place, self._shape, start, end)
@@ -129,10 +145,7 @@ class RecordingPane:
     def _show_part(self) -> None:
         region = self._session.region
         self.whole.disabled = region is None
-        box = self.dragging.box
-        box.visible = region is not None
-        if region is not None:
-            box.update(**edges_of(self._place, self._shape, region))
+        self.dragging.outline(None if region is None else edges_of(self._place, self._shape, region))
         if self._session.frames is not None:
             first, end = self._session.frames
             self.frames.value = first, self.frames.end if end is None else end
@@ -147,6 +160,9 @@ class RecordingPane:
         x = left + (column + 0.5) * (right - left) / columns
         y = top - (row + 0.5) * (top - bottom) / rows
         self._cross.data = {"x": [x], "y": [y]}
+        self._follows = True
+        self.row.value, self.column.value = pixel
+        self._follows = False
         trace = trace_of(self._session)
         if trace is None:
             self.facts.object = hint("This pixel is outside of the region that is used.")

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from html import escape
+from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -11,9 +15,8 @@ from bokeh.events import Tap
 from bokeh.models import ColumnDataSource, HoverTool
 from bokeh.plotting import figure
 
-from mirrorskin import engine
-from mirrorskin.engine.metrology import Measures, Section, section
-from mirrorskin.io import InputError
+from mirrorskin.engine.metrology import Measures, Section, group_of, section
+from mirrorskin.io import InputError, Region
 from mirrorskin.io.model.result import display_order
 from mirrorskin.view.app.look import hint, plain_axes, problem, table, text
 from mirrorskin.view.app.picture import (
@@ -25,6 +28,7 @@ from mirrorskin.view.app.picture import (
     filled_marks,
     hex_of,
     pixel_at,
+    recoloured,
     region_between,
     show_change,
     show_map,
@@ -35,54 +39,148 @@ from mirrorskin.view.result.scale import labelled, title_of_height
 from mirrorskin.view.result.sheet import Sheet, percent
 
 _PICTURE = 410, 350  # largest size, CSS pixels
-_SECTION = 600, 230
-_DRAG = {"Draw a section": "section", "Draw a region to measure": "region", "Move the picture": "move"}
-_NEXT = {"previous result": "before", "change since then": "change", "nothing": ""}
+_SECTION = 270  # height, CSS pixels
+_DRAG = {
+    "Draw a section": "section",
+    "Draw a region to measure": "region",
+    "Draw around dust": "mask",
+    "Move the picture": "move",
+}
+_NEXT = {"the map of B": "before", "the change, A minus B": "change", "nothing": ""}
+_PREVIOUS = "previous result"
 _BAND = 2  # standard deviations
+_PALETTES = ("viridis", "cividis", "magma", "gray", "turbo", "RdBu_r")
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8a6d00", "#56b4e9")  # for all eyes
+_FRESH, _STALE = {"opacity": "1", "filter": "none"}, {"opacity": "0.35", "filter": "grayscale(1)"}
+_PRESSED = ".bk-btn.bk-active { outline: 2px solid light-dark(#1f6f78, #66c2cb); outline-offset: -2px; }"
+_COPY = "navigator.clipboard.writeText(source.data.text[0])"
 
 
 class ResultPane:
-    """A map of the result, next to the same map of the previous one."""
+    """A map of the result (A), next to the same map of another one (B), sections, and measures.
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
-        self.map = pn.widgets.Select(label="Map", width=230)
-        self.compared = pn.widgets.Select(label="Next to it", options=_NEXT, value="before", width=170)
-        self.marked = pn.widgets.Checkbox(label="Mark filled heights", value=True)
-        self.drag = pn.widgets.RadioButtonGroup(options=_DRAG, value="section", color="default")
-        self.turn = pn.widgets.IntInput(label="Turn", start=0, width=80, visible=False)
+    Parameters
+    ----------
+    session : Session
+    others : callable, optional
+        Returns names of other results, by which `take` gives them.
+    take : callable, optional
+        Calls a function with a result of the list, when it has been read.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        others: Callable[[], Mapping[str, int]] | None = None,
+        take: Callable[[int, Callable[[Computed], object]], object] | None = None,
+    ) -> None:
+        self._session, self._others, self._take = session, others, take
+        widgets = pn.widgets
+        self.map = widgets.Select(label="Map", width=190)
+        self.other = widgets.Select(label="B", options={_PREVIOUS: None}, width=190)
+        self.compared = widgets.Select(label="Next to it", options=_NEXT, value="before", width=170)
+        self.marked = widgets.Checkbox(label="Mark filled heights", value=True)
+        self.drag = widgets.RadioButtonGroup(
+            label="The pointer", options=_DRAG, value="section", color="default", stylesheets=[_PRESSED]
+        )
+        self.turn = widgets.IntInput(label="Turn", start=0, width=80, visible=False)
+        self.palette = widgets.Select(
+            label="Colours", options={"of the map": "", **{name: name for name in _PALETTES}}, width=110
+        )
+        self.low = widgets.FloatInput(label="From", value=None, placeholder="automatic", width=115)
+        self.high = widgets.FloatInput(label="To", value=None, placeholder="automatic", width=115)
+        self._follows = False  # whether the fields show what was chosen for another map before
+        self._colours: dict[str, tuple[str, float | None, float | None]] = {}  # by map
         self._pictures: dict[str, Picture] = {}
         self._dragging: Dragging | None = None
-        self._pair = pn.Row()
-        self.caption = text(width=1100)
+        self._pair = pn.FlexBox(styles={"flex": "0 1 auto"})
+        self.caption = text(sizing_mode="stretch_width")
         self.section = _SectionGraph()
         self.where = text()
-        self.measures = text(width=500)
-        self.restart = pn.widgets.Button(label="Measure the whole map", width=190)
+        self.measures = text(sizing_mode="stretch_width")
+        self.restart = widgets.Button(label="Measure the whole map", width=190)
+        self.unmask = widgets.Button(label="Forget the dust", width=140, visible=False)
+        self.uncut = widgets.Button(label="Remove the last section", width=190, visible=False)
+        self.copy = widgets.Button(label="Copy measures", width=140)
+        self.table = widgets.FileDownload(
+            callback=self._csv, filename="measures.csv", label="Save measures.csv", width=180,
+        )  # fmt: skip
+        self._text = ColumnDataSource(data={"text": [""]})
+        self.copy.js_on_click(args={"source": self._text}, code=_COPY)
+        self._measured: Measures | None = None
         self._place: tuple[Any, ...] = ()
-        self.map.param.watch(lambda _: self._show_maps(), "value")
-        self.compared.param.watch(lambda _: self._show_maps(), "value")
-        self.marked.param.watch(lambda _: self._show_maps(), "value")
+        self.map.param.watch(lambda _: self._choose_map(), "value")
+        for field in (self.palette, self.low, self.high):
+            field.param.watch(lambda _: self._recolour(), "value")
+        for field in (self.compared, self.marked):
+            field.param.watch(lambda _: self._show_maps(), "value")
+        self.other.param.watch(lambda event: self._compare(event.new), "value")
         self.drag.param.watch(lambda event: self._choose_mode(event.new), "value")
         self.turn.param.watch(lambda event: session.choose_turn(event.new), "value")
         self.restart.on_click(lambda _: session.measure_in(None))
+        self.unmask.on_click(lambda _: session.mask([]))
+        self.uncut.on_click(lambda _: session.cut(*session.sections[:-1]))
         session.watch("result", callback=self._show)
+        session.watch("problem", callback=self._fade)
         session.watch("measured", callback=self._show_measures)
         session.watch("ends", callback=self._show_section)
+        session.watch("compared", callback=self._show_compared)
+        self.update_others()
         self._show()
-        self.view = pn.Column(
-            pn.Row(self.map, self.turn, self.compared, pn.Column(self.drag, self.marked)),
-            self._pair,
-            self.caption,
-            pn.Row(
-                pn.Column(self.where, pn.pane.Bokeh(self.section.figure)),
-                pn.Column(self.measures, self.restart),
-            ),
+        section = pn.Column(
+            pn.Row(self.where, self.uncut),
+            pn.pane.Bokeh(self.section.figure, sizing_mode="stretch_width", min_width=380),
+            styles={"flex": "1 1 420px"},
+            min_width=380,
         )
+        buttons = pn.FlexBox(self.restart, self.unmask, self.copy, self.table)
+        self._body = pn.Column(
+            pn.FlexBox(pn.Column(self._pair, self.caption, styles={"flex": "0 1 auto"}), section),
+            self.measures,
+            buttons,
+            sizing_mode="stretch_width",
+        )
+        self.view = pn.Column(
+            pn.FlexBox(
+                self.map, self.turn, self.palette, self.low, self.high, self.other, self.compared,
+                pn.Column(self.drag, self.marked),
+            ),
+            self._body,
+            sizing_mode="stretch_width",
+        )  # fmt: skip
+        self._fade()
+
+    def update_others(self) -> None:
+        """Offer the other results of the list."""
+        self.other.options = {_PREVIOUS: None, **(self._others() if self._others else {})}
+        self.other.visible = len(self.other.options) > 1
+
+    def _compare(self, number: int | None) -> None:
+        if number is None or self._take is None:
+            self._session.compare(None)
+        else:
+            self._take(number, self._session.compare)
 
     def _choose_mode(self, mode: str) -> None:
         if self._dragging is not None:
             self._dragging.mode = mode
+
+    def _choose_map(self) -> None:
+        palette, low, high = self._colours.get(self.map.value, ("", None, None))
+        self._follows = True
+        self.palette.value, self.low.value, self.high.value = palette, low, high
+        self._follows = False
+        self._show_maps()
+
+    def _recolour(self) -> None:
+        if self._follows:
+            return
+        self._colours[self.map.value] = self.palette.value, self.low.value, self.high.value
+        self._show_maps()
+
+    def _fade(self) -> None:
+        """Grey what does not belong to the options, until it does."""
+        self._body.styles = dict(_STALE if self._session.computing else _FRESH)
 
     def _show(self) -> None:
         """Show a new result."""
@@ -102,25 +200,26 @@ class ResultPane:
         self._show_section()
         self._show_measures()
 
+    def _show_compared(self) -> None:
+        self._show_maps()
+        self._show_section()
+
     def _show_maps(self) -> None:
         name = self.map.value
         sheet = self._session.sheet(self._session.now)
         if sheet is None or name not in sheet.result:
             return
         self._prepare(sheet)
-        now = show_map(sheet, name)
+        now = recoloured(show_map(sheet, name), *self._colours.get(name, ("", None, None)))
         self._draw("now", sheet, now, self._session.now)
-        before = self._session.sheet(self._session.before) if self.compared.value else None
+        before = self._session.sheet(self._session.compared) if self.compared.value else None
         fits = before is not None and name in before.result and before.place == sheet.place
-        if before is not None and fits:
-            self._draw_next(before, show_map(before, name, now), now)
         other = [self._panes["before"]] if fits else []
-        if self._session.before is None and self._session.whole is not None:
-            other = [
-                text(
-                    hint("After a change of an option, the previous result is shown here."), margin=(160, 60)
-                )
-            ]
+        if before is not None and fits:
+            shown = show_map(before, name, now)
+            self._draw_next(before, replace(shown, palette=now.palette) if now.palette else shown, now)
+        elif before is not None:
+            other = [text(hint("B has no such map of the same place and size."), margin=(160, 60))]
         self._pair[:] = [self._panes["now"], *other]
         self.caption.object = f"<p>{escape(now.caption)}</p>{_legend(sheet, now, self.marked.value)}"
 
@@ -131,23 +230,31 @@ class ResultPane:
         self._place = sheet.place, sheet.unit
         now = Picture(sheet.place, sheet.unit, _PICTURE)
         self._pictures = {"now": now, "before": Picture(sheet.place, sheet.unit, _PICTURE, like=now)}
+        self._lines = ColumnDataSource(data={"x": [], "y": [], "colour": []})
+        self._dust = ColumnDataSource(data={"x": [], "y": []})
+        for width, colour in ((5, "white"), (3, "colour")):
+            now.figure.multi_line("x", "y", source=self._lines, line_width=width, line_color=colour)
+        now.figure.patches(
+            "x", "y", source=self._dust, fill_color="white", fill_alpha=0.5, hatch_pattern="/",
+            line_color="black", line_width=1.5,
+        )  # fmt: skip
         self._dragging = Dragging(now, self._drawn, self.drag.value)
         now.figure.on_event(Tap, self._tapped)
         self._panes = {name: pn.pane.Bokeh(picture.figure) for name, picture in self._pictures.items()}
 
     def _draw_next(self, before: Sheet, shown: Shown, now: Shown) -> None:
-        """Draw the previous map, or the change since then, which codes and directions do not have."""
+        """Draw the map of B, or the change from it, which codes and directions do not have."""
         if self.compared.value == "change" and now.values.dtype.kind == "f":
             self._pictures["before"].show(show_change(now, shown))
         else:
-            self._draw("before", before, shown, self._session.before)
+            self._draw("before", before, shown, self._session.compared)
 
     def _draw(self, which: str, sheet: Sheet, shown: Shown, computed: Computed | None) -> None:
         assert computed is not None
         picture = self._pictures[which]
         heights = self.map.value == sheet.result.name_of("height")
         marks = filled_marks(sheet) if heights and self.marked.value else None
-        name = "previous" if which == "before" else "now"
+        name = "B" if which == "before" else "A"
         picture.show(shown, marks, f"{name}: {computed.label}")
 
     def _tapped(self, event: Any) -> None:
@@ -159,69 +266,117 @@ class ResultPane:
         first = self._session.part().origin
         self._session.point_at(int(row) + first[0], int(column) + first[1])
 
-    def _drawn(self, mode: str, start: Point, end: Point) -> None:
+    def _drawn(self, mode: str, *points: Point) -> None:
         sheet = self._session.sheet(self._session.now)
         if sheet is None:
             return
         if mode == "section":
-            self._session.cut((start, end))
-            return
-        self._session.measure_in(region_between(sheet.place, (len(sheet.y), len(sheet.x)), start, end))
+            kept = self._session.sections[: len(_COLOURS) - 1]
+            self._session.cut(*kept, (points[0], points[-1]))
+        elif mode == "mask":
+            self._session.mask([*self._session.masks, points])
+        else:
+            start, end = points
+            self._session.measure_in(region_between(sheet.place, (len(sheet.y), len(sheet.x)), start, end))
 
     def _show_section(self) -> None:
         sheet = self._session.sheet(self._session.now)
+        self.uncut.visible = bool(self._session.sections)
         if sheet is None or sheet.result.height is None:
             self.where.object = ""
             return
-        try:
-            profile = section(sheet.result, *(self._session.ends or ()))
-        except InputError:
-            self._session.ends = None
+        profiles = []
+        for ends in [*self._session.sections]:
+            try:
+                profiles.append(section(sheet.result, *ends))
+            except InputError:
+                self._session.sections.remove(ends)
+        if not self._session.sections:
+            with suppress(InputError):
+                profiles.append(section(sheet.result))
+        if not profiles:
+            self.where.object = hint("No section can be drawn there.")
             return
         if self._dragging is not None:
-            self._dragging.line.data = {"x": profile.x[[0, -1]], "y": profile.y[[0, -1]]}
-        before = self._session.sheet(self._session.before)
+            self._dragging.line.data = {"x": [], "y": []}
+            self._lines.data = {
+                "x": [profile.x[[0, -1]] for profile in profiles],
+                "y": [profile.y[[0, -1]] for profile in profiles],
+                "colour": [*_COLOURS[: len(profiles)]],
+            }
+        before = self._session.sheet(self._session.compared)
         other = None
         if before is not None and before.result.height is not None and before.place == sheet.place:
-            other = section(before.result, (profile.x[0], profile.y[0]), (profile.x[-1], profile.y[-1]))
-        self.section.show(sheet, profile, other)
-        ends = [f"({profile.x[end]:.3g}, {profile.y[end]:.3g})" for end in (0, -1)]
-        self.where.object = f"<p>Section from {ends[0]} to {ends[1]} {sheet.unit}</p>"
+            first = profiles[0]
+            other = section(before.result, (first.x[0], first.y[0]), (first.x[-1], first.y[-1]))
+        self.section.show(sheet, profiles, other)
+        ends_of = [f"({profiles[-1].x[end]:.3g}, {profiles[-1].y[end]:.3g})" for end in (0, -1)]
+        count = f"Section {len(profiles)}" if len(profiles) > 1 else "Section"
+        self.where.object = f"<p>{count} from {ends_of[0]} to {ends_of[1]} {sheet.unit}</p>"
 
     def _show_measures(self) -> None:
-        sheet = self._session.sheet(self._session.now)
-        region = self._session.measured
-        self.restart.disabled = region is None
+        session = self._session
+        sheet, region, masks = session.sheet(session.now), session.measured, session.masks
+        self.restart.disabled, self.unmask.visible = region is None, bool(masks)
         if sheet is None:
             return
         if sheet.result.height is None:
-            self.measures.object, self.restart.visible = hint("This result has no heights to measure."), False
+            self.measures.object = hint("This result has no heights to measure.")
+            self.restart.visible = self.copy.visible = self.table.visible = False
             return
-        self.restart.visible = True
+        self.restart.visible = self.copy.visible = self.table.visible = True
         if self._dragging is not None:
-            self._dragging.box.visible = region is not None
-            if region is not None:
-                shape = len(sheet.y), len(sheet.x)
-                self._dragging.box.update(**edges_of(sheet.place, shape, region))
-        now = self._session.now
-
-        def measure() -> Measures | InputError:
-            try:
-                return engine.measure(sheet.result, region=region)
-            except InputError as error:
-                return error
+            shape = len(sheet.y), len(sheet.x)
+            self._dragging.outline(None if region is None else edges_of(sheet.place, shape, region))
+            corners = [np.transpose(polygon) for polygon in masks]
+            self._dust.data = {"x": [x for x, _ in corners], "y": [y for _, y in corners]}
+        now, where = session.now, _words(region, masks)
+        found, measure = session.measures()
 
         def show(measures: Measures | InputError) -> None:
-            if (now, region) != (self._session.now, self._session.measured):
+            if (now, region, masks) != (session.now, session.measured, session.masks):
                 return
+            self.measures.styles = dict(_FRESH)
+            self._measured = None if isinstance(measures, InputError) else measures
+            self.copy.disabled = self.table.disabled = self._measured is None
+            self._text.data = {"text": [as_text(self._measured, "\t")]}
             if isinstance(measures, InputError):
                 self.measures.object = problem(str(measures))
                 return
-            rows = {name: str(value) for name, value in measures.quantities.items()}
-            where = "the whole map" if region is None else f"the region {region.text}"
-            self.measures.object = f"<h3>Measures of {where}</h3>{table(rows, _SECTION[1] - 60)}"
+            self.measures.object = f"<h3>Measures of {where}</h3>{_grouped(measures)}"
 
-        self._session.run(measure, show)
+        if found is not None:
+            show(found)
+            return
+        self.measures.styles = dict(_STALE)
+        session.run(measure, show)
+
+    def _csv(self) -> StringIO:
+        return StringIO(as_text(self._measured, ","))
+
+
+def as_text(measures: Measures | None, separator: str) -> str:
+    """Return measures as lines of a table: name, value, standard uncertainty, and unit."""
+    lines = [("quantity", "value", "standard uncertainty", "unit")]
+    for name, value in (measures.quantities if measures else {}).items():
+        lines.append((name, repr(float(value.value)), repr(float(value.sigma)), value.unit))
+    return "".join(separator.join(line) + "\n" for line in lines)
+
+
+def _words(region: Region | None, masks: Sequence[Any]) -> str:
+    """Return what is measured, in words."""
+    where = "the whole map" if region is None else f"the region {region.text}"
+    areas = f"{len(masks)} areas" if len(masks) > 1 else "one area"
+    return f"{where} without {areas} of dust" if masks else where
+
+
+def _grouped(measures: Measures) -> str:
+    """Return measures as tables, one for each group, in columns."""
+    groups: dict[str, dict[str, str]] = {}
+    for name, value in measures.quantities.items():
+        groups.setdefault(group_of(name), {})[name] = str(value)
+    tables = (f"<section><h4>{escape(name)}</h4>{table(rows)}</section>" for name, rows in groups.items())
+    return f'<div class="groups">{"".join(tables)}</div>'
 
 
 def _legend(sheet: Sheet, shown: Shown, marked: bool) -> str:
@@ -243,26 +398,29 @@ def _legend(sheet: Sheet, shown: Shown, marked: bool) -> str:
 
 
 class _SectionGraph:
-    """Heights along a line, with a band of standard deviations, and those of the previous result."""
+    """Heights along lines, with a band of standard deviations, and those of B."""
 
     def __init__(self) -> None:
         self.figure = figure(
-            width=_SECTION[0],
-            height=_SECTION[1],
+            height=_SECTION,
+            min_width=380,
+            sizing_mode="stretch_width",
             tools="pan,wheel_zoom,reset",
             toolbar_location=None,
         )
         plain_axes(self.figure)
         empty: dict[str, list[float]] = {"x": [], "y": [], "low": [], "high": [], "sigma": []}
-        self.sources = {name: ColumnDataSource(data=empty) for name in ("now", "filled", "before")}
+        numbers = [f"section {number}" for number in range(2, len(_COLOURS) + 1)]
+        self.sources = {name: ColumnDataSource(data=empty) for name in ("now", "filled", "before", *numbers)}
         self._band = self.figure.vbar(
-            "x", 1.0, "high", "low", source=self.sources["now"], color="#0072b2", alpha=0.25, line_width=0
+            "x", 1.0, "high", "low", source=self.sources["now"], color=_COLOURS[0], alpha=0.25, line_width=0
         )
         looks = {
-            "before": ("#8d99a6", "solid", "previous"),
-            "now": ("#0072b2", "solid", f"measured, ± {_BAND} standard deviations"),
+            "before": ("#8d99a6", "solid", "B"),
+            "now": (_COLOURS[0], "solid", f"measured, ± {_BAND} standard deviations"),
             "filled": (hex_of(FILLED_RGB), "dashed", "filled"),
         }
+        looks |= {name: (colour, "solid", name) for name, colour in zip(numbers, _COLOURS[1:], strict=True)}
         lines = {}
         for name, (colour, dash, label) in looks.items():
             lines[name] = self.figure.line(
@@ -270,15 +428,17 @@ class _SectionGraph:
                 legend_label=label,
             )  # fmt: skip
         self.figure.legend.update(
-            orientation="horizontal", label_text_font_size="11px", padding=3, background_fill_alpha=0.7
-        )
+            orientation="horizontal", label_text_font_size="11px", padding=3, background_fill_alpha=0.0,
+            border_line_alpha=0.0,
+        )  # fmt: skip
         self._legend = {item.label.value: item for item in self.figure.legend[0].items}
         self.figure.add_layout(self.figure.legend[0], "above")
         self.hover = HoverTool(renderers=[lines["now"]], mode="vline")
         self.figure.add_tools(self.hover)
 
-    def show(self, sheet: Sheet, profile: Section, before: Section | None) -> None:
-        """Draw a section, and that of the previous result."""
+    def show(self, sheet: Sheet, profiles: Sequence[Section], before: Section | None) -> None:
+        """Draw sections, and the first one of B."""
+        profile = profiles[0]
         factor, unit = sheet.of_height.figure_scale, sheet.of_height.figure_unit
         measured = np.where(profile.filled, np.nan, factor * profile.height)
         band = _BAND * factor * profile.sigma
@@ -294,8 +454,13 @@ class _SectionGraph:
             profile, np.where(profile.filled, factor * profile.height, np.nan)
         )
         self.sources["before"].data = _line(before or profile, factor * before.height if before else None)
-        self._legend["previous"].visible = before is not None
+        self._legend["B"].visible = before is not None
         self._legend["filled"].visible = bool(profile.filled.any())
+        for number in range(2, len(_COLOURS) + 1):
+            name = f"section {number}"
+            other = profiles[number - 1] if number <= len(profiles) else None
+            self.sources[name].data = _line(other or profile, factor * other.height if other else None)
+            self._legend[name].visible = other is not None
         title = title_of_height(sheet)
         self.figure.xaxis.axis_label = f"distance along the section ({sheet.unit})"
         self.figure.yaxis.axis_label = labelled(title, sheet.of_height)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import panel as pn
-from bokeh.models import ColumnDataSource, Range1d
+from bokeh.models import ColumnDataSource, CustomJS, Range1d
 from bokeh.plotting import figure
 
+from mirrorskin.hw.rig.plans import HorizontalPlan, Plan, RockPlan, TwistPlan
 from mirrorskin.io import InputError, pixel_axes
 from mirrorskin.view.app.look import heading, hint, plain_axes, problem, table, text
 from mirrorskin.view.app.picture import Picture, show_frame, show_map
@@ -35,6 +38,17 @@ _STATES = {
     "ready": "ready, the stage rests",
     "moving": "the stage moves",
 }
+_STOP = """
+const say = detail => document.dispatchEvent(new CustomEvent("stop-asked", {detail}))
+fetch(address, {method: "POST", signal: AbortSignal.timeout(1000)}).then(
+  async answer => say(answer.ok ? "" : await answer.text() || `answer ${answer.status}`),
+  () => say("the program does not answer"))
+"""
+_DRAWN = """
+requestAnimationFrame(() => requestAnimationFrame(() => seen.data = {number: cb_obj.data.number}))
+"""
+_UNSEEN = 5.0  # seconds after which a picture that was not drawn does not hold up the next one
+_WAIT = 0.5  # s at rest, pressed, before the body slides or twists
 _SATURATED = 0.001  # share of the pixels above which the exposure is too long
 
 
@@ -52,11 +66,14 @@ class RigPane:
         self._drawn: Any = None
         self._ranges: dict[str, tuple[float, float]] = {}  # of the maps of a run
         self._shown: Any = None
+        self._sent = ColumnDataSource(data={"number": [0]})
+        self._seen = ColumnDataSource(data={"number": [0]})  # what the browser has drawn
+        self._sent_at = -math.inf
+        self._sent.js_on_change("data", CustomJS(args={"seen": self._seen}, code=_DRAWN))
         self.stop = pn.widgets.Button(label="STOP", color="danger", width=110, height=38)
         self.stop.on_click(lambda _: self._stop())
         if control.stop_address:  # answered at once, also while this program computes
-            code = "fetch(address, {method: 'POST', mode: 'no-cors'})"
-            self.stop.js_on_click(args={"address": control.stop_address}, code=code)
+            self.stop.js_on_click(args={"address": control.stop_address}, code=_STOP)
         home = control.settings.stage.home
         label = "Connect, and home the stage (it moves)" if home else "Connect"
         self.connect = pn.widgets.Button(label=label, color="primary", width=270)
@@ -68,13 +85,14 @@ class RigPane:
         unit = "mm" if control.settings.camera.pixel_sides else "px"
         self.camera = Picture(extent(x, y), unit, _PICTURE)
         self.growing = Picture(extent(x, y), unit, _PICTURE)
+        self.camera.figure.tags = [self._sent, self._seen]
         self.histogram = ColumnDataSource(data={"left": [], "right": [], "top": []})
-        self._places = {name: text(width=120) for name in control.settings.stage.axes}
+        self._places = {name: text(width=90) for name in control.settings.stage.axes}
         self.steps = {
             unit: pn.widgets.Select(label=f"Step ({unit})", options=values, value=values[1], width=_NARROW)
             for unit, values in _STEPS.items()
         }
-        self.view = pn.Row(
+        self.view = pn.FlexBox(
             pn.Column(pn.pane.Bokeh(self.camera.figure), pn.pane.Bokeh(self._histogram()), self.facts),
             pn.Column(
                 pn.Row(self.connect), self.state, *self._jogging(), *self._running(), width=440
@@ -109,13 +127,13 @@ class RigPane:
         for name, axis in axes.items():
             buttons = []
             for sign, label in ((-1, "\N{MINUS SIGN}"), (1, "+")):
-                button = pn.widgets.Button(label=label, width=44)
+                button = pn.widgets.Button(label=f"{name} {label}", width=72)
                 button.on_click(lambda _, name=name, sign=sign: self._jog(name, sign))
                 self.jogs[name, sign] = button
                 buttons.append(button)
             low, high = axis.limits
             limits = hint(f"{low:g} to {high:g} {axis.unit}")
-            name_of = text(f"<p>{_NAMES[name]}</p>{limits}", width=130)
+            name_of = text(f"<p>{_NAMES[name]}</p>{limits}", width=110)
             rows.append(pn.Row(name_of, *buttons, self._places[name], margin=(0, 0)))
         self.lift = pn.widgets.Button(label="Lift", width=90)
         self.lift.on_click(lambda _: self._ask(self.control.lift))
@@ -123,22 +141,54 @@ class RigPane:
 
     def _running(self) -> list[Any]:
         """Return the fields of a run."""
-        field = pn.widgets.FloatInput
-        kinds = ["press", *(["rotation"] if "pitch" in self.control.settings.stage.axes else [])]
-        self.motion = pn.widgets.Select(label="Motion", options=kinds, value="press", width=_NARROW)
-        deepest = self.control.settings.stage.press
+        axes, deepest = self.control.settings.stage.axes, self.control.settings.stage.press
+
+        def field(label: str, value: float, step: float = 0.1) -> Any:
+            return pn.widgets.FloatInput(label=label, value=value, step=step, width=_NARROW)
+
         self.press = {
-            "start": field(label="From travel (mm)", value=0.0, step=0.1, width=_NARROW),
-            "stop": field(label="To travel (mm)", value=min(1.5, deepest), step=0.1, width=_NARROW),
-            "speed": field(label="Speed (mm/s)", value=0.5, step=0.1, width=_NARROW),
+            "start": field("From travel (mm)", 0.0),
+            "stop": field("To travel (mm)", min(1.5, deepest)),
+            "speed": field("Speed (mm/s)", 0.5),
         }
+        at = min(1.0, deepest)
         self.turn = {
-            "press": field(label="At travel (mm)", value=min(1.0, deepest), step=0.1, width=_NARROW),
-            "tilt": field(label="Tilt (deg)", value=2.5, step=0.1, width=_NARROW),
-            "turns": field(label="Turns", value=1.0, step=1.0, width=_NARROW),
-            "rate": field(label="Turns per second", value=0.5, step=0.1, width=_NARROW),
+            "press": field("At travel (mm)", at),
+            "tilt": field("Tilt (deg)", 2.5),
+            "turns": field("Turns", 1.0, 1.0),
+            "rate": field("Turns per second", 0.5),
         }
-        self._fields = pn.Row(*self.press.values(), margin=0)
+        self.slide = {
+            "press": field("At travel (mm)", at),
+            "distance": field("Distance (mm)", 0.5),
+            "direction": field("Direction (deg)", 0.0, 15.0),
+            "speed": field("Speed (mm/s)", 0.2),
+        }
+        self.twist = {
+            "press": field("At travel (mm)", at),
+            "angle": field("Angle (deg)", 10.0, 1.0),
+            "speed": field("Speed (deg/s)", 4.0),
+        }
+        self.rock = {
+            "press": field("At travel (mm)", at),
+            "tilt": field("Tilt (deg)", 2.5),
+            "phase": field("Direction (deg)", 0.0, 15.0),
+            "speed": field("Speed (deg/s)", 2.0),
+        }
+        # Fields and the plan by motion, where the stage has the axes.
+        self._motions: dict[str, tuple[dict[str, Any], Callable[..., Plan]]] = {
+            "press": (self.press, vertical_plan)
+        }
+        if {"pitch", "roll"} <= {*axes}:
+            self._motions |= {"rotation": (self.turn, axial_plan), "rocking": (self.rock, RockPlan)}
+        if {"x", "y"} <= {*axes}:
+            self._motions["slide"] = self.slide, partial(HorizontalPlan, wait=_WAIT)
+        if "twist" in axes:
+            self._motions["twist"] = self.twist, partial(TwistPlan, wait=_WAIT)
+        self.motion = pn.widgets.Select(
+            label="Motion", options=[*self._motions], value="press", width=_NARROW
+        )
+        self._fields = pn.FlexBox(*self.press.values())
         self.file = pn.widgets.TextInput(
             label="Record to (may be empty)", placeholder="recording.h5", width=280
         )
@@ -162,8 +212,7 @@ class RigPane:
             self._add("live result", control.result)
 
     def _choose_motion(self) -> None:
-        fields = self.press if self.motion.value == "press" else self.turn
-        self._fields[:] = list(fields.values())
+        self._fields[:] = list(self._motions[self.motion.value][0].values())
 
     def _stop(self) -> None:
         self.control.stop()
@@ -180,18 +229,32 @@ class RigPane:
         self._ask(lambda: self.control.jog(axis, sign * by))
 
     def _start(self) -> None:
+        fields, plan_of = self._motions[self.motion.value]
         try:
-            if self.motion.value == "press":
-                plan = vertical_plan(**{name: field.value for name, field in self.press.items()})
-            else:
-                values = {name: field.value for name, field in self.turn.items()}
-                plan = axial_plan(**{**values, "tilt": math.radians(values["tilt"])})
+            plan = plan_of(**{name: _in_radians(field) for name, field in fields.items()})
         except InputError as error:
             self.control.problem = str(error)
             self.refresh()
             return
         name = self.file.value.strip()
         self._ask(lambda: self.control.run(plan, Path(name) if name else None))
+
+    def refresh_when_drawn(self) -> None:
+        """Show what the rig shows now, if the browser has drawn what was shown before.
+
+        Pictures do not queue then, and the newest one is shown.
+        """
+        now = time.monotonic()
+        drawn = self._seen.data["number"] == self._sent.data["number"]
+        if drawn or now - self._sent_at > _UNSEEN:
+            self.refresh()
+            self._sent_at = now
+            self._sent.data = {"number": [self._sent.data["number"][0] + 1]}
+
+    def begin_showing(self) -> None:
+        """Show the rig now: the browser has not drawn what changed while it showed something else."""
+        self._sent_at = -math.inf
+        self.refresh()
 
     def refresh(self) -> None:
         """Show what the rig shows now."""
@@ -234,10 +297,12 @@ class RigPane:
             self._ranges.clear()  # a run begins
             return
         facts = {"Frames used": f"{status.used}, {status.skipped} skipped, {status.dropped} dropped"}
-        if update.motion == "vertical":
-            facts["Travel"] = f"{update.position:.3f} mm"
-        else:
+        if update.motion in ("vertical", "horizontal"):
+            facts["Travel" if update.motion == "vertical" else "Slide"] = f"{update.position:.3f} mm"
+        elif update.motion == "axial" and "slope" not in update.maps:
             facts["Phase"] = f"{math.degrees(update.position) % 360:.1f} deg"
+        else:
+            facts["Tilt" if update.motion == "axial" else "Twist"] = f"{math.degrees(update.position):.2f} deg"
         for name, value in update.maps.numbers().items():
             declared = update.maps.declaration(name)
             facts[declared.title_of(name)] = in_figure_unit(value, declared)
@@ -249,6 +314,13 @@ class RigPane:
             low, high = self._ranges[first] = min(low, shown.low), max(high, shown.high)
             self.growing.show(replace(shown, low=low, high=high), about="while the stage moves")
         _set(self.run, table(facts))
+
+
+def _in_radians(field: Any) -> float:
+    """Return the value of a field, angles in radians."""
+    if field.value is None:
+        raise InputError(f"{field.label}: a number is needed")
+    return math.radians(field.value) if "(deg" in field.label else float(field.value)
 
 
 def _set(pane: Any, content: str) -> None:

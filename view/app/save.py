@@ -47,7 +47,7 @@ class SavePane:
             width=220,
             label="Save result.h5",
         )
-        self.problem = text(width=900)
+        self.problem = text(sizing_mode="stretch_width")
         self.command = _text("command", 90)
         self.python = _text("python", 190)
         self.format.param.watch(lambda _: self._name_file(), "value")
@@ -120,7 +120,8 @@ def _text(name: str, height: int) -> Any:
     return pn.widgets.TextAreaInput(
         label="",
         height=height,
-        width=900,
+        sizing_mode="stretch_width",
+        max_width=900,
         disabled=False,
         css_classes=["code", name],
         resizable=False,

@@ -21,7 +21,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 from mirrorskin.io import InputError
 
@@ -29,6 +29,7 @@ HERE = "127.0.0.1"
 
 _NAMES = HERE, "localhost", "[::1]"
 _TOKEN_BYTES = 24
+_DROP_BYTES = 8 * 1024**3  # of a file that is dropped on a page, at most
 _PAGES = 16  # each has its own result, and memory of the device
 _HTTP_PORT = 80  # which browsers leave out
 
@@ -53,6 +54,8 @@ class AppServer:
         Milliseconds after which a page that was closed, or lost its connection, is forgotten.
     page_limit : int
         Number of open pages; further ones are refused.
+    drops : Path, optional
+        A folder for files that are dropped on a page; without one, none are accepted.
 
     Attributes
     ----------
@@ -66,7 +69,12 @@ class AppServer:
     """
 
     def __init__(
-        self, page: Callable[[], Any], port: int = 0, lifetime: int = 15_000, page_limit: int = _PAGES
+        self,
+        page: Callable[[], Any],
+        port: int = 0,
+        lifetime: int = 15_000,
+        page_limit: int = _PAGES,
+        drops: Path | None = None,
     ) -> None:
         from panel.io.resources import DIST_DIR
         from panel.io.server import get_server
@@ -85,7 +93,10 @@ class AppServer:
             prefix=token,
             title="mirrorskin",
             ico_path="none",  # Bokeh's is at an address without the token
-            extra_patterns=[(r"/(favicon\.ico)", StaticFileHandler, {"path": str(DIST_DIR / "images")})],
+            extra_patterns=[
+                (r"/(favicon\.ico)", StaticFileHandler, {"path": str(DIST_DIR / "images")}),
+                *([] if drops is None else [(r"/drop/(.+)", _receiver(), {"folder": drops})]),
+            ],
             show=False,
             start=False,
             session_token_expiration=86400,
@@ -129,8 +140,8 @@ def open_browser(address: str, folder: Path) -> None:
 class StopServer:
     """A server that calls a function when its secret address receives a POST, such as `RigControl.stop`.
 
-    Threads of its own answer, so that it works while the server of the pages is busy, and for a page that
-    has lost its connection.
+    The answer is 204 if the function returned, and otherwise 500 with the reason. Threads of its own answer,
+    so that it works while the server of the pages is busy, and for a page that has lost its connection.
 
     Attributes
     ----------
@@ -143,12 +154,22 @@ class StopServer:
 
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
-                is_path = secrets.compare_digest(self.path.encode(), path.encode())
                 here = self.headers.get("Host", "").lower() in hosts
-                if is_path and here:
+                if not here or not secrets.compare_digest(self.path.encode(), path.encode()):
+                    self._answer(404 if here else 421)
+                    return
+                try:
                     stop()
-                self.send_response(204 if is_path and here else 404 if here else 421)
+                except Exception as error:
+                    self._answer(500, str(error) or type(error).__name__)
+                else:
+                    self._answer(204)
+
+            def _answer(self, status: int, why: str = "") -> None:
+                self.send_response(status)
+                self.send_header("Access-Control-Allow-Origin", "*")  # the page reads whether it was stopped
                 self.end_headers()
+                self.wfile.write(why.encode())
 
             def log_message(self, format: str, *args: Any) -> None:  # noqa: A002  # overrides
                 pass
@@ -164,6 +185,40 @@ class StopServer:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+
+
+def _receiver() -> Any:
+    """Return the handler of files that are dropped on a page: each is written to a folder of its own."""
+    from tornado.web import RequestHandler, stream_request_body
+
+    @stream_request_body
+    class Receiver(RequestHandler):
+        def initialize(self, folder: Path) -> None:
+            self._folder, self._file = folder, cast(Any, None)
+
+        def prepare(self) -> None:
+            self.request.connection.set_max_body_size(_DROP_BYTES)  # type: ignore[union-attr]
+
+        def data_received(self, chunk: bytes) -> None:
+            self._open().write(chunk)
+
+        def _open(self) -> Any:
+            if self._file is None:
+                name = Path(self.path_args[0].replace("\\", "/")).name
+                self._place = Path(secrets.token_hex(8), name or "file")
+                (self._folder / self._place.parent).mkdir()
+                self._file = (self._folder / self._place).open("xb")
+            return self._file
+
+        def post(self, _: str) -> None:
+            self._open().close()
+            self.write(self._place.as_posix())
+
+        def on_connection_close(self) -> None:
+            if self._file is not None:
+                self._file.close()
+
+    return Receiver
 
 
 def _hosts(port: int) -> list[str]:

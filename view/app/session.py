@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mirrorskin import engine, io
 from mirrorskin.engine.base.options import Option, plain
 from mirrorskin.engine.base.reconstruction import calibrated, load_operation, method_for, run_class
+from mirrorskin.engine.metrology import Measures
 from mirrorskin.io.files.opening import is_result
 from mirrorskin.io.formats.registry import is_of_others
 from mirrorskin.io.model.result import map_shape
@@ -25,7 +26,11 @@ T = TypeVar("T")
 Ends = tuple[tuple[float, float], tuple[float, float]]
 """Ends of a section, x and y, mm."""
 
+Polygon = tuple[tuple[float, float], ...]
+"""Corners, x and y, mm."""
+
 _MODULE = "mirrorskin.engine"
+_KEPT = 400_000_000  # bytes of results that are kept, so that options can be changed back at once
 
 
 @dataclass(frozen=True)
@@ -57,11 +62,36 @@ class Opening:
 
 @dataclass(frozen=True)
 class Computed:
-    """A result, and what it was computed with."""
+    """A result, what it was computed with, and its measures by what was measured."""
 
     result: io.Result
     label: str
     seconds: float = 0.0
+    measures: dict[Hashable, Measures | io.InputError] = field(default_factory=dict, compare=False)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the maps."""
+        return sum(values.nbytes for values in self.result.values())
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a result is computed with, which can be undone."""
+
+    kind: type[Any]
+    changed: dict[str, Any]
+    region: io.Region | None
+    frames: tuple[int, int | None] | None
+
+    @property
+    def key(self) -> Hashable | None:
+        """What is equal for equal results; None if it depends on files that may change."""
+        options = self.kind.options
+        if any(_is_file(options[name], value) for name, value in self.changed.items()):
+            return None
+        values = sorted((name, repr(plain(value))) for name, value in self.changed.items())
+        return self.kind, tuple(values), self.region, self.frames
 
 
 class Run(Protocol):
@@ -124,9 +154,15 @@ class Session:
         self._samples: tuple[int, int, NDArray[Any]] | None = None
         self.pixel: tuple[int, int] | None = None  # row and column in the whole picture
         self.measured: io.Region | None = None  # pixels of the maps
-        self.ends: Ends | None = None
+        self.sections: list[Ends] = []
+        self.masks: list[Polygon] = []
         self.turn: int | None = None
         self.changed: dict[str, Any] = {}  # options that differ from their defaults
+        self.refused: dict[str, str] = {}  # why the text in the field of an option is not used
+        self.other: Computed | None = None  # what is compared with the result instead of the previous one
+        self._done: list[Choice] = []
+        self._undone: list[Choice] = []
+        self._kept: dict[Hashable, Computed] = {}  # the least recently used one first
         if isinstance(source, io.Result):
             self.name = str(source.process.get("source", "result"))
             self._keep(Computed(source, "stored result"))
@@ -141,6 +177,7 @@ class Session:
         if self.whole is not None:
             kind = load_operation(opening.operation) if opening.operation else method_for(self.whole.motion)
             self.kind: type[Any] = kind
+            self._first_kind = kind
             self.compute()
 
     @property
@@ -156,7 +193,8 @@ class Session:
     @property
     def kind_name(self) -> str:
         """``MODULE:CLASS`` of the operation."""
-        return self.opening.operation or _name_of(self.kind)
+        named = self.opening.operation
+        return named if named and self.kind is self._first_kind else _name_of(self.kind)
 
     def operations(self) -> dict[str, str]:
         """Return the operations that apply to the motion: names as in `load_operation`, by label."""
@@ -187,7 +225,7 @@ class Session:
         return self.changed.get(name, self.kind.options[name].default)
 
     def watch(self, *names: str, callback: Callable[[], None]) -> None:
-        """Call back after a change of "result", "pixel", "measured", "ends" or "part"."""
+        """Call back after a change, such as of "result", "problem", "pixel", "measured", "ends" or "part"."""
         for name in names:
             self._watchers.setdefault(name, []).append(callback)
 
@@ -197,40 +235,90 @@ class Session:
         ):
             callback()
 
+    @property
+    def choice(self) -> Choice:
+        """What the result is computed with."""
+        return Choice(self.kind, dict(self.changed), self.region, self.frames)
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether `undo` has something to do."""
+        return bool(self._done)
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether `redo` has something to do."""
+        return bool(self._undone)
+
+    def undo(self) -> None:
+        """Return to the operation, options and part before the last change."""
+        if self._done:
+            self._undone.append(self.choice)
+            self._return_to(self._done.pop())
+
+    def redo(self) -> None:
+        """Repeat the last change that was undone."""
+        if self._undone:
+            self._done.append(self.choice)
+            self._return_to(self._undone.pop())
+
+    def _return_to(self, choice: Choice) -> None:
+        self.kind, self.changed, self.refused = choice.kind, dict(choice.changed), {}
+        self._use_part(choice.region, choice.frames)
+        self._tell("operation")
+        self.compute()
+
+    def _remember(self) -> None:
+        self._done.append(self.choice)
+        self._undone.clear()
+
     def choose_operation(self, name: str) -> None:
         """Choose another operation; its options have their defaults."""
-        self.kind, self.changed = load_operation(name), {}
+        self._remember()
+        self.kind, self.changed, self.refused = load_operation(name), {}, {}
         self._tell("operation")
         self.compute()
 
     def choose(self, name: str, value: Any) -> None:
-        """Set an option, and compute the result again; a value that is refused leaves the problem only."""
+        """Set an option, and compute the result again; a value that is refused leaves the reason only."""
         declared = self.kind.options[name]
         try:
             checked = declared.check(value)
         except io.InputError as error:
-            self.problem = str(error)
-            self._tell("problem")
+            self.refuse(name, str(error))
             return
+        if self.refused.pop(name, None):
+            self._tell("problem")
         kept = value if isinstance(value, str) else checked  # of a file its name, not what it contains
         if _same(kept, self.value(name)):
             return
+        self._remember()
         self.changed.pop(name, None)
         if not _same(kept, declared.default):
             self.changed[name] = kept
         self.compute()
 
+    def refuse(self, name: str, why: str) -> None:
+        """Keep the result, which does not belong to the text in the field of an option."""
+        self.refused[name] = why
+        self._tell("problem")
+
     def choose_part(self, region: io.Region | None, frames: tuple[int, int | None] | None) -> None:
         """Use a part of the recording, and compute the result again."""
+        if (region, frames) != (self.region, self.frames):
+            self._remember()
+            self._use_part(region, frames)
+            self.compute()
+
+    def _use_part(self, region: io.Region | None, frames: tuple[int, int | None] | None) -> None:
         if (region, frames) == (self.region, self.frames):
             return
         self.region, self.frames = region, frames
         if self._part is not None:
             self.run(self._part.close, _ignore)  # it may be in use
             self._part = self._samples = None
-        self.measured = self.ends = None
+        self.measured, self.sections, self.masks = None, [], []
         self._tell("part")
-        self.compute()
 
     def point_at(self, row: int, column: int) -> None:
         """Choose a pixel of the whole picture."""
@@ -245,10 +333,54 @@ class Session:
         self.measured = region
         self._tell("measured")
 
-    def cut(self, ends: Ends | None) -> None:
-        """Choose the ends of the section; None for the row through the highest point."""
-        self.ends = ends
+    def mask(self, polygons: Sequence[Polygon]) -> None:
+        """Leave out what is inside of polygons, such as dust, from the measures."""
+        self.masks = [*polygons]
+        self._tell("measured")
+
+    def cut(self, *sections: Ends) -> None:
+        """Choose the ends of the sections; none for the row through the highest point."""
+        self.sections = [*sections]
         self._tell("ends")
+
+    @property
+    def ends(self) -> Ends | None:
+        """Ends of the first section; None for the row through the highest point."""
+        return self.sections[0] if self.sections else None
+
+    @property
+    def compared(self) -> Computed | None:
+        """What the result is compared with: another file's result, or the previous one."""
+        return self.other or self.before
+
+    def compare(self, other: Computed | None) -> None:
+        """Compare with another result; None for the previous one."""
+        self.other = other
+        self._tell("compared")
+
+    def measures(self) -> tuple[Measures | io.InputError | None, Callable[[], Measures | io.InputError]]:
+        """Return the measures of the shown result, if they are known, and a function that measures."""
+        now, region, masks, turn = self.now, self.measured, [*self.masks], self.turn
+        assert now is not None
+        key = region, repr(masks), turn
+
+        def measure() -> Measures | io.InputError:
+            if key not in now.measures:
+                try:
+                    now.measures[key] = self._measure(now, region, masks)
+                except io.InputError as error:
+                    now.measures[key] = error
+            return now.measures[key]
+
+        return now.measures.get(key), measure
+
+    def _measure(self, computed: Computed, region: io.Region | None, masks: Sequence[Polygon]) -> Measures:
+        sheet = self.sheet(computed)
+        assert sheet is not None
+        result, name = sheet.result, sheet.result.name_of("height")
+        if masks and name is not None:
+            result = result.assign(**{name: np.where(inside(sheet, masks), np.float32(np.nan), result[name])})
+        return engine.measure(result, region=region)
 
     def choose_turn(self, turn: int) -> None:
         """Choose the turn whose maps are shown."""
@@ -299,6 +431,11 @@ class Session:
         """Compute the result with the current options; the last one is kept next to it."""
         self._version += 1
         version, kind, changed, label = self._version, self.kind, dict(self.changed), self.label()
+        key = self.choice.key
+        if (computed := self._kept.get(key)) is not None:
+            self.problem, self.computing = "", False
+            self._end(version, computed)
+            return
         self.problem, self.computing = "", True
         self._tell("problem")
         try:
@@ -321,15 +458,19 @@ class Session:
                 return error
             return Computed(result, label, time.perf_counter() - started)
 
-        self.run(work, lambda computed: self._end(version, computed))
+        self.run(work, lambda computed: self._end(version, computed, key))
 
-    def _end(self, version: int, computed: Computed | Exception) -> None:
+    def _end(self, version: int, computed: Computed | Exception, key: Hashable | None = None) -> None:
         """Keep a result, or report why there is none, unless it is outdated."""
         if version != self._version:
             return
         self.computing = False
         self.failed = isinstance(computed, Exception)
         if isinstance(computed, Computed):
+            if key is not None:
+                self._kept[key] = computed
+                while len(self._kept) > 1 and sum(kept.size for kept in self._kept.values()) > _KEPT:
+                    self._kept.pop(next(iter(self._kept)))
             self._keep(computed)
             return
         self.problem = str(computed)
@@ -361,6 +502,25 @@ class Session:
 def holds_result(path: Path) -> bool:
     """Return whether a file is a result, not frames."""
     return not is_of_others(path) and is_result(path)
+
+
+def inside(sheet: Sheet, polygons: Sequence[Polygon]) -> NDArray[np.bool_]:
+    """Return which pixels of a sheet have their centres in a polygon, (H, W)."""
+    from matplotlib.path import Path as Outline
+
+    found = np.zeros((len(sheet.y), len(sheet.x)), bool)
+    for polygon in polygons:
+        (left, bottom), (right, top) = np.min(polygon, axis=0), np.max(polygon, axis=0)
+        rows = np.flatnonzero((sheet.y >= bottom) & (sheet.y <= top))
+        columns = np.flatnonzero((sheet.x >= left) & (sheet.x <= right))
+        y, x = np.meshgrid(sheet.y[rows], sheet.x[columns], indexing="ij")
+        within = Outline(np.asarray(polygon)).contains_points(np.stack([x.ravel(), y.ravel()], axis=-1))
+        found[np.ix_(rows, columns)] |= within.reshape(x.shape)
+    return found
+
+
+def _is_file(option: Option, value: Any) -> bool:
+    return option.kind in ("file", "path") or (option.kind == "map" and isinstance(value, str))
 
 
 def shown(value: Any) -> str:

@@ -9,7 +9,7 @@ import panel as pn
 
 from mirrorskin.view.app.session import Computed, Session
 
-_SIZE = 1100, 740
+_HEIGHT = 740
 
 
 class SurfacePane:
@@ -19,8 +19,8 @@ class SurfacePane:
         self._session = session
         self._drawn: Computed | None = None
         self._looked_at = False
-        self.page = pn.pane.HTML("", width=_SIZE[0], height=_SIZE[1])
-        self.view = pn.Column(self.page)
+        self.page = pn.pane.HTML("", sizing_mode="stretch_width", height=_HEIGHT)
+        self.view = pn.Column(self.page, sizing_mode="stretch_width")
         session.watch("result", callback=self._draw)
 
     def shown_in(self, tabs: Any, number: int) -> None:
@@ -52,6 +52,6 @@ class SurfacePane:
         """Show a page with the surface of a result, unless another one is drawn."""
         if of is not self._drawn:
             return
-        style = f"border:0;width:100%;height:{_SIZE[1]}px"
+        style = f"border:0;width:100%;height:{_HEIGHT}px"
         srcdoc = escape(page, quote=True)
         self.page.object = f'<iframe title="Surface" srcdoc="{srcdoc}" style="{style}"></iframe>'

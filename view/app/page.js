@@ -1,0 +1,92 @@
+// What the page does by itself: it notices that the program does not answer, and that STOP failed.
+const LOOK = 200  // ms from one look at the clock to the next
+const SILENT = 1300  // ms without a pulse, which comes four times a second, after which the page is off
+const STOP_BY_HAND = "Use the emergency switch, or cut the power of the stage."
+const shown = id => document.getElementById(id)
+const stoppable = shown("stop") !== null
+
+let pulsed = performance.now()  // when the program was last heard
+let silence = 0  // ms, of which the page itself was held up in none
+let looked = pulsed
+
+function pulse() {
+  [pulsed, silence] = [performance.now(), 0]
+  look()
+}
+
+function look() {
+  const now = performance.now()
+  silence += Math.min(now - looked, 2 * LOOK)
+  looked = now
+  const lost = silence > SILENT
+  for (const part of [shown("head"), shown("body")]) part.inert = lost
+  const banner = shown("lost")
+  banner.hidden = !lost
+  if (!lost) return
+  const age = Math.round((now - pulsed) / 1000)
+  const rig = stoppable ? ` The stage may still move: press STOP; if that fails, ${STOP_BY_HAND.toLowerCase()}` : ""
+  const text = `The program does not answer. What is shown is ${age} s old.${rig}`
+  if (banner.textContent !== text) banner.textContent = text
+}
+
+document.addEventListener("stop-asked", event => {
+  const banner = shown("unstopped")
+  banner.textContent = event.detail ? `STOP failed: ${event.detail}. ${STOP_BY_HAND}` : ""
+  banner.hidden = !event.detail
+})
+
+function listen() {
+  const page = globalThis.Bokeh?.documents?.[0]
+  const model = page && [...page.all_models].find(model => model.tags?.includes("pulse"))
+  if (!model) return void setTimeout(listen, 50)
+  page.config.notify_connection_status = false  // the banner tells more
+  model.change.connect(pulse)
+  page.on_event("connection_lost", () => silence = 2 * SILENT)
+  pulse()
+  setInterval(look, LOOK)
+  page.on_change(() => { clearTimeout(painting); painting = setTimeout(() => paint(page), 30) })
+  dark.addEventListener("change", () => paint(page))
+  paint(page)
+  takeDrops([...page.all_models].find(model => model.tags?.includes("dropped")))
+}
+
+// Figures are drawn on canvases, whose colours the style of the page does not reach.
+const dark = matchMedia("(prefers-color-scheme: dark)")
+const painted = new WeakMap()
+let painting = 0
+
+function paint(page) {
+  const [ink, line, faint] = dark.matches ? ["#d5dbe2", "#8a96a3", "#2e3742"] : ["#3a434e", "#5c6675", "#e1e4e8"]
+  const colours = {
+    text_color: ink, label_text_color: ink, title_text_color: ink,
+    axis_label_text_color: ink, major_label_text_color: ink,
+    axis_line_color: line, major_tick_line_color: line, minor_tick_line_color: line,
+    grid_line_color: faint, outline_line_color: faint,
+  }
+  for (const model of page.all_models) {
+    const known = ["Axis", "Grid", "Title", "ColorBar", "Legend", "Figure", "Plot"]
+    if (!known.some(kind => model.type.endsWith(kind)) || painted.get(model) === ink) continue
+    painted.set(model, ink)
+    const here = Object.entries(colours).filter(([name]) => name in model.properties)
+    model.setv(Object.fromEntries(here), {sync: false})
+  }
+}
+
+// A file that is dropped on the page goes to the server, and opens when it has arrived.
+function takeDrops(field) {
+  if (!field) return
+  const root = document.documentElement
+  const aside = event => { event.preventDefault(); root.classList.remove("drop") }
+  addEventListener("dragover", event => { event.preventDefault(); root.classList.add("drop") })
+  addEventListener("dragleave", aside)
+  addEventListener("drop", async event => {
+    aside(event)
+    for (const file of event.dataTransfer.files) {
+      const address = new URL(`drop/${encodeURIComponent(file.name)}`, location.href)
+      const answer = await fetch(address, {method: "POST", body: file}).catch(() => null)
+      if (answer?.ok) field.value = await answer.text()
+    }
+  })
+}
+
+listen()
