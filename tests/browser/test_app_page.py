@@ -216,7 +216,7 @@ def test_a_section_is_drawn_by_dragging(opened):
 
 def test_a_region_is_measured_by_dragging(opened):
     opened.show("Result")
-    opened.page.get_by_text("Draw a region to measure").click()
+    opened.page.get_by_text("Region to measure", exact=True).click()
     whole = opened.page.get_by_text("Measures of the whole map")
     whole.wait_for()
     box = opened.page.locator(".bk-Canvas:visible").first.bounding_box()

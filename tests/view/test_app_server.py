@@ -284,9 +284,13 @@ def test_pages_are_served_while_one_computes(blocked, tmp_path):
     computed = threading.Event()
 
     def page():
-        app = App(tmp_path / "press.h5", opening=Opening(operation=name))
-        app.session.watch("result", callback=computed.set)
-        return app.view
+        return Watched(tmp_path / "press.h5", opening=Opening(operation=name)).view
+
+    class Watched(App):
+        def _keep(self, number, result):
+            super()._keep(number, result)
+            if result is not None:
+                computed.set()
 
     async def look(address):
         socket = await _open_socket(address, await asyncio.to_thread(_token, address))
@@ -345,3 +349,35 @@ def test_a_stop_that_fails_is_answered_with_the_reason():
         urllib.request.urlopen(urllib.request.Request(server.address, method="POST"), timeout=PATIENCE)
     assert failed.value.code == 500
     assert failed.value.read() == b"the stage does not answer"
+
+
+@pytest.fixture
+def receiving(tmp_path):
+    """The parts of the address of a server that takes files, and the folder where it puts them."""
+    folder = tmp_path / "drops"
+    folder.mkdir()
+    with serving(_page, drops=folder) as address:
+        yield address, folder
+
+
+@pytest.mark.parametrize("name", ["ball.h5", "..%2F..%2Fball.h5", "%2Ftmp%2Fball.h5", "a%5Cball.h5"])
+def test_a_file_that_is_dropped_is_put_into_a_folder_of_its_own(receiving, name):
+    address, folder = receiving
+    content = bytes(range(256)) * 10_000
+    request = urllib.request.Request(f"{address.geturl()}drop/{name}", data=content)
+    with urllib.request.urlopen(request, timeout=PATIENCE) as reply:
+        place = reply.read().decode()
+    assert place.partition("/")[2] == "ball.h5"
+    assert (folder / place).read_bytes() == content
+    assert [path for path in folder.rglob("*") if path.is_file()] == [folder / place]
+
+
+def test_other_pages_cannot_drop_files(receiving):
+    address, folder = receiving
+    assert post(f"{address.geturl()}drop/ball.h5", Origin="http://example.org") == 403
+    assert post(f"http://{address.netloc}/wrong/drop/ball.h5") == 404
+    assert list(folder.iterdir()) == []
+
+
+def test_without_a_folder_no_file_is_taken(served):
+    assert post(f"{served.geturl()}drop/ball.h5") == 404

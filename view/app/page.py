@@ -148,7 +148,7 @@ class App:
     def _offer(self, names: dict[str, int]) -> None:
         """Offer recordings and results by name."""
         self.choice.options, self.choice.visible = names, len(names) > 1
-        self.choice.size = min(max(len(names), 2), 8)
+        self.choice.size = min(max(len(names), 3), 8)
 
     def add(self, name: str, source: Shown) -> None:
         """Show another recording or result, which can be chosen from then on."""
@@ -217,7 +217,20 @@ class App:
             ("Surface", self.surface.view),
             ("Save and copy", self.save.view),
         ]
-        self.tabs = pn.Tabs(*tabs, sizing_mode="stretch_width", stylesheets=[_TABS])
+        places = [pn.Column(sizing_mode="stretch_width") for _ in tabs]
+        self.tabs = pn.Tabs(
+            *((name, place) for (name, _), place in zip(tabs, places, strict=True)),
+            sizing_mode="stretch_width",
+            stylesheets=[_TABS],
+        )
+
+        def fill() -> None:
+            """Fill the chosen tab only: others would take the place that they need."""
+            for number, ((_, view), place) in enumerate(zip(tabs, places, strict=True)):
+                place[:] = [view] if number == self.tabs.active else []
+
+        self.tabs.param.watch(lambda _: fill(), "active")
+        fill()
         self.surface.shown_in(self.tabs, len(tabs) - 2)
         self._main[:] = [self.tabs]
         self._keep(number, session.now)

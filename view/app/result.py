@@ -40,12 +40,7 @@ from mirrorskin.view.result.sheet import Sheet, percent
 
 _PICTURE = 410, 350  # largest size, CSS pixels
 _SECTION = 270  # height, CSS pixels
-_DRAG = {
-    "Draw a section": "section",
-    "Draw a region to measure": "region",
-    "Draw around dust": "mask",
-    "Move the picture": "move",
-}
+_DRAG = {"Section": "section", "Region to measure": "region", "Dust": "mask", "Move the picture": "move"}
 _NEXT = {"the map of B": "before", "the change, A minus B": "change", "nothing": ""}
 _PREVIOUS = "previous result"
 _BAND = 2  # standard deviations
@@ -77,7 +72,7 @@ class ResultPane:
         self._session, self._others, self._take = session, others, take
         widgets = pn.widgets
         self.map = widgets.Select(label="Map", width=190)
-        self.other = widgets.Select(label="B", options={_PREVIOUS: None}, width=190)
+        self.other = widgets.Select(label="B", options={_PREVIOUS: ""}, value="", width=190)
         self.compared = widgets.Select(label="Next to it", options=_NEXT, value="before", width=170)
         self.marked = widgets.Checkbox(label="Mark filled heights", value=True)
         self.drag = widgets.RadioButtonGroup(
@@ -135,7 +130,8 @@ class ResultPane:
         )
         buttons = pn.FlexBox(self.restart, self.unmask, self.copy, self.table)
         self._body = pn.Column(
-            pn.FlexBox(pn.Column(self._pair, self.caption, styles={"flex": "0 1 auto"}), section),
+            pn.FlexBox(self._pair, section),
+            self.caption,
             self.measures,
             buttons,
             sizing_mode="stretch_width",
@@ -152,14 +148,14 @@ class ResultPane:
 
     def update_others(self) -> None:
         """Offer the other results of the list."""
-        self.other.options = {_PREVIOUS: None, **(self._others() if self._others else {})}
+        self.other.options = {_PREVIOUS: "", **(self._others() if self._others else {})}
         self.other.visible = len(self.other.options) > 1
 
-    def _compare(self, number: int | None) -> None:
-        if number is None or self._take is None:
-            self._session.compare(None)
-        else:
+    def _compare(self, number: int | str) -> None:
+        if isinstance(number, int) and self._take is not None:
             self._take(number, self._session.compare)
+        else:
+            self._session.compare(None)
 
     def _choose_mode(self, mode: str) -> None:
         if self._dragging is not None:

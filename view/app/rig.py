@@ -302,7 +302,8 @@ class RigPane:
         elif update.motion == "axial" and "slope" not in update.maps:
             facts["Phase"] = f"{math.degrees(update.position) % 360:.1f} deg"
         else:
-            facts["Tilt" if update.motion == "axial" else "Twist"] = f"{math.degrees(update.position):.2f} deg"
+            name = "Tilt" if update.motion == "axial" else "Twist"
+            facts[name] = f"{math.degrees(update.position):.2f} deg"
         for name, value in update.maps.numbers().items():
             declared = update.maps.declaration(name)
             facts[declared.title_of(name)] = in_figure_unit(value, declared)
