@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,18 @@ import panel as pn
 from bokeh.models import ColumnDataSource, CustomJS, Range1d
 from bokeh.plotting import figure
 
-from mirrorskin.hw.rig.plans import HorizontalPlan, Plan, RockPlan, TwistPlan
 from mirrorskin.io import InputError, pixel_axes
 from mirrorskin.view.app.look import heading, hint, plain_axes, problem, table, text
 from mirrorskin.view.app.picture import Picture, show_frame, show_map
-from mirrorskin.view.app.rig_control import RigControl, axial_plan, judge, vertical_plan
+from mirrorskin.view.app.rig_control import (
+    RigControl,
+    axial_plan,
+    judge,
+    rock_plan,
+    slide_plan,
+    twist_plan,
+    vertical_plan,
+)
 from mirrorskin.view.drawing.canvas import extent
 from mirrorskin.view.result.scale import in_figure_unit
 from mirrorskin.view.result.sheet import sheet_of
@@ -48,7 +54,6 @@ _DRAWN = """
 requestAnimationFrame(() => requestAnimationFrame(() => seen.data = {number: cb_obj.data.number}))
 """
 _UNSEEN = 5.0  # seconds after which a picture that was not drawn does not hold up the next one
-_WAIT = 0.5  # s at rest, pressed, before the body slides or twists
 _SATURATED = 0.001  # share of the pixels above which the exposure is too long
 
 
@@ -176,15 +181,15 @@ class RigPane:
             "speed": field("Speed (deg/s)", 2.0),
         }
         # Fields and the plan by motion, where the stage has the axes.
-        self._motions: dict[str, tuple[dict[str, Any], Callable[..., Plan]]] = {
+        self._motions: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {
             "press": (self.press, vertical_plan)
         }
         if {"pitch", "roll"} <= {*axes}:
-            self._motions |= {"rotation": (self.turn, axial_plan), "rocking": (self.rock, RockPlan)}
+            self._motions |= {"rotation": (self.turn, axial_plan), "rocking": (self.rock, rock_plan)}
         if {"x", "y"} <= {*axes}:
-            self._motions["slide"] = self.slide, partial(HorizontalPlan, wait=_WAIT)
+            self._motions["slide"] = self.slide, slide_plan
         if "twist" in axes:
-            self._motions["twist"] = self.twist, partial(TwistPlan, wait=_WAIT)
+            self._motions["twist"] = self.twist, twist_plan
         self.motion = pn.widgets.Select(
             label="Motion", options=[*self._motions], value="press", width=_NARROW
         )

@@ -24,7 +24,7 @@ from mirrorskin.hw.base.errors import HardwareError
 from mirrorskin.hw.base.rig_file import RigSettings, StageSettings
 from mirrorskin.hw.base.stage import Position, Stage
 from mirrorskin.hw.rig import rig as rigs
-from mirrorskin.hw.rig.plans import AxialPlan, Plan, VerticalPlan
+from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, RockPlan, TwistPlan, VerticalPlan
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import PlannedScan
 from mirrorskin.hw.rig.sweep import make_scan
@@ -35,6 +35,7 @@ State = Literal["disconnected", "connecting", "ready", "moving"]
 _SLOW = 0.1  # of an axis's speed, for moves by hand
 _LOOK = 0.02  # seconds from one look at a move to the next
 _MOST = 64  # frames that are taken at once
+_WAIT = 0.5  # s at rest, pressed, before the body slides or twists
 _JOIN = 30.0  # seconds that the thread may take to close the rig
 _STOPPED = "The stage was stopped. Look at it, then connect again."
 
@@ -274,6 +275,21 @@ def vertical_plan(start: float, stop: float, speed: float) -> Plan:
 def axial_plan(press: float, tilt: float, turns: float, rate: float) -> Plan:
     """Return the plan of a rotation without a halt: mm, radians, and turns per second."""
     return AxialPlan(press, tilt, turns, rate=rate)
+
+
+def slide_plan(press: float, distance: float, direction: float, speed: float) -> Plan:
+    """Return the plan of a slide without a halt: mm, radians, and mm/s."""
+    return HorizontalPlan(press, distance, direction, speed=speed, wait=_WAIT)
+
+
+def twist_plan(press: float, angle: float, speed: float) -> Plan:
+    """Return the plan of a twist without a halt: mm, radians, and radians per second."""
+    return TwistPlan(press, angle, speed=speed, wait=_WAIT)
+
+
+def rock_plan(press: float, tilt: float, phase: float, speed: float) -> Plan:
+    """Return the plan of rocking without a halt: mm, radians, and radians per second."""
+    return RockPlan(press, tilt, phase, speed=speed)
 
 
 @dataclass(frozen=True)
