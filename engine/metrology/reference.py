@@ -37,9 +37,9 @@ def subtract(result: Maps, reference: Maps) -> Result:
 
     Examples
     --------
-    >>> wear = subtract(np.full((2, 3), 0.3), np.full((2, 3), 0.1))
-    >>> wear.height.round(6).tolist()
-    [[0.2, 0.2, 0.2], [0.2, 0.2, 0.2]]
+    >>> wear = subtract(np.full((2, 3), 0.5), np.full((2, 3), 0.25))
+    >>> wear.height.tolist()
+    [[0.25, 0.25, 0.25], [0.25, 0.25, 0.25]]
     """
     first, second = as_result(result, "result"), as_result(reference, "reference")
     upper, lower = heights_of(first), heights_of(second)

@@ -397,7 +397,7 @@ def groove(section: Section) -> Groove:
             "the groove has too few samples, or the section too little of its sides: cut elsewhere"
         )
     height, slope = levels.fit(kept, inside, middle)
-    if abs(height.value) < _CLEAR_DEPTH * math.sqrt(rest / distance.size):
+    if abs(height.value) < _CLEAR_DEPTH * math.sqrt(max(rest, 0.0) / distance.size):
         raise InputError("there is no groove along the section: nothing exceeds the unevenness beside it")
     step = float(np.median(np.diff(distance)))
     wall = step / math.sqrt(12)
