@@ -117,4 +117,5 @@ def watched(compute: Callable[[], Result]) -> Watched:
         result = compute()
     issued = [str(warning.message) for warning in caught if issubclass(warning.category, MirrorskinWarning)]
     told = "; ".join(warnings_in(result.process) or issued)
-    return result, told, str(result.process.get("notes", ""))
+    notes = "; ".join(str(text) for name, text in result.process.items() if f"_{name}".endswith("_notes"))
+    return result, told, notes
