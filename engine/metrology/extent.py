@@ -20,6 +20,8 @@ Mask = NDArray[np.bool_]
 _REACH = 3  # pixels on either side of the highest one to which a paraboloid is fitted
 _MIN_PIXELS = 20  # of these 49 pixels that must have a height
 _NEAR = 3.0  # standard deviations above the lowest pixel, up to which others count as candidates
+_OF_TOP = 0.5  # share of the noise's variance that a paraboloid leaves, and the choice of its place adds
+_NEAR_MEDIAN = 1.5  # standard deviations from a median, up to which errors of heights change it
 _OF_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
 _COMMON_BORDER = 0.1  # share of the border's error with the same sign everywhere
 _UNIFORM = 1 / math.sqrt(3)  # standard deviation of a uniform distribution between -1 and 1
@@ -86,8 +88,8 @@ def _difference(upper: Quantity, lower: Quantity) -> Quantity:
     return Quantity(upper.value - lower.value, math.hypot(upper.sigma, lower.sigma), upper.unit)
 
 
-def rim(patch: Patch) -> Quantity | None:
-    """Return the median height of the outermost measured pixels of the largest connected area, mm.
+def rim_pixels(patch: Patch) -> Mask | None:
+    """Return the outermost measured pixels of the largest connected area.
 
     Borders of holes and the picture's border are no rim. None if more than half of the area's outline is the
     picture's border.
@@ -109,9 +111,20 @@ def rim(patch: Patch) -> Quantity | None:
     outermost &= patch.measured
     if not outermost.any():
         return None
-    pixels = int(np.count_nonzero(outermost))
-    sigma = min(_OF_MEDIAN * patch.error_of_sum(outermost) / pixels, _median_sigma(patch, outermost))
-    return Quantity(float(np.median(patch.height[outermost])), sigma, "mm")
+    return outermost
+
+
+def rim(patch: Patch) -> Quantity | None:
+    """Return the median height of the rim, mm."""
+    outermost = rim_pixels(patch)
+    if outermost is None:
+        return None
+    height, sigma = patch.height[outermost], _median_sigma(patch, outermost)
+    middle, common = float(np.median(height)), patch.common_variance(outermost)
+    # On slopes, only few pixels are as high as their median, whose errors change it.
+    pixels = int(np.count_nonzero(abs(height - middle) <= _NEAR_MEDIAN * sigma))
+    variance = common + (sigma**2 - common) * min(_OF_MEDIAN**2 / max(pixels, 1), 1.0)
+    return Quantity(middle, math.sqrt(variance), "mm")
 
 
 def _median_sigma(patch: Patch, chosen: Mask) -> float:
@@ -138,10 +151,16 @@ def _highest(patch: Patch) -> Quantity:
     sigma = np.nan if patch.sigma is None else float(np.median(patch.sigma[rows, columns][measured]))
     top = _top(x, y, z)
     if top is None:
-        near = z[(abs(y) <= 1) & (abs(x) <= 1)]
-        top = float(np.mean(near)), float(np.std(near))
+        middle = z[(abs(y) <= 1) & (abs(x) <= 1)]
+        top = float(np.mean(middle)), float(np.std(middle))
     value, misfit = top
-    return Quantity(value, math.hypot(sigma, misfit), "mm")
+    if patch.sigma is None:
+        return Quantity(value, np.nan, "mm")
+    near = np.zeros(patch.measured.shape, bool)
+    near[rows, columns] = measured
+    noise = sigma**2 - patch.common_variance(near)
+    variance = sigma**2 - (1 - _OF_TOP) * noise + max(misfit**2 - noise, 0.0)
+    return Quantity(value, math.sqrt(variance), "mm")
 
 
 def _top(x: NDArray[np.intp], y: NDArray[np.intp], z: Doubles) -> tuple[float, float] | None:
@@ -173,12 +192,15 @@ def _lowest(patch: Patch) -> Quantity:
     pair = np.where(height >= adjacent, height, np.inf)
     place = np.unravel_index(int(np.argmin(pair if np.isfinite(pair).any() else height)), height.shape)
     value = float(height[place])
-    sigma = np.nan if patch.sigma is None else float(patch.sigma[place])
-    if np.isfinite(sigma):
-        # The least of n normal variates is about sqrt(2 ln n) standard deviations below their mean.
-        candidates = int(np.count_nonzero(height <= value + _NEAR * sigma))
-        sigma *= max(1.0, math.sqrt(2 * math.log(max(candidates, 1))))
-    return Quantity(value, sigma, "mm")
+    if patch.sigma is None:
+        return Quantity(value, np.nan, "mm")
+    # The least of n normal variates is about sqrt(2 ln n) standard deviations below their mean, and the least
+    # that two neighbours reach sqrt(ln n).
+    candidates = height <= value + _NEAR * patch.sigma[place]
+    sigma, number = float(np.median(patch.sigma[candidates])), int(np.count_nonzero(candidates))
+    common = 0.0 if math.isinf(patch.noise_length) else patch.common_variance(candidates)
+    noise = sigma**2 - common
+    return Quantity(value, math.sqrt(sigma**2 + noise * max(0.0, math.log(number) - 1)), "mm")
 
 
 def areas(patch: Patch) -> dict[str, Quantity]:
@@ -209,14 +231,23 @@ def areas(patch: Patch) -> dict[str, Quantity]:
     return quantities
 
 
-def volume(patch: Patch, level: float, level_sigma: float, name: str) -> dict[str, Quantity]:
+def volume(
+    patch: Patch, level: float, name: str, *, level_sigma: float = 0.0, level_pixels: Mask | None = None
+) -> dict[str, Quantity]:
     """Return the volume between the surface and a plane at a level, mm, in mm3; negative below the plane.
 
-    Errors of heights are partly independent, and partly common: see `Patch.error_of_sum`.
+    Errors of heights are partly independent, and partly common: see `Patch.error_of_sum`. An error of the
+    pixels whose median is the level changes the level as well.
     """
-    above = patch.height - level
+    above, pixels = patch.height - level, np.count_nonzero(patch.measured)
     value = patch.pixel_area * float(np.nansum(above))
-    errors = math.hypot(patch.error_of_sum(), level_sigma * np.count_nonzero(patch.measured))
+    weights: Doubles | float = 1.0
+    if level_pixels is not None and math.isfinite(patch.noise_length):
+        share = level_pixels / np.count_nonzero(level_pixels)
+        weights = 1 - pixels * share
+        # The error of a median is that at its height; on slopes it exceeds that of the mean.
+        level_sigma = math.sqrt(max(level_sigma**2 - patch.error_of_sum(share) ** 2, 0.0))
+    errors = math.hypot(patch.error_of_sum(weights), pixels * level_sigma)
     edge = _error_of_border(above[border(patch.measured)])
     quantities = {name: Quantity(value, patch.pixel_area * math.hypot(errors, edge), "mm3")}
     if np.isfinite(patch.filled).any():

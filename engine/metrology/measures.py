@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.inputs import Maps, as_result
-from mirrorskin.engine.metrology.extent import areas, border, heights, volume
+from mirrorskin.engine.metrology.extent import areas, border, heights, rim_pixels, volume
 from mirrorskin.engine.metrology.fitting import FAR, FEW
 from mirrorskin.engine.metrology.forms import (
     Plane,
@@ -278,9 +278,11 @@ def _volumes(patch: Patch, base: Quantity | None) -> dict[str, Quantity]:
     """Return the volume above the rim, and below the sheet's rest plane if heights are absolute."""
     volumes: dict[str, Quantity] = {}
     if base is not None:
-        volumes |= volume(patch, base.value, base.sigma, "volume above rim")
+        volumes |= volume(
+            patch, base.value, "volume above rim", level_sigma=base.sigma, level_pixels=rim_pixels(patch)
+        )
     if patch.absolute:
-        for name, above in volume(patch, 0.0, 0.0, "volume below rest plane").items():
+        for name, above in volume(patch, 0.0, "volume below rest plane").items():
             volumes[name] = replace(above, value=-above.value)
     return volumes
 

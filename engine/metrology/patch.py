@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,19 @@ from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE, second_diff
 
 Mask = NDArray[np.bool_]
 
-_HIGH, _UPPER = 0.95, 0.85  # quantiles of heights at the upper end of their range, for a mean and a median
+_HIGH = 0.95  # quantile of heights at the upper end of their range
+_USUAL, _MEAN_OF_USUAL = 0.95, 0.76  # quantile of the square of a normal variate, and its mean below it
+_PER_LEVEL = 4  # least number of pixels of one height, if heights are steps
+_FLAT = 0.5  # share of the pixels of an interval of heights that are flat, from which it is a flat part
+
+
+class CommonErrors(NamedTuple):
+    """How errors of the n measured heights depend on each other, see `common_errors`."""
+
+    share: Doubles  # (n,): of the variance that heights of one interval have in common
+    flat: Doubles  # (n,): share of an interval that is flat, from 0 to 1
+    interval: NDArray[np.intp]  # (n,): number of the interval
+    sigma: float  # millimetres: of an error that all heights have in common
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +50,7 @@ class Patch:
     place: tuple[slice, slice]  # of the patch in the picture
     noise_length: float  # millimetres over which errors of heights are correlated
     of_press: bool  # whether heights are those of a press, which has heights only in contact
+    common: CommonErrors | None  # of the measured heights, with standard deviations
     notes: tuple[str, ...]  # what is omitted
 
     @property
@@ -55,36 +69,84 @@ class Patch:
         measured = self.measured
         return np.full(np.count_nonzero(measured), np.nan) if self.sigma is None else self.sigma[measured]
 
-    def error_of_sum(self, chosen: Mask | None = None) -> float:
-        """Return the standard deviation of the sum of measured heights, mm, of all pixels or of chosen ones.
+    def error_of_sum(self, weights: Doubles | float = 1.0) -> float:
+        """Return the standard deviation, mm, of the sum of measured heights times ``weights``, (H, W).
 
         Errors that are correlated over a length are shared by the pixels within it. Those that a press has
-        because of its steps are the same at equal heights; over many steps they cancel, but for half a step
-        at the ends of the range.
+        because of its steps are the same at equal heights: they cancel where heights spread over a step, but
+        not on flat parts.
         """
-        measured = self.measured if chosen is None else self.measured & chosen
-        if self.sigma is None:
+        measured = self.measured
+        if self.sigma is None or self.common is None:
             return math.nan
-        sigma = self.sigma[measured]
-        total = float(np.sum(sigma))
+        weighted = np.broadcast_to(weights, measured.shape)[measured] * self.sigma[measured]
+        total = float(np.sum(np.abs(weighted)))
         if math.isinf(self.noise_length):
             return total
         alike = 1 + 2 * math.pi * self.noise_length**2 / self.pixel_area
-        # Chosen pixels may be of one height, such as those of the rim.
-        common = 1 - independent_share(self.height, self.sigma) if chosen is None else 1.0
-        share = math.sqrt(common) * step_share(
-            self.height[measured], sigma, _HIGH if chosen is None else _UPPER
-        )
-        return min(math.hypot(math.sqrt(alike * float(np.sum(sigma**2))), share * total), total)
+        common, flat, interval, common_sigma = self.common
+        alone = np.where(flat > _FLAT, 1 - common, 1.0) * weighted**2
+        sums = np.bincount(interval, flat * np.sqrt(common) * weighted)
+        own = min(math.hypot(math.sqrt(alike * float(np.sum(alone))), float(np.linalg.norm(sums))), total)
+        all_at_once = np.sum(np.broadcast_to(weights, measured.shape)[measured]) * common_sigma
+        return math.hypot(own, float(all_at_once))
+
+    def common_variance(self, chosen: Mask) -> float:
+        """Return the usual variance, mm^2, of chosen heights that those of equal height have in common."""
+        if self.sigma is None or self.common is None:
+            return math.nan
+        square = float(np.median(self.sigma[chosen])) ** 2
+        if math.isinf(self.noise_length):
+            return square
+        share = float(np.median(self.common.share[chosen[self.measured]]))
+        return min(square, max(share * square, self.common.sigma**2))
 
 
-def step_share(height: Doubles, sigma: Doubles, high: float = _HIGH) -> float:
+def common_errors(height: Doubles, sigma: Doubles, result: Result) -> CommonErrors:
+    """Return what errors of heights, (H, W) mm, have in common because a press moves in steps.
+
+    An interval of heights is a step. It is flat if it has more pixels than those above and below. There,
+    second differences show what is independent from pixel to pixel. Elsewhere, errors of steps show as
+    heights that are all at the same place between two frames.
+    """
+    fitted, measured = result.fitted, np.isfinite(height)
+    ratio = np.full(measured.shape, np.nan)
+    if min(measured.shape) > 2:
+        ratio[1:-1, 1:-1] = (second_differences(height) / sigma[1:-1, 1:-1]) ** 2
+    values, ratio = height[measured], ratio[measured]
+    places = np.asarray(fitted.frame_travel or (), np.float64)
+    if fitted.event is None or len(places) < 2:
+        levels = np.unique(values)
+        places = levels if levels.size < values.size / _PER_LEVEL else levels[:0]
+    step = abs(float(np.median(np.diff(places)))) if len(places) > 1 else 0.0
+    above = (values - np.min(values)) / (step or max(math.sqrt(12) * float(np.mean(sigma[measured])), 1e-12))
+    intervals = [np.rint(above + offset).astype(np.intp) for offset in (0.0, 0.3)]
+    # A flat part may be at the limit of two intervals.
+    flat, interval = max(((_flatness(part), part) for part in intervals), key=lambda pair: pair[0].sum())
+    slope = flat <= _FLAT
+    alike = abs(np.mean(np.exp(2j * np.pi * above[slope]))) if slope.any() else 0.0
+    # Noise may move a few pixels of a flat part only, between one estimate of the crossing and another.
+    known = ratio[~slope & np.isfinite(ratio)]
+    usual = known[known <= np.quantile(known, _USUAL)] if known.size else known
+    few = float(np.mean(usual)) / _MEAN_OF_USUAL if usual.size else 0.0
+    share = np.where(slope, alike, max(1 - min(max(_independent(known), few), 1.0), alike))
+    return CommonErrors(share, flat, interval, fitted.height_common_sigma or 0.0)
+
+
+def _flatness(interval: NDArray[np.intp]) -> Doubles:
+    """Return for heights in numbered intervals, (n,), the share that those above and below do not have."""
+    count = np.pad(np.bincount(interval), 1)
+    flat = 1 - (count[:-2] + count[2:]) / (2 * np.maximum(count[1:-1], 1))
+    return np.asarray(np.clip(flat, 0, 1)[interval])
+
+
+def step_share(height: Doubles, sigma: Doubles) -> float:
     """Return half a step over the range of heights, (n,) mm, at most 1; a step is up to sqrt(12) sigmas.
 
-    The range is that between a ``high`` quantile and the low one.
+    The range is that between 5 % and 95 % of the heights.
     """
     step = math.sqrt(12) * float(np.mean(sigma)) if sigma.size else 0.0
-    extent = float(np.subtract(*np.quantile(height, [high, 1 - high]))) if height.size else 0.0
+    extent = float(np.subtract(*np.quantile(height, [_HIGH, 1 - _HIGH]))) if height.size else 0.0
     return 1.0 if 2 * extent <= step else step / (2 * extent)
 
 
@@ -95,7 +157,11 @@ def independent_share(height: Doubles, sigma: Doubles) -> float:
     """
     if min(height.shape) < 3:
         return 1.0
-    ratio = (second_differences(height) / sigma[1:-1, 1:-1]) ** 2
+    return _independent((second_differences(height) / sigma[1:-1, 1:-1]) ** 2)
+
+
+def _independent(ratio: Doubles) -> float:
+    """Return this share from squares of second differences over variances."""
     known = ratio[np.isfinite(ratio)]
     return min(1.0, float(np.median(known)) / MEDIAN_SQUARE) if known.size else 1.0
 
@@ -136,10 +202,12 @@ def patch_of(result: Result, region: Region | None = None, kept: Mask | None = N
     contact = measured if result.contact is None else result.contact != 0
     if kept is not None:
         contact = contact & kept
+    heights = np.where(measured & ~filled, height, np.nan)[part].astype(np.float64)
+    sigma = None if result.height_sigma is None else result.height_sigma[part].astype(np.float64)
     patch = Patch(
-        height=np.where(measured & ~filled, height, np.nan)[part].astype(np.float64),
+        height=heights,
         filled=np.where(measured & filled, height, np.nan)[part].astype(np.float64),
-        sigma=None if result.height_sigma is None else result.height_sigma[part].astype(np.float64),
+        sigma=sigma,
         contact=contact[part],
         contact_given=result.contact is not None,
         secant=None if result.normals is None else _secant(result.normals[part]),
@@ -151,6 +219,7 @@ def patch_of(result: Result, region: Region | None = None, kept: Mask | None = N
         place=part,
         noise_length=noise_length(result),
         of_press=result.fitted.event is not None,
+        common=None if sigma is None else common_errors(heights, sigma, result),
         notes=(*left_out, *notes),
     )
     return patch, result.assign(height=np.where(measured, height, np.float32(np.nan)))

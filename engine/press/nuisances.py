@@ -92,7 +92,8 @@ class Nuisances(Step):
             if any(errors) or self.dark_sigma or self.bright_sigma:  # otherwise it changes hardly anything
                 slow = edges.slow()
         step = abs(float(np.median(np.diff(context.positions("travel")))))
-        share = math.hypot(self._share(context), *(error / math.sqrt(2) for error in errors))
+        share, common = self._shares(context)
+        share = math.hypot(share, *(error / math.sqrt(2) for error in errors))
         added = _Added(
             footprint.variance,
             (share * widening) ** 2,
@@ -101,16 +102,24 @@ class Nuisances(Step):
         clear_lag = lag > max(_CLEAR_LAG, 2 * header.prior("lag_sigma"))
         if clear_lag:  # a pixel that turns light at once seems to do so slowly
             added = added._replace(offset=added.offset + (_SHIFTED * step) ** 2)
-        found = result.assign(height_sigma=partial(added.to, result))
+        fitted = result.fitted
+        if edges is not None and np.isfinite(edges.slope).any():
+            slope = edges.slope[np.isfinite(edges.slope)]
+            width = math.hypot(widening * float(np.sqrt(np.mean(slope**2))), slow or edges.slow())
+            fitted = replace(fitted, height_common_sigma=common * width)
+        found = result.assign(height_sigma=partial(added.to, result), fitted=fitted)
         if footprint.clear:
             process = {**result.process, "blur": round(math.sqrt(footprint.variance - PIXEL), 2)}
-            found = found.assign(process=process, fitted=replace(result.fitted, footprint=footprint.variance))
+            found = found.assign(process=process, fitted=replace(fitted, footprint=footprint.variance))
         if clear_lag or any(errors):
             found = with_findings(found, *_findings(errors, lag if clear_lag else 0.0))
         return found
 
-    def _share(self, context: Context) -> float:
-        """Return the uncertainty of the level at the threshold, before the frames, as a share of the rise."""
+    def _shares(self, context: Context) -> tuple[float, float]:
+        """Return the uncertainty of the level at the threshold, before the frames, as a share of the rise.
+
+        The second value is that of gamma and drift alone, whose errors are the same at all pixels.
+        """
         operation, prior = cast("PressOperation", context.operation), context.source.header.prior
         threshold, dark, bright = operation.lowest_threshold, operation.dark, operation.bright
         given = 0.0
@@ -119,8 +128,8 @@ class Nuisances(Step):
             given = math.hypot((1 - threshold) * self.dark_sigma, threshold * self.bright_sigma)
             given /= float(np.nanmedian(rise))
         gamma = -math.log(threshold) * prior("gamma_sigma") if threshold else 0.0
-        light = math.hypot(gamma, prior("frame_gain_sigma"), prior("drift_sigma"))
-        return math.hypot(given, threshold * light)
+        common = threshold * math.hypot(gamma, prior("drift_sigma"))
+        return math.hypot(given, common, threshold * prior("frame_gain_sigma")), common
 
 
 class _Added(NamedTuple):

@@ -85,6 +85,11 @@ class Fitted:
     height_correlation: float | None = parameter(
         "length over which errors of fused heights are correlated", "mm", default=None
     )
+    height_common_sigma: float | None = parameter(
+        "standard deviation of the error that heights of a press have in common because of gamma and drift",
+        "mm",
+        default=None,
+    )
     source_frames: tuple[int, int] | None = parameter(
         "first frame of the recording, and the end, if all frames between them were used", default=None
     )

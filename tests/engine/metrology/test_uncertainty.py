@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from height_maps import places, result_of
-from scipy import ndimage
+from scipy import ndimage, special
 
 from mirrorskin import engine, io
 from mirrorskin.engine.metrology import PARAMETERS, profile_parameters, roughness
+from mirrorskin.engine.metrology.extent import border
 
 SHAPE, SIZE = (90, 110), (0.04, 0.04)
 WHITE, CORRELATED, RELATIVE = 0.0, 0.16, np.inf
@@ -247,3 +248,34 @@ def test_measure_and_functions_have_the_same_uncertainty():
         engine.measure(surface, form="plane", noise_length=0).quantities["plane tilt"].sigma
         < plane.tilt.sigma
     )
+
+
+@pytest.mark.parametrize("width", [0.0, 1.0, 6.0])
+@pytest.mark.parametrize(("rise", "tilt"), [(0.15, 0.0), (-0.15, 0.0), (-0.15, 0.02)])
+def test_rim_and_volume_of_a_press_are_within_their_uncertainties(rise, tilt, width):
+    """A dome or a crater in a brim, whose pixels turn light within ``width`` steps of 20 um.
+
+    Gamma and drift differ from press to press by their priors, the height of the brim by half a step.
+    """
+    step, size, drawn = 0.02, 0.12, {}
+    x, y = np.meshgrid(*2 * [size * (np.arange(64) - 31.5)])
+    distance = np.hypot(x, y)
+    brim, inside = tilt * x, np.maximum(0.0, 1 - (distance / 1.8) ** 2)
+    rng = np.random.default_rng(int(width))
+    for _ in range(16):
+        height = brim + rise * inside - 0.28 + step * rng.uniform(-0.5, 0.5)
+        area = distance < 3.3
+        outermost = border(area)
+        travel = step * np.arange(28)
+        down = travel[:, np.newaxis, np.newaxis] + np.where(area, height, -9.0)
+        shares = special.ndtr(down / (width * step / 2.563 + 1e-6)) ** (1 + 0.02 * rng.normal())
+        shares *= 1 + 0.005 * rng.normal() * np.linspace(-1, 1, 28)[:, np.newaxis, np.newaxis]
+        frames = np.rint(20 + 200 * shares + rng.normal(0, 2, shares.shape)).clip(0, 255).astype(np.uint8)
+        levels = {"dark": 20.0, "bright": 220.0}
+        press = engine.reconstruct(frames, travel=travel, pixel_size=size, fill=False, **levels)
+        measured, rim = engine.measure(press).quantities, np.median(height[outermost])
+        true = {"rim height": rim, "volume above rim": size**2 * np.sum(height[area] - rim)}
+        for name, value in true.items():
+            drawn.setdefault(name, []).append((measured[name].value - value) / measured[name].sigma)
+    for name, errors in drawn.items():
+        assert 0.15 < np.mean(np.square(errors)) < 2.5, name
