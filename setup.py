@@ -9,6 +9,7 @@ from setuptools.command.build_py import build_py
 
 _HERE = Path(__file__).parent
 _DEVELOPMENT = {"bench", "evaluation"}  # packages of a checkout, which are not installed
+_HOME = tomllib.loads((_HERE / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["mirrorskin"]["home"]
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!\w+:|#)([^)]+)\)")
 
 
@@ -23,12 +24,10 @@ class BuildModules(build_py):
 
 def long_description() -> str:
     """Return README.md with links and pictures that work outside of the repository."""
-    project = tomllib.loads((_HERE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    home = project["urls"]["Homepage"]
 
     def absolute(link: re.Match[str]) -> str:
         picture, words, path = link.groups()
-        return f"{picture}[{words}]({home}/{'raw' if picture else 'blob'}/main/{path})"
+        return f"{picture}[{words}]({_HOME}/{'raw' if picture else 'blob'}/main/{path})"
 
     return _LINK.sub(absolute, (_HERE / "README.md").read_text(encoding="utf-8"))
 
@@ -38,6 +37,12 @@ packages = find_packages(include=[*folders, *(f"{folder}.*" for folder in folder
 setup(
     long_description=long_description(),
     long_description_content_type="text/markdown",
+    project_urls={
+        "Homepage": _HOME,
+        "Documentation": f"{_HOME}/blob/main/docs/index.md",
+        "Changelog": f"{_HOME}/blob/main/CHANGELOG.md",
+        "Issues": f"{_HOME}/issues",
+    },
     packages=["mirrorskin", *(f"mirrorskin.{name}" for name in packages)],
     package_dir={"mirrorskin": "."},
     cmdclass={"build_py": BuildModules},

@@ -120,7 +120,13 @@ def test_a_table_of_the_sensor_is_what_the_report_prints(name):
     assert page[start : start + len(printed)] == printed
 
 
-def test_the_citation_names_the_version_of_the_package():
+def test_the_citation_names_the_version_and_the_address_of_the_package():
     root = DOCS.parent
-    version = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
-    assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text(encoding="utf-8")
+    settings = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))
+    citation = (root / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {settings['project']['version']}\n" in citation
+    home = settings["tool"]["mirrorskin"]["home"]
+    assert f'\nrepository-code: "{home}"\n' in citation
+    # A move of the repository changes these two files only.
+    pages = [*root.glob("*.md"), *root.glob("*.py"), *root.glob("*.yml"), *DOCS.rglob("*.md")]
+    assert [path.name for path in pages if home in path.read_text(encoding="utf-8")] == []

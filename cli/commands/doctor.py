@@ -16,7 +16,7 @@ from mirrorskin.cli.output import print_fields, print_json
 _VARIABLES = re.compile(r"(OCL|POCL|PYOPENCL|XDG_CACHE|MIRRORSKIN)\w*$")
 _DEVELOPMENT = ("bench", "browser", "dev", "docs", "ptxas")  # extras that users do not need
 _REQUIREMENT = re.compile(r"\s*([\w.-]+)[^;]*(?:;.*\bextra\s*==\s*['\"]([\w-]+)['\"])?")
-_PACKAGES = "numpy", "scipy", "h5py", "hdf5plugin", "opencv-contrib-python-headless", "pyopencl"
+_PACKAGES = "numpy", "scipy", "h5py", "opencv-contrib-python-headless", "pyopencl"
 
 
 def command(as_json: options.Json = False) -> None:

@@ -53,8 +53,12 @@ def packing(compression: Compression) -> dict[str, Any]:
         return {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     if compression == "lzf":
         return {"compression": "lzf", "shuffle": True}
-    import hdf5plugin  # registers its filters with HDF5
-
+    try:
+        import hdf5plugin  # registers its filters with HDF5
+    except ImportError:
+        raise InputError(
+            f"--compression {compression} needs hdf5plugin: pip install 'mirrorskin[codecs]', or choose gzip"
+        ) from None
     if compression == "bitshuffle":
         return {**hdf5plugin.Bitshuffle(cname="lz4")}
     return {**hdf5plugin.Blosc(cname="lz4", shuffle=hdf5plugin.Blosc.BITSHUFFLE)}

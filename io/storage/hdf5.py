@@ -8,6 +8,7 @@ import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TypeAlias, TypeGuard
 
@@ -668,16 +669,21 @@ def _filters(dataset: h5py.Dataset) -> list[tuple[int, str]]:
     return [(code, name.decode(errors="replace")) for code, _, _, name in filters]
 
 
+# Filters of hdf5plugin: Blosc, LZ4, bitshuffle, Zstandard, ZFP, SZ, SZ3, bzip2, Blosc2, FCIDECOMP, SPERR.
+_OF_PLUGIN = (32001, 32004, 32008, 32015, 32013, 32017, 32024, 307, 32026, 32018, 32028)
+
+
 def _check_filters(dataset: h5py.Dataset, where: str, memory_limit: int | None) -> None:
     filters = _filters(dataset)
     if not all(h5py.h5z.filter_avail(code) for code, _ in filters):
-        import hdf5plugin  # noqa: F401  # registers bitshuffle, blosc and others with HDF5
+        with suppress(ImportError):
+            import hdf5plugin  # noqa: F401  # registers bitshuffle, blosc and others with HDF5
     for code, name in filters:
         if not h5py.h5z.filter_avail(code):
-            raise InputError(
-                f"{where} is packed with filter {code} ({name or 'unnamed'}), which is not installed: "
-                "install its HDF5 plugin and name its folder in HDF5_PLUGIN_PATH"
-            )
+            wanted = f"{where} is packed with filter {code} ({name or 'unnamed'}), which is not installed"
+            if code in _OF_PLUGIN and find_spec("hdf5plugin") is None:
+                raise InputError(f"{wanted}: pip install 'mirrorskin[codecs]'")
+            raise InputError(f"{wanted}: install its HDF5 plugin and name its folder in HDF5_PLUGIN_PATH")
     # A single frame must fit into memory in any case.
     several = filters and dataset.ndim > 2 and dataset.chunks[0] > 1
     size = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize

@@ -12,10 +12,12 @@ import h5py
 import hdf5plugin
 import numpy as np
 import pytest
-from commands import Ended, done, refused
+from commands import Ended, done, refused, run
 from stacks import MadeUp, random_stack, record, sphere
 
-from mirrorskin import io
+from mirrorskin import engine, io
+from mirrorskin.io.files.recorder import packing
+from mirrorskin.io.storage import hdf5 as storage_hdf5
 
 PHASE = np.arange(8) * np.pi / 4
 GIVEN = ["--motion", "vertical", "--travel-step", "0.1mm"]
@@ -269,3 +271,36 @@ def test_a_full_disk_is_one_line():
     refused(
         "press.h5 could not be written: File too large", *words, run=partial(process, command=("-c", FULL))
     )
+
+
+def test_the_suffix_of_another_kind_of_file_is_refused(folder):
+    run("simulate", "vertical", "--size", "12x10", "--frames", "6", "-o", "press.h5")
+    for words in ("reconstruct press.h5 -o x.txt", "simulate vertical --size 12x10 --frames 6 -o x.dat"):
+        refused("this is written as HDF5. Name it x.h5", *words.split())
+    with pytest.raises(io.InputError, match=r"Name it flat\.h5"):
+        io.save_result(io.Result(height=np.zeros((2, 3), np.float32)), "flat.xls")
+    run("reconstruct", "press.h5", "-o", "run.2")  # a number is no kind of file
+    assert {path.name for path in folder.iterdir()} == {"press.h5", "run.2"}
+
+
+def test_an_array_of_colours_says_so(tmp_path):
+    np.save(tmp_path / "rgb.npy", np.zeros((8, 12, 10, 3), np.uint8))
+    travel = ["--motion", "vertical", "--travel-step", "0.1mm", "-o"]
+    refused(
+        "the last axis is one of colours", "reconstruct", tmp_path / "rgb.npy", *travel, tmp_path / "r.h5"
+    )
+    with pytest.raises(io.InputError, match=r"take one colour, frames\[\.\.\., 1\]") as caught:
+        engine.find_onset(np.zeros((8, 12, 10, 3), np.uint8), np.arange(8) * 0.1)
+    assert caught.value.__cause__ is None
+
+
+def test_codecs_are_an_extra_that_messages_name(monkeypatch):
+    stack(chunks=(8, 50, 70), **hdf5plugin.Bitshuffle())()
+    monkeypatch.setitem(sys.modules, "hdf5plugin", None)
+    with pytest.raises(io.InputError, match=r"pip install 'mirrorskin\[codecs\]', or choose gzip"):
+        packing("bitshuffle")
+    assert packing("gzip")["compression"] == "gzip"
+    monkeypatch.setattr(storage_hdf5, "find_spec", lambda _: None)
+    monkeypatch.setattr(h5py.h5z, "filter_avail", lambda code: code < 300)
+    with pytest.raises(io.InputError, match=r"which is not installed: pip install 'mirrorskin\[codecs\]'"):
+        io.open_recording("bad.h5", travel=np.arange(8) * 0.1)
