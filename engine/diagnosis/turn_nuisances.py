@@ -387,10 +387,9 @@ class _Fit:
         gives many directions, which seem to determine what the plane does not show.
         """
         self._equations: _Equations | None = None
-        self._left, normal, _ = self._parts(self._zenith, self._azimuth)
+        self._left, normal, *_ = self._parts(self._zenith, self._azimuth, all_derivatives=False)
         self._clear = self._without_noise(normal)
-        _, self._by_normal, by_nuisances = self._parts(*self._clear)
-        self._by_gain, self._by_rest = by_nuisances()
+        _, self._by_normal, self._by_gain, self._by_rest = self._parts(*self._clear)
 
     def _without_noise(self, by_normal: Doubles) -> tuple[Doubles, Doubles]:
         """Return zeniths and azimuths whose scatter along each axis is that of the normals without noise."""
@@ -419,11 +418,11 @@ class _Fit:
         return max(float(np.sum(self._left**2)) / freedom, self.floor**2)
 
     def _parts(
-        self, zenith: Doubles, azimuth: Doubles
-    ) -> tuple[Doubles, Doubles, Callable[[], tuple[Doubles, Doubles]]]:
-        """Return the residuals for normals, and their derivatives by normals; a call returns others.
+        self, zenith: Doubles, azimuth: Doubles, all_derivatives: bool = True
+    ) -> tuple[Doubles, Doubles, Doubles, Doubles]:
+        """Return the residuals for normals, and their derivatives by normals, gains and other nuisances.
 
-        These are the derivatives by gains, and by the other nuisances.
+        The last ones are empty unless all are asked for.
         """
         frames = len(self._counts)
         gains, offsets = self._values[:frames, np.newaxis], self._values[frames : 2 * frames, np.newaxis]
@@ -457,17 +456,16 @@ class _Fit:
         steep = share * (1 + gamma) * ratio**gamma  # counts of the frame per count of linear light
         by_angle = steep * (1 + gain) * self._gain
         by_normal = np.stack([by_angle * by_zenith, by_angle * by_azimuth])
-
-        def by_nuisances() -> tuple[Doubles, Doubles]:
-            by_tilt = (cosine * lean + sine * upright * np.cos(turned)) / down * self._tilt
-            by_rest = np.stack([
-                shown * np.log(ratio), steep * self._gain * angle, steep, by_angle * by_tilt,
-                -by_angle * by_azimuth * sine, before - shown, *((1 + gains) * light * places[:, np.newaxis]),
-                *(by_angle * swing * patterns[:, np.newaxis]),
-            ])  # fmt: skip
-            return (1 + uneven @ places) * light, by_rest
-
-        return left, by_normal, by_nuisances
+        by_gain = (1 + uneven @ places) * light
+        if not all_derivatives:
+            return left, by_normal, by_gain, np.empty((0, *by_gain.shape))
+        by_tilt = (cosine * lean + sine * upright * np.cos(turned)) / down * self._tilt
+        by_rest = np.stack([
+            shown * np.log(ratio), steep * self._gain * angle, steep, by_angle * by_tilt,
+            -by_angle * by_azimuth * sine, before - shown, *((1 + gains) * light * places[:, np.newaxis]),
+            *(by_angle * swing * patterns[:, np.newaxis]),
+        ])  # fmt: skip
+        return left, by_normal, by_gain, by_rest
 
     def _normal_equations(self) -> _Equations:
         """Return what the samples say of the nuisances at the present normals."""
@@ -565,7 +563,9 @@ class _Fit:
         own_error = math.sqrt(noise * float(np.median(np.trace(inverses, axis1=1, axis2=2))))
         # The swing of a pixel's area is that of a bent surface, whose errors are the pixels' own.
         named = slice(0, len(values) - _SWINGING)
-        common = through[:, :, named] @ _root(covariance[named, named])
+        sizes = np.sqrt(np.maximum(np.diag(covariance)[named], 1e-300))
+        scaled = covariance[named, named] / np.multiply.outer(sizes, sizes) + _ROUNDING * np.eye(len(sizes))
+        common = through[:, :, named] @ (sizes[:, np.newaxis] * np.linalg.cholesky(scaled))
         size = math.sqrt(float(np.mean(np.sum(effect**2, axis=1))))
         products = gram(through.reshape(-1, len(values)))
         both = np.ix_(removable, removable)
@@ -635,13 +635,6 @@ class _Fit:
         largest = max(sizes.values(), default=0.0)
         ordered = sorted(sizes, key=lambda name: -sizes[name])
         return tuple(name for name in ordered if sizes[name] > largest / 4)
-
-
-def _root(covariance: Doubles) -> Doubles:
-    """Return a matrix whose product with its transpose is a covariance."""
-    sizes = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    scaled = covariance / np.multiply.outer(sizes, sizes) + _ROUNDING * np.eye(len(sizes))
-    return np.asarray(sizes[:, np.newaxis] * np.linalg.cholesky(scaled))
 
 
 def _largest(square: Doubles) -> tuple[Doubles, Doubles]:

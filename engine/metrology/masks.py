@@ -50,6 +50,25 @@ class Picture:
         return _of_shape(read_map(Path(self.path)) != 0, heights.height.shape, str(self.path))
 
 
+def inside_polygon(x: Doubles, y: Doubles, corners: ArrayLike) -> Kept:
+    """Return which points, x of the columns and y of the rows, are inside a polygon, (H, W)."""
+    outline = np.asarray(corners, np.float64)
+    if outline.ndim != 2 or outline.shape[1] != 2 or len(outline) < 3:
+        raise InputError("a polygon needs at least three corners, x and y in mm")
+    (left, bottom), (right, top) = outline.min(axis=0), outline.max(axis=0)
+    rows, columns = np.flatnonzero((y >= bottom) & (y <= top)), np.flatnonzero((x >= left) & (x <= right))
+    across, up = np.meshgrid(x[columns], y[rows])
+    inside = np.zeros(across.shape, bool)
+    # A ray to the right crosses the outline an odd number of times from inside.
+    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        if y0 != y1:
+            crossed = (y0 > up) != (y1 > up)
+            inside ^= crossed & (across < x0 + (up - y0) * (x1 - x0) / (y1 - y0))
+    found = np.zeros((len(y), len(x)), bool)
+    found[np.ix_(rows, columns)] = inside
+    return found
+
+
 @dataclass(frozen=True, slots=True)
 class Polygon:
     """A polygon, by its corners, x and y in mm from the picture's centre.
@@ -62,17 +81,7 @@ class Polygon:
 
     def kept(self, heights: Heights) -> Kept:
         """Return which pixels are measured."""
-        x, y = heights.x, heights.y
-        corners = np.asarray(self.corners, np.float64)
-        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
-            raise InputError("a polygon needs at least three corners, x and y in mm")
-        across, up = np.meshgrid(x, y)
-        inside = np.zeros(across.shape, bool)
-        # A ray to the right crosses the outline an odd number of times from inside.
-        for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            if y0 != y1:
-                crossed = (y0 > up) != (y1 > up)
-                inside ^= crossed & (across < x0 + (up - y0) * (x1 - x0) / (y1 - y0))
+        inside = inside_polygon(heights.x, heights.y, self.corners)
         return inside if self.only else ~inside
 
 

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.inputs import Maps, as_result, spacing
 from mirrorskin.engine.metrology.patch import heights_of, noise_length
 from mirrorskin.io import InputError, Result
-from mirrorskin.io.base.findings import merged
+from mirrorskin.io.base.findings import carried
 
-_FINDINGS = "warnings", "notes"
 _SAME_SIZE = 1e-3  # largest relative difference of pixel sizes
 
 
@@ -81,9 +80,7 @@ def subtract(result: Maps, reference: Maps) -> Result:
         offset_unknown=unknown,
         x=first.x if first.x is not None else second.x,
         y=first.y if first.y is not None else second.y,
-        process=merged(
-            first.process, {name: second.process[name] for name in _FINDINGS if name in second.process}
-        ),
+        process={**first.process, **carried(first.process, reference=second.process)},
         calibration=first.calibration,
     ).with_fitted(height_correlation=length)
 

@@ -190,9 +190,10 @@ class Texture:
         """Raise InputError if hardly any window has texture."""
         fraction = float(np.mean(self.textured))
         if fraction < _LEAST_TEXTURED:
+            noise = f" beyond the noise of {self.noise:.2g} counts" if np.isfinite(self.noise) else ""
             raise InputError(
-                f"{name}: {100 * (1 - fraction):.0f} % of the windows show no texture beyond the noise of"
-                f" {self.noise:.2g} counts: displacement needs a speckled or printed sheet"
+                f"{name}: {100 * (1 - fraction):.0f} % of the windows show no texture{noise}: displacement"
+                " needs a speckled or printed sheet"
             )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import engine, io
+from mirrorskin.engine import metrology
 from mirrorskin.engine.base.options import Option, plain
 from mirrorskin.engine.base.reconstruction import calibrated, load_operation, method_for, run_class
 from mirrorskin.engine.metrology import Measures
@@ -377,10 +378,8 @@ class Session:
     def _measure(self, computed: Computed, region: io.Region | None, masks: Sequence[Polygon]) -> Measures:
         sheet = self.sheet(computed)
         assert sheet is not None
-        result, name = sheet.result, sheet.result.name_of("height")
-        if masks and name is not None:
-            result = result.assign(**{name: np.where(inside(sheet, masks), np.float32(np.nan), result[name])})
-        return engine.measure(result, region=region)
+        dust = [metrology.Polygon(corners) for corners in masks]
+        return engine.measure(sheet.result, region=region, mask=dust or None)
 
     def choose_turn(self, turn: int) -> None:
         """Choose the turn whose maps are shown."""
@@ -502,21 +501,6 @@ class Session:
 def holds_result(path: Path) -> bool:
     """Return whether a file is a result, not frames."""
     return not is_of_others(path) and is_result(path)
-
-
-def inside(sheet: Sheet, polygons: Sequence[Polygon]) -> NDArray[np.bool_]:
-    """Return which pixels of a sheet have their centres in a polygon, (H, W)."""
-    from matplotlib.path import Path as Outline
-
-    found = np.zeros((len(sheet.y), len(sheet.x)), bool)
-    for polygon in polygons:
-        (left, bottom), (right, top) = np.min(polygon, axis=0), np.max(polygon, axis=0)
-        rows = np.flatnonzero((sheet.y >= bottom) & (sheet.y <= top))
-        columns = np.flatnonzero((sheet.x >= left) & (sheet.x <= right))
-        y, x = np.meshgrid(sheet.y[rows], sheet.x[columns], indexing="ij")
-        within = Outline(np.asarray(polygon)).contains_points(np.stack([x.ravel(), y.ravel()], axis=-1))
-        found[np.ix_(rows, columns)] |= within.reshape(x.shape)
-    return found
 
 
 def _is_file(option: Option, value: Any) -> bool:

@@ -137,7 +137,7 @@ def test_no_result_replaces_a_recording_even_with_overwrite(tmp_path):
 
 
 def test_results_that_may_be_replaced_and_what_is_exported_are_replaced(tmp_path):
-    for path in (tmp_path / "a.h5", tmp_path / "a.txt"):
+    for path in (tmp_path / "a.h5", tmp_path / "a"):
         save(path)
         io.save_result(io.Result(height=MAP), path, overwrite=True)
         write_new(path, [b"text"])
