@@ -33,8 +33,7 @@ _SLOPE_NOISE = 0.2  # steps: what errors of heights between two frames do to a s
 _MIN_PIXELS = 16  # pixels that an estimate needs
 _MIN_FRAMES = 8  # frames from which edges show a blur
 _INTERPOLATED = 0.17, 0.06  # square steps: what interpolation adds to the variance of an edge, and its error
-_MOSTLY, _WITHIN = 0.8, 0.75  # share of light, and of a step, of pixels that turn light at once
-_AT_ONCE = 0.4  # least share of pixels that turn light at once, of those whose slope lets them
+_MOSTLY, _WITHIN = 0.8, 0.9  # share of light, and of a step, of pixels that turn light at once
 _OF_SLOPES = 0.1  # relative error of a footprint because slopes differ inside pixels
 _OF_MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
 _END_FRACTION = 0.1  # of the frames, at each end, in which levels are compared with the references
@@ -264,9 +263,8 @@ class Edges:
     def lag(self, prior: float, widening: float) -> float:
         """Return the share of a frame that the next one still shows, root mean square.
 
-        Of pixels that turn light within a step, most are fully light in the next frame, unless it lags. If
-        only few do, their edges are about as long as a step. The travel in which a pixel turns light is its
-        slope times ``widening``.
+        Of pixels that turn light within a step, most are fully light in the next frame, unless it lags. The
+        travel in which a pixel turns light is its slope times ``widening``.
         """
         each = np.arange(self.shares.shape[1])
         after = np.argmax(self.shares >= _MOSTLY, axis=0)
@@ -274,7 +272,7 @@ class Edges:
         after, each = after[usable], each[usable]
         before, first, *later = (self.shares[after + number, each] for number in (-1, 0, 1, 2))
         sudden = (before < max(_MOSTLY - 0.75, 3 * self.noise)) & (np.min(later, axis=0) > _MOSTLY)
-        if np.count_nonzero(sudden) < max(_MIN_PIXELS, _AT_ONCE * sudden.size) or self.noise > _MOST_NOISE:
+        if np.count_nonzero(sudden) < _MIN_PIXELS or self.noise > _MOST_NOISE:
             return prior
         share, most = np.quantile((first / np.mean(later, axis=0))[sudden], (0.5, _MOSTLY))
         if most - share > _ALIKE * max(self.noise, _LEAST_NOISE):  # these turn light slowly

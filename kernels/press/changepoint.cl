@@ -16,7 +16,6 @@
 #define STEP 4096.0f
 
 #define STRAIGHT 0.005f
-#define SHAPE 0.02f
 #define SPIKE 8
 #define DOUBT 2
 #define SPREAD 0.3f
@@ -159,7 +158,7 @@ typedef struct {
 } answer_t;
 
 typedef struct {
-    float noise, tolerance, level;  // standard deviations of a sample: of its noise, and from the shape of a hypothesis
+    float noise, level;
     int own_levels;
 } query_t;
 
@@ -171,7 +170,7 @@ typedef struct {
 #define IMPOSSIBLE ((answer_t){INFINITY, 1, 0, 0})
 
 // One sample in transition between samples on the levels: the length of the ramp is not determined.
-answer_t single(const samples_t *samples, const int begin, const levels_t levels, const float noise, const float tolerance)
+answer_t single(const samples_t *samples, const int begin, const levels_t levels, const float noise)
 {
     const float above = (samples->values[begin + 1] - samples->values[begin]) / STEP - levels.dark;
     const float rise = GREATER(levels.light - levels.dark, 0.1f), fraction = LIMITED(above / rise, 0, 1);
@@ -180,7 +179,7 @@ answer_t single(const samples_t *samples, const int begin, const levels_t levels
     const float noise_sigma = 2 / 3.0f * longest * noise / rise, missed = above - fraction * rise;
     answer_t answer;
     answer.misfit = missed * missed;
-    answer.prior = SINGLE * sqrt(2 * M_PI_F) * tolerance;
+    answer.prior = SINGLE * sqrt(2 * M_PI_F) * noise;
     answer.crossing = begin - REACH + 2 / 3.0f * shift;
     answer.variance = noise_sigma * noise_sigma + shift * shift / 18;
     return answer;
@@ -190,7 +189,7 @@ answer_t single(const samples_t *samples, const int begin, const levels_t levels
 // are added to the misfit. The crossing is on the line.
 answer_t ramp(
     const samples_t *samples, const int begin, const int length, const levels_t levels, const float noise,
-    const float tolerance, const float enough, float *bent)
+    const float enough, float *bent)
 {
     const int end = begin + length, first = begin - REACH;
     const long value = samples->values[end] - samples->values[begin];
@@ -215,7 +214,7 @@ answer_t ramp(
     const float reach = 0.5f * (length + 1), off = LIMITED((levels.crossed - mean) * duration, -reach, reach);
     answer_t answer;
     answer.misfit = misfit + (away * away + back * back) / (duration * duration);
-    answer.prior = RAMP * 2 * M_PI_F * tolerance * tolerance * sqrt(12.0f) * duration / length;
+    answer.prior = RAMP * 2 * M_PI_F * noise * noise * sqrt(12.0f) * duration / length;
     answer.crossing = middle + off;
     const float apart = off * off * length / (float)spread;
     const float variance = noise * noise * (1.0f / length + apart) + levels.variance;
@@ -268,26 +267,21 @@ answer_t hypothesis(
         levels.variance = low_part * low_part / (before + ends->slack) + high_part * high_part / (after + ends->slack);
     }
     answer_t answer = {0, 1, begin - REACH - 0.5f, 1 / 12.0f};
-    if (length == 1) answer = single(samples, begin, levels, noise, query.tolerance);
-    if (length > 1) answer = ramp(samples, begin, length, levels, noise, query.tolerance, enough - misfit, bent);
+    if (length == 1) answer = single(samples, begin, levels, noise);
+    if (length > 1) answer = ramp(samples, begin, length, levels, noise, enough - misfit, bent);
     answer.misfit += misfit;
     return answer;
 }
 
 #define LOWEST_BIT(bits) (31 - (int)clz((bits) & -(bits)))
 
-// Mean and variance of the crossing over all hypotheses by weight; the least misfit, in squared sigmas, and the levels
-// of that hypothesis.
-typedef struct {
-    float crossing, variance, misfit, dark, light;
-} posterior_t;
-
-// The sums are of crossings relative to that of the most likely hypothesis.
-posterior_t weigh(const samples_t *samples, const query_t query)
+// Mean and variance over all hypotheses by weight, and the least misfit in squared sigmas. The sums are of crossings
+// relative to that of the most likely hypothesis.
+float3 weigh(const samples_t *samples, const query_t query)
 {
     const ends_t ends = ends_of(samples, query.noise);
-    const float scale = 1 / (query.tolerance * query.tolerance);
-    float best = INFINITY, enough = INFINITY, likely = 0, weight = 0, sum = 0, square = 0, dark = 0, light = 1;
+    const float scale = 1 / (query.noise * query.noise);
+    float best = INFINITY, enough = INFINITY, likely = 0, weight = 0, sum = 0, square = 0;
     for (int slot = samples->low + 1; slot < samples->high; ++slot)
         enough = LESSER(enough, ends.before[slot] + ends.square[slot] - ends.fitted[slot] + NEGLIGIBLE / scale);
 
@@ -321,35 +315,32 @@ posterior_t weigh(const samples_t *samples, const query_t query)
             sum = (sum - shift * weight) * kept + relative_weight * away;
             weight = weight * kept + relative_weight;
             likely += shift;
-            dark = better ? ends.dark[begin] : dark;
-            light = better ? 1 - ends.missing[begin + length] : light;
             best = LESSER(best, cost);
             enough = LESSER(enough, (best + NEGLIGIBLE) / scale);
         }
         if (length > 1 && !(fits & ((2u << last) - 1))) break;  // no longer line can fit
     }
     const float mean = sum / weight;
-    return (posterior_t){likely + mean, GREATER(square / weight - mean * mean, 0), best, dark, light};
+    return (float3)(likely + mean, GREATER(square / weight - mean * mean, 0), best);
 }
 
 #define SAMPLE(slot) ((samples->values[(slot) + 1] - samples->values[slot]) / STEP)
 
 // The variance of a crossing between two samples in transition if the edge is blurred by a lens, in excess of
 // the noise.
-float variance_of_blur(const samples_t *samples, const query_t query, const posterior_t posterior)
+float variance_of_blur(const samples_t *samples, const query_t query, const float crossing)
 {
-    const float crossing = posterior.crossing, dark = query.own_levels ? posterior.dark : 0;
-    const float range = query.own_levels ? GREATER(posterior.light - dark, 0.1f) : 1, level = dark + query.level * range;
+    const float level = query.level;
     const int nearest = round_even(crossing), later = SAMPLE(LIMITED(nearest + REACH, 0, SLOTS - 1)) >= level;
     const int at_sample = LESSER(crossing - nearest, nearest - crossing) > -SAME_TIME;
     const int frame = at_sample ? nearest - later : (int)floor(crossing), slot = frame + REACH;
     if (slot < samples->low || slot + 1 >= samples->high) return 0;
     const float low = SAMPLE(slot), high = SAMPLE(slot + 1);
     const float margin = PLATEAU * query.noise;
-    if (low < dark + margin || low >= level || high < level || high > dark + range - margin) return 0;
+    if (low < margin || low >= level || high < level || high > 1 - margin) return 0;
     // The quantile of a share is proportional to v + BENT v^3, with v = share - 1/2.
-    const float first = (low - dark) / range - 0.5f, second = (high - dark) / range - 0.5f, middle = query.level - 0.5f;
-    const float both = first * first + first * second + second * second, rise = high - low, fraction = (level - low) / rise;
+    const float first = low - 0.5f, second = high - 0.5f, middle = level - 0.5f, rise = high - low;
+    const float both = first * first + first * second + second * second, fraction = (level - low) / rise;
     const float bent = fraction * (1 + BENT * (middle * middle + middle * first + first * first)) / (1 + BENT * both);
     const float off = frame + bent - crossing, noise_sigma = query.noise / rise;
     return GREATER(off * off - noise_sigma * noise_sigma * (fraction * fraction + (1 - fraction) * (1 - fraction)), 0.0f);
@@ -358,16 +349,15 @@ float variance_of_blur(const samples_t *samples, const query_t query, const post
 // The same without the misfit, and with a variance that includes it and the blur.
 float2 estimate(const samples_t *samples, query_t query)
 {
-    const posterior_t posterior = weigh(samples, query);
+    const float3 posterior = weigh(samples, query);
     const int freedom = max(samples->high - samples->low - 4, 1);
-    const float blur = variance_of_blur(samples, query, posterior);
-    if (posterior.misfit <= DOUBT * freedom) return (float2)(posterior.crossing, posterior.variance + blur);
+    const float blur = variance_of_blur(samples, query, posterior.x);
+    if (posterior.z <= DOUBT * freedom) return (float2)(posterior.x, posterior.y + blur);
     // Samples that no hypothesis fits are noisier than stated, or change in another way.
-    query.noise = query.tolerance * sqrt(posterior.misfit / freedom);
-    query.tolerance = query.noise;
-    const posterior_t again = weigh(samples, query);
-    const float moved = again.crossing - posterior.crossing;
-    return (float2)(posterior.crossing, again.variance + moved * moved + blur);
+    query.noise *= sqrt(posterior.z / freedom);
+    const float3 again = weigh(samples, query);
+    const float moved = again.x - posterior.x;
+    return (float2)(posterior.x, again.y + moved * moved + blur);
 }
 
 void gather(
@@ -436,7 +426,7 @@ __kernel void changepoint_heights(
         const float dim = start[p] - below[p];
         const int hovered = dim > REACH && is_flat(&samples, spread);
         const float2 crossing = hovered ? (float2)(-dim / 2, dim * dim / 12)
-                                        : estimate(&samples, (query_t){spread, sqrt(spread * spread + SHAPE * SHAPE), level, own_levels});
+                                        : estimate(&samples, (query_t){spread, level, own_levels});
         const float middle = LIMITED(crossing.x, (float)-start[p], (float)(count - 1 - start[p]));
         const float deviation = sqrt(crossing.y);
         const float2 at = travel_at(travel, count, start[p], middle);

@@ -31,8 +31,7 @@ SLOTS = 2 * REACH + 1
 UNIT = 1 << 20  # unit of the scan: one fully light frame
 STEP = 1 << 12  # unit of the heights: the range from dark to bright
 
-STRAIGHT = 0.005  # share of that range: least noise of a sample
-SHAPE = 0.02  # share of that range by which edges differ from levels and a straight ramp
+STRAIGHT = 0.005  # share of that range to which no transition is a straight ramp
 SPIKE = 8  # a sample that exceeds both neighbours by this many sigmas is a spike
 DOUBT = 2  # tolerated misfit of the best hypothesis, in times of the expected one
 SPREAD = 0.3  # standard deviation of a pixel's own levels about the given ones, as a share of that range
@@ -154,15 +153,12 @@ def changepoint_heights(start: Array, excess: Array, below: Array, since: Array,
         samples = _add_up(_without_spikes(values, available, np.rint(SPIKE * spread * STEP)), available)
         dim = start[changed] - below[changed]
         hovered = (dim > REACH) & _flat(samples, spread)
-        tolerance = np.hypot(spread, SHAPE)
-        crossing, deviation, misfit, *levels = _weigh(samples, spread, tolerance, level, own_levels)
+        crossing, deviation, misfit = _weigh(samples, spread, level, own_levels)
         # Samples that no hypothesis fits are noisier than stated, or change in another way.
-        dark_level, light_level = levels if own_levels else (0, 1)
-        blur = _variance_of_blur(samples, spread, level, crossing, dark_level, light_level)
+        blur = _variance_of_blur(samples, spread, level, crossing)
         odd = misfit > DOUBT * samples.freedom
-        larger = tolerance * np.sqrt(misfit / samples.freedom)
-        spread, tolerance = (np.where(odd, larger, value) for value in (spread, tolerance))
-        again = _weigh(samples, spread, tolerance, level, own_levels)
+        spread = np.where(odd, spread * np.sqrt(misfit / samples.freedom), spread)
+        again = _weigh(samples, spread, level, own_levels)
         deviation = np.where(odd, np.hypot(again[1], again[0] - crossing), deviation)
         deviation = np.hypot(deviation, np.sqrt(blur))
         crossing, deviation = np.where(hovered, (-dim / 2, dim / np.sqrt(12)), (crossing, deviation))
@@ -259,23 +255,17 @@ def _flat(samples: _Samples, noise: Floats) -> NDArray[np.bool_]:
 
 
 def _hypotheses(
-    samples: _Samples, noise: Floats, tolerance: Floats, level: float, own_levels: bool
-) -> Iterator[tuple[Floats, ...]]:
-    """Yield misfit, prior, crossing in frames from the start, its variance, and levels of each hypothesis."""
+    samples: _Samples, noise: Floats, level: float, own_levels: bool
+) -> Iterator[tuple[Floats, Floats, Floats, Floats]]:
+    """Yield misfit, prior, crossing in frames from the start, and its variance of each hypothesis."""
     for length in range(SLOTS + 1):
         for begin in range(SLOTS - length + 1):
-            yield _hypothesis(samples, noise, tolerance, level, own_levels, begin, length)
+            yield _hypothesis(samples, noise, level, own_levels, begin, length)
 
 
 def _hypothesis(
-    samples: _Samples,
-    noise: Floats,
-    tolerance: Floats,
-    level: float,
-    own_levels: bool,
-    begin: int,
-    length: int,
-) -> tuple[Floats, ...]:
+    samples: _Samples, noise: Floats, level: float, own_levels: bool, begin: int, length: int
+) -> tuple[Floats, Floats, Floats, Floats]:
     end = begin + length
     before, after = begin - samples.low, samples.high - end
     fits = (before >= 0) & (after >= 0)
@@ -296,14 +286,14 @@ def _hypothesis(
         shape = np.ones_like(noise)
         missed, prior, crossing, variance = 0 * shape, shape, (begin - REACH - 0.5) * shape, shape / 12
     elif length == 1:
-        missed, prior, crossing, variance = _single(samples, begin, levels, noise, tolerance)
+        missed, prior, crossing, variance = _single(samples, begin, levels, noise)
     else:
-        missed, prior, crossing, variance = _ramp(samples, begin, length, levels, noise, tolerance)
-    return np.where(fits, misfit + missed, np.inf), prior, crossing, variance, dark, light
+        missed, prior, crossing, variance = _ramp(samples, begin, length, levels, noise)
+    return np.where(fits, misfit + missed, np.inf), prior, crossing, variance
 
 
 def _single(
-    samples: _Samples, begin: int, levels: _Levels, noise: Floats, tolerance: Floats
+    samples: _Samples, begin: int, levels: _Levels, noise: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """One sample in transition between samples on the levels: the length of the ramp is not determined.
 
@@ -317,12 +307,12 @@ def _single(
     longest = 1 / np.maximum(fraction, 1 - fraction)
     shift = longest * ((levels.crossed - levels.dark) / rise - fraction)
     variance = (2 / 3 * longest * noise / rise) ** 2 + shift**2 / 18
-    prior = SINGLE * np.sqrt(2 * np.pi) * tolerance
+    prior = SINGLE * np.sqrt(2 * np.pi) * noise
     return (above - fraction * rise) ** 2, prior, begin - REACH + 2 / 3 * shift, variance
 
 
 def _ramp(
-    samples: _Samples, begin: int, length: int, levels: _Levels, noise: Floats, tolerance: Floats
+    samples: _Samples, begin: int, length: int, levels: _Levels, noise: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Fit a straight line to the samples in transition.
 
@@ -345,38 +335,28 @@ def _ramp(
     back = np.maximum(np.maximum(late, last - arrives), 0)
 
     missed = np.maximum(square - value**2 / length - slope**2 * spread, 0) + (away**2 + back**2) / duration**2
-    prior = RAMP * 2 * np.pi * tolerance**2 * np.sqrt(12) * duration / length
+    prior = RAMP * 2 * np.pi * noise**2 * np.sqrt(12) * duration / length
     reach = (length + 1) / 2
     off = np.clip(crossing - middle, -reach, reach)
     variance = duration**2 * (noise**2 * (1 / length + off**2 / spread) + levels.variance)
     return np.where(rises, missed, np.inf), prior, middle + off, np.minimum(variance, reach**2 / 3)
 
 
-def _variance_of_blur(
-    samples: _Samples,
-    noise: Floats,
-    level: float,
-    crossing: Floats,
-    dark: Floats | float,
-    light: Floats | float,
-) -> Floats:
+def _variance_of_blur(samples: _Samples, noise: Floats, level: float, crossing: Floats) -> Floats:
     """Return the variance of the crossing of an edge blurred by a lens, in excess of the noise."""
-    span = np.maximum(light - dark, 0.1)
-    crossed = dark + level * span
     # If a sample is at the crossing, the level determines whether it is the earlier or the later one.
     nearest = np.rint(crossing).astype(np.intp)
     at = np.clip(nearest + REACH, samples.low, samples.high - 1)
-    later = samples.total(at, at + 1)[0] >= crossed
+    later = samples.total(at, at + 1)[0] >= level
     frame = np.where(np.abs(crossing - nearest) < SAME_TIME, nearest - later, np.floor(crossing)).astype(
         np.intp
     )
     slot = np.clip(frame + REACH, samples.low, samples.high - 2)
     low, high = (samples.total(slot + side, slot + side + 1)[0] for side in (0, 1))
-    under_way = (slot == frame + REACH) & (low < crossed) & (high >= crossed)
-    under_way &= (low >= dark + PLATEAU * noise) & (high <= dark + span - PLATEAU * noise)
+    under_way = (slot == frame + REACH) & (low < level) & (high >= level)
+    under_way &= (low >= PLATEAU * noise) & (high <= 1 - PLATEAU * noise)
     rise = np.where(under_way, high - low, 1)
-    first, second = ((part - dark) / span - 0.5 for part in (low, high))
-    middle, fraction = level - 0.5, (crossed - low) / rise
+    first, second, middle, fraction = low - 0.5, high - 0.5, level - 0.5, (level - low) / rise
     both = first**2 + first * second + second**2
     # The quantile of a share is proportional to v + BENT v^3, with v = share - 1/2.
     bent = fraction * (1 + BENT * (middle**2 + middle * first + first**2)) / (1 + BENT * both)
@@ -390,17 +370,14 @@ def _travel_at(travel: Floats, frame: Floats) -> Floats:
     return np.asarray(travel[before] + (frame - before) * (travel[before + 1] - travel[before]))
 
 
-def _weigh(
-    samples: _Samples, noise: Floats, tolerance: Floats, level: float, own_levels: bool
-) -> tuple[Floats, ...]:
-    """Return mean and standard deviation, the least misfit in squared sigmas, and the levels there."""
-    answers = zip(*_hypotheses(samples, noise, tolerance, level, own_levels), strict=True)
-    misfit, prior, crossing, variance, dark, light = (np.array(part) for part in answers)
-    misfit /= tolerance**2
-    first, each = misfit.argmin(axis=0), np.arange(misfit.shape[1])
-    best = misfit[first, each]
+def _weigh(samples: _Samples, noise: Floats, level: float, own_levels: bool) -> tuple[Floats, Floats, Floats]:
+    """Return mean and standard deviation over all hypotheses, and the least misfit, squared sigmas."""
+    answers = zip(*_hypotheses(samples, noise, level, own_levels), strict=True)
+    misfit, prior, crossing, variance = (np.array(part) for part in answers)
+    misfit /= noise**2
+    best = misfit.min(axis=0)
     weight = prior * np.exp((best - misfit) / 2)
     weight /= weight.sum(axis=0)
     mean = np.sum(weight * crossing, axis=0)
     spread = np.sum(weight * (variance + (crossing - mean) ** 2), axis=0)
-    return mean, np.sqrt(spread), best, dark[first, each], light[first, each]
+    return mean, np.sqrt(spread), best

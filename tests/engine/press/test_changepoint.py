@@ -32,11 +32,11 @@ def test_no_fixed_threshold_is_better_on_noisy_ramps(noise):
     best, change, each = compare(noise, pixels=1000)
     assert rms(change) <= 0.95 * rms(best)
     assert np.median(np.abs(change)) <= 0.75 * np.median(np.abs(best))
-    # Against the best threshold of each width alone: a step is a draw, and at 1.5 to 2 frames the samples do
-    # not tell one frame from two, unless all edges are straight, as only a threshold may assume here.
-    ratio, widths = rms(change, axis=1) / each, np.array(WIDTHS)
-    assert np.all(ratio[(widths < 1.5) | (widths > 2)] <= 1.03)
-    assert np.all(ratio[widths >= 3] <= 0.85)
+    # Against the best threshold of each width alone: a step is a draw, and at 1.5 frames the samples do not
+    # tell one frame from two, which a threshold chosen for 1.5 need not know.
+    ratio = rms(change, axis=1) / each
+    assert np.all(ratio[np.array(WIDTHS) != 1.5] <= 1.03)
+    assert np.all(ratio[np.array(WIDTHS) >= 3] <= 0.85)
 
 
 @SLOW
@@ -59,8 +59,8 @@ def test_sigma_is_true_unknown_levels_cost_little_and_a_release_is_as_good(devic
     assert 0.65 < np.mean(square) < 1.1  # ramps are straight, and sigma allows for a blur where noise is low
     each = np.mean(square, axis=1)
     assert each[0] == pytest.approx(1, abs=0.3)
-    assert np.all((each > 0.2) & (each < 1.3))
-    assert np.all(each[np.array(WIDTHS) >= 4] > 0.6)
+    assert np.all((each > 0.25) & (each < 1.3))
+    assert np.all(each[np.array(WIDTHS) >= 4] > 0.7)
 
     split = find_change_point(frames, travel, **options)
     assert rms(errors(split, middle)) < 1.35 * rms(error)

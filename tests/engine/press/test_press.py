@@ -8,7 +8,6 @@ import geometry
 import numpy as np
 import pytest
 from presses import random_press
-from scipy import special
 from stacks import MadeUp, ball, record
 
 from mirrorskin import engine, io
@@ -221,31 +220,3 @@ def test_the_sphere_is_measured_to_the_limit_of_its_steps(step, count, rms):
         calm, wrong = np.abs(error), np.abs(spiked - surface.height)
         worse = np.nan_to_num(wrong, nan=np.inf) > np.nan_to_num(calm, nan=np.inf) + 1e-6
         assert 0 < np.mean(worse | (np.isnan(calm) & np.isfinite(wrong))) <= 0.015
-
-
-def rising(width, steps, shape):
-    """The share of light at steps after the crossing; it rises from 10 to 90 % in ``width`` steps."""
-    if shape == "blurred":
-        return special.ndtr(2.563 * steps / max(width, 1e-9))
-    place = np.clip(1.106 * steps / max(width, 1e-9), -1, 1)  # at 45 degrees to the pixels
-    return 0.5 + place - np.sign(place) * place**2 / 2
-
-
-@pytest.mark.parametrize("noise", [1.0, 4.0])
-@pytest.mark.parametrize("shape", ["blurred", "tilted"])
-@pytest.mark.parametrize("levels", [{"dark": 20.0, "bright": 220.0}, {}])
-@pytest.mark.parametrize("method", METHODS)
-def test_sigma_is_true_and_continuous_over_widths_of_edges(method, levels, shape, noise):
-    """A plane in steps of 5 um, whose pixels turn light within 0 to 10 steps."""
-    rng, row = np.random.default_rng(3), np.arange(40)
-    onset = 22 + 0.35 * (row - 20) + 0.03 * (row[:, np.newaxis] - 20)
-    frame, widths = np.arange(44)[:, np.newaxis, np.newaxis], [*np.arange(0, 2.05, 0.1), 3, 6, 10]
-    sigmas = []
-    for width in widths:
-        counts = 20 + 200 * rising(width, frame - onset, shape) + rng.normal(0, noise, (44, 40, 40))
-        found = FIND[method](np.rint(counts).astype(np.uint8), 0.005 * np.arange(44), **levels, blur=0)
-        square = ((found.height + 0.005 * onset) / found.height_sigma) ** 2
-        assert 0.1 < np.nanmean(square) < 2, width  # least where an edge might be sudden
-        sigmas.append(np.nanmean(found.height_sigma))
-    change = np.abs(np.diff(np.log(sigmas[:21])))
-    assert change.max() < np.log(1.5)
