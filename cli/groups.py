@@ -217,6 +217,31 @@ class ExistingPath(AnyPath):
         return super().convert(value, param, ctx)
 
 
+def matches(word: str, what: str) -> list[Any] | None:
+    """Return the files and Zarr stores that a pattern, such as ``lot/*.h5``, matches; None for a path.
+
+    InputError without any; ``what`` names them.
+    """
+    import glob
+
+    from mirrorskin.io import InputError
+    from mirrorskin.io.base.url import Url, is_zarr, path_of
+    from mirrorskin.io.storage.zarr import find_stores
+
+    path = path_of(word)
+    if os.path.lexists(path) or not glob.has_magic(word):
+        return None
+    if isinstance(path, Url):
+        return find_stores(path)
+    every = map(Path, sorted(glob.glob(word, recursive=True)))  # noqa: PTH207  # paths may be absolute
+    found = [
+        path for path in every if (path.is_file() or is_zarr(path)) and not any(map(is_zarr, path.parents))
+    ]
+    if not found:
+        raise InputError(f"{word}: no file matches. Name {what}")
+    return found
+
+
 class NameOrFile(click.ParamType[str]):
     """A name, or a file if it has an ending."""
 

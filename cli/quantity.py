@@ -11,10 +11,8 @@ import re
 
 from mirrorskin.io import InputError, Region
 from mirrorskin.io.base.text import shortened
-from mirrorskin.io.base.units import Kind, in_base
+from mirrorskin.io.base.units import NUMBER, Kind, in_base
 
-NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
-"""Pattern of a number with a decimal point."""
 _LETTERS = "A-Za-z\u00b5\u03bc\u00c5\u212b\u00e5\u00f6"  # those of µm and of ångström, too
 _UNIT = rf"[{_LETTERS}]+(?:[-_][A-Za-z]+)*|[°'\"\u2032\u2033]"
 _EXAMPLES: dict[Kind, str] = {

@@ -13,13 +13,13 @@ from mirrorskin.cli import quantity
 from mirrorskin.io import InputError
 from mirrorskin.io.base.system import read_text
 from mirrorskin.io.base.text import shortened
-from mirrorskin.io.base.units import BASE, PLAIN, Kind, in_base, is_common, units_of
+from mirrorskin.io.base.units import BASE, NUMBER, PLAIN, Kind, in_base, is_common, units_of
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-_VALUE = re.compile(rf"\s*(?:{quantity.NUMBER}|[+-]?(?:nan|inf))", re.IGNORECASE)
-_PLAIN = re.compile(rf"\s*{quantity.NUMBER}\s*")
+_VALUE = re.compile(rf"\s*(?:{NUMBER}|[+-]?(?:nan|inf))", re.IGNORECASE)
+_PLAIN = re.compile(rf"\s*{NUMBER}\s*")
 # Blanks between a number and its unit.
 _SPACED_UNIT = re.compile(r"(?<=[\d.])[ \t]+(?=(?:[^\W\d_]+|[°'\"\u2032\u2033])(?:\s|$))")
 _BRACKETS = re.compile(r"[\[({]\s*([^\])}]*?)\s*[\])}]")

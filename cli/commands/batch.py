@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import glob
 import os
 import re
 import sys
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.groups import Argument, Option
+from mirrorskin.cli.groups import Argument, Option, matches
 from mirrorskin.cli.output import printable
 
 if TYPE_CHECKING:
@@ -114,27 +113,12 @@ def command(
 def _find(words: Sequence[str], folder: Path) -> list[Path]:
     """Return the recordings, without results among them."""
     from mirrorskin.io import InputError
-    from mirrorskin.io.base.url import Url, is_zarr, path_of
-    from mirrorskin.io.storage.zarr import find_stores
+    from mirrorskin.io.base.url import Url, path_of
 
     paths: list[Path] = []
     for word in words:
-        path = path_of(word)
-        if os.path.lexists(path) or not glob.has_magic(word):
-            paths.append(path)
-            continue
-        if isinstance(path, Url):
-            paths += find_stores(path)
-            continue
-        every = map(Path, sorted(glob.glob(word, recursive=True)))  # noqa: PTH207  # paths may be absolute
-        answers = [
-            path
-            for path in every
-            if (path.is_file() or is_zarr(path)) and not any(map(is_zarr, path.parents))
-        ]
-        if not answers:
-            raise InputError(f"{word}: no file matches. Name recordings")
-        paths += answers
+        found = matches(word, "recordings")
+        paths += [path_of(word)] if found is None else found
     if not any(isinstance(path, Url) or os.path.lexists(path) for path in paths):
         raise InputError(f"{paths[0]}: no such file")
     recordings = [path for path in paths if not _is_result(path, folder)]

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import glob
 import os
 from collections.abc import Iterator, Mapping
 from enum import StrEnum
+from glob import has_magic
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.groups import Argument, ExistingPath, Option
+from mirrorskin.cli.groups import Argument, ExistingPath, Option, matches
 from mirrorskin.cli.output import print_json, print_table, printable
 from mirrorskin.cli.stack import STACK
 from mirrorskin.io.formats.registry import surfaces
@@ -135,7 +135,7 @@ def command(
     def length(text: str | None, option: str) -> float | None:
         return None if text is None else quantity.length(text, option)
 
-    _check_written(output, chart)
+    _check_written(output, chart, [*paths, reference, *map(Path, mask or [])])
     allowed = _limits(limits or [])
     how: dict[str, Any] = {
         "region": chosen.get("region"),
@@ -166,8 +166,8 @@ def command(
         _print_budget(measures, names)
 
 
-def _check_written(output: Path | None, chart: Path | None) -> None:
-    """Raise InputError for a file that cannot be written, before anything is measured."""
+def _check_written(output: Path | None, chart: Path | None, inputs: list[Path | None]) -> None:
+    """Raise InputError for a file that cannot be written, or is an input, before anything is measured."""
     from mirrorskin import io
     from mirrorskin.view.drawing.canvas import FIGURE_SUFFIXES, check_drawing
 
@@ -181,7 +181,7 @@ def _check_written(output: Path | None, chart: Path | None) -> None:
         raise io.InputError(f"-o {output}: name a table that ends in .csv")
     for path in (output, chart):
         if path is not None:
-            io.check_output(path)
+            io.check_output(path, *(file for file in inputs if isinstance(file, Path)))
 
 
 def _write_table(table: Table, output: Path | None, chart: Path | None) -> None:
@@ -200,15 +200,8 @@ def _paths(words: list[str]) -> list[Path]:
     """Return the files and addresses that words or patterns name."""
     paths: list[Path] = []
     for word in words:
-        if os.path.lexists(word) or not glob.has_magic(word):
-            paths.append(ExistingPath().convert(word, None, None))
-            continue
-        matches = sorted(glob.glob(word, recursive=True))  # noqa: PTH207  # paths may be absolute
-        if not matches:
-            from mirrorskin.io import InputError
-
-            raise InputError(f"{word}: no file matches. Name results")
-        paths += map(Path, matches)
+        found = matches(word, "results") if has_magic(word) else None
+        paths += [ExistingPath().convert(word, None, None)] if found is None else found
     return paths
 
 
@@ -258,13 +251,14 @@ def _limits(words: list[str]) -> dict[str, Limit]:
 
     from mirrorskin.engine.metrology import Limit
     from mirrorskin.io import InputError
+    from mirrorskin.io.base.system import read_text
 
     limits: dict[str, Limit] = {}
     for word in words:
         if word.lower().endswith(".toml"):
             try:
-                lines = tomllib.loads(Path(word).read_text("utf-8"))
-            except (OSError, ValueError) as error:
+                lines = tomllib.loads(read_text(Path(word)))
+            except (OSError, ValueError, RecursionError) as error:
                 raise InputError(f"--limits {word}: {error}") from None
         else:
             name, equals, bounds = word.partition("=")
@@ -282,9 +276,13 @@ def _report_table(table: Table, expanded: bool, as_json: bool) -> None:
         for row in table.rows:
             measures = row.measures
             entry: dict[str, Any] = {"file": row.name}
-            entry |= {"problem": row.problem} if measures is None else {"quantities": measures.quantities}
-            entry |= {} if measures is None else {"notes": measures.notes}
-            files.append(entry | ({"limits": str(table.verdict(row))} if table.limits else {}))
+            if measures is None:
+                entry["problem"] = row.problem
+            else:
+                entry |= {"quantities": measures.quantities, "notes": measures.notes}
+            if table.limits:
+                entry["limits"] = str(table.verdict(row))
+            files.append(entry)
         print_json({"files": files})
         return
     names = table.main()

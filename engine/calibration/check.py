@@ -101,10 +101,9 @@ class Check:
         both = self.before, self.after
         maps = {name: [when[name] for when in both if name in when] for name in self.after}
         excess = [
-            f"{name} {worst:.1f} times"
-            for name, each in maps.items()
-            for worst in [max(errors.whole.rms / errors.expected for errors in each[-1:])]
-            if worst > _MAX_EXCESS
+            f"{name} {ratio:.1f} times"
+            for name, errors in self.after.items()
+            if (ratio := errors.whole.rms / errors.expected) > _MAX_EXCESS
         ]
         unknown = [
             name for name, each in maps.items() if all(math.isnan(error_map.expected) for error_map in each)

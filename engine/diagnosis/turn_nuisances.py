@@ -468,12 +468,9 @@ class _Fit:
         return left, by_normal, by_gain, by_rest
 
     def _normal_equations(self) -> _Equations:
-        """Return what the samples say of the nuisances at the present normals."""
-        if self._equations is None:
-            self._equations = self._make_equations()
-        return self._equations
-
-    def _make_equations(self) -> _Equations:
+        """Return what the samples say of the nuisances at the present normals, which keep it."""
+        if self._equations is not None:
+            return self._equations
         frames, count = self._counts.shape
         noise = self._noise
         normal, gain, rest = self._by_normal, self._by_gain, self._by_rest
@@ -498,7 +495,8 @@ class _Fit:
         own[2 * frames :, 2 * frames :] = gram(lines.T)
         # Not by products of matrices: the threads that they start wait for those of OpenCL.
         own -= np.einsum("nk,nl->kl", cross.reshape(-1, size), through.reshape(-1, size))
-        return _Equations(inverses, through, own, noise)
+        self._equations = _Equations(inverses, through, own, noise)
+        return self._equations
 
     def improve(self) -> None:
         """Do one step."""

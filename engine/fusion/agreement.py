@@ -72,12 +72,15 @@ class Disagreement:
         RMS difference, weighted as in the surface, mm; without contradiction, that of the means of cells.
     zenith_bias : ZenithBias, optional
         The error of the slopes, if they disagree and one is significant.
+    certain : bool
+        Whether a clear one is a fault: usual errors of a turn may explain it.
     """
 
     chi2: float = math.nan
     clear: bool = False
     rms: float = math.nan
     zenith_bias: ZenithBias | None = None
+    certain: bool = True
 
 
 def find_disagreement(
@@ -134,6 +137,7 @@ def describe_disagreement(
                 f"heights and normals disagree by {1000 * disagreement.rms:.2g} µm, which height_sigma"
                 " includes: do both show the same surface, is the zenith's response calibrated, and is the"
                 " light steady?",
+                disagreement.certain,
             )
         )
     if scatter > 1:

@@ -50,7 +50,8 @@ _MIN_EXCESS = 1.15  # ratio of the median to the usual one from which on chance 
 _COMPARED = 1 << 16  # slopes whose misfit is computed
 _CORRECTIONS = 3  # largest number of corrections of the slopes
 _IMPROVED = 0.5  # share of the disagreement that a correction must leave at most
-_DOUBTFUL = 0.5  # share of a disagreement that stays, although errors of the turn explain it
+_DOUBTFUL = 0.5  # share of a disagreement that stays, although usual errors of a turn explain it
+_CERTAIN = 4.0  # its chi^2 from which it is a warning nevertheless
 _ITERATIONS = 5  # largest number of updates of the components' offsets
 _OFFSET_TOLERANCE = 1e-3  # change of an offset, in half intervals, that ends them
 
@@ -167,16 +168,18 @@ class FusionSolver:
         before = Disagreement()
         if common.mode is not None:
             before = find_disagreement(surface.height, height, weight, slopes, self._pixel_size)
-            slopes, extended = (each.without(common.mode, slopes.defined) for each in (slopes, extended))
+            slopes = slopes.without(common.mode)
+            along_x = np.where(slopes.defined, slopes.dz_dx, extended.dz_dx)
+            along_y = np.where(slopes.defined, slopes.dz_dy, extended.dz_dy)
+            extended = replace(extended, dz_dx=along_x, dz_dy=along_y)
             at: dict[str, Any] = {"initial_heights": surface.height, "sigma": sigma}
             surface = self._solve(extended, height, weight, **at)
         # Outliers are not part of the surface, but may count in the next call.
         self._near = near.assign(height=np.where(surface.component < 0, near.height, surface.height))
         disagreement = find_disagreement(surface.height, height, weight, slopes, self._pixel_size)
         if before.clear and not disagreement.clear:  # either of both may be wrong
-            disagreement = replace(
-                disagreement, clear=True, rms=max(disagreement.rms, _DOUBTFUL * before.rms)
-            )
+            rms, certain = max(disagreement.rms, _DOUBTFUL * before.rms), before.chi2 > _CERTAIN
+            disagreement = replace(disagreement, clear=True, rms=rms, certain=certain)
         self._correlation = _correlation_length(extended, weight)
         if surface.height_sigma is not None:
             self._scatter = _scatter(surface.height, slopes, self._pixel_size)

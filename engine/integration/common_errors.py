@@ -118,13 +118,12 @@ def find_common_errors(
     squares = np.maximum(squares, 1.0)
     amplitudes = directions @ (directions.T @ pull / squares)
     errors, effect = (directions / np.sqrt(squares)).T @ moved, amplitudes @ moved
-    mode = None
+    mode, left = None, 1.0
     if np.max(np.abs(amplitudes), initial=0.0) > _BEYOND:
-        effect *= 0.0
+        left = 0.0
     elif amplitudes @ pull > 1:  # more than one standard deviation
-        mode = np.tensordot(amplitudes, shapes, 1)
-        effect *= _LEFT
-    return CommonErrors(np.vstack([errors, effect]), grid.used, inside.shape, mode)
+        mode, left = np.tensordot(amplitudes, shapes, 1), _LEFT
+    return CommonErrors(np.vstack([errors, left * effect]), grid.used, inside.shape, mode)
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,14 +48,13 @@ class Slopes:
         """Where there are slopes, (H, W)."""
         return np.asarray(self.weights[0] > 0)
 
-    def without(self, mode: Doubles, wrong: NDArray[np.bool_]) -> Slopes:
-        """Return slopes without an error of normals, where these are wrong; see `find_common_errors`."""
-        normals = normals_of_slopes(self.dz_dx[wrong], self.dz_dy[wrong])
+    def without(self, mode: Doubles) -> Slopes:
+        """Return slopes without an error of normals; see `find_common_errors`."""
+        wrong, dz_dx, dz_dy = self.defined, self.dz_dx.copy(), self.dz_dy.copy()
+        normals = normals_of_slopes(dz_dx[wrong], dz_dy[wrong])
         x, y = np.meshgrid(*picture_axes((wrong.shape[0], wrong.shape[1])))
-        dz_dx, dz_dy = self.dz_dx.copy(), self.dz_dy.copy()
-        for slope, (error,) in zip(
-            (dz_dx, dz_dy), mode_slopes(mode[np.newaxis], normals, x[wrong], y[wrong]), strict=True
-        ):
+        errors = mode_slopes(mode[np.newaxis], normals, x[wrong], y[wrong])
+        for slope, (error,) in zip((dz_dx, dz_dy), errors, strict=True):
             slope[wrong] -= error
         return replace(self, dz_dx=dz_dx, dz_dy=dz_dy)
 

@@ -51,8 +51,8 @@ def highest_point(result: Result) -> HighestPoint:
     return HighestPoint(_highest(patch), float(patch.x[column]), float(patch.y[row]))
 
 
-def heights(patch: Patch) -> dict[str, Quantity]:
-    """Return the heights of the highest and the lowest point, the median, and the height of the rim, mm.
+def heights(patch: Patch, outermost: Mask | None) -> dict[str, Quantity]:
+    """Return the heights of the highest and the lowest point, the median, and that of the rim's pixels, mm.
 
     The *highest point* is the top of a paraboloid fitted to 7 x 7 pixels around the highest pixel after a
     median filter; the highest pixel itself would have the largest error. If the paraboloid has no top there,
@@ -61,7 +61,8 @@ def heights(patch: Patch) -> dict[str, Quantity]:
     (see `find_uncertain`) do not count. Its uncertainty increases with the number of candidates. If a filled
     point is higher than the highest point, values that depend on it are also returned "with filled".
     """
-    highest, lowest, base = _highest(patch), _lowest(patch), rim(patch)
+    highest, lowest = _highest(patch), _lowest(patch)
+    base = None if outermost is None else rim(patch, outermost)
     median = Quantity(float(np.median(patch.height[patch.measured])), float(np.median(patch.sigmas())), "mm")
     measured = {
         "highest point": highest,
@@ -114,11 +115,8 @@ def rim_pixels(patch: Patch) -> Mask | None:
     return outermost
 
 
-def rim(patch: Patch) -> Quantity | None:
-    """Return the median height of the rim, mm."""
-    outermost = rim_pixels(patch)
-    if outermost is None:
-        return None
+def rim(patch: Patch, outermost: Mask) -> Quantity:
+    """Return the median height of the rim's pixels, mm."""
     height, sigma = patch.height[outermost], _median_sigma(patch, outermost)
     middle, common = float(np.median(height)), patch.common_variance(outermost)
     # On slopes, only few pixels are as high as their median, whose errors change it.
@@ -148,7 +146,6 @@ def _highest(patch: Patch) -> Quantity:
     measured = patch.measured[rows, columns]
     y, x = np.nonzero(measured)
     y, x, z = y + rows.start - row, x + columns.start - column, patch.height[rows, columns][measured]
-    sigma = np.nan if patch.sigma is None else float(np.median(patch.sigma[rows, columns][measured]))
     top = _top(x, y, z)
     if top is None:
         middle = z[(abs(y) <= 1) & (abs(x) <= 1)]
@@ -156,6 +153,7 @@ def _highest(patch: Patch) -> Quantity:
     value, misfit = top
     if patch.sigma is None:
         return Quantity(value, np.nan, "mm")
+    sigma = float(np.median(patch.sigma[rows, columns][measured]))
     near = np.zeros(patch.measured.shape, bool)
     near[rows, columns] = measured
     noise = sigma**2 - patch.common_variance(near)

@@ -225,18 +225,18 @@ def measure(
         maps = subtract(maps, reference)
     patch, comparable = patch_of(maps, region)
     if mask is not None:
+        assert maps.x is not None  # patch_of needs both
+        assert maps.y is not None
         heights_there = Heights(
-            heights_of(maps).astype(np.float64),
-            _axis(maps.x),
-            _axis(maps.y),
-            partial(_outliers, patch, form, maps),
+            heights_of(maps).astype(np.float64), maps.x, maps.y, partial(_outliers, patch, form, maps)
         )
         patch, comparable = patch_of(maps, region, kept_by(mask, heights_there))
     if noise_length is not None:
         patch = replace(patch, noise_length=noise_length)
-    quantities, notes = heights(patch), list(patch.notes)
+    outermost = rim_pixels(patch)
+    quantities, notes = heights(patch, outermost), list(patch.notes)
     quantities |= areas(patch)
-    quantities |= _volumes(patch, quantities.get("rim height"))
+    quantities |= _volumes(patch, quantities.get("rim height"), outermost)
     form_removed = _remove_form(patch, form, robust, notes)
     quantities |= form_removed.quantities
     budget: dict[str, dict[str, float]] = {}
@@ -257,10 +257,6 @@ def measure(
     return Measures(quantities, [*inherited, *notes, *_assumed(patch, scale)], budget, rough.smooth)
 
 
-def _axis(axis: Doubles | None) -> Doubles:
-    return np.zeros(0) if axis is None else axis
-
-
 def _outliers(patch: Patch, form: FormName | None, result: Result) -> NDArray[np.bool_]:
     """Return which heights, (H, W), are outliers of the form, fitted robustly to those of a patch."""
     fitted = _fit(patch, form, True)
@@ -274,12 +270,12 @@ def _outliers(patch: Patch, form: FormName | None, result: Result) -> NDArray[np
     return outliers
 
 
-def _volumes(patch: Patch, base: Quantity | None) -> dict[str, Quantity]:
+def _volumes(patch: Patch, base: Quantity | None, outermost: NDArray[np.bool_] | None) -> dict[str, Quantity]:
     """Return the volume above the rim, and below the sheet's rest plane if heights are absolute."""
     volumes: dict[str, Quantity] = {}
     if base is not None:
         volumes |= volume(
-            patch, base.value, "volume above rim", level_sigma=base.sigma, level_pixels=rim_pixels(patch)
+            patch, base.value, "volume above rim", level_sigma=base.sigma, level_pixels=outermost
         )
     if patch.absolute:
         for name, above in volume(patch, 0.0, "volume below rest plane").items():

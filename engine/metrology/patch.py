@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +21,7 @@ Mask = NDArray[np.bool_]
 
 _HIGH = 0.95  # quantile of heights at the upper end of their range
 _USUAL, _MEAN_OF_USUAL = 0.95, 0.76  # quantile of the square of a normal variate, and its mean below it
+_MOST_INTERVALS = 1 << 20  # of equal heights, which are counted
 _PER_LEVEL = 4  # least number of pixels of one height, if heights are steps
 _FLAT = 0.5  # share of the pixels of an interval of heights that are flat, from which it is a flat part
 
@@ -50,7 +53,7 @@ class Patch:
     place: tuple[slice, slice]  # of the patch in the picture
     noise_length: float  # millimetres over which errors of heights are correlated
     of_press: bool  # whether heights are those of a press, which has heights only in contact
-    common: CommonErrors | None  # of the measured heights, with standard deviations
+    common: Callable[[], CommonErrors] | None  # of the measured heights, with standard deviations; kept
     notes: tuple[str, ...]  # what is omitted
 
     @property
@@ -84,7 +87,7 @@ class Patch:
         if math.isinf(self.noise_length):
             return total
         alike = 1 + 2 * math.pi * self.noise_length**2 / self.pixel_area
-        common, flat, interval, common_sigma = self.common
+        common, flat, interval, common_sigma = self.common()
         alone = np.where(flat > _FLAT, 1 - common, 1.0) * weighted**2
         sums = np.bincount(interval, flat * np.sqrt(common) * weighted)
         own = min(math.hypot(math.sqrt(alike * float(np.sum(alone))), float(np.linalg.norm(sums))), total)
@@ -98,8 +101,9 @@ class Patch:
         square = float(np.median(self.sigma[chosen])) ** 2
         if math.isinf(self.noise_length):
             return square
-        share = float(np.median(self.common.share[chosen[self.measured]]))
-        return min(square, max(share * square, self.common.sigma**2))
+        common = self.common()
+        share = float(np.median(common.share[chosen[self.measured]]))
+        return min(square, max(share * square, common.sigma**2))
 
 
 def common_errors(height: Doubles, sigma: Doubles, result: Result) -> CommonErrors:
@@ -119,7 +123,8 @@ def common_errors(height: Doubles, sigma: Doubles, result: Result) -> CommonErro
         levels = np.unique(values)
         places = levels if levels.size < values.size / _PER_LEVEL else levels[:0]
     step = abs(float(np.median(np.diff(places)))) if len(places) > 1 else 0.0
-    above = (values - np.min(values)) / (step or max(math.sqrt(12) * float(np.mean(sigma[measured])), 1e-12))
+    least = max(float(np.ptp(values)) / _MOST_INTERVALS, 1e-12)
+    above = (values - np.min(values)) / (step or max(math.sqrt(12) * float(np.mean(sigma[measured])), least))
     intervals = [np.rint(above + offset).astype(np.intp) for offset in (0.0, 0.3)]
     # A flat part may be at the limit of two intervals.
     flat, interval = max(((_flatness(part), part) for part in intervals), key=lambda pair: pair[0].sum())
@@ -219,7 +224,7 @@ def patch_of(result: Result, region: Region | None = None, kept: Mask | None = N
         place=part,
         noise_length=noise_length(result),
         of_press=result.fitted.event is not None,
-        common=None if sigma is None else common_errors(heights, sigma, result),
+        common=None if sigma is None else cache(partial(common_errors, heights, sigma, result)),
         notes=(*left_out, *notes),
     )
     return patch, result.assign(height=np.where(measured, height, np.float32(np.nan)))

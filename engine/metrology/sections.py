@@ -432,6 +432,12 @@ class _Levels:
         """Return the height of the second level above the first one, mm, and the slope of both."""
         x, z, up = self.distance[kept] - place, self.height[kept], upper[kept].astype(np.float64)
         parameters, spread, rest = _lines(x, z, up)
+        cubic = np.vander(x / np.abs(x).max(), 4)
+        coefficients, *_ = np.linalg.lstsq(cubic, z, rcond=None)
+        if np.sum((z - coefficients @ cubic.T) ** 2) < rest:
+            raise InputError(
+                "there is no step along the section: a smooth curve fits it better than two levels"
+            )
         section = self.section
         number = np.flatnonzero(self.measured)[kept]
         if section.correlation is not None:
@@ -442,12 +448,6 @@ class _Levels:
         common = 0.0
         if section.common is not None:  # independent of each other on both levels
             common = math.sqrt(2) * float(np.mean(np.nan_to_num(section.common[number])))
-        cubic = np.vander(x / np.abs(x).max(), 4)
-        coefficients, *_ = np.linalg.lstsq(cubic, z, rcond=None)
-        if np.sum((z - coefficients @ cubic.T) ** 2) < rest:
-            raise InputError(
-                "there is no step along the section: a smooth curve fits it better than two levels"
-            )
         slope, rise = float(parameters[1]), float(parameters[2])
         across = math.sqrt(1 + slope**2)
         return (

@@ -6,6 +6,7 @@ import math
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -17,14 +18,12 @@ from mirrorskin.engine.base.inputs import Maps
 from mirrorskin.engine.metrology.measures import Measures, measure
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.io import InputError
-from mirrorskin.io.base.units import Kind, in_base
+from mirrorskin.io.base.units import NUMBER, ratio
 from mirrorskin.io.formats.tables import save_table
 from mirrorskin.kernels.array_types import Doubles
 
 _COVERAGE = 2  # standard uncertainties of the guard band (ISO 14253-1)
-_NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
-_BOUND = re.compile(rf"\s*(?:({_NUMBER})\s*([^\s0-9:][^\s:]*)?)?\s*")
-_KINDS: tuple[Kind, ...] = ("length", "angle")
+_BOUND = re.compile(rf"\s*(?:({NUMBER})\s*([^\s0-9:][^\s:]*)?)?\s*")
 _PLAIN = {"²": "2", "³": "3", "°": "deg", "^": ""}
 
 
@@ -99,11 +98,9 @@ def _factor(name: str, unit: str, own: str) -> float:
     plain, wanted = ("".join(_PLAIN.get(letter, letter) for letter in text) for text in (unit, own))
     if not plain or plain == wanted:
         return 1.0
-    for kind in _KINDS:
-        try:
-            return in_base(unit, kind) / in_base(own, kind)
-        except ValueError:
-            continue
+    if own:
+        with suppress(InputError):
+            return ratio(unit, own)
     raise InputError(f"limits of {name} are in {unit}: {f'give {own}' if own else 'it has no unit'}")
 
 
@@ -150,9 +147,7 @@ class Table:
         """Return names of the quantities that have limits, or of those that matter most."""
         if self.limits:
             return list(self.limits)
-        wanted = [
-            *dict.fromkeys(name for row in self.rows if row.measures for name in row.measures.main(count))
-        ]
+        wanted = {name for row in self.rows if row.measures for name in row.measures.main(count)}
         return [name for name in self.names if name in wanted][:count]
 
     def unit(self, name: str) -> str:
@@ -184,8 +179,9 @@ class Table:
         if self.limits:
             columns["limits"] = [str(self.verdict(row)) for row in self.rows]
         for name in self.names:
+            unit = self.unit(name)
             for column, values in zip((name, f"u({name})"), self.values(name), strict=True):
-                columns[column], units[column] = values, self.unit(name)
+                columns[column], units[column] = values, unit
         columns["remarks"] = [
             row.problem or "; ".join(row.measures.notes if row.measures else []) for row in self.rows
         ]
@@ -258,9 +254,10 @@ def table(
         except InputError as error:
             rows.append(Row(name, None, str(error)))
     found = Table(rows, read)
+    names = found.names
     for name, limit in read.items():
-        if found.names and name not in found.names:
-            raise InputError(f"limits of {name}: no result has it; there are {', '.join(found.names)}")
+        if names and name not in names:
+            raise InputError(f"limits of {name}: no result has it; there are {', '.join(names)}")
         limit.within(name, found.unit(name))
     return found
 

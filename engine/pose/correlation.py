@@ -200,10 +200,15 @@ def _shifts(first: Relief, second: Relief, size: tuple[int, int]) -> tuple[Doubl
     return x2 - x1 + pixels[1] * first.pixel, y2 - y1 - pixels[0] * first.pixel
 
 
-def turned_starts(first: PoseMap, second: PoseMap, min_common: float) -> list[Start]:
-    """Return the motions at the highest peaks of the correlation over all rotations about z."""
-    pixel = working_pixel((first, second), _SIDE_OF_TURNS)
-    mine, theirs = Relief.of(first, pixel), Relief.of(second, pixel)
+def turned_starts(
+    maps: tuple[PoseMap, PoseMap], reliefs: tuple[Relief, Relief], min_common: float
+) -> list[Start]:
+    """Return the motions at the highest peaks of the correlation over all rotations about z.
+
+    ``reliefs`` are those of the maps at the working pixel of `SIDE` pixels.
+    """
+    pixel = working_pixel(maps, _SIDE_OF_TURNS)
+    mine, theirs = (Relief.of(map_, pixel) for map_ in maps)
     count = 2 * math.ceil(math.pi * max(mine.values.shape) / 4)
     angles = 2 * math.pi / count * np.arange(count)
     best = []
@@ -211,8 +216,7 @@ def turned_starts(first: PoseMap, second: PoseMap, min_common: float) -> list[St
         found = starts(mine.turned(angle), theirs, min_common, angle)
         best.append(found[0].significance if found else 0.0)
     order = np.argsort(best)[::-1][:_TURNS]
-    pixel = working_pixel((first, second), SIDE)
-    mine, theirs = Relief.of(first, pixel), Relief.of(second, pixel)
+    mine, theirs = reliefs
     step = 2 * math.pi / count / 3
     near = (angles[number] + part * step for number, part in itertools.product(order, (-1, 0, 1)))
     found = [start for angle in near for start in starts(mine.turned(angle), theirs, min_common, angle)]
@@ -233,7 +237,7 @@ def _without_form(height: Doubles, known: NDArray[np.bool_]) -> Doubles:
     rows, columns = np.indices(known.shape, dtype=np.float64)
     x, y = columns / known.shape[1] - 0.5, rows / known.shape[0] - 0.5
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
-    used = known & (np.add(*np.indices(known.shape)) % 3 == 0)
+    used = known & ((rows + columns) % 3 == 0)
     if np.count_nonzero(used) < 3 * len(terms):
         return height
     form = np.linalg.lstsq(terms[:, used].T, height[used], rcond=None)[0]

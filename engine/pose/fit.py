@@ -183,7 +183,7 @@ class PairFit:
 
         Without a start, the identity is tried, then a search. A ``near`` start needs no coarse maps.
         """
-        levels = [self] if near else self._levels()
+        levels = [self] if near else self._levels
         motion, typical = self._descend(levels, start or STILL)
         for searched, guesses in self._searches() if start is None and not typical < _POOR else ():
             other, other_typical, _ = self._best_of(searched, guesses)
@@ -197,23 +197,24 @@ class PairFit:
 
     def solve_from(self, far: Sequence[Motion], near: Sequence[Motion]) -> tuple[Motion, Equations, Doubles]:
         """Return what `solve` does for the best of some starts: refined from coarse maps, or as precise."""
-        coarse, fine = self._levels(), self._levels(working_pixel((self.first, self.second), SIDE))
-        solutions = [
-            (*self._best_of(levels, starts), levels) for levels, starts in ((coarse, far), (fine, near))
-        ]
-        better = len(far) == 0 or not solutions[0][1] * _BETTER < solutions[1][1]
-        motion, _, start, levels = solutions[int(better)]
+        coarse, fine = (
+            (*self._best_of(levels, guesses), levels)
+            for levels, guesses in ((self._levels, far), (self._fine_levels(), near))
+        )
+        motion, _, start, levels = coarse if coarse[1] * _BETTER < fine[1] else fine
         if motion is None:
             raise InputError("the two maps share too few pixels: give a start, or results that overlap")
         return self._determined(levels, self.refine(motion, steps=_FINAL_STEPS) or motion, start)
 
-    def rival(self, motion: Motion, starts: Sequence[Motion]) -> Motion | None:
-        """Return a motion refined from some starts that fits about as well as one from which it differs."""
-        levels = self._levels(working_pixel((self.first, self.second), SIDE))
+    def rival(self, motion: Motion, guesses: Sequence[Motion]) -> Motion | None:
+        """Return a motion refined from some guesses that fits about as well as one from which it differs."""
+        if not guesses:
+            return None
+        levels = self._fine_levels()
         middle, pixel = self.first.extent.middle, max(self.first.grid[2:])
         limit = self.equations(motion).typical / _BETTER
-        for start in starts:
-            other, typical = self._descend(levels, start)
+        for guess in guesses:
+            other, typical = self._descend(levels, guess)
             if other is None or typical > limit or not self.shares_enough(other):
                 continue
             if np.linalg.norm(other.apply(middle) - motion.apply(middle)) > _OTHER * pixel:
@@ -233,16 +234,24 @@ class PairFit:
             now = self.equations(motion, unbiased=True)
         return motion, now, free
 
-    def _levels(self, coarsest: float = math.inf) -> list[PairFit]:
-        """Return the maps from fine to coarse, with pixels of at most ``coarsest`` mm."""
-        levels = [self]
-        for first, second in coarser([self.first, self.second], _COARSEST):
-            if min(first.extent.pixels, second.extent.pixels) < FEWEST_SHARED:
-                break
-            if max(first.grid[2:]) > 1.5 * coarsest:
-                break
-            levels.append(PairFit(first, second, self.device))
-        return levels
+    @cached_property
+    def _coarser(self) -> list[PairFit]:  # without this one: a cycle would keep its maps on the device
+        """The maps at half their resolution, at a quarter, and so on."""
+        pairs = itertools.takewhile(
+            lambda pair: min(map_.extent.pixels for map_ in pair) >= FEWEST_SHARED,
+            coarser([self.first, self.second], _COARSEST),
+        )
+        return [PairFit(first, second, self.device) for first, second in pairs]
+
+    @property
+    def _levels(self) -> list[PairFit]:
+        """The maps from fine to coarse."""
+        return [self, *self._coarser]
+
+    def _fine_levels(self) -> list[PairFit]:
+        """Return those whose pixels are about as large as those of correlated maps, or smaller."""
+        limit = 1.5 * working_pixel((self.first, self.second), SIDE)
+        return [self, *itertools.takewhile(lambda fit: max(fit.first.grid[2:]) <= limit, self._coarser)]
 
     def _descend(
         self, levels: list[PairFit], start: Motion | None, free: Doubles = _NONE
@@ -256,20 +265,20 @@ class PairFit:
 
     def _searches(self) -> Iterator[tuple[list[PairFit], list[Motion]]]:
         """Yield starts without a guess, the fastest first, and the maps by which to refine them."""
-        pixel = working_pixel((self.first, self.second), SIDE)
-        levels = self._levels(pixel)
-        first, second = (Relief.of(map_, pixel) for map_ in (self.first, self.second))
-        yield levels, [start.motion for start in starts(first, second, MIN_COMMON)]
-        coarse = self._levels()
-        yield coarse, coarse[-1]._from_grid()
-        yield levels, [start.motion for start in turned_starts(self.first, self.second, MIN_COMMON)]
+        maps = self.first, self.second
+        pixel = working_pixel(maps, SIDE)
+        levels = self._fine_levels()
+        reliefs = Relief.of(self.first, pixel), Relief.of(self.second, pixel)
+        yield levels, [start.motion for start in starts(*reliefs, MIN_COMMON)]
+        yield self._levels, self._levels[-1]._from_grid()
+        yield levels, [start.motion for start in turned_starts(maps, reliefs, MIN_COMMON)]
 
     def _best_of(
-        self, levels: list[PairFit], starts: Sequence[Motion]
+        self, levels: list[PairFit], guesses: Sequence[Motion]
     ) -> tuple[Motion | None, float, Motion]:
-        """Refine motions from some starts; return the best, its typical chi square, and its start."""
+        """Refine motions from some guesses; return the best, its typical chi square, and its guess."""
         best, lowest, origin = None, math.inf, STILL
-        for start in starts:
+        for start in guesses:
             motion, typical = self._descend(levels, start)
             if motion is not None and typical < lowest and self.shares_enough(motion):
                 best, lowest, origin = motion, typical, start

@@ -79,7 +79,7 @@ class PoseGraph:
         self.links: dict[tuple[int, int], Pose] = {}
         self._maps, self._names, self._device = maps, names, device
         self._places = None if offsets is None else np.cumsum([(0.0, 0.0), *offsets], axis=0)
-        self._ambiguous: dict[tuple[int, int], Finding] = {}
+        self._ambiguous: list[Finding] = []
         self._best: tuple[float, str] | None = None  # chi square of the best pair without a link, and text
         self._connect()
 
@@ -139,19 +139,18 @@ class PoseGraph:
     def _connected(self, first: int, second: int) -> bool:
         return second in self._tree(first)
 
-    def _tree(self, root: int) -> dict[int, tuple[int, Motion]]:
-        """Return the motions from a map to those connected with it, and the maps that they lead through."""
-        tree = {root: (root, STILL)}
+    def _tree(self, root: int) -> dict[int, Motion]:
+        """Return the motions from a map to those connected with it."""
+        tree = {root: STILL}
         queue = [root]
         for number in queue:
             for (first, second), pose in self.links.items():
-                for here, there, motion in (
-                    (first, second, pose.motion),
-                    (second, first, pose.motion.inverse()),
-                ):
-                    if here == number and there not in tree:
-                        tree[there] = number, tree[number][1].then(motion)
-                        queue.append(there)
+                if first == number and second not in tree:
+                    tree[second] = tree[number].then(pose.motion)
+                    queue.append(second)
+                elif second == number and first not in tree:
+                    tree[first] = tree[number].then(pose.motion.inverse())
+                    queue.append(first)
         return tree
 
     def _link(self, first: int, second: int, far: list[Motion] | None, guesses: Sequence[Start]) -> None:
@@ -188,7 +187,7 @@ class PoseGraph:
                 f"{self._names[first]} and {self._names[second]} fit as well if shifted by {x:.3g} and"
                 f" {y:.3g} mm along x and y: state --offset, if the surface repeats itself"
             )
-            self._ambiguous[first, second] = Finding("ambiguous motion", text)
+            self._ambiguous.append(Finding("ambiguous motion", text))
 
     def _is_link(self, pose: Pose, first: int, second: int) -> bool:
         return pose.chi_square < _MAX_CHI2 and self._share(pose, first, second) >= MIN_COMMON
@@ -216,7 +215,7 @@ class PoseGraph:
     def solve(self) -> Poses:
         """Link all pairs that overlap, and return the poses that fit all links best."""
         tree = self._tree(0)
-        motions = [tree[number][1] for number in range(len(self._maps))]
+        motions = [tree[number] for number in range(len(self._maps))]
         for _ in range(_ROUNDS):
             before = len(self.links)
             for first, second in itertools.combinations(range(len(self._maps)), 2):
@@ -258,9 +257,8 @@ class PoseGraph:
             motions = [motion.small_step(d, np.zeros(3)) for motion, d in zip(motions, step, strict=True)]
         values = np.linalg.eigvalsh(normal[6:, 6:])
         squares, freedom = 0.0, -int(np.count_nonzero(values > _UNFIT * values[-1]))
-        for (first, second), link in self.links.items():
-            rest, _ = _residual(link, motions[first], motions[second])
-            squares += float(rest @ _information(link) @ rest)
+        for pair, link in self.links.items():
+            squares += self._closure(pair, motions)
             freedom += 6 - len(link.undetermined)
         return list(motions), covariance, squares / freedom if freedom > 0 else np.nan
 
@@ -274,7 +272,7 @@ class PoseGraph:
             rotation = np.asarray(Rotation.from_matrix(motion.turn).as_rotvec())
             block = np.asarray(covariance[part(number), part(number)], np.float64)
             poses.append(replace(link, rotation=rotation, translation=motion.shift, covariance=block))
-        findings = list(self._ambiguous.values())
+        findings = list(self._ambiguous)
         undetermined = [
             str(name)
             for name, pose in zip(self._names, poses, strict=True)

@@ -405,9 +405,11 @@ def _merged(touches: Sequence[Result], maps: Sequence[PoseMap], found: Poses, na
     unknown = relative[0]
     free = [number > 0 and (unknown or is_relative) for number, is_relative in enumerate(relative)]
     levels = np.zeros(len(touches))
-    for _ in range(_LEVELLINGS if any(free) else 1):
+    passes = _LEVELLINGS if any(free) else 1
+    for number in range(passes):
+        with_them = with_normals and number == passes - 1  # levels need heights alone
         placed = [
-            _Moved.of(touch, map_, pose, x, y, with_normals, float(level))
+            _Moved.of(touch, map_, pose, x, y, with_them, float(level))
             for touch, map_, pose, level in zip(touches, maps, poses, levels, strict=True)
         ]
         change, common = _levels(placed, free, found.covariance)
@@ -468,13 +470,10 @@ def _mean_heights(
         weight[moved.window] += np.where(finite, 1 / moved.variance, 0.0)
         height[moved.window] += np.where(finite, moved.height / moved.variance, 0.0)
     covered = weight > 0
-    height = np.where(covered, height / np.where(covered, weight, 1.0), np.nan)
+    weight = np.where(covered, weight, 1.0)
+    height = np.where(covered, height / weight, np.nan)
     shares = [
-        np.where(
-            np.isfinite(moved.height),
-            1 / (moved.variance * np.where(covered, weight, 1.0)[moved.window]),
-            0.0,
-        )
+        np.where(np.isfinite(moved.height), 1 / (moved.variance * weight[moved.window]), 0.0)
         for moved in placed
     ]
     with_mean = []  # covariances of each touch's common errors with those of the mean
@@ -490,7 +489,7 @@ def _mean_heights(
                 )
         with_mean.append(covariance)
         shared[moved.window] += shares[i] * covariance
-    own = np.where(covered, 1 / np.where(covered, weight, 1.0), np.nan)
+    own = np.where(covered, 1 / weight, np.nan)
     variance = own + np.maximum(shared, 0.0)
     apart, spread = np.zeros(shape), np.zeros(shape)
     for i, moved in enumerate(placed):
@@ -535,13 +534,10 @@ def _mean_normals(
         # A rotation by d changes a normal n by d x n, whose mean square is tr(C) - n' C n.
         turns = poses[i].motion.turn, poses[k].motion.turn
         turned = turns[0].T @ covariance[part(i), part(k)][:3, :3] @ turns[1]
-        (rows, columns), (mine, theirs) = placed[i].window, both
-        here = (
-            slice(rows.start + mine[0].start, rows.start + mine[0].stop),
-            slice(columns.start + mine[1].start, columns.start + mine[1].stop),
-        )
-        n = normals[here]
+        (mine, theirs), window = both, placed[i].window
+        n = normals[window][mine]
         square = np.trace(turned) - np.einsum("...a,ab,...b->...", n, turned, n)
-        common[here] += np.nan_to_num(each[i][mine] * each[k][theirs] * square / weight[here] ** 2)
+        product = each[i][mine] * each[k][theirs] * square
+        common[window][mine] += np.nan_to_num(product / weight[window][mine] ** 2)
     sigma = np.sqrt(1 / weight + np.maximum(common, 0.0))
     return normals.astype(np.float32), sigma.astype(np.float32)

@@ -84,19 +84,19 @@ class Nuisances(Step):
         """Return heights with larger standard deviations, and what the frames show clearly."""
         edges, header = Edges.of(result, context), context.source.header
         footprint, lag = footprint_of(edges, header, self.blur), header.prior("lag_sigma")
-        errors, slow = (0.0, 0.0), 0.0
+        errors, slow, counted = (0.0, 0.0), 0.0, 0.0
         widening = math.sqrt(1 + 2 * math.pi * max(footprint.variance - PIXEL, 0.0))
         if edges is not None:
-            errors, lag = edges.level_errors(), edges.lag(lag, widening)
+            errors, lag, slow = edges.level_errors(), edges.lag(lag, widening), edges.slow()
             if any(errors) or self.dark_sigma or self.bright_sigma:  # otherwise it changes hardly anything
-                slow = edges.slow()
+                counted = slow
         step = abs(float(np.median(np.diff(context.positions("travel")))))
         share, common = self._shares(context)
         share = math.hypot(share, *(error / math.sqrt(2) for error in errors))
         added = _Added(
             footprint.variance,
             (share * widening) ** 2,
-            (share * slow) ** 2 + (lag * step) ** 2,
+            (share * counted) ** 2 + (lag * step) ** 2,
         )
         clear_lag = lag > max(_CLEAR_LAG, 2 * header.prior("lag_sigma"))
         if clear_lag:  # a pixel that turns light at once seems to do so slowly
@@ -104,7 +104,7 @@ class Nuisances(Step):
         fitted = result.fitted
         if edges is not None and np.isfinite(edges.slope).any():
             slope = edges.slope[np.isfinite(edges.slope)]
-            width = math.hypot(widening * float(np.sqrt(np.mean(slope**2))), slow or edges.slow())
+            width = math.hypot(widening * float(np.sqrt(np.mean(slope**2))), slow)
             fitted = replace(fitted, height_common_sigma=common * width)
         found = result.assign(height_sigma=partial(added.to, result), fitted=fitted)
         if footprint.clear:

@@ -16,6 +16,9 @@ from mirrorskin.io.base.types import InputError
 
 Kind = Literal["length", "angle", "time", "memory", "force", "pressure"]
 
+NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+"""Pattern of a number with a decimal point."""
+
 BASE: dict[Kind, str] = {
     "length": "mm",
     "angle": "rad",

@@ -24,7 +24,7 @@ from mirrorskin.view.app.options import OptionsPane
 from mirrorskin.view.app.recording import RecordingPane
 from mirrorskin.view.app.result import ResultPane
 from mirrorskin.view.app.save import SavePane
-from mirrorskin.view.app.session import Computed, Opening, Run, Session, T, run_now
+from mirrorskin.view.app.session import Computed, Opening, Run, Session, T, keep_recent, run_now
 from mirrorskin.view.app.surface import SurfacePane
 
 if TYPE_CHECKING:
@@ -242,11 +242,10 @@ class App:
 
     def _keep(self, number: int, computed: Computed | None) -> None:
         """Keep a result to compare others with, and not more than fit into a limited memory."""
-        self._computed.pop(number, None)
-        if computed is not None:
-            self._computed[number] = computed
-        while len(self._computed) > 1 and sum(kept.size for kept in self._computed.values()) > _KEPT:
-            self._computed.pop(next(iter(self._computed)))
+        if computed is None:
+            self._computed.pop(number, None)
+        else:
+            keep_recent(self._computed, number, computed, _KEPT)
 
     def _take(self, number: int, then: Callable[[Computed], object]) -> None:
         """Call a function with a result of the list, which is read or computed if that is necessary."""

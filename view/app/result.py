@@ -326,11 +326,11 @@ class ResultPane:
             self._dragging.outline(None if region is None else edges_of(sheet.place, shape, region))
             corners = [np.transpose(polygon) for polygon in masks]
             self._dust.data = {"x": [x for x, _ in corners], "y": [y for _, y in corners]}
-        now, where = session.now, _words(region, masks)
+        now, turn, where = session.now, session.turn, _words(region, masks)
         found, measure = session.measures()
 
         def show(measures: Measures | InputError) -> None:
-            if (now, region, masks) != (session.now, session.measured, session.masks):
+            if (now, turn, region, masks) != (session.now, session.turn, session.measured, session.masks):
                 return
             self.measures.styles = dict(_FRESH)
             self._measured = None if isinstance(measures, InputError) else measures

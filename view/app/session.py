@@ -361,25 +361,22 @@ class Session:
 
     def measures(self) -> tuple[Measures | io.InputError | None, Callable[[], Measures | io.InputError]]:
         """Return the measures of the shown result, if they are known, and a function that measures."""
-        now, region, masks, turn = self.now, self.measured, [*self.masks], self.turn
+        now, region, masks = self.now, self.measured, [*self.masks]
+        sheet = self.sheet(now)  # of the turn that is chosen now
         assert now is not None
-        key = region, repr(masks), turn
+        assert sheet is not None
+        key = region, repr(masks), self.turn
 
         def measure() -> Measures | io.InputError:
             if key not in now.measures:
                 try:
-                    now.measures[key] = self._measure(now, region, masks)
+                    dust = [metrology.Polygon(corners) for corners in masks]
+                    now.measures[key] = engine.measure(sheet.result, region=region, mask=dust or None)
                 except io.InputError as error:
                     now.measures[key] = error
             return now.measures[key]
 
         return now.measures.get(key), measure
-
-    def _measure(self, computed: Computed, region: io.Region | None, masks: Sequence[Polygon]) -> Measures:
-        sheet = self.sheet(computed)
-        assert sheet is not None
-        dust = [metrology.Polygon(corners) for corners in masks]
-        return engine.measure(sheet.result, region=region, mask=dust or None)
 
     def choose_turn(self, turn: int) -> None:
         """Choose the turn whose maps are shown."""
@@ -433,7 +430,7 @@ class Session:
         key = self.choice.key
         if (computed := self._kept.get(key)) is not None:
             self.problem, self.computing = "", False
-            self._end(version, computed)
+            self._end(version, computed, key)
             return
         self.problem, self.computing = "", True
         self._tell("problem")
@@ -467,9 +464,7 @@ class Session:
         self.failed = isinstance(computed, Exception)
         if isinstance(computed, Computed):
             if key is not None:
-                self._kept[key] = computed
-                while len(self._kept) > 1 and sum(kept.size for kept in self._kept.values()) > _KEPT:
-                    self._kept.pop(next(iter(self._kept)))
+                keep_recent(self._kept, key, computed, _KEPT)
             self._keep(computed)
             return
         self.problem = str(computed)
@@ -501,6 +496,14 @@ class Session:
 def holds_result(path: Path) -> bool:
     """Return whether a file is a result, not frames."""
     return not is_of_others(path) and is_result(path)
+
+
+def keep_recent(kept: dict[Any, Computed], key: Hashable, computed: Computed, limit: int) -> None:
+    """Keep a result as the one that was used last, and not more than fit into a number of bytes."""
+    kept.pop(key, None)
+    kept[key] = computed
+    while len(kept) > 1 and sum(one.size for one in kept.values()) > limit:
+        kept.pop(next(iter(kept)))
 
 
 def _is_file(option: Option, value: Any) -> bool:

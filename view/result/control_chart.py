@@ -25,14 +25,13 @@ _MOST_LABELS = 40  # results whose names are written
 _LONGEST = 24  # letters of a name
 
 
-def control_chart(table: Table, names: Sequence[str] | None = None) -> Figure:
+def control_chart(table: Table) -> Figure:
     """Draw a control chart of individual values (ISO 7870-2), a panel for each quantity.
 
     Parameters
     ----------
     table : Table
-    names : sequence of str, optional
-        Quantities; by default those with limits, or the five that matter most.
+        Its quantities with limits are drawn, or the five that matter most.
 
     Returns
     -------
@@ -45,7 +44,7 @@ def control_chart(table: Table, names: Sequence[str] | None = None) -> Figure:
     InputError
         No result has a quantity.
     """
-    shown = [name for name in names or table.main() if np.isfinite(table.values(name)[0]).any()]
+    shown = [name for name in table.main() if np.isfinite(table.values(name)[0]).any()]
     if not shown:
         raise InputError("no result has a quantity to draw: nothing was measured")
     figure = new_figure(_WIDTH, _HEIGHT * len(shown) + _EXTRA)

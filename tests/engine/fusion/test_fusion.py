@@ -1,6 +1,5 @@
 """One surface from heights of a press and normals of a rotation: by eq. 10, on the twin, and in part."""
 
-import warnings
 from dataclasses import replace
 from functools import cache
 
@@ -104,9 +103,7 @@ def test_the_twin_s_ball_is_right_within_10_micrometres_after_registration(pivot
     assert rms(error) <= 0.002  # as it is today
     radius = engine.measure(result, form="sphere").quantities["sphere radius"]
     assert abs(radius.value - RADIUS) <= 0.01
-    assert (
-        abs(radius.value - RADIUS) < 0.004
-    )  # its sigma does not contain the errors of all heights of a step
+    assert abs(radius.value - RADIUS) < 0.004  # sigma lacks what all heights of a step have in common
     assert 0.3 < np.mean((error / result.height_sigma[sure]) ** 2) < 3
 
 
@@ -637,7 +634,8 @@ def test_sigma_of_the_fused_sample_is_the_scatter_of_its_errors(inputs):
     ]
     rms, _, chi_square, _ = np.mean(scores, axis=0)
     assert rms < (1.0 if inputs == "results" else 0.7)  # µm
-    assert 0.4 < chi_square < 1.35  # results: less certain, as frames were not registered
+    # Of results, sigma is larger, as frames were not registered.
+    assert (0.4 if inputs == "results" else 0.8) < chi_square < 1.35
 
 
 def test_results_fused_note_that_recordings_are_more_accurate():
@@ -746,9 +744,7 @@ def uneven(counts):
 
 @cache
 def fused_in_uneven_light(seed):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", io.MirrorskinWarning)  # they disagree
-        return engine.fuse(pressed_waves(seed), turned_waves(seed + 100, light=uneven), register=False)
+    return engine.fuse(pressed_waves(seed), turned_waves(seed + 100, light=uneven), register=False)
 
 
 def test_uneven_light_is_corrected_as_the_press_shows_it():
