@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.live.status import SHOWN, Status, Update
-from mirrorskin.io import Result, pixel_axes
+from mirrorskin.io import Result
+from mirrorskin.io.base.types import axes_with_unit
 from mirrorskin.io.base.units import numbers_with_unit
 from mirrorskin.io.model.maps import is_deviation
 from mirrorskin.io.model.result import display_order
@@ -43,10 +44,10 @@ class LiveView:
     def __init__(
         self, where: str | Path, shape: tuple[int, int], pixel_size: tuple[float, float] | None = None
     ) -> None:
-        self._x, _ = pixel_axes(shape, pixel_size or (1.0, 1.0))
+        self._x, _, unit = axes_with_unit(shape, pixel_size)
         self._ranges: dict[str, _Range] = {}
         self._titles: dict[str, str] = {}
-        self._greys, self._scaled = _Range(), pixel_size is not None
+        self._greys, self._scaled = _Range(), unit == "mm"
         self._stream = open_stream(where, "--view")
         self._stream.send_blueprint(_blueprint({}, self._scaled))
 
@@ -167,7 +168,7 @@ def _blueprint(titles: Mapping[str, str], scaled: bool) -> Any:
     """Return the layout of the viewer, with a view for each map."""
     import rerun.blueprint as rrb
 
-    across = "Middle row, mm, true to scale" if scaled else "Middle row"
+    across = "Middle row, mm, true to scale" if scaled else "Middle row, along pixels"
     return rrb.Blueprint(
         rrb.Grid(
             rrb.Spatial2DView(origin="camera", name="Camera"),

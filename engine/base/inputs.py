@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.io import Fitted, InputError, Result, open_result, pixel_axes
 from mirrorskin.io.base.arguments import as_array, check_pixel_size
 from mirrorskin.io.model.fitted import taken_from
-from mirrorskin.io.model.maps import FIELDS, declaration_of
-from mirrorskin.io.model.result import map_shape, shape_of, size_of_maps
+from mirrorskin.io.model.maps import FIELDS, TABLE, declaration_of
+from mirrorskin.io.model.result import in_pixels, map_shape, shape_of, size_of_maps
 
 if TYPE_CHECKING:
     import xarray
@@ -39,7 +39,8 @@ def as_result(
         The argument, for messages.
     quantity : str
     pixel_size : float or (float, float), optional
-        Millimetres along x and y; by default from ``x`` and ``y`` of the maps, if available.
+        Millimetres along x and y; by default from ``x`` and ``y`` of the maps, if available. Heights in
+        pixels become millimetres.
 
     Raises
     ------
@@ -60,7 +61,20 @@ def as_result(
     if len(size) < 2:  # the caller reports a missing map
         return result
     x, y = pixel_axes((size[0], size[1]), pixels)
-    return result.assign(x=x, y=y)
+    return _in_millimetres(result, pixels).assign(x=x, y=y)
+
+
+def _in_millimetres(result: Result, pixel_size: tuple[float, float]) -> Result:
+    """Return a result whose heights are in millimetres, also if they were in pixels."""
+    if not in_pixels(result):
+        return result
+    if pixel_size[0] != pixel_size[1]:
+        raise InputError("slopes were integrated along square pixels: integrate again with this pixel_size")
+    scaled = {
+        name: None if (values := getattr(result, name)) is None else values * np.float32(pixel_size[0])
+        for name in ("height", "height_sigma")
+    }
+    return result.assign(scaled, declarations={"height": TABLE["height"]})
 
 
 def is_maps(value: Any) -> TypeGuard[Maps]:

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Result
+from mirrorskin.io.base.types import PIXEL
 from mirrorskin.io.base.units import numbers_with_unit
 from mirrorskin.io.model.maps import SIGMA, SlipStatus, is_builtin, is_deviation, place_of, status_of
+from mirrorskin.io.model.result import in_pixels
 
 _STICKS = status_of(SlipStatus).codes[SlipStatus.STICKS]
 
@@ -37,7 +39,9 @@ class Summary:
     filled : int or None
         Pixels whose height was filled, if holes were searched for.
     relief : (float, float) or None
-        Range of relative heights of a result with normals, mm.
+        Range of relative heights of a result with normals.
+    relief_unit : str
+        Unit of these.
     counts : dict of str to int
         Number of pixels of each code of the status, if the status is the main result, as for slip.
     numbers : dict of str to (float, float or None, str)
@@ -56,6 +60,7 @@ class Summary:
     turns: int | None = None
     filled: int | None = None
     relief: tuple[float, float] | None = None
+    relief_unit: str = "mm"
     counts: dict[str, int] = field(default_factory=dict)
     numbers: dict[str, tuple[float, float | None, str]] = field(default_factory=dict)
 
@@ -80,7 +85,7 @@ class Summary:
         if self.in_contact is not None and self.answered:
             yield f"in contact at {self.in_contact}"
         if self.relief is not None:
-            yield f"relative height {_from_to(*self.relief, 'mm')}"
+            yield f"relative height {_from_to(*self.relief, self.relief_unit)}"
         yield from (f"{count} {name}" for name, count in self.counts.items())
         for name, (value, sigma, unit) in self.numbers.items():
             spread = "" if sigma is None else f" ± {sigma:.2g}"
@@ -92,6 +97,7 @@ class Summary:
         ``lowest`` and ``highest`` are rounded to nine digits, which distinguish all values of float32.
         """
         facts = asdict(self)
+        del facts["relief_unit"]
         facts |= {name: float(f"{facts[name]:.9g}") for name in ("lowest", "highest")}
         facts |= {name.replace(" ", "_"): count for name, count in facts.pop("counts").items()}
         for name, (value, sigma, _) in facts.pop("numbers").items():
@@ -150,6 +156,7 @@ def summarise(result: Result) -> Summary:
         turns=len(answered) if answered.ndim == 3 and not declared.per_frame else None,
         filled=None if result.filled is None else int(np.count_nonzero(result.filled)),
         relief=None if result.height is None or not relative else _range(result.height),
+        relief_unit=PIXEL if in_pixels(result) else "mm",
         counts=dict(_counts(result)),
         numbers=dict(_numbers(result)),
     )

@@ -19,6 +19,7 @@ from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.base.arguments import Check, as_array_or_number, check_pixel_size, checked, in_unit
 from mirrorskin.io.base.findings import carried
 from mirrorskin.io.base.threads import ThreadSafe
+from mirrorskin.io.model.maps import IN_PIXELS
 from mirrorskin.kernels.device import Device, open_device
 
 _MAPS: Mapping[str, Check] = {
@@ -85,7 +86,8 @@ def integrate(
         Instead of dz_dx also a Result, mapping, xarray.Dataset or path of a result file, with ``normals``,
         ``normals_sigma`` and, optionally, ``contact``.
     pixel_size : array_like, optional
-        Millimetres, one number or (x, y); by default that of the result. Not allowed with a camera.
+        Millimetres, one number or (x, y); by default that of the result. Without one, heights are in pixels,
+        and the result has no ``x`` and ``y``. Not allowed with a camera.
     normals : array_like or device array, (H, W, 3), optional
         Surface normals instead of slopes: components along x, y and z, which points to the camera; of any
         length. Not finite or 0 where undefined. Normals of surfaces that face away, or within 0.6 degrees of
@@ -110,7 +112,8 @@ def integrate(
         Nonzero at pixels where the surface is discontinuous. Such a pixel keeps only one link, to the
         neighbour off the edge with the most similar slopes, so that it does not connect both sides.
     known_heights : array_like, (H, W), optional
-        Known heights, mm, or depths in any unit; NaN elsewhere. These pixels need no slope.
+        Known heights, in the unit of ``height``, or depths in any unit; NaN elsewhere. These pixels need
+        no slope.
     known_height_weights : array_like, scalar or (H, W), optional
         Inverse variances of known heights, 1/mm^2 (or the inverse square of the unit of depths), 0 where
         unknown; default 1. Weights are clipped at 1e4 times the weight w of a link.
@@ -124,8 +127,8 @@ def integrate(
     Returns
     -------
     Result
-        ``height``, (H, W) or (K, H, W), mm: with a camera the depth, in the unit of known ones. NaN where
-        undefined. Other maps are (H, W), and shared by all surfaces.
+        ``height``, (H, W) or (K, H, W), mm, or pixels without a pixel size: with a camera the depth, in the
+        unit of known ones. NaN where undefined. Other maps are (H, W), and shared by all surfaces.
 
         ``height_sigma``: expected standard deviation, about the mean of the component if it has no known
         height; NaN where the noise of the slopes cannot be estimated. With ``robust`` it contains the
@@ -139,7 +142,7 @@ def integrate(
 
         ``filled``: all 0. ``edges``: 1 on both sides of a discontinuity, if ``robust``.
 
-        ``x`` and ``y``: pixel centres, without a camera.
+        ``x`` and ``y``: pixel centres, with a pixel size.
 
         Of a result, also its ``fitted``; its warnings and notes are in ``process``.
 
@@ -152,7 +155,7 @@ def integrate(
     ------
     mirrorskin.io.InputError
         Maps of different sizes, or without anything to integrate; numbers outside of their limits; a result
-        without normals or a pixel size, or with other arguments than those allowed.
+        without normals, or with other arguments than those allowed.
     NotConverged
         The tolerance was not reached.
     mirrorskin.kernels.errors.DeviceError
@@ -196,7 +199,10 @@ def integrate(
         return _integrate_maps(dz_dx, pixel_size, arrays | {"normals": normals}, options)
     if is_maps(normals):
         return _integrate_maps(normals, pixel_size, arrays | {"dz_dx": dz_dx}, options)
-    return integrate_arrays(dz_dx, pixel_size=pixel_size, normals=normals, **arrays, **options)
+    unknown = pixel_size is None and camera is None
+    size = 1.0 if unknown else pixel_size
+    surface = integrate_arrays(dz_dx, pixel_size=size, normals=normals, **arrays, **options)
+    return surface.assign(x=None, y=None, declarations=IN_PIXELS) if unknown else surface
 
 
 def _integrate_maps(
@@ -210,10 +216,12 @@ def _integrate_maps(
             raise InputError(f"{name} is for arrays: leave it out, or give normals=result.normals")
     needed = "normals", "normals_sigma"
     result = of_one_size(required_maps("normals", maps, *needed, pixel_size=pixel_size), "normals")
-    size, device = pixel_size_of(result, "normals", pixel_size), device_of_maps(options.get("device"), result)
+    device, unknown = device_of_maps(options.get("device"), result), result.x is None or result.y is None
+    size = (1.0, 1.0) if unknown else pixel_size_of(result, "normals")
     surface = integrate_result(result, size, robust=robust, device=device)
     process = {**surface.process, **carried(surface.process, normals=result.process)}
-    return surface.assign(x=result.x, y=result.y, process=process, fitted=result.fitted | surface.fitted)
+    surface = surface.assign(x=result.x, y=result.y, process=process, fitted=result.fitted | surface.fitted)
+    return surface.assign(declarations=IN_PIXELS) if unknown else surface
 
 
 class Integrator(ThreadSafe):

@@ -132,6 +132,12 @@ def kept_by(masks: Masks, heights: Heights) -> Kept:
     return kept
 
 
+def in_millimetres(masks: Masks) -> bool:
+    """Return whether a mask is stated by lengths."""
+    several = masks if isinstance(masks, list | tuple) else [masks]
+    return any(isinstance(mask, Polygon | Levels) for mask in several)
+
+
 def _is_mask(value: object) -> TypeGuard[Mask]:
     return hasattr(value, "kept")
 

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from html import escape
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ from mirrorskin.engine.metrology.forms import (
     fit_polynomial,
     fit_sphere,
 )
-from mirrorskin.engine.metrology.masks import Heights, Masks, kept_by
+from mirrorskin.engine.metrology.masks import Heights, Masks, in_millimetres, kept_by
 from mirrorskin.engine.metrology.noise import realisations
 from mirrorskin.engine.metrology.parameters import PARAMETERS
 from mirrorskin.engine.metrology.patch import Patch, heights_of, patch_of
@@ -37,6 +37,8 @@ from mirrorskin.engine.metrology.texture import DRAWS, FormRemoval, Roughness, r
 from mirrorskin.io import InputError, Region, Result
 from mirrorskin.io.base.arguments import check_number, checked, in_unit
 from mirrorskin.io.base.findings import findings_of
+from mirrorskin.io.base.types import axes_with_unit
+from mirrorskin.io.model.result import in_pixels
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import mad_sigma
 
@@ -223,6 +225,11 @@ def measure(
     maps = as_result(result, "result", pixel_size=pixel_size)
     if reference is not None:
         maps = subtract(maps, reference)
+    if in_pixels(maps):
+        _refuse_millimetres(
+            mask=mask, s_filter=s_filter, l_filter=l_filter, section=section, noise_length=noise_length
+        )
+        maps = _along_pixels(maps)
     patch, comparable = patch_of(maps, region)
     if mask is not None:
         assert maps.x is not None  # patch_of needs both
@@ -251,10 +258,37 @@ def measure(
     lens = None if maps.calibration is None else maps.calibration.lens
     scale = 0.0 if lens is None else lens.scale_sigma
     quantities, budget = _scaled(quantities, budget, scale)
+    units = {name: quantity.unit for name, quantity in quantities.items()}
+    if in_pixels(maps):
+        quantities = {name: quantity.in_pixels() for name, quantity in quantities.items()}
+        budget = {
+            name: {cause: Quantity(part, 0.0, units[name]).in_pixels().value for cause, part in parts.items()}
+            for name, parts in budget.items()
+        }
+    size = f"the pixel size is {f'known within {100 * scale:.2g} %' if scale else 'taken as exact'}"
+    if in_pixels(maps):
+        size = "lengths are in pixels, whose size is unknown"
     inherited = [finding.text for finding in findings_of("result", maps.process)]
     if reference is not None:
         notes.append("heights are differences from those of the reference")
-    return Measures(quantities, [*inherited, *notes, *_assumed(patch, scale)], budget, rough.smooth)
+    return Measures(quantities, [*inherited, *notes, *_assumed(patch, size)], budget, rough.smooth)
+
+
+def _refuse_millimetres(**lengths: Any) -> None:
+    """Raise InputError for arguments that are in millimetres, which heights in pixels do not have."""
+    for name, value in lengths.items():
+        if value is not None and not (name == "mask" and not in_millimetres(value)):
+            raise InputError(
+                f"{name} is in mm, and the heights are in pixels, whose size is unknown: give pixel_size, or"
+                " integrate again with one"
+            )
+
+
+def _along_pixels(result: Result) -> Result:
+    """Return a result whose places are in pixels, as its heights are."""
+    rows, columns = heights_of(result).shape
+    x, y, _ = axes_with_unit((rows, columns), None)
+    return result.assign(x=x, y=y)
 
 
 def _outliers(patch: Patch, form: FormName | None, result: Result) -> NDArray[np.bool_]:
@@ -499,10 +533,9 @@ def _scaled(
     return scaled, parts
 
 
-def _assumed(patch: Patch, scale: float) -> list[str]:
-    """Return notes on the assumptions behind values and uncertainties."""
-    size = f"known within {100 * scale:.2g} %" if scale else "taken as exact"
-    notes = [f"± is the standard uncertainty (k = 1); the pixel size is {size}"]
+def _assumed(patch: Patch, size: str) -> list[str]:
+    """Return notes on the assumptions behind values and uncertainties; ``size`` is that on the pixel size."""
+    notes = [f"± is the standard uncertainty (k = 1); {size}"]
     if patch.sigma is not None:
         notes.append(f"errors of heights are {_correlation(patch.noise_length)}")
     filled = int(np.count_nonzero(np.isfinite(patch.filled)))

@@ -5,6 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from mirrorskin.io.base.types import PIXEL
+
+_IN_PIXELS = {  # units and factors of values whose lengths are pixels
+    "mm": (PIXEL, 1.0),
+    "mm2": (f"{PIXEL}2", 1.0),
+    "mm3": (f"{PIXEL}3", 1.0),
+    "µm": (PIXEL, 1e-3),
+    "ml/m2": (f"{PIXEL}3/{PIXEL}2", 1e-3),  # 1 ml/m2 is 1 µm
+}
 _ROUNDING = 1e-12  # relative uncertainty that is explained by rounding
 
 
@@ -30,6 +39,11 @@ class Quantity:
     value: float
     sigma: float
     unit: str
+
+    def in_pixels(self) -> Quantity:
+        """Return a quantity whose lengths were taken for mm although they are in pixels, with its unit."""
+        unit, factor = _IN_PIXELS.get(self.unit, (self.unit, 1.0))
+        return Quantity(factor * self.value, factor * self.sigma, unit)
 
     def expanded(self, coverage: float) -> Quantity:
         """Return the quantity with its uncertainty multiplied by a coverage factor."""

@@ -9,6 +9,8 @@ from mirrorskin.engine.base.inputs import Maps, as_result, spacing
 from mirrorskin.engine.metrology.patch import heights_of, noise_length
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.findings import carried
+from mirrorskin.io.model.maps import IN_PIXELS
+from mirrorskin.io.model.result import in_pixels
 
 _SAME_SIZE = 1e-3  # largest relative difference of pixel sizes
 
@@ -54,6 +56,10 @@ def subtract(result: Maps, reference: Maps) -> Result:
             raise InputError(
                 "the pixel size of the result is {} mm, and of the reference {} mm".format(*shown)
             )
+    if in_pixels(first) != in_pixels(second):
+        raise InputError(
+            "heights of the result and of the reference are in px and mm: the pixel size of one is unknown"
+        )
     difference = (upper.astype(np.float64) - lower).astype(np.float32)
     known = np.isfinite(difference)
     sigma = None
@@ -82,6 +88,7 @@ def subtract(result: Maps, reference: Maps) -> Result:
         y=first.y if first.y is not None else second.y,
         process={**first.process, **carried(first.process, reference=second.process)},
         calibration=first.calibration,
+        declarations=IN_PIXELS if in_pixels(first) else None,
     ).with_fitted(height_correlation=length)
 
 

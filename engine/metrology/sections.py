@@ -17,9 +17,10 @@ from mirrorskin.engine.metrology.fitting import at_least, covariance
 from mirrorskin.engine.metrology.noise import correlation
 from mirrorskin.engine.metrology.patch import heights_of, independent_share, noise_length
 from mirrorskin.engine.metrology.quantity import Quantity
-from mirrorskin.io import InputError, Result, pixel_axes
+from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.arguments import as_array, check_number, checked, in_unit
 from mirrorskin.io.base.findings import findings_of
+from mirrorskin.io.base.types import axes_with_unit
 from mirrorskin.kernels.array_types import Doubles
 
 Mask = NDArray[np.bool_]
@@ -134,7 +135,7 @@ def section(
             raise InputError(
                 "the result has no pixel size to place a section by: reconstruct it again with --pixel-size"
             )
-        (x, y), unit = pixel_axes((height.shape[0], height.shape[1]), (1.0, 1.0)), "px"
+        x, y, unit = axes_with_unit((height.shape[0], height.shape[1]), None)
     size = spacing(x, y) if height.size > 1 else (1.0, 1.0)
     if start is None or end is None:
         row = _top_row(height)

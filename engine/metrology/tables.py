@@ -18,6 +18,7 @@ from mirrorskin.engine.base.inputs import Maps
 from mirrorskin.engine.metrology.measures import Measures, measure
 from mirrorskin.engine.metrology.quantity import Quantity
 from mirrorskin.io import InputError
+from mirrorskin.io.base.types import PIXEL
 from mirrorskin.io.base.units import NUMBER, ratio
 from mirrorskin.io.formats.tables import save_table
 from mirrorskin.kernels.array_types import Doubles
@@ -253,13 +254,29 @@ def table(
             rows.append(Row(name, measure(lot[key], **options)))
         except InputError as error:
             rows.append(Row(name, None, str(error)))
-    found = Table(rows, read)
+    found = Table(_of_one_unit(rows), read)
     names = found.names
     for name, limit in read.items():
         if names and name not in names:
             raise InputError(f"limits of {name}: no result has it; there are {', '.join(names)}")
         limit.within(name, found.unit(name))
     return found
+
+
+def _of_one_unit(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows; those whose lengths are in another unit than in the first one, without measures."""
+    units = [
+        {quantity.unit for quantity in row.measures.quantities.values()} if row.measures else set()
+        for row in rows
+    ]
+    pixels = [PIXEL in used for used in units]
+    first = next((pixel for pixel, row in zip(pixels, rows, strict=True) if row.measures), False)
+    own, other = ("px", "mm") if first else ("mm", "px")
+    problem = f"lengths are in {other}, those of the results before in {own}: give pixel_size"
+    return [
+        row if row.measures is None or pixel == first else Row(row.name, None, problem)
+        for row, pixel in zip(rows, pixels, strict=True)
+    ]
 
 
 def _name_of(maps: Any, number: int) -> str:

@@ -414,3 +414,20 @@ def pixel_axes(shape: tuple[int, int], pixel_size: tuple[float, float]) -> tuple
     x = (np.arange(columns) - (columns - 1) / 2) * pixel_size[0]
     y = ((rows - 1) / 2 - np.arange(rows)) * pixel_size[1]
     return np.asarray(x, np.float64), np.asarray(y, np.float64)
+
+
+PIXEL = "px"
+"""Unit of lengths where the pixel size is unknown."""
+
+
+def axes_with_unit(
+    shape: tuple[int, int], pixel_size: tuple[float, float] | None
+) -> tuple[Floats, Floats, str]:
+    """Return the positions of pixel centres from the picture's centre, and their unit: mm, or pixels.
+
+    Examples
+    --------
+    >>> axes_with_unit((1, 3), None)
+    (array([-1.,  0.,  1.]), array([0.]), 'px')
+    """
+    return *pixel_axes(shape, pixel_size or (1.0, 1.0)), PIXEL if pixel_size is None else "mm"

@@ -15,7 +15,7 @@ from mirrorskin.io.base.system import check_unpacked
 from mirrorskin.io.base.text import one_line
 from mirrorskin.io.base.types import Floats, InputError, ProcessValue, pixel_axes
 from mirrorskin.io.base.units import in_base
-from mirrorskin.io.model.result import Result, zero_of_relative
+from mirrorskin.io.model.result import Result, in_pixels, zero_of_relative
 
 SOFTWARE, DATE, SOURCE = "software", "date", "source"
 """Names of notes."""
@@ -45,6 +45,8 @@ def check_millimetres(result: Result, path: str | Path) -> None:
     """Raise InputError for a result without a pixel size."""
     if result.x is None or result.y is None:
         again = "reconstruct it again with --pixel-size"
+        if in_pixels(result):
+            again = "integrate again with pixel_size"
         raise InputError(f"{path} needs millimetres, and the result has no pixel size: {again}, {REMEDY}")
 
 

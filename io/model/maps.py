@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.base.types import InputError
+from mirrorskin.io.base.types import PIXEL, InputError
 from mirrorskin.io.base.units import ratio
 
 SIGMA = "_sigma"
@@ -543,6 +543,9 @@ TWIST: Mapping[str, Map] = {
 }
 """Declarations that differ from the table's when the body twists."""
 
+IN_PIXELS: Mapping[str, Map] = {"height": msgspec.structs.replace(TABLE["height"], unit=PIXEL)}
+"""Declarations that differ from the table's when slopes are integrated without a pixel size."""
+
 
 def is_deviation(name: str) -> bool:
     """Return whether a name is the name of a standard deviation."""
@@ -591,13 +594,14 @@ def check_declarations(declarations: Mapping[str, Map]) -> None:
     """Raise InputError if declarations change the meaning of a built-in name, or two maps have one quantity.
 
     Only the legend and the texts of a built-in map may differ from the table, and the unit of maps that
-    become angles in a twist.
+    become angles in a twist, or lengths in pixels.
     """
     stands_for: dict[str, str] = {}
     for name, declaration in declarations.items():
         if not isinstance(declaration, Map):
             raise InputError(f"the declaration of {name} is {declaration!r:.40}. Use mirrorskin.io.Map(...)")
-        table = TWIST if name in TWIST and declaration.unit == TWIST[name].unit else TABLE
+        others = (other for other in (TWIST, IN_PIXELS) if name in other)
+        table = next((other for other in others if declaration.unit == other[name].unit), TABLE)
         if name in table:
             for problem in conflicts(declaration, table[name], f"the map {name}"):
                 raise InputError(f"{problem}, as the built-in map has, or choose another name")

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.io.base.arguments import unknown_argument
 from mirrorskin.io.base.findings import merged
-from mirrorskin.io.base.types import Floats, InputError, ProcessValue
+from mirrorskin.io.base.types import PIXEL, Floats, InputError, ProcessValue
 from mirrorskin.io.model.fitted import Fitted, taken_from
 from mirrorskin.io.model.maps import (
     FIELDS,
@@ -363,6 +363,12 @@ class Result(MapContainer, Mapping[str, Any]):
 
         maps, others = from_xarray(dataset)
         return cls(maps, **others)
+
+
+def in_pixels(result: Result) -> bool:
+    """Return whether heights are in pixels, because slopes were integrated without a pixel size."""
+    name = result.name_of("height")
+    return name is not None and result.declaration(name).unit == PIXEL
 
 
 def _restore(maps: Mapping[str, Any], others: Mapping[str, Any]) -> Result:

@@ -11,7 +11,7 @@ from shown import ball
 from stacks import record
 
 from mirrorskin import engine, io
-from mirrorskin.io.model.maps import TABLE
+from mirrorskin.io.model.maps import IN_PIXELS, TABLE
 from mirrorskin.twin import Axial, Twin, Vertical
 from mirrorskin.view.app import App, Opening
 from mirrorskin.view.app.options import read, widget_of
@@ -468,3 +468,15 @@ def test_nothing_is_saved_while_a_result_is_computed(postponed):
 def test_nothing_to_show_is_refused():
     with pytest.raises(io.InputError, match="name a file"):
         App()
+
+
+def test_a_result_in_pixels_is_cut_masked_and_measured_in_pixels():
+    session = Session(ball(x=None, y=None, declarations=IN_PIXELS))
+    pane = ResultPane(session)
+    session.cut(((-10.0, 0.0), (10.0, 0.0)))
+    assert "from (-10, 0) to (10, 0) px" in pane.where.object
+    session.mask([((-3.0, -3.0), (3.0, -3.0), (0.0, 3.0))])
+    found, _ = session.measures()
+    assert found.quantities["highest point"].unit == "px"
+    assert any(note.startswith("pixels left out by a mask") for note in found.notes)
+    assert " px\n" in as_text(found, " ")

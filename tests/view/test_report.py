@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import engine, io
+from mirrorskin.io.model.maps import IN_PIXELS
 from mirrorskin.view import report
 from mirrorskin.view.report import contents
 from mirrorskin.view.report.contents import align
@@ -446,3 +447,13 @@ def test_warnings_are_at_the_top_of_the_page(tmp_path, quick):
     page = written(tmp_path, doubtful)
     assert "Frame 3: lost." in " ".join(page.texts["p"])
     assert page.texts["strong"] == ["Warning:"]
+
+
+def test_a_surface_in_pixels_is_in_pixels_everywhere():
+    found = cap().assign(x=None, y=None, declarations=IN_PIXELS)
+    surface = surface_data(found)
+    assert (surface["unit"], surface["unit_of_height"], surface["stretch"]) == ("px", "px", 1.0)
+    shown = contents.contents_of(found, "surface", None, None)
+    assert shown["texts"]["highest"].endswith(" px")
+    assert shown["units"][0].startswith("Lengths are in pixels")
+    assert {row.unit for row in shown["numbers"].rows} <= {"px", "px²", "px³", "px³/px²", "", "%", "°"}

@@ -10,6 +10,7 @@ from shown import ball, colours_at, rendered
 from mirrorskin import engine, io
 from mirrorskin.engine.metrology import section
 from mirrorskin.io.model.maps import (
+    IN_PIXELS,
     FocusStatus,
     PoseStatus,
     PressStatus,
@@ -101,6 +102,17 @@ def test_without_pixel_size_heights_are_along_pixels_and_have_no_scale_bar():
     assert axes.get_xlabel() == "x (px)"
     assert axes.get_xlim() == (-16, 16)
     assert not axes.lines
+
+
+def test_heights_in_pixels_are_drawn_in_pixels_and_to_scale():
+    result = ball(x=None, y=None, declarations=IN_PIXELS)
+    heights, histogram = (panel_of(draw, result) for draw in (draw_height, draw_histogram))
+    across = panel_of(draw_section, result, section(result))
+    assert across.get_xlabel() == "distance from A (px)"
+    assert across.get_ylabel() == "height (px)"
+    assert "heights stretched" in note(across)
+    assert note(histogram).endswith(" px")
+    assert heights.get_ylabel() == "y (px)"
 
 
 def test_notes_explain_colours_and_the_size_of_a_level():

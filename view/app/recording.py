@@ -11,7 +11,7 @@ from bokeh.events import Tap
 from bokeh.models import BoxAnnotation, ColumnDataSource, HoverTool, Label, Range1d, Span
 from bokeh.plotting import figure
 
-from mirrorskin.io import pixel_axes
+from mirrorskin.io.base.types import axes_with_unit
 from mirrorskin.view.app.look import hint, plain_axes, table, text
 from mirrorskin.view.app.picture import (
     Dragging,
@@ -40,10 +40,9 @@ class RecordingPane:
         assert session.whole is not None
         self._session = session
         count, rows, columns = session.whole.shape
-        x, y = pixel_axes((rows, columns), session.whole.header.pixel_size or (1.0, 1.0))
+        x, y, unit = axes_with_unit((rows, columns), session.whole.header.pixel_size)
         self._place = extent(x, y)
         self._shape = rows, columns
-        unit = "mm" if session.whole.header.pixel_size else "px"
         self.picture = Picture(self._place, unit, _PICTURE)
         self._cross = ColumnDataSource(data={"x": [], "y": []})
         for width, colour in ((4, "white"), (2, "black")):

@@ -284,12 +284,12 @@ class ResultPane:
         profiles = []
         for ends in [*self._session.sections]:
             try:
-                profiles.append(section(sheet.result, *ends))
+                profiles.append(_section(sheet, *ends))
             except InputError:
                 self._session.sections.remove(ends)
         if not self._session.sections:
             with suppress(InputError):
-                profiles.append(section(sheet.result))
+                profiles.append(_section(sheet))
         if not profiles:
             self.where.object = hint("No section can be drawn there.")
             return
@@ -304,7 +304,7 @@ class ResultPane:
         other = None
         if before is not None and before.result.height is not None and before.place == sheet.place:
             first = profiles[0]
-            other = section(before.result, (first.x[0], first.y[0]), (first.x[-1], first.y[-1]))
+            other = _section(before, (first.x[0], first.y[0]), (first.x[-1], first.y[-1]))
         self.section.show(sheet, profiles, other)
         ends_of = [f"({profiles[-1].x[end]:.3g}, {profiles[-1].y[end]:.3g})" for end in (0, -1)]
         count = f"Section {len(profiles)}" if len(profiles) > 1 else "Section"
@@ -436,6 +436,7 @@ class _SectionGraph:
         """Draw sections, and the first one of B."""
         profile = profiles[0]
         factor, unit = sheet.of_height.figure_scale, sheet.of_height.figure_unit
+        error = sheet.of_height.deviation("height")
         measured = np.where(profile.filled, np.nan, factor * profile.height)
         band = _BAND * factor * profile.sigma
         self._band.glyph.width = float(np.ptp(profile.distance)) / max(len(profile.distance) - 1, 1)
@@ -444,7 +445,7 @@ class _SectionGraph:
             "y": measured,
             "low": measured - band,
             "high": measured + band,
-            "sigma": 1e3 * profile.sigma,
+            "sigma": error.figure_scale * profile.sigma,
         }
         self.sources["filled"].data = _line(
             profile, np.where(profile.filled, factor * profile.height, np.nan)
@@ -463,8 +464,13 @@ class _SectionGraph:
         self.hover.tooltips = [
             ("Distance", f"@x{{0.000}} {sheet.unit}"),
             (title.capitalize(), f"@y{{0.0000}} {unit}"),
-            ("Standard deviation", "@sigma{0.00} µm"),
+            ("Standard deviation", f"@sigma{{0.00}} {error.figure_unit}"),
         ]
+
+
+def _section(sheet: Sheet, *ends: Point) -> Section:
+    """Return a section whose places are in the unit of the sheet."""
+    return section(sheet.result.assign(x=sheet.x, y=sheet.y), *ends)
 
 
 def _line(profile: Section, height: Any) -> dict[str, Any]:

@@ -14,7 +14,8 @@ import panel as pn
 from bokeh.models import ColumnDataSource, CustomJS, Range1d
 from bokeh.plotting import figure
 
-from mirrorskin.io import InputError, pixel_axes
+from mirrorskin.io import InputError
+from mirrorskin.io.base.types import axes_with_unit
 from mirrorskin.view.app.look import heading, hint, plain_axes, problem, table, text
 from mirrorskin.view.app.picture import Picture, show_frame, show_map
 from mirrorskin.view.app.rig_control import (
@@ -86,8 +87,7 @@ class RigPane:
         self.state = text(width=420)
         self.facts = text(width=_PICTURE[0])
         rows, columns = control.settings.camera.shape
-        x, y = pixel_axes((rows, columns), control.settings.camera.pixel_sides or (1.0, 1.0))
-        unit = "mm" if control.settings.camera.pixel_sides else "px"
+        x, y, unit = axes_with_unit((rows, columns), control.settings.camera.pixel_sides)
         self.camera = Picture(extent(x, y), unit, _PICTURE)
         self.growing = Picture(extent(x, y), unit, _PICTURE)
         self.camera.figure.tags = [self._sent, self._seen]

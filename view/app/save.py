@@ -105,13 +105,14 @@ class SavePane:
                 return path.read_bytes()
             sheet = session.sheet(session.now)
             assert sheet is not None
+            ends = session.ends if sheet.unit == "mm" else None  # of a report and a table
             if suffix == _REPORT:
                 from mirrorskin.view.report import write_report
 
-                write_report(sheet.result, path, name=session.name, section=session.ends)
+                write_report(sheet.result, path, name=session.name, section=ends)
                 return path.read_bytes()
             check_export(sheet.result, path)
-            columns = section_columns(sheet.result, session.ends) if with_section else None
+            columns = section_columns(sheet.result, ends) if with_section else None
             io.export_result(sheet.result, path, section=columns)
             return path.read_bytes()
 

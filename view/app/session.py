@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin import engine, io
-from mirrorskin.engine import metrology
 from mirrorskin.engine.base.options import Option, plain
 from mirrorskin.engine.base.reconstruction import calibrated, load_operation, method_for, run_class
 from mirrorskin.engine.metrology import Measures
+from mirrorskin.engine.metrology.masks import inside_polygon
 from mirrorskin.io.files.opening import is_result
 from mirrorskin.io.formats.registry import is_of_others
 from mirrorskin.io.model.result import map_shape
@@ -25,10 +25,10 @@ from mirrorskin.view.result.sheet import Sheet, sheet_of
 T = TypeVar("T")
 
 Ends = tuple[tuple[float, float], tuple[float, float]]
-"""Ends of a section, x and y, mm."""
+"""Ends of a section, x and y, mm; pixels where the pixel size is unknown."""
 
 Polygon = tuple[tuple[float, float], ...]
-"""Corners, x and y, mm."""
+"""Corners, x and y, as those ends."""
 
 _MODULE = "mirrorskin.engine"
 _KEPT = 400_000_000  # bytes of results that are kept, so that options can be changed back at once
@@ -370,8 +370,9 @@ class Session:
         def measure() -> Measures | io.InputError:
             if key not in now.measures:
                 try:
-                    dust = [metrology.Polygon(corners) for corners in masks]
-                    now.measures[key] = engine.measure(sheet.result, region=region, mask=dust or None)
+                    dust = [inside_polygon(sheet.x, sheet.y, corners) for corners in masks]
+                    mask = ~np.any(dust, axis=0) if dust else None
+                    now.measures[key] = engine.measure(sheet.result, region=region, mask=mask)
                 except io.InputError as error:
                     now.measures[key] = error
             return now.measures[key]

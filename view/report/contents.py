@@ -16,9 +16,10 @@ from mirrorskin.engine.metrology import Quantity
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.findings import warnings_in
 from mirrorskin.io.base.opencv import encode
+from mirrorskin.io.base.types import PIXEL
 from mirrorskin.io.model.result import zero_of_relative
 from mirrorskin.view.report.surface import surface_data
-from mirrorskin.view.report.words import PIXELS, UNITS, Rows, map_rows, picture_texts, split_process
+from mirrorskin.view.report.words import PIXELS, Rows, map_rows, picture_texts, split_process, units_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -62,7 +63,7 @@ def contents_of(result: Result, name: str, section: Ends | None, turn: int | Non
         "provenance": _groups(provenance),
         "calibration": _calibration_of(result),
         "maps": map_rows(result),
-        "units": UNITS,
+        "units": units_of(result),
         "citation": _citation(name, result.process),
     }
     shown = {key: text for key, text in _HEADINGS.items() if key not in _NOT_ALWAYS or contents[key]}
@@ -79,10 +80,12 @@ def _surface_texts(result: Result, surface: Mapping[str, Any] | None) -> dict[st
     """Return the texts of the surface, and notes on what is not shown."""
     if surface is None:
         return {"notes": [_NO_HEIGHTS if result.height is None else _NO_SURFACE]}
-    notes = [f"{PIXELS} The surface is not in true proportions."] if surface["unit"] == "px" else []
+    unit, across = surface["unit_of_height"], surface["unit"]
+    notes = [PIXELS] if across == PIXEL else []
+    notes += ["The surface is not in true proportions."] if across != unit else []
     low, high = (f"{end:.3f}".replace("-", "\N{MINUS SIGN}") for end in surface["shown"])
-    about = f"Surface in space, from {low} to {high} mm high; the picture of heights below shows the same"
-    return {"notes": notes + _relative(result), "surface": about, "lowest": low, "highest": f"{high} mm"}
+    about = f"Surface in space, from {low} to {high} {unit} high; the picture of heights below shows the same"
+    return {"notes": notes + _relative(result), "surface": about, "lowest": low, "highest": f"{high} {unit}"}
 
 
 def _relative(result: Result) -> list[str]:
@@ -133,6 +136,7 @@ def _day(process: Mapping[str, object]) -> str:
 
 
 _UNITS = {"mm2": "mm²", "mm3": "mm³", "ml/m2": "ml/m²", "deg": "°"}
+_UNITS |= {"px2": "px²", "px3": "px³", "px3/px2": "px³/px²"}
 _DIGIT, _POINT = "\N{FIGURE SPACE}", "\N{PUNCTUATION SPACE}"
 
 

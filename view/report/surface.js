@@ -76,7 +76,7 @@ function placeOf(event) {
 
 // Show the coordinates of a point, or nothing.
 function tell(found) {
-  const words = [["x", data.unit], ["y", data.unit], ["z", "mm"]].map(([name, unit]) =>
+  const words = [["x", data.unit], ["y", data.unit], ["z", data.unit_of_height]].map(([name, unit]) =>
     found ? `${name} ${found[name].toFixed(3).replace("-", "\u2212")} ${unit}` : "");
   part("readout").textContent = [...words, found?.filled ? "filled" : ""].join(" \u2003").trim();
 }
@@ -159,7 +159,7 @@ function explain() {
   part("ramp").style.background = `linear-gradient(to right, ${data.colours.map(rgb).join(", ")})`;
   if (data.filled) part("filled").style.background = rgb(data.filled);
   ["width", "depth", "height"].forEach((name, k) => {
-    const size = view.box.size[k], unit = k === 2 ? "mm" : data.unit;
+    const size = view.box.size[k], unit = k === 2 ? data.unit_of_height : data.unit;
     part(name).textContent = `${unit === "px" ? Math.round(size) : size.toPrecision(3)} ${unit}`;
   });
 }

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io import Result, pixel_axes
-from mirrorskin.io.base.types import Floats
+from mirrorskin.io import Result
+from mirrorskin.io.base.types import Floats, axes_with_unit
 from mirrorskin.view.drawing.colours import FILLED_RGB, SEQUENTIAL, span
 
 MOST_EXAGGERATED = 20
@@ -31,12 +31,14 @@ def surface_data(result: Result) -> dict[str, Any] | None:
     heights = grid.height[grid.piece >= 0]
     if min(grid.height.shape) < 2 or not heights.size:
         return None
-    scaled = result.x is not None and result.y is not None
+    unit = result.declaration(result.name_of("height") or "height").unit
+    scaled = grid.unit == unit
     shown = span(heights)
     ideal = _RELIEF * max(np.ptp(grid.x), np.ptp(grid.y)) / max(shown[1] - shown[0], 1e-9)
     stretch, factor = (1.0, ideal) if scaled else (ideal, 1.0)
     return {
-        "unit": "mm" if scaled else "px",
+        "unit": grid.unit,
+        "unit_of_height": unit,
         "x": np.round(grid.x, 6).tolist(),
         "y": np.round(grid.y, 6).tolist(),
         **_encoded(grid, heights),
@@ -90,11 +92,13 @@ class Grid:
     x, y : ndarray, (n,) and (m,), float64
         Positions of the samples, mm or pixels from the picture's centre; y points up.
     height : ndarray, (m, n), float64
-        Millimetres; NaN in a hole.
+        NaN in a hole.
     piece : ndarray, (m, n), int64
         Number of the connected piece, from 0; -1 in a hole.
     filled : ndarray, (m, n), bool
         Where the height was not measured.
+    unit : str
+        Of x and y.
     """
 
     x: Floats
@@ -102,6 +106,7 @@ class Grid:
     height: Floats
     piece: NDArray[np.int64]
     filled: NDArray[np.bool_]
+    unit: str
 
 
 def sample(result: Result, limit: int = MOST) -> Grid:
@@ -115,7 +120,7 @@ def sample(result: Result, limit: int = MOST) -> Grid:
     assert result.height is not None
     answered = np.isfinite(result.height)
     rows, columns = (_reach(np.asarray(answered.any(axis=axis))) for axis in (1, 0))
-    y, x = _places(result)
+    x, y, unit = _places(result)
     kind_of, height = _kinds(result)[rows, columns], result.height[rows, columns].astype(np.float64)
     block = -(-height.shape[0] // limit), -(-height.shape[1] // limit)
     kind, mean = _averaged(_blocks(kind_of, block, _HOLE), _blocks(height, block, np.nan))
@@ -127,6 +132,7 @@ def sample(result: Result, limit: int = MOST) -> Grid:
         np.where(hole, np.nan, mean),
         np.where(hole, _HOLE, kind // 2),
         ~hole & (kind % 2 == 1),
+        unit,
     )
 
 
@@ -136,14 +142,13 @@ def _reach(answered: NDArray[np.bool_]) -> slice:
     return slice(int(where[0]), int(where[-1]) + 1)
 
 
-def _places(result: Result) -> tuple[Floats, Floats]:
-    """Return y and x of the pixels."""
+def _places(result: Result) -> tuple[Floats, Floats, str]:
+    """Return x and y of the pixels, and their unit."""
     if result.x is not None and result.y is not None:
-        return result.y, result.x
+        return result.x, result.y, "mm"
     assert result.height is not None
     rows, columns = result.height.shape
-    x, y = pixel_axes((rows, columns), (1.0, 1.0))
-    return y, x
+    return axes_with_unit((rows, columns), None)
 
 
 def _kinds(result: Result) -> NDArray[np.int64]:

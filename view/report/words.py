@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from mirrorskin.io.model.result import in_pixels
+
 if TYPE_CHECKING:
     from mirrorskin.io import Result
 
@@ -51,14 +53,22 @@ def map_rows(result: Result) -> list[tuple[str, str, str]]:
     return rows
 
 
-UNITS = (
-    "Lengths are in millimetres. x runs to the right and y up the picture, both from its centre to the "
+_LENGTHS = "Lengths are in millimetres."
+_LENGTHS_IN_PIXELS = "Lengths are in pixels, as the pixel size is unknown."
+_UNITS_OF_ALL = (
+    "{lengths} x runs to the right and y up the picture, both from its centre to the "
     "centres of the pixels; z runs towards the camera. Angles are radians in the file, and degrees in "
     "pictures.",
     "A pixel without an answer is NaN in the file and empty in pictures. Every uncertainty is a standard "
     "uncertainty (k = 1).",
 )
-"""Conventions for all numbers of a result."""
+
+
+def units_of(result: Result) -> tuple[str, ...]:
+    """Return the conventions for all numbers of a result."""
+    lengths = _LENGTHS_IN_PIXELS if in_pixels(result) else _LENGTHS
+    return tuple(text.format(lengths=lengths) for text in _UNITS_OF_ALL)
+
 
 PIXELS = "The pixel size of this result is unknown, so positions are in pixels from the centre."
 

@@ -125,7 +125,7 @@ def _stretch(axes: Axes, sheet: Sheet, profile: Section) -> str:
     scale = sheet.of_height.figure_scale
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     equal = apart(low, high) != (low, high)
-    if sheet.unit != "mm" or not finite.size:
+    if sheet.unit != sheet.of_height.unit or not finite.size:
         axes.margins(y=0.2)
         if equal:
             axes.set_ylim(*(scale * end for end in apart(low, high)))

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io import Result, pixel_axes, select_turn
-from mirrorskin.io.base.types import Floats
+from mirrorskin.io import Result, select_turn
+from mirrorskin.io.base.types import Floats, axes_with_unit
 from mirrorskin.io.base.units import numbers_with_unit
 from mirrorskin.io.model.maps import Map
 from mirrorskin.io.model.result import map_shape
@@ -88,7 +88,7 @@ def sheet_of(result: Result) -> Sheet:
     if result.x is not None and result.y is not None:
         return Sheet(result, result.x, result.y, "mm")
     rows, columns = map_shape(result)
-    return Sheet(result, *pixel_axes((rows, columns), (1.0, 1.0)), "px")
+    return Sheet(result, *axes_with_unit((rows, columns), None))
 
 
 def draw_map(axes: Axes, sheet: Sheet, values: NDArray[Any], label: str = "", **colours: Any) -> AxesImage:

@@ -157,7 +157,6 @@ BAD = {
     "normals: shape (4, 5)": {"normals": FLAT, "camera": CAMERA},
     "normals: shape (0, 5, 3)": {"normals": NORMALS[:0], "camera": CAMERA},
     "pixel_size 0.1: a camera determines it": {"normals": NORMALS, "camera": CAMERA, "pixel_size": 0.1},
-    "pixel_size is None": {"normals": NORMALS},
     "nothing to integrate": {"normals": -NORMALS, "camera": CAMERA},
     "known_heights: some are not above 0": {"normals": NORMALS, "camera": CAMERA, "known_heights": FLAT},
     "initial_heights: some are not": {"normals": NORMALS, "camera": CAMERA, "initial_heights": FLAT},

@@ -394,7 +394,6 @@ BAD = {
         **OF_RESULT,
         "dz_dx": {**NORMALS, "normals_sigma": MAP[:2, :3]},
     },
-    "normals has no pixel size: specify pixel_size, in mill": {**OF_RESULT, "pixel_size": None},
     "mask is for arrays: leave it out": {**OF_RESULT, "mask": np.ones((3, 4))},
     "dz_dx is for arrays: leave it out": {"dz_dy": None, "normals": NORMALS},
     "sigma is for arrays: leave it out": {**OF_RESULT, "sigma": False},
@@ -409,6 +408,16 @@ def test_bad_input_is_refused_in_one_line(message):
         engine.integrate(**options)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("arguments", [{"dz_dx": MAP, "dz_dy": MAP}, {"dz_dx": NORMALS}])
+def test_heights_without_a_pixel_size_are_in_pixels(arguments, tmp_path):
+    surface, scaled = (engine.integrate(**arguments, pixel_size=size) for size in (None, 0.1))
+    assert surface.x is None
+    io.save_result(surface, tmp_path / "surface.h5")
+    for result in (surface, io.open_result(tmp_path / "surface.h5")):
+        assert [result.declaration(name).unit for name in ("height", "height_sigma")] == ["px", "px"]
+    np.testing.assert_allclose(0.1 * surface.height, scaled.height, atol=1e-6)
 
 
 # One call after the other, and frame after frame.

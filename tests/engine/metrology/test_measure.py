@@ -5,6 +5,8 @@ import pytest
 from height_maps import cap, places, result_of
 
 from mirrorskin import engine, io
+from mirrorskin.engine import metrology
+from mirrorskin.io.model.maps import IN_PIXELS
 
 NAN = np.nan
 SHAPE, SIZE = (211, 207), (0.03, 0.03)
@@ -323,3 +325,44 @@ def test_what_cannot_be_measured_is_refused_in_a_line(ball):
         assert "\n" not in str(caught.value)
     with pytest.raises(io.InputError, match="no sphere fits"):
         engine.measure(result_of(np.zeros((9, 9))), form="sphere")
+
+
+@pytest.fixture(scope="module")
+def ball_in_pixels(ball):
+    """The cap of a picture whose pixel size is unknown."""
+    maps = {name: np.asarray(ball[name]) / np.float32(SIZE[0]) for name in ("height", "height_sigma")}
+    return io.Result(maps, declarations=IN_PIXELS)
+
+
+def test_lengths_are_in_pixels_where_the_pixel_size_is_unknown(ball, ball_in_pixels):
+    along, scaled = (engine.measure(result).quantities for result in (ball_in_pixels, ball))
+    assert {quantity.unit for quantity in along.values()} == {"px", "px2", "px3", "px3/px2", "", "deg", "%"}
+    assert along["sphere radius"].value == pytest.approx(RADIUS / SIZE[0], rel=1e-5)
+    assert along["measured area"].value == pytest.approx(scaled["measured area"].value / SIZE[0] ** 2)
+    assert metrology.Quantity(20.0, 1.0, "ml/m2").in_pixels().value == pytest.approx(0.02)  # 20 µm
+
+
+def test_a_pixel_size_turns_pixels_into_millimetres(ball, ball_in_pixels):
+    measured = values(ball_in_pixels, pixel_size=SIZE[0])
+    assert measured["sphere radius"] == pytest.approx(values(ball)["sphere radius"], rel=1e-5)
+    with pytest.raises(io.InputError, match="square pixels"):
+        engine.measure(ball_in_pixels, pixel_size=(0.03, 0.04))
+
+
+@pytest.mark.parametrize(
+    ("name", "length"),
+    [("l_filter", 0.8), ("section", ((0, 0), (1, 0))), ("mask", [metrology.Levels(above=0.0)])],
+)
+def test_lengths_in_millimetres_are_refused_where_the_pixel_size_is_unknown(ball_in_pixels, name, length):
+    with pytest.raises(io.InputError, match=f"{name} is in mm, and the heights are in pixels"):
+        engine.measure(ball_in_pixels, **{name: length})
+
+
+def test_a_table_has_lengths_in_one_unit(ball, ball_in_pixels):
+    table = metrology.table({"first": ball_in_pixels, "second": ball})
+    assert table.unit("highest point") == "px"
+    assert "lengths are in mm, those of the results before in px" in table.rows[1].problem
+    whole = metrology.table({"first": ball_in_pixels, "second": ball}, pixel_size=SIZE[0])
+    assert [row.problem for row in whole.rows] == ["", ""]
+    with pytest.raises(io.InputError, match="px and mm"):
+        metrology.subtract(ball_in_pixels, ball)
