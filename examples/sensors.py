@@ -46,5 +46,5 @@ def compare(thing, title, size, pixel_size, step, *, surface=False):
     view.height_figure(results, truths[0], title, Path(f"{thing}.png"), surface=surface)
 
 
-compare("sphere", "A ball of 10 mm with four sensors, 30 x 0.1 mm", 160, 0.075, 0.1, surface=True)
-compare("coin", "A 5 yen coin with four sensors, 30 x 0.12 mm", 160, 0.164, 0.12)
+compare("sphere", "Ball, 10 mm in diameter, 30 steps of 0.1 mm, four sensors", 160, 0.075, 0.1, surface=True)
+compare("coin", "5 yen coin, 22 mm in diameter, 30 steps of 0.12 mm, four sensors", 160, 0.164, 0.12)

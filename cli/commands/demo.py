@@ -15,7 +15,7 @@ import click
 from mirrorskin.cli import options
 from mirrorskin.cli.commands.simulate import make_twin, preset, record
 from mirrorskin.cli.groups import Option
-from mirrorskin.cli.output import make_folder, print_json, print_table, progress
+from mirrorskin.cli.output import make_folder, print_json, print_table, printable, progress
 
 if TYPE_CHECKING:
     from mirrorskin import io
@@ -40,19 +40,30 @@ class Press:
 _CAMERA = "--noise 1 --electrons 40 --gain-deviation 0.02 --offset-deviation 0.5 --point-spread 0.5"
 PRESSES = {
     "fig5": Press(
-        "Fig. 5: sphere, 10 mm, 30 x 0.1 mm",
+        "Fig. 5: ball, 10 mm in diameter, pressed in 30 steps of 0.1 mm",
         f"vertical {_CAMERA} --size 240x240 --pixel-size 0.05mm --frames 30 --travel-step 0.1mm"
         " --travel-start 0.1mm",
         surface=True,
     ),
     "fig6": Press(
-        "Fig. 6: 5 yen coin, 22 mm, 90 x 0.02 mm",
+        "Fig. 6: 5 yen coin, 22 mm in diameter, pressed in 90 steps of 0.02 mm",
         f"vertical {_CAMERA} --object coin --size 640x640 --pixel-size 0.041mm --frames 90"
         " --travel-step 0.02mm --travel-start 0.02mm",
-        detail=(-0.3, 0.02),
+        detail=(-0.3, 0.0),
     ),
 }
-_TURN_TITLE = "Fig. 10 (a): sphere, 10 mm, 8 x 45 deg"
+LABELS = {
+    "sub-frame": "onset between frames",
+    "eq. 4": "first bright frame (eq. 4)",
+    "paper": "paper's method",
+    "exact": "maximum likelihood",
+    "exact, registered": "as b, frames registered",
+    "rotation, registered": "rotation (frames registered)",
+}
+"""Names in figures of methods whose names in tables are short."""
+_HEIGHTS_TITLE = "Fig. 10 (b): ball, 10 mm in diameter, integrated from the normals of a rotation"
+_FUSED_TITLE = "Fig. 5 and Fig. 10 fused: ball, 10 mm in diameter, from a press and a rotation"
+_TURN_TITLE = "Fig. 10 (a): normals of a ball, 10 mm in diameter, from 8 frames of a turn at a tilt of 2.5°"
 TURN = (
     f"axial {_CAMERA} --size 240x240 --pixel-size 0.05mm --pattern linear --references exact"
     " --frames 8 --press 1.5mm --tilt 2.5deg"
@@ -104,12 +115,12 @@ def command(
     scores: dict[str, Scores] = {}
     with _drawing() as draw:
         for number, (name, press) in enumerate(PRESSES.items(), 1):
-            _announce(number, press.title)
+            _announce(f"{number} of {_STEPS}: {press.title}")
             scores[name] = _press(name, press, output, device, overwrite, draw)
-        _announce(_STEPS - 1, _TURN_TITLE)
+        _announce(f"{_STEPS - 1} of {_STEPS}: {_TURN_TITLE}")
         truth, results = _turn(output, device, overwrite, draw)
         scores[_TURN] = _judge(results, truth)
-        _announce(_STEPS, "a press and a rotation, fused")
+        _announce(f"{_STEPS} of {_STEPS}: {_FUSED_TITLE}")
         scores |= _surfaces(results, truth, output, device, overwrite, draw)
     if as_json:
         print_json(scores)
@@ -120,8 +131,13 @@ def command(
     click.echo(f"recordings, results and figures are in {output}: look at {output / 'fig5.png'}")
 
 
-def _announce(number: int, title: str) -> None:
-    click.echo(f"{number} of {_STEPS}: {title}", err=True)
+def _announce(step: str) -> None:
+    click.echo(printable(step), err=True)
+
+
+def _named(results: Results) -> Results:
+    """Return results by their names in figures."""
+    return {LABELS.get(name, name): result for name, result in results.items()}
 
 
 @contextmanager
@@ -130,13 +146,16 @@ def _drawing() -> Iterator[Draw]:
     with warnings.catch_warnings(), ThreadPoolExecutor(max_workers=1) as thread:
         # Set here because threads share the filters: a thread that restores them removes those of another.
         warnings.filterwarnings("ignore", "Non-empty compiler output")
-        figures = []
+        figures = {}
 
-        def draw(figure: Callable[..., None], *arguments: Any, **options: Any) -> None:
-            figures.append(thread.submit(figure, *arguments, **options))
+        def draw(
+            draw_figure: Draw, results: Results, truth: io.Truth, title: str, path: Path, **style: Any
+        ) -> None:
+            figures[path] = thread.submit(draw_figure, _named(results), truth, title, path, **style)
 
         yield draw
-        for figure in figures:
+        for path, figure in figures.items():
+            _announce(f"  drawing {path.name}")
             figure.result()
 
 
@@ -148,7 +167,10 @@ def _press(name: str, press: Press, folder: Path, device: str | None, overwrite:
     truth = _record(press.line, path, device, overwrite)
     results: Results = {}
     with io.open_recording(path) as recording:
+        assert recording.travel is not None
+        first_travel = float(recording.travel[0])
         for method, subframe in (("sub-frame", True), ("eq. 4", False)):
+            _announce(f"  reconstructing heights: {LABELS[method]}")
             with progress("reconstructing", recording.shape[0]) as show:
                 results[method] = engine.reconstruct(
                     recording, subframe=subframe, device=device, progress=show
@@ -160,6 +182,7 @@ def _press(name: str, press: Press, folder: Path, device: str | None, overwrite:
         *(results, truth, press.title, figure),
         surface=press.surface,
         detail=press.detail,
+        first_travel=first_travel,
     )
     return _judge(results, truth)
 
@@ -173,6 +196,7 @@ def _turn(folder: Path, device: str | None, overwrite: bool, draw: Draw) -> tupl
     results: Results = {}
     with io.open_recording(path) as recording:
         for name, (method, registered) in _METHODS.items():
+            _announce(f"  reconstructing normals: {name}")
             heights = truth.height if registered else None
             results[name] = engine.reconstruct(recording, method=method, heights=heights, device=device)
             target = folder / f"{_TURN}-{name.replace(', ', '-')}-result.h5"
@@ -188,15 +212,13 @@ def _surfaces(
     from mirrorskin import io, view
 
     rotation = {"rotation, registered": turned["exact, registered"], "rotation": turned["exact"]}
-    title = "Fig. 10 (b): sphere, 10 mm, integrated from its normals"
-    draw(view.surface_figure, rotation, truth, title, folder / "fig10b.png")
+    draw(view.surface_figure, rotation, truth, _HEIGHTS_TITLE, folder / "fig10b.png")
     fused = {
         "press": io.open_result(folder / f"{_FUSED_PRESS}-result.h5"),
         "rotation": turned["exact"],
         "press and rotation": _fuse(folder, device, overwrite),
     }
-    title = "Fig. 5 and Fig. 10 fused: sphere, 10 mm, from a press and a rotation"
-    draw(view.surface_figure, fused, truth, title, folder / "fused.png")
+    draw(view.surface_figure, fused, truth, _FUSED_TITLE, folder / "fused.png")
     judged = {name: result for name, result in fused.items() if name != "rotation"}  # that is in fig10b
     return {"fig10b": _judge(rotation, truth), "fused": _judge(judged, truth)}
 
@@ -206,6 +228,7 @@ def _fuse(folder: Path, device: str | None, overwrite: bool) -> io.Result:
     from mirrorskin import engine, io
     from mirrorskin.engine.fusion.fusion import frames_to_read
 
+    _announce("  fusing the press and the rotation")
     with (
         io.open_recording(folder / f"{_FUSED_PRESS}.h5") as vertical,
         io.open_recording(folder / f"{_TURN}.h5") as axial,
@@ -218,6 +241,7 @@ def _fuse(folder: Path, device: str | None, overwrite: bool) -> io.Result:
 
 def _record(line: str, path: Path, device: str | None, overwrite: bool) -> io.Truth:
     """Record a preset; return the truth."""
+    _announce(f"  simulating the sensor: {path.name}")
     motion, values = preset(line)
     twin = make_twin(motion, values, device=device)
     record(twin, path, overwrite)

@@ -25,7 +25,7 @@ SIGMA = "_sigma"
 LONGEST_DECLARATION = 60_000
 """Limit of the size of a declaration in a file: attributes in HDF5 have at most 64 kB."""
 
-FILLED_SHADES = "#331a00", "#ffb266"
+FILLED_SHADES = "#cc5500", "#ffdcb8"
 """Shades of orange of heights that were not measured but filled, from the lowest to the highest height."""
 
 Axes = Literal["pixels", "frames", "pieces", "none"]

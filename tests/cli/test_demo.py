@@ -45,7 +45,13 @@ def shown(tmp_path_factory):
         patch.setattr(canvas, "_DPI", 40)
         ended = run("demo -o", folder)
     assert ended.code == 0, ended.said
-    assert [step.split(":")[0] for step in ended.said.splitlines()] == [f"{n} of 4" for n in range(1, 5)]
+    steps = ended.said.splitlines()
+    assert [step.split(":")[0] for step in steps if step[0] != " "] == [f"{n} of 4" for n in range(1, 5)]
+    assert [step for step in steps if "simulating" in step] == [
+        f"  simulating the sensor: {name}.h5" for name in ("fig5", "fig6", "fig10a")
+    ]
+    assert len([step for step in steps if "reconstructing" in step]) == 2 * len(PRESSED) + len(TURNED)
+    assert steps[-len(FIGURES) :] == [f"  drawing {name}.png" for name in FIGURES]
     return ended.out.splitlines(), folder
 
 

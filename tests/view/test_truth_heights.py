@@ -1,5 +1,7 @@
 """Figures of heights are drawn, and errors state which maps are missing."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -33,10 +35,38 @@ def truth_of(height):
     return io.Truth(height, *(np.zeros_like(height) for _ in range(2)), np.ones(height.shape, np.uint8))
 
 
+def figure_of(results, truth, **options):
+    """Draw a figure, and return it."""
+    kept = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(heights, "save_figure", lambda figure, title, path, resolution: kept.append(figure))
+        view.height_figure(results, truth, "title", Path("a.png"), **options)
+    return kept[0]
+
+
 def draw(results, truth, surface=False):
-    """Draw a figure; return the axes of the whole, and those of the cuts."""
-    figure = heights._draw_heights(results, truth, surface)
-    return figure.axes[0], next(axes for axes in figure.axes if "cut" in axes.get_title())
+    """Draw a figure; return the axes of the first whole, and those of the section."""
+    figure = figure_of(results, truth, surface=surface)
+    return figure.axes[0], panel(figure, "section")
+
+
+def title_of(axes):
+    """Return the title of a panel without its letter."""
+    return axes.get_title("left").partition("  ")[2]
+
+
+def note_of(axes):
+    """Return the note below the title of a panel."""
+    return axes.texts[0].get_text()
+
+
+def panel(figure, title):
+    return next(axes for axes in figure.axes if title_of(axes) == title)
+
+
+def legend_of(figure):
+    (legend,) = figure.legends
+    return [text.get_text() for text in legend.get_texts()]
 
 
 @pytest.fixture
@@ -117,11 +147,10 @@ def test_the_first_map_is_as_the_picture_does():
 @pytest.mark.parametrize("count", [1, 4])
 def test_the_first_and_the_last_are_drawn_as_a_whole(surfaces, surface, count):
     results = {f"sensor {k}": result_of(slope() - np.float32(0.1 * k)) for k in range(count)}
-    figure = heights._draw_heights(results, truth_of(slope()), surface)
-    wholes = [axes for axes in figure.axes if axes.get_title().startswith("sensor")]
-    names = [axes.get_title().split("\n")[0].removesuffix(" (mm)") for axes in wholes]
+    figure = figure_of(results, truth_of(slope()), surface=surface)
+    wholes = [axes for axes in figure.axes if title_of(axes).startswith("sensor")]
     expected = ["sensor 0"] if count == 1 else ["sensor 0", f"sensor {count - 1}"]
-    assert names == expected
+    assert [title_of(axes) for axes in wholes] == expected
     drawn = surfaces if surface else [axes.get_images()[0].get_array() for axes in wholes]
     for name, shown in zip(expected, drawn, strict=True):
         height = results[name].height
@@ -170,7 +199,8 @@ def test_all_results_are_cut_across_the_middle_against_the_truth(surface):
         expected = truth if name == "truth" else results[name].height
         np.testing.assert_array_equal(line.get_ydata(), expected[10])
     assert len({to_rgb(line.get_color()) for line in lines.values()}) == len(lines)
-    assert [text.get_text() for text in right.get_legend().get_texts()] == list(lines)
+    named = {text.partition(":")[0] for text in legend_of(right.figure)}
+    assert named == set(lines)
     lowest, highest = right.get_ylim()
     assert lowest < min(result.height.min() for result in results.values())
     assert highest > 0
@@ -195,9 +225,9 @@ def test_what_was_filled_is_orange_on_a_map_and_as_bright_as_it_is_high():
     height = slope()
     plain, _ = draw({"a": result_of(height, filled=np.zeros(height.shape, np.uint8))}, truth_of(height))
     assert len(plain.get_images()) == 1
-    assert "filled" not in plain.get_title()
+    assert "filled" not in note_of(plain)
     axes, _ = draw({"a": result_of(height, filled=filled_in())}, truth_of(height))
-    assert "orange: filled" in axes.get_title()
+    assert note_of(axes) == "filled: 4 %"  # 25 of 600
     grey, orange = axes.get_images()
     for picture, part in ((grey, filled_in() == 0), (orange, filled_in() == 1)):
         shown = np.ma.filled(picture.get_array(), np.nan)
@@ -208,53 +238,99 @@ def test_what_was_filled_is_orange_on_a_map_and_as_bright_as_it_is_high():
     colours = orange.cmap(orange.norm(np.linspace(height.min(), height.max(), 9)))[:, :3]
     assert np.all(colours[:, 0] - colours[:, 2] > 0.15)  # red above blue at any height
     assert np.all(np.diff(colours.sum(axis=1)) > 0)
+    bars = [bar.texts[0].get_text() for bar in axes.child_axes]
+    assert bars == ["measured", "filled"]
 
 
 def test_a_surface_is_shown_as_measured_and_then_filled_in_a_colour_of_its_own(surfaces, styles):
     height = slope()
-    figure = heights._draw_heights({"a": result_of(height, filled=filled_in())}, truth_of(height), True)
-    measured, closed = figure.axes[:2]
+    result = result_of(height, filled=filled_in())
+    measured, closed = figure_of({"a": result}, truth_of(height), surface=True).axes[:2]
     np.testing.assert_array_equal(np.isnan(surfaces[0][2]), filled_in() == 1)
     np.testing.assert_array_equal(surfaces[1][2], height)
-    orange = np.all(styles[1]["facecolors"][..., :3] == to_rgb("tab:orange"), axis=-1)
-    np.testing.assert_array_equal(orange, filled_in() == 1)
-    assert "filled" not in measured.get_title()
-    assert "orange: filled, 4 % of the heights" in closed.get_title()  # 25 of 600
+    red, green, blue, _ = np.moveaxis(styles[1]["facecolors"], -1, 0)
+    np.testing.assert_array_equal((red > green + 0.1) & (green > blue), filled_in() == 1)
+    assert [title_of(axes) for axes in (measured, closed)] == ["a", "the same, holes filled"]
+    assert "holes: no answer" in note_of(measured)
+    assert "holes" not in note_of(closed)
 
 
-def test_surfaces_share_a_vertical_scale_that_holds_all_of_them():
-    deep = slope().copy()
+def test_a_surface_has_labels_with_units_and_states_its_scale():
+    figure = figure_of({"a": result_of(slope())}, truth_of(slope()), surface=True)
+    axes = figure.axes[0]
+    assert [axis.get_label_text() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)] == [
+        f"{name} (mm)" for name in "xyz"
+    ]
+    assert note_of(axes) == "heights stretched 5 times"  # 0.3 mm of 4 mm
+    low, high = axes.get_zlim()
+    _, length, depth = axes._box_aspect
+    assert depth / length == pytest.approx(5 * (high - low) / np.ptp(axes.get_ylim()))
+
+
+def test_surfaces_share_a_vertical_scale_that_holds_all_but_outliers():
+    deep = np.asarray(slope() - np.float32(0.2))
     deep[3, 4] = -7
-    figure = heights._draw_heights({"a": result_of(slope()), "b": result_of(deep)}, truth_of(slope()), True)
-    panel, other = (axes.get_zlim() for axes in figure.axes if isinstance(axes, Axes3D))
-    assert panel == other
-    assert panel[0] <= -7
-    assert panel[1] >= 0
+    results = {"a": result_of(slope()), "b": result_of(deep)}
+    figure = figure_of(results, truth_of(slope()), surface=True)
+    first, last = (axes for axes in figure.axes if isinstance(axes, Axes3D))
+    assert first.get_zlim() == last.get_zlim()
+    assert first.get_zlim()[0] == pytest.approx(slope().min() - 0.2)
+    assert first.get_zlim()[1] >= 0
+    assert "1 px below the axis" in note_of(last)
+    assert "axis" not in note_of(first)
 
 
 def test_a_detail_has_a_scale_of_its_own():
     height = slope()
-    figure = heights._draw_heights({"a": result_of(height)}, truth_of(height), False, (-0.1, 0.02))
-    panels = [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
-    whole, _, part, profile = panels
-    assert whole.get_images()[0].norm.vmin < -0.25
-    assert (part.get_images()[0].norm.vmin, part.get_images()[0].norm.vmax) == (-0.1, 0.02)
-    assert profile.get_ylim() == (-0.1, 0.02)
+    figure = figure_of({"a": result_of(height)}, truth_of(height), detail=(-0.1, 0.0))
+    norm = figure.axes[0].get_images()[0].norm
+    assert (norm.vmin, norm.vmax) == (-0.1, 0.0)
+    assert panel(figure, "section").get_ylim()[0] < -0.3
+    low, high = panel(figure, "section, enlarged").get_ylim()
+    assert low == -0.1
+    assert 0 < high < 0.02
+
+
+@KINDS
+def test_the_first_frame_of_a_press_is_marked(surface):
+    figure = figure_of({"a": result_of(slope())}, truth_of(slope()), surface=surface, first_travel=0.02)
+    (line,) = [line for line in panel(figure, "section").get_lines() if line.get_linestyle() == ":"]
+    np.testing.assert_array_equal(line.get_ydata(), -0.02)
+    assert "first frame, at 0.02 mm: nothing higher is measured" in legend_of(figure)
+
+
+def test_errors_of_maps_share_a_scale_and_state_their_rms():
+    results = {"a": result_of(slope() + np.float32(0.002)), "b": result_of(slope() - np.float32(0.004))}
+    figure = figure_of(results, truth_of(slope()))
+    first, last = panel(figure, "error of a"), panel(figure, "error of b")
+    assert first.get_images()[0].norm.vmax == last.get_images()[0].norm.vmax == pytest.approx(4, rel=1e-3)
+    assert (note_of(first), note_of(last)) == ("RMS 2 \N{MICRO SIGN}m", "RMS 4 \N{MICRO SIGN}m")
+    assert "b: RMS error 4 \N{MICRO SIGN}m" in legend_of(figure)
+
+
+def test_a_figure_shows_the_part_of_the_field_with_heights():
+    height = np.where(filled_in() == 1, slope(), np.float32(np.nan))
+    axes, section = draw({"a": result_of(height)}, truth_of(slope()))
+    x, y = io.pixel_axes(height.shape, (0.1, 0.2))
+    left, right = axes.get_xlim()
+    assert x[8] < left < x[9]
+    assert x[15] < right < x[16]
+    assert section.get_xlim() == (left, right)
+    assert axes.get_ylim()[0] < y[12] < y[8] < axes.get_ylim()[1]
 
 
 @KINDS
 def test_what_was_filled_is_open_on_the_cut(surface):
     height = slope()
     _, right = draw({"a": result_of(height, filled=filled_in())}, truth_of(height), surface)
-    _, measured, filled = right.get_lines()
+    _, measured, filled = right.get_lines()[:3]
     inside = filled_in()[10] == 1
     np.testing.assert_array_equal(np.isnan(measured.get_ydata()), inside)
     np.testing.assert_array_equal(np.isnan(filled.get_ydata()), ~inside)
     np.testing.assert_array_equal(filled.get_ydata()[inside], height[10][inside])
     assert filled.get_markerfacecolor() == "none"
     assert filled.get_color() == measured.get_color()
-    assert "filled" in right.get_title()
-    assert [text.get_text() for text in right.get_legend().get_texts()] == ["truth", "a"]
+    assert "open: filled" in legend_of(right.figure)
 
 
 def test_components_that_know_no_height_are_moved_to_the_truth_and_the_others_are_not():
@@ -273,8 +349,8 @@ def test_components_that_know_no_height_are_moved_to_the_truth_and_the_others_ar
     expected = np.where(component < 0, np.nan, truth + (component == 0))
     np.testing.assert_allclose(shown, expected, atol=1e-6)
     np.testing.assert_array_equal(result.height, kept)
-    assert "truth's level" in axes.get_title()
+    assert "mean height set to the true one" in note_of(axes)
     moved = result_of(kept, component=component, offset_unknown=np.zeros(3, np.uint8))
     axes, _ = draw({"a": moved}, truth_of(truth))
     np.testing.assert_array_equal(np.ma.filled(axes.get_images()[0].get_array(), np.nan), kept)
-    assert "level" not in axes.get_title()
+    assert "mean height" not in note_of(axes)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -24,10 +26,23 @@ def truth():
     return io.Truth(TRUE, np.zeros_like(TRUE), np.zeros_like(TRUE), np.ones(SHAPE, np.uint8))
 
 
+def figure_of(results):
+    """Draw a figure, and return it."""
+    kept = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surfaces, "save_figure", lambda figure, title, path, resolution: kept.append(figure))
+        view.surface_figure(results, truth(), "title", Path("a.png"))
+    return kept[0]
+
+
 def drawn(results):
-    """Draw; return the axes of the surface, the map, the errors, the cuts and their errors."""
-    figure = surfaces._draw_surfaces(results, truth())
-    return [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
+    """Draw; return the axes of the surface, the map, the errors, the sections and their errors."""
+    return [axes for axes in figure_of(results).axes if axes.get_label() != "<colorbar>"]
+
+
+def note_of(axes):
+    """Return the note below the title of a panel."""
+    return axes.texts[0].get_text()
 
 
 def shown(axes):
@@ -41,8 +56,8 @@ def test_a_surface_becomes_a_picture(tmp_path):
 
 def test_the_last_is_drawn_as_a_whole_and_all_are_cut():
     whole, last_whole, errors, cuts, below = drawn({"first": result_of(5), "last": result_of(2)})
-    assert whole.get_title().startswith("last")
-    assert last_whole.get_title().startswith("last")
+    assert whole.get_title("left") == "a  last"
+    assert last_whole.get_title("left") == "b  height"
     np.testing.assert_array_equal(shown(last_whole), result_of(2).height)
     np.testing.assert_allclose(shown(errors), 2, atol=1e-3)
     assert [line.get_label() for line in cuts.get_lines()] == ["truth", "first", "last"]
@@ -62,7 +77,7 @@ def test_red_is_too_high_and_the_title_contains_the_rms():
     assert red[0] > red[2]
     assert blue[2] > blue[0]
     assert picture.norm.vmin == -picture.norm.vmax
-    assert "RMS 3.0 \N{MICRO SIGN}m" in errors.get_title()
+    assert "RMS 3 \N{MICRO SIGN}m" in note_of(errors)
 
 
 def test_errors_of_what_was_filled_are_framed_and_open():
@@ -74,7 +89,7 @@ def test_errors_of_what_was_filled_are_framed_and_open():
     x, y = io.pixel_axes(SHAPE, (0.1, 0.1))
     np.testing.assert_allclose(corners[:, 0].min(), x[10], atol=0.06)
     np.testing.assert_allclose(corners[:, 1].max(), y[8], atol=0.06)
-    assert "orange: round what was filled" in errors.get_title()
+    assert "filled 1 \N{MICRO SIGN}m (outlined)" in note_of(errors)
     for axes in (cuts, below):
         inside = axes.get_lines()[2].get_ydata()
         np.testing.assert_array_equal(np.isfinite(inside), filled[10] == 1)
@@ -91,7 +106,7 @@ def test_a_surface_without_any_answer_is_shown_as_such(tmp_path):
     nothing = result_of(np.nan)
     view.surface_figure({"a": nothing}, truth(), "title", tmp_path / "a.png")
     _, _, errors, _, _ = drawn({"a": nothing})
-    assert "no pixel answered" in errors.get_title()
+    assert "no pixel answered" in note_of(errors)
 
 
 def test_what_cannot_be_drawn_is_refused(tmp_path):

@@ -69,17 +69,22 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def save_figure(figure: Figure, title: str, path: Path) -> None:
+def save_figure(figure: Figure, title: str, path: Path, resolution: float = 1.0) -> None:
     """Write a figure with its title, or raise InputError; see `write_figure`."""
     figure.suptitle(title, x=0.02, ha="left", weight="bold")
-    write_figure(figure, path)
+    write_figure(figure, path, resolution)
 
 
-def write_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, PDF or SVG, which appears complete or not at all, or raise InputError."""
+def write_figure(figure: Figure, path: Path, resolution: float = 1.0) -> None:
+    """Write a figure as PNG, PDF or SVG, which appears complete or not at all, or raise InputError.
+
+    The resolution of pixels is relative to that of other figures.
+    """
     suffix = path.suffix.lower()
     drawn = (
-        encode_figure(figure, _DPI) if suffix == ".png" else _encode_lines(figure, suffix.removeprefix("."))
+        encode_figure(figure, resolution * _DPI)
+        if suffix == ".png"
+        else _encode_lines(figure, suffix.removeprefix("."))
     )
     write_new(path, [drawn])
 

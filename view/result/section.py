@@ -51,7 +51,7 @@ def draw_section(axes: Axes, sheet: Sheet, profile: Section) -> None:
         width, unit = sheet.height_text(_TIMES * float(np.nanmedian(profile.sigma))).split(" ", 1)
         label = f"± {_TIMES} sigma: {float(width):.2g} {unit}"
         axes.fill_between(profile.distance, *band, color="tab:blue", alpha=0.25, lw=0, label=label)
-    stretched = _stretch(axes, sheet, profile)
+    note = _stretch(axes, sheet, profile)
     for name, end in (("A", 0), ("B", 1)):
         axes.annotate(
             name,
@@ -70,7 +70,7 @@ def draw_section(axes: Axes, sheet: Sheet, profile: Section) -> None:
     axes.grid(alpha=0.3)
     if np.isfinite(profile.height).any():
         axes.legend(fontsize=SMALL, **BESIDE)
-    entitle(axes, "Section", f"{_ends(profile, sheet.unit)}{stretched}")
+    entitle(axes, "Section", f"{_ends(profile, sheet.unit)}{note}")
 
 
 def _joined(height: Floats, filled: NDArray[np.bool_]) -> Floats:
@@ -134,9 +134,14 @@ def _stretch(axes: Axes, sheet: Sheet, profile: Section) -> str:
     half = BOX * length / times / 2
     middle = (low + high) / 2
     axes.set_ylim(scale * (middle - half), scale * (middle + half))
+    return f"; {stretched(times)}"
+
+
+def stretched(times: float) -> str:
+    """Return a vertical exaggeration as text."""
     if times == 1:
-        return "; true to scale"
-    return f"; heights stretched {times:g} times" if times > 1 else f"; heights shrunk {1 / times:g} times"
+        return "true to scale"
+    return f"heights stretched {times:g} times" if times > 1 else f"heights shrunk {1 / times:g} times"
 
 
 def _ends(profile: Section, unit: str) -> str:

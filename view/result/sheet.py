@@ -113,14 +113,14 @@ def lay_out(axes: Axes, sheet: Sheet) -> None:
         scales.yaxis.label.set_fontsize(TEXT)
 
 
-def entitle(axes: Axes, title: str, note: str = "") -> None:
-    """Add a title to a panel, and a note in smaller letters below it."""
+def entitle(axes: Axes, title: str, note: str = "", top: float = 1.0) -> None:
+    """Add a title to a panel, and a note in smaller letters below it, above a height of the panel."""
     # Without y, Matplotlib measures all tick labels to place the title.
-    axes.set_title(title, loc="left", y=1.0, fontsize=TITLE, weight="bold", pad=18, parse_math=False)
+    axes.set_title(title, loc="left", y=top, fontsize=TITLE, weight="bold", pad=18, parse_math=False)
     axes.set_anchor("NW")  # aligns the titles of a row
     axes.annotate(
         note,
-        (0, 1),
+        (0, top),
         (0, 5),
         "axes fraction",
         textcoords="offset points",
