@@ -43,6 +43,7 @@ _BETTER = 0.95  # chi square, relative to that of starts that are preferred, bel
 _OTHER = 3.0  # pixels by which motions differ
 _GOOD = 1.3  # typical chi square below which no further start is tried
 _NONE = np.zeros((6, 0))
+_NO_LIMIT = 1e30
 _MAX_STEP = 0.35  # longest step, relative to the object's size
 
 
@@ -60,8 +61,8 @@ class Equations:
         Chi square per degree of freedom; `compared` is their number.
     """
 
-    def __init__(self, sums: NDArray[np.float32], size: float, unbiased: bool) -> None:
-        self._scale, self._sums = _scale_of(size), sums
+    def __init__(self, sums: NDArray[np.floating], size: float, unbiased: bool) -> None:
+        self._scale, self._sums, self._size, self._unbiased = _scale_of(size), sums, size, unbiased
         upper, right, chi, expected, heights, normals, *products = _split(sums.sum(axis=0, dtype=np.float64))
         self.normal_matrix: NDArray[Any] = _symmetric(upper, self._scale)
         self.unbiased: NDArray[Any] = self.normal_matrix
@@ -71,6 +72,16 @@ class Equations:
         self.pixels: float = max(float(normals[0]), float(heights[0]))
         self.compared: float = float(expected[0])
         self.chi_square: float = float(chi[0]) / max(self.compared, 1e-9)
+
+    def after(self, step: Doubles) -> Equations:
+        """Return the sums after a step, (6,), for residuals that are linear in it."""
+        sums = self._sums.astype(np.float64)
+        upper, right, chi, *_ = _split(sums)
+        step = step * self._scale
+        added = upper[:, _UPPER] @ step
+        chi += ((2 * right + added) @ step)[:, np.newaxis]
+        right += added
+        return Equations(sums, self._size, self._unbiased)
 
     @cached_property
     def typical(self) -> float:
@@ -143,17 +154,28 @@ class PairFit:
         self.first, self.second, self.device = first, second, device
         self._arrays: dict[tuple[int, ...], tuple[Array, Array]] = {}  # poses and sums, by the sums' shape
 
-    def equations(self, motion: Motion, unbiased: bool = False, step: int = 1) -> Equations:
-        """Return the sums at a motion."""
-        return Equations(self._sums([motion], unbiased, step)[0], self.second.extent.size, unbiased)
+    def after(self, first: PoseMap) -> PairFit:
+        """Return the fit of another first map to the same second one, which uses the same memory."""
+        fit = PairFit(first, self.second, self.device)
+        fit._arrays = self._arrays
+        return fit
 
-    def _sums(self, motions: Sequence[Motion], unbiased: bool = False, step: int = 1) -> NDArray[np.float32]:
+    def equations(
+        self, motion: Motion, unbiased: bool = False, step: int = 1, limit: float = _NO_LIMIT
+    ) -> Equations:
+        """Return the sums at a motion, without pixels whose chi square is above a limit."""
+        return Equations(self._sums([motion], unbiased, step, limit)[0], self.second.extent.size, unbiased)
+
+    def _sums(
+        self, motions: Sequence[Motion], unbiased: bool = False, step: int = 1, limit: float = _NO_LIMIT
+    ) -> NDArray[np.float32]:
         """Return the sums of each block at each motion, (n, blocks, numbers); J'WK only if ``unbiased``."""
         first, second = self.first, self.second
         rows, columns = first.shape
         side = BLOCK * step
         blocks = -(-rows // side) * -(-columns // side)
-        maps = *second.extent.middle, *first.grid, *second.grid, first.flat_limit, second.flat_limit
+        limits = first.flat_limit, second.flat_limit, limit
+        maps = *second.extent.middle, *first.grid, *second.grid, *limits
         rows_of_poses = [[*motion.turn.ravel(), *motion.shift, *maps] for motion in motions]
         shape = len(motions), blocks, PARTS[-1 if unbiased else -2]
         if shape not in self._arrays:
@@ -334,19 +356,20 @@ class PairFit:
             directions = complement(free if free.size else now.free(_LIKELY[now.chi_square > _MAX_CHI2]))
             if not directions.size:
                 break
-            motion, moved = self.step(motion, now, directions)
+            motion, moved, _ = self.step(motion, now, directions)
             if moved < _LAST_STEP:
                 break
         return motion
 
-    def step(self, motion: Motion, now: Equations, directions: Doubles) -> tuple[Motion, float]:
-        """Return the motion after a Gauss-Newton step in given directions, and its length in sigmas."""
+    def step(self, motion: Motion, now: Equations, directions: Doubles) -> tuple[Motion, float, Doubles]:
+        """Return the motion after a Gauss-Newton step in given directions; the step in sigmas, and itself."""
         matrix = directions.T @ now.normal_matrix @ directions
         matrix += _MIN_INFORMATION / 10 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
         step = -directions @ np.linalg.solve(matrix, directions.T @ now.right)
         step /= max(float(np.linalg.norm(step)) / (_MAX_STEP * self.second.extent.size), 1.0)
         sigmas = math.sqrt(step @ now.normal_matrix @ step / max(now.chi_square, 1.0))
-        return motion.small_step(step * _scale_of(self.second.extent.size), self.second.extent.middle), sigmas
+        moved = motion.small_step(step * _scale_of(self.second.extent.size), self.second.extent.middle)
+        return moved, sigmas, step
 
     def at_origin(self) -> Doubles:
         """Return the matrix, (6, 6), that converts steps of these equations to motions about the origin."""

@@ -65,13 +65,12 @@ class PoseMap:
     grid : tuple of float
     flat_limit : float
         Squared sine of the tilt with which the normals were measured, or 1.
-    extent : Extent
     """
 
     records: Array
     grid: Grid
     flat_limit: float
-    extent: Extent
+    known_extent: Extent | None = None
 
     @classmethod
     def of(
@@ -81,20 +80,29 @@ class PoseMap:
         device: Device,
         curved: bool = True,
         spiky: bool = True,
+        size: int = 1,
     ) -> PoseMap:
         """Return the map of a result; without ``curved`` the second derivatives are 0.
 
-        Spikes are left out, unless ``spiky`` is False.
+        Spikes are left out, unless ``spiky`` is False. A pixel is the mean of ``size`` x ``size`` ones.
         """
-        grid = _grid(result, pixel_size)
-        records = _records(result, grid, device, curved, spiky)
-        (extent,) = _extents([(records, grid)])
+        x, y, step_x, step_y = _grid(result, pixel_size)
+        middle = (size - 1) / 2
+        grid = x + middle * step_x, y - middle * step_y, size * step_x, size * step_y
+        return cls(_records(result, grid, device, curved, spiky, size), grid, _least(result))
+
+    @cached_property
+    def extent(self) -> Extent:
+        """Contents of the map; InputError if there is nothing to compare."""
+        if self.known_extent is not None:
+            return self.known_extent
+        (extent,) = _extents([(self.records, self.grid)])
         if not extent.compared:
             raise InputError(
                 "a map has no usable pixel with a sigma: give heights with height_sigma, or with normals and "
                 "normals_sigma"
             )
-        return cls(records, grid, _least(result), extent)
+        return extent
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -167,17 +175,30 @@ def _grid(result: Result, pixel_size: ArrayLike | None) -> Grid:
     return float(x[0]), float(y[0]), float(x[1] - x[0]), float(y[0] - y[1])
 
 
-def _records(result: Result, grid: Grid, device: Device, curved: bool, spiky: bool) -> Array:
+def _records(result: Result, grid: Grid, device: Device, curved: bool, spiky: bool, size: int) -> Array:
     """Return the records of a result's maps on a device."""
 
     def map_of(quantity: str, dtype: DTypeLike, *components: int) -> Operand | None:
-        return operand_of(result, quantity, dtype, (*shape, *components), device)
+        return operand_of(result, quantity, dtype, (high, wide, *components), device)
 
-    rows, columns = shape = shape_of(result, result.name_of("height") or "")
+    high, wide = shape_of(result, result.name_of("height") or "")
+    rows, columns = shape = high // size, wide // size
     pixels, (_, _, step_x, step_y) = rows * columns, grid
     height, normals = map_of("height", np.float32), map_of("normals", np.float32, 3)
     sigma = map_of("height_sigma", np.float32)
-    for _ in range(2 if spiky and sigma is not None else 0):  # the second time, next to spikes
+    if size > 1:
+        means = [
+            None if values is None else device.array("means", shape, np.float32, zeroed=False)
+            for values in (height, sigma)
+        ]
+        _run(
+            device, "pose_means", rows, columns, size,
+            wide=wide, height=height, height_sigma=sigma, mean=means[0], mean_sigma=means[1],
+            moved=8 * high * wide,
+        )  # fmt: skip
+        height, sigma = means
+    passes = 1 if size > 1 else 2  # the second time next to spikes; few are, where pixels are averaged
+    for _ in range(passes if spiky and sigma is not None else 0):
         clean = device.array("clean", shape, np.float32, zeroed=False)
         _run(
             device, "pose_spikes", rows, columns,
@@ -203,10 +224,10 @@ def _records(result: Result, grid: Grid, device: Device, curved: bool, spiky: bo
         "normals_sigma": None if normals is None else map_of("normals_sigma", np.float32),
         **{name: map_of(name, np.uint8) for name in ("filled", "contact", "edges")},
         "records": device.array("records", (*shape, 8), np.float32, zeroed=False),
-        "slopes": device.array("slopes", (2, *shape), np.float32, zeroed=False),
+        "slopes": device.array("slopes", (2, *shape), np.float32, zeroed=False) if curved else None,
     }
     moved = sum(values.nbytes for values in maps.values() if values is not None)
-    _run(device, "pose_records", rows, columns, **maps, moved=moved)
+    _run(device, "pose_records", rows, columns, size, high=high, wide=wide, **maps, moved=moved)
     records: Array = maps["records"]
     if curved:
         _run(
@@ -216,10 +237,10 @@ def _records(result: Result, grid: Grid, device: Device, curved: bool, spiky: bo
     return records
 
 
-def _run(device: Device, name: str, rows: int, columns: int, **arguments: Any) -> None:
+def _run(device: Device, name: str, rows: int, columns: int, size: int = 1, **arguments: Any) -> None:
     """Run a kernel over the pixels of a picture."""
     items = -(-rows * columns // device.layout.tile)
-    device.kernel("pose_maps", name)(items, rows=rows, columns=columns, **arguments)
+    device.kernel("pose_maps", name, SIZE=size)(items, rows=rows, columns=columns, **arguments)
 
 
 def _least(result: Result) -> float:

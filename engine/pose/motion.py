@@ -17,6 +17,16 @@ class Motion:
     turn: Doubles
     shift: Doubles
 
+    @classmethod
+    def of(cls, vector: Doubles, shift: Doubles) -> Motion:
+        """Return the motion with a rotation vector, (3,), and a translation."""
+        return cls(np.asarray(cv2.Rodrigues(np.asarray(vector, np.float64))[0]), shift)
+
+    @property
+    def vector(self) -> Doubles:
+        """The rotation vector, (3,)."""
+        return np.asarray(cv2.Rodrigues(self.turn)[0].ravel())
+
     def apply(self, points: Doubles) -> Doubles:
         """Move points, (..., 3)."""
         return points @ self.turn.T + self.shift
@@ -31,8 +41,8 @@ class Motion:
 
     def small_step(self, step: Doubles, centre: Doubles) -> Motion:
         """Return this motion followed by a small rotation about a point and a translation, (6,)."""
-        turn = np.asarray(cv2.Rodrigues(step[:3])[0], np.float64)
-        moved = self.then(Motion(turn, centre - turn @ centre + step[3:]))
+        small = Motion.of(step[:3], step[3:])
+        moved = self.then(Motion(small.turn, centre - small.turn @ centre + small.shift))
         # Rounding errors would accumulate, because the transpose is used as the inverse. A Newton step
         # towards the nearest rotation squares them.
         return Motion(moved.turn @ (1.5 * np.eye(3) - 0.5 * moved.turn.T @ moved.turn), moved.shift)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from mirrorskin.engine.base.device_arrays import device_of_maps
 from mirrorskin.engine.base.inputs import Maps, as_result
@@ -57,7 +57,7 @@ class Pose:
     @property
     def motion(self) -> Motion:
         """R and t."""
-        return Motion(np.asarray(Rotation.from_rotvec(self.rotation).as_matrix()), self.translation)
+        return Motion.of(self.rotation, self.translation)
 
     @property
     def sigma(self) -> Doubles:
@@ -89,17 +89,13 @@ class Pose:
 
     def _changed(self, motion: Motion, covariance: Doubles, free: Doubles) -> Pose:
         """Return another motion with its errors, and orthonormal undetermined directions."""
-        directions, sizes, _ = np.linalg.svd(free.T, full_matrices=False)
-        vector = np.asarray(Rotation.from_matrix(motion.turn).as_rotvec(), np.float64)
-        kept = directions[:, sizes > _EQUAL_TOLERANCE]
-        others = np.eye(6) - kept @ kept.T
-        return replace(
-            self,
-            rotation=vector,
-            translation=motion.shift,
-            covariance=others @ covariance @ others,
-            undetermined=kept.T,
-        )
+        if len(free):
+            directions, sizes, _ = np.linalg.svd(free.T, full_matrices=False)
+            kept = directions[:, sizes > _EQUAL_TOLERANCE]
+            others = np.eye(6) - kept @ kept.T
+            covariance, free = others @ covariance @ others, kept.T
+        maps: dict[str, Any] = {"covariance": covariance, "undetermined": free}
+        return replace(self, rotation=motion.vector, translation=motion.shift, **maps)
 
 
 IDENTITY = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0, 6)))

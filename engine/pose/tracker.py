@@ -2,35 +2,48 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mirrorskin.engine.base.inputs import Maps, as_result
-from mirrorskin.engine.pose.fit import FEWEST_SHARED, PairFit, complement
+from mirrorskin.engine.pose.fit import FEWEST_SHARED, Equations, PairFit, complement
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
 from mirrorskin.io import Result
 from mirrorskin.io.base.findings import findings_of
 from mirrorskin.io.base.threads import ThreadSafe
+from mirrorskin.io.model.result import shape_of
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 
-_MIN_COMMON = 0.6  # share of the key's pixels below which the next result becomes the key
-_COARSE_STRIDE = 4  # pixel step of the coarse fit
-_MAX_STEPS, _LAST_STEP = 8, 0.3  # maximum number of steps; size of the step that ends them, sigmas
-_LOST = 3.0  # times the key's first chi square, above which the motion is searched again
+_MIN_COMMON = 0.6  # share of the key's pixels below which another result becomes the key
+_BETTER = 1.2  # ratio of the pixels shared with an earlier key to those shared with the present one
+_MOST_KEYS = 64  # largest number of earlier keys that are remembered
+_SIDE = 100  # least pixels along the shorter side of averaged maps
+_STRIDE = 4  # pixel step of the coarse fit
+_MAX_COARSE, _MAX_FINE = 8, 4  # largest number of steps
+_CLOSE, _EXACT = 3.0, 0.1  # errors that coarse and fine steps may leave, sigmas
+_CLEAR = 3.0  # sigmas of a step from which the next one shows its error
+_MIN_KEPT = 0.5  # share of the pixels that are not outliers
+_LOST = 3.0  # chi square, in units of the key's first one, above which the motion is searched
+_SEARCHED = "its motion was too large to follow, and was searched for"
+_OUTLIER = 30.0  # chi square of a pixel that is left out, in units of the key's first chi square
 
 
 class PoseTracker(ThreadSafe):
     """Estimates the motion of an object from the first result of a stream to each later one.
 
     Each result is compared with a key: the first result, or a later one if too few pixels overlap with the
-    previous key. Errors therefore increase with the number of keys, not of results. The start is extrapolated
-    from the last two results, and refined on every fourth row and column, then on all pixels. Directions that
-    the key does not determine are identified with the first result after it, and are kept fixed.
+    previous key. Errors therefore increase with the number of keys, not of results; an earlier key that
+    overlaps more is taken again, so they do not increase along a path that returns. The start is extrapolated
+    from the last two results, and refined on every fourth row and column, then on all pixels, without
+    outliers. Maps are averaged to 100 to 200 pixels along their shorter side, which hardly costs accuracy.
+    Directions that the key does not determine are identified with the first result after it, and are kept
+    fixed. A step too large for this is searched as `estimate_pose` does, and noted.
 
     Parameters
     ----------
@@ -63,10 +76,8 @@ class PoseTracker(ThreadSafe):
     def __init__(self, pixel_size: ArrayLike | None = None, *, device: str | Device | None = None) -> None:
         self.keys: int = 0
         self._pixel_size, self._device = pixel_size, open_device(device)
-        self._key: PoseMap | None = None
-        self._key_pose = IDENTITY
-        self._free: Doubles | None = None
-        self._fewest, self._worst = 0.0, np.inf  # pixels, and chi square
+        self._key: _Key | None = None
+        self._earlier: list[_Key] = []
         self._results = 0
         self._notes: tuple[str, ...] = ()  # of the last result
         self._back, self._last = STILL, STILL  # from the last result to the key, and to the one before
@@ -90,52 +101,62 @@ class PoseTracker(ThreadSafe):
 
     def _find(self, result: Result) -> Pose:
         """Return the motion from the first result; its notes are those of the keys."""
-        if self._key is None:
-            self._take_key(result, self._key_pose)
-            return self._key_pose
-        if self._free is None:
-            return self._first_after_key(result)
-        fit = PairFit(self._map(result, curved=False), self._key, self._device)
-        directions, motion = complement(self._free), self._last.then(self._back)
-        for step in (_COARSE_STRIDE, 1):
-            for _ in range(_MAX_STEPS):
-                now = fit.equations(motion, step=step)
-                if now.pixels < FEWEST_SHARED:
-                    return self._search(result)
-                motion, moved = fit.step(motion, now, directions)
-                if moved < _LAST_STEP:
-                    break
-        if now.chi_square > self._worst:
-            return self._search(result)
-        pose = self._moved_to(motion, pose_of(fit, motion, now, self._free))
-        if now.pixels < self._fewest:
+        key = self._key
+        if key is None:
+            self._take_key(result, IDENTITY)
+            return IDENTITY
+        expected = self._last.then(self._back)
+        if key.fit is None:
+            return self._first_after_key(key, result, expected)
+        map_ = self._map(result, curved=False)
+        found = key.follow(map_, expected)
+        if found is None:
+            return self._search(key, result)
+        pose = self._moved_to(found.motion, key.pose_of(found))
+        if found.now.pixels < key.fewest and not self._return_to_key(map_, found):
             self._take_key(result, pose)
         return pose
 
-    def _first_after_key(self, result: Result) -> Pose:
+    def _first_after_key(self, key: _Key, result: Result, expected: Motion) -> Pose:
         """Return the pose of the first result after a key, and determine the undetermined directions."""
-        assert self._key is not None
-        fit = PairFit(self._map(result), self._key, self._device)
-        motion, now, self._free = fit.solve(self._last.then(self._back), near=True)
-        self._fewest, self._worst = _MIN_COMMON * now.pixels, _LOST * max(now.chi_square, 1.0)
-        return self._moved_to(motion, pose_of(fit, motion, now, self._free))
+        fit = PairFit(self._map(result), key.map, self._device)
+        motion, now, free = fit.solve(expected, near=True)
+        key.start(fit, now, free)
+        return self._moved_to(motion, key.pose_of(_Found(fit, motion, now)))
 
-    def _search(self, result: Result) -> Pose:
+    def _search(self, key: _Key, result: Result) -> Pose:
         """Return the pose of a result that is far from the expected pose."""
-        assert self._key is not None
-        fit = PairFit(self._map(result), self._key, self._device)
+        fit = PairFit(self._map(result), key.map, self._device)
         motion, now, free = fit.solve()
-        return self._moved_to(motion, pose_of(fit, motion, now, free))
+        pose = self._moved_to(motion, key.pose.then(pose_of(fit, motion, now, free).inverse()))
+        return replace(pose, notes=(*pose.notes, f"result {self._results}: {_SEARCHED}"))
 
-    def _moved_to(self, motion: Motion, to_key: Pose) -> Pose:
+    def _return_to_key(self, map_: PoseMap, last: _Found) -> bool:
+        """Take the earlier key again that shares most pixels with a map, if it shares enough."""
+        assert self._key is not None
+        first_to_result = self._key.pose.motion.then(last.motion.inverse())
+        limit, best = _BETTER * last.now.pixels, None
+        for key in self._earlier:
+            found = key.follow(map_, first_to_result.inverse().then(key.pose.motion))
+            if found is not None and found.now.pixels > max(limit, key.fewest):
+                limit, best = found.now.pixels, (key, found.motion)
+        if best is None:
+            return False
+        self._earlier = [key for key in self._earlier if key is not best[0]] + [self._key]
+        self._key, self._back = best
+        return True
+
+    def _moved_to(self, motion: Motion, pose: Pose) -> Pose:
         """Store the motion back to the key, and return the pose."""
         self._last = motion.then(self._back.inverse())
         self._back = motion
-        return self._key_pose.then(to_key.inverse())
+        return pose
 
     def _take_key(self, result: Result, pose: Pose) -> None:
-        self._key, self._key_pose, self._free = self._map(result), self._noted(pose), None
-        self._back = STILL
+        map_ = self._map(result)
+        if self._key is not None:
+            self._earlier = [*self._earlier, self._key][-_MOST_KEYS:]
+        self._key, self._back = _Key(map_, self._noted(pose)), STILL
         self.keys += 1
 
     def _noted(self, pose: Pose) -> Pose:
@@ -143,4 +164,69 @@ class PoseTracker(ThreadSafe):
         return replace(pose, notes=tuple(dict.fromkeys((*pose.notes, *self._notes))))
 
     def _map(self, result: Result, curved: bool = True) -> PoseMap:
-        return PoseMap.of(result, self._pixel_size, self._device, curved)
+        size = max(1, min(shape_of(result, result.name_of("height") or "height")) // _SIDE)
+        map_ = PoseMap.of(result, self._pixel_size, self._device, curved, size=size)
+        if curved:
+            _ = map_.extent  # InputError for one without contents
+        return map_
+
+
+class _Found(NamedTuple):
+    """A motion from a result to a key, and the equations there."""
+
+    fit: PairFit
+    motion: Motion
+    now: Equations
+
+
+@dataclass(slots=True)
+class _Key:
+    """A result with which others are compared."""
+
+    map: PoseMap
+    pose: Pose  # from the first result
+    fit: PairFit | None = None  # of the first result after it
+    free: Doubles = field(default_factory=lambda: np.zeros((6, 0)))  # directions that are not determined
+    directions: Doubles = field(default_factory=lambda: np.eye(6))  # the others
+    fewest: float = 0.0  # pixels that results must share with it
+    typical: float = 1.0  # chi square
+    bend: float = np.inf  # error that a coarse step leaves over the square of the step, both in sigmas
+
+    def start(self, fit: PairFit, now: Equations, free: Doubles) -> None:
+        """Keep what the first result after this key shows."""
+        self.fit, self.free, self.directions = fit, free, complement(free)
+        self.fewest, self.typical = _MIN_COMMON * now.pixels, max(now.chi_square, now.typical, 1.0)
+
+    def follow(self, map_: PoseMap, motion: Motion) -> _Found | None:
+        """Return the motion from a map to this key near an expected motion, or None."""
+        if self.fit is None:
+            return None
+        fit, last = self.fit.after(map_), 0.0
+        for _ in range(_MAX_COARSE):
+            now = fit.equations(motion, step=_STRIDE)
+            if now.pixels < FEWEST_SHARED:
+                return None
+            motion, moved, _ = fit.step(motion, now, self.directions)
+            if last > _CLEAR:
+                self.bend = moved / last**2
+            last = moved
+            if min(moved, self.bend * moved**2) < _CLOSE:
+                found = self._refined(fit, motion, now.pixels * _STRIDE**2)
+                if found is not None:
+                    return found
+        return None
+
+    def _refined(self, fit: PairFit, motion: Motion, shared: float) -> _Found | None:
+        """Return a motion refined with all pixels but outliers; None if these are most of the shared ones."""
+        for _ in range(_MAX_FINE):
+            now = fit.equations(motion, limit=_OUTLIER * self.typical)
+            if now.pixels < max(_MIN_KEPT * shared, FEWEST_SHARED) or now.chi_square > _LOST * self.typical:
+                return None
+            motion, moved, step = fit.step(motion, now, self.directions)
+            if min(moved, self.bend / _STRIDE * moved**2) < _EXACT:
+                break
+        return _Found(fit, motion, now.after(step))
+
+    def pose_of(self, found: _Found) -> Pose:
+        """Return the motion from the first result to the one from which a motion to this key was found."""
+        return self.pose.then(pose_of(*found, self.free).inverse())

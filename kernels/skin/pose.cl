@@ -16,7 +16,7 @@
 
 #define BLOCK 8
 #define SUMS (BESIDE ? 67 : 31)
-#define POSE 25
+#define POSE 26
 #define NEAR 1e20f
 #define VAGUE 100.0f
 
@@ -150,7 +150,7 @@ __kernel void pose_equations(
     UNROLL for (int i = 0; i < 9; ++i) turn[i] = pose[i];
     const float3 shift = vload3(3, pose), centre = vload3(4, pose);
     const float x0 = pose[15], y0 = pose[16], step_x = pose[17], step_y = pose[18], flat_limit = pose[23];
-    const float other_x = pose[19], other_y = pose[20], wide = pose[21], high = pose[22], other_flat_limit = pose[24];
+    const float other_x = pose[19], other_y = pose[20], wide = pose[21], high = pose[22], other_flat_limit = pose[24], limit = pose[25];
     const float east_x = 1.0f / wide, south_y = 1.0f / high;
     F total[SUMS];
     UNROLL for (int i = 0; i < SUMS; ++i) total[i] = 0.0f;
@@ -207,13 +207,17 @@ __kernel void pose_equations(
             const Symmetric other = same_variances(n, theirs.square, other_flat_limit);
             const F xx = shape_here.xx + other.xx, xy = shape_here.xy + other.xy, yy = shape_here.yy + other.yy;
             const F area = xx * yy - xy * xy;
-            const F is_clear = (defined & (xx + yy < VAGUE)) ? (F)1.0f : (F)0.0f, low = inverse_roots(xx);
-            const Vector lower = {is_clear * low, xy * low, is_clear * inverse_roots(area) * xx * low};
+            const I is_clear = defined & (xx + yy < VAGUE);
+            const F low = inverse_roots(xx), long_side = inverse_roots(area) * xx * low;
             const F lift = (turn[2] * n.x + turn[5] * n.y + turn[8] * n.z) * over_z, own_height = lift * lift * mine.variance;
             const I compared = defined & (mine.variance < NEAR) & (theirs.variance < NEAR);
-            const F height_weight = compared ? inverse_roots(own_height + theirs.variance) : (F)0.0f;
-            const F r0 = (turned.x - n.x) * lower.x, r1 = (turned.y - n.y - lower.y * r0) * lower.z;
-            const F r2 = compared ? height_weight * (place.z - height) : (F)0.0f;
+            const F d0 = (turned.x - n.x) * low, d1 = (turned.y - n.y - xy * low * d0) * long_side;
+            const F firm = compared ? inverse_roots(own_height + theirs.variance) : (F)0.0f, d2 = firm * (place.z - height);
+            const I kept = (is_clear ? d0 * d0 + d1 * d1 : (F)0.0f) + d2 * d2 <= limit;
+            const I with_normal = kept & is_clear, with_height = kept & compared;
+            const F one = with_normal ? (F)1.0f : (F)0.0f, height_weight = with_height ? firm : (F)0.0f;
+            const Vector lower = {one * low, xy * low, one * long_side};
+            const F r0 = with_normal ? d0 : (F)0.0f, r1 = with_normal ? d1 : (F)0.0f, r2 = with_height ? d2 : (F)0.0f;
             const F traced = (yy * other.xx - 2.0f * xy * other.xy + xx * other.yy) / area;
             Jacobian j;
             jacobian(n, (Symmetric){theirs.xx, theirs.xy, theirs.yy}, over_z, arm, lower, height_weight, &j);
@@ -223,10 +227,10 @@ __kernel void pose_equations(
                 total[21 + i] += (i < 5 ? j.x[i] * r0 + j.y[i] * r1 : 0.0f) + j.z[i] * r2;
             }
             total[27] += r0 * r0 + r1 * r1 + r2 * r2;
-            total[28] += is_clear * (2.0f - (1.0f - fraction) * traced)
+            total[28] += one * (2.0f - (1.0f - fraction) * traced)
                 + height_weight * height_weight * (own_height + fraction * theirs.variance);
-            total[29] += compared ? (F)1.0f : (F)0.0f;
-            total[30] += is_clear;
+            total[29] += with_height ? (F)1.0f : (F)0.0f;
+            total[30] += one;
 #if BESIDE
             const F over_turned = 1.0f / turned.z;
             const Symmetric curved = turn_curvature(before.z, (Symmetric){mine.xx, mine.xy, mine.yy}, over_turned, turn, turned);

@@ -51,10 +51,11 @@ def pose_equations(step: int, first: Array, second: Array, poses: Array, sums: A
         A block has `BLOCK` x `BLOCK` pixels that count.
     first, second : (H, W, 8)
         Records; the two maps may be of different sizes.
-    poses : (count, 25)
+    poses : (count, 26)
         Rotation matrix (9); translation (3); centre of further rotations (3); x and y of the first pixel and
         pixel size along x and y of the first map (4), and of the second (4); squared sines of the tilts with
-        which the normals of both maps were measured (2), or 1 for normals with isotropic errors.
+        which the normals of both maps were measured (2), or 1 for normals with isotropic errors; limit of the
+        chi square of a pixel, above which it is left out.
     sums : (count, blocks, PARTS[-1] or PARTS[-2])
         See `PARTS`.
     """
@@ -85,7 +86,7 @@ def _equations_at(step: int, first: Array, second: Array, pose: Array, sums: Arr
     other = _variances(theirs[0], theirs[1], np.eye(3), theirs[2], pose[24])
     xx, xy, yy = variance + other
     is_clear = xx + yy < VAGUE
-    lower = is_clear / np.sqrt(xx), xy / np.sqrt(xx), is_clear / np.sqrt(yy - xy * xy / xx)
+    lower = 1 / np.sqrt(xx), xy / np.sqrt(xx), 1 / np.sqrt(yy - xy * xy / xx)
     part = (1 - weight_square) * _trace(other, xx, xy, yy)
     lift = turn[:, 2] @ n / n[2]
     own_height = lift**2 * mine[:, 4]
@@ -93,6 +94,11 @@ def _equations_at(step: int, first: Array, second: Array, pose: Array, sums: Arr
     compared = (mine[:, 4] < NEAR) & (theirs[4] < NEAR)
     sure = np.where(compared, sure, 0)
     residual = np.stack([*_whiten(turned[0] - n[0], turned[1] - n[1], lower), sure * (place[2] - theirs[3])])
+    residual[:2] *= is_clear
+    kept = np.sum(residual**2, axis=0) <= pose[25]
+    is_clear, compared = is_clear & kept, compared & kept
+    lower, sure = (is_clear * lower[0], lower[1], is_clear * lower[2]), sure * kept
+    residual *= kept
     jacobian, other_jacobian = (_jacobian(surface, arm, lower, sure) for surface in (shape, shape_here))
     expected = is_clear * (2 - part) + sure**2 * (own_height + weight_square * theirs[4])
 

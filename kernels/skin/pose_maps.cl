@@ -1,8 +1,13 @@
 // Records of a map for the fit of a motion, from its heights and normals. Specification: pose_maps.py.
 //
 // TILE     pixels of one work-item: 1 on a GPU, many on a CPU
+// SIZE     pixels of a map along each side of a pixel of the records
 
 #include "common.clh"
+
+#ifndef SIZE
+#define SIZE 1
+#endif
 
 #define INLINE static inline __attribute__((always_inline))
 #define BYTES __global const uchar *restrict
@@ -22,9 +27,17 @@
 #define NUMBERS 8
 #define SUMMARY 6
 
+typedef float8 __attribute__((aligned(4))) Loose;  // unaligned
+
 #define EACH_PIXEL                                      \
     const int begin = (int)get_global_id(0) * TILE;     \
     for (int p = begin; p < LESSER(begin + TILE, rows * columns); ++p)
+
+// The same, row by row: a division for each pixel would take longer than most of the rest.
+#define EACH_PIXEL_OF_ROWS                                                                            \
+    const int begin = (int)get_global_id(0) * TILE, end = LESSER(begin + TILE, rows * columns);      \
+    for (int p = begin, row = begin / columns; p < end; ++row)                                       \
+        for (int column = p - row * columns; column < columns && p < end; ++column, ++p)
 
 // Slopes along x and y of the plane fitted to the valid heights of 5 x 5 pixels; NAN if it is undetermined.
 INLINE float2 gradient_at(
@@ -71,14 +84,14 @@ __kernel void pose_gradient(
     }
 }
 
-// Whether an edge, or a pixel without contact, is within two pixels; each of the maps may be missing.
+// Whether an edge, or a pixel without contact, is within two pixels of a block; each of the maps may be missing.
 INLINE int is_near_border(
-    __global const uchar *edges, __global const uchar *contact, const int rows, const int columns, const int p)
+    __global const uchar *edges, __global const uchar *contact, const int rows, const int columns, const int row,
+    const int column)
 {
-    const int row = p / columns, column = p % columns;
     int is_left_out = 0;
-    for (int y = GREATER(row - AROUND, 0); y <= LESSER(row + AROUND, rows - 1); ++y)
-        for (int x = GREATER(column - AROUND, 0); x <= LESSER(column + AROUND, columns - 1); ++x) {
+    for (int y = GREATER(row - AROUND, 0); y < LESSER(row + SIZE + AROUND, rows); ++y)
+        for (int x = GREATER(column - AROUND, 0); x < LESSER(column + SIZE + AROUND, columns); ++x) {
             if (edges) is_left_out |= edges[y * columns + x] != 0;
             if (contact) is_left_out |= contact[y * columns + x] == 0;
         }
@@ -90,58 +103,98 @@ INLINE float height_at(MAP height, const int rows, const int columns, const int 
     return row >= 0 && column >= 0 && row < rows && column < columns ? height[row * columns + column] : NAN;
 }
 
-// Copies heights; NAN for spikes, which are far from their neighbours along all known lines, and from their cubic.
-__kernel void pose_spikes(const int rows, const int columns, MAP height, MAP height_sigma, OUT clean)
+// Whether a height is far from its neighbours along all known lines, and from their cubic.
+INLINE int is_spike(
+    MAP height, const int rows, const int columns, const int row, const int column, const float here, const float limit)
 {
     const int down[4] = {0, 1, 1, 1}, right[4] = {1, 0, 1, -1};
-    EACH_PIXEL {
-        const int row = p / columns, column = p % columns;
+    const int is_at_border = row == 0 || column == 0 || row == rows - 1 || column == columns - 1;
+    int lines = 0;
+    for (int i = 0; i < 4; ++i) {
+        const int y = down[i], x = right[i];
+        const float near = height_at(height, rows, columns, row - y, column - x) + height_at(height, rows, columns, row + y, column + x);
+        const float bend = fabs(here - 0.5f * near);
+        if (bend != bend) continue;
+        if (!(bend > limit)) return 0;
+        const float wide = height_at(height, rows, columns, row - 2 * y, column - 2 * x) + height_at(height, rows, columns, row + 2 * y, column + 2 * x);
+        if (fabs(here - (4 * near - wide) / 6) < 0.5f * bend) return 0;
+        ++lines;
+    }
+    return lines > !is_at_border;
+}
+
+// Copies heights; NAN for spikes.
+__kernel void pose_spikes(const int rows, const int columns, MAP height, MAP height_sigma, OUT clean)
+{
+    EACH_PIXEL_OF_ROWS {
         const float limit = SPIKE * height_sigma[p], here = height[p];
-        const int is_at_border = row == 0 || column == 0 || row == rows - 1 || column == columns - 1;
-        int lines = 0, far = 0;
-        for (int i = 0; i < 4; ++i) {
-            const int y = down[i], x = right[i];
-            const float near = height_at(height, rows, columns, row - y, column - x) + height_at(height, rows, columns, row + y, column + x);
-            const float bend = fabs(here - 0.5f * near);
-            if (!(bend > limit)) {
-                lines += bend == bend;
-                continue;
-            }
-            const float wide = height_at(height, rows, columns, row - 2 * y, column - 2 * x) + height_at(height, rows, columns, row + 2 * y, column + 2 * x);
-            ++lines;
-            far += !(fabs(here - (4 * near - wide) / 6) < 0.5f * bend);
+        clean[p] = here;
+        const int is_inside = column > 0 && column < columns - 1;
+        if (is_inside && fabs(here - 0.5f * (height[p - 1] + height[p + 1])) <= limit) continue;
+        if (is_spike(height, rows, columns, row, column, here, limit)) clean[p] = NAN;
+    }
+}
+
+#define SHARE (1.0f / (SIZE * SIZE))
+// q: the pixels of a map in a pixel of the records
+#define EACH_IN_BLOCK                                                                                          \
+    for (int i = 0, q; i < SIZE * SIZE && (q = (SIZE * row + i / SIZE) * wide + SIZE * column + i % SIZE, 1); ++i)
+
+// Means of SIZE x SIZE heights, and their standard deviations; NAN if one of them is unknown.
+__kernel void pose_means(
+    const int rows, const int columns, const int wide, MAP height, MAP height_sigma, OUT mean, OUT mean_sigma)
+{
+    EACH_PIXEL_OF_ROWS {
+        float sum = 0, square = 0;
+        EACH_IN_BLOCK sum += height[q];
+        mean[p] = SHARE * sum;
+        if (height_sigma) {
+            EACH_IN_BLOCK square += height_sigma[q] > 0 ? height_sigma[q] * height_sigma[q] : NAN;
+            mean_sigma[p] = SHARE * sqrt(square);
         }
-        clean[p] = lines > !is_at_border && far == lines ? NAN : here;
     }
 }
 
 __kernel void pose_records(
-    const int rows, const int columns, MAP height, MAP height_sigma, __global const int *restrict component,
-    BYTES offset_unknown, MAP normals, MAP gradient, MAP normals_sigma, BYTES filled, BYTES contact, BYTES edges,
-    OUT records, OUT slopes)
+    const int rows, const int columns, const int high, const int wide, MAP height, MAP height_sigma,
+    __global const int *restrict component, BYTES offset_unknown, MAP normals, MAP gradient, MAP normals_sigma,
+    BYTES filled, BYTES contact, BYTES edges, OUT records, OUT slopes)
 {
-    EACH_PIXEL {
-        float x, y, upright, square = NOT_COMPARED, variance = FAR;
-        if (normals) {
-            x = normals[3 * p];
-            y = normals[3 * p + 1];
-            upright = normals[3 * p + 2];
-        } else {
+    EACH_PIXEL_OF_ROWS {
+        float x = 0, y = 0, upright = 0, square = normals_sigma ? 0 : NOT_COMPARED, variance = FAR;
+        if (height_sigma && height_sigma[p] > 0) variance = GREATER(height_sigma[p] * height_sigma[p], SHARPEST);
+        int used = FINITE(height[p]);
+        if (!normals) {
             const float a = gradient[2 * p], b = gradient[2 * p + 1];
             upright = 1.0f / sqrt(1.0f + a * a + b * b);
             x = -a * upright;
             y = -b * upright;
         }
-        if (normals_sigma) square = normals_sigma[p] > 0 ? GREATER(normals_sigma[p] * normals_sigma[p], SHARPEST) : NAN;
-        if (height_sigma && height_sigma[p] > 0) variance = GREATER(height_sigma[p] * height_sigma[p], SHARPEST);
-        if (component && (component[p] < 0 || offset_unknown[component[p]])) variance = FAR;
-        int used = FINITE(height[p]) && upright > STEEPEST && FINITE(square);
-        if (filled) used = used && !filled[p];
-        if (edges || contact) used = used && !is_near_border(edges, contact, rows, columns, p);
-        const float values[NUMBERS] = {x, y, square, height[p], variance, 0, 0, 0};
-        for (int i = 0; i < NUMBERS; ++i) records[NUMBERS * p + i] = used ? values[i] : NAN;
-        slopes[p] = used ? -x / upright : NAN;
-        slopes[rows * columns + p] = used ? -y / upright : NAN;
+        if (normals) {
+            EACH_IN_BLOCK {
+                x += SHARE * normals[3 * q];
+                y += SHARE * normals[3 * q + 1];
+                upright += SHARE * normals[3 * q + 2];
+            }
+        }
+        if (normals_sigma) {
+            EACH_IN_BLOCK square += normals_sigma[q] > 0 ? SHARE * SHARE * normals_sigma[q] * normals_sigma[q] : NAN;
+            square = square == square ? GREATER(square, SHARPEST) : NAN;
+        }
+        if (component) {
+            EACH_IN_BLOCK if (component[q] < 0 || offset_unknown[component[q]]) variance = FAR;
+        }
+        if (filled) {
+            EACH_IN_BLOCK used = used && !filled[q];
+        }
+        used = used && upright > STEEPEST && FINITE(square);
+        if (edges || contact) used = used && !is_near_border(edges, contact, high, wide, SIZE * row, SIZE * column);
+        const float8 values = {x, y, square, height[p], variance, 0, 0, 0};
+        *(__global Loose *)(records + NUMBERS * p) = used ? values : (float8)NAN;
+        if (slopes) {
+            slopes[p] = used ? -x / upright : NAN;
+            slopes[rows * columns + p] = used ? -y / upright : NAN;
+        }
     }
 }
 

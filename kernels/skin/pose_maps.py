@@ -84,6 +84,16 @@ def pose_spikes(height: Array, height_sigma: Array, clean: Array) -> None:
     clean[...] = np.where(spikes & (lines.sum(axis=0) >= needed), np.nan, height)
 
 
+def pose_means(
+    height: Array, height_sigma: Array | None, mean: Array, mean_sigma: Array | None, size: int = 1
+) -> None:
+    """Write the means of size x size heights, and their standard deviations; NaN if one is unknown."""
+    mean[...] = _blocks(height, size).mean(axis=0)
+    if height_sigma is not None and mean_sigma is not None:
+        sigmas = _blocks(np.where(height_sigma > 0, height_sigma, np.nan), size)
+        mean_sigma[...] = np.sqrt(np.sum(sigmas**2, axis=0)) / size**2
+
+
 def pose_records(
     height: Array,
     height_sigma: Array | None,
@@ -96,7 +106,8 @@ def pose_records(
     contact: Array | None,
     edges: Array | None,
     records: Array,
-    slopes: Array,
+    slopes: Array | None,
+    size: int = 1,
 ) -> None:
     """Write the records of a map without second derivatives, (H, W, 8), and its slopes, (2, H, W).
 
@@ -104,26 +115,34 @@ def pose_records(
     are computed from the ``gradient``, (H, W, 2). Heights of components with unknown offset are not compared.
     A pixel is not used if it is filled, steep, or at most two pixels away from an edge or a pixel without
     contact.
+
+    A pixel of the records is a block of ``size`` x ``size`` pixels of the maps, except of heights, their
+    standard deviations and the gradient, which are means already. Its normal is the mean of theirs.
     """
     if normals is None:
         assert gradient is not None
         normals = np.dstack([-gradient, np.ones(height.shape)])
         normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    else:
+        normals = _blocks(normals, size).mean(axis=0)
     square, variance = np.full(height.shape, NOT_COMPARED), np.full(height.shape, FAR)
     with np.errstate(invalid="ignore", divide="ignore"):
         if normals_sigma is not None:
-            square = np.where(normals_sigma > 0, np.maximum(normals_sigma**2, SHARPEST), np.nan)
+            squares = _blocks(np.where(normals_sigma > 0, normals_sigma**2, np.nan), size)
+            square = np.maximum(squares.mean(axis=0) / size**2, SHARPEST)
         if height_sigma is not None:
             variance = np.where(height_sigma > 0, np.maximum(height_sigma**2, SHARPEST), FAR)
         if component is not None and offset_unknown is not None:
-            variance = np.where(np.append(offset_unknown, 1).astype(bool)[component], FAR, variance)
+            unknown = np.append(offset_unknown, 1).astype(bool)[component]
+            variance = np.where(_blocks(unknown, size).any(axis=0), FAR, variance)
         used = np.isfinite(height) & (normals[..., 2] > STEEPEST) & np.isfinite(square)
         if filled is not None:
-            used &= filled == 0
+            used &= ~_blocks(filled != 0, size).any(axis=0)
         for border in (None if edges is None else edges != 0, None if contact is None else contact == 0):
             if border is not None:
-                used &= ~_near(border)
-        slopes[...] = np.where(used, -np.moveaxis(normals[..., :2], -1, 0) / normals[..., 2], np.nan)
+                used &= ~_blocks(_near(border), size).any(axis=0)
+        if slopes is not None:
+            slopes[...] = np.where(used, -np.moveaxis(normals[..., :2], -1, 0) / normals[..., 2], np.nan)
     records[...] = 0
     records[..., :2], records[..., 2], records[..., 3] = normals[..., :2], square, height
     records[..., 4] = variance
@@ -165,6 +184,17 @@ def pose_summary(x0: float, y0: float, step_x: float, step_y: float, records: Ar
         points = places[here]
         spread = np.sum((points - points.mean(axis=0)) ** 2) if len(points) else 0.0
         out[:] = len(points), np.count_nonzero(compared[here]), *points.sum(axis=0), spread
+
+
+def _blocks(values: Array, size: int) -> Array:
+    """Return the values of blocks of size x size pixels, (size^2, rows, columns, ...), without the rest."""
+    rows, columns = values.shape[0] // size, values.shape[1] // size
+    return np.stack(
+        [
+            values[row : rows * size : size, column : columns * size : size]
+            for row, column in np.ndindex(size, size)
+        ]
+    )
 
 
 def _near(border: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -691,19 +691,20 @@ def summed(actual, expected, values):
 
 
 POSES = {"size": (((24, 33), 1), ((3, 2), 1), ((40, 30), 2)), "least": (1.0, 0.002), "beside": (0, 1)}
+LIMITS = (1e30, 1000.0)  # of the chi square of a pixel
 
 
 @case(
     "pose_equations",
-    POSES,
+    POSES | {"limit": LIMITS},
     per=lambda device, values: math.prod(values["sums"].shape[:2]),
     checks={"sums": summed},
 )
-def _(size, least, beside):
+def _(size, least, beside, limit):
     shape, step = size
     grid = -(shape[1] - 1) / 2 * 0.05, (shape[0] - 1) / 2 * 0.06, 0.05, 0.06
     turns = (Rotation.from_rotvec((0.02, -0.05, turn)).as_matrix().ravel() for turn in (0.3, -0.1, 0.0))
-    poses = [[*turn, 0.03, -0.04, 0.01, 0.1, -0.2, 0.05, *grid, *grid, least, least] for turn in turns]
+    poses = [[*turn, 0.03, -0.04, 0.01, 0.1, -0.2, 0.05, *grid, *grid, least, least, limit] for turn in turns]
     sums = np.zeros(
         (3, math.prod(-(-size // (pose.BLOCK * step)) for size in shape), pose.PARTS[-1 if beside else -2])
     )
@@ -733,22 +734,39 @@ def _(shape):
     return {"height": height, "height_sigma": np.full(shape, 0.01), "clean": np.zeros(shape), "shape": shape}
 
 
-@case("pose_records", MAPS | {"maps": ("heights", "normals", "all")})
-def _(shape, maps):
-    rng, records = np.random.default_rng(3), waves(shape, 0.2)
-    x, y = records[..., 0], records[..., 1]
-    values = NONE_BUT_HEIGHTS | {"height": records[..., 3], "gradient": None, "shape": shape}
+@case("pose_means", MAPS | {"size": (1, 2, 3), "with_sigma": (True, False)})
+def _(shape, size, with_sigma):
+    fine = waves((size * shape[0] + size - 1, size * shape[1] + size - 1), 0.2)
+    sigma = np.where(fine[..., 4] < 1.5e-6, np.sqrt(fine[..., 4]), 0.0) if with_sigma else None
+    means = np.zeros(shape), np.zeros(shape) if with_sigma else None
+    values = named("height height_sigma mean mean_sigma", fine[..., 3], sigma, *means)
+    return values | {"size": size, "macros": {"SIZE": size}, "wide": fine.shape[1], "shape": shape}
+
+
+@case("pose_records", MAPS | {"maps": ("heights", "normals", "all"), "size": (1, 2)}, atol=1e-6)
+def _(shape, maps, size):
+    rng, height = np.random.default_rng(3), waves(shape, 0.2)
+    fine = size * shape[0] + size - 1, size * shape[1] + size - 1
+    records = waves(fine, 0.2)
+    values = NONE_BUT_HEIGHTS | {"height": height[..., 3], "gradient": None, "shape": shape}
+    values |= named("size macros high wide", size, {"SIZE": size}, *fine)
     values |= named("records slopes", np.zeros((*shape, 8)), np.zeros((2, *shape)))
     if maps == "heights":
-        return values | {"gradient": np.stack([-x, -y], axis=-1), "height_sigma": np.sqrt(records[..., 4])}
+        x, y, _, _, variance, *_ = height.T.swapaxes(1, 2)
+        return values | {"gradient": np.stack([-x, -y], axis=-1), "height_sigma": np.sqrt(variance)}
+    x, y = records[..., 0], records[..., 1]
     values |= {"normals": np.dstack([x, y, np.sqrt(1 - x * x - y * y)])}
-    values |= {"normals_sigma": np.where(rng.random(shape) < 0.1, 0.0, 0.01)}
+    values |= {"normals_sigma": np.where(rng.random(fine) < 0.1, 0.0, 0.01)}
     if maps == "normals":
-        return values
-    flags = ((rng.random(shape) < density).astype(np.uint8) for density in (0.1, 0.98, 0.02))
+        return values | {"slopes": None}
+    flags = ((rng.random(fine) < density).astype(np.uint8) for density in (0.1, 0.98, 0.02))
     values |= named("filled contact edges", *flags)
-    apart = {"component": rng.integers(-1, 3, shape, dtype=np.int32)}
-    return values | apart | {"height_sigma": x**2, "offset_unknown": np.array([0, 1, 0], np.uint8)}
+    apart = {"component": rng.integers(-1, 3, fine, dtype=np.int32)}
+    return (
+        values
+        | apart
+        | {"height_sigma": height[..., 0] ** 2, "offset_unknown": np.array([0, 1, 0], np.uint8)}
+    )
 
 
 @case("pose_curvature", MAPS, checks={"records": near(1e-4, 1e-4)})

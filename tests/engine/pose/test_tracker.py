@@ -25,3 +25,78 @@ def test_a_result_that_shares_nothing_is_refused() -> None:
     tracker.push(sampled(bumpy, rng=rng))
     with pytest.raises(io.InputError, match="share too few pixels"):
         tracker.push(sampled(bumpy, shift=(50, 0, 0), rng=rng))
+
+
+def circle(steps: int, radius: float) -> list[np.ndarray]:
+    """Return shifts around a closed path that begins at 0."""
+    angles = 2 * np.pi * np.arange(steps) / steps
+    return [radius * np.array([np.sin(angle), 1 - np.cos(angle), 0]) for angle in angles]
+
+
+def test_a_path_that_returns_takes_earlier_keys_again() -> None:
+    rng, tracker = np.random.default_rng(2), engine.pose.PoseTracker()
+    for number, shift in enumerate(circle(16, 0.8) * 3):
+        tracker.push(sampled(bumpy, (0, 0, 0), shift, rng=rng))
+        if number == 16:
+            keys = tracker.keys
+    assert 1 < tracker.keys == keys
+
+
+def test_outliers_of_a_percent_of_the_pixels_change_a_pose_by_less_than_its_sigma() -> None:
+    rng = np.random.default_rng(3)
+    results = [sampled(bumpy, shift=(0.02 * number, 0, 0), rng=rng) for number in range(5)]
+    spoilt = [
+        result.assign(height=np.where(rng.random((60, 80)) < 0.01, result.height + 2.8, result.height))
+        for result in results
+    ]
+    clean, robust = engine.pose.PoseTracker(), engine.pose.PoseTracker()
+    for result, bad in zip(results, spoilt, strict=True):
+        pose, other = clean.push(result), robust.push(bad)
+    assert np.all(np.abs(other.translation - pose.translation) < pose.sigma[3:])
+
+
+def test_a_step_too_large_to_follow_is_found_and_noted() -> None:
+    rng, tracker = np.random.default_rng(4), engine.pose.PoseTracker()
+    for number in range(3):
+        tracker.push(sampled(bumpy, shift=(0.01 * number, 0, 0), rng=rng))
+    vector, shift = (0, 0, 1.2), (0.4, -0.3, 0)
+    pose = tracker.push(sampled(bumpy, vector, shift, rng=rng))
+    error = error_of(pose, vector, shift)
+    assert error @ np.linalg.solve(pose.covariance, error) / 6 < 5
+    assert "too large to follow" in pose.notes[-1]
+
+
+def test_contact_that_is_lost_is_refused_and_found_again() -> None:
+    rng, tracker = np.random.default_rng(5), engine.pose.PoseTracker()
+    for number in range(3):
+        tracker.push(sampled(bumpy, shift=(0.02 * number, 0, 0), rng=rng))
+    gone = sampled(bumpy, rng=rng)
+    with pytest.raises(io.InputError, match="no usable pixel"):
+        tracker.push(gone.assign(height=np.full((60, 80), np.nan, np.float32)))
+    pose = tracker.push(sampled(bumpy, shift=(0.1, 0, 0), rng=rng))
+    assert pose.translation == pytest.approx([0.1, 0, 0], abs=0.003)
+
+
+def test_a_hole_that_moves_with_the_contact_is_left_out() -> None:
+    rng, tracker = np.random.default_rng(6), engine.pose.PoseTracker()
+    row, column = np.indices((60, 80))
+    for number in range(6):
+        result, shift = sampled(bumpy, shift=(0.02 * number, 0, 0), rng=rng), (0.02 * number, 0, 0)
+        hole = np.hypot(row - 30, column - 20 - 6 * number) < 12
+        pose = tracker.push(result.assign(height=np.where(hole, np.nan, result.height)))
+    error = error_of(pose, (0, 0, 0), shift)
+    assert error @ np.linalg.solve(pose.covariance, error) / 6 < 5
+
+
+def test_averaging_of_large_maps_costs_a_tenth_of_the_accuracy_at_most() -> None:
+    rng, tracker, errors = np.random.default_rng(7), engine.pose.PoseTracker(), []
+    size = {"shape": (240, 320), "pixel": 0.0125}
+    key = sampled(bumpy, rng=rng, **size)
+    tracker.push(key)
+    for number in range(1, 9):
+        vector, shift = (0, 0, 0.01 * number), (0.02 * number, 0, 0)
+        result = sampled(bumpy, vector, shift, rng=rng, **size)
+        poses = tracker.push(result), engine.pose.estimate_pose(key, result)
+        errors.append([error_of(pose, vector, shift) / pose.sigma for pose in poses])
+    averaged, whole = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
+    assert averaged < 1.1 * whole
