@@ -150,8 +150,15 @@ def command(
         "noise_length": length(noise_length, "--noise-length"),
     }
     if len(paths) > 1 or output or allowed or chart:
+        if budget and not as_json:
+            raise io.InputError(
+                "--budget is printed of one result, without limits: add --json, or leave it out"
+            )
         table = engine.metrology.table(_Opened(paths, turn), limits=allowed, **how)
-        _report_table(table, expanded, as_json)
+        if as_json:
+            _print_files(table, budget)
+        else:
+            _report_table(table, table.names if every else table.main(), expanded)
         _write_table(table, output, chart)
         _end(table)
         return
@@ -269,23 +276,25 @@ def _limits(words: list[str]) -> dict[str, Limit]:
     return limits
 
 
-def _report_table(table: Table, expanded: bool, as_json: bool) -> None:
-    """Print the main quantities of each result, or all of them as JSON."""
-    if as_json:
-        files = []
-        for row in table.rows:
-            measures = row.measures
-            entry: dict[str, Any] = {"file": row.name}
-            if measures is None:
-                entry["problem"] = row.problem
-            else:
-                entry |= {"quantities": measures.quantities, "notes": measures.notes}
-            if table.limits:
-                entry["limits"] = str(table.verdict(row))
-            files.append(entry)
-        print_json({"files": files})
-        return
-    names = table.main()
+def _print_files(table: Table, budget: bool) -> None:
+    """Print all quantities of each result as JSON."""
+    files = []
+    for row in table.rows:
+        measures = row.measures
+        entry: dict[str, Any] = {"file": row.name}
+        if measures is None:
+            entry["problem"] = row.problem
+        else:
+            entry |= {"quantities": measures.quantities, "notes": measures.notes}
+            entry |= {"budget": measures.budget} if budget else {}
+        if table.limits:
+            entry["limits"] = str(table.verdict(row))
+        files.append(entry)
+    print_json({"files": files})
+
+
+def _report_table(table: Table, names: list[str], expanded: bool) -> None:
+    """Print some quantities of each result."""
     rows = []
     for row in table.rows:
         cells = []

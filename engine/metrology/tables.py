@@ -152,8 +152,9 @@ class Table:
         return [name for name in self.names if name in wanted][:count]
 
     def unit(self, name: str) -> str:
-        """Return the unit of a quantity."""
-        return next((quantity.unit for row in self.rows if (quantity := row.quantity(name))), "")
+        """Return the unit of a quantity; of one that no result has, that of its limits."""
+        stated = self.limits[name].unit if name in self.limits else ""
+        return next((quantity.unit for row in self.rows if (quantity := row.quantity(name))), stated)
 
     def values(self, name: str) -> tuple[Doubles, Doubles]:
         """Return values and standard uncertainties of a quantity, (rows,); NaN where unknown."""
@@ -246,12 +247,12 @@ def table(
         name: limit if isinstance(limit, Limit) else Limit.read(limit, name)
         for name, limit in (limits or {}).items()
     }
-    lot: Mapping[Any, Maps] = results if isinstance(results, Mapping) else dict(enumerate(results))
+    lot = results if isinstance(results, Mapping) else None
     rows = []
-    for key in lot:
-        name = key if isinstance(key, str) else _name_of(lot[key], key)
+    for number, each in enumerate(results):
+        name = str(each) if lot is not None or isinstance(each, str | os.PathLike) else str(number)
         try:
-            rows.append(Row(name, measure(lot[key], **options)))
+            rows.append(Row(name, measure(each if lot is None else lot[each], **options)))
         except InputError as error:
             rows.append(Row(name, None, str(error)))
     found = Table(_of_one_unit(rows), read)
@@ -277,7 +278,3 @@ def _of_one_unit(rows: Sequence[Row]) -> list[Row]:
         row if row.measures is None or pixel == first else Row(row.name, None, problem)
         for row, pixel in zip(rows, pixels, strict=True)
     ]
-
-
-def _name_of(maps: Any, number: int) -> str:
-    return os.fspath(maps) if isinstance(maps, str | os.PathLike) else str(number)

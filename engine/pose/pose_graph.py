@@ -80,6 +80,7 @@ class PoseGraph:
         self._maps, self._names, self._device = maps, names, device
         self._places = None if offsets is None else np.cumsum([(0.0, 0.0), *offsets], axis=0)
         self._ambiguous: list[Finding] = []
+        self._searches = 0
         self._best: tuple[float, str] | None = None  # chi square of the best pair without a link, and text
         self._connect()
 
@@ -95,10 +96,9 @@ class PoseGraph:
             pairs = sorted(
                 itertools.combinations(range(len(self._maps)), 2), key=lambda pair: pair[1] - pair[0]
             )
-            searches = 0
             for first, second in pairs:
-                if not self._connected(first, second) and searches < _MAX_SEARCHES:
-                    searches += 1
+                if not self._connected(first, second) and self._searches < _MAX_SEARCHES:
+                    self._searches += 1
                     self._link(first, second, None, [])
         apart = next((n for n in range(len(self._maps)) if not self._connected(0, n)), None)
         if apart is not None:
@@ -180,7 +180,7 @@ class PoseGraph:
         """Keep a finding if another peak of the correlation leads to another motion that fits as well."""
         highest = max((guess.significance for guess in guesses), default=0.0)
         rivals = [guess.motion for guess in guesses if guess.significance > _RIVAL_PEAK * highest]
-        other = fit.rival(pose.motion, rivals[1:])
+        other = fit.rival(pose.motion, rivals)
         if other is not None:
             x, y, _ = other.shift - pose.translation
             text = (
@@ -198,7 +198,8 @@ class PoseGraph:
     def _refusal(self, apart: int) -> str:
         """Return the message about a map that no link connects to the first one."""
         if self._places is None:
-            tried = "as they are, shifted by the peaks of their correlation, and at all rotations about z"
+            some = f" (the {_MAX_SEARCHES} nearest pairs)" if self._searches == _MAX_SEARCHES else ""
+            tried = f"as they are, at the peaks of their correlation, and at all rotations about z{some}"
             remedy = "give results that share a fifth of their pixels or more, or state --offset"
         else:
             tried = f"at the stated offset and at shifts within {_NEAR:.0%} of the field of it"

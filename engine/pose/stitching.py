@@ -20,6 +20,7 @@ from mirrorskin.engine.pose.motion import Motion
 from mirrorskin.engine.pose.pose import Pose
 from mirrorskin.engine.pose.pose_graph import PoseGraph, Poses, part
 from mirrorskin.io import InputError, Result, select_turn
+from mirrorskin.io.base.arguments import as_array
 from mirrorskin.io.base.findings import Finding, carried, in_process, with_findings
 from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.io.model.maps import StitchStatus, status_of
@@ -151,11 +152,8 @@ def stitch(
 
 def _each_offset(offsets: ArrayLike, count: int) -> list[tuple[float, float]]:
     """Return the offset of each touch after the first."""
-    try:
-        pairs = np.asarray(offsets, np.float64).reshape(-1, 2)
-    except (TypeError, ValueError):
-        pairs = np.zeros((0, 2))
-    if len(pairs) not in (1, count - 1) or not np.isfinite(pairs).all():
+    pairs = np.asarray(as_array("offsets", offsets, "mm"), np.float64)
+    if pairs.shape not in ((2,), (1, 2), (count - 1, 2)) or not np.isfinite(pairs).all():
         raise InputError(
             f"offsets {offsets!r:.60}: give x and y in mm, once or {count - 1} times for {count} results"
         )

@@ -187,6 +187,25 @@ def test_a_result_that_cannot_be_measured_is_a_row(ball, tmp_path):
     assert "has no heights" in (tmp_path / "t.csv").read_text()
 
 
+def test_limits_of_results_that_cannot_be_measured_are_kept(tmp_path):
+    io.save_result(io.Result(azimuth=np.zeros(SHAPE, np.float32)), tmp_path / "wave.h5")
+    ended = run("measure", tmp_path / "wave.h5", "--limits", "Sq=:2um", "-o", tmp_path / "t.csv")
+    assert "1 of 1 could not be measured" in ended.said
+    assert "limits of Sq: at most 2 um" in (tmp_path / "t.csv").read_text()
+
+
+def test_all_quantities_of_many_results_are_columns(ball, rough):
+    columns = [run("measure", ball, rough, *more).out.splitlines()[0] for more in ([], ["--all"])]
+    assert "measured area" not in columns[0]
+    assert "measured area" in columns[1]
+
+
+def test_the_budgets_of_many_results_are_in_json(ball, rough):
+    refused("add --json", "measure", ball, rough, "--budget")
+    files = json.loads(run("measure", ball, rough, "--budget", "--json").out)["files"]
+    assert all("sphere radius" in entry["budget"] or "Sq" in entry["budget"] for entry in files)
+
+
 def test_masks_and_references_are_options(rough, tmp_path):
     plain, masked = (told(rough, *more)["quantities"] for more in ([], ["--mask=defects"]))
     assert plain["Sz"]["value"] > 200 > 20 > masked["Sz"]["value"]

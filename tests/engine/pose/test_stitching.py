@@ -256,7 +256,7 @@ def test_the_order_of_fields_does_not_matter():
 def test_a_refusal_says_what_was_tried():
     rng = np.random.default_rng(0)
     fields = [cut(rough(seed), 0, rng, size=(50, 60)) for seed in (1, 2)]
-    with pytest.raises(io.InputError, match=r"shifted by the peaks .* rotations about z; at best .* sigmas"):
+    with pytest.raises(io.InputError, match=r"at the peaks .* rotations about z; at best .* sigmas"):
         engine.pose.stitch(fields)
     with pytest.raises(io.InputError, match=r"within 10% of the field .* check --offset"):
         engine.pose.stitch(fields, offsets=(0.2, 0.0))
@@ -280,7 +280,12 @@ def test_a_plain_surface_is_where_it_is_stated_with_a_warning():
     assert "do not determine all of the motion of result 1" in whole.result.process["warnings"]
 
 
-@pytest.mark.parametrize("offsets", [(1.0,), [(1.0, 0.0)] * 3, (np.nan, 0.0), "here"])
+def test_an_offset_that_is_no_number_is_refused():
+    with pytest.raises(io.InputError, match="offsets is 'here': numbers are needed"):
+        engine.pose.stitch(touches(moves=MOVES[:2]), offsets="here")
+
+
+@pytest.mark.parametrize("offsets", [(1.0,), [(1.0, 0.0)] * 3, (np.nan, 0.0), [1.0, 0.0, 1.0, 0.0]])
 def test_offsets_that_are_no_positions_are_refused(offsets):
     with pytest.raises(io.InputError, match="once or 1 times"):
         engine.pose.stitch(touches(moves=MOVES[:2]), offsets=offsets)
