@@ -137,8 +137,9 @@ class Loop:
         started = self._source.now()
         (at, position, picture), frames = self._newest, self._monitor.used
         maps = self._run.maps(max(_PATIENCE, self._idle()))
-        update = Update(frames, at, self._source.motion, position, picture.copy(), maps)
         finished = self._source.now()
+        motion = self._source.motion
+        update = Update(frames, at, motion, position, picture.copy(), maps, finished - at)
         self._updated, self._pending = started, False
         self._monitor.updated()
         self._monitor.time(UPDATED, finished - started)

@@ -48,6 +48,9 @@ class Update:
         The maps that the operation shows, and numbers, with their declarations; see `first`.
         Of built-in operations: ``height``, ``normals``, ``contact``, ``edges`` (which may be of earlier
         frames), ``displacement`` since the first frame, and of a body that rocks ``slope``.
+    latency : float
+        Seconds from the newest frame's time, its exposure if the source states it, to these maps; NaN
+        without a time.
     """
 
     frames: int
@@ -56,6 +59,7 @@ class Update:
     position: float
     picture: NDArray[Any]
     maps: Result = field(default_factory=Result)
+    latency: float = math.nan
 
     def __getattr__(self, name: str) -> Any:
         if name in Update.__slots__:  # the constructor failed

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import Any, cast
 
@@ -18,7 +20,7 @@ from mirrorskin.engine.base.device_arrays import on_host
 from mirrorskin.engine.base.frames import as_frames, check_dtype
 from mirrorskin.engine.base.method import Method
 from mirrorskin.engine.base.operation import COMPONENTS, Operation
-from mirrorskin.engine.live.loop import LATENCY, Loop
+from mirrorskin.engine.live.loop import LATENCY, Loop, OnUpdate
 from mirrorskin.engine.live.run import LiveRun
 from mirrorskin.engine.live.status import Status, Update
 from mirrorskin.io import Block, Header, InputError, Motion, Result
@@ -52,6 +54,9 @@ class Stream(Closing):
         Properties of all frames, such as the pixel size; its motion is used.
     latency : float
         Seconds; infinite to use all frames: then `push` waits while 64 frames wait.
+    on_update : callable, optional
+        Called with each update and the status, in the stream's thread, which waits for it. What it raises
+        ends the stream as an error of the operation does.
 
     Raises
     ------
@@ -79,13 +84,15 @@ class Stream(Closing):
         motion: Motion | None = None,
         header: Header | None = None,
         latency: float = LATENCY,
+        on_update: OnUpdate | None = None,
     ) -> None:
         self._source = _Pushed(_header(operation, motion, header), shape, check_dtype(dtype), latency)
         self._run = LiveRun(self._source, operation)
         self._run.precompile()
         if {"pose", "tilt"} & {name for name, needed in self._run.operation.positions.items() if needed}:
             self._source.needed += ("tilt",)
-        self._loop = Loop(self._source, self._run, latency=latency, on_update=self._source.keep)
+        keep = self._source.keep if on_update is None else _both(self._source.keep, on_update)
+        self._loop = Loop(self._source, self._run, latency=latency, on_update=keep)
         self._thread = threading.Thread(
             target=_run, args=(self._loop, self._source), name="mirrorskin-stream", daemon=True
         )
@@ -121,6 +128,37 @@ class Stream(Closing):
         """Return the newest maps, for a display, without waiting; None before the first ones."""
         self._source.check()
         return self._source.latest
+
+    async def updates(self) -> AsyncIterator[Update]:
+        """Yield the newest maps whenever there are new ones, until the stream is closed.
+
+        An update that is not taken before the next one is omitted. Whatever the operation refused is raised.
+
+        Examples
+        --------
+        >>> import asyncio
+        >>> from mirrorskin import engine
+        >>> async def watch():
+        ...     with engine.live.Stream(engine.Press(dark=0, bright=255), (2, 3)) as stream:
+        ...         stream.push(np.full((2, 3), 255, np.uint8), travel=0.1)
+        ...         async for update in stream.updates():
+        ...             return update.frames
+        >>> asyncio.run(watch())
+        1
+        """
+        shown, event, loop = None, asyncio.Event(), asyncio.get_running_loop()
+        with self._source.watched(lambda: loop.call_soon_threadsafe(event.set)):
+            while True:
+                event.clear()
+                ended = self._source.finished
+                newest = self.latest()
+                if newest is not None and newest is not shown:
+                    shown = newest
+                    yield newest
+                elif ended:
+                    return
+                else:
+                    await event.wait()
 
     @property
     def status(self) -> Status:
@@ -165,6 +203,18 @@ def _run(loop: Loop, source: _Pushed) -> None:
         loop.run()
     except BaseException as error:  # it is raised by the next call of another thread
         source.fail(error)
+    finally:
+        source.finish()
+
+
+def _both(first: OnUpdate, then: OnUpdate) -> OnUpdate:
+    """Return a function that calls two."""
+
+    def call(update: Update, status: Status) -> None:
+        first(update, status)
+        then(update, status)
+
+    return call
 
 
 def _header(operation: Operation | Method, motion: Motion | None, header: Header | None) -> Header:
@@ -198,6 +248,8 @@ class _Pushed(Closing):
         self._count = self._lost = 0
         self._newest, self._names = -math.inf, frozenset[str]()
         self._idle = self._ended = self._raised = False
+        self.finished = False  # the last frame was processed, or an error ended it
+        self._watchers: list[Callable[[], object]] = []
         self._error: BaseException | None = None
 
     def now(self) -> float:
@@ -210,8 +262,28 @@ class _Pushed(Closing):
         raise RuntimeError("a stream cannot be rewound")
 
     def keep(self, update: Update, status: Status) -> None:
-        """Keep the newest maps."""
+        """Keep the newest maps, and tell those who wait for them."""
         self.latest = update
+        self._tell()
+
+    @contextmanager
+    def watched(self, tell: Callable[[], object]) -> Iterator[None]:
+        """Call a function, from the reader's thread, after each update and at the end."""
+        self._watchers.append(tell)
+        try:
+            yield
+        finally:
+            self._watchers.remove(tell)
+
+    def finish(self) -> None:
+        """Note that no update follows."""
+        self.finished = True
+        self._tell()
+
+    def _tell(self) -> None:
+        for tell in tuple(self._watchers):
+            with suppress(RuntimeError):  # its event loop has ended
+                tell()
 
     def put(self, frames: ArrayLike, at: float | None, positions: Mapping[str, ArrayLike]) -> None:
         """Add frames, after everything about them has been checked."""

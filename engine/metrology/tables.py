@@ -247,7 +247,7 @@ def table(
         name: limit if isinstance(limit, Limit) else Limit.read(limit, name)
         for name, limit in (limits or {}).items()
     }
-    lot = results if isinstance(results, Mapping) else None
+    lot: Mapping[Any, Maps] | None = results if isinstance(results, Mapping) else None
     rows = []
     for number, each in enumerate(results):
         name = str(each) if lot is not None or isinstance(each, str | os.PathLike) else str(number)

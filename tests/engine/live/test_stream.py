@@ -1,5 +1,6 @@
 """Frames of the user's own camera: maps equal those of a recording, and faults reach the pushing thread."""
 
+import asyncio
 import gc
 import math
 import subprocess
@@ -45,6 +46,58 @@ def test_frames_are_pushed_from_any_thread(frames):
         thread.start()
         thread.join()
         assert pushed.result().process["frames"] == len(frames)
+
+
+def test_each_update_is_told_with_its_latency(frames):
+    told = []
+    with stream(engine.Press(**LEVELS), on_update=lambda update, status: told.append(update)) as pushed:
+        for frame, travel in zip(frames, TRAVEL, strict=True):
+            pushed.push(frame, travel=travel, time=pushed.now() - 1.0)  # exposed a second ago
+        pushed.result()
+    assert told[-1].frames == len(frames)
+    assert all(update.latency > 1.0 for update in told)
+
+
+def test_an_error_of_the_function_that_is_told_is_raised_by_the_next_call(frames):
+    def fail(update, status):
+        raise ValueError("no room")
+
+    pushed = stream(engine.Press(**LEVELS), on_update=fail)
+    pushed.push(frames[0], travel=0.0)
+    with pytest.raises(ValueError, match="no room"):
+        pushed.result()
+
+
+def test_updates_are_awaited_until_the_stream_is_closed(frames):
+    async def watch(pushed):
+        return [update async for update in pushed.updates()]
+
+    with stream(engine.Press(**LEVELS)) as pushed:
+
+        def play():
+            pushed.push(frames, travel=TRAVEL)
+            pushed.close()
+
+        thread = threading.Thread(target=play)
+        thread.start()
+        seen = asyncio.run(watch(pushed))
+        thread.join()
+    assert seen[-1].frames == len(frames)
+    assert len({update.frames for update in seen}) == len(seen)
+
+
+def test_what_the_operation_refused_is_raised_to_who_awaits_updates():
+    async def watch(pushed):
+        async for _ in pushed.updates():
+            pass
+
+    def fail(update, status):
+        raise ValueError("no room")
+
+    pushed = stream(engine.Press(**LEVELS), on_update=fail)
+    pushed.push(np.zeros(SHAPE, np.uint8), travel=0.0)
+    with pytest.raises(ValueError, match="no room"):
+        asyncio.run(watch(pushed))
 
 
 def test_the_newest_maps_can_be_looked_at(frames):
