@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.conjugate_gradients import Face, conjugate_gradients
 
 Singles = NDArray[np.float32]
+Reals = NDArray[Any]
 Real = TypeVar("Real", np.float32, np.float64)
 Mask = NDArray[np.bool_]
 
@@ -26,11 +27,14 @@ TOLERANCE = 1e-4
 _SOFTNESS = 3 / (4 * math.pi)  # 1 / (pi E*) at E = 1, with E* = E / (1 - nu^2) and nu = 1/2
 _MAX_CONTACT_CHANGES = 40  # maximum number of changes of the contact
 _MAX_STEPS = 300  # maximum number of conjugate-gradient steps
+_ROUGHLY = 0.1  # gap in a contact that may change, as a share of its initial gap
 _GRADIENT_ERROR = 1e-3  # maximum gap of a flat punch that is pressed in by 1
 _NO_SLOPE = 1e-9  # slope below which its direction is undefined
 _FIRM = 0.05  # share of the maximum pressure below which the contact of a cell is neglected in derivatives
 _ROUGH_TOLERANCE, _ROUGH_STEPS = 2e-2, 60  # relative residual, and maximum number of steps, for derivatives
-_SIZES = 4  # cells: granularity of the size of windows
+_SIZES = 4  # pixels: granularity of the size of windows
+_MARGIN = 0.1  # of the window in which the contact is searched, as a share of the initial contact's length
+_COARSEST = 16  # pixels: minimum side of a surface of half the resolution
 
 
 class HalfSpace:
@@ -46,11 +50,22 @@ class HalfSpace:
     wavenumbers above the grid's own (Vico, Greengard and Ferrando, J. Comput. Phys. 323, 2016, 191-203).
     The pressure outside the grid is 0.
 
-    ``shape`` is rows and columns; ``pixel_size`` is along x and y, mm.
+    ``shape`` is rows and columns; ``pixel_size`` is along x and y, mm. A part of a larger grid, ``whole``,
+    has that grid's weights, so that each of its sizes costs one transform and not many Bessel functions.
     """
 
-    def __init__(self, shape: tuple[int, int], pixel_size: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        pixel_size: tuple[float, float],
+        whole: tuple[int, int] | None = None,
+    ) -> None:
         self.shape, self.pixel_size, self._padded = shape, pixel_size, _padded(shape)
+        self._whole = whole or shape
+
+    def part(self, shape: tuple[int, int]) -> HalfSpace:
+        """Return the half-space of a part of the grid."""
+        return HalfSpace(shape, self.pixel_size, self._whole)
 
     @property
     def pixel_area(self) -> float:
@@ -61,65 +76,104 @@ class HalfSpace:
         """Return the displacement by pressures over Young's modulus, (..., H, W) mm, positive inwards."""
         rows, columns = self.shape
         wave = fft.rfft2(strain, self._padded)
-        wave *= _spectrum(self.shape, self.pixel_size).astype(wave.real.dtype)
+        wave *= _spectrum(self.shape, self._whole, self.pixel_size, wave.real.dtype)
         moved: NDArray[Real] = fft.irfft2(wave, self._padded, overwrite_x=True)[..., :rows, :columns]
         return moved
 
     def pressed(self, moved: NDArray[Real]) -> NDArray[Real]:
         """Return approximately the strain of displacements, (..., H, W), as if the grid were periodic."""
         wave = fft.rfft2(moved)
-        reach = _reach(self.shape, self.pixel_size)
-        wave /= _cut_off(self.shape, self.pixel_size, reach).astype(wave.real.dtype)
+        wave *= _inverse_spectrum(self.shape, self.pixel_size, wave.real.dtype)
         strain: NDArray[Real] = fft.irfft2(wave, self.shape, overwrite_x=True)
         return strain
 
     def influence(self) -> Doubles:
         """Return the displacement of the pixels below and to the right by unit strain on one, (H, W), mm."""
-        return _influence(self.shape, self.pixel_size)
+        return _influence(self._whole, self.pixel_size)[: self.shape[0], : self.shape[1]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pressed:
     """A rigid surface and the half-space in equilibrium; maps are (H, W)."""
 
-    strain: Doubles  # pressure over Young's modulus, 0 or more
-    height: Doubles  # of the half-space's surface above its rest plane, mm
+    strain: Reals  # pressure over Young's modulus, 0 or more
     contact: Mask
     load: float  # force over Young's modulus, mm^2
 
 
 def press(
-    space: HalfSpace, surface: Doubles, compliance: float = 0.0, start: Pressed | None = None
+    space: HalfSpace,
+    surface: Reals,
+    compliance: float = 0.0,
+    start: Pressed | None = None,
+    tolerance: float = 0.0,
 ) -> Pressed:
     """Press a rigid surface into the half-space without friction.
 
     In contact, the half-space takes the surface's height; elsewhere the pressure is 0. The contact is found
     by an active-set method: conjugate gradients solve for the pressure in the current contact; then pixels
-    with negative pressure are removed and overlapping ones are added, until the contact does not change.
+    with negative pressure are removed and overlapping ones are added, until the contact does not change. This
+    is done in a window around the contact, which grows if the surface overlaps with the sheet outside. The
+    initial guess is the contact of a surface of half the resolution.
 
-    ``surface``, (H, W), is mm above the rest plane for a stiff stage, NaN where there is none. The stage
-    deflects by ``compliance``, 1/mm, for each mm^2 of load. ``start`` is a similar press, as an initial
-    guess. NotConverged if the contact does not converge.
+    ``surface``, (H, W), is mm above the rest plane for a stiff stage, NaN where there is none; its type is
+    that of the computation. The stage deflects by ``compliance``, 1/mm, for each mm^2 of load. ``start`` is a
+    similar press, as an initial guess. Gaps in contact, and overlaps elsewhere, are at most ``tolerance``,
+    mm, if that is more than `TOLERANCE`. NotConverged if the contact does not converge.
     """
-    surface = np.where(np.isfinite(surface), surface, -np.inf)
-    reach = surface > 0
+    surface = np.where(np.isfinite(surface), surface, surface.dtype.type(-np.inf))
+    reach, nothing = surface > 0, np.zeros(space.shape, surface.dtype)
     if not reach.any():
-        zeros = np.zeros(space.shape)
-        return Pressed(zeros, zeros, np.zeros(space.shape, bool), 0.0)
-    tolerance = TOLERANCE * float(surface.max())
-    contact, strain = reach, np.zeros(space.shape)
-    if start is not None and start.contact.any():
+        return Pressed(nothing, reach, 0.0)
+    tolerance = max(tolerance, TOLERANCE * float(surface.max()))
+    if start is None and min(space.shape) >= 2 * _COARSEST:
+        start = _coarse_press(space, surface, compliance)
+    contact, strain = reach, nothing
+    if start is not None and (reach & start.contact).any():
         contact, strain = reach & start.contact, start.strain
-    if not contact.any():
-        contact = reach
+    while True:
+        window, part = _window(space, contact, _MARGIN)
+        inner = strain[window], contact[window]
+        pressure, touching = _press_within(part, surface[window], compliance, tolerance, *inner)
+        strain, contact = nothing.copy(), np.zeros_like(reach)
+        strain[window], contact[window] = pressure, touching
+        load = float(pressure.sum(dtype=np.float64)) * space.pixel_area
+        outside = reach.copy()
+        outside[window] = False
+        if outside.any():
+            window, part = _window(space, reach)
+            gap = _opening(part, compliance)(strain[window]) - surface[window]
+            outside[window] &= gap < -tolerance
+        if not outside.any():
+            return Pressed(strain, contact, load)
+        contact |= outside
+
+
+def _press_within(
+    space: HalfSpace, surface: Reals, compliance: float, tolerance: float, strain: Reals, contact: Mask
+) -> tuple[Reals, Mask]:
+    """Return the strain and the contact, given initial ones."""
     for _ in range(_MAX_CONTACT_CHANGES):
-        strain, gap = _solve(space, surface, compliance, tolerance, contact, np.where(contact, strain, 0.0))
+        strain = np.where(contact, strain, strain.dtype.type(0))
+        strain, gap, error = _solve(space, surface, compliance, tolerance, contact, strain, _ROUGHLY)
         changed = np.where(contact, strain > 0, gap < -tolerance)
-        if np.array_equal(changed, contact):
-            load = float(strain.sum()) * space.pixel_area
-            return Pressed(strain, space.displacement(strain), contact, load)
+        if error <= tolerance and np.array_equal(changed, contact):
+            return strain, contact
         contact = changed
     raise NotConverged(f"the contact did not converge in {_MAX_CONTACT_CHANGES} rounds")
+
+
+def _coarse_press(space: HalfSpace, surface: Reals, compliance: float) -> Pressed | None:
+    """Return the strain and the contact of a surface of half the resolution, if it touches."""
+    rows, columns = (size // 2 for size in space.shape)
+    blocks = surface[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2)
+    size = 2 * space.pixel_size[0], 2 * space.pixel_size[1]
+    coarse = press(HalfSpace((rows, columns), size), blocks.mean(axis=(1, 3)), compliance)
+    odd = [(0, whole - 2 * half) for whole, half in zip(space.shape, (rows, columns), strict=True)]
+    strain, contact = (
+        np.pad(values.repeat(2, axis=0).repeat(2, axis=1), odd) for values in (coarse.strain, coarse.contact)
+    )
+    return Pressed(strain, contact, coarse.load)
 
 
 def load_gradient(space: HalfSpace, contact: Mask, compliance: float = 0.0) -> Doubles:
@@ -128,27 +182,45 @@ def load_gradient(space: HalfSpace, contact: Mask, compliance: float = 0.0) -> D
     They equal the pixel area times the strain under a flat punch of the contact's shape, indented by 1: the
     operator is symmetric, and the pressure at the border of a contact is 0, so its motion adds nothing.
     """
-    flat, zeros = np.ones(space.shape), np.zeros(space.shape)
-    if not contact.any():
-        return zeros
-    return _solve(space, flat, compliance, _GRADIENT_ERROR, contact, zeros)[0] * space.pixel_area
+    gradient = np.zeros(space.shape)
+    if contact.any():
+        window, part = _window(space, contact)
+        flat, zeros = np.ones(part.shape), np.zeros(part.shape)
+        strain, *_ = _solve(part, flat, compliance, _GRADIENT_ERROR, contact[window], zeros)
+        gradient[window] = strain * space.pixel_area
+    return gradient
 
 
 def _solve(
-    space: HalfSpace, surface: Doubles, compliance: float, tolerance: float, contact: Mask, strain: Doubles
-) -> tuple[Doubles, Doubles]:
-    """Return the strain for which the sheet follows the surface in contact, and the gap everywhere."""
+    space: HalfSpace,
+    surface: Reals,
+    compliance: float,
+    tolerance: float,
+    contact: Mask,
+    strain: Reals,
+    share: float = 0.0,
+) -> tuple[Reals, Reals, float]:
+    """Return the strain for which the sheet follows the surface in contact, the gap, and its largest there.
+
+    The largest gap is at most a tolerance, or a share of that of the initial strain, if it is larger.
+    """
+    errors: list[float] = []
+
+    def converged(residual: Reals) -> bool:
+        errors.append(float(np.abs(residual).max()))
+        return errors[-1] <= max(tolerance, share * errors[0])
+
     solution = conjugate_gradients(
         _opening(space, compliance),
         surface,
         Face.of(contact, space.pressed),
-        converged=lambda residual: float(np.abs(residual).max()) <= tolerance,
+        converged=converged,
         steps=_MAX_STEPS,
         start=strain,
     )
     if not solution.converged:
         raise NotConverged(f"the pressure in contact was not found in {_MAX_STEPS} steps")
-    return solution.x, solution.product - surface
+    return solution.x, solution.product - surface, errors[-1]
 
 
 def _opening(space: HalfSpace, compliance: float) -> Callable[[NDArray[Real]], NDArray[Real]]:
@@ -200,9 +272,17 @@ def _cut_off(shape: tuple[int, int], pixel_size: tuple[float, float], reach: flo
 
 
 @lru_cache(maxsize=128)
-def _spectrum(shape: tuple[int, int], pixel_size: tuple[float, float]) -> Doubles:
-    """Return the transform of the weights on the padded grid: real, because they are even."""
-    return spectrum_of(_influence(shape, pixel_size))
+def _spectrum(
+    shape: tuple[int, int], whole: tuple[int, int], pixel_size: tuple[float, float], dtype: np.dtype[Any]
+) -> Reals:
+    """Return the transform of a whole grid's weights on a part, padded: real, because they are even."""
+    return spectrum_of(_influence(whole, pixel_size)[: shape[0], : shape[1]]).astype(dtype)
+
+
+@lru_cache(maxsize=128)
+def _inverse_spectrum(shape: tuple[int, int], pixel_size: tuple[float, float], dtype: np.dtype[Any]) -> Reals:
+    """Return the inverse of the spectrum of a point's displacement on a periodic grid, 1/mm."""
+    return (1 / _cut_off(shape, pixel_size, _reach(shape, pixel_size))).astype(dtype)
 
 
 def spectrum_of(weights: Doubles, sign: float = 1.0) -> Doubles:
@@ -256,7 +336,7 @@ def sweep(
     interval = np.clip(np.searchsorted(travel, targets.onset), 0, len(travel) - 1)
     for number, depth in enumerate(travel):
         state = press(space, surface + depth, compliance, state)
-        rise = _gradient(space, state.height)
+        rise = _gradient(space, space.displacement(state.strain))
         slope = np.hypot(*rise)
         compared = np.isfinite(targets.onset) & (interval == number)
         if number == len(travel) - 1:
@@ -332,17 +412,22 @@ def _pressed_by(space: HalfSpace, contact: Mask, heights: Singles, compliance: f
     return np.asarray(solution.x[:, contact], np.float64)
 
 
-def _window(space: HalfSpace, contact: Mask) -> tuple[tuple[slice, slice], HalfSpace]:
-    """Return the part of the grid that contains the contact, and its half-space."""
+def _window(space: HalfSpace, contact: Mask, margin: float = 0.0) -> tuple[tuple[slice, slice], HalfSpace]:
+    """Return the part of the grid that contains the contact, and its half-space.
+
+    The margin on each side is a share of the contact's length.
+    """
     window = []
     for axis, size in zip((1, 0), space.shape, strict=True):
         places = np.flatnonzero(contact.any(axis=axis))
+        extent = int(places[-1] + 1 - places[0])
+        more = math.ceil(margin * extent)
         # Sizes are rounded, so that few spectra are computed.
-        length = min(size, -(-(places[-1] + 1 - places[0]) // _SIZES) * _SIZES)
-        start = min(int(places[0]), size - length)
-        window.append(slice(start, start + int(length)))
+        length = min(size, -(-(extent + 2 * more) // _SIZES) * _SIZES)
+        start = min(max(int(places[0]) - more, 0), size - length)
+        window.append(slice(start, start + length))
     shape = window[0].stop - window[0].start, window[1].stop - window[1].start
-    return (window[0], window[1]), HalfSpace(shape, space.pixel_size)
+    return (window[0], window[1]), space.part(shape)
 
 
 def _square(maps: Singles) -> Singles:

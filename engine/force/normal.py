@@ -115,11 +115,12 @@ def find_force(
     if errors.ndim and np.isfinite(errors).any():
         errors = fill_with_nearest(errors)
     space = HalfSpace((surface.shape[0], surface.shape[1]), size)
-    pressed = press(space, surface + travel, compliance)
+    lowered = (surface + travel).astype(np.float32)
+    pressed = press(space, lowered, compliance)
     gradient = load_gradient(space, pressed.contact, compliance)
     common = travel_sigma * float(gradient.sum())
     independent = float(np.sqrt(np.sum(np.where(pressed.contact, errors * gradient, 0.0) ** 2)))
-    excess = _excess_load(space, surface + travel, errors, compliance, pressed)
+    excess = _excess_load(space, lowered, errors, compliance, pressed)
     load = pressed.load - excess
     spread = math.hypot(young * common, young * independent, young_sigma * load, young * _UNCERTAIN * excess)
     pressure = (young * pressed.strain * (load / pressed.load if pressed.load else 1)).astype(np.float32)
@@ -131,7 +132,7 @@ def find_force(
 
 def _excess_load(
     space: HalfSpace,
-    surface: NDArray[np.float64],
+    surface: NDArray[np.float32],
     errors: NDArray[np.float64],
     compliance: float,
     pressed: Pressed,
@@ -145,7 +146,8 @@ def _excess_load(
     if not np.any(errors * pressed.contact > 0):
         return 0.0
     added = np.where(np.isfinite(errors), errors, 0.0) * np.random.default_rng(0).normal(size=surface.shape)
-    loads = [press(space, surface + sign * added, compliance, pressed).load for sign in (-1, 1)]
+    added = added.astype(np.float32)
+    loads = [press(space, surface + sign * added, compliance, pressed).load for sign in (np.float32(-1), 1)]
     return min(sum(loads) / 2 - pressed.load, pressed.load / 2)
 
 

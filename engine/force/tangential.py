@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,10 +22,11 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.conjugate_gradients import Face, conjugate_gradients
 
 Mask = NDArray[np.bool_]
+Singles = NDArray[np.float32]
 
 _SOFTNESS = 3 / (4 * math.pi)  # 1 / (4 pi G) at E = 1: G = E / 3
 _UP = np.array([1.0, -1.0]).reshape(2, 1, 1)  # y points up, rows increase downwards
-_TOLERANCE, _ROUGH = 1e-5, 1e-3  # residual relative to the largest displacement; with damping, the second
+_TOLERANCE, _ROUGH = 1e-4, 1e-3  # residual relative to the largest displacement; with damping, the second
 _MAX_STEPS = 400  # maximum number of conjugate gradient steps
 _MAX_DISPLACEMENT = 1e6  # maximum displacement, mm
 _MIN_COVERAGE = 0.8  # minimum share of the contact with a displacement
@@ -119,9 +121,8 @@ def find_tangential_force(
     traction = np.zeros((*touches.shape, 2), np.float32)
     touches, spread = touches[rows, columns], spread[:, rows, columns]
     target = np.where(touches, moved[:, rows, columns] * _UP, 0.0)
-    system = _System(touches, size)
-    units = [touches * unit for unit in np.eye(2)[:, :, np.newaxis, np.newaxis]]
-    weights = np.stack([system.solve(unit, _TOLERANCE) for unit in units]) * size[0] * size[1]
+    system = ContactShear(touches, size)
+    weights = system.weights() * size[0] * size[1]
     force = young * np.sum(weights * target, axis=(1, 2, 3)) * _UP.ravel()
     window = (0, 0, window_size, window_size)
     shared = ndimage.uniform_filter(weights * spread, window, mode="constant") * window_size
@@ -193,76 +194,126 @@ def _touches(contact: ArrayLike | None, pressure: ArrayLike | None, shape: tuple
     return touches
 
 
-class _System:
-    """The linear map from tractions over Young's modulus, (2, H, W), to displacements, along x and rows."""
+class ContactShear:
+    """The linear map from tractions over Young's modulus to displacements of a contact, along x and rows.
 
-    def __init__(self, contact: Mask, pixel_size: tuple[float, float]) -> None:
-        self._contact, shape = contact, contact.shape
+    Maps are (..., 2, H, W), float32. A part of a larger grid, ``whole``, has that grid's weights.
+    """
+
+    def __init__(
+        self, contact: Mask, pixel_size: tuple[float, float], whole: tuple[int, ...] | None = None
+    ) -> None:
+        self._contact, self._size, shape = contact, pixel_size, contact.shape
         self._padded = fft.next_fast_len(2 * shape[0] - 1), fft.next_fast_len(2 * shape[1] - 1, real=True)
-        reach = math.hypot(shape[0] * pixel_size[1], shape[1] * pixel_size[0])
-        wide = [
-            fft.next_fast_len(count + math.ceil(reach / size))
-            for count, size in zip(shape, pixel_size[::-1], strict=True)
-        ]
-        weights = [
-            fft.irfft2(part, wide)[: shape[0], : shape[1]] for part in _tensor(wide, pixel_size, reach)
-        ]
-        self._along, self._up, self._across = (
-            spectrum_of(part, sign) for part, sign in zip(weights, (1.0, 1.0, -1.0), strict=True)
-        )
-        along, up, across = _tensor(shape, pixel_size, reach)
-        determinant = along * up - across**2
-        self._inverse = up / determinant, along / determinant, -across / determinant
+        self._spectra = _spectra(shape, whole or shape, pixel_size)
 
-    def displaced(self, strain: Doubles) -> Doubles:
-        """Return the displacement of the contact by tractions, mm."""
-        spectra = self._along, self._up, self._across
-        return np.where(self._contact, _filtered(strain, spectra, self._padded), 0.0)
+    def weights(self, start: Singles | None = None) -> Singles:
+        """Return the tractions that displace the contact by 1 along x, and along rows, (2, 2, H, W)."""
+        units = np.eye(2, dtype=np.float32)[:, :, np.newaxis, np.newaxis] * self._contact
+        return self._solve(units, _TOLERANCE, start=start)
 
-    def solve(self, target: Doubles, tolerance: float, damping: float = 0.0) -> Doubles:
+    def _solve(
+        self, target: Singles, tolerance: float, damping: float = 0.0, start: Singles | None = None
+    ) -> Singles:
         """Return the traction for a displacement of the contact, by preconditioned conjugate gradients."""
-        goal = tolerance * float(np.abs(target).max())
-        shape = self._contact.shape
+        goal, factor = tolerance * float(np.abs(target).max()), np.float32(damping)
+        shape, nothing = self._contact.shape, np.float32(0)
+        inverse = _inverse_spectra(shape, self._size, damping)
+
+        def displaced(strain: Singles) -> Singles:
+            moved = _filtered(strain, self._spectra, self._padded)
+            return moved + factor * strain if damping else moved
+
         solution = conjugate_gradients(
-            lambda strain: self.displaced(strain) + damping * strain,
+            displaced,
             target,
-            Face.of(self._contact, lambda residual: _filtered(residual, self._inverse, shape)),
+            Face.of(self._contact, lambda residual: _filtered(residual, inverse, shape)),
             converged=lambda residual: float(np.abs(residual).max()) <= goal,
             steps=_MAX_STEPS,
+            start=None if start is None else np.where(self._contact, start, nothing),
+            axes=(-3, -2, -1),
         )
         if not solution.converged:
             raise NotConverged(f"the traction in contact was not found in {_MAX_STEPS} steps")
         return np.asarray(solution.x)
 
-    def damped(self, target: Doubles, sigma: Doubles) -> Doubles:
+    def damped(self, displacement: Doubles, sigma: Doubles) -> Singles:
         """Return the damped traction whose misfit equals the standard deviation of the displacements."""
+        target = displacement.astype(np.float32)
         noise = float(np.mean(sigma[:, self._contact] ** 2))
         if not noise:
-            return self.solve(target, _TOLERANCE)
+            return self._solve(target, _TOLERANCE)
         softness = _SOFTNESS * math.sqrt(np.count_nonzero(self._contact))
+        strain: Singles | None = None
 
         def excess(power: float) -> float:
+            nonlocal strain
             damping = softness * 10**power
-            misfit = damping * self.solve(target, _ROUGH, damping)
-            return float(np.mean(misfit[:, self._contact] ** 2)) / noise - 1
+            strain = self._solve(target, _ROUGH, damping, strain)
+            misfit = damping * strain[:, self._contact]
+            return math.log10(float(np.mean(misfit**2)) / noise)
 
         low, high = (math.log10(end) for end in _DAMPING)
-        if excess(high) < 0:  # noise explains all displacements
-            return np.zeros_like(target)
-        power = low if excess(low) > 0 else float(brentq(excess, low, high, xtol=0.05))
-        return self.solve(target, _ROUGH, softness * 10**power)
+        power, step = 0.0, -1.0 if excess(0.0) > 0 else 1.0
+        while (excess(power + step) > 0) == (step < 0):
+            power += step
+            if power >= high:  # noise explains all displacements
+                return np.zeros_like(target)
+            if power <= low:
+                break
+        else:
+            power = float(brentq(excess, *sorted((power, power + step)), xtol=0.05))
+        return self._solve(target, _ROUGH, softness * 10**power, strain)
 
 
-def _filtered(values: Doubles, spectra: tuple[Doubles, Doubles, Doubles], shape: tuple[int, ...]) -> Doubles:
-    """Return the convolution of vectors, (2, H, W), with a symmetric tensor of spectra xx, yy and xy."""
-    x, y = fft.rfft2(values, shape)
+def _filtered(values: Singles, spectra: Singles, shape: tuple[int, ...]) -> Singles:
+    """Return the convolution of vectors, (..., 2, H, W), with a symmetric tensor of spectra xx, yy and xy."""
+    wave = fft.rfft2(values, shape)
     xx, yy, xy = spectra
-    product = np.stack([xx * x + xy * y, xy * x + yy * y])
-    return np.asarray(fft.irfft2(product, shape)[:, : values.shape[1], : values.shape[2]])
+    x, y = wave[..., 0, :, :], wave[..., 1, :, :]
+    product = np.empty_like(wave)
+    product[..., 0, :, :] = xx * x + xy * y
+    product[..., 1, :, :] = xy * x + yy * y
+    moved = fft.irfft2(product, shape, overwrite_x=True)
+    return np.asarray(moved[..., : values.shape[-2], : values.shape[-1]])
 
 
+@lru_cache(maxsize=16)
+def _responses(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> list[Doubles]:
+    """Return the weights xx, yy and xy of the convolution, (H, W) each."""
+    reach = _reach(shape, pixel_size)
+    wide = tuple(
+        fft.next_fast_len(count + math.ceil(reach / size))
+        for count, size in zip(shape, pixel_size[::-1], strict=True)
+    )
+    return [fft.irfft2(part, wide)[: shape[0], : shape[1]] for part in _tensor(wide, pixel_size, reach)]
+
+
+@lru_cache(maxsize=32)
+def _spectra(shape: tuple[int, ...], whole: tuple[int, ...], pixel_size: tuple[float, float]) -> Singles:
+    """Return the transforms of a whole grid's weights on a part, padded."""
+    weights = [part[: shape[0], : shape[1]] for part in _responses(whole, pixel_size)]
+    spectra = [spectrum_of(part, sign) for part, sign in zip(weights, (1.0, 1.0, -1.0), strict=True)]
+    return np.stack(spectra).astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def _inverse_spectra(shape: tuple[int, ...], pixel_size: tuple[float, float], damping: float) -> Singles:
+    """Return the inverse of the spectra, with damping, on a periodic grid."""
+    along, up, across = _tensor(shape, pixel_size, _reach(shape, pixel_size))
+    along, up = along + damping, up + damping
+    determinant = along * up - across**2
+    return np.stack([up / determinant, along / determinant, -across / determinant]).astype(np.float32)
+
+
+def _reach(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> float:
+    """Return the largest distance on a grid, mm."""
+    return math.hypot(shape[0] * pixel_size[1], shape[1] * pixel_size[0])
+
+
+@lru_cache(maxsize=32)
 def _tensor(
-    shape: tuple[int, ...] | list[int], pixel_size: tuple[float, float], reach: float
+    shape: tuple[int, ...], pixel_size: tuple[float, float], reach: float
 ) -> tuple[Doubles, Doubles, Doubles]:
     """Return the spectra xx, yy and xy of the displacements by a point force, cut off at a reach, mm.
 
