@@ -120,12 +120,13 @@ def speckles():
 
 
 def dragged():
-    """Return the displacement of a skin that is dragged in the middle of the picture."""
+    """Return an object, and the displacement of a skin that it drags in the middle of the picture."""
     row, column = np.mgrid[-1:1:48j, -1:1:64j]
     touching = np.hypot(row, column) < 0.5
     displacement = np.dstack([0.05 * touching, 0 * row])
     names = {"pixel_size": 0.05, "modulus": 0.1, "touching": touching, "sigma": 1e-3}
-    return {"engine": engine, "displacement": displacement, **names}
+    height = -0.3 * (row**2 + column**2)
+    return {"engine": engine, "height": height, "displacement": displacement, **names}
 
 
 def arrays():

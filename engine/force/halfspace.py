@@ -99,6 +99,11 @@ class Pressed:
     strain: Reals  # pressure over Young's modulus, 0 or more
     contact: Mask
     load: float  # force over Young's modulus, mm^2
+    gap: Reals  # gap in contact that the search left, mm; 0 elsewhere
+
+    def more(self, gradient: Reals) -> float:
+        """Return what a sum of pressures lacks because of the gap, given its derivatives by heights."""
+        return -float(np.sum(gradient * self.gap))
 
 
 def press(
@@ -124,7 +129,7 @@ def press(
     surface = np.where(np.isfinite(surface), surface, surface.dtype.type(-np.inf))
     reach, nothing = surface > 0, np.zeros(space.shape, surface.dtype)
     if not reach.any():
-        return Pressed(nothing, reach, 0.0)
+        return Pressed(nothing, reach, 0.0, nothing)
     tolerance = max(tolerance, TOLERANCE * float(surface.max()))
     if start is None and min(space.shape) >= 2 * _COARSEST:
         start = _coarse_press(space, surface, compliance)
@@ -132,33 +137,33 @@ def press(
     if start is not None and (reach & start.contact).any():
         contact, strain = reach & start.contact, start.strain
     while True:
-        window, part = _window(space, contact, _MARGIN)
+        window, part = window_of(space, contact, _MARGIN)
         inner = strain[window], contact[window]
-        pressure, touching = _press_within(part, surface[window], compliance, tolerance, *inner)
-        strain, contact = nothing.copy(), np.zeros_like(reach)
-        strain[window], contact[window] = pressure, touching
+        pressure, touching, remaining = _press_within(part, surface[window], compliance, tolerance, *inner)
+        strain, contact, left = nothing.copy(), np.zeros_like(reach), nothing.copy()
+        strain[window], contact[window], left[window] = pressure, touching, remaining
         load = float(pressure.sum(dtype=np.float64)) * space.pixel_area
         outside = reach.copy()
         outside[window] = False
         if outside.any():
-            window, part = _window(space, reach)
+            window, part = window_of(space, reach)
             gap = _opening(part, compliance)(strain[window]) - surface[window]
             outside[window] &= gap < -tolerance
         if not outside.any():
-            return Pressed(strain, contact, load)
+            return Pressed(strain, contact, load, left)
         contact |= outside
 
 
 def _press_within(
     space: HalfSpace, surface: Reals, compliance: float, tolerance: float, strain: Reals, contact: Mask
-) -> tuple[Reals, Mask]:
-    """Return the strain and the contact, given initial ones."""
+) -> tuple[Reals, Mask, Reals]:
+    """Return the strain, the contact and the gap in it, given an initial strain and contact."""
     for _ in range(_MAX_CONTACT_CHANGES):
         strain = np.where(contact, strain, strain.dtype.type(0))
         strain, gap, error = _solve(space, surface, compliance, tolerance, contact, strain, _ROUGHLY)
         changed = np.where(contact, strain > 0, gap < -tolerance)
         if error <= tolerance and np.array_equal(changed, contact):
-            return strain, contact
+            return strain, contact, np.where(contact, gap, gap.dtype.type(0))
         contact = changed
     raise NotConverged(f"the contact did not converge in {_MAX_CONTACT_CHANGES} rounds")
 
@@ -173,7 +178,7 @@ def _coarse_press(space: HalfSpace, surface: Reals, compliance: float) -> Presse
     strain, contact = (
         np.pad(values.repeat(2, axis=0).repeat(2, axis=1), odd) for values in (coarse.strain, coarse.contact)
     )
-    return Pressed(strain, contact, coarse.load)
+    return Pressed(strain, contact, coarse.load, strain)
 
 
 def load_gradient(space: HalfSpace, contact: Mask, compliance: float = 0.0) -> Doubles:
@@ -182,13 +187,32 @@ def load_gradient(space: HalfSpace, contact: Mask, compliance: float = 0.0) -> D
     They equal the pixel area times the strain under a flat punch of the contact's shape, indented by 1: the
     operator is symmetric, and the pressure at the border of a contact is 0, so its motion adds nothing.
     """
-    gradient = np.zeros(space.shape)
-    if contact.any():
-        window, part = _window(space, contact)
-        flat, zeros = np.ones(part.shape), np.zeros(part.shape)
-        strain, *_ = _solve(part, flat, compliance, _GRADIENT_ERROR, contact[window], zeros)
-        gradient[window] = strain * space.pixel_area
+    if not contact.any():
+        return np.zeros(space.shape)
+    gradient: Doubles = punches(space, contact, np.ones((1, *space.shape)), compliance)[0] * space.pixel_area
     return gradient
+
+
+def punches(
+    space: HalfSpace, contact: Mask, forms: Reals, compliance: float = 0.0, start: Reals | None = None
+) -> Reals:
+    """Return the strains under punches of the contact's shape and given forms, (n, H, W), mm, about 1."""
+    window, part = window_of(space, contact)
+    inner, touching = (slice(None), *window), contact[window]
+    strains = np.zeros_like(forms)
+    solution = conjugate_gradients(
+        _opening(part, compliance),
+        forms[inner],
+        Face.of(touching, part.pressed),
+        converged=lambda residual: float(np.abs(residual).max()) <= _GRADIENT_ERROR,
+        steps=_MAX_STEPS,
+        start=None if start is None else np.where(touching, start[inner], start.dtype.type(0)),
+        axes=(1, 2),
+    )
+    if not solution.converged:
+        raise NotConverged(f"the pressure of a punch was not found in {_MAX_STEPS} steps")
+    strains[inner] = solution.x
+    return strains
 
 
 def _solve(
@@ -398,7 +422,7 @@ def _pressed_by(space: HalfSpace, contact: Mask, heights: Singles, compliance: f
     All are solved at once by conjugate gradients: for maps of this size, the threads of a factorisation would
     cost more than they save. Two digits are sufficient, because the derivatives only guide the search.
     """
-    window, space = _window(space, contact)
+    window, space = window_of(space, contact)
     contact, heights = contact[window], heights[(slice(None), *window)]
     enough = _ROUGH_TOLERANCE**2 * _square(heights)
     solution = conjugate_gradients(
@@ -412,7 +436,7 @@ def _pressed_by(space: HalfSpace, contact: Mask, heights: Singles, compliance: f
     return np.asarray(solution.x[:, contact], np.float64)
 
 
-def _window(space: HalfSpace, contact: Mask, margin: float = 0.0) -> tuple[tuple[slice, slice], HalfSpace]:
+def window_of(space: HalfSpace, contact: Mask, margin: float = 0.0) -> tuple[tuple[slice, slice], HalfSpace]:
     """Return the part of the grid that contains the contact, and its half-space.
 
     The margin on each side is a share of the contact's length.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mirrorskin.engine.press.elastic import PressFit
     from mirrorskin.io import Stiffness
 
-_UNCERTAIN = 0.4  # relative standard deviation of the correction for errors of heights
+UNCERTAIN = 0.4  # relative standard deviation of the correction for errors of heights
 _MAX_OUTSIDE = 0.01  # maximum share of the load outside the picture
 
 
@@ -96,18 +96,10 @@ def find_force(
     (0.107, 0.002)
     """
     result = as_result(height, "height")
-    if result.height is None:
-        raise InputError("height has no map of that name: give the result of a press, or an array (H, W)")
-    surface, size = np.asarray(result.height, np.float64), pixel_size_of(result, "height", pixel_size)
-    if surface.ndim != 2 or 0 in surface.shape:
-        raise InputError(f"heights have shape {surface.shape}: one map (H, W) is needed")
-    if travel is None:
-        travel = result.fitted.travel
-        if travel is None:
-            raise InputError("travel is missing: specify by how many millimetres the body is lowered")
+    surface, travel = surface_of(result, travel)
+    size = pixel_size_of(result, "height", pixel_size)
     young, young_sigma = modulus_of(result, modulus, modulus_sigma)
-    _check(travel=(travel, -math.inf), travel_sigma=(travel_sigma, 0.0), modulus_sigma=(modulus_sigma, 0.0))
-    _check(compliance=(compliance, 0.0))
+    check_bounds(travel_sigma=travel_sigma, modulus_sigma=modulus_sigma, compliance=compliance)
     height_sigma = 0.0 if result.height_sigma is None else result.height_sigma
     errors = np.asarray(height_sigma if sigma is None else sigma, np.float64)
     if errors.shape not in ((), surface.shape):
@@ -115,14 +107,15 @@ def find_force(
     if errors.ndim and np.isfinite(errors).any():
         errors = fill_with_nearest(errors)
     space = HalfSpace((surface.shape[0], surface.shape[1]), size)
-    lowered = (surface + travel).astype(np.float32)
+    lowered = (surface + np.float64(travel)).astype(np.float32)
     pressed = press(space, lowered, compliance)
     gradient = load_gradient(space, pressed.contact, compliance)
     common = travel_sigma * float(gradient.sum())
     independent = float(np.sqrt(np.sum(np.where(pressed.contact, errors * gradient, 0.0) ** 2)))
-    excess = _excess_load(space, lowered, errors, compliance, pressed)
-    load = pressed.load - excess
-    spread = math.hypot(young * common, young * independent, young_sigma * load, young * _UNCERTAIN * excess)
+    added = np.where(np.isfinite(errors), errors, 0.0) * np.random.default_rng(0).normal(size=surface.shape)
+    excess = excess_load(space, lowered, added.astype(np.float32), compliance, pressed, gradient)
+    load = pressed.load + pressed.more(gradient) - excess
+    spread = math.hypot(young * common, young * independent, young_sigma * load, young * UNCERTAIN * excess)
     pressure = (young * pressed.strain * (load / pressed.load if pressed.load else 1)).astype(np.float32)
     force = _force(pressure, pressed.contact, young * load, spread)
     x, y = pixel_axes((surface.shape[0], surface.shape[1]), size)
@@ -130,25 +123,41 @@ def find_force(
     return force.assign(x=x, y=y, process=process).with_fitted(travel=float(travel))
 
 
-def _excess_load(
+def surface_of(result: Result, travel: float | None) -> tuple[NDArray[Any], float]:
+    """Return the heights of a result, (H, W) mm, and the travel, as given or that of the result."""
+    if result.height is None:
+        raise InputError("height has no map of that name: give the result of a press, or an array (H, W)")
+    surface = np.asarray(result.height)
+    if surface.ndim != 2 or 0 in surface.shape:
+        raise InputError(f"heights have shape {surface.shape}: one map (H, W) is needed")
+    if travel is None:
+        travel = result.fitted.travel
+        if travel is None:
+            raise InputError("travel is missing: specify by how many millimetres the body is lowered")
+    if not math.isfinite(travel):
+        raise InputError(f"travel {travel:g} is not possible: give a finite number")
+    return surface, travel
+
+
+def excess_load(
     space: HalfSpace,
     surface: NDArray[np.float32],
-    errors: NDArray[np.float64],
+    errors: NDArray[np.float32],
     compliance: float,
     pressed: Pressed,
+    gradient: NDArray[Any],
 ) -> float:
-    """Return the increase of the load due to independent errors of heights, mm^2.
+    """Return the increase of the load due to errors of heights, of which some are drawn, mm^2.
 
     Peaks increase the load more than dents decrease it. Errors of the same size are added with both signs,
     which cancels linear terms; the mean change of the load approximates the change that the heights already
     contain (SIMEX, Cook and Stefanski 1994).
     """
-    if not np.any(errors * pressed.contact > 0):
+    if not errors[pressed.contact].any():
         return 0.0
-    added = np.where(np.isfinite(errors), errors, 0.0) * np.random.default_rng(0).normal(size=surface.shape)
-    added = added.astype(np.float32)
-    loads = [press(space, surface + sign * added, compliance, pressed).load for sign in (np.float32(-1), 1)]
-    return min(sum(loads) / 2 - pressed.load, pressed.load / 2)
+    both = [press(space, moved, compliance, pressed) for moved in (surface - errors, surface + errors)]
+    mean = sum(each.load + each.more(gradient) for each in both) / 2
+    return min(mean - pressed.load - pressed.more(gradient), pressed.load / 2)
 
 
 def _force(pressure: NDArray[np.float32], contact: NDArray[np.bool_], force: float, sigma: float) -> Result:
@@ -174,11 +183,11 @@ def check_modulus(modulus: float) -> float:
     return modulus
 
 
-def _check(**values: tuple[float, float]) -> None:
-    for name, (value, minimum) in values.items():
-        if not (math.isfinite(value) and value >= minimum):
-            bound = "a finite number" if minimum == -math.inf else f"{minimum:g} or more"
-            raise InputError(f"{name} {value:g} is not possible: give {bound}")
+def check_bounds(**values: float) -> None:
+    """Raise InputError for a number below 0, or one that is not finite."""
+    for name, value in values.items():
+        if not (math.isfinite(value) and value >= 0):
+            raise InputError(f"{name} {value:g} is not possible: give 0 or more")
 
 
 def force_of_press(fit: PressFit, stiffness: Stiffness | float) -> Result:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,11 +26,11 @@ Mask = NDArray[np.bool_]
 Singles = NDArray[np.float32]
 
 _SOFTNESS = 3 / (4 * math.pi)  # 1 / (4 pi G) at E = 1: G = E / 3
-_UP = np.array([1.0, -1.0]).reshape(2, 1, 1)  # y points up, rows increase downwards
+UP = np.array([1.0, -1.0]).reshape(2, 1, 1)  # y points up, rows increase downwards
 _TOLERANCE, _ROUGH = 1e-4, 1e-3  # residual relative to the largest displacement; with damping, the second
 _MAX_STEPS = 400  # maximum number of conjugate gradient steps
 _MAX_DISPLACEMENT = 1e6  # maximum displacement, mm
-_MIN_COVERAGE = 0.8  # minimum share of the contact with a displacement
+MIN_COVERAGE = 0.8  # minimum share of the contact with a displacement
 _DAMPING = 1e-4, 1e4  # range of the damping, relative to the compliance of the contact as a whole
 
 
@@ -120,15 +121,15 @@ def find_tangential_force(
     rows, columns = (slice(int(part.min()), int(part.max()) + 1) for part in np.nonzero(touches))
     traction = np.zeros((*touches.shape, 2), np.float32)
     touches, spread = touches[rows, columns], spread[:, rows, columns]
-    target = np.where(touches, moved[:, rows, columns] * _UP, 0.0)
+    target = np.where(touches, moved[:, rows, columns] * UP, 0.0)
     system = ContactShear(touches, size)
     weights = system.weights() * size[0] * size[1]
-    force = young * np.sum(weights * target, axis=(1, 2, 3)) * _UP.ravel()
+    force = young * np.sum(weights * target, axis=(1, 2, 3)) * UP.ravel()
     window = (0, 0, window_size, window_size)
     shared = ndimage.uniform_filter(weights * spread, window, mode="constant") * window_size
     from_measurement = young * np.sqrt(np.sum(shared**2, axis=(1, 2, 3)))
     strain = system.damped(target, spread)
-    traction[rows, columns] = np.moveaxis(young * strain * _UP, 0, -1)
+    traction[rows, columns] = np.moveaxis(young * strain * UP, 0, -1)
     force_sigma = np.hypot(from_measurement, young_sigma / young * force)
     return Result(
         traction=traction,
@@ -150,21 +151,10 @@ def _checked(
     window_size: int,
 ) -> tuple[Doubles, Doubles, Mask]:
     """Return displacements without gaps, their standard deviations, and the contact."""
-    if result.displacement is None:
-        raise InputError("displacement has no map of that name: give the result of a slide, or an array")
-    moved = np.asarray(result.displacement, np.float64)
-    moved = moved[-1] if moved.ndim == 4 and len(moved) else moved
-    if moved.ndim != 3 or moved.shape[2] != 2 or 0 in moved.shape:
-        raise InputError(f"displacements have shape {moved.shape}: one map (H, W, 2) is needed")
+    moved, spread = last_displacement(result, sigma)
     if contact is None and pressure is None:
         contact, pressure = result.contact, result.pressure
     touches = _touches(contact, pressure, moved.shape[:2])
-    displacement_sigma = 0.0 if result.displacement_sigma is None else result.displacement_sigma
-    spread = np.asarray(displacement_sigma if sigma is None else sigma, np.float64)
-    spread = spread[-1] if sigma is None and spread.ndim == 4 else spread
-    if spread.shape not in ((), moved.shape[:2], moved.shape):
-        raise InputError(f"sigma has shape {spread.shape}: it must be that of the map, {moved.shape[:2]}")
-    spread = np.broadcast_to(spread[..., np.newaxis] if spread.ndim == 2 else spread, moved.shape)
     if window_size < 1:
         raise InputError(f"window_size {window_size} is not possible: give pixels, 1 or more")
     finite = np.isfinite(moved).all(axis=-1)
@@ -173,13 +163,29 @@ def _checked(
     fraction = np.count_nonzero(finite & touches) / np.count_nonzero(touches)
     if not np.isfinite(spread).any() or np.any(spread < 0):
         raise InputError("sigma is below 0, or nowhere known: give millimetres, 0 or more")
-    if fraction < _MIN_COVERAGE:
-        raise InputError(f"{fraction:.0%} of the contact has a displacement: {_MIN_COVERAGE:.0%} are needed")
+    if fraction < MIN_COVERAGE:
+        raise InputError(f"{fraction:.0%} of the contact has a displacement: {MIN_COVERAGE:.0%} are needed")
     filled = (
         np.stack([fill_with_nearest(np.where(finite, part, np.nan)) for part in np.moveaxis(values, -1, 0)])
         for values in (moved, spread)
     )
     return next(filled), next(filled), touches
+
+
+def last_displacement(result: Result, sigma: ArrayLike | None = None) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the last displacement of a result and its standard deviation, (H, W, 2), as given or its own."""
+    if result.displacement is None:
+        raise InputError("displacement has no map of that name: give the result of a slide, or an array")
+    moved = np.asarray(result.displacement)
+    moved = moved[-1] if moved.ndim == 4 and len(moved) else moved
+    if moved.ndim != 3 or moved.shape[2] != 2 or 0 in moved.shape:
+        raise InputError(f"displacements have shape {moved.shape}: one map (H, W, 2) is needed")
+    displacement_sigma = 0.0 if result.displacement_sigma is None else result.displacement_sigma
+    spread = np.asarray(displacement_sigma if sigma is None else sigma)
+    spread = spread[-1] if sigma is None and spread.ndim == 4 else spread
+    if spread.shape not in ((), moved.shape[:2], moved.shape):
+        raise InputError(f"sigma has shape {spread.shape}: it must be that of the map, {moved.shape[:2]}")
+    return moved, np.broadcast_to(spread[..., np.newaxis] if spread.ndim == 2 else spread, moved.shape)
 
 
 def _touches(contact: ArrayLike | None, pressure: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
@@ -207,10 +213,10 @@ class ContactShear:
         self._padded = fft.next_fast_len(2 * shape[0] - 1), fft.next_fast_len(2 * shape[1] - 1, real=True)
         self._spectra = _spectra(shape, whole or shape, pixel_size)
 
-    def weights(self, start: Singles | None = None) -> Singles:
+    def weights(self, error: float = _TOLERANCE, start: Singles | None = None) -> Singles:
         """Return the tractions that displace the contact by 1 along x, and along rows, (2, 2, H, W)."""
         units = np.eye(2, dtype=np.float32)[:, :, np.newaxis, np.newaxis] * self._contact
-        return self._solve(units, _TOLERANCE, start=start)
+        return self._solve(units, error, start=start)
 
     def _solve(
         self, target: Singles, tolerance: float, damping: float = 0.0, start: Singles | None = None

@@ -527,6 +527,12 @@ TABLE: Mapping[str, Map] = {
     "force": Map("normal force at the greatest travel", "N", "float64", "none"),
     "force_x": Map("force along x that the object exerts on the sensor at the end", "N", "float64", "none"),
     "force_y": Map("force along y that the object exerts on the sensor at the end", "N", "float64", "none"),
+    "pressure_centre_x": Map(
+        "centre of pressure along x; undefined if nothing touches", "mm", "float64", "none"
+    ),
+    "pressure_centre_y": Map(
+        "centre of pressure along y; undefined if nothing touches", "mm", "float64", "none"
+    ),
 }
 """The maps, series and numbers that built-in operations return, in the order of files and figures."""
 

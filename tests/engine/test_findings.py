@@ -73,6 +73,10 @@ CONSUMERS = {
         lambda: engine.force.find_force(touch(), 0.5, PIXEL, modulus=0.1).process["warnings"],
         f"height: {LOST}",
     ),
+    "ForceTracker": (
+        lambda: engine.force.ForceTracker(PIXEL, 0.1, binning=1).push(touch(), -9.0).process["warnings"],
+        f"result: {LOST}",
+    ),
     "find_tangential_force": (
         lambda: engine.force.find_tangential_force(displacement(), PIXEL, 0.1).process["warnings"],
         f"displacement: {LOST}",
