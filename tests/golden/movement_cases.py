@@ -70,6 +70,21 @@ def find_force() -> Answer:
 
 
 @case(FORCE)
+def force_tracker() -> Answer:
+    x, y = places((64, 80))
+    random, tracker = np.random.default_rng(4), force.ForceTracker(PIXEL, 0.1, binning=2, window_size=4)
+    found = []
+    for number in range(4):
+        height = dome((64, 80), 0.4)[0] + random.normal(0, 0.001, (64, 80))
+        shift = np.stack([0.01 * number - 0.003 * np.hypot(x, y) ** 2, 0.002 * x * y], axis=-1)
+        maps = {"height": height, "height_sigma": np.full((64, 80), 0.001), "displacement": shift}
+        found.append(tracker.push(maps, 0.2 + 0.02 * number))
+    numbers = [value for name, value in sorted(found[-1].items()) if np.ndim(value) == 0]
+    forces = [(one.force, one.force_x, one.pressure_centre_x) for one in found]
+    return {"pressure": found[-1].pressure, "numbers": np.array(numbers), "forces": np.array(forces)}
+
+
+@case(FORCE)
 def find_tangential_force() -> Answer:
     x, y = places((40, 52))
     contact = np.hypot(x - 0.1, y) < 0.7
