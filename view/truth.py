@@ -17,6 +17,7 @@ from mirrorskin.view.drawing.canvas import (
     draw_image,
     exceeded,
     explain_colours,
+    explain_heights,
     extent,
     filled_colours,
     new_figure,
@@ -224,33 +225,15 @@ def _colours(
 
 
 def draw_height_bars(
-    axes: Axes, limits: Range, reliefs: Sequence[Relief], bounds: tuple[float, float] = (1.04, 0.08)
+    axes: Axes, limits: Range, reliefs: Sequence[Relief], place: tuple[float, float] = (1.04, 0.08)
 ) -> None:
-    """Draw the colours of measured and of filled heights, on one scale, at a left edge and with a width."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    shades: dict[str, Any] = {"measured": SEQUENTIAL}
-    if any(relief.filled.any() for relief in reliefs):
-        shades["filled"] = filled_colours()
-    left, width = bounds
+    """Draw the colours of measured and of filled heights, on one scale."""
     beyond = exceeded(np.concatenate([relief.height.ravel() for relief in reliefs]), *limits)
-    for number, (name, colours) in enumerate(shades.items()):
-        bar = axes.inset_axes((left + 1.15 * width * number, 0, width, 1))
-        axes.figure.colorbar(ScalarMappable(Normalize(*limits), colours), cax=bar, extend=beyond)
-        bar.text(
-            *(0.5, 0.5, name),
-            transform=bar.transAxes,
-            rotation=90,
-            ha="center",
-            va="center",
-            fontsize=SMALL,
-            color="white" if colours == SEQUENTIAL else "black",
-        )
+    filled = any(relief.filled.any() for relief in reliefs)
+    explain_heights(axes, limits, "height (mm)", beyond, filled=filled, text=SMALL, place=place)
+    for bar in axes.child_axes:
         bar.tick_params(labelsize=SMALL)
-        if name != list(shades)[-1]:
-            bar.set_yticks([])
-    bar.set_ylabel("height (mm)", fontsize=TEXT)
+        bar.yaxis.label.set_fontsize(TEXT)
 
 
 def _draw_height_errors(

@@ -403,7 +403,7 @@ def in_micrometres(result):
 
 
 def test_declared_heights_have_the_displayed_unit_in_the_map():
-    bar = map_of("rise", in_micrometres(along())).child_axes[0]
+    bar = map_of("rise", in_micrometres(along())).child_axes[-1]
     assert bar.get_ylabel() == "rise (µm)"
     np.testing.assert_allclose(bar.get_ylim(), [-1000, 0], atol=1)
 

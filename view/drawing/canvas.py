@@ -210,6 +210,44 @@ def explain_colours(axes: Axes, picture: ScalarMappable, label: str, extend: str
     bar.yaxis.label.set_parse_math(False)
 
 
+def explain_heights(
+    axes: Axes,
+    ends: tuple[float, float],
+    label: str,
+    extend: str = "neither",
+    *,
+    filled: bool,
+    text: float,
+    place: tuple[float, float],
+) -> None:
+    """Draw a colour bar of heights adjacent to a panel, and with ``filled`` one of filled heights next to it.
+
+    The bars have one scale and their names on them, in letters of that size. The first starts at ``place[0]``
+    and each has the width ``place[1]``, relative to the panel.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    left, width = place
+    shades = {"measured": (SEQUENTIAL, "white")} | ({"filled": (filled_colours(), "black")} if filled else {})
+    for number, (name, (colours, ink)) in enumerate(shades.items()):
+        bar = axes.inset_axes((left + 1.15 * width * number, 0, width, 1))
+        axes.figure.colorbar(ScalarMappable(Normalize(*ends), colours), cax=bar, extend=extend)
+        if filled:
+            bar.text(
+                *(0.5, 0.5, name),
+                transform=bar.transAxes,
+                rotation=90,
+                ha="center",
+                va="center",
+                fontsize=text,
+                color=ink,
+            )
+        if number < len(shades) - 1:
+            bar.set_yticks([])
+    bar.set_ylabel(label, parse_math=False)
+
+
 def exceeded(values: NDArray[Any], low: float, high: float) -> str:
     """Return which ends of the colour scale are exceeded, as an argument of ``explain_colours``."""
     below, above = bool(np.any(values < low)), bool(np.any(values > high))

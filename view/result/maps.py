@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.base.types import Floats
 from mirrorskin.io.model.maps import Map
-from mirrorskin.view.drawing.canvas import draw_classes, explain_colours, filled_colours, round_length
+from mirrorskin.view.drawing.canvas import draw_classes, explain_heights, filled_colours, round_length
 from mirrorskin.view.drawing.colours import (
     MISSING,
     MISSING_RGB,
@@ -34,16 +34,15 @@ _EDGE = 0.1  # space for a letter, relative to the picture's width
 
 def draw_height(axes: Axes, sheet: Sheet, profile: Section | None = None) -> None:
     """Draw heights by colour, with a scale bar, and the line of the section."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
     height = sheet.result.height
     assert height is not None
     scale = scale_of(sheet, sheet.result.name_of("height") or "height")
     ends = scale.low / sheet.of_height.figure_scale, scale.high / sheet.of_height.figure_scale
     draw_map(axes, sheet, height_picture(height, sheet.filled, ends), interpolation="antialiased")
-    colours = ScalarMappable(Normalize(scale.low, scale.high), scale.colours)
-    explain_colours(axes, colours, scale.label, scale.beyond)
+    filled = bool(sheet.filled.any())
+    place = (1.03, 0.05 if filled else 0.04)
+    span = scale.low, scale.high
+    explain_heights(axes, span, scale.label, scale.beyond, filled=filled, text=SMALL, place=place)
     if sheet.true_to_scale and sheet.unit == "mm" and height.size > 1:
         _draw_scale(axes, sheet)
     if profile is not None:
