@@ -60,12 +60,13 @@ class Picture:
 
     A picture that does not fit on a device is divided into bands of rows, as is one on several devices.
 
-    Each work-item of a kernel processes ``TILE`` pixels, in vectors of ``LANES`` if it uses these; ``FRAME``
-    is the type of a sample, and ``BITS`` its width. A kernel gets its arguments by name, and without being
-    asked those of these that it has: all maps; ``pixels``, ``rows`` and ``columns``; ``stride``, the pixels
-    from plane to plane of a map; ``each``, the samples from frame to frame of ``frames``; and in a scan
-    ``frames``, their number ``count``, and ``first``, the number of the first of them. Arrays are copied to
-    the device, floats as float32. A map called ``frames`` holds frames of its own.
+    Each work-item of a kernel processes ``TILE`` pixels, in vectors of ``LANES`` if it uses these;
+    ``FRAME`` is the type of a sample, and ``BITS`` its width. A kernel gets its arguments by name, and
+    without being asked those of these that it has: all maps; ``pixels``, ``rows`` and ``columns``;
+    ``above``, the rows of the picture above the band; ``stride``, the pixels from plane to plane of a map;
+    ``each``, the samples from frame to frame of ``frames``; and in a scan ``frames``, their number
+    ``count``, and ``first``, the number of the first of them. Arrays are copied to the device, floats as
+    float32. A map called ``frames`` holds frames of its own.
 
     Parameters
     ----------
@@ -254,7 +255,8 @@ class Picture:
         moved = sum(array.nbytes for array in available.values()) if whole else 0
         available |= self._constants[device]
         available |= {"pixels": band.pixels, "rows": band.rows.stop - band.rows.start}
-        available |= {"columns": self._shape[1], "stride": band.stride, "each": band.stride}
+        available |= {"columns": self._shape[1], "above": band.rows.start}
+        available |= {"stride": band.stride, "each": band.stride}
         if scanned is not None:
             available |= scanned
             moved += scanned["count"] * band.pixels * self._itemsize

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,8 +14,13 @@ from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.picture import Picture
 from mirrorskin.engine.base.tiling import Planes
-from mirrorskin.engine.diagnosis.footprint import with_curvature
-from mirrorskin.engine.optical.focus_travel import CurveShape, TravelJump, common_shape, curves_of
+from mirrorskin.engine.optical.focus_curves import (
+    CurveShape,
+    LightTrend,
+    TravelJump,
+    common_shape,
+    curves_of,
+)
 from mirrorskin.io import InputError, Map
 from mirrorskin.io.base.types import FRAME_DTYPES
 from mirrorskin.io.model.maps import TABLE, FocusStatus, status_of
@@ -26,11 +31,19 @@ from mirrorskin.kernels.numerics.least_squares import mad_sigma
 _TILE = 16384  # pixels of a work-item on a CPU: some rows, whose sums along columns it moves down
 _LARGEST = 1e18  # noise whose square a float32 holds
 _LEAST_CONTRAST = 5.0  # smallest contrast of a peak above that of noise, in standard errors
-_BETWEEN = 2 / 3  # variance of noise between pixels two reaches apart, whose windows overlap
 _UNUSUAL = 3.0  # standard deviations from the median misfit, beyond which a pixel has its own
 _LEAST_SHARE = 0.1  # of the pixels of a window with a peak, below which errors do not grow any more
 _LEAST_CURVATURE = 3.0  # smallest curvature of a peak, in standard errors
 _FLOATS = "height", "sharpness", "spread", "gain", "misfit"  # maps of focus.cl
+_OWN = "shifted", "shifted_noise", "texture", "texture_noise", "left"  # maps of focus.cl
+_ALL_ROWS = 2**18  # most pixels of a picture of which all rows show the relief
+# Relief inside the window; see docs/method/focus.md.
+_UNSEEN = 1.4  # variance of the errors of pixels, over that which texture shows
+_VARIED = 0.4  # standard deviation of the relief of a part of the picture, over that of a larger one
+_PARTS = 9, 3, 1  # blocks along a side of a part; a block has radius^2 pixels
+_LEAST_RELIEF = 0.1  # of a part, over that of a larger one
+_LEAST_TEXTURE = 0.25  # square of what a pixel varies by because of focus, over that because of noise
+_TINY, _VAST = np.float32(1e-18), np.float32(1e18)  # their squares are numbers
 
 
 class Focus(Operation):
@@ -48,7 +61,7 @@ class Focus(Operation):
 
     motions = ("vertical",)
     dtypes = FRAME_DTYPES
-    checks = (TravelJump,)
+    checks = (TravelJump, LightTrend)
     usual_findings = "not a press", "reversed"  # each pixel is sharp in between
     for_device = True
 
@@ -80,9 +93,15 @@ class Focus(Operation):
         """Prepare the kernel and its maps."""
         if self.noise is None:
             raise InputError("noise is missing: give the standard deviation of a sample in counts, such as 2")
-        maps: dict[str, Any] = {"best": np.int32, "status": np.uint8, **dict.fromkeys(_FLOATS, np.float32)}
-        maps |= {"peak": Planes(2 * self.reach + 1, np.float32), "recent": Planes(self.reach, np.float32)}
+        maps: dict[str, Any] = dict.fromkeys(_FLOATS + _OWN, np.float32)
+        maps |= {"best": np.int32, "status": np.uint8, "recent": Planes(self.reach, np.float32)}
+        maps |= dict.fromkeys(("peak", "detail", "last"), Planes(2 * self.reach + 1, np.float32))
         self._maps = Picture(self, "focus", maps, around=self.radius, tile=_TILE)
+
+    @property
+    def _every(self) -> int:
+        """Rows from one to the next that pixels' own samples are kept in: in large pictures, some suffice."""
+        return max(1, self.radius // 2) if math.prod(self.shape) > _ALL_ROWS else 1
 
     def peaks(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the contrast in the frames around the sharpest one of each pixel, and its number."""
@@ -92,7 +111,7 @@ class Focus(Operation):
     def push(self, frames: NDArray[Any], *, travel: ArrayLike) -> None:
         """Take in the next frames, (n, H, W), and the travel of each, (n,) mm."""
         check_strokes(travel, len(frames), "travel")
-        self._maps.scan("focus_scan", frames, radius=self.radius, reach=self.reach)
+        self._maps.scan("focus_scan", frames, radius=self.radius, reach=self.reach, every=self._every)
 
     def result(self) -> dict[str, Any]:
         """Return height, status and sharpness of the frames so far."""
@@ -103,20 +122,18 @@ class Focus(Operation):
         places = (travel[np.clip(around, 0, len(travel) - 1)] - travel[:, np.newaxis]) / unit
         variance = min(self.noise, _LARGEST) ** 2
         self._maps.run(
-            "focus_fit", count=len(travel), radius=self.radius, reach=self.reach, variance=variance,
-            least_contrast=_LEAST_CONTRAST, least_curvature=_LEAST_CURVATURE, places=places, travel=travel,
-            unit=unit,
+            "focus_fit", count=len(travel), radius=self.radius, reach=self.reach, every=self._every,
+            variance=variance, least_contrast=_LEAST_CONTRAST, least_curvature=_LEAST_CURVATURE,
+            places=places, travel=travel, unit=unit,
         )  # fmt: skip
         status, *floats = self._maps.take("status", *_FLOATS)
-        height, sharpness, spread, gain, misfit = map(np.asarray, floats)
+        height, _, spread, gain, misfit = map(np.asarray, floats)
         shape = self._shape(travel, unit)
         sigma = np.sqrt(np.float32(variance) * spread + self._excess(misfit, shape) * gain)
         if shape is not None:
             sigma = np.hypot(sigma, np.float32(shape.bias))
-        # The window shows the mean of its heights, which is not that of its middle on a curved surface.
-        footprint = ((2 * self.radius + 1) ** 2 - 1) / 12
-        off_centre = _off_centre(height, sigma, sharpness, footprint)
-        sigma = np.hypot(with_curvature(height, sigma, footprint), off_centre)
+        own = _OwnCurves(*map(np.asarray, self._maps.take(*_OWN)))
+        sigma = np.sqrt(sigma**2 + _relief(own, variance, self.radius))
         # Where few pixels around have a peak, noise and their surroundings decided which ones.
         peaks = cv2.blur(np.isfinite(height).astype(np.float32), (2 * self.radius + 1,) * 2)
         sigma = sigma / np.maximum(peaks, _LEAST_SHARE) ** 2
@@ -158,28 +175,71 @@ def _mean_around(values: NDArray[Any], reach: int) -> NDArray[np.float32]:
     return np.asarray(np.divide(total, weight, out=np.zeros_like(total), where=weight > 0))
 
 
-def _off_centre(
-    height: NDArray[Any], sigma: NDArray[Any], sharpness: NDArray[Any], variance: float
-) -> NDArray[np.float32]:
-    """Return standard deviations, mm, because uneven texture is not centred in the window.
+_Sums = NDArray[np.float32]
 
-    The squares of samples of a texture whose logarithm rises by g per pixel have their centre g times the
-    variance of the window away.
+
+class _OwnCurves(NamedTuple):
+    """What the samples of the pixels themselves show, maps; see `mirrorskin.kernels.optical.focus`."""
+
+    shifted: NDArray[Any]
+    shifted_noise: NDArray[Any]
+    texture: NDArray[Any]
+    texture_noise: NDArray[Any]
+    left: NDArray[Any]
+
+
+def _relief(own: _OwnCurves, variance: float, radius: int) -> NDArray[np.float32]:
+    """Return the variance, mm^2, of the heights of pixels about those that their windows show.
+
+    See docs/method/focus.md, "Relief inside the window". It is that of a part of the picture, the less exact
+    ones being drawn towards that of a larger part.
     """
-    reach = math.ceil(math.sqrt(variance))
-    texture = 2 * np.log(np.where(sharpness > 0, sharpness, np.float32(np.nan)))
-    noise = sigma**2 * np.float32(_BETWEEN / reach**2)
-    slope = np.maximum(_slopes(height, reach) - noise, 0)
-    product = np.float32(variance**2) * _slopes(texture, reach) * slope
-    return np.sqrt(_mean_around(product, reach))
+    pixels, excess = own.texture > 0, float(np.sum(own.left, dtype=np.float64))
+    count = np.count_nonzero(pixels)
+    if count == 0:
+        return np.zeros(pixels.shape, np.float32)
+    # Curves of another shape leave more than noise does; noise that is less than stated leaves less.
+    share = np.float32(min(1.0, variance * count / excess) if excess > 0 else 0.0)
+    blocks = [_in_blocks(values, radius) for values in (*own[:-1], pixels)]
+    blocks[1], blocks[3] = share * blocks[1], share * blocks[3]
+    mean, error = _mean_relief(*(np.full_like(part, np.sum(part, dtype=np.float64)) for part in blocks))
+    found = (mean + np.hypot(mean, error)) / 2  # as it is not negative
+    for size in _PARTS:
+        mean, error = _mean_relief(*(_around(part, size) for part in blocks))
+        usual = error**2 / (error**2 + (_VARIED * found) ** 2)
+        # A block has too few pieces of texture to show that it has less relief than its surroundings.
+        least = _LEAST_RELIEF if size > 1 else 1.0
+        found = np.maximum(usual * found + (1 - usual) * mean, least * found)
+    rows, columns = pixels.shape
+    whole = found.shape[1] * radius, found.shape[0] * radius
+    smooth = cv2.resize(np.float32(_UNSEEN) * found, whole, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(smooth, np.float32)[:rows, :columns]
 
 
-def _slopes(values: NDArray[Any], reach: int) -> NDArray[np.float32]:
-    """Return the sum of the squares of both slopes over ``reach`` pixels on each side."""
-    padded = cv2.copyMakeBorder(values.astype(np.float32), reach, reach, reach, reach, cv2.BORDER_REPLICATE)
-    across = padded[reach:-reach, 2 * reach :] - padded[reach:-reach, : -2 * reach]
-    down = padded[2 * reach :, reach:-reach] - padded[: -2 * reach, reach:-reach]
-    return np.asarray((across**2 + down**2) / (4 * reach**2), np.float32)
+def _mean_relief(
+    shifted: _Sums, noise: _Sums, texture: _Sums, texture_noise: _Sums, count: _Sums
+) -> tuple[_Sums, _Sums]:
+    """Return the mean relief, mm^2, of parts of the picture by sums over them, and its standard error."""
+    signal = shifted - noise
+    weight = np.maximum(texture - texture_noise, _LEAST_TEXTURE * texture_noise) + _TINY
+    error = np.sqrt((3 * noise + 4 * np.maximum(signal, 0)) * noise / np.maximum(count, 1))
+    return signal / weight, np.where(count > 0, error / weight + _TINY, _VAST)
+
+
+def _around(blocks: _Sums, size: int) -> _Sums:
+    """Return sums over size x size blocks."""
+    border = cv2.BORDER_CONSTANT
+    return np.asarray(cv2.boxFilter(blocks, -1, (size, size), normalize=False, borderType=border), np.float32)
+
+
+def _in_blocks(values: NDArray[Any], side: int) -> _Sums:
+    """Return sums of blocks of side x side pixels, those at the end being filled with 0."""
+    down, across = (-length % side for length in values.shape)
+    whole = np.asarray(values, np.float32)
+    if down or across:
+        whole = np.asarray(cv2.copyMakeBorder(whole, 0, down, 0, across, cv2.BORDER_CONSTANT))
+    shape = whole.shape[1] // side, whole.shape[0] // side
+    return np.asarray(cv2.resize(whole, shape, interpolation=cv2.INTER_AREA)) * np.float32(side**2)
 
 
 find_focus = travel_function(
@@ -193,11 +253,10 @@ find_focus = travel_function(
     of log S, noise^2 (2 (N - 1) noise^2 + 4 S) / S^2 (a non-central chi-square). The standard error
     follows from these and from the median misfit of such curves in the picture, or that in the window if
     it is unusual; what all curves have in common in the fourth order is no misfit, but its effect on the
-    peaks is added. Where the surface is curved, half of the window's variance, ((2 radius + 1)^2 - 1) /
-    12 square pixels, times its second derivatives is added; where it is inclined and the texture uneven,
-    that variance times its slope and the slope of log S. The sum is divided by the square of the share of
-    the window's pixels that have a peak. With ``reach=1``, which fits three samples exactly, it is
-    unknown: NaN.
+    peaks is added. So is the relief inside the window: by how much peaks of pixels' own samples differ
+    from that of the window. The sum is divided by the square of the share of the window's pixels that
+    have a peak, and what light that changes over the stack shifts peaks by is added. With ``reach=1``,
+    which fits three samples exactly, it is unknown: NaN.
 
     Returns
     -------
@@ -219,7 +278,7 @@ find_focus = travel_function(
     >>> frames = np.exp(-((travel - 3.7) ** 2) / 9)[:, None, None] * texture
     >>> focus = engine.optical.find_focus(frames.astype(np.float32), travel, noise=0.01)
     >>> round(float(focus.height[10, 10]), 2), round(float(focus.height_sigma[10, 10]), 4)
-    (-3.7, 0.0023)
+    (-3.7, 0.0049)
     """,
     "Distance that the camera or its plane of focus was lowered, mm, in steps of any size.",
 )

@@ -59,6 +59,28 @@ void remember(
     for (int i = 0; i < width; ++i) now[i] = sharp[i];
 }
 
+// Copies the last samples of pixels whose sharpest frame is the one in the middle of these.
+void keep_own(
+    const float *own, const size_t place, const int width, const size_t plane, const int t, const int reach,
+    __global const int *restrict best, OUT detail, OUT last)
+{
+    const int kept = 2 * reach + 1;
+    OUT now = last + t % kept * plane + place;
+    for (int i = 0; i < width; ++i) now[i] = own[i];
+    for (int low = 0; low < width; low += CHUNK) {
+        const size_t start = place + low;
+        const int size = min(CHUNK, width - low);
+        int whole[CHUNK], some = 0;
+        for (int i = 0; i < size; ++i) some |= whole[i] = -(best[start + i] == t - reach);
+        if (!some) continue;
+        for (int k = 0; k < kept; ++k) {
+            OUT from = last + (t + 1 + k) % kept * plane + start;
+            OUT to = detail + k * plane + start;
+            for (int i = 0; i < size; ++i) to[i] = as_float(CHOSEN(whole[i], as_int(from[i]), as_int(to[i])));
+        }
+    }
+}
+
 #define MOVING_SUMS (TILE > 1 && BITS < 32)
 #if MOVING_SUMS
 // Sums along columns move down row by row, and their sums along rows to the right, in integers.
@@ -79,8 +101,10 @@ void add_row(__global const FRAME *row, const int width, const int sign, Sum *re
 #endif
 
 __kernel void focus_scan(
-    __global const FRAME *restrict frames, const int count, const int rows, const int columns, const int stride,
-    const int first, const int radius, const int reach, __global int *restrict best, OUT peak, OUT recent)
+    __global const FRAME *restrict frames, const int count, const int rows, const int columns, const int above,
+    const int stride,
+    const int first, const int radius, const int reach, const int every, __global int *restrict best, OUT peak,
+    OUT recent, OUT detail, OUT last)
 {
     const int pixels = rows * columns;
 #if TILE == 1
@@ -109,7 +133,7 @@ __kernel void focus_scan(
             for (int row = row_low; row < row_end; ++row) {
                 const int top = max(row - radius, 0), bottom = min(row + radius, rows - 1);
                 __global const FRAME *restrict middle = frame + (size_t)row * columns + base;
-                float sharp[STRIP], sum[STRIP], square[STRIP];  // of differences from the middle, which lose no digits
+                float sharp[STRIP], own[STRIP], sum[STRIP], square[STRIP];  // of differences from the middle, which lose no digits
 #if MOVING_SUMS
                 if (row + radius < rows)
                     add_row(frame + (size_t)(row + radius) * columns + leftmost, used, 1, sums + start, squares + start);
@@ -147,8 +171,10 @@ __kernel void focus_scan(
                 for (int i = 0; i < width; ++i) {
                     const float size = (bottom - top + 1) * wide[i];
                     sharp[i] = square[i] - sum[i] * sum[i] / size;
+                    own[i] = -sum[i] / size;
                 }
                 remember(sharp, row * columns + base, width, stride, t, reach, best, peak, recent);
+                if ((above + row) % every == 0) keep_own(own, row * columns + base, width, stride, t, reach, best, detail, last);
             }
         }
     }
@@ -171,6 +197,15 @@ float logarithm(const float x)
     return power * M_LN2_F + sum;
 }
 
+// exp(x) - 1 from -4 to 0, by the series at x / 8 and (1 + y)^2 - 1 = y (2 + y).
+float below_one(const float x)
+{
+    const float part = (x < -4 ? -4 : x) / 8;
+    float y = part * (1 + part / 2 * (1 + part / 3 * (1 + part / 4)));
+    for (int i = 0; i < 3; ++i) y *= 2 + y;
+    return y;
+}
+
 #define SIGNAL(k) (peak[(k) * plane + p] - noisy[i])
 
 // One of the points of the fit; its weight is the inverse variance of the logarithm for noise of variance 1, from a
@@ -184,17 +219,20 @@ float logarithm(const float x)
     const float value = weight > 0 ? logarithm(signal / top[i]) : 0;
 
 __kernel void focus_fit(
-    const int rows, const int columns, const int stride, const int count, const int radius, const int reach, const float variance,
+    const int rows, const int columns, const int above, const int stride, const int count, const int radius, const int reach,
+    const int every, const float variance,
     const float least_contrast, const float least_curvature, MAP places, MAP travel, const float unit,
-    __global const int *restrict best, MAP peak, OUT height, OUT spread, OUT gain, OUT misfit, OUT sharpness,
-    __global uchar *restrict status)
+    __global const int *restrict best, MAP peak, MAP detail, OUT height, OUT spread, OUT gain, OUT misfit,
+    OUT sharpness, OUT shifted, OUT shifted_noise, OUT texture, OUT texture_noise, OUT left, __global uchar *restrict status)
 {
     const int pixels = rows * columns, low = get_global_id(0) * TILE, limit = min(pixels, low + TILE);
     const size_t plane = stride;
     for (int base = low; base < limit; base += BLOCK) {
         const int width = min(BLOCK, limit - base);
         float freedom[BLOCK], noisy[BLOCK], top[BLOCK], points[BLOCK], total[BLOCK], mean[BLOCK], norm[BLOCK], skew[BLOCK];
-        float bent[BLOCK], level[BLOCK], along[BLOCK], across[BLOCK], residual[BLOCK], taken[BLOCK], moved[BLOCK];
+        float bent[BLOCK], level[BLOCK], along[BLOCK], across[BLOCK], residual[BLOCK], taken[BLOCK], moves[BLOCK];
+        float vertex[BLOCK], shape[BLOCK], slope[BLOCK], sample[BLOCK], shape2[BLOCK], mixed[BLOCK], slope2[BLOCK];
+        float with_shape[BLOCK], with_slope[BLOCK], square[BLOCK];
         EACH {
             const int row = p / columns, column = p % columns;
             const int high = LESSER(row + radius, rows - 1) - GREATER(row - radius, 0) + 1;
@@ -203,7 +241,9 @@ __kernel void focus_fit(
             noisy[i] = freedom[i] * variance;
             top[i] = SIGNAL(reach);
             points[i] = total[i] = mean[i] = norm[i] = skew[i] = bent[i] = 0;
-            level[i] = along[i] = across[i] = residual[i] = taken[i] = moved[i] = 0;
+            level[i] = along[i] = across[i] = residual[i] = taken[i] = moves[i] = 0;
+            shape[i] = slope[i] = sample[i] = shape2[i] = mixed[i] = slope2[i] = 0;
+            with_shape[i] = with_slope[i] = square[i] = 0;
         }
         for (int k = 0; k <= 2 * reach; ++k) EACH {
             POINT
@@ -234,15 +274,32 @@ __kernel void focus_fit(
         for (int k = 0; k <= 2 * reach; ++k) EACH {
             POLYNOMIALS
             const float missed = weight > 0 ? value - level[i] - along[i] * line - across[i] * parabola : 0;
-            const float moves = weight * (line / norm[i] - along[i] / across[i] * parabola / bent[i]);
+            const float move = weight * (line / norm[i] - along[i] / across[i] * parabola / bent[i]);
             residual[i] += weight * missed * missed;
             taken[i] += weight * weight * (1 / total[i] + line * line / norm[i] + parabola * parabola / bent[i]);
-            moved[i] += moves * moves;
+            moves[i] += move * move;
+        }
+        EACH vertex[i] = mean[i] + skew[i] / 2 - along[i] / (2 * across[i]);
+        // The pixel's own samples, minus the sharpest one, are a constant + b shape + m slope: the sums of this fit.
+        int some = 0;
+        EACH some |= (above + p / columns) % every == 0;
+        for (int k = 0; some && k <= 2 * reach; ++k) EACH {
+            const float place = places[best[p] * (2 * reach + 1) + k] - vertex[i];
+            const float part = below_one(across[i] / 2 * place * place), along_it = -across[i] * place * (1 + part);
+            const float own = detail[k * plane + p] - detail[reach * plane + p];
+            shape[i] += part;
+            slope[i] += along_it;
+            sample[i] += own;
+            shape2[i] += part * part;
+            mixed[i] += part * along_it;
+            slope2[i] += along_it * along_it;
+            with_shape[i] += part * own;
+            with_slope[i] += along_it * own;
+            square[i] += own * own;
         }
         EACH {
             const int sharpest = best[p];
             MAP at = places + sharpest * (2 * reach + 1);
-            const float vertex = mean[i] + skew[i] / 2 - along[i] / (2 * across[i]);
             const float scale = unit / (2 * across[i]), free = total[i] - taken[i];
             const float curvature = across[i] < 0 ? across[i] * across[i] * bent[i] : 0;
             int fitted = points[i] > 2 && top[i] > least_contrast * variance * sqrt(2 * freedom[i])
@@ -251,17 +308,32 @@ __kernel void focus_fit(
             misfit[p] = fitted && points[i] > 3 && free > 0
                 ? (residual[i] / (chi * chi * chi) - (points[i] - 3) * variance) / free : NAN;
             const float before = at[reach - 1], after = at[reach + 1];
-            fitted &= vertex > LESSER(LESSER(before, after), 0) && vertex < GREATER(GREATER(before, after), 0);
+            fitted &= vertex[i] > LESSER(LESSER(before, after), 0) && vertex[i] < GREATER(GREATER(before, after), 0);
             int code = fitted ? IN_FOCUS : NO_PEAK;
             if (sharpest == 0 || sharpest == count - 1) code = AT_AN_END;
             if (!(top[i] - top[i] == 0)) code = INVALID;
             fitted = code == IN_FOCUS;
             status[p] = code;
-            height[p] = fitted ? -(travel[sharpest] + unit * vertex) : NAN;
+            height[p] = fitted ? -(travel[sharpest] + unit * vertex[i]) : NAN;
             const float tilt = along[i] / across[i];
             spread[p] = fitted ? (1 / norm[i] + tilt * tilt / bent[i]) * scale * scale : NAN;
-            gain[p] = moved[i] * scale * scale;
+            gain[p] = moves[i] * scale * scale;
             sharpness[p] = top[i] < 0 ? 0 : sqrt(top[i] / GREATER(freedom[i], 1));
+            const float n = 2 * reach + 1, a = shape2[i] - shape[i] * shape[i] / n;
+            const float b = mixed[i] - shape[i] * slope[i] / n, c = slope2[i] - slope[i] * slope[i] / n;
+            const float u = with_shape[i] - shape[i] * sample[i] / n, v = with_slope[i] - slope[i] * sample[i] / n;
+            const float determinant = a * c - b * b, by_shape = (c * u - b * v) / determinant;
+            const float by_slope = (a * v - b * u) / determinant;
+            const float unexplained = square[i] - sample[i] * sample[i] / n - by_shape * u - by_slope * v;
+            const float shift2 = by_slope * by_slope * unit * unit, texture2 = by_shape * by_shape;
+            const int own = fitted && (above + p / columns) % every == 0 && sharpest >= reach && sharpest + reach < count
+                && shift2 - shift2 == 0 && texture2 - texture2 == 0;
+            const float noise = own && reach > 1 ? GREATER(unexplained, 0) / (n - 3) : 0;
+            shifted[p] = own ? shift2 : 0;
+            shifted_noise[p] = noise > 0 ? noise * a / determinant * unit * unit : 0;
+            texture[p] = own ? texture2 : 0;
+            texture_noise[p] = noise > 0 ? noise * c / determinant : 0;
+            left[p] = noise;
         }
     }
 }

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 
-def focus_scan(frames: Array, first: int, radius: int, reach: int, best: Array, peak: Array,
-               recent: Array) -> None:  # fmt: skip
+def focus_scan(frames: Array, first: int, radius: int, reach: int, above: int, every: int, best: Array,
+               peak: Array, recent: Array, detail: Array, last: Array) -> None:  # fmt: skip
     """Process a block of frames; the maps are the state, updated in place.
 
     Parameters
@@ -21,11 +21,17 @@ def focus_scan(frames: Array, first: int, radius: int, reach: int, best: Array, 
     first : number of the block's first frame in the stack
     radius : half-width of the window, pixels; windows are truncated at the border
     reach : number of frames kept on each side of the peak
+    above : rows of the picture above the first one of the frames
+    every : rows of the picture from one to the next whose own samples are kept, the first being row 0
     best : (H, W), frame with the largest contrast: the sum of squared deviations of the samples of a window
         from their mean
     peak : (2 reach + 1, H, W), contrast in the frames around the best; NaN for a missing frame
     recent : (reach, H, W), contrast in the last frames: frame t in plane t % reach
+    detail : (2 reach + 1, H, W), sample of the pixel minus the mean of its window in the frames around the
+        best, once all have been there
+    last : (2 reach + 1, H, W), the same in the last frames: frame t in plane t % (2 reach + 1)
     """
+    kept = (above + np.arange(frames.shape[1])) % every == 0
     for t, frame in enumerate(frames.astype(np.float64), first):
         size, border = (2 * radius + 1, 2 * radius + 1), radius
         inside = sliding_window_view(np.pad(np.ones(frame.shape), border), size)
@@ -42,11 +48,16 @@ def focus_scan(frames: Array, first: int, radius: int, reach: int, best: Array, 
         peak[reach][better] = sharp[better]
         best[better] = t
         recent[t % reach] = sharp
+        last[t % len(last), kept] = (frame - mean)[kept]
+        order = (t + 1 + np.arange(len(last))) % len(last)
+        whole = (best == t - reach) & kept[:, np.newaxis]
+        detail[:, whole] = last[order][:, whole]
 
 
-def focus_fit(radius: int, reach: int, variance: float, least_contrast: float, least_curvature: float,
-              places: Array, travel: Array, unit: float, best: Array, peak: Array, height: Array,
-              spread: Array, gain: Array, misfit: Array, sharpness: Array,
+def focus_fit(radius: int, reach: int, above: int, every: int, variance: float, least_contrast: float,
+              least_curvature: float, places: Array, travel: Array, unit: float, best: Array, peak: Array,
+              detail: Array, height: Array, spread: Array, gain: Array, misfit: Array, sharpness: Array,
+              shifted: Array, shifted_noise: Array, texture: Array, texture_noise: Array, left: Array,
               status: Array) -> None:  # fmt: skip
     """Fit a parabola to the logarithms of the contrast around the peak, by orthogonal polynomials.
 
@@ -54,7 +65,7 @@ def focus_fit(radius: int, reach: int, variance: float, least_contrast: float, l
 
     Parameters
     ----------
-    radius, reach, best, peak : as of `focus_scan`
+    radius, reach, above, every, best, peak, detail : as of `focus_scan`
     variance : variance of a sample, counts^2
     least_contrast : minimum contrast of a peak in excess of that of noise, standard errors
     least_curvature : minimum curvature of a peak, standard errors
@@ -68,6 +79,10 @@ def focus_fit(radius: int, reach: int, variance: float, least_contrast: float, l
         The residual sum of squares has a chi-square distribution with n degrees of freedom, whose median is
         (1 - 2 / 9n)^3 n (Wilson and Hilferty 1931)
     sharpness : (H, W), standard deviation of the window's samples in the sharpest frame, without the noise
+    texture, shifted : (H, W), squares of the coefficients of the pixel's own samples, see `_own_curve`: what
+        it varies by, and this times the height by which its own peak differs, mm
+    shifted_noise, texture_noise : (H, W), variances of these coefficients because of noise
+    left : (H, W), variance of noise by the residuals; these five are 0 where a sample or the peak is missing
     status : (H, W), codes of FocusStatus
     """
     sizes = [
@@ -109,3 +124,39 @@ def focus_fit(radius: int, reach: int, variance: float, least_contrast: float, l
         moves = (weight**2 * (first / norm - along / across * second / bent) ** 2).sum(axis=0)
         gain[:] = moves * scale**2
         sharpness[:] = np.sqrt(np.where(top < 0, 0, top) / np.maximum(freedom, 1))
+        whole = has_peak & (best >= reach) & (best < len(travel) - reach)
+        whole &= ((above + np.arange(len(best))) % every == 0)[:, np.newaxis]
+        own = _own_curve(detail - detail[reach], place - vertex, across)
+        for values, target in zip(own, (shifted, shifted_noise, texture, texture_noise, left), strict=True):
+            scale = unit**2 if target is shifted or target is shifted_noise else 1.0
+            target[:] = np.where(whole & np.isfinite(own[0] + own[2]), scale * values, 0)
+
+
+def _own_curve(detail: Array, place: Array, across: Array) -> tuple[Array, ...]:
+    """Return what a pixel's own samples show of its peak, by the curve of its window.
+
+    By a least-squares fit, they are constant + b e + m (-2 q t e), where q t^2 is the logarithm of the
+    amplitude e(t) of the window, half of that of its contrast. A peak that is d away from the window's has
+    m = b d.
+
+    Parameters
+    ----------
+    detail : (2 reach + 1, H, W)
+    place : (2 reach + 1, H, W), t
+    across : (H, W), 2 q
+
+    Returns
+    -------
+    m^2, the variance of m because of noise, b^2, that of b, and the variance of noise by the residuals
+    """
+    shape = np.exp(np.clip(across * place**2 / 2, -4, 0))
+    columns = np.stack([shape, -across * place * shape])
+    columns = columns - columns.mean(axis=1, keepdims=True)
+    samples = detail - detail.mean(axis=0)
+    (a, b), (_, c) = np.einsum("ikyx,jkyx->ijyx", columns, columns)
+    along, moving = np.einsum("ikyx,kyx->iyx", columns, samples)
+    determinant = a * c - b * b
+    texture, shifted = (c * along - b * moving) / determinant, (a * moving - b * along) / determinant
+    residual = np.sum((samples - texture * columns[0] - shifted * columns[1]) ** 2, axis=0)
+    noise = residual / (len(detail) - 3) if len(detail) > 3 else 0 * residual
+    return shifted**2, noise * a / determinant, texture**2, noise * c / determinant, noise

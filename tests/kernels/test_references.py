@@ -422,16 +422,20 @@ def _(bits):  # counts end where the bits do
 WHOLE_ROWS = {"shape": (11, 130), "stride": 11 * 130}
 
 
-@case("focus_scan", DTYPES | {"radius": (1, 3), "reach": (1, 2), "first": (0, 4)}, rtol=2e-5)
-def _(dtype, radius, reach, first):
+SCANS = {"radius": (1, 3), "reach": (1, 2), "first": (0, 4), "every": (1, 2)}
+
+
+@case("focus_scan", DTYPES | SCANS, rtol=2e-5)
+def _(dtype, radius, reach, first, every):
     frames = np.random.default_rng(0).integers(0, 250, (9, 11, 130)).astype(dtype)
     if dtype == "float32":
         frames[4, 5, 20] = frames[0, 9, 50] = np.nan
-    state = np.zeros((11, 130), np.int32), np.zeros((2 * reach + 1, 11, 130)), np.zeros((reach, 11, 130))
+    planes = [np.zeros((count, 11, 130)) for count in (reach, *3 * (2 * reach + 1,))]
+    state = named("best recent peak detail last", np.zeros((11, 130), np.int32), *planes)
     if first:
-        focus.focus_scan(frames[:first], 0, radius, reach, *state)
-    values = {"frames": frames[first:], "first": first, "radius": radius, "reach": reach, **WHOLE_ROWS}
-    return values | named("best peak recent", *state)
+        focus.focus_scan(frames[:first], 0, radius, reach, 5, every, **state)
+    values = named("first radius reach above every", first, radius, reach, 5, every)
+    return values | {"frames": frames[first:]} | state | WHOLE_ROWS
 
 
 def sound(rtol, atol=0.0):
@@ -451,10 +455,12 @@ def sound(rtol, atol=0.0):
 
 FITTED = named("height spread gain", sound(1e-5), sound(1e-3), sound(1e-3))
 FITTED |= named("misfit sharpness status", sound(2e-2, 1e-3), near(1e-4, 0.0), near(0.0, 0.0, fraction=1e-3))
+OWN = "shifted", "shifted_noise", "texture", "texture_noise", "left"
+FITTED |= dict.fromkeys(OWN, sound(1e-2, 1e-4))
 
 
-@case("focus_fit", {"reach": (1, 2, 4), "variance": (0.0, 2.25)}, checks=FITTED)
-def _(reach, variance):
+@case("focus_fit", {"reach": (1, 2, 4), "variance": (0.0, 2.25), "every": (1, 3)}, checks=FITTED)
+def _(reach, variance, every):
     rng, size = np.random.default_rng(1), (11, 130)
     travel, best = np.cumsum(rng.uniform(0.01, 0.03, 12)), rng.integers(0, 12, size).astype(np.int32)
     frame, steps = best + np.arange(-reach, reach + 1)[:, None, None], np.arange(-reach, reach + 1)
@@ -464,11 +470,12 @@ def _(reach, variance):
     peak = peak * rng.uniform(0.98, 1.02, peak.shape)
     peak[(frame < 0) | (frame > 11)] = np.nan
     peak[:, 3, 7], peak[1:, 4, 9], peak[:, 5, 5] = np.nan, np.nan, 3.0
-    arrays = named("places travel best peak", places, travel, best, peak)
-    arrays |= {name: np.zeros(size) for name in ("height", "spread", "gain", "misfit", "sharpness")}
-    numbers = named("radius least_contrast least_curvature unit count", 2, 5.0, 3.0, 0.02, 12)
+    detail = rng.normal(0, 20, size) * (peak / 4000) ** 0.5 + rng.normal(0, 1, peak.shape)
+    arrays = named("places travel best peak detail", places, travel, best, peak, detail)
+    arrays |= {name: np.zeros(size) for name in ("height", "spread", "gain", "misfit", "sharpness", *OWN)}
+    numbers = named("radius least_contrast least_curvature unit count above", 2, 5.0, 3.0, 0.02, 12, 1)
     arrays |= {"status": np.zeros(size, np.uint8), "macros": {"FRAME": "uchar"}, **WHOLE_ROWS}
-    return arrays | numbers | {"reach": reach, "variance": variance}
+    return arrays | numbers | {"reach": reach, "variance": variance, "every": every}
 
 
 def triangles(actual, expected, values):

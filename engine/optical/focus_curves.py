@@ -1,7 +1,8 @@
-"""Whether the peaks of sharpness fit to the travel of the frames: a lost frame spoils those around it.
+"""Curves of sharpness: what they have in common, and whether travel and light of the frames fit to them.
 
 The logarithm of the contrast is a parabola of the travel around the sharpest frame. If a frame is missing
-there, it is one if later frames have travelled a step further.
+there, it is one if later frames have travelled a step further. Light that changes with the travel shifts all
+peaks.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.io import Result
 from mirrorskin.io.base.findings import Finding, with_findings
+from mirrorskin.io.watch.traces import FrameSamples
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE
+from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE, fit_clipped
 
 if TYPE_CHECKING:
     from mirrorskin.engine.optical.focus import Focus
@@ -24,6 +26,7 @@ _LINES, _FEWEST = 64, 64  # lines of pixels along a side that are used; least nu
 _SHIFTS = 1, -1, 2  # steps of the travel by which later frames may be wrong
 _BETTER = 0.25  # largest ratio of the squares of residuals with and without a jump
 _CONTRAST = 5.0  # least contrast of a peak above that of noise, in standard errors
+_DISTANCES = 32  # most distances from the focus at which light is compared
 _LARGEST = 1e18  # noise whose square a float32 holds
 
 
@@ -38,6 +41,67 @@ class TravelJump(Step):
             return result
         jump = find_travel_jump(*operation.peaks(), context.positions("travel"), freedom, noise**2)
         return result if jump is None else with_findings(result, jump)
+
+
+class LightTrend(Step):
+    """Add to standard deviations what light that changes over the stack shifts peaks by."""
+
+    def apply(self, result: Result, context: Context) -> Result:
+        """Return the result with larger standard deviations, if samples of all frames show the light."""
+        operation, travel = cast("Focus", context.operation), context.positions("travel")
+        noise, freedom = operation.noise or 0.0, (2 * operation.radius + 1) ** 2 - 1
+        unit = float(np.ptp(travel)) / max(len(travel) - 1, 1)
+        if context.samples is None or not 0 < noise < _LARGEST:
+            return result
+        curves = curves_of(*operation.peaks(), travel, unit, freedom, noise**2)
+        if curves is None:
+            return result
+        bent = _parabolas(*curves[:3])[0][:, 2]
+        if not (peaked := bent < 0).any():
+            return result
+        width = float(np.median(-1 / bent[peaked])) * unit**2
+        trend = light_trend(context.samples, np.asarray(result["height"]), travel)
+        return result.assign(height_sigma=np.hypot(result["height_sigma"], np.float32(width) * trend))
+
+
+def light_trend(samples: FrameSamples, height: NDArray[Any], travel: Doubles) -> NDArray[np.float32]:
+    """Return the slopes of the logarithm of the light, 1/mm of travel: a plane over the picture, (H, W).
+
+    Defocus is the same above and below the focus, so that only the light changes samples at equal distances
+    from there differently.
+    """
+    peak = -samples.of_map(height).astype(np.float64).ravel()
+    places, order = np.unique(travel, return_index=True)
+    values = samples.values[order].reshape(len(places), -1).astype(np.float64)
+    known = np.isfinite(peak) & np.isfinite(values).all(axis=0) & (values.mean(axis=0) > 0)
+    if len(places) < 2 or np.count_nonzero(known) < _FEWEST:
+        return np.zeros(height.shape, np.float32)
+    peak, values = peak[known], values[:, known]
+    farthest = np.minimum(peak - places[0], places[-1] - peak)
+    change, weight = np.zeros_like(peak), np.zeros_like(peak)
+    for distance in np.linspace(0, np.ptp(places) / 2, min(len(places) // 2, _DISTANCES) + 1)[1:]:
+        above, below = (_interpolated(values, places, peak + side * distance) for side in (1, -1))
+        used = farthest >= distance
+        change += np.where(used, distance * (above - below), 0)
+        weight += np.where(used, 2 * distance**2, 0)
+    rows, columns = (np.linspace(-1, 1, length) for length in height.shape)
+    grid = np.meshgrid(rows[samples.rows], columns[samples.columns], indexing="ij")
+    plane = np.stack([np.ones(known.size), *(axis.ravel() for axis in grid)], axis=1)[known]
+    used = weight > 0
+    slopes = change[used] / weight[used] / values.mean(axis=0)[used]
+    fitted = fit_clipped(plane[used], slopes, 1 / np.sqrt(weight[used]))
+    if fitted is None:
+        return np.zeros(height.shape, np.float32)
+    level, down, across = fitted.parameters
+    return np.asarray(level + down * rows[:, np.newaxis] + across * columns, np.float32)
+
+
+def _interpolated(values: Doubles, places: Doubles, at: Doubles) -> Doubles:
+    """Return the values, (T, n), at one place each, (n,)."""
+    after = np.clip(np.searchsorted(places, at), 1, len(places) - 1)
+    share = (at - places[after - 1]) / (places[after] - places[after - 1])
+    pixels = np.arange(values.shape[1])
+    return np.asarray((1 - share) * values[after - 1, pixels] + share * values[after, pixels])
 
 
 def find_travel_jump(
