@@ -26,7 +26,10 @@ _LEVELS = 4  # maximum number of resolutions
 _MIN_CONVERGED = 0.5  # minimum share of windows that are found
 _MIN_CONTRAST = 0.5  # minimum contrast of the same texture, relative to the reference
 _CONVERGED_FRACTION = 0.98  # share of the nodes that must converge; windows with little texture never do
+_LARGEST_CHANGE = 0.5  # pixels, in the last iteration of a window that is found
 _LAST_CHANGE = 0.03  # pixels: the linearisation error is then below 0.001 pixels
+_SEPARATE_ITERATIONS, _SETTLED = 4, 0.03  # of windows without neighbours: largest number, last change, pixels
+_LEAST_STEP = 0.1  # of such a window from frame to frame, from which the next one is extrapolated, pixels
 _FIELD_WEIGHT = 0.01  # weight of the previous field, relative to that of the median node
 _TILE, _NODES = 4096, 16  # pixels and nodes per work-item on a CPU
 
@@ -74,9 +77,11 @@ class Tracker:
     device : Device
     """
 
-    def __init__(self, reference: AnyArray, window: int, step: int, device: Device) -> None:
-        self._make = partial(_Level, window=window, step=step, device=device)
-        self._least = 2 * window
+    def __init__(
+        self, reference: AnyArray, window: int, step: int, device: Device, separate: bool = False
+    ) -> None:
+        self._make = partial(_Level, window=window, step=step, device=device, separate=separate)
+        self._separate, self._least = separate, 2 * window
         self._reference = reference
         self.finest: _Level = self._make(reference)
         self._fields = [self.finest.rest, self.finest.rest]
@@ -95,7 +100,11 @@ class Tracker:
     def follow(self, frame: AnyArray, stride: float = 1.0) -> NodeField:
         """Return the displacement of a frame; ``stride`` is its step as a multiple of the previous step."""
         last, before = self._fields
-        begin = last + stride * (last - before)
+        step = last - before
+        if self._separate:  # its noise would be extrapolated, too
+            step[:2] *= np.abs(step[:2]) > _LEAST_STEP
+            step[2:] = 0
+        begin = last + stride * step
         best, field = self.finest.follow(frame, begin)
         for correlated in (False, True):
             if np.mean(best.converged) >= _MIN_CONVERGED * np.mean(self.finest.usable):
@@ -171,7 +180,9 @@ class Tracker:
         )
         taper = cv2.createHanningWindow(frame.shape[::-1], cv2.CV_64F)
         (right, down), _ = cv2.phaseCorrelate(reference, moved, taper)
-        return np.asarray(self.finest.rest + np.array([right, down])[:, None, None])
+        field = self.finest.rest.copy()
+        field[:2] = np.array([right, down])[:, None, None]
+        return field
 
 
 class _Level:
@@ -180,8 +191,8 @@ class _Level:
     step: int
     measured: Doubles
 
-    def __init__(self, reference: AnyArray, window: int, step: int, device: Device) -> None:
-        self._device, self._window, self.step = device, window, step
+    def __init__(self, reference: AnyArray, window: int, step: int, device: Device, separate: bool) -> None:
+        self._device, self._window, self.step, self._separate = device, window, step, separate
         self._frame_type = C_TYPES[reference.dtype.name]
         self._top = int(np.iinfo(reference.dtype).max) if reference.dtype.kind == "u" else 0
         self._tile, self._nodes = (_TILE, _NODES) if device.layout.tile > 1 else (1, 1)
@@ -190,7 +201,7 @@ class _Level:
         self._first, self._halo = (step - window) // 2, 2 * window + 8
         self.start: float = self._first + (window - 1) / 2
         self.grid: tuple[int, int] = -(-rows // step), -(-columns // step)
-        self.rest: NDArray[Any] = np.zeros((2, *self.grid))
+        self.rest: NDArray[Any] = np.zeros((AFFINE if separate else 2, *self.grid))
         padded = rows + 2 * MARGIN, columns + 2 * MARGIN
         with_halo = rows + 2 * self._halo, columns + 2 * self._halo
         shapes = {
@@ -198,7 +209,7 @@ class _Level:
             "planes": (4, *with_halo),
             "difference": (2, *with_halo),
             **dict.fromkeys(("field", "next_field"), self.rest.shape),
-            "answer": (AFFINE + 3, *self.grid),
+            "answer": (AFFINE + 3 + separate, *self.grid),
             "inverse": (self._items, PACKED, self._nodes),
             "summary": (4, *self.grid),
         }
@@ -308,6 +319,8 @@ class _Level:
         self._fit_spline(frame)
         maps = self._maps
         maps["field"].write(field)
+        if self._separate:
+            return self._follow_separately(field)
         for _ in range(ITERATIONS):
             self._solve()
             last, field = field, maps["next_field"].read()
@@ -317,13 +330,37 @@ class _Level:
         answer = maps["answer"].read().astype(np.float64)
         moved = answer[:2]
         gain, squares, variances = answer[AFFINE:]
+        with np.errstate(invalid="ignore"):
+            converged = (np.abs(moved - last).max(axis=0) < _LARGEST_CHANGE) & (gain > _MIN_CONTRAST)
+        return NodeField(moved, self._variance(gain, squares, variances), converged), field
+
+    def _follow_separately(self, field: Doubles) -> tuple[NodeField, Doubles]:
+        """Return the displacement of windows without neighbours, and their affine fields."""
+        maps = self._maps
+        self._launch(
+            "follow",
+            math.prod(self.grid),
+            **self._sizes,
+            iterations=_SEPARATE_ITERATIONS,
+            settled=_SETTLED,
+            **{name: maps[name] for name in ("coefficients", "planes", "inverse", "field", "answer")},
+        )
+        answer = maps["answer"].read().astype(np.float64)
+        gain, squares, variances, change = answer[AFFINE:]
+        with np.errstate(invalid="ignore"):
+            converged = (change < _LARGEST_CHANGE) & (gain > _MIN_CONTRAST)
+        moved = answer[:AFFINE]
+        return NodeField(
+            moved[:2], self._variance(gain, squares, variances * self.measured), converged
+        ), np.where(converged, moved, field)
+
+    def _variance(self, gain: Doubles, squares: Doubles, variances: Doubles) -> Doubles:
+        """Return the variance of a sample from sums of squares and of the variances of differences."""
         with np.errstate(invalid="ignore", divide="ignore"):
             # The reference's noise is multiplied by the gain.
-            variances += (gain**2 - 1) * self.measured
+            variances = variances + (gain**2 - 1) * self.measured
             # By rounding, the sum of squares of a frame without noise may be below 0.
-            variance = np.maximum(squares, 0) / (variances * (1 - PARAMETERS / self.measured))
-            converged = (np.abs(moved - last).max(axis=0) < 0.5) & (gain > _MIN_CONTRAST)
-        return NodeField(moved, variance, converged), field
+            return np.maximum(squares, 0) / (variances * (1 - PARAMETERS / self.measured))
 
     def _solve(self) -> None:
         """Warp the frame back by the field, solve all windows, and compute the next field."""
@@ -351,8 +388,10 @@ class _Level:
         places = [(self.start + self.step * np.arange(n)) * scale for n in self.grid]
         rows, columns = ((place - level.start) / level.step for place in places)
         where = np.meshgrid(rows, columns, indexing="ij")
-        parts = [map_coordinates(part, where, order=1, mode="nearest") / scale for part in field]
-        return np.stack(parts)
+        parts = [map_coordinates(part, where, order=1, mode="nearest") for part in field]
+        moved = np.stack(parts)
+        moved[:2] /= scale  # derivatives per half window are the same
+        return moved
 
     def _launch(self, name: str, items: int, **arguments: Any) -> None:
         macros: dict[str, str | int] = {"FRAME": self._frame_type, "WINDOW": self._window, "STEP": self.step}

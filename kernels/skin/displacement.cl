@@ -43,6 +43,7 @@ typedef float4 __attribute__((aligned(4))) Four;  // unaligned
 #define AFFINE 6  // number of affine parameters
 #define PACKED (PARAMETERS * (PARAMETERS + 1) / 2)  // elements of a symmetric matrix
 #define MOST 1e5f  // maximum magnitude of an inverse matrix
+#define MOST_CHANGE 1.5f  // pixels in an iteration
 
 #define STRIP (TILE < 256 ? TILE : 256)  // pixels of a row that are processed together
 
@@ -185,6 +186,39 @@ __kernel void displacement_planes(
 
 #define LINE(at, w) (w##0 * LOAD(at) + w##1 * LOAD((at) + 1) + w##2 * LOAD((at) + 2) + w##3 * LOAD((at) + 3))
 
+// A frame at positions inside it, which become the fractions of a pixel.
+F interpolate(MAP coefficients, const int stride, F *x, F *y)
+{
+    const I west = CONVERT(*x, I), north = CONVERT(*y, I);
+    *x -= CONVERT(west, F);
+    *y -= CONVERT(north, F);
+    F x0, x1, x2, x3, y0, y1, y2, y3, value;
+    CUBIC(x, *x)
+    CUBIC(y, *y)
+    const I place = (north - 1 + MARGIN) * stride + west - 1 + MARGIN;
+    const int begin = PLACE_OF(place, 0);
+    if (!any_of(place != begin + NUMBERS)) {  // neighbours go to neighbours
+        MAP at = coefficients + begin;
+        return y0 * LINE(at, x) + y1 * LINE(at + stride, x) + y2 * LINE(at + 2 * stride, x) + y3 * LINE(at + 3 * stride, x);
+    }
+    for (int i = 0; i < LANES; ++i) {
+        MAP at = coefficients + PLACE_OF(place, i);
+        const float4 line = LANE(y0, i) * FOUR(at) + LANE(y1, i) * FOUR(at + stride)
+            + LANE(y2, i) * FOUR(at + 2 * stride) + LANE(y3, i) * FOUR(at + 3 * stride);
+        LANE(value, i) = LANE(x0, i) * line.x + LANE(x1, i) * line.y + LANE(x2, i) * line.z + LANE(x3, i) * line.w;
+    }
+    return value;
+}
+
+// Variance of the interpolated value for noise of variance 1, at fractions of a pixel.
+F interpolated_noise(const F x, const F y)
+{
+    F x0, x1, x2, x3, y0, y1, y2, y3;
+    CUBIC(x, x)
+    CUBIC(y, y)
+    return NOISE_GAIN(x) * NOISE_GAIN(y);
+}
+
 // The window of the first node starts at the pixel FIRST. The node is at its centre, LAG before the pixel OFFSET.
 #define FIRST ((STEP - WINDOW - ((STEP - WINDOW) & 1)) / 2)
 #define OFFSET (FIRST + WINDOW / 2)
@@ -245,32 +279,13 @@ __kernel void displacement_warp(
             const I inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1);
             x = inside ? x : 0;
             y = inside ? y : 0;
-            const I west = CONVERT(x, I), north = CONVERT(y, I);
-            x -= CONVERT(west, F);
-            y -= CONVERT(north, F);
-            F x0, x1, x2, x3, y0, y1, y2, y3, value;
-            CUBIC(x, x)
-            CUBIC(y, y)
-            const I place = (north - 1 + MARGIN) * stride + west - 1 + MARGIN;
-            const int begin = PLACE_OF(place, 0);
-            if (!any_of(place != begin + NUMBERS)) {  // neighbours go to neighbours
-                MAP at = coefficients + begin;
-                value = y0 * LINE(at, x) + y1 * LINE(at + stride, x) + y2 * LINE(at + 2 * stride, x)
-                    + y3 * LINE(at + 3 * stride, x);
-            } else {
-                for (int i = 0; i < LANES; ++i) {
-                    MAP at = coefficients + PLACE_OF(place, i);
-                    const float4 line = LANE(y0, i) * FOUR(at) + LANE(y1, i) * FOUR(at + stride)
-                        + LANE(y2, i) * FOUR(at + 2 * stride) + LANE(y3, i) * FOUR(at + 3 * stride);
-                    LANE(value, i) = LANE(x0, i) * line.x + LANE(x1, i) * line.y + LANE(x2, i) * line.z + LANE(x3, i) * line.w;
-                }
-            }
+            const F value = interpolate(coefficients, stride, &x, &y);
             const int p = (row + halo) * width + column + halo;
             const F counts = LOAD(planes + p), along_x = LOAD(planes + plane + p), along_y = LOAD(planes + 2 * plane + p);
             const I measured = counts - counts == 0;
             const F deviation = counts - value + along_x * to_right + along_y * to_down;
             const F differs = measured ? (inside ? deviation : (F)NAN) : 0;
-            const F variance = measured ? 1 + NOISE_GAIN(x) * NOISE_GAIN(y) : 0;
+            const F variance = measured ? 1 + interpolated_noise(x, y) : 0;
             if (column + LANES <= limit) {
                 STORE(difference + p, differs);
                 STORE(difference + plane + p, variance);
@@ -471,6 +486,127 @@ __kernel void displacement_solve(
     }
 }
 
+// The same least squares without neighbours, for windows that hardly overlap: an item follows a window through all
+// iterations, and its frame is interpolated in registers only.
+#define MAGNITUDE(x) GREATER(x, -(x))
+#define COLUMN_GROUPS ((WINDOW + LANES - 1) / LANES)
+#define BENT 0.1f  // pixels per half window
+#define MOST_SLOPE 3.0f
+
+// Adds products with the differences of a row of the reference from values of the frame.
+#define ADD_SAMPLES(within, values)                                                                          \
+    {                                                                                                        \
+        MAP at = corner + j * width + g * LANES;                                                             \
+        const float below = PLACE(j);                                                                        \
+        const F counts = LOAD(at), texture = LOAD(at + 3 * plane);                                           \
+        const F differs = (within) & (counts - counts == 0) ? counts - (values) : 0;                         \
+        const F by_x = differs * LOAD(at + plane), by_y = differs * LOAD(at + 2 * plane);                    \
+        of_x += by_x;                                                                                        \
+        of_y += by_y;                                                                                        \
+        of_x_down += by_x * below;                                                                           \
+        of_y_down += by_y * below;                                                                           \
+        of_level += differs;                                                                                 \
+        of_level_down += differs * below;                                                                    \
+        of_gain += differs * texture;                                                                        \
+        of_square += differs * differs;                                                                      \
+    }
+
+__kernel void displacement_follow(
+    const int rows, const int columns, const int node_rows, const int node_columns, const int halo, const int iterations,
+    const float settled, MAP coefficients, MAP planes, MAP inverse, MAP field, OUT answer)
+{
+    const int node = get_global_id(0), nodes = node_rows * node_columns;
+    if (node >= nodes) return;
+    const int node_row = node / node_columns, node_column = node - node_row * node_columns;
+    const int width = columns + 2 * halo, plane = width * (rows + 2 * halo), stride = columns + 2 * MARGIN;
+    const int first_row = FIRST + node_row * STEP, first_column = FIRST + node_column * STEP;
+    const int pieces = (node_columns + NODES - 1) / NODES, piece = node_column / NODES;
+    MAP corner = planes + (halo + first_row) * width + halo + first_column;
+    MAP packed = inverse + (size_t)(node_row * pieces + piece) * PACKED * NODES + node_column - piece * NODES;
+    float moved[AFFINE], solved[PARAMETERS], squares = 0, change = NAN;
+    for (int k = 0; k < AFFINE; ++k) moved[k] = field[k * nodes + node];
+    for (int iteration = 0; iteration < iterations; ++iteration) {
+        float sums[PARAMETERS + 1];
+        for (int k = 0; k <= PARAMETERS; ++k) sums[k] = 0;
+        // The least squares represent small derivatives, so that all pixels are displaced alike.
+        float largest = 0;
+        for (int k = 2; k < AFFINE; ++k) largest = GREATER(largest, MAGNITUDE(moved[k]));
+        const int bends = largest > BENT;
+        for (int k = 2; k < AFFINE; ++k) moved[k] = bends ? moved[k] : 0;
+        const float left = first_column + moved[0], above = first_row + moved[1];
+        const int whole = left >= 0 && left + WINDOW <= columns && above >= 0 && above + WINDOW <= rows;
+        for (int g = 0; g < COLUMN_GROUPS; ++g) {
+            const I number = g * LANES + NUMBERS;
+            const F across = PLACE(CONVERT(number, F));
+            const I within = number < WINDOW;
+            F of_x = 0, of_y = 0, of_x_down = 0, of_y_down = 0, of_level = 0, of_level_down = 0, of_gain = 0, of_square = 0;
+            if (!bends && whole) {
+                const int west = (int)left, north = (int)above;
+                const float part_x = left - west, part_y = above - north;
+                F x0, x1, x2, x3, y0, y1, y2, y3;
+                CUBIC(x, part_x)
+                CUBIC(y, part_y)
+                MAP from = coefficients + (north - 1 + MARGIN) * stride + west - 1 + MARGIN + g * LANES;
+                F line0 = LINE(from, x), line1 = LINE(from + stride, x), line2 = LINE(from + 2 * stride, x);
+                for (int j = 0; j < WINDOW; ++j) {
+                    const F line3 = LINE(from + (j + 3) * stride, x);
+                    ADD_SAMPLES(within, y0 * line0 + y1 * line1 + y2 * line2 + y3 * line3)
+                    line0 = line1;
+                    line1 = line2;
+                    line2 = line3;
+                }
+            } else {
+                const F begin_x = CONVERT(number, F) + left + moved[2] * across, begin_y = above + moved[4] * across;
+                for (int j = 0; j < WINDOW; ++j) {
+                    F x = begin_x + moved[3] * PLACE(j), y = begin_y + j + moved[5] * PLACE(j);
+                    const I inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1);
+                    x = inside ? x : 0;
+                    y = inside ? y : 0;
+                    const F value = interpolate(coefficients, stride, &x, &y);
+                    ADD_SAMPLES(within, inside ? value : (F)NAN)
+                }
+            }
+            sums[0] += sum_over_lanes(of_x);
+            sums[1] += sum_over_lanes(of_y);
+            sums[2] += sum_over_lanes(of_x * across);
+            sums[3] += sum_over_lanes(of_x_down);
+            sums[4] += sum_over_lanes(of_y * across);
+            sums[5] += sum_over_lanes(of_y_down);
+            sums[6] += sum_over_lanes(of_level);
+            sums[7] += sum_over_lanes(of_level * across);
+            sums[8] += sum_over_lanes(of_level_down);
+            sums[9] += sum_over_lanes(of_gain);
+            sums[10] += sum_over_lanes(of_square);
+        }
+        for (int k = 0; k < PARAMETERS; ++k) solved[k] = 0;
+        MAP element = packed;
+        for (int k = 0; k < PARAMETERS; ++k)
+            for (int l = 0; l <= k; ++l) {
+                solved[k] += *element * sums[l];
+                if (l < k) solved[l] += *element * sums[k];
+                element += NODES;
+            }
+        squares = sums[PARAMETERS];
+        for (int k = 0; k < PARAMETERS; ++k) squares -= solved[k] * sums[k];
+        change = GREATER(MAGNITUDE(solved[0]), MAGNITUDE(solved[1]));
+        if (!(squares - squares == 0 && change - change == 0)) {
+            moved[0] = moved[1] = change = NAN;
+            break;
+        }
+        for (int k = 0; k < 2; ++k) moved[k] += LIMITED(solved[k], -MOST_CHANGE, MOST_CHANGE);
+        for (int k = 2; k < AFFINE; ++k) moved[k] = LIMITED(moved[k] + solved[k], -MOST_SLOPE, MOST_SLOPE);
+        if (change < settled) break;
+    }
+    // The weights of a fraction and of one less it are the same, in reverse.
+    const F variance = 1 + interpolated_noise(MAGNITUDE(moved[0] - (int)moved[0]), MAGNITUDE(moved[1] - (int)moved[1]));
+    OUT out = answer + node;
+    for (int k = 0; k < AFFINE; ++k) out[k * nodes] = moved[k];
+    out[AFFINE * nodes] = 1 - solved[PARAMETERS - 1];
+    out[(AFFINE + 1) * nodes] = squares;
+    out[(AFFINE + 2) * nodes] = LANE(variance, 0);
+    out[(AFFINE + 3) * nodes] = change;
+}
+
 // Within rounding.
 F exact_inverse_roots(const F x)
 {
@@ -627,7 +763,6 @@ __kernel void displacement_normals(
 }
 
 #define REACH 2  // nodes on either side whose windows predict the displacement of a node
-#define MOST_CHANGE 1.5f
 
 __kernel void displacement_field(
     const int node_rows, const int node_columns, const float hold, MAP trust, MAP answer, MAP field, OUT next_field)

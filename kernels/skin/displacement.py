@@ -33,6 +33,10 @@ PACKED = PARAMETERS * (PARAMETERS + 1) // 2
 """Elements of a symmetric matrix of the parameters: those of its lower triangle, by rows."""
 MAX_CHANGE = 1.5
 """Maximum change of the field in one iteration, pixels."""
+BENT = 0.1
+"""Derivatives of the displacement, pixels per half window, up to which a window is displaced as a whole."""
+MAX_SLOPE = 3.0
+"""Maximum derivative of the displacement of a window, pixels per half window."""
 MOST = 1e5
 """Maximum norm of the inverse of a normal matrix whose diagonal is scaled to 1."""
 
@@ -190,20 +194,13 @@ def displacement_warp(
     rows, columns = (length - 2 * halo for length in planes.shape[1:])
     right, down = interpolate_nodes(field, start, step, (rows, columns))
     x, y = np.arange(columns) + right, np.arange(rows)[:, None] + down
-    inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
-    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
-    west, north = np.floor(x).astype(int), np.floor(y).astype(int)
-    weights_x, weights_y = cubic(x - west), cubic(y - north)
-    value = np.zeros((rows, columns))
-    for j in range(4):
-        for i in range(4):
-            warped = coefficients[north + j - 1 + MARGIN, west + i - 1 + MARGIN].astype(np.float64)
-            value += weights_y[j] * weights_x[i] * warped
+    value = _interpolated(coefficients, x, y, rows, columns)
     core = np.s_[halo : halo + rows, halo : halo + columns]
     counts, along_x, along_y = planes[:3, *core].astype(np.float64)
     measured = np.isfinite(counts)
-    warped = np.where(inside, counts - value + along_x * right + along_y * down, np.nan)
-    variance = 1 + noise_gain(weights_x) * noise_gain(weights_y)
+    warped = counts - value + along_x * right + along_y * down
+    x, y = (np.where(np.isfinite(value), place, 0.0) for place in (x, y))
+    variance = 1 + noise_gain(cubic(x - np.floor(x))) * noise_gain(cubic(y - np.floor(y)))
     difference[0][core] = np.where(measured, warped, 0)
     difference[1][core] = np.where(measured, variance, 0)
 
@@ -325,6 +322,83 @@ def displacement_solve(
         answer[AFFINE, here] = 1 - solution[-1]
         answer[AFFINE + 1, here] = np.sum(residual**2, axis=1) - np.sum(solution * sums, axis=0)
         answer[AFFINE + 2, here] = np.sum(variance, axis=1)
+
+
+def displacement_follow(
+    step: int,
+    first: int,
+    window: int,
+    halo: int,
+    iterations: int,
+    settled: float,
+    coefficients: Array,
+    planes: Array,
+    inverse: Array,
+    field: Array,
+    answer: Array,
+) -> None:
+    """Write the displacement of each node after several iterations, in which no other node has a part.
+
+    A window is displaced by its own affine field. Derivatives up to ``BENT`` are left to the least squares:
+    all pixels are displaced alike.
+
+    Parameters
+    ----------
+    step, first, window, halo : distance between nodes, start of the first window, side of a window, and
+        margin of the planes; pixels
+    iterations, settled : maximum number of iterations; a node ends after one that moves it by less than
+        ``settled`` pixels
+    coefficients, planes, inverse : as of ``displacement_warp`` and ``displacement_solve``
+    field : (6, rows, columns), initial values of the displacement, and of its derivatives as in the answer
+    answer : (10, nodes), as of ``displacement_solve``, but the variance is that of one difference; and the
+        last change of the displacement, pixels. The displacement changes by at most ``MAX_CHANGE`` in an
+        iteration, the derivatives are at most ``MAX_SLOPE``. NaN where the window leaves the frame
+    """
+    node_rows, node_columns = field.shape[1:]
+    rows, columns = (length - 2 * halo for length in planes.shape[1:])
+    matrices, start = unpack(inverse, node_rows, node_columns), first - halo + (window - 1) / 2
+    place = np.arange(window) - (window - 1) / 2
+    down, right = (part.reshape(-1) for part in np.meshgrid(place, place, indexing="ij"))
+    for node in range(node_rows * node_columns):
+        row, column = divmod(node, node_columns)
+        here = windows(planes, row, step, first, window, node_columns)[:, column : column + 1]
+        design = basis(here, window)[0]
+        measured = np.isfinite(here[0, 0])
+        moved = field[:, row, column].copy()
+        for _ in range(iterations):
+            if np.abs(moved[2:]).max() <= BENT:
+                moved[2:] = 0
+            x = start + column * step + right + moved[0] + (moved[2] * right + moved[3] * down) * 2 / window
+            y = start + row * step + down + moved[1] + (moved[4] * right + moved[5] * down) * 2 / window
+            differs = np.where(measured, here[0, 0] - _interpolated(coefficients, x, y, rows, columns), 0.0)
+            sums = design.T @ differs
+            solution = matrices[row, column] @ sums
+            squares, change = np.sum(differs**2) - solution @ sums, np.abs(solution[:2]).max()
+            if not np.isfinite(squares + change):
+                moved[:2] = change = np.nan
+                break
+            moved[:2] += np.clip(solution[:2], -MAX_CHANGE, MAX_CHANGE)
+            moved[2:] = np.clip(moved[2:] + solution[2:AFFINE], -MAX_SLOPE, MAX_SLOPE)
+            if change < settled:
+                break
+        gains = [noise_gain(cubic(part - np.floor(part))) for part in moved[:2]]
+        answer[:, node] = [*moved, 1 - solution[-1], squares, 1 + gains[0] * gains[1], change]
+
+
+def _interpolated(
+    coefficients: Array, x: NDArray[np.float64], y: NDArray[np.float64], rows: int, columns: int
+) -> NDArray[np.float64]:
+    """Return the spline of padded coefficients at positions of a frame; NaN outside."""
+    inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
+    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    west, north = np.floor(x).astype(int), np.floor(y).astype(int)
+    weights_x, weights_y = cubic(x - west), cubic(y - north)
+    value = np.zeros(x.shape)
+    for j in range(4):
+        for i in range(4):
+            warped = coefficients[north + j - 1 + MARGIN, west + i - 1 + MARGIN].astype(np.float64)
+            value += weights_y[j] * weights_x[i] * warped
+    return np.where(inside, value, np.nan)
 
 
 def displacement_field(

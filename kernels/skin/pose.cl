@@ -47,21 +47,12 @@ Record transposed(const float8 *r)
                     (F)(i.hi, m.hi), (F)(j.hi, n.hi), (F)(k.hi, o.hi), (F)(l.hi, p.hi)};
 }
 
-float sum_over_lanes(const F x)
-{
-    const float4 four = x.lo + x.hi;
-    const float2 two = four.lo + four.hi;
-    return two.x + two.y;
-}
-
 #define NUMBERS (I)(0, 1, 2, 3, 4, 5, 6, 7)
 #else
 Record transposed(const float8 *r)
 {
     return (Record){r->s0, r->s1, r->s2, r->s3, r->s4, r->s5, r->s6, r->s7};
 }
-
-float sum_over_lanes(const F x) { return x; }
 
 #define NUMBERS 0
 #endif

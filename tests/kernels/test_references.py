@@ -267,6 +267,24 @@ def _(nodes):
     return SIZES | texture | arrays | values | {"inverse": inverse}
 
 
+@case(
+    "displacement_follow", ITEMS | {"iterations": (1, 3), "bent": (0.02, 0.2)},
+    per=lambda *_: math.prod(GRID), **CLOSE,
+)  # fmt: skip
+def _(nodes, iterations, bent):
+    _, padded, texture = textures()
+    inverse = packed(np.zeros((*GRID, displacement.PARAMETERS, displacement.PARAMETERS)), nodes)
+    displacement.displacement_normals(
+        STEP, FIRST + HALO, WINDOW, texture["planes"], inverse, np.zeros((4, *GRID))
+    )
+    texture["field"] = np.concatenate(
+        [texture["field"], np.random.default_rng(2).normal(0, bent, (4, *GRID))]
+    )
+    values = {"first": FIRST + HALO, "window": WINDOW, "iterations": iterations, "settled": 0.0}
+    arrays = {"coefficients": padded, "inverse": inverse, "answer": np.zeros((10, math.prod(GRID)))}
+    return SIZES | texture | values | arrays | {"macros": displaced(nodes)}
+
+
 @case("displacement_field", {"grid": (GRID, (1, 3), (40, 300))}, per="whole row", **CLOSE)
 def _(grid):
     rng = np.random.default_rng(4)
