@@ -117,8 +117,7 @@ def find_displacement(
         raise InputError("the reference has samples that are not finite: leave out the part that has them")
     size = check_pixel_size(pixel_size)
     check_windows(reference.shape, window_size, window_step)
-    if noise is not None and not 0 < noise < 1e9:
-        raise InputError(f"noise {noise}: a standard deviation in counts above 0 is needed, such as 1.5")
+    check_noise(noise)
     tracker = Tracker(reference, window_size, window_step, device_of(device, reference, frames))
     fields = [tracker.follow(frame) for frame in frames]
     texture = Texture.of(tracker, np.mean([field.variance for field in fields], axis=0), noise)
@@ -288,6 +287,12 @@ def node_status(field: NodeField, texture: Texture) -> NDArray[np.uint8]:
     status = np.where(np.isfinite(field.moved[0]), status, DisplacementStatus.INVALID_INPUT)
     status = np.where(texture.textured, status, DisplacementStatus.NO_TEXTURE)
     return np.where(texture.usable, status, DisplacementStatus.INVALID_INPUT).astype(np.uint8)
+
+
+def check_noise(noise: float | None) -> None:
+    """Raise InputError unless a standard deviation is possible."""
+    if noise is not None and not 0 < noise < 1e9:
+        raise InputError(f"noise {noise}: a standard deviation in counts above 0 is needed, such as 1.5")
 
 
 def check_windows(shape: tuple[int, ...], window_size: int, window_step: int) -> None:

@@ -162,7 +162,7 @@ class SlipOnset(Operation):
             raise InputError("the pixel size is missing, which slip needs: give --pixel-size (pixel_size=)")
         self._size = check_pixel_size(self.pixel_size)
         check_windows(shape, self.window_size, self.window_step)
-        self._contact, self._contact_origin, self._findings = _read_contact(self.contact, shape)
+        self._contact, self._contact_origin, self._findings = read_contact(self.contact, shape)
         self._tracker: Tracker | None = None
         self._places: list[Doubles] = []
         self._fields: list[NodeField] = []
@@ -464,7 +464,7 @@ class _Course:
         return ratio
 
 
-def _read_contact(
+def read_contact(
     contact: Maps | None, shape: tuple[int, int]
 ) -> tuple[NDArray[np.bool_] | None, str, dict[str, str]]:
     """Return the contact, if it is specified, its origin for ``process``, and the findings of its result."""
