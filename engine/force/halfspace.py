@@ -33,7 +33,9 @@ _NO_SLOPE = 1e-9  # slope below which its direction is undefined
 _FIRM = 0.05  # share of the maximum pressure below which the contact of a cell is neglected in derivatives
 _ROUGH_TOLERANCE, _ROUGH_STEPS = 2e-2, 60  # relative residual, and maximum number of steps, for derivatives
 _SIZES = 4  # pixels: granularity of the size of windows
-_MARGIN = 0.1  # of the window in which the contact is searched, as a share of the initial contact's length
+MARGIN = 0.1
+"""Margin of the window in which a contact is searched, as a share of the initial contact's length."""
+
 _COARSEST = 16  # pixels: minimum side of a surface of half the resolution
 
 
@@ -137,7 +139,7 @@ def press(
     if start is not None and (reach & start.contact).any():
         contact, strain = reach & start.contact, start.strain
     while True:
-        window, part = window_of(space, contact, _MARGIN)
+        window, part = window_of(space, contact, MARGIN)
         inner = strain[window], contact[window]
         pressure, touching, remaining = _press_within(part, surface[window], compliance, tolerance, *inner)
         strain, contact, left = nothing.copy(), np.zeros_like(reach), nothing.copy()

@@ -10,11 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.base.inputs import Maps, as_result, pixel_size_of
-from mirrorskin.engine.base.resample import fill_with_nearest
-from mirrorskin.engine.force.halfspace import HalfSpace, Pressed, load_gradient, press
+from mirrorskin.engine.force.blocks import BlockErrors, Blocks
+from mirrorskin.engine.force.halfspace import MARGIN, HalfSpace, Pressed, load_gradient, press, window_of
+from mirrorskin.engine.metrology.patch import noise_length
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.base.arguments import check_number, checked, in_unit
 from mirrorskin.io.base.findings import carried
+from mirrorskin.io.model.result import in_pixels
 
 if TYPE_CHECKING:
     from mirrorskin.engine.press.elastic import PressFit
@@ -63,7 +65,8 @@ def find_force(
         Young's modulus, MPa; by default that of the result's calibration.
     sigma : array_like, scalar or (H, W), optional
         Independent standard deviations of the heights, mm; NaN is replaced by the value of the nearest pixel.
-        By default ``height_sigma`` of the result, or 0.
+        By default ``height_sigma`` of the result, or 0, with the correlation of its errors: over
+        ``height_correlation`` if the heights are fused, or of all if they are integrated.
     travel_sigma : float
         Standard deviation of the travel, or of an error common to all heights, mm.
     modulus_sigma : float
@@ -95,29 +98,31 @@ def find_force(
     >>> round(found.force, 3), round(found.force_sigma, 3)
     (0.107, 0.002)
     """
-    result = as_result(height, "height")
+    result = as_result(height, "height", pixel_size=pixel_size)
     surface, travel = surface_of(result, travel)
     size = pixel_size_of(result, "height", pixel_size)
     young, young_sigma = modulus_of(result, modulus, modulus_sigma)
     check_bounds(travel_sigma=travel_sigma, modulus_sigma=modulus_sigma, compliance=compliance)
-    height_sigma = 0.0 if result.height_sigma is None else result.height_sigma
-    errors = np.asarray(height_sigma if sigma is None else sigma, np.float64)
+    fitted, own = result.fitted, sigma is None
+    errors = np.asarray((0.0 if result.height_sigma is None else result.height_sigma) if own else sigma)
     if errors.shape not in ((), surface.shape):
         raise InputError(f"sigma has shape {errors.shape}: give one number, or one a pixel {surface.shape}")
-    if errors.ndim and np.isfinite(errors).any():
-        errors = fill_with_nearest(errors)
     space = HalfSpace((surface.shape[0], surface.shape[1]), size)
     lowered = (surface + np.float64(travel)).astype(np.float32)
     pressed = press(space, lowered, compliance)
     gradient = load_gradient(space, pressed.contact, compliance)
-    common = travel_sigma * float(gradient.sum())
-    independent = float(np.sqrt(np.sum(np.where(pressed.contact, errors * gradient, 0.0) ** 2)))
-    added = np.where(np.isfinite(errors), errors, 0.0) * np.random.default_rng(0).normal(size=surface.shape)
-    excess = excess_load(space, lowered, added.astype(np.float32), compliance, pressed, gradient)
+    common = math.hypot(travel_sigma, (own and fitted.height_common_sigma) or 0.0) * float(gradient.sum())
+    independent = excess = 0.0
+    if pressed.load > 0:
+        spread, length = np.broadcast_to(errors, space.shape), noise_length(result) if own else 0.0
+        uncertain = BlockErrors(spread, Blocks(space.shape, size, 1), length)
+        window, _ = window_of(space, pressed.contact, MARGIN)
+        independent = math.sqrt(uncertain.variance(gradient[window][np.newaxis], window)[0])
+        excess = excess_load(space, lowered, uncertain.drawn(window), compliance, pressed, gradient)
     load = pressed.load + pressed.more(gradient) - excess
-    spread = math.hypot(young * common, young * independent, young_sigma * load, young * UNCERTAIN * excess)
+    terms = young * common, young * independent, young_sigma * load, young * UNCERTAIN * excess
     pressure = (young * pressed.strain * (load / pressed.load if pressed.load else 1)).astype(np.float32)
-    force = _force(pressure, pressed.contact, young * load, spread)
+    force = _force(pressure, pressed.contact, young * load, math.hypot(*terms))
     x, y = pixel_axes((surface.shape[0], surface.shape[1]), size)
     process = {"modulus": float(young), **carried({}, height=result.process)}
     return force.assign(x=x, y=y, process=process).with_fitted(travel=float(travel))
@@ -134,6 +139,8 @@ def surface_of(result: Result, travel: float | None) -> tuple[NDArray[Any], floa
         travel = result.fitted.travel
         if travel is None:
             raise InputError("travel is missing: specify by how many millimetres the body is lowered")
+    if in_pixels(result):
+        raise InputError("heights are in pixels: specify pixel_size, in millimetres")
     if not math.isfinite(travel):
         raise InputError(f"travel {travel:g} is not possible: give a finite number")
     return surface, travel

@@ -67,6 +67,21 @@ def test_independent_errors_of_heights_give_the_scatter_that_is_expected():
     assert np.std(drawn) == pytest.approx(expected, rel=0.3)  # 9 % is the error of 60 draws
 
 
+@pytest.mark.parametrize("length", [0.2, np.inf])
+def test_errors_that_heights_of_a_result_share_are_larger(length):
+    """Errors of fused heights are correlated over a length, those of integrated slopes everywhere."""
+    generator, ball, x = np.random.default_rng(4), -(distances(48) ** 2) / 6, PIXEL * np.arange(48)
+    fitted = io.Fitted(integration="direct") if np.isinf(length) else io.Fitted(height_correlation=length)
+    places = np.exp(-0.5 * ((x - x[:, np.newaxis]) / length) ** 2) + 1e-9 * np.eye(48)
+    factor, drawn = np.linalg.cholesky(places), []
+    for _ in range(40):
+        noise = 0.003 * factor @ generator.normal(size=(48, 48)) @ factor.T
+        maps = {"height": ball + noise, "height_sigma": np.full((48, 48), 0.003), "x": x, "y": -x}
+        drawn.append(find_force(maps | {"fitted": fitted}, 0.4, modulus=MODULUS))
+    expected = np.mean([force.force_sigma for force in drawn])
+    assert np.std([force.force for force in drawn]) == pytest.approx(expected, rel=0.35)
+
+
 @pytest.mark.parametrize("noise", [0.002, 0.005, 0.01, 0.02])
 def test_errors_of_heights_do_not_raise_the_force(noise):
     generator, ball = np.random.default_rng(4), -(distances(64) ** 2) / 6
@@ -130,11 +145,15 @@ def test_what_is_lifted_presses_with_nothing():
     assert (force.force, force.force_sigma, bool(force.contact.any())) == (0.0, 0.0, False)
 
 
+IN_PIXELS = engine.integrate(normals=np.broadcast_to([0.0, 0.0, 1.0], (8, 9, 3)))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"modulus": None}, "modulus is missing"),
         ({"travel": None}, "travel is missing"),
+        ({"height": IN_PIXELS, "pixel_size": None}, "heights are in pixels"),
         ({"pixel_size": None}, "height has no pixel size"),
         ({"height": {"status": np.zeros((4, 4))}}, "height has no map of that name"),
         ({"modulus": 0.0}, "modulus of 0 MPa"),
