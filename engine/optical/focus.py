@@ -15,6 +15,7 @@ from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.picture import Picture
 from mirrorskin.engine.base.tiling import Planes
 from mirrorskin.engine.optical.focus_curves import (
+    GRID_LINES,
     CurveShape,
     LightTrend,
     TravelJump,
@@ -26,7 +27,7 @@ from mirrorskin.io.base.types import FRAME_DTYPES
 from mirrorskin.io.model.maps import TABLE, FocusStatus, status_of
 from mirrorskin.io.model.positions import check_strokes
 from mirrorskin.kernels.array_types import Doubles
-from mirrorskin.kernels.numerics.least_squares import mad_sigma
+from mirrorskin.kernels.numerics.least_squares import mad_sigma, median
 
 _TILE = 16384  # pixels of a work-item on a CPU: some rows, whose sums along columns it moves down
 _LARGEST = 1e18  # noise whose square a float32 holds
@@ -43,6 +44,7 @@ _VARIED = 0.4  # standard deviation of the relief of a part of the picture, over
 _PARTS = 9, 3, 1  # blocks along a side of a part; a block has radius^2 pixels
 _LEAST_RELIEF = 0.1  # of a part, over that of a larger one
 _LEAST_TEXTURE = 0.25  # square of what a pixel varies by because of focus, over that because of noise
+_OUTLYING = 25.0  # variance by a pixel's residuals over the median, from which on it is left out
 _TINY, _VAST = np.float32(1e-18), np.float32(1e18)  # their squares are numbers
 
 
@@ -104,8 +106,10 @@ class Focus(Operation):
         return max(1, self.radius // 2) if math.prod(self.shape) > _ALL_ROWS else 1
 
     def peaks(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the contrast in the frames around the sharpest one of each pixel, and its number."""
-        best, *peak = self._maps.read("best", *(("peak", place) for place in range(2 * self.reach + 1)))
+        """Return the contrast in the frames around the sharpest one, and its number, on a grid of pixels."""
+        parts = self._maps.read("best", *(("peak", place) for place in range(2 * self.reach + 1)))
+        thin = max(1, min(self.shape) // GRID_LINES)
+        best, *peak = (part[::thin, ::thin] for part in parts)
         return np.stack(peak), best
 
     def push(self, frames: NDArray[Any], *, travel: ArrayLike) -> None:
@@ -194,10 +198,13 @@ def _relief(own: _OwnCurves, variance: float, radius: int) -> NDArray[np.float32
     See docs/method/focus.md, "Relief inside the window". It is that of a part of the picture, the less exact
     ones being drawn towards that of a larger part.
     """
-    pixels, excess = own.texture > 0, float(np.sum(own.left, dtype=np.float64))
-    count = np.count_nonzero(pixels)
-    if count == 0:
+    pixels = own.texture > 0
+    if not pixels.any():
         return np.zeros(pixels.shape, np.float32)
+    outlying = own.left > _OUTLYING * median(own.left[pixels])
+    if outlying.any():  # as at a hot sample
+        own, pixels = _OwnCurves(*(np.where(outlying, 0, values) for values in own)), pixels & ~outlying
+    excess, count = float(np.sum(own.left, dtype=np.float64)), np.count_nonzero(pixels)
     # Curves of another shape leave more than noise does; noise that is less than stated leaves less.
     share = np.float32(min(1.0, variance * count / excess) if excess > 0 else 0.0)
     blocks = [_in_blocks(values, radius) for values in (*own[:-1], pixels)]

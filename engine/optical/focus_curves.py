@@ -22,7 +22,10 @@ from mirrorskin.kernels.numerics.least_squares import MEDIAN_SQUARE, fit_clipped
 if TYPE_CHECKING:
     from mirrorskin.engine.optical.focus import Focus
 
-_LINES, _FEWEST = 64, 64  # lines of pixels along a side that are used; least number of pixels around a frame
+GRID_LINES = 64
+"""Lines of pixels along a side of the picture whose curves are used."""
+
+_FEWEST = 64  # least number of pixels around a frame
 _SHIFTS = 1, -1, 2  # steps of the travel by which later frames may be wrong
 _BETTER = 0.25  # largest ratio of the squares of residuals with and without a jump
 _CONTRAST = 5.0  # least contrast of a peak above that of noise, in standard errors
@@ -150,11 +153,10 @@ def curves_of(
 ) -> tuple[Doubles, Doubles, Doubles, NDArray[Any]] | None:
     """Return log S, its weights and places in ``unit``, (2 reach + 1, n), and the sharpest frames, (n,).
 
-    They are those of a grid of pixels whose curves are whole; None if these are few.
+    They are those of pixels whose curves are whole; None if these are few.
     """
-    reach, thin = len(peak) // 2, max(1, min(best.shape) // _LINES)
-    signal = peak[:, ::thin, ::thin].reshape(len(peak), -1).astype(np.float64) - freedom * variance
-    sharpest = best[::thin, ::thin].ravel()
+    reach, sharpest = len(peak) // 2, best.ravel()
+    signal = peak.reshape(len(peak), -1).astype(np.float64) - freedom * variance
     enough = _CONTRAST * variance * np.sqrt(2 * freedom)
     whole = np.isfinite(signal).all(axis=0) & (signal > 0).all(axis=0) & (signal[reach] > enough)
     whole &= (sharpest >= reach) & (sharpest < len(travel) - reach)
