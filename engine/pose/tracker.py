@@ -21,7 +21,10 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 
 _MIN_COMMON = 0.6  # share of the key's pixels below which another result becomes the key
-_BETTER = 1.2  # ratio of the pixels shared with an earlier key to those shared with the present one
+_LEAVING = 0.1  # loss of shared pixels, as a share, after which earlier keys are compared
+# Mean square error of the pose by an earlier key over that by the present one, for it to be taken again:
+# while the present one is still shared, and else.
+_BETTER, _GOOD_ENOUGH = 0.8, 2.0
 _MOST_KEYS = 64  # largest number of earlier keys that are remembered
 _SIDE = 100  # least pixels along the shorter side of averaged maps
 _STRIDE = 4  # pixel step of the coarse fit
@@ -38,8 +41,8 @@ class PoseTracker(ThreadSafe):
     """Estimates the motion of an object from the first result of a stream to each later one.
 
     Each result is compared with a key: the first result, or a later one if too few pixels overlap with the
-    previous key. Errors therefore increase with the number of keys, not of results; an earlier key that
-    overlaps more is taken again, so they do not increase along a path that returns. The start is extrapolated
+    previous key. Errors therefore increase with the number of keys, not of results; an earlier key by
+    which the pose is more certain is taken again, so they do not increase along a path that returns. The start is extrapolated
     from the last two results, and refined on every fourth row and column, then on all pixels, without
     outliers. Maps are averaged to 100 to 200 pixels along their shorter side, which hardly costs accuracy.
     Directions that the key does not determine are identified with the first result after it, and are kept
@@ -113,7 +116,11 @@ class PoseTracker(ThreadSafe):
         if found is None:
             return self._search(key, result)
         pose = self._moved_to(found.motion, key.pose_of(found))
-        if found.now.pixels < key.fewest and not self._return_to_key(map_, found):
+        share = key.share(found)
+        if key.has_left(share) or share < _MIN_COMMON:
+            limit = _BETTER if share > _MIN_COMMON else _GOOD_ENOUGH
+            pose = self._return_to_key(map_, found.motion, pose, limit)
+        if share < _MIN_COMMON and self._key is key:
             self._take_key(result, pose)
         return pose
 
@@ -131,20 +138,22 @@ class PoseTracker(ThreadSafe):
         pose = self._moved_to(motion, key.pose.then(pose_of(fit, motion, now, free).inverse()))
         return replace(pose, notes=(*pose.notes, f"result {self._results}: {_SEARCHED}"))
 
-    def _return_to_key(self, map_: PoseMap, last: _Found) -> bool:
-        """Take the earlier key again that shares most pixels with a map, if it shares enough."""
+    def _return_to_key(self, map_: PoseMap, motion: Motion, pose: Pose, limit: float) -> Pose:
+        """Take the earlier key again with which the pose is most certain, and return the best pose."""
         assert self._key is not None
-        first_to_result = self._key.pose.motion.then(last.motion.inverse())
-        limit, best = _BETTER * last.now.pixels, None
-        for key in self._earlier:
-            found = key.follow(map_, first_to_result.inverse().then(key.pose.motion))
-            if found is not None and found.now.pixels > max(limit, key.fewest):
-                limit, best = found.now.pixels, (key, found.motion)
-        if best is None:
-            return False
-        self._earlier = [key for key in self._earlier if key is not best[0]] + [self._key]
-        self._key, self._back = best
-        return True
+        present, best = self._key, limit * self._key.spread(pose)
+        first_to_map = present.pose.motion.then(motion.inverse())
+        for key in (*self._earlier,):
+            found = key.follow(map_, first_to_map.inverse().then(key.pose.motion))
+            if found is None or (share := key.share(found)) < _MIN_COMMON + _LEAVING:
+                continue
+            other = key.pose_of(found)
+            if key.spread(other) < best:
+                pose, best, key.peak = other, key.spread(other), share
+                self._key, self._back = key, found.motion
+        if self._key is not present:
+            self._earlier = [key for key in self._earlier if key is not self._key] + [present]
+        return pose
 
     def _moved_to(self, motion: Motion, pose: Pose) -> Pose:
         """Store the motion back to the key, and return the pose."""
@@ -188,14 +197,32 @@ class _Key:
     fit: PairFit | None = None  # of the first result after it
     free: Doubles = field(default_factory=lambda: np.zeros((6, 0)))  # directions that are not determined
     directions: Doubles = field(default_factory=lambda: np.eye(6))  # the others
-    fewest: float = 0.0  # pixels that results must share with it
+    pixels: float = 0.0  # that the first result after it shares
+    peak: float = 1.0  # largest share of them lately
     typical: float = 1.0  # chi square
     bend: float = np.inf  # error that a coarse step leaves over the square of the step, both in sigmas
 
     def start(self, fit: PairFit, now: Equations, free: Doubles) -> None:
         """Keep what the first result after this key shows."""
         self.fit, self.free, self.directions = fit, free, complement(free)
-        self.fewest, self.typical = _MIN_COMMON * now.pixels, max(now.chi_square, now.typical, 1.0)
+        self.pixels, self.typical = now.pixels, max(now.chi_square, now.typical, 1.0)
+
+    def share(self, found: _Found) -> float:
+        """Return the share of the pixels that another result shares."""
+        return found.now.pixels / self.pixels
+
+    def has_left(self, share: float) -> bool:
+        """Return whether results have moved away from this key by a step since this was last true."""
+        self.peak = max(self.peak, share)
+        if share > self.peak - _LEAVING:
+            return False
+        self.peak = share
+        return True
+
+    def spread(self, pose: Pose) -> float:
+        """Return the mean square error of the points of this key after a motion, mm²."""
+        variances = np.diag(pose.covariance)
+        return float(variances[3:].sum() + self.map.extent.size**2 * variances[:3].sum())
 
     def follow(self, map_: PoseMap, motion: Motion) -> _Found | None:
         """Return the motion from a map to this key near an expected motion, or None."""

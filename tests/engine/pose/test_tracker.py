@@ -100,3 +100,41 @@ def test_averaging_of_large_maps_costs_a_tenth_of_the_accuracy_at_most() -> None
         errors.append([error_of(pose, vector, shift) / pose.sigma for pose in poses])
     averaged, whole = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
     assert averaged < 1.1 * whole
+
+
+@pytest.mark.slow
+def test_rounds_of_a_closed_path_do_not_drift() -> None:
+    rng, tracker = np.random.default_rng(8), engine.pose.PoseTracker()
+    angles = 2 * np.pi * np.arange(100) / 100
+    size = {"shape": (120, 160), "pixel": 0.025, "height_sigma": 1e-9, "normals_sigma": 1e-9}
+    path, clean = [], []
+    for angle in angles:
+        across, along = np.sin(angle), 1 - np.cos(angle)
+        moved = (
+            (0.1 * across, 0.1 * along, 0.3 * across),
+            (1.5 * across, 1.5 * along, 0.05 * np.sin(2 * angle)),
+        )
+        path.append(moved)
+        clean.append(sampled(bumpy, *moved, rng=rng, **size))
+    errors, squares = [], []
+    for number in range(1001):
+        pose = tracker.push(noisy(clean[number % 100], rng))
+        error = error_of(pose, *path[number % 100])
+        if number % 100 == 0 and number:
+            errors.append(error)
+        if number:
+            squares.append(error @ np.linalg.solve(pose.covariance, error) / 6)
+    assert np.degrees(np.abs(errors)[:, :3].max()) < 0.1
+    assert np.abs(errors)[:, 3:].max() < 0.005
+    assert 0.7 < np.mean(squares) < 1.5
+
+
+def noisy(clean: io.Result, rng: np.random.Generator) -> io.Result:
+    """Return a result with noise of 1 µm and 0.01 rad."""
+    normals = clean.normals + rng.normal(0, 0.01 / np.sqrt(2), clean.normals.shape)
+    return clean.assign(
+        height=(clean.height + rng.normal(0, 1e-3, clean.height.shape)).astype(np.float32),
+        height_sigma=np.full(clean.height.shape, 1e-3, np.float32),
+        normals=(normals / np.linalg.norm(normals, axis=-1, keepdims=True)).astype(np.float32),
+        normals_sigma=np.full(clean.height.shape, 0.01, np.float32),
+    )
