@@ -41,12 +41,12 @@ class PoseTracker(ThreadSafe):
     """Estimates the motion of an object from the first result of a stream to each later one.
 
     Each result is compared with a key: the first result, or a later one if too few pixels overlap with the
-    previous key. Errors therefore increase with the number of keys, not of results; an earlier key by
-    which the pose is more certain is taken again, so they do not increase along a path that returns. The start is extrapolated
-    from the last two results, and refined on every fourth row and column, then on all pixels, without
-    outliers. Maps are averaged to 100 to 200 pixels along their shorter side, which hardly costs accuracy.
-    Directions that the key does not determine are identified with the first result after it, and are kept
-    fixed. A step too large for this is searched as `estimate_pose` does, and noted.
+    previous key. Errors therefore increase with the number of keys, not of results; an earlier key by which
+    the pose is more certain is taken again, so they do not increase along a path that returns. The start is
+    extrapolated from the last two results, and refined on every fourth row and column, then on all pixels,
+    without outliers. Maps are averaged to 100 to 200 pixels along their shorter side, which hardly costs
+    accuracy. Directions that the key does not determine are identified with the first result after it, and
+    are kept fixed. A step too large for this is searched as `estimate_pose` does, and noted.
 
     Parameters
     ----------
