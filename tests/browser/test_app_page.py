@@ -91,7 +91,7 @@ class Page:
         return row.locator("td").inner_text()
 
     def set_threshold(self, value):
-        field = self.page.get_by_label("Threshold (share)")
+        field = self.page.get_by_role("textbox", name="Threshold (share)")
         field.fill(str(value))
         field.press("Enter")
 
@@ -148,7 +148,7 @@ def test_the_command_is_copied(opened):
     opened.show("Save and copy")
     opened.expect_command("mirrorskin reconstruct")
     command = opened.command.input_value()
-    opened.page.get_by_text("Copy", exact=True).first.click()
+    opened.page.get_by_text("Copy the command").click()
     opened.page.wait_for_function("async text => await navigator.clipboard.readText() === text", arg=command)
 
 
@@ -165,7 +165,7 @@ def test_an_option_beyond_its_limits_says_why_next_to_the_field(opened):
     opened.set_threshold(1.7)
     note = opened.page.get_by_text("threshold 1.7: a share from 0 to 1 is needed, such as 0.5")
     note.wait_for()
-    field = opened.page.get_by_label("Threshold (share)").bounding_box()
+    field = opened.page.get_by_role("textbox", name="Threshold (share)").bounding_box()
     assert 0 < note.bounding_box()["y"] - field["y"] < 100
     opened.set_threshold(0.5)
     note.wait_for(state="hidden")
@@ -241,6 +241,24 @@ def test_nothing_needs_to_be_scrolled_sideways(opened, tab, width):
     opened.show(tab)
     opened.page.wait_for_load_state("networkidle")
     assert opened.page.evaluate("() => document.scrollingElement.scrollWidth") <= width
+
+
+CONTROLS = {"button", "checkbox", "combobox", "listbox", "radio", "slider", "spinbutton", "tab", "textbox"}
+
+
+def unnamed(page):
+    """Return the roles of controls that have no name for those who cannot see the page."""
+    nodes = page.context.new_cdp_session(page).send("Accessibility.getFullAXTree")["nodes"]
+    roles = [(node.get("role", {}).get("value"), node.get("name", {}).get("value", "")) for node in nodes]
+    return [role for role, name in roles if role in CONTROLS and not name.strip()]
+
+
+@pytest.mark.parametrize("tab", ["Recording", "Result", "Save and copy"])
+def test_every_control_has_a_name(opened, tab):
+    opened.show(tab)
+    opened.page.get_by_role("button", name="wheel zoom").or_(opened.command).first.wait_for()
+    opened.page.wait_for_timeout(1000)
+    assert unnamed(opened.page) == []
 
 
 def test_it_asks_no_other_machine_and_complains_of_nothing(opened, address):

@@ -57,7 +57,7 @@ def opened(browser, server):
 
 def run(page, speed):
     """Start a press, and wait until it is under way."""
-    field = page.get_by_label("Speed (mm/s)")
+    field = page.get_by_role("textbox", name="Speed (mm/s)")
     field.fill(str(speed))
     field.press("Enter")
     page.locator("button", has_text="Start").click()

@@ -311,6 +311,47 @@ def test_files_of_a_folder_are_opened_from_the_page(press, tmp_path):
     assert app.session.name == "ball.h5"
 
 
+def test_folders_of_pictures_and_zarr_are_offered(tmp_path):
+    for name, inside in (
+        ("a", "1.bmp"),
+        ("b", "1.JPG"),
+        ("c", "1.pgm"),
+        ("d", "zarr.json"),
+        ("e", "notes.md"),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / inside).touch()
+    assert App(folder=tmp_path).files.names.options == ["a", "b", "c", "d"]
+
+
+def test_a_folder_is_looked_at_when_its_list_is_opened(press):
+    app = App(press, folder=press.parent)
+    assert app.files.names.options == []
+    next(iter(app.view.select(pn.Card))).collapsed = False
+    assert app.files.names.options == ["press.h5"]
+
+
+def test_a_reset_is_one_step_to_undo_and_none_without_changes(app):
+    app.options.reset.param.trigger("clicks")
+    assert not app.session.can_undo
+    app.options.widgets["threshold"].value = 0.3
+    app.options.widgets["hold"].value = 3
+    app.options.reset.param.trigger("clicks")
+    assert app.session.changed == {}
+    app.options.undo.param.trigger("clicks")
+    assert app.session.changed == {"threshold": 0.3, "hold": 3}
+    app.options.undo.param.trigger("clicks")
+    app.options.undo.param.trigger("clicks")
+    assert not app.session.can_undo
+
+
+def test_a_reset_empties_a_field_that_was_refused(app):
+    app.options.widgets["threshold"].value = 1.7
+    app.options.reset.param.trigger("clicks")
+    assert app.options.widgets["threshold"].value == 0.5
+    assert not app.options.notes["threshold"].visible
+
+
 @pytest.mark.parametrize("place", ["../ball.h5", "/etc/passwd", "a/../ball.h5", "none/ball.h5"])
 def test_only_what_was_dropped_is_opened_as_such(tmp_path, place):
     io.save_result(ball(), tmp_path / "ball.h5")

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import panel as pn
 
-from mirrorskin.io.formats.registry import format_of_surface, has_frames
+from mirrorskin.io.base.url import is_zarr
+from mirrorskin.io.formats.pictures import PICTURE_SUFFIXES
+from mirrorskin.io.formats.registry import format_of_frames, format_of_surface, has_frames
 from mirrorskin.view.app.look import hint, text
+from mirrorskin.view.app.session import Run, run_now
 
-_PICTURES = (".png", ".tif", ".tiff")
 _LOOKED_AT = 20  # names in a folder, before it is taken for one without pictures
 _WIDTH = 262
 
@@ -27,10 +29,18 @@ class FilesPane:
         Where the server puts files that are dropped on the page.
     open_file : callable
         Called with the name and the path of a file.
+    run : Run
+        How the files are listed.
     """
 
-    def __init__(self, folder: Path, drops: Path | None, open_file: Callable[[str, Path], object]) -> None:
-        self._folder, self._drops, self._open_file = folder, drops, open_file
+    def __init__(
+        self,
+        folder: Path,
+        drops: Path | None,
+        open_file: Callable[[str, Path], object],
+        run: Run = run_now,
+    ) -> None:
+        self._folder, self._drops, self._open_file, self._run = folder, drops, open_file, run
         self.names = pn.widgets.Select(label="Files of this folder", size=6, width=_WIDTH, options=[])
         self.open = pn.widgets.Button(label="Open", width=120)
         self.again = pn.widgets.Button(label="Look again", width=120)
@@ -42,11 +52,13 @@ class FilesPane:
         self.view = pn.Column(
             self.names, pn.Row(self.open, self.again), text(about, width=_WIDTH), self.dropped, margin=0
         )
-        self.look()
 
     def look(self) -> None:
         """List the files that can be opened."""
-        names = [path.name for path in candidates(self._folder)]
+        self._run(lambda: candidates(self._folder), self._offer)
+
+    def _offer(self, paths: Sequence[Path]) -> None:
+        names = [path.name for path in paths]
         self.names.options = names
         self.open.disabled = not names
 
@@ -73,7 +85,11 @@ def candidates(folder: Path) -> Sequence[Path]:
 
 def _is_offered(path: Path) -> bool:
     with suppress(OSError):
-        if path.is_dir() and path.suffix.lower() != ".zarr":
-            return any(inner.suffix.lower() in _PICTURES for inner in islice(path.iterdir(), _LOOKED_AT))
+        if path.is_dir() and not is_zarr(path):
+            form = format_of_frames(path)
+            if form is not None and form.folder_mark[0]:  # such as a bag of messages
+                return True
+            inside = islice(path.iterdir(), _LOOKED_AT)
+            return any(inner.suffix.lower() in PICTURE_SUFFIXES for inner in inside)
         return has_frames(path) or format_of_surface(path) is not None
     return False

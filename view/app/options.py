@@ -16,6 +16,7 @@ from mirrorskin.view.app.session import Session
 _WIDTH = 262
 _DEGREES = {"rad": "deg"}  # units that people write instead of the declared one
 _STEPS = 100  # of a slider
+_UNTITLED = ".bk-slider-title { display: none; }"  # it is a name for who cannot see the field above
 _FILE = re.compile(r"\.[A-Za-z]\w*$")  # the end of the name of a file
 
 
@@ -126,7 +127,8 @@ def widget_of(option: Option, value: Any) -> tuple[Any, Any]:
         step = (high - low) / _STEPS
         field = widgets.FloatInput(label=titled, value=value, step=step, **settings)
         slider = widgets.FloatSlider(
-            label="",
+            label=titled,
+            stylesheets=[_UNTITLED],
             start=low,
             end=high,
             step=step,

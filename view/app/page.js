@@ -44,18 +44,34 @@ function listen() {
   page.on_event("connection_lost", () => silence = 2 * SILENT)
   pulse()
   setInterval(look, LOOK)
-  page.on_change(() => { clearTimeout(painting); painting = setTimeout(() => paint(page), 30) })
-  dark.addEventListener("change", () => paint(page))
-  paint(page)
+  page.on_change(event => {
+    if (event.model === model) return
+    clearTimeout(dressing)
+    dressing = setTimeout(() => dressNew(page), 30)
+  })
+  dark.addEventListener("change", () => dress(page.all_models))
+  dressNew(page)
   takeDrops([...page.all_models].find(model => model.tags?.includes("dropped")))
 }
 
-// Figures are drawn on canvases, whose colours the style of the page does not reach.
+// What came to the page since the last look has its colours and names set.
 const dark = matchMedia("(prefers-color-scheme: dark)")
-const painted = new WeakMap()
-let painting = 0
+const dressed = new WeakSet()
+let dressing = 0
 
-function paint(page) {
+function dressNew(page) {
+  const added = [...page.all_models].filter(model => !dressed.has(model))
+  for (const model of added) dressed.add(model)
+  if (added.length) dress(added)
+}
+
+function dress(models) {
+  paint(models)
+  setTimeout(dressParts, 300)  // when they are on the page
+}
+
+// Figures are drawn on canvases, whose colours the style of the page does not reach.
+function paint(models) {
   const [ink, line, faint] = dark.matches ? ["#d5dbe2", "#8a96a3", "#2e3742"] : ["#3a434e", "#5c6675", "#e1e4e8"]
   const colours = {
     text_color: ink, label_text_color: ink, title_text_color: ink,
@@ -63,12 +79,46 @@ function paint(page) {
     axis_line_color: line, major_tick_line_color: line, minor_tick_line_color: line,
     grid_line_color: faint, outline_line_color: faint,
   }
-  for (const model of page.all_models) {
+  for (const model of models) {
     const known = ["Axis", "Grid", "Title", "ColorBar", "Legend", "Figure", "Plot"]
-    if (!known.some(kind => model.type.endsWith(kind)) || painted.get(model) === ink) continue
-    painted.set(model, ink)
+    if (!known.some(kind => model.type.endsWith(kind))) continue
     const here = Object.entries(colours).filter(([name]) => name in model.properties)
     model.setv(Object.fromEntries(here), {sync: false})
+  }
+}
+
+const ARROW = "url('data:image/svg+xml;utf8,<svg viewBox=\"0 0 25 20\" xmlns=\"http://www.w3.org/2000/svg\">"
+  + "<path d=\"M 0,0 25,0 12.5,20 Z\" fill=\"%23d5dbe2\"/></svg>')"
+
+function* partsOf(root) {
+  for (const part of root.querySelectorAll("*")) {
+    yield part
+    if (part.shadowRoot) yield* partsOf(part.shadowRoot)
+  }
+}
+
+// Names for those who cannot see the page, where the widgets have none, and colours that they do not adapt.
+function dressParts() {
+  for (const part of partsOf(document)) {
+    const title = () => part.getRootNode().querySelector("label, .bk-slider-title")?.textContent.trim() ?? ""
+    if (part.matches("select:not([size])")) {
+      part.style.backgroundImage = dark.matches ? ARROW : ""
+    } else if (part.matches(".noUi-target")) {
+      part.style.background = dark.matches ? "#3a434e" : ""
+    } else if (part.matches(".bk-spin-btn")) {
+      part.ariaLabel = `${part.matches(".bk-spin-btn-up") ? "Increase" : "Decrease"} ${title()}`
+    } else if (part.matches(".noUi-handle")) {
+      const end = part.matches(".noUi-handle-upper") ? ", end" : ""
+      part.ariaLabel = title().replace(/:.*/s, "") + end
+    } else if (part.matches("input[type=checkbox]")) {
+      part.ariaLabel = part.parentNode.textContent.trim()
+    } else if (part.matches(".bk-tool-icon")) {
+      const button = part.getRootNode().host
+      const kind = [...part.classList].map(name => name.match(/^bk-tool-icon-(.*)/)?.[1]).find(name => name)
+      button.role = "button"
+      button.tabIndex = 0
+      button.ariaLabel = kind?.replaceAll("-", " ") ?? "more tools"
+    }
   }
 }
 

@@ -38,6 +38,7 @@ PULSE = 250
 
 _KEPT = 600_000_000  # bytes of results of the list that are kept to be compared
 _TABS = ".bk-tab.bk-active { color: inherit; background: transparent; }"
+_LIST = ".bk-input { padding: 4px 8px; }"
 _SIDE = 290  # width of the list and the options
 _RIG = -1  # the choice of the rig, among numbers of files
 
@@ -117,15 +118,22 @@ class App:
             stop = [self.rig.stop]
             if self._worker is not None:
                 pn.state.add_periodic_callback(self.rig.refresh_when_drawn, REFRESH)
-        self.choice = pn.widgets.Select(label="Recordings and results", size=2, width=_SIDE - 20)
+        self.choice = pn.widgets.Select(
+            label="Recordings and results", size=2, width=_SIDE - 20, stylesheets=[_LIST]
+        )
         self._offer(names)
         self.choice.value = next(iter(names.values()), None)
         self.choice.param.watch(lambda _: self._open(), "value")
-        self.files = FilesPane(folder, drops, self.add) if folder is not None else None
+        self.files = FilesPane(folder, drops, self.add, self._run) if folder is not None else None
         files = pn.Card(
             *([self.files.view] if self.files else []), title="Open a file", collapsed=bool(names),
             width=_SIDE - 20, visible=folder is not None, margin=(8, 10),
         )  # fmt: skip
+        if self.files is not None:
+            look = self.files.look  # only if it is opened: a folder may have many files
+            files.param.watch(lambda event: None if event.new else look(), "collapsed")
+            if not names:
+                look()
         self._about = text(sizing_mode="stretch_width", margin=(9, 10))
         self._part = pn.Column(margin=0)  # the options of what is shown
         self._main = pn.Column(styles={"flex": "1 1 400px", "min-width": "0"})

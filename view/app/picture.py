@@ -326,7 +326,7 @@ class Picture:
                 self.figure.add_layout(item, "right")
         for item in (self._log, self._rgba, *self._bars):  # until a map is shown
             item.visible = False
-        self.hover = HoverTool(renderers=[self._plain], tooltips=[])
+        self.hover = HoverTool(renderers=[self._plain], tooltips=[], attachment="above")
         self.figure.add_tools(self.hover)
         self.figure.on_event(RangesUpdate, self._look_again)
 

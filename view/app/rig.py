@@ -98,11 +98,14 @@ class RigPane:
             for unit, values in _STEPS.items()
         }
         self.view = pn.FlexBox(
-            pn.Column(pn.pane.Bokeh(self.camera.figure), pn.pane.Bokeh(self._histogram()), self.facts),
             pn.Column(
-                pn.Row(self.connect), self.state, *self._jogging(), *self._running(), width=440
+                pn.pane.Bokeh(self.camera.figure), self.facts, pn.pane.Bokeh(self.growing.figure),
+                *self._about_run(),
             ),
-            pn.Column(pn.pane.Bokeh(self.growing.figure), *self._about_run()),
+            pn.Column(
+                pn.Row(self.connect), self.state, *self._jogging(), *self._running(),
+                pn.pane.Bokeh(self._histogram()), width=440,
+            ),
         )  # fmt: skip
         self.refresh()
 

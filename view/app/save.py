@@ -25,6 +25,7 @@ _OWN = {
     "report: a page with pictures, numbers and the surface (.html)": (_REPORT, False),
     "the section as a table (.csv)": (".csv", True),
 }
+_TITLED = "label { font-size: 1rem; font-weight: 620; }"  # as a heading
 _SAME = (".tiff", ".zarr")  # another name of .tif, and a folder, which a browser does not save
 
 
@@ -48,20 +49,17 @@ class SavePane:
             label="Save result.h5",
         )
         self.problem = text(sizing_mode="stretch_width")
-        self.command = _text("command", 90)
-        self.python = _text("python", 190)
+        self.command = _text("The same result on the command line", 90)
+        self.python = _text("The same result in Python", 190)
         self.format.param.watch(lambda _: self._name_file(), "value")
         session.watch("result", "problem", "part", "ends", callback=self._show)
         self._show()
         texts = []
         if session.whole is not None:
-            for title, area in (
-                ("The same result on the command line", self.command),
-                ("The same result in Python", self.python),
-            ):
-                copy = pn.widgets.Button(label="Copy", width=90)
+            for area, what in ((self.command, "command"), (self.python, "script")):
+                copy = pn.widgets.Button(label=f"Copy the {what}", width=140)
                 copy.js_on_click(args={"source": area}, code="navigator.clipboard.writeText(source.value)")
-                texts += [heading(title), area, copy]
+                texts += [area, copy]
         self.view = pn.Column(
             heading("Save a file"),
             self.format,
@@ -117,14 +115,15 @@ class SavePane:
             return path.read_bytes()
 
 
-def _text(name: str, height: int) -> Any:
+def _text(title: str, height: int) -> Any:
     return pn.widgets.TextAreaInput(
-        label="",
+        label=title,
+        stylesheets=[_TITLED],
         height=height,
         sizing_mode="stretch_width",
         max_width=900,
         disabled=False,
-        css_classes=["code", name],
+        css_classes=["code"],
         resizable=False,
         max_length=100_000,
     )

@@ -275,10 +275,14 @@ class Session:
 
     def choose_operation(self, name: str) -> None:
         """Choose another operation; its options have their defaults."""
-        self._remember()
-        self.kind, self.changed, self.refused = load_operation(name), {}, {}
-        self._tell("operation")
-        self.compute()
+        kind = load_operation(name)
+        same = kind is self.kind and not self.changed  # there is nothing to undo, and nothing to compute
+        if not same:
+            self._remember()
+        self.kind, self.changed, self.refused = kind, {}, {}
+        self._tell("operation", "problem")
+        if not same:
+            self.compute()
 
     def choose(self, name: str, value: Any) -> None:
         """Set an option, and compute the result again; a value that is refused leaves the reason only."""
