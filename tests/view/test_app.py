@@ -247,21 +247,41 @@ def test_changes_are_undone_and_repeated_without_computing_again(app):
 
 
 def test_what_does_not_belong_to_the_options_is_grey(press):
-    waiting = []
-    session = Session(press, run=lambda work, then: waiting.append((work, then)))
+    waiting, aside = [], []
+    session = Session(
+        press,
+        run=lambda work, then: waiting.append((work, then)),
+        run_aside=lambda work, then: aside.append((work, then)),
+    )
     _compute(waiting)
     pane = ResultPane(session)
     _compute(waiting)
+    _compute(aside)
     assert pane._body.styles["opacity"] == pane.measures.styles["opacity"] == "1"
     session.choose("threshold", 0.3)
     assert pane._body.styles["opacity"] != "1"
     work, then = waiting.pop(0)
-    then(work())  # the map is there, its measures are not
+    then(work())  # the result is there, its map is not drawn
+    assert pane._body.styles["opacity"] != "1"
+    _compute(waiting)
     assert pane._body.styles["opacity"] == "1"
     assert pane.measures.styles["opacity"] != "1"
-    _compute(waiting)
+    _compute(aside)
     assert pane.measures.styles["opacity"] == "1"
     session.close()
+
+
+def test_nothing_is_measured_for_a_result_that_is_not_shown_any_more(press):
+    aside = []
+    session = Session(press, run_aside=lambda work, then: aside.append((work, then)))
+    pane = ResultPane(session)
+    session.choose("threshold", 0.3)
+    (outdated, _), (last, _) = aside
+    assert outdated() is None
+    assert last() is session.measures()[0]
+    assert pane._measured is None
+    session.close()
+    assert outdated() is None
 
 
 def test_colours_are_chosen_for_each_map(app):
@@ -408,10 +428,11 @@ def test_the_pointer_reads_a_height_with_its_standard_deviation_in_the_units_of_
         "Origin",
     ]
     finite = np.isfinite(result.height)
-    np.testing.assert_allclose(shown.readings.columns["value0"][finite], result.height[finite])
+    whole = slice(None), slice(None)
+    np.testing.assert_allclose(shown.readings.columns["value0"](whole)[finite], result.height[finite])
     finite = np.isfinite(result.height_sigma)
     np.testing.assert_allclose(
-        shown.readings.columns["sigma"][finite], 1e3 * result.height_sigma[finite], 1e-6
+        shown.readings.columns["sigma"](whole)[finite], 1e3 * result.height_sigma[finite], 1e-6
     )
 
 

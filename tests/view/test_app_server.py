@@ -134,6 +134,14 @@ def test_a_web_socket_of_another_page_is_refused(served, origin):
 
 
 @pytest.mark.parametrize("origin", FOREIGN)
+def test_pulses_are_sent_to_own_pages_only(served, origin):
+    own = f"http://{served.netloc}"
+    assert _connect(served, f"{served.path}pulse", own) == 101
+    assert _connect(served, f"{served.path}pulse", origin) == 403
+    assert _connect(served, "/pulse", own) == 404
+
+
+@pytest.mark.parametrize("origin", FOREIGN)
 def test_a_request_of_another_page_is_refused(served, origin):
     assert status(served.geturl(), Origin=origin) == 403
 

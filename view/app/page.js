@@ -1,6 +1,7 @@
 // What the page does by itself: it notices that the program does not answer, and that STOP failed.
 const LOOK = 200  // ms from one look at the clock to the next
 const SILENT = 1300  // ms without a pulse, which comes four times a second, after which the page is off
+const AGAIN = 1000  // ms from one attempt to connect to the next
 const STOP_BY_HAND = "Use the emergency switch, or cut the power of the stage."
 const shown = id => document.getElementById(id)
 const stoppable = shown("stop") !== null
@@ -35,17 +36,25 @@ document.addEventListener("stop-asked", event => {
   banner.hidden = !event.detail
 })
 
+// Bokeh's connection is that of what is shown, and the program's pulses have one of their own.
+let connected = true
+
+function feel() {
+  const pulses = new WebSocket(new URL("pulse", location.href).href.replace(/^http/, "ws"))
+  pulses.onmessage = () => { if (connected) pulse() }
+  pulses.onclose = () => setTimeout(feel, AGAIN)
+}
+
 function listen() {
   const page = globalThis.Bokeh?.documents?.[0]
-  const model = page && [...page.all_models].find(model => model.tags?.includes("pulse"))
-  if (!model) return void setTimeout(listen, 50)
+  if (!page) return void setTimeout(listen, 50)
   page.config.notify_connection_status = false  // the banner tells more
-  model.change.connect(pulse)
-  page.on_event("connection_lost", () => silence = 2 * SILENT)
+  page.on_event("connection_lost", () => [connected, silence] = [false, 2 * SILENT])
+  page.on_event("client_reconnected", () => connected = true)
   pulse()
+  feel()
   setInterval(look, LOOK)
-  page.on_change(event => {
-    if (event.model === model) return
+  page.on_change(() => {
     clearTimeout(dressing)
     dressing = setTimeout(() => dressNew(page), 30)
   })

@@ -16,7 +16,6 @@ import panel as pn
 from panel.io.resources import LOCAL_DIST
 
 from mirrorskin import io
-from mirrorskin.engine.base.summary import summarise
 from mirrorskin.io.base.findings import warnings_in
 from mirrorskin.view.app.files import FilesPane
 from mirrorskin.view.app.look import hint, problem, text
@@ -32,9 +31,6 @@ if TYPE_CHECKING:
     from mirrorskin.view.app.rig_control import RigControl
 
 Shown = str | Path | io.Recording | io.Result
-
-PULSE = 250
-"""Milliseconds from one sign of life to the next."""
 
 _KEPT = 600_000_000  # bytes of results of the list that are kept to be compared
 _TABS = ".bk-tab.bk-active { color: inherit; background: transparent; }"
@@ -97,6 +93,10 @@ class App:
         self._run = (
             run_now if self._worker is None else _in_thread(self._worker, pn.state.curdoc, self._closed)
         )
+        self._measurer = ThreadPoolExecutor(1, "mirrorskin-measures") if self._worker else None
+        self._run_aside = (
+            run_now if self._measurer is None else _in_thread(self._measurer, pn.state.curdoc, self._closed)
+        )
         self._sources = [*zip(sources, openings, strict=True)]
         self._computed: dict[int, Computed] = {}  # results of the list, the least recently used one first
         self._opening = 0  # counts what is opened
@@ -144,13 +144,11 @@ class App:
             sizing_mode="stretch_width",
         )
         self._open()
-        self._pulse = text("0", visible=False, tags=["pulse"])  # the page is off if it stops
         if self._worker is not None:
             # What is added to the page later is styled by this server, too, not by Panel's in the internet.
             pn.state.curdoc.template_variables["dist_url"] = LOCAL_DIST
-            pn.state.add_periodic_callback(self._beat, PULSE)
         title = text("<h1>mirrorskin</h1>", width=120)
-        self.head = pn.Row(title, self._about, self._pulse, sizing_mode="stretch_width")
+        self.head = pn.Row(title, self._about, sizing_mode="stretch_width")
         self.view = pn.Column(pn.Row(*stop, self.head), self.body, sizing_mode="stretch_width")
 
     def _offer(self, names: dict[str, int]) -> None:
@@ -194,7 +192,7 @@ class App:
         """Open a file; the work of a thread."""
         source, opening = self._sources[number]
         try:
-            return Session(source, opening, self._run)
+            return Session(source, opening, self._run, self._run_aside)
         except io.InputError as error:
             return error
 
@@ -292,7 +290,7 @@ class App:
         messages: Sequence[str] = ()
         if session.now is not None:
             messages = warnings_in(session.now.result.process)
-            parts.append(str(summarise(session.now.result)))
+            parts.append(session.now.summary)
             if session.now.seconds:
                 parts.append(f"computed in {session.now.seconds:.2f} s")
         busy = '<i class="busy"></i>' if session.computing else ""
@@ -309,8 +307,9 @@ class App:
         if self.session is not None:
             self.session.close()
         self._closed.set()
-        if self._worker is not None:
-            self._worker.shutdown(wait=False)
+        for worker in (self._worker, self._measurer):
+            if worker is not None:
+                worker.shutdown(wait=False, cancel_futures=True)
 
     def page(self) -> Any:
         """Return the page for a window of its own."""
@@ -324,9 +323,6 @@ class App:
         for name, place in places.items():
             page.add_panel(name, place)
         return page
-
-    def _beat(self) -> None:
-        self._pulse.object = str(int(self._pulse.object) + 1)
 
 
 def _file(name: str) -> str:

@@ -28,16 +28,18 @@ from numpy.typing import NDArray
 
 from mirrorskin.io import Region
 from mirrorskin.io.base.opencv import encode
-from mirrorskin.io.model.maps import SIGMA
+from mirrorskin.io.model.maps import SIGMA, Map
 from mirrorskin.view.app.look import plain_axes
 from mirrorskin.view.drawing.colours import DIVERGING, FILLED_RGB, MISSING_RGB, apart, normal_colours, span
 from mirrorskin.view.result.maps import ball_colours, code_colours
-from mirrorskin.view.result.scale import UNDEFINED_NOTE, displayed_values, scale_of
+from mirrorskin.view.result.scale import UNDEFINED_NOTE, in_figures, scale_of
 from mirrorskin.view.result.sheet import Sheet, percent
 
 Edges = tuple[float, float, float, float]
 """Left, right, bottom and top of a picture."""
 Point = tuple[float, float]
+Window = tuple[slice, slice]
+"""Rows and columns."""
 
 _SHADES = 256
 _PIXELS = 1200  # of a side of what is sent, at most
@@ -54,9 +56,12 @@ _NUMBER = "return value > 1e38 ? 'unknown' : `${Number(value).toPrecision(5)} ${
 
 @dataclass(frozen=True)
 class Readings:
-    """What the pointer reads: values at pixels, (H, W), lines of text, words of codes, and units."""
+    """What the pointer reads: values at pixels, lines of text, words of codes, and units.
 
-    columns: dict[str, NDArray[Any]] = field(default_factory=dict)
+    The values are functions of the rows and columns that are sent, as few of a large map are.
+    """
+
+    columns: dict[str, Callable[[Window], NDArray[Any]]] = field(default_factory=dict)
     tooltips: Sequence[tuple[str, str]] = ()
     words: dict[str, dict[int, str]] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
@@ -176,7 +181,8 @@ def show_change(now: Shown, before: Shown) -> Shown:
     side = float(np.percentile(changes, _CHANGE_SHOWN)) if changes.any() else 0.0
     _, side = apart(-side, side)
     tooltips = [("x, y", "$x{0.000}, $y{0.000}"), ("Change", _READ)]
-    readings = Readings({"value0": _to_read(change)}, tooltips, units=now.readings.units)
+    columns: dict[str, Callable[[Window], NDArray[Any]]] = {"value0": lambda window: _to_read(change[window])}
+    readings = Readings(columns, tooltips, units=now.readings.units)
     caption = "The current result minus the previous one."
     label = f"Change of {now.label[:1].lower()}{now.label[1:]}"
     return Shown(
@@ -194,39 +200,56 @@ def _key() -> str:
 def _read_at_pixels(sheet: Sheet, name: str) -> Readings:
     """Return what the pointer reads: position, value with its standard deviation, status, and origin."""
     result, declared = sheet.result, sheet.result.declaration(name)
-    columns: dict[str, NDArray[Any]] = {}
+    columns: dict[str, Callable[[Window], NDArray[Any]]] = {}
     words: dict[str, dict[int, str]] = {}
     units: dict[str, str] = {}
     tooltips = [("x, y", f"$x{{0.000}}, $y{{0.000}} {sheet.unit}")]
     unit = declared.figure_unit
     if declared.codes:
-        columns["code"] = result[name]
+        columns["code"] = result[name].__getitem__
         tooltips.append((declared.title_of(name), "@code{custom}"))
         words["@code"] = declared.codes
     else:
-        values = displayed_values(sheet, name)
+        values = _last(sheet, name)
         parts = declared.components or ("",)
         for number, part in enumerate(parts):
             key = f"value{number}"
-            columns[key] = _to_read(values[..., number] if part else values)
+            columns[key] = _reader(declared, values, number if part else None)
             units[key] = unit
             tooltips.append((part or declared.title_of(name), f"@{key}{{custom}}"))
     sigma = f"{name}{SIGMA}"
     if sigma in result and result[sigma].ndim == 2:
         error = result.declaration(sigma)
-        columns["sigma"] = _to_read(displayed_values(sheet, sigma))
+        columns["sigma"] = _reader(error, result[sigma])
         units["sigma"] = error.figure_unit
         tooltips.append(("Standard deviation", "@sigma{custom}"))
     status = "status"
     if status in result and name != status and result.declaration(status).codes:
-        columns["status"] = result[status]
+        columns["status"] = result[status].__getitem__
         tooltips.append(("Status", "@status{custom}"))
         words["@status"] = result.declaration(status).codes
     if result.filled is not None and name == result.name_of("height"):
-        columns["filled"] = result.filled
+        columns["filled"] = result.filled.__getitem__
         tooltips.append(("Origin", "@filled{custom}"))
         words["@filled"] = result.declaration("filled").codes
     return Readings(columns, tooltips, words, units)
+
+
+def _last(sheet: Sheet, name: str) -> NDArray[Any]:
+    """Return a map; of frames, the last one."""
+    declared = sheet.result.declaration(name)
+    values: NDArray[Any] = sheet.result[name]
+    return values[-1] if declared.per_frame and values.ndim > 2 + bool(declared.components) else values
+
+
+def _reader(
+    declared: Map, values: NDArray[Any], component: int | None = None
+) -> Callable[[Window], NDArray[np.float32]]:
+    def read(window: Window) -> NDArray[np.float32]:
+        shown = in_figures(declared, values[window])
+        return _to_read(shown if component is None else shown[..., component])
+
+    return read
 
 
 def _to_read(values: NDArray[Any]) -> NDArray[np.float32]:
@@ -327,6 +350,7 @@ class Picture:
         for item in (self._log, self._rgba, *self._bars):  # until a map is shown
             item.visible = False
         self.hover = HoverTool(renderers=[self._plain], tooltips=[], attachment="above")
+        self._about_hover: tuple[Any, ...] = ()  # what the hover tool has been told
         self.figure.add_tools(self.hover)
         self.figure.on_event(RangesUpdate, self._look_again)
 
@@ -346,6 +370,10 @@ class Picture:
         self._shown, self._drawn_marks = shown, marks
         self._send()
         read = shown.readings
+        about_hover = drawn, [*read.tooltips], read.units, read.words
+        if about_hover == self._about_hover:  # other models would have Bokeh search all for references
+            return
+        self._about_hover = about_hover
         formats = {
             f"@{name}": CustomJSHover(args={"unit": unit}, code=_NUMBER) for name, unit in read.units.items()
         }
@@ -361,13 +389,13 @@ class Picture:
         window, edges = self._window(shown.values.shape)
         self.source.data = {
             "image": [shown.values[window]],
-            **{name: [values[window]] for name, values in shown.readings.columns.items()},
+            **{name: [read(window)] for name, read in shown.readings.columns.items()},
             **edges,
         }
         empty = np.zeros((1, 1), np.uint32)
         self.marks.data = {"image": [empty if marks is None else marks[window]], **edges}
 
-    def _window(self, shape: tuple[int, ...]) -> tuple[tuple[slice, slice], dict[str, list[float]]]:
+    def _window(self, shape: tuple[int, ...]) -> tuple[Window, dict[str, list[float]]]:
         """Return rows and columns to send, and where they are."""
         left, right, bottom, top = self.place
         rows, columns = shape[:2]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from html import escape
 from io import StringIO
 from typing import Any
@@ -14,6 +14,7 @@ import panel as pn
 from bokeh.events import Tap
 from bokeh.models import ColumnDataSource, HoverTool
 from bokeh.plotting import figure
+from numpy.typing import NDArray
 
 from mirrorskin.engine.metrology import Measures, Section, group_of, section
 from mirrorskin.io import InputError, Region
@@ -33,7 +34,7 @@ from mirrorskin.view.app.picture import (
     show_change,
     show_map,
 )
-from mirrorskin.view.app.session import Computed, Session
+from mirrorskin.view.app.session import Computed, Ends, Session
 from mirrorskin.view.drawing.colours import FILLED_RGB, MISSING_RGB
 from mirrorskin.view.result.scale import labelled, title_of_height
 from mirrorskin.view.result.sheet import Sheet, percent
@@ -49,6 +50,53 @@ _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8a6d00", "#56b4e9")  #
 _FRESH, _STALE = {"opacity": "1", "filter": "none"}, {"opacity": "0.35", "filter": "grayscale(1)"}
 _PRESSED = ".bk-btn.bk-active { outline: 2px solid light-dark(#1f6f78, #66c2cb); outline-offset: -2px; }"
 _COPY = "navigator.clipboard.writeText(source.data.text[0])"
+
+
+_Colours = tuple[str, float | None, float | None]
+"""A colour map, and the values at its ends; the map's own where there is none."""
+_Drawing = tuple[Shown, NDArray[np.uint32] | None, str]
+"""A map with marks, and what its title adds."""
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What is drawn: a map with marks of filled heights, or its change; and what the title adds."""
+
+    sheet: Sheet
+    name: str
+    about: str
+    marked: bool
+    change: bool = False
+
+    def drawing(self, shown: Shown) -> _Drawing:
+        """Return a drawing of the map with marks of filled heights, if the map has them."""
+        heights = self.marked and self.name == self.sheet.result.name_of("height")
+        marks = filled_marks(self.sheet) if heights and self.sheet.filled.any() else None
+        return shown, marks, self.about
+
+
+@dataclass(frozen=True)
+class _Drawings:
+    """The map of the result and what is next to it, with a caption and a legend."""
+
+    caption: str
+    now: _Drawing
+    before: _Drawing | None = None
+
+
+def _drawings(
+    drawn: _Drawn, other: _Drawn | None, colours: tuple[str, float | None, float | None]
+) -> _Drawings:
+    """Prepare drawings; the work of a thread, as maps may be large."""
+    now = recoloured(show_map(drawn.sheet, drawn.name), *colours)
+    caption = f"<p>{escape(now.caption)}</p>{_legend(drawn.sheet, now, drawn.marked)}"
+    if other is None:
+        return _Drawings(caption, drawn.drawing(now))
+    shown = show_map(other.sheet, other.name, now)
+    shown = replace(shown, palette=now.palette) if now.palette else shown
+    if other.change and now.values.dtype.kind == "f":  # codes and directions have none
+        return _Drawings(caption, drawn.drawing(now), (show_change(now, shown), None, ""))
+    return _Drawings(caption, drawn.drawing(now), other.drawing(shown))
 
 
 class ResultPane:
@@ -85,7 +133,7 @@ class ResultPane:
         self.low = widgets.FloatInput(label="From", value=None, placeholder="automatic", width=115)
         self.high = widgets.FloatInput(label="To", value=None, placeholder="automatic", width=115)
         self._follows = False  # whether the fields show what was chosen for another map before
-        self._colours: dict[str, tuple[str, float | None, float | None]] = {}  # by map
+        self._colours: dict[str, _Colours] = {}  # by map
         self._pictures: dict[str, Picture] = {}
         self._dragging: Dragging | None = None
         self._pair = pn.FlexBox(styles={"flex": "0 1 auto"})
@@ -104,6 +152,8 @@ class ResultPane:
         self.copy.js_on_click(args={"source": self._text}, code=_COPY)
         self._measured: Measures | None = None
         self._place: tuple[Any, ...] = ()
+        self._asked = self._drawn_last = self._cuts = 0  # count drawings, and sections, that were asked for
+        self._body = pn.Column(sizing_mode="stretch_width")
         self.map.param.watch(lambda _: self._choose_map(), "value")
         for field in (self.palette, self.low, self.high):
             field.param.watch(lambda _: self._recolour(), "value")
@@ -129,13 +179,7 @@ class ResultPane:
             min_width=380,
         )
         buttons = pn.FlexBox(self.restart, self.unmask, self.copy, self.table)
-        self._body = pn.Column(
-            pn.FlexBox(self._pair, section),
-            self.caption,
-            self.measures,
-            buttons,
-            sizing_mode="stretch_width",
-        )
+        self._body[:] = [pn.FlexBox(self._pair, section), self.caption, self.measures, buttons]
         self.view = pn.Column(
             pn.FlexBox(
                 self.map, self.turn, self.palette, self.low, self.high, self.other, self.compared,
@@ -162,6 +206,8 @@ class ResultPane:
             self._dragging.mode = mode
 
     def _choose_map(self) -> None:
+        if self._follows:
+            return
         palette, low, high = self._colours.get(self.map.value, ("", None, None))
         self._follows = True
         self.palette.value, self.low.value, self.high.value = palette, low, high
@@ -176,7 +222,8 @@ class ResultPane:
 
     def _fade(self) -> None:
         """Grey what does not belong to the options, until it does."""
-        self._body.styles = dict(_STALE if self._session.computing else _FRESH)
+        stale = self._session.computing or self._drawn_last != self._asked
+        self._body.styles = dict(_STALE if stale else _FRESH)
 
     def _show(self) -> None:
         """Show a new result."""
@@ -187,8 +234,10 @@ class ResultPane:
         height = sheet.result.name_of("height")
         if list(self.map.options or {}) != list(names):
             chosen = self.map.value
+            self._follows = True
             self.map.options = names
             self.map.value = chosen if chosen in names.values() else display_order(sheet.result)[0]
+            self._follows = False
         turns = self._session.turns
         self.turn.visible, self.turn.end = turns > 0, max(turns - 1, 0)
         self.section.figure.visible = height is not None
@@ -201,23 +250,44 @@ class ResultPane:
         self._show_section()
 
     def _show_maps(self) -> None:
-        name = self.map.value
-        sheet = self._session.sheet(self._session.now)
+        name, session = self.map.value, self._session
+        sheet = session.sheet(session.now)
         if sheet is None or name not in sheet.result:
             return
         self._prepare(sheet)
-        now = recoloured(show_map(sheet, name), *self._colours.get(name, ("", None, None)))
-        self._draw("now", sheet, now, self._session.now)
-        before = self._session.sheet(self._session.compared) if self.compared.value else None
-        fits = before is not None and name in before.result and before.place == sheet.place
-        other = [self._panes["before"]] if fits else []
-        if before is not None and fits:
-            shown = show_map(before, name, now)
-            self._draw_next(before, replace(shown, palette=now.palette) if now.palette else shown, now)
-        elif before is not None:
+        before = session.sheet(session.compared) if self.compared.value else None
+        about_a, about_b = (one.label if one else "" for one in (session.now, session.compared))
+        drawn = _Drawn(sheet, name, f"A: {about_a}", self.marked.value)
+        other = None
+        if before is not None and name in before.result and before.place == sheet.place:
+            other = replace(
+                drawn, sheet=before, about=f"B: {about_b}", change=self.compared.value == "change"
+            )
+        colours = self._colours.get(name, ("", None, None))
+        self._asked += 1
+        asked, missing = self._asked, before is not None and other is None
+
+        def draw(drawings: _Drawings) -> None:
+            if asked == self._asked:
+                self._drawn_last = asked
+                self._draw(drawings, missing)
+
+        self._fade()
+        session.run(lambda: _drawings(drawn, other, colours), draw)
+
+    def _draw(self, drawings: _Drawings, missing: bool) -> None:
+        """Draw the map of the result, and what is next to it."""
+        other: list[Any] = []
+        if drawings.before is not None:
+            other = [self._panes["before"]]
+        elif missing:
             other = [text(hint("B has no such map of the same place and size."), margin=(160, 60))]
+        for which, drawing in (("now", drawings.now), ("before", drawings.before)):
+            if drawing is not None:
+                self._pictures[which].show(*drawing)
         self._pair[:] = [self._panes["now"], *other]
-        self.caption.object = f"<p>{escape(now.caption)}</p>{_legend(sheet, now, self.marked.value)}"
+        self.caption.object = drawings.caption
+        self._fade()
 
     def _prepare(self, sheet: Sheet) -> None:
         """Make pictures of the size of the maps, if their size has changed."""
@@ -237,21 +307,6 @@ class ResultPane:
         self._dragging = Dragging(now, self._drawn, self.drag.value)
         now.figure.on_event(Tap, self._tapped)
         self._panes = {name: pn.pane.Bokeh(picture.figure) for name, picture in self._pictures.items()}
-
-    def _draw_next(self, before: Sheet, shown: Shown, now: Shown) -> None:
-        """Draw the map of B, or the change from it, which codes and directions do not have."""
-        if self.compared.value == "change" and now.values.dtype.kind == "f":
-            self._pictures["before"].show(show_change(now, shown))
-        else:
-            self._draw("before", before, shown, self._session.compared)
-
-    def _draw(self, which: str, sheet: Sheet, shown: Shown, computed: Computed | None) -> None:
-        assert computed is not None
-        picture = self._pictures[which]
-        heights = self.map.value == sheet.result.name_of("height")
-        marks = filled_marks(sheet) if heights and self.marked.value else None
-        name = "B" if which == "before" else "A"
-        picture.show(shown, marks, f"{name}: {computed.label}")
 
     def _tapped(self, event: Any) -> None:
         """Choose the pixel whose brightness the recording shows."""
@@ -276,20 +331,29 @@ class ResultPane:
             self._session.measure_in(region_between(sheet.place, (len(sheet.y), len(sheet.x)), start, end))
 
     def _show_section(self) -> None:
-        sheet = self._session.sheet(self._session.now)
-        self.uncut.visible = bool(self._session.sections)
+        session = self._session
+        sheet = session.sheet(session.now)
+        self.uncut.visible = bool(session.sections)
         if sheet is None or sheet.result.height is None:
             self.where.object = ""
             return
-        profiles = []
-        for ends in [*self._session.sections]:
-            try:
-                profiles.append(_section(sheet, *ends))
-            except InputError:
-                self._session.sections.remove(ends)
-        if not self._session.sections:
-            with suppress(InputError):
-                profiles.append(_section(sheet))
+        before = session.sheet(session.compared)
+        if before is not None and (before.result.height is None or before.place != sheet.place):
+            before = None
+        self._cuts += 1
+        cuts, ends = self._cuts, [*session.sections]
+
+        def draw(profiles: _Profiles) -> None:
+            if cuts == self._cuts:
+                for wrong in profiles.wrong:
+                    session.sections.remove(wrong)
+                self._draw_section(sheet, profiles)
+
+        session.run(lambda: _profiles(sheet, ends, before), draw)
+
+    def _draw_section(self, sheet: Sheet, drawn: _Profiles) -> None:
+        """Draw sections, and where they are."""
+        profiles = drawn.now
         if not profiles:
             self.where.object = hint("No section can be drawn there.")
             return
@@ -300,12 +364,7 @@ class ResultPane:
                 "y": [profile.y[[0, -1]] for profile in profiles],
                 "colour": [*_COLOURS[: len(profiles)]],
             }
-        before = self._session.sheet(self._session.compared)
-        other = None
-        if before is not None and before.result.height is not None and before.place == sheet.place:
-            first = profiles[0]
-            other = _section(before, (first.x[0], first.y[0]), (first.x[-1], first.y[-1]))
-        self.section.show(sheet, profiles, other)
+        self.section.show(sheet, profiles, drawn.before)
         ends_of = [f"({profiles[-1].x[end]:.3g}, {profiles[-1].y[end]:.3g})" for end in (0, -1)]
         count = f"Section {len(profiles)}" if len(profiles) > 1 else "Section"
         self.where.object = f"<p>{count} from {ends_of[0]} to {ends_of[1]} {sheet.unit}</p>"
@@ -329,8 +388,9 @@ class ResultPane:
         now, turn, where = session.now, session.turn, _words(region, masks)
         found, measure = session.measures()
 
-        def show(measures: Measures | InputError) -> None:
-            if (now, turn, region, masks) != (session.now, session.turn, session.measured, session.masks):
+        def show(measures: Measures | InputError | None) -> None:
+            shown = session.now, session.turn, session.measured, session.masks
+            if measures is None or shown != (now, turn, region, masks):
                 return
             self.measures.styles = dict(_FRESH)
             self._measured = None if isinstance(measures, InputError) else measures
@@ -345,7 +405,7 @@ class ResultPane:
             show(found)
             return
         self.measures.styles = dict(_STALE)
-        session.run(measure, show)
+        session.run_aside(measure, show)
 
     def _csv(self) -> StringIO:
         return StringIO(as_text(self._measured, ","))
@@ -466,6 +526,33 @@ class _SectionGraph:
             (title.capitalize(), f"@y{{0.0000}} {unit}"),
             ("Standard deviation", f"@sigma{{0.00}} {error.figure_unit}"),
         ]
+
+
+@dataclass(frozen=True)
+class _Profiles:
+    """Sections of the result, the first one of B, and the ends between which there is none."""
+
+    now: list[Section]
+    before: Section | None
+    wrong: list[Ends]
+
+
+def _profiles(sheet: Sheet, ends: Sequence[Ends], before: Sheet | None) -> _Profiles:
+    """Cut along ends, by default the row through the highest point; the work of a thread."""
+    profiles, wrong = [], []
+    for pair in ends:
+        try:
+            profiles.append(_section(sheet, *pair))
+        except InputError:
+            wrong.append(pair)
+    if not profiles:
+        with suppress(InputError):
+            profiles.append(_section(sheet))
+    other = None
+    if before is not None and profiles:
+        first = profiles[0]
+        other = _section(before, (first.x[0], first.y[0]), (first.x[-1], first.y[-1]))
+    return _Profiles(profiles, other, wrong)
 
 
 def _section(sheet: Sheet, *ends: Point) -> Section:

@@ -27,6 +27,9 @@ from mirrorskin.io import InputError
 
 HERE = "127.0.0.1"
 
+PULSE = 250
+"""Milliseconds from one sign of life to the next."""
+
 _NAMES = HERE, "localhost", "[::1]"
 _TOKEN_BYTES = 24
 _DROP_BYTES = 8 * 1024**3  # of a file that is dropped on a page, at most
@@ -95,6 +98,7 @@ class AppServer:
             ico_path="none",  # Bokeh's is at an address without the token
             extra_patterns=[
                 (r"/(favicon\.ico)", StaticFileHandler, {"path": str(DIST_DIR / "images")}),
+                (r"/pulse", _pulses()),
                 *([] if drops is None else [(r"/drop/(.+)", _receiver(), {"folder": drops})]),
             ],
             show=False,
@@ -185,6 +189,25 @@ class StopServer:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+
+
+def _pulses() -> Any:
+    """Return the handler of a WebSocket that sends signs of life: the page is off if they stop.
+
+    Bokeh's own WebSocket would take a hundred times as long for each.
+    """
+    from tornado.ioloop import PeriodicCallback
+    from tornado.websocket import WebSocketHandler
+
+    class Pulses(WebSocketHandler):
+        def open(self) -> None:
+            self._beat = PeriodicCallback(lambda: self.write_message(""), PULSE)
+            self._beat.start()
+
+        def on_close(self) -> None:
+            self._beat.stop()
+
+    return Pulses
 
 
 def _receiver() -> Any:

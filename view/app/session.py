@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from mirrorskin import engine, io
 from mirrorskin.engine.base.options import Option, plain
 from mirrorskin.engine.base.reconstruction import calibrated, load_operation, method_for, run_class
+from mirrorskin.engine.base.summary import summarise
 from mirrorskin.engine.metrology import Measures
 from mirrorskin.engine.metrology.masks import inside_polygon
 from mirrorskin.io.files.opening import is_result
@@ -69,6 +71,11 @@ class Computed:
     label: str
     seconds: float = 0.0
     measures: dict[Hashable, Measures | io.InputError] = field(default_factory=dict, compare=False)
+
+    @cached_property
+    def summary(self) -> str:
+        """The result in one line."""
+        return str(summarise(self.result))
 
     @property
     def size(self) -> int:
@@ -125,7 +132,9 @@ class Session:
         What is shown.
     opening : Opening
     run : Run
-        How results are computed, one after the other.
+        How results are computed and drawings prepared, one after the other.
+    run_aside : Run, optional
+        How results are measured, which takes longer, one after the other.
 
     Raises
     ------
@@ -138,9 +147,10 @@ class Session:
         source: str | Path | io.Recording | io.Result,
         opening: Opening | None = None,
         run: Run = run_now,
+        run_aside: Run | None = None,
     ) -> None:
-        self.run = run
-        self.computing = False
+        self.run, self.run_aside = run, run_aside or run
+        self.computing = self._closed = False
         self._version = 0  # of what is to be computed
         self._watchers: dict[str, list[Callable[[], None]]] = {}
         self.opening = opening = opening or Opening()
@@ -363,15 +373,22 @@ class Session:
         self.other = other
         self._tell("compared")
 
-    def measures(self) -> tuple[Measures | io.InputError | None, Callable[[], Measures | io.InputError]]:
-        """Return the measures of the shown result, if they are known, and a function that measures."""
+    def measures(
+        self,
+    ) -> tuple[Measures | io.InputError | None, Callable[[], Measures | io.InputError | None]]:
+        """Return the measures of the shown result, if they are known, and a function that measures.
+
+        It returns None if another result is shown when it is called.
+        """
         now, region, masks = self.now, self.measured, [*self.masks]
         sheet = self.sheet(now)  # of the turn that is chosen now
         assert now is not None
         assert sheet is not None
         key = region, repr(masks), self.turn
 
-        def measure() -> Measures | io.InputError:
+        def measure() -> Measures | io.InputError | None:
+            if self._closed or self.now is not now:
+                return None
             if key not in now.measures:
                 try:
                     dust = [inside_polygon(sheet.x, sheet.y, corners) for corners in masks]
@@ -457,7 +474,9 @@ class Session:
                 result = run_class(kind, source, check, device=self.opening.device, **changed)
             except Exception as error:
                 return error
-            return Computed(result, label, time.perf_counter() - started)
+            computed = Computed(result, label, time.perf_counter() - started)
+            _ = computed.summary  # here, not in the thread that answers pages
+            return computed
 
         self.run(work, lambda computed: self._end(version, computed, key))
 
@@ -487,12 +506,14 @@ class Session:
         return ", ".join(parts) or "default options"
 
     def _keep(self, computed: Computed) -> None:
+        _ = computed.summary
         self.before, self.now = self.now, computed
         self._tell("result", "problem")
 
     def close(self) -> None:
         """Close the recording; what is being computed is given up."""
         self._version += 1
+        self._closed = True
         for recording in (self.whole, self._part):
             if recording is not None and self.path is not None:
                 self.run(recording.close, _ignore)

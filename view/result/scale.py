@@ -69,7 +69,11 @@ def scale_of(sheet: Sheet, name: str) -> Scale:
 
 def displayed_values(sheet: Sheet, name: str) -> Floats:
     """Return the values of a map in the unit of figures, NaN where undefined; of frames, the last ones."""
-    declared, values = sheet.result.declaration(name), sheet.result[name]
+    return in_figures(sheet.result.declaration(name), sheet.result[name])
+
+
+def in_figures(declared: Map, values: NDArray[Any]) -> Floats:
+    """Return values of a map as `displayed_values` does."""
     last = values[-1] if declared.per_frame and values.ndim > 2 + bool(declared.components) else values
     answered = declared.has_answer(last).reshape(*last.shape[:2], *[1] * (last.ndim - 2))
     return np.where(answered, declared.figure_scale * last.astype(np.float64), np.nan)
