@@ -39,6 +39,17 @@ MARGIN = 0.1
 _COARSEST = 16  # pixels: minimum side of a surface of half the resolution
 
 
+def transform(values: Reals, padded: tuple[int, int]) -> NDArray[Any]:
+    """Return the transform of maps, (..., H, W), on a padded grid; empty rows are not transformed."""
+    return np.asarray(fft.fft(fft.rfft(values, padded[1]), padded[0], axis=-2, overwrite_x=True))
+
+
+def inverse_transform(wave: NDArray[Any], padded: tuple[int, int], shape: tuple[int, int]) -> Reals:
+    """Return the maps, (..., H, W), of a shape, from their transforms on a padded grid."""
+    rows = fft.ifft(wave, axis=-2, overwrite_x=True)[..., : shape[0], :]
+    return np.asarray(fft.irfft(rows, padded[1])[..., : shape[1]])
+
+
 class HalfSpace:
     """The displacement of the surface of an incompressible half-space under pressure on a grid.
 
@@ -76,10 +87,9 @@ class HalfSpace:
 
     def displacement(self, strain: NDArray[Real]) -> NDArray[Real]:
         """Return the displacement by pressures over Young's modulus, (..., H, W) mm, positive inwards."""
-        rows, columns = self.shape
-        wave = fft.rfft2(strain, self._padded)
+        wave = transform(strain, self._padded)
         wave *= _spectrum(self.shape, self._whole, self.pixel_size, wave.real.dtype)
-        moved: NDArray[Real] = fft.irfft2(wave, self._padded, overwrite_x=True)[..., :rows, :columns]
+        moved: NDArray[Real] = inverse_transform(wave, self._padded, self.shape)
         return moved
 
     def pressed(self, moved: NDArray[Real]) -> NDArray[Real]:

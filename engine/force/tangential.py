@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.base.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.base.resample import fill_with_nearest
-from mirrorskin.engine.force.halfspace import spectrum_of
+from mirrorskin.engine.force.halfspace import inverse_transform, spectrum_of, transform
 from mirrorskin.engine.force.normal import modulus_of
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.base.arguments import as_array_or_number, check_count, check_number, checked, in_unit
@@ -114,14 +114,12 @@ def find_tangential_force(
     0.018
     """
     result = as_result(displacement, "displacement", quantity="displacement")
-    moved, spread, touches = _checked(result, sigma, contact, normal_pressure, window_size)
+    target, spread, touches, place = _checked(result, sigma, contact, normal_pressure, window_size)
     size = pixel_size_of(result, "displacement", pixel_size)
     young, young_sigma = modulus_of(result, modulus, modulus_sigma)
     x, y = pixel_axes((touches.shape[0], touches.shape[1]), size)
-    rows, columns = (slice(int(part.min()), int(part.max()) + 1) for part in np.nonzero(touches))
     traction = np.zeros((*touches.shape, 2), np.float32)
-    touches, spread = touches[rows, columns], spread[:, rows, columns]
-    target = np.where(touches, moved[:, rows, columns] * UP, 0.0)
+    touches = touches[place]
     system = ContactShear(touches, size)
     weights = system.weights() * size[0] * size[1]
     force = young * np.sum(weights * target, axis=(1, 2, 3)) * UP.ravel()
@@ -129,7 +127,7 @@ def find_tangential_force(
     shared = ndimage.uniform_filter(weights * spread, window, mode="constant") * window_size
     from_measurement = young * np.sqrt(np.sum(shared**2, axis=(1, 2, 3)))
     strain = system.damped(target, spread)
-    traction[rows, columns] = np.moveaxis(young * strain * UP, 0, -1)
+    traction[place] = np.moveaxis(young * strain * UP, 0, -1)
     force_sigma = np.hypot(from_measurement, young_sigma / young * force)
     return Result(
         traction=traction,
@@ -149,27 +147,33 @@ def _checked(
     contact: ArrayLike | None,
     pressure: ArrayLike | None,
     window_size: int,
-) -> tuple[Doubles, Doubles, Mask]:
-    """Return displacements without gaps, their standard deviations, and the contact."""
+) -> tuple[Doubles, Doubles, Mask, tuple[slice, slice]]:
+    """Return displacements in contact along x and rows, standard deviations, the contact, and its place.
+
+    The first two, (2, H, W), are of the smallest part of the map that contains the contact, without gaps.
+    """
     moved, spread = last_displacement(result, sigma)
     if contact is None and pressure is None:
         contact, pressure = result.contact, result.pressure
     touches = _touches(contact, pressure, moved.shape[:2])
     if window_size < 1:
         raise InputError(f"window_size {window_size} is not possible: give pixels, 1 or more")
+    rows, columns = (slice(int(part.min()), int(part.max()) + 1) for part in np.nonzero(touches))
+    inside = touches[rows, columns]
+    moved, spread = (np.asarray(part[rows, columns], np.float64) for part in (moved, spread))
     finite = np.isfinite(moved).all(axis=-1)
     if finite.any() and not (farthest := np.abs(moved[finite]).max()) < _MAX_DISPLACEMENT:
         raise InputError(f"a displacement is {farthest:.3g} mm: less than {_MAX_DISPLACEMENT:g} are needed")
-    fraction = np.count_nonzero(finite & touches) / np.count_nonzero(touches)
+    fraction = np.count_nonzero(finite & inside) / np.count_nonzero(inside)
     if not np.isfinite(spread).any() or np.any(spread < 0):
         raise InputError("sigma is below 0, or nowhere known: give millimetres, 0 or more")
     if fraction < MIN_COVERAGE:
         raise InputError(f"{fraction:.0%} of the contact has a displacement: {MIN_COVERAGE:.0%} are needed")
-    filled = (
+    target, sigmas = (
         np.stack([fill_with_nearest(np.where(finite, part, np.nan)) for part in np.moveaxis(values, -1, 0)])
         for values in (moved, spread)
     )
-    return next(filled), next(filled), touches
+    return np.where(inside, target * UP, 0.0), sigmas, touches, (rows, columns)
 
 
 def last_displacement(result: Result, sigma: ArrayLike | None = None) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -223,7 +227,7 @@ class ContactShear:
     ) -> Singles:
         """Return the traction for a displacement of the contact, by preconditioned conjugate gradients."""
         goal, factor = tolerance * float(np.abs(target).max()), np.float32(damping)
-        shape, nothing = self._contact.shape, np.float32(0)
+        shape, nothing = (self._contact.shape[0], self._contact.shape[1]), np.float32(0)
         inverse = _inverse_spectra(shape, self._size, damping)
 
         def displaced(strain: Singles) -> Singles:
@@ -272,16 +276,15 @@ class ContactShear:
         return self._solve(target, _ROUGH, softness * 10**power, strain)
 
 
-def _filtered(values: Singles, spectra: Singles, shape: tuple[int, ...]) -> Singles:
+def _filtered(values: Singles, spectra: Singles, shape: tuple[int, int]) -> Singles:
     """Return the convolution of vectors, (..., 2, H, W), with a symmetric tensor of spectra xx, yy and xy."""
-    wave = fft.rfft2(values, shape)
+    wave = transform(values, shape)
     xx, yy, xy = spectra
     x, y = wave[..., 0, :, :], wave[..., 1, :, :]
     product = np.empty_like(wave)
     product[..., 0, :, :] = xx * x + xy * y
     product[..., 1, :, :] = xy * x + yy * y
-    moved = fft.irfft2(product, shape, overwrite_x=True)
-    return np.asarray(moved[..., : values.shape[-2], : values.shape[-1]])
+    return inverse_transform(product, shape, (values.shape[-2], values.shape[-1]))
 
 
 @lru_cache(maxsize=16)
