@@ -75,7 +75,7 @@ class Blocks:
         strips = sum((values[k::step] for k in range(1, step)), start=values[0::step])
         means = sum((strips[:, k::step] for k in range(1, step)), start=strips[:, 0::step])
         means = (means / step**2).astype(np.float32)
-        gaps = np.isnan(means)
+        gaps = ~np.isfinite(means)
         if step > 1 and gaps.any():
             parts = values.reshape(rows, step, columns, step).transpose(0, 2, 1, 3)[gaps]
             finite = np.isfinite(parts)

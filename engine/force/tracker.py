@@ -25,6 +25,7 @@ Singles = NDArray[np.float32]
 
 _TOLERANCE = 0.25  # gap in contact, standard deviations of the mean of a block
 _LOOSE = 5e-4  # maximum gap in contact as a share of the maximum height; the load is corrected for it
+_CLEARLY = 6.0  # standard deviations
 _STALE = 0.05  # share of the contact that may change before gradients of the load are computed anew
 _SAME_LOAD = 0.1  # relative change of the load after which its increase by noise is computed anew
 _SHEAR_ERROR = 1e-3  # of displacements in contact under tractions that move it by 1
@@ -168,7 +169,11 @@ class ForceTracker(ThreadSafe):
             found |= {name: float(value), f"{name}_sigma": math.hypot(sigma, by_modulus)}
         if pressed.load > 0:
             found["pressure"] = pressed.strain * np.float32(found["force"] / pressed.load)
-        process = in_process(_findings(pressed.contact, covered), carried({}, result=result.process))
+        findings = _findings(pressed.contact, covered)
+        if not pressed.load > 0 and _touches(surface + np.float32(travel), result.height_sigma):
+            text = f"what touches is smaller than {self._binning} pixels: use a smaller binning"
+            findings.append(Finding("small contact", text))
+        process = in_process(findings, carried({}, result=result.process))
         fitted = Fitted(travel=float(travel))
         return Result(
             found, x=axes[0], y=axes[1], process={"modulus": float(young), **process}, fitted=fitted
@@ -225,6 +230,11 @@ class _State:
             self.shears, self.sheared = np.zeros((2, 2, *contact.shape), np.float32), contact
             self.shears[place] = weights
         return self.shears[place]
+
+
+def _touches(surface: NDArray[Any], sigma: NDArray[Any] | None) -> bool:
+    """Return whether a pixel is clearly above the sheet."""
+    return bool(np.any(surface > (0.0 if sigma is None else _CLEARLY * sigma)))
 
 
 def _findings(contact: Mask, covered: float) -> list[Finding]:

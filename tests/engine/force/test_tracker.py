@@ -203,8 +203,20 @@ def test_missing_displacements_and_the_edge_are_reported():
     assert "reaches the edge" in found.process["warnings"]
 
 
-def test_an_object_may_end_within_the_maps():
-    height = np.where(np.hypot(X, Y[:, np.newaxis]) < 1.5, paraboloid(), np.nan)
+def test_contacts_smaller_than_a_block_are_reported():
+    height = np.full(SHAPE, -0.5)
+    height[80:82, 100:102] = 0.0
+    found = ForceTracker(modulus=MODULUS).push(result(height, 0.001), 0.1)
+    assert found.force == 0
+    assert "use a smaller binning" in found.process["warnings"]
+    found = ForceTracker(modulus=MODULUS, binning=1).push(result(height, 0.001), 0.1)
+    assert found.force > 0
+    assert "warnings" not in found.process
+
+
+@pytest.mark.parametrize("missing", [np.nan, -np.inf])
+def test_an_object_may_end_within_the_maps(missing):
+    height = np.where(np.hypot(X, Y[:, np.newaxis]) < 1.5, paraboloid(), missing)
     height[75:78, 100:103] = np.nan
     expected = find_force(paraboloid(), 0.4, PIXEL, MODULUS)
     found = ForceTracker(modulus=MODULUS).push(result(height), 0.4)
