@@ -27,6 +27,7 @@ from mirrorskin.bench.suite import (
     pose,
     report,
     robust,
+    trackers,
     twin,
 )
 from mirrorskin.bench.suite.harness import Cases, DisagreementError
@@ -49,6 +50,7 @@ _MODULES = (
     batch,
     live,
     pose,
+    trackers,
     peers,
 )
 CASES: Cases = {name: run for module in _MODULES for name, run in module.CASES.items()}

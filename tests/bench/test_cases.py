@@ -32,6 +32,8 @@ QUICK = (
     "file-s3",
     "batch-small",
     "live-vertical-vga",
+    "live-pose-and-slip",
+    "live-force",
 )
 
 
