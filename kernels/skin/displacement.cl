@@ -499,7 +499,7 @@ __kernel void displacement_solve(
         MAP at = corner + j * width + g * LANES;                                                             \
         const float below = PLACE(j);                                                                        \
         const F counts = LOAD(at), texture = LOAD(at + 3 * plane);                                           \
-        const F differs = (within) & (counts - counts == 0) ? counts - (values) : 0;                         \
+        const F differs = ((within) & (counts - counts == 0)) ? counts - (values) : 0;                       \
         const F by_x = differs * LOAD(at + plane), by_y = differs * LOAD(at + 2 * plane);                    \
         of_x += by_x;                                                                                        \
         of_y += by_y;                                                                                        \
