@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Result
-from mirrorskin.io.base.types import PIXEL
 from mirrorskin.io.base.units import numbers_with_unit
 from mirrorskin.io.model.maps import SIGMA, SlipStatus, is_builtin, is_deviation, place_of, status_of
-from mirrorskin.io.model.result import in_pixels
 
 _STICKS = status_of(SlipStatus).codes[SlipStatus.STICKS]
 
@@ -156,7 +154,7 @@ def summarise(result: Result) -> Summary:
         turns=len(answered) if answered.ndim == 3 and not declared.per_frame else None,
         filled=None if result.filled is None else int(np.count_nonzero(result.filled)),
         relief=None if result.height is None or not relative else _range(result.height),
-        relief_unit=PIXEL if in_pixels(result) else "mm",
+        relief_unit=result.declaration("height").unit,
         counts=dict(_counts(result)),
         numbers=dict(_numbers(result)),
     )

@@ -606,8 +606,10 @@ def check_declarations(declarations: Mapping[str, Map]) -> None:
     for name, declaration in declarations.items():
         if not isinstance(declaration, Map):
             raise InputError(f"the declaration of {name} is {declaration!r:.40}. Use mirrorskin.io.Map(...)")
-        others = (other for other in (TWIST, IN_PIXELS) if name in other)
-        table = next((other for other in others if declaration.unit == other[name].unit), TABLE)
+        table = TABLE
+        for variant in (TWIST, IN_PIXELS):
+            if name in variant and declaration.unit == variant[name].unit:
+                table = variant
         if name in table:
             for problem in conflicts(declaration, table[name], f"the map {name}"):
                 raise InputError(f"{problem}, as the built-in map has, or choose another name")
