@@ -108,7 +108,8 @@ def speckles():
     texture = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (64, 80)), (0, 0), 1.5)
     frames = np.stack([np.roll(texture, number, axis=1) for number in range(4)]).astype(np.uint8)
     positions = np.column_stack([0.03 * np.arange(4.0), np.zeros(4)])
-    contact = np.ones(frames.shape[1:], np.uint8)
+    row, column = np.indices(frames.shape[1:])
+    contact = (np.hypot(row - 31.5, column - 39.5) < 24).astype(np.uint8)
     return {
         "slip": engine.slip,
         "reference": frames[0],

@@ -38,7 +38,7 @@ _LEAST_CURVATURE = 3.0  # smallest curvature of a peak, in standard errors
 _FLOATS = "height", "sharpness", "spread", "gain", "misfit"  # maps of focus.cl
 _OWN = "shifted", "shifted_noise", "texture", "texture_noise", "left"  # maps of focus.cl
 _ALL_ROWS = 2**18  # most pixels of a picture of which all rows show the relief
-# Relief inside the window; see docs/method/focus.md.
+# Relief inside the window: see the documentation.
 _UNSEEN = 1.4  # variance of the errors of pixels, over that which texture shows
 _VARIED = 0.4  # standard deviation of the relief of a part of the picture, over that of a larger one
 _PARTS = 9, 3, 1  # blocks along a side of a part; a block has radius^2 pixels
@@ -195,7 +195,7 @@ class _OwnCurves(NamedTuple):
 def _relief(own: _OwnCurves, variance: float, radius: int) -> NDArray[np.float32]:
     """Return the variance, mm^2, of the heights of pixels about those that their windows show.
 
-    See docs/method/focus.md, "Relief inside the window". It is that of a part of the picture, the less exact
+    See the documentation, "Relief inside the window". It is that of a part of the picture, the less exact
     ones being drawn towards that of a larger part.
     """
     pixels = own.texture > 0

@@ -18,7 +18,9 @@ def pose_of(
     rows, columns = shape
     grid = -(columns - 1) / 2 * PIXEL[0], (rows - 1) / 2 * PIXEL[1], *PIXEL
     turn = Rotation.from_rotvec(vector).as_matrix().ravel()
-    return np.array([*turn, *shift, 0.1, -0.2, 0.05, *grid, *grid, least_facing, least_facing], np.float32)
+    return np.array(
+        [*turn, *shift, 0.1, -0.2, 0.05, *grid, *grid, least_facing, least_facing, 1e30], np.float32
+    )
 
 
 def blocks_of(shape: tuple[int, int], step: int) -> int:
