@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from enum import StrEnum
-from glob import has_magic
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -207,7 +206,7 @@ def _paths(words: list[str]) -> list[Path]:
     """Return the files and addresses that words or patterns name."""
     paths: list[Path] = []
     for word in words:
-        found = matches(word, "results") if has_magic(word) else None
+        found = matches(word, "results")
         paths += [ExistingPath().convert(word, None, None)] if found is None else found
     return paths
 

@@ -73,7 +73,7 @@ class HalfSpace:
         pixel_size: tuple[float, float],
         whole: tuple[int, int] | None = None,
     ) -> None:
-        self.shape, self.pixel_size, self._padded = shape, pixel_size, _padded(shape)
+        self.shape, self.pixel_size, self._padded = shape, pixel_size, padded_shape(shape)
         self._whole = whole or shape
 
     def part(self, shape: tuple[int, int]) -> HalfSpace:
@@ -272,7 +272,8 @@ def _opening(space: HalfSpace, compliance: float) -> Callable[[NDArray[Real]], N
     return opened
 
 
-def _padded(shape: tuple[int, int]) -> tuple[int, int]:
+def padded_shape(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return the size of the padded grid, on which a convolution does not wrap around."""
     rows, columns = shape
     return fft.next_fast_len(2 * rows - 1), fft.next_fast_len(2 * columns - 1, real=True)
 
@@ -281,7 +282,7 @@ def _padded(shape: tuple[int, int]) -> tuple[int, int]:
 def _influence(shape: tuple[int, int], pixel_size: tuple[float, float]) -> Doubles:
     """Return the weights of the convolution: the cut-off spectrum's inverse transform, on a larger grid."""
     rows, columns = shape
-    reach = _reach(shape, pixel_size)
+    reach = reach_of(shape, pixel_size)
     padded = (
         fft.next_fast_len(rows + math.ceil(reach / pixel_size[1])),
         fft.next_fast_len(columns + math.ceil(reach / pixel_size[0]), real=True),
@@ -290,7 +291,7 @@ def _influence(shape: tuple[int, int], pixel_size: tuple[float, float]) -> Doubl
     return np.ascontiguousarray(weights[:rows, :columns])
 
 
-def _reach(shape: tuple[int, int], pixel_size: tuple[float, float]) -> float:
+def reach_of(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> float:
     """Return the largest distance on a grid, mm."""
     return math.hypot(shape[0] * pixel_size[1], shape[1] * pixel_size[0])
 
@@ -318,13 +319,13 @@ def _spectrum(
 @lru_cache(maxsize=128)
 def _inverse_spectrum(shape: tuple[int, int], pixel_size: tuple[float, float], dtype: np.dtype[Any]) -> Reals:
     """Return the inverse of the spectrum of a point's displacement on a periodic grid, 1/mm."""
-    return (1 / _cut_off(shape, pixel_size, _reach(shape, pixel_size))).astype(dtype)
+    return (1 / _cut_off(shape, pixel_size, reach_of(shape, pixel_size))).astype(dtype)
 
 
 def spectrum_of(weights: Doubles, sign: float = 1.0) -> Doubles:
     """Return the transform of weights (H, W) on the padded grid, which are even, or odd along both axes."""
     rows, columns = weights.shape
-    whole = np.zeros(_padded((rows, columns)))
+    whole = np.zeros(padded_shape((rows, columns)))
     whole[:rows, :columns] = weights
     if rows > 1:
         whole[-rows + 1 :, :columns] = sign * weights[:0:-1]

@@ -14,7 +14,13 @@ from scipy.optimize import brentq
 from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.base.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.base.resample import fill_with_nearest
-from mirrorskin.engine.force.halfspace import inverse_transform, spectrum_of, transform
+from mirrorskin.engine.force.halfspace import (
+    inverse_transform,
+    padded_shape,
+    reach_of,
+    spectrum_of,
+    transform,
+)
 from mirrorskin.engine.force.normal import modulus_of
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.base.arguments import as_array_or_number, check_count, check_number, checked, in_unit
@@ -214,7 +220,7 @@ class ContactShear:
         self, contact: Mask, pixel_size: tuple[float, float], whole: tuple[int, ...] | None = None
     ) -> None:
         self._contact, self._size, shape = contact, pixel_size, contact.shape
-        self._padded = fft.next_fast_len(2 * shape[0] - 1), fft.next_fast_len(2 * shape[1] - 1, real=True)
+        self._padded = padded_shape(shape)
         self._spectra = _spectra(shape, whole or shape, pixel_size)
 
     def weights(self, error: float = _TOLERANCE, start: Singles | None = None) -> Singles:
@@ -290,7 +296,7 @@ def _filtered(values: Singles, spectra: Singles, shape: tuple[int, int]) -> Sing
 @lru_cache(maxsize=16)
 def _responses(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> list[Doubles]:
     """Return the weights xx, yy and xy of the convolution, (H, W) each."""
-    reach = _reach(shape, pixel_size)
+    reach = reach_of(shape, pixel_size)
     wide = tuple(
         fft.next_fast_len(count + math.ceil(reach / size))
         for count, size in zip(shape, pixel_size[::-1], strict=True)
@@ -309,15 +315,10 @@ def _spectra(shape: tuple[int, ...], whole: tuple[int, ...], pixel_size: tuple[f
 @lru_cache(maxsize=8)
 def _inverse_spectra(shape: tuple[int, ...], pixel_size: tuple[float, float], damping: float) -> Singles:
     """Return the inverse of the spectra, with damping, on a periodic grid."""
-    along, up, across = _tensor(shape, pixel_size, _reach(shape, pixel_size))
+    along, up, across = _tensor(shape, pixel_size, reach_of(shape, pixel_size))
     along, up = along + damping, up + damping
     determinant = along * up - across**2
     return np.stack([up / determinant, along / determinant, -across / determinant]).astype(np.float32)
-
-
-def _reach(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> float:
-    """Return the largest distance on a grid, mm."""
-    return math.hypot(shape[0] * pixel_size[1], shape[1] * pixel_size[0])
 
 
 @lru_cache(maxsize=32)

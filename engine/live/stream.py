@@ -86,13 +86,13 @@ class Stream(Closing):
         latency: float = LATENCY,
         on_update: OnUpdate | None = None,
     ) -> None:
-        self._source = _Pushed(_header(operation, motion, header), shape, check_dtype(dtype), latency)
+        header = _header(operation, motion, header)
+        self._source = _Pushed(header, shape, check_dtype(dtype), latency, on_update)
         self._run = LiveRun(self._source, operation)
         self._run.precompile()
         if {"pose", "tilt"} & {name for name, needed in self._run.operation.positions.items() if needed}:
             self._source.needed += ("tilt",)
-        keep = self._source.keep if on_update is None else _both(self._source.keep, on_update)
-        self._loop = Loop(self._source, self._run, latency=latency, on_update=keep)
+        self._loop = Loop(self._source, self._run, latency=latency, on_update=self._source.keep)
         self._thread = threading.Thread(
             target=_run, args=(self._loop, self._source), name="mirrorskin-stream", daemon=True
         )
@@ -207,16 +207,6 @@ def _run(loop: Loop, source: _Pushed) -> None:
         source.finish()
 
 
-def _both(first: OnUpdate, then: OnUpdate) -> OnUpdate:
-    """Return a function that calls two."""
-
-    def call(update: Update, status: Status) -> None:
-        first(update, status)
-        then(update, status)
-
-    return call
-
-
 def _header(operation: Operation | Method, motion: Motion | None, header: Header | None) -> Header:
     """Return the header of a stream, with its motion."""
     if header is not None:
@@ -236,13 +226,20 @@ class _Pushed(Closing):
     name = "stream"
     rewindable = False
 
-    def __init__(self, header: Header, shape: tuple[int, int], dtype: np.dtype[Any], latency: float) -> None:
+    def __init__(
+        self,
+        header: Header,
+        shape: tuple[int, int],
+        dtype: np.dtype[Any],
+        latency: float,
+        on_update: OnUpdate | None,
+    ) -> None:
         self.header, self.motion = header, header.motion
         self.shape, self.dtype = (_ENDLESS, *shape), dtype
         self.needed: tuple[str, ...] = (POSITIONS[self.motion],)
         self.latest: Update | None = None
         self._start = time.monotonic()
-        self._keeps_all = latency == math.inf
+        self._keeps_all, self._on_update = latency == math.inf, on_update
         self._changed = threading.Condition()
         self._waiting: deque[tuple[NDArray[Any], float, dict[str, Floats]]] = deque()
         self._count = self._lost = 0
@@ -265,6 +262,8 @@ class _Pushed(Closing):
         """Keep the newest maps, and tell those who wait for them."""
         self.latest = update
         self._tell()
+        if self._on_update is not None:
+            self._on_update(update, status)
 
     @contextmanager
     def watched(self, tell: Callable[[], object]) -> Iterator[None]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -94,8 +93,13 @@ class Pose:
             kept = directions[:, sizes > _EQUAL_TOLERANCE]
             others = np.eye(6) - kept @ kept.T
             covariance, free = others @ covariance @ others, kept.T
-        maps: dict[str, Any] = {"covariance": covariance, "undetermined": free}
-        return replace(self, rotation=motion.vector, translation=motion.shift, **maps)
+        return replace(
+            self,
+            rotation=motion.vector,
+            translation=motion.shift,
+            covariance=covariance,
+            undetermined=free,
+        )
 
 
 IDENTITY = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0, 6)))

@@ -143,7 +143,7 @@ class PoseTracker(ThreadSafe):
         assert self._key is not None
         present, best = self._key, limit * self._key.spread(pose)
         first_to_map = present.pose.motion.then(motion.inverse())
-        for key in (*self._earlier,):
+        for key in self._earlier:
             found = key.follow(map_, first_to_map.inverse().then(key.pose.motion))
             if found is None or (share := key.share(found)) < _MIN_COMMON + _LEAVING:
                 continue

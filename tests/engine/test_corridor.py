@@ -50,7 +50,7 @@ def test_library_run(recordings, levels):
 @pytest.mark.parametrize(
     ("line", "functions", "files"),
     [
-        ("reconstruct press.h5", 563, 73),
+        ("reconstruct press.h5", 562, 73),
         ("reconstruct turn.h5", 764, 96),
         ("fuse press.h5 turn.h5", 940, 112),
     ],
