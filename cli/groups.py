@@ -224,13 +224,14 @@ def matches(word: str, what: str) -> list[Any] | None:
     """
     import glob
 
-    from mirrorskin.io import InputError
     from mirrorskin.io.base.url import Url, is_zarr, path_of
-    from mirrorskin.io.storage.zarr import find_stores
 
     path = path_of(word)
     if os.path.lexists(path) or not glob.has_magic(word):
         return None
+    from mirrorskin.io import InputError
+    from mirrorskin.io.storage.zarr import find_stores
+
     if isinstance(path, Url):
         return find_stores(path)
     every = map(Path, sorted(glob.glob(word, recursive=True)))  # noqa: PTH207  # paths may be absolute
