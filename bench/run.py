@@ -27,7 +27,6 @@ from mirrorskin.bench.suite import (
     pose,
     report,
     robust,
-    trackers,
     twin,
 )
 from mirrorskin.bench.suite.harness import Cases, DisagreementError
@@ -50,7 +49,6 @@ _MODULES = (
     batch,
     live,
     pose,
-    trackers,
     peers,
 )
 CASES: Cases = {name: run for module in _MODULES for name, run in module.CASES.items()}

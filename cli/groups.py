@@ -174,6 +174,13 @@ class Command(click.Command):
         _list_parameters(self, ctx, formatter)
 
 
+class CommandGroup(LazyGroup, Command):
+    """A command that also has commands of its own, which take none of its options."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(invoke_without_command=True, **settings)
+
+
 class _Argument(click.Argument):
     """An argument that help lists."""
 

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from mirrorskin import io
+from mirrorskin.cli.commands.bench.paced import shared_memory
 from mirrorskin.cli.commands.bench.timing import OURS
 from mirrorskin.engine import reconstruct
-from mirrorskin.evaluation.base.sources import Frames, shared_memory
+from mirrorskin.evaluation.base.sources import Frames
 from mirrorskin.evaluation.scenes.inputs import STEPS, TILT, fill_press, fill_turns, phases, references
 from mirrorskin.io.files.recorder import Compression
 from mirrorskin.kernels.device import Device

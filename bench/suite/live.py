@@ -1,175 +1,113 @@
-"""Whole live runs with frames from memory at their times: sustained rate and latency.
+"""Live runs of `mirrorskin bench live`, with targets: sustained rate, latency, and processor time.
 
 Targets: a press without loss at 1000 frames/s of 640 x 480 and 150 frames/s of 1920 x 1200; a rotation with
-normals and heights of 640 x 480 at 60 updates/s, with a latency from frame to height of 15 ms (99 %: 30 ms).
+normals and heights of 640 x 480 at 60 updates/s, with a latency from frame to height of 15 ms (99 %: 30 ms);
+trackers of 320 x 240 at 1000 frames/s, pose and slip together with a latency of 3 ms (99 %).
 """
 
 from __future__ import annotations
 
 import math
 import os
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 
 from mirrorskin.bench.suite.harness import Cases, Run
-from mirrorskin.cli.commands.bench.records import Case, Target
-from mirrorskin.engine import Press, Rotation
-from mirrorskin.engine.live import RAISED, LiveRun, Loop, Status, Update
-from mirrorskin.evaluation.base.sources import Paced
-from mirrorskin.evaluation.scenes.inputs import SCALES, STEPS, TILT, fill_press, fill_turns
-from mirrorskin.io import Header
+from mirrorskin.cli.commands.bench.live_runs import Ran, measure_live
+from mirrorskin.cli.commands.bench.records import Case, LiveRow, Target, as_ms
+from mirrorskin.engine.live import RAISED
 from mirrorskin.kernels.device import Device
 
-_PIXEL, _DEPTH = 0.03, 3.0  # mm
-_PRESS = 256  # number of different frames of a press; each is repeated
-_TURNS = 64  # frames after which a rotation repeats
+Shape = tuple[int, int]
+Judge = Callable[[LiveRow, Ran], tuple[Target, ...]]
+
+_VGA, _HALF = (480, 640), (240, 320)
+_QUICK = (60, 80), 100.0, 0.3  # rows and columns, frames/s, s
 _KEPT_UP = 0.99  # minimum rate, as a share of the specified frame rate
 _NEAR = 1e-2  # tolerated difference of the last heights from the converged ones, as a share of the range
 _UPDATES, _MEDIAN, _SLOWEST = 60, 15, 30  # updates/s, and ms from frame to height
+_LATENCY = 3.0  # ms, 99 % of the frames, of pose and slip together
+_PROCESSOR = {"press": 1.0, "turn": 4.0, "pose": 0.7, "slip": 0.8, "force": 1.0}  # ms a frame
 
 
-@dataclass(frozen=True, slots=True)
-class LiveCase:
-    """Frames of uint8, (H, W), at a rate for some seconds; `least` is the rate to be sustained."""
-
-    name: str
-    shape: tuple[int, int]
-    rate: float
-    seconds: float
-    least: float = 0.0
-
-    @property
-    def count(self) -> int:
-        """Number of frames."""
-        return round(self.rate * self.seconds)
-
-    @property
-    def size(self) -> str:
-        """The frames in words."""
-        rows, columns = self.shape
-        return f"{columns} x {rows} uint8, {self.rate:g} frames/s for {self.seconds:g} s"
-
-
-@dataclass(frozen=True, slots=True)
-class Ran:
-    """The outcome of a run: counts, seconds, the last update, and the load of the machine before."""
-
-    status: Status
-    seconds: float
-    last: Update
-    load: float
-
-
-def run_press(case: LiveCase, device: Device, quick: bool) -> Case:
-    """Compute heights during a press."""
-    frames = np.empty((_PRESS, *case.shape), np.uint8)
-    fill_press(frames)
-    source = Paced(
-        frames,
-        lambda number: number * _PRESS // case.count,
-        Header("vertical", pixel_size=(_PIXEL, _PIXEL)),
-        lambda number: number * (_DEPTH / case.count),
-        case.rate,
-        case.count,
-    )
-    ran = _run(source, LiveRun(source, Press(device=device)))
-    targets = () if quick else judge_press(ran, case.least)
-    title = f"heights during a press; {case.size}"
-    return Case(case.name, title, [], {}, _notes(ran), targets)
-
-
-def run_rotation(case: LiveCase, device: Device, quick: bool) -> Case:
-    """Compute normals, edges and heights during a rotation."""
-    offset, gain, noise = SCALES["uint8"]
-    frames = np.empty((_TURNS, *case.shape), np.uint8)
-    fill_turns(frames)
-    scale: dict[str, Any] = {"zenith_gain": np.asarray(gain), "zenith_offset": np.asarray(offset)}
-    source = Paced(
-        frames,
-        lambda number: number % _TURNS,
-        Header("axial", pixel_size=(_PIXEL, _PIXEL), tilt=TILT, **scale),
-        lambda number: number * (math.tau / STEPS),
-        case.rate,
-        case.count,
-    )
-    noise = math.hypot(noise, 1 / math.sqrt(12))
-    live_run = LiveRun(source, Rotation(window_frames=STEPS, noise=noise, device=device))
-    ran = _run(source, live_run)
-    best, height = live_run.result().height, ran.last.height
-    assert best is not None
-    assert height is not None
-    off = (height - best)[np.isfinite(best)].astype(np.float64)
-    span = float(np.nanmax(best) - np.nanmin(best))
-    rms, largest = math.sqrt(float(np.mean(off**2))) / span, float(np.abs(off).max()) / span
-    note = (
-        f"the last heights differ from the converged ones by {rms:.1e} of their range, at most {largest:.1e}"
-    )
-    targets = () if quick else judge_rotation(ran, rms)
-    title = f"normals, heights and edges during a rotation; {case.size}"
-    return Case(case.name, title, [], {}, (*_notes(ran), note), targets)
-
-
-def _run(source: Paced, operation: LiveRun) -> Ran:
-    last: list[Update] = []
-
-    def keep(update: Update, status: Status) -> None:
-        last[:] = [update]
-
-    operation.precompile()
-    load, begun = os.getloadavg()[0], time.monotonic()
-    status = Loop(source, operation, on_update=keep).run()
-    return Ran(status, time.monotonic() - begun, last[0], load)
-
-
-def judge_press(ran: Ran, required_rate: float) -> tuple[Target, ...]:
+def judge_press(least: float, row: LiveRow, ran: Ran) -> tuple[Target, ...]:
     """Return the targets of the sustained rate and of losses."""
-    rate, lost = ran.status.used / ran.seconds, ran.status.dropped + ran.status.skipped
-    bound, met = f"at least {required_rate:g} a second", rate >= _KEPT_UP * required_rate
+    rate = (row.frames - row.lost) / row.seconds
+    met = rate >= _KEPT_UP * least
     return (
-        Target("frames that were used", bound, f"{rate:.1f} a second", met),
-        Target("frames dropped or skipped", "none", f"{lost} of {ran.status.frames}", lost == 0),
+        Target("frames that were used", f"at least {least:g} a second", f"{rate:.1f} a second", met),
+        Target("frames lost", "none", f"{row.lost} of {row.frames}", row.lost == 0),
+        *judge_cost(row, ran),
     )
 
 
-def judge_rotation(ran: Ran, rms: float) -> tuple[Target, ...]:
+def judge_rotation(row: LiveRow, ran: Ran) -> tuple[Target, ...]:
     """Return the targets of updates, their latency, and the difference from the converged heights."""
-    rate, shown = ran.status.updates / ran.seconds, ran.status.latency[RAISED]
+    assert ran.status is not None
+    assert ran.last is not None
+    rate, shown = row.updates / row.seconds, ran.status.latency[RAISED]
     median, p99 = 1e3 * shown.median, 1e3 * shown.p99
+    best, height = ran.result.height, ran.last.height
+    known = np.isfinite(best)
+    off = (height - best)[known].astype(np.float64)
+    rms = math.sqrt(float(np.mean(off**2))) / float(np.ptp(best[known]))
     what = "frame in to height out"
     return (
         Target("updates", f"at least {_UPDATES} a second", f"{rate:.1f} a second", rate >= _UPDATES),
         Target(f"{what}, median", f"at most {_MEDIAN} ms", f"{median:.1f} ms", median <= _MEDIAN),
         Target(f"{what}, 99 %", f"at most {_SLOWEST} ms", f"{p99:.1f} ms", p99 <= _SLOWEST),
         Target("heights compared with the converged ones", f"within {_NEAR:g}", f"{rms:.1e}", rms <= _NEAR),
+        *judge_cost(row, ran),
     )
 
 
-def _notes(ran: Ran) -> tuple[str, ...]:
-    """Return counts, latencies and the load of the machine."""
-    status = ran.status
-    stages = "; ".join(
-        f"{stage} {1e3 * latency.median:.2f} (99 % below {1e3 * latency.p99:.2f})"
-        for stage, latency in status.latency.items()
-        if math.isfinite(latency.median)
-    )
-    counts = (
-        f"{status.frames} frames in {ran.seconds:.1f} s, {status.used} used, {status.skipped} skipped,"
-        f" {status.dropped} dropped; {status.updates} updates"
-    )
-    return counts, f"milliseconds, median: {stages}", f"load of the machine before: {ran.load:.2f}"
+def judge_cost(row: LiveRow, ran: Ran) -> tuple[Target, ...]:
+    """Return the target of the processor time of a frame."""
+    limit = _PROCESSOR[row.name]
+    met = row.processor <= 1e-3 * limit
+    return (Target("processor time of a frame", f"at most {limit:g} ms", f"{as_ms(row.processor)} ms", met),)
 
 
-def _case(case: LiveCase, run: Callable[[LiveCase, Device, bool], Case]) -> dict[str, Run]:
-    short = replace(case, shape=(48, 64), rate=100.0, seconds=0.3)
-    return {case.name: lambda device, quick: run(short if quick else case, device, quick)}
+def judge_latency(row: LiveRow, ran: Ran) -> tuple[Target, ...]:
+    """Return the targets of latency and losses."""
+    late = 1e3 * row.latency["99"]
+    return (
+        Target("latency, 99 %", f"at most {_LATENCY:g} ms", f"{late:.2f} ms", late <= _LATENCY),
+        Target("frames lost", "none", f"{row.lost} of {row.frames}", row.lost == 0),
+    )
+
+
+def _run(
+    name: str, of: str, shape: Shape, rate: float, seconds: float, judge: Judge, device: Device, quick: bool
+) -> Case:
+    if quick:
+        shape, rate, seconds = _QUICK
+    load = os.getloadavg()[0]
+    row, ran = measure_live(of, shape, rate, seconds, device)
+    notes = [f"load of the machine before: {load:.2f}"]
+    if ran.status is not None:
+        notes += [
+            f"{stage}: median {as_ms(latency.median)} ms, 99 % below {as_ms(latency.p99)} ms"
+            for stage, latency in ran.status.latency.items()
+            if math.isfinite(latency.median)
+        ]
+    title = f"{of} of {row.size}, {rate:g} frames a second for {seconds:g} s"
+    targets = () if quick else judge(row, ran)
+    return Case(name, title, notes=tuple(notes), targets=targets, live=(row,))
+
+
+def _case(name: str, of: str, shape: Shape, rate: float, seconds: float, judge: Judge) -> dict[str, Run]:
+    return {name: partial(_run, name, of, shape, rate, seconds, judge)}
 
 
 CASES: Cases = {
-    **_case(LiveCase("live-vertical-vga", (480, 640), 1000.0, 60.0, least=1000.0), run_press),
-    **_case(LiveCase("live-vertical-1920x1200", (1200, 1920), 165.0, 30.0, least=150.0), run_press),
-    **_case(LiveCase("live-axial-vga", (480, 640), 66.0, 60.0), run_rotation),
+    **_case("live-vertical-vga", "press", _VGA, 1000.0, 60.0, partial(judge_press, 1000.0)),
+    **_case("live-vertical-1920x1200", "press", (1200, 1920), 165.0, 30.0, partial(judge_press, 150.0)),
+    **_case("live-axial-vga", "turn", _VGA, 66.0, 60.0, judge_rotation),
+    **_case("live-pose", "pose", _HALF, 1000.0, 10.0, judge_cost),
+    **_case("live-slip", "slip", _HALF, 1000.0, 10.0, judge_cost),
+    **_case("live-force", "force", _HALF, 1000.0, 10.0, judge_cost),
+    **_case("live-pose-and-slip", "pose+slip", _HALF, 1000.0, 10.0, judge_latency),
 }

@@ -44,12 +44,13 @@ from mirrorskin.bench.suite.harness import (
     ratio_target,
 )
 from mirrorskin.cli.commands.bench.limits import time_works
+from mirrorskin.cli.commands.bench.paced import shared_memory
 from mirrorskin.cli.commands.bench.records import Case, Target
 from mirrorskin.cli.commands.bench.timing import OURS, Work
 from mirrorskin.engine import reconstruct
 from mirrorskin.engine.base.tiling import MEMORY_LIMIT
 from mirrorskin.evaluation.base.object_store import object_store
-from mirrorskin.evaluation.base.sources import Frames, shared_memory
+from mirrorskin.evaluation.base.sources import Frames
 from mirrorskin.evaluation.scenes.inputs import SCALES, STEPS, Floats, references
 from mirrorskin.io.base.url import path_of
 from mirrorskin.kernels.device import Device, list_devices, open_device

@@ -17,6 +17,7 @@ from mirrorskin import engine
 from mirrorskin.bench.suite.correlation import fit_with_numba
 from mirrorskin.bench.suite.harness import Cases, agree, check_memory, missing
 from mirrorskin.cli.commands.bench.records import Case, Row, Target
+from mirrorskin.cli.commands.bench.scenes import wavy_dome
 from mirrorskin.cli.commands.bench.timing import OURS, ROUNDS, Work, take_turns
 from mirrorskin.evaluation.scenes.inputs import (
     PIXEL,
@@ -27,7 +28,6 @@ from mirrorskin.evaluation.scenes.inputs import (
     phases,
     roof,
     turn_noise,
-    wavy_dome,
 )
 from mirrorskin.kernels.device import Device
 

@@ -10,9 +10,9 @@ import numpy as np
 from mirrorskin.bench.suite.harness import Cases
 from mirrorskin.cli.commands.bench.limits import time_works
 from mirrorskin.cli.commands.bench.records import Case, Target
+from mirrorskin.cli.commands.bench.scenes import wavy_dome
 from mirrorskin.cli.commands.bench.timing import OURS, Work
 from mirrorskin.engine.pose import Pose, PoseTracker
-from mirrorskin.evaluation.scenes.inputs import wavy_dome
 from mirrorskin.kernels.device import Device
 
 _SHAPE, _QUICK = (240, 320), (60, 80)

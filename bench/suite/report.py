@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mirrorskin.bench.suite import glance
-from mirrorskin.cli.commands.bench.records import Case, Row, Run, as_ms, as_percent
+from mirrorskin.cli.commands.bench.records import LIVE_HEAD, Case, Row, Run, as_ms, as_percent
 from mirrorskin.cli.commands.bench.timing import FIRST, OURS
 
 HEAD = (
@@ -57,6 +57,12 @@ _METHOD = (
 _GLANCE = (
     "Times in milliseconds, from NumPy arrays to maps unless stated otherwise. The limit is the time to read "
     "the same bytes from memory. Peers return the same maps."
+)
+_LIVE = (
+    "Frames come from memory at a pace, by `mirrorskin bench live`. used, updates: frames, and maps or "
+    "results of a tracker, a second. 50 %, 95 %, 99 %: latency from when a frame was due to its maps. "
+    "processor: ms of all threads a frame, on simulated time; there the result must be that of the same "
+    "frames offline."
 )
 _TARGETS = "Every target of the project, whether it is met or not."
 _CALLS = (
@@ -105,7 +111,9 @@ def as_markdown(run: Run) -> str:
     parts = [f"# Benchmarks, run of {run.date[:10]}", LEGEND]
     for case in run.cases:
         parts.append(f"## {case.name}: {case.title}")
-        for head, rows, numbers in ((HEAD, as_rows(case), True), (TARGET_HEAD, as_targets(case), False)):
+        live = [row.cells for row in case.live]
+        tables = (HEAD, as_rows(case), True), (LIVE_HEAD, live, True), (TARGET_HEAD, as_targets(case), False)
+        for head, rows, numbers in tables:
             parts += [as_table(head, rows, numbers=numbers)] if rows else []
         parts += as_notes(case)
     versions = ", ".join(f"{name} {version or 'not installed'}" for name, version in run.versions.items())
@@ -122,6 +130,7 @@ def as_page(runs: Mapping[Path, Run], chart: str) -> str:
         ("At a glance", _GLANCE, _glance),
         ("Calls", _CALLS, _calls),
         ("Works and peers", _PEERS, _peers),
+        ("Live", _LIVE, _live),
         ("Targets", _TARGETS, _targets),
     ):
         parts += _topic(title, about, machines, describe)
@@ -198,6 +207,11 @@ def _glance(machine: Machine) -> list[str]:
 def _targets(machine: Machine) -> list[str]:
     cells = [[case.name, *row] for case in machine.values() for row in as_targets(case)]
     return [as_table(("case", *TARGET_HEAD), cells, numbers=False)] if cells else []
+
+
+def _live(machine: Machine) -> list[str]:
+    cells = [row.cells for case in machine.values() for row in case.live]
+    return [as_table(LIVE_HEAD, cells)] if cells else []
 
 
 def _calls(machine: Machine) -> list[str]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mirrorskin import engine
+from mirrorskin.cli.commands.bench.scenes import wavy_dome
 from mirrorskin.engine.live import LiveRun
 from mirrorskin.evaluation.scenes.depth import SCENES
 from mirrorskin.evaluation.scenes.inputs import (
@@ -29,7 +30,6 @@ from mirrorskin.evaluation.scenes.inputs import (
     random_cuts,
     roof,
     travel_of,
-    wavy_dome,
 )
 from mirrorskin.io import Block, Header, pixel_axes
 from mirrorskin.kernels.device import Device

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from mirrorskin.io import Result, pixel_axes
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.uint8]
@@ -35,8 +32,6 @@ _LOST = 0.3  # cosine between lean and azimuth above which contact is lost
 _WAVES, _FINEST = 12, 12.0  # number of waves; periods of the finest wave along the longer side
 _SLOPE = 0.3  # root mean square of the slopes
 _BLOB, _OUTSIDE = 25, 0.35  # blobs of a mask along the shorter side, fraction of the pixels outside
-_FIELD = 8.0  # width of a dome's picture, mm
-_HEIGHT_SIGMA, _NORMAL_SIGMA = 1e-3, 0.01  # of a dome's noise, mm and rad
 _LENGTHS = (0.1, 0.4)  # range of the lengths of cuts, divided by the shorter side
 
 
@@ -263,27 +258,3 @@ def roof(shape: Shape) -> tuple[Floats, Floats, Flags]:
     vectors /= np.sqrt(np.sum(np.square(vectors), axis=-1, keepdims=True))
     contact = np.hypot(row - shape[0] / 4, column - shape[1] / 4) > shape[0] / 8
     return vectors.astype(np.float32), sigma, contact.astype(np.uint8)
-
-
-def wavy_dome(shape: tuple[int, int], right: float, up: float, turn: float, seed: int) -> Result:
-    """Return waves on a dome, rotated about z and translated, with noise of the stated deviations."""
-    rng = np.random.default_rng(seed)
-    x, y = pixel_axes(shape, (_FIELD / shape[1], _FIELD / shape[1]))
-    across, high = np.meshgrid(x - right, y - up)
-    cosine, sine = math.cos(turn), math.sin(turn)
-    u, v = cosine * across + sine * high, cosine * high - sine * across
-    height = -0.03 * (u * u + 0.7 * v * v) + 0.05 * np.sin(1.5 * u + 0.3) * np.cos(1.2 * v)
-    p = -0.06 * u + 0.075 * np.cos(1.5 * u + 0.3) * np.cos(1.2 * v)
-    q = -0.042 * v - 0.06 * np.sin(1.5 * u + 0.3) * np.sin(1.2 * v)
-    slopes = np.stack([cosine * p - sine * q, sine * p + cosine * q], axis=-1)
-    slopes += rng.normal(0, _NORMAL_SIGMA / math.sqrt(2), slopes.shape)
-    normals = np.dstack([-slopes, np.ones(shape)])
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return Result(
-        height=(height + rng.normal(0, _HEIGHT_SIGMA, shape)).astype(np.float32),
-        height_sigma=np.full(shape, _HEIGHT_SIGMA, np.float32),
-        normals=normals.astype(np.float32),
-        normals_sigma=np.full(shape, _NORMAL_SIGMA, np.float32),
-        x=x,
-        y=y,
-    )

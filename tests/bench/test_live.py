@@ -4,26 +4,44 @@ import numpy as np
 import pytest
 from live_frames import paced, phases, turn_frames, turn_header
 
-from mirrorskin.bench.suite.live import Ran, judge_press, judge_rotation
+from mirrorskin.bench.suite.live import judge_cost, judge_latency, judge_press, judge_rotation
+from mirrorskin.cli.commands.bench.live_runs import Ran
+from mirrorskin.cli.commands.bench.records import LiveRow
 from mirrorskin.engine.live import RAISED, Latency, Status, Update
+from mirrorskin.io import Result
 from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 SHAPE = (20, 5, 7)
 
 
-def ran(**status):
-    counts = {"frames": 600, "used": 600, "updates": 600, **status}
-    picture = np.zeros((2, 2), np.uint8)
-    update = Update(600, 1.0, "axial", 0.0, picture)
-    return Ran(Status(**counts, latency={RAISED: Latency(0.014, 0.029)}), 10.0, update, 0.5)
+def row(name, **changes):
+    values = {"frames": 600, "lost": 0, "updates": 600, "seconds": 10.0, "processor": 1e-3, **changes}
+    latency = {"50": 0.001, "95": 0.002, "99": 0.003}
+    return LiveRow(name=name, size="2x2", rate=60.0, latency=latency, as_offline=True, **values)
+
+
+def ran(height_error):
+    height = np.array([[0.0, 1.0], [np.nan, 0.0]])
+    update = Update(600, 1.0, "axial", 0.0, np.zeros((2, 2), np.uint8), Result(height=height + height_error))
+    status = Status(latency={RAISED: Latency(0.014, 0.029)})
+    return Ran(10.0, 0.6, 0, [], Result(height=height), status, update)
+
+
+def met(targets):
+    return [target.met for target in targets]
 
 
 def test_targets_are_judged_by_what_was_counted():
-    assert all(target.met for target in judge_rotation(ran(), 1e-3))
-    assert [target.met for target in judge_rotation(ran(updates=590), 1e-1)] == [False, True, True, False]
-    assert [target.met for target in judge_press(ran(), 60.0)] == [True, True]
-    assert [target.met for target in judge_press(ran(dropped=1), 60.0)] == [True, False]
-    assert [target.met for target in judge_press(ran(used=500, skipped=1), 60.0)] == [False, False]
+    assert met(judge_rotation(row("turn"), ran(1e-3))) == [True] * 5
+    assert met(judge_rotation(row("turn", updates=590, processor=5e-3), ran(1e-1))) == [
+        *(False, True, True),
+        *(False, False),
+    ]
+    assert met(judge_press(60.0, row("press"), None)) == [True] * 3
+    assert met(judge_press(60.0, row("press", lost=1), None)) == [True, False, True]
+    assert met(judge_press(60.0, row("press", lost=100), None)) == [False, False, True]
+    assert met(judge_cost(row("pose"), None)) == [False]
+    assert met(judge_latency(row("pose+slip", lost=1), None)) == [True, False]
 
 
 def test_frames_come_when_they_are_due_and_those_that_wait_come_together():

@@ -73,7 +73,7 @@ def test_the_package_s_table_is_the_default(made_up):
         (["-o", "table.json", "--against", "table.json"], "table.json is the input"),
         (["--against", "none.json"], "none.json: no such file"),
         (["--against", "other.json"], "missing required field `date`"),
-        (["compare", "table.json"], "unexpected extra argument"),
+        (["compare", "table.json"], "No such command 'compare'"),
     ],
 )
 def test_bad_input_gets_one_line_and_nothing_is_written(tmp_path, made_up, words, said):

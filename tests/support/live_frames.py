@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.evaluation.base.sources import Paced
+from mirrorskin.cli.commands.bench.paced import Pace, Paced
 from mirrorskin.evaluation.scenes import inputs as scenes
 from mirrorskin.io import Block, Header
 from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
@@ -57,10 +57,8 @@ def paced(
         lambda number: number,
         header,
         lambda number: places[number],
-        rate,
-        len(frames),
+        Pace(rate, len(frames), clock or SimulatedClock()),
         slots=slots,
-        clock=clock or SimulatedClock(),
     )
 
 

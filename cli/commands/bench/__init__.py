@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import click
 
 from mirrorskin.cli import options
-from mirrorskin.cli.groups import Option
+from mirrorskin.cli.groups import CommandGroup, Option, make_command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,6 +24,7 @@ triad) as many bytes. first call: without memory kept from earlier calls. times 
 
 
 def command(
+    context: click.Context,
     output: Annotated[
         Path | None, Option("--output", "-o", metavar="RUN.json", help="Write the measurements there.")
     ] = None,
@@ -42,17 +43,15 @@ def command(
     Measures find_onset, correlate and integrate on simulated frames, and the device's bandwidth, arithmetic
     and launches; compares both with a table. Takes about half a minute.
     """
-    from mirrorskin import io
+    if context.invoked_subcommand is not None:
+        _refuse_options(context, context.invoked_subcommand)
+        return
     from mirrorskin.cli.commands.bench.operations import CASES
-    from mirrorskin.cli.commands.bench.records import describe_run, open_run
+    from mirrorskin.cli.commands.bench.records import check_run_output, describe_run, open_run, write_run
     from mirrorskin.cli.output import progress
-    from mirrorskin.io.storage.atomic import write_new
     from mirrorskin.kernels.device import open_device
 
-    if output is not None:
-        if output.suffix != ".json":
-            raise io.InputError(f"{output}: the name must end in .json")
-        io.check_output(output, *([against] if against else []))
+    check_run_output(output, against)
     table = open_run(against or TABLE)
     opened = open_device(device)
     cases = []
@@ -65,9 +64,28 @@ def command(
         click.echo(run.as_json().decode(), nl=False)
     else:
         _print(run, table)
-    if output is not None:
-        write_new(output, [run.as_json()])
-        click.echo(f"written to {output}", err=True)
+    write_run(run, output)
+
+
+app = make_command(
+    "bench",
+    command,
+    CommandGroup,
+    package="mirrorskin.cli.commands.bench",
+    purposes={"live": "Measure rates, latencies, processor times and lost frames of live runs."},
+)
+
+
+def _refuse_options(context: click.Context, command: str) -> None:
+    """Raise InputError if an option was given before the name of another command."""
+    from mirrorskin.io import InputError
+
+    for parameter in context.command.get_params(context):
+        source = context.get_parameter_source(parameter.name or "")
+        if source is not None and source.name == "COMMANDLINE":
+            raise InputError(
+                f"{parameter.opts[0]} is not of 'bench {command}': write options after {command!r}"
+            )
 
 
 def _print(run: Run, table: Run) -> None:

@@ -12,11 +12,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Annotated
 
+import click
 import msgspec
 import numpy as np
 
-from mirrorskin.io import InputError
+from mirrorskin.io import InputError, check_output
 from mirrorskin.io.base.system import read_text
+from mirrorskin.io.storage.atomic import write_new
 from mirrorskin.kernels.device import Device
 from mirrorskin.processors import usable_cores
 
@@ -33,6 +35,14 @@ _PACKAGES = (
     "scipy",
     "pyamg",
 )
+PERCENTILES = "50", "95", "99"
+LIVE_HEAD = (
+    *("of", "size", "due a second", "used", "updates", "lost"),
+    *(f"{percent} %, ms" for percent in PERCENTILES),
+    *("processor", "as offline"),
+)
+"""Head of a table of `LiveRow`: rates of frames and updates, frames lost, latency, and processor time, ms."""
+
 _Seconds = Annotated[float, msgspec.Meta(ge=0)]
 
 
@@ -117,6 +127,54 @@ class Target(msgspec.Struct, frozen=True):
     met: bool
 
 
+class LiveRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One run with frames from memory at their times.
+
+    Attributes
+    ----------
+    name, size : str
+        What was computed, and columns x rows of a frame.
+    rate : float
+        Frames a second that were due.
+    seconds : float
+        From the first frame to the last result.
+    frames, lost, updates : int
+        Frames due; those among them that were not used; updates of the maps, or results of a tracker.
+    latency : dict of float
+        Percentiles, by their number, of the seconds from when a frame was due to the maps that include it.
+    processor : float
+        Seconds of processor time of all threads per frame, of a run on simulated time.
+    as_offline : bool
+        Whether the run on simulated time lost nothing, and its result is that without a pace.
+    """
+
+    name: str
+    size: str
+    rate: float
+    seconds: _Seconds
+    frames: int
+    lost: int
+    updates: int
+    latency: dict[str, float]
+    processor: _Seconds
+    as_offline: bool
+
+    @property
+    def cells(self) -> list[str]:
+        """The run as cells of a table under `LIVE_HEAD`."""
+        return [
+            self.name,
+            self.size,
+            f"{self.rate:g}",
+            f"{(self.frames - self.lost) / self.seconds:.0f}",
+            f"{self.updates / self.seconds:.0f}",
+            str(self.lost),
+            *(as_ms(self.latency[percent]) if self.latency else "" for percent in PERCENTILES),
+            as_ms(self.processor),
+            "yes" if self.as_offline else "no",
+        ]
+
+
 class Case(msgspec.Struct, frozen=True):
     """All works on one input.
 
@@ -129,6 +187,7 @@ class Case(msgspec.Struct, frozen=True):
         Peers that were not run, and why.
     notes : tuple of str
     targets : tuple of Target
+    live : tuple of LiveRow
     """
 
     name: str
@@ -137,6 +196,7 @@ class Case(msgspec.Struct, frozen=True):
     absent: dict[str, str] = {}
     notes: tuple[str, ...] = ()
     targets: tuple[Target, ...] = ()
+    live: tuple[LiveRow, ...] = ()
 
     def share(self, row: Row) -> float:
         """Return the bandwidth of a row divided by the limit, by the clock; NaN without a limit."""
@@ -224,6 +284,21 @@ def open_run(path: Path) -> Run:
         reason = str(error).replace("JSON is", "the JSON is")
         reason = reason[:1].lower() + reason[1:]
         raise InputError(f"{path}: {reason}. Specify a file that 'mirrorskin bench -o' wrote") from error
+
+
+def check_run_output(path: Path | None, *inputs: Path | None) -> None:
+    """Raise InputError if a run cannot be written to a path, before anything is measured."""
+    if path is not None:
+        if path.suffix != ".json":
+            raise InputError(f"{path}: the name must end in .json")
+        check_output(path, *filter(None, inputs))
+
+
+def write_run(run: Run, path: Path | None) -> None:
+    """Write a run, if there is a path, and report it."""
+    if path is not None:
+        write_new(path, [run.as_json()])
+        click.echo(f"written to {path}", err=True)
 
 
 def as_ms(seconds: float) -> str:

@@ -1,0 +1,217 @@
+"""Live runs with frames from memory: on simulated time, to compare their results, and in real time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mirrorskin.cli.commands.bench import scenes
+from mirrorskin.cli.commands.bench.paced import Pace, Paced
+from mirrorskin.cli.commands.bench.records import PERCENTILES, LiveRow
+from mirrorskin.engine import Press, Rotation, Run
+from mirrorskin.engine.base.running import plan_of
+from mirrorskin.engine.force import ForceTracker
+from mirrorskin.engine.live import LiveRun, Loop, Status, Update
+from mirrorskin.engine.pose import PoseTracker
+from mirrorskin.engine.slip import SlipTracker
+from mirrorskin.io import InputError
+from mirrorskin.kernels.device import Device
+from mirrorskin.twin import SimulatedClock
+
+NAMES = "press", "turn", "pose", "slip", "force"
+_LOOPED = NAMES[:2]
+_ROUNDS = 20  # of a tracker's inputs on simulated time
+_ROUNDING = 1e-5  # of float32, over the largest number of a map
+_MODULUS, _TRAVEL = 0.1, 0.3  # MPa and mm, of the forces
+
+Push = Callable[[Any], object]
+
+
+class Ran(NamedTuple):
+    """A run: seconds, processor time in it, lost frames, seconds of latency, and the last result."""
+
+    seconds: float
+    processor: float
+    lost: int
+    latency: Sequence[float]
+    result: Any
+    status: Status | None = None
+    last: Update | None = None
+
+
+class Looped:
+    """A press or turns in the live loop; the press lasts for all of a run, turns are repeated."""
+
+    def __init__(self, name: str, shape: scenes.Shape, device: Device) -> None:
+        self._turns = name == "turn"
+        self._twin = (scenes.turns_on_ball if self._turns else scenes.press_of_ball)(shape, device)
+        self._method: Press | Rotation = (
+            Rotation(window_frames=scenes.STEPS, noise=scenes.NOISE, device=device)
+            if self._turns
+            else Press(device=device)
+        )
+        self._frames = np.empty(self._twin.shape, self._twin.dtype)
+        self._twin.read(self._frames)
+        self.count: int = len(self._frames)
+
+    def run(self, pace: Pace) -> Ran:
+        """Push frames at a pace."""
+        count, positions = self.count, self._twin.movement.positions
+        step = positions[0] * (count / pace.count)
+
+        def order(number: Any) -> Any:
+            return number % count if self._turns else number * count // pace.count
+
+        def places(number: Any) -> Any:
+            return positions[number % count] if self._turns else step * (number + 1)
+
+        source = Paced(self._frames, order, self._twin.header, places, pace)
+        live = LiveRun(source, self._method)
+        live.precompile()
+        latency: list[float] = []
+        last: list[Update] = []
+
+        def keep(update: Update, status: Status) -> None:
+            latency.append(update.latency)
+            last[:] = [update]
+
+        used = time.process_time()
+        status = Loop(source, live, on_update=keep).run()
+        used = time.process_time() - used
+        lost = status.skipped + status.dropped
+        return Ran(pace.now(), used, lost, latency, live.result(), status, *last)
+
+    def offline(self) -> Any:
+        """Return the result of the same frames without a loop; of turns, that of the last one."""
+        plan = plan_of(self._method, self._twin)
+        if self._turns:
+            plan = replace(plan, frames=range(self.count - scenes.STEPS, self.count))
+        return Run(plan, self._twin).complete()
+
+
+class Tracked:
+    """Trackers that take the same inputs again and again, one after the other for each frame."""
+
+    def __init__(self, names: Sequence[str], shape: scenes.Shape, device: Device) -> None:
+        made = {"pose": scenes.moving_domes, "slip": scenes.sliding_texture, "force": scenes.loaded_domes}
+        self._names, self._shape, self._device = names, shape, device
+        self._inputs: list[Any] = list(zip(*(made[name](shape) for name in names), strict=True))
+        self.count: int = _ROUNDS * len(self._inputs)
+
+    def run(self, pace: Pace) -> Ran:
+        """Push inputs when they are due; only the newest one if several are."""
+        push = self._warm()
+        latency: list[float] = []
+        result: Any = None
+        number = lost = 0
+        used = time.process_time()
+        while number < pace.count:
+            newest = pace.wait(number) - 1
+            result = push(newest)
+            latency.append(pace.now() - newest / pace.rate)
+            number, lost = newest + 1, lost + newest - number
+        return Ran(pace.now(), time.process_time() - used, lost, latency, result)
+
+    def offline(self) -> Any:
+        """Return the last result of the same inputs without a pace."""
+        push = self._warm()
+        return [push(number) for number in range(self.count)][-1]
+
+    def _warm(self) -> Callable[[int], Any]:
+        """Return new trackers that have taken each input once, as a function of the number of an input."""
+        pushes = [_tracker(name, self._shape, self._device) for name in self._names]
+
+        def push(number: int) -> Any:
+            inputs = self._inputs[number % len(self._inputs)]
+            return [push(value) for push, value in zip(pushes, inputs, strict=True)]
+
+        for number in range(len(self._inputs)):
+            push(number)
+        return push
+
+
+def _tracker(name: str, shape: scenes.Shape, device: Device) -> Push:
+    if name == "pose":
+        return PoseTracker(device=device).push
+    if name == "slip":
+        contact = scenes.round_contact(shape)
+        return SlipTracker(contact, scenes.FIELD / shape[1], device=device).push
+    force = ForceTracker(modulus=_MODULUS)
+    return lambda maps: force.push(maps, _TRAVEL)
+
+
+def check_name(name: str) -> str:
+    """Return a name of `measure_live`; InputError if there is no such run."""
+    parts = name.split("+")
+    if unknown := [part for part in parts if part not in NAMES]:
+        raise InputError(f"{unknown[0]!r} does not run live: name {', '.join(NAMES)}")
+    if len(parts) > 1 and {*parts} & {*_LOOPED}:
+        raise InputError(f"{name}: {' and '.join(_LOOPED)} run alone; join {', '.join(NAMES[2:])} only")
+    return name
+
+
+def measure_live(
+    name: str, shape: scenes.Shape, rate: float, seconds: float, device: Device
+) -> tuple[LiveRow, Ran]:
+    """Run live work on simulated time, and then in real time.
+
+    Parameters
+    ----------
+    name : str
+        One of `NAMES`, or trackers joined by +, which take turns for each frame.
+    shape : (int, int)
+        Rows and columns of a frame.
+    rate, seconds : float
+        Frames a second, and how long they come in real time.
+    device : Device
+
+    Returns
+    -------
+    row : LiveRow
+    ran : Ran
+        The run in real time.
+    """
+    work = Looped(name, shape, device) if name in _LOOPED else Tracked(name.split("+"), shape, device)
+    expected = work.offline()
+    simulated = work.run(Pace(rate, work.count, SimulatedClock()))
+    pace = Pace(rate, max(1, round(rate * seconds)))
+    ran = work.run(pace)
+    values = np.percentile(ran.latency, [float(percent) for percent in PERCENTILES]) if ran.latency else ()
+    row = LiveRow(
+        name=name,
+        size=f"{shape[1]}x{shape[0]}",
+        rate=rate,
+        seconds=ran.seconds,
+        frames=pace.count,
+        lost=ran.lost,
+        updates=len(ran.latency),
+        latency=dict(zip(PERCENTILES, map(float, values), strict=False)),
+        processor=simulated.processor / work.count,
+        as_offline=simulated.lost == 0 and _is_same(simulated.result, expected),
+    )
+    return row, ran
+
+
+def _is_same(value: Any, other: Any) -> bool:
+    """Return whether live results, or a list of them, have the numbers of offline ones, but for rounding.
+
+    A live result may have further maps.
+    """
+    if isinstance(other, Mapping):
+        return {*other} <= {*value} and all(_is_same(value[name], other[name]) for name in other)
+    if isinstance(other, list | tuple):
+        return len(value) == len(other) and all(map(_is_same, value, other))
+    if is_dataclass(other):
+        names = [field.name for field in fields(other) if field.compare]
+        return all(_is_same(getattr(value, name), getattr(other, name)) for name in names)
+    if isinstance(other, np.ndarray | np.generic | float) and np.asarray(other).dtype.kind == "f":
+        numbers = np.asarray(other)
+        largest = float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers)))
+        if np.shape(value) != numbers.shape:
+            return False
+        return np.allclose(value, numbers, _ROUNDING, _ROUNDING * largest, equal_nan=True)
+    return bool(np.array_equal(value, other))
