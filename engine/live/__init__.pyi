@@ -1,7 +1,8 @@
 from .loop import LATENCY, Loop
 from .run import LiveRun
-from .status import PUSHED, RAISED, SHOWN, STAGES, UPDATED, WAITED, Latency, Status, Update
+from .status import PUSHED, RAISED, SHOWN, STAGES, UPDATED, WAITED, Event, Latency, Status, Update
 from .stream import Stream
+from .tracking import Frames, Limit, Tracker
 
 __all__ = [
     "LATENCY",
@@ -11,10 +12,14 @@ __all__ = [
     "STAGES",
     "UPDATED",
     "WAITED",
+    "Event",
+    "Frames",
     "Latency",
+    "Limit",
     "LiveRun",
     "Loop",
     "Status",
     "Stream",
+    "Tracker",
     "Update",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.base.running import part_of
 from mirrorskin.engine.live.run import LiveRun
 from mirrorskin.engine.live.status import PUSHED, RAISED, SHOWN, UPDATED, WAITED, Monitor, Status, Update
+from mirrorskin.engine.live.tracking import Events, Limit, Tracker, Trackers
 from mirrorskin.io import Block, InputError, LiveSource
 from mirrorskin.io.storage.layout import POSITIONS
 
@@ -32,9 +34,14 @@ class Loop:
     """Push the frames of a live source into a run; the status is available after an exception, too.
 
     *Policy.* All waiting frames are taken at once. Frames that are older than ``latency`` are skipped, except
-    for the newest one; frames that the source has lost are counted as dropped. An update follows each push,
-    at most ``updates`` per second. Low-priority work is done until the next frame is expected. So no queue
-    grows, and each frame is counted as pushed, skipped or dropped.
+    for the newest one: with a latency of 0 only the newest frame is used, with an infinite one all are.
+    Frames that the source has lost are counted as dropped. An update follows each push, at most ``updates``
+    per second. Low-priority work is done until the next frame is expected. So no queue grows, and each frame
+    is counted as pushed, skipped or dropped.
+
+    *Trackers* give an answer for each update. With trackers, frames that waited together are pushed one by
+    one, so that each used frame has an update. What a tracker refuses, such as a frame without contact, is
+    stated in ``Update.lost``, and the loop continues.
 
     Parameters
     ----------
@@ -42,9 +49,17 @@ class Loop:
     run : LiveRun
         Call ``run.precompile()`` first.
     latency : float
-        Seconds.
+        Seconds, from 0; see *Policy*.
     updates : float, optional
-        Updates per second at most; by default as many as the operation states.
+        Updates per second at most; by default as many as the operation states, and with trackers one per
+        frame.
+    trackers : mapping of str to trackers or callables, optional
+        A `PoseTracker` or a `ForceTracker`, which gets the maps of each update and the body's travel, a
+        `SlipTracker`, which gets its frame, or a function of the `Update`, which has the answers of the
+        trackers before it. Answers are in ``Update.tracked``. The mapping may be changed while the loop runs,
+        as for a new tracker of a new contact.
+    events : mapping of str to Limit, optional
+        Conditions on updates; what starts or ends is in ``Update.events``.
     on_update : callable, optional
         Called with each update and the status; the loop waits for it.
     stop : callable, optional
@@ -58,7 +73,7 @@ class Loop:
     Raises
     ------
     mirrorskin.io.InputError
-        A latency or rate that is not above 0.
+        A latency below 0, or a rate that is not above 0; an object that is not a tracker or a limit.
     """
 
     def __init__(
@@ -68,16 +83,22 @@ class Loop:
         *,
         latency: float = LATENCY,
         updates: float | None = None,
+        trackers: Mapping[str, Tracker] | None = None,
+        events: Mapping[str, Limit] | None = None,
         on_update: OnUpdate | None = None,
         stop: Callable[[], bool] | None = None,
         mark: Mark | None = None,
         guard: Callable[[], AbstractContextManager[Any]] = nullcontext,
     ) -> None:
-        rate_limit = run.operation.updates_per_second if updates is None else updates
-        for name, number in (("latency", latency), ("updates", rate_limit)):
-            if not number > 0:
-                raise InputError(f"{name} {number}: a number above 0 is needed")
+        usual = math.inf if trackers is not None else run.operation.updates_per_second
+        rate_limit = usual if updates is None else updates
+        if not latency >= 0:
+            raise InputError(f"latency {latency}: a number of seconds of at least 0 is needed")
+        if not rate_limit > 0:
+            raise InputError(f"updates {rate_limit}: a number above 0 is needed")
         self._source, self._run = source, run
+        self._trackers = None if trackers is None else Trackers(trackers)
+        self._events = Events(events or {})
         self._latency, self._period = latency, 1 / rate_limit
         self._on_update, self._stop, self._mark, self._guard = on_update, stop, mark, guard
         self._monitor = Monitor()
@@ -92,24 +113,49 @@ class Loop:
         """Counts and times so far."""
         return self._monitor.status(fresh=True)
 
+    def precompile(self) -> None:
+        """Compile and run all kernels of the run and of the trackers, before the first frame."""
+        self._run.precompile()
+        if self._trackers is not None:
+            self._trackers.precompile(self._source.shape[1:], self._source.dtype)
+
     def run(self) -> Status:
         """Push until the source ends, or ``stop`` returns True."""
         while (block := self._source.read(self._run.staging_buffer)) is not None:
-            self._take(block)
-            if self._stop is not None and self._stop():
-                break
-            if self._source.now() - self._updated >= self._period:
-                self._update()
+            used = self._monitor.used
+            for part in self._parts(block):
+                newest = part.index + len(part.frames) == block.index + len(block.frames)
+                self._take(part, newest and self._monitor.used == used)
+                if self._stop is not None and self._stop():
+                    return self._finish()
+                if self._source.now() - self._updated >= self._period:
+                    self._update()
             self._run.idle_work(self._idle())
+        return self._finish()
+
+    def _finish(self) -> Status:
+        """Update once more, if frames were pushed since."""
         if self._pending:
             self._update()
         return self.status
 
-    def _take(self, block: Block) -> None:
-        """Push the frames of a block, except for those that are skipped, and mark them."""
+    def _parts(self, block: Block) -> Iterator[Block]:
+        """Yield what is pushed together: all frames of a block, or one by one for trackers."""
+        if self._trackers is None or len(block.frames) == 1:
+            yield block
+            return
+        for number in range(len(block.frames)):
+            part = part_of(block, slice(number, number + 1))
+            yield part if number == 0 else replace(part, dropped=0)  # lost frames are counted once
+
+    def _take(self, block: Block, newest: bool) -> None:
+        """Push the frames of a block, except for those that are too old, and mark them.
+
+        The last one is used at any age if it is the newest of those that waited together.
+        """
         now, count = self._source.now(), len(block.frames)
         time = np.full(count, now) if block.time is None else block.time
-        used = (now - time <= self._latency) | (np.arange(count) == count - 1)
+        used = (now - time <= self._latency) | (newest & (np.arange(count) == count - 1))
         used &= (block.index + np.arange(count)) % self._run.every == 0
         self._monitor.time(WAITED, *(now - time).tolist())
         self._times.extend(time.tolist())
@@ -126,7 +172,8 @@ class Loop:
             last = int(np.flatnonzero(used)[-1])
             at = math.nan if block.time is None else float(block.time[last])
             places = getattr(block, self._run.position)  # a tilt, if the source has those of frames
-            place = (getattr(block, POSITIONS[self._source.motion]) if places is None else places)[last]
+            places = getattr(block, POSITIONS[self._source.motion]) if places is None else places
+            place: Any = math.nan if places is None else places[last]
             self._newest = at, float(np.hypot(*place) if np.ndim(place) else place), block.frames[last]
             self._taken, self._pending = float(time[last]), True
             self._monitor.time(PUSHED, self._source.now() - now)
@@ -136,21 +183,27 @@ class Loop:
             return
         started = self._source.now()
         (at, position, picture), frames = self._newest, self._monitor.used
-        maps = self._run.maps(max(_PATIENCE, self._idle()))
+        maps, motion = self._run.maps(max(_PATIENCE, self._idle())), self._source.motion
+        update = Update(frames, at, motion, position, picture.copy(), maps)
+        if self._trackers is not None:
+            tracked, lost = self._trackers.track(update, self._source.header.press)
+            update = replace(update, tracked=tracked, lost=lost)
         finished = self._source.now()
-        motion = self._source.motion
-        update = Update(frames, at, motion, position, picture.copy(), maps, finished - at)
         self._updated, self._pending = started, False
         self._monitor.updated()
         self._monitor.time(UPDATED, finished - started)
         self._arrived.append(self._taken)
-        if update.first is not None:
+        if update.first is not None or update.tracked:
             self._monitor.time(SHOWN, finished - self._taken)
         if update.height is not None:
             lag = min(update.height_lag, len(self._arrived) - 1)
             self._monitor.time(RAISED, finished - self._arrived[-1 - lag])
+        status = self._monitor.status()
+        events = self._events.of(update)
+        p99 = status.latency[SHOWN].p99
+        update = replace(update, latency=finished - at, latency_p99=p99, events=events)
         if self._on_update is not None:
-            self._on_update(update, self._monitor.status())
+            self._on_update(update, status)
 
     def _idle(self) -> float:
         """Return the seconds until the next frame is expected, less a margin."""

@@ -17,8 +17,8 @@ from mirrorskin.io.model.result import display_order
 
 WAITED, PUSHED, UPDATED, SHOWN, RAISED = "waited", "push", "update", "frame to map", "frame to height"
 STAGES = (WAITED, PUSHED, UPDATED, SHOWN, RAISED)
-"""The timed stages: the wait of a frame from its arrival, a push, an update, and the delays of the maps and
-of the heights since the arrival of the newest frame that they include."""
+"""The timed stages: the wait of a frame from its arrival, a push, an update, and the delays of the maps, with
+the answers of trackers, and of the heights since the arrival of the newest frame that they include."""
 
 _KEPT = 4096  # number of times per stage
 _LATELY = 1.0  # seconds over which the rate is computed
@@ -26,8 +26,29 @@ _FRESH = 0.25  # seconds for which percentiles are reused
 
 
 @dataclass(frozen=True, slots=True)
+class Event:
+    """A quantity that rose above its limit, or fell back; see `Limit`.
+
+    Attributes
+    ----------
+    name : str
+    started : bool
+        Whether the quantity rose above the limit, rather than fell back.
+    time : float
+        Time of the frame that shows it, seconds on the scale of ``Block.time``; NaN without times.
+    value : float
+        The quantity in this frame.
+    """
+
+    name: str
+    started: bool
+    time: float
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
 class Update:
-    """Maps of the frames so far; no other object writes to them.
+    """Maps of the frames so far, and answers of the trackers; no other object writes to them.
 
     Attributes are the maps by name or quantity, as those of a result: ``update.height`` is an array, or None
     if it is not available.
@@ -49,8 +70,17 @@ class Update:
         Of built-in operations: ``height``, ``normals``, ``contact``, ``edges`` (which may be of earlier
         frames), ``displacement`` since the first frame, and of a body that rocks ``slope``.
     latency : float
-        Seconds from the newest frame's time, its exposure if the source states it, to these maps; NaN
+        Seconds from the newest frame's time, its exposure if the source states it, to this update; NaN
         without a time.
+    latency_p99 : float
+        99th percentile of the latencies of the last 4096 updates, seconds; up to a quarter of a second old.
+    tracked : mapping of str to object
+        Answers of the trackers by name, such as a pose or forces; None if a tracker has none for this frame,
+        as without contact.
+    lost : mapping of str to str
+        The reasons of those that have none.
+    events : tuple of Event
+        What started or ended with this frame.
     """
 
     frames: int
@@ -60,6 +90,10 @@ class Update:
     picture: NDArray[Any]
     maps: Result = field(default_factory=Result)
     latency: float = math.nan
+    latency_p99: float = math.nan
+    tracked: Mapping[str, Any] = field(default_factory=dict)
+    lost: Mapping[str, str] = field(default_factory=dict)
+    events: tuple[Event, ...] = ()
 
     def __getattr__(self, name: str) -> Any:
         if name in Update.__slots__:  # the constructor failed

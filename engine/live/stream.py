@@ -23,6 +23,7 @@ from mirrorskin.engine.base.operation import COMPONENTS, Operation
 from mirrorskin.engine.live.loop import LATENCY, Loop, OnUpdate
 from mirrorskin.engine.live.run import LiveRun
 from mirrorskin.engine.live.status import Status, Update
+from mirrorskin.engine.live.tracking import Frames, Limit, Tracker
 from mirrorskin.io import Block, Header, InputError, Motion, Result
 from mirrorskin.io.base.arguments import check_number, unknown_argument
 from mirrorskin.io.base.types import Closing, Floats
@@ -38,12 +39,13 @@ class Stream(Closing):
 
     A separate thread runs the operation by the policy of `Loop`: frames that waited longer than ``latency``
     are skipped, except for the newest one. An error there is raised by the next call, or by `close` if no
-    other call raised it. A stream to which nothing refers any more ends its thread.
+    other call raised it. A stream to which nothing refers any more ends its thread. All kernels are compiled
+    and run once before the first frame.
 
     Parameters
     ----------
     operation : Operation or Method
-        Such as ``engine.Press(dark=16, bright=223)``.
+        Such as ``engine.Press(dark=16, bright=223)``; `Frames` for trackers alone.
     shape : (int, int)
         Rows and columns of a frame.
     dtype : dtype
@@ -53,7 +55,9 @@ class Stream(Closing):
     header : Header, optional
         Properties of all frames, such as the pixel size; its motion is used.
     latency : float
-        Seconds; infinite to use all frames: then `push` waits while 64 frames wait.
+        Seconds; 0 to use only the newest frame; infinite to use all frames: then `push` waits while 64 wait.
+    trackers, events : mapping, optional
+        Trackers and limits by name; see `Loop`.
     on_update : callable, optional
         Called with each update and the status, in the stream's thread, which waits for it. What it raises
         ends the stream as an error of the operation does.
@@ -61,7 +65,7 @@ class Stream(Closing):
     Raises
     ------
     mirrorskin.io.InputError
-        The operation cannot run live, or does not apply to the motion.
+        The operation cannot run live, or does not apply to the motion; a tracker or a limit is none.
 
     Examples
     --------
@@ -84,15 +88,26 @@ class Stream(Closing):
         motion: Motion | None = None,
         header: Header | None = None,
         latency: float = LATENCY,
+        trackers: Mapping[str, Tracker] | None = None,
+        events: Mapping[str, Limit] | None = None,
         on_update: OnUpdate | None = None,
     ) -> None:
         header = _header(operation, motion, header)
         self._source = _Pushed(header, shape, check_dtype(dtype), latency, on_update)
         self._run = LiveRun(self._source, operation)
-        self._run.precompile()
+        if isinstance(self._run.operation, Frames):
+            self._source.needed = ()
         if {"pose", "tilt"} & {name for name, needed in self._run.operation.positions.items() if needed}:
             self._source.needed += ("tilt",)
-        self._loop = Loop(self._source, self._run, latency=latency, on_update=self._source.keep)
+        self._loop = Loop(
+            self._source,
+            self._run,
+            latency=latency,
+            trackers=trackers,
+            events=events,
+            on_update=self._source.keep,
+        )
+        self._loop.precompile()
         self._thread = threading.Thread(
             target=_run, args=(self._loop, self._source), name="mirrorskin-stream", daemon=True
         )
@@ -214,6 +229,8 @@ def _header(operation: Operation | Method, motion: Motion | None, header: Header
             raise InputError(f"motion {motion!r} contradicts the header's, {header.motion!r}: leave it out")
         return header
     possible = operation.motions or tuple(POSITIONS)
+    if isinstance(operation, Frames):
+        return Header(motion or "vertical")
     if motion is None and len(possible) > 1:
         name, motions = type(operation).__name__, ", ".join(possible)
         raise InputError(f"{name} applies to several motions: give motion, one of {motions}")

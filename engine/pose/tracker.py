@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from mirrorskin.engine.pose.fit import FEWEST_SHARED, Equations, PairFit, comple
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
-from mirrorskin.io import Result
+from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.findings import findings_of
 from mirrorskin.io.base.threads import ThreadSafe
 from mirrorskin.io.model.result import shape_of
@@ -84,6 +85,19 @@ class PoseTracker(ThreadSafe):
         self._results = 0
         self._notes: tuple[str, ...] = ()  # of the last result
         self._back, self._last = STILL, STILL  # from the last result to the key, and to the one before
+
+    def precompile(self, shape: tuple[int, int], dtype: object = None) -> None:
+        """Compile what maps of a shape need, with another tracker, so that the first ones are not delayed."""
+        trial = PoseTracker(1.0 if self._pixel_size is None else self._pixel_size, device=self._device)
+        row, column = np.indices(shape, np.float32)
+        for shift in (0.0, 0.0, 0.1):
+            slopes = np.stack([np.cos(0.1 * (column - shift)), np.sin(0.07 * row)], axis=-1)
+            normals = np.dstack([0.1 * slopes, np.ones(shape, np.float32)])
+            normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+            sigma = np.full(shape, 0.01, np.float32)
+            height = np.cos(0.07 * row) - np.sin(0.1 * (column - shift))
+            with suppress(InputError):
+                trial.push(Result(height=height, height_sigma=sigma, normals=normals, normals_sigma=sigma))
 
     def push(self, maps: Maps) -> Pose:
         """Return the motion from the first result to the next one, a result or maps as for `estimate_pose`.

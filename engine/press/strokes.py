@@ -108,12 +108,13 @@ class Strokes(PressOperation):
         return self.with_event(result)
 
     def preview(self, seconds: float) -> Result:
-        """Return height and contact, without the other maps."""
+        """Return height and the contact at the newest travel, without the other maps."""
         if self.count < self.least_frames:
             return Result()
         onset = self._with_open(1).event_maps()
         contact = np.isin(onset.status, (PressStatus.ONSET, PressStatus.LIGHT_AT_START))
-        return Result(height=onset.height, contact=contact.astype(np.uint8))
+        contact &= ~(onset.height < np.float32(-self._travel[-1]))  # of a lifted body, what is still touched
+        return Result(height=onset.height, height_sigma=onset.sigma, contact=contact.astype(np.uint8))
 
     def precompile(self) -> None:
         """Push two presses without an object, so that all kernels are compiled."""

@@ -103,7 +103,7 @@ class LastTurn(Normals):
             return Result()
         window.estimate()
         started = time.perf_counter()
-        normals, contact = window.maps.read("vectors", "contact")
+        normals, sigma, contact = window.maps.read("vectors", "sigma", "contact")
         self._has_estimate = True
         if heights is not None:
             heights.follow(window)
@@ -115,7 +115,8 @@ class LastTurn(Normals):
         raised: dict[str, Any] = {} if heights is None else {"height_lag": heights.lag}
         if height is not None:
             raised |= {"height": height, "offset_unknown": np.ones(1, np.uint8)}
-        return Result(raised, normals=normals, contact=contact, edges=self._edges.lines, declarations=_LAG)
+        maps = {"normals": normals, "normals_sigma": sigma, "contact": contact, "edges": self._edges.lines}
+        return Result(raised | maps, declarations=_LAG)
 
     def idle_work(self, seconds: float) -> None:
         """Continue to draw the edges, for some seconds at most."""

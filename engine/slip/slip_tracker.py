@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import cv2
@@ -24,7 +25,7 @@ from mirrorskin.engine.slip.displacement import (
 )
 from mirrorskin.engine.slip.search import read_contact
 from mirrorskin.engine.slip.tracking import NodeField, Tracker
-from mirrorskin.io import Map, Result, pixel_axes
+from mirrorskin.io import InputError, Map, Result, pixel_axes
 from mirrorskin.io.base.arguments import check_count, check_number, checked
 from mirrorskin.io.base.threads import ThreadSafe
 from mirrorskin.io.base.types import ProcessValue
@@ -158,6 +159,18 @@ class SlipTracker(ThreadSafe):
         self._texture: Texture
         self._covariance: Doubles  # of a displacement, by noise, mm^2
         self._diagonal: Doubles
+
+    takes_frames = True
+
+    def precompile(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Compile what frames of a shape and type need, with another tracker, so that none is delayed."""
+        noise = 1.0 if self._noise is None else self._noise
+        options: dict[str, Any] = {"window_step": self._chosen_step, "noise": noise, "device": self._device}
+        trial = SlipTracker(self._contact, self._size, window_size=self._window, **options)
+        texture = np.random.default_rng(0).integers(0, 256, shape).astype(dtype)
+        with suppress(InputError):  # refused when the first frame is
+            for shift in range(3):
+                trial.push(np.roll(texture, shift, axis=1))
 
     def push(self, frame: AnyArray) -> Result:
         """Return displacement and slip in the next frame, (H, W), uint8, uint16 or float32.

@@ -151,10 +151,10 @@ def test_each_update_has_the_newest_frame_and_the_status_so_far():
     assert np.all(np.diff([update.time for update, _ in updates]) > 0)
 
 
-@pytest.mark.parametrize("wrong", [{"latency": 0.0}, {"updates": -1.0}, {"latency": math.nan}])
+@pytest.mark.parametrize("wrong", [{"latency": -0.1}, {"updates": -1.0}, {"latency": math.nan}])
 def test_an_impossible_latency_or_rate_is_refused(wrong):
     source, slow = make()
-    with pytest.raises(InputError, match="above 0"):
+    with pytest.raises(InputError, match=r"above 0|at least 0"):
         Loop(source, slow, **wrong).run()
 
 

@@ -163,6 +163,26 @@ def test_without_contact_there_are_no_heights_and_they_come_with_it():
     assert np.isfinite(updates[-1]["height"]).mean() > 0.3
 
 
+def test_contact_that_is_lost_is_found_again_with_its_heights():
+    frames = np.concatenate([turn_frames(SHAPE)] * 3)
+    frames[SHAPE[0] : 2 * SHAPE[0]] = round(OFFSET)
+    places = phases(len(frames))
+    live = LiveRun(
+        paced(frames, turn_header(), places), Rotation(window_frames=WINDOW, noise=NOISE, blur=0.0)
+    )
+    areas, heights = [], []
+    for number in range(len(frames)):
+        live.push(frames[[number]], phase=places[[number]])
+        update = live.maps()
+        areas.append(update.get("contact_area"))
+        heights.append(update.get("height"))
+    found, lost, again = (turn * SHAPE[0] - 1 for turn in (1, 2, 3))
+    assert areas[lost] == 0
+    assert areas[again] == pytest.approx(areas[found], rel=0.02)
+    off = heights[again] - heights[found]
+    assert np.nanstd(off) < 0.02 * np.ptp(heights[found][np.isfinite(heights[found])])
+
+
 def test_without_a_gain_there_is_the_wave_alone():
     frames, live = make(header=turn_header(zenith_gain=None))
     update = feed(live, frames, [SHAPE[0]])[-1]

@@ -1,0 +1,206 @@
+"""Trackers and events of a live loop: what a controller needs of each frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.base.errors import NotConverged
+from mirrorskin.engine.base.operation import Operation, Plan
+from mirrorskin.engine.live.status import Event, Update
+from mirrorskin.io import InputError, Result, Source
+
+Tracker = Any
+"""An object with ``push(maps)``, or ``push(frame)`` if it ``takes_frames``, or a function of the update."""
+
+
+class Frames(Operation):
+    """Frames without an operation, for a stream or a loop of trackers alone; it applies to any motion.
+
+    Examples
+    --------
+    >>> from mirrorskin import engine
+    >>> tracked = []
+    >>> brightness = {"brightness": lambda update: float(update.picture.mean())}
+    >>> with engine.live.Stream(
+    ...     engine.live.Frames(),
+    ...     (2, 3),
+    ...     latency=math.inf,
+    ...     trackers=brightness,
+    ...     on_update=lambda update, status: tracked.append(update.tracked["brightness"]),
+    ... ) as stream:
+    ...     for counts in (10, 20):
+    ...         stream.push(np.full((2, 3), counts, np.uint8))
+    >>> tracked
+    [10.0, 20.0]
+    """
+
+    updates_per_second = math.inf
+
+    def plan(self, source: Source) -> Plan:
+        """Return the plan for a source, without checks of its frames."""
+        return replace(super().plan(source), checked=False)
+
+    def start(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Make room for a frame."""
+        self._newest = np.zeros(shape, dtype)
+
+    def push(self, frames: NDArray[Any]) -> None:
+        """Keep the newest frame."""
+        np.copyto(self._newest, frames[-1])
+
+    def result(self) -> Mapping[str, Any]:
+        """Return the newest frame."""
+        return {"newest": self._newest}
+
+    def preview(self, seconds: float) -> Result:
+        """Return no maps: an update has its picture."""
+        return Result()
+
+
+class Trackers:
+    """The trackers of a loop, each with its name; the mapping may be changed between updates."""
+
+    def __init__(self, trackers: Mapping[str, Tracker]) -> None:
+        self._trackers = trackers
+        for name, tracker in trackers.items():
+            _check(name, tracker)
+
+    def precompile(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
+        """Compile what the trackers need for frames of a shape and type."""
+        for tracker in self._trackers.values():
+            if hasattr(tracker, "precompile"):
+                tracker.precompile(shape, dtype)
+
+    def track(self, update: Update, press: float | None) -> tuple[dict[str, Any], dict[str, str]]:
+        """Return the answers for an update by name, and the reasons of those that are missing.
+
+        ``press`` is the travel of motions that are not vertical.
+        """
+        tracked: dict[str, Any] = {}
+        lost: dict[str, str] = {}
+        travel = update.position if update.motion == "vertical" else press
+        maps = update.maps
+        if travel is not None and math.isfinite(travel) and maps.fitted.travel is None:
+            maps = maps.with_fitted(travel=float(travel))
+        so_far = replace(update, maps=maps, tracked=tracked, lost=lost)
+        for name, tracker in tuple(self._trackers.items()):
+            try:
+                if not hasattr(tracker, "push"):
+                    tracked[name] = tracker(so_far)
+                else:
+                    takes_frames = getattr(tracker, "takes_frames", False)
+                    tracked[name] = tracker.push(update.picture if takes_frames else maps)
+            except (InputError, NotConverged) as error:
+                tracked[name], lost[name] = None, str(error)
+        return tracked, lost
+
+
+def _check(name: str, tracker: Tracker) -> None:
+    if not hasattr(tracker, "push") and not callable(tracker):
+        raise InputError(
+            f"trackers: {name} is a {type(tracker).__name__}. Give a tracker, such as a PoseTracker, or a"
+            " function of the update"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A limit of a quantity of updates, for events: one starts above it, and ends at a lower one.
+
+    Parameters
+    ----------
+    quantity : callable
+        Returns a number for an `Update`; None or NaN if it is unknown, which starts and ends nothing.
+    above : float
+        The event starts when the quantity exceeds this.
+    until : float, optional
+        It ends when the quantity is at most this; by default ``above``.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        ``until`` is larger than ``above``, or one of them is NaN.
+
+    Examples
+    --------
+    >>> limit = Limit(lambda update: update.position, above=0.5, until=0.4)
+    >>> [limit.holds(position, False) for position in (0.45, 0.55)]
+    [False, True]
+    >>> limit.holds(0.45, True)
+    True
+    """
+
+    quantity: Callable[[Update], float | None]
+    above: float
+    until: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.above >= (self.above if self.until is None else self.until):
+            raise InputError(f"a limit of {self.above} until {self.until}: until must not be larger")
+
+    @classmethod
+    def contact(cls, area: float = 0.0) -> Limit:
+        """Return the limit of an area of contact, mm², or pixels of it if the pixel size is unknown."""
+        return cls(_contact, area)
+
+    @classmethod
+    def slip(cls, share: float = 0.02, tracker: str = "slip") -> Limit:
+        """Return the limit of the share of the contact that slips, as a `SlipTracker` of this name finds it.
+
+        The share is 1 if the tracker finds no part that sticks, as after a sudden slip.
+        """
+        return cls(lambda update: _slipping(update.tracked.get(tracker)), share)
+
+    @classmethod
+    def force(cls, newtons: float, until: float | None = None, tracker: str = "force") -> Limit:
+        """Return the limit of the normal force, N, as a `ForceTracker` of this name finds it."""
+        return cls(lambda update: getattr(update.tracked.get(tracker), "force", None), newtons, until)
+
+    def holds(self, value: float, before: bool) -> bool:
+        """Return whether an event goes on or starts with a value; ``before`` says whether one is going on."""
+        lower = self.above if self.until is None else self.until
+        return value > (lower if before else self.above)
+
+
+def _contact(update: Update) -> float | None:
+    if update.contact_area is not None or update.maps.contact is None:
+        return update.contact_area
+    return float(np.count_nonzero(update.maps.contact))
+
+
+def _slipping(found: Result | None) -> float | None:
+    if found is None or found.stick_ratio is None:
+        return None
+    return 1.0 if math.isnan(found.shift_x) else 1 - float(found.stick_ratio[-1])
+
+
+class Events:
+    """The limits of a loop by name, and the events that go on."""
+
+    def __init__(self, limits: Mapping[str, Limit]) -> None:
+        self._limits = dict(limits)
+        self._going_on = dict.fromkeys(limits, False)
+        for name, limit in self._limits.items():
+            if not isinstance(limit, Limit):
+                raise InputError(
+                    f"events: {name} is a {type(limit).__name__}. Give a Limit, such as Limit.contact()"
+                )
+
+    def of(self, update: Update) -> tuple[Event, ...]:
+        """Return what starts or ends with an update."""
+        changes = []
+        for name, limit in self._limits.items():
+            value = limit.quantity(update)
+            if value is None or math.isnan(value):
+                continue
+            before = self._going_on[name]
+            self._going_on[name] = now = limit.holds(value, before)
+            if now != before:
+                changes.append(Event(name, now, update.time, float(value)))
+        return tuple(changes)
