@@ -147,13 +147,13 @@ __kernel void normals_exact(ARGUMENTS)
             // Too few informative samples give no result, whatever the steps.
             const I irregular = (usable < count) & (usable >= LEAST);
             if (any_of(irregular)) {
-                Direction at = begin[i];
-                for (int more = 0; more < MORE; ++more) {
-                    const Sums closer = look_closely(at, of[i], error_of_one, cos_tilt, sin_tilt);
-                    sums[i] = blend_sums(sums[i], closer, irregular);
-                    at = step(at, closer);
+                normal = blend(normal, begin[i], irregular);
+                I moves = irregular;
+                for (int more = 0; more < MORE && any_of(moves); ++more) {
+                    const Sums closer = look_closely(normal, of[i], error_of_one, cos_tilt, sin_tilt);
+                    sums[i] = blend_sums(sums[i], closer, moves);
+                    moves = move(&normal, step(normal, closer), moves);
                 }
-                normal = blend(normal, at, irregular);
             }
             // A sheet at rest has zenith 0; one in contact has a mean of at least the tilt.
             const I at_rest = summary[i].wave.mean < limits.rest;

@@ -4,7 +4,6 @@
 #include "normals.clh"
 
 #define STEPS 3  // Gauss-Newton steps of all pixels
-#define SETTLED 1e-12f  // squared step, radians, below which further steps are omitted
 
 // The wall's parameters, before those of its inverse and its curve.
 enum {
@@ -198,17 +197,13 @@ __kernel void normals_wall(
         // Too few informative samples give no result, whatever the steps.
         const I irregular = ((summary.usable < count) | (sums.within < count)) & (summary.usable >= LEAST);
         if (any_of(irregular)) {
-            Direction at = begin;
-            for (int more = 0; more < MORE; ++more) {
-                const Sums closer = look_closely(at, of, place, wall, summary.error_of_one);
-                sums = blend_sums(sums, closer, irregular);
-                const Direction before = at;
-                at = step(at, closer);
-                const F along = at.ct - before.ct, x = at.st * at.cp - before.st * before.cp;
-                const F y = at.st * at.sp - before.st * before.sp;
-                if (!any_of(irregular & (along * along + x * x + y * y > SETTLED))) break;
+            normal = blend(normal, begin, irregular);
+            I moves = irregular;
+            for (int more = 0; more < MORE && any_of(moves); ++more) {
+                const Sums closer = look_closely(normal, of, place, wall, summary.error_of_one);
+                sums = blend_sums(sums, closer, moves);
+                moves = move(&normal, step(normal, closer), moves);
             }
-            normal = blend(normal, at, irregular);
         }
         const I usable = LESSER(summary.usable, sums.within), at_rest = normal.st < limits.rest;
         const F model = limits.model * (1.0f / count) * sums.m11;
