@@ -63,6 +63,13 @@ def slipped(printed):
     assert values == pytest.approx(true, rel=0.02)
 
 
+def held(printed):
+    (on, off) = numbers(printed, r"force (\S+) to (\S+) N, (\d+) onsets? of slip, slid by (\S+) µm")
+    assert on[0] > 0.48 > off[0]
+    assert on[2] > 0
+    assert on[3] < 10 < off[3]
+
+
 def vibrated(printed):
     for values, expected in numbers(printed, r"RMS error (\S+?)(?: µm)?, expected (\S+)"):
         assert 0.2 * expected < values < 1.5 * expected  # the twin has no lens, whose blur is in the sigma
@@ -104,6 +111,7 @@ def numbers(printed, pattern):
 
 SLOW = {
     "force": forces,
+    "hold": held,
     "moving_object": moved,
     "sensors": compared,
     "slip": slipped,

@@ -21,6 +21,9 @@ ITERATIONS = 1000
 # Relative to the total displacement; smaller steps are ignored.
 _NO_STEP = 1e-9
 
+# Relative error of a displacement that is computed in single precision; steps are not followed closer.
+_ROUNDING = 5e-7
+
 # Tractions this close to the limit are at it.
 _AT_LIMIT = 1 - 1e-9
 
@@ -36,25 +39,54 @@ class Friction:
     by conjugate gradients that are projected onto the limit, as Polonsky and Keer (1999) do for pressure,
     starting from the extrapolated traction of the preceding step.
 
+    If the object is pressed more or less in between, what sticks keeps its place on the sheet, and slips only
+    where the traction exceeds the new limit.
+
     ``traction``, (2, H, W), is exerted by the object on the body, N/mm^2, along x and y; it is 0 outside the
-    ``window`` of the grid.
+    ``window`` of the grid. ``slid``, (2, H, W), is how far the object has slid over the sheet since it
+    touched, mm.
     """
 
     def __init__(self, space: HalfSpace, pressure: Floats, coefficient: float) -> None:
         self.traction: Floats = np.zeros((2, *space.shape))
+        self.slid: Floats = np.zeros_like(self.traction)
+        self._half_space, self._coefficient = space, coefficient
         self._pixel_area = space.pixel_area
+        self._displacement: Floats = np.zeros((2, *space.shape))
+        # Displacement of a pixel under its own load.
+        self._own = float(space.window(1, 1).tangential(np.ones((2, 1, 1))).mean())
+        self.press(pressure)
+
+    def press(self, pressure: Floats) -> None:
+        """Change the pressure, N/mm^2, while the object rests along the sheet."""
+        held, self.traction = self.traction, np.zeros_like(self.traction)
         self._contact = pressure > 0
+        self.slid = self.slid * self._contact
         self.window: Window = np.s_[0:0, 0:0]
-        if self._contact.any():
-            self.window = rectangle(self._contact)
-            self._touches = self._contact[self.window]
-            self._limit = np.where(self._touches, coefficient * pressure[self.window], 0.0)
-            self._space = space.window(*self._touches.shape)
-            self._before = self._shift = np.zeros((2, *self._touches.shape))
-            self._step = self._growth = np.zeros_like(self._before)
-            self._inverse = _inverse(self._space)
-            # Displacement of a pixel under its own load.
-            self._own = float(space.window(1, 1).tangential(np.ones((2, 1, 1))).mean())
+        if not self._contact.any():
+            return
+        rows, columns = self.window = rectangle(self._contact)
+        self._touches = self._contact[self.window]
+        self._limit = np.where(self._touches, self._coefficient * pressure[self.window], 0.0)
+        self._space = self._half_space.window(*self._touches.shape)
+        self._inverse = _inverse(self._space)
+        self._before = np.where(self._touches, self._displacement[:, rows, columns], 0.0)
+        self._step = self._growth = self._shift = np.zeros_like(self._before)
+        if not held.any():
+            return
+        across, along = both = rectangle(self._contact | held.any(axis=0))
+        loaded = self._half_space.window(across.stop - across.start, along.stop - along.start)
+        shift = loaded.tangential(held[:, *both].astype(np.float32))
+        shift = shift[
+            :,
+            rows.start - across.start : rows.stop - across.start,
+            columns.start - along.start : columns.stop - along.start,
+        ]
+        start = held[:, rows, columns] * _shrink(held[:, rows, columns], self._limit)
+        tolerance = TOLERANCE * float(_length(shift).max())
+        traction, self._shift, _ = self._follow(start, self._shifted(start), shift, tolerance)
+        self.traction[:, rows, columns] = traction
+        self.slid[:, rows, columns] += np.where(self._touches, shift - self._shift, 0.0)
 
     @property
     def force(self) -> Floats:
@@ -77,15 +109,16 @@ class Friction:
         far = float(_length(step).max())
         # Steps of the size of rounding errors are accumulated.
         if far > _NO_STEP * max(float(_length(place).max()) for place in (here, self._shift)):
-            tolerance = TOLERANCE * far
+            tolerance = max(TOLERANCE * far, _ROUNDING * float(_length(self._shift).max()))
             held = self.traction[:, *self.window]
             likely = held + self._likeness(step) * self._growth
             likely *= _shrink(likely, self._limit)
-            begin = self._shift + self._shifted(likely - held)
-            traction, self._shift, limited = self._follow(likely, begin, self._shift + step, tolerance)
+            begin, target = self._shift + self._shifted(likely - held), self._shift + step
+            traction, self._shift, limited = self._follow(likely, begin, target, tolerance)
             self._step, self._growth = step, traction - held
             self.traction[:, *self.window] = traction
-            self._before = here
+            self.slid[:, *self.window] += np.where(self._touches, target - self._shift, 0.0)
+            self._before, self._displacement = here, displacement
             slips[self.window] = limited.where & (limited.slip > tolerance)
         return slips
 

@@ -196,6 +196,21 @@ class SkinHistory:
         return before, min(before + 1, last), frame - before
 
 
+class Grip(NamedTuple):
+    """Friction at one moment.
+
+    Attributes
+    ----------
+    force : ndarray, (2,)
+        Force of the object on the body along x and y, N.
+    slid : ndarray, (2,)
+        How far the object has slid over the sheet since it touched, where the pressure is greatest, mm.
+    """
+
+    force: Floats
+    slid: Floats
+
+
 class SkinState:
     """Stick and slip of a pressed body as it moves, of which only the current state is kept.
 
@@ -211,12 +226,31 @@ class SkinState:
     """
 
     def __init__(self, skin: Elastic, travel: float, coefficient: float) -> None:
-        self._skin = skin
-        pressure = skin.solve(pose_at_press(travel)).pressure
-        self._friction = Friction(skin.space, pressure, coefficient)
-        self._slide = _Slide(self._friction, skin, coefficient * pressure)
+        self._skin, self._coefficient = skin, coefficient
+        self._pressure = skin.solve(pose_at_press(travel)).pressure
+        self._friction = Friction(skin.space, self._pressure, coefficient)
+        self._slide = _Slide(self._friction, skin, coefficient * self._pressure)
         self._place: Floats | None = None
         self._margin = 0, 0
+
+    @property
+    def grip(self) -> Grip:
+        """The present force along the sheet, and how far the object has slid."""
+        most = int(np.argmax(self._pressure))
+        return Grip(self._friction.force, self._friction.slid.reshape(2, -1)[:, most].copy())
+
+    @property
+    def touches(self) -> bool:
+        """Whether there is contact."""
+        return bool(self._pressure.any())
+
+    def press(self, travel: float) -> None:
+        """Press to another travel, mm, at the same position."""
+        self._pressure = self._skin.solve(pose_at_press(travel)).pressure
+        self._friction.press(self._pressure)
+        self._slide.press(self._coefficient * self._pressure)
+        if self._place is not None:
+            self._take_drag(self._place)
 
     def go(self, place: Floats) -> None:
         """Move the body along a straight line to a position: x and y, (2,), mm, or a twist, (1,), radians."""
@@ -227,6 +261,9 @@ class SkinState:
         self._place = place
         rows, columns = _margin(self._skin, place[np.newaxis])
         self._margin = max(rows, self._margin[0]), max(columns, self._margin[1])
+        self._take_drag(place)
+
+    def _take_drag(self, place: Floats) -> None:
         window = self._friction.window
         load = self._friction.traction[:, *window].astype(np.float32)
         self._drag = Drag.by(self._skin.space, window, load, self._margin, place)
@@ -241,12 +278,18 @@ class _Slide:
 
     def __init__(self, friction: Friction, skin: Elastic, limit: Floats) -> None:
         self.onset = np.full(limit.shape, np.nan)
-        self._friction, self._limit, self._places = friction, limit, skin.grid_places
-        self._pressed = skin.grid_places[:, limit > 0]
-        self._far = float(skin.space.tangential(np.stack([limit, np.zeros_like(limit)]))[0].max())
+        self._friction, self._space, self._places = friction, skin.space, skin.grid_places
         self._place: Floats | None = None
+        self._now = 0.0, limit**2
+        self.press(limit)
+
+    def press(self, limit: Floats) -> None:
+        """Continue with another limit of the traction, N/mm^2."""
+        self._limit, self._pressed = limit, self._places[:, limit > 0]
+        self._far = float(self._space.tangential(np.stack([limit, np.zeros_like(limit)]))[0].max())
         # The travel, and the squared difference of the traction from its limit: now, and one step before.
-        self._now, self._before = (0.0, limit**2), (0.0, limit**2)
+        lacking = (limit - np.hypot(*self._friction.traction)) ** 2
+        self._now = self._before = self._now[0], lacking
 
     def go(self, step: Floats) -> None:
         """Move from one frame to the next."""

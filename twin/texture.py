@@ -18,7 +18,7 @@ from mirrorskin.twin.movement import Pose
 from mirrorskin.twin.optics import Ideal, Wall
 from mirrorskin.twin.scene import Light
 from mirrorskin.twin.skin import Elastic, Sheet
-from mirrorskin.twin.slip import Drag, SkinHistory, SkinState
+from mirrorskin.twin.slip import Drag, Grip, SkinHistory, SkinState
 from mirrorskin.twin.view import View
 
 TextureName = Literal["flakes", "dots", "random-dots"]
@@ -218,23 +218,33 @@ class _DraggedFlakes:
 class DraggedCoat:
     """The same for a body that moves from pose to pose and whose skin is dragged by friction.
 
-    While pressure and lean are constant, it slides or twists from where it was pressed, not both. Another
-    press, or a lean, releases the skin.
+    It slides or twists from where it was pressed, not both; in between it may be pressed more or less. A lean
+    releases the skin.
     """
 
     def __init__(self, coat: Coat, skin: Elastic, coefficient: float) -> None:
         self._coat, self._skin, self._coefficient = coat, skin, coefficient
-        self._travel, self._pressed_at = math.nan, np.zeros(3)
+        self._travel: float | None = None
+        self._place = self._pressed_at = np.zeros(3)
         self._state: SkinState | None = None
         self._twists = False
+
+    @property
+    def grip(self) -> Grip:
+        """The present force along the sheet, and how far the object has slid."""
+        return Grip(np.zeros(2), np.zeros(2)) if self._state is None else self._state.grip
 
     def shade(self, light: Light, height: Floats, pose: Pose, _: float) -> Light:
         """Return the light of pixels for the light from the mirror, in the pose after the previous ones."""
         rotation, travel = pose.rotation, float(pose.shift[2])
         x, y, _ = -rotation.T @ pose.shift
         place = np.array([x, y, math.atan2(rotation[0, 1], rotation[0, 0])])
-        if abs(travel - self._travel) > _STILL or rotation[2, 2] < 1 - _STILL:
+        if rotation[2, 2] < 1 - _STILL:
             self._travel, self._pressed_at, self._state = travel, place, None
+        elif self._travel is None:
+            self._travel = travel
+        elif abs(travel - self._travel) > _STILL:
+            self._press(travel, place)
         delta = place - self._pressed_at
         twists = bool(abs(delta[2]) > _STILL)
         if twists != self._twists:
@@ -243,4 +253,16 @@ class DraggedCoat:
             self._state = SkinState(self._skin, travel, self._coefficient)
         if self._state is not None:
             self._state.go(delta[2:] if twists else delta[:2])
+        self._place = place
         return self._coat.shade(light, height, history=self._state)
+
+    def _press(self, travel: float, place: Floats) -> None:
+        """Press to another travel on the way to a place; what touches is held by friction."""
+        assert self._travel is not None
+        if self._state is None and abs(place - self._place).max() > _STILL:
+            self._state = SkinState(self._skin, self._travel, self._coefficient)
+        if self._state is not None and self._state.touches:
+            self._state.press(travel)
+        if self._state is None or not self._state.touches:
+            self._pressed_at, self._state = place, None
+        self._travel = travel

@@ -25,7 +25,7 @@ from mirrorskin.twin.pattern import Linear, Pattern, Uniform, make_pattern
 from mirrorskin.twin.references import ReferenceName, ball_references, exact_references
 from mirrorskin.twin.scene import Imprint, Scene, Shade, Witness
 from mirrorskin.twin.skin import Conform, Elastic, Sheet
-from mirrorskin.twin.slip import SkinHistory
+from mirrorskin.twin.slip import Grip, SkinHistory
 from mirrorskin.twin.texture import Coat, DraggedCoat, SheetTexture
 from mirrorskin.twin.view import View
 
@@ -304,12 +304,23 @@ class Twin(Closing):
         """
         self._sensor.expose(self._anywhere.light(pose_at), number, out)
 
+    @property
+    def grip(self) -> Grip:
+        """Force along the sheet, and slide, at the last `look`, of a texture in elastic contact; else 0."""
+        return Grip(np.zeros(2), np.zeros(2)) if self._dragged is None else self._dragged.grip
+
     @functools.cached_property
     def _anywhere(self) -> Scene:
         coat, skin, optics, shade = self._optics, self._skin, self._optics, None
-        if isinstance(coat, Coat) and isinstance(skin, Elastic):
-            optics, shade = coat.optics, DraggedCoat(coat, skin, self._body.friction).shade
+        if self._dragged is not None and isinstance(coat, Coat):
+            optics, shade = coat.optics, self._dragged.shade
         return Scene(skin, optics, self._camera.exposure, imprint=self._imprint, shade=shade)
+
+    @functools.cached_property
+    def _dragged(self) -> DraggedCoat | None:
+        if isinstance(self._optics, Coat) and isinstance(self._skin, Elastic):
+            return DraggedCoat(self._optics, self._skin, self._body.friction)
+        return None
 
     @functools.cached_property
     def _imprint(self) -> Imprint | None:

@@ -28,6 +28,7 @@ _ORDER = [
     "force",
     "vibration",
     "slip",
+    "hold",
     "moving_object",
 ]
 _WITHOUT_FIGURE = {"own_camera", "steepest_rise"}  # described in docs/live.md and docs/operations.md

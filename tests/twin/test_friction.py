@@ -162,3 +162,59 @@ def test_a_step_that_does_not_settle_reports_it(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(friction, "ITERATIONS", 2)
     with pytest.raises(RuntimeError, match="did not converge in 2 iterations"):
         Friction(SPACE, BALL, MU).move(push(0.5 * FAR))
+
+
+LESS = contact_theory.paraboloid(4.0, 1.5, MODULUS)
+SMALLER = LESS.pressure(np.minimum(R, 1.5))
+LARGER = contact_theory.paraboloid(4.0, 1.85, MODULUS).pressure(np.minimum(R, 1.85))
+
+
+def test_an_object_that_is_pressed_more_holds_its_traction_and_slips_nowhere() -> None:
+    contact = Friction(SPACE, BALL, MU)
+    contact.move(push(0.5 * FAR))
+    held, slid = force(contact), contact.slid.copy()
+    contact.press(LARGER)
+    np.testing.assert_allclose(force(contact), held, rtol=1e-6)
+    np.testing.assert_allclose(contact.slid, slid, atol=1e-3 * FAR)
+
+
+def test_an_object_that_is_pressed_less_slips_where_its_traction_exceeds_the_limit() -> None:
+    contact = Friction(SPACE, BALL, MU)
+    contact.move(push(0.5 * FAR))
+    contact.press(SMALLER)
+    traction = np.hypot(*contact.traction)
+    assert np.all(traction <= MU * SMALLER * (1 + 1e-9))
+    assert traction[R > 1.2].sum() == pytest.approx((MU * SMALLER)[R > 1.2].sum(), rel=1e-3)
+    assert np.hypot(*contact.slid)[SIDE // 2, SIDE // 2] < 1e-3 * FAR
+
+
+def test_an_object_that_is_pressed_less_slides_under_the_friction_of_that_press() -> None:
+    contact = Friction(SPACE, BALL, MU)
+    contact.move(push(0.5 * FAR))
+    contact.press(SMALLER)
+    contact.move(push(3 * FAR))
+    assert force(contact)[0] == pytest.approx(MU * SMALLER.sum() * PIXEL**2, rel=1e-3)
+    middle = contact.slid[:, SIDE // 2, SIDE // 2]
+    far = contact_theory.sliding_distance(LESS, MU, MODULUS)
+    np.testing.assert_allclose(middle, [3 * FAR - far, 0], atol=2e-3 * FAR)
+
+
+def test_an_object_that_is_lifted_and_pressed_again_holds_no_traction() -> None:
+    contact = Friction(SPACE, BALL, MU)
+    contact.move(push(0.5 * FAR))
+    contact.press(0 * BALL)
+    contact.press(BALL)
+    assert not contact.traction.any()
+    assert not contact.slid.any()
+    contact.move(push(FAR))  # by half of it since the contact
+    theory = contact_theory.pushed(HERTZ, MU, MODULUS, 0.5 * FAR)
+    assert force(contact)[0] == pytest.approx(theory.force, rel=0.01)
+
+
+def test_small_steps_after_a_large_one_converge() -> None:
+    contact = Friction(SPACE, BALL, MU)
+    contact.move(push(0.5 * FAR))
+    for step in (1e-3, 1e-4, 1e-5):
+        contact.move(push((0.5 + step) * FAR))
+    theory = contact_theory.pushed(HERTZ, MU, MODULUS, (0.5 + 1e-5) * FAR)
+    assert force(contact)[0] == pytest.approx(theory.force, rel=0.01)

@@ -41,6 +41,7 @@ from mirrorskin.twin.emulator.camera import TwinCamera, pose_at
 from mirrorskin.twin.emulator.port import GrblLine, GrblMachine, GrblPort
 from mirrorskin.twin.emulator.server import FrameServer
 from mirrorskin.twin.movement import Movement, Pose
+from mirrorskin.twin.slip import Grip
 
 PRESS = 3.0
 """Maximum travel of the emulated stage, mm."""
@@ -177,6 +178,11 @@ class EmulatedRig:
         """Return the true position of the body at a time of the clock."""
         at_machine = self.machine.position(at)
         return Position(**{name: axis.value(at_machine[axis.letter]) for name, axis in self._axes.items()})
+
+    @property
+    def grip(self) -> Grip:
+        """The true force along the sheet and the slide in the newest frame; see `Twin.grip`."""
+        return self._seen.grip
 
     def open_stage(self, settings: StageSettings, unlock: bool = False) -> GrblStage:
         """Open the emulated stage, or another one if the port differs; see ``rig.open_stage``."""
