@@ -175,7 +175,7 @@ def _contact(update: Update) -> float | None:
 
 
 def _slipping(found: Result | None) -> float | None:
-    if found is None or found.stick_ratio is None:
+    if found is None or found.stick_ratio is None or math.isnan(found.stick_ratio[-1]):
         return None
     return 1.0 if math.isnan(found.shift_x) else 1 - float(found.stick_ratio[-1])
 

@@ -31,6 +31,9 @@ MAPS = {
 }
 """Declarations of the maps of `find_displacement`: each component has its own standard deviation."""
 
+XY = np.array([1, 1j])
+"""Converts vectors (x, y) to x + i y."""
+
 _RANK = np.array([1, 0, 2, 3], np.uint8)  # rank of a status: a pixel has the highest of its nodes
 _MOST_STEP = 64  # maximum distance of nodes, pixels
 _CORRELATED_SAMPLES = 4  # samples over which residuals are correlated
@@ -208,40 +211,52 @@ def _at_nodes(
     status = node_status(field, texture)
     found_nodes = (status == DisplacementStatus.FOUND)[..., None]
     displacement = np.where(found_nodes, field.moved.transpose(1, 2, 0) * [size[0], -size[1]], np.nan)
-    noisy = (sigma * misfit(field, texture, window)) ** 2
-    sigma = np.sqrt(noisy + bending_variance(displacement, sigma**2, tracker.finest.step, window))
+    variance = sigma**2
+    bending = bending_variance(
+        displacement @ XY,
+        np.moveaxis(variance, -1, 0),
+        tracker.finest.step,
+        window,
+    )
+    variance = variance * misfit(field.variance, texture.variance, window)[..., None]
+    sigma = np.sqrt(variance + np.moveaxis(bending, 0, -1))
     return displacement, np.where(found_nodes, sigma, np.nan), status
 
 
-def misfit(field: NodeField, texture: Texture, window: int) -> Doubles:
-    """Return the factor, (rows, columns, 1), of sigma for a frame's misfit beyond noise.
+def misfit(variance: Doubles, usual: Doubles, window: int) -> Doubles:
+    """Return the factor of the variance of a displacement for a frame's misfit beyond noise.
 
-    Residuals due to changes of brightness are correlated over some samples; the factor allows for that.
+    It is computed from the variance of a sample in the frame and the usual one. Residuals due to changes of
+    brightness are correlated over some samples; the factor allows for that.
     """
     chance = 1 + 2 * math.sqrt(2) / window  # two standard deviations of a window's variance
-    more = np.fmax(field.variance / texture.variance - chance, 0)
-    return np.asarray(np.sqrt(1 + _CORRELATED_SAMPLES * more)[..., None])
+    return np.asarray(1 + _CORRELATED_SAMPLES * np.fmax(variance / usual - chance, 0))
 
 
-def bending_variance(displacement: Doubles, variance: Doubles, step: int, window: int) -> Doubles:
-    """Return the approximate squared bias, (rows, columns, 2), of displacements that bend within windows.
+def bending_variance(
+    displacement: NDArray[np.complex128], variance: Doubles, step: int, window: int
+) -> Doubles:
+    """Return the approximate squared bias along x and y of displacements that bend within windows.
 
     An affine field misses the mean of the second-order terms, window^2 / 24 times the Laplacian, which is
-    computed from displacements a window apart. Its noise, from the ``variance``, is subtracted.
+    computed from displacements x + i y, (rows, columns), a window apart. Its noise, from the ``variance``,
+    (2, rows, columns), is subtracted.
     """
     apart = max(1, round(window / step))
-    laplacian = np.zeros(displacement.shape)
-    for axis in (0, 1):
-        sums, values = (np.moveaxis(part, axis, 0) for part in (laplacian, displacement))
+    laplacian = np.zeros_like(displacement)
+    for sums, values in ((laplacian, displacement), (laplacian.T, displacement.T)):
         if len(values) > 2 * apart:
             second = values[: -2 * apart] + values[2 * apart :]
             second -= 2 * values[apart:-apart]
             sums[apart:-apart] += second
             sums[:apart] += second[0]
             sums[-apart:] += second[-1]
-    bias = np.stack([fill_with_nearest(part) for part in np.moveaxis(laplacian, -1, 0)], axis=-1)
-    bias *= (window / (apart * step)) ** 2 / 24
-    return np.asarray(np.fmax(bias**2 - _LAPLACIAN_NOISE * variance, 0))
+    bias = fill_with_nearest(laplacian) * ((window / (apart * step)) ** 2 / 24)
+    square = np.empty(variance.shape)
+    np.square(bias.real, out=square[0])
+    np.square(bias.imag, out=square[1])
+    square -= _LAPLACIAN_NOISE * variance
+    return np.fmax(square, 0, out=square)
 
 
 def excess_scatter(displacement: Doubles, sigma: Doubles, step: int, window: int) -> float:

@@ -18,6 +18,7 @@ from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.slip.displacement import (
+    XY,
     Texture,
     bending_variance,
     check_windows,
@@ -247,8 +248,12 @@ class SlipOnset(Operation):
         status, onset = self._pixels(tracker, codes, onsets, contact, course.end)
         slipped = status == SlipStatus.SLIPPED
         noisy = np.einsum("yxii->yxi", self._covariance(texture))
-        bent = bending_variance(moved[-1], noisy, self.window_step, self.window_size)
-        noisy = noisy * misfit(fields[-1], texture, self.window_size) ** 2
+        bent = np.moveaxis(
+            bending_variance(moved[-1] @ XY, np.moveaxis(noisy, -1, 0), self.window_step, self.window_size),
+            0,
+            -1,
+        )
+        noisy = noisy * misfit(fields[-1].variance, texture.variance, self.window_size)[..., None]
         spread = tracker.positive_to_pixels(np.sqrt(np.mean(noisy + bent, axis=-1)))
         last = tracker.to_pixels(moved[-1])
         process: dict[str, ProcessValue] = {
@@ -465,14 +470,20 @@ class _Course:
 
 
 def read_contact(
-    contact: Maps | None, shape: tuple[int, int]
+    contact: Maps | None, shape: tuple[int, int], needed: bool = True
 ) -> tuple[NDArray[np.bool_] | None, str, dict[str, str]]:
-    """Return the contact, if it is specified, its origin for ``process``, and the findings of its result."""
+    """Return the contact, if it is specified, its origin for ``process``, and the findings of its result.
+
+    If a contact is not ``needed``, it may be nowhere.
+    """
     if contact is None:
         return None, "estimated", {}
     result = as_result(contact, "contact", quantity="contact")
     try:
-        return *_contact_of(result, shape), carried({}, contact=result.process)
+        touched, origin = _contact_of(result, shape)
+        if needed and not touched.any():
+            raise InputError("contact is nowhere: give a map that is not 0 where the skin touches the object")
+        return touched, origin, carried({}, contact=result.process)
     except InputError as error:
         path = os.fspath(contact) if isinstance(contact, str | os.PathLike) else ""
         raise (error if path in str(error) else InputError(f"{path}: {error}")) from None
@@ -491,14 +502,11 @@ def _contact_of(result: Result, shape: tuple[int, int]) -> tuple[NDArray[np.bool
 
 
 def _check_contact(contact: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return the pixels where a map is not 0; raise InputError without any, or for another shape."""
+    """Return the pixels where a map is not 0; raise InputError for another shape."""
     if contact.shape != shape:
         size = f"{shape[0]} x {shape[1]}"
         raise InputError(
             f"contact has shape {contact.shape}, the frames are {size}:"
             " give that of the same camera and region"
         )
-    touched = np.asarray(np.nan_to_num(contact) != 0)
-    if not touched.any():
-        raise InputError("contact is nowhere: give a map that is not 0 where the skin touches the object")
-    return touched
+    return np.asarray(np.nan_to_num(contact) != 0)

@@ -28,10 +28,14 @@ _MIN_CONTRAST = 0.5  # minimum contrast of the same texture, relative to the ref
 _CONVERGED_FRACTION = 0.98  # share of the nodes that must converge; windows with little texture never do
 _LARGEST_CHANGE = 0.5  # pixels, in the last iteration of a window that is found
 _LAST_CHANGE = 0.03  # pixels: the linearisation error is then below 0.001 pixels
-_SEPARATE_ITERATIONS, _SETTLED = 4, 0.03  # of windows without neighbours: largest number, last change, pixels
-_LEAST_STEP = 0.1  # of such a window from frame to frame, from which the next one is extrapolated, pixels
+_SEPARATE_ITERATIONS, _SETTLED = 4, 0.05  # of windows without neighbours: largest number, last change, pixels
+_LEAST_STEP = 0.1  # pixels by which the step of such a window must differ from the mean one to be used
+_REACH = 16  # pixels by which the samples of such a window may be displaced from its start
 _FIELD_WEIGHT = 0.01  # weight of the previous field, relative to that of the median node
 _TILE, _NODES = 4096, 16  # pixels and nodes per work-item on a CPU
+
+Part = tuple[slice, slice]
+"""Rows and columns of nodes, with starts and stops."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +45,8 @@ class NodeField:
     Attributes
     ----------
     moved : ndarray, (2, rows, columns), float64
-        Pixels to the right and down; NaN where a window leaves the picture or has no texture.
+        Pixels to the right and down, of the nodes that were followed; NaN where a window leaves the picture
+        or has no texture.
     variance : ndarray, (rows, columns), float64
         Variance of a sample, counts^2, from the residual in the window.
     converged : ndarray, (rows, columns), bool
@@ -97,24 +102,49 @@ class Tracker:
             levels.append(self._make(counts))
         return levels
 
-    def follow(self, frame: AnyArray, stride: float = 1.0) -> NodeField:
-        """Return the displacement of a frame; ``stride`` is its step as a multiple of the previous step."""
+    def follow(self, frame: AnyArray, stride: float = 1.0, part: Part | None = None) -> NodeField:
+        """Return the displacement of a frame; ``stride`` is its step as a multiple of the previous step.
+
+        Windows without neighbours may be followed in a part of the nodes only; the others then keep the field
+        that the nearest of these have.
+        """
         last, before = self._fields
         step = last - before
         if self._separate:  # its noise would be extrapolated, too
-            step[:2] *= np.abs(step[:2]) > _LEAST_STEP
+            moves = step[:2]
+            mean = moves.mean(axis=(1, 2), keepdims=True)
+            step[:2] = np.where(np.abs(moves - mean) > _LEAST_STEP, moves, mean)
             step[2:] = 0
         begin = last + stride * step
-        best, field = self.finest.follow(frame, begin)
+        part = part or self.finest.whole
+        best, field = self.finest.follow(frame, begin, part)
+        least = _MIN_CONVERGED * np.count_nonzero(self.finest.usable[part])
         for correlated in (False, True):
-            if np.mean(best.converged) >= _MIN_CONVERGED * np.mean(self.finest.usable):
+            if np.count_nonzero(best.converged) >= least:
                 break
             frame = on_host(frame)
-            displacement, other = self._follow_down(frame, self._correlated(frame) if correlated else begin)
-            if np.mean(displacement.converged) > np.mean(best.converged):
+            displacement, other = self._follow_down(
+                frame, self._correlated(frame) if correlated else begin, part
+            )
+            if np.count_nonzero(displacement.converged) > np.count_nonzero(best.converged):
                 best, field = displacement, other
         self._fields = [field, last]
         return best
+
+    @property
+    def moved(self) -> Doubles:
+        """Displacement of the nodes in the last frame, (2, rows, columns), pixels to the right and down."""
+        return self._fields[0][:2]
+
+    def spread(self, part: Part) -> None:
+        """Give nodes outside of a part, which were not followed, the fields of the nearest ones in it."""
+        nearest = np.ix_(
+            *(
+                np.clip(np.arange(size), inner.start, inner.stop - 1)
+                for size, inner in zip(self.finest.grid, part, strict=True)
+            )
+        )
+        self._fields = [field[:, *nearest] for field in self._fields]
 
     def to_pixels(self, values: Doubles, on_device: bool = False) -> AnyArray:
         """Return values of the nodes, (rows, columns) or ([T,] rows, columns, n), at all pixels.
@@ -159,15 +189,16 @@ class Tracker:
             for size, nodes in zip(level.shape, level.grid, strict=True)
         ]
 
-    def _follow_down(self, frame: NDArray[Any], field: Doubles) -> tuple[NodeField, Doubles]:
-        """Follow a frame from the coarsest resolution to the finest."""
+    def _follow_down(self, frame: NDArray[Any], field: Doubles, part: Part) -> tuple[NodeField, Doubles]:
+        """Follow a frame from the coarsest resolution to a part of the finest."""
         frames = [frame]
         for _ in self._levels[1:]:
             frames.append(cv2.pyrDown(frames[-1].astype(np.float32)))
         for number in reversed(range(len(self._levels))):
             level = self._levels[number]
+            start = level.at_nodes(field, self.finest, 2.0**number)
             displacement, field = level.follow(
-                frames[number], level.at_nodes(field, self.finest, 2.0**number)
+                frames[number], start, part if level is self.finest else level.whole
             )
             if level is not self.finest:
                 field = self.finest.at_nodes(field, level, 0.5**number)
@@ -193,23 +224,26 @@ class _Level:
 
     def __init__(self, reference: AnyArray, window: int, step: int, device: Device, separate: bool) -> None:
         self._device, self._window, self.step, self._separate = device, window, step, separate
-        self._frame_type = C_TYPES[reference.dtype.name]
-        self._top = int(np.iinfo(reference.dtype).max) if reference.dtype.kind == "u" else 0
         self._tile, self._nodes = (_TILE, _NODES) if device.layout.tile > 1 else (1, 1)
+        self._macros: dict[str, str | int] = {"FRAME": C_TYPES[reference.dtype.name], "WINDOW": window}
+        self._macros |= {"STEP": step, "TILE": self._tile, "NODES": self._nodes}
+        if reference.dtype.kind == "u":
+            self._macros["TOP"] = int(np.iinfo(reference.dtype).max)
         self.shape: tuple[int, int] = reference.shape
         rows, columns = self.shape
         self._first, self._halo = (step - window) // 2, 2 * window + 8
         self.start: float = self._first + (window - 1) / 2
         self.grid: tuple[int, int] = -(-rows // step), -(-columns // step)
         self.rest: NDArray[Any] = np.zeros((AFFINE if separate else 2, *self.grid))
-        padded = rows + 2 * MARGIN, columns + 2 * MARGIN
+        self.whole: Part = slice(0, self.grid[0]), slice(0, self.grid[1])
         with_halo = rows + 2 * self._halo, columns + 2 * self._halo
         shapes = {
-            **dict.fromkeys(("padded", "half", "coefficients"), padded),
+            "coefficients": (rows + 2 * MARGIN, columns + 2 * MARGIN),
+            **dict.fromkeys(("sums", "counts"), self.shape),
             "planes": (4, *with_halo),
             "difference": (2, *with_halo),
             **dict.fromkeys(("field", "next_field"), self.rest.shape),
-            "answer": (AFFINE + 3 + separate, *self.grid),
+            "answer": (AFFINE + 3, *self.grid),
             "inverse": (self._items, PACKED, self._nodes),
             "summary": (4, *self.grid),
         }
@@ -233,7 +267,7 @@ class _Level:
         frame = {"frame": self._fit_spline(reference)}
         maps, (rows, columns) = self._maps, self.shape
         sizes: dict[str, Any] = {"rows": rows, "columns": columns}
-        sums = {"sums": maps["padded"], "counts": maps["half"]}
+        sums = {name: maps[name] for name in ("sums", "counts")}
         self._launch("across", rows * math.ceil(columns / self._tile), **sizes, **frame, **sums)
         wide = columns + 2 * self._halo
         self._launch(
@@ -297,30 +331,42 @@ class _Level:
         """Memory on the device for a frame from the host."""
         return self._device.array("frame", self.shape, self._dtype, zeroed=False)
 
-    def _fit_spline(self, frame: AnyArray) -> Array:
-        """Compute the coefficients of a frame's spline on the device, and return the frame there."""
-        maps, (rows, columns) = self._maps, self.shape
+    def _fit_spline(self, frame: AnyArray, inside: Part | None = None) -> Array:
+        """Compute the coefficients of a frame's spline on the device, and return the frame there.
+
+        ``inside`` are the rows and columns of the samples to be interpolated, by default all.
+        """
+        coefficients, (rows, columns) = self._maps["coefficients"], self.shape
         placed = frame if isinstance(frame, Array) else self._frame
         if placed is not frame:
             placed.write(frame)
-        height, width = maps["padded"].shape
-        pixels = width * height
-        items = height * math.ceil(width / self._tile)
-        self._launch("pad", items, rows=rows, columns=columns, frame=placed, padded=maps["padded"])
-        items = math.ceil(pixels / self._tile)
-        for step, source, filtered in ((1, "padded", "half"), (width, "half", "coefficients")):
-            self._launch(
-                "filter", items, pixels=pixels, step=step, source=maps[source], filtered=maps[filtered]
-            )
+        (top, bottom), (left, right) = (
+            (0, size + 2 * MARGIN)
+            if part is None
+            else (max(part.start, 0) + MARGIN - 2, min(part.stop, size) + MARGIN + 2)
+            for part, size in zip(inside or (None, None), self.shape, strict=True)
+        )
+        self._launch(
+            "spline",
+            (bottom - top) * math.ceil((right - left) / self._tile),
+            rows=rows,
+            columns=columns,
+            top=top,
+            bottom=bottom,
+            left=left,
+            right=right,
+            frame=placed,
+            coefficients=coefficients,
+        )
         return placed
 
-    def follow(self, frame: AnyArray, field: Doubles) -> tuple[NodeField, Doubles]:
+    def follow(self, frame: AnyArray, field: Doubles, part: Part) -> tuple[NodeField, Doubles]:
         """Return the displacement of a frame, starting from a field, and the final field."""
-        self._fit_spline(frame)
         maps = self._maps
         maps["field"].write(field)
         if self._separate:
-            return self._follow_separately(field)
+            return self._follow_separately(frame, field, part)
+        self._fit_spline(frame)
         for _ in range(ITERATIONS):
             self._solve()
             last, field = field, maps["next_field"].read()
@@ -334,25 +380,40 @@ class _Level:
             converged = (np.abs(moved - last).max(axis=0) < _LARGEST_CHANGE) & (gain > _MIN_CONTRAST)
         return NodeField(moved, self._variance(gain, squares, variances), converged), field
 
-    def _follow_separately(self, field: Doubles) -> tuple[NodeField, Doubles]:
+    def _follow_separately(self, frame: AnyArray, field: Doubles, part: Part) -> tuple[NodeField, Doubles]:
         """Return the displacement of windows without neighbours, and their affine fields."""
-        maps = self._maps
+        maps, (rows, columns), moves = self._maps, part, field[1::-1, *part].reshape(2, -1)
+        begin, end = moves.min(axis=1).tolist(), moves.max(axis=1).tolist()
+        top, left = (
+            math.floor(self._first + nodes.start * self.step + move) - _REACH
+            for nodes, move in zip(part, begin, strict=True)
+        )
+        bottom, right = (
+            math.ceil(self._first + (nodes.stop - 1) * self.step + move) + self._window + _REACH
+            for nodes, move in zip(part, end, strict=True)
+        )
+        self._fit_spline(frame, (slice(top, bottom), slice(left, right)))
         self._launch(
             "follow",
-            math.prod(self.grid),
+            (rows.stop - rows.start) * (columns.stop - columns.start),
             **self._sizes,
+            top=rows.start,
+            bottom=rows.stop,
+            left=columns.start,
+            right=columns.stop,
             iterations=_SEPARATE_ITERATIONS,
             settled=_SETTLED,
-            **{name: maps[name] for name in ("coefficients", "planes", "inverse", "field", "answer")},
+            **{
+                name: maps[name]
+                for name in ("coefficients", "planes", "inverse", "summary", "field", "answer")
+            },
         )
-        answer = maps["answer"].read().astype(np.float64)
-        gain, squares, variances, change = answer[AFFINE:]
-        with np.errstate(invalid="ignore"):
-            converged = (change < _LARGEST_CHANGE) & (gain > _MIN_CONTRAST)
-        moved = answer[:AFFINE]
-        return NodeField(
-            moved[:2], self._variance(gain, squares, variances * self.measured), converged
-        ), np.where(converged, moved, field)
+        answer = maps["answer"].read()[:, *part].astype(np.float64)
+        moved, (gain, variance, change) = answer[:AFFINE], answer[AFFINE:]
+        converged = (change < _LARGEST_CHANGE) & (gain > _MIN_CONTRAST)
+        field = field.copy()
+        np.copyto(field[:, *part], moved, where=converged)
+        return NodeField(moved[:2], variance, converged), field
 
     def _variance(self, gain: Doubles, squares: Doubles, variances: Doubles) -> Doubles:
         """Return the variance of a sample from sums of squares and of the variances of differences."""
@@ -394,12 +455,10 @@ class _Level:
         return moved
 
     def _launch(self, name: str, items: int, **arguments: Any) -> None:
-        macros: dict[str, str | int] = {"FRAME": self._frame_type, "WINDOW": self._window, "STEP": self.step}
-        macros |= {"TILE": self._tile, "NODES": self._nodes}
-        if self._top:
-            macros["TOP"] = self._top
         moved = sum(array.nbytes for array in arguments.values() if isinstance(array, Array))
-        self._device.kernel("displacement", f"displacement_{name}", **macros)(items, **arguments, moved=moved)
+        self._device.kernel("displacement", f"displacement_{name}", **self._macros)(
+            items, **arguments, moved=moved
+        )
 
 
 def invert_symmetric(matrices: Doubles) -> Doubles:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -98,6 +99,12 @@ class MapContainer:
         return as_html(self)
 
 
+@lru_cache(maxsize=256)
+def _ordered(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return names of maps in the order of the table."""
+    return tuple(sorted(names, key=place_of))
+
+
 class Result(MapContainer, Mapping[str, Any]):
     """The maps of a reconstruction: a read-only mapping from names to arrays, with attribute access.
 
@@ -168,7 +175,7 @@ class Result(MapContainer, Mapping[str, Any]):
         **named: Any,
     ) -> None:
         values = {**(maps or {}), **named}
-        kept = {name: values[name] for name in sorted(values, key=place_of) if values[name] is not None}
+        kept = {name: values[name] for name in _ordered(tuple(values)) if values[name] is not None}
         declared = {name: declaration for name, declaration in (declarations or {}).items() if name in kept}
         check_declarations(declared)
         for name, value in {

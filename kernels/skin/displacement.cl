@@ -58,30 +58,60 @@ int reflected(const int place, const int length)
     return rest < length ? rest : period - rest;
 }
 
-__kernel void displacement_pad(const int rows, const int columns, __global const FRAME *restrict frame, OUT padded)
-{
-    const int width = columns + 2 * MARGIN, pieces = (width + TILE - 1) / TILE, line = get_global_id(0) / pieces;
-    if (line >= rows + 2 * MARGIN) return;
-    int x = (get_global_id(0) - line * pieces) * TILE;
-    const int end = min(x + TILE, width), row = reflected(line - MARGIN, rows);
-    __global const FRAME *restrict samples = frame + row * columns;
-    OUT out = padded + line * width;
-    for (; x < min(end, MARGIN); ++x) out[x] = samples[reflected(x - MARGIN, columns)];
-    for (; x < min(end, MARGIN + columns); ++x) out[x] = samples[x - MARGIN];
-    for (; x < end; ++x) out[x] = samples[reflected(x - MARGIN, columns)];
-}
+// sqrt(3) times the powers of the spline's pole, sqrt(3) - 2. `BOTH(k)` is the sum of the two samples k away.
+#define FILTERED(middle, BOTH)                                                                                      \
+    (1.7320508f * (middle) - 0.46410162f * BOTH(1) + 0.12435565f * BOTH(2) - 0.033320997f * BOTH(3)                 \
+        + 0.0089283345f * BOTH(4) - 0.0023923402f * BOTH(5) + 6.4102660e-4f * BOTH(6) - 1.7176256e-4f * BOTH(7)     \
+        + 4.6023640e-5f * BOTH(8))
+typedef WIDE(FRAME) __attribute__((aligned(sizeof(FRAME)))) Samples;  // unaligned
+#define SUM_OF_uchar int
+#define SUM_OF_ushort int
+#define SUM_OF_float float
+typedef WIDE(JOIN(SUM_OF_, FRAME)) Sums;  // whole numbers are added first, which saves conversions
+#define SAMPLES(k) CONVERT(*(__global const Samples *)(frame + line[TAPS + (k)] + x), Sums)
+#define ABOVE_AND_BELOW(k) CONVERT(SAMPLES(-(k)) + SAMPLES(k), F)
+#define ON_BOTH_SIDES(k) (KEPT(at - (k)) + KEPT(at + (k)))
 
-// sqrt(3) times the powers of the spline's pole, sqrt(3) - 2.
-#define BESIDE(k, weight) (weight) * (source[p - (k) * step] + source[p + (k) * step])
-
-__kernel void displacement_filter(const int pixels, const int step, MAP source, OUT filtered)
+__kernel void displacement_spline(
+    const int rows, const int columns, const int top, const int bottom, const int left, const int right,
+    __global const FRAME *restrict frame, OUT coefficients)
 {
-    const int first = get_global_id(0) * TILE, reach = TAPS * step;
-    const int begin = max(first, reach), end = min(first + TILE, pixels - reach);
-    for (int p = begin; p < end; ++p) {
-        filtered[p] = 1.7320508f * source[p] + BESIDE(1, -0.46410162f) + BESIDE(2, 0.12435565f)
-            + BESIDE(3, -0.033320997f) + BESIDE(4, 0.0089283345f) + BESIDE(5, -0.0023923402f)
-            + BESIDE(6, 6.4102660e-4f) + BESIDE(7, -1.7176256e-4f) + BESIDE(8, 4.6023640e-5f);
+    const int pieces = (right - left + TILE - 1) / TILE, y = top + get_global_id(0) / pieces;
+    if (y >= bottom) return;
+    const int first = left + (get_global_id(0) - (y - top) * pieces) * TILE, end = min(first + TILE, right);
+    // A strip is not shorter than others, as mirrored samples are copied within it.
+    const int strips = (end - first + STRIP - 1) / STRIP, strip = (end - first + strips - 1) / strips;
+    OUT out = coefficients + y * (columns + 2 * MARGIN);
+    int line[2 * TAPS + 1];
+    for (int k = 0; k <= 2 * TAPS; ++k) line[k] = reflected(y - MARGIN + k - TAPS, rows) * columns;
+    for (int base = first; base < end; base += strip) {
+        // Filtered along the columns of the picture, then along the row.
+        const int size = min(strip, end - base), start = base - MARGIN - TAPS, stop = start + size + 2 * TAPS;
+        const int low = LIMITED(start, 0, columns), count = LIMITED(stop, 0, columns) - low;
+        float along[STRIP + 2 * TAPS + LANES];
+        float *inside = along + low - start;
+        for (int x = low; x < low + count; x += LANES) {
+            const F value = FILTERED(CONVERT(SAMPLES(0), F), ABOVE_AND_BELOW);
+            *(Loose *)(inside + x - low) = value;
+        }
+        for (int side = 0; side < 2; ++side)
+            for (int place = side ? max(low + count, start) : start; place < (side ? stop : min(low, stop)); ++place) {
+                const int x = columns > MARGIN + TAPS ? MIRROR(place, columns) : reflected(place, columns);
+                float value;
+                if (x >= low && x < low + count) value = inside[x - low];
+                else {
+                    const F values = FILTERED(CONVERT(SAMPLES(0), F), ABOVE_AND_BELOW);
+                    value = LANE(values, 0);
+                }
+                along[place - start] = value;
+            }
+        for (int i = 0; i < size; i += LANES) {
+            const float *at = along + i + TAPS;
+            const F value = FILTERED(KEPT(at), ON_BOTH_SIDES);
+            if (i + LANES <= size) STORE(out + base + i, value);
+            else
+                for (int k = 0; k < size - i; ++k) out[base + i + k] = LANE(value, k);
+        }
     }
 }
 
@@ -512,12 +542,14 @@ __kernel void displacement_solve(
     }
 
 __kernel void displacement_follow(
-    const int rows, const int columns, const int node_rows, const int node_columns, const int halo, const int iterations,
-    const float settled, MAP coefficients, MAP planes, MAP inverse, MAP field, OUT answer)
+    const int rows, const int columns, const int node_rows, const int node_columns, const int halo, const int top,
+    const int bottom, const int left, const int right, const int iterations, const float settled, MAP coefficients,
+    MAP planes, MAP inverse, MAP summary, MAP field, OUT answer)
 {
-    const int node = get_global_id(0), nodes = node_rows * node_columns;
-    if (node >= nodes) return;
-    const int node_row = node / node_columns, node_column = node - node_row * node_columns;
+    const int item = get_global_id(0), wide = right - left, nodes = node_rows * node_columns;
+    if (item >= wide * (bottom - top)) return;
+    const int node_row = top + item / wide, node_column = left + item % wide;
+    const int node = node_row * node_columns + node_column;
     const int width = columns + 2 * halo, plane = width * (rows + 2 * halo), stride = columns + 2 * MARGIN;
     const int first_row = FIRST + node_row * STEP, first_column = FIRST + node_column * STEP;
     const int pieces = (node_columns + NODES - 1) / NODES, piece = node_column / NODES;
@@ -526,23 +558,23 @@ __kernel void displacement_follow(
     float moved[AFFINE], solved[PARAMETERS], squares = 0, change = NAN;
     for (int k = 0; k < AFFINE; ++k) moved[k] = field[k * nodes + node];
     for (int iteration = 0; iteration < iterations; ++iteration) {
-        float sums[PARAMETERS + 1];
-        for (int k = 0; k <= PARAMETERS; ++k) sums[k] = 0;
         // The least squares represent small derivatives, so that all pixels are displaced alike.
         float largest = 0;
         for (int k = 2; k < AFFINE; ++k) largest = GREATER(largest, MAGNITUDE(moved[k]));
         const int bends = largest > BENT;
         for (int k = 2; k < AFFINE; ++k) moved[k] = bends ? moved[k] : 0;
-        const float left = first_column + moved[0], above = first_row + moved[1];
-        const int whole = left >= 0 && left + WINDOW <= columns && above >= 0 && above + WINDOW <= rows;
+        const float before = first_column + moved[0], above = first_row + moved[1];
+        const int whole = before >= 0 && before + WINDOW <= columns && above >= 0 && above + WINDOW <= rows;
+        F all_x = 0, all_y = 0, all_level = 0, x_across = 0, y_across = 0, level_across = 0;
+        F of_x_down = 0, of_y_down = 0, of_level_down = 0, of_gain = 0, of_square = 0;
         for (int g = 0; g < COLUMN_GROUPS; ++g) {
             const I number = g * LANES + NUMBERS;
             const F across = PLACE(CONVERT(number, F));
             const I within = number < WINDOW;
-            F of_x = 0, of_y = 0, of_x_down = 0, of_y_down = 0, of_level = 0, of_level_down = 0, of_gain = 0, of_square = 0;
+            F of_x = 0, of_y = 0, of_level = 0;
             if (!bends && whole) {
-                const int west = (int)left, north = (int)above;
-                const float part_x = left - west, part_y = above - north;
+                const int west = (int)before, north = (int)above;
+                const float part_x = before - west, part_y = above - north;
                 F x0, x1, x2, x3, y0, y1, y2, y3;
                 CUBIC(x, part_x)
                 CUBIC(y, part_y)
@@ -556,7 +588,7 @@ __kernel void displacement_follow(
                     line2 = line3;
                 }
             } else {
-                const F begin_x = CONVERT(number, F) + left + moved[2] * across, begin_y = above + moved[4] * across;
+                const F begin_x = CONVERT(number, F) + before + moved[2] * across, begin_y = above + moved[4] * across;
                 for (int j = 0; j < WINDOW; ++j) {
                     F x = begin_x + moved[3] * PLACE(j), y = begin_y + j + moved[5] * PLACE(j);
                     const I inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1);
@@ -566,18 +598,17 @@ __kernel void displacement_follow(
                     ADD_SAMPLES(within, inside ? value : (F)NAN)
                 }
             }
-            sums[0] += sum_over_lanes(of_x);
-            sums[1] += sum_over_lanes(of_y);
-            sums[2] += sum_over_lanes(of_x * across);
-            sums[3] += sum_over_lanes(of_x_down);
-            sums[4] += sum_over_lanes(of_y * across);
-            sums[5] += sum_over_lanes(of_y_down);
-            sums[6] += sum_over_lanes(of_level);
-            sums[7] += sum_over_lanes(of_level * across);
-            sums[8] += sum_over_lanes(of_level_down);
-            sums[9] += sum_over_lanes(of_gain);
-            sums[10] += sum_over_lanes(of_square);
+            all_x += of_x;
+            all_y += of_y;
+            all_level += of_level;
+            x_across += of_x * across;
+            y_across += of_y * across;
+            level_across += of_level * across;
         }
+        const F all[] = {
+            all_x, all_y, x_across, of_x_down, y_across, of_y_down, all_level, level_across, of_level_down, of_gain, of_square};
+        float sums[PARAMETERS + 1];
+        for (int k = 0; k <= PARAMETERS; ++k) sums[k] = sum_over_lanes(all[k]);
         for (int k = 0; k < PARAMETERS; ++k) solved[k] = 0;
         MAP element = packed;
         for (int k = 0; k < PARAMETERS; ++k)
@@ -598,13 +629,14 @@ __kernel void displacement_follow(
         if (change < settled) break;
     }
     // The weights of a fraction and of one less it are the same, in reverse.
-    const F variance = 1 + interpolated_noise(MAGNITUDE(moved[0] - (int)moved[0]), MAGNITUDE(moved[1] - (int)moved[1]));
+    const F noise = interpolated_noise(MAGNITUDE(moved[0] - (int)moved[0]), MAGNITUDE(moved[1] - (int)moved[1]));
+    const float gain = 1 - solved[PARAMETERS - 1], samples = summary[3 * nodes + node];
     OUT out = answer + node;
     for (int k = 0; k < AFFINE; ++k) out[k * nodes] = moved[k];
-    out[AFFINE * nodes] = 1 - solved[PARAMETERS - 1];
-    out[(AFFINE + 1) * nodes] = squares;
-    out[(AFFINE + 2) * nodes] = LANE(variance, 0);
-    out[(AFFINE + 3) * nodes] = change;
+    out[AFFINE * nodes] = gain;
+    // The reference's noise is multiplied by the gain. By rounding, the squares may be below 0.
+    out[(AFFINE + 1) * nodes] = (squares < 0 ? 0 : squares) / ((LANE(noise, 0) + gain * gain) * (samples - PARAMETERS));
+    out[(AFFINE + 2) * nodes] = change;
 }
 
 // Within rounding.

@@ -15,6 +15,8 @@ derivatives of these, brightness and its two slopes, gain. `basis` returns the c
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,7 @@ POLE = np.sqrt(3.0) - 2
 TAPS = 8
 """Number of samples on either side that contribute to a coefficient."""
 MARGIN = TAPS + 4
-"""Mirrored samples around a padded frame; the outer ones have no coefficient."""
+"""Coefficients outside of a frame, of its mirror image."""
 PARAMETERS, AFFINE = 10, 6
 """Number of parameters of a window, and of those that describe its motion."""
 PACKED = PARAMETERS * (PARAMETERS + 1) // 2
@@ -45,24 +47,20 @@ CORRELATION = tuple(float(np.mean(np.cos(k * _ANGLES) / _ROOT**2)) for k in rang
 """Covariance of coefficients 0 to 3 samples apart, for samples with noise of variance 1."""
 
 
-def displacement_pad(frame: Array, padded: Array) -> None:
-    """Write a frame and its mirror image around it into a map that is larger by a margin on each side."""
-    padded[:] = np.pad(frame.astype(np.float64), MARGIN, mode="reflect")
+def displacement_spline(
+    top: int, bottom: int, left: int, right: int, frame: Array, coefficients: Array
+) -> None:
+    """Write the coefficients of a frame's spline in a part of a map with a margin on each side.
 
-
-def displacement_filter(step: int, source: Array, filtered: Array) -> None:
-    """Write the spline's coefficients along one axis: ``step`` is 1 along rows, else the length of a row.
-
-    Values near the start and end of the map, where samples are missing, are unchanged.
+    The frame is mirrored at its ends. ``top`` to ``bottom`` and ``left`` to ``right`` are rows and columns of
+    the coefficients, (rows + 2 MARGIN, columns + 2 MARGIN).
     """
-    flat, out, reach = source.reshape(-1).astype(np.float64), filtered.reshape(-1), TAPS * step
-    middle = flat[reach:-reach].copy()
-    for k in range(1, TAPS + 1):
-        neighbours = (
-            flat[reach - k * step : flat.size - reach - k * step] + flat[reach + k * step :][: middle.size]
-        )
-        middle += POLE**k * neighbours
-    out[reach:-reach] = np.sqrt(3.0) * middle
+    filtered = np.pad(frame.astype(np.float64), MARGIN + TAPS, mode="reflect")
+    for axis in (0, 1):
+        size = filtered.shape[axis] - 2 * TAPS
+        near = [filtered.take(range(k, k + size), axis) for k in range(2 * TAPS + 1)]
+        filtered = np.sqrt(3.0) * sum(POLE ** abs(k - TAPS) * part for k, part in enumerate(near))
+    coefficients[top:bottom, left:right] = filtered[top:bottom, left:right]
 
 
 def displacement_across(window: int, frame: Array, sums: Array, counts: Array) -> None:
@@ -329,15 +327,20 @@ def displacement_follow(
     first: int,
     window: int,
     halo: int,
+    top: int,
+    bottom: int,
+    left: int,
+    right: int,
     iterations: int,
     settled: float,
     coefficients: Array,
     planes: Array,
     inverse: Array,
+    summary: Array,
     field: Array,
     answer: Array,
 ) -> None:
-    """Write the displacement of each node after several iterations, in which no other node has a part.
+    """Write the displacement of some nodes after several iterations, in which no other node has a part.
 
     A window is displaced by its own affine field. Derivatives up to ``BENT`` are left to the least squares:
     all pixels are displaced alike.
@@ -346,21 +349,22 @@ def displacement_follow(
     ----------
     step, first, window, halo : distance between nodes, start of the first window, side of a window, and
         margin of the planes; pixels
+    top, bottom, left, right : rows and columns of the nodes
     iterations, settled : maximum number of iterations; a node ends after one that moves it by less than
         ``settled`` pixels
-    coefficients, planes, inverse : as of ``displacement_warp`` and ``displacement_solve``
+    coefficients, planes, inverse, summary : as of ``displacement_warp`` and ``displacement_normals``
     field : (6, rows, columns), initial values of the displacement, and of its derivatives as in the answer
-    answer : (10, nodes), as of ``displacement_solve``, but the variance is that of one difference; and the
-        last change of the displacement, pixels. The displacement changes by at most ``MAX_CHANGE`` in an
-        iteration, the derivatives are at most ``MAX_SLOPE``. NaN where the window leaves the frame
+    answer : (9, rows, columns), displacement and derivatives as of ``displacement_solve``; gain; variance of
+        a sample, from the squares; and the last change of the displacement, pixels. The displacement changes
+        by at most ``MAX_CHANGE`` in an iteration, the derivatives are at most ``MAX_SLOPE``. NaN where the
+        window leaves the frame
     """
     node_rows, node_columns = field.shape[1:]
     rows, columns = (length - 2 * halo for length in planes.shape[1:])
     matrices, start = unpack(inverse, node_rows, node_columns), first - halo + (window - 1) / 2
     place = np.arange(window) - (window - 1) / 2
-    down, right = (part.reshape(-1) for part in np.meshgrid(place, place, indexing="ij"))
-    for node in range(node_rows * node_columns):
-        row, column = divmod(node, node_columns)
+    below, across = (part.reshape(-1) for part in np.meshgrid(place, place, indexing="ij"))
+    for row, column in itertools.product(range(top, bottom), range(left, right)):
         here = windows(planes, row, step, first, window, node_columns)[:, column : column + 1]
         design = basis(here, window)[0]
         measured = np.isfinite(here[0, 0])
@@ -368,8 +372,14 @@ def displacement_follow(
         for _ in range(iterations):
             if np.abs(moved[2:]).max() <= BENT:
                 moved[2:] = 0
-            x = start + column * step + right + moved[0] + (moved[2] * right + moved[3] * down) * 2 / window
-            y = start + row * step + down + moved[1] + (moved[4] * right + moved[5] * down) * 2 / window
+            x = (
+                start
+                + column * step
+                + across
+                + moved[0]
+                + (moved[2] * across + moved[3] * below) * 2 / window
+            )
+            y = start + row * step + below + moved[1] + (moved[4] * across + moved[5] * below) * 2 / window
             differs = np.where(measured, here[0, 0] - _interpolated(coefficients, x, y, rows, columns), 0.0)
             sums = design.T @ differs
             solution = matrices[row, column] @ sums
@@ -381,8 +391,11 @@ def displacement_follow(
             moved[2:] = np.clip(moved[2:] + solution[2:AFFINE], -MAX_SLOPE, MAX_SLOPE)
             if change < settled:
                 break
-        gains = [noise_gain(cubic(part - np.floor(part))) for part in moved[:2]]
-        answer[:, node] = [*moved, 1 - solution[-1], squares, 1 + gains[0] * gains[1], change]
+        noise = math.prod(noise_gain(cubic(part - np.floor(part))) for part in moved[:2])
+        gain, samples = 1 - solution[-1], summary[3, row, column]
+        # The reference's noise is multiplied by the gain.
+        variance = np.maximum(squares, 0) / ((noise + gain**2) * (samples - PARAMETERS))
+        answer[:, row, column] = [*moved, gain, variance, change]
 
 
 def _interpolated(

@@ -184,22 +184,27 @@ PICTURE, STEP, WINDOW, GRID = (34, 45), 4, 11, (9, 12)
 FIRST, HALO, MARGIN = (STEP - WINDOW) // 2, 2 * WINDOW + 8, displacement.MARGIN
 GRID_SIZE = {"node_rows": GRID[0], "node_columns": GRID[1], "step": STEP}
 SIZES, ITEMS = GRID_SIZE | {"halo": HALO, "shape": PICTURE}, {"nodes": (1, 8, 16)}
-COEFFICIENTS = np.s_[displacement.TAPS : -displacement.TAPS, displacement.TAPS : -displacement.TAPS]
 TEXTURE, CLOSE = Speckle(3), {"rtol": 1e-4, "atol": 3e-6}
 
 
+def spline(frame):
+    """Return the coefficients of a frame."""
+    coefficients = np.zeros([size + 2 * MARGIN for size in frame.shape], np.float32)
+    displacement.displacement_spline(0, len(coefficients), 0, coefficients.shape[1], frame, coefficients)
+    return coefficients
+
+
 def textures(dtype="float32"):
-    """Return a moved frame, without and with its margin, and planes of a reference that lacks a pixel."""
+    """Return a moved frame, its coefficients, and planes of a reference that lacks a pixel."""
     first = TEXTURE.frame(PICTURE, 0, 0).astype(dtype).astype(float)
     frame = TEXTURE.frame(PICTURE, 2.3, -1.4, noise=1).astype(dtype)
-    padded = np.zeros([size + 2 * MARGIN for size in PICTURE], np.float32)
-    displacement.displacement_pad(frame, padded)
+    coefficients = spline(frame)
     down, right = np.gradient(first)
     lost = np.arange(first.size).reshape(first.shape) == 20 * PICTURE[1] + 20
     rest = [np.pad(np.where(lost, 0, part), HALO) for part in (right, down, first - first.mean())]
     planes = np.stack([np.pad(np.where(lost, np.nan, first), HALO, constant_values=np.nan), *rest])
     field = np.array([2.0, -1.0])[:, None, None] + np.random.default_rng(1).normal(0, 0.4, (2, *GRID))
-    return frame, padded, {"planes": planes, "field": field, "macros": displaced()}
+    return frame, coefficients, {"planes": planes, "field": field, "macros": displaced()}
 
 
 def displaced(nodes=16, frame="float"):
@@ -219,42 +224,35 @@ def node_items(device, values):
     return len(values["inverse"])
 
 
-def padded_rows(device, values):
-    rows, columns = values["padded"].shape
-    return rows * -(-columns // device.layout.tile)
-
-
-@case("displacement_pad", DTYPES | {"shape": (PICTURE, (6, 9))}, per=padded_rows)
-def _(dtype, shape):
-    frame = textures(dtype)[0][: shape[0], : shape[1]]
-    padded, macros = np.zeros([size + 2 * MARGIN for size in shape]), displaced(frame=C_TYPES[dtype])
-    return {"frame": frame, "padded": padded, "shape": shape, "macros": macros}
+def spline_rows(device, values):
+    return (values["bottom"] - values["top"]) * -(-(values["right"] - values["left"]) // device.layout.tile)
 
 
 @case(
-    "displacement_filter",
-    {"step": (1, PICTURE[1] + 2 * MARGIN)},
-    checks={"filtered": near(1e-4, 1e-3, inside=COEFFICIENTS)},
-)
-def _(step):
-    _, padded, values = textures()
-    arrays = {"source": padded, "filtered": 0 * padded, "step": step, "shape": padded.shape}
-    return arrays | {"macros": values["macros"]}
+    "displacement_spline", DTYPES | {"shape": (PICTURE, (6, 9), (9, 700)), "whole": (0, 1)}, per=spline_rows,
+    checks={"coefficients": near(1e-4, 1e-3)},
+)  # fmt: skip
+def _(dtype, shape, whole):
+    frame = np.resize(textures(dtype)[0], shape)
+    rows, columns = (size + 2 * MARGIN for size in shape)
+    part = (0, rows, 0, columns) if whole else (3, rows - 5, 2, columns - 3)
+    arrays = {"frame": frame, "coefficients": np.zeros((rows, columns)), "shape": shape}
+    return arrays | named("top bottom left right", *part) | {"macros": displaced(frame=C_TYPES[dtype])}
 
 
 @case("displacement_warp", {"nodes": (1, 16), "smooth": (0, 1)}, per="whole row", **CLOSE)
 def _(nodes, smooth):
-    _, padded, values = textures()
+    _, coefficients, values = textures()
     if smooth:  # neighbours of a pixel are displaced to neighbours
         values["field"][:] = np.linspace([2.2, -1.6], [2.6, -1.3], GRID[1]).T[:, np.newaxis]
     difference, start = np.zeros((2, *values["planes"].shape[1:])), FIRST + (WINDOW - 1) / 2
-    arrays = {"start": start, "coefficients": padded, "difference": difference}
+    arrays = {"start": start, "coefficients": coefficients, "difference": difference}
     return SIZES | values | arrays | {"macros": displaced(nodes)}
 
 
 @case("displacement_solve", ITEMS, per=node_items, **CLOSE)
 def _(nodes):
-    (_, padded, texture), count = textures(), math.prod(GRID)
+    (_, coefficients, texture), count = textures(), math.prod(GRID)
     inverse = packed(np.zeros((*GRID, displacement.PARAMETERS, displacement.PARAMETERS)), nodes)
     displacement.displacement_normals(
         STEP, FIRST + HALO, WINDOW, texture["planes"], inverse, np.zeros((4, *GRID))
@@ -262,26 +260,30 @@ def _(nodes):
     arrays = {"difference": np.zeros((2, *texture["planes"].shape[1:])), "answer": np.zeros((9, count))}
     start = FIRST + (WINDOW - 1) / 2
     maps = texture["planes"], texture["field"], arrays["difference"]
-    displacement.displacement_warp(STEP, start, HALO, padded, *maps)
+    displacement.displacement_warp(STEP, start, HALO, coefficients, *maps)
     values = {"first": FIRST + HALO, "window": WINDOW, "macros": displaced(nodes)}
     return SIZES | texture | arrays | values | {"inverse": inverse}
 
 
 @case(
     "displacement_follow", ITEMS | {"iterations": (1, 3), "bent": (0.02, 0.2)},
-    per=lambda *_: math.prod(GRID), **CLOSE,
+    per=lambda *_: (GRID[0] - 2) * GRID[1], **CLOSE,
 )  # fmt: skip
 def _(nodes, iterations, bent):
-    _, padded, texture = textures()
-    inverse = packed(np.zeros((*GRID, displacement.PARAMETERS, displacement.PARAMETERS)), nodes)
-    displacement.displacement_normals(
-        STEP, FIRST + HALO, WINDOW, texture["planes"], inverse, np.zeros((4, *GRID))
+    _, coefficients, texture = textures()
+    inverse, summary = (
+        packed(np.zeros((*GRID, displacement.PARAMETERS, displacement.PARAMETERS)), nodes),
+        np.zeros((4, *GRID)),
     )
+    displacement.displacement_normals(STEP, FIRST + HALO, WINDOW, texture["planes"], inverse, summary)
     texture["field"] = np.concatenate(
         [texture["field"], np.random.default_rng(2).normal(0, bent, (4, *GRID))]
     )
     values = {"first": FIRST + HALO, "window": WINDOW, "iterations": iterations, "settled": 0.0}
-    arrays = {"coefficients": padded, "inverse": inverse, "answer": np.zeros((10, math.prod(GRID)))}
+    values |= named("top bottom left right", 1, GRID[0] - 1, 0, GRID[1])
+    arrays = named(
+        "coefficients inverse summary answer", coefficients, inverse, summary, np.zeros((9, *GRID))
+    )
     return SIZES | texture | values | arrays | {"macros": displaced(nodes)}
 
 
@@ -308,11 +310,7 @@ def measured(dtype):
     frame[20:, 20:] = 7
     top = {} if dtype == "float32" else {"TOP": np.iinfo(dtype).max}
     frame[3, 5] = top.get("TOP", 90)
-    padded = np.zeros([size + 2 * MARGIN for size in PICTURE], np.float32)
-    displacement.displacement_pad(frame, padded)
-    half, coefficients = padded.copy(), padded.copy()
-    displacement.displacement_filter(1, padded, half)
-    displacement.displacement_filter(padded.shape[1], half, coefficients)
+    coefficients = spline(frame)
     wide = PICTURE[0] + 2 * HALO, PICTURE[1] + 2 * HALO
     values = named("frame coefficients sums counts", frame, coefficients, *np.full((2, *PICTURE), np.nan))
     values |= named("planes difference", np.full((4, *wide), np.nan), np.full((2, *wide), np.nan))

@@ -105,7 +105,7 @@ def test_changes_of_the_light_are_not_slip():
         lit = frame(0.2 * k, 0, seed=k) * (1 - 0.06 * k) + 6 * k + np.linspace(0, 2 * k, SHAPE[1])
         result = tracker.push(lit.round().astype(np.uint8))
     assert result.stick_ratio == 1
-    assert 0.5 < chi_square(result, 1.0, 0) < 1.6
+    assert 0.5 < chi_square(result, 1.0, 0) < 1.8  # brightness is not quite a plane
 
 
 def test_a_covered_window_has_no_value_and_does_not_slip():
@@ -139,6 +139,103 @@ def test_sigma_includes_the_errors_of_keys():
     assert result.process["keys"] == tracker.keys
 
 
+def disc(radius, shape=SHAPE):
+    y, x = np.indices(shape)
+    return (np.hypot(x - shape[1] / 2, y - shape[0] / 2) < radius).astype(np.uint8)
+
+
+def growing(frames, first=16, rate=2.0, step=0.35):
+    """Frames and contacts of an object that moves to the right while the contact grows and takes skin along.
+
+    Skin moves with the object from when it is touched.
+    """
+    for k in range(frames):
+        radius = first + rate * k
+
+        def right(x, y, k=k):
+            touched = np.maximum((np.hypot(x - SHAPE[1] / 2, y - SHAPE[0] / 2) - first) / rate, 0)
+            return step * np.maximum(k - touched, 0)
+
+        yield frame(right, lambda x, y: 0 * x, seed=k), disc(radius)
+
+
+def test_skin_that_a_growing_contact_takes_along_sticks():
+    tracker = SlipTracker(pixel_size=PIXEL)
+    for k, (picture, contact) in enumerate(growing(12)):
+        result = tracker.push(picture, contact)
+        assert result.stick_ratio > 0.95  # the displacement bends sharply at the border
+        assert result.shift_x == pytest.approx(0.35 * k * PIXEL, abs=5 * result.shift_x_sigma + 1e-9)
+    assert result.shift_x_sigma < 0.2 * PIXEL
+    assert (result.contact > 0).sum() > 2 * (disc(16) > 0).sum() / tracker._step**2
+
+
+def test_a_contact_of_a_few_windows_starts_when_it_is_larger():
+    tracker = SlipTracker(pixel_size=PIXEL)
+    for k, radius in enumerate((0, 5, 8, 30, 30)):
+        result = tracker.push(frame(0.3 * k, 0, seed=k), disc(radius))
+        if radius < 30:
+            assert math.isnan(result.shift_x)
+    assert result.shift_x == pytest.approx(0.3 * PIXEL, abs=5 * result.shift_x_sigma)
+    assert result.stick_ratio == 1
+
+
+def test_a_contact_that_is_found_again_starts_anew():
+    tracker = SlipTracker(CONTACT, PIXEL)
+
+    def slides(x, y):
+        return np.where(abs(y - 48) < 12, 0.0, 3.0) + 0 * x
+
+    for k in range(6):
+        result = tracker.push(frame(lambda x, y, k=k: k / 5 * slides(x, y), lambda x, y: 0 * x, seed=k))
+    assert (result.status == SLIPPED).any()
+    lost = tracker.push(frame(slides, lambda x, y: 0 * x, seed=6), 0 * CONTACT)
+    assert (lost.status == NO_CONTACT).all()
+    assert np.isnan(lost.stick_ratio)
+    assert math.isnan(lost.shift_x)
+    again = tracker.push(frame(slides, lambda x, y: 0 * x, seed=7), CONTACT)
+    assert again.stick_ratio == 1
+    assert again.shift_x == 0
+    assert (again.frame == -1).all()
+
+
+def test_skin_from_outside_the_contact_is_known_after_a_change_of_the_key():
+    contact = np.zeros(SHAPE, np.uint8)
+    contact[30:66, 6:36] = 1
+    tracker, frames = SlipTracker(contact, PIXEL, window_step=6), 44
+    for k in range(frames):
+        result = tracker.push(frame(-1.1 * k, 0, seed=k))
+    assert tracker.keys > 1
+    touched = result.contact > 0
+    found = touched & np.isfinite(result.displacement[..., 0])
+    assert found.sum() > 0.6 * touched.sum()  # others have left the picture since the last key
+    error = result.displacement - [-1.1 * (frames - 1) * PIXEL, 0]
+    assert 0.4 < np.mean((error / result.displacement_sigma)[found] ** 2) < 2
+
+
+def test_the_contact_is_that_of_the_picture():
+    contact = np.zeros(SHAPE, np.uint8)
+    contact[30:66, 6:36] = 1
+    tracker = SlipTracker(contact, PIXEL, window_step=6)
+    for k in range(24):
+        result = tracker.push(frame(-1.1 * k, 0, seed=k), contact)
+    touched = result.contact > 0
+    now = (result.x + np.zeros(touched.shape) + result.displacement[..., 0])[touched]
+    assert np.isfinite(now).mean() > 0.9
+    place = now[np.isfinite(now)] / PIXEL + (SHAPE[1] - 1) / 2
+    assert (place > 2).all()
+    assert (place < 40).all()
+
+
+def test_results_have_one_shape_for_all_contacts():
+    tracker = SlipTracker(CONTACT, PIXEL)
+    first = tracker.push(frame(seed=0))
+    moved = tracker.push(frame(0.2, 0, seed=1), np.roll(CONTACT, 20, axis=1))
+    for name in ("displacement", "status", "contact", "frame"):
+        assert first[name].shape == moved[name].shape
+    np.testing.assert_array_equal(first.x, moved.x)
+    assert (moved.contact > 0)[:, moved.x > 1.5].any()
+
+
 def pressed(movement):
     return Twin(
         object=Sphere(10.0),
@@ -158,7 +255,7 @@ def test_onset_of_slip_is_found_within_two_frames(motion):
     path = 1.5 * 0.5 * 0.5 * share  # until all slides
     twin = pressed(Horizontal(np.outer(path, [1, 0]), 0.5) if motion == "slide" else Twist(share, 0.5))
     touched = twin.sheet(0).contact
-    tracker, detected = SlipTracker(touched, 0.03), None
+    tracker, detected = SlipTracker(touched, 0.03, window_step=9), None
     for k, picture in enumerate(twin.read(np.empty(twin.shape, twin.dtype)).frames):
         result = tracker.push(picture)
         detected = np.full(result.status.shape, -1) if detected is None else detected
@@ -203,13 +300,13 @@ def test_results_are_kept_in_files(followed, tmp_path):
 def test_frames_need_no_new_memory_of_their_size():
     shape = (480, 640)
     tracker = SlipTracker(np.ones(shape, np.uint8), PIXEL)
-    pictures = [np.tile(frame(0.1 * k, 0, seed=k), (5, 6))[:480, :640].astype(np.float32) for k in range(4)]
-    for picture in pictures[:3]:
+    pictures = [np.tile(frame(0.1 * k, 0, seed=k), (5, 6))[:480, :640].astype(np.float32) for k in range(5)]
+    for picture in pictures[:4]:
         tracker.push(picture)
     tracemalloc.start()
     try:
-        tracker.push(pictures[3])
-        assert tracemalloc.get_traced_memory()[1] < pictures[3].nbytes / 3
+        tracker.push(pictures[4])
+        assert tracemalloc.get_traced_memory()[1] < pictures[4].nbytes / 8
     finally:
         tracemalloc.stop()
 
@@ -222,6 +319,7 @@ def test_bad_input_is_one_line():
         ({"contact": 0 * CONTACT}, "contact is nowhere"),
         ({"contact": CONTACT[:-1]}, "contact has shape"),
         ({"pixel_size": None}, "no pixel size"),
+        ({"contact": None, "pixel_size": None}, "pixel_size"),
     ]:
         with pytest.raises(io.InputError, match=message):
             SlipTracker(**({"contact": CONTACT, "pixel_size": PIXEL} | options)).push(frame())
