@@ -230,10 +230,7 @@ class SlipTracker(ThreadSafe):
         if tracker is None:
             check_frames(frame[np.newaxis], frame.dtype, frame.shape)
             self._shape, self._dtype = frame.shape, frame.dtype
-            self._contact = (
-                self._contact if contact is None else as_result(contact, "contact", quantity="contact")
-            )
-            touched = self._read_contact(self._contact, contact is None)
+            touched = self._read_contact(self._contact if contact is None else contact, contact is None)
             self._step = self._chosen_step or self._usual_step(touched)
             check_windows(self._shape, self._window, self._step)
             self._place_windows(self._take_key(frame))
@@ -297,8 +294,8 @@ class SlipTracker(ThreadSafe):
         self._before: Places = np.zeros(grid, complex)  # displacements until the key
         self._before_covariance = np.zeros((3, *grid))
         # Of windows that have touched: places on the object, as it was when the contact started; variances of
-        # the object's motion until then, along an axis and of the angle; whether the window was then in contact
-        # as a whole; and slip.
+        # its motion until then, along an axis and of the angle; whether the window was then in contact as a
+        # whole; and slip.
         self._fixed: Places = np.full(grid, complex(np.nan, np.nan))
         self._drift = np.zeros((2, *grid))
         self._settled, self._slipped, self._exceeded = np.zeros((3, *grid), bool)
@@ -335,7 +332,7 @@ class SlipTracker(ThreadSafe):
         self._part = rows, columns
 
     def _share_in_contact(self, moved: Doubles) -> Doubles:
-        """Return the share of each window that is in contact, when displaced by pixels to the right and down."""
+        """Return the share of each window in contact, if displaced by pixels to the right and down."""
         right, down = np.rint(moved).astype(int)
         top, left = self._corners[0] + down, self._corners[1] + right
         (top, bottom), (left, right) = (
@@ -455,7 +452,7 @@ class SlipTracker(ThreadSafe):
         if self._since_key:
             seen |= found
         common, matched = np.count_nonzero(seen & touched), np.count_nonzero(found & touched)
-        return _MIN_MATCHED * common < matched < _MIN_COMMON * common
+        return bool(_MIN_MATCHED * common < matched < _MIN_COMMON * common)
 
     def _change_key(self, frame: NDArray[Any]) -> None:
         """Let the newest frame be the key: its windows show skin that was between those of the last key.
@@ -476,14 +473,14 @@ class SlipTracker(ThreadSafe):
         for _ in range(_PASSES):
             place = grid - _between(steps, place) / self._step
         last = np.array(shape)[:, None, None] - 1
-        inside = ((place >= 0) & (place <= last)).all(axis=0)
+        inside = np.all((place >= 0) & (place <= last), axis=0)
         # Variance of a mean of adjacent windows, whose errors are correlated as far as they overlap.
         part, ratio = place - np.floor(place), self._step / self._window
         squares = np.prod(1 - 2 * min(ratio, 1.0) * part * (1 - part), axis=0)
         overlap = part * np.maximum(1 - (1 - part) * ratio, 0) + (1 - part) * np.maximum(1 - part * ratio, 0)
         weight = np.maximum(squares - _CANCELS * np.prod(overlap, axis=0), 0.0)
         bending = bending * (ratio**4 * np.where(self._partial, 1.0, _KINK))
-        inside &= (_between(bending - self._covariance[:2], place) < 0).all(axis=0)
+        inside = inside & np.all(_between(bending - self._covariance[:2], place) < 0, axis=0)
         covariance = self._before_covariance.copy()
         covariance[:2] += bending
         covariance = _between(covariance, place) + weight * self._covariance

@@ -138,13 +138,11 @@ class Tracker:
 
     def spread(self, part: Part) -> None:
         """Give nodes outside of a part, which were not followed, the fields of the nearest ones in it."""
-        nearest = np.ix_(
-            *(
-                np.clip(np.arange(size), inner.start, inner.stop - 1)
-                for size, inner in zip(self.finest.grid, part, strict=True)
-            )
+        rows, columns = (
+            np.clip(np.arange(size), inner.start, inner.stop - 1)
+            for size, inner in zip(self.finest.grid, part, strict=True)
         )
-        self._fields = [field[:, *nearest] for field in self._fields]
+        self._fields = [field[:, rows[:, None], columns] for field in self._fields]
 
     def to_pixels(self, values: Doubles, on_device: bool = False) -> AnyArray:
         """Return values of the nodes, (rows, columns) or ([T,] rows, columns, n), at all pixels.
