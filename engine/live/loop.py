@@ -55,9 +55,9 @@ class Loop:
         frame.
     trackers : mapping of str to trackers or callables, optional
         A `PoseTracker` or a `ForceTracker`, which gets the maps of each update and the body's travel, a
-        `SlipTracker`, which gets its frame, or a function of the `Update`, which has the answers of the
-        trackers before it. Answers are in ``Update.tracked``. The mapping may be changed while the loop runs,
-        as for a new tracker of a new contact.
+        `SlipTracker` or a `TurnTracker`, which gets its frame, or a function of the `Update`, which has the
+        answers of the trackers before it. Answers are in ``Update.tracked``. The mapping may be changed
+        while the loop runs, as for a new tracker of a new contact.
     events : mapping of str to Limit, optional
         Conditions on updates; what starts or ends is in ``Update.events``.
     on_update : callable, optional
@@ -97,7 +97,7 @@ class Loop:
         if not rate_limit > 0:
             raise InputError(f"updates {rate_limit}: a number above 0 is needed")
         self._source, self._run = source, run
-        self._trackers = None if trackers is None else Trackers(trackers)
+        self._trackers = None if trackers is None else Trackers(trackers, source.motion)
         self._events = Events(events or {})
         self._latency, self._period = latency, 1 / rate_limit
         self._on_update, self._stop, self._mark, self._guard = on_update, stop, mark, guard

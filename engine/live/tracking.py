@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.base.operation import Operation, Plan
 from mirrorskin.engine.live.status import Event, Update
-from mirrorskin.io import InputError, Result, Source
+from mirrorskin.io import InputError, Motion, Result, Source
 
 Tracker = Any
-"""An object with ``push(maps)``, or ``push(frame)`` if it ``takes_frames``, or a function of the update."""
+"""An object with ``push(maps)``, or of the parts of an update that it ``takes``, or a function of it."""
 
 
 class Frames(Operation):
@@ -66,10 +66,10 @@ class Frames(Operation):
 class Trackers:
     """The trackers of a loop, each with its name; the mapping may be changed between updates."""
 
-    def __init__(self, trackers: Mapping[str, Tracker]) -> None:
+    def __init__(self, trackers: Mapping[str, Tracker], motion: Motion) -> None:
         self._trackers = trackers
         for name, tracker in trackers.items():
-            _check(name, tracker)
+            _check(name, tracker, motion)
 
     def precompile(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Compile what the trackers need for frames of a shape and type."""
@@ -94,18 +94,23 @@ class Trackers:
                 if not hasattr(tracker, "push"):
                     tracked[name] = tracker(so_far)
                 else:
-                    takes_frames = getattr(tracker, "takes_frames", False)
-                    tracked[name] = tracker.push(update.picture if takes_frames else maps)
+                    taken = getattr(tracker, "takes", ("maps",))
+                    tracked[name] = tracker.push(*(getattr(so_far, each) for each in taken))
             except (InputError, NotConverged) as error:
                 tracked[name], lost[name] = None, str(error)
         return tracked, lost
 
 
-def _check(name: str, tracker: Tracker) -> None:
+def _check(name: str, tracker: Tracker, motion: Motion) -> None:
     if not hasattr(tracker, "push") and not callable(tracker):
         raise InputError(
             f"trackers: {name} is a {type(tracker).__name__}. Give a tracker, such as a PoseTracker, or a"
             " function of the update"
+        )
+    motions: tuple[Motion, ...] = getattr(tracker, "motions", ())
+    if motions and motion not in motions:
+        raise InputError(
+            f"trackers: {name} follows {' and '.join(motions)} motions, but the frames are of a {motion} one"
         )
 
 

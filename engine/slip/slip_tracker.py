@@ -180,7 +180,7 @@ class SlipTracker(ThreadSafe):
         self._texture: Texture
         self._covariance: Doubles  # xx, yy and xy of a displacement, by noise, mm^2
 
-    takes_frames = True
+    takes = ("picture",)
 
     def precompile(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Compile what frames of a shape and type need, with another tracker, so that none is delayed."""

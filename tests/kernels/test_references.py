@@ -15,7 +15,7 @@ from mirrorskin.kernels.device import C_TYPES
 from mirrorskin.kernels.integration.breaks import DOWN, RIGHT
 from mirrorskin.kernels.optical import focus, lambert
 from mirrorskin.kernels.rotation import correlation, registration
-from mirrorskin.kernels.skin import displacement, pose, pose_maps
+from mirrorskin.kernels.skin import displacement, pose, pose_maps, turn_pose
 from mirrorskin.kernels.twin.skin import FLAKES
 
 DTYPES, WHOLE = {"dtype": ("uint8", "uint16", "float32")}, {"dtype": ("uint8", "uint16")}
@@ -713,6 +713,12 @@ def summed(actual, expected, values):
     np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-4)
 
 
+def zeniths_summed(actual, expected, values):
+    scale = np.abs(expected).max(axis=0) + 1e-6 * np.abs(expected).max()
+    assert expected[:, pose.PARTS[5]].any()
+    np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-4)
+
+
 POSES = {"size": (((24, 33), 1), ((3, 2), 1), ((40, 30), 2)), "least": (1.0, 0.002), "beside": (0, 1)}
 LIMITS = (1e30, 1000.0)  # of the chi square of a pixel
 
@@ -735,6 +741,30 @@ def _(size, least, beside, limit):
         "first second poses sums", waves(shape, 0.0), waves(shape, 0.1, seed=1), np.array(poses), sums
     )
     sizes = {"count": 3, "other_rows": shape[0], "other_columns": shape[1], "step": step, "shape": shape}
+    return maps | sizes | {"macros": {"BESIDE": beside}}
+
+
+@case(
+    "turn_pose_equations",
+    {"size": (((24, 33), 1), ((7, 6), 1), ((40, 30), 2)), "beside": (0, 1), "limit": LIMITS},
+    per=lambda device, values: len(values["sums"]),
+    checks={"sums": zeniths_summed},
+)
+def _(size, beside, limit):
+    shape, step = size
+    grid = -(shape[1] - 1) / 2 * 0.05, (shape[0] - 1) / 2 * 0.06, 0.05, 0.06
+    matrix, axis = Rotation.from_rotvec((0.02, -0.05, 0.3)).as_matrix().ravel(), (0.024, -0.032, 0.9984**0.5)
+    turn, rng = waves(shape, 0.0), np.random.default_rng(1)
+    frame = np.hypot(turn[..., 0], turn[..., 1]) + rng.normal(0, 0.02, shape)
+    numbers = [*matrix, 0.03, -0.04, 0.01, 0.1, -0.2, 0.05, *grid, *grid, 0.002, *axis, 16, limit, 1]
+    sums = np.zeros(
+        (
+            math.prod(-(-size // (pose.BLOCK * step)) for size in shape),
+            turn_pose.LIGHT[-1 if beside else 3],
+        )
+    )
+    maps = named("turn zeniths pose sums", turn, frame, np.array(numbers), sums)
+    sizes = {"other_rows": shape[0], "other_columns": shape[1], "step": step, "shape": shape, "base": 0.1}
     return maps | sizes | {"macros": {"BESIDE": beside}}
 
 

@@ -20,7 +20,7 @@ SHAPE, PIXEL = (80, 96), 0.05
 class Slow:
     """A tracker of frames that takes a time of its own."""
 
-    takes_frames = True
+    takes = ("picture",)
 
     def __init__(self, clock=None, seconds=0.0):
         self.clock, self.seconds = clock, seconds
