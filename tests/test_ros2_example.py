@@ -1,13 +1,15 @@
-"""The node of examples/ros2 on a rig of fakes: its messages, read by another program from a bag.
+"""The nodes of examples/ros2 on a rig of fakes: their messages, read by another program from a bag.
 
 ROS 2's own Python packages are not on the package index. `rosbags` has the definitions of their messages.
 """
 
+import math
 import runpy
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from rig_fakes import fake_rig, spreading
@@ -18,8 +20,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from mirrorskin import hw
 
-NODE = Path(__file__).parents[1] / "examples" / "ros2" / "press_node.py"
+NODES = Path(__file__).parents[1] / "examples" / "ros2"
 SHAPE = (24, 32)
+NOW = 1000.0
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -62,10 +65,26 @@ def _typed(value):
     return value.typed() if hasattr(value, "typed") else value
 
 
+class Moment(SimpleNamespace):
+    """A time of a node's clock, seconds."""
+
+    def __init__(self, seconds):
+        super().__init__(seconds=seconds)
+
+    def __sub__(self, seconds):
+        return Moment(self.seconds - seconds)
+
+    def to_msg(self):
+        whole = math.floor(self.seconds)
+        nanoseconds = round(1e9 * (self.seconds - whole))
+        return message_class("builtin_interfaces/msg/Time")(sec=whole, nanosec=nanoseconds)
+
+
 @pytest.fixture
 def bag(monkeypatch, tmp_path):
     """The bag that a node's messages are written to, and what it did; ROS 2's modules are made up."""
     kinds = {name: f"sensor_msgs/msg/{name}" for name in ("Image", "PointCloud2", "PointField")}
+    kinds |= {name: f"geometry_msgs/msg/{name}" for name in ("PoseWithCovarianceStamped", "WrenchStamped")}
     classes = {name: message_class(kind) for name, kind in kinds.items()}
     times = iter(range(10**6))
     path, ended = tmp_path / "bag", []
@@ -74,27 +93,33 @@ def bag(monkeypatch, tmp_path):
         def __init__(self, name):
             self.writer = Writer(path, version=9)
             self.writer.open()
+            self.published = []  # the writer takes them in its own thread only
 
         def create_publisher(self, kind, topic, depth):
             name = next(kinds[name] for name, message_class in classes.items() if message_class is kind)
             connection = self.writer.add_connection(f"/{topic}", name, typestore=STORE)
 
             def publish(message):
-                self.writer.write(connection, next(times), STORE.serialize_cdr(message.typed(), name))
+                data = STORE.serialize_cdr(message.typed(), name)
+                self.published.append((connection, next(times), data))
 
             return SimpleNamespace(publish=publish)
 
         def get_clock(self):
-            stamp = message_class("builtin_interfaces/msg/Time")
-            return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=stamp))
+            return SimpleNamespace(now=lambda: Moment(NOW))
 
         def destroy_node(self):
+            for message in self.published:
+                self.writer.write(*message)
             self.writer.close()
             ended.append("node")
 
     for name, names in (
         ("rclpy", {"init": lambda: None, "shutdown": lambda: ended.append("rclpy")}),
         ("rclpy.node", {"Node": Node}),
+        ("rclpy.duration", {"Duration": lambda seconds: seconds}),
+        ("geometry_msgs", {}),
+        ("geometry_msgs.msg", classes),
         ("sensor_msgs", {}),
         ("sensor_msgs.msg", classes),
     ):
@@ -110,14 +135,19 @@ def published(bag, clock, monkeypatch):
     rig = fake_rig(spreading(SHAPE), clock, rate=60.0, stated={"pixel_size": (0.05, 0.05), "rate": 60.0})
     monkeypatch.setattr(hw, "load_rig", lambda _path: rig.settings)
     monkeypatch.setattr(hw, "open_rig", lambda settings: rig)
-    runpy.run_path(str(NODE))["main"]("rig.toml", 1.0)
+    runpy.run_path(str(NODES / "press_node.py"))["main"]("rig.toml", 1.0)
     assert bag.ended == ["node", "rclpy"]
     assert rig.stage.closed
+    return received(bag)
+
+
+def received(bag):
+    """Return the messages in a bag by topic."""
+    messages = {}
     with AnyReader([bag.path]) as reader:
-        received = {}
         for connection, _, data in reader.messages():
-            received.setdefault(connection.topic, []).append(reader.deserialize(data, connection.msgtype))
-    return received
+            messages.setdefault(connection.topic, []).append(reader.deserialize(data, connection.msgtype))
+    return messages
 
 
 def points_of(cloud):
@@ -149,3 +179,68 @@ def test_the_surface_has_standard_errors_at_the_end(published):
     assert len(points) > 20
     assert np.all(points[:, 3] > 0)
     np.testing.assert_allclose(np.abs(points[:, :2]).max(axis=0), [0.775e-3, 0.575e-3], atol=0.3e-3)
+
+
+RADIUS, DEPTH, MODULUS, PIXEL = 3.0, 0.2, 0.1, 0.05  # of a ball, mm; MPa; mm
+
+
+def ball(shape=(48, 64)):
+    """Return a picture of a ball, which is light where it touches a speckled sheet."""
+    x, y = (PIXEL * (np.arange(size) - (size - 1) / 2) for size in shape[::-1])
+    depth = (x**2 + (y**2)[:, np.newaxis]) / (2 * RADIUS)
+    speckle = cv2.GaussianBlur(np.random.default_rng(1).normal(0, 1, shape), (0, 0), 1.5)
+    light = 210 + 30 * speckle / np.abs(speckle).max()
+    return lambda place: np.where(place.travel > depth, light, 5).astype(np.uint8)
+
+
+@pytest.fixture
+def tracked(bag, clock, monkeypatch):
+    """Run the node that tracks; return what another program reads in the bag, by topic."""
+    rig = fake_rig(ball(), clock, rate=60.0, stated={"pixel_size": (PIXEL, PIXEL), "rate": 60.0})
+    monkeypatch.setattr(hw, "load_rig", lambda _path: rig.settings)
+    monkeypatch.setattr(hw, "open_rig", lambda settings: rig)
+    runpy.run_path(str(NODES / "track_node.py"))["main"]("rig.toml", DEPTH, MODULUS, 0.2)
+    assert bag.ended == ["node", "rclpy"]
+    assert rig.stage.closed
+    return received(bag)
+
+
+def seconds_of(message):
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+def test_force_and_torque_are_published(tracked):
+    last = tracked["/force"][-1].wrench
+    assert last.force.z == pytest.approx(16 / 9 * MODULUS * math.sqrt(RADIUS) * DEPTH**1.5, rel=0.1)
+    assert math.isnan(last.force.x)  # unknown without a displacement
+    assert tracked["/force"][0].wrench.force.z < last.force.z
+
+
+def test_the_pose_is_published_in_metres_with_its_covariance(tracked):
+    pose = tracked["/pose"][-1].pose
+    place, turn = pose.pose.position, pose.pose.orientation
+    covariance = np.reshape(pose.covariance, (6, 6))
+    sigma = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(covariance, covariance.T)
+    assert sigma[2] < 1e-5
+    assert sigma[5] > 100  # a ball's spin is not determined
+    assert abs(place.z) < 5e-5
+    assert turn.w == pytest.approx(1, abs=1e-3)
+
+
+def test_slip_is_published_for_each_window(tracked):
+    cloud = tracked["/slip"][-1]
+    assert [field.name for field in cloud.fields][3:5] == ["displacement_x", "displacement_y"]
+    points = np.frombuffer(cloud.data, "<f4").reshape(cloud.width, 8)
+    sticks = points[points[:, 7] == 2]
+    assert len(sticks) > 3
+    assert np.abs(sticks[:, 3:5]).max() < 1e-6
+    assert np.abs(points[:, :2]).max() < 1.2e-3
+
+
+def test_stamps_are_the_times_of_the_exposures(tracked):
+    for topic in ("/force", "/pose"):
+        stamps = np.array([seconds_of(message) for message in tracked[topic]])
+        assert np.all(stamps <= NOW)
+        assert np.all(stamps > NOW - 0.2)
+    assert {message.header.frame_id for message in tracked["/slip"]} == {"sensor"}

@@ -55,9 +55,10 @@ class Loop:
         frame.
     trackers : mapping of str to trackers or callables, optional
         A `PoseTracker` or a `ForceTracker`, which gets the maps of each update and the body's travel, a
-        `SlipTracker` or a `TurnTracker`, which gets its frame, or a function of the `Update`, which has the
-        answers of the trackers before it. Answers are in ``Update.tracked``. The mapping may be changed
-        while the loop runs, as for a new tracker of a new contact.
+        `SlipTracker`, which gets its frame and a map of contact, a `TurnTracker`, which gets its frame and
+        phase, or a function of the `Update`, which has the answers of the trackers before it. Answers are in
+        ``Update.tracked``. The mapping may be changed while the loop runs, as for a new tracker of a new
+        contact.
     events : mapping of str to Limit, optional
         Conditions on updates; what starts or ends is in ``Update.events``.
     on_update : callable, optional

@@ -91,11 +91,13 @@ class Trackers:
         so_far = replace(update, maps=maps, tracked=tracked, lost=lost)
         for name, tracker in tuple(self._trackers.items()):
             try:
+                taken = getattr(tracker, "takes", ("maps",))
                 if not hasattr(tracker, "push"):
                     tracked[name] = tracker(so_far)
+                elif "maps" in taken and not maps:
+                    tracked[name], lost[name] = None, "the frames do not determine maps yet"
                 else:
-                    taken = getattr(tracker, "takes", ("maps",))
-                    tracked[name] = tracker.push(*(getattr(so_far, each) for each in taken))
+                    tracked[name] = tracker.push(*(getattr(so_far, part) for part in taken))
             except (InputError, NotConverged) as error:
                 tracked[name], lost[name] = None, str(error)
         return tracked, lost

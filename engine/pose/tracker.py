@@ -47,7 +47,9 @@ class PoseTracker(ThreadSafe):
     extrapolated from the last two results, and refined on every fourth row and column, then on all pixels,
     without outliers. Maps are averaged to 100 to 200 pixels along their shorter side, which hardly costs
     accuracy. Directions that the key does not determine are identified with the first result after it, and
-    are kept fixed. A step too large for this is searched as `estimate_pose` does, and noted.
+    are kept fixed. If the next result shares too few pixels with the first one but has more, as when contact
+    grows, it takes the place of the first. A step too large for this is searched as `estimate_pose` does, and
+    noted.
 
     Parameters
     ----------
@@ -141,7 +143,13 @@ class PoseTracker(ThreadSafe):
     def _first_after_key(self, key: _Key, result: Result, expected: Motion) -> Pose:
         """Return the pose of the first result after a key, and determine the undetermined directions."""
         fit = PairFit(self._map(result), key.map, self._device)
-        motion, now, free = fit.solve(expected, near=True)
+        try:
+            motion, now, free = fit.solve(expected, near=True)
+        except InputError:  # poses start from the first result that shares enough, as when contact grows
+            if self.keys == 1 and fit.first.extent.compared > key.map.extent.compared:
+                self._key, self.keys = None, 0
+                self._take_key(result, IDENTITY)
+            raise
         key.start(fit, now, free)
         return self._moved_to(motion, key.pose_of(_Found(fit, motion, now)))
 
@@ -187,7 +195,8 @@ class PoseTracker(ThreadSafe):
         return replace(pose, notes=tuple(dict.fromkeys((*pose.notes, *self._notes))))
 
     def _map(self, result: Result, curved: bool = True) -> PoseMap:
-        size = max(1, min(shape_of(result, result.name_of("height") or "height")) // _SIDE)
+        name = result.name_of("height")
+        size = 1 if name is None else max(1, min(shape_of(result, name)) // _SIDE)
         map_ = PoseMap.of(result, self._pixel_size, self._device, curved, size=size)
         if curved:
             _ = map_.extent  # InputError for one without contents

@@ -180,13 +180,13 @@ class SlipTracker(ThreadSafe):
         self._texture: Texture
         self._covariance: Doubles  # xx, yy and xy of a displacement, by noise, mm^2
 
-    takes = ("picture",)
+    takes = "picture", "contact"  # of the updates of a loop
 
     def precompile(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Compile what frames of a shape and type need, with another tracker, so that none is delayed."""
         noise = 1.0 if self._noise is None else self._noise
         options: dict[str, Any] = {"window_step": self._chosen_step, "noise": noise, "device": self._device}
-        trial = SlipTracker(self._contact, self._size, window_size=self._window, **options)
+        trial = SlipTracker(np.ones(shape), self._size, window_size=self._window, **options)
         texture = np.random.default_rng(0).integers(0, 256, shape).astype(dtype)
         with suppress(InputError):  # refused when the first frame is
             for shift in range(3):

@@ -225,6 +225,60 @@ def test_a_pose_is_lost_without_contact_and_found_again():
     assert np.all(np.abs(found.translation) < 5e-3)
 
 
+def test_a_pose_is_found_when_contact_grows_from_a_few_pixels():
+    tracker = engine.pose.PoseTracker(PIXEL)
+    tracker.push(ball(0.001))
+    with pytest.raises(io.InputError, match="too few pixels"):
+        tracker.push(ball(0.3))
+    assert np.all(np.abs(tracker.push(ball(0.3)).translation) < 5e-3)
+    assert tracker.keys == 1
+
+
+def test_trackers_of_maps_have_no_answer_before_there_are_maps():
+    press = engine.Press(dark=0, bright=255)
+    with stream({"pose": engine.pose.PoseTracker()}, press, SHAPE) as pushed:
+        pushed.push(np.zeros(SHAPE, np.uint8), travel=0.0)
+    assert pushed.latest().lost == {"pose": "the frames do not determine maps yet"}
+
+
+def test_slip_starts_anew_when_contact_is_found_again():
+    texture = np.random.default_rng(1).normal(0, 1, (60, 80))
+    texture = cv2.GaussianBlur(texture, (0, 0), 1.5)
+    texture = (120 + 60 * texture / np.abs(texture).max()).astype(np.float32)
+    touched = np.zeros((60, 80), np.uint8)
+    touched[6:54, 8:72] = 1
+
+    class Touch(engine.Operation):
+        motions = ("vertical",)
+        updates_per_second = math.inf
+        contact = io.Map("contact", dtype="uint8")
+
+        def push(self, frames, *, travel):
+            self.place = float(travel[-1])
+
+        def result(self):
+            return {"contact": touched * (self.place > 0)}
+
+    updates = []
+    with Stream(
+        Touch(),
+        (60, 80),
+        np.float32,
+        latency=math.inf,
+        trackers={"slip": engine.slip.SlipTracker(pixel_size=0.1, noise=0.1)},
+        events={"contact": Limit.contact()},
+        on_update=lambda update, status: updates.append(update),
+    ) as pushed:
+        for travel, moved in ((1.0, 0), (1.0, 1), (0.0, 0), (0.0, 0), (1.0, 0), (1.0, 1)):
+            pushed.push(np.roll(texture, moved, axis=1), travel=travel)
+    shifts = [update.tracked["slip"].shift_x for update in updates]
+    assert shifts[1] == pytest.approx(0.1, abs=0.002)
+    assert math.isnan(shifts[3])
+    assert shifts[5] == pytest.approx(0.1, abs=0.002)
+    starts = [update.time for update in updates if any(event.started for event in update.events)]
+    assert len(starts) == 2
+
+
 def test_events_of_contact_and_of_a_force():
     events = {"contact": Limit.contact(), "strong": Limit.force(0.1, until=0.08)}
     depths = [0.0, 0.1, 0.4, 0.0, 0.4]
