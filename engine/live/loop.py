@@ -162,11 +162,10 @@ class Loop:
         self._times.extend(time.tolist())
         with self._guard():
             self._monitor.took(now, count, int(np.count_nonzero(used)), block.dropped)
-            edges = np.flatnonzero(np.diff(used, prepend=False, append=False))
-            part = block
-            for start, stop in edges.reshape(-1, 2).tolist():  # contiguous frames
-                self._run.push_block(part, slice(start, stop))
-                part = replace(block, dropped=0)  # lost frames are counted once
+            if used.all():
+                self._run.push_block(block)
+            else:
+                self._push_some(block, used)
             if self._mark is not None:
                 self._mark(block.index, used)
         if used.any():
@@ -178,6 +177,13 @@ class Loop:
             self._newest = at, float(np.hypot(*place) if np.ndim(place) else place), block.frames[last]
             self._taken, self._pending = float(time[last]), True
             self._monitor.time(PUSHED, self._source.now() - now)
+
+    def _push_some(self, block: Block, used: NDArray[np.bool_]) -> None:
+        """Push the frames of a block that are used."""
+        edges, part = np.flatnonzero(np.diff(used, prepend=False, append=False)), block
+        for start, stop in edges.reshape(-1, 2).tolist():  # contiguous frames
+            self._run.push_block(part, slice(start, stop))
+            part = replace(block, dropped=0)  # lost frames are counted once
 
     def _update(self) -> None:
         if not self._pending or self._newest is None:

@@ -85,10 +85,13 @@ class Strokes(PressOperation):
         for start, stop in zip([0, *turns], [*turns, len(frames)], strict=True):
             if start in turns and stop > start:
                 self._turn(frames[start - 1] if start > 0 else self._last)
+                self._last = None  # kernels may still read it
             if stop > start:
                 self._searches[self._direction].push(frames[start:stop], values[start:stop])
                 self._travel += values[start:stop].tolist()
-        self._last = frames[-1].copy()
+        if self._last is None:
+            self._last = np.empty_like(frames[-1])
+        self._last[...] = frames[-1]
 
     def result(self) -> Result:
         """Return the maps of all strokes so far; the last one is assumed to end here."""
@@ -112,7 +115,7 @@ class Strokes(PressOperation):
         if self.count < self.least_frames:
             return Result()
         onset = self._with_open(1).event_maps()
-        contact = np.isin(onset.status, (PressStatus.ONSET, PressStatus.LIGHT_AT_START))
+        contact = (onset.status == PressStatus.ONSET) | (onset.status == PressStatus.LIGHT_AT_START)
         contact &= ~(onset.height < np.float32(-self._travel[-1]))  # of a lifted body, what is still touched
         return Result(height=onset.height, height_sigma=onset.sigma, contact=contact.astype(np.uint8))
 

@@ -36,7 +36,8 @@ typedef ushort Count;
 #else
 typedef uint Count;
 #endif
-#define CHUNK (TILE < 256 ? TILE : 256)  // pixels examined together when something happens
+#define CHUNK (TILE < 256 ? TILE : 256)  // most pixels examined together when something happens
+#define SINGLE (TILE < 16 ? TILE : 16)  // the same for a frame on its own, in which less happens
 #define MOST (BITS == 8 ? 255 : 65535)
 #define NONE ((Count)~0u)
 #define SPAN 64  // frames that are counted before anything else is examined
@@ -262,6 +263,7 @@ __kernel void onset_scan(
     const Count whole = LESSER(needed, MOST);
     // counted frames of a run: beyond this it cannot be confirmed within SPAN
     const Count unconfirmed = LESSER(hold, 2 * SPAN);
+    const int chunk = count > 1 ? CHUNK : SINGLE;
 #if TILE > 1
     Count clock[SPAN + 1];
     for (int t = 0; t <= SPAN; ++t) clock[t] = t;
@@ -326,7 +328,7 @@ __kernel void onset_scan(
         }
 
         for (int low = 0, high; low < width; low = high) {
-            high = min(low + CHUNK, width);
+            high = LESSER(low + chunk, width);
             Count changed = needed > MOST, before[CHUNK];
             for (int p = low; p < high; ++p)
                 changed |= ((remain[p] > 0) & ((held[p] != length + unconfirmed) | (remain[p] != whole))) | bad[p];
@@ -458,7 +460,7 @@ __kernel void onset_scan(
     // If the last sample is near the level, the next block cannot determine how long it has been.
     __global const FRAME *restrict final = frames + (size_t)(count - 1) * pixels;
     for (int low = 0, high; low < width; low = high) {
-        high = min(low + CHUNK, width);
+        high = LESSER(low + chunk, width);
         int unsure = 0;
         for (int p = low; p < high; ++p) unsure |= (remain[p] == whole) & !(SEE(final[p]) < NEAR_LIMIT(p));
         for (int p = low; p < high && unsure; ++p)

@@ -129,10 +129,18 @@ __kernel void normals_exact(ARGUMENTS)
         Summary summary[PART];
         Direction begin[PART], nearer[PART];
         Sums sums[PART];
+        int some = 0;  // whether any pixel may have a result
         for (int i = 0; i < PART; ++i) {
             const int next = from + i * LANES, p = next < end ? next : from;
             of[i] = SAMPLES(SCALE(2), SCALE(3));
             summary[i] = survey(of[i], noise);
+            some |= any_of(summary[i].usable >= LEAST);
+        }
+        if (bare && !some) {
+            const F none = 0.0f;
+            for (int p = from; p < LESSER(from + PART * LANES, end); p += LANES)
+                keep_answer(maps, p, turns, (I)0, none, none, none, none, (I)0);
+            continue;
         }
         for (int i = 0; i < PART; ++i) begin[i] = begin_at(of[i], summary[i].usable, cos_tilt, sin_tilt);
         for (int i = 0; i < PART; ++i) sums[i] = look(begin[i], of[i], summary[i].wave, weights, cos_tilt, sin_tilt, 0);

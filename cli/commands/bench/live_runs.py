@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mirrorskin.cli.commands.bench import scenes
-from mirrorskin.cli.commands.bench.paced import Pace, Paced
+from mirrorskin.cli.commands.bench.paced import Pace, Paced, shared_memory
 from mirrorskin.cli.commands.bench.records import PERCENTILES, LiveRow
 from mirrorskin.engine import Press, Rotation, Run
 from mirrorskin.engine.base.running import plan_of
@@ -54,7 +54,7 @@ class Looped:
             if self._turns
             else Press(device=device)
         )
-        self._frames = np.empty(self._twin.shape, self._twin.dtype)
+        self._frames = shared_memory(self._twin.shape, self._twin.dtype)
         self._twin.read(self._frames)
         self.count: int = len(self._frames)
 

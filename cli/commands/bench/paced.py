@@ -94,10 +94,12 @@ class Paced(Closing):
         slot = first % slots
         length = min(due - first, 1 if out is None else len(out), slots - slot)
         number = np.arange(first, first + length)
-        frames = self._ring[slot : slot + length]
-        np.take(
-            self._frames, self._order(number), axis=0, out=frames, mode="clip"
-        )  # without an intermediate copy
+        order = self._order(number)
+        if length == 1:  # a camera writes to memory without the processor
+            frames = self._frames[order[0] : order[0] + 1]
+        else:
+            frames = self._ring[slot : slot + length]
+            np.take(self._frames, order, axis=0, out=frames, mode="clip")  # without an intermediate copy
         self._given = first + length
         place = np.asarray(self._places(number), np.float64)
         self._read.append(place)

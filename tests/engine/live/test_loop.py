@@ -37,7 +37,7 @@ class Slow:
     def operation(self):
         return self
 
-    def push_block(self, block, part):
+    def push_block(self, block, part=slice(None)):
         frames = block.frames[part]
         assert np.array_equal(block.phase[part], PLACES[frames[:, 0, 0]])
         self.pushed += frames[:, 0, 0].tolist()
