@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
@@ -26,8 +27,39 @@ OnUpdate = Callable[[Update, Status], None]
 Mark = Callable[[int, NDArray[np.bool_]], None]
 
 _INTERVALS = 32  # number of frames from which the frame rate is estimated
+_PICTURES = 8  # number of arrays that are kept for the pictures of updates
 _PATIENCE = 0.01  # seconds: least time that an update waits for slow maps
 _IDLE_MARGIN = 0.001  # seconds before the next expected frame in which no work is started
+
+
+class _Pictures:
+    """Copies of frames, in arrays that are used again as soon as nothing else refers to them.
+
+    A view of an array refers to it, so an array is not changed while any part of it is in use.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: deque[NDArray[Any]] = deque(maxlen=_PICTURES)
+
+    def copy(self, picture: NDArray[Any]) -> NDArray[Any]:
+        """Return a copy of a frame."""
+        for number in range(len(self._arrays)):
+            if _references(self._arrays, number) == _ALONE:
+                copied = self._arrays[number]
+                break
+        else:
+            copied = np.empty(picture.shape, picture.dtype)
+            self._arrays.append(copied)
+        np.copyto(copied, picture)
+        return copied
+
+
+def _references(objects: Sequence[object], number: int) -> int:
+    """Return the number of references to an object of a sequence, with those that counting needs."""
+    return sys.getrefcount(objects[number])
+
+
+_ALONE = _references([object()], 0)  # without any other reference
 
 
 class Loop:
@@ -102,7 +134,7 @@ class Loop:
         self._events = Events(events or {})
         self._latency, self._period = latency, 1 / rate_limit
         self._on_update, self._stop, self._mark, self._guard = on_update, stop, mark, guard
-        self._monitor = Monitor()
+        self._monitor, self._pictures = Monitor(), _Pictures()
         self._taken = self._updated = -math.inf  # time of the newest frame that was pushed, of an update
         self._newest: tuple[float, float, NDArray[Any]] | None = None  # its time, position and picture
         self._pending = False
@@ -191,7 +223,7 @@ class Loop:
         started = self._source.now()
         (at, position, picture), frames = self._newest, self._monitor.used
         maps, motion = self._run.maps(max(_PATIENCE, self._idle())), self._source.motion
-        update = Update(frames, at, motion, position, picture.copy(), maps)
+        update = Update(frames, at, motion, position, self._pictures.copy(picture), maps)
         if self._trackers is not None:
             tracked, lost = self._trackers.track(update, self._source.header.press)
             update = replace(update, tracked=tracked, lost=lost)

@@ -259,6 +259,7 @@ class _Pushed(Closing):
         self._keeps_all, self._on_update = latency == math.inf, on_update
         self._changed = threading.Condition()
         self._waiting: deque[tuple[NDArray[Any], float, dict[str, Floats]]] = deque()
+        self._free: list[NDArray[Any]] = []  # arrays of frames that were processed
         self._count = self._lost = 0
         self._newest, self._names = -math.inf, frozenset[str]()
         self._idle = self._ended = self._raised = False
@@ -322,10 +323,12 @@ class _Pushed(Closing):
                     self._changed.wait_for(lambda: len(self._waiting) < _WAITING or self._stopped)
                 self._check()
                 if len(self._waiting) == _WAITING:
-                    self._waiting.popleft()
+                    self._free.append(self._waiting.popleft()[0])
                     self._lost += 1
                 here = {name: value[number] for name, value in places.items()}
-                self._waiting.append((frame.copy(), when, here))
+                copied = self._free.pop() if self._free else np.empty(self.shape[1:], self.dtype)
+                np.copyto(copied, frame)
+                self._waiting.append((copied, when, here))
                 self._changed.notify_all()
 
     def _checked(self, positions: Mapping[str, ArrayLike], count: int, single: bool) -> dict[str, Floats]:
@@ -374,6 +377,7 @@ class _Pushed(Closing):
         frames, times, places = zip(*taken, strict=True)
         part = out[: len(taken)]
         np.stack(frames, out=part)
+        self._free += frames
         first, self._count = self._count, self._count + len(taken)
         positions: dict[str, Any] = {name: np.array([place[name] for place in places]) for name in places[0]}
         return Block(part, first, time=np.array(times), dropped=lost, **positions)

@@ -6,6 +6,7 @@ import math
 import subprocess
 import sys
 import threading
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -109,6 +110,41 @@ def test_the_newest_maps_can_be_looked_at(frames):
     assert newest.frames == len(frames)
     np.testing.assert_array_equal(newest.picture, frames[-1])
     assert np.isfinite(newest.height).any()
+
+
+def test_a_picture_that_is_referred_to_is_not_changed():
+    kept, frames = [], np.arange(40, dtype=np.uint8)[:, np.newaxis, np.newaxis] * np.ones(SHAPE, np.uint8)
+
+    def keep(update, status):
+        kept.append(update.picture[2:, 1:] if update.frames % 3 else update.picture)
+
+    with Stream(engine.live.Frames(), SHAPE, latency=math.inf, trackers={}, on_update=keep) as pushed:
+        pushed.push(frames)
+    assert [int(part.min()) for part in kept] == [int(part.max()) for part in kept] == list(range(40))
+
+
+@pytest.mark.parametrize("latency", [0.0, math.inf])
+def test_in_the_steady_state_there_are_no_new_arrays_of_the_size_of_a_frame(latency):
+    shape = (480, 640)
+    frame = np.zeros(shape, np.uint8)
+    brightness = {"brightness": lambda update: int(update.picture[::8, ::8].max())}
+    updated = threading.Semaphore(0)
+    with Stream(
+        engine.live.Frames(),
+        shape,
+        latency=latency,
+        trackers=brightness,
+        on_update=lambda update, status: updated.release(),
+    ) as pushed:
+        for number in range(40):
+            if number == 20:
+                tracemalloc.start()
+            pushed.push(frame, time=0.0)
+            assert updated.acquire(timeout=60)
+            assert pushed.latest().tracked["brightness"] == 0
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert peak < 0.5 * frame.nbytes
 
 
 def test_every_frame_is_counted(frames):
