@@ -10,6 +10,7 @@ import weakref
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, cast
 
@@ -22,7 +23,7 @@ from mirrorskin.engine.base.method import Method
 from mirrorskin.engine.base.operation import COMPONENTS, Operation
 from mirrorskin.engine.live.loop import LATENCY, Loop, OnUpdate
 from mirrorskin.engine.live.run import LiveRun
-from mirrorskin.engine.live.status import Status, Update
+from mirrorskin.engine.live.status import Event, Status, Update
 from mirrorskin.engine.live.tracking import Frames, Limit, Tracker
 from mirrorskin.io import Block, Header, InputError, Motion, Result
 from mirrorskin.io.base.arguments import check_number, unknown_argument
@@ -147,7 +148,8 @@ class Stream(Closing):
     async def updates(self) -> AsyncIterator[Update]:
         """Yield the newest maps whenever there are new ones, until the stream is closed.
 
-        An update that is not taken before the next one is omitted. Whatever the operation refused is raised.
+        An update that is not taken before the next one is omitted, except for its events, which are in the
+        next one. Whatever the operation refused is raised.
 
         Examples
         --------
@@ -161,19 +163,19 @@ class Stream(Closing):
         >>> asyncio.run(watch())
         1
         """
-        shown, event, loop = None, asyncio.Event(), asyncio.get_running_loop()
-        with self._source.watched(lambda: loop.call_soon_threadsafe(event.set)):
+        shown, changed, loop = None, asyncio.Event(), asyncio.get_running_loop()
+        with self._source.watched(lambda: loop.call_soon_threadsafe(changed.set)) as events:
             while True:
-                event.clear()
+                changed.clear()
                 ended = self._source.finished
                 newest = self.latest()
                 if newest is not None and newest is not shown:
                     shown = newest
-                    yield newest
+                    yield replace(newest, events=tuple(events.popleft() for _ in range(len(events))))
                 elif ended:
                     return
                 else:
-                    await event.wait()
+                    await changed.wait()
 
     @property
     def status(self) -> Status:
@@ -264,7 +266,7 @@ class _Pushed(Closing):
         self._newest, self._names = -math.inf, frozenset[str]()
         self._idle = self._ended = self._raised = False
         self.finished = False  # the last frame was processed, or an error ended it
-        self._watchers: list[Callable[[], object]] = []
+        self._watchers: list[tuple[Callable[[], object], deque[Event]]] = []
         self._error: BaseException | None = None
 
     def now(self) -> float:
@@ -278,19 +280,27 @@ class _Pushed(Closing):
 
     def keep(self, update: Update, status: Status) -> None:
         """Keep the newest maps, and tell those who wait for them."""
-        self.latest = update
+        with self._changed:
+            for _, events in self._watchers:
+                events.extend(update.events)
+            self.latest = update
         self._tell()
         if self._on_update is not None:
             self._on_update(update, status)
 
     @contextmanager
-    def watched(self, tell: Callable[[], object]) -> Iterator[None]:
-        """Call a function, from the reader's thread, after each update and at the end."""
-        self._watchers.append(tell)
+    def watched(self, tell: Callable[[], object]) -> Iterator[deque[Event]]:
+        """Call a function, from the reader's thread, after each update and at the end; collect events.
+
+        The first events are those of the newest update.
+        """
+        with self._changed:
+            watcher = tell, deque[Event](() if self.latest is None else self.latest.events)
+            self._watchers.append(watcher)
         try:
-            yield
+            yield watcher[1]
         finally:
-            self._watchers.remove(tell)
+            self._watchers.remove(watcher)
 
     def finish(self) -> None:
         """Note that no update follows."""
@@ -298,7 +308,7 @@ class _Pushed(Closing):
         self._tell()
 
     def _tell(self) -> None:
-        for tell in tuple(self._watchers):
+        for tell, _ in tuple(self._watchers):
             with suppress(RuntimeError):  # its event loop has ended
                 tell()
 

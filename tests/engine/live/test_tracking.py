@@ -129,9 +129,27 @@ def test_answers_and_events_are_awaited():
     events = {"high": Limit(lambda update: update.tracked["number"], above=2)}
     with stream({"number": Slow()}, events=events) as pushed:
         pushed.push(NUMBERS[3], time=pushed.now())
+        pushed.result()
         update = asyncio.run(watch(pushed))
     assert update.tracked["number"] == 3
     assert [(event.name, event.started, event.value) for event in update.events] == [("high", True, 3.0)]
+
+
+def test_events_of_updates_that_were_not_awaited_are_in_the_next_one():
+    async def watch(pushed):
+        updates = pushed.updates()
+        pushed.push(NUMBERS[0])
+        found = [await anext(updates)]
+        pushed.push(NUMBERS[1:4])
+        pushed.result()
+        found.append(await anext(updates))
+        return found
+
+    events = {"odd": Limit(lambda update: update.tracked["number"] % 2, above=0)}
+    with stream({"number": Slow()}, events=events) as pushed:
+        first, second = asyncio.run(watch(pushed))
+    assert (first.events, second.tracked["number"]) == ((), 3)
+    assert [event.started for event in second.events] == [True, False, True]
 
 
 def test_an_error_of_a_tracker_ends_the_stream():
@@ -266,7 +284,7 @@ def test_slip_starts_anew_when_contact_is_found_again():
         np.float32,
         latency=math.inf,
         trackers={"slip": engine.slip.SlipTracker(pixel_size=0.1, noise=0.1)},
-        events={"contact": Limit.contact()},
+        events={"contact": Limit.contact(), "slip": Limit.slip()},
         on_update=lambda update, status: updates.append(update),
     ) as pushed:
         for travel, moved in ((1.0, 0), (1.0, 1), (0.0, 0), (0.0, 0), (1.0, 0), (1.0, 1)):
@@ -275,8 +293,8 @@ def test_slip_starts_anew_when_contact_is_found_again():
     assert shifts[1] == pytest.approx(0.1, abs=0.002)
     assert math.isnan(shifts[3])
     assert shifts[5] == pytest.approx(0.1, abs=0.002)
-    starts = [update.time for update in updates if any(event.started for event in update.events)]
-    assert len(starts) == 2
+    changes = [(event.name, event.started) for update in updates for event in update.events]
+    assert changes == [("contact", True), ("contact", False), ("contact", True)]
 
 
 def test_events_of_contact_and_of_a_force():
