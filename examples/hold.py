@@ -202,7 +202,7 @@ def main():
         below.plot(record.time, 1e3 * np.array(record.slid))
         for onset in record.onsets:
             below.axvline(onset, color="tab:orange", linewidth=1)
-        below.set(xlabel="time (s)", ylabel="slide (µm)")
+        below.set(xlabel="time (s)", ylabel="slide (µm), and onsets of slip", ylim=(-50, 1000))
     figure.savefig("hold.png", dpi=80)
 
 

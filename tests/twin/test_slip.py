@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mirrorskin.hw.base.stage import Position
 from mirrorskin.io import InputError
 from mirrorskin.io.base.types import Floats
 from mirrorskin.kernels.device import open_device
-from mirrorskin.twin import Body, Horizontal, Sphere, Twist
+from mirrorskin.twin import Body, Horizontal, SheetTexture, Sphere, Twin, Twist, Vertical
+from mirrorskin.twin.emulator.camera import pose_at
 from mirrorskin.twin.movement import pose_at_press
 from mirrorskin.twin.skin import Elastic
 from mirrorskin.twin.slip import SkinHistory
@@ -190,3 +192,26 @@ def test_a_body_that_does_not_press_moves_no_skin() -> None:
 def test_too_long_a_displacement_is_refused() -> None:
     with pytest.raises(InputError, match=r"a displacement of 50 mm .* points, .*: use larger pixels"):
         history(Horizontal([[0.0, 0.0], [50.0, 0.0]], 0.1), 0.5, 0.005)
+
+
+def test_a_body_that_is_lifted_while_it_slides_is_dragged_by_the_friction_of_its_press() -> None:
+    friction = 0.3
+    twin = Twin(
+        object=Sphere(10.0),
+        shape=(32, 32),
+        pixel_size=0.12,
+        movement=Vertical([0.5]),
+        contact="elastic",
+        body=Body(friction=friction),
+        texture=SheetTexture("flakes", size=0.5, contrast=0.5),
+    )
+    out = np.empty(twin.shape[1:], twin.dtype)
+    for x, travel in ((0.0, 0.5), (0.4, 0.5), (0.45, 0.3), (0.5, 0.3)):
+        twin.look(lambda late, x=x, travel=travel: pose_at(Position(travel, x=x)), 0, out)
+    lifted = Twin(
+        object=Sphere(10.0), shape=(32, 32), pixel_size=0.12, movement=Vertical([0.3]), contact="elastic"
+    )
+    assert np.hypot(*twin.grip.force) == pytest.approx(friction * lifted.sheet(0).force, rel=0.01)
+    assert twin.grip.slid[0] < -0.2
+    twin.look(lambda late: pose_at(Position(-0.1, x=0.5)), 0, out)
+    assert not np.any(twin.grip.force)
