@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, toeplitz
@@ -18,6 +19,8 @@ from mirrorskin.kernels.array_types import Doubles
 
 Singles = NDArray[np.float32]
 Window = tuple[slice, slice]
+
+_NEGLIGIBLE, _JITTER = 1e-8, 1e-6  # covariances relative to the variance: left out; added to it
 
 
 @dataclass(frozen=True)
@@ -68,16 +71,21 @@ class Blocks:
         return rows, columns
 
     def means(self, values: NDArray[Any]) -> Singles:
-        """Return the means of blocks, NaN where most of a block is undefined."""
+        """Return the means of blocks, (H, W) or (H, W, n), NaN where most of a block is undefined."""
         step = self.binning
-        rows, columns = (size // step for size in values.shape)
+        rows, columns = values.shape[0] // step, values.shape[1] // step
         values = values[: rows * step, : columns * step]
-        strips = sum((values[k::step] for k in range(1, step)), start=values[0::step])
-        means = sum((strips[:, k::step] for k in range(1, step)), start=strips[:, 0::step])
-        means = (means / step**2).astype(np.float32)
+        if step == 1:
+            return np.array(values, np.float32)
+        if min(values.strides) <= 0 or values.dtype not in (np.float32, np.float64):
+            values = np.ascontiguousarray(values, np.float64)
+        means = cv2.resize(values, (columns, rows), interpolation=cv2.INTER_AREA).astype(
+            np.float32, copy=False
+        )
         gaps = ~np.isfinite(means)
-        if step > 1 and gaps.any():
-            parts = values.reshape(rows, step, columns, step).transpose(0, 2, 1, 3)[gaps]
+        if gaps.any():
+            gaps = gaps.reshape(rows, columns, -1).any(axis=-1)
+            parts = values.reshape(rows, step, columns, step, *values.shape[2:]).swapaxes(1, 2)[gaps]
             finite = np.isfinite(parts)
             count = np.count_nonzero(finite, axis=(1, 2))
             total = np.where(finite, parts, 0).sum(axis=(1, 2))
@@ -91,25 +99,28 @@ class Blocks:
         is symmetric inside a map, so it also converts weights of values to weights of means. Next to missing
         values the second difference is taken for 0, or ``extended``, for that of the next block inside.
         """
-        values = means.copy()
         factor = means.dtype.type((1 - 1 / self.binning**2) / 24)
-        for axis in (-2, -1):
-            bend = np.diff(means, 2, axis=axis)
-            if extended:
-                for ahead, behind in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
-                    one, other = (
-                        (..., part, slice(None))[: 3 if axis == -2 else 2] for part in (ahead, behind)
-                    )
-                    bend[one] = np.where(np.isnan(bend[one]), bend[other], bend[one])
-            inner = values[..., 1:-1, :] if axis == -2 else values[..., 1:-1]
-            inner -= factor * np.where(np.isfinite(bend), bend, means.dtype.type(0))
+        if not factor:
+            return means
+        values = means.copy()
+        for source, target in ((means, values), (means.swapaxes(-1, -2), values.swapaxes(-1, -2))):
+            bend = source[..., 2:] + source[..., :-2]
+            bend -= 2 * source[..., 1:-1]
+            if not np.isfinite(bend).all():
+                if extended:
+                    for ahead, behind in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
+                        one, other = bend[..., ahead], bend[..., behind]
+                        np.copyto(one, other, where=np.isnan(one))
+                bend[~np.isfinite(bend)] = 0
+            bend *= factor
+            target[..., 1:-1] -= bend
         return values
 
     def alike(self, length: float, boxes: bool = False) -> tuple[Doubles, Doubles]:
-        """Return the covariances of means along rows and along columns, if pixels have the variance 1.
+        """Return the covariances of means along a column and along a row, by distance in blocks, from 0.
 
-        Errors of pixels are correlated over a Gaussian ``length``, mm, or are those of overlapping ``boxes``,
-        whose length is in pixels.
+        Pixels have the variance 1. Their errors are correlated over a Gaussian ``length``, mm, or are those
+        of overlapping ``boxes``, whose length is in pixels. Covariances that are negligible are left out.
         """
         (rows, columns), (width, height) = self.space.shape, self.pixel_size
         along_rows, along_columns = (length, length) if boxes else (length / height, length / width)
@@ -119,18 +130,19 @@ class Blocks:
 
 @lru_cache(maxsize=16)
 def _alike(count: int, binning: int, length: float, boxes: bool) -> Doubles:
-    """Return the covariance of means along an axis, (n, n), for a variance of 1; see `Blocks.alike`."""
+    """Return the covariance of means along an axis, by distance, for a variance of 1; see `Blocks.alike`."""
     inside = np.arange(binning)
     lag = np.abs(np.arange(count)[:, np.newaxis, np.newaxis] * binning + inside[:, np.newaxis] - inside)
     if boxes:
         near = np.maximum(1 - lag / length, 0)
     else:
         near = np.exp(-0.5 * (lag / length) ** 2) if length else (lag == 0).astype(np.float64)
-    return np.asarray(toeplitz(near.mean(axis=(1, 2))))
+    alike = near.mean(axis=(1, 2))
+    return np.asarray(alike[: np.flatnonzero(alike > _NEGLIGIBLE * alike[0])[-1] + 1])
 
 
 class BlockErrors:
-    """Errors of means, from standard deviations of pixels, (H, W), if known; see `Blocks.alike`."""
+    """Errors of means, given standard deviations of pixels, (H, W) or (H, W, n); see `Blocks.alike`."""
 
     def __init__(
         self, sigma: NDArray[Any] | None, blocks: Blocks, length: float, boxes: bool = False
@@ -141,37 +153,51 @@ class BlockErrors:
     def usual(self, window: Window) -> float:
         """Return the usual standard deviation of a mean in a window."""
         rows, columns = self._alike
-        return float(np.median(self._spread(window))) * math.sqrt(rows[0, 0] * columns[0, 0])
+        spread = self._spread(window).ravel()
+        return float(np.partition(spread, spread.size // 2)[spread.size // 2]) * math.sqrt(
+            rows[0] * columns[0]
+        )
 
     def variance(self, weights: Doubles, window: Window) -> Doubles:
-        """Return the variances of sums of means, weighted by (n, H, W) in a window."""
-        rows, columns = self._inner(window)
-        shares = weights * self._spread(window)
-        return np.asarray(np.sum(shares * (rows @ shares @ columns), axis=(1, 2)))
+        """Return the variances of sums of means, weighted by (n, H, W) in a window.
+
+        Of errors of n kinds, each has its own weights.
+        """
+        rows, columns = (np.concatenate([part[:0:-1], part]) for part in self._alike)
+        spread = self._spread(window)
+        shares = weights * (spread if spread.ndim == 2 else spread.transpose(2, 0, 1))
+        if rows.size == columns.size == 1:
+            return np.asarray(np.einsum("...ij,...ij->...", shares, shares) * (rows[0] * columns[0]))
+        alike = np.empty_like(shares)
+        for part, out in zip(shares, alike, strict=True):
+            cv2.sepFilter2D(part, -1, columns, rows, dst=out, borderType=cv2.BORDER_CONSTANT)
+        return np.maximum(np.einsum("...ij,...ij->...", shares, alike), 0)
 
     def drawn(self, window: Window) -> Singles:
         """Return random errors of means, (H, W), 0 outside a window."""
         errors = np.zeros(self._blocks.space.shape, np.float32)
-        rows, columns = (
-            cholesky(part + 1e-9 * part[0, 0] * np.eye(len(part)), lower=True) for part in self._inner(window)
-        )
+        roots = []
+        for part, inner in zip(self._alike, window, strict=True):
+            size = inner.stop - inner.start
+            column = np.pad(part[:size], (0, max(size - part.size, 0)))
+            column[0] *= 1 + _JITTER
+            roots.append(cholesky(toeplitz(column), lower=True))
         spread = self._spread(window)
+        rows, columns = roots
         errors[window] = spread * (rows @ np.random.default_rng(0).normal(size=spread.shape) @ columns.T)
         return errors
-
-    def _inner(self, window: Window) -> tuple[Doubles, Doubles]:
-        rows, columns = (
-            part[: inner.stop - inner.start, : inner.stop - inner.start]
-            for part, inner in zip(self._alike, window, strict=True)
-        )
-        return rows, columns
 
     def _spread(self, window: Window) -> Doubles:
         """Return the RMS standard deviation of a block's pixels, in a window; where unknown, the nearest."""
         if self._sigma is None:
             return np.zeros([part.stop - part.start for part in window])
         if self._found is None or self._found[0] != window:
-            square = self._blocks.means(self._sigma[self._blocks.pixels(window)] ** 2)
-            square = fill_with_nearest(square) if np.isfinite(square).any() else np.zeros_like(square)
-            self._found = window, np.sqrt(square).astype(np.float64)
+            inside = self._sigma[self._blocks.pixels(window)]
+            square = self._blocks.means(inside * inside)
+            if not np.isfinite(square).all():
+                layers = square.reshape(*square.shape[:2], -1)
+                for n in range(layers.shape[2]):
+                    layer = layers[..., n]
+                    layer[...] = fill_with_nearest(layer) if np.isfinite(layer).any() else 0
+            self._found = window, np.sqrt(square, dtype=np.float64)
         return self._found[1]

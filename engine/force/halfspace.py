@@ -20,6 +20,7 @@ Singles = NDArray[np.float32]
 Reals = NDArray[Any]
 Real = TypeVar("Real", np.float32, np.float64)
 Mask = NDArray[np.bool_]
+Window = tuple[slice, slice]
 
 TOLERANCE = 1e-4
 """Maximum gap in contact, as a share of the surface's maximum height above the rest plane."""
@@ -32,6 +33,7 @@ _GRADIENT_ERROR = 1e-3  # maximum gap of a flat punch that is pressed in by 1
 _NO_SLOPE = 1e-9  # slope below which its direction is undefined
 _FIRM = 0.05  # share of the maximum pressure below which the contact of a cell is neglected in derivatives
 _ROUGH_TOLERANCE, _ROUGH_STEPS = 2e-2, 60  # relative residual, and maximum number of steps, for derivatives
+_OWN = _SOFTNESS * 4 * math.log(1 + math.sqrt(2))  # displacement of a square of side 1 by unit strain on it
 _SIZES = 4  # pixels: granularity of the size of windows
 MARGIN = 0.1
 """Margin of the window in which a contact is searched, as a share of the initial contact's length."""
@@ -104,6 +106,14 @@ class HalfSpace:
         return _influence(self._whole, self.pixel_size)[: self.shape[0], : self.shape[1]]
 
 
+class Sheet(NamedTuple):
+    """The solution in a part of the grid, from which that for a similar surface is found."""
+
+    window: Window
+    strain: Reals  # also that of pixels that are pulled a little
+    moved: Reals  # displacement against the stage, mm
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Pressed:
     """A rigid surface and the half-space in equilibrium; maps are (H, W)."""
@@ -112,6 +122,7 @@ class Pressed:
     contact: Mask
     load: float  # force over Young's modulus, mm^2
     gap: Reals  # gap in contact that the search left, mm; 0 elsewhere
+    sheet: Sheet | None = None
 
     def more(self, gradient: Reals) -> float:
         """Return what a sum of pressures lacks because of the gap, given its derivatives by heights."""
@@ -136,7 +147,8 @@ def press(
     ``surface``, (H, W), is mm above the rest plane for a stiff stage, NaN where there is none; its type is
     that of the computation. The stage deflects by ``compliance``, 1/mm, for each mm^2 of load. ``start`` is a
     similar press, as an initial guess. Gaps in contact, and overlaps elsewhere, are at most ``tolerance``,
-    mm, if that is more than `TOLERANCE`. NotConverged if the contact does not converge.
+    mm, if that is more than `TOLERANCE`; from a similar press, a pixel remains in contact if a pull that
+    displaces it by less would be needed. NotConverged if the contact does not converge.
     """
     surface = np.where(np.isfinite(surface), surface, surface.dtype.type(-np.inf))
     reach, nothing = surface > 0, np.zeros(space.shape, surface.dtype)
@@ -145,14 +157,20 @@ def press(
     tolerance = max(tolerance, TOLERANCE * float(surface.max()))
     if start is None and min(space.shape) >= 2 * _COARSEST:
         start = _coarse_press(space, surface, compliance)
-    contact, strain = reach, nothing
+    contact, strain, sheet = reach, nothing, None
     if start is not None and (reach & start.contact).any():
-        contact, strain = reach & start.contact, start.strain
+        contact, strain, sheet = reach & start.contact, start.strain, start.sheet
     while True:
-        window, part = window_of(space, contact, MARGIN)
-        inner = strain[window], contact[window]
-        pressure, touching, remaining = _press_within(part, surface[window], compliance, tolerance, *inner)
+        if sheet is not None and _is_inside(contact, sheet.window):
+            window, part = sheet.window, space.part(sheet.strain.shape)
+        else:
+            sheet, (window, part) = None, window_of(space, contact, MARGIN)
+        inner, touching, remaining = _press_within(
+            part, surface[window], compliance, tolerance, strain[window], contact[window], sheet
+        )
+        sheet = Sheet(window, *inner)
         strain, contact, left = nothing.copy(), np.zeros_like(reach), nothing.copy()
+        pressure = np.maximum(sheet.strain, 0)
         strain[window], contact[window], left[window] = pressure, touching, remaining
         load = float(pressure.sum(dtype=np.float64)) * space.pixel_area
         outside = reach.copy()
@@ -162,20 +180,36 @@ def press(
             gap = _opening(part, compliance)(strain[window]) - surface[window]
             outside[window] &= gap < -tolerance
         if not outside.any():
-            return Pressed(strain, contact, load, left)
+            return Pressed(strain, contact, load, left, sheet)
         contact |= outside
 
 
 def _press_within(
-    space: HalfSpace, surface: Reals, compliance: float, tolerance: float, strain: Reals, contact: Mask
-) -> tuple[Reals, Mask, Reals]:
-    """Return the strain, the contact and the gap in it, given an initial strain and contact."""
+    space: HalfSpace,
+    surface: Reals,
+    compliance: float,
+    tolerance: float,
+    strain: Reals,
+    contact: Mask,
+    similar: Sheet | None,
+) -> tuple[tuple[Reals, Reals], Mask, Reals]:
+    """Return strain and displacement of the sheet, the contact, and the gap in it, from initial ones.
+
+    The first solution is rough, unless that of a ``similar`` surface is available.
+    """
+    moved, pull, share = None, 0.0, _ROUGHLY
+    if similar is not None:
+        strain, moved, share = similar.strain, similar.moved, 0.0
+        pull = tolerance / (_OWN * math.sqrt(space.pixel_area))
     for _ in range(_MAX_CONTACT_CHANGES):
+        if moved is not None and strain[~contact].any():
+            moved = None
         strain = np.where(contact, strain, strain.dtype.type(0))
-        strain, gap, error = _solve(space, surface, compliance, tolerance, contact, strain, _ROUGHLY)
-        changed = np.where(contact, strain > 0, gap < -tolerance)
+        strain, moved, error = _solve(space, surface, compliance, tolerance, contact, strain, share, moved)
+        gap = moved - surface
+        changed = np.where(contact, strain > -pull, gap < -tolerance)
         if error <= tolerance and np.array_equal(changed, contact):
-            return strain, contact, np.where(contact, gap, gap.dtype.type(0))
+            return (strain, moved), contact, np.where(contact, gap, gap.dtype.type(0))
         contact = changed
     raise NotConverged(f"the contact did not converge in {_MAX_CONTACT_CHANGES} rounds")
 
@@ -234,9 +268,10 @@ def _solve(
     tolerance: float,
     contact: Mask,
     strain: Reals,
-    share: float = 0.0,
+    share: float,
+    moved: Reals | None,
 ) -> tuple[Reals, Reals, float]:
-    """Return the strain for which the sheet follows the surface in contact, the gap, and its largest there.
+    """Return the strain for which the sheet follows the surface in contact, the sheet, and the largest gap.
 
     The largest gap is at most a tolerance, or a share of that of the initial strain, if it is larger.
     """
@@ -253,10 +288,11 @@ def _solve(
         converged=converged,
         steps=_MAX_STEPS,
         start=strain,
+        moved=moved,
     )
     if not solution.converged:
         raise NotConverged(f"the pressure in contact was not found in {_MAX_STEPS} steps")
-    return solution.x, solution.product - surface, errors[-1]
+    return solution.x, solution.product, errors[-1]
 
 
 def _opening(space: HalfSpace, compliance: float) -> Callable[[NDArray[Real]], NDArray[Real]]:
@@ -465,6 +501,15 @@ def window_of(space: HalfSpace, contact: Mask, margin: float = 0.0) -> tuple[tup
         window.append(slice(start, start + length))
     shape = window[0].stop - window[0].start, window[1].stop - window[1].start
     return (window[0], window[1]), space.part(shape)
+
+
+def _is_inside(contact: Mask, window: Window) -> bool:
+    """Return whether a contact is within a window, and not at an edge that is inside the grid."""
+    inner = tuple(
+        slice(part.start + (part.start > 0), part.stop - (part.stop < size))
+        for part, size in zip(window, contact.shape, strict=True)
+    )
+    return np.count_nonzero(contact[inner]) == np.count_nonzero(contact)
 
 
 def _square(maps: Singles) -> Singles:

@@ -195,7 +195,9 @@ def last_displacement(result: Result, sigma: ArrayLike | None = None) -> tuple[N
     spread = spread[-1] if sigma is None and spread.ndim == 4 else spread
     if spread.shape not in ((), moved.shape[:2], moved.shape):
         raise InputError(f"sigma has shape {spread.shape}: it must be that of the map, {moved.shape[:2]}")
-    return moved, np.broadcast_to(spread[..., np.newaxis] if spread.ndim == 2 else spread, moved.shape)
+    if spread.shape != moved.shape:
+        spread = np.broadcast_to(spread[..., np.newaxis] if spread.ndim == 2 else spread, moved.shape)
+    return moved, spread
 
 
 def _touches(contact: ArrayLike | None, pressure: ArrayLike | None, shape: tuple[int, ...]) -> Mask:

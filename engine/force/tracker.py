@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.base.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.force.blocks import BlockErrors, Blocks, Window
-from mirrorskin.engine.force.halfspace import MARGIN, Mask, Pressed, press, punches, window_of
+from mirrorskin.engine.force.halfspace import Mask, Pressed, press, punches
 from mirrorskin.engine.force.normal import UNCERTAIN, check_bounds, excess_load, modulus_of, surface_of
 from mirrorskin.engine.force.tangential import MIN_COVERAGE, UP, ContactShear, last_displacement
 from mirrorskin.engine.metrology.patch import noise_length
@@ -190,8 +190,12 @@ class _State:
         self.object: Mask  # blocks with a height
         self.inside: Mask  # blocks in the window that touch, with their four neighbours
         self._usual = 0.0  # standard deviation of a mean
-        self.punches: Singles | None = None  # strains that move the contact by the forms of the blocks
-        self.shears: Singles | None = None  # tractions that move the contact by 1 along x, and along rows
+        # Strains that move the contact by the forms of the blocks, and tractions that move it by 1 along x and
+        # along rows; and the weights of means that these are.
+        self.punches: Singles | None = None
+        self.shears: Singles | None = None
+        self.punch_weights: Singles
+        self.shear_weights: Singles
         self._punched = self.sheared = np.zeros(0, bool)  # the contacts of these
         self._start: Pressed | None = None
         self._load, self.excess = 0.0, 0.0  # a load, and its increase by noise, as a share of it
@@ -207,11 +211,12 @@ class _State:
         if not pressed.load > 0:
             return
         contact = pressed.contact
-        self.window, _ = window_of(space, contact, MARGIN)
+        assert pressed.sheet is not None
+        self.window = pressed.sheet.window
         self._usual, self.inside = errors.usual(self.window), _inside(contact[self.window])
         if self.punches is None or _changed(contact, self._punched) > _STALE:
             self.punches = punches(space, contact, self.blocks.forms, self._compliance, self.punches)
-            self._punched = contact
+            self.punch_weights, self._punched = self.blocks.at_centres(self.punches), contact
         if abs(pressed.load - self._load) > _SAME_LOAD * self._load:
             drawn, gradient = errors.drawn(self.window), self.punches[0] * space.pixel_area
             excess = excess_load(space, heights, drawn, self._compliance, pressed, gradient)
@@ -221,15 +226,15 @@ class _State:
         """Return the share of blocks in contact that are at its border."""
         return 1 - np.count_nonzero(self.inside) / np.count_nonzero(self.pressed.contact)
 
-    def shear(self) -> Singles:
-        """Return the tractions that move the contact by 1 along x, and along rows, in the window."""
+    def shear(self) -> None:
+        """Find the tractions that move the contact by 1 along x, and along rows, if it has changed."""
         contact, place = self.pressed.contact, (..., *self.window)
         if self.shears is None or _changed(contact, self.sheared) > _STALE:
             system = ContactShear(contact[self.window], self.blocks.space.pixel_size, contact.shape)
             weights = system.weights(_SHEAR_ERROR, None if self.shears is None else self.shears[place])
             self.shears, self.sheared = np.zeros((2, 2, *contact.shape), np.float32), contact
             self.shears[place] = weights
-        return self.shears[place]
+            self.shear_weights = self.blocks.at_centres(self.shears)
 
 
 def _touches(surface: NDArray[Any], sigma: NDArray[Any] | None) -> bool:
@@ -286,20 +291,18 @@ def _normal(
     assert state.punches is not None
     blocks, pressed, window = state.blocks, state.pressed, state.window
     strain, left = pressed.strain[window].astype(np.float64), pressed.gap[window]
-    area = blocks.space.pixel_area
-    gradients = state.punches[(slice(None), *window)].astype(np.float64) * area
-    total = pressed.load - np.sum(gradients * left, axis=(1, 2))[0]
-    load, centre, size = total * (1 - state.excess), [], []
+    area, place = blocks.space.pixel_area, (slice(None), *window)
+    lacking = area * np.einsum("nij,ij->n", state.punches[place], left, dtype=np.float64)
+    total = pressed.load - lacking[0]
+    load, centre, size, mixed = total * (1 - state.excess), [], [], np.eye(3)
     for axis, scale, part in zip(axes, blocks.scales(axes), (1, 2), strict=True):
         lever = axis - axis.mean()
         profile, inside = area * strain.sum(axis=part - 1), lever[window[2 - part]]
-        moment = float(profile @ inside)
-        gradient = scale * gradients[part]
-        middle = (moment - float(np.sum(gradient * left))) / total
+        middle = (float(profile @ inside) - scale * lacking[part]) / total
         centre.append(middle + float(axis.mean()))
         size.append(math.sqrt(max(float(profile @ inside**2) / total - middle**2, 0.0)))
-        gradients[part] = (gradient - middle * gradients[0]) / total
-    weights: Doubles = blocks.at_centres(gradients)
+        mixed[part, part], mixed[part, 0] = scale / total, -middle / total
+    weights = np.einsum("kn,nij->kij", area * mixed, state.punch_weights[place])
     spread = np.hypot(np.sqrt(errors.variance(weights, window)), common * weights.sum(axis=(1, 2)))
     rough = _border_error(state)
     others = [load * math.hypot(rough, UNCERTAIN * state.excess)]
@@ -319,21 +322,25 @@ def _tangential(
     The second number is the share of the contact that has a displacement.
     """
     blocks, window = state.blocks, state.window
-    weights = state.shear().astype(np.float64) * blocks.space.pixel_area
+    state.shear()
+    assert state.shears is not None
+    place, area = (..., *window), blocks.space.pixel_area
     contact, fine = state.sheared[window], blocks.pixels(window)
-    means = np.stack([blocks.means(moved[..., part][fine]) for part in (0, 1)])
-    means[:, ~contact] = np.nan
+    means = blocks.means(moved[fine]).transpose(2, 0, 1)
     gaps = contact & ~np.isfinite(means).all(axis=0)
-    covered = 1 - np.count_nonzero(gaps) / np.count_nonzero(contact)
+    missing = np.count_nonzero(gaps)
+    covered = 1 - missing / np.count_nonzero(contact)
     if covered < MIN_COVERAGE:
         return np.zeros((2, 2)), covered
+    means = np.where(contact, means, np.float32(np.nan))
     means = blocks.at_centres(means, extended=True)
-    if gaps.any():
+    if missing:
         means = np.stack([fill_with_nearest(part) for part in means])
-    force = np.sum(weights * np.where(contact, means * UP, 0.0), axis=(1, 2, 3)) * UP.ravel()
-    variance = np.zeros(2)
-    for part in (0, 1):
-        spread = BlockErrors(sigma[..., part], blocks, window_size, boxes=True)
-        variance += spread.variance(blocks.at_centres(weights[:, part]), window)
+    means[:, ~contact] = 0
+    means *= UP.astype(np.float32)
+    force = area * np.einsum("klij,lij->k", state.shears[place], means, dtype=np.float64) * UP.ravel()
+    errors = BlockErrors(sigma, blocks, window_size, boxes=True)
+    weights = area * state.shear_weights[place].astype(np.float64)
+    variance = np.array([errors.variance(part, window).sum() for part in weights])
     sigma = np.hypot(np.sqrt(variance), _SHEAR_MODEL * state.border_share() * np.hypot(*force))
     return np.stack([force, sigma], axis=-1), covered

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -77,7 +78,7 @@ def conjugate_gradients(
     limit
         Returns the x within the limits that is closest to an x: the same array if it is within them.
     axes
-        Axes of one system; systems along the other axes are solved simultaneously. By default all axes.
+        Last axes, those of one system; systems along the others are solved simultaneously. By default all.
     """
     x = np.zeros_like(target) if start is None else start
     if moved is None:
@@ -86,8 +87,11 @@ def conjugate_gradients(
     gain: Array | float = np.inf
     tiny = np.finfo(target.dtype).tiny
 
+    systems = (1,) * target.ndim if axes is None else (*target.shape[: -len(axes)], *(1 for _ in axes))
+    flat = math.prod(systems), -1
+
     def inner(first: Array, second: Array) -> Array:
-        return np.asarray(np.sum(first * second, axis=axes, keepdims=True))
+        return np.einsum("ni,ni->n", first.reshape(flat), second.reshape(flat)).reshape(systems)
 
     for step in range(steps + 1):
         rest = target - moved
