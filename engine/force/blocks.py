@@ -84,7 +84,7 @@ class Blocks:
         )
         gaps = ~np.isfinite(means)
         if gaps.any():
-            gaps = gaps.reshape(rows, columns, -1).any(axis=-1)
+            gaps = np.any(gaps.reshape(rows, columns, -1), axis=-1)
             parts = values.reshape(rows, step, columns, step, *values.shape[2:]).swapaxes(1, 2)[gaps]
             finite = np.isfinite(parts)
             count = np.count_nonzero(finite, axis=(1, 2))
@@ -171,7 +171,7 @@ class BlockErrors:
         alike = np.empty_like(shares)
         for part, out in zip(shares, alike, strict=True):
             cv2.sepFilter2D(part, -1, columns, rows, dst=out, borderType=cv2.BORDER_CONSTANT)
-        return np.maximum(np.einsum("...ij,...ij->...", shares, alike), 0)
+        return np.asarray(np.maximum(np.einsum("...ij,...ij->...", shares, alike), 0))
 
     def drawn(self, window: Window) -> Singles:
         """Return random errors of means, (H, W), 0 outside a window."""

@@ -509,7 +509,7 @@ def _is_inside(contact: Mask, window: Window) -> bool:
         slice(part.start + (part.start > 0), part.stop - (part.stop < size))
         for part, size in zip(window, contact.shape, strict=True)
     )
-    return np.count_nonzero(contact[inner]) == np.count_nonzero(contact)
+    return bool(np.count_nonzero(contact[inner]) == np.count_nonzero(contact))
 
 
 def _square(maps: Singles) -> Singles:

@@ -190,8 +190,8 @@ class _State:
         self.object: Mask  # blocks with a height
         self.inside: Mask  # blocks in the window that touch, with their four neighbours
         self._usual = 0.0  # standard deviation of a mean
-        # Strains that move the contact by the forms of the blocks, and tractions that move it by 1 along x and
-        # along rows; and the weights of means that these are.
+        # Strains that move the contact by the forms of the blocks, and tractions that move it by 1 along x
+        # and along rows; and the weights of means that these are.
         self.punches: Singles | None = None
         self.shears: Singles | None = None
         self.punch_weights: Singles

@@ -61,7 +61,7 @@ _WINDOWS = 200  # about as many are followed in the first contact
 _MOST_WINDOWS = 800  # in the whole picture
 _MARGIN = 2  # windows around the contact that are followed, too
 _TOUCHES, _LEAVES = 0.5, 0.25  # share of a window in contact, above which it touches; below which no longer
-_SHRUNK = 0.5  # share of the windows followed so far, below which only those of a smaller contact are
+_SHRUNK = 0.7  # share of the windows followed so far, below which only those of a smaller contact are
 _MEMORY = 64  # frames over which the noise is averaged
 _FIRST = 4  # frames in which any residual is noise
 _USUAL, _OUTLIER = (
@@ -76,6 +76,7 @@ _ROUNDS = 2  # fits of the motion
 _FITS, _SLIPS = 9.0, 20.0  # chi square of a departure, two degrees of freedom: up to it none; from it slip
 _LEAST_ANGLE = 3.0  # standard deviations of the angle, from which the rotation has a centre
 _CANCELS = 0.75  # share of the noise of a key that cancels where its windows overlap those of the last one
+_UNKNOWN = complex(np.nan, np.nan)  # place or displacement of a window
 _PASSES = 5  # of the search for the points of the skin that are at the windows of a new key
 
 
@@ -296,7 +297,7 @@ class SlipTracker(ThreadSafe):
         # Of windows that have touched: places on the object, as it was when the contact started; variances of
         # its motion until then, along an axis and of the angle; whether the window was then in contact as a
         # whole; and slip.
-        self._fixed: Places = np.full(grid, complex(np.nan, np.nan))
+        self._fixed: Places = np.full(grid, _UNKNOWN)
         self._drift = np.zeros((2, *grid))
         self._settled, self._slipped, self._exceeded = np.zeros((3, *grid), bool)
         self._fitted, self._onset = np.zeros(grid, np.int32), np.full(grid, -1, np.int32)
@@ -311,7 +312,7 @@ class SlipTracker(ThreadSafe):
         share = self._share_in_contact(self._tracker.moved)
         touched = share > np.where(self._touched, _LEAVES, _TOUCHES)
         lost = self._touched & ~touched
-        self._fixed[lost], self._onset[lost] = complex(np.nan, np.nan), -1
+        self._fixed[lost], self._onset[lost] = _UNKNOWN, -1
         for states in (self._settled, self._slipped, self._exceeded):
             states[lost] = False
         self._touched, self._partial = touched, share < 1
@@ -327,7 +328,7 @@ class SlipTracker(ThreadSafe):
         both = tuple(
             slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in zip(part, before, strict=True)
         )
-        if self._fixed[rows, columns].size > _SHRUNK * self._fixed[before].size:
+        if self._frames and self._fixed[rows, columns].size > _SHRUNK * self._fixed[before].size:
             rows, columns = both
         self._part = rows, columns
 
@@ -347,7 +348,7 @@ class SlipTracker(ThreadSafe):
         """Return the windows of the first frame."""
         found = self._followed[self._part]
         noise, bending = np.zeros((3, *found.shape)), np.zeros((2, *found.shape))
-        return _Windows(found, np.zeros(found.shape, complex), noise, bending)
+        return _Windows(found, np.where(found, 0j, _UNKNOWN), noise, bending)
 
     def _learn(self, tracker: Tracker, field: NodeField) -> None:
         """Average the noise of the windows, except for residuals that are not noise."""
@@ -371,7 +372,7 @@ class SlipTracker(ThreadSafe):
         variance, covariance = self._texture.variance[part], self._covariance[:, *part]
         found = field.converged & self._followed[part] & (field.variance < _OUTLIER * variance)
         right, down = field.moved
-        moved = np.where(found, right * self._size[0] - 1j * self._size[1] * down, np.nan)
+        moved = np.where(found, right * self._size[0] - 1j * self._size[1] * down, _UNKNOWN)
         bending = bending_variance(moved, covariance[:2], self._step, self._window)
         bending[:, self._partial[part]] *= _KINK
         noise = covariance * misfit(field.variance, variance, self._window)
@@ -436,7 +437,7 @@ class SlipTracker(ThreadSafe):
     def _start_contact(self, now: Places, found: Mask) -> _Motion | None:
         """Let all windows in contact stick; return the motion, which is none, if they are enough."""
         part = self._part
-        self._fixed[part] = np.where(found, now, np.nan)
+        self._fixed[part] = np.where(found, now, _UNKNOWN)
         self._settled[part] = found & ~self._partial[part]
         self._drift[:, *part] = 0
         self._fitted[part] = self._frames
@@ -495,7 +496,7 @@ class SlipTracker(ThreadSafe):
         share = self._share_in_contact(np.zeros((2, *shape)))
         self._touched, self._partial = share > _TOUCHES, share < 1
         entered = np.isfinite(self._fixed) & self._touched
-        self._fixed[~entered] = complex(np.nan, np.nan)
+        self._fixed[~entered] = _UNKNOWN
         self._settled, self._slipped, self._exceeded = (
             states[nearest] & entered for states in (self._settled, self._slipped, self._exceeded)
         )
@@ -509,23 +510,20 @@ class SlipTracker(ThreadSafe):
         inside = inside & (_between(known[np.newaxis].astype(np.float64), place)[0] > 1 - 1e-6)
         values = np.where(known, values, 0.0)
         real, imaginary = _between(np.stack([values.real, values.imag]), place)
-        return np.where(inside, real + 1j * imaginary, complex(np.nan, np.nan)), inside
+        return np.where(inside, real + 1j * imaginary, _UNKNOWN), inside
 
     def _result(self, windows: _Windows, motion: _Motion | None) -> Result:
         """Return the maps of a frame."""
-        part, found, grid = self._part, windows.found, self._nodes.shape
+        part, grid = self._part, self._nodes.shape
         touched, slipped, followed = self._touched[part], self._slipped[part], self._followed[part]
         moved = np.full((*grid, 2), np.nan, np.float32)
         covariance = np.full((*grid, 3), np.nan, np.float32)
         total = windows.moved + self._before[part]
-        found = found & np.isfinite(total)
-        moved[*part, 0], moved[*part, 1] = (
-            np.where(found, total.real, np.nan),
-            np.where(found, total.imag, np.nan),
-        )
+        moved[part] = total.view(np.float64).reshape(*total.shape, 2)
         noise = windows.noise + self._before_covariance[:, *part]
         noise[:2] += windows.bending
-        covariance[part] = np.where(found, noise, np.nan).transpose(1, 2, 0)
+        np.copyto(noise, np.nan, where=np.isnan(total))
+        covariance[part] = noise.transpose(1, 2, 0)
         status = np.full(grid, SlipStatus.NO_CONTACT, np.uint8)
         counted, inner = touched & followed, status[part]
         inner[touched] = SlipStatus.NO_TEXTURE
@@ -576,7 +574,7 @@ def _chi_square(left: Places, xx: Doubles, yy: Doubles, xy: Doubles) -> Doubles:
 def _numbers(motion: _Motion | None, middle: complex) -> dict[str, float]:
     """Return the angle, the centre and the displacement of the middle of a motion, with their sigmas."""
     angle = spread = centre_spread = shift_spread = np.nan
-    centre = shift = complex(np.nan, np.nan)
+    centre = shift = _UNKNOWN
     if motion is not None:
         angle, spread = float(np.angle(motion.turn)), float(np.sqrt(motion.angle_variance))
         arm = middle - motion.about

@@ -91,7 +91,8 @@ def conjugate_gradients(
     flat = math.prod(systems), -1
 
     def inner(first: Array, second: Array) -> Array:
-        return np.einsum("ni,ni->n", first.reshape(flat), second.reshape(flat)).reshape(systems)
+        sums: Array = np.einsum("ni,ni->n", first.reshape(flat), second.reshape(flat))
+        return sums.reshape(systems)
 
     for step in range(steps + 1):
         rest = target - moved
