@@ -601,7 +601,7 @@ class Kernel:
         *,
         moved: int,
         first_item: int = 0,
-        **arguments: Operand | float | np.generic | None,
+        **arguments: Operand | float | Sequence[float] | np.generic | None,
     ) -> None:
         """Enqueue one launch.
 
@@ -613,9 +613,9 @@ class Kernel:
             Bytes that it must read and write, for the profile.
         first_item : int
             Number of the first item, for work that is done in parts.
-        **arguments : Array, BorrowedBuffer, number or None
-            The kernel's arguments by their names in the source. Numbers are converted to the types there;
-            None is a null pointer.
+        **arguments : Array, BorrowedBuffer, number, sequence of numbers or None
+            The kernel's arguments by their names in the source. Numbers are converted to the types there, and
+            sequences to vectors; None is a null pointer.
 
         Raises
         ------

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
+from numpy.typing import NDArray
 
 from mirrorskin.kernels.errors import DeviceError
 
@@ -43,6 +44,8 @@ def _argument(kernel: cl.Kernel, place: int) -> tuple[str, str]:
 def converter(argument: str, type_name: str) -> Convert | None:
     """Return a function that converts a number to the type of an argument; None for a buffer.
 
+    A vector, such as float16, is converted from as many numbers.
+
     Raises
     ------
     DeviceError
@@ -50,9 +53,21 @@ def converter(argument: str, type_name: str) -> Convert | None:
     """
     if type_name.endswith("*"):
         return None
-    scalar = _SCALARS.get(type_name.replace("unsigned ", "u"))
+    kind = type_name.replace("unsigned ", "u").rstrip("0123456789")
+    length = type_name[len(type_name.rstrip("0123456789")) :]
+    scalar = _SCALARS.get(kind)
     if scalar is None:
         raise DeviceError(f"argument {argument} is of type {type_name}: use a number or a __global pointer")
+    if length:
+        return lambda values: _vector(values, scalar, int(length))
     if issubclass(scalar, np.integer):
         return lambda value: scalar(operator.index(value))
     return scalar
+
+
+def _vector(values: Any, scalar: Any, length: int) -> NDArray[Any]:
+    """Return numbers as a vector argument."""
+    vector = np.array(values, scalar)
+    if vector.shape != (length,):
+        raise TypeError(f"{length} numbers are needed")
+    return vector

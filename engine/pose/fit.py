@@ -20,10 +20,21 @@ from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
-from mirrorskin.kernels.skin.pose import BLOCK, PARTS
+from mirrorskin.kernels.skin.pose import (
+    BLOCK,
+    FEWEST,
+    FOUND,
+    LEAST,
+    MAX_STEP,
+    NO_LIMIT,
+    PARTS,
+    POSE,
+    SCATTER_AT,
+    SHIFT_AT,
+    SUMS_AT,
+    TURN_AT,
+)
 
-FEWEST_SHARED = 20
-"""Smallest number of pixels that two maps must share."""
 MIN_COMMON = 0.2
 """Smallest share of the smaller map's pixels that two maps must share to be compared."""
 
@@ -33,7 +44,7 @@ _MIN_INFORMATION = 1e-5  # share of the mean information that is added to all di
 _LIKELY = 0.5, 0.02  # noise assumed by `Equations.free` during steps, near the solution and far from it
 _MAX_CHI2 = 3.0  # chi square above which a motion is far from the solution
 _COARSEST = 24  # pixels along the shorter side of the coarsest maps
-_MAX_STEPS, _LAST_STEP = 40, 1e-2  # maximum number of steps; step, in standard deviations, that ends them
+MAX_STEPS, _LAST_STEP = 40, 1e-2  # maximum number of steps; step, in standard deviations, that ends them
 _BLOCKS = 100  # weight, in blocks, of the covariance of independent errors
 _POOR = 2.0  # typical chi square above which other starts are tried
 _ANGLES, _SHIFTS, _TRIED = 24, 13, 6  # starts of the grid: rotations, shifts per axis, and number refined
@@ -42,9 +53,7 @@ _FINAL_STEPS = 200  # maximum number of steps at the chosen motion: they are sho
 _BETTER = 0.95  # chi square, relative to that of starts that are preferred, below which other ones are taken
 _OTHER = 3.0  # pixels by which motions differ
 _GOOD = 1.3  # typical chi square below which no further start is tried
-_NONE = np.zeros((6, 0))
-_NO_LIMIT = 1e30
-_MAX_STEP = 0.35  # longest step, relative to the object's size
+_NONE, _ALL = np.zeros((6, 0)), np.eye(6)
 
 
 class Equations:
@@ -61,34 +70,21 @@ class Equations:
         Chi square per degree of freedom; `compared` is their number.
     """
 
-    def __init__(self, sums: NDArray[np.floating], size: float, unbiased: bool) -> None:
-        self._scale, self._sums, self._size, self._unbiased = _scale_of(size), sums, size, unbiased
-        upper, right, chi, expected, heights, normals, *products = _split(sums.sum(axis=0, dtype=np.float64))
+    def __init__(self, total: Doubles, size: float) -> None:
+        self._scale = _scale_of(size)
+        upper, right, chi, expected, heights, normals, *products = _split(total)
         self.normal_matrix: NDArray[Any] = _symmetric(upper, self._scale)
         self.unbiased: NDArray[Any] = self.normal_matrix
-        if unbiased:
+        if products:
             self.unbiased = products[0].reshape(6, 6) * np.outer(self._scale, self._scale)
         self.right: NDArray[Any] = right * self._scale
         self.pixels: float = max(float(normals[0]), float(heights[0]))
         self.compared: float = float(expected[0])
         self.chi_square: float = float(chi[0]) / max(self.compared, 1e-9)
 
-    def after(self, step: Doubles) -> Equations:
-        """Return the sums after a step, (6,), for residuals that are linear in it."""
-        sums = self._sums.astype(np.float64)
-        upper, right, chi, *_ = _split(sums)
-        step = step * self._scale
-        added = upper[:, _UPPER] @ step
-        chi += ((2 * right + added) @ step)[:, np.newaxis]
-        right += added
-        return Equations(sums, self._size, self._unbiased)
-
-    @cached_property
-    def typical(self) -> float:
-        """Median chi square of the blocks, which is insensitive to a dent in the object."""
-        _, _, chi, expected, *_ = _split(self._sums.astype(np.float64))
-        used = expected > 0
-        return float(np.median(chi[used] / expected[used])) if used.any() else math.inf
+    def scatter(self) -> tuple[NDArray[Any], int]:
+        """Return the sum over blocks of the products of their J'Wr, (6, 6), and the number of blocks."""
+        raise NotImplementedError
 
     def free(self, noise: float | None = None) -> Doubles:
         """Return orthonormal directions, (6, k), that the maps do not determine.
@@ -110,16 +106,56 @@ class Equations:
         correlated. A few blocks determine its size but hardly its shape, which is then closer to the
         covariance of independent errors.
         """
-        directions = complement(free)
-        _, scores, _, _, heights, normals, *_ = _split(self._sums.astype(np.float64))
-        scores = scores * self._scale
-        count = int(np.count_nonzero(normals + heights))
+        directions, (products, count) = complement(free), self.scatter()
         independent = directions.T @ self.normal_matrix @ directions
-        scatter = directions.T @ scores.T @ scores @ directions * count / max(count - 6, 1)
+        scatter = directions.T @ products @ directions * count / max(count - 6, 1)
         size = np.trace(np.linalg.solve(independent, scatter)) / len(independent)
         middle = (count * scatter + _BLOCKS * size * independent) / (count + _BLOCKS)
         inverse = np.linalg.inv(directions.T @ self.unbiased @ directions)
         return np.asarray(directions @ inverse @ middle @ inverse.T @ directions.T)
+
+
+class BlockEquations(Equations):
+    """Equations from the sums of blocks, (blocks, numbers)."""
+
+    def __init__(self, sums: NDArray[np.floating], size: float) -> None:
+        super().__init__(sums.sum(axis=0, dtype=np.float64), size)
+        self._sums = sums
+
+    def scatter(self) -> tuple[NDArray[Any], int]:
+        """Return the sum over blocks of the products of their J'Wr, (6, 6), and the number of blocks."""
+        _, scores, _, _, heights, normals, *_ = _split(self._sums.astype(np.float64))
+        scores = scores * self._scale
+        return scores.T @ scores, int(np.count_nonzero(normals + heights))
+
+    @cached_property
+    def typical(self) -> float:
+        """Median chi square of the blocks, which is insensitive to a dent in the object."""
+        _, _, chi, expected, *_ = _split(self._sums.astype(np.float64))
+        used = expected > 0
+        return float(np.median(chi[used] / expected[used])) if used.any() else math.inf
+
+
+class Followed(Equations):
+    """A motion that `PairFit.follow` found, and the equations there.
+
+    Attributes
+    ----------
+    motion : Motion
+    bend : float
+        Error that a coarse step leaves over the square of the step, both in sigmas.
+    """
+
+    def __init__(self, found: NDArray[np.floating], size: float) -> None:
+        blocks, bend, *_ = values = found.astype(np.float64)
+        super().__init__(values[SUMS_AT:SCATTER_AT], size)
+        self.bend: float = float(bend)
+        self.motion: Motion = Motion(values[TURN_AT:SHIFT_AT].reshape(3, 3), values[SHIFT_AT:SUMS_AT]).rigid()
+        self._blocks, self._products = int(blocks), values[SCATTER_AT:]
+
+    def scatter(self) -> tuple[NDArray[Any], int]:
+        """Return the sum over blocks of the products of their J'Wr, (6, 6), and the number of blocks."""
+        return _symmetric(self._products, self._scale), self._blocks
 
 
 def _split(sums: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -140,6 +176,8 @@ def _symmetric(upper: Doubles, scale: Doubles) -> Doubles:
 
 def complement(free: Doubles) -> Doubles:
     """Return orthonormal directions, (6, 6 - k), orthogonal to the given ones."""
+    if not free.size:
+        return _ALL
     return np.asarray(np.linalg.svd(free, full_matrices=True)[0][:, free.shape[1] :])
 
 
@@ -152,7 +190,7 @@ class PairFit:
 
     def __init__(self, first: PoseMap, second: PoseMap, device: Device) -> None:
         self.first, self.second, self.device = first, second, device
-        self._arrays: dict[tuple[int, ...], tuple[Array, Array]] = {}  # poses and sums, by the sums' shape
+        self._arrays: dict[tuple[str | int, ...], Array] = {}  # by name and shape
 
     def after(self, first: PoseMap) -> PairFit:
         """Return the fit of another first map to the same second one, which uses the same memory."""
@@ -160,30 +198,66 @@ class PairFit:
         fit._arrays = self._arrays
         return fit
 
-    def equations(
-        self, motion: Motion, unbiased: bool = False, step: int = 1, limit: float = _NO_LIMIT
-    ) -> Equations:
-        """Return the sums at a motion, without pixels whose chi square is above a limit."""
-        return Equations(self._sums([motion], unbiased, step, limit)[0], self.second.extent.size, unbiased)
+    def equations(self, motion: Motion, unbiased: bool = False) -> BlockEquations:
+        """Return the sums at a motion."""
+        return BlockEquations(self._sums([motion], unbiased)[0], self.second.extent.size)
 
-    def _sums(
-        self, motions: Sequence[Motion], unbiased: bool = False, step: int = 1, limit: float = _NO_LIMIT
-    ) -> NDArray[np.float32]:
+    def follow(self, expected: Motion, key: Array, bend: float) -> Followed | None:
+        """Return the motion near an expected one; None if there is none, or the maps hardly match there.
+
+        ``key`` is that of `constants`, and ``bend`` the last one of `Followed`.
+        """
+        device, (rows, columns) = self.device, self.first.shape
+        group = device.layout.group
+        device.kernel("pose", "pose_follow", BESIDE=0, GROUP=group)(
+            group,
+            rows=rows,
+            columns=columns,
+            other_rows=self.second.shape[0],
+            other_columns=self.second.shape[1],
+            expected=(*expected.turn.ravel(), *expected.shift, bend, 0, 0, 0),
+            key=key,
+            first=self.first.records,
+            second=self.second.records,
+            sums=self._array("sums of blocks", self._blocks, PARTS[-2]),
+            found=self._array("found", FOUND),
+            moved=32 * rows * columns,
+        )
+        found = self._array("found", FOUND).read()
+        return Followed(found, self.second.extent.size) if found[0] else None
+
+    def constants(self, typical: float, directions: Doubles) -> Array:
+        """Return what `follow` needs of two maps, on the device.
+
+        They are the typical chi square and the directions in which the motion is followed.
+        """
+        first, second = self.first, self.second
+        numbers = first.flat_limit, second.flat_limit, second.extent.size, typical
+        projection = (directions @ directions.T).ravel()
+        values = [*second.extent.middle, *first.grid, *second.grid, *numbers, *projection]
+        return self.device.from_host("key", values)
+
+    @property
+    def _blocks(self) -> int:
+        rows, columns = self.first.shape
+        return -(-rows // BLOCK) * -(-columns // BLOCK)
+
+    def _array(self, name: str, *shape: int) -> Array:
+        """Return an array that is kept for the next use."""
+        if (name, *shape) not in self._arrays:
+            self._arrays[name, *shape] = self.device.array(name, shape, np.float32, zeroed=False)
+        return self._arrays[name, *shape]
+
+    def _sums(self, motions: Sequence[Motion], unbiased: bool = False) -> NDArray[np.float32]:
         """Return the sums of each block at each motion, (n, blocks, numbers); J'WK only if ``unbiased``."""
         first, second = self.first, self.second
-        rows, columns = first.shape
-        side = BLOCK * step
-        blocks = -(-rows // side) * -(-columns // side)
-        limits = first.flat_limit, second.flat_limit, limit
+        (rows, columns), blocks = first.shape, self._blocks
+        limits = first.flat_limit, second.flat_limit, NO_LIMIT
         maps = *second.extent.middle, *first.grid, *second.grid, *limits
         rows_of_poses = [[*motion.turn.ravel(), *motion.shift, *maps] for motion in motions]
-        shape = len(motions), blocks, PARTS[-1 if unbiased else -2]
-        if shape not in self._arrays:
-            poses = self.device.from_host("poses", rows_of_poses)
-            self._arrays[shape] = poses, self.device.array("sums", shape, np.float32, zeroed=False)
-        else:
-            self._arrays[shape][0].write(np.asarray(rows_of_poses, np.float32))
-        poses, sums = self._arrays[shape]
+        poses = self._array("poses", len(motions), POSE)
+        poses.write(np.asarray(rows_of_poses, np.float32))
+        sums = self._array("sums", len(motions), blocks, PARTS[-1 if unbiased else -2])
         self.device.kernel("pose", "pose_equations", BESIDE=int(unbiased))(
             len(motions) * blocks,
             count=len(motions),
@@ -191,16 +265,17 @@ class PairFit:
             columns=columns,
             other_rows=second.shape[0],
             other_columns=second.shape[1],
-            step=step,
             first=first.records,
             second=second.records,
             poses=poses,
             sums=sums,
-            moved=32 * rows * columns // step**2 * len(motions),
+            moved=32 * rows * columns * len(motions),
         )
         return sums.read()
 
-    def solve(self, start: Motion | None = None, near: bool = False) -> tuple[Motion, Equations, Doubles]:
+    def solve(
+        self, start: Motion | None = None, near: bool = False
+    ) -> tuple[Motion, BlockEquations, Doubles]:
         """Return the motion, its equations, and the directions that they do not determine.
 
         Without a start, the identity is tried, then a search. A ``near`` start needs no coarse maps.
@@ -217,7 +292,9 @@ class PairFit:
             raise InputError("the two maps share too few pixels: give a start, or results that overlap")
         return self._determined(levels, motion, start or STILL)
 
-    def solve_from(self, far: Sequence[Motion], near: Sequence[Motion]) -> tuple[Motion, Equations, Doubles]:
+    def solve_from(
+        self, far: Sequence[Motion], near: Sequence[Motion]
+    ) -> tuple[Motion, BlockEquations, Doubles]:
         """Return what `solve` does for the best of some starts: refined from coarse maps, or as precise."""
         coarse, fine = (
             (*self._best_of(levels, guesses), levels)
@@ -245,7 +322,7 @@ class PairFit:
 
     def _determined(
         self, levels: list[PairFit], motion: Motion, start: Motion
-    ) -> tuple[Motion, Equations, Doubles]:
+    ) -> tuple[Motion, BlockEquations, Doubles]:
         """Return a motion, as its start along undetermined directions, and what `solve` returns."""
         now = self.equations(motion, unbiased=True)
         free = now.free()
@@ -260,7 +337,7 @@ class PairFit:
     def _coarser(self) -> list[PairFit]:  # without this one: a cycle would keep its maps on the device
         """The maps at half their resolution, at a quarter, and so on."""
         pairs = itertools.takewhile(
-            lambda pair: min(map_.extent.pixels for map_ in pair) >= FEWEST_SHARED,
+            lambda pair: min(map_.extent.pixels for map_ in pair) >= FEWEST,
             coarser([self.first, self.second], _COARSEST),
         )
         return [PairFit(first, second, self.device) for first, second in pairs]
@@ -347,29 +424,29 @@ class PairFit:
                 Motion(turn, middle + np.array([along, up, 0]) * extent) for along in shifts for up in shifts
             ]
 
-    def refine(self, motion: Motion, free: Doubles = _NONE, steps: int = _MAX_STEPS) -> Motion | None:
+    def refine(self, motion: Motion, free: Doubles = _NONE, steps: int = MAX_STEPS) -> Motion | None:
         """Refine a motion until steps outside of the free directions are small; None without overlap."""
         for _ in range(steps):
             now = self.equations(motion, unbiased=not free.size)
-            if now.pixels < FEWEST_SHARED:
+            if now.pixels < FEWEST:
                 return None
             directions = complement(free if free.size else now.free(_LIKELY[now.chi_square > _MAX_CHI2]))
             if not directions.size:
                 break
-            motion, moved, _ = self.step(motion, now, directions)
+            motion, moved = self._step(motion, now, directions)
             if moved < _LAST_STEP:
                 break
         return motion
 
-    def step(self, motion: Motion, now: Equations, directions: Doubles) -> tuple[Motion, float, Doubles]:
-        """Return the motion after a Gauss-Newton step in given directions; the step in sigmas, and itself."""
+    def _step(self, motion: Motion, now: Equations, directions: Doubles) -> tuple[Motion, float]:
+        """Return the motion after a Gauss-Newton step in given directions, and the step in sigmas."""
         matrix = directions.T @ now.normal_matrix @ directions
-        matrix += _MIN_INFORMATION / 10 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
+        matrix += LEAST * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
         step = -directions @ np.linalg.solve(matrix, directions.T @ now.right)
-        step /= max(float(np.linalg.norm(step)) / (_MAX_STEP * self.second.extent.size), 1.0)
+        step /= max(float(np.linalg.norm(step)) / (MAX_STEP * self.second.extent.size), 1.0)
         sigmas = math.sqrt(step @ now.normal_matrix @ step / max(now.chi_square, 1.0))
         moved = motion.small_step(step * _scale_of(self.second.extent.size), self.second.extent.middle)
-        return moved, sigmas, step
+        return moved, sigmas
 
     def at_origin(self) -> Doubles:
         """Return the matrix, (6, 6), that converts steps of these equations to motions about the origin."""

@@ -42,10 +42,15 @@ class Motion:
     def small_step(self, step: Doubles, centre: Doubles) -> Motion:
         """Return this motion followed by a small rotation about a point and a translation, (6,)."""
         small = Motion.of(step[:3], step[3:])
-        moved = self.then(Motion(small.turn, centre - small.turn @ centre + small.shift))
-        # Rounding errors would accumulate, because the transpose is used as the inverse. A Newton step
-        # towards the nearest rotation squares them.
-        return Motion(moved.turn @ (1.5 * np.eye(3) - 0.5 * moved.turn.T @ moved.turn), moved.shift)
+        return self.then(Motion(small.turn, centre - small.turn @ centre + small.shift)).rigid()
+
+    def rigid(self) -> Motion:
+        """Return this motion without rounding errors of the rotation.
+
+        They would accumulate, because the transpose is used as the inverse. A Newton step towards the nearest
+        rotation squares them.
+        """
+        return Motion(self.turn @ (1.5 * np.eye(3) - 0.5 * self.turn.T @ self.turn), self.shift)
 
     def adjoint(self) -> Doubles:
         """Return the matrix, (6, 6), that converts small motions before this one to ones after it."""

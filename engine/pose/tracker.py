@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mirrorskin.engine.base.inputs import Maps, as_result
-from mirrorskin.engine.pose.fit import FEWEST_SHARED, Equations, PairFit, complement
+from mirrorskin.engine.pose.fit import BlockEquations, Equations, Followed, PairFit, complement
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
@@ -18,8 +17,10 @@ from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.findings import findings_of
 from mirrorskin.io.base.threads import ThreadSafe
 from mirrorskin.io.model.result import shape_of
+from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
+from mirrorskin.kernels.skin.pose import NO_LIMIT
 
 _MIN_COMMON = 0.6  # share of the key's pixels below which another result becomes the key
 _LEAVING = 0.1  # loss of shared pixels, as a share, after which earlier keys are compared
@@ -28,14 +29,7 @@ _LEAVING = 0.1  # loss of shared pixels, as a share, after which earlier keys ar
 _BETTER, _GOOD_ENOUGH = 0.8, 2.0
 _MOST_KEYS = 64  # largest number of earlier keys that are remembered
 _SIDE = 100  # least pixels along the shorter side of averaged maps
-_STRIDE = 4  # pixel step of the coarse fit
-_MAX_COARSE, _MAX_FINE = 8, 4  # largest number of steps
-_CLOSE, _EXACT = 3.0, 0.1  # errors that coarse and fine steps may leave, sigmas
-_CLEAR = 3.0  # sigmas of a step from which the next one shows its error
-_MIN_KEPT = 0.5  # share of the pixels that are not outliers
-_LOST = 3.0  # chi square, in units of the key's first one, above which the motion is searched
 _SEARCHED = "its motion was too large to follow, and was searched for"
-_OUTLIER = 30.0  # chi square of a pixel that is left out, in units of the key's first chi square
 
 
 class PoseTracker(ThreadSafe):
@@ -131,11 +125,12 @@ class PoseTracker(ThreadSafe):
         found = key.follow(map_, expected)
         if found is None:
             return self._search(key, result)
-        pose = self._moved_to(found.motion, key.pose_of(found))
-        share = key.share(found)
+        fit, now = found
+        pose = self._moved_to(now.motion, key.pose_of(fit, now.motion, now))
+        share = key.share(now)
         if key.has_left(share) or share < _MIN_COMMON:
             limit = _BETTER if share > _MIN_COMMON else _GOOD_ENOUGH
-            pose = self._return_to_key(map_, found.motion, pose, limit)
+            pose = self._return_to_key(map_, now.motion, pose, limit)
         if share < _MIN_COMMON and self._key is key:
             self._take_key(result, pose)
         return pose
@@ -151,7 +146,7 @@ class PoseTracker(ThreadSafe):
                 self._take_key(result, IDENTITY)
             raise
         key.start(fit, now, free)
-        return self._moved_to(motion, key.pose_of(_Found(fit, motion, now)))
+        return self._moved_to(motion, key.pose_of(fit, motion, now))
 
     def _search(self, key: _Key, result: Result) -> Pose:
         """Return the pose of a result that is far from the expected pose."""
@@ -167,12 +162,13 @@ class PoseTracker(ThreadSafe):
         first_to_map = present.pose.motion.then(motion.inverse())
         for key in self._earlier:
             found = key.follow(map_, first_to_map.inverse().then(key.pose.motion))
-            if found is None or (share := key.share(found)) < _MIN_COMMON + _LEAVING:
+            if found is None or (share := key.share(found[1])) < _MIN_COMMON + _LEAVING:
                 continue
-            other = key.pose_of(found)
+            fit, now = found
+            other = key.pose_of(fit, now.motion, now)
             if key.spread(other) < best:
                 pose, best, key.peak = other, key.spread(other), share
-                self._key, self._back = key, found.motion
+                self._key, self._back = key, now.motion
         if self._key is not present:
             self._earlier = [key for key in self._earlier if key is not self._key] + [present]
         return pose
@@ -203,14 +199,6 @@ class PoseTracker(ThreadSafe):
         return map_
 
 
-class _Found(NamedTuple):
-    """A motion from a result to a key, and the equations there."""
-
-    fit: PairFit
-    motion: Motion
-    now: Equations
-
-
 @dataclass(slots=True)
 class _Key:
     """A result with which others are compared."""
@@ -219,20 +207,21 @@ class _Key:
     pose: Pose  # from the first result
     fit: PairFit | None = None  # of the first result after it
     free: Doubles = field(default_factory=lambda: np.zeros((6, 0)))  # directions that are not determined
-    directions: Doubles = field(default_factory=lambda: np.eye(6))  # the others
     pixels: float = 0.0  # that the first result after it shares
     peak: float = 1.0  # largest share of them lately
     typical: float = 1.0  # chi square
-    bend: float = np.inf  # error that a coarse step leaves over the square of the step, both in sigmas
+    bend: float = NO_LIMIT  # of the last motion found
+    constants: Array | None = None  # of the fit to `layout`
+    layout: tuple[object, ...] = ()
 
-    def start(self, fit: PairFit, now: Equations, free: Doubles) -> None:
+    def start(self, fit: PairFit, now: BlockEquations, free: Doubles) -> None:
         """Keep what the first result after this key shows."""
-        self.fit, self.free, self.directions = fit, free, complement(free)
+        self.fit, self.free = fit, free
         self.pixels, self.typical = now.pixels, max(now.chi_square, now.typical, 1.0)
 
-    def share(self, found: _Found) -> float:
+    def share(self, now: Equations) -> float:
         """Return the share of the pixels that another result shares."""
-        return found.now.pixels / self.pixels
+        return now.pixels / self.pixels
 
     def has_left(self, share: float) -> bool:
         """Return whether results have moved away from this key by a step since this was last true."""
@@ -247,36 +236,19 @@ class _Key:
         variances = np.diag(pose.covariance)
         return float(variances[3:].sum() + self.map.extent.size**2 * variances[:3].sum())
 
-    def follow(self, map_: PoseMap, motion: Motion) -> _Found | None:
+    def follow(self, map_: PoseMap, motion: Motion) -> tuple[PairFit, Followed] | None:
         """Return the motion from a map to this key near an expected motion, or None."""
         if self.fit is None:
             return None
-        fit, last = self.fit.after(map_), 0.0
-        for _ in range(_MAX_COARSE):
-            now = fit.equations(motion, step=_STRIDE)
-            if now.pixels < FEWEST_SHARED:
-                return None
-            motion, moved, _ = fit.step(motion, now, self.directions)
-            if last > _CLEAR:
-                self.bend = moved / last**2
-            last = moved
-            if min(moved, self.bend * moved**2) < _CLOSE:
-                found = self._refined(fit, motion, now.pixels * _STRIDE**2)
-                if found is not None:
-                    return found
-        return None
+        fit, layout = self.fit.after(map_), (map_.grid, map_.flat_limit)
+        if self.constants is None or layout != self.layout:
+            self.layout, self.constants = layout, fit.constants(self.typical, complement(self.free))
+        found = fit.follow(motion, self.constants, self.bend)
+        if found is None:
+            return None
+        self.bend = found.bend
+        return fit, found
 
-    def _refined(self, fit: PairFit, motion: Motion, shared: float) -> _Found | None:
-        """Return a motion refined with all pixels but outliers; None if these are most of the shared ones."""
-        for _ in range(_MAX_FINE):
-            now = fit.equations(motion, limit=_OUTLIER * self.typical)
-            if now.pixels < max(_MIN_KEPT * shared, FEWEST_SHARED) or now.chi_square > _LOST * self.typical:
-                return None
-            motion, moved, step = fit.step(motion, now, self.directions)
-            if min(moved, self.bend / _STRIDE * moved**2) < _EXACT:
-                break
-        return _Found(fit, motion, now.after(step))
-
-    def pose_of(self, found: _Found) -> Pose:
+    def pose_of(self, fit: PairFit, motion: Motion, now: Equations) -> Pose:
         """Return the motion from the first result to the one from which a motion to this key was found."""
-        return self.pose.then(pose_of(*found, self.free).inverse())
+        return self.pose.then(pose_of(fit, motion, now, self.free).inverse())

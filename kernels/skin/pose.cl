@@ -2,6 +2,7 @@
 //
 // TILE     1 on a GPU; otherwise an item processes a row of LANES pixels at once
 // BESIDE   1 if the Jacobian by the first map's own curvature is also computed
+// GROUP    items of the work-group of pose_follow
 
 #include "common.clh"
 
@@ -12,11 +13,12 @@
 #endif
 #include "lanes.clh"
 
+#define INLINE static inline __attribute__((always_inline))
+
 #define UNROLL _Pragma("unroll")
 
 #define BLOCK 8
 #define SUMS (BESIDE ? 67 : 31)
-#define POSE 26
 #define NEAR 1e20f
 #define VAGUE 100.0f
 
@@ -127,21 +129,27 @@ void jacobian(const Vector n, const Symmetric h, const F over_z, const Vector ar
     rows->z[5] = height_weight;
 }
 
-// For each pose and each block of the first map's pixels: the SUMS sums described in pose.py.
-__kernel void pose_equations(
-    const int count, const int rows, const int columns, const int other_rows, const int other_columns, const int step,
-    MAP first, MAP second, MAP poses, OUT sums)
+// A motion, its two maps' positions and limits, as described in pose.py.
+typedef struct {
+    float turn[9], shift[3], centre[3], grid[4], other_grid[4], flat_limit, other_flat_limit, limit;
+} Pose;
+
+#define BLOCKS_ACROSS(columns, step) (((columns) + BLOCK * (step) - 1) / (BLOCK * (step)))
+#define BLOCKS(rows, columns, step) (BLOCKS_ACROSS(rows, step) * BLOCKS_ACROSS(columns, step))
+
+// Writes the SUMS sums described in pose.py over a block of the first map's pixels.
+INLINE void add_block(
+    const int block, const int rows, const int columns, const int other_rows, const int other_columns, const int step,
+    MAP first, MAP second, const Pose *pose, OUT sums)
 {
-    const int side = BLOCK * step, across = (columns + side - 1) / side, blocks = (rows + side - 1) / side * across;
-    const int item = get_global_id(0), block = item % blocks;
+    const int side = BLOCK * step, across = BLOCKS_ACROSS(columns, step);
     const int top = block / across * side, begin = block % across * side;
-    if (item / blocks >= count) return;
-    MAP pose = poses + item / blocks * POSE;
-    float turn[9];
-    UNROLL for (int i = 0; i < 9; ++i) turn[i] = pose[i];
-    const float3 shift = vload3(3, pose), centre = vload3(4, pose);
-    const float x0 = pose[15], y0 = pose[16], step_x = pose[17], step_y = pose[18], flat_limit = pose[23];
-    const float other_x = pose[19], other_y = pose[20], wide = pose[21], high = pose[22], other_flat_limit = pose[24], limit = pose[25];
+    const float *turn = pose->turn;
+    const float3 shift = vload3(0, pose->shift), centre = vload3(0, pose->centre);
+    const float x0 = pose->grid[0], y0 = pose->grid[1], step_x = pose->grid[2], step_y = pose->grid[3];
+    const float other_x = pose->other_grid[0], other_y = pose->other_grid[1];
+    const float wide = pose->other_grid[2], high = pose->other_grid[3];
+    const float flat_limit = pose->flat_limit, other_flat_limit = pose->other_flat_limit, limit = pose->limit;
     const float east_x = 1.0f / wide, south_y = 1.0f / high;
     F total[SUMS];
     UNROLL for (int i = 0; i < SUMS; ++i) total[i] = 0.0f;
@@ -231,6 +239,219 @@ __kernel void pose_equations(
                 UNROLL for (int k = 0; k < 6; ++k) total[31 + 6 * i + k] += PRODUCT(j, i, other_jacobian, k);
 #endif
         }
-    OUT out = sums + item * SUMS;
-    UNROLL for (int i = 0; i < SUMS; ++i) out[i] = sum_over_lanes(total[i]);
+    UNROLL for (int i = 0; i < SUMS; ++i) sums[i] = sum_over_lanes(total[i]);
+}
+
+// For each pose and each block of the first map's pixels: the SUMS sums.
+__kernel void pose_equations(
+    const int count, const int rows, const int columns, const int other_rows, const int other_columns, MAP first,
+    MAP second, __global const Pose *restrict poses, OUT sums)
+{
+    const int item = get_global_id(0), blocks = BLOCKS(rows, columns, 1);
+    if (item / blocks >= count) return;
+    const Pose pose = poses[item / blocks];
+    add_block(item % blocks, rows, columns, other_rows, other_columns, 1, first, second, &pose, sums + item * SUMS);
+}
+
+#if GROUP > 1
+#define ITEMS GROUP
+#define BARRIER barrier(CLK_GLOBAL_MEM_FENCE)
+#else
+#define ITEMS 1
+#define BARRIER
+#endif
+
+#define STRIDE 4
+#define MAX_COARSE 8
+#define MAX_FINE 4
+#define CLOSE 3.0f
+#define EXACT 0.1f
+#define CLEAR 3.0f
+#define FEWEST 20.0f
+#define MIN_KEPT 0.5f
+#define LOST 3.0f
+#define OUTLIER 30.0f
+#define NO_LIMIT 1e30f
+#define LEAST 1e-6f
+#define MAX_STEP 0.35f
+
+#define SCALE(i) ((i) < 3 ? per_size : 1.0f)
+#define AT(i, k) UPPER(LESSER(i, k), GREATER(i, k))
+#define CHI_SQUARE (total[27] / GREATER(total[28], 1e-9f))
+
+// What stays the same while maps are compared with one map.
+typedef struct {
+    float centre[3], grid[4], other_grid[4], flat_limit, other_flat_limit, size, typical, projection[36];
+} Key;
+
+// Solves an equation with a positive definite matrix by Cholesky's method; the matrix is overwritten.
+INLINE void solve(float matrix[6][6], float *right)
+{
+    UNROLL for (int i = 0; i < 6; ++i) {
+        UNROLL for (int k = 0; k <= i; ++k) {
+            float rest = matrix[i][k];
+            UNROLL for (int j = 0; j < k; ++j) rest -= matrix[i][j] * matrix[k][j];
+            matrix[i][k] = k < i ? rest * matrix[k][k] : inverse_root(GREATER(rest, 1e-30f));  // 1 / the diagonal
+        }
+        UNROLL for (int k = 0; k < i; ++k) right[i] -= matrix[i][k] * right[k];
+        right[i] *= matrix[i][i];
+    }
+    UNROLL for (int i = 5; i >= 0; --i) {
+        UNROLL for (int k = i + 1; k < 6; ++k) right[i] -= matrix[k][i] * right[k];
+        right[i] *= matrix[i][i];
+    }
+}
+
+// A Gauss-Newton step in the directions of a projection; also returns the step in standard deviations.
+INLINE float find_step(const float *total, const float *projection, const float per_size, float *step)
+{
+    float full[6][6], part[6][6], matrix[6][6], right[6], trace = 0, kept = 0;
+    for (int i = 0; i < 6; ++i) {
+        right[i] = 0;
+        for (int k = 0; k < 6; ++k) {
+            full[i][k] = total[AT(i, k)] * SCALE(i) * SCALE(k);
+            right[i] -= projection[6 * i + k] * total[21 + k] * SCALE(k);
+        }
+        trace += full[i][i];
+        kept += projection[7 * i];
+    }
+    for (int i = 0; i < 6; ++i)
+        for (int k = 0; k < 6; ++k) {
+            part[i][k] = 0;
+            for (int j = 0; j < 6; ++j) part[i][k] += projection[6 * i + j] * full[j][k];
+        }
+    float projected = 0;
+    for (int i = 0; i < 6; ++i)
+        for (int k = 0; k < 6; ++k) {
+            matrix[i][k] = 0;
+            for (int j = 0; j < 6; ++j) matrix[i][k] += part[i][j] * projection[6 * j + k];
+            if (i == k) projected += matrix[i][k];
+        }
+    // The other directions get a diagonal of their own, so that the step along them is 0.
+    for (int i = 0; i < 6; ++i)
+        for (int k = 0; k < 6; ++k) {
+            const float own = projection[6 * i + k];
+            matrix[i][k] += LEAST * projected / kept * own + trace / 6 * ((i == k) - own);
+        }
+    solve(matrix, right);
+    float square = 0, gain = 0;
+    for (int i = 0; i < 6; ++i) square += right[i] * right[i];
+    const float shorter = 1.0f / GREATER(root(square) * per_size / MAX_STEP, 1.0f);
+    for (int i = 0; i < 6; ++i) step[i] = shorter * right[i];
+    for (int i = 0; i < 6; ++i)
+        for (int k = 0; k < 6; ++k) gain += step[i] * full[i][k] * step[k];
+    for (int i = 0; i < 6; ++i) step[i] *= SCALE(i);
+    return root(GREATER(gain, 1e-30f) / GREATER(CHI_SQUARE, 1.0f));
+}
+
+// Adds a small rotation about the centre, by Cayley's formula, and a translation.
+INLINE void move(Pose *pose, const float *step)
+{
+    const float x = step[0], y = step[1], z = step[2], scale = 1 / (1 + 0.25f * (x * x + y * y + z * z));
+    const float low = 0.5f * scale;
+    const float small[9] = {
+        1 - low * (y * y + z * z), low * x * y - scale * z, low * x * z + scale * y,
+        low * x * y + scale * z, 1 - low * (x * x + z * z), low * y * z - scale * x,
+        low * x * z - scale * y, low * y * z + scale * x, 1 - low * (x * x + y * y)};
+    float turn[9], arm[3];
+    for (int i = 0; i < 3; ++i) arm[i] = pose->shift[i] - pose->centre[i];
+    for (int i = 0; i < 3; ++i) {
+        for (int k = 0; k < 3; ++k)
+            turn[3 * i + k] = small[3 * i] * pose->turn[k] + small[3 * i + 1] * pose->turn[3 + k] + small[3 * i + 2] * pose->turn[6 + k];
+        pose->shift[i] = pose->centre[i] + step[3 + i] + small[3 * i] * arm[0] + small[3 * i + 1] * arm[1] + small[3 * i + 2] * arm[2];
+    }
+    for (int i = 0; i < 9; ++i) pose->turn[i] = turn[i];
+}
+
+// The motion from one map to another near an expected one, by one work-group.
+__kernel GROUP_SIZE void pose_follow(
+    const int rows, const int columns, const int other_rows, const int other_columns, const float16 expected,
+    __global const Key *restrict key, MAP first, MAP second, OUT sums, OUT found)
+{
+    const int item = get_local_id(0);
+    const Key fixed = *key;
+    const float per_size = 1.0f / fixed.size;
+    Pose pose, rough;
+    float start[16], total[SUMS], step[6];
+    vstore16(expected, 0, start);
+    for (int i = 0; i < 9; ++i) pose.turn[i] = start[i];
+    for (int i = 0; i < 3; ++i) {
+        pose.shift[i] = start[9 + i];
+        pose.centre[i] = fixed.centre[i];
+    }
+    for (int i = 0; i < 4; ++i) {
+        pose.grid[i] = fixed.grid[i];
+        pose.other_grid[i] = fixed.other_grid[i];
+    }
+    pose.flat_limit = fixed.flat_limit;
+    pose.other_flat_limit = fixed.other_flat_limit;
+    float bend = start[12], last = 0, shared = 0;
+    int coarse = 0, fine = -1, blocks = 0;  // fine: number of steps with all pixels, -1 during coarse ones
+    while (coarse < MAX_COARSE || fine >= 0) {
+        const int stride = fine < 0 ? STRIDE : 1;
+        pose.limit = fine < 0 ? NO_LIMIT : OUTLIER * fixed.typical;
+        blocks = BLOCKS(rows, columns, stride);
+        for (int block = item; block < blocks; block += ITEMS)
+            add_block(
+                block, rows, columns, other_rows, other_columns, stride, first, second, &pose, sums + block * SUMS);
+        BARRIER;
+        for (int i = 0; i < SUMS; ++i) total[i] = 0;
+        for (int block = 0; block < blocks; ++block)
+            for (int i = 0; i < SUMS; ++i) total[i] += sums[block * SUMS + i];
+        BARRIER;
+        const float pixels = GREATER(total[29], total[30]);
+        if (fine < 0 && pixels < FEWEST) break;
+        if (fine >= 0 && (pixels < GREATER(MIN_KEPT * shared, FEWEST) || CHI_SQUARE > LOST * fixed.typical)) {
+            fine = -1;
+            pose = rough;
+            continue;
+        }
+        const float moved = find_step(total, fixed.projection, per_size, step);
+        move(&pose, step);
+        if (fine >= 0) {
+            ++fine;
+            if (LESSER(moved, bend / STRIDE * moved * moved) < EXACT || fine == MAX_FINE) break;
+            continue;
+        }
+        if (last > CLEAR) bend = moved / (last * last);
+        last = moved;
+        ++coarse;
+        if (LESSER(moved, bend * moved * moved) < CLOSE) {
+            fine = 0;
+            shared = pixels * STRIDE * STRIDE;
+            rough = pose;
+        }
+    }
+    if (fine < 0) {
+        if (item == 0) found[0] = 0;
+        return;
+    }
+    // The sums after the last step, for residuals that are linear in it.
+    for (int block = item; block < blocks; block += ITEMS) {
+        OUT own = sums + block * SUMS;
+        for (int i = 0; i < 6; ++i)
+            for (int k = 0; k < 6; ++k) own[21 + i] += own[AT(i, k)] * step[k];
+    }
+    BARRIER;
+    for (int i = 0; i < 6; ++i)
+        for (int k = i; k < 6; ++k) {
+            if (UPPER(i, k) % ITEMS != item) continue;
+            float scatter = 0;
+            for (int block = 0; block < blocks; ++block) scatter += sums[block * SUMS + 21 + i] * sums[block * SUMS + 21 + k];
+            found[14 + SUMS + UPPER(i, k)] = scatter;
+        }
+    if (item > 0) return;
+    for (int i = 0; i < 6; ++i) {
+        float added = 0;
+        for (int k = 0; k < 6; ++k) added += total[AT(i, k)] * step[k];
+        total[27] += (2 * total[21 + i] + added) * step[i];
+        total[21 + i] += added;
+    }
+    int used = 0;
+    for (int block = 0; block < blocks; ++block) used += sums[block * SUMS + 29] + sums[block * SUMS + 30] > 0;
+    found[0] = used;
+    found[1] = bend;
+    for (int i = 0; i < 9; ++i) found[2 + i] = pose.turn[i];
+    for (int i = 0; i < 3; ++i) found[11 + i] = pose.shift[i];
+    for (int i = 0; i < SUMS; ++i) found[14 + i] = total[i];
 }

@@ -8,6 +8,7 @@ unusable pixel is NaN.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,27 @@ NEAR = 1e20
 """Variance above which a height is not compared: even the smallest interpolated share of FAR exceeds it."""
 VAGUE = 100.0
 """Radians^2 above which a normal is not compared."""
+POSE = 26
+"""Numbers of a pose of `pose_equations`."""
+NO_LIMIT = 1e30
+"""Limit of a pixel's chi square above which none is left out."""
+FEWEST = 20
+"""Smallest number of pixels that two maps must share."""
+TURN_AT, SHIFT_AT, SUMS_AT, SCATTER_AT = 2, 11, 14, 14 + PARTS[-2]
+"""Offsets in the answer of `pose_follow`."""
+FOUND = SCATTER_AT + PARTS[1]
+"""Numbers in that answer."""
+LEAST = 1e-6
+"""Share of the mean information that is added to all directions of a step, for rounding errors."""
+MAX_STEP = 0.35
+"""Longest step, relative to the object's size."""
+_STRIDE = 4  # pixel step of coarse steps
+_MAX_COARSE, _MAX_FINE = 8, 4  # largest number of steps
+_CLOSE, _EXACT = 3.0, 0.1  # errors that coarse and fine steps may leave, sigmas
+_CLEAR = 3.0  # sigmas of a step from which the next one shows its error
+_MIN_KEPT = 0.5  # share of the pixels that are not outliers
+_LOST = 3.0  # chi square, in units of the typical one, above which the maps do not match
+_OUTLIER = 30.0  # chi square of a pixel that is left out, in units of the typical one
 
 
 class Shape(NamedTuple):
@@ -42,13 +64,11 @@ class Shape(NamedTuple):
     yy: Doubles
 
 
-def pose_equations(step: int, first: Array, second: Array, poses: Array, sums: Array) -> None:
-    """Write sums over each block of the first map's pixels at some poses; every ``step``-th pixel counts.
+def pose_equations(first: Array, second: Array, poses: Array, sums: Array) -> None:
+    """Write sums over each block of `BLOCK` x `BLOCK` pixels of the first map at some poses.
 
     Parameters
     ----------
-    step : int
-        A block has `BLOCK` x `BLOCK` pixels that count.
     first, second : (H, W, 8)
         Records; the two maps may be of different sizes.
     poses : (count, 26)
@@ -60,7 +80,98 @@ def pose_equations(step: int, first: Array, second: Array, poses: Array, sums: A
         See `PARTS`.
     """
     for pose, out in zip(poses, sums, strict=True):
-        _equations_at(step, first, second, pose, out)
+        _equations_at(1, first, second, pose, out)
+
+
+def pose_follow(expected: Array, key: Array, first: Array, second: Array, found: Array) -> None:
+    """Write the motion from one map to another near an expected motion.
+
+    Gauss-Newton steps use every `_STRIDE`-th row and column until the error that they leave, which is
+    proportional to their square, is below `_CLOSE` sigmas; then all pixels without outliers. If more than
+    half of the pixels are outliers, or chi square is too large, coarse steps continue.
+
+    Parameters
+    ----------
+    expected : (16,)
+        Rotation matrix (9) and translation (3) of the expected motion, and the error that a coarse step
+        leaves over the square of the step, both in sigmas, or `NO_LIMIT` if unknown; the rest is not used.
+    key : (51,)
+        Numbers 12 to 24 of a pose of `pose_equations`; the object's size; typical chi square; projection onto
+        the directions in which the motion is followed (36), in units of the size.
+    first, second : (H, W, 8)
+        Records.
+    found : (FOUND,)
+        Number of blocks with shared pixels, 0 if no motion is found; error over the square of a step as in
+        ``expected``; rotation matrix; translation; sums over all pixels, as of `pose_equations` without J'WK;
+        and the upper triangle of the sum over blocks of the products of their J'Wr. The sums are those after
+        the last step, for residuals that are linear in it.
+    """
+    found[0] = 0
+    size, typical, projection = key[13], key[14], key[15:].reshape(6, 6)
+    scale = np.repeat([1 / size, 1.0], 3)
+    motion, bend, last, shared = np.array(expected[:12]), expected[12], 0.0, 0.0
+    rough, coarse, fine = motion, 0, -1
+    while coarse < _MAX_COARSE or fine >= 0:
+        stride = _STRIDE if fine < 0 else 1
+        pose = np.concatenate([motion, key[:13], [NO_LIMIT if fine < 0 else _OUTLIER * typical]])
+        blocks = math.prod(-(-side // (BLOCK * stride)) for side in first.shape[:2])
+        sums = np.zeros((blocks, PARTS[-2]))
+        _equations_at(stride, first, second, pose, sums)
+        total = sums.sum(axis=0)
+        pixels, chi_square = total[29:31].max(), total[27] / max(total[28], 1e-9)
+        if fine < 0 and pixels < FEWEST:
+            return
+        if fine >= 0 and (pixels < max(_MIN_KEPT * shared, FEWEST) or chi_square > _LOST * typical):
+            fine, motion = -1, rough
+            continue
+        step, moved = _step(total, chi_square, projection, scale)
+        motion = _moved(motion, step * scale, key[:3])
+        if fine >= 0:
+            fine += 1
+            if min(moved, bend / _STRIDE * moved**2) < _EXACT or fine == _MAX_FINE:
+                break
+            continue
+        if last > _CLEAR:
+            bend = moved / last**2
+        last, coarse = moved, coarse + 1
+        if min(moved, bend * moved**2) < _CLOSE:
+            fine, shared, rough = 0, pixels * _STRIDE**2, motion
+    if fine < 0:
+        return
+    sums[:, 21:27] += _matrix(sums) @ (step * scale)
+    after = sums.sum(axis=0)
+    after[27] += (total[21:27] + after[21:27]) @ (step * scale)
+    products = sums[:, 21:27].T @ sums[:, 21:27]
+    used = np.count_nonzero(sums[:, 29] + sums[:, 30])
+    found[:] = [used, bend, *motion, *after, *products[np.triu_indices(6)]]
+
+
+def _matrix(sums: Array) -> Doubles:
+    """Return J'WJ, (..., 6, 6), from sums."""
+    matrix = np.zeros((*sums.shape[:-1], 6, 6))
+    row, column = np.triu_indices(6)
+    matrix[..., row, column] = matrix[..., column, row] = sums[..., :21]
+    return matrix
+
+
+def _step(total: Doubles, chi_square: float, projection: Doubles, scale: Doubles) -> tuple[Doubles, float]:
+    """Return a Gauss-Newton step in units of the object's size, and its length in sigmas."""
+    full = _matrix(total) * np.outer(scale, scale)
+    matrix = projection @ full @ projection
+    matrix += LEAST * np.trace(matrix) / np.trace(projection) * projection
+    matrix += np.trace(full) / 6 * (np.eye(6) - projection)
+    step = np.asarray(np.linalg.solve(matrix, -projection @ (total[21:27] * scale)), np.float64)
+    step = step / max(float(np.linalg.norm(step)) / (MAX_STEP / scale[0]), 1.0)
+    return step, math.sqrt(step @ full @ step / max(chi_square, 1.0))
+
+
+def _moved(motion: Doubles, step: Doubles, centre: Doubles) -> Doubles:
+    """Return a motion, (12,), followed by a rotation about a point, by Cayley's formula, and a shift."""
+    x, y, z = step[:3] / 2
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    small = np.linalg.solve(np.eye(3) - cross, np.eye(3) + cross)
+    shift = small @ (motion[9:] - centre) + centre + step[3:]
+    return np.concatenate([(small @ motion[:9].reshape(3, 3)).ravel(), shift])
 
 
 def _equations_at(step: int, first: Array, second: Array, pose: Array, sums: Array) -> None:

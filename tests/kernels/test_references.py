@@ -719,7 +719,11 @@ def zeniths_summed(actual, expected, values):
     np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-4)
 
 
-POSES = {"size": (((24, 33), 1), ((3, 2), 1), ((40, 30), 2)), "least": (1.0, 0.002), "beside": (0, 1)}
+def blocks_of(shape):
+    return math.prod(-(-size // pose.BLOCK) for size in shape)
+
+
+POSES = {"shape": ((24, 33), (3, 2), (40, 30)), "least": (1.0, 0.002), "beside": (0, 1)}
 LIMITS = (1e30, 1000.0)  # of the chi square of a pixel
 
 
@@ -729,18 +733,15 @@ LIMITS = (1e30, 1000.0)  # of the chi square of a pixel
     per=lambda device, values: math.prod(values["sums"].shape[:2]),
     checks={"sums": summed},
 )
-def _(size, least, beside, limit):
-    shape, step = size
+def _(shape, least, beside, limit):
     grid = -(shape[1] - 1) / 2 * 0.05, (shape[0] - 1) / 2 * 0.06, 0.05, 0.06
     turns = (Rotation.from_rotvec((0.02, -0.05, turn)).as_matrix().ravel() for turn in (0.3, -0.1, 0.0))
     poses = [[*turn, 0.03, -0.04, 0.01, 0.1, -0.2, 0.05, *grid, *grid, least, least, limit] for turn in turns]
-    sums = np.zeros(
-        (3, math.prod(-(-size // (pose.BLOCK * step)) for size in shape), pose.PARTS[-1 if beside else -2])
-    )
+    sums = np.zeros((3, blocks_of(shape), pose.PARTS[-1 if beside else -2]))
     maps = named(
         "first second poses sums", waves(shape, 0.0), waves(shape, 0.1, seed=1), np.array(poses), sums
     )
-    sizes = {"count": 3, "other_rows": shape[0], "other_columns": shape[1], "step": step, "shape": shape}
+    sizes = {"count": 3, "other_rows": shape[0], "other_columns": shape[1], "shape": shape}
     return maps | sizes | {"macros": {"BESIDE": beside}}
 
 
@@ -766,6 +767,37 @@ def _(size, beside, limit):
     maps = named("turn zeniths pose sums", turn, frame, np.array(numbers), sums)
     sizes = {"other_rows": shape[0], "other_columns": shape[1], "step": step, "shape": shape, "base": 0.1}
     return maps | sizes | {"macros": {"BESIDE": beside}}
+
+
+def is_followed(actual, expected, values):
+    assert (actual[0] > 0) == values["is_near"]
+    if values["is_near"]:
+        sums = pose.SUMS_AT + pose.PARTS[2]
+        np.testing.assert_allclose(actual[2:14], expected[2:14], atol=2e-6)
+        np.testing.assert_allclose(actual[:2], expected[:2], rtol=0.1)  # the second is of a short step
+        np.testing.assert_allclose(actual[sums:], expected[sums:], rtol=1e-3, atol=1e-3 * abs(expected[-1]))
+
+
+@case(
+    "pose_follow",
+    {"free": (0, 2), "start": (0.0, 0.05, 30.0)},
+    per=lambda device, values: device.layout.group,
+    checks={"found": is_followed, "sums": lambda *_: None},
+)
+def _(free, start):
+    shape = 60, 70
+    grid = -(shape[1] - 1) / 2 * 0.05, (shape[0] - 1) / 2 * 0.06, 0.05, 0.06
+    directions = np.linalg.qr(np.random.default_rng(5).normal(size=(6, 6)))[0][:, free:]
+    other = grid[0] + 0.013, grid[1] + 0.017, *grid[2:]  # so that no border falls on a pixel
+    key = [0.1, -0.2, 0.05, *grid, *other, 1.0, 1.0, 1.5, 10.0, *(directions @ directions.T).ravel()]
+    motion = Rotation.from_rotvec((0, 0, start / 10)).as_matrix().ravel(), (start, 0, 0)
+    first, second = waves(shape, 0.0), waves(shape, 0.05, seed=1)
+    second[..., 5:] = np.moveaxis([-1.69 * second[..., 3], 0 * second[..., 3], -0.81 * second[..., 3]], 0, -1)
+    values = named("key first second", np.array(key), first, second)
+    values |= {"expected": (*np.concatenate(motion).tolist(), pose.NO_LIMIT, 0.0, 0.0, 0.0)}
+    values |= {"sums": np.zeros((blocks_of(shape), pose.PARTS[-2])), "found": np.zeros(pose.FOUND)}
+    values |= {"other_rows": shape[0], "other_columns": shape[1], "shape": shape, "is_near": start < 1}
+    return values | {"macros": {"BESIDE": 0}}
 
 
 @case("pose_gradient", {"shape": ((1, 1), (3, 50), (40, 37))}, atol=1e-4)

@@ -23,8 +23,8 @@ def pose_of(
     )
 
 
-def blocks_of(shape: tuple[int, int], step: int) -> int:
-    return int(np.prod([-(-size // (BLOCK * step)) for size in shape]))
+def blocks_of(shape: tuple[int, int]) -> int:
+    return int(np.prod([-(-size // BLOCK) for size in shape]))
 
 
 def test_the_gradient_of_a_plane_is_its_slope_up_to_the_border() -> None:
@@ -54,8 +54,8 @@ def test_a_moved_ball_fits_where_it_was_moved_to() -> None:
     first, second = sphere_map(*shape, 5, (0, 0, -5)), sphere_map(*shape, 5, (*move[:2], move[2] - 5))
     pose = pose_of((0, 0, 0), shape, tuple(move), 1.0).astype(float)
     pose[12:15] = [*move[:2], move[2] - 5]
-    sums = np.zeros((1, blocks_of(shape, 1), PARTS[-1]))
-    pose_equations(1, first, second, pose[np.newaxis], sums)
+    sums = np.zeros((1, blocks_of(shape), PARTS[-1]))
+    pose_equations(first, second, pose[np.newaxis], sums)
     total = sums.sum(axis=(0, 1))
     normal_matrix = np.zeros((6, 6))
     normal_matrix[np.triu_indices(6)] = total[: PARTS[1]]
@@ -80,8 +80,8 @@ def test_the_jacobian_is_the_residuals_change(number: int) -> None:
         moved = Rotation.from_rotvec(step[:3]).apply(shift - centre) + centre + step[3:]
         pose = pose_of((0, 0, 0), shape, tuple(moved), 1.0).astype(float)
         pose[:9] = turn.as_matrix().ravel()
-        sums = np.zeros((1, blocks_of(shape, 1), PARTS[-1]))
-        pose_equations(1, first[10:-10, 10:-10], second, shifted(pose)[np.newaxis], sums)
+        sums = np.zeros((1, blocks_of(shape), PARTS[-1]))
+        pose_equations(first[10:-10, 10:-10], second, shifted(pose)[np.newaxis], sums)
         return sums.sum(axis=(0, 1))
 
     small = 1e-4
