@@ -333,6 +333,10 @@ class PairFit:
             now = self.equations(motion, unbiased=True)
         return motion, now, free
 
+    def halved(self) -> PairFit:
+        """Return the fit of the same maps at half their resolution."""
+        return PairFit(*coarser([self.first, self.second], min(self.first.shape) // 2)[0], self.device)
+
     @cached_property
     def _coarser(self) -> list[PairFit]:  # without this one: a cycle would keep its maps on the device
         """The maps at half their resolution, at a quarter, and so on."""

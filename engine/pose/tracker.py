@@ -28,7 +28,8 @@ _LEAVING = 0.1  # loss of shared pixels, as a share, after which earlier keys ar
 # while the present one is still shared, and else.
 _BETTER, _GOOD_ENOUGH = 0.8, 2.0
 _MOST_KEYS = 64  # largest number of earlier keys that are remembered
-_SIDE = 100  # least pixels along the shorter side of averaged maps
+_SIDE, _LEAST_SIDE = 100, 60  # least pixels along the shorter side of averaged maps; of smooth ones
+_AS_GOOD = 1.1  # chi square, and mean square error, relative to those of finer maps, that smooth ones reach
 _SEARCHED = "its motion was too large to follow, and was searched for"
 
 
@@ -121,8 +122,8 @@ class PoseTracker(ThreadSafe):
         expected = self._last.then(self._back)
         if key.fit is None:
             return self._first_after_key(key, result, expected)
-        map_ = self._map(result, curved=False)
-        found = key.follow(map_, expected)
+        maps = {key.size: self._map(result, key.size)}
+        found = key.follow(maps[key.size], expected)
         if found is None:
             return self._search(key, result)
         fit, now = found
@@ -130,7 +131,7 @@ class PoseTracker(ThreadSafe):
         share = key.share(now)
         if key.has_left(share) or share < _MIN_COMMON:
             limit = _BETTER if share > _MIN_COMMON else _GOOD_ENOUGH
-            pose = self._return_to_key(map_, now.motion, pose, limit)
+            pose = self._return_to_key(result, maps, now.motion, pose, limit)
         if share < _MIN_COMMON and self._key is key:
             self._take_key(result, pose)
         return pose
@@ -146,6 +147,10 @@ class PoseTracker(ThreadSafe):
                 self._take_key(result, IDENTITY)
             raise
         key.start(fit, now, free)
+        smooth = _smooth(fit, motion, now, free)
+        if smooth is not None:
+            key.start(*smooth, free)
+            key.size *= 2
         return self._moved_to(motion, key.pose_of(fit, motion, now))
 
     def _search(self, key: _Key, result: Result) -> Pose:
@@ -155,13 +160,20 @@ class PoseTracker(ThreadSafe):
         pose = self._moved_to(motion, key.pose.then(pose_of(fit, motion, now, free).inverse()))
         return replace(pose, notes=(*pose.notes, f"result {self._results}: {_SEARCHED}"))
 
-    def _return_to_key(self, map_: PoseMap, motion: Motion, pose: Pose, limit: float) -> Pose:
-        """Take the earlier key again with which the pose is most certain, and return the best pose."""
+    def _return_to_key(
+        self, result: Result, maps: dict[int, PoseMap], motion: Motion, pose: Pose, limit: float
+    ) -> Pose:
+        """Take the earlier key again with which the pose is most certain, and return the best pose.
+
+        ``maps`` are those of the result by the size of their pixels.
+        """
         assert self._key is not None
         present, best = self._key, limit * self._key.spread(pose)
         first_to_map = present.pose.motion.then(motion.inverse())
         for key in self._earlier:
-            found = key.follow(map_, first_to_map.inverse().then(key.pose.motion))
+            if key.size not in maps:
+                maps[key.size] = self._map(result, key.size)
+            found = key.follow(maps[key.size], first_to_map.inverse().then(key.pose.motion))
             if found is None or (share := key.share(found[1])) < _MIN_COMMON + _LEAVING:
                 continue
             fit, now = found
@@ -183,20 +195,47 @@ class PoseTracker(ThreadSafe):
         map_ = self._map(result)
         if self._key is not None:
             self._earlier = [*self._earlier, self._key][-_MOST_KEYS:]
-        self._key, self._back = _Key(map_, self._noted(pose)), STILL
+        self._key, self._back = _Key(map_, self._noted(pose), self._size(result)), STILL
         self.keys += 1
 
     def _noted(self, pose: Pose) -> Pose:
         """Return a pose with the notes of the last result."""
         return replace(pose, notes=tuple(dict.fromkeys((*pose.notes, *self._notes))))
 
-    def _map(self, result: Result, curved: bool = True) -> PoseMap:
+    def _size(self, result: Result) -> int:
+        """Return the pixels of a result along a side of one of the averaged maps."""
         name = result.name_of("height")
-        size = 1 if name is None else max(1, min(shape_of(result, name)) // _SIDE)
-        map_ = PoseMap.of(result, self._pixel_size, self._device, curved, size=size)
-        if curved:
-            _ = map_.extent  # InputError for one without contents
+        return 1 if name is None else max(1, min(shape_of(result, name)) // _SIDE)
+
+    def _map(self, result: Result, size: int = 0) -> PoseMap:
+        """Return a map of a result; without a size, with second derivatives, as a key needs them."""
+        if size:
+            return PoseMap.of(result, self._pixel_size, self._device, curved=False, size=size)
+        map_ = PoseMap.of(result, self._pixel_size, self._device, size=self._size(result))
+        _ = map_.extent  # InputError for one without contents
         return map_
+
+
+def _smooth(
+    fit: PairFit, motion: Motion, now: Equations, free: Doubles
+) -> tuple[PairFit, BlockEquations] | None:
+    """Return the fit of maps at half the resolution, and its equations, if it is about as good."""
+    if min(*fit.first.shape, *fit.second.shape) < 2 * _LEAST_SIDE:
+        return None
+    coarse = fit.halved()
+    found = coarse.refine(motion, free)
+    if found is None:
+        return None
+    there, directions = coarse.equations(found, unbiased=True), complement(free)
+    errors = (
+        float(np.trace(np.linalg.inv(directions.T @ equations.unbiased @ directions)))
+        for equations in (now, there)
+    )
+    fine_error, coarse_error = errors
+    is_as_good = 0 < coarse_error < _AS_GOOD * fine_error and there.chi_square < _AS_GOOD * max(
+        now.chi_square, 1.0
+    )
+    return (coarse, there) if is_as_good else None
 
 
 @dataclass(slots=True)
@@ -205,6 +244,7 @@ class _Key:
 
     map: PoseMap
     pose: Pose  # from the first result
+    size: int  # pixels of a result along a side of one of the averaged maps with which it is compared
     fit: PairFit | None = None  # of the first result after it
     free: Doubles = field(default_factory=lambda: np.zeros((6, 0)))  # directions that are not determined
     pixels: float = 0.0  # that the first result after it shares
