@@ -5,10 +5,18 @@
 
 #include "common.clh"
 
+#if TILE > 1
+#define LANES 8  // pixels of a row that are processed at once
+#else
+#define LANES 1
+#endif
+#include "lanes.clh"
+
 #ifndef SIZE
 #define SIZE 1
 #endif
 
+#define UNROLL _Pragma("unroll")
 #define INLINE static inline __attribute__((always_inline))
 #define BYTES __global const uchar *restrict
 #define FINITE(value) ((value) - (value) == 0.0f)
@@ -28,16 +36,19 @@
 #define SUMMARY 6
 
 typedef float8 __attribute__((aligned(4))) Loose;  // unaligned
+typedef F __attribute__((aligned(4))) Lanes;
+#define LOAD(values) (*(__global const Lanes *)(values))
 
 #define EACH_PIXEL                                      \
     const int begin = (int)get_global_id(0) * TILE;     \
     for (int p = begin; p < LESSER(begin + TILE, rows * columns); ++p)
 
-// The same, row by row: a division for each pixel would take longer than most of the rest.
-#define EACH_PIXEL_OF_ROWS                                                                            \
-    const int begin = (int)get_global_id(0) * TILE, end = LESSER(begin + TILE, rows * columns);      \
-    for (int p = begin, row = begin / columns; p < end; ++row)                                       \
-        for (int column = p - row * columns; column < columns && p < end; ++column, ++p)
+// Groups of up to LANES pixels of a row: the first one, p, its row and column, and their count.
+#define EACH_GROUP                                                                                       \
+    const int begin = (int)get_global_id(0) * TILE, end = LESSER(begin + TILE, rows * columns);         \
+    for (int p = begin, row = begin / columns; p < end; ++row)                                           \
+        for (int column = p - row * columns, stop = LESSER(end, (row + 1) * columns), count;             \
+             p < stop && (count = LESSER(LANES, stop - p), 1); column += count, p += count)
 
 // Slopes along x and y of the plane fitted to the valid heights of 5 x 5 pixels; NAN if it is undetermined.
 INLINE float2 gradient_at(
@@ -126,16 +137,53 @@ INLINE int is_spike(
 // Copies heights; NAN for spikes.
 __kernel void pose_spikes(const int rows, const int columns, MAP height, MAP height_sigma, OUT clean)
 {
-    EACH_PIXEL_OF_ROWS {
-        const float limit = SPIKE * height_sigma[p], here = height[p];
-        clean[p] = here;
-        const int is_inside = column > 0 && column < columns - 1;
-        if (is_inside && fabs(here - 0.5f * (height[p - 1] + height[p + 1])) <= limit) continue;
-        if (is_spike(height, rows, columns, row, column, here, limit)) clean[p] = NAN;
+    EACH_GROUP {
+        if (count == LANES && column > 0 && column + LANES < columns) {
+            const F here = LOAD(height + p), bend = here - 0.5f * (LOAD(height + p - 1) + LOAD(height + p + 1));
+            const F limits = SPIKE * LOAD(height_sigma + p);
+            if (!any_of(!((bend <= limits) & (-bend <= limits)))) {
+                *(__global Lanes *)(clean + p) = here;
+                continue;
+            }
+        }
+        for (int i = 0; i < count; ++i) {
+            const float here = height[p + i], limit = SPIKE * height_sigma[p + i];
+            clean[p + i] = is_spike(height, rows, columns, row, column + i, here, limit) ? NAN : here;
+        }
+    }
+}
+
+// Sums over SIZE rows of a group's values with some parts a pixel, or of the squares of positive values.
+INLINE void add_lines(MAP values, const int wide, const int count, const int parts, const int squared, float *line)
+{
+    for (int i = 0; i < LANES * SIZE * parts; ++i) line[i] = 0;
+    if (count == LANES) {
+        UNROLL for (int i = 0; i < SIZE * parts; ++i) {
+            F sum = 0.0f;
+            UNROLL for (int y = 0; y < SIZE; ++y) {
+                const F value = LOAD(values + y * wide * parts + LANES * i);
+                sum += squared ? (value > 0.0f ? value * value : (F)NAN) : value;
+            }
+            *(Lanes *)(line + LANES * i) = sum;
+        }
+    } else {
+        for (int i = 0; i < count * SIZE * parts; ++i)
+            for (int y = 0; y < SIZE; ++y) {
+                const float value = values[y * wide * parts + i];
+                line[i] += squared ? (value > 0 ? value * value : NAN) : value;
+            }
     }
 }
 
 #define SHARE (1.0f / (SIZE * SIZE))
+
+// The sum of the SIZE numbers of a line for a pixel.
+INLINE float sum_of_line(const float *line, const int parts)
+{
+    float sum = 0;
+    UNROLL for (int i = 0; i < SIZE; ++i) sum += line[parts * i];
+    return sum;
+}
 // q: the pixels of a map in a pixel of the records
 #define EACH_IN_BLOCK                                                                                          \
     for (int i = 0, q; i < SIZE * SIZE && (q = (SIZE * row + i / SIZE) * wide + SIZE * column + i % SIZE, 1); ++i)
@@ -144,13 +192,14 @@ __kernel void pose_spikes(const int rows, const int columns, MAP height, MAP hei
 __kernel void pose_means(
     const int rows, const int columns, const int wide, MAP height, MAP height_sigma, OUT mean, OUT mean_sigma)
 {
-    EACH_PIXEL_OF_ROWS {
-        float sum = 0, square = 0;
-        EACH_IN_BLOCK sum += height[q];
-        mean[p] = SHARE * sum;
+    EACH_GROUP {
+        const int q = SIZE * (row * wide + column);
+        float line[LANES * SIZE];
+        add_lines(height + q, wide, count, 1, 0, line);
+        for (int i = 0; i < count; ++i) mean[p + i] = SHARE * sum_of_line(line + SIZE * i, 1);
         if (height_sigma) {
-            EACH_IN_BLOCK square += height_sigma[q] > 0 ? height_sigma[q] * height_sigma[q] : NAN;
-            mean_sigma[p] = SHARE * sqrt(square);
+            add_lines(height_sigma + q, wide, count, 1, 1, line);
+            for (int i = 0; i < count; ++i) mean_sigma[p + i] = SHARE * root(sum_of_line(line + SIZE * i, 1));
         }
     }
 }
@@ -160,41 +209,48 @@ __kernel void pose_records(
     __global const int *restrict component, BYTES offset_unknown, MAP normals, MAP gradient, MAP normals_sigma,
     BYTES filled, BYTES contact, BYTES edges, OUT records, OUT slopes)
 {
-    EACH_PIXEL_OF_ROWS {
-        float x = 0, y = 0, upright = 0, square = normals_sigma ? 0 : NOT_COMPARED, variance = FAR;
-        if (height_sigma && height_sigma[p] > 0) variance = GREATER(height_sigma[p] * height_sigma[p], SHARPEST);
-        int used = FINITE(height[p]);
-        if (!normals) {
-            const float a = gradient[2 * p], b = gradient[2 * p + 1];
-            upright = 1.0f / sqrt(1.0f + a * a + b * b);
-            x = -a * upright;
-            y = -b * upright;
-        }
-        if (normals) {
-            EACH_IN_BLOCK {
-                x += SHARE * normals[3 * q];
-                y += SHARE * normals[3 * q + 1];
-                upright += SHARE * normals[3 * q + 2];
+    EACH_GROUP {
+        const int first = SIZE * (row * wide + column);
+        float normal_line[3 * LANES * SIZE], square_line[LANES * SIZE];
+        if (normals) add_lines(normals + 3 * first, wide, count, 3, 0, normal_line);
+        if (normals_sigma) add_lines(normals_sigma + first, wide, count, 1, 1, square_line);
+        for (const int after = column + count; column < after; ++column, ++p) {
+            const int lane = count - (after - column);
+            float x = 0, y = 0, upright = 0, square = normals_sigma ? 0 : NOT_COMPARED, variance = FAR;
+            if (height_sigma && height_sigma[p] > 0) variance = GREATER(height_sigma[p] * height_sigma[p], SHARPEST);
+            int used = FINITE(height[p]);
+            if (normals) {
+                const float *line = normal_line + 3 * SIZE * lane;
+                x = SHARE * sum_of_line(line, 3);
+                y = SHARE * sum_of_line(line + 1, 3);
+                upright = SHARE * sum_of_line(line + 2, 3);
+            } else {
+                const float a = gradient[2 * p], b = gradient[2 * p + 1];
+                upright = 1.0f / sqrt(1.0f + a * a + b * b);
+                x = -a * upright;
+                y = -b * upright;
+            }
+            if (normals_sigma) {
+                square = SHARE * SHARE * sum_of_line(square_line + SIZE * lane, 1);
+                square = square == square ? GREATER(square, SHARPEST) : NAN;
+            }
+            if (component) {
+                EACH_IN_BLOCK if (component[q] < 0 || offset_unknown[component[q]]) variance = FAR;
+            }
+            if (filled) {
+                EACH_IN_BLOCK used = used && !filled[q];
+            }
+            used = used && upright > STEEPEST && FINITE(square);
+            if (edges || contact) used = used && !is_near_border(edges, contact, high, wide, SIZE * row, SIZE * column);
+            const float8 values = {x, y, square, height[p], variance, 0, 0, 0};
+            *(__global Loose *)(records + NUMBERS * p) = used ? values : (float8)NAN;
+            if (slopes) {
+                slopes[p] = used ? -x / upright : NAN;
+                slopes[rows * columns + p] = used ? -y / upright : NAN;
             }
         }
-        if (normals_sigma) {
-            EACH_IN_BLOCK square += normals_sigma[q] > 0 ? SHARE * SHARE * normals_sigma[q] * normals_sigma[q] : NAN;
-            square = square == square ? GREATER(square, SHARPEST) : NAN;
-        }
-        if (component) {
-            EACH_IN_BLOCK if (component[q] < 0 || offset_unknown[component[q]]) variance = FAR;
-        }
-        if (filled) {
-            EACH_IN_BLOCK used = used && !filled[q];
-        }
-        used = used && upright > STEEPEST && FINITE(square);
-        if (edges || contact) used = used && !is_near_border(edges, contact, high, wide, SIZE * row, SIZE * column);
-        const float8 values = {x, y, square, height[p], variance, 0, 0, 0};
-        *(__global Loose *)(records + NUMBERS * p) = used ? values : (float8)NAN;
-        if (slopes) {
-            slopes[p] = used ? -x / upright : NAN;
-            slopes[rows * columns + p] = used ? -y / upright : NAN;
-        }
+        column -= count;
+        p -= count;
     }
 }
 
