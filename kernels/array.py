@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar, cast
 
 import numpy as np
 import pyopencl as cl
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import DTypeLike, NDArray
 
 from mirrorskin.kernels import memory
@@ -360,13 +360,11 @@ class Array:
             return out
         if self._mapped is not None or self._buffer is None:
             return self._host[rows].copy()
-        with self.device.profile.waiting_for(self.name):
-            mapping = Mapping(
-                queue, self.buffer, shape, self.dtype, cl.map_flags.READ, offset=start, after=after
-            )
-        copied: NDArray[Any] = np.array(mapping)
-        mapping.release(queue)
-        return copied
+        out = _empty(shape, self.dtype)
+        if out.nbytes:
+            with self.device.profile.waiting_for(self.name):
+                cl.enqueue_copy(queue, out, self.buffer, src_offset=start, wait_for=after, is_blocking=True)
+        return out
 
     def _part(self, rows: int | slice) -> tuple[int, tuple[int, ...]]:
         """Return the offset of some rows, in bytes, and their shape."""
@@ -477,7 +475,7 @@ class BorrowedBuffer:
         # Kernels only read it, but Intel's runtime copies read-only memory that is not aligned to 128 bytes.
         access = cl.mem_flags.READ_WRITE if values.flags.writeable else cl.mem_flags.READ_ONLY
         flags = access | cl.mem_flags.USE_HOST_PTR
-        loaded = as_strided(values.reshape(-1).view(np.uint8), (values.nbytes + SLACK,))
+        loaded = (ctypes.c_char * (values.nbytes + SLACK)).from_address(values.ctypes.data)
         with _naming(device, name, values.nbytes):
             self.buffer: cl.Buffer = cl.Buffer(device.context, flags, hostbuf=loaded)
 
@@ -503,7 +501,8 @@ def can_be_borrowed(values: NDArray[Any]) -> bool:
     whole = values
     while isinstance(whole.base, np.ndarray) and whole.base.flags.c_contiguous:
         whole = whole.base
-    end, last = (array.ctypes.data + array.nbytes for array in (values, whole))
+    end = values.ctypes.data + values.nbytes
+    last = end if whole is values else whole.ctypes.data + whole.nbytes
     return bool(-(-last // memory.PAGE) * memory.PAGE - end >= SLACK)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,8 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from mirrorskin.engine.pose.correlation import SIDE, Relief, starts, turned_starts, working_pixel
-from mirrorskin.engine.pose.maps import PoseMap, coarser
-from mirrorskin.engine.pose.motion import STILL, Motion, cross_matrix
+from mirrorskin.engine.pose.maps import PoseMap, Workspace, coarser
+from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
@@ -71,16 +71,16 @@ class Equations:
     """
 
     def __init__(self, total: Doubles, size: float) -> None:
-        self._scale = _scale_of(size)
-        upper, right, chi, expected, heights, normals, *products = _split(total)
-        self.normal_matrix: NDArray[Any] = _symmetric(upper, self._scale)
+        self._size, scale = size, _scale_of(size)
+        upper, right, numbers, products = total[:21], total[21:27], total[27:31].tolist(), total[31:]
+        chi, self.compared, heights, normals = numbers
+        self.normal_matrix: NDArray[Any] = _symmetric(upper, size)
         self.unbiased: NDArray[Any] = self.normal_matrix
-        if products:
-            self.unbiased = products[0].reshape(6, 6) * np.outer(self._scale, self._scale)
-        self.right: NDArray[Any] = right * self._scale
-        self.pixels: float = max(float(normals[0]), float(heights[0]))
-        self.compared: float = float(expected[0])
-        self.chi_square: float = float(chi[0]) / max(self.compared, 1e-9)
+        if products.size:
+            self.unbiased = products.reshape(6, 6) * _squared_scale(size)
+        self.right: NDArray[Any] = right * scale
+        self.pixels: float = max(normals, heights)
+        self.chi_square: float = chi / max(self.compared, 1e-9)
 
     def scatter(self) -> tuple[NDArray[Any], int]:
         """Return the sum over blocks of the products of their J'Wr, (6, 6), and the number of blocks."""
@@ -106,13 +106,19 @@ class Equations:
         correlated. A few blocks determine its size but hardly its shape, which is then closer to the
         covariance of independent errors.
         """
-        directions, (products, count) = complement(free), self.scatter()
-        independent = directions.T @ self.normal_matrix @ directions
-        scatter = directions.T @ products @ directions * count / max(count - 6, 1)
-        size = np.trace(np.linalg.solve(independent, scatter)) / len(independent)
-        middle = (count * scatter + _BLOCKS * size * independent) / (count + _BLOCKS)
-        inverse = np.linalg.inv(directions.T @ self.unbiased @ directions)
-        return np.asarray(directions @ inverse @ middle @ inverse.T @ directions.T)
+        (products, count), independent, unbiased = self.scatter(), self.normal_matrix, self.unbiased
+        directions = complement(free) if free.size else None
+        if directions is not None:
+            products, independent, unbiased = (
+                directions.T @ matrix @ directions for matrix in (products, independent, unbiased)
+            )
+        inverse = np.linalg.inv(unbiased)
+        alike = inverse if unbiased is independent else np.linalg.inv(independent)
+        scatter = products * (count / max(count - 6, 1))
+        size = np.vdot(alike, scatter) / len(independent)
+        middle = (count * scatter + (_BLOCKS * size) * independent) / (count + _BLOCKS)
+        covariance = inverse @ middle @ inverse.T
+        return np.asarray(covariance if directions is None else directions @ covariance @ directions.T)
 
 
 class BlockEquations(Equations):
@@ -125,7 +131,7 @@ class BlockEquations(Equations):
     def scatter(self) -> tuple[NDArray[Any], int]:
         """Return the sum over blocks of the products of their J'Wr, (6, 6), and the number of blocks."""
         _, scores, _, _, heights, normals, *_ = _split(self._sums.astype(np.float64))
-        scores = scores * self._scale
+        scores = scores * _scale_of(self._size)
         return scores.T @ scores, int(np.count_nonzero(normals + heights))
 
     @cached_property
@@ -147,15 +153,15 @@ class Followed(Equations):
     """
 
     def __init__(self, found: NDArray[np.floating], size: float) -> None:
-        blocks, bend, *_ = values = found.astype(np.float64)
+        values = found.astype(np.float64)
         super().__init__(values[SUMS_AT:SCATTER_AT], size)
-        self.bend: float = float(bend)
+        self._blocks, self.bend = int(values[0]), float(values[1])
         self.motion: Motion = Motion(values[TURN_AT:SHIFT_AT].reshape(3, 3), values[SHIFT_AT:SUMS_AT]).rigid()
-        self._blocks, self._products = int(blocks), values[SCATTER_AT:]
+        self._products = values[SCATTER_AT:]
 
     def scatter(self) -> tuple[NDArray[Any], int]:
         """Return the sum over blocks of the products of their J'Wr, (6, 6), and the number of blocks."""
-        return _symmetric(self._products, self._scale), self._blocks
+        return _symmetric(self._products, self._size), self._blocks
 
 
 def _split(sums: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -164,14 +170,21 @@ def _split(sums: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     return [sums[..., start:end] for start, end in itertools.pairwise((0, *ends))]
 
 
+@lru_cache
 def _scale_of(size: float) -> Doubles:
     """Return the factors that convert rotations and translations to units of the object's size."""
     return np.repeat([1 / size, 1.0], 3)
 
 
-def _symmetric(upper: Doubles, scale: Doubles) -> Doubles:
-    """Return the matrices, (..., 6, 6), whose upper triangles are given, scaled along rows and columns."""
-    return np.asarray(upper[..., _UPPER] * np.outer(scale, scale))
+@lru_cache
+def _squared_scale(size: float) -> Doubles:
+    """Return the products of these factors, (6, 6)."""
+    return np.outer(_scale_of(size), _scale_of(size))
+
+
+def _symmetric(upper: Doubles, size: float) -> Doubles:
+    """Return the matrices, (..., 6, 6), whose upper triangles are given, in units of the object's size."""
+    return np.asarray(upper[..., _UPPER] * _squared_scale(size))
 
 
 def complement(free: Doubles) -> Doubles:
@@ -190,12 +203,12 @@ class PairFit:
 
     def __init__(self, first: PoseMap, second: PoseMap, device: Device) -> None:
         self.first, self.second, self.device = first, second, device
-        self._arrays: dict[tuple[str | int, ...], Array] = {}  # by name and shape
+        self._array = Workspace(device).array
 
     def after(self, first: PoseMap) -> PairFit:
         """Return the fit of another first map to the same second one, which uses the same memory."""
         fit = PairFit(first, self.second, self.device)
-        fit._arrays = self._arrays
+        fit._array = self._array
         return fit
 
     def equations(self, motion: Motion, unbiased: bool = False) -> BlockEquations:
@@ -241,12 +254,6 @@ class PairFit:
     def _blocks(self) -> int:
         rows, columns = self.first.shape
         return -(-rows // BLOCK) * -(-columns // BLOCK)
-
-    def _array(self, name: str, *shape: int) -> Array:
-        """Return an array that is kept for the next use."""
-        if (name, *shape) not in self._arrays:
-            self._arrays[name, *shape] = self.device.array(name, shape, np.float32, zeroed=False)
-        return self._arrays[name, *shape]
 
     def _sums(self, motions: Sequence[Motion], unbiased: bool = False) -> NDArray[np.float32]:
         """Return the sums of each block at each motion, (n, blocks, numbers); J'WK only if ``unbiased``."""
@@ -400,12 +407,12 @@ class PairFit:
         It finds smooth forms, which differ by little from pixel to pixel, where a correlation has no peak.
         """
         candidates: list[tuple[float, Motion]] = []
-        scale = _scale_of(self.second.extent.size)
+        size = self.second.extent.size
         for grid in self._grid():
             sums = self._sums(grid).sum(axis=1, dtype=np.float64)
             upper, right, chi, compared, heights, normals = _split(sums)
             overlap = np.maximum(heights, normals)[:, 0] > MIN_COMMON * self.first.extent.pixels
-            matrix, slope = _symmetric(upper[overlap], scale), right[overlap] * scale
+            matrix, slope = _symmetric(upper[overlap], size), right[overlap] * _scale_of(size)
             matrix += (
                 _MIN_INFORMATION
                 * np.trace(matrix, axis1=1, axis2=2)[:, np.newaxis, np.newaxis]
@@ -451,10 +458,3 @@ class PairFit:
         sigmas = math.sqrt(step @ now.normal_matrix @ step / max(now.chi_square, 1.0))
         moved = motion.small_step(step * _scale_of(self.second.extent.size), self.second.extent.middle)
         return moved, sigmas
-
-    def at_origin(self) -> Doubles:
-        """Return the matrix, (6, 6), that converts steps of these equations to motions about the origin."""
-        moved = np.eye(6)
-        moved[3:, :3] = cross_matrix(self.second.extent.middle)
-        moved[:, :3] /= self.second.extent.size
-        return moved

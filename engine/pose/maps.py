@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mirrorskin.engine.base.device_arrays import operand_of
+from mirrorskin.engine.pose.motion import cross_matrix
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.base.arguments import check_pixel_size
 from mirrorskin.io.model.result import shape_of
@@ -22,6 +23,28 @@ from mirrorskin.kernels.skin.pose_maps import STRIP, SUMMARY
 
 Grid = tuple[float, float, float, float]
 """x and y of the first pixel, and the pixel's size along x and y, mm."""
+
+
+class Workspace:
+    """Memory on a device for maps that are needed one after the other.
+
+    Attributes
+    ----------
+    inputs : list of Operand
+        Maps of the last result, which the device may still be reading.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.inputs: list[Operand] = []
+        self._device = device
+        self._arrays: dict[tuple[str | int, ...], Array] = {}
+
+    def array(self, name: str, *shape: int) -> Array:
+        """Return the array of a name and shape."""
+        key = name, *shape
+        if key not in self._arrays:
+            self._arrays[key] = self._device.array(name, shape, np.float32, zeroed=False)
+        return self._arrays[key]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,15 +104,18 @@ class PoseMap:
         curved: bool = True,
         spiky: bool = True,
         size: int = 1,
+        workspace: Workspace | None = None,
     ) -> PoseMap:
         """Return the map of a result; without ``curved`` the second derivatives are 0.
 
-        Spikes are left out, unless ``spiky`` is False. A pixel is the mean of ``size`` x ``size`` ones.
+        Spikes are left out, unless ``spiky`` is False. A pixel is the mean of ``size`` x ``size`` ones. A map
+        in a ``workspace`` is valid until the next one is made there; by default, its memory is its own.
         """
         x, y, step_x, step_y = _grid(result, pixel_size)
         middle = (size - 1) / 2
         grid = x + middle * step_x, y - middle * step_y, size * step_x, size * step_y
-        return cls(_records(result, grid, device, curved, spiky, size), grid, _least(result))
+        records = _records(result, grid, device, curved, spiky, size, workspace or Workspace(device))
+        return cls(records, grid, _least(result))
 
     @cached_property
     def extent(self) -> Extent:
@@ -103,6 +129,14 @@ class PoseMap:
                 "normals_sigma"
             )
         return extent
+
+    @cached_property
+    def at_origin(self) -> Doubles:
+        """Matrix, (6, 6), that converts motions about the middle, in units of the size, to those about 0."""
+        moved = np.eye(6)
+        moved[3:, :3] = cross_matrix(self.extent.middle)
+        moved[:, :3] /= self.extent.size
+        return moved
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -175,11 +209,18 @@ def _grid(result: Result, pixel_size: ArrayLike | None) -> Grid:
     return float(x[0]), float(y[0]), float(x[1] - x[0]), float(y[0] - y[1])
 
 
-def _records(result: Result, grid: Grid, device: Device, curved: bool, spiky: bool, size: int) -> Array:
+def _records(
+    result: Result, grid: Grid, device: Device, curved: bool, spiky: bool, size: int, workspace: Workspace
+) -> Array:
     """Return the records of a result's maps on a device."""
 
     def map_of(quantity: str, dtype: DTypeLike, *components: int) -> Operand | None:
-        return operand_of(result, quantity, dtype, (high, wide, *components), device)
+        operand = operand_of(result, quantity, dtype, (high, wide, *components), device)
+        if operand is not None:
+            inputs.append(operand)
+        return operand
+
+    array, inputs = workspace.array, list[Operand]()
 
     high, wide = shape_of(result, result.name_of("height") or "")
     rows, columns = shape = high // size, wide // size
@@ -187,10 +228,7 @@ def _records(result: Result, grid: Grid, device: Device, curved: bool, spiky: bo
     height, normals = map_of("height", np.float32), map_of("normals", np.float32, 3)
     sigma = map_of("height_sigma", np.float32)
     if size > 1:
-        means = [
-            None if values is None else device.array("means", shape, np.float32, zeroed=False)
-            for values in (height, sigma)
-        ]
+        means = array("mean", *shape), None if sigma is None else array("mean_sigma", *shape)
         _run(
             device, "pose_means", rows, columns, size,
             wide=wide, height=height, height_sigma=sigma, mean=means[0], mean_sigma=means[1],
@@ -198,8 +236,8 @@ def _records(result: Result, grid: Grid, device: Device, curved: bool, spiky: bo
         )  # fmt: skip
         height, sigma = means
     passes = 1 if size > 1 else 2  # the second time next to spikes; few are, where pixels are averaged
-    for _ in range(passes if spiky and sigma is not None else 0):
-        clean = device.array("clean", shape, np.float32, zeroed=False)
+    for number in range(passes if spiky and sigma is not None else 0):
+        clean = array(f"clean {number}", *shape)
         _run(
             device, "pose_spikes", rows, columns,
             height=height, height_sigma=sigma, clean=clean, moved=12 * pixels,
@@ -207,7 +245,7 @@ def _records(result: Result, grid: Grid, device: Device, curved: bool, spiky: bo
         height = clean
     gradient = None
     if normals is None:
-        gradient = device.array("gradient", (*shape, 2), np.float32, zeroed=False)
+        gradient = array("gradient", *shape, 2)
         _run(
             device, "pose_gradient", rows, columns,
             step_x=step_x, step_y=step_y, values=height, gradient=gradient, moved=12 * pixels,
@@ -223,11 +261,12 @@ def _records(result: Result, grid: Grid, device: Device, curved: bool, spiky: bo
         "gradient": gradient,
         "normals_sigma": None if normals is None else map_of("normals_sigma", np.float32),
         **{name: map_of(name, np.uint8) for name in ("filled", "contact", "edges")},
-        "records": device.array("records", (*shape, 8), np.float32, zeroed=False),
-        "slopes": device.array("slopes", (2, *shape), np.float32, zeroed=False) if curved else None,
+        "records": array("records", *shape, 8),
+        "slopes": array("slopes", 2, *shape) if curved else None,
     }
     moved = sum(values.nbytes for values in maps.values() if values is not None)
     _run(device, "pose_records", rows, columns, size, high=high, wide=wide, **maps, moved=moved)
+    workspace.inputs = inputs
     records: Array = maps["records"]
     if curved:
         _run(

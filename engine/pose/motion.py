@@ -9,6 +9,8 @@ import numpy as np
 
 from mirrorskin.kernels.array_types import Doubles
 
+_NEWTON = 1.5 * np.eye(3)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
@@ -50,7 +52,7 @@ class Motion:
         They would accumulate, because the transpose is used as the inverse. A Newton step towards the nearest
         rotation squares them.
         """
-        return Motion(self.turn @ (1.5 * np.eye(3) - 0.5 * self.turn.T @ self.turn), self.shift)
+        return Motion(self.turn @ (_NEWTON - 0.5 * (self.turn.T @ self.turn)), self.shift)
 
     def adjoint(self) -> Doubles:
         """Return the matrix, (6, 6), that converts small motions before this one to ones after it."""
@@ -65,5 +67,5 @@ STILL = Motion(np.eye(3), np.zeros(3))
 
 def cross_matrix(vector: Doubles) -> Doubles:
     """Return the matrix, (3, 3), of the cross product with a vector on the left."""
-    x, y, z = vector
+    x, y, z = vector.tolist()  # numbers of Python, of which NumPy makes an array faster
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

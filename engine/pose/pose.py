@@ -93,13 +93,7 @@ class Pose:
             kept = directions[:, sizes > _EQUAL_TOLERANCE]
             others = np.eye(6) - kept @ kept.T
             covariance, free = others @ covariance @ others, kept.T
-        return replace(
-            self,
-            rotation=motion.vector,
-            translation=motion.shift,
-            covariance=covariance,
-            undetermined=free,
-        )
+        return Pose(motion.vector, motion.shift, covariance, self.chi_square, self.pixels, free, self.notes)
 
 
 IDENTITY = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0, 6)))
@@ -186,7 +180,20 @@ def estimate_pose(
 
 def pose_of(fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose:
     """Return the pose of a fitted motion, about the picture's centre."""
-    change = fit.at_origin()
+    change = fit.second.at_origin
     covariance = change @ now.covariance(free) @ change.T
     pose = replace(IDENTITY, chi_square=now.chi_square, pixels=int(now.pixels))
     return pose._changed(motion, covariance, (change @ free).T)
+
+
+def pose_after(before: Pose, fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose:
+    """Return a pose followed by the inverse of a fitted motion, of independent errors."""
+    back = motion.inverse()
+    change = back.adjoint()
+    own = change @ fit.second.at_origin
+    covariance = own @ now.covariance(free) @ own.T + change @ before.covariance @ change.T
+    undetermined = before.undetermined
+    if free.size or len(undetermined):
+        undetermined = np.concatenate([undetermined @ change.T, (own @ free).T])
+    pose = replace(before, chi_square=now.chi_square, pixels=int(now.pixels))
+    return pose._changed(before.motion.then(back), covariance, undetermined)

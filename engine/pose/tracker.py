@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from mirrorskin.engine.base.inputs import Maps, as_result
 from mirrorskin.engine.pose.fit import BlockEquations, Equations, Followed, PairFit, complement
-from mirrorskin.engine.pose.maps import PoseMap
+from mirrorskin.engine.pose.maps import PoseMap, Workspace
 from mirrorskin.engine.pose.motion import STILL, Motion
-from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
+from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_after
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.findings import findings_of
 from mirrorskin.io.base.threads import ThreadSafe
@@ -79,6 +79,7 @@ class PoseTracker(ThreadSafe):
         self._pixel_size, self._device = pixel_size, open_device(device)
         self._key: _Key | None = None
         self._earlier: list[_Key] = []
+        self._workspace = Workspace(self._device)  # of results that are not keys
         self._results = 0
         self._notes: tuple[str, ...] = ()  # of the last result
         self._back, self._last = STILL, STILL  # from the last result to the key, and to the one before
@@ -157,7 +158,7 @@ class PoseTracker(ThreadSafe):
         """Return the pose of a result that is far from the expected pose."""
         fit = PairFit(self._map(result), key.map, self._device)
         motion, now, free = fit.solve()
-        pose = self._moved_to(motion, key.pose.then(pose_of(fit, motion, now, free).inverse()))
+        pose = self._moved_to(motion, pose_after(key.pose, fit, motion, now, free))
         return replace(pose, notes=(*pose.notes, f"result {self._results}: {_SEARCHED}"))
 
     def _return_to_key(
@@ -200,6 +201,8 @@ class PoseTracker(ThreadSafe):
 
     def _noted(self, pose: Pose) -> Pose:
         """Return a pose with the notes of the last result."""
+        if not self._notes:
+            return pose
         return replace(pose, notes=tuple(dict.fromkeys((*pose.notes, *self._notes))))
 
     def _size(self, result: Result) -> int:
@@ -210,7 +213,9 @@ class PoseTracker(ThreadSafe):
     def _map(self, result: Result, size: int = 0) -> PoseMap:
         """Return a map of a result; without a size, with second derivatives, as a key needs them."""
         if size:
-            return PoseMap.of(result, self._pixel_size, self._device, curved=False, size=size)
+            return PoseMap.of(
+                result, self._pixel_size, self._device, curved=False, size=size, workspace=self._workspace
+            )
         map_ = PoseMap.of(result, self._pixel_size, self._device, size=self._size(result))
         _ = map_.extent  # InputError for one without contents
         return map_
@@ -291,4 +296,4 @@ class _Key:
 
     def pose_of(self, fit: PairFit, motion: Motion, now: Equations) -> Pose:
         """Return the motion from the first result to the one from which a motion to this key was found."""
-        return self.pose.then(pose_of(fit, motion, now, self.free).inverse())
+        return pose_after(self.pose, fit, motion, now, self.free)

@@ -156,7 +156,6 @@ __kernel void pose_spikes(const int rows, const int columns, MAP height, MAP hei
 // Sums over SIZE rows of a group's values with some parts a pixel, or of the squares of positive values.
 INLINE void add_lines(MAP values, const int wide, const int count, const int parts, const int squared, float *line)
 {
-    for (int i = 0; i < LANES * SIZE * parts; ++i) line[i] = 0;
     if (count == LANES) {
         UNROLL for (int i = 0; i < SIZE * parts; ++i) {
             F sum = 0.0f;
@@ -167,11 +166,13 @@ INLINE void add_lines(MAP values, const int wide, const int count, const int par
             *(Lanes *)(line + LANES * i) = sum;
         }
     } else {
-        for (int i = 0; i < count * SIZE * parts; ++i)
+        for (int i = 0; i < count * SIZE * parts; ++i) {
+            line[i] = 0;
             for (int y = 0; y < SIZE; ++y) {
                 const float value = values[y * wide * parts + i];
                 line[i] += squared ? (value > 0 ? value * value : NAN) : value;
             }
+        }
     }
 }
 
