@@ -235,7 +235,9 @@ def _records(
             moved=8 * high * wide,
         )  # fmt: skip
         height, sigma = means
-    passes = 1 if size > 1 else 2  # the second time next to spikes; few are, where pixels are averaged
+    # Twice, because of spikes next to spikes, unless pixels are averaged; the last time with the records,
+    # unless normals are computed from the heights.
+    passes = (size == 1) + (normals is None)
     for number in range(passes if spiky and sigma is not None else 0):
         clean = array(f"clean {number}", *shape)
         _run(
@@ -253,6 +255,7 @@ def _records(
     unknown = result.offset_unknown
     apart = result.component is not None and unknown is not None and np.any(unknown)
     maps: dict[str, Any] = {
+        "spiky": int(spiky and normals is not None),
         "height": height,
         "height_sigma": sigma,
         "component": map_of("component", np.int32) if apart else None,
@@ -264,7 +267,7 @@ def _records(
         "records": array("records", *shape, 8),
         "slopes": array("slopes", 2, *shape) if curved else None,
     }
-    moved = sum(values.nbytes for values in maps.values() if values is not None)
+    moved = sum(values.nbytes for values in maps.values() if isinstance(values, Operand))
     _run(device, "pose_records", rows, columns, size, high=high, wide=wide, **maps, moved=moved)
     workspace.inputs = inputs
     records: Array = maps["records"]

@@ -37,6 +37,7 @@
 
 typedef float8 __attribute__((aligned(4))) Loose;  // unaligned
 typedef F __attribute__((aligned(4))) Lanes;
+typedef I __attribute__((aligned(4))) Flags;
 #define LOAD(values) (*(__global const Lanes *)(values))
 
 #define EACH_PIXEL                                      \
@@ -134,25 +135,6 @@ INLINE int is_spike(
     return lines > !is_at_border;
 }
 
-// Copies heights; NAN for spikes.
-__kernel void pose_spikes(const int rows, const int columns, MAP height, MAP height_sigma, OUT clean)
-{
-    EACH_GROUP {
-        if (count == LANES && column > 0 && column + LANES < columns) {
-            const F here = LOAD(height + p), bend = here - 0.5f * (LOAD(height + p - 1) + LOAD(height + p + 1));
-            const F limits = SPIKE * LOAD(height_sigma + p);
-            if (!any_of(!((bend <= limits) & (-bend <= limits)))) {
-                *(__global Lanes *)(clean + p) = here;
-                continue;
-            }
-        }
-        for (int i = 0; i < count; ++i) {
-            const float here = height[p + i], limit = SPIKE * height_sigma[p + i];
-            clean[p + i] = is_spike(height, rows, columns, row, column + i, here, limit) ? NAN : here;
-        }
-    }
-}
-
 // Sums over SIZE rows of a group's values with some parts a pixel, or of the squares of positive values.
 INLINE void add_lines(MAP values, const int wide, const int count, const int parts, const int squared, float *line)
 {
@@ -178,16 +160,58 @@ INLINE void add_lines(MAP values, const int wide, const int count, const int par
 
 #define SHARE (1.0f / (SIZE * SIZE))
 
-// The sum of the SIZE numbers of a line for a pixel.
-INLINE float sum_of_line(const float *line, const int parts)
+// The sums of the SIZE numbers of a line for each pixel of a group.
+INLINE F sums_of_line(const float *line, const int parts)
 {
-    float sum = 0;
-    UNROLL for (int i = 0; i < SIZE; ++i) sum += line[parts * i];
-    return sum;
+    float sums[LANES];
+    UNROLL for (int lane = 0; lane < LANES; ++lane) {
+        sums[lane] = 0;
+        UNROLL for (int i = 0; i < SIZE; ++i) sums[lane] += line[parts * (SIZE * lane + i)];
+    }
+    return *(const Lanes *)sums;
 }
-// q: the pixels of a map in a pixel of the records
-#define EACH_IN_BLOCK                                                                                          \
-    for (int i = 0, q; i < SIZE * SIZE && (q = (SIZE * row + i / SIZE) * wide + SIZE * column + i % SIZE, 1); ++i)
+
+// A group's values of which only some are in memory; NAN for the others.
+INLINE F some_of(MAP values, const int count)
+{
+    if (count == LANES) return LOAD(values);
+    float some[LANES];
+    for (int lane = 0; lane < LANES; ++lane) some[lane] = lane < count ? values[lane] : NAN;
+    return *(const Lanes *)some;
+}
+
+INLINE void put_some(OUT values, const int count, const F numbers)
+{
+    if (count == LANES) {
+        *(__global Lanes *)values = numbers;
+        return;
+    }
+    float some[LANES];
+    *(Lanes *)some = numbers;
+    for (int lane = 0; lane < count; ++lane) values[lane] = some[lane];
+}
+
+// Whether the heights of a group are surely no spikes, by their neighbours of the same row.
+INLINE int is_smooth(
+    MAP height, const int p, const int column, const int columns, const int count, const F here, const F limit)
+{
+    if (count < LANES || column == 0 || column + LANES >= columns) return 0;
+    const F bend = here - 0.5f * (LOAD(height + p - 1) + LOAD(height + p + 1));
+    return !any_of(!((bend <= limit) & (-bend <= limit)));
+}
+
+// Copies heights; NAN for spikes.
+__kernel void pose_spikes(const int rows, const int columns, MAP height, MAP height_sigma, OUT clean)
+{
+    EACH_GROUP {
+        const F here = some_of(height + p, count), limit = SPIKE * some_of(height_sigma + p, count);
+        put_some(clean + p, count, here);
+        if (is_smooth(height, p, column, columns, count, here, limit)) continue;
+        for (int i = 0; i < count; ++i)
+            if (is_spike(height, rows, columns, row, column + i, height[p + i], SPIKE * height_sigma[p + i]))
+                clean[p + i] = NAN;
+    }
+}
 
 // Means of SIZE x SIZE heights, and their standard deviations; NAN if one of them is unknown.
 __kernel void pose_means(
@@ -197,61 +221,83 @@ __kernel void pose_means(
         const int q = SIZE * (row * wide + column);
         float line[LANES * SIZE];
         add_lines(height + q, wide, count, 1, 0, line);
-        for (int i = 0; i < count; ++i) mean[p + i] = SHARE * sum_of_line(line + SIZE * i, 1);
+        put_some(mean + p, count, SHARE * sums_of_line(line, 1));
         if (height_sigma) {
             add_lines(height_sigma + q, wide, count, 1, 1, line);
-            for (int i = 0; i < count; ++i) mean_sigma[p + i] = SHARE * root(sum_of_line(line + SIZE * i, 1));
+            put_some(mean_sigma + p, count, SHARE * roots(sums_of_line(line, 1)));
         }
     }
 }
 
 __kernel void pose_records(
-    const int rows, const int columns, const int high, const int wide, MAP height, MAP height_sigma,
+    const int rows, const int columns, const int high, const int wide, const int spiky, MAP height, MAP height_sigma,
     __global const int *restrict component, BYTES offset_unknown, MAP normals, MAP gradient, MAP normals_sigma,
     BYTES filled, BYTES contact, BYTES edges, OUT records, OUT slopes)
 {
     EACH_GROUP {
         const int first = SIZE * (row * wide + column);
-        float normal_line[3 * LANES * SIZE], square_line[LANES * SIZE];
-        if (normals) add_lines(normals + 3 * first, wide, count, 3, 0, normal_line);
-        if (normals_sigma) add_lines(normals_sigma + first, wide, count, 1, 1, square_line);
-        for (const int after = column + count; column < after; ++column, ++p) {
-            const int lane = count - (after - column);
-            float x = 0, y = 0, upright = 0, square = normals_sigma ? 0 : NOT_COMPARED, variance = FAR;
-            if (height_sigma && height_sigma[p] > 0) variance = GREATER(height_sigma[p] * height_sigma[p], SHARPEST);
-            int used = FINITE(height[p]);
-            if (normals) {
-                const float *line = normal_line + 3 * SIZE * lane;
-                x = SHARE * sum_of_line(line, 3);
-                y = SHARE * sum_of_line(line + 1, 3);
-                upright = SHARE * sum_of_line(line + 2, 3);
-            } else {
-                const float a = gradient[2 * p], b = gradient[2 * p + 1];
-                upright = 1.0f / sqrt(1.0f + a * a + b * b);
-                x = -a * upright;
-                y = -b * upright;
+        const F z = some_of(height + p, count), none = NAN;
+        F x, y, upright, square = NOT_COMPARED, variance = FAR;
+        if (normals) {
+            float line[3 * LANES * SIZE];
+            add_lines(normals + 3 * first, wide, count, 3, 0, line);
+            x = SHARE * sums_of_line(line, 3);
+            y = SHARE * sums_of_line(line + 1, 3);
+            upright = SHARE * sums_of_line(line + 2, 3);
+        } else {
+            float along[LANES], up[LANES];
+            for (int i = 0; i < LANES; ++i) {
+                along[i] = i < count ? gradient[2 * (p + i)] : NAN;
+                up[i] = i < count ? gradient[2 * (p + i) + 1] : NAN;
             }
-            if (normals_sigma) {
-                square = SHARE * SHARE * sum_of_line(square_line + SIZE * lane, 1);
-                square = square == square ? GREATER(square, SHARPEST) : NAN;
-            }
-            if (component) {
-                EACH_IN_BLOCK if (component[q] < 0 || offset_unknown[component[q]]) variance = FAR;
-            }
-            if (filled) {
-                EACH_IN_BLOCK used = used && !filled[q];
-            }
-            used = used && upright > STEEPEST && FINITE(square);
-            if (edges || contact) used = used && !is_near_border(edges, contact, high, wide, SIZE * row, SIZE * column);
-            const float8 values = {x, y, square, height[p], variance, 0, 0, 0};
-            *(__global Loose *)(records + NUMBERS * p) = used ? values : (float8)NAN;
-            if (slopes) {
-                slopes[p] = used ? -x / upright : NAN;
-                slopes[rows * columns + p] = used ? -y / upright : NAN;
-            }
+            const F a = *(const Lanes *)along, b = *(const Lanes *)up;
+            upright = inverse_roots(1.0f + a * a + b * b);
+            x = -a * upright;
+            y = -b * upright;
         }
-        column -= count;
-        p -= count;
+        if (normals_sigma) {
+            float line[LANES * SIZE];
+            add_lines(normals_sigma + first, wide, count, 1, 1, line);
+            square = SHARE * SHARE * sums_of_line(line, 1);
+            square = square < SHARPEST ? (F)SHARPEST : square;
+        }
+        int flags[LANES], far[LANES], is_each_smooth = 1;
+        for (int i = 0; i < LANES; ++i) flags[i] = far[i] = 0;
+        if (height_sigma) {
+            const F sigma = some_of(height_sigma + p, count), own = sigma * sigma;
+            variance = sigma > 0.0f ? GREATER(own, (F)SHARPEST) : variance;
+            is_each_smooth = !spiky || is_smooth(height, p, column, columns, count, z, SPIKE * sigma);
+        }
+        if (component || filled || edges || contact || !is_each_smooth)
+            for (int lane = 0; lane < count; ++lane) {
+                if (!is_each_smooth)
+                    flags[lane] = is_spike(
+                        height, rows, columns, row, column + lane, height[p + lane], SPIKE * height_sigma[p + lane]);
+                const int left = SIZE * (column + lane);
+                for (int i = 0, q; i < SIZE * SIZE; ++i) {
+                    q = (SIZE * row + i / SIZE) * wide + left + i % SIZE;
+                    if (component) far[lane] |= component[q] < 0 || offset_unknown[component[q]];
+                    if (filled) flags[lane] |= filled[q] != 0;
+                }
+                if (edges || contact) flags[lane] |= is_near_border(edges, contact, high, wide, SIZE * row, left);
+            }
+        const I is_left_out = *(const Flags *)flags != 0, is_unknown = *(const Flags *)far != 0;
+        const I used = FINITE(z) & (upright > STEEPEST) & FINITE(square) & !is_left_out;
+        float values[5][LANES];
+        *(Lanes *)values[0] = used ? x : none;
+        *(Lanes *)values[1] = used ? y : none;
+        *(Lanes *)values[2] = used ? square : none;
+        *(Lanes *)values[3] = used ? z : none;
+        *(Lanes *)values[4] = used ? (is_unknown ? (F)FAR : variance) : none;
+        for (int i = 0; i < count; ++i) {
+            const float rest = values[0][i] != values[0][i] ? NAN : 0;
+            *(__global Loose *)(records + NUMBERS * (p + i)) =
+                (float8)(values[0][i], values[1][i], values[2][i], values[3][i], values[4][i], rest, rest, rest);
+        }
+        if (slopes) {
+            put_some(slopes + p, count, used ? -x / upright : none);
+            put_some(slopes + rows * columns + p, count, used ? -y / upright : none);
+        }
     }
 }
 

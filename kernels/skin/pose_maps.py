@@ -64,24 +64,7 @@ def pose_spikes(height: Array, height_sigma: Array, clean: Array) -> None:
     it whose neighbours are valid, two or more (one at the border); and from the cubic of four neighbours, if
     they are valid, by half as much, as a curved surface does not.
     """
-    wide, (rows, columns) = np.pad(height, 2, constant_values=np.nan), height.shape
-
-    def both(down: int, right: int) -> Array:
-        ahead, back = (
-            wide[2 + k * down : 2 + k * down + rows, 2 + k * right : 2 + k * right + columns] for k in (1, -1)
-        )
-        return np.asarray(ahead + back)
-
-    steps = (0, 1), (1, 0), (1, 1), (1, -1)
-    near = np.array([both(*step) for step in steps])
-    far = np.array([both(2 * down, 2 * right) for down, right in steps])
-    with np.errstate(invalid="ignore"):
-        bends, rests = np.abs(height - near / 2), np.abs(height - (4 * near - far) / 6)
-        lines, high = np.isfinite(bends), (bends > SPIKE * height_sigma) & ~(rests < bends / 2)
-        spikes = np.all(high | ~lines, axis=0)
-    needed = np.full((rows, columns), 1)
-    needed[1:-1, 1:-1] = 2
-    clean[...] = np.where(spikes & (lines.sum(axis=0) >= needed), np.nan, height)
+    clean[...] = np.where(_spikes(height, height_sigma), np.nan, height)
 
 
 def pose_means(
@@ -107,6 +90,7 @@ def pose_records(
     edges: Array | None,
     records: Array,
     slopes: Array | None,
+    spiky: int,
     size: int = 1,
 ) -> None:
     """Write the records of a map without second derivatives, (H, W, 8), and its slopes, (2, H, W).
@@ -114,7 +98,7 @@ def pose_records(
     Records and slopes of unused pixels are NaN. All maps but the height may be None. Without normals, they
     are computed from the ``gradient``, (H, W, 2). Heights of components with unknown offset are not compared.
     A pixel is not used if it is filled, steep, or at most two pixels away from an edge or a pixel without
-    contact.
+    contact; or, if ``spiky``, a spike as of `pose_spikes`.
 
     A pixel of the records is a block of ``size`` x ``size`` pixels of the maps, except of heights, their
     standard deviations and the gradient, which are means already. Its normal is the mean of theirs.
@@ -136,6 +120,8 @@ def pose_records(
             unknown = np.append(offset_unknown, 1).astype(bool)[component]
             variance = np.where(_blocks(unknown, size).any(axis=0), FAR, variance)
         used = np.isfinite(height) & (normals[..., 2] > STEEPEST) & np.isfinite(square)
+        if spiky and height_sigma is not None:
+            used &= ~_spikes(height, height_sigma)
         if filled is not None:
             used &= ~_blocks(filled != 0, size).any(axis=0)
         for border in (None if edges is None else edges != 0, None if contact is None else contact == 0):
@@ -203,3 +189,24 @@ def _near(border: NDArray[np.bool_]) -> NDArray[np.bool_]:
     rows, columns = border.shape
     shifts = np.ndindex(2 * AROUND + 1, 2 * AROUND + 1)
     return np.asarray(np.any([wide[i : i + rows, k : k + columns] for i, k in shifts], axis=0))
+
+
+def _spikes(height: Array, height_sigma: Array) -> NDArray[np.bool_]:
+    wide, (rows, columns) = np.pad(height, 2, constant_values=np.nan), height.shape
+
+    def both(down: int, right: int) -> Array:
+        ahead, back = (
+            wide[2 + k * down : 2 + k * down + rows, 2 + k * right : 2 + k * right + columns] for k in (1, -1)
+        )
+        return np.asarray(ahead + back)
+
+    steps = (0, 1), (1, 0), (1, 1), (1, -1)
+    near = np.array([both(*step) for step in steps])
+    far = np.array([both(2 * down, 2 * right) for down, right in steps])
+    with np.errstate(invalid="ignore"):
+        bends, rests = np.abs(height - near / 2), np.abs(height - (4 * near - far) / 6)
+        lines, high = np.isfinite(bends), (bends > SPIKE * height_sigma) & ~(rests < bends / 2)
+        spikes = np.all(high | ~lines, axis=0)
+    needed = np.full((rows, columns), 1)
+    needed[1:-1, 1:-1] = 2
+    return np.asarray(spikes & (lines.sum(axis=0) >= needed))

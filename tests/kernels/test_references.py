@@ -834,7 +834,7 @@ def _(shape, maps, size):
     fine = size * shape[0] + size - 1, size * shape[1] + size - 1
     records = waves(fine, 0.2)
     values = NONE_BUT_HEIGHTS | {"height": height[..., 3], "gradient": None, "shape": shape}
-    values |= named("size macros high wide", size, {"SIZE": size}, *fine)
+    values |= named("size macros high wide spiky", size, {"SIZE": size}, *fine, 0)
     values |= named("records slopes", np.zeros((*shape, 8)), np.zeros((2, *shape)))
     if maps == "heights":
         x, y, _, _, variance, *_ = height.T.swapaxes(1, 2)
@@ -850,7 +850,7 @@ def _(shape, maps, size):
     return (
         values
         | apart
-        | {"height_sigma": height[..., 0] ** 2, "offset_unknown": np.array([0, 1, 0], np.uint8)}
+        | {"spiky": 1, "height_sigma": height[..., 0] ** 2, "offset_unknown": np.array([0, 1, 0], np.uint8)}
     )
 
 
