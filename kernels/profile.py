@@ -15,6 +15,7 @@ from mirrorskin.kernels.waiting import waiting
 
 Kind = Literal["compile", "upload", "fill", "copy", "kernel", "download", "wait"]
 
+_TIMES = cl.profiling_info.START, cl.profiling_info.END
 _PENDING_LIMIT = 1024  # events kept before they are read, which bounds the memory of an endless run
 
 
@@ -90,7 +91,8 @@ class Profile:
         for kind, name, event, nbytes in pending:
             with waiting:
                 event.wait()
-            self._add(kind, name, (event.profile.end - event.profile.start) * 1e-9, nbytes)
+            start, end = map(event.get_profiling_info, _TIMES)  # not event.profile, which takes 20 times as long
+            self._add(kind, name, (end - start) * 1e-9, nbytes)
 
     def _add(self, kind: Kind, name: str, seconds: float, nbytes: int) -> None:
         record = self._records.setdefault((kind, name), Record(kind, name))
