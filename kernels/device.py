@@ -50,6 +50,7 @@ _log = logging.getLogger("mirrorskin.kernels")
 _opening = threading.Lock()
 _numbers = itertools.count()  # of buffers that were arguments of kernels
 _UNSET = object()  # no value of an argument
+_NUMBERS = frozenset((int, float))
 _opened: WeakSet[Device] = WeakSet()
 _left_out: set[cl.Device] = set()  # devices that failed and were replaced by others
 _KINDS = ("gpu", "cpu", "other")  # in the order of preference
@@ -398,7 +399,7 @@ class Device:
         >>> words.read().tolist()
         [0, 1, 2, 3, 0, 1, 2, 3]
         """
-        key = file, name, self.layout, *defines.items()
+        key = file, name, self.layout.tile, self.layout.group, *defines.items()  # hashed sooner than a layout
         kernel = self._kernels.get(key)
         if kernel is None:
             macros = {"TILE": self.layout.tile, **defines}
@@ -656,8 +657,9 @@ class Kernel:
         for place, (name, convert) in enumerate(self._signature):
             given = arguments[name]
             if convert is not None:
-                # The same number needs no conversion; an array of no dimension may have changed.
-                if given is self._given[place] and not isinstance(given, np.ndarray):
+                # The same number needs no conversion, except 0 or -0; an array may have changed.
+                last = self._given[place]
+                if type(given) in _NUMBERS and type(given) is type(last) and given == last and given:
                     continue
                 self._given[place] = _UNSET
                 try:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import pyopencl as cl
 
@@ -15,7 +15,7 @@ from mirrorskin.kernels.waiting import waiting
 
 Kind = Literal["compile", "upload", "fill", "copy", "kernel", "download", "wait"]
 
-_TIMES = cl.profiling_info.START, cl.profiling_info.END
+_TIMES = cl.profiling_info.START, cl.profiling_info.END  # event.profile takes 20 times as long
 _PENDING_LIMIT = 1024  # events kept before they are read, which bounds the memory of an endless run
 
 
@@ -91,7 +91,7 @@ class Profile:
         for kind, name, event, nbytes in pending:
             with waiting:
                 event.wait()
-            start, end = map(event.get_profiling_info, _TIMES)  # not event.profile, which takes 20 times as long
+            start, end = (cast(int, event.get_profiling_info(number)) for number in _TIMES)
             self._add(kind, name, (end - start) * 1e-9, nbytes)
 
     def _add(self, kind: Kind, name: str, seconds: float, nbytes: int) -> None:

@@ -64,23 +64,24 @@ class Equations:
     pixels : float
     normal_matrix, unbiased : ndarray, (6, 6)
         J'WJ, and J'WK, in which the noise of the Jacobians is averaged out; J'WJ if K was not computed.
-    right : ndarray, (6,)
-        J'Wr.
     chi_square : float
         Chi square per degree of freedom; `compared` is their number.
     """
 
     def __init__(self, total: Doubles, size: float) -> None:
-        self._size, scale = size, _scale_of(size)
-        upper, right, numbers, products = total[:21], total[21:27], total[27:31].tolist(), total[31:]
-        chi, self.compared, heights, normals = numbers
-        self.normal_matrix: NDArray[Any] = _symmetric(upper, size)
+        self._total, self._size = total, size
+        chi, self.compared, heights, normals = total[27:31].tolist()
+        self.normal_matrix: NDArray[Any] = total[_UPPER] * _squared_scale(size)
         self.unbiased: NDArray[Any] = self.normal_matrix
-        if products.size:
-            self.unbiased = products.reshape(6, 6) * _squared_scale(size)
-        self.right: NDArray[Any] = right * scale
+        if len(total) > PARTS[-2]:
+            self.unbiased = total[PARTS[-2] :].reshape(6, 6) * _squared_scale(size)
         self.pixels: float = max(normals, heights)
         self.chi_square: float = chi / max(self.compared, 1e-9)
+
+    @property
+    def right(self) -> NDArray[Any]:
+        """J'Wr, (6,)."""
+        return self._total[21:27] * _scale_of(self._size)
 
     def scatter(self) -> tuple[NDArray[Any], int]:
         """Return the sum over blocks of the products of their J'Wr, (6, 6), and the number of blocks."""
@@ -116,7 +117,8 @@ class Equations:
         alike = inverse if unbiased is independent else np.linalg.inv(independent)
         scatter = products * (count / max(count - 6, 1))
         size = np.vdot(alike, scatter) / len(independent)
-        middle = (count * scatter + (_BLOCKS * size) * independent) / (count + _BLOCKS)
+        share = count / (count + _BLOCKS)
+        middle = share * scatter + ((1 - share) * size) * independent
         covariance = inverse @ middle @ inverse.T
         return np.asarray(covariance if directions is None else directions @ covariance @ directions.T)
 
@@ -155,7 +157,7 @@ class Followed(Equations):
     def __init__(self, found: NDArray[np.floating], size: float) -> None:
         values = found.astype(np.float64)
         super().__init__(values[SUMS_AT:SCATTER_AT], size)
-        self._blocks, self.bend = int(values[0]), float(values[1])
+        self._blocks, self.bend = int(found[0]), float(found[1])
         self.motion: Motion = Motion(values[TURN_AT:SHIFT_AT].reshape(3, 3), values[SHIFT_AT:SUMS_AT]).rigid()
         self._products = values[SCATTER_AT:]
 
@@ -342,7 +344,8 @@ class PairFit:
 
     def halved(self) -> PairFit:
         """Return the fit of the same maps at half their resolution."""
-        return PairFit(*coarser([self.first, self.second], min(self.first.shape) // 2)[0], self.device)
+        first, second = coarser([self.first, self.second], min(self.first.shape) // 2)[0]
+        return PairFit(first, second, self.device)
 
     @cached_property
     def _coarser(self) -> list[PairFit]:  # without this one: a cycle would keep its maps on the device

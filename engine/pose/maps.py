@@ -41,7 +41,7 @@ class Workspace:
 
     def array(self, name: str, *shape: int) -> Array:
         """Return the array of a name and shape."""
-        key = name, *shape
+        key: tuple[str | int, ...] = (name, *shape)
         if key not in self._arrays:
             self._arrays[key] = self._device.array(name, shape, np.float32, zeroed=False)
         return self._arrays[key]

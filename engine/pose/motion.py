@@ -57,7 +57,8 @@ class Motion:
     def adjoint(self) -> Doubles:
         """Return the matrix, (6, 6), that converts small motions before this one to ones after it."""
         matrix = np.zeros((6, 6))
-        matrix[:3, :3] = matrix[3:, 3:] = self.turn
+        matrix[:3, :3] = self.turn
+        matrix[3:, 3:] = self.turn
         matrix[3:, :3] = cross_matrix(self.shift) @ self.turn
         return matrix
 
