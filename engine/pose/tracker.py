@@ -40,11 +40,11 @@ class PoseTracker(ThreadSafe):
     previous key. Errors therefore increase with the number of keys, not of results; an earlier key by which
     the pose is more certain is taken again, so they do not increase along a path that returns. The start is
     extrapolated from the last two results, and refined on every fourth row and column, then on all pixels,
-    without outliers. Maps are averaged to 100 to 200 pixels along their shorter side, which hardly costs
-    accuracy. Directions that the key does not determine are identified with the first result after it, and
-    are kept fixed. If the next result shares too few pixels with the first one but has more, as when contact
-    grows, it takes the place of the first. A step too large for this is searched as `estimate_pose` does, and
-    noted.
+    without outliers. Maps are averaged to 100 to 200 pixels along their shorter side, or to half as many if
+    the surface is smooth, which hardly costs accuracy. Directions that the key does not determine are
+    identified with the first result after it, and are kept fixed. If the next result shares too few pixels
+    with the first one but has more, as when contact grows, it takes the place of the first. A step too large
+    for this is searched as `estimate_pose` does, and noted.
 
     Parameters
     ----------

@@ -47,7 +47,8 @@ UNOPTIMISED = {"OCLGRIND_BUILD_OPTIONS": "-cl-opt-disable -Dalways_inline=noinli
 # Tests on few pixels that still reach all kernels and types. Of vectors of eight pixels its watch crashes.
 SMALL = (
     "odd_sizes or references_of_each_pixel or used_again or is_light or (read_all and 127)"
-    " or (triad_all and 127) or displacement_ or gpu-pose_equations or pose_gradient or pose_records"
+    " or (triad_all and 127) or displacement_ or gpu-pose_equations or gpu-pose_follow or pose_gradient"
+    " or gpu-pose_records"
 )
 
 
