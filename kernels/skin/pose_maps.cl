@@ -191,7 +191,7 @@ INLINE void put_some(OUT values, const int count, const F numbers)
     for (int lane = 0; lane < count; ++lane) values[lane] = some[lane];
 }
 
-// Whether the heights of a group are surely no spikes, by their neighbours of the same row.
+// Whether no height of a group is a spike, by the neighbours in the same row.
 INLINE int is_smooth(
     MAP height, const int p, const int column, const int columns, const int count, const F here, const F limit)
 {

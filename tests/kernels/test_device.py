@@ -241,9 +241,20 @@ def test_arguments_have_the_types_that_macros_and_conditions_give_them(device):
 
 def test_an_argument_that_no_number_becomes_is_one_line(device):
     with pytest.raises(
-        DeviceError, match="argument pair is of type int2: use a number or a __global pointer"
+        DeviceError, match="argument taken is of type sampler_t: use a number or a __global pointer"
     ):
-        device.kernel("__kernel void one(const int2 pair) { }", "one")
+        device.kernel("__kernel void one(const sampler_t taken) { }", "one")
+
+
+def test_a_vector_is_an_argument_of_as_many_numbers(device):
+    source = (
+        "__kernel void one(const float4 numbers, __global float *sum) { *sum = numbers.x + 4 * numbers.w; }"
+    )
+    one, total = device.kernel(source, "one"), device.array("sum", (1,), np.float32)
+    one(1, numbers=(1, 0, 0, 0.5), sum=total, moved=0)
+    assert total.read()[0] == 3
+    with pytest.raises(TypeError, match="4 numbers are needed"):
+        one(1, numbers=(1, 0), sum=total, moved=0)
 
 
 def test_a_parked_array_keeps_its_content(device):
