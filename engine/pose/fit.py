@@ -136,6 +136,16 @@ class BlockEquations(Equations):
         scores = scores * _scale_of(self._size)
         return scores.T @ scores, int(np.count_nonzero(normals + heights))
 
+    def after(self, step: Doubles) -> BlockEquations:
+        """Return the sums after a step, (6,), for residuals that are linear in it."""
+        sums = self._sums.astype(np.float64)
+        upper, right, chi, *_ = _split(sums)
+        step = step * _scale_of(self._size)
+        added = upper[:, _UPPER] @ step
+        chi += ((2 * right + added) @ step)[:, np.newaxis]
+        right += added
+        return BlockEquations(sums, self._size)
+
     @cached_property
     def typical(self) -> float:
         """Median chi square of the blocks, which is insensitive to a dent in the object."""
@@ -223,14 +233,17 @@ class PairFit:
         ``key`` is that of `constants`, and ``bend`` the last one of `Followed`.
         """
         device, (rows, columns) = self.device, self.first.shape
-        group = device.layout.group
+        group, turn, (x, y, z) = device.layout.group, expected.turn.tolist(), expected.shift.tolist()
         device.kernel("pose", "pose_follow", BESIDE=0, GROUP=group)(
             group,
             rows=rows,
             columns=columns,
             other_rows=self.second.shape[0],
             other_columns=self.second.shape[1],
-            expected=(*expected.turn.ravel(), *expected.shift, bend, 0, 0, 0),
+            expected_x=(*turn[0], x),
+            expected_y=(*turn[1], y),
+            expected_z=(*turn[2], z),
+            expected_bend=bend,
             key=key,
             first=self.first.records,
             second=self.second.records,
@@ -447,17 +460,17 @@ class PairFit:
             directions = complement(free if free.size else now.free(_LIKELY[now.chi_square > _MAX_CHI2]))
             if not directions.size:
                 break
-            motion, moved = self._step(motion, now, directions)
+            motion, moved, _ = self.step(motion, now, directions)
             if moved < _LAST_STEP:
                 break
         return motion
 
-    def _step(self, motion: Motion, now: Equations, directions: Doubles) -> tuple[Motion, float]:
-        """Return the motion after a Gauss-Newton step in given directions, and the step in sigmas."""
+    def step(self, motion: Motion, now: Equations, directions: Doubles) -> tuple[Motion, float, Doubles]:
+        """Return the motion after a Gauss-Newton step in given directions; the step in sigmas, and itself."""
         matrix = directions.T @ now.normal_matrix @ directions
         matrix += LEAST * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
         step = -directions @ np.linalg.solve(matrix, directions.T @ now.right)
         step /= max(float(np.linalg.norm(step)) / (MAX_STEP * self.second.extent.size), 1.0)
         sigmas = math.sqrt(step @ now.normal_matrix @ step / max(now.chi_square, 1.0))
         moved = motion.small_step(step * _scale_of(self.second.extent.size), self.second.extent.middle)
-        return moved, sigmas
+        return moved, sigmas, step

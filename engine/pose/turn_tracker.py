@@ -17,7 +17,7 @@ from mirrorskin.engine.base.device_arrays import on_host
 from mirrorskin.engine.base.frames import as_frames
 from mirrorskin.engine.base.running import Run
 from mirrorskin.engine.integration import integrate
-from mirrorskin.engine.pose.fit import FEWEST_SHARED, Equations, PairFit, complement
+from mirrorskin.engine.pose.fit import BlockEquations, PairFit, complement
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
@@ -31,7 +31,7 @@ from mirrorskin.io.base.types import body_axes
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
-from mirrorskin.kernels.skin.pose import BLOCK
+from mirrorskin.kernels.skin.pose import BLOCK, FEWEST, NO_LIMIT
 from mirrorskin.kernels.skin.turn_pose import LIGHT, NUMBERS
 
 Floats = NDArray[np.float32]
@@ -47,7 +47,6 @@ _HEIGHT_PASSES = 2  # of a key: its heights decide where frames show its pixels
 _RETURN = 0.1  # additional share that an earlier key must have to be taken again
 _STRIDE = 4  # pixel step of the coarse fit
 _CLOSE = 3.0  # error, sigmas, from which outliers are left out
-_NO_LIMIT = 1e30
 _ROWS, _COLUMNS = np.triu_indices(6)
 
 
@@ -362,7 +361,7 @@ class _Found(NamedTuple):
 
     fit: _FrameFit
     motion: Motion
-    now: Equations
+    now: BlockEquations
     light: float  # share by which it is stronger
 
 
@@ -377,7 +376,7 @@ class _FrameFit(PairFit):
 
     def at(
         self, axis: Doubles, motion: Motion, unbiased: bool, step: int, limit: float, other: bool
-    ) -> tuple[Equations, float]:
+    ) -> tuple[BlockEquations, float]:
         """Return the sums at a motion, without the part that the light of the frame explains, and that."""
         map_, window = self.second, self._window
         (rows, columns), size = map_.shape, map_.extent.size
@@ -404,7 +403,7 @@ class _FrameFit(PairFit):
             moved=36 * rows * columns // step**2,
         )
         alone, light = _without_light(sums.read())
-        return Equations(alone, size, unbiased), light
+        return BlockEquations(alone, size), light
 
 
 @dataclass(slots=True)
@@ -444,24 +443,24 @@ class _Key:
 
         ``other`` says that the frame is not one of the key's.
         """
-        motion, limit, shared = self.pose.motion.inverse().then(expected), _NO_LIMIT, 0.0
+        motion, limit, shared = self.pose.motion.inverse().then(expected), NO_LIMIT, 0.0
         last = math.inf
         for _ in range(_MAX_STEPS):
-            stride = 1 if self.free is None or limit < _NO_LIMIT else _STRIDE
+            stride = 1 if self.free is None or limit < NO_LIMIT else _STRIDE
             now, light = self.fit.at(axis, motion, self.free is None, stride, limit, other)
-            if now.pixels < max(FEWEST_SHARED, _MIN_KEPT * shared):
+            if now.pixels < max(FEWEST, _MIN_KEPT * shared):
                 return None
             if self.free is None:
                 self._start(now)
             motion, moved, step = self.fit.step(motion, now, self.directions)
-            if limit < _NO_LIMIT and (moved < _EXACT or last / 2 < moved < 1):
+            if limit < NO_LIMIT and (moved < _EXACT or last / 2 < moved < 1):
                 return self._accepted(_Found(self.fit, motion, now.after(step), light))
             last = moved
             if moved < _CLOSE:
                 limit, shared = _OUTLIER * max(self.typical, now.chi_square), now.pixels * stride**2
         return None
 
-    def _start(self, now: Equations) -> None:
+    def _start(self, now: BlockEquations) -> None:
         """Keep which directions are determined."""
         self.free = now.free()
         if self.free.shape[1] == 6:

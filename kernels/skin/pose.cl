@@ -365,18 +365,21 @@ INLINE void move(Pose *pose, const float *step)
 
 // The motion from one map to another near an expected one, by one work-group.
 __kernel GROUP_SIZE void pose_follow(
-    const int rows, const int columns, const int other_rows, const int other_columns, const float16 expected,
-    __global const Key *restrict key, MAP first, MAP second, OUT sums, OUT found)
+    const int rows, const int columns, const int other_rows, const int other_columns, const float4 expected_x,
+    const float4 expected_y, const float4 expected_z, const float expected_bend, __global const Key *restrict key,
+    MAP first, MAP second, OUT sums, OUT found)
 {
     const int item = get_local_id(0);
     const Key fixed = *key;
     const float per_size = 1.0f / fixed.size;
     Pose pose, rough;
-    float start[16], total[SUMS], step[6];
-    vstore16(expected, 0, start);
-    for (int i = 0; i < 9; ++i) pose.turn[i] = start[i];
+    float total[SUMS], step[6];
+    const float4 expected[3] = {expected_x, expected_y, expected_z};
     for (int i = 0; i < 3; ++i) {
-        pose.shift[i] = start[9 + i];
+        pose.turn[3 * i] = expected[i].x;
+        pose.turn[3 * i + 1] = expected[i].y;
+        pose.turn[3 * i + 2] = expected[i].z;
+        pose.shift[i] = expected[i].w;
         pose.centre[i] = fixed.centre[i];
     }
     for (int i = 0; i < 4; ++i) {
@@ -385,7 +388,7 @@ __kernel GROUP_SIZE void pose_follow(
     }
     pose.flat_limit = fixed.flat_limit;
     pose.other_flat_limit = fixed.other_flat_limit;
-    float bend = start[12], last = 0, shared = 0;
+    float bend = expected_bend, last = 0, shared = 0;
     int coarse = 0, fine = -1, blocks = 0;  // fine: number of steps with all pixels, -1 during coarse ones
     while (coarse < MAX_COARSE || fine >= 0) {
         const int stride = fine < 0 ? STRIDE : 1;

@@ -83,7 +83,16 @@ def pose_equations(first: Array, second: Array, poses: Array, sums: Array) -> No
         _equations_at(1, first, second, pose, out)
 
 
-def pose_follow(expected: Array, key: Array, first: Array, second: Array, found: Array) -> None:
+def pose_follow(
+    expected_x: Array,
+    expected_y: Array,
+    expected_z: Array,
+    expected_bend: float,
+    key: Array,
+    first: Array,
+    second: Array,
+    found: Array,
+) -> None:
     """Write the motion from one map to another near an expected motion.
 
     Gauss-Newton steps use every `_STRIDE`-th row and column until the error that they leave, which is
@@ -92,24 +101,27 @@ def pose_follow(expected: Array, key: Array, first: Array, second: Array, found:
 
     Parameters
     ----------
-    expected : (16,)
-        Rotation matrix (9) and translation (3) of the expected motion, and the error that a coarse step
-        leaves over the square of the step, both in sigmas, or `NO_LIMIT` if unknown; the rest is not used.
+    expected_x, expected_y, expected_z : (4,)
+        A row of the rotation matrix of the expected motion, and the translation along this axis.
+    expected_bend : float
+        Error that a coarse step leaves over the square of the step, both in sigmas; `NO_LIMIT` if unknown.
     key : (51,)
         Numbers 12 to 24 of a pose of `pose_equations`; the object's size; typical chi square; projection onto
         the directions in which the motion is followed (36), in units of the size.
     first, second : (H, W, 8)
         Records.
     found : (FOUND,)
-        Number of blocks with shared pixels, 0 if no motion is found; error over the square of a step as in
-        ``expected``; rotation matrix; translation; sums over all pixels, as of `pose_equations` without J'WK;
-        and the upper triangle of the sum over blocks of the products of their J'Wr. The sums are those after
-        the last step, for residuals that are linear in it.
+        Number of blocks with shared pixels, 0 if no motion is found; error over the square of a step as
+        ``expected_bend``; rotation matrix; translation; sums over all pixels, as of `pose_equations` without
+        J'WK; and the upper triangle of the sum over blocks of the products of their J'Wr. The sums are those
+        after the last step, for residuals that are linear in it.
     """
     found[0] = 0
     size, typical, projection = key[13], key[14], key[15:].reshape(6, 6)
     scale = np.repeat([1 / size, 1.0], 3)
-    motion, bend, last, shared = np.array(expected[:12]), expected[12], 0.0, 0.0
+    expected = np.array([expected_x, expected_y, expected_z])
+    motion, bend = np.concatenate([expected[:, :3].ravel(), expected[:, 3]]), expected_bend
+    last = shared = 0.0
     rough, coarse, fine = motion, 0, -1
     while coarse < _MAX_COARSE or fine >= 0:
         stride = _STRIDE if fine < 0 else 1

@@ -790,11 +790,12 @@ def _(free, start):
     directions = np.linalg.qr(np.random.default_rng(5).normal(size=(6, 6)))[0][:, free:]
     other = grid[0] + 0.013, grid[1] + 0.017, *grid[2:]  # so that no border falls on a pixel
     key = [0.1, -0.2, 0.05, *grid, *other, 1.0, 1.0, 1.5, 10.0, *(directions @ directions.T).ravel()]
-    motion = Rotation.from_rotvec((0, 0, start / 10)).as_matrix().ravel(), (start, 0, 0)
+    motion = np.column_stack([Rotation.from_rotvec((0, 0, start / 10)).as_matrix(), (start, 0, 0)])
     first, second = waves(shape, 0.0), waves(shape, 0.05, seed=1)
     second[..., 5:] = np.moveaxis([-1.69 * second[..., 3], 0 * second[..., 3], -0.81 * second[..., 3]], 0, -1)
     values = named("key first second", np.array(key), first, second)
-    values |= {"expected": (*np.concatenate(motion).tolist(), pose.NO_LIMIT, 0.0, 0.0, 0.0)}
+    values |= named("expected_x expected_y expected_z", *map(tuple, motion.tolist()))
+    values |= {"expected_bend": pose.NO_LIMIT}
     values |= {"sums": np.zeros((blocks_of(shape), pose.PARTS[-2])), "found": np.zeros(pose.FOUND)}
     values |= {"other_rows": shape[0], "other_columns": shape[1], "shape": shape, "is_near": start < 1}
     return values | {"macros": {"BESIDE": 0}}
