@@ -187,35 +187,31 @@ class Loop:
         The last one is used at any age if it is the newest of those that waited together.
         """
         now, count = self._source.now(), len(block.frames)
-        time = np.full(count, now) if block.time is None else block.time
-        used = (now - time <= self._latency) | (newest & (np.arange(count) == count - 1))
-        used &= (block.index + np.arange(count)) % self._run.every == 0
-        self._monitor.time(WAITED, *(now - time).tolist())
-        self._times.extend(time.tolist())
+        times = [now] * count if block.time is None else block.time.tolist()
+        used = [
+            (now - time <= self._latency or (newest and number == count - 1))
+            and (block.index + number) % self._run.every == 0
+            for number, time in enumerate(times)
+        ]
+        self._monitor.time(WAITED, *(now - time for time in times))
+        self._times.extend(times)
         with self._guard():
-            self._monitor.took(now, count, int(np.count_nonzero(used)), block.dropped)
-            if used.all():
-                self._run.push_block(block)
-            else:
-                self._push_some(block, used)
+            self._monitor.took(now, count, sum(used), block.dropped)
+            edges = [n for n in range(count + 1) if (n > 0 and used[n - 1]) != (n < count and used[n])]
+            for start, stop in zip(edges[::2], edges[1::2], strict=True):  # contiguous frames
+                part = block if start == edges[0] else replace(block, dropped=0)  # losses are counted once
+                self._run.push_block(part, slice(None) if stop - start == count else slice(start, stop))
             if self._mark is not None:
-                self._mark(block.index, used)
-        if used.any():
-            last = int(np.flatnonzero(used)[-1])
-            at = math.nan if block.time is None else float(block.time[last])
+                self._mark(block.index, np.array(used))
+        if edges:
+            last = edges[-1] - 1
+            at = math.nan if block.time is None else times[last]
             places = getattr(block, self._run.position)  # a tilt, if the source has those of frames
             places = getattr(block, POSITIONS[self._source.motion]) if places is None else places
             place: Any = math.nan if places is None else places[last]
             self._newest = at, float(np.hypot(*place) if np.ndim(place) else place), block.frames[last]
-            self._taken, self._pending = float(time[last]), True
+            self._taken, self._pending = times[last], True
             self._monitor.time(PUSHED, self._source.now() - now)
-
-    def _push_some(self, block: Block, used: NDArray[np.bool_]) -> None:
-        """Push the frames of a block that are used."""
-        edges, part = np.flatnonzero(np.diff(used, prepend=False, append=False)), block
-        for start, stop in edges.reshape(-1, 2).tolist():  # contiguous frames
-            self._run.push_block(part, slice(start, stop))
-            part = replace(block, dropped=0)  # lost frames are counted once
 
     def _update(self) -> None:
         if not self._pending or self._newest is None:
@@ -223,10 +219,9 @@ class Loop:
         started = self._source.now()
         (at, position, picture), frames = self._newest, self._monitor.used
         maps, motion = self._run.maps(max(_PATIENCE, self._idle())), self._source.motion
-        update = Update(frames, at, motion, position, self._pictures.copy(picture), maps)
+        update = Update(frames, at, motion, position, self._pictures.copy(picture), maps, tracked={}, lost={})
         if self._trackers is not None:
-            tracked, lost = self._trackers.track(update, self._source.header.press)
-            update = replace(update, tracked=tracked, lost=lost)
+            self._trackers.track(update, self._source.header.press)
         finished = self._source.now()
         self._updated, self._pending = started, False
         self._monitor.updated()

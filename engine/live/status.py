@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Motion, Result
-from mirrorskin.io.base.threads import ThreadSafe
 from mirrorskin.io.model.result import display_order
 
 WAITED, PUSHED, UPDATED, SHOWN, RAISED = "waited", "push", "update", "frame to map", "frame to height"
@@ -157,10 +157,11 @@ class Status:
     latency: Mapping[str, Latency] = field(default_factory=dict)
 
 
-class Monitor(ThreadSafe):
-    """Counts frames and updates, and times stages."""
+class Monitor:
+    """Counts frames and updates, and times stages; several threads may use it at once."""
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._counts = dict.fromkeys(("frames", "used", "skipped", "dropped", "updates"), 0)
         self._times: dict[str, deque[float]] = {stage: deque(maxlen=_KEPT) for stage in STAGES}
         self._lately: deque[tuple[float, int]] = deque()
@@ -175,35 +176,39 @@ class Monitor(ThreadSafe):
 
     def took(self, now: float, frames: int, used: int, dropped: int) -> None:
         """Count frames taken from the source."""
-        if math.isnan(self._started):
-            self._started = now
-        self._now = now
-        counts = {"frames": frames, "used": used, "skipped": frames - used, "dropped": dropped}
-        for name, count in counts.items():
-            self._counts[name] += count
-        self._lately.append((now, self._counts["frames"]))
-        while now - self._lately[0][0] > _LATELY:
-            self._lately.popleft()
+        with self._lock:
+            if math.isnan(self._started):
+                self._started = now
+            self._now = now
+            counts = {"frames": frames, "used": used, "skipped": frames - used, "dropped": dropped}
+            for name, count in counts.items():
+                self._counts[name] += count
+            self._lately.append((now, self._counts["frames"]))
+            while now - self._lately[0][0] > _LATELY:
+                self._lately.popleft()
 
     def updated(self) -> None:
         """Count an update."""
-        self._counts["updates"] += 1
+        with self._lock:
+            self._counts["updates"] += 1
 
     def time(self, stage: str, *seconds: float) -> None:
         """Record durations of a stage; NaN is ignored."""
-        self._times[stage].extend(duration for duration in seconds if math.isfinite(duration))
+        with self._lock:
+            self._times[stage].extend(duration for duration in seconds if math.isfinite(duration))
 
     def status(self, fresh: bool = False) -> Status:
         """Return counts and times so far; percentiles may be a quarter of a second old, unless ``fresh``."""
-        if fresh or not self._now - self._computed < _FRESH:
-            self._latency = {stage: _latency(times) for stage, times in self._times.items()}
-            self._computed = self._now
-        seconds = 0.0 if math.isnan(self._started) else self._now - self._started
-        rate = 0.0
-        if len(self._lately) > 1:
-            (first, before), (last, after) = self._lately[0], self._lately[-1]
-            rate = (after - before) / (last - first) if last > first else 0.0
-        return Status(**self._counts, seconds=seconds, rate=rate, latency=dict(self._latency))
+        with self._lock:
+            if fresh or not self._now - self._computed < _FRESH:
+                self._latency = {stage: _latency(times) for stage, times in self._times.items()}
+                self._computed = self._now
+            seconds = 0.0 if math.isnan(self._started) else self._now - self._started
+            rate = 0.0
+            if len(self._lately) > 1:
+                (first, before), (last, after) = self._lately[0], self._lately[-1]
+                rate = (after - before) / (last - first) if last > first else 0.0
+            return Status(**self._counts, seconds=seconds, rate=rate, latency=dict(self._latency))
 
 
 def _latency(times: deque[float]) -> Latency:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,30 +77,26 @@ class Trackers:
             if hasattr(tracker, "precompile"):
                 tracker.precompile(shape, dtype)
 
-    def track(self, update: Update, press: float | None) -> tuple[dict[str, Any], dict[str, str]]:
-        """Return the answers for an update by name, and the reasons of those that are missing.
+    def track(self, update: Update, press: float | None) -> None:
+        """Write the answers into an update, and the reasons of those that are missing.
 
         ``press`` is the travel of motions that are not vertical.
         """
-        tracked: dict[str, Any] = {}
-        lost: dict[str, str] = {}
+        tracked, lost = cast("dict[str, Any]", update.tracked), cast("dict[str, str]", update.lost)
         travel = update.position if update.motion == "vertical" else press
-        maps = update.maps
-        if travel is not None and math.isfinite(travel) and maps.fitted.travel is None:
-            maps = maps.with_fitted(travel=float(travel))
-        so_far = replace(update, maps=maps, tracked=tracked, lost=lost)
+        if update.maps and travel is not None and math.isfinite(travel) and update.maps.fitted.travel is None:
+            update = replace(update, maps=update.maps.with_fitted(travel=float(travel)))
         for name, tracker in tuple(self._trackers.items()):
             try:
                 taken = getattr(tracker, "takes", ("maps",))
                 if not hasattr(tracker, "push"):
-                    tracked[name] = tracker(so_far)
-                elif "maps" in taken and not maps:
+                    tracked[name] = tracker(update)
+                elif "maps" in taken and not update.maps:
                     tracked[name], lost[name] = None, "the frames do not determine maps yet"
                 else:
-                    tracked[name] = tracker.push(*(getattr(so_far, part) for part in taken))
+                    tracked[name] = tracker.push(*(getattr(update, part) for part in taken))
             except (InputError, NotConverged) as error:
                 tracked[name], lost[name] = None, str(error)
-        return tracked, lost
 
 
 def _check(name: str, tracker: Tracker, motion: Motion) -> None:
