@@ -214,6 +214,8 @@ __attribute__((always_inline)) float2 answer(
         if (next >= 0 && next <= from - first) first_rises[p] = SEE(frames[(size_t)next * pixels + (p)]); \
     }
 
+#define LACK(a, b) ((a) > (b) ? (a) - (b) : 0)
+
 // One of several frames processed together: where it is dark, the run of the pixel restarts, unless it is
 // confirmed. Both conditions hold where neither difference is 0: many processors cannot compare unsigned
 // bytes, but have saturated differences.
@@ -224,7 +226,6 @@ __attribute__((always_inline)) float2 answer(
     bad[p] |= (end_of_run > clock##i) & BROKEN(sample); \
     end_of_run = again ? next##i : end_of_run;
 #else
-#define LACK(a, b) ((a) > (b) ? (a) - (b) : 0)
 #define TAKE(i) \
     sample = SEE(group[(size_t)(i) * pixels + p]); \
     again = LESSER((Count)LACK(LIGHT(p), sample), (Count)LACK(end_of_run, clock##i)); \
@@ -259,7 +260,8 @@ __kernel void onset_scan(
 {
     const int base = get_global_id(0) * TILE, width = min(TILE, pixels - base);
     // Frames after an onset until it is final.
-    const int needed = SUBFRAME && hold < 3 ? 3 : hold, after = needed - hold;
+    const int needed = SUBFRAME && hold < 3 ? 3 : hold;
+    const Count after = needed - hold;
     const Count whole = LESSER(needed, MOST);
     // counted frames of a run: beyond this it cannot be confirmed within SPAN
     const Count unconfirmed = LESSER(hold, 2 * SPAN);
@@ -308,7 +310,8 @@ __kernel void onset_scan(
         // When a run is confirmed, counted from `now`, if all frames from its start are light; beyond `unconfirmed`
         // if it starts after `now`.
         Count held[TILE], bad[TILE];
-        for (int p = 0; p < width; ++p) held[p] = remain[p] > after ? LESSER(remain[p] - after, unconfirmed) : 0;
+        const Count dark = length + unconfirmed;  // if the last frame is dark
+        for (int p = 0; p < width; ++p) held[p] = LESSER((Count)LACK(remain[p], after), unconfirmed);
         for (int p = 0; p < width; ++p) bad[p] = 0;
         for (int t = 0; t < length;) {
             __global const FRAME *restrict group = span + (size_t)t * pixels;
@@ -327,12 +330,14 @@ __kernel void onset_scan(
             }
         }
 
+        // Chunks in which nothing happens are skipped as a whole.
         for (int low = 0, high; low < width; low = high) {
-            high = LESSER(low + chunk, width);
+            high = LESSER(low + (low % CHUNK ? chunk : CHUNK), width);
             Count changed = needed > MOST, before[CHUNK];
             for (int p = low; p < high; ++p)
-                changed |= ((remain[p] > 0) & ((held[p] != length + unconfirmed) | (remain[p] != whole))) | bad[p];
+                changed |= (remain[p] > 0 ? (held[p] ^ dark) | (remain[p] ^ whole) : 0) | bad[p];
             if (!changed) continue;
+            high = LESSER(low + chunk, width);
 
             for (int p = low; p < high; ++p) {
                 const int start_of_run = times[p], unbroken = start_of_run >= 0 ? start_of_run : now;
@@ -460,10 +465,12 @@ __kernel void onset_scan(
     // If the last sample is near the level, the next block cannot determine how long it has been.
     __global const FRAME *restrict final = frames + (size_t)(count - 1) * pixels;
     for (int low = 0, high; low < width; low = high) {
-        high = LESSER(low + chunk, width);
-        int unsure = 0;
+        high = LESSER(low + (low % CHUNK ? chunk : CHUNK), width);
+        Count unsure = 0;
         for (int p = low; p < high; ++p) unsure |= (remain[p] == whole) & !(SEE(final[p]) < NEAR_LIMIT(p));
-        for (int p = low; p < high && unsure; ++p)
+        if (!unsure) continue;
+        high = LESSER(low + chunk, width);
+        for (int p = low; p < high; ++p)
             if (times[p] == DARK && SEE(final[p]) >= NEAR_LIMIT(p)) LOOK_BACK(p, first + count - 1)
     }
     for (int p = 0; p < width; ++p) lasts[p] = final[p];
