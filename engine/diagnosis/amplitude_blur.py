@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.device_arrays import AnyArray, on_host
 from mirrorskin.engine.base.frames import take_places
 from mirrorskin.engine.base.picture import Picture
+from mirrorskin.engine.diagnosis.footprint import LEAST_BLUR, PIXEL
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
@@ -29,27 +30,35 @@ GRID_LINES = 48
 MIN_PIXELS = 400
 """Least number of pixels that determine a blur."""
 
+LEAST = PIXEL + LEAST_BLUR**2
+"""Variance of what a pixel sees at best, square pixels: its area, and the blur of the best lens."""
+BEND_NOISE = 20.0
+"""Variance of a sum of four neighbours less four times the middle, of a variance of 1."""
+
 _MIN_BLUR = 0.4  # pixels: least standard deviation of a point spread that is reported
 _SIDE_Z_SCORE = 2.0  # standard errors from which on the blur of a side of the picture is one
 
 
-def add_blur(maps: Picture, sigma: str, vectors: Sequence[str], strength: str) -> None:
+def add_blur(maps: Picture, sigma: str, vectors: Sequence[str], strength: str, least: float = 0.0) -> None:
     """Add the error because of blur to the standard deviations of directions, radians, a map of a picture.
 
     ``vectors`` are the maps of the components of a signal, (H, W) each or (H, W, 3) together, of any length
     and NaN where unknown; ``strength`` is that of the signal, (H, W).
+    ``least`` is the variance of the blur, square pixels, if none is clear.
     """
-    variance = find_blur([maps.view(name) for name in vectors], maps.view(strength))
+    found = find_blur([maps.view(name) for name in vectors], maps.view(strength))
+    # Noise is not subtracted from the bend for a blur that is found, and as uncertain as that.
+    variance, noise = (least, BEND_NOISE) if found == 0 else (found, 0.0)
     if variance == 0:
         return
     if len(maps.bands) > 1:  # the picture does not fit on one device
         deviation, *parts = maps.read(sigma, *vectors)
         reach, factor = _reach(variance), variance / 2
         bend = blur.blur_bend(parts[0], parts[-1], reach)
-        blur.blur_add(parts[0], bend, reach, factor, 0.0, 0.0, 0.0, deviation)
+        blur.blur_add(parts[0], bend, reach, factor, noise, 0.0, 0.0, deviation)
         maps.fill(sigma, deviation)
         return
-    _add([maps.array(name) for name in vectors], maps.array(sigma), variance)
+    _add([maps.array(name) for name in vectors], maps.array(sigma), variance, noise)
 
 
 def with_bend(

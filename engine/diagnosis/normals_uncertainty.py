@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.base.device_arrays import AnyArray, on_host, stored_map
 from mirrorskin.engine.base.frames import QUANTUM, take_places, typical_value
 from mirrorskin.engine.base.steps import Context, Step
-from mirrorskin.engine.diagnosis.amplitude_blur import with_bend
+from mirrorskin.engine.diagnosis.amplitude_blur import BEND_NOISE, with_bend
 from mirrorskin.engine.diagnosis.curl import AzimuthBias, find_azimuth_bias
 from mirrorskin.engine.diagnosis.registration import Registered
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
@@ -33,7 +33,6 @@ _PARTS, _POINTS = 8, 64  # of the extent of the normals: distance between slopes
 _GRID = 64  # points along a side that show this extent
 _MIN_POINTS, _MIN_CORRELATION = 100, 0.1  # points, and their correlation, that decide
 _MAX_CORRELATION = 0.05  # of neighbours: greatest one of a mirrored surface
-_BEND_NOISE = 20.0  # variance of a sum of four neighbours less four times the middle, of a variance of 1
 _REACH = 5  # pixels: size of the neighbourhood whose loss of contact affects a registered sample
 
 
@@ -156,7 +155,7 @@ class NuisanceUncertainty(Step):
             normals, sigma = (stored_map(result, name) for name in ("normals", "normals_sigma"))
             several = normals.ndim == 4
             turns = zip(normals, sigma, strict=True) if several else [(normals, sigma)]
-            maps = [with_bend(*turn, footprint, _BEND_NOISE, common, operation.device) for turn in turns]
+            maps = [with_bend(*turn, footprint, BEND_NOISE, common, operation.device) for turn in turns]
             return np.stack(list(map(on_host, maps))) if several else maps[0]
 
         fitted = replace(result.fitted, footprint=footprint or None)

@@ -14,7 +14,7 @@ from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.picture import PerFrame, PerPixel, Picture
 from mirrorskin.engine.base.tiling import Planes
-from mirrorskin.engine.diagnosis.amplitude_blur import add_blur
+from mirrorskin.engine.diagnosis.amplitude_blur import LEAST, add_blur
 from mirrorskin.engine.optical.lamp_errors import CELLS, LampErrors, LampFit, find_lamp_errors
 from mirrorskin.io import InputError, Map
 from mirrorskin.io.base.arguments import as_array
@@ -195,7 +195,7 @@ class PhotometricStereo(Operation):
                 noise=self.lamp_fit.noise,
                 usual=usual,
             )
-        add_blur(self._maps, "normals_sigma", ["normals"], "albedo")
+        add_blur(self._maps, "normals_sigma", ["normals"], "albedo", LEAST)
         maps = dict(zip(_ANSWERS, self._maps.take(*_ANSWERS), strict=True))
         return maps if noise.ndim or np.isnan(noise) else maps | {"noise": float(noise)}
 

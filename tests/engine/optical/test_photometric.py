@@ -221,7 +221,7 @@ def test_light_without_a_fault_has_no_finding():
         for lamps in (round_lamps(0.6), TWO_RINGS, LAMPS):
             frames, dark = recorded(lamps, seed=seed)
             result = photometric_stereo(frames, light=lamps, dark=dark, shadow=4)
-            assert 0.6 < chi2(result, bumps()) < 1.1
+            assert 0.5 < chi2(result, bumps()) < 1.1
 
 
 def test_brightness_that_is_not_proportional_to_light_is_found():
@@ -234,4 +234,4 @@ def test_brightness_that_is_not_proportional_to_light_is_found():
 def test_brightness_that_is_proportional_to_light_has_no_finding():
     result = engine.run(shone_on(bumps()), PhotometricStereo(zenith=0.5))
     assert "warnings" not in result.process
-    assert 0.6 < chi2(result, bumps()) < 1.1
+    assert 0.5 < chi2(result, bumps()) < 1.1
