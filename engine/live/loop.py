@@ -136,7 +136,7 @@ class Loop:
         self._on_update, self._stop, self._mark, self._guard = on_update, stop, mark, guard
         self._monitor, self._pictures = Monitor(), _Pictures()
         self._taken = self._updated = -math.inf  # time of the newest frame that was pushed, of an update
-        self._newest: tuple[float, float, NDArray[Any]] | None = None  # its time, position and picture
+        self._newest: tuple[float, float, NDArray[Any]] | None = None  # its exposure, position and picture
         self._pending = False
         self._times: deque[float] = deque(maxlen=_INTERVALS)
         self._arrived: deque[float] = deque(maxlen=_INTERVALS)  # times of the newest frames of updates
@@ -205,7 +205,7 @@ class Loop:
                 self._mark(block.index, np.array(used))
         if edges:
             last = edges[-1] - 1
-            at = math.nan if block.time is None else times[last]
+            at = math.nan if block.time is None else times[last] - block.lateness
             places = getattr(block, self._run.position)  # a tilt, if the source has those of frames
             places = getattr(block, POSITIONS[self._source.motion]) if places is None else places
             place: Any = math.nan if places is None else places[last]
@@ -234,7 +234,7 @@ class Loop:
             self._monitor.time(RAISED, finished - self._arrived[-1 - lag])
         status = self._monitor.status()
         events = self._events.of(update)
-        p99 = status.latency[SHOWN].p99
+        p99 = status.latency[SHOWN].p99 + self._taken - at  # from the exposure
         update = replace(update, latency=finished - at, latency_p99=p99, events=events)
         if self._on_update is not None:
             self._on_update(update, status)

@@ -35,7 +35,7 @@ class Event:
     started : bool
         Whether the quantity rose above the limit, rather than fell back.
     time : float
-        Time of the frame that shows it, seconds on the scale of ``Block.time``; NaN without times.
+        That of the update, seconds.
     value : float
         The quantity in this frame.
     """
@@ -58,7 +58,8 @@ class Update:
     frames : int
         Number of frames used so far.
     time : float
-        Time of the newest frame, seconds on the scale of ``Block.time``; NaN if the source has no times.
+        Time of the newest frame's exposure, seconds on the scale of ``Block.time``, which may be the arrival;
+        NaN if the source has no times.
     motion : {"vertical", "axial", "horizontal", "twist"}
     position : float
         Position of the body in the newest frame: travel, mm; phase, twist or, of a body that rocks, tilt,
@@ -70,8 +71,7 @@ class Update:
         Of built-in operations: ``height``, ``normals``, ``contact``, ``edges`` (which may be of earlier
         frames), ``displacement`` since the first frame, and of a body that rocks ``slope``.
     latency : float
-        Seconds from the newest frame's time, its exposure if the source states it, to this update; NaN
-        without a time.
+        Seconds from ``time`` to this update; NaN without a time.
     latency_p99 : float
         99th percentile of the latencies of the last 4096 updates, seconds; up to a quarter of a second old.
     tracked : mapping of str to object

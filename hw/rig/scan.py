@@ -199,8 +199,19 @@ class Scan(Closing):
         properties |= {name: np.full(len(frames), value) for name, value in self.plan.constants.items()}
         stays_valid = frames.flags.c_contiguous
         return Block(
-            frames, self.count, arrival - origin, dropped=dropped, stays_valid=stays_valid, **properties
+            frames,
+            self.count,
+            arrival - origin,
+            dropped=dropped,
+            lateness=self._lateness,
+            stays_valid=stays_valid,
+            **properties,
         )
+
+    @property
+    def _lateness(self) -> float:
+        """Seconds from an exposure to its arrival, 0 if unknown."""
+        return self.rig.settings.camera.delay or 0.0
 
     def _prepare(self) -> None:
         """Move to the start of the scan, and wait there; the body leans only when it is pressed."""

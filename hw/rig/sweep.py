@@ -108,6 +108,11 @@ class SweepScan(Scan):
         distances = track.at(even_times(number, arrival) - self.delay.seconds)
         return {self.plan.series: self.plan.recorded(distances)}
 
+    @property
+    def _lateness(self) -> float:
+        """Seconds from an exposure to its arrival."""
+        return self.delay.seconds
+
     def _prepare(self) -> None:
         super()._prepare()
         _ = self.delay

@@ -61,6 +61,8 @@ class Block:
         Row and column of the first pixel in the full picture.
     dropped : int
         Frames lost between the preceding block and this one.
+    lateness : float
+        Seconds by which ``time`` is later than the exposures, such as the delay of a camera; 0 if unknown.
     stays_valid : bool
         Whether the memory of the frames belongs to the source, is not overwritten while it is referenced, and
         is readable for 64 bytes beyond the frames, so that a device can use it without a copy.
@@ -78,6 +80,7 @@ class Block:
     frame_weights: Floats | None = None
     origin: tuple[int, int] = (0, 0)
     dropped: int = 0
+    lateness: float = 0.0
     stays_valid: bool = False
 
     @property

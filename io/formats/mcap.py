@@ -317,7 +317,7 @@ class GrowingMessages(Closing):
         assert block.time is not None  # live frames have times
         if self._begun is None:
             self._begun = time.time_ns() - round(float(block.time[-1]) * _SECOND)
-        stamps = _stamps(self._begun, block.time)
+        stamps = _stamps(self._begun, block.time - block.lateness)
         _put_frames(self._file, block, stamps)
         self._stamps += stamps
         for name in _SERIES:

@@ -1,7 +1,7 @@
 """The live loop's policy, on simulated time."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -149,6 +149,17 @@ def test_each_update_has_the_newest_frame_and_the_status_so_far():
         np.testing.assert_array_equal(update.picture, FRAMES[number])
     assert len(updates) == COUNT
     assert np.all(np.diff([update.time for update, _ in updates]) > 0)
+
+
+def test_the_time_and_the_latency_of_an_update_are_those_of_the_exposure():
+    source, slow = make(update_time=0.002)
+    read, updates = source.read, []
+    source.read = lambda out: None if (block := read(out)) is None else replace(block, lateness=0.04)
+    Loop(source, slow, on_update=lambda update, status: updates.append(update)).run()
+    np.testing.assert_allclose([update.time for update in updates], np.arange(COUNT) / RATE - 0.04)
+    np.testing.assert_allclose([update.latency for update in updates], 0.042)
+    assert updates[-1].latency_p99 == pytest.approx(0.042)
+    assert len(updates) == COUNT
 
 
 @pytest.mark.parametrize("wrong", [{"latency": -0.1}, {"updates": -1.0}, {"latency": math.nan}])

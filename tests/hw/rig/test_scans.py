@@ -230,6 +230,10 @@ def test_the_delay_of_a_slow_and_a_fast_camera_is_measured(rate):
     assert delay.error < 0.01
 
 
+def test_blocks_state_how_late_their_frames_arrive(pressed):
+    assert {block.lateness for block in pressed[1]} == {0.03}
+
+
 @pytest.mark.parametrize("camera", [{}, {"source": "http://camera/video", "delay": 0.03}])
 def test_an_unstated_delay_and_that_of_a_stream_are_measured(camera):
     with make_rig(spreading((24, 24)), 100.0, delay=0.05, jitter=0.003, late=0.002) as rig:
