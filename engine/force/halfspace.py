@@ -310,8 +310,8 @@ def _opening(space: HalfSpace, compliance: float) -> Callable[[NDArray[Real]], N
 
 def padded_shape(shape: tuple[int, ...]) -> tuple[int, int]:
     """Return the size of the padded grid, on which a convolution does not wrap around."""
-    rows, columns = shape
-    return fft.next_fast_len(2 * rows - 1), fft.next_fast_len(2 * columns - 1, real=True)
+    rows, columns = (2 * fft.next_fast_len(size, real=True) for size in shape)
+    return rows, columns
 
 
 @lru_cache(maxsize=128)
