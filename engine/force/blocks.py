@@ -20,6 +20,7 @@ from mirrorskin.kernels.array_types import Doubles
 Singles = NDArray[np.float32]
 Window = tuple[slice, slice]
 
+_SQUARES = 2**14  # pixels that are squared at a time
 _NEGLIGIBLE, _JITTER = 1e-8, 1e-6  # covariances relative to the variance: left out; added to it
 
 
@@ -192,8 +193,7 @@ class BlockErrors:
         if self._sigma is None:
             return np.zeros([part.stop - part.start for part in window])
         if self._found is None or self._found[0] != window:
-            inside = self._sigma[self._blocks.pixels(window)]
-            square = self._blocks.means(inside * inside)
+            square = self._squares(self._sigma[self._blocks.pixels(window)])
             if not np.isfinite(square).all():
                 layers = square.reshape(*square.shape[:2], -1)
                 for n in range(layers.shape[2]):
@@ -201,3 +201,12 @@ class BlockErrors:
                     layer[...] = fill_with_nearest(layer) if np.isfinite(layer).any() else 0
             self._found = window, np.sqrt(square, dtype=np.float64)
         return self._found[1]
+
+    def _squares(self, sigma: NDArray[Any]) -> Singles:
+        """Return the means of squares, of some rows at a time: there is no new array of a frame's size."""
+        step = self._blocks.binning
+        row = sigma[:step].size
+        size = step * max(1, _SQUARES // max(row, 1))
+        strips = (sigma[start : start + size] for start in range(0, len(sigma), size))
+        parts = [self._blocks.means(strip * strip) for strip in strips]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)

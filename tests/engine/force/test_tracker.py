@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -212,6 +214,25 @@ def test_contacts_smaller_than_a_block_are_reported():
     found = ForceTracker(modulus=MODULUS, binning=1).push(result(height, 0.001), 0.1)
     assert found.force > 0
     assert "warnings" not in found.process
+
+
+def test_results_need_no_new_memory_of_their_size():
+    shape, size = (480, 640), 0.0125
+    x, y = io.pixel_axes(shape, (size, size))
+    height = (-(x**2 + y[:, np.newaxis] ** 2) / 10).astype(np.float32)
+    sigma = np.full(shape, 1e-3, np.float32)
+    moved = np.full((*shape, 2), 0.01, np.float32)
+    maps = {"height": height, "height_sigma": sigma, "displacement": moved}
+    pressed = io.Result(maps | {"displacement_sigma": 0.1 * moved}, x=x, y=y)
+    tracker = ForceTracker(modulus=MODULUS)
+    for _ in range(3):
+        tracker.push(pressed, 0.3)
+    tracemalloc.start()
+    try:
+        tracker.push(pressed, 0.3)
+        assert tracemalloc.get_traced_memory()[1] < 0.6 * height.nbytes  # of both displacements: 0.2
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("missing", [np.nan, -np.inf])
