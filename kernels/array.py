@@ -6,7 +6,7 @@ import ctypes
 import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import cached_property, wraps
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar, cast
 
@@ -380,14 +380,17 @@ class Array:
 
     def _allocate(self) -> None:
         flags = cl.mem_flags.READ_WRITE
-        with _naming(self.device, self.name, self.nbytes), waiting:
-            if self.is_shared:
-                self._buffer = cl.Buffer(
-                    self.device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
-                )
-            else:
-                self._buffer, self.arrived = self.device.take_buffer(self.nbytes + SLACK)
-                self.last_use = None
+        try:
+            with waiting:
+                if self.is_shared:
+                    self._buffer = cl.Buffer(
+                        self.device.context, flags | cl.mem_flags.USE_HOST_PTR, hostbuf=self._memory
+                    )
+                else:
+                    self._buffer, self.arrived = self.device.take_buffer(self.nbytes + SLACK)
+                    self.last_use = None
+        except cl.Error as error:
+            raise _hold_error(self.device, self.name, self.nbytes, error) from error
 
 
 def adopt(device: Device, name: str, values: pyopencl.array.Array) -> Array:
@@ -450,6 +453,8 @@ def _put(target: NDArray[Any], values: NDArray[Any], first: int) -> None:
 def _empty(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return previously used memory on the host, if available."""
     nbytes = math.prod(shape) * dtype.itemsize
+    if nbytes < memory.PAGE:
+        return np.empty(shape, dtype)
     return memory.take(nbytes, zeroed=False)[:nbytes].view(dtype).reshape(shape)
 
 
@@ -476,8 +481,10 @@ class BorrowedBuffer:
         access = cl.mem_flags.READ_WRITE if values.flags.writeable else cl.mem_flags.READ_ONLY
         flags = access | cl.mem_flags.USE_HOST_PTR
         loaded = (ctypes.c_char * (values.nbytes + SLACK)).from_address(values.ctypes.data)
-        with _naming(device, name, values.nbytes):
+        try:
             self.buffer: cl.Buffer = cl.Buffer(device.context, flags, hostbuf=loaded)
+        except cl.Error as error:
+            raise _hold_error(device, name, self.nbytes, error) from error
 
     def __del__(self) -> None:
         if self.last_use is not None:
@@ -519,15 +526,11 @@ def _wait_before_end(command: cl.Event, memory_in_use: NDArray[Any]) -> None:
         keep_for_ever(memory_in_use)
 
 
-@contextmanager
-def _naming(device: Device, name: str, nbytes: int) -> Iterator[None]:
-    """Add the name of the array to a device's out-of-memory error."""
-    try:
-        yield
-    except cl.Error as error:
-        if error.code not in _NO_ROOM:
-            raise device_error(device, f"hold {name}", error) from None
-        raise DeviceMemoryError(_no_room(device, name, nbytes)) from error
+def _hold_error(device: Device, name: str, nbytes: int, error: cl.Error) -> DeviceError:
+    """Return the error of an array that a device cannot hold."""
+    if error.code in _NO_ROOM:
+        return DeviceMemoryError(_no_room(device, name, nbytes))
+    return device_error(device, f"hold {name}", error)
 
 
 def _no_room(device: Device, name: str, nbytes: int) -> str:

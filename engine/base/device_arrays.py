@@ -11,7 +11,6 @@ from numpy.typing import DTypeLike
 
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.arguments import as_array
-from mirrorskin.io.model.result import shape_of
 from mirrorskin.kernels.array import Array, Operand, adopt
 from mirrorskin.kernels.device import Choice, Device, are_several, open_device, opened_devices
 
@@ -83,10 +82,10 @@ def operand_of(
     name = result.name_of(quantity)
     if name is None:
         return None
-    map_shape = shape_of(result, name)
+    stored = result.on_device(name)
+    map_shape = np.shape(result[name]) if stored is None else tuple(stored.shape)
     if map_shape != shape:
         raise InputError(f"{name} has shape {map_shape}, but the height needs {shape}: give maps of one size")
-    stored = result.on_device(name)
     if isinstance(stored, Array) and stored.dtype == dtype and stored.device.context == device.context:
         return stored
     values = np.asarray(result[name])

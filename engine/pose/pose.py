@@ -88,12 +88,19 @@ class Pose:
 
     def _changed(self, motion: Motion, covariance: Doubles, free: Doubles) -> Pose:
         """Return another motion with its errors, and orthonormal undetermined directions."""
-        if len(free):
-            directions, sizes, _ = np.linalg.svd(free.T, full_matrices=False)
-            kept = directions[:, sizes > _EQUAL_TOLERANCE]
-            others = np.eye(6) - kept @ kept.T
-            covariance, free = others @ covariance @ others, kept.T
-        return Pose(motion.vector, motion.shift, covariance, self.chi_square, self.pixels, free, self.notes)
+        return _pose(motion, covariance, free, self.chi_square, self.pixels, self.notes)
+
+
+def _pose(
+    motion: Motion, covariance: Doubles, free: Doubles, chi_square: float, pixels: int, notes: tuple[str, ...]
+) -> Pose:
+    """Return a motion with its errors, which are left out in undetermined directions, (k, 6)."""
+    if len(free):
+        directions, sizes, _ = np.linalg.svd(free.T, full_matrices=False)
+        kept = directions[:, sizes > _EQUAL_TOLERANCE]
+        others = np.eye(6) - kept @ kept.T
+        covariance, free = others @ covariance @ others, kept.T
+    return Pose(motion.vector, motion.shift, covariance, chi_square, pixels, free, notes)
 
 
 IDENTITY = Pose(np.zeros(3), np.zeros(3), np.zeros((6, 6)), 1.0, 0, np.zeros((0, 6)))
@@ -182,8 +189,7 @@ def pose_of(fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose
     """Return the pose of a fitted motion, about the picture's centre."""
     change = fit.second.at_origin
     covariance = change @ now.covariance(free) @ change.T
-    pose = replace(IDENTITY, chi_square=now.chi_square, pixels=int(now.pixels))
-    return pose._changed(motion, covariance, (change @ free).T)
+    return _pose(motion, covariance, (change @ free).T, now.chi_square, int(now.pixels), ())
 
 
 def pose_after(before: Pose, fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose:
@@ -191,9 +197,11 @@ def pose_after(before: Pose, fit: PairFit, motion: Motion, now: Equations, free:
     back = motion.inverse()
     change = back.adjoint()
     own = change @ fit.second.at_origin
-    covariance = own @ now.covariance(free) @ own.T + change @ before.covariance @ change.T
+    covariance = own @ now.covariance(free) @ own.T
+    if before.covariance is not IDENTITY.covariance:
+        covariance += change @ before.covariance @ change.T
     undetermined = before.undetermined
     if free.size or len(undetermined):
         undetermined = np.concatenate([undetermined @ change.T, (own @ free).T])
-    pose = replace(before, chi_square=now.chi_square, pixels=int(now.pixels))
-    return pose._changed(before.motion.then(back), covariance, undetermined)
+    moved = before.motion.then(back)
+    return _pose(moved, covariance, undetermined, now.chi_square, int(now.pixels), before.notes)

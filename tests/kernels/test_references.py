@@ -775,7 +775,7 @@ def is_followed(actual, expected, values):
         sums = pose.SUMS_AT + pose.PARTS[2]
         np.testing.assert_allclose(actual[2:14], expected[2:14], atol=1e-5)
         np.testing.assert_allclose(actual[:2], expected[:2], rtol=0.1)  # the second is of a short step
-        np.testing.assert_allclose(actual[sums:], expected[sums:], rtol=1e-3, atol=1e-3 * abs(expected[-1]))
+        np.testing.assert_allclose(actual[sums:], expected[sums:], rtol=5e-3, atol=1e-3 * abs(expected[-1]))
 
 
 @case(
