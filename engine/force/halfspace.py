@@ -147,21 +147,22 @@ def press(
     ``surface``, (H, W), is mm above the rest plane for a stiff stage, NaN where there is none; its type is
     that of the computation. The stage deflects by ``compliance``, 1/mm, for each mm^2 of load. ``start`` is a
     similar press, as an initial guess. Gaps in contact, and overlaps elsewhere, are at most ``tolerance``,
-    mm, if that is more than `TOLERANCE`; from a similar press, a pixel remains in contact if a pull that
-    displaces it by less would be needed. NotConverged if the contact does not converge.
+    mm, if that is more than `TOLERANCE`; then, from a similar press, a pixel remains in contact if a pull
+    that displaces it by less would be needed. NotConverged if the contact does not converge.
     """
     surface = np.where(np.isfinite(surface), surface, surface.dtype.type(-np.inf))
     reach, nothing = surface > 0, np.zeros(space.shape, surface.dtype)
     if not reach.any():
         return Pressed(nothing, reach, 0.0, nothing)
+    follows = tolerance > 0  # otherwise contact and pressure must not depend on the initial guess
     tolerance = max(tolerance, TOLERANCE * float(surface.max()))
     if start is None and min(space.shape) >= 2 * _COARSEST:
         start = _coarse_press(space, surface, compliance)
     contact, strain, sheet = reach, nothing, None
     if start is not None and (reach & start.contact).any():
-        contact, strain, sheet = reach & start.contact, start.strain, start.sheet
+        contact, strain, sheet = reach & start.contact, start.strain, start.sheet if follows else None
     while True:
-        if sheet is not None and _is_inside(contact, sheet.window):
+        if follows and sheet is not None and _is_inside(contact, sheet.window):
             window, part = sheet.window, space.part(sheet.strain.shape)
         else:
             sheet, (window, part) = None, window_of(space, contact, MARGIN)
