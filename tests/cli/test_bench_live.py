@@ -44,7 +44,7 @@ def test_a_result_that_differs_from_the_offline_one_ends_with_an_error(monkeypat
 
     def drift(self, maps):
         calls.append(maps)
-        return push(self, calls[0] if len(calls) > 600 else maps)  # the offline run is over
+        return push(self, calls[0] if len(calls) > 300 else maps)  # the offline run is over
 
     monkeypatch.setattr(PoseTracker, "push", drift)
     ended = run("bench", "live", "--of", "pose", *TINY)

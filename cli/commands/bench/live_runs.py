@@ -24,7 +24,7 @@ from mirrorskin.twin import SimulatedClock
 
 NAMES = "press", "turn", "pose", "slip", "force"
 _LOOPED = NAMES[:2]
-_ROUNDS = 20  # of a tracker's inputs on simulated time
+_ROUNDS = 10  # of a tracker's inputs on simulated time
 _ROUNDING = 1e-5  # of float32, over the largest number of a map
 _MODULUS, _TRAVEL = 0.1, 0.3  # MPa and mm, of the forces
 
