@@ -156,7 +156,8 @@ class Limit:
     def slip(cls, share: float = 0.02, tracker: str = "slip") -> Limit:
         """Return the limit of the share of the contact that slips, as a `SlipTracker` of this name finds it.
 
-        The share is 1 if the tracker finds no part that sticks, as after a sudden slip.
+        The share is 1 if the tracker finds no part that sticks, as after a sudden slip, and 0 without a
+        contact.
         """
         return cls(lambda update: _slipping(update.tracked.get(tracker)), share)
 
@@ -178,8 +179,10 @@ def _contact(update: Update) -> float | None:
 
 
 def _slipping(found: Result | None) -> float | None:
-    if found is None or found.stick_ratio is None or math.isnan(found.stick_ratio[-1]):
+    if found is None or found.stick_ratio is None:
         return None
+    if math.isnan(found.stick_ratio[-1]):  # nothing touches
+        return 0.0
     return 1.0 if math.isnan(found.shift_x) else 1 - float(found.stick_ratio[-1])
 
 

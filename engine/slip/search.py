@@ -509,4 +509,5 @@ def _check_contact(contact: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.
             f"contact has shape {contact.shape}, the frames are {size}:"
             " give that of the same camera and region"
         )
-    return np.asarray(np.nan_to_num(contact) != 0)
+    touched = np.asarray(contact != 0)
+    return touched & ~np.isnan(contact) if contact.dtype.kind == "f" else touched

@@ -217,7 +217,7 @@ class SlipTracker(ThreadSafe):
             ``centre_x`` and ``centre_y`` of the skin that sticks, and its displacement ``shift_x`` and
             ``shift_y`` at the middle of the contact, with their standard deviations, since the contact
             started. These are NaN if less than four windows stick; a centre also if there is no significant
-            rotation.
+            rotation; the share until a contact of four windows has started.
 
             `mirrorskin.engine.force.find_tangential_force` takes it.
 
@@ -389,11 +389,14 @@ class SlipTracker(ThreadSafe):
         partial = self._partial[part] | ~settled
         used = found & touched & np.isfinite(fixed)
         place, at, before, sticks = fixed[used], now[used], slipped[used], ~(partial | slipped)[used]
-        covariance = windows.noise + self._before_covariance[:, *part]
-        covariance[:2] += windows.bending * partial  # skin that sticks does not bend
         drift, turned = self._drift[:, *part][:, used]
-        xx, yy, xy = covariance[:, used]
-        xx, yy = xx + drift, yy + drift
+        xx, yy, xy = windows.noise[:, used]
+        if self.keys > 1:
+            more_xx, more_yy, more_xy = self._before_covariance[:, *part][:, used]
+            xx, yy, xy = xx + more_xx, yy + more_yy, xy + more_xy
+        # Skin that sticks does not bend.
+        bent_x, bent_y = windows.bending[:, used] * partial[used]
+        xx, yy = xx + bent_x + drift, yy + bent_y + drift
         weights, fit, motion = 2 / (xx + yy), sticks, None
         chi_square = np.zeros(at.shape)
         for _ in range(_ROUNDS):
@@ -532,7 +535,7 @@ class SlipTracker(ThreadSafe):
         inner[known] = SlipStatus.STICKS
         inner[known & slipped] = SlipStatus.SLIPPED
         count = np.count_nonzero(counted)
-        stuck = 1 - np.count_nonzero(counted & slipped) / count if count else np.nan
+        stuck = 1 - np.count_nonzero(counted & slipped) / count if count and self._started else np.nan
         maps = {
             "displacement": moved,
             "displacement_sigma": np.sqrt(covariance[..., :2]),

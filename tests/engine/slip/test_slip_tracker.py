@@ -175,6 +175,7 @@ def test_a_contact_of_a_few_windows_starts_when_it_is_larger():
         result = tracker.push(frame(0.3 * k, 0, seed=k), disc(radius))
         if radius < 30:
             assert math.isnan(result.shift_x)
+            assert np.isnan(result.stick_ratio)
     assert result.shift_x == pytest.approx(0.3 * PIXEL, abs=5 * result.shift_x_sigma)
     assert result.stick_ratio == 1
 
