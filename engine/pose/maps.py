@@ -267,7 +267,7 @@ def _records(
         "records": array("records", *shape, 8),
         "slopes": array("slopes", 2, *shape) if curved else None,
     }
-    moved = sum(values.nbytes for values in maps.values() if isinstance(values, Operand))
+    moved = sum(values.nbytes for values in inputs) + maps["records"].nbytes
     _run(device, "pose_records", rows, columns, size, high=high, wide=wide, **maps, moved=moved)
     workspace.inputs = inputs
     records: Array = maps["records"]
