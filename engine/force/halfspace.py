@@ -21,6 +21,8 @@ Reals = NDArray[Any]
 Real = TypeVar("Real", np.float32, np.float64)
 Mask = NDArray[np.bool_]
 Window = tuple[slice, slice]
+Spectra = Callable[[tuple[int, int], tuple[float, float], float], tuple[Doubles, ...]]
+"""Of a shape, a pixel size and the distance at which the displacement is cut off."""
 
 TOLERANCE = 1e-4
 """Maximum gap in contact, as a share of the surface's maximum height above the rest plane."""
@@ -103,7 +105,7 @@ class HalfSpace:
 
     def influence(self) -> Doubles:
         """Return the displacement of the pixels below and to the right by unit strain on one, (H, W), mm."""
-        return _influence(self._whole, self.pixel_size)[: self.shape[0], : self.shape[1]]
+        return influences(_cut_off, self._whole, self.pixel_size)[0][: self.shape[0], : self.shape[1]]
 
 
 class Sheet(NamedTuple):
@@ -316,16 +318,18 @@ def padded_shape(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=128)
-def _influence(shape: tuple[int, int], pixel_size: tuple[float, float]) -> Doubles:
-    """Return the weights of the convolution: the cut-off spectrum's inverse transform, on a larger grid."""
+def influences(spectra: Spectra, shape: tuple[int, ...], pixel_size: tuple[float, float]) -> list[Doubles]:
+    """Return the weights of convolutions: inverse transforms of spectra that are cut off, on a larger grid."""
     rows, columns = shape
     reach = reach_of(shape, pixel_size)
     padded = (
         fft.next_fast_len(rows + math.ceil(reach / pixel_size[1])),
         fft.next_fast_len(columns + math.ceil(reach / pixel_size[0]), real=True),
     )
-    weights: Doubles = fft.irfft2(_cut_off(padded, pixel_size, reach), padded)
-    return np.ascontiguousarray(weights[:rows, :columns])
+    return [
+        np.ascontiguousarray(fft.irfft2(part, padded)[:rows, :columns])
+        for part in spectra(padded, pixel_size, reach)
+    ]
 
 
 def reach_of(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> float:
@@ -334,15 +338,15 @@ def reach_of(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> float:
 
 
 @lru_cache(maxsize=128)
-def _cut_off(shape: tuple[int, int], pixel_size: tuple[float, float], reach: float) -> Doubles:
-    """Return the spectrum of a point's displacement, cut off at a distance, at a grid's wavenumbers; mm."""
+def _cut_off(shape: tuple[int, int], pixel_size: tuple[float, float], reach: float) -> tuple[Doubles, ...]:
+    """Return the one spectrum of a point's displacement, cut off at a distance, at a grid's wavenumbers; mm."""
     q_y = 2 * math.pi * fft.fftfreq(shape[0], pixel_size[1])
     q_x = 2 * math.pi * fft.rfftfreq(shape[1], pixel_size[0])
     q = np.hypot(q_y[:, np.newaxis], q_x[np.newaxis])
     q[0, 0] = 1.0
     spectrum = special.itj0y0(q * reach)[0] / q
     spectrum[0, 0] = reach
-    return np.asarray(2 * math.pi * _SOFTNESS * spectrum)
+    return (2 * math.pi * _SOFTNESS * spectrum,)
 
 
 @lru_cache(maxsize=128)
@@ -350,13 +354,14 @@ def _spectrum(
     shape: tuple[int, int], whole: tuple[int, int], pixel_size: tuple[float, float], dtype: np.dtype[Any]
 ) -> Reals:
     """Return the transform of a whole grid's weights on a part, padded: real, because they are even."""
-    return spectrum_of(_influence(whole, pixel_size)[: shape[0], : shape[1]]).astype(dtype)
+    weights = influences(_cut_off, whole, pixel_size)[0]
+    return spectrum_of(weights[: shape[0], : shape[1]]).astype(dtype)
 
 
 @lru_cache(maxsize=128)
 def _inverse_spectrum(shape: tuple[int, int], pixel_size: tuple[float, float], dtype: np.dtype[Any]) -> Reals:
     """Return the inverse of the spectrum of a point's displacement on a periodic grid, 1/mm."""
-    return (1 / _cut_off(shape, pixel_size, reach_of(shape, pixel_size))).astype(dtype)
+    return (1 / _cut_off(shape, pixel_size, reach_of(shape, pixel_size))[0]).astype(dtype)
 
 
 def spectrum_of(weights: Doubles, sign: float = 1.0) -> Doubles:

@@ -15,6 +15,7 @@ from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.base.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.force.halfspace import (
+    influences,
     inverse_transform,
     padded_shape,
     reach_of,
@@ -300,21 +301,10 @@ def _filtered(values: Singles, spectra: Singles, shape: tuple[int, int]) -> Sing
     return inverse_transform(product, shape, (values.shape[-2], values.shape[-1]))
 
 
-@lru_cache(maxsize=16)
-def _responses(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> list[Doubles]:
-    """Return the weights xx, yy and xy of the convolution, (H, W) each."""
-    reach = reach_of(shape, pixel_size)
-    wide = tuple(
-        fft.next_fast_len(count + math.ceil(reach / size))
-        for count, size in zip(shape, pixel_size[::-1], strict=True)
-    )
-    return [fft.irfft2(part, wide)[: shape[0], : shape[1]] for part in _tensor(wide, pixel_size, reach)]
-
-
 @lru_cache(maxsize=32)
 def _spectra(shape: tuple[int, ...], whole: tuple[int, ...], pixel_size: tuple[float, float]) -> Singles:
     """Return the transforms of a whole grid's weights on a part, padded."""
-    weights = [part[: shape[0], : shape[1]] for part in _responses(whole, pixel_size)]
+    weights = [part[: shape[0], : shape[1]] for part in influences(_tensor, whole, pixel_size)]
     spectra = [spectrum_of(part, sign) for part, sign in zip(weights, (1.0, 1.0, -1.0), strict=True)]
     return np.stack(spectra).astype(np.float32)
 
