@@ -319,7 +319,7 @@ def padded_shape(shape: tuple[int, ...]) -> tuple[int, int]:
 
 @lru_cache(maxsize=128)
 def influences(spectra: Spectra, shape: tuple[int, ...], pixel_size: tuple[float, float]) -> list[Doubles]:
-    """Return the weights of convolutions: inverse transforms of spectra that are cut off, on a larger grid."""
+    """Return weights of convolutions: the inverse transforms of cut-off spectra, on a larger grid."""
     rows, columns = shape
     reach = reach_of(shape, pixel_size)
     padded = (
@@ -339,7 +339,7 @@ def reach_of(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> float:
 
 @lru_cache(maxsize=128)
 def _cut_off(shape: tuple[int, int], pixel_size: tuple[float, float], reach: float) -> tuple[Doubles, ...]:
-    """Return the one spectrum of a point's displacement, cut off at a distance, at a grid's wavenumbers; mm."""
+    """Return the one spectrum of a point's displacement, cut off at a reach, at a grid's wavenumbers; mm."""
     q_y = 2 * math.pi * fft.fftfreq(shape[0], pixel_size[1])
     q_x = 2 * math.pi * fft.rfftfreq(shape[1], pixel_size[0])
     q = np.hypot(q_y[:, np.newaxis], q_x[np.newaxis])
