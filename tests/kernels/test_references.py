@@ -716,7 +716,9 @@ def summed(actual, expected, values):
 def zeniths_summed(actual, expected, values):
     scale = np.abs(expected).max(axis=0) + 1e-6 * np.abs(expected).max()
     assert expected[:, pose.PARTS[5]].any()
-    np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-4)
+    np.testing.assert_allclose(
+        actual / scale, expected / scale, atol=3e-4
+    )  # without FMA, one sum differs by 1.3e-4
 
 
 def blocks_of(shape):
