@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable
 from functools import partial
 
+import cv2
 import numpy as np
 
 from mirrorskin.bench.suite.harness import Cases, Run
@@ -27,6 +28,7 @@ _VGA, _HALF = (480, 640), (240, 320)
 _QUICK = (60, 80), 100.0, 0.3  # rows and columns, frames/s, s
 _KEPT_UP = 0.99  # minimum rate, as a share of the specified frame rate
 _NEAR = 1e-2  # tolerated difference of the last heights from the converged ones, as a share of the range
+_AROUND = 5, 5  # pixels with heights around one that is compared: single ones have any offset
 _UPDATES, _MEDIAN, _SLOWEST = 60, 15, 30  # updates/s, and ms from frame to height
 _LATENCY = 3.0  # ms, 99 % of the frames, of pose and slip together
 _PROCESSOR = {"press": 1.0, "turn": 4.0, "pose": 0.7, "slip": 0.8, "force": 1.0}  # ms a frame
@@ -50,7 +52,8 @@ def judge_rotation(row: LiveRow, ran: Ran) -> tuple[Target, ...]:
     rate, shown = row.updates / row.seconds, ran.status.latency[RAISED]
     median, p99 = 1e3 * shown.median, 1e3 * shown.p99
     best, height = ran.result.height, ran.last.height
-    known = np.isfinite(best)
+    known = np.isfinite(best) & np.isfinite(height)
+    known = cv2.erode(known.astype(np.uint8), np.ones(_AROUND, np.uint8)) > 0
     off = (height - best)[known].astype(np.float64)
     rms = math.sqrt(float(np.mean(off**2))) / float(np.ptp(best[known]))
     what = "frame in to height out"

@@ -127,13 +127,13 @@ class Multigrid:
             solver.copy("release", solver.cycle.x, height, batch)
         return height
 
-    def follow(self, links: Links, *, deep: bool, start: Array | None = None) -> Array:
+    def follow(self, links: Links, *, deep: bool, start: Array | None = None, anew: bool = False) -> Array:
         """Do one step from the last heights, or from ``start``, (H, W), towards those of a similar graph.
 
         The step minimises the energy in the plane of the preconditioned residual and the last step. It is a
         conjugate gradient step if the graph is unchanged, and never increases the error. The step is only
         enqueued; heights are valid until the next solution or step. ``deep``: rebuild all levels of the
-        graph, not only the finest.
+        graph, not only the finest. ``anew``: without the last step.
         """
         h, solver = self._hierarchy, self._alone
         cycle = solver.cycle
@@ -142,6 +142,7 @@ class Multigrid:
         cycle.follow(deep=deep)
         if start is not None:
             solver.copy("admit", solver.x, start)
+        if anew:
             solver.p.fill()
         solver.started = True
         solver.copy("admit", solver.source, links.source)

@@ -173,7 +173,10 @@ class _Search:
                 links = self._current()
                 if step == 0:
                     self._solver.rebuild(links)
-                heights, start = self._solver.follow(links, deep=False, start=start), None
+                heights, start = (
+                    self._solver.follow(links, deep=False, start=start, anew=start is not None),
+                    None,
+                )
         return heights
 
     def link(self, heights: Array, scale: float = 1.0, cap: float = math.inf) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -21,19 +22,23 @@ MAPS = {"dz_dx": "dz_dx", "dz_dy": "dz_dy", "weight_x": "map_x", "weight_y": "ma
 
 _REBUILD_INTERVAL = 8  # frames between which all levels of the multigrid are rebuilt
 _FIRST_RESIDUAL, _FIRST_CYCLES = 1e-3, 30  # tolerance and limit of the first solution
-_LARGEST_GAP = 0.3  # relative error above which the next frame is solved from scratch
-_CHECK_INTERVAL = 8  # frames between checks of the gap, which wait for the device
+_MORE_STEPS = 6  # largest number of further steps for a frame
+_AROUND, _ANY = (5, 5), 1e-3  # pixels around one that enters; least share of them that has heights
+# Relative error above which further steps follow, and then the next frame is solved from scratch.
+_LARGEST_GAP = 0.3
 
 
 class WarmStartIntegrator(ThreadSafe):
-    """Integrate slopes on the device frame after frame; heights are one step behind those of `Integrator`.
+    """Integrate slopes on the device frame after frame, by a step of the solver for each frame.
+
+    Where pixels enter, as at the border of a contact, further steps follow.
 
     Attributes
     ----------
     maps : dict of Array, (H, W), float32
         Written by kernels before each frame; see `MAPS`.
     gap : float
-        Relative error of the heights before the last step that was checked; NaN before the first check.
+        Relative error of the heights before the last step; NaN before the first one.
     """
 
     gap: float
@@ -45,6 +50,8 @@ class WarmStartIntegrator(ThreadSafe):
         self._levelling = Levelling(self._graph)
         self._multigrid: Multigrid | None = None
         self._height: Floats | None = None
+        self._start = device.array("start", shape, np.float32)  # heights from which a step begins
+        self._last: Floats  # heights of the last frame
         self._steps, self.gap = 0, math.nan
 
     def push(self, typical_weight: float) -> None:
@@ -56,7 +63,9 @@ class WarmStartIntegrator(ThreadSafe):
         self._links = self._graph.links()
         self._relief: Array | None = None
         if self._multigrid is not None and self._steps:
-            self._relief = self._multigrid.follow(self._links, deep=self._steps % _REBUILD_INTERVAL == 0)
+            self._start.write(_extended(self._last))
+            deep = self._steps % _REBUILD_INTERVAL == 0
+            self._relief = self._multigrid.follow(self._links, deep=deep, start=self._start)
         self._device.flush()
         self._height = None
 
@@ -71,15 +80,22 @@ class WarmStartIntegrator(ThreadSafe):
         if components.count == 0:
             self._steps = 0
             return np.full(self._shape, np.nan, np.float32)
-        relief = self._from_scratch() if self._relief is None else self._relief
+        relief = self._from_scratch() if self._relief is None else self._near(self._relief)
         height: Floats = self._levelling.level(components, relief, [LEVEL])
-        self._steps += 1
-        if self._steps > 1 and self._steps % _CHECK_INTERVAL == 0:
-            assert self._multigrid is not None
-            self.gap = self._multigrid.gap()
-            if not self.gap < _LARGEST_GAP:
-                self._steps = 0
+        self._steps, self._last = self._steps + 1, height
         return height
+
+    def _near(self, relief: Array) -> Array:
+        """Return heights after as many steps as they need."""
+        assert self._multigrid is not None
+        for _ in range(_MORE_STEPS):
+            self.gap = self._multigrid.gap()
+            if self.gap < _LARGEST_GAP:
+                return relief
+            relief = self._multigrid.follow(self._links, deep=False)
+        if not self._multigrid.gap() < _LARGEST_GAP:
+            self._steps = -1  # the next frame begins anew
+        return relief
 
     def _from_scratch(self) -> Array:
         if self._multigrid is None:
@@ -87,3 +103,14 @@ class WarmStartIntegrator(ThreadSafe):
         else:
             self._multigrid.rebuild(self._links, plain=True)
         return self._multigrid.solve(tolerance=_FIRST_RESIDUAL, limit=_FIRST_CYCLES).height
+
+
+def _extended(height: Floats) -> Floats:
+    """Return heights, and where there are none those around, with which pixels that enter begin."""
+    known = np.isfinite(height)
+    total, cover = (
+        cv2.blur(values, _AROUND)
+        for values in (np.where(known, height, np.float32(0)), known.astype(np.float32))
+    )
+    around = np.divide(total, cover, out=np.zeros_like(height), where=cover > _ANY)
+    return np.where(known, height, around)

@@ -21,8 +21,11 @@ def row(name, **changes):
 
 
 def ran(height_error):
-    height = np.array([[0.0, 1.0], [np.nan, 0.0]])
-    update = Update(600, 1.0, "axial", 0.0, np.zeros((2, 2), np.uint8), Result(height=height + height_error))
+    height = np.tile([0.0, 1.0], (12, 6))
+    height[0, 0] = np.nan
+    update = Update(
+        600, 1.0, "axial", 0.0, np.zeros((12, 12), np.uint8), Result(height=height + height_error)
+    )
     status = Status(latency={RAISED: Latency(0.014, 0.029)})
     return Ran(10.0, 0.6, 0, [], Result(height=height), status, update)
 

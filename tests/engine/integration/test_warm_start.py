@@ -85,6 +85,22 @@ def test_another_surface_is_found_within_some_steps(device):
     assert miss(height, best(other).height) < 5e-3
 
 
+def test_a_border_that_changes_is_followed(device):
+    """As that of a contact: single pixels enter and leave with each frame."""
+    shape = (90, 120)
+    y, x = np.mgrid[: shape[0], : shape[1]] / max(shape)
+    slopes = [np.sin(9 * x), np.cos(7 * y)]
+    follower, random = WarmStartIntegrator(device, shape, PIXEL), np.random.default_rng(0)
+    for _ in range(12):
+        inside = np.hypot(x - 0.5, y - 0.4) + random.normal(0, 0.02, shape) < 0.3
+        weights = np.where(inside, 1.0, 0.0)
+        cut = [np.where(inside, values, np.nan) for values in slopes]
+        maps = [values.astype(np.float32) for values in (*cut, weights, weights)]
+        height, exact = follow(follower, maps), best(maps)
+        core = np.hypot(x - 0.5, y - 0.4) < 0.2
+        assert np.std((height - exact.height)[core]) < 1e-2 * np.ptp(exact.height[core])
+
+
 def test_nothing_has_no_heights_and_does_not_stay(device):
     shape = (20, 30)
     maps, follower = scene(shape), WarmStartIntegrator(device, shape, PIXEL)
