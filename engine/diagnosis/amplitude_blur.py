@@ -23,7 +23,6 @@ from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, fit_clipped
-from mirrorskin.kernels.optical import blur
 
 GRID_LINES = 48
 """Lines of pixels along a side that are used."""
@@ -53,10 +52,7 @@ def add_blur(maps: Picture, sigma: str, vectors: Sequence[str], strength: str, l
         return
     if len(maps.bands) > 1:  # the picture does not fit on one device
         deviation, *parts = maps.read(sigma, *vectors)
-        reach, factor = _reach(variance), variance / 2
-        bend = blur.blur_bend(parts[0], parts[-1], reach)
-        blur.blur_add(parts[0], bend, reach, factor, noise, 0.0, 0.0, deviation)
-        maps.fill(sigma, deviation)
+        maps.fill(sigma, _with_bands(parts, deviation, variance, noise, (0.0, 0.0), maps.bands[0].device))
         return
     _add([maps.array(name) for name in vectors], maps.array(sigma), variance, noise)
 
@@ -89,16 +85,28 @@ def with_bend(
         spread = sigma.copy_region(0, sigma.shape)
         _add([vectors], spread, variance, noise, common)
         return spread
-    sigma, vectors = (on_host(values) for values in (sigma, vectors))
-    rows, columns = sigma.shape
-    around = 2 * _reach(variance)
-    most = device.max_allocation // (vectors.itemsize * vectors.shape[-1] * columns)  # rows at once
+    return _with_bands([on_host(vectors)], on_host(sigma), variance, noise, common, device)
+
+
+def _with_bands(
+    vectors: Sequence[NDArray[Any]],
+    sigma: NDArray[Any],
+    variance: float,
+    noise: float,
+    common: tuple[float, float],
+    device: Device,
+) -> NDArray[Any]:
+    """Return standard deviations with the error of directions, by bands that fit on a device."""
+    rows, around = len(sigma), 2 * _reach(variance)
+    row = max(values[:1].nbytes for values in vectors)
+    most = device.max_allocation // row  # rows at once
     step, changed = rows if most >= rows else max(1, most - 2 * around), np.empty_like(sigma)
     for first in range(0, rows, step):
         start = max(0, first - around)
         part = slice(start, min(rows, first + step + around))
-        spread = device.from_host("normals_sigma", sigma[part], np.float32)
-        _add([device.from_host("normals", vectors[part], np.float32)], spread, variance, noise, common)
+        spread = device.from_host("sigma", sigma[part], np.float32)
+        arrays = [device.from_host("vectors", values[part], np.float32) for values in vectors]
+        _add(arrays, spread, variance, noise, common)
         changed[first : first + step] = spread.read()[first - start :][:step]
     return changed
 

@@ -41,7 +41,6 @@ OUTSIDE = {
     "multigrid_tail": "it reads the same bytes again and again, from caches",
     "rectangle_modes": "at 4K; its memory of a work-group leaves room for few groups",
     "pose_equations": "few work-items, each with many operations",
-    "pose_follow": "one work-group, for maps of few pixels",
     "estimate_pose, 240 x 320": HOST,
     "find_displacement, 3 frames": HOST,
     "fit_fringes, 16 frames": HOST,

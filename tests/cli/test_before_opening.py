@@ -109,7 +109,7 @@ def opened(prepared, monkeypatch):
         (f"{SLIDE} --contact small.h5", "contact has shape (5, 5), the frames are 24 x 32"),
         (f"{SLIDE} --contact none.h5", "none.h5: no such file"),
         (f"{SLIDE} --window-size 1001", "6 to 24 pixels are possible"),
-        (f"{PRESS} --latency 0s", "latency 0.0: a number above 0 is needed"),
+        (f"{PRESS} --latency -1s", "latency -1.0: a number of seconds of at least 0 is needed"),
         (f"{PRESS} --device nonsense", "no such device"),
         (f"{PRESS} --calibration other.h5", "other"),
         (f"{PRESS} --view nowhere", "give window, browser or a FILE.rrd"),
