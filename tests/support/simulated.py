@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from mirrorskin import hw
 from mirrorskin.hw.rig import check
 from mirrorskin.hw.rig import rig as rigs
 from mirrorskin.twin.emulator.rig import EmulatedRig
@@ -27,7 +28,9 @@ def simulate(
     stage = open_stage or functools.partial(rigs.open_stage, clock=clock)
     camera = open_camera or functools.partial(rigs.open_camera, clock=clock)
     both = {"clock": clock, "open_stage": stage, "open_camera": camera}
-    patch.setattr(rigs, "open_rig", functools.partial(rigs.open_rig, **both))
+    opened = functools.partial(rigs.open_rig, **both)
+    for place in (rigs, hw):  # the package keeps what it has given
+        patch.setattr(place, "open_rig", opened)
     patch.setattr(check, "check_rig", functools.partial(check.check_rig, **both))
     patch.setattr(rigs, "open_stage", stage)
     patch.setattr(rigs, "open_camera", camera)
