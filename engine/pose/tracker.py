@@ -22,12 +22,14 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device, open_device
 from mirrorskin.kernels.skin.pose import NO_LIMIT
 
+MOST_KEYS = 64
+"""Largest number of earlier keys that are remembered."""
+
 _MIN_COMMON = 0.6  # share of the key's pixels below which another result becomes the key
 _LEAVING = 0.1  # loss of shared pixels, as a share, after which earlier keys are compared
 # Mean square error of the pose by an earlier key over that by the present one, for it to be taken again:
 # while the present one is still shared, and else.
 _BETTER, _GOOD_ENOUGH = 0.8, 2.0
-_MOST_KEYS = 64  # largest number of earlier keys that are remembered
 _SIDE, _LEAST_SIDE = 100, 60  # least pixels along the shorter side of averaged maps; of smooth ones
 _AS_GOOD = 1.1  # chi square, and mean square error, relative to those of finer maps, that smooth ones reach
 _SEARCHED = "its motion was too large to follow, and was searched for"
@@ -195,7 +197,7 @@ class PoseTracker(ThreadSafe):
     def _take_key(self, result: Result, pose: Pose) -> None:
         map_ = self._map(result)
         if self._key is not None:
-            self._earlier = [*self._earlier, self._key][-_MOST_KEYS:]
+            self._earlier = [*self._earlier, self._key][-MOST_KEYS:]
         self._key, self._back = _Key(map_, self._noted(pose), self._size(result)), STILL
         self.keys += 1
 

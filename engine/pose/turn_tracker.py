@@ -21,6 +21,7 @@ from mirrorskin.engine.pose.fit import BlockEquations, PairFit, complement
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_of
+from mirrorskin.engine.pose.tracker import MOST_KEYS
 from mirrorskin.engine.rotation.moving_normals import MovingNormals
 from mirrorskin.engine.rotation.normals import Normals
 from mirrorskin.engine.rotation.scale import make_scale
@@ -221,7 +222,8 @@ class TurnTracker(ThreadSafe):
             if there is None:  # the present one is used as long as it is shared
                 return
             self.keys += 1
-        self._earlier = [other for other in (*self._earlier, self._key) if other is not key]
+        others = [other for other in (*self._earlier, self._key) if other is not key]
+        self._earlier = others[-MOST_KEYS:]
         self._key = key
 
 

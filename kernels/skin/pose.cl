@@ -6,28 +6,16 @@
 
 #include "common.clh"
 
-#if TILE > 1
-#define LANES 8  // pixels of a row of a block
-#else
-#define LANES 1
-#endif
-#include "lanes.clh"
+#include "pose.clh"
 
 #define INLINE static inline __attribute__((always_inline))
 
-#define UNROLL _Pragma("unroll")
-
-#define BLOCK 8
 #define SUMS (BESIDE ? 67 : 31)
 #define NEAR 1e20f
-#define VAGUE 100.0f
 
 #define LOAD(map, p) (*(__global const Loose *)((map) + 8 * (p)))
 #define KEEP(values, memory) (*(Lanes *)(memory) = (values))
-#define KEPT(memory) (*(const Lanes *)(memory))
 typedef float8 __attribute__((aligned(4))) Loose;  // unaligned
-typedef F __attribute__((aligned(4))) Lanes;
-typedef I __attribute__((aligned(4))) Places;
 
 typedef struct { F x, y, z; } Vector;
 typedef struct { F xx, xy, yy; } Symmetric;  // covariance of a normal's x and y, or second derivatives
@@ -48,15 +36,11 @@ Record transposed(const float8 *r)
     return (Record){(F)(i.lo, m.lo), (F)(j.lo, n.lo), (F)(k.lo, o.lo), (F)(l.lo, p.lo),
                     (F)(i.hi, m.hi), (F)(j.hi, n.hi), (F)(k.hi, o.hi), (F)(l.hi, p.hi)};
 }
-
-#define NUMBERS (I)(0, 1, 2, 3, 4, 5, 6, 7)
 #else
 Record transposed(const float8 *r)
 {
     return (Record){r->s0, r->s1, r->s2, r->s3, r->s4, r->s5, r->s6, r->s7};
 }
-
-#define NUMBERS 0
 #endif
 
 // Invalid pixels get weight 0 and finite values.
@@ -105,7 +89,6 @@ Symmetric turn_curvature(const F z_before, const Symmetric h, const F over_z, co
 // Three rows of the Jacobian, six numbers each; the first two are whitened, and are 0 for a translation along
 // z.
 typedef struct { F x[5], y[5], z[6]; } Jacobian;
-#define UPPER(i, k) ((i) * (11 - (i)) / 2 + (k))
 #define PRODUCT(a, i, b, k) \
     (((i) < 5 && (k) < 5 ? (a).x[i] * (b).x[k] + (a).y[i] * (b).y[k] : 0.0f) + (a).z[i] * (b).z[k])
 
@@ -159,7 +142,7 @@ INLINE void add_block(
             UNROLL for (int i = 0; i < LANES; ++i)
                 records[i] = LOAD(first, row * columns + LESSER(column + i * step, columns - 1));
             Record mine = transposed(records);
-            const I number = column + step * NUMBERS;
+            const I number = column + step * ORDER;
             const F x = x0 + CONVERT(number, F) * step_x;
             const float y = y0 - row * step_y;
             const Vector place = {turn[0] * x + turn[1] * y + turn[2] * mine.z + shift.x,

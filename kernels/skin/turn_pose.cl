@@ -5,32 +5,11 @@
 
 #include "common.clh"
 
-#if TILE > 1
-#define LANES 8  // pixels of a row of a block
-#else
-#define LANES 1
-#endif
-#include "lanes.clh"
+#include "pose.clh"
 
-#define UNROLL _Pragma("unroll")
-
-#define BLOCK 8
 #define SUMS (BESIDE ? 81 : 39)
 #define NUMBERS 8  // of a record
-#define VAGUE 100.0f
 #define CLEAR 10.0f
-
-#define KEPT(memory) (*(const Lanes *)(memory))
-typedef F __attribute__((aligned(4))) Lanes;
-typedef I __attribute__((aligned(4))) Places;
-
-#if LANES > 1
-#define ORDER (I)(0, 1, 2, 3, 4, 5, 6, 7)
-#else
-#define ORDER 0
-#endif
-
-#define UPPER(i, k) ((i) * (11 - (i)) / 2 + (k))
 
 // The angle with a sine and a cosine, in proportion, above 0.
 F angle_of(const F sine, const F cosine)
