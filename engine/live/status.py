@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.io import Motion, Result
+from mirrorskin.io.base.threads import computes
 from mirrorskin.io.model.result import display_order
 
 WAITED, PUSHED, UPDATED, SHOWN, RAISED = "waited", "push", "update", "frame to map", "frame to height"
@@ -197,6 +198,7 @@ class Monitor:
         with self._lock:
             self._times[stage].extend(duration for duration in seconds if math.isfinite(duration))
 
+    @computes  # NumPy's percentiles contain C++
     def status(self, fresh: bool = False) -> Status:
         """Return counts and times so far; percentiles may be a quarter of a second old, unless ``fresh``."""
         with self._lock:
