@@ -1,0 +1,340 @@
+"""The least standard errors of a calibration from touches of unknown objects (Cramer-Rao bound).
+
+``python evaluation/calibration/fisher.py [-o evaluation/stored/fisher.json]`` prints the standard errors of
+one touch of each object, and stores them. It shares no code with mirrorskin: NumPy and SciPy alone.
+
+A touch is a press, which measures the height of each pixel with `PRESS_SIGMA`, and a turn. In frame t, the
+brightness of a pixel whose normal n has the angle a = arccos(n . axis_t) with the body's axis is ::
+
+    y = (1 + g_t) (offset + gain (1 + u_x x + u_y y) (a + c a^2)) + noise,
+
+with x and y from -1 to 1 over the picture. The axis leans by (1 + e cos 2(p - m)) half_angle towards p + pi,
+p = phase_t + phase, in the first order of the ellipticity. Normals are those of the heights, by central
+differences. The heights of all pixels are unknown: they are parameters, which are marginalised.
+
+The information of a touch is J^T J / noise^2 over brightness, heights and parameters; the block of the
+heights is sparse, and its Schur complement is the information of the parameters. That of several touches is
+the sum. The camera is a usual one of 8 bits: see `Sensor`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+Map = NDArray[np.float64]
+
+SHAPE = (44, 56)  # pixels
+PIXEL = 0.1  # mm
+FRAMES = 12  # of a turn
+PRESS_SIGMA = 0.006  # mm
+UNKNOWN_HEIGHT = 30.0  # mm: standard deviation of the height of a pixel without a press
+FRAME_GAIN_SIGMA = 0.005  # as a share: the light of a frame, if it is unknown
+_STEP = 1e-6  # by which a parameter or a slope changes, to differentiate the brightness
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Parameters at which the information is computed.
+
+    ``gain`` is in counts per radian, ``offset`` in counts, ``curvature`` c per radian, ``half_angle`` and
+    ``phase`` in radians. ``ellipse`` is e cos 2m and e sin 2m. ``noise`` is that of a sample, counts: 1 count
+    of read and shot noise, and the rounding of 8 bits.
+    """
+
+    gain: float = 265.0
+    offset: float = 10.0
+    curvature: float = 0.0
+    uneven: tuple[float, float] = (0.0, 0.0)
+    half_angle: float = math.radians(2.5)
+    phase: float = 0.0
+    ellipse: tuple[float, float] = (0.0, 0.0)
+    noise: float = math.hypot(1.0, 1 / math.sqrt(12))
+
+    def vector(self) -> Map:
+        """Return the parameters, relative where `NAMES` says so."""
+        values = (self.gain, self.offset, self.curvature, *self.uneven)
+        return np.array([*values, self.half_angle, self.phase, *self.ellipse])
+
+
+NAMES = (
+    "gain",
+    "offset",
+    "curvature",
+    "uneven x",
+    "uneven y",
+    "half-angle",
+    "phase",
+    "ellipticity x",
+    "ellipticity y",
+)
+
+
+def render(parameters: Map, p: Map, q: Map, x: Map, y: Map, phases: Map) -> Map:
+    """Return the brightness, (T, H, W), of slopes p = dz/dx and q = dz/dy at x and y, from -1 to 1."""
+    gain, offset, curvature, u_x, u_y, half, shift, e_x, e_y = parameters
+    turned = (phases + shift)[:, np.newaxis, np.newaxis]
+    lean = half * (1 + e_x * np.cos(2 * turned) + e_y * np.sin(2 * turned))
+    axis = -np.sin(lean) * np.cos(turned), -np.sin(lean) * np.sin(turned), np.cos(lean)
+    length = np.sqrt(1 + p**2 + q**2)
+    normal = -p / length, -q / length, 1 / length
+    across = np.sqrt(
+        sum((normal[i] * axis[j] - normal[j] * axis[i]) ** 2 for i, j in ((0, 1), (1, 2), (2, 0)))
+    )
+    angle = np.arctan2(across, sum(n * a for n, a in zip(normal, axis, strict=True)))
+    return np.asarray(offset + gain * (1 + u_x * x + u_y * y) * (angle + curvature * angle**2))
+
+
+def differences(shape: tuple[int, int], pixel: float) -> tuple[sparse.csr_array, sparse.csr_array]:
+    """Return the matrices that take heights, row by row, to dz/dx and dz/dy; y is up the picture."""
+
+    def along(count: int) -> sparse.csr_array:
+        rows, columns, values = [], [], []
+        for number in range(count):
+            before, after = max(0, number - 1), min(count - 1, number + 1)
+            rows += [number, number]
+            columns += [before, after]
+            values += [-1 / ((after - before) * pixel), 1 / ((after - before) * pixel)]
+        return sparse.csr_array((values, (rows, columns)), shape=(count, count))
+
+    height, width = shape
+    return (
+        sparse.csr_array(sparse.kron(sparse.eye_array(height), along(width))),
+        sparse.csr_array(sparse.kron(-along(height), sparse.eye_array(width))),
+    )
+
+
+@dataclass(frozen=True)
+class Bound:
+    """The information of touches about the parameters and, after them, the gains of frames."""
+
+    information: Map
+    prior: Map = field(default_factory=lambda: np.zeros(len(NAMES)))
+
+    def sigmas(self) -> dict[str, float]:
+        """Return the least standard errors of the parameters, in their units; infinite if undetermined.
+
+        A parameter is undetermined if a direction without information contains it.
+        """
+        information = self.information + np.diag(self.prior)
+        scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        values, vectors = np.linalg.eigh(information / np.multiply.outer(scale, scale))
+        known = values > 1e-10
+        variance = np.sum(vectors[:, known] ** 2 / values[known], axis=1) / scale**2
+        free = np.sum(vectors[:, ~known] ** 2, axis=1) > 1e-6
+        sigma = np.where(free, np.inf, np.sqrt(variance))
+        return dict(zip(NAMES, sigma[: len(NAMES)].tolist(), strict=True))
+
+
+def bound(
+    height: Map,
+    *,
+    pixel: float = PIXEL,
+    sensor: Sensor | None = None,
+    frames: int = FRAMES,
+    press_sigma: float | None = PRESS_SIGMA,
+    unknown_frame_gains: bool = False,
+    priors: Mapping[str, float] | None = None,
+    seen: NDArray[np.bool_] | None = None,
+) -> Bound:
+    """Return the information of one touch of an object.
+
+    Parameters
+    ----------
+    height : ndarray, (H, W)
+        The object, mm.
+    pixel : float
+        Size of a pixel, mm.
+    sensor : Sensor, optional
+    frames : int
+        Number of frames of the turn.
+    press_sigma : float or None
+        Standard deviation of the height of a pixel by the press, mm; None without a press.
+    unknown_frame_gains : bool
+        Whether the light of each frame is unknown, with a standard deviation of `FRAME_GAIN_SIGMA`.
+    priors : mapping, optional
+        Standard deviations of parameters, in their units, by name; 0 for a parameter that is known.
+    seen : ndarray, (H, W), bool, optional
+        Pixels whose brightness is used; by default all.
+    """
+    sensor = sensor or Sensor()
+    rows, columns = height.shape
+    x, y = np.meshgrid(np.linspace(-1, 1, columns), np.linspace(1, -1, rows))
+    by_x, by_y = differences((rows, columns), pixel)
+    p, q = ((matrix @ height.ravel()).reshape(height.shape) for matrix in (by_x, by_y))
+    phases, centre = np.arange(frames) * 2 * np.pi / frames, sensor.vector()
+
+    def brightness(change: Map, dp: float = 0.0, dq: float = 0.0) -> Map:
+        light = render(centre + change, p + dp, q + dq, x, y, phases)
+        return (light if seen is None else np.where(seen, light, 0.0)).reshape(frames, -1)
+
+    def slope(step: Callable[[float], Map]) -> Map:
+        return (step(_STEP) - step(-_STEP)) / (2 * _STEP)
+
+    still = np.zeros(len(NAMES))
+    by_p = slope(lambda step: brightness(still, dp=step))
+    by_q = slope(lambda step: brightness(still, dq=step))
+    unit = np.eye(len(NAMES))
+    lines = [slope(lambda step, row=row: brightness(step * row)) for row in unit]  # type: ignore[misc]
+    if unknown_frame_gains:
+        light = brightness(still)
+        lines += [np.where(np.arange(frames)[:, np.newaxis] == t, light, 0.0) for t in range(frames)]
+    by_parameter = np.stack(lines)
+    own = np.einsum("kti,lti->kl", by_parameter, by_parameter) / sensor.noise**2
+    heights = sparse.eye_array(height.size) / (press_sigma or UNKNOWN_HEIGHT) ** 2
+    cross = np.zeros((height.size, len(lines)))
+    for t in range(frames):
+        jacobian = sparse.diags_array(by_p[t]) @ by_x + sparse.diags_array(by_q[t]) @ by_y
+        heights = heights + jacobian.T @ jacobian / sensor.noise**2
+        cross += jacobian.T @ by_parameter[:, t].T / sensor.noise**2
+    information = own - cross.T @ splu(sparse.csc_array(heights)).solve(cross)
+    prior = np.zeros(len(lines))
+    prior[len(NAMES) :] = FRAME_GAIN_SIGMA**-2
+    for name, sigma in (priors or {}).items():
+        prior[NAMES.index(name)] = max(sigma, 1e-9) ** -2
+    return Bound((information + information.T) / 2, prior)
+
+
+# --- objects ------------------------------------------------------------------------------------------------
+
+
+def _axes(shape: tuple[int, int] = SHAPE, pixel: float = PIXEL) -> tuple[Map, Map]:
+    rows, columns = shape
+    across = (np.arange(columns) - (columns - 1) / 2) * pixel
+    down = ((rows - 1) / 2 - np.arange(rows)) * pixel
+    x, y = np.meshgrid(across, down)
+    return x, y
+
+
+def rough(slope: float = 0.2, length: float = 0.35) -> Map:
+    """Return a rough surface of a Gaussian correlation length, mm, and an RMS slope along each axis."""
+    white = np.random.default_rng(1).standard_normal(SHAPE)
+    f_y, f_x = (np.fft.fftfreq(count, PIXEL) for count in SHAPE)
+    spectrum = np.exp(-((np.pi * length) ** 2) * (f_x**2 + f_y[:, np.newaxis] ** 2) / 2)
+    height = np.fft.ifft2(np.fft.fft2(white) * spectrum).real
+    return np.asarray(height * slope / np.sqrt(np.mean(np.gradient(height, PIXEL)[0] ** 2)))
+
+
+def woven() -> Map:
+    """Return a weave: crossed waves."""
+    x, y = _axes()
+    return np.asarray(0.06 * (np.sin(2 * np.pi * x / 1.1) + np.sin(2 * np.pi * y / 0.9 + 0.4)))
+
+
+def dimpled() -> Map:
+    """Return a plate of round bumps in a hexagonal grid."""
+    x, y = _axes()
+    step = 1.3
+    row = np.round(y / (step * 0.866))
+    dx = (x + step / 2 * (row % 2)) / step
+    r2 = ((dx - np.round(dx)) * step) ** 2 + (y - row * step * 0.866) ** 2
+    return np.asarray(0.2 * np.exp(-r2 / (2 * 0.33**2)))
+
+
+def knurled() -> Map:
+    """Return a knurl: pyramids with rounded edges."""
+    x, y = _axes()
+    u, v = (x + y) / math.sqrt(2), (x - y) / math.sqrt(2)
+    ridges = [np.sqrt(0.02 + np.sin(np.pi * each / 1.2) ** 2) for each in (u, v)]
+    return np.asarray(0.12 * (ridges[0] + ridges[1]))
+
+
+def cone() -> Map:
+    """Return a cone with a slope of 25 degrees and a tip of 0.25 mm."""
+    x, y = _axes()
+    return np.asarray(-math.tan(math.radians(25)) * np.sqrt(x**2 + y**2 + 0.25**2))
+
+
+def staircase() -> Map:
+    """Return a staircase: treads that are level, and inclined by 5 degrees, in turn."""
+    x, _ = _axes()
+    tread, along = _treads(x)
+    return np.asarray(0.15 * tread + math.tan(math.radians(5)) * (tread % 2) * along)
+
+
+def _treads(x: Map) -> tuple[Map, Map]:
+    """Return the number of the tread, and the distance to its middle, mm."""
+    tread = np.floor(x / 0.8)
+    return tread, x - (tread + 0.5) * 0.8
+
+
+def _without_risers() -> NDArray[np.bool_]:
+    """Return the pixels of the staircase whose differences stay on one tread."""
+    tread = _treads(_axes()[0])[0]
+    padded = np.pad(tread, ((0, 0), (1, 1)), mode="edge")
+    return np.asarray((padded[:, :-2] == tread) & (padded[:, 2:] == tread))
+
+
+OBJECTS: Mapping[str, Callable[[], Map]] = {
+    "rough": rough,
+    "woven": woven,
+    "dimpled": dimpled,
+    "knurled": knurled,
+    "cone": cone,
+    "staircase": staircase,
+}
+
+COLUMNS: Mapping[str, tuple[str, float]] = {
+    "gain": ("gain, %", 100 / Sensor.gain),
+    "offset": ("offset, counts", 1.0),
+    "curvature": ("curvature, %/rad", 100.0),
+    "half-angle": ("half-angle, %", 100 / Sensor.half_angle),
+    "phase": ("phase, degrees", math.degrees(1)),
+    "ellipticity x": ("ellipticity, %", 100.0),
+    "uneven x": ("uneven light, %", 100.0),
+}
+"""Heading of a column, and the factor of its unit."""
+
+CASES: Mapping[str, Mapping[str, object]] = {
+    "press and turn": {},
+    "press and turn, unknown light of each frame": {"unknown_frame_gains": True},
+    "turn alone": {"press_sigma": None},
+}
+
+
+def measure() -> dict[str, dict[str, dict[str, float | None]]]:
+    """Return the standard errors of one touch by case, object and column; None if undetermined."""
+    table: dict[str, dict[str, dict[str, float | None]]] = {}
+    for case, options in CASES.items():
+        for name, make in OBJECTS.items():
+            seen = _without_risers() if name == "staircase" else None
+            sigmas = bound(make(), seen=seen, **options).sigmas()  # type: ignore[arg-type]
+            row = {
+                head: (value if math.isfinite(value := factor * sigmas[key]) else None)
+                for key, (head, factor) in COLUMNS.items()
+            }
+            table.setdefault(case, {})[name] = row
+    return table
+
+
+def _text(value: float | None) -> str:
+    return "undetermined" if value is None else f"{value:.2g}"
+
+
+def main() -> None:
+    """Print the table, and store it."""
+    parser = argparse.ArgumentParser(description="The least standard errors of a calibration from touches.")
+    parser.add_argument("-o", "--output", type=Path, help="JSON file to write")
+    options = parser.parse_args()
+    table = measure()
+    for case, rows in table.items():
+        heads = list(next(iter(rows.values())))
+        print(f"{case}\n\n| object | {' | '.join(heads)} |\n|---{'|---:' * len(heads)}|")
+        for name, row in rows.items():
+            print(f"| {name} | {' | '.join(map(_text, row.values()))} |")
+        print()
+    if options.output:
+        options.output.write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
