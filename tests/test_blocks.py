@@ -45,6 +45,11 @@ FILES = {  # commands that write what the blocks of a page take for granted
         "reconstruct press.h5 -o first.h5",
         "reconstruct press.h5 -o second.h5",
     ],
+    "docs/method/sensor-health.md": [
+        f"simulate vertical {SMALL} 12 -o press.h5",
+        "reconstruct press.h5 -o first.h5",
+        "reconstruct press.h5 -o second.h5",
+    ],
     "docs/method/photometric-stereo.md": [f"simulate axial {SMALL} 8 -o turn.h5"],
     "docs/method/press.md": [f"simulate vertical {SMALL} 12 -o press.h5"],
     "docs/recordings.md": [f"simulate vertical {SMALL} 12 -o coin.h5"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import re
 import sys
@@ -228,6 +229,31 @@ def _report(outcomes: Sequence[Outcome], folder: Path, seconds: float, as_json: 
     warned = sum(outcome.warned for outcome in outcomes)
     if warned:
         click.echo(f"with warnings: {warned} of {states['done']}; --strict makes them failures")
+    for line in _brightness_trends(outcomes):
+        click.echo(line)
+
+
+def _brightness_trends(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """Yield how the brightness of the sensor changes from recording to recording, in the order of names."""
+    import numpy as np
+
+    from mirrorskin import io
+    from mirrorskin.engine.metrology.measures import HEALTH
+    from mirrorskin.engine.metrology.tables import find_trend
+
+    ordered = sorted(outcomes, key=lambda outcome: str(outcome.job.source))
+    for motion, what in (("vertical", "presses"), ("axial", "rotations")):
+        changes = []
+        for outcome in ordered:
+            if outcome.motion != motion or outcome.state == "failed":
+                continue
+            change = outcome.brightness_change
+            if outcome.state == "kept":
+                change = (io.open_result(outcome.job.target).fitted.light_change or (None,))[0]
+            changes.append(math.nan if change is None else 100 * change)
+        trend = find_trend(np.array(changes), "%")
+        if trend is not None:
+            yield f"{HEALTH[0]} of {what} {trend}"
 
 
 def _fields(outcome: Outcome) -> dict[str, Any]:

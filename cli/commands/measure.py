@@ -157,7 +157,9 @@ def command(
         if as_json:
             _print_files(table, budget)
         else:
-            _report_table(table, table.names if every else table.main(), expanded)
+            names = table.names if every else table.main()
+            _report_table(table, names, expanded)
+            _report_trends(table, names)
         _write_table(table, output, chart)
         _end(table)
         return
@@ -289,7 +291,9 @@ def _print_files(table: Table, budget: bool) -> None:
         if table.limits:
             entry["limits"] = str(table.verdict(row))
         files.append(entry)
-    print_json({"files": files})
+    trends = {name: trend for name in table.names if (trend := table.trend(name))}
+    steps = {name: {"step": trend.step, "results": trend.results} for name, trend in trends.items()}
+    print_json({"files": files} | ({"trends": steps} if steps else {}))
 
 
 def _report_table(table: Table, names: list[str], expanded: bool) -> None:
@@ -303,6 +307,16 @@ def _report_table(table: Table, names: list[str], expanded: bool) -> None:
         verdict = [str(table.verdict(row))] if table.limits else []
         rows.append([row.name, *cells, *verdict, row.problem])
     print_table(["result", *names, *(["limits"] if table.limits else []), ""], rows)
+
+
+def _report_trends(table: Table, names: list[str]) -> None:
+    """Print how quantities change from result to result: those shown, and those of the sensor."""
+    from mirrorskin.engine.metrology.measures import HEALTH
+
+    for name in dict.fromkeys([*names, *HEALTH]):
+        trend = table.trend(name)
+        if trend is not None:
+            click.echo(printable(f"{name} {trend}"))
 
 
 def _end(table: Table) -> None:

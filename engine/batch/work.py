@@ -44,6 +44,7 @@ class Outcome:
     device: str = ""  # title of the device
     motion: str = ""  # motion of the recording, if it could be opened
     warned: bool = False  # whether the result, computed now, has warnings
+    brightness_change: float | None = None  # mean of the result's `light_change`, if it was computed now
 
 
 def find_settled(job: Job, plan: Plan) -> Outcome | None:
@@ -113,6 +114,7 @@ def _compute(
         bytes=math.prod(source.shape) * source.dtype.itemsize,
         device=opened.info.title,
         warned=bool(warnings),
+        brightness_change=(result.fitted.light_change or (None,))[0],
     )
 
 

@@ -3,6 +3,7 @@ from .brightness import LinearBrightness, WallBrightness
 from .check import Check, ErrorMap, ErrorSummary, check_ball
 from .force import KnownPress, StiffnessFit, fit_stiffness, known_press
 from .gel import BallOnset, BallPlace, GelFit, ball_onset, fit_gel
+from .health import compare_brightness
 from .lens import LensFit, calibrate_lens
 from .references import LevelReport, Measured, measure_references
 from .tilt import PrecessionFit, fit_precession
@@ -32,6 +33,7 @@ __all__ = [
     "ball_onset",
     "calibrate_lens",
     "check_ball",
+    "compare_brightness",
     "fit_gel",
     "fit_precession",
     "fit_stiffness",

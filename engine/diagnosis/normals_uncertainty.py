@@ -18,6 +18,7 @@ from mirrorskin.engine.diagnosis.amplitude_blur import BEND_NOISE, with_bend
 from mirrorskin.engine.diagnosis.curl import AzimuthBias, find_azimuth_bias
 from mirrorskin.engine.diagnosis.registration import Registered
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
+from mirrorskin.engine.diagnosis.sensor_health import change_of_swing, with_light_change
 from mirrorskin.engine.diagnosis.swing import ModulationEffects, find_modulation_effects
 from mirrorskin.engine.diagnosis.turn_nuisances import TurnNuisances
 from mirrorskin.io import Result
@@ -94,8 +95,9 @@ class ResponseUncertainty(Step):
     """Compare the swing of the brightness with what tilt and gain predict.
 
     Gains of pixels are added to the errors, and noted; the area that a pixel sees is used. Blur, and a
-    response that is not linear, are warnings: see `mirrorskin.engine.diagnosis.swing`. A calibrated response
-    is not judged.
+    response that is not linear, are warnings: see `mirrorskin.engine.diagnosis.swing`, and so is brightness
+    that has changed since the calibration: see `mirrorskin.engine.diagnosis.sensor_health`. A calibrated
+    response is not judged.
     """
 
     needs = ("normals", "normals_sigma", "zenith", "mean", "modulation", "contact")
@@ -128,7 +130,9 @@ class ResponseUncertainty(Step):
             )
         if modulation.area > 0 and operation.blur is None:
             result = result.assign(fitted=replace(result.fitted, footprint=modulation.area))
-        return with_findings(result, *_of_swing(modulation))
+        result = with_findings(result, *_of_swing(modulation))
+        change = change_of_swing(modulation, context.source.header, tilt)
+        return with_light_change(result, change, "axial")
 
 
 class NuisanceUncertainty(Step):

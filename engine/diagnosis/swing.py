@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,6 +46,19 @@ _MIN_RANGE = 0.05  # least range of the swing, as a share of it, that is a respo
 _MIN_GAIN = 0.01  # least standard deviation of the gains of pixels
 
 
+class Swing(NamedTuple):
+    """The swing of the brightness, relative to the expected one, at some pixels: each (n,)."""
+
+    ratio: Doubles
+    sigma: Doubles
+    response: Doubles  # relative change of the ratio for that of the light, whose zenith is wrong, too
+    x: Doubles  # from -1 to 1
+    y: Doubles
+    turning: Doubles  # square of the angle by which azimuths turn, 1/pixel^2
+    bending: Doubles  # increase of the zenith along its azimuth, radians per pixel
+    zenith: Doubles  # minus its mean, radians
+
+
 @dataclass(frozen=True, slots=True)
 class ModulationEffects:
     """Effects on the swing of the brightness; 0 if one is not significant.
@@ -60,12 +73,15 @@ class ModulationEffects:
         Standard deviation of the lens's point spread, pixels, if it is a large one.
     response : float
         Range over the picture of the swing that changes with the zenith, relative to the swing.
+    swing : Swing, optional
+        What they are found in.
     """
 
     gain: float = 0.0
     area: float = 0.0
     blur: float = 0.0
     response: float = 0.0
+    swing: Swing | None = None
 
 
 def find_modulation_effects(
@@ -118,19 +134,30 @@ def find_modulation_effects(
     )
     noise, rough = noise[finite], rough[finite]
     gain = _gain(rough, noise)
+    zenith = zenith[finite] - np.mean(zenith[finite])
+    response = 1 + _steepness(middle[0][finite], tilt)
+    swing = Swing(
+        middle[3][finite], np.hypot(noise, gain), response, x, y, turning[finite], bending[finite], zenith
+    )
     columns_of = np.stack([
-        np.ones_like(x), turning[finite], bending[finite], zenith[finite] - np.mean(zenith[finite]),
-        x, y, x * x, x * y, y * y,
+        np.ones_like(x), swing.turning, swing.bending, zenith, x, y, x * x, x * y, y * y
     ], axis=1)  # fmt: skip
-    given = middle[3][finite], columns_of, np.hypot(noise, gain)
+    given = swing.ratio, columns_of, swing.sigma
     area = _area(*given)
     blur = math.sqrt(max(area - PIXEL, 0.0))
-    return ModulationEffects(gain, area, blur if blur > _MIN_BLUR else 0.0, _response(*given))
+    return ModulationEffects(gain, area, blur if blur > _MIN_BLUR else 0.0, _response(*given), swing)
 
 
 def _expected(zenith: Doubles, tilt: float) -> Doubles:
     """Return the swing of the angle to the body's axis, radians."""
     return np.asarray(np.interp(zenith, *_swings(tilt)))
+
+
+def _steepness(zenith: Doubles, tilt: float) -> Doubles:
+    """Return the relative change of the swing for that of the zenith: 0 where surfaces are steep."""
+    step = 0.01
+    above, below = (np.log(_expected(factor * zenith, tilt)) for factor in (1 + step, 1 - step))
+    return np.asarray((above - below) / (2 * step))
 
 
 @functools.lru_cache(4)

@@ -58,11 +58,19 @@ _TEXTURE = "texture"
 _RATIO = 2.0  # Birge's ratio above which a surface does not have the form
 _SCALE = "calibration scale"  # contribution to an uncertainty
 # The contribution that quantities of a group have alone.
-_CAUSES = {"form": "fit", "areas and volumes": "heights, border", "section": "heights, pixel size"}
+_CAUSES = {
+    "sensor": "light, calibration",
+    "form": "fit",
+    "areas and volumes": "heights, border",
+    "section": "heights, pixel size",
+}
 _SECTION = {"section length", "height difference", "distance in space", "slope"}
 _SECTION |= {"step height", "step at", "slope beside step"}
 _SECTION |= {"groove depth", "groove width", "groove at", "slope beside groove"}
 
+
+HEALTH = ("brightness change", "brightness change to rim")
+"""Quantities of the sensor, not of the surface: what `mirrorskin.engine.diagnosis.sensor_health` found."""
 
 MAIN = (
     *(
@@ -94,6 +102,8 @@ def group_of(name: str) -> str:
         return PARAMETERS[first].group
     if first in ("plane", "sphere", "polynomial"):
         return "form"
+    if name in HEALTH:
+        return "sensor"
     if name in _SECTION:
         return "section"
     return "areas and volumes" if "area" in name or "volume" in name else "heights"
@@ -255,6 +265,7 @@ def measure(
         quantities |= _profile(
             patch, form_removed, comparable, (section, section_width), (s_filter, l_filter), notes, budget
         )
+    quantities |= _health(maps)
     lens = None if maps.calibration is None else maps.calibration.lens
     scale = 0.0 if lens is None else lens.scale_sigma
     quantities, budget = _scaled(quantities, budget, scale)
@@ -272,6 +283,15 @@ def measure(
     if reference is not None:
         notes.append("heights are differences from those of the reference")
     return Measures(quantities, [*inherited, *notes, *_assumed(patch, size)], budget, rough.smooth)
+
+
+def _health(result: Result) -> dict[str, Quantity]:
+    """Return how much the brightness has changed since the calibration, if the result states it."""
+    change, sigma = result.fitted.light_change, result.fitted.light_change_sigma
+    if change is None or sigma is None:
+        return {}
+    parts = zip(HEALTH, (0, -1), strict=True)
+    return {name: Quantity(100 * change[part], 100 * sigma[part], "%") for name, part in parts}
 
 
 def _refuse_millimetres(**lengths: Any) -> None:

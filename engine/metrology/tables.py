@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from mirrorskin.io.formats.tables import save_table
 from mirrorskin.kernels.array_types import Doubles
 
 _COVERAGE = 2  # standard uncertainties of the guard band (ISO 14253-1)
+_LEAST_TREND, _CLEAR_TREND = 10, 4.5  # results, and standard deviations of a slope, from which it is a trend
 _BOUND = re.compile(rf"\s*(?:({NUMBER})\s*([^\s0-9:][^\s:]*)?)?\s*")
 _PLAIN = {"²": "2", "³": "3", "°": "deg", "^": ""}
 
@@ -106,6 +107,45 @@ def _factor(name: str, unit: str, own: str) -> float:
 
 
 @dataclass(frozen=True, slots=True)
+class Trend:
+    """A clear change of a quantity from result to result.
+
+    Attributes
+    ----------
+    step : Quantity
+        Change from one result to the next.
+    results : int
+        Number of results that have the quantity.
+    line : ndarray, (rows,)
+        The quantity by the trend, for each row.
+    """
+
+    step: Quantity
+    results: int
+    line: Doubles
+
+    def __str__(self) -> str:
+        verb, step = ("falls" if self.step.value < 0 else "rises"), self.step
+        total = abs(step.value) * (len(self.line) - 1)
+        size = replace(step, value=abs(step.value))
+        return f"{verb} by {size} from result to result, {total:.2g} {step.unit} in all {len(self.line)}"
+
+
+def find_trend(values: Doubles, unit: str) -> Trend | None:
+    """Return the trend of values, (rows,), NaN where unknown; None if none is clear. See `Table.trend`."""
+    number, known = np.arange(float(values.size)), np.isfinite(values)
+    if np.count_nonzero(known) < _LEAST_TREND:
+        return None
+    x, y = number[known], values[known]
+    away = x - np.mean(x)
+    slope = float(away @ y / (away @ away))
+    line = np.mean(y) + slope * (number - np.mean(x))
+    left = y - line[known]
+    sigma = float(np.sqrt(left @ left / (len(x) - 2) / (away @ away)))
+    return Trend(Quantity(slope, sigma, unit), len(x), line) if abs(slope) > _CLEAR_TREND * sigma else None
+
+
+@dataclass(frozen=True, slots=True)
 class Row:
     """The measures of one result, or why there are none."""
 
@@ -163,6 +203,21 @@ class Table:
         pairs = [((quantity or unknown).value, (quantity or unknown).sigma) for quantity in quantities]
         values, sigmas = np.array(pairs).reshape(-1, 2).T
         return values, sigmas
+
+    def trend(self, name: str) -> Trend | None:
+        """Return the trend of a quantity over the results in their order; None if none is clear.
+
+        It is a straight line by least squares. The scatter of the values determines whether it is clear:
+        errors that all results have in common, such as those of the calibration, do not change it.
+
+        Examples
+        --------
+        >>> values = 0.0, 1.1, 1.9, 3.0, 4.2, 4.9, 6.0, 7.1, 8.0, 9.0
+        >>> lot = [Row("", Measures({"Sq": Quantity(value, 0.1, "um")}, [])) for value in values]
+        >>> print(Table(lot).trend("Sq"))
+        rises by 1.000 ± 0.011 um from result to result, 9 um in all 10
+        """
+        return find_trend(self.values(name)[0], self.unit(name))
 
     def verdict(self, row: Row) -> Verdict:
         """Return the worst verdict on the quantities of a row that have limits."""

@@ -14,6 +14,13 @@ from mirrorskin.engine.base.device_arrays import device_of_maps, operand_of
 from mirrorskin.engine.base.options import option
 from mirrorskin.engine.base.steps import Context, Step
 from mirrorskin.engine.diagnosis.footprint import LEAST_BLUR, PIXEL
+from mirrorskin.engine.diagnosis.sensor_health import (
+    LightChange,
+    Samples,
+    find_light_change,
+    with_light_change,
+)
+from mirrorskin.engine.diagnosis.turn_nuisances import picture_axes
 from mirrorskin.io import Header, Result
 from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.io.model.result import shape_of
@@ -112,7 +119,8 @@ class Nuisances(Step):
             found = found.assign(process=process, fitted=replace(fitted, footprint=footprint.variance))
         if clear_lag or any(errors):
             found = with_findings(found, *_findings(errors, lag if clear_lag else 0.0))
-        return found
+        change = None if edges is None else edges.light_change(context)
+        return with_light_change(found, change, "vertical")
 
     def _shares(self, context: Context) -> tuple[float, float]:
         """Return the uncertainty of the level at the threshold, before the frames, as a share of the rise.
@@ -249,6 +257,31 @@ class Edges:
             )
             level_errors.append(middle if abs(middle) > clear else 0.0)
         return level_errors[0], level_errors[1]
+
+    def light_change(self, context: Context) -> LightChange | None:
+        """Return by how much full light differs from its reference; None without references."""
+        operation = cast("PressOperation", context.operation)
+        missing = operation.dark is None or operation.bright is None
+        if missing or operation.estimated_levels or context.samples is None:
+            return None
+        few = max(1, round(_END_FRACTION * len(self.travel)))
+        usable = self.onset < self.travel[-1] - _MIN_DISTANCE * (self.travel[-1] - self.travel[0])
+        ratio = np.where(usable, self.shares[-few:].mean(axis=0), np.nan).astype(np.float64)
+        middle = ratio[np.isfinite(ratio)]
+        if middle.size < _MIN_GRID_PIXELS:
+            return None
+        # What differs from pixel to pixel, such as slopes that show no full light, is no change of the lamp.
+        spread = mad_sigma(middle - np.median(middle))
+        header = context.source.header
+        x, y = picture_axes(operation.shape)
+        x, y = np.meshgrid(x[context.samples.columns], y[context.samples.rows])
+        none = np.empty((len(ratio), 0))
+        light = Samples(
+            ratio, np.full(len(ratio), max(spread, _LEAST_NOISE)), np.ones(len(ratio)), x.ravel(), y.ravel(),
+            none, *np.empty((2, 0)),
+        )  # fmt: skip
+        common = math.hypot(header.prior("frame_gain_sigma"), header.prior("drift_sigma"), spread)
+        return find_light_change(light, common, common)
 
     def slow(self) -> float:
         """Return the travel in which the flattest pixels turn light in addition to their slopes, mm."""

@@ -1,7 +1,8 @@
 """The least standard errors of a calibration from touches of unknown objects (Cramer-Rao bound).
 
-``python evaluation/calibration/fisher.py [-o evaluation/stored/fisher.json]`` prints the standard errors of
-one touch of each object, and stores them. It shares no code with mirrorskin: NumPy and SciPy alone.
+``python evaluation/calibration/fisher.py [--freeze]`` prints the standard errors of one touch of each object,
+and stores them, in ``evaluation/stored/fisher.json`` and docs/method/sensor-health.md. It shares no code with
+mirrorskin: NumPy and SciPy alone.
 
 A touch is a press, which measures the height of each pixel with `PRESS_SIGMA`, and a turn. In frame t, the
 brightness of a pixel whose normal n has the angle a = arccos(n . axis_t) with the body's axis is ::
@@ -32,6 +33,11 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 Map = NDArray[np.float64]
+
+STORED = Path(__file__).resolve().parents[1] / "stored" / "fisher.json"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "method" / "sensor-health.md"
+_START, _END = "<!-- fisher -->\n", "<!-- end fisher -->"
+_UNDETERMINED = 100.0  # from which on a standard error is none
 
 SHAPE = (44, 56)  # pixels
 PIXEL = 0.1  # mm
@@ -316,24 +322,36 @@ def measure() -> dict[str, dict[str, dict[str, float | None]]]:
     return table
 
 
+def as_text(table: Mapping[str, Mapping[str, Mapping[str, float | None]]]) -> str:
+    """Return the tables of all cases for a page."""
+    lines = []
+    for case, rows in table.items():
+        heads = list(next(iter(rows.values())))
+        lines += [f"| {case} | {' | '.join(heads)} |", f"|---{'|---:' * len(heads)}|"]
+        lines += [f"| {name} | {' | '.join(map(_text, row.values()))} |" for name, row in rows.items()]
+        lines.append("")
+    return "\n".join(lines)
+
+
 def _text(value: float | None) -> str:
-    return "undetermined" if value is None else f"{value:.2g}"
+    return "undetermined" if value is None or value > _UNDETERMINED else f"{value:.2g}"
+
+
+def with_table(page: str, text: str) -> str:
+    """Return a page with the tables between its marks."""
+    head, rest = page.split(_START)
+    return f"{head}{_START}\n{text}\n{_END}{rest.split(_END, 1)[1]}"
 
 
 def main() -> None:
     """Print the table, and store it."""
     parser = argparse.ArgumentParser(description="The least standard errors of a calibration from touches.")
-    parser.add_argument("-o", "--output", type=Path, help="JSON file to write")
-    options = parser.parse_args()
+    parser.add_argument("--freeze", action="store_true", help="store the table, and write it into the page")
     table = measure()
-    for case, rows in table.items():
-        heads = list(next(iter(rows.values())))
-        print(f"{case}\n\n| object | {' | '.join(heads)} |\n|---{'|---:' * len(heads)}|")
-        for name, row in rows.items():
-            print(f"| {name} | {' | '.join(map(_text, row.values()))} |")
-        print()
-    if options.output:
-        options.output.write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
+    print(as_text(table))
+    if parser.parse_args().freeze:
+        STORED.write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
+        PAGE.write_text(with_table(PAGE.read_text(encoding="utf-8"), as_text(table)), encoding="utf-8")
 
 
 if __name__ == "__main__":

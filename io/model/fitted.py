@@ -47,6 +47,17 @@ class Fitted:
         default=None,
         valid=lambda factors: len(factors) % 50 == 0 and bool(np.isfinite(factors).all()),
     )
+    light_change: tuple[float, float, float, float] | None = parameter(
+        "relative change of the brightness since the calibration: mean over the picture, increase from its"
+        " centre to the right and to the upper border, and from its centre to the rim",
+        default=None,
+        valid=lambda change: bool(np.isfinite(change).all()),
+    )
+    light_change_sigma: tuple[float, float, float, float] | None = parameter(
+        "standard deviations of `light_change`, with those of the calibration",
+        default=None,
+        valid=lambda sigma: bool(np.isfinite(sigma).all()),
+    )
     slope_direction: float | None = parameter(
         "direction of `slope`, counter-clockwise from x", "rad", default=None
     )

@@ -44,15 +44,15 @@ def test_library_run(recordings, levels):
         with io.open_recording(recordings / "press.h5") as recording:
             engine.run(recording, engine.Onset(**levels))
 
-    assert_few(run, 391, 55)
+    assert_few(run, 396, 57)
 
 
 @pytest.mark.parametrize(
     ("line", "functions", "files"),
     [
-        ("reconstruct press.h5", 562, 73),
-        ("reconstruct turn.h5", 764, 96),
-        ("fuse press.h5 turn.h5", 940, 112),
+        ("reconstruct press.h5", 570, 75),
+        ("reconstruct turn.h5", 771, 97),
+        ("fuse press.h5 turn.h5", 949, 113),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):

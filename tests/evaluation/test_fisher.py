@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mirrorskin.evaluation.calibration import fisher
 
-STORED = Path(fisher.__file__).parents[1] / "stored" / "fisher.json"
 EXACT = 1e-7  # mm: a press whose heights are as good as known
 
 
@@ -63,8 +61,13 @@ def test_the_bound_falls_with_the_square_root_of_the_touches() -> None:
 
 
 def test_the_stored_table_is_that_of_the_program() -> None:
-    stored = json.loads(STORED.read_text(encoding="utf-8"))
+    stored = json.loads(fisher.STORED.read_text(encoding="utf-8"))
     measured = fisher.measure()
     for case, rows in stored.items():
         for name, row in rows.items():
             assert measured[case][name] == pytest.approx(row, rel=0.01), (case, name)
+
+
+def test_the_page_has_the_stored_table() -> None:
+    page, stored = (path.read_text(encoding="utf-8") for path in (fisher.PAGE, fisher.STORED))
+    assert fisher.with_table(page, fisher.as_text(json.loads(stored))) == page

@@ -37,7 +37,8 @@ def control_chart(table: Table) -> Figure:
     -------
     Figure
         Values with expanded uncertainties (k = 2); the mean and the control limits at three standard
-        deviations, from the mean difference of results that follow each other; and the limits of the table.
+        deviations, from the mean difference of results that follow each other; a trend, if one is clear; and
+        the limits of the table.
 
     Raises
     ------
@@ -91,6 +92,9 @@ def _draw(axes: Axes, table: Table, name: str) -> None:
         reach = _CONTROL * float(np.mean(np.abs(np.diff(known)))) / _RANGE
         for bound in (mean - reach, mean + reach):
             axes.axhline(bound, color="0.3", lw=1, ls=":", label="control limits")
+    trend = table.trend(name)
+    if trend is not None:
+        axes.plot(number, trend.line, color="tab:orange", lw=1.4, label="trend")
     if name not in table.limits:
         return
     low, high = table.limits[name].within(name, unit)

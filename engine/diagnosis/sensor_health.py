@@ -1,0 +1,184 @@
+"""How much the brightness of a sensor has changed since its calibration, by an ordinary recording.
+
+The swing of a rotation's brightness, and the full light of a press, are compared with what the calibration
+states. Their ratios, at a grid of pixels, are a weighted sum ::
+
+    ratio - 1 = change + towards_x x + towards_y y + to_rim (x^2 + y^2 - 2/3) + skew x y + nuisances,
+
+with x and y from -1 to 1 over the picture. The nuisances have priors; what is uncertain of the calibration
+itself is added to the standard deviations. See the documentation, "Health of a sensor".
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from mirrorskin.engine.diagnosis.footprint import LEAST_BLUR, PIXEL
+from mirrorskin.engine.diagnosis.swing import ModulationEffects
+from mirrorskin.engine.diagnosis.turn_nuisances import shift_of
+from mirrorskin.io import Fitted, Header, Motion, Result
+from mirrorskin.io.base.findings import Finding, with_findings
+from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.numerics.least_squares import OUTLYING, gram, mad_sigma
+
+KIND = "brightness change"
+"""Kind of the finding."""
+
+_WIDE = 1.0  # standard deviation of a change of brightness before the recording: it may be any
+_SHOWN = 0.015  # standard deviation, without that of the calibration, of a mean that an object shows
+_LEAST_PRIOR = 1e-6  # standard deviation of a nuisance that is known
+_ROUNDS = 4  # in which outliers are left out
+_LEAST_PIXELS = 100  # that show a change
+_TO_RIM = 4 / 3  # mean of x^2 + y^2 over the border of the picture, minus that at the centre
+_CLEAR = 4.0  # standard deviations from which on a change is reported
+_GAMMA = 0.6  # root mean square of 1 + ln(light) over usual zeniths: gamma changes the swing by so much
+_PER_ZENITH = 3.0  # per radian: its derivative by the zenith
+_USUAL_ZENITH = 0.2  # radians: standard deviation of zeniths on which heights may depend
+_AREA = 0.25  # square pixels: standard deviation of the area that a pixel sees
+_MOST_TURNED = 0.2  # square of the angle by which azimuths turn over an area: its effect is proportional
+_LEAST_CHANGE = 0.02  # that is reported
+
+
+Parts = tuple[float, float, float, float]
+
+
+class LightChange(NamedTuple):
+    """Relative change of the brightness, and its standard deviation.
+
+    The four values are the mean over the picture; the increase from the centre to the right border, and to
+    the upper one; and the increase from the centre to the rim.
+    """
+
+    value: Parts
+    sigma: Parts
+
+
+class Samples(NamedTuple):
+    """Ratios of the brightness to what a calibration states, at some pixels."""
+
+    ratio: Doubles  # (n,)
+    sigma: Doubles  # (n,): standard deviations
+    response: Doubles  # (n,): changes of the ratios for those of the brightness
+    x: Doubles  # (n,): places, from -1 to 1
+    y: Doubles
+    nuisances: Doubles  # (n, k): what else may change the ratio: its derivatives
+    expected: Doubles  # (k,): the nuisances before the recording
+    prior: Doubles  # (k,): their standard deviations
+
+
+def find_light_change(samples: Samples, common: float, uneven: float) -> LightChange | None:
+    """Return the change of the brightness; None if the object does not show its mean.
+
+    Parameters
+    ----------
+    samples : Samples
+    common : float
+        Relative standard deviation of what the calibration states of all pixels together.
+    uneven : float
+        The same, of each term of uneven light over the picture.
+    """
+    ratio, sigma, response, x, y, nuisances, expected, prior = samples
+    usable = np.isfinite(ratio) & np.isfinite(sigma) & (sigma > 0) & np.isfinite(nuisances).all(axis=1)
+    if np.count_nonzero(usable) < _LEAST_PIXELS:
+        return None
+    terms = np.stack([np.ones_like(x), x, y, x * x + y * y - 2 / 3, x * y], axis=1)
+    columns = np.concatenate([terms * response[:, np.newaxis], nuisances], axis=1)[usable]
+    values = ratio[usable] - 1 - nuisances[usable] @ expected
+    weights = 1 / sigma[usable]
+    columns, values = columns * weights[:, np.newaxis], values * weights
+    priors = np.concatenate([np.full(terms.shape[1], _WIDE), np.maximum(prior, _LEAST_PRIOR)])
+    precision = np.diag(priors**-2.0)
+    kept = np.full(len(values), True)
+    for _ in range(_ROUNDS):
+        used = columns.compress(kept, axis=0)
+        products = gram(used)
+        factors = np.linalg.solve(products + precision, used.T @ values[kept])
+        residual = values - columns @ factors
+        before, kept = kept, np.abs(residual) <= OUTLYING * max(mad_sigma(residual), 1e-9)
+        if np.array_equal(before, kept) or np.count_nonzero(kept) < _LEAST_PIXELS:
+            break
+    spread = max(1.0, float(np.mean(residual[before] ** 2)))
+    covariance = np.linalg.inv(products / spread + precision)
+    scale = np.array([1.0, 1.0, 1.0, _TO_RIM])
+    variance = scale**2 * np.diag(covariance)[:4]
+    if variance[0] > _SHOWN**2:
+        return None
+    known = common, uneven, uneven, _TO_RIM * uneven
+    return LightChange(
+        cast("Parts", tuple((scale * factors[:4]).tolist())),
+        cast("Parts", tuple(np.sqrt(variance + np.square(known)).tolist())),
+    )
+
+
+def with_light_change(result: Result, change: LightChange | None, motion: Motion) -> Result:
+    """Return a result that states a change of the brightness, with a finding if it is significant."""
+    if change is None:
+        return result
+    fitted = replace(result.fitted, light_change=change.value, light_change_sigma=change.sigma)
+    finding = find_clear_change(fitted, motion)
+    result = result.assign(fitted=fitted)
+    return result if finding is None else with_findings(result, finding)
+
+
+def find_clear_change(fitted: Fitted, motion: Motion) -> Finding | None:
+    """Return the finding about the stated change of the brightness; None if it is not significant.
+
+    It is that of the mean, of the rim or of one side, whichever is the most significant. A rotation whose
+    brightness has changed has wrong normals: a warning. Heights of a press only have the note.
+    """
+    warning = motion == "axial"
+    if fitted.light_change is None or fitted.light_change_sigma is None:
+        return None
+    value, sigma = np.array(fitted.light_change), np.array(fitted.light_change_sigma)
+    score = np.where(np.abs(value) > _LEAST_CHANGE, np.abs(value) / sigma, 0.0)
+    if not np.max(score) > _CLEAR:
+        return None
+    part = int(np.argmax(score))
+    amount, error = float(value[part]), float(sigma[part])
+    place = ""
+    if part in (1, 2):  # a lamp that fades is more usual than one that grows brighter
+        side = (("left", "right"), ("lower border", "upper border"))[part - 1][amount < 0]
+        place, amount = f" towards the {side}", -abs(amount)
+    elif part == 3:
+        place = " from the centre to the rim"
+    verb, percent = ("fallen" if amount < 0 else "risen"), f"{100 * abs(amount):.2g} ± {100 * error:.1g} %"
+    reference, remedy = (
+        ("calibration", "calibrate the zenith again") if warning else ("references", "take references again")
+    )
+    text = (
+        f"brightness{place} has {verb} by {percent} since the {reference}, because of the lamp or the gel:"
+        f" {remedy}"
+    )
+    return Finding(KIND, text, warning)
+
+
+def change_of_swing(effects: ModulationEffects, header: Header, tilt: float) -> LightChange | None:
+    """Return the change of the brightness by the swing of a rotation; None if it shows other faults, too."""
+    swing = effects.swing
+    if swing is None or effects.blur > 0 or effects.response > 0:
+        return None
+    footprint = PIXEL + LEAST_BLUR**2
+    # Where azimuths turn by much within the area that a pixel sees, its effect is not proportional.
+    sigma = swing.sigma * (1 + (_AREA * swing.turning / _MOST_TURNED) ** 2)
+    gamma, shift = header.prior("gamma_sigma"), shift_of(header, tilt) / tilt
+    # Points move in the picture by their height above the pivot, which differs from place to place.
+    x, y = swing.x, swing.y
+    moved = swing.bending[:, np.newaxis] * np.stack(
+        [np.ones_like(x), swing.zenith / _USUAL_ZENITH, x, y, x * x + y * y - 2 / 3], axis=1
+    )
+    samples = Samples(
+        swing.ratio - swing.sigma**2 / 2,  # an amplitude by noisy waves is too large on average
+        sigma,
+        swing.response,
+        x,
+        y,
+        np.concatenate([np.stack([swing.turning, swing.zenith], axis=1), moved], axis=1),
+        np.array([-footprint / 2, *[0.0] * 6]),
+        np.array([_AREA / 2, _PER_ZENITH * gamma, *[shift] * 5]),
+    )
+    stated = header.prior("zenith_gain_sigma"), header.prior("tilt_sigma"), _GAMMA * gamma
+    return find_light_change(samples, math.hypot(*stated), header.prior("uneven_light_sigma"))
