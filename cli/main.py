@@ -44,6 +44,7 @@ PURPOSES = {
     "import": "Convert frames of another program to a recording.",
     "capture": "Move the stage, and record what the camera sees.",
     "live": "Reconstruct while the stage moves.",
+    "touch": "Press and turn until the surface has the requested standard deviation.",
     "reconstruct": "Reconstruct heights from a press, normals and heights from a rotation, or slip.",
     "correlate": "Fit mean, cosine and sine of the phase to each pixel's brightness.",
     "run": "Run an operation over a recording: built-in, or your own.",

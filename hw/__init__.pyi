@@ -9,6 +9,7 @@ from .rig.plans import AxialPlan, HorizontalPlan, RockPlan, TwistPlan, VerticalP
 from .rig.rig import Rig, open_rig
 from .rig.scan import StepScan
 from .rig.sweep import SweepScan
+from .rig.touch import RigTouch
 from .stages.grbl import GrblStage
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "Limits",
     "Position",
     "Rig",
+    "RigTouch",
     "RockPlan",
     "Stage",
     "StepScan",

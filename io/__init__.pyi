@@ -19,6 +19,7 @@ from .files.recorder import Recorder
 from .files.recording import Recording
 from .files.result_file import check_result_output, open_result, save_result
 from .files.streaming import StreamRecorder
+from .files.touch_file import save_touch
 from .files.zarr_export import save_zarr
 from .formats.export import export_result
 from .formats.mcap import save_messages
@@ -91,6 +92,7 @@ __all__ = [
     "save_messages",
     "save_result",
     "save_table",
+    "save_touch",
     "save_zarr",
     "select_turn",
     "surface_mesh",

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 def command(
     vertical: Annotated[Path, Argument(metavar="VERTICAL", help=f"Press: {FORMATS}.")],
-    axial: Annotated[Path, Argument(metavar="AXIAL", help="Rotation, of the same formats.")],
+    axial: Annotated[
+        Path | None,
+        Argument(metavar="AXIAL", help="Rotation, of the same formats; that of a touch is in its recording."),
+    ] = None,
     output: Annotated[Path | None, options.result_option("VERTICAL-fused.h5")] = None,
     overwrite: options.Overwrite = False,
     calibration: options.Calibration = None,
@@ -51,6 +54,13 @@ def command(
     robust = chosen.pop("robust", False)
     limit = bytes_of(memory, "--memory")
     target = output or vertical.with_name(f"{vertical.stem}-fused.h5")
+    if axial is None:
+        if stack or chosen or robust or not register:
+            raise io.InputError(
+                f"{vertical} alone is fused as 'touch' did it: remove the options, or name AXIAL"
+            )
+        _repeat_touch(vertical, target, calibration, limit, device, as_json, overwrite)
+        return
     with (
         _open(vertical, "vertical", stack, limit) as pressed,
         _open(axial, "axial", stack, limit) as turned,
@@ -74,6 +84,31 @@ def command(
         report_unverified(opened)
         process = {name.removeprefix(prefix): value for name, value in result.process.items()}
         report_notes(str(path), process)
+
+
+def _repeat_touch(
+    recording: Path,
+    target: Path,
+    calibration: Path | None,
+    limit: int,
+    device: str | None,
+    as_json: bool,
+    overwrite: bool,
+) -> None:
+    """Compute the surface of a touch again, from its recording."""
+    from mirrorskin import engine, io
+    from mirrorskin.cli.output import report_notes, report_unverified, save_and_report
+    from mirrorskin.engine.base.reconstruction import calibrated
+    from mirrorskin.io.files.touch_file import open_touch
+
+    with open_touch(recording, limit) as (press, turn):
+        io.check_result_output(target, recording, calibration, overwrite=overwrite)
+        calibration = calibration_of(press, calibration)
+        shared = None if calibration is None else io.open_calibration(calibration)
+        result = engine.live.fuse_touch(calibrated(press, shared), calibrated(turn, shared), device)
+    save_and_report(result, target, device, as_json, overwrite=overwrite)
+    report_unverified(press)
+    report_notes(str(recording), result.process)
 
 
 def _open(path: Path, place: Motion, stack: StackOptions, limit: int) -> Recording:

@@ -304,10 +304,12 @@ class Edges:
         usable = (after > 0) & (after + 2 < len(self.travel)) & (self.slope * widening < _WITHIN * self.step)
         after, each = after[usable], each[usable]
         before, first, *later = (self.shares[after + number, each] for number in (-1, 0, 1, 2))
+        finite = np.isfinite([first, *later]).all(axis=0)  # not where both levels are equal
+        before, first, *later = (shares[finite] for shares in (before, first, *later))
         sudden = (before < max(_MOSTLY - 0.75, 3 * self.noise)) & (np.min(later, axis=0) > _MOSTLY)
         if np.count_nonzero(sudden) < _MIN_PIXELS or self.noise > _MOST_NOISE:
             return prior
-        share, most = np.quantile((first / np.mean(later, axis=0))[sudden], (0.5, _MOSTLY))
+        share, most = np.quantile(first[sudden] / np.mean(later, axis=0)[sudden], (0.5, _MOSTLY))
         if most - share > _ALIKE * max(self.noise, _LEAST_NOISE):  # these turn light slowly
             return prior
         return math.hypot(max(1 - float(most), 0.0), self.noise / 2)

@@ -55,7 +55,7 @@ class PlannedScan(Closing):
         else:
             count = math.ceil((plan.path.duration + MARGIN) * (camera.rate or _RATE))
         self.shape, self.dtype = (count, *camera.shape), np.dtype(camera.dtype)
-        header = _header(settings, plan)
+        header = make_header(settings, plan)
         dark = np.zeros(camera.shape, np.float32) if header.dark is None else header.dark
         self.header: Header = replace(header, dark=dark)
 
@@ -124,7 +124,7 @@ class Scan(Closing):
     @functools.cached_property
     def header(self) -> Header:
         """Metadata of all frames; the first access prepares the scan."""
-        header = _header(self.rig.settings, self.plan)
+        header = make_header(self.rig.settings, self.plan)
         lifted = self.lift()
         if header.dark is None:
             late = max(_UNKNOWN_DELAY, self.rig.settings.camera.delay or 0.0) + self.rig.period
@@ -226,7 +226,7 @@ class Scan(Closing):
         self.rig.clock.sleep(max(0.0, due - self.rig.clock.now()))
 
 
-def _header(settings: RigSettings, plan: Plan) -> Header:
+def make_header(settings: RigSettings, plan: Plan) -> Header:
     """Return the metadata that are available before anything moves."""
     stage, camera = settings.stage, settings.camera
     header = Header(
@@ -321,21 +321,8 @@ class StepScan(Scan):
     def _go_on(self) -> None:
         """Move to the next position, and compute the time after which frames show the settled body."""
         self._step += 1
-        place = self._places[self._step]
-        rest = self.rig.go(place)
-        check_there(rest, place, self.rig.stage.name)
+        self._since = settle_at(self.rig, self._places[self._step], self.settle)
         self._left = self.frames
-        if self.rig.trigger is not None:
-            self._since = -math.inf
-            self._sleep_until(rest.time + self.settle)
-            return
-        camera = self.rig.settings.camera
-        delay = camera.delay or 0.0
-        if camera.delay is None or camera.streamed:
-            delay = max(_UNKNOWN_DELAY, delay)
-        exposure = self.rig.period if camera.exposure is None else camera.exposure
-        self._since = rest.time + self.settle + delay + exposure / 2
-        self.rig.camera.flush()
 
     def _take(self, limit: int) -> tuple[NDArray[Any], Floats, int]:
         """Take frames that are new enough; losses before the first frame of a position are ignored."""
@@ -345,6 +332,22 @@ class StepScan(Scan):
             if new < len(taken.time):
                 first = self._left == self.frames
                 return taken.pixels[new:], taken.time[new:], 0 if first else taken.dropped
+
+
+def settle_at(rig: Rig, place: Position, settle: float) -> float:
+    """Move to a place, and return the arrival time after which frames show the settled body."""
+    rest = rig.go(place)
+    check_there(rest, place, rig.stage.name)
+    if rig.trigger is not None:
+        rig.clock.sleep(max(0.0, rest.time + settle - rig.clock.now()))
+        return -math.inf
+    camera = rig.settings.camera
+    delay = camera.delay or 0.0
+    if camera.delay is None or camera.streamed:
+        delay = max(_UNKNOWN_DELAY, delay)
+    exposure = rig.period if camera.exposure is None else camera.exposure
+    rig.camera.flush()
+    return rest.time + settle + delay + exposure / 2
 
 
 def check_there(rest: Report, place: Position, name: str) -> None:

@@ -92,7 +92,8 @@ def open_recording(
         For Zarr a folder ``NAME.zarr``, a zipped one, or an address such as ``s3://bucket/NAME.zarr``.
     dataset : str, optional
         Name of the stack, of an archive's array or of a topic, or number of a TIFF's series or a video's
-        stream; required if the file was not written by mirrorskin and contains several.
+        stream; required if the file was not written by mirrorskin and contains several. In the recording of a
+        touch, ``turn`` is the turn after the press.
     channel : int, optional
         Channel of a TIFF or an array with several, or colour (0 red, 1 green, 2 blue); by default colours
         become luma.
@@ -158,6 +159,9 @@ def open_recording(
             file = opening.enter_context(open_file(path, memory_limit))
         except InputError as error:
             raise _explained(path, error) from None
+        if dataset is not None and file.marked(MARK, f"/{dataset.strip('/')}/entry"):
+            file.enter(dataset.strip("/"))  # another recording in the same file, as the turn of a touch
+            dataset = None
         ours = file.marked(MARK)
         file.check_layout(MARK)
         names = [dataset or STACK] if ours else names_of_stack(file, dataset)

@@ -87,6 +87,10 @@ class Hdf5File(Closing):
         parent = self._groups[group]
         return None if parent is None else self.walk(parent, last)
 
+    def enter(self, group: str) -> None:
+        """Take a group for the whole file: names are relative to it from now on."""
+        self._groups = {"": self.find(f"/{group}")}
+
     def follow(self, name: str, remedy: str) -> Node:
         """Return an object; raise InputError with the remedy if it does not exist."""
         node = self.find(name)

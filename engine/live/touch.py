@@ -1,0 +1,611 @@
+"""A touch: press, lean and turn until the fused surface has the requested standard deviation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.fusion.fusion import fuse
+from mirrorskin.engine.live.recipe import PRESS_STEPS, TURN_FRAMES, Contact, Measured, Recipe, cheapest
+from mirrorskin.engine.press.press import Press
+from mirrorskin.io import ArrayRecording, Calibrated, Calibration, InputError, Result
+from mirrorskin.io.base.arguments import check_number, checked, in_unit
+from mirrorskin.io.base.findings import Finding
+from mirrorskin.io.base.types import Header, Source
+from mirrorskin.io.watch.watch import FrameChecker
+from mirrorskin.kernels.device import Choice
+
+CLEAR_CHANGE = 8.0
+"""Change of a pixel's counts on contact, in standard deviations of the noise."""
+
+CLEAR_ERROR = 2.0
+"""Error of the common height, in standard deviations, from which on it is removed."""
+
+_MIN_PIXELS = 16  # pixels that must have changed
+_NOISE_MIN = 0.3  # counts: rounding alone, as the standard deviation of integers
+_LEAST_SHARE = 0.01  # of the pixels, on either side of a press step that shows the common height
+_LEAST_GROWTH = 0.005  # share of the picture: contact that grows by less has ended
+_LIGHT_MAX = 0.06  # share of the light by which it may change between frames
+_RETAKES = 2  # of what the check complains about
+_GAIN_MIN = 0.97  # more frames that leave more than this share of the standard deviation were of no use
+_USELESS = 2  # extensions in a row that were of no use, after which a touch ends
+_MARGIN = 0.9  # of the requested standard deviation, which recipes aim at
+_RETAKEN = ("flicker", "outliers", "repeated frames", "phase jump", "cut off", "no response")
+_SATURATED = "cut off"
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A position of the body at rest: the travel, mm, and the lean, radians."""
+
+    travel: float
+    tilt: float = 0.0
+    phase: float = 0.0
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A frame, (H, W), and the position of the body at rest in it."""
+
+    pose: Pose
+    frame: NDArray[Any]
+
+
+class TouchSensor(Protocol):
+    """What a touch needs of a sensor: a body that can be moved, and frames of it at rest.
+
+    `mirrorskin.hw.RigTouch` is one of a stage and a camera.
+
+    Attributes
+    ----------
+    name : str
+    shape : (int, int)
+        Rows and columns of a frame.
+    dtype : dtype
+        uint8, uint16 or float32.
+    header : Header
+        Of a rotation at the deepest travel, with pixel size, zenith gain, tilt and pivot.
+    start, deepest : float
+        Travel without contact, and greatest travel, mm.
+    search : float
+        Distance between frames until there is contact, mm.
+    """
+
+    name: str
+    shape: tuple[int, int]
+    dtype: np.dtype[Any]
+    header: Header
+    start: float
+    deepest: float
+    search: float
+
+    def take(self, travel: float, tilt: float = 0.0, phase: float = 0.0, /) -> NDArray[Any]:
+        """Move to a travel, mm, and a lean, radians, rest there, and return a frame of its own, (H, W)."""
+
+    def lift(self) -> None:
+        """Set the body upright, and lift it."""
+
+    def now(self) -> float:
+        """Return the time, seconds."""
+
+
+@dataclass(frozen=True)
+class Touched:
+    """Outcome of a touch.
+
+    Attributes
+    ----------
+    result : Result
+        The surface; ``height_sigma`` includes the uncertainty of the common height.
+    press, turn : ArrayRecording
+        The frames that it was computed from; `fuse_touch` of them repeats it.
+    reached : bool
+        Whether the requested share of the pixels has the requested standard deviation.
+    share : float
+        Share of the pixels with normals that has it.
+    sigma : float
+        Standard deviation that the requested share of the pixels has, mm; infinite if some have none.
+    reason : str
+        Why the touch ended.
+    planned : Recipe
+        What was expected when there was contact.
+    press_steps, turn_frames, search_frames, retaken : int
+        Frames that were taken: of the press from the last one without contact, of the turn, before contact,
+        and those that were taken again.
+    seconds : float
+        Time from the first frame to the last.
+    """
+
+    result: Result
+    press: ArrayRecording
+    turn: ArrayRecording
+    reached: bool
+    share: float
+    sigma: float
+    reason: str
+    planned: Recipe
+    press_steps: int
+    turn_frames: int
+    search_frames: int
+    retaken: int
+    seconds: float
+
+    def __str__(self) -> str:
+        known = f"{self.share:.1%} of the pixels have the requested standard deviation"
+        frames = f"{self.press_steps} press steps and {self.turn_frames} turn frames in {self.seconds:.1f} s"
+        return f"{frames}: {known}; {self.reason}"
+
+
+@checked(sigma=in_unit("mm", check_number), share=check_number, within=in_unit("s", check_number))
+def touch(
+    sensor: TouchSensor,
+    sigma: float,
+    *,
+    share: float = 0.95,
+    within: float = math.inf,
+    calibration: Calibration | None = None,
+    device: Choice = None,
+    taken: list[Taken] | None = None,
+    on_update: Callable[[str, Result | None], None] | None = None,
+) -> Touched:
+    """Press and turn until a share of the pixels has the requested standard deviation.
+
+    The body is lowered until pixels change, and further in the steps of the recipe that is expected to
+    suffice; it leans and turns at the deepest place. The fused surface decides: its standard deviations are
+    measured from the frames. If they are too large, the frames that are expected to help most are added. What
+    the check of the frames complains about is taken again.
+
+    With n turn frames and b boundaries between press steps the expected variance of a height is ::
+
+        a^2 s_r s_t ln(1 + 8 / (w a^2 s_r s_t)) / (4 pi) + beta^2 / b
+
+    where a is the pixel size, s_r = c / (g sqrt(n)) and s_t = tan(theta) c sqrt(2 / n) / (g d) are the
+    standard deviations of slopes along and across the inclination theta, for the noise c, the zenith gain g
+    and the tilt d; beta is the rise within a pixel, a tan(theta) / sqrt(12), and w the density of boundaries.
+
+    Parameters
+    ----------
+    sensor : TouchSensor
+        Such as `mirrorskin.hw.RigTouch`.
+    sigma : float
+        Requested standard deviation of heights, mm, above 0.
+    share : float
+        Share of the pixels with normals that must have it, above 0 to 1.
+    within : float
+        Seconds from the first frame; the best surface so far is returned then.
+    calibration : Calibration, optional
+        Applied to the frames of both movements.
+    device : str, Device or sequence of them, optional
+        See ``mirrorskin.kernels.device.open_devices``.
+    taken : list of Taken, optional
+        Receives all frames that are used, so that a caller can keep them if the touch fails.
+    on_update : callable, optional
+        Called with a line of text and the newest surface, or None, whenever either changes.
+
+    Returns
+    -------
+    Touched
+        The surface, why the touch ended, and the recordings of both movements.
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        Impossible numbers; a sensor without zenith gain or pixel size; or no contact.
+
+    Examples
+    --------
+    >>> from mirrorskin import engine, hw
+    >>> with hw.open_rig(hw.load_rig("rig.toml"), steps=True) as rig:  # doctest: +SKIP
+    ...     print(engine.live.touch(hw.RigTouch(rig), 0.003))
+    """
+    if not 0 < sigma < math.inf:
+        raise InputError(f"sigma {sigma:g} mm is not possible: give a standard deviation above 0, as 0.002")
+    if not 0 < share <= 1:
+        raise InputError(f"share {share:g} is not possible: give one above 0, at most 1")
+    if not within > 0:
+        raise InputError(f"within {within:g} s is not possible: give a time above 0")
+    check_sensor(sensor, calibration)
+    tell = on_update or (lambda text, result: None)
+    work = _Touch(sensor, sigma, share, within, calibration, device, [] if taken is None else taken, tell)
+    return work.run()
+
+
+def check_sensor(sensor: TouchSensor, calibration: Calibration | None = None) -> Header:
+    """Return the calibrated header of a turn; InputError without what heights from slopes need."""
+    blank = np.zeros((2, *sensor.shape), sensor.dtype)
+    frames = [Taken(Pose(0.0, 1.0, phase), blank[0]) for phase in (0.0, 1.0)]
+    _, turn = recordings_of(sensor, frames)
+    assert turn is not None
+    header = _calibrated(turn, calibration).header
+    for value, what in ((header.pixel_size, "pixel_size"), (header.zenith_gain, "zenith_gain")):
+        if value is None:
+            raise InputError(
+                f"{sensor.name}: a touch needs {what}: give it in the rig file, or a calibration"
+            )
+    return header
+
+
+def _calibrated(source: ArrayRecording, calibration: Calibration | None) -> Source:
+    return source if calibration is None else Calibrated(source, calibration)
+
+
+def recordings_of(
+    sensor: TouchSensor, frames: Sequence[Taken]
+) -> tuple[ArrayRecording | None, ArrayRecording | None]:
+    """Return the frames so far as a press, in the order of travel, and a rotation; None for less than two.
+
+    The press has no references: each pixel has levels of its own, because the light depends on its slope.
+    """
+    upright = sorted((t for t in frames if t.pose.tilt == 0), key=lambda t: t.pose.travel)
+    leaning = [taken for taken in frames if taken.pose.tilt != 0]
+    header = sensor.header
+    levels = {"dark", "bright", "zenith_gain", "zenith_offset", "press", "tilt", "pivot", "motion"}
+    fields = {name: getattr(header, name) for name in header.__dataclass_fields__}
+    plain = {name: value for name, value in fields.items() if name not in levels and value is not None}
+    press = turn = None
+    if len(upright) >= 2:
+        stack = np.stack([taken.frame for taken in upright])
+        travel = [taken.pose.travel for taken in upright]
+        title = f"{sensor.name}, press"
+        press = ArrayRecording(stack, {"travel": travel}, {**plain, "title": title}, name=title)
+    if len(leaning) >= 2:
+        stack = np.stack([taken.frame for taken in leaning])
+        phase = [taken.pose.phase for taken in leaning]
+        axial = {name: value for name, value in fields.items() if name != "motion" and value is not None}
+        title = f"{sensor.name}, turn"
+        axial |= {"press": leaning[0].pose.travel, "title": title}
+        turn = ArrayRecording(stack, {"phase": phase}, axial, name=title)
+    return press, turn
+
+
+def fuse_touch(press: Source, turn: Source, device: Choice = None) -> Result:
+    """Return the surface of the press and the turn of a touch.
+
+    Each pixel of the press has levels of its own. The common height is checked: at each press step, the
+    pixels in contact must be the highest ones. The mean error of the steps is removed from the heights if it
+    is clear, more than two standard deviations. Their scatter over the steps, with the rise of the surface
+    within a pixel as one prior degree of freedom, divided by the square root of their number, is the
+    uncertainty of the common height, which is added to ``height_sigma``. Parts of the surface whose height is
+    unknown have none.
+    """
+    method: dict[str, Any] = {"method": "change-point"}
+    surface = fuse(press, turn, press=method, device=device)
+    travel: NDArray[np.float64] = np.asarray(press.travel)  # type: ignore[attr-defined]
+    onset = -np.asarray(Press(**method, fill=False, device=device).run(press).height, np.float64)
+    errors = _height_errors(surface, onset, travel)
+    rise = _rise_within_pixel(surface, max(press.header.pixel_size or (0.0,)))
+    if errors.size:
+        mean = float(errors.mean())
+        common = math.sqrt((rise**2 + float(np.sum((errors - mean) ** 2))) / errors.size**2)
+    else:  # it rises by less than a step
+        mean, common = 0.0, float(np.diff(np.unique(travel))[-1]) / math.sqrt(12)
+    shift = mean if abs(mean) > CLEAR_ERROR * common else 0.0
+    sigma = np.hypot(np.asarray(surface.height_sigma), np.float32(common))
+    component, unknown = np.asarray(surface.component), np.asarray(surface.offset_unknown)
+    sigma[(component >= 0) & (unknown[np.maximum(component, 0)] != 0)] = np.nan
+    process = {**surface.process, "common_height_sigma": common, "common_height_shift": shift}
+    return surface.assign(
+        height=np.asarray(surface.height) + np.float32(shift), height_sigma=sigma, process=process
+    )
+
+
+def _height_errors(
+    surface: Result, onset: NDArray[np.float64], travel: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return, for each press step that shows it, by how much the surface is too low there, mm.
+
+    Of the pixels within half a step, those that are in contact must be the highest ones: the height at which
+    the fewest pixels contradict this is compared with the travel.
+    """
+    depth = -np.asarray(surface.height, np.float64)
+    usual = np.isfinite(depth) & np.isfinite(onset) & np.isfinite(np.asarray(surface.height_sigma))
+    depth, onset = depth[usual], onset[usual]
+    least = max(_MIN_PIXELS, _LEAST_SHARE * len(onset))
+    places = np.unique(travel)
+    errors = []
+    for before, place, after in zip(places, places[1:], places[2:], strict=False):
+        near = (depth > (before + place) / 2) & (depth < (place + after) / 2)
+        order = np.argsort(depth[near])
+        there, touched = depth[near][order], onset[near][order] < place
+        if min(np.count_nonzero(touched), np.count_nonzero(~touched)) < least:
+            continue
+        wrong = np.concatenate([[0], np.cumsum(~touched)]) + np.concatenate(
+            [np.cumsum(touched[::-1])[::-1], [0]]
+        )
+        fewest = np.flatnonzero(wrong == wrong.min())
+        edges = np.concatenate([there[:1], (there[1:] + there[:-1]) / 2, there[-1:]])
+        errors.append(float(np.mean(edges[fewest])) - place)
+    return np.array(errors)
+
+
+def _rise_within_pixel(surface: Result, pixel: float) -> float:
+    """Return the standard deviation of the surface within a typical pixel, mm."""
+    normals = np.asarray(surface.normals, np.float64)
+    normals = normals[np.isfinite(normals[..., 0])]
+    slope = np.hypot(normals[:, 0], normals[:, 1]) / np.maximum(normals[:, 2], 1e-3)
+    return pixel * float(np.median(slope)) / math.sqrt(12) if slope.size else math.inf
+
+
+def sigma_of_normals(surface: Result) -> NDArray[np.float64]:
+    """Return the standard deviations of the heights of all pixels with a normal, mm; inf without any."""
+    with_normal = np.isfinite(np.asarray(surface.normals)[..., 0])
+    sigma = np.asarray(surface.height_sigma, np.float64)[with_normal]
+    return np.where(np.isfinite(sigma), sigma, np.inf)
+
+
+class _Touch:
+    """State of a touch."""
+
+    def __init__(
+        self,
+        sensor: TouchSensor,
+        sigma: float,
+        share: float,
+        within: float,
+        calibration: Calibration | None,
+        device: Choice,
+        taken: list[Taken],
+        tell: Callable[[str, Result | None], None],
+    ) -> None:
+        self._sensor, self._sigma, self._share, self._within = sensor, sigma, share, within
+        self._device, self._tell, self._taken = device, tell, taken
+        self._calibration = calibration
+        self._began = sensor.now()
+        self._searched = self._retaken = 0
+        self._doubts: dict[str, str] = {}  # findings that were left, by kind
+
+    def run(self) -> Touched:
+        """Find contact, press and turn, and add what helps until the surface is good enough."""
+        contact = self._find_contact()
+        planned = self._plan(contact)
+        self._tell(f"expected: {planned}", None)
+        self._press(np.linspace(self._first, self._sensor.deepest, planned.press_steps + 1)[1:])
+        self._turn(planned.turn_frames)
+        outcome = best = self._measure(planned)
+        if not best.reached and _contradict(best):  # something may have moved
+            self._tell(f"{best}; heights and slopes contradict each other: all is taken again", best.result)
+            poses = [taken.pose for taken in self._taken[self._searched :]]
+            del self._taken[self._searched :]
+            self._retaken += len(poses)
+            for pose in poses:
+                self._take(pose)
+            outcome = best = self._measure(planned)
+        useless, reason = 0, ""
+        while not best.reached:
+            following, reason = self._following(contact, outcome)
+            if following is None:
+                break
+            self._tell(f"{outcome}; expected: {following}", outcome.result)
+            self._extend(outcome, following)
+            newer = self._measure(planned)
+            useless = useless + 1 if newer.sigma > _GAIN_MIN * best.sigma else 0
+            outcome = newer
+            best = outcome if outcome.reached or outcome.sigma < best.sigma else best
+            if useless == _USELESS and not best.reached:
+                reason = f"more frames no longer help, limited by {_limit(best)}"
+                break
+        self._sensor.lift()
+        reason = "; ".join(["the request is met" if best.reached else reason, *self._doubts.values()])
+        return replace(best, reason=reason, retaken=self._retaken, seconds=self._seconds)
+
+    def _take(self, pose: Pose) -> NDArray[Any]:
+        frame = self._sensor.take(pose.travel, pose.tilt, pose.phase)
+        self._taken.append(Taken(pose, frame))
+        return frame
+
+    @property
+    def _seconds(self) -> float:
+        return self._sensor.now() - self._began
+
+    def _find_contact(self) -> Contact:
+        """Lower the body until pixels change; return what is expected of the touch."""
+        sensor = self._sensor
+        places = np.arange(sensor.start, sensor.deepest, sensor.search)
+        frames = [np.asarray(self._take(Pose(float(place))), np.float32) for place in places[:2]]
+        noise = max(_NOISE_MIN, float(np.std(frames[1] - frames[0])) / math.sqrt(2))
+        before = (frames[0] + frames[1]) / 2
+        for place in places[2:]:
+            frame = np.asarray(self._take(Pose(float(place))), np.float32)
+            changed = np.abs(frame - before) > CLEAR_CHANGE * noise
+            if np.count_nonzero(changed) >= _MIN_PIXELS:
+                break
+        else:
+            sensor.lift()
+            raise InputError(
+                f"{sensor.name}: no contact down to a travel of {sensor.deepest:g} mm: check the position of"
+                " the object and the light, or allow a deeper press"
+            )
+        self._before, self._clear = before, CLEAR_CHANGE * noise
+        self._taken.pop()  # it is between press steps, which must be even
+        self._first = self._taken[-1].pose.travel
+        self._searched = len(self._taken)
+        header = check_sensor(sensor, self._calibration)
+        gain, offset = (
+            0.0 if counts is None else float(np.mean(counts))
+            for counts in (header.zenith_gain, header.zenith_offset)
+        )
+        zenith = float(np.median(np.clip((frame[changed] - offset) / gain, 0.05, 1.2)))
+        pixel, tilt = max(header.pixel_size or (0.0,)), header.tilt or 0.0
+        return Contact(pixel, noise, abs(gain), tilt, zenith, sensor.deepest - self._first)
+
+    def _plan(self, contact: Contact) -> Recipe:
+        """Return the cheapest recipe; if none suffices in time, what is possible in it."""
+        room = (self._within - self._seconds) / self._each
+        recipe = cheapest(contact.variance, _MARGIN * self._sigma)
+        if recipe is None or recipe.frames > room:
+            most = min(room, (PRESS_STEPS[1] + TURN_FRAMES[1]) / 2)
+            turn = TURN_FRAMES[0]
+            press = max(PRESS_STEPS[0], min(PRESS_STEPS[1] // 2, math.floor(most) - turn))
+            recipe = Recipe(press, turn, math.sqrt(contact.variance(press, turn)))
+        return self._timed(recipe, 0)
+
+    @property
+    def _each(self) -> float:
+        """Seconds per frame so far."""
+        return self._seconds / (len(self._taken) + 1)
+
+    def _timed(self, recipe: Recipe, taken: int) -> Recipe:
+        return replace(recipe, seconds=self._each * (recipe.frames - taken))
+
+    def _press(self, travels: Sequence[float] | NDArray[np.float64]) -> None:
+        """Take frames at some travels, and again if the check complains; end if contact stops growing."""
+        share, first = 0.0, len(self._taken)
+        for travel in sorted(travels):
+            if any(abs(travel - taken.pose.travel) < 1e-6 for taken in self._taken):
+                continue
+            frame = self._take(Pose(float(travel)))
+            here = float(np.mean(np.abs(frame - self._before) > self._clear))
+            if travel > self._deepest and 0 < here < share + _LEAST_GROWTH:
+                break
+            share = here
+        self._check(first)
+
+    def _turn(self, count: int) -> None:
+        """Lean at the deepest place, and take evenly spaced frames of a turn."""
+        sensor = self._sensor
+        tilt, press = sensor.header.tilt or 0.0, self._deepest
+        earlier = [taken for taken in self._taken if taken.pose.tilt]
+        first, shift = len(self._taken), math.pi / len(earlier) if earlier else 0.0
+        for number in range(count):
+            self._take(Pose(press, tilt, (math.tau * number / count + shift) % math.tau))
+        self._check(first)
+
+    @property
+    def _deepest(self) -> float:
+        """Travel of the deepest frame that is upright."""
+        return max(taken.pose.travel for taken in self._taken if not taken.pose.tilt)
+
+    def _check(self, first: int) -> None:
+        """Take frames from a number on again, while the check complains about them."""
+        sensor = self._sensor
+        leaning = bool(self._taken[-1].pose.tilt)
+        for attempt in range(_RETAKES + 1):
+            recording = recordings_of(sensor, self._taken)[int(leaning)]
+            if recording is None:
+                return
+            found = {finding.kind: finding.text for finding in _check(recording) if finding.kind in _RETAKEN}
+            if not found or attempt == _RETAKES:
+                self._doubts |= found
+                return
+            again = [taken.pose for taken in self._taken[first:] if bool(taken.pose.tilt) == leaning]
+            del self._taken[first:]
+            self._retaken += len(again)
+            self._tell(f"{len(again)} frames are taken again: {'; '.join(found.values())}", None)
+            for pose in again:
+                self._take(pose)
+
+    def _measure(self, planned: Recipe) -> Touched:
+        """Return the outcome so far."""
+        press, turn = recordings_of(self._sensor, self._taken)
+        assert press is not None
+        assert turn is not None
+        calibration = self._calibration
+        result = fuse_touch(_calibrated(press, calibration), _calibrated(turn, calibration), self._device)
+        sigma = sigma_of_normals(result)
+        share = float(np.mean(sigma <= self._sigma)) if sigma.size else 0.0
+        reaching = float(np.quantile(sigma, self._share, method="higher")) if sigma.size else math.inf
+        steps = press.shape[0] - self._searched
+        counts = steps, turn.shape[0], self._searched, self._retaken
+        reached = share >= self._share
+        return Touched(result, press, turn, reached, share, reaching, "", planned, *counts, self._seconds)
+
+    def _following(self, contact: Contact, outcome: Touched) -> tuple[Recipe | None, str]:
+        """Return the next recipe, or None and the reason; press steps are halved, so that they stay even."""
+        press, turn = outcome.press_steps, outcome.turn_frames
+        finer = [press, 2 * press] if 2 * press <= PRESS_STEPS[1] else [press]
+        more = [(steps, count) for steps in finer for count in range(turn, TURN_FRAMES[1] + 1)][1:]
+        known = math.isfinite(outcome.sigma)
+        if not more or not (known or len(finer) == 2):
+            text = f"{press} press steps and {turn} turn frames do not suffice"
+            return None, f"{text}, limited by {_limit(outcome)}"
+        variance = outcome.sigma**2 if known else math.inf
+        measured = Measured(press, turn, variance, contact.variance_of_turn(press, turn))
+        recipes = [Recipe(*counts, math.sqrt(measured.after(*counts))) for counts in more]
+        enough = [recipe for recipe in recipes if recipe.sigma <= _MARGIN * self._sigma]
+        usual = (2 * press, turn) if len(finer) == 2 else (press, min(2 * turn, TURN_FRAMES[1]))
+        other = next(recipe for recipe in recipes if (recipe.press_steps, recipe.turn_frames) == usual)
+        recipe = self._timed(min(enough, key=lambda r: (r.frames, r.sigma), default=other), press + turn)
+        if self._seconds + recipe.seconds > self._within:
+            return None, f"there is no time for {recipe}, limited by {_limit(outcome)}"
+        return recipe, ""
+
+    def _extend(self, outcome: Touched, recipe: Recipe) -> None:
+        """Take the middles of all press steps, and turn frames in between those so far."""
+        if recipe.press_steps > outcome.press_steps:
+            places = self._places
+            self._press((places[1:] + places[:-1]) / 2)
+        if recipe.turn_frames > outcome.turn_frames:
+            self._turn(recipe.turn_frames - outcome.turn_frames)
+
+    @property
+    def _places(self) -> NDArray[np.float64]:
+        """Travels of the press, from the last one without contact."""
+        travels = {taken.pose.travel for taken in self._taken if not taken.pose.tilt}
+        return np.array(sorted(travel for travel in travels if travel >= self._first))
+
+
+def _check(recording: ArrayRecording) -> Sequence[Finding]:
+    """Return the warnings of the check of frames, also of few."""
+    watch = FrameChecker(recording, alone=True)
+    frames, count = np.empty(recording.shape, recording.dtype), 0
+    recording.rewind()
+    while count < len(frames) and (block := recording.read(frames[count:])) is not None:
+        watch.push(block)
+        frames[count : count + len(block.frames)] = block.frames
+        count += len(block.frames)
+    recording.rewind()
+    change = _change_of_light(frames, recording.phase)
+    found = watch.check().warnings
+    if change > _LIGHT_MAX:
+        found += (Finding("flicker", f"the light changes by {change:.1%} between frames: use a steady lamp"),)
+    return found
+
+
+def _change_of_light(frames: NDArray[Any], phase: NDArray[np.float64] | None) -> float:
+    """Return the largest change of the light between frames, as a share of it.
+
+    Of a turn, the mean brightness of the picture is fitted by one harmonic of the phase. Of a press, pixels
+    in contact in two frames and in the one before have the same brightness in both.
+    """
+    counts = frames.astype(np.float32)
+    lit = counts > max(1.0, float(counts.max())) / 4
+    if phase is not None:
+        always = lit.all(axis=0)
+        if np.count_nonzero(always) < _MIN_PIXELS:
+            return 0.0
+        means = counts[:, always].mean(axis=1).astype(np.float64)
+        columns = np.column_stack([np.ones(len(phase)), np.cos(phase), np.sin(phase)])
+        residual = means - columns @ np.linalg.lstsq(columns, means, rcond=None)[0]
+        free = max(1e-9, 1 - min(3, len(phase)) / len(phase))  # share of a change that the fit leaves
+        return float(np.abs(residual).max() / means.mean() / free) if len(phase) > 3 else 0.0
+    changes = [0.0]
+    for number in range(2, len(counts)):
+        both = lit[number - 2] & lit[number - 1] & lit[number]
+        if np.count_nonzero(both) >= max(_MIN_PIXELS, _LEAST_SHARE * both.size):
+            changes.append(abs(float(np.median(counts[number][both] / counts[number - 1][both])) - 1))
+    return max(changes)
+
+
+def _contradict(outcome: Touched) -> bool:
+    """Return whether most of the variance is the contradiction of heights and slopes."""
+    return 2 * float(outcome.result.process.get("disagreement", 0.0)) ** 2 > outcome.sigma**2
+
+
+def _limit(outcome: Touched) -> str:
+    """Return what limits the standard deviation of an outcome."""
+    result = outcome.result
+    sigma = np.asarray(result.height_sigma, np.float64)
+    with_normal = np.isfinite(np.asarray(result.normals)[..., 0])
+    if not np.isfinite(sigma[with_normal]).any() or not math.isfinite(outcome.sigma):
+        return "pixels without a height: there is no contact, or no light"
+    common = float(result.process["common_height_sigma"])
+    if 2 * common**2 > outcome.sigma**2:
+        return f"the common height ({1e3 * common:.2g} µm, from the press steps)"
+    if _contradict(outcome):
+        return "the calibration: heights and slopes contradict each other"
+    return "the noise of the slopes, and the blur at edges"
