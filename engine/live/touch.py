@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +32,7 @@ _NOISE_MIN = 0.3  # counts: rounding alone, as the standard deviation of integer
 _LEAST_SHARE = 0.01  # of the pixels, on either side of a press step that shows the common height
 _LEAST_GROWTH = 0.005  # share of the picture: contact that grows by less has ended
 _LIGHT_MAX = 0.06  # share of the light by which it may change between frames
+_MOVED_MAX, _SMOOTHED = 0.5, 2.0  # pixels: largest shift between press and turn, and Gaussian blur for it
 _RETAKES = 2  # of what the check complains about
 _GAIN_MIN = 0.97  # more frames that leave more than this share of the standard deviation were of no use
 _USELESS = 2  # extensions in a row that were of no use, after which a touch ends
@@ -366,15 +368,8 @@ class _Touch:
         self._tell(f"expected: {planned}", None)
         self._press(np.linspace(self._first, self._sensor.deepest, planned.press_steps + 1)[1:])
         self._turn(planned.turn_frames)
+        self._take_again_if_moved()
         outcome = best = self._measure(planned)
-        if not best.reached and _contradict(best):  # something may have moved
-            self._tell(f"{best}; heights and slopes contradict each other: all is taken again", best.result)
-            poses = [taken.pose for taken in self._taken[self._searched :]]
-            del self._taken[self._searched :]
-            self._retaken += len(poses)
-            for pose in poses:
-                self._take(pose)
-            outcome = best = self._measure(planned)
         useless, reason = 0, ""
         while not best.reached:
             following, reason = self._following(contact, outcome)
@@ -499,6 +494,23 @@ class _Touch:
             for pose in again:
                 self._take(pose)
 
+    def _take_again_if_moved(self) -> None:
+        """Take press and turn again if the object moved between them, as by a bump."""
+        for attempt in range(_RETAKES + 1):
+            moved = _moved(*recordings_of(self._sensor, self._taken))
+            if moved <= _MOVED_MAX:
+                return
+            text = f"the object moved by {moved:.1f} pixels between press and turn"
+            if attempt == _RETAKES:
+                self._doubts["moved"] = text
+                return
+            self._tell(f"{text}: both are taken again", None)
+            poses = [taken.pose for taken in self._taken[self._searched :]]
+            del self._taken[self._searched :]
+            self._retaken += len(poses)
+            for pose in poses:
+                self._take(pose)
+
     def _measure(self, planned: Recipe) -> Touched:
         """Return the outcome so far."""
         press, turn = recordings_of(self._sensor, self._taken)
@@ -589,6 +601,26 @@ def _change_of_light(frames: NDArray[Any], phase: NDArray[np.float64] | None) ->
         if np.count_nonzero(both) >= max(_MIN_PIXELS, _LEAST_SHARE * both.size):
             changes.append(abs(float(np.median(counts[number][both] / counts[number - 1][both])) - 1))
     return max(changes)
+
+
+def _moved(press: ArrayRecording | None, turn: ArrayRecording | None) -> float:
+    """Return by how many pixels the mean picture of a turn is shifted from the deepest one of the press.
+
+    The mean of a turn shows the same picture, because its leans cancel. The shift is that of least squares.
+    """
+    assert press is not None
+    assert turn is not None
+    frames = np.stack([turn.frame(number) for number in range(turn.shape[0])])
+    pictures = press.frame(press.shape[0] - 1), frames.mean(axis=0)
+    deepest, mean = (cv2.GaussianBlur(np.float32(picture), (0, 0), _SMOOTHED) for picture in pictures)
+    lit = (np.minimum(deepest, mean) > deepest.max() / 4).astype(np.uint8)
+    inner = cv2.erode(lit, np.ones((9, 9), np.uint8)) > 0
+    if np.count_nonzero(inner) < _MIN_PIXELS**2:
+        return 0.0
+    down, right = np.gradient(deepest)
+    columns = np.column_stack([right[inner], down[inner], deepest[inner]])  # and the light
+    shift = np.linalg.lstsq(columns, (deepest - mean)[inner], rcond=1e-2)[0]
+    return float(np.hypot(*shift[:2]))
 
 
 def _contradict(outcome: Touched) -> bool:
