@@ -161,6 +161,7 @@ QUICK = {
     "focus": focused,
     "fringes": unwrapped,
     "fused": fused,
+    "touch": fused,
     "lamps": lit,
     "live_heights": grown,
     "own_camera": streamed,

@@ -18,6 +18,7 @@ _ORDER = [
     "sphere",
     "coin",
     "fused",
+    "touch",
     "own_data",
     "app",
     "live_heights",

@@ -140,7 +140,7 @@ class Touched:
     def __str__(self) -> str:
         known = f"{self.share:.1%} of the pixels have the requested standard deviation"
         frames = f"{self.press_steps} press steps and {self.turn_frames} turn frames in {self.seconds:.1f} s"
-        return f"{frames}: {known}; {self.reason}"
+        return f"{frames}: {known}{self.reason and f'; {self.reason}'}"
 
 
 @checked(sigma=in_unit("mm", check_number), share=check_number, within=in_unit("s", check_number))
@@ -612,7 +612,9 @@ def _moved(press: ArrayRecording | None, turn: ArrayRecording | None) -> float:
     assert turn is not None
     frames = np.stack([turn.frame(number) for number in range(turn.shape[0])])
     pictures = press.frame(press.shape[0] - 1), frames.mean(axis=0)
-    deepest, mean = (cv2.GaussianBlur(np.float32(picture), (0, 0), _SMOOTHED) for picture in pictures)
+    deepest, mean = (
+        cv2.GaussianBlur(np.asarray(picture, np.float32), (0, 0), _SMOOTHED) for picture in pictures
+    )
     lit = (np.minimum(deepest, mean) > deepest.max() / 4).astype(np.uint8)
     inner = cv2.erode(lit, np.ones((9, 9), np.uint8)) > 0
     if np.count_nonzero(inner) < _MIN_PIXELS**2:
