@@ -30,10 +30,9 @@ def show(text, result):
 
 
 with EmulatedRig("cone", rate=20.0, clock=CLOCK, **SCENE) as emulated:
-    settings = emulated.settings
-    with Rig(emulated.open_stage(settings.stage), emulated.camera, settings, CLOCK) as rig:
-        with hw.RigTouch(rig, press=0.6, start=-0.8) as sensor:
-            outcome = engine.live.touch(sensor, SIGMA, on_update=show)
+    rig = Rig(emulated.open_stage(emulated.settings.stage), emulated.camera, emulated.settings, CLOCK)
+    with rig, hw.RigTouch(rig, press=0.6, start=-0.8) as sensor:
+        outcome = engine.live.touch(sensor, SIGMA, on_update=show)
     surface, turn = outcome.result, outcome.turn
     truth = emulated.twin(Axial(turn.phase, turn.header.tilt, turn.header.press)).truth
 print(outcome)
