@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, sparse, special
@@ -37,21 +38,39 @@ _FIRM = 0.05  # share of the maximum pressure below which the contact of a cell 
 _ROUGH_TOLERANCE, _ROUGH_STEPS = 2e-2, 60  # relative residual, and maximum number of steps, for derivatives
 _OWN = _SOFTNESS * 4 * math.log(1 + math.sqrt(2))  # displacement of a square of side 1 by unit strain on it
 _SIZES = 4  # pixels: granularity of the size of windows
+_INVERSE = cv2.DFT_INVERSE | cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT
 MARGIN = 0.1
 """Margin of the window in which a contact is searched, as a share of the initial contact's length."""
 
 _COARSEST = 16  # pixels: minimum side of a surface of half the resolution
 
 
-def transform(values: Reals, padded: tuple[int, int]) -> NDArray[Any]:
-    """Return the transform of maps, (..., H, W), on a padded grid; empty rows are not transformed."""
-    return np.asarray(fft.fft(fft.rfft(values, padded[1]), padded[0], axis=-2, overwrite_x=True))
+def transform(values: Reals, padded: tuple[int, int]) -> Reals:
+    """Return the transforms of maps, (..., H, W), on a padded grid, in OpenCV's packed format for real maps."""
+    waves = np.zeros((*values.shape[:-2], *padded), values.dtype)
+    waves[..., : values.shape[-2], : values.shape[-1]] = values
+    for wave in waves.reshape(-1, *padded):
+        cv2.dft(wave, dst=wave)
+    return waves
 
 
-def inverse_transform(wave: NDArray[Any], padded: tuple[int, int], shape: tuple[int, int]) -> Reals:
-    """Return the maps, (..., H, W), of a shape, from their transforms on a padded grid."""
-    rows = fft.ifft(wave, axis=-2, overwrite_x=True)[..., : shape[0], :]
-    return np.asarray(fft.irfft(rows, padded[1])[..., : shape[1]])
+def inverse_transform(waves: Reals, shape: tuple[int, ...]) -> Reals:
+    """Return the maps, (..., H, W), of a shape, from their transforms, which are overwritten."""
+    for wave in waves.reshape(-1, *waves.shape[-2:]):
+        cv2.dft(wave, dst=wave, flags=_INVERSE)
+    return waves[..., : shape[0], : shape[1]]
+
+
+def packed(spectrum: Doubles, columns: int) -> Doubles:
+    """Return a real spectrum, (H, columns // 2 + 1), as factors of the numbers of a packed transform.
+
+    A packed transform has real and imaginary parts next to each other, along rows; those of the first column,
+    and of the last if ``columns`` is even, are along this column. Numbers without imaginary part have none.
+    """
+    factors = spectrum.repeat(2, axis=1)[:, 1 : columns + 1]
+    for column in (0, -1) if columns % 2 == 0 else (0,):
+        factors[:, column] = factors[:, column].repeat(2)[1 : len(factors) + 1]
+    return factors
 
 
 class HalfSpace:
@@ -92,16 +111,14 @@ class HalfSpace:
     def displacement(self, strain: NDArray[Real]) -> NDArray[Real]:
         """Return the displacement by pressures over Young's modulus, (..., H, W) mm, positive inwards."""
         wave = transform(strain, self._padded)
-        wave *= _spectrum(self.shape, self._whole, self.pixel_size, wave.real.dtype)
-        moved: NDArray[Real] = inverse_transform(wave, self._padded, self.shape)
-        return moved
+        wave *= _spectrum(self.shape, self._whole, self.pixel_size, wave.dtype)
+        return inverse_transform(wave, self.shape)
 
     def pressed(self, moved: NDArray[Real]) -> NDArray[Real]:
         """Return approximately the strain of displacements, (..., H, W), as if the grid were periodic."""
-        wave = fft.rfft2(moved)
-        wave *= _inverse_spectrum(self.shape, self.pixel_size, wave.real.dtype)
-        strain: NDArray[Real] = fft.irfft2(wave, self.shape, overwrite_x=True)
-        return strain
+        wave = transform(moved, self.shape)
+        wave *= _inverse_spectrum(self.shape, self.pixel_size, wave.dtype)
+        return inverse_transform(wave, self.shape)
 
     def influence(self) -> Doubles:
         """Return the displacement of the pixels below and to the right by unit strain on one, (H, W), mm."""
@@ -361,11 +378,12 @@ def _spectrum(
 @lru_cache(maxsize=128)
 def _inverse_spectrum(shape: tuple[int, int], pixel_size: tuple[float, float], dtype: np.dtype[Any]) -> Reals:
     """Return the inverse of the spectrum of a point's displacement on a periodic grid, 1/mm."""
-    return (1 / _cut_off(shape, pixel_size, reach_of(shape, pixel_size))[0]).astype(dtype)
+    spectrum = 1 / _cut_off(shape, pixel_size, reach_of(shape, pixel_size))[0]
+    return packed(spectrum, shape[1]).astype(dtype)
 
 
 def spectrum_of(weights: Doubles, sign: float = 1.0) -> Doubles:
-    """Return the transform of weights (H, W) on the padded grid, which are even, or odd along both axes."""
+    """Return the packed transform of weights (H, W) on the padded grid, even, or odd along both axes."""
     rows, columns = weights.shape
     whole = np.zeros(padded_shape((rows, columns)))
     whole[:rows, :columns] = weights
@@ -373,7 +391,7 @@ def spectrum_of(weights: Doubles, sign: float = 1.0) -> Doubles:
         whole[-rows + 1 :, :columns] = sign * weights[:0:-1]
     if columns > 1:
         whole[:, -columns + 1 :] = sign * whole[:, columns - 1 : 0 : -1]
-    return np.ascontiguousarray(fft.rfft2(whole).real)
+    return packed(fft.rfft2(whole).real, whole.shape[1])
 
 
 class Targets(NamedTuple):

@@ -17,6 +17,7 @@ from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.force.halfspace import (
     influences,
     inverse_transform,
+    packed,
     padded_shape,
     reach_of,
     spectrum_of,
@@ -35,7 +36,6 @@ Singles = NDArray[np.float32]
 _SOFTNESS = 3 / (4 * math.pi)  # 1 / (4 pi G) at E = 1: G = E / 3
 UP = np.array([1.0, -1.0]).reshape(2, 1, 1)  # y points up, rows increase downwards
 _TOLERANCE, _ROUGH = 1e-4, 1e-3  # residual relative to the largest displacement; with damping, the second
-_LARGEST_BATCHED = 2**14  # numbers whose transforms stay in a processor's cache when several are done at once
 _MAX_STEPS = 400  # maximum number of conjugate gradient steps
 _MAX_DISPLACEMENT = 1e6  # maximum displacement, mm
 MIN_COVERAGE = 0.8  # minimum share of the contact with a displacement
@@ -288,17 +288,15 @@ class ContactShear:
 
 def _filtered(values: Singles, spectra: Singles, shape: tuple[int, int]) -> Singles:
     """Return the convolution of vectors, (..., 2, H, W), with a symmetric tensor of spectra xx, yy and xy."""
-    if values.ndim == 4 and values[0].size > _LARGEST_BATCHED:
-        return np.stack([_filtered(part, spectra, shape) for part in values])
     wave = transform(values, shape)
     xx, yy, xy = spectra
     x, y = wave[..., 0, :, :], wave[..., 1, :, :]
-    product = np.empty_like(wave)
-    np.multiply(xx, x, out=product[..., 0, :, :])
-    np.multiply(yy, y, out=product[..., 1, :, :])
-    product[..., 0, :, :] += xy * y
-    product[..., 1, :, :] += xy * x
-    return inverse_transform(product, shape, (values.shape[-2], values.shape[-1]))
+    across = xy * x
+    x *= xx
+    x += xy * y
+    y *= yy
+    y += across
+    return inverse_transform(wave, values.shape[-2:])
 
 
 @lru_cache(maxsize=32)
@@ -315,7 +313,8 @@ def _inverse_spectra(shape: tuple[int, ...], pixel_size: tuple[float, float], da
     along, up, across = _tensor(shape, pixel_size, reach_of(shape, pixel_size))
     along, up = along + damping, up + damping
     determinant = along * up - across**2
-    return np.stack([up / determinant, along / determinant, -across / determinant]).astype(np.float32)
+    parts = up / determinant, along / determinant, -across / determinant
+    return np.stack([packed(part, shape[1]) for part in parts]).astype(np.float32)
 
 
 @lru_cache(maxsize=32)
