@@ -160,6 +160,17 @@ class Multigrid:
         solver.copy("release", solver.x, self._height)
         return self._height
 
+    def enter(self, dz_dx: Array, dz_dy: Array, pixel_size: tuple[float, float]) -> None:
+        """Give pixels without links the heights that those around imply, along slopes, (H, W).
+
+        It is done before the graph is replaced by one in which they have links. Slopes are NaN where there
+        are none.
+        """
+        h = self._hierarchy
+        links = {name: h.graph[name] for name in ("right", "down")}
+        steps = {"step_x": pixel_size[0], "step_y": -pixel_size[1]}
+        h.copy_picture("enter", self._alone.x, dz_dx, dz_dy=dz_dy, **links, **steps)
+
     def deviation(self, flags: Array, uneven: bool) -> NDArray[np.float32]:
         """Return the heights' standard deviation, (H, W), if the weights are inverse variances.
 

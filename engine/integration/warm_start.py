@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -23,7 +22,6 @@ MAPS = {"dz_dx": "dz_dx", "dz_dy": "dz_dy", "weight_x": "map_x", "weight_y": "ma
 _REBUILD_INTERVAL = 8  # frames between which all levels of the multigrid are rebuilt
 _FIRST_RESIDUAL, _FIRST_CYCLES = 1e-3, 30  # tolerance and limit of the first solution
 _MORE_STEPS = 6  # largest number of further steps for a frame
-_AROUND, _ANY = (5, 5), 1e-3  # pixels around one that enters; least share of them that has heights
 # Relative error above which further steps follow, and then the next frame is solved from scratch.
 _LARGEST_GAP = 0.3
 
@@ -31,7 +29,8 @@ _LARGEST_GAP = 0.3
 class WarmStartIntegrator(ThreadSafe):
     """Integrate slopes on the device frame after frame, by a step of the solver for each frame.
 
-    Where pixels enter, as at the border of a contact, further steps follow.
+    Pixels that enter, as at the border of a contact, start at the heights that those around imply along the
+    slopes. Further steps follow where this is not enough.
 
     Attributes
     ----------
@@ -50,8 +49,6 @@ class WarmStartIntegrator(ThreadSafe):
         self._levelling = Levelling(self._graph)
         self._multigrid: Multigrid | None = None
         self._height: Floats | None = None
-        self._start = device.array("start", shape, np.float32)  # heights from which a step begins
-        self._last: Floats  # heights of the last frame
         self._steps, self.gap = 0, math.nan
 
     def push(self, typical_weight: float) -> None:
@@ -63,9 +60,9 @@ class WarmStartIntegrator(ThreadSafe):
         self._links = self._graph.links()
         self._relief: Array | None = None
         if self._multigrid is not None and self._steps:
-            self._start.write(_extended(self._last))
+            self._multigrid.enter(self.maps["dz_dx"], self.maps["dz_dy"], self._pixel_size)
             deep = self._steps % _REBUILD_INTERVAL == 0
-            self._relief = self._multigrid.follow(self._links, deep=deep, start=self._start)
+            self._relief = self._multigrid.follow(self._links, deep=deep)
         self._device.flush()
         self._height = None
 
@@ -82,7 +79,7 @@ class WarmStartIntegrator(ThreadSafe):
             return np.full(self._shape, np.nan, np.float32)
         relief = self._from_scratch() if self._relief is None else self._near(self._relief)
         height: Floats = self._levelling.level(components, relief, [LEVEL])
-        self._steps, self._last = self._steps + 1, height
+        self._steps += 1
         return height
 
     def _near(self, relief: Array) -> Array:
@@ -104,13 +101,3 @@ class WarmStartIntegrator(ThreadSafe):
             self._multigrid.rebuild(self._links, plain=True)
         return self._multigrid.solve(tolerance=_FIRST_RESIDUAL, limit=_FIRST_CYCLES).height
 
-
-def _extended(height: Floats) -> Floats:
-    """Return heights, and where there are none those around, with which pixels that enter begin."""
-    known = np.isfinite(height)
-    total, cover = (
-        cv2.blur(values, _AROUND)
-        for values in (np.where(known, height, np.float32(0)), known.astype(np.float32))
-    )
-    around = np.divide(total, cover, out=np.zeros_like(height), where=cover > _ANY)
-    return np.where(known, height, around)

@@ -914,6 +914,32 @@ __kernel void multigrid_admit_graph(
     }
 }
 
+// Heights of nodes that have slopes but had no link: means of those that nodes in a square around imply, with the mean of
+// both slopes, weighted by the inverse of their squared distances. `right` and `down` are still the last graph's.
+#define SIDE 3
+#define HAD_LINK(i) (right[i] > 0 || right[(i) - 1] > 0 || down[i] > 0 || down[(i) - stride] > 0)
+__kernel void multigrid_enter(
+    LEVEL_ARGS, const int columns, const float step_x, const float step_y, MAP right, MAP down, MAP map, MAP dz_dy,
+    __global float *level)
+{
+    PICTURE_ITEMS
+    for (int c = from; c < upto; ++c) {
+        const int i = base + (row + 1) * stride + c, p = row * columns + c;
+        if (map[p] != map[p] || HAD_LINK(i)) continue;
+        float sum = 0, weights = 0;
+        for (int y = -LESSER(SIDE, row); y <= LESSER(SIDE, rows - 1 - row); ++y)
+            for (int x = -LESSER(SIDE, c); x <= LESSER(SIDE, columns - 1 - c); ++x) {
+                const int j = i + y * stride + x, q = p + y * columns + x;
+                if (map[q] != map[q] || !HAD_LINK(j)) continue;
+                const float rise = 0.5f * (x * step_x * (map[p] + map[q]) + y * step_y * (dz_dy[p] + dz_dy[q]));
+                const float weight = 1.0f / (x * x + y * y);
+                sum += weight * (level[j] - rise);
+                weights += weight;
+            }
+        if (weights > 0) level[i] = sum / weights;
+    }
+}
+
 // The last step, and the map of the heights.
 __kernel void multigrid_finish(
     LEVEL_ARGS, const int columns, const int cycle, const int step, VALUES history, VALUES direction, OUT level, OUT map)

@@ -56,6 +56,8 @@ COARSEST = 64
 """Maximum number of nodes of the coarsest level, in rows whose length is a multiple of 16."""
 ROUNDS = 4
 """Number of rounds in which parts of blocks are assigned to other aggregates."""
+NEAR = 3
+"""Rows and columns from which nodes that enter a graph get their heights."""
 INDEPENDENT = 1e-4
 """Minimum share of the products' determinant for which two directions are used."""
 
@@ -106,8 +108,9 @@ class Level:
 
 def shifted(values: Any, down: int, right: int) -> NDArray[Any]:
     """Return the value of each node's neighbour in a direction, 0 where there is none."""
-    rows, columns = values.shape
-    return np.pad(values, 1)[1 + down : 1 + down + rows, 1 + right : 1 + right + columns]
+    (rows, columns), margin = values.shape, max(abs(down), abs(right))
+    first_row, first_column = margin + down, margin + right
+    return np.pad(values, margin)[first_row : first_row + rows, first_column : first_column + columns]
 
 
 def step_of(to: Any) -> tuple[Any, Any]:
@@ -298,6 +301,31 @@ def best_step(bz: float, zz: float, zp: float, pp: float, bp: float) -> tuple[fl
         along, again = np.linalg.solve([[zz, zp], [zp, pp]], [bz, bp])
         return float(along), float(again)
     return (bz / zz if zz > 0 else 0.0), 0.0
+
+
+def enter(
+    right: Doubles, down: Doubles, dz_dx: Doubles, dz_dy: Doubles, steps: tuple[float, float], x: Doubles
+) -> Doubles:
+    """Return heights, (rows, columns), with those of nodes that have slopes but had no link.
+
+    They are means of the heights that nodes with a link, at most `NEAR` rows and columns away, imply with the
+    mean of both slopes, weighted by the inverse of the squared distance. ``right`` and ``down`` are the links
+    of the last graph, slopes are NaN where undefined, and ``steps`` the lengths from a column, and from a
+    row, to the next, along x and y.
+    """
+    had = np.maximum(right, shifted(right, 0, -1)) + np.maximum(down, shifted(down, -1, 0)) > 0
+    defined, sums, weights = np.isfinite(dz_dx), np.zeros(x.shape), np.zeros(x.shape)
+    slopes = np.nan_to_num(dz_dx), np.nan_to_num(dz_dy)
+    for v in range(-NEAR, NEAR + 1):
+        for u in range(-NEAR, NEAR + 1):
+            distances = u * steps[0], v * steps[1]
+            rise = sum(
+                d * (slope + shifted(slope, v, u)) / 2 for d, slope in zip(distances, slopes, strict=True)
+            )
+            weight = shifted(had & defined, v, u) / max(u * u + v * v, 1)
+            sums += weight * (shifted(x, v, u) - rise)
+            weights += weight
+    return np.where(defined & ~had & (weights > 0), sums / np.where(weights > 0, weights, 1), x)
 
 
 # --- Variances ---

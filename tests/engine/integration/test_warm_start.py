@@ -99,6 +99,7 @@ def test_a_border_that_changes_is_followed(device):
         height, exact = follow(follower, maps), best(maps)
         core = np.hypot(x - 0.5, y - 0.4) < 0.2
         assert np.std((height - exact.height)[core]) < 1e-2 * np.ptp(exact.height[core])
+    assert follower.gap < 0.1
 
 
 def test_nothing_has_no_heights_and_does_not_stay(device):

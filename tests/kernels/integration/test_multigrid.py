@@ -275,6 +275,20 @@ def test_pictures_come_to_the_finest_level_and_back(cases):
     np.testing.assert_allclose(returned.read(), expected, rtol=1e-5)
 
 
+def test_nodes_that_enter_get_heights_along_the_slopes(cases):
+    case = cases("holes", False)
+    heights, level = case.random()
+    slopes = np.where(case.rng.random((2, *SHAPE)) < 0.9, case.rng.normal(size=(2, *SHAPE)), np.nan)
+    slopes[:, np.isnan(slopes).any(axis=0)] = np.nan
+    dz_dx, dz_dy = (case.map(slope.astype(np.float32)) for slope in slopes)
+    links = {name: case.h.graph[name] for name in ("right", "down")}
+    case.h.copy_picture("enter", level, dz_dx, dz_dy=dz_dy, **links, step_x=0.2, step_y=-0.3)
+    right, down = case.levels[0].links[:2]
+    expected = twin.enter(right, down, *slopes, (0.2, -0.3), heights)
+    assert np.any(expected != heights)
+    close(case.get(level), expected)
+
+
 @pytest.mark.parametrize(("kind", "anchored"), [*GRAPHS, ("isolated", False), ("isolated", True)])
 @pytest.mark.parametrize("number", [3, 4, 5])
 def test_the_variance_of_a_level_is_exact(cases, kind, anchored, number):
