@@ -46,7 +46,7 @@ _COARSEST = 16  # pixels: minimum side of a surface of half the resolution
 
 
 def transform(values: Reals, padded: tuple[int, int]) -> Reals:
-    """Return the transforms of maps, (..., H, W), on a padded grid, in OpenCV's packed format for real maps."""
+    """Return the transforms of maps, (..., H, W), on a padded grid, in OpenCV's packed format."""
     waves = np.zeros((*values.shape[:-2], *padded), values.dtype)
     waves[..., : values.shape[-2], : values.shape[-1]] = values
     for wave in waves.reshape(-1, *padded):

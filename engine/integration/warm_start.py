@@ -23,7 +23,7 @@ _REBUILD_INTERVAL = 8  # frames between which all levels of the multigrid are re
 _FIRST_RESIDUAL, _FIRST_CYCLES = 1e-3, 30  # tolerance and limit of the first solution
 _MORE_STEPS = 6  # largest number of further steps for a frame
 # Relative error above which further steps follow, and then the next frame is solved from scratch.
-_LARGEST_GAP = 0.3
+_LARGEST_GAP = 0.1
 
 
 class WarmStartIntegrator(ThreadSafe):
