@@ -104,7 +104,9 @@ def conjugate_gradients(
         steepest = here.project(here.precondition(residual))
         before, gain = gain, inner(residual, steepest)
         memory = np.maximum(gain - inner(last, steepest), 0) / np.maximum(before, tiny)
-        direction, last = here.project(steepest + memory * direction), residual
+        direction, last = steepest + memory * direction, residual
+        if callable(face):  # the direction before may be outside of this face
+            direction = here.project(direction)
         along = product(direction)
         stiff = along if here.curvature is None else along + here.curvature * direction
         length = inner(residual, direction) / np.maximum(inner(direction, stiff), tiny)

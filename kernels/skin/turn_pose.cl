@@ -16,15 +16,7 @@ F angle_of(const F sine, const F cosine)
 {
     const I steep = sine > cosine;
     const F a = steep ? cosine / sine : sine / cosine, b = a * a;
-    F sum = 0.00245672441f;
-    sum = sum * b - 0.0144013604f;
-    sum = sum * b + 0.0397812352f;
-    sum = sum * b - 0.0723485947f;
-    sum = sum * b + 0.104989477f;
-    sum = sum * b - 0.141612306f;
-    sum = sum * b + 0.199859068f;
-    sum = sum * b - 0.333325982f;
-    const F low = a * (sum * b + 0.999999881f);
+    const F low = a * ARCTANGENT_RATIO(b);
     return steep ? 1.57079633f - low : low;
 }
 

@@ -109,7 +109,7 @@ def loaded_domes(shape: Shape) -> Sequence[Result]:
     results = []
     for a in _angles():
         away = (x - 0.05 * math.sin(a)) ** 2 + (y[:, np.newaxis] - 0.05 * math.cos(a)) ** 2
-        moved = np.broadcast_to(np.array([0.05 * math.sin(a), 0.0], np.float32), (*shape, 2))
+        moved = np.full((*shape, 2), [0.05 * math.sin(a), 0.0], np.float32)
         results.append(
             Result(
                 height=(-away / 10 + rng.normal(0, 1e-3, shape)).astype(np.float32),
