@@ -7,6 +7,9 @@
 
 #include "common.clh"
 
+#define LANES WIDTH
+#include "lanes.clh"
+
 #define STEEPEST 0.17364818f  // cosine of the zenith at which slopes are limited
 // radians^2: variance of the azimuth up to which the shortening by its mean cosine is corrected
 #define WIDEST 0.25f
@@ -14,8 +17,6 @@
 #define LEAST 1.1754944e-38f
 
 #if WIDTH == 8
-typedef float8 F;
-typedef int8 I;
 typedef float8 __attribute__((aligned(4))) Loose;  // unaligned
 typedef uchar8 __attribute__((aligned(1))) Bytes;
 #define READ(map, p) (*(__global const Loose *)((map) + (p)))
@@ -29,8 +30,6 @@ typedef uchar8 __attribute__((aligned(1))) Bytes;
     F y = (F)(a.s1, a.s4, a.s7, b.s2, b.s5, c.s0, c.s3, c.s6);                                         \
     F z = (F)(a.s2, a.s5, b.s0, b.s3, b.s6, c.s1, c.s4, c.s7);
 #else
-typedef float F;
-typedef int I;
 #define READ(map, p) ((map)[p])
 #define WRITE(map, p, values) ((map)[p] = (values))
 #define GET(line, i) ((line)[i])
@@ -61,6 +60,13 @@ __kernel void slopes_find(
         READ_VECTORS
         const F s = READ(sigma, p);
         const I valid = (FLAGS(contact, p) != 0) & (z > 0.0f) & (s > 0.0f) & (s < INFINITY);
+        if (!any_of(valid)) {
+            WRITE(dz_dx, p, (F)NAN);
+            WRITE(dz_dy, p, (F)NAN);
+            WRITE(squares_x, p, (F)0.0f);
+            WRITE(squares_y, p, (F)0.0f);
+            continue;
+        }
         x = valid ? x : (F)0.0f;
         y = valid ? y : (F)0.0f;
         const F flat = x * x + y * y, slant = 1.0f / GREATER(z, (F)STEEPEST);
@@ -114,19 +120,24 @@ __kernel void slopes_weigh(
         for (int i = to; i < width + 2 * AROUND + WIDTH; ++i) x[i] = y[i] = 0.0f;
         for (int i = 0; i < width; i += WIDTH) {
             const int p = row * columns + begin + i;
-            const F sum_x = FIVE(x), sum_y = FIVE(y), slope = READ(dz_dx, p), s = READ(sigma, p);
+            const F slope = READ(dz_dx, p);
             const I valid = slope == slope;
-            const F variance = valid ? s * s : (F)1.0f, flat = READ(squares_x, p) + READ(squares_y, p);
-            const F upright = 1.0f - flat, steep = 1.0f / GREATER(upright, (F)(STEEPEST * STEEPEST));
-            UNSURE(flat, variance)
-            const F here = fraction * variance * steep * steep + 0.5f * flat * steep * turned * turned;
-            const F orthogonal = (1.0f - fraction) * variance * steep, twice = 2.0f * turned;
-            const F east_of = (sum_x + LEAST) / (sum_x + sum_y + 2.0f * LEAST) - 0.5f;
-            const F share_x = 0.5f + east_of * EXPONENTIAL(twice);
-            const F high = LESSER(share_x, (F)1.0f), east = GREATER(high, (F)0.0f), north = 1.0f - east;
-            const F one = GREATER(1.0f / (east * here + north * orthogonal), (F)lowest);
-            const F two = GREATER(1.0f / (north * here + east * orthogonal), (F)lowest);
-            const F in_x = valid ? LESSER(one, (F)highest) : (F)0.0f, in_y = valid ? LESSER(two, (F)highest) : (F)0.0f;
+            F in_x = 0.0f, in_y = 0.0f;
+            if (any_of(valid)) {
+                const F sum_x = FIVE(x), sum_y = FIVE(y), s = READ(sigma, p);
+                const F variance = valid ? s * s : (F)1.0f, flat = READ(squares_x, p) + READ(squares_y, p);
+                const F upright = 1.0f - flat, steep = 1.0f / GREATER(upright, (F)(STEEPEST * STEEPEST));
+                UNSURE(flat, variance)
+                const F here = fraction * variance * steep * steep + 0.5f * flat * steep * turned * turned;
+                const F orthogonal = (1.0f - fraction) * variance * steep, twice = 2.0f * turned;
+                const F east_of = (sum_x + LEAST) / (sum_x + sum_y + 2.0f * LEAST) - 0.5f;
+                const F share_x = 0.5f + east_of * EXPONENTIAL(twice);
+                const F high = LESSER(share_x, (F)1.0f), east = GREATER(high, (F)0.0f), north = 1.0f - east;
+                const F one = GREATER(1.0f / (east * here + north * orthogonal), (F)lowest);
+                const F two = GREATER(1.0f / (north * here + east * orthogonal), (F)lowest);
+                in_x = valid ? LESSER(one, (F)highest) : (F)0.0f;
+                in_y = valid ? LESSER(two, (F)highest) : (F)0.0f;
+            }
             if (i + WIDTH <= width) {
                 WRITE(weight_x, p, in_x);
                 WRITE(weight_y, p, in_y);
