@@ -168,7 +168,7 @@ class Multigrid:
         """
         h = self._hierarchy
         links = {name: h.graph[name] for name in ("right", "down")}
-        steps = {"step_x": pixel_size[0], "step_y": -pixel_size[1]}
+        steps: dict[str, Any] = {"step_x": pixel_size[0], "step_y": -pixel_size[1]}
         h.copy_picture("enter", self._alone.x, dz_dx, dz_dy=dz_dy, **links, **steps)
 
     def deviation(self, flags: Array, uneven: bool) -> NDArray[np.float32]:

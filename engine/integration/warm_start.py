@@ -100,4 +100,3 @@ class WarmStartIntegrator(ThreadSafe):
         else:
             self._multigrid.rebuild(self._links, plain=True)
         return self._multigrid.solve(tolerance=_FIRST_RESIDUAL, limit=_FIRST_CYCLES).height
-
