@@ -6,12 +6,15 @@ ROS 2's own Python packages are not on the package index. `rosbags` has the defi
 import math
 import runpy
 import sys
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from msgspec import structs
 from rig_fakes import fake_rig, spreading
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
@@ -19,6 +22,8 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from mirrorskin import hw
+from mirrorskin.hw.rig.rig import Rig
+from mirrorskin.twin.emulator.rig import EmulatedRig
 
 NODES = Path(__file__).parents[1] / "examples" / "ros2"
 SHAPE = (24, 32)
@@ -80,6 +85,12 @@ class Moment(SimpleNamespace):
         return message_class("builtin_interfaces/msg/Time")(sec=whole, nanosec=nanoseconds)
 
 
+def answer(answers, node):
+    """Call the services of a node once."""
+    for name, callback in node.services:
+        answers[name] = callback(None, SimpleNamespace(success=False, message=""))
+
+
 @pytest.fixture
 def bag(monkeypatch, tmp_path):
     """The bag that a node's messages are written to, and what it did; ROS 2's modules are made up."""
@@ -87,7 +98,7 @@ def bag(monkeypatch, tmp_path):
     kinds |= {name: f"geometry_msgs/msg/{name}" for name in ("PoseWithCovarianceStamped", "WrenchStamped")}
     classes = {name: message_class(kind) for name, kind in kinds.items()}
     times = iter(range(10**6))
-    path, ended = tmp_path / "bag", []
+    path, ended, answers = tmp_path / "bag", [], {}
 
     class Node:
         def __init__(self, name):
@@ -105,6 +116,9 @@ def bag(monkeypatch, tmp_path):
 
             return SimpleNamespace(publish=publish)
 
+        def create_service(self, kind, name, callback):
+            self.services = [(name, callback)]
+
         def get_clock(self):
             return SimpleNamespace(now=lambda: Moment(NOW))
 
@@ -114,8 +128,15 @@ def bag(monkeypatch, tmp_path):
             self.writer.close()
             ended.append("node")
 
+    rclpy = {
+        "init": lambda: None,
+        "shutdown": lambda: ended.append("rclpy"),
+        "spin": partial(answer, answers),
+    }
     for name, names in (
-        ("rclpy", {"init": lambda: None, "shutdown": lambda: ended.append("rclpy")}),
+        ("rclpy", rclpy),
+        ("std_srvs", {}),
+        ("std_srvs.srv", {"Trigger": object}),
         ("rclpy.node", {"Node": Node}),
         ("rclpy.duration", {"Duration": lambda seconds: seconds}),
         ("geometry_msgs", {}),
@@ -126,7 +147,7 @@ def bag(monkeypatch, tmp_path):
         module = ModuleType(name)
         vars(module).update(names)
         monkeypatch.setitem(sys.modules, name, module)
-    return SimpleNamespace(path=path, ended=ended)
+    return SimpleNamespace(path=path, ended=ended, answers=answers)
 
 
 @pytest.fixture
@@ -139,6 +160,29 @@ def published(bag, clock, monkeypatch):
     assert bag.ended == ["node", "rclpy"]
     assert rig.stage.closed
     return received(bag)
+
+
+@pytest.fixture
+def touch(bag, clock, monkeypatch):
+    """Call the service of the node that touches; return its answer, and the messages by topic."""
+    scene = {"shape": (48, 64), "pixel_size": 0.06, "pattern": "linear", "rate": 20.0}
+    monkeypatch.syspath_prepend(NODES)
+    with EmulatedRig("sphere", clock=clock, **scene) as emulated:
+        stage = structs.replace(emulated.settings.stage, press=1.0)
+        settings = replace(emulated.settings, stage=stage)
+        opened = Rig(emulated.open_stage(stage), emulated.camera, settings, clock)
+        monkeypatch.setattr(hw, "load_rig", lambda _path: settings)
+        monkeypatch.setattr(hw, "open_rig", lambda settings, steps: opened)
+        runpy.run_path(str(NODES / "touch_node.py"))["main"]("rig.toml", 20.0)
+    return bag.answers["touch"], received(bag)
+
+
+def test_the_service_touches_and_publishes_the_surface(touch):
+    answer, messages = touch
+    assert answer.success, answer.message
+    assert "the request is met" in answer.message
+    points = points_of(messages["/surface"][-1])
+    assert np.nanmedian(points[:, 3]) < 20e-6  # holes that were filled have none
 
 
 def received(bag):

@@ -104,6 +104,48 @@ def test_a_second_request_waits_for_the_first(ready):
     assert ready.control.problem == "Wait until the stage rests."
 
 
+@pytest.fixture
+def lit(clock, monkeypatch):
+    """The control of a connected rig whose wall shows slopes."""
+    scene = {"shape": (48, 64), "pixel_size": 0.06, "pattern": "linear"}
+    with EmulatedRig(rate=20.0, clock=clock, **scene) as rig:
+        simulate(monkeypatch, clock, rig.open_stage, rig.open_camera)
+        control = RigControl(rig.settings, clock=clock)
+        control.connect()
+        while control.state != "ready":
+            clock.sleep(0.02)
+        yield SimpleNamespace(rig=rig, control=control, clock=clock)
+        control.close()
+
+
+def test_a_touch_shows_its_surface_and_is_recorded(lit, tmp_path):
+    pane = RigPane(lit.control, lambda *shown: None)
+    pane.motion.value = "touch"
+    pane.touch["sigma"].value = 20.0
+    pane.file.value = str(tmp_path / "frames.h5")
+    pane._start()
+    while lit.control.state != "moving":
+        lit.clock.sleep(0.02)
+    while lit.control.state == "moving":
+        lit.clock.sleep(0.1)
+    pane.refresh()
+    assert "the request is met" in pane.run.object, lit.control.problem
+    assert np.isfinite(lit.control.result.height).any()
+    with io.open_recording(tmp_path / "frames.h5", dataset="turn") as turn:
+        assert turn.motion == "axial"
+
+
+def test_stop_ends_a_touch(lit):
+    lit.control.touch(0.001, 0.95, 1.0, 0.04)
+    while lit.control.state != "moving":
+        lit.clock.sleep(0.02)
+    lit.clock.sleep(1.0)
+    lit.control.stop()
+    while lit.control.state != "disconnected":
+        lit.clock.sleep(0.02)
+    assert "was stopped" in lit.control.problem
+
+
 def test_stop_ends_a_move_at_once(ready):
     before = travel(ready)
     ready.control.jog("travel", 3.0)

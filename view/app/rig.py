@@ -54,6 +54,7 @@ fetch(address, {method: "POST", signal: AbortSignal.timeout(1000)}).then(
 _DRAWN = """
 requestAnimationFrame(() => requestAnimationFrame(() => seen.data = {number: cb_obj.data.number}))
 """
+_TOUCH = "touch"  # a press and a turn, until the surface is good enough
 _UNSEEN = 5.0  # seconds after which a picture that was not drawn does not hold up the next one
 _SATURATED = 0.001  # share of the pixels above which the exposure is too long
 
@@ -72,6 +73,7 @@ class RigPane:
         self._drawn: Any = None
         self._ranges: dict[str, tuple[float, float]] = {}  # of the maps of a run
         self._shown: Any = None
+        self._noted = ""  # text of a touch
         self._sent = ColumnDataSource(data={"number": [0]})
         self._seen = ColumnDataSource(data={"number": [0]})  # what the browser has drawn
         self._sent_at = -math.inf
@@ -183,12 +185,19 @@ class RigPane:
             "phase": field("Direction (deg)", 0.0, 15.0),
             "speed": field("Speed (deg/s)", 2.0),
         }
+        self.touch = {
+            "sigma": field("Standard deviation (µm)", 3.0, 1.0),
+            "share": field("Of the pixels (%)", 95.0, 1.0),
+            "press": field("To travel (mm)", at),
+            "tilt": field("Tilt (deg)", 2.5),
+        }
         # Fields and the plan by motion, where the stage has the axes.
         self._motions: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {
             "press": (self.press, vertical_plan)
         }
         if {"pitch", "roll"} <= {*axes}:
             self._motions |= {"rotation": (self.turn, axial_plan), "rocking": (self.rock, rock_plan)}
+            self._motions[_TOUCH] = self.touch, dict
         if {"x", "y"} <= {*axes}:
             self._motions["slide"] = self.slide, slide_plan
         if "twist" in axes:
@@ -239,13 +248,19 @@ class RigPane:
     def _start(self) -> None:
         fields, plan_of = self._motions[self.motion.value]
         try:
-            plan = plan_of(**{name: _in_radians(field) for name, field in fields.items()})
+            values = {name: _in_radians(field) for name, field in fields.items()}
+            plan = plan_of(**values)
         except InputError as error:
             self.control.problem = str(error)
             self.refresh()
             return
         name = self.file.value.strip()
-        self._ask(lambda: self.control.run(plan, Path(name) if name else None))
+        record = Path(name) if name else None
+        if self.motion.value == _TOUCH:
+            request = 1e-3 * values["sigma"], values["share"] / 100, values["press"], values["tilt"]
+            self._ask(lambda: self.control.touch(*request, record))
+        else:
+            self._ask(lambda: self.control.run(plan, record))
 
     def refresh_when_drawn(self) -> None:
         """Show what the rig shows now, if the browser has drawn what was shown before.
@@ -281,6 +296,9 @@ class RigPane:
         if state.frame is not None and state.frame is not self._drawn:
             self._drawn = state.frame
             self._show_frame(state.frame)
+        if state.note != self._noted:
+            self._noted = state.note
+            self._show_touch()
         if state.update is not self._shown:
             self._shown = state.update
             self._show_run()
@@ -298,6 +316,13 @@ class RigPane:
             "Frames": f"{self.control.seen.frames}, {self.control.seen.rate:.1f} per second",
         }
         _set(self.facts, table(facts))
+
+    def _show_touch(self) -> None:
+        """Show what a touch expects or why it ended, and its newest surface."""
+        surface = self.control.seen.surface
+        if surface is not None:
+            self.growing.show(show_map(sheet_of(surface), "height"), about="of the touch")
+        _set(self.run, hint(self._noted))
 
     def _show_run(self) -> None:
         update, status = self.control.seen.update, self.control.seen.status

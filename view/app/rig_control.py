@@ -17,6 +17,7 @@ from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.reconstruction import method_for
 from mirrorskin.engine.live import LiveRun, Loop
 from mirrorskin.engine.live.status import Status, Update
+from mirrorskin.engine.live.touch import Taken, recordings_of, touch
 from mirrorskin.engine.rotation.last_turn import choose_window
 from mirrorskin.engine.rotation.rotation import Rotation
 from mirrorskin.hw.base.clock import SYSTEM, Clock
@@ -28,6 +29,7 @@ from mirrorskin.hw.rig.plans import AxialPlan, HorizontalPlan, Plan, RockPlan, T
 from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import PlannedScan
 from mirrorskin.hw.rig.sweep import make_scan
+from mirrorskin.hw.rig.touch import RigTouch
 from mirrorskin.io.watch.saturation import scale_top
 
 State = Literal["disconnected", "connecting", "ready", "moving"]
@@ -42,13 +44,15 @@ _STOPPED = "The stage was stopped. Look at it, then connect again."
 
 @dataclass(frozen=True)
 class Seen:
-    """What the rig shows: the newest frame, and the maps of a live run."""
+    """What the rig shows: the newest frame, and the maps of a live run, or the surface of a touch."""
 
     frame: NDArray[Any] | None = None
     frames: int = 0
     rate: float = float("nan")
     update: Update | None = None
     status: Status | None = None
+    surface: io.Result | None = None
+    note: str = ""  # what a touch expects, and why it ended
 
 
 class RigControl:
@@ -160,6 +164,18 @@ class RigControl:
                 return
         self._give(lambda rig: self._run(rig, plan, record))
 
+    def touch(
+        self, sigma: float, share: float, press: float, tilt: float, record: Path | None = None
+    ) -> None:
+        """Press and turn until a share of the pixels has a standard deviation, mm; record if asked to."""
+        if record is not None:
+            try:
+                io.check_output(record, replaces="nothing")
+            except io.InputError as error:
+                self.problem = str(error)
+                return
+        self._give(lambda rig: self._touch(_WatchedTouch(self, rig, press, tilt=tilt), sigma, share, record))
+
     def _give(self, task: Callable[[Rig], None]) -> None:
         if self.state != "ready" or self._task is not None:
             self.problem = "Connect first." if self.state == "disconnected" else "Wait until the stage rests."
@@ -250,6 +266,24 @@ class RigControl:
         self.recorded = None if recorder is None else recorder.path
         self.result = run.result()
 
+    def _touch(self, sensor: RigTouch, sigma: float, share: float, record: Path | None) -> None:
+        self.result = self.recorded = None
+        self.seen = replace(self.seen, update=None, status=None, surface=None, note="")
+        taken: list[Taken] = []
+
+        def on_update(text: str, surface: io.Result | None) -> None:
+            self.seen = replace(self.seen, note=text, surface=surface or self.seen.surface)
+
+        try:
+            with sensor:
+                outcome = touch(sensor, sigma, share=share, taken=taken, on_update=on_update)
+        finally:
+            press, turn = recordings_of(sensor, taken)
+            if record is not None and press is not None:
+                io.save_touch(record, press, turn)
+        self.result = outcome.result
+        on_update(str(outcome), outcome.result)
+
     def _live(self, source: io.LiveSource, plan: Plan, rate: float) -> LiveRun:
         """Return the operation of the runs, with a window of one turn for the method of a rotation."""
         computed = (self._operation or method_for(plan.motion))()
@@ -265,6 +299,21 @@ class RigControl:
         """Raise after a stop, which the stage may not have obeyed yet, and while the rig is closed."""
         if self._ending():
             raise HardwareError(_STOPPED)
+
+
+class _WatchedTouch(RigTouch):
+    """A rig whose frames are shown, and whose touch ends when it is stopped."""
+
+    def __init__(self, control: RigControl, rig: Rig, press: float, *, tilt: float) -> None:
+        super().__init__(rig, press, tilt=tilt)
+        self._control, self._watched = control, rig
+
+    def take(self, travel: float, tilt: float = 0.0, phase: float = 0.0, /) -> NDArray[Any]:
+        """Return a frame of the body at rest, and show it; HardwareError after a stop."""
+        self._control._check_ending()
+        frame = super().take(travel, tilt, phase)
+        self._control._show(self._watched, frame, 1)
+        return frame
 
 
 def vertical_plan(start: float, stop: float, speed: float) -> Plan:
