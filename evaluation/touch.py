@@ -101,18 +101,22 @@ def try_recipe(name: str, press_steps: int, turn_frames: int, seed: int = 0) -> 
     return tried(result, turned.truth)
 
 
-def try_all(name: str) -> list[list[float]]:
-    """Return the standard deviation of all recipes, µm: a list of turn frames for each number of steps."""
-    return [[try_recipe(name, steps, frames).sigma for frames in TURNS] for steps in PRESSES]
+def try_all(name: str) -> list[list[float | None]]:
+    """Return the standard deviation of all recipes, µm: a list of turn frames for each number of steps.
+
+    None if there is none, as where pixels with a normal have no height.
+    """
+    sigma = [[try_recipe(name, steps, frames).sigma for frames in TURNS] for steps in PRESSES]
+    return [[round(value, 3) if math.isfinite(value) else None for value in row] for row in sigma]
 
 
-def fewest(sigma: Sequence[Sequence[float]], request: float) -> int | None:
+def fewest(sigma: Sequence[Sequence[float | None]], request: float) -> int | None:
     """Return the fewest frames of a recipe with at most the requested standard deviation, µm."""
     frames = [
         steps + count
         for steps, row in zip(PRESSES, sigma, strict=True)
         for count, value in zip(TURNS, row, strict=True)
-        if value <= request
+        if value is not None and value <= request
     ]
     return min(frames, default=None)
 
@@ -168,7 +172,7 @@ def main(arguments: Sequence[str]) -> None:
     if arguments[:1] == ["recipes"]:
         stored = json.loads(_STORED.read_text()) if _STORED.exists() else {}
         for name in arguments[1:] or OBJECTS:
-            stored[name] = [[round(value, 3) for value in row] for row in try_all(name)]
+            stored[name] = try_all(name)
             _STORED.write_text(json.dumps(stored) + "\n")
         return
     rows = list(measure(*map(int, arguments)))
