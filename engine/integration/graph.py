@@ -124,12 +124,23 @@ class PixelGraph:
         maps = {name: self.array(name) for name in ("right", "down", "source")}
         if self.known_heights:
             maps["anchor"] = self.array("anchor")
-        self._run("links_join", {"KEEP": 1}, **self._problem(plane, None), **maps, place=0)
+        self._join(plane, maps)
         return Links(self.device, self.shape, maps["right"], maps["down"], maps.get("anchor"), maps["source"])
 
     def put_source(self, plane: Plane, sources: Array, number: int) -> None:
         """Write only the right side, to ``sources``, (K, H, W), at a number."""
-        self._run("links_join", {}, **self._problem(plane, None), source=sources, place=number)
+        rows, columns = self.shape
+        self._join(plane, {"source": sources}, number * rows * columns)
+
+    def put_links(self, maps: Mapping[str, Array], start: int, stride: int) -> None:
+        """Write ``right``, ``down`` and ``source`` in rows that are ``stride`` apart, from ``start`` on."""
+        self._join(LEVEL, maps, start, stride)
+
+    def _join(
+        self, plane: Plane, maps: Mapping[str, Array], start: int = 0, stride: int | None = None
+    ) -> None:
+        rows = {"start": start, "stride": stride or self.shape[1]}
+        self._run("links_join", {"KEEP": int(len(maps) > 1)}, **self._problem(plane, None), **maps, **rows)
 
     def misfit(
         self, reliefs: Array, plane: Plane = LEVEL, links: Links | None = None, number: int = 0

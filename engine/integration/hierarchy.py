@@ -146,12 +146,14 @@ class Hierarchy:
         self._build_tail(tail, plain=plain, strength=strength)
         self.moves[...] = 0 if plain else self.changes.read()
 
-    def follow(self, links: Links, *, deep: bool) -> None:
+    def follow(self, links: Links | None, *, deep: bool) -> None:
         """Update a plain hierarchy for a similar graph, without copies to the host.
 
+        ``links``: None if they are in place.
         Unless ``deep``, only the finest level is updated. Cycles must be prepared again.
         """
-        self._admit_graph(links)
+        if links is not None:
+            self._admit_graph(links)
         tail = self.first_of_tail(1)
         if deep:
             for number in range(tail):

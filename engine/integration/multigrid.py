@@ -127,25 +127,34 @@ class Multigrid:
             solver.copy("release", solver.cycle.x, height, batch)
         return height
 
-    def follow(self, links: Links, *, deep: bool, start: Array | None = None, anew: bool = False) -> Array:
+    def in_place(self) -> tuple[dict[str, Array], int, int]:
+        """Return where weights and right side of the finest level are; see `PixelGraph.put_links`."""
+        graph, finest = self._hierarchy.graph, self._hierarchy.levels[0]
+        maps = {"right": graph["right"], "down": graph["down"], "source": self._alone.source}
+        return maps, finest.first, finest.stride
+
+    def follow(
+        self, links: Links | None, *, deep: bool, start: Array | None = None, anew: bool = False
+    ) -> Array:
         """Do one step from the last heights, or from ``start``, (H, W), towards those of a similar graph.
 
         The step minimises the energy in the plane of the preconditioned residual and the last step. It is a
         conjugate gradient step if the graph is unchanged, and never increases the error. The step is only
-        enqueued; heights are valid until the next solution or step. ``deep``: rebuild all levels of the
-        graph, not only the finest. ``anew``: without the last step.
+        enqueued; heights are valid until the next solution or step. ``links``: None if they are in place.
+        ``deep``: rebuild all levels of the graph, not only the finest. ``anew``: without the last step.
         """
         h, solver = self._hierarchy, self._alone
         cycle = solver.cycle
-        self._links = links
         h.follow(links, deep=deep)
+        if links is not None:
+            self._links = links
+            solver.copy("admit", solver.source, links.source)
         cycle.follow(deep=deep)
         if start is not None:
             solver.copy("admit", solver.x, start)
         if anew:
             solver.p.fill()
         solver.started = True
-        solver.copy("admit", solver.source, links.source)
         solver.find_residual()
         cycle.launch()
         count = solver.parts.shape[0]

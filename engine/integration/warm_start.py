@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from mirrorskin.engine.integration.graph import LEVEL, Levelling, PixelGraph, find_components
 from mirrorskin.engine.integration.multigrid import Multigrid
-from mirrorskin.engine.integration.validation import Floats, Inputs
+from mirrorskin.engine.integration.validation import Flags, Floats, Inputs
 from mirrorskin.io.base.arguments import check_pixel_size
 from mirrorskin.io.base.threads import ThreadSafe
 from mirrorskin.kernels.array import Array
@@ -19,7 +19,6 @@ from mirrorskin.kernels.device import Device
 MAPS = {"dz_dx": "dz_dx", "dz_dy": "dz_dy", "weight_x": "map_x", "weight_y": "map_y"}
 """Slopes, NaN where undefined, and their inverse variances, 0 there; with the names of the graph's arrays."""
 
-_REBUILD_INTERVAL = 8  # frames between which all levels of the multigrid are rebuilt
 _FIRST_RESIDUAL, _FIRST_CYCLES = 1e-3, 30  # tolerance and limit of the first solution
 _MORE_STEPS = 6  # largest number of further steps for a frame
 # Relative error above which further steps follow, and then the next frame is solved from scratch.
@@ -49,6 +48,8 @@ class WarmStartIntegrator(ThreadSafe):
         self._levelling = Levelling(self._graph)
         self._multigrid: Multigrid | None = None
         self._height: Floats | None = None
+        self._flags: Flags = np.zeros(shape, np.uint8)
+        self._components = find_components(self._flags, by_links=False)
         self._steps, self.gap = 0, math.nan
 
     def push(self, typical_weight: float) -> None:
@@ -57,12 +58,12 @@ class WarmStartIntegrator(ThreadSafe):
         inputs = Inputs(**maps, pixel_size=self._pixel_size, typical_weight=typical_weight)
         self._graph.use_device_maps(inputs)
         self._flagged = self._graph.flags.last_use
-        self._links = self._graph.links()
         self._relief: Array | None = None
         if self._multigrid is not None and self._steps:
             self._multigrid.enter(self.maps["dz_dx"], self.maps["dz_dy"], self._pixel_size)
-            deep = self._steps % _REBUILD_INTERVAL == 0
-            self._relief = self._multigrid.follow(self._links, deep=deep)
+            self._graph.put_links(*self._multigrid.in_place())
+            # All levels: a cycle is of no use where coarse ones join what is not joined any more.
+            self._relief = self._multigrid.follow(None, deep=True)
         self._device.flush()
         self._height = None
 
@@ -73,12 +74,14 @@ class WarmStartIntegrator(ThreadSafe):
         return self._height
 
     def _level(self) -> Floats:
-        components = find_components(self._graph.flags.read(after=self._flagged), by_links=False)
-        if components.count == 0:
+        flags = self._graph.flags.read(after=self._flagged)
+        if not np.array_equal(flags, self._flags):
+            self._components, self._flags = find_components(flags, by_links=False), flags
+        if self._components.count == 0:
             self._steps = 0
             return np.full(self._shape, np.nan, np.float32)
         relief = self._from_scratch() if self._relief is None else self._near(self._relief)
-        height: Floats = self._levelling.level(components, relief, [LEVEL])
+        height: Floats = self._levelling.level(self._components, relief, [LEVEL])
         self._steps += 1
         return height
 
@@ -89,14 +92,15 @@ class WarmStartIntegrator(ThreadSafe):
             self.gap = self._multigrid.gap()
             if self.gap < _LARGEST_GAP:
                 return relief
-            relief = self._multigrid.follow(self._links, deep=False)
+            relief = self._multigrid.follow(None, deep=False)
         if not self._multigrid.gap() < _LARGEST_GAP:
             self._steps = -1  # the next frame begins anew
         return relief
 
     def _from_scratch(self) -> Array:
+        links = self._graph.links()
         if self._multigrid is None:
-            self._multigrid = Multigrid(self._links, plain=True)
+            self._multigrid = Multigrid(links, plain=True)
         else:
-            self._multigrid.rebuild(self._links, plain=True)
+            self._multigrid.rebuild(links, plain=True)
         return self._multigrid.solve(tolerance=_FIRST_RESIDUAL, limit=_FIRST_CYCLES).height

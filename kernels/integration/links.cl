@@ -223,8 +223,8 @@ float chosen(const int linked, const float value)
 #define KEPT_MAPS
 #endif
 
-// Of several right-hand sides with the same links, stored one below the other, the current one.
-__kernel void links_join(GRAPH, KEPT_MAPS OUT source, const int place)
+// Rows of the output are `stride` apart, from `start` on.
+__kernel void links_join(GRAPH, KEPT_MAPS OUT source, const long start, const int stride)
 {
     PIECE(ROWS)
     if (top >= rows) return;
@@ -244,6 +244,7 @@ __kernel void links_join(GRAPH, KEPT_MAPS OUT source, const int place)
         for (int i = 1; i < width; ++i) from_left[i + 1] = X_RISE(first + i, first + i - 1, RIGHT);
         for (int i = 0; i < width; ++i) {
             const int p = first + i;
+            const long at = start + (long)row * stride + begin + i;
             const float below = Y_RISE(p);
             float sum = from_left[i] - from_left[i + 1] + above[i] - below;
             above[i] = below;
@@ -251,12 +252,12 @@ __kernel void links_join(GRAPH, KEPT_MAPS OUT source, const int place)
             const float weight = ANCHOR(p), rise = heights[p] - LEVEL(row, begin + i);
             sum += chosen(flags[p] & KNOWN, weight * rise);
 #endif
-            source[(long)place * rows * columns + p] = sum;
+            source[at] = sum;
 #if KEEP
-            right[p] = chosen(flags[p] & RIGHT, X_WEIGHT(p, p + 1));
-            down[p] = chosen(flags[p] & DOWN, Y_WEIGHT(p, p + next));
+            right[at] = chosen(flags[p] & RIGHT, X_WEIGHT(p, p + 1));
+            down[at] = chosen(flags[p] & DOWN, Y_WEIGHT(p, p + next));
 #if HEIGHTS
-            anchor[p] = chosen(flags[p] & KNOWN, weight);
+            anchor[at] = chosen(flags[p] & KNOWN, weight);
 #endif
 #endif
         }

@@ -102,6 +102,21 @@ def test_a_border_that_changes_is_followed(device):
     assert follower.gap < 0.1
 
 
+def test_one_step_is_enough_where_a_contact_moves(device):
+    shape, steps = (120, 160), []
+    y, x = np.mgrid[: shape[0], : shape[1]] / max(shape)
+    follower, random = WarmStartIntegrator(device, shape, PIXEL), np.random.default_rng(0)
+    for number in range(24):
+        away = 0.02 * np.cos(0.4 * number), 0.02 * np.sin(0.4 * number)
+        inside = np.hypot(x - 0.5 - away[0], y - 0.4 - away[1]) < 0.3
+        slopes = [values + random.normal(0, 1e-3, shape) for values in (np.sin(9 * x), np.cos(7 * y))]
+        cut = [np.where(inside, values, np.nan) for values in slopes]
+        maps = [values.astype(np.float32) for values in (*cut, *[np.where(inside, 1.0, 0.0)] * 2)]
+        follow(follower, maps)
+        steps.append(follower.gap)
+    assert max(steps[1:]) < 0.05
+
+
 def test_nothing_has_no_heights_and_does_not_stay(device):
     shape = (20, 30)
     maps, follower = scene(shape), WarmStartIntegrator(device, shape, PIXEL)

@@ -102,6 +102,19 @@ def test_kernels_and_reference_build_the_same_graph(device, shape, scene):
     near(pixel_links.read(), np.stack([0 * source, source, 0 * source]))
 
 
+def test_links_are_put_into_rows_of_another_length(device):
+    shape, start, stride = (23, 37), 5, 48
+    graph = PixelGraph(device, shape)
+    graph.upload(SCENES["weights"].inputs(shape))
+    joined = graph.links()
+    expected = {name: getattr(joined, name).read() for name in ("right", "down", "source")}
+    maps = {name: put(graph, np.zeros(start + shape[0] * stride)) for name in expected}
+    graph.put_links(maps, start, stride)
+    for name, values in expected.items():
+        rows = maps[name].read()[start:].reshape(-1, stride)
+        np.testing.assert_array_equal(rows, np.pad(values, ((0, 0), (0, stride - shape[1]))))
+
+
 @scenes
 def test_kernels_and_reference_find_the_same_misfit(device, scene):
     inputs, graph = scene.inputs((23, 37)), PixelGraph(device, (23, 37))
