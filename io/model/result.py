@@ -236,7 +236,7 @@ class Result(MapContainer, Mapping[str, Any]):
 
     def _own_name(self, quantity: str) -> str:
         """Return the name of a quantity in this result; the quantity itself if it has none."""
-        if quantity in self._maps:
+        if quantity in self._maps or not self.declarations:
             return quantity
         base = quantity.removesuffix(SIGMA) if is_deviation(quantity) else quantity
         names = (name for name, declaration in self.declarations.items() if declaration.quantity == base)
