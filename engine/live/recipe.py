@@ -75,8 +75,9 @@ class Contact:
     >>> few, many = contact.variance(4, 4), contact.variance(16, 16)
     >>> few > many
     True
-    >>> cheapest(contact.variance, 0.005)
-    Recipe(press_steps=4, turn_frames=4, sigma=0.004..., seconds=nan)
+    >>> recipe = cheapest(contact.variance, 0.005)
+    >>> recipe.press_steps, recipe.turn_frames, recipe.sigma < 0.005
+    (3, 4, True)
     """
 
     pixel_size: float

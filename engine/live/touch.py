@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.fusion.fusion import fuse
 from mirrorskin.engine.live.recipe import PRESS_STEPS, TURN_FRAMES, Contact, Measured, Recipe, cheapest
 from mirrorskin.engine.press.press import Press
@@ -198,6 +199,8 @@ def touch(
     ------
     mirrorskin.io.InputError
         Impossible numbers; a sensor without zenith gain or pixel size; or no contact.
+    mirrorskin.engine.NotConverged
+        No surface was found, with all frames either.
 
     Examples
     --------
@@ -359,6 +362,7 @@ class _Touch:
         self._calibration = calibration
         self._began = sensor.now()
         self._searched = self._retaken = 0
+        self._error: NotConverged | None = None
         self._doubts: dict[str, str] = {}  # findings that were left, by kind
 
     def run(self) -> Touched:
@@ -369,22 +373,25 @@ class _Touch:
         self._press(np.linspace(self._first, self._sensor.deepest, planned.press_steps + 1)[1:])
         self._turn(planned.turn_frames)
         self._take_again_if_moved()
-        outcome = best = self._measure(planned)
+        best, sigma = self._measure(planned, None)
         useless, reason = 0, ""
-        while not best.reached:
-            following, reason = self._following(contact, outcome)
+        while best is None or not best.reached:
+            following, reason = self._following(contact, sigma, best)
             if following is None:
                 break
-            self._tell(f"{outcome}; expected: {following}", outcome.result)
-            self._extend(outcome, following)
-            newer = self._measure(planned)
-            useless = useless + 1 if newer.sigma > _GAIN_MIN * best.sigma else 0
-            outcome = newer
-            best = outcome if outcome.reached or outcome.sigma < best.sigma else best
-            if useless == _USELESS and not best.reached:
+            text = "no surface yet" if best is None else str(best)
+            self._tell(f"{text}; expected: {following}", best and best.result)
+            self._extend(following)
+            before = math.inf if best is None else best.sigma
+            best, sigma = self._measure(planned, best)
+            useless = useless + 1 if sigma > _GAIN_MIN * before else 0
+            if best is not None and useless == _USELESS and not best.reached:
                 reason = f"more frames no longer help, limited by {_limit(best)}"
                 break
         self._sensor.lift()
+        if best is None:
+            assert self._error is not None
+            raise self._error
         reason = "; ".join(["the request is met" if best.reached else reason, *self._doubts.values()])
         return replace(best, reason=reason, retaken=self._retaken, seconds=self._seconds)
 
@@ -511,31 +518,41 @@ class _Touch:
             for pose in poses:
                 self._take(pose)
 
-    def _measure(self, planned: Recipe) -> Touched:
-        """Return the outcome so far."""
+    @property
+    def _counts(self) -> tuple[int, int]:
+        """Numbers of press steps and of turn frames."""
+        turn = sum(1 for taken in self._taken if taken.pose.tilt)
+        return len(self._taken) - turn - self._searched, turn
+
+    def _measure(self, planned: Recipe, best: Touched | None) -> tuple[Touched | None, float]:
+        """Return the best outcome so far, and the standard deviation that the share of the pixels has now."""
         press, turn = recordings_of(self._sensor, self._taken)
         assert press is not None
         assert turn is not None
         calibration = self._calibration
-        result = fuse_touch(_calibrated(press, calibration), _calibrated(turn, calibration), self._device)
+        try:
+            result = fuse_touch(_calibrated(press, calibration), _calibrated(turn, calibration), self._device)
+        except NotConverged as error:  # more frames may help
+            self._error = error
+            return best, math.inf
         sigma = sigma_of_normals(result)
         share = float(np.mean(sigma <= self._sigma)) if sigma.size else 0.0
         reaching = float(np.quantile(sigma, self._share, method="higher")) if sigma.size else math.inf
-        steps = press.shape[0] - self._searched
-        counts = steps, turn.shape[0], self._searched, self._retaken
         reached = share >= self._share
-        return Touched(result, press, turn, reached, share, reaching, "", planned, *counts, self._seconds)
+        counts = *self._counts, self._searched, self._retaken
+        outcome = Touched(result, press, turn, reached, share, reaching, "", planned, *counts, self._seconds)
+        return outcome if best is None or reached or reaching < best.sigma else best, reaching
 
-    def _following(self, contact: Contact, outcome: Touched) -> tuple[Recipe | None, str]:
+    def _following(self, contact: Contact, sigma: float, best: Touched | None) -> tuple[Recipe | None, str]:
         """Return the next recipe, or None and the reason; press steps are halved, so that they stay even."""
-        press, turn = outcome.press_steps, outcome.turn_frames
+        press, turn = self._counts
+        limited = "" if best is None else f", limited by {_limit(best)}"
         finer = [press, 2 * press] if 2 * press <= PRESS_STEPS[1] else [press]
         more = [(steps, count) for steps in finer for count in range(turn, TURN_FRAMES[1] + 1)][1:]
-        known = math.isfinite(outcome.sigma)
+        known = math.isfinite(sigma)
         if not more or not (known or len(finer) == 2):
-            text = f"{press} press steps and {turn} turn frames do not suffice"
-            return None, f"{text}, limited by {_limit(outcome)}"
-        variance = outcome.sigma**2 if known else math.inf
+            return None, f"{press} press steps and {turn} turn frames do not suffice{limited}"
+        variance = sigma**2 if known else math.inf
         measured = Measured(press, turn, variance, contact.variance_of_turn(press, turn))
         recipes = [Recipe(*counts, math.sqrt(measured.after(*counts))) for counts in more]
         enough = [recipe for recipe in recipes if recipe.sigma <= _MARGIN * self._sigma]
@@ -543,16 +560,17 @@ class _Touch:
         other = next(recipe for recipe in recipes if (recipe.press_steps, recipe.turn_frames) == usual)
         recipe = self._timed(min(enough, key=lambda r: (r.frames, r.sigma), default=other), press + turn)
         if self._seconds + recipe.seconds > self._within:
-            return None, f"there is no time for {recipe}, limited by {_limit(outcome)}"
+            return None, f"there is no time for {recipe}{limited}"
         return recipe, ""
 
-    def _extend(self, outcome: Touched, recipe: Recipe) -> None:
+    def _extend(self, recipe: Recipe) -> None:
         """Take the middles of all press steps, and turn frames in between those so far."""
-        if recipe.press_steps > outcome.press_steps:
+        steps, frames = self._counts
+        if recipe.press_steps > steps:
             places = self._places
             self._press((places[1:] + places[:-1]) / 2)
-        if recipe.turn_frames > outcome.turn_frames:
-            self._turn(recipe.turn_frames - outcome.turn_frames)
+        if recipe.turn_frames > frames:
+            self._turn(recipe.turn_frames - frames)
 
     @property
     def _places(self) -> NDArray[np.float64]:
