@@ -156,7 +156,7 @@ def measure(seeds: int = 3) -> Iterator[tuple[str, ...]]:
                     "-" if needed is None else str(needed),
                     "-" if needed is None or not outcome.reached else f"{frames / needed:.2f}",
                     f"{outcome.seconds:.1f}",
-                    outcome.reason,
+                    "" if outcome.reached else outcome.reason,
                 )
 
 

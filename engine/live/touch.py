@@ -32,12 +32,12 @@ _MIN_PIXELS = 16  # pixels that must have changed
 _NOISE_MIN = 0.3  # counts: rounding alone, as the standard deviation of integers
 _LEAST_SHARE = 0.01  # of the pixels, on either side of a press step that shows the common height
 _LEAST_GROWTH = 0.005  # share of the picture: contact that grows by less has ended
-_LIGHT_MAX = 0.06  # share of the light by which it may change between frames
+_LIGHT_MAX = 0.08  # share of the light by which it may change between frames
 _MOVED_MAX, _SMOOTHED = 0.5, 2.0  # pixels: largest shift between press and turn, and Gaussian blur for it
 _RETAKES = 2  # of what the check complains about
 _GAIN_MIN = 0.97  # more frames that leave more than this share of the standard deviation were of no use
 _USELESS = 2  # extensions in a row that were of no use, after which a touch ends
-_MARGIN = 0.9  # of the requested standard deviation, which recipes aim at
+_MARGIN = 0.9  # of the requested standard deviation, which additional frames aim at
 _RETAKEN = ("flicker", "outliers", "repeated frames", "phase jump", "cut off", "no response")
 _SATURATED = "cut off"
 
@@ -380,7 +380,7 @@ class _Touch:
             if following is None:
                 break
             text = "no surface yet" if best is None else str(best)
-            self._tell(f"{text}; expected: {following}", best and best.result)
+            self._tell(f"{text}; expected: {following}", None if best is None else best.result)
             self._extend(following)
             before = math.inf if best is None else best.sigma
             best, sigma = self._measure(planned, best)
@@ -438,7 +438,7 @@ class _Touch:
     def _plan(self, contact: Contact) -> Recipe:
         """Return the cheapest recipe; if none suffices in time, what is possible in it."""
         room = (self._within - self._seconds) / self._each
-        recipe = cheapest(contact.variance, _MARGIN * self._sigma)
+        recipe = cheapest(contact.variance, self._sigma)
         if recipe is None or recipe.frames > room:
             most = min(room, (PRESS_STEPS[1] + TURN_FRAMES[1]) / 2)
             turn = TURN_FRAMES[0]
