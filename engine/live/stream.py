@@ -24,7 +24,7 @@ from mirrorskin.engine.base.operation import COMPONENTS, Operation
 from mirrorskin.engine.live.loop import LATENCY, Loop, OnUpdate
 from mirrorskin.engine.live.run import LiveRun
 from mirrorskin.engine.live.status import Event, Status, Update
-from mirrorskin.engine.live.tracking import Frames, Limit, Tracker
+from mirrorskin.engine.live.tracking import Limit, Tracker
 from mirrorskin.io import Block, Header, InputError, Motion, Result
 from mirrorskin.io.base.arguments import check_number, unknown_argument
 from mirrorskin.io.base.types import Closing, Floats
@@ -52,7 +52,8 @@ class Stream(Closing):
     dtype : dtype
         uint8, uint16 or float32.
     motion : {"vertical", "axial", "horizontal", "twist"}, optional
-        How the body moves; by default the motion that the operation applies to.
+        How the body moves; by default the motion that the operation applies to, and any if it takes no
+        positions.
     header : Header, optional
         Properties of all frames, such as the pixel size; its motion is used.
     latency : float
@@ -96,7 +97,7 @@ class Stream(Closing):
         header = _header(operation, motion, header)
         self._source = _Pushed(header, shape, check_dtype(dtype), latency, on_update)
         self._run = LiveRun(self._source, operation)
-        if isinstance(self._run.operation, Frames):
+        if not self._run.operation.positions:
             self._source.needed = ()
         if {"pose", "tilt"} & {name for name, needed in self._run.operation.positions.items() if needed}:
             self._source.needed += ("tilt",)
@@ -231,9 +232,8 @@ def _header(operation: Operation | Method, motion: Motion | None, header: Header
             raise InputError(f"motion {motion!r} contradicts the header's, {header.motion!r}: leave it out")
         return header
     possible = operation.motions or tuple(POSITIONS)
-    if isinstance(operation, Frames):
-        return Header(motion or "vertical")
-    if motion is None and len(possible) > 1:
+    needs_positions = isinstance(operation, Method) or bool(operation.positions)
+    if motion is None and len(possible) > 1 and needs_positions:
         name, motions = type(operation).__name__, ", ".join(possible)
         raise InputError(f"{name} applies to several motions: give motion, one of {motions}")
     return Header(cast(Motion, motion or possible[0]))

@@ -232,6 +232,28 @@ def test_times_that_run_backwards_are_refused_and_no_frame_is_lost(frames):
         assert (pushed.status.used, pushed.status.skipped) == (2, 0)
 
 
+class Brightest(engine.Operation):
+    """The largest sample of each pixel."""
+
+    brightest = io.Map("largest sample", "counts")
+
+    def start(self, shape, dtype):
+        self._most = np.zeros(shape, dtype)
+
+    def push(self, frames):
+        np.maximum(self._most, frames.max(axis=0), out=self._most)
+
+    def result(self):
+        return {"brightest": self._most.astype(np.float32)}
+
+
+def test_an_operation_that_takes_no_positions_needs_neither_them_nor_a_motion():
+    with Stream(Brightest(), (4, 5), latency=math.inf) as stream:
+        for counts in (10, 30, 20):
+            stream.push(np.full((4, 5), counts, np.uint8))
+        assert (stream.result().brightest == 30).all()
+
+
 class Failing(engine.Operation):
     """It fails at a frame with a count above 200."""
 
