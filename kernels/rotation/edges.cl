@@ -113,6 +113,18 @@ __kernel void edges_jumps(
     const int stride = columns + 2 * MARGIN, plane = (rows + 2 * MARGIN) * stride;
     __global const float *x = cells + (row + MARGIN) * stride + first + MARGIN, *y = x + plane, *z = y + plane;
     __global const float *variance = z + plane, *valid = variance + plane, *unbarred = valid + plane;
+#if TILE > 1  // far from all contact there is no pair
+    float around = 0;
+    for (int away = 0; away <= MARGIN * stride && !(around > 0); away += stride)
+        for (int i = -MARGIN; i < width + MARGIN; ++i) around += valid[i + away] + valid[i - away];
+    if (!(around > 0)) {
+        for (int i = 0; i < width; ++i) {
+            undecided[target + i] = FIRST || undecided[target + i];
+            strength[target + i] = directions[target + i] = 0;
+        }
+        return;
+    }
+#endif
 
     float best[CHUNK], square[CHUNK], error[CHUNK], min_variance[CHUNK];
     int direction[CHUNK];
