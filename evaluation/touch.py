@@ -49,7 +49,8 @@ SCENE: Mapping[str, Any] = {"shape": (96, 128), "pixel_size": 0.03, "pattern": "
 PRESSES = range(PRESS_STEPS[0], PRESS_STEPS[1] + 1)
 TURNS = 4, 5, 6, 8, 12, 24
 
-_STORED = Path(__file__).parent / "stored" / "touch.json"
+STORED = Path(__file__).parent / "stored" / "touch.json"
+"""Standard deviations of all recipes, by object; see `try_all`."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def touched(name: str, request: float, seed: int, within: float = math.inf) -> t
 
 def measure(seeds: int = 3) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table."""
-    best = json.loads(_STORED.read_text())
+    best = json.loads(STORED.read_text())
     for name in OBJECTS:
         for number, request in enumerate(REQUESTS):
             for seed in range(1, seeds + 1):
@@ -170,10 +171,10 @@ def main(arguments: Sequence[str]) -> None:
     """Try all recipes of some objects, or print the table of touches."""
     warnings.simplefilter("ignore", io.MirrorskinWarning)
     if arguments[:1] == ["recipes"]:
-        stored = json.loads(_STORED.read_text()) if _STORED.exists() else {}
+        stored = json.loads(STORED.read_text()) if STORED.exists() else {}
         for name in arguments[1:] or OBJECTS:
             stored[name] = try_all(name)
-            _STORED.write_text(json.dumps(stored) + "\n")
+            STORED.write_text(json.dumps(stored) + "\n")
         return
     rows = list(measure(*map(int, arguments)))
     print(Table("Touches on the emulated rig", HEAD, rows))

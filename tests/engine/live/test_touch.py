@@ -90,7 +90,7 @@ def test_its_recording_repeats_the_result_bit_by_bit(reached, tmp_path):
 
 
 def test_a_request_that_cannot_be_met_ends_with_the_best_surface_and_the_reason():
-    with sensor_of("texture") as (_, _, sensor), sensor:
+    with sensor_of("cone") as (_, _, sensor), sensor:
         outcome = engine.live.touch(sensor, 1e-5)
     assert not outcome.reached
     assert "limited by" in outcome.reason
