@@ -135,7 +135,7 @@ def find_modulation_effects(
     noise, rough = noise[finite], rough[finite]
     gain = _gain(rough, noise)
     zenith = zenith[finite] - np.mean(zenith[finite])
-    response = 1 + _steepness(middle[0][finite], tilt)
+    response = 1 - _steepness(middle[0][finite], tilt)
     swing = Swing(
         middle[3][finite], np.hypot(noise, gain), response, x, y, turning[finite], bending[finite], zenith
     )
