@@ -19,7 +19,7 @@ from mirrorskin.engine.diagnosis.curl import AzimuthBias, find_azimuth_bias
 from mirrorskin.engine.diagnosis.registration import Registered
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.engine.diagnosis.sensor_health import change_of_swing, with_light_change
-from mirrorskin.engine.diagnosis.swing import ModulationEffects, find_modulation_effects
+from mirrorskin.engine.diagnosis.swing import ModulationEffects, find_modulation_effects, swing_of_wall
 from mirrorskin.engine.diagnosis.turn_nuisances import TurnNuisances
 from mirrorskin.io import Result
 from mirrorskin.io.base.findings import Finding, with_findings
@@ -96,8 +96,8 @@ class ResponseUncertainty(Step):
 
     Gains of pixels are added to the errors, and noted; the area that a pixel sees is used. Blur, and a
     response that is not linear, are warnings: see `mirrorskin.engine.diagnosis.swing`, and so is brightness
-    that has changed since the calibration: see `mirrorskin.engine.diagnosis.sensor_health`. A calibrated
-    response is not judged.
+    that has changed since the calibration: see `mirrorskin.engine.diagnosis.sensor_health`. Of a calibrated
+    response, only the latter is judged.
     """
 
     needs = ("normals", "normals_sigma", "zenith", "mean", "modulation", "contact")
@@ -108,22 +108,22 @@ class ResponseUncertainty(Step):
         fitted = result.fitted
         noise, slope, frames, tilt = fitted.noise, fitted.shot_noise, fitted.frames, fitted.tilt
         normals, mean = (stored_map(result, name) for name in ("normals", "mean"))
-        if operation.response is not None or normals.ndim == 4:
+        if normals.ndim == 4:
             return result
         if noise is None or slope is None or frames is None or tilt is None:  # of a class with its own result
             return result
         cosine, sine = (stored_map(context.computed, name) for name in ("cosine", "sine"))
         base = noise**2 - (slope * typical_value(mean) if slope > 0 else 0.0)
-        modulation = find_modulation_effects(
-            normals,
-            mean,
-            cosine,
-            sine,
-            result.contact,
-            cast("ArrayLike", operation.zenith_gain),
-            tilt,
-            CountNoise(base / frames, slope / frames, QUANTUM**2 / frames),
-        )
+        maps = normals, mean, cosine, sine, result.contact
+        noise_of_mean = CountNoise(base / frames, slope / frames, QUANTUM**2 / frames)
+        header, response = context.source.header, operation.response
+        if response is not None:
+            swing = swing_of_wall(*maps, response, tilt, noise_of_mean)
+            # The swing is a difference of light whose zeniths are two tilts apart.
+            sigma = math.sqrt(2) * float(np.nanmedian(response.sigma)) / tilt
+            return with_light_change(result, change_of_swing(swing, header, tilt, sigma), "axial")
+        gain = cast("ArrayLike", operation.zenith_gain)
+        modulation = find_modulation_effects(*maps, gain, tilt, noise_of_mean)
         if modulation.gain > 0:
             result = _with_share_of_zenith(result, modulation.gain).with_fitted(
                 pixel_gain_sigma=modulation.gain
@@ -131,7 +131,8 @@ class ResponseUncertainty(Step):
         if modulation.area > 0 and operation.blur is None:
             result = result.assign(fitted=replace(result.fitted, footprint=modulation.area))
         result = with_findings(result, *_of_swing(modulation))
-        change = change_of_swing(modulation, context.source.header, tilt)
+        doubtful = modulation.blur > 0 or modulation.response > 0
+        change = None if doubtful else change_of_swing(modulation.swing, header, tilt)
         return with_light_change(result, change, "axial")
 
 

@@ -18,7 +18,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from mirrorskin.engine.diagnosis.footprint import LEAST_BLUR, PIXEL
-from mirrorskin.engine.diagnosis.swing import ModulationEffects
+from mirrorskin.engine.diagnosis.swing import Swing
 from mirrorskin.engine.diagnosis.turn_nuisances import shift_of
 from mirrorskin.io import Fitted, Header, Motion, Result
 from mirrorskin.io.base.findings import Finding, with_findings
@@ -156,10 +156,14 @@ def find_clear_change(fitted: Fitted, motion: Motion) -> Finding | None:
     return Finding(KIND, text, warning)
 
 
-def change_of_swing(effects: ModulationEffects, header: Header, tilt: float) -> LightChange | None:
-    """Return the change of the brightness by the swing of a rotation; None if it shows other faults, too."""
-    swing = effects.swing
-    if swing is None or effects.blur > 0 or effects.response > 0:
+def change_of_swing(
+    swing: Swing | None, header: Header, tilt: float, gain_sigma: float | None = None
+) -> LightChange | None:
+    """Return the change of the brightness by the swing of a rotation.
+
+    ``gain_sigma`` is the relative standard deviation of a calibrated response; by default that of the gain.
+    """
+    if swing is None:
         return None
     footprint = PIXEL + LEAST_BLUR**2
     # Where azimuths turn by much within the area that a pixel sees, its effect is not proportional.
@@ -180,5 +184,6 @@ def change_of_swing(effects: ModulationEffects, header: Header, tilt: float) -> 
         np.array([-footprint / 2, *[0.0] * 6]),
         np.array([_AREA / 2, _PER_ZENITH * gamma, *[shift] * 5]),
     )
-    stated = header.prior("zenith_gain_sigma"), header.prior("tilt_sigma"), _GAMMA * gamma
+    gain_sigma = header.prior("zenith_gain_sigma") if gain_sigma is None else gain_sigma
+    stated = gain_sigma, header.prior("tilt_sigma"), _GAMMA * gamma
     return find_light_change(samples, math.hypot(*stated), header.prior("uneven_light_sigma"))

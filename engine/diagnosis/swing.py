@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,10 @@ from mirrorskin.engine.diagnosis.footprint import PIXEL
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, OUTLYING, fit_clipped, gram, mad_sigma
+from mirrorskin.kernels.rotation.normals_wall import Wall, light_of_turn
+
+if TYPE_CHECKING:
+    from mirrorskin.engine.rotation.response import Response
 
 _MIN_ZENITH = 1.5  # tilts, from which on the zenith and the swing are independent
 _REACH = 1  # pixels between the middle and its neighbours
@@ -42,6 +46,9 @@ _MAX_TURNING = 0.05  # the same, of pixels that show a response: a pixel's area 
 _AREA_ITERATIONS = 4
 _MOST_TURNED = 0.2  # square of the angle by which azimuths turn over an area: its effect is proportional
 _TURNING, _ZENITH = 1, 3  # numbers of the columns of a fit
+_PHASES = 8  # of a turn, at which the light under a wall is computed
+_STEP = 1e-3  # relative increase of the slope, for derivatives
+_MOST_STEEP = 0.7  # relative change of the swing for that of the light, of a pixel that shows a change
 _MIN_RANGE = 0.05  # least range of the swing, as a share of it, that is a response
 _MIN_GAIN = 0.01  # least standard deviation of the gains of pixels
 
@@ -146,6 +153,78 @@ def find_modulation_effects(
     area = _area(*given)
     blur = math.sqrt(max(area - PIXEL, 0.0))
     return ModulationEffects(gain, area, blur if blur > _MIN_BLUR else 0.0, _response(*given), swing)
+
+
+def swing_of_wall(
+    normals: AnyArray,
+    mean: AnyArray,
+    cosine: AnyArray,
+    sine: AnyArray,
+    usable: NDArray[Any],
+    response: Response,
+    tilt: float,
+    noise_of_mean: CountNoise,
+) -> Swing | None:
+    """Return the swing of the brightness under a calibrated wall, relative to the expected one.
+
+    Arguments as for `find_modulation_effects`; ``response`` replaces the gain. Pixels whose light leaves the
+    range of the response are left out.
+    """
+    rows, columns = usable.shape
+    thin = max(1, math.isqrt(int(np.count_nonzero(usable))) // GRID_LINES)
+    if min(rows, columns) <= 2 * _REACH:
+        return None
+    down, right = range(_REACH, rows - _REACH, thin), range(_REACH, columns - _REACH, thin)
+    places = (0, 0), (0, _REACH), (0, -_REACH), (-_REACH, 0), (_REACH, 0)
+    vectors = np.stack(take_places([normals], down, right, places)[0], dtype=np.float64)
+    ((used,), (level,), (along,), (across,)) = take_places(
+        [usable, mean, cosine, sine], down, right, [(0, 0)]
+    )
+    scale = response.planes[:, down.start : down.stop : thin, right.start : right.stop : thin]
+    finite = np.isfinite(vectors).all(axis=(0, 1)) & (used > 0) & np.isfinite(scale).all(axis=0)
+    finite &= np.hypot(*vectors[0, :2]) > math.sin(_MIN_ZENITH * tilt)
+    if np.count_nonzero(finite) < MIN_PIXELS:
+        return None
+    normal, planes = vectors[0][:, finite].T, scale[:, finite].astype(np.float64)
+    light, swing, within = _wall_swing(normal, planes, response.wall, tilt)
+    nearby, near_swing, _ = _wall_swing(_steeper(normal), planes, response.wall, tilt)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steepness = np.log(near_swing / swing) / np.log(nearby / light)
+        amplitude = np.hypot(along, across)[finite] * np.abs(planes[1])
+        ratio = np.where(within & (np.abs(steepness) < _MOST_STEEP), amplitude / swing, np.nan)
+        sigma = math.sqrt(2) * noise_of_mean.at(level[finite]) * np.abs(planes[1]) / swing
+        flat = np.hypot(vectors[:, 0], vectors[:, 1])
+        zenith, x, y = np.arctan2(flat, vectors[:, 2]), vectors[:, 0] / flat, vectors[:, 1] / flat
+    apart = 2 * _REACH
+    turning = sum(
+        ((each[first] - each[second]) / apart) ** 2 for each in (x, y) for first, second in ((1, 2), (3, 4))
+    )
+    bending = ((zenith[1] - zenith[2]) * x[0] + (zenith[3] - zenith[4]) * y[0]) / apart
+    row, column = (
+        np.broadcast_to(positions, finite.shape)[finite]
+        for positions in np.ix_(1 - 2 * np.array(down) / (rows - 1), 2 * np.array(right) / (columns - 1) - 1)
+    )
+    mean_zenith = float(np.mean(zenith[0][finite]))
+    return Swing(
+        ratio, sigma, 1 - steepness, column, row, np.asarray(turning)[finite], bending[finite],
+        zenith[0][finite] - mean_zenith,
+    )  # fmt: skip
+
+
+def _wall_swing(
+    normal: Doubles, planes: Doubles, wall: Wall, tilt: float
+) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
+    """Return mean and amplitude of the light of normals, (n, 3), over a turn, and whether it is in range."""
+    phase = np.arange(_PHASES) * 2 * math.pi / _PHASES
+    light, within = light_of_turn(normal, phase, planes, wall, tilt)
+    return light.mean(axis=0), np.abs(2 * np.exp(1j * phase) @ light) / _PHASES, np.all(within, axis=0)
+
+
+def _steeper(normal: Doubles) -> Doubles:
+    """Return normals, (n, 3), whose zenith is a little larger."""
+    turned = normal.copy()
+    turned[:, :2] *= 1 + _STEP
+    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
 
 
 def _expected(zenith: Doubles, tilt: float) -> Doubles:

@@ -110,6 +110,19 @@ def normals_wall(
     return conclude(normal, sums, samples, usable, tilt, limits, limits.model * steepness, rest)
 
 
+def light_of_turn(
+    normal: Doubles, phase: Doubles, scale: Doubles, wall: Wall, tilt: float
+) -> tuple[Doubles, NDArray[np.bool_]]:
+    """Return the light of normals, (n, 3), at phases, (N,), and whether it is in range: each (N, n).
+
+    ``scale`` is that of `normals_wall`.
+    """
+    turning, _ = _rotations(np.stack([np.cos(phase), np.sin(phase)]), tilt)
+    facing = np.einsum("kij,nj->kni", turning, normal)
+    places = _places(scale, turning, wall)
+    return wall_light(places, facing, wall.geometry, wall.lamps, wall.curve, wall.reach)
+
+
 def _start(samples: Samples, scale: Doubles, wall: Wall) -> Doubles:
     """Return the directions given by the mean light and the wave, (n, 3)."""
     present = np.maximum((~samples.missing).sum(axis=0), 1)

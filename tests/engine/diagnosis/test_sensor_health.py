@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
-from mirrorskin import engine
+from mirrorskin import engine, io
+from mirrorskin.engine.calibration import fit_zenith, measure_references
 from mirrorskin.engine.metrology import table
-from mirrorskin.evaluation.calibration import fisher
+from mirrorskin.evaluation.base.sources import Frames
+from mirrorskin.evaluation.calibration import fisher, scorer
+from mirrorskin.evaluation.calibration.scenes import BALL, Lab, nine_balls, press_for
 from mirrorskin.evaluation.scenes import rotations
 from mirrorskin.io.files.arrays import ArrayRecording
 
@@ -142,3 +145,30 @@ def test_a_recording_is_compared_without_a_result():
     finding = engine.calibration.compare_brightness(recording)
     assert finding is not None
     assert finding.text in quietly(recording).process["warnings"]
+
+
+WAVES = scorer.waves(0.22, 2.4, 0.35, 6.0)
+
+
+@pytest.fixture(scope="module")
+def walled():
+    """Return a sensor with a wall, and its calibration by balls, at a coarse resolution."""
+    lab = Lab(shape=(72, 72), pixel_size=0.125)
+    levels = [lab.flat(light, 32, take) for light, take in ((0.0, 900), (1.0, 901))]
+    taken = measure_references(levels[:1], levels[1:]).references
+    response = fit_zenith(nine_balls(lab, 3.0, 1), BALL / 2, references=taken)
+    still = io.Precession(lab.tilt, 0.0, 1, 0.0, 0.0, (0.0, 0.0), lab.pivot)
+    camera = io.CameraId("", lab.shape, np.dtype("uint8"))
+    return lab, io.Calibration(camera, taken, zenith=response, precession=still)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", [1.0, 0.95])
+def test_a_wall_whose_light_has_changed_states_it(walled, light):
+    lab, calibration = walled
+    turned = lab.turned(WAVES, press_for(WAVES), 30)
+    dark = np.nan_to_num(calibration.references.dark)
+    frames = np.rint(dark + light * (turned.frames - dark)).clip(0, 255).astype(np.uint8)
+    changed = Frames(frames, turned.header, turned.name, **turned.series)
+    result = engine.reconstruct(changed, calibration=calibration)
+    assert result.fitted.light_change[0] == pytest.approx(light - 1, abs=0.01)
