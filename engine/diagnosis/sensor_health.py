@@ -30,6 +30,7 @@ KIND = "brightness change"
 
 _WIDE = 1.0  # standard deviation of a change of brightness before the recording: it may be any
 _SHOWN = 0.015  # standard deviation, without that of the calibration, of a mean that an object shows
+_MOST_INFLATED = 5.0  # ratio of standard deviations with and without nuisances that an object separates
 _LEAST_PRIOR = 1e-6  # standard deviation of a nuisance that is known
 _ROUNDS = 4  # in which outliers are left out
 _LEAST_PIXELS = 100  # that show a change
@@ -105,8 +106,15 @@ def find_light_change(samples: Samples, common: float, uneven: float) -> LightCh
     covariance = np.linalg.inv(products / spread + precision)
     scale = np.array([1.0, 1.0, 1.0, _TO_RIM])
     variance = scale**2 * np.diag(covariance)[:4]
-    if variance[0] > _SHOWN**2:
+    # A fit that separates effects which are nearly the same relies on a model that is not exact: on a ball,
+    # places, zeniths and movements in the picture change together.
+    light, others = np.split(used, [terms.shape[1]], axis=1)
+    alone = spread * np.linalg.inv(gram(light) + precision[: terms.shape[1], : terms.shape[1]])
+    confused = variance > scale**2 * np.diag(alone)[:4] * _MOST_INFLATED**2
+    if variance[0] > _SHOWN**2 or confused[0]:
         return None
+    mixed = alone @ light.T @ others / spread
+    variance += np.where(confused, scale**2 * np.sum((mixed[:4] * prior) ** 2, axis=1), 0.0)
     known = common, uneven, uneven, _TO_RIM * uneven
     return LightChange(
         cast("Parts", tuple((scale * factors[:4]).tolist())),
