@@ -35,6 +35,7 @@ _LEAST_GROWTH = 0.005  # share of the picture: contact that grows by less has en
 _LIGHT_MAX = 0.08  # share of the light by which it may change between frames
 _MOVED_MAX, _SMOOTHED = 0.5, 2.0  # pixels: largest shift between press and turn, and Gaussian blur for it
 _MANY = 8  # press steps of a recipe, from which on half of them are taken first
+_SAME_CONTACT = 0.75  # least ratio of the areas of contact in press and turn
 _RETAKES = 2  # of what the check complains about
 _GAIN_MIN = 0.97  # more frames that leave more than this share of the standard deviation were of no use
 _USELESS = 2  # extensions in a row that were of no use, after which a touch ends
@@ -498,8 +499,11 @@ class _Touch:
             if not found or attempt == _RETAKES:
                 self._doubts |= found
                 return
+            if attempt:  # an earlier frame may be wrong
+                first = self._searched
             again = [taken.pose for taken in self._taken[first:] if bool(taken.pose.tilt) == leaning]
-            del self._taken[first:]
+            kept = [taken for taken in self._taken[first:] if bool(taken.pose.tilt) != leaning]
+            self._taken[first:] = kept
             self._retaken += len(again)
             self._tell(f"{len(again)} frames are taken again: {'; '.join(found.values())}", None)
             for pose in again:
@@ -512,6 +516,8 @@ class _Touch:
             if moved <= _MOVED_MAX:
                 return
             text = f"the object moved by {moved:.1f} pixels between press and turn"
+            if math.isinf(moved):
+                text = "press and turn do not show the same contact"
             if attempt == _RETAKES:
                 self._doubts["moved"] = text
                 return
@@ -626,7 +632,7 @@ def _change_of_light(frames: NDArray[Any], phase: NDArray[np.float64] | None) ->
 
 
 def _moved(press: ArrayRecording | None, turn: ArrayRecording | None) -> float:
-    """Return by how many pixels the mean picture of a turn is shifted from the deepest one of the press.
+    """Return by how many pixels the picture of a turn is shifted from that of a press; inf if it differs.
 
     The mean of a turn shows the same picture, because its leans cancel. The shift is that of least squares.
     """
@@ -637,7 +643,11 @@ def _moved(press: ArrayRecording | None, turn: ArrayRecording | None) -> float:
     deepest, mean = (
         cv2.GaussianBlur(np.asarray(picture, np.float32), (0, 0), _SMOOTHED) for picture in pictures
     )
-    lit = (np.minimum(deepest, mean) > deepest.max() / 4).astype(np.uint8)
+    light = deepest.max() / 4
+    contact = np.count_nonzero(deepest > light), np.count_nonzero(mean > light)
+    if min(contact) < _SAME_CONTACT * max(contact):
+        return math.inf
+    lit = (np.minimum(deepest, mean) > light).astype(np.uint8)
     inner = cv2.erode(lit, np.ones((9, 9), np.uint8)) > 0
     if np.count_nonzero(inner) < _MIN_PIXELS**2:
         return 0.0

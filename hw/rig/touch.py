@@ -24,6 +24,11 @@ SEARCH = 0.2
 """Distance between frames until there is contact, mm, by default."""
 
 
+_CATCHING_UP = (
+    0.5  # share of a period: frames in quicker succession were held up, and may show an earlier place
+)
+
+
 class RigTouch:
     """A rig for `mirrorskin.engine.live.touch`; its limits are checked before anything moves.
 
@@ -78,10 +83,16 @@ class RigTouch:
         """Move to a travel, mm, and a lean, radians, rest there, and return a frame of its own, (H, W)."""
         place = Position(travel, tilt * math.cos(phase), tilt * math.sin(phase))
         since = settle_at(self._rig, place, SETTLE)
+        camera, last = self._rig.settings.camera, math.inf
+        least = _CATCHING_UP * self._rig.period  # seconds between frames that did not wait for each other
+        if self._rig.trigger is not None or not (camera.delay is None or camera.streamed):
+            last = -math.inf
         while True:
             taken = self._rig.take(1)
-            if taken.time[-1] > since:
+            time = float(taken.time[-1])
+            if time > since and time - last >= least:
                 return np.array(taken.pixels[-1])
+            last = time
 
     def lift(self) -> None:
         """Set the body upright, and lift it to the end of its travel."""

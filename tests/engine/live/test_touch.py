@@ -183,6 +183,25 @@ def test_a_bump_between_press_and_turn_is_taken_again():
     assert outcome.reached
 
 
+def test_a_frame_of_an_earlier_place_is_taken_again():
+    with sensor_of() as (_, _, sensor):
+        take, frames = sensor.take, []
+
+        def held_up(travel, tilt=0.0, phase=0.0):
+            frames.append(take(travel, tilt, phase))
+            return (
+                frames[-2]
+                if len(frames) > 2 and travel == DEPTH and not tilt and len(frames) < 10
+                else frames[-1]
+            )
+
+        sensor.take = held_up
+        with sensor:
+            outcome = engine.live.touch(sensor, 0.01)
+    assert outcome.retaken > 0
+    assert outcome.reached
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
