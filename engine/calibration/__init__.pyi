@@ -1,9 +1,8 @@
 from .board import Charuco, Dots, mean_of_still, paint_board
 from .brightness import LinearBrightness, WallBrightness
-from .check import Check, ErrorMap, ErrorSummary, check_ball
+from .check import Check, ErrorMap, ErrorSummary, check_ball, compare_brightness
 from .force import KnownPress, StiffnessFit, fit_stiffness, known_press
 from .gel import BallOnset, BallPlace, GelFit, ball_onset, fit_gel
-from .health import compare_brightness
 from .lens import LensFit, calibrate_lens
 from .references import LevelReport, Measured, measure_references
 from .tilt import PrecessionFit, fit_precession

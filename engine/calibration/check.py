@@ -1,19 +1,24 @@
-"""Errors that remain after a calibration, on a ball that was not used for it."""
+"""What remains of a calibration: errors on a ball that was not used for it, and changes of the brightness."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.base.provenance import naming
-from mirrorskin.engine.base.reconstruction import reconstruct
+from mirrorskin.engine.base.reconstruction import calibrated, method_for, reconstruct
+from mirrorskin.engine.base.running import Progress, Run
 from mirrorskin.engine.calibration.ball import see_ball
 from mirrorskin.engine.calibration.sources import check_ball_radius
+from mirrorskin.engine.diagnosis.sensor_health import find_clear_change
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
+from mirrorskin.io.base.findings import Finding
+from mirrorskin.io.base.threads import computes
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.numerics import least_squares
@@ -369,3 +374,51 @@ def _summary(values: Doubles, group: NDArray[np.intp], shape: tuple[int, ...], f
     bias = np.bincount(group, values, minlength=count.size) / divisor
     rms = np.sqrt(np.bincount(group, values**2, minlength=count.size) / divisor)
     return ErrorSummary(count.reshape(shape), rms.reshape(shape), bias.reshape(shape))
+
+
+@computes
+def compare_brightness(
+    source: Source,
+    calibration: Calibration | str | Path | None = None,
+    progress: Progress | None = None,
+) -> Finding | None:
+    """Compare the brightness of a press or a rotation with the calibration of its sensor.
+
+    Every reconstruction does this, too. See the documentation, "Health of a sensor".
+
+    Parameters
+    ----------
+    source : Source
+        A recording, which is read once, and rewound before and after.
+    calibration : Calibration or path, optional
+        By default that with the recording; without one, the numbers that the recording states.
+    progress : callable, optional
+        Called with the number of frames so far.
+
+    Returns
+    -------
+    Finding or None
+        By how much the brightness has changed, if it is clear. None, too, if the recording has nothing to be
+        compared with, or cannot be reconstructed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mirrorskin.twin import Axial, Twin
+    >>> movement = Axial(np.pi / 4 * np.arange(8), tilt=0.05, press=1.0)
+    >>> turn = Twin(object="step", shape=(80, 80), pixel_size=0.13, movement=movement, pattern="linear")
+    >>> compare_brightness(turn) is None
+    True
+    """
+    if source.motion not in ("vertical", "axial") or not source.rewindable:
+        return None
+    source.rewind()
+    try:
+        opened = calibrated(source, calibration)
+        plan = replace(method_for(source.motion)().plan(opened), steps=[])
+        result = Run(plan, opened).complete(progress)
+    except InputError:
+        return None
+    finally:
+        source.rewind()
+    return find_clear_change(result.fitted, source.motion)
