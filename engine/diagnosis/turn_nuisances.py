@@ -1,14 +1,9 @@
 """What may be wrong with the brightness of a rotation: all of it at once, with priors.
 
-The model of a sample in frame t, at a pixel with the normal n, is ::
-
-    y = dark + (1 + g_t) (1 + u) R (l / R)^(1 + c) + o_t,    l = base + z + (1 + r) gain angle(n, t) - dark,
-
-with gains g and offsets o of the frames, uneven light u, a quadratic of the place without its mean, the
-camera's gamma 1 + c, an error r of the zenith gain and z of the zenith offset. The angle between normal and
-axis contains an error of the tilt and of the phase, and a frame may show a share of the one before (lag). R
-is full light. The normals of a grid of pixels are fitted together with these nuisances, each of which has a
-prior (`mirrorskin.io.Header.prior`). What the pixels do not determine stays as uncertain as its prior.
+The model of a sample is that of `mirrorskin.engine.diagnosis.turn_light`. The angle between normal and axis
+contains an error of the tilt and of the phase. The normals of a grid of pixels are fitted together with these
+nuisances, each of which has a prior (`mirrorskin.io.Header.prior`). What the pixels do not determine stays as
+uncertain as its prior.
 
 The covariance of the nuisances becomes that of normals, as a few *modes*: errors that all pixels have in
 common, each a function of the normal and of the place. A slope that is wrong everywhere in the same way
@@ -19,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -28,6 +23,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.correlation.design_matrix import basis
 from mirrorskin.engine.diagnosis.residual_noise import valid
+from mirrorskin.engine.diagnosis.turn_light import (
+    GLOBALS,
+    UNEVEN,
+    AxisAngles,
+    PixelScale,
+    Sums,
+    light_of,
+    uneven_terms,
+)
 from mirrorskin.io import Header
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import gram
@@ -41,9 +45,7 @@ _OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usua
 _MAX_MISFIT = 4.0  # variance of residuals, relative to that of two waves a pixel, of a model that fits
 _LEAST_NOISE = 0.3  # counts of 8 bits: rounding
 _ITERATIONS = 3
-_GLOBALS = ("gamma", "zenith_gain", "zenith_offset", "tilt", "phase", "lag")
-_UNEVEN = 5  # terms of uneven light
-_SWINGS = 0.03, 0.03, 0.03, *(0.01,) * _UNEVEN  # of the swing by zenith and place: a pixel has an area
+_SWINGS = 0.03, 0.03, 0.03, *(0.01,) * UNEVEN  # of the swing by zenith and place: a pixel has an area
 _SHIFTS = 3  # terms of the movement of points in the picture, by zenith
 _UNKNOWN_SHIFT = 1.0  # pixels
 _SWINGING = len(_SWINGS) + _SHIFTS
@@ -167,7 +169,7 @@ class TurnNuisances:
         light = (frames - offset - low) / gain
         if self.uneven.any():
             x, y = picture_axes((frames.shape[1], frames.shape[2]))
-            terms = _places(x, y[:, np.newaxis])
+            terms = uneven_terms(x, y[:, np.newaxis])
             light /= 1 + sum(factor * term for factor, term in zip(self.uneven, terms, strict=True))
         if self.gamma:
             light = self.full * np.maximum(light / self.full, 0) ** (1 / (1 + self.gamma))
@@ -247,11 +249,9 @@ def find_nuisances(
     seen = np.full((3, len(whole)), np.nan)
     seen[:, whole] = wave
     rise = grid.rise(seen[0], np.arctan2(seen[2], seen[1]))[whole]
-    swing = np.hypot(wave[1], wave[2]) / tilt
     faces = (wave[0] > -tilt) & (wave[0] < _UPRIGHT)
-    usable = faces & (wave[0] > _STEEP * tilt) & (swing > _SWING[0]) & (swing < _SWING[1])
     full = max(float(np.max(counts - dark)) if scale.bright is None else scale.bright, 1e-9)
-    usable &= np.min(counts - dark, axis=0) > _LEAST_LIGHT * full
+    usable = shows_model(wave, np.min(counts - dark, axis=0), tilt, full)
     priors = _priors_of(header, phase, np.ndim(scale.gain) > 0, counts, grid.shift)
 
     def fit_to(part: NDArray[np.bool_]) -> _Fit:
@@ -265,6 +265,17 @@ def find_nuisances(
         return _found(fit_to, usable, faces, wave, tilt, informed)
     except np.linalg.LinAlgError:  # a tilt or a gain that no sensor has
         return None
+
+
+def shows_model(wave: Doubles, least: Doubles, tilt: float, full: float) -> NDArray[np.bool_]:
+    """Return the pixels at which the model holds, (...).
+
+    ``wave`` is the wave of the zenith with the phase, (3, ...) radians: its mean, cosine and sine. ``least`` is
+    the light of the darkest frame, (...), and ``full`` full light, counts above the dark level.
+    """
+    swing = np.hypot(wave[1], wave[2]) / tilt
+    usable = (wave[0] > _STEEP * tilt) & (wave[0] < _UPRIGHT) & (swing > _SWING[0]) & (swing < _SWING[1])
+    return np.asarray(usable & (least > _LEAST_LIGHT * full))
 
 
 def _found(
@@ -301,7 +312,7 @@ def _thinned(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _priors_of(header: Header, phase: Doubles, has_map: bool, counts: Doubles, shift: float) -> Doubles:
-    """Return the covariance of the nuisances: gains of T frames, offsets, `_GLOBALS`, uneven light, swings.
+    """Return the covariance of the nuisances: gains of T frames, offsets, `GLOBALS`, uneven light, swings.
 
     Uneven light is known if the zenith gain is a map. The light of a frame may differ by chance, may drift,
     and may change with the phase: what moves with the body reflects it.
@@ -319,13 +330,13 @@ def _priors_of(header: Header, phase: Doubles, has_map: bool, counts: Doubles, s
         (_OFFSETS * offset) ** 2 * (np.eye(frames) + np.outer(ramp, ramp)),
     ]
     uneven = 0.0 if has_map else header.prior("uneven_light_sigma")
-    numbers = [header.prior(f"{name}_sigma") for name in _GLOBALS]
-    numbers[_GLOBALS.index("zenith_offset")] = offset
+    numbers = [header.prior(f"{name}_sigma") for name in GLOBALS]
+    numbers[GLOBALS.index("zenith_offset")] = offset
     swings = [*_SWINGS, *[shift] * _SHIFTS]
-    size = 2 * frames + len(numbers) + _UNEVEN + len(swings)
+    size = 2 * frames + len(numbers) + UNEVEN + len(swings)
     covariance = np.zeros((size, size))
     covariance[:frames, :frames], covariance[frames : 2 * frames, frames : 2 * frames] = blocks
-    ends = np.square([*numbers, *[uneven] * _UNEVEN, *swings])
+    ends = np.square([*numbers, *[uneven] * UNEVEN, *swings])
     covariance[2 * frames :, 2 * frames :] = np.diag(ends)
     diagonal = np.einsum("ii->i", covariance)
     diagonal += _FLOOR * max(float(diagonal.max()), 1.0) * (diagonal == 0)
@@ -333,12 +344,14 @@ def _priors_of(header: Header, phase: Doubles, has_map: bool, counts: Doubles, s
 
 
 class _Equations(NamedTuple):
-    """Inverses of the normals' matrices, their products with the nuisances', these' own, and the noise."""
+    """Normal equations of the nuisances after the normals are eliminated."""
 
-    inverses: Doubles
-    through: Doubles
-    own: Doubles
+    inverses: Doubles  # of the normals' matrices
+    through: Doubles  # their products with the cross terms
+    own: Doubles  # of the nuisances
     noise: float
+    push: Doubles  # of the normals
+    pull: Doubles  # of the nuisances, without normals
 
 
 class _Fit:
@@ -426,89 +439,48 @@ class _Fit:
         """
         frames = len(self._counts)
         gains, offsets = self._values[:frames, np.newaxis], self._values[frames : 2 * frames, np.newaxis]
-        gamma, gain, offset, tilt, phase, lag = self._values[2 * frames :][: len(_GLOBALS)]
-        uneven, swings = np.split(self._values[2 * frames + len(_GLOBALS) :], [_UNEVEN])
-        sine, cosine = np.sin(zenith), np.cos(zenith)
-        half = self._tilt * (1 + tilt)
-        lean, upright = math.sin(half), math.cos(half)
-        turned = azimuth - self._phase - phase
-        along = cosine * upright - sine * lean * np.cos(turned)
-        angle = np.arccos(np.clip(along, -1, 1))
-        down = np.maximum(np.sin(angle), 1e-9)
-        by_zenith = (sine * upright + cosine * lean * np.cos(turned)) / down
-        by_azimuth = -lean * np.sin(turned) / down  # for a rotation of the normal by an angle
-        places = np.stack(_places(self._x, self._y))
+        values, swings = np.split(self._values[2 * frames :], [len(GLOBALS) + UNEVEN])
+        half, shift = (values[GLOBALS.index(name)] for name in ("tilt", "phase"))
+        half = self._tilt * (1 + half)
+        angles = AxisAngles.of(zenith, azimuth, self._phase + shift, math.sin(half), math.cos(half))
+        places = np.stack(uneven_terms(self._x, self._y))
         steepness = self._zenith - np.mean(self._zenith)
         steepness /= max(float(np.std(steepness)), _LEAST_SPREAD)
         powers = np.stack([np.ones_like(steepness), steepness, steepness**2])
         patterns = np.concatenate([powers, places, powers * self._rise / self._tilt])
-        swing = angle - np.mean(angle, axis=0)
-        angle = angle + (swings @ patterns) * swing
-        linear = np.maximum(
-            self._base + offset + (1 + gain) * self._gain * angle - self._dark, 1e-6 * self._full
+        swing = angles.angle - np.mean(angles.angle, axis=0)
+        scale = PixelScale(self._gain, self._base, self._dark, self._full)
+        seen = light_of(
+            angles, (swings @ patterns) * swing, scale, gains, offsets, values, places, all_derivatives
         )
-        ratio = linear / self._full
-        light = self._full * ratio ** (1 + gamma)
-        share = (1 + gains) * (1 + uneven @ places)
-        shown = share * light
-        before = np.concatenate([shown[:1], shown[:-1]])
-        left = self._counts - self._dark - shown - offsets - lag * (before - shown)
-        steep = share * (1 + gamma) * ratio**gamma  # counts of the frame per count of linear light
-        by_angle = steep * (1 + gain) * self._gain
-        by_normal = np.stack([by_angle * by_zenith, by_angle * by_azimuth])
-        by_gain = (1 + uneven @ places) * light
+        left = self._counts - self._dark - seen.light
+        by_normal = np.stack([seen.by_angle * angles.by_zenith, seen.by_angle * angles.by_azimuth])
         if not all_derivatives:
-            return left, by_normal, by_gain, np.empty((0, *by_gain.shape))
-        by_tilt = (cosine * lean + sine * upright * np.cos(turned)) / down * self._tilt
-        by_rest = np.stack([
-            shown * np.log(ratio), steep * self._gain * angle, steep, by_angle * by_tilt,
-            -by_angle * by_azimuth * sine, before - shown, *((1 + gains) * light * places[:, np.newaxis]),
-            *(by_angle * swing * patterns[:, np.newaxis]),
-        ])  # fmt: skip
-        return left, by_normal, by_gain, by_rest
+            return left, by_normal, seen.by_gain, seen.by_globals
+        seen.by_globals[GLOBALS.index("tilt")] *= self._tilt
+        by_swings = seen.by_angle * swing * patterns[:, np.newaxis]
+        return left, by_normal, seen.by_gain, np.concatenate([seen.by_globals, by_swings])
 
     def _normal_equations(self) -> _Equations:
         """Return what the samples say of the nuisances at the present normals, which keep it."""
         if self._equations is not None:
             return self._equations
-        frames, count = self._counts.shape
         noise = self._noise
-        normal, gain, rest = self._by_normal, self._by_gain, self._by_rest
-        matrices = np.einsum("ati,bti->iab", normal, normal)
+        sums = Sums.of(self._left, self._by_normal, self._by_gain, self._by_rest)
+        matrices, cross, own = sums.matrices, sums.cross, sums.own
         matrices[:, [0, 1], [0, 1]] += 1e-12 * np.trace(matrices, axis1=1, axis2=2)[:, np.newaxis]
         inverses = np.linalg.inv(matrices)
-        size = len(self._values)
-        cross = np.empty((count, 2, size))
-        cross[:, :, :frames] = np.moveaxis(normal * gain, 2, 0)
-        cross[:, :, frames : 2 * frames] = np.moveaxis(normal, 2, 0)
-        cross[:, :, 2 * frames :] = np.einsum("ati,kti->iak", normal, rest)
         through = inverses @ cross
-        own = np.zeros((size, size))
-        at = np.arange(frames)
-        own[at, at] = np.sum(gain**2, axis=1)
-        own[at, frames + at] = own[frames + at, at] = np.sum(gain, axis=1)
-        own[frames + at, frames + at] = count
-        own[2 * frames :, :frames] = np.einsum("kti,ti->kt", rest, gain)
-        own[2 * frames :, frames : 2 * frames] = np.sum(rest, axis=2)
-        own[: 2 * frames, 2 * frames :] = own[2 * frames :, : 2 * frames].T
-        lines = rest.reshape(len(rest), -1)
-        own[2 * frames :, 2 * frames :] = gram(lines.T)
         # Not by products of matrices: the threads that they start wait for those of OpenCL.
-        own -= np.einsum("nk,nl->kl", cross.reshape(-1, size), through.reshape(-1, size))
-        self._equations = _Equations(inverses, through, own, noise)
+        own -= np.einsum("nk,nl->kl", cross.reshape(-1, len(own)), through.reshape(-1, len(own)))
+        push, pull = sums.push, sums.pull - np.einsum("iak,ia->k", through, sums.push)
+        self._equations = _Equations(inverses, through, own, noise, push, pull)
         return self._equations
 
     def improve(self) -> None:
         """Do one step."""
-        inverses, through, own, noise = self._normal_equations()
-        push = np.einsum("ati,ti->ia", self._by_normal, self._left)
-        pull = np.concatenate([
-            np.sum(self._by_gain * self._left, axis=1),
-            np.sum(self._left, axis=1),
-            np.einsum("kti,ti->k", self._by_rest, self._left),
-        ])  # fmt: skip
-        pull -= np.einsum("iak,ia->k", through, push)
-        pull -= noise * (self._precision @ self._values)
+        inverses, through, own, noise, push, pull = self._normal_equations()
+        pull = pull - noise * (self._precision @ self._values)
         step = np.linalg.solve(own + noise * self._precision, pull)
         turn = np.einsum("iab,ib->ia", inverses, push) - through @ step
         self._values += step
@@ -522,7 +494,7 @@ class _Fit:
         The scale is that of greatest evidence (MacKay 1992): the sum of squares of estimates, relative to the
         prior, over the number of those that the pixels determine.
         """
-        _, _, own, noise = self._normal_equations()
+        _, _, own, noise, *_ = self._normal_equations()
         covariance, frames = np.linalg.inv(own / noise + self._precision), len(self._counts)
         ends = 0, frames, 2 * frames, len(own) - _SWINGING, len(own)
         for part in itertools.starmap(slice, itertools.pairwise(ends)):
@@ -548,14 +520,14 @@ class _Fit:
 
     def nuisances(self, informed: bool = True) -> TurnNuisances:
         """Return the estimates, and what remains; unless ``informed``, only the priors are used."""
-        inverses, through, own, noise = self._normal_equations()
+        inverses, through, own, noise, *_ = self._normal_equations()
         if not informed:
             own = np.zeros_like(own)
         covariance = np.linalg.inv(own / noise + self._precision)
         covariance = (covariance + covariance.T) / 2
         frames, values = self._counts.shape[0], self._values
         removable = np.ones(len(values), bool)
-        removable[2 * frames + _GLOBALS.index("tilt") : 2 * frames + len(_GLOBALS)] = False
+        removable[2 * frames + GLOBALS.index("tilt") : 2 * frames + len(GLOBALS)] = False
         removable[-_SWINGING:] = False
         effect = through @ np.where(removable, values, 0.0)  # (n, 2)
         own_error = math.sqrt(noise * float(np.median(np.trace(inverses, axis1=1, axis2=2))))
@@ -574,7 +546,7 @@ class _Fit:
         modes, variance = self._modes(errors)
         gains, offsets = values[:frames], values[frames : 2 * frames]
         gamma, gain, offset = values[2 * frames :][:3]
-        uneven = values[2 * frames + len(_GLOBALS) :][:_UNEVEN]
+        uneven = values[2 * frames + len(GLOBALS) :][:UNEVEN]
         return TurnNuisances(
             1 + gains, offsets.copy(), float(gamma), float(gain), float(offset),
             uneven.copy(), self._full, self._count, modes, variance, worth,
@@ -621,9 +593,9 @@ class _Fit:
         """Return the names of nuisances that the object shows hardly better than their priors."""
         frames = self._counts.shape[0]
         parts = {"light of the frames": slice(0, frames), "dark level": slice(frames, 2 * frames)}
-        for number, name in enumerate(_GLOBALS):
+        for number, name in enumerate(GLOBALS):
             parts[name.replace("_", " ")] = slice(2 * frames + number, 2 * frames + number + 1)
-        parts["uneven light"] = slice(2 * frames + len(_GLOBALS), len(self._values) - _SWINGING)
+        parts["uneven light"] = slice(2 * frames + len(GLOBALS), len(self._values) - _SWINGING)
         sizes = {}
         for name, part in parts.items():
             before = float(np.sum(products[part, part] * self._priors[part, part]))
@@ -649,18 +621,13 @@ def _largest(square: Doubles) -> tuple[Doubles, Doubles]:
     return values, axes @ turned
 
 
-def _places(x: Doubles, y: Doubles) -> Sequence[Doubles]:
-    """Return the terms of uneven light, each with a mean of 0 over the picture."""
-    return x, y, x * x - 1 / 3, x * y, y * y - 1 / 3
-
-
 def _functions(zenith: Doubles, cosine: Doubles, sine: Doubles, x: Doubles, y: Doubles) -> Doubles:
     """Return the functions of zenith, azimuth and place that modes are sums of, (25, n)."""
     one = np.ones_like(zenith)
     powers = one, zenith, zenith**2
     turns = one, cosine, sine, cosine**2 - sine**2, 2 * cosine * sine
     terms = [power * turn for power in powers for turn in turns]
-    terms += [power * place for power in powers[:2] for place in _places(x, y)]
+    terms += [power * place for power in powers[:2] for place in uneven_terms(x, y)]
     return np.stack(terms)
 
 
