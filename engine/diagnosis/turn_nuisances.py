@@ -257,7 +257,7 @@ def find_nuisances(
     def fit_to(part: NDArray[np.bool_]) -> _Fit:
         return _Fit(
             counts[:, part], phase, tilt, gain[part], base[part], dark[part], wave[:, part],
-            (x[part], y[part]), rise[part], full, priors,
+            (x[part], y[part]), rise[part], full, priors, header.prior("gamma") - 1,
         )  # fmt: skip
 
     usable, faces = (_thinned(part) for part in (usable, faces))
@@ -270,7 +270,7 @@ def find_nuisances(
 def shows_model(wave: Doubles, least: Doubles, tilt: float, full: float) -> NDArray[np.bool_]:
     """Return the pixels at which the model holds, (...).
 
-    ``wave`` is the wave of the zenith with the phase, (3, ...) radians: its mean, cosine and sine. ``least`` is
+    ``wave`` is the wave of the zenith with the phase, (3, ...) radians: mean, cosine and sine. ``least`` is
     the light of the darkest frame, (...), and ``full`` full light, counts above the dark level.
     """
     swing = np.hypot(wave[1], wave[2]) / tilt
@@ -314,33 +314,46 @@ def _thinned(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _priors_of(header: Header, phase: Doubles, has_map: bool, counts: Doubles, shift: float) -> Doubles:
     """Return the covariance of the nuisances: gains of T frames, offsets, `GLOBALS`, uneven light, swings.
 
-    Uneven light is known if the zenith gain is a map. The light of a frame may differ by chance, may drift,
-    and may change with the phase: what moves with the body reflects it.
+    Uneven light is known if the zenith gain is a map.
     """
     frames = len(phase)
-    ramp = np.linspace(-0.5, 0.5, frames)
-    wave = basis(phase)[:, 1:]
-    count = max(1.0, float(np.ptp(counts)) / 255)  # a count of 8 bits
-    offset = header.prior("zenith_offset_sigma")
-    if header.zenith_offset_sigma is None:
-        offset *= count
-    blocks = [
-        header.prior("frame_gain_sigma") ** 2 * (np.eye(frames) + _WAVE**2 * wave @ wave.T)
-        + header.prior("drift_sigma") ** 2 * np.outer(ramp, ramp),
-        (_OFFSETS * offset) ** 2 * (np.eye(frames) + np.outer(ramp, ramp)),
-    ]
+    offset = offset_prior(header, counts)
     uneven = 0.0 if has_map else header.prior("uneven_light_sigma")
     numbers = [header.prior(f"{name}_sigma") for name in GLOBALS]
     numbers[GLOBALS.index("zenith_offset")] = offset
     swings = [*_SWINGS, *[shift] * _SHIFTS]
     size = 2 * frames + len(numbers) + UNEVEN + len(swings)
     covariance = np.zeros((size, size))
+    blocks = frame_priors(header, phase, offset)
     covariance[:frames, :frames], covariance[frames : 2 * frames, frames : 2 * frames] = blocks
     ends = np.square([*numbers, *[uneven] * UNEVEN, *swings])
     covariance[2 * frames :, 2 * frames :] = np.diag(ends)
     diagonal = np.einsum("ii->i", covariance)
     diagonal += _FLOOR * max(float(diagonal.max()), 1.0) * (diagonal == 0)
     return covariance
+
+
+def offset_prior(header: Header, counts: Doubles) -> float:
+    """Return the standard deviation of the zenith offset, counts; by default, counts of 8 bits."""
+    offset = header.prior("zenith_offset_sigma")
+    return offset if header.zenith_offset_sigma is not None else offset * count_of(counts)
+
+
+def count_of(counts: Doubles) -> float:
+    """Return a count of 8 bits in counts of a camera."""
+    return max(1.0, float(np.ptp(counts)) / 255)
+
+
+def frame_priors(header: Header, phase: Doubles, offset: float) -> tuple[Doubles, Doubles]:
+    """Return the covariances of the gains and of the offsets of T frames, (T, T).
+
+    The light of a frame may differ by chance, may drift, and may change with the phase: what moves with the
+    body reflects it. ``offset`` is the standard deviation of the zenith offset, counts.
+    """
+    chance, ramp = np.eye(len(phase)), np.linspace(-0.5, 0.5, len(phase))
+    wave, drift = basis(phase)[:, 1:], np.outer(ramp, ramp)
+    gains = header.prior("frame_gain_sigma") ** 2 * (chance + _WAVE**2 * wave @ wave.T)
+    return gains + header.prior("drift_sigma") ** 2 * drift, (_OFFSETS * offset) ** 2 * (chance + drift)
 
 
 class _Equations(NamedTuple):
@@ -359,7 +372,7 @@ class _Fit:
 
     def __init__(
         self, counts: Doubles, phase: Doubles, tilt: float, gain: Doubles, base: Doubles, dark: Doubles,
-        wave: Doubles, places: tuple[Doubles, Doubles], rise: Doubles, full: float, priors: Doubles,
+        wave: Doubles, places: tuple[Doubles, Doubles], rise: Doubles, full: float, priors: Doubles, gamma: float,
     ) -> None:  # fmt: skip
         self._counts, self._phase, self._tilt, self._full = counts, phase[:, np.newaxis], tilt, full
         self._gain, self._base, self._dark = gain, base, dark
@@ -369,8 +382,10 @@ class _Fit:
         self._stated_precision = np.linalg.inv(priors)
         self._precision = self._stated_precision.copy()
         self._scales: dict[int, float] = {}  # of the variances of nuisances, by group
-        self._values = np.zeros(len(priors))
-        self._count = max(1.0, float(np.ptp(counts)) / 255)
+        self._means = np.zeros(len(priors))
+        self._means[2 * len(phase) + GLOBALS.index("gamma")] = gamma
+        self._values = self._means.copy()
+        self._count = count_of(counts)
         self.floor = _LEAST_NOISE * self._count
         self._look()
 
@@ -473,14 +488,14 @@ class _Fit:
         through = inverses @ cross
         # Not by products of matrices: the threads that they start wait for those of OpenCL.
         own -= np.einsum("nk,nl->kl", cross.reshape(-1, len(own)), through.reshape(-1, len(own)))
-        push, pull = sums.push, sums.pull - np.einsum("iak,ia->k", through, sums.push)
-        self._equations = _Equations(inverses, through, own, noise, push, pull)
+        pull: Doubles = sums.pull - np.einsum("iak,ia->k", through, sums.push)
+        self._equations = _Equations(inverses, through, own, noise, sums.push, pull)
         return self._equations
 
     def improve(self) -> None:
         """Do one step."""
         inverses, through, own, noise, push, pull = self._normal_equations()
-        pull = pull - noise * (self._precision @ self._values)
+        pull = pull - noise * (self._precision @ (self._values - self._means))
         step = np.linalg.solve(own + noise * self._precision, pull)
         turn = np.einsum("iab,ib->ia", inverses, push) - through @ step
         self._values += step
@@ -501,7 +516,8 @@ class _Fit:
             prior = self._stated_precision[part, part]  # of a group, which others do not depend on
             scale = self._scales.get(part.start, 1.0)
             determined = len(prior) - float(np.sum(prior * covariance[part, part])) / scale
-            size = float(self._values[part] @ prior @ self._values[part])
+            away = self._values[part] - self._means[part]
+            size = float(away @ prior @ away)
             if determined > 1:
                 self._scales[part.start] = scale = min(max(1.0, size / determined), _WIDEST)
             self._priors[part, part] = scale * self._stated[part, part]
@@ -580,7 +596,7 @@ class _Fit:
     def _is_odd(self, covariance: Doubles) -> bool:
         """Return whether gamma differs from 1, and the swing by zenith does not contradict it."""
         gamma, steepness = 2 * len(self._counts), len(self._values) - _SWINGING + 1
-        value, swing = self._values[gamma], self._values[steepness]
+        value, swing = self._values[gamma] - self._means[gamma], self._values[steepness]
         error = math.sqrt(covariance[steepness, steepness])
         least = max(_ODD_GAMMA * math.sqrt(self._stated[gamma, gamma]), _LEAST_GAMMA)
         least = max(least, _CLEAR * math.sqrt(covariance[gamma, gamma]))

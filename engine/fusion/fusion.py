@@ -331,10 +331,7 @@ def _fuse_sources(
     common: dict[str, Any] = {"memory_limit": memory_limit, "device": opened}
     turn = Rotation(**{**_options_of(rotation), **common})
     _check_rotation(axial, turn)
-    press_options = _options_of(press)
-    taken = _Evidence(blur=press_options.get("blur"))
-    method = Press(**{**press_options, **common, "fill": False, "blur": 0.0})
-    pressed = run_over(vertical, method, progress, [taken])
+    pressed, taken = press_evidence(vertical, {**_options_of(press), **common}, progress)
     if not np.isfinite(pressed.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
     before = fill_with_nearest(pressed.height)
@@ -392,7 +389,16 @@ def _options_of(method: Method | Mapping[str, Any] | None) -> Mapping[str, Any]:
     return method.option_values() if isinstance(method, Method) else method or {}
 
 
-class _Evidence(Step):
+def press_evidence(
+    vertical: Source, options: Mapping[str, Any], progress: Progress | None = None
+) -> tuple[Result, PressEvidence]:
+    """Return the maps of a press by options of `Press`, without filled holes, and what they are evidence of."""
+    taken = PressEvidence(blur=options.get("blur"))
+    method = Press(**{**options, "fill": False, "blur": 0.0})
+    return run_over(vertical, method, progress, [taken]), taken
+
+
+class PressEvidence(Step):
     """Take what the solver needs from a press: heights as intervals, and the area that a pixel sees.
 
     Slopes determine how far a lens that blurs has moved each height, but they are blurred as well.

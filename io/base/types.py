@@ -171,6 +171,17 @@ class Header:
         example="15e-6",
         in_steps=False,
     )
+    gamma: float | None = stated(
+        of="camera",
+        unit="",
+        text="power of the light that brightness follows, relative to full light; 1 if it is not stated",
+        use="frames of a rotation are corrected for it",
+        short="power of the light that brightness follows",
+        kind="number",
+        within=(0.2, 5.0),
+        example="1.02",
+        default=1.0,
+    )
     gamma_sigma: float | None = _prior("camera", 0.02, "the camera's gamma about 1", example="0.005")
     frame_gain_sigma: float | None = _prior(
         "camera", 0.005, "the light of a frame, as a share of it", example="0.001"

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from mirrorskin.io.base.selection import Region
 from mirrorskin.io.base.types import Block, Floats, Header, InputError, LiveSource, Source
-from mirrorskin.io.model.calibration import PARTS, Calibration, CameraId, Precession
-from mirrorskin.io.model.parameters import parameters
+from mirrorskin.io.model.calibration import PARTS, Calibration, CameraId, LinearResponse, Precession
+from mirrorskin.io.model.parameters import median, parameters
 
 Size = tuple[float, float]
 
@@ -105,6 +105,19 @@ def cropped(calibration: Calibration, region: Region, pixel_size: Size | None) -
     return replace(calibration, camera=replace(calibration.camera, shape=region.shape), **parts)
 
 
+def _brightness(response: LinearResponse) -> dict[str, Any]:
+    """Return the properties of a header that a response determines."""
+    sigma = response.sigma
+    return {
+        "zenith_gain": response.gain.astype(np.float64),
+        "zenith_offset": response.offset.astype(np.float64),
+        "gamma": response.gamma,
+        "zenith_gain_sigma": sigma["gain"] / abs(median(response.gain)),
+        "zenith_offset_sigma": sigma["offset"],
+        "gamma_sigma": sigma["gamma"],
+    }
+
+
 class Calibrated:
     """A source with the header and the phases of a calibration; frames are passed on unchanged.
 
@@ -161,7 +174,7 @@ class Calibrated:
 
     @functools.cached_property
     def header(self) -> Header:
-        """The header of the source, with references, pixel size, tilt and pivot of the calibration."""
+        """The source's header, with references, pixel size, response, tilt and pivot of the calibration."""
         stored = self.source.header
         self._check(stored.camera)
         calibration = self.calibration
@@ -170,6 +183,8 @@ class Calibrated:
             properties |= {"dark": calibration.references.dark, "bright": calibration.references.bright}
         if calibration.lens is not None:
             properties["pixel_size"] = calibration.lens.pixel_size
+        if self.motion == "axial" and calibration.response is not None:
+            properties |= _brightness(calibration.response)
         if self.motion == "axial" and calibration.precession is not None:
             properties |= self._movement(stored, calibration.precession)
         header = replace(stored, **properties)

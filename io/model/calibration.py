@@ -199,6 +199,36 @@ class WallResponse(Part):
 
 
 @part
+class LinearResponse(Part):
+    """Brightness as a function of the zenith, from touches, and what these touches determine.
+
+    A mirror whose zenith is theta has the brightness ``offset + gain theta``, to the power ``gamma`` relative
+    to full light; see `mirrorskin.engine.diagnosis.turn_light`.
+    """
+
+    command: ClassVar[str] = "self"
+    signal: ClassVar[str] = "gain"
+    motion: ClassVar[str] = "axial"
+
+    gain: NDArray[np.float32] = parameter("counts per radian of zenith", "counts/rad", title="zenith gain")
+    offset: NDArray[np.float32] = parameter("counts at zenith 0", "counts", title="zenith offset")
+    gamma: float = parameter("power of the light that the brightness follows", valid=_above_zero)
+    names: tuple[str, ...] = parameter("names of the parameters of the touches", shape=("p",))
+    values: Floats = parameter(
+        "parameters of the touches, relative to the other numbers of the calibration", shape=("p",)
+    )
+    information: Floats = parameter(
+        "information of all touches about the parameters, without priors", shape=("p", "p")
+    )
+    pull: Floats = parameter(
+        "information times the deviation of the parameters that touches alone would have", shape=("p",)
+    )
+    touches: int = parameter("number of touches used", valid=lambda value: value >= 1)
+    time: float = parameter("time of the last touch since 1970; NaN if unknown", "s", title="")
+    sigma: Mapping[str, float] = parameter("standard errors, by the names of the parameters", default=dict)
+
+
+@part
 class Precession(Part):
     """Lean of the body's axis as a function of the phase."""
 
@@ -386,9 +416,10 @@ class Calibration:
     precession : Precession or None
     gel : Gel or None
     stiffness : Stiffness or None
+    response : LinearResponse or None
     process : mapping
         Provenance of each part: "references.program", "zenith.sources" and so on, by the names of the
-        commands: references, scale, zenith, tilt, elastic, force.
+        commands: references, scale, zenith, tilt, elastic, force, self.
     name : str
         The file that it was read from, for messages.
     """
@@ -400,6 +431,7 @@ class Calibration:
     precession: Precession | None = None
     gel: Gel | None = None
     stiffness: Stiffness | None = None
+    response: LinearResponse | None = None
     process: Mapping[str, ProcessValue] = field(default_factory=dict)
     name: str = ""
 
@@ -430,5 +462,6 @@ PARTS: dict[str, type[Part]] = {
     "precession": Precession,
     "gel": Gel,
     "stiffness": Stiffness,
+    "response": LinearResponse,
 }
 """The classes of the parts, by the attributes of a calibration."""

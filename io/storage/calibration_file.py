@@ -89,7 +89,7 @@ def update_calibration(
     Parameters
     ----------
     path : str or Path
-    part : References, Lens, WallResponse, Precession, Gel or Stiffness
+    part : References, Lens, WallResponse, LinearResponse, Precession, Gel or Stiffness
     camera : CameraId
         Camera that the part belongs to.
     process : mapping, optional

@@ -1,0 +1,344 @@
+"""Normal equations of one window of a touch: its surface is eliminated, the sensor's parameters remain.
+
+The unknowns of a window are the heights z of its pixels. A normal is that of the slopes of z, by differences
+that are exact for polynomials of sixth degree; the slopes may differ from it by what these differences leave
+out where the surface is rough. Frames of the turn determine the slopes, and the press ties z to absolute
+heights. The light that a pixel sees is the mean over its footprint: to second order, angles to the axis
+are those of the mean normal, and a term that grows with the variance of the footprint and the square of
+the curvature of the surface.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.diagnosis.footprint import LEAST_BLUR, PIXEL
+from mirrorskin.engine.diagnosis.turn_light import GLOBALS, UNEVEN, AxisAngles, PixelScale, Sums, light_of
+from mirrorskin.engine.press.intervals import IntervalScatter, interval_evidence
+from mirrorskin.kernels.array_types import Doubles
+
+SHARED = (
+    *GLOBALS,
+    *(f"uneven_{term}" for term in ("x", "y", "xx", "xy", "yy")),
+    *("oval_x", "oval_y", "footprint", "pivot_z", "pixel_size"),
+)
+"""Names of the sensor's parameters in the order of a fit."""
+
+FOOTPRINT = PIXEL + LEAST_BLUR**2
+"""Assumed variance of a pixel's footprint, square pixels; the parameter is the relative error of it."""
+
+_STENCIL = np.array([-1, 9, -45, 0, 45, -9, 1]) / 60.0  # first derivative at the middle
+MARGIN = 3
+"""Pixels at the edge of a window whose slopes are not used."""
+
+_ROUGH = 0.1  # share of the second difference of slopes by which a slope may differ from that of the heights
+_SMOOTH = 1e-6  # weight of second differences of heights, relative to that of slopes: where nothing is seen
+_OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
+_LEAST_ZENITH = 1e-3  # radians
+
+
+_SLOPE_WEIGHT = 1e3  # of a slope by the wave of a pixel
+TURNS = np.linspace(-math.pi, math.pi, 24, endpoint=False)
+"""Angles by which azimuths are turned to find the phase of a stage, radians."""
+
+
+class Poses(NamedTuple):
+    """Movement of the body in a turn of T frames, as it was assumed to register them."""
+
+    phase: Doubles  # (T, 1), radians
+    tilt: float  # half-angle, radians
+    arm: float | None  # mm from the pivot up to the sheet's rest plane; None: frames are not registered
+
+
+class _Moves(NamedTuple):
+    """Changes of the slopes that pixels show in frames, (2, T, n)."""
+
+    by_tilt: Doubles  # relative
+    by_phase: Doubles
+    by_pivot: Doubles  # per mm of its height
+
+
+class Eliminated(NamedTuple):
+    """Information of a window on the nuisances: gains and offsets of the frames, and `SHARED`."""
+
+    own: Doubles  # (K, K)
+    pull: Doubles  # (K,)
+    step: Callable[[Doubles], Doubles]  # of the heights, (S * S,) mm, for a step of the nuisances
+
+
+@dataclass(slots=True, eq=False)
+class Window:
+    """A square window of a touch: samples of its inner pixels, and the heights of its S x S pixels."""
+
+    counts: Doubles  # (T, n), of inner pixels
+    scale: PixelScale  # of inner pixels
+    places: Doubles  # (5, n): terms of uneven light
+    pixel_size: tuple[float, float]  # mm
+    place: tuple[slice, slice]  # rows and columns of inner pixels in the picture
+    usable: NDArray[np.bool_]  # (n,)
+    middle: Doubles  # (S * S,): middles of the intervals of a press, mm; NaN without
+    half: Doubles  # (S * S,): half-widths, mm
+    relief: Doubles  # (n,): heights with which inner pixels were registered, mm
+    z: Doubles  # (S * S,): heights, mm
+    noise_gain: float  # factor of the noise by registration
+    evidence: tuple[Doubles, Doubles] | None = field(default=None)  # heights of the press, and their weights
+    left: Doubles = field(default_factory=lambda: np.empty(0))  # (T, n): residuals
+    rough: Doubles = field(default_factory=lambda: np.empty(0))  # (n,): second differences of slopes
+
+    @property
+    def size(self) -> int:
+        """Pixels along a side."""
+        return math.isqrt(len(self.z))
+
+    def start(self, wave: Doubles) -> Doubles:
+        """Compute first heights from zeniths and azimuths of the frames' waves, (3, n), and the press.
+
+        Returns the misfit of these slopes to a surface if all azimuths were mirrored or not, and turned by
+        `TURNS`, (2, len(TURNS)).
+        """
+        steepness, azimuth = np.tan(np.clip(wave[0], 0, 1.4)), np.arctan2(wave[2], wave[1])
+        parts = [
+            -steepness * np.stack([np.cos(angle), np.sin(angle)])
+            for mirrored in (azimuth, -azimuth)
+            for angle in (mirrored, mirrored + math.pi / 2)
+        ]
+        stated = np.where(np.tile(self.usable, 2), np.reshape(parts, (4, -1)), 0.0).T
+        weight = _SLOPE_WEIGHT * np.tile(self.usable, 2).astype(np.float64)
+        slopes, firm = self._slopes(), self._press_weight()
+        matrix = slopes.T @ slopes.multiply(weight[:, np.newaxis]) + _diagonal(firm)
+        solver = _Solver(matrix + _smoothness(self.size) * (_SMOOTH * float(np.max(matrix.diagonal()))))
+        known = np.nan_to_num(self.middle) * firm
+        right = np.column_stack([slopes.T @ (weight[:, np.newaxis] * stated), known])
+        *by_slopes, by_press = solver.backward(solver.forward(right)).T
+        misfits = np.empty((2, len(TURNS)))
+        for kind, turn in np.ndindex(misfits.shape):
+            share = math.cos(TURNS[turn]), math.sin(TURNS[turn])
+            z = by_press + share[0] * by_slopes[2 * kind] + share[1] * by_slopes[2 * kind + 1]
+            slope = share[0] * stated[:, 2 * kind] + share[1] * stated[:, 2 * kind + 1]
+            misfits[kind, turn] = np.sum(weight * (slopes @ z - slope) ** 2)
+            misfits[kind, turn] += np.nansum(firm * (self.middle - z) ** 2)
+        self.z = by_press + by_slopes[0]
+        return misfits
+
+    def _press_weight(self) -> Doubles:
+        return np.nan_to_num(3 / self.half**2)
+
+    def _slopes(self) -> Any:
+        """Return the matrix from heights to slopes along x and y of inner pixels, (2 n, S * S)."""
+        from scipy.sparse import vstack
+
+        along_x, along_y = _derivatives(self.size)
+        return vstack([along_x / self.pixel_size[0], along_y / -self.pixel_size[1]]).tocsr()
+
+    def use_intervals(self, spread: IntervalScatter) -> None:
+        """Take heights of the press from their intervals, at the present heights."""
+        known = np.isfinite(self.middle)
+        height, weight = self.z.copy(), np.zeros(len(self.z))
+        found = interval_evidence(self.z[known], self.middle[known], self.half[known], spread)
+        height[known], weight[known] = found
+        self.evidence = height, weight
+
+    def look(self, poses: Poses, gains: Doubles, offsets: Doubles, values: Doubles) -> Sums:
+        """Compute residuals, and return the normal equations of slopes of usable pixels and nuisances."""
+        named = dict(zip(SHARED, values.tolist(), strict=True))
+        slopes = (self._slopes() @ self.z).reshape(2, -1) * (1 - named["pixel_size"])
+        inner = self.size - 2 * MARGIN
+        maps = slopes.reshape(2, inner, inner)
+        by_column, by_row = (np.gradient(maps, axis=axis).reshape(2, -1) for axis in (2, 1))
+        turned = poses.phase + named["phase"]
+        double = np.cos(2 * turned), np.sin(2 * turned)
+        larger = (1 + named["tilt"]) * (1 + named["oval_x"] * double[0] + named["oval_y"] * double[1])
+        ahead = named["phase"] + named["oval_y"] * double[0] - named["oval_x"] * double[1]
+        tilt, phase = poses.tilt * larger, poses.phase + ahead
+        moves = self._moves(poses, by_column, by_row)
+        seen = slopes[:, np.newaxis] + (larger - 1) * moves.by_tilt + ahead * moves.by_phase
+        seen = seen + named["pivot_z"] * moves.by_pivot
+
+        def angles_of(slope: Doubles) -> AxisAngles:
+            steepness = np.maximum(np.hypot(*slope), _LEAST_ZENITH)
+            azimuth = np.arctan2(-slope[1], -slope[0])
+            return AxisAngles.of(np.arctan(steepness), azimuth, phase, np.sin(tilt), np.cos(tilt))
+
+        angles = angles_of(seen)
+        width, bend = math.sqrt(FOOTPRINT), -2 * angles_of(slopes).angle
+        for change in (by_column, -by_column, by_row, -by_row):
+            bend = bend + angles_of(slopes + width * change).angle / 2
+        light = light_of(
+            angles, (1 + named["footprint"]) * bend, self.scale, gains[:, np.newaxis], offsets[:, np.newaxis],
+            values[: len(GLOBALS) + UNEVEN], self.places,
+        )  # fmt: skip
+        self.left = self.counts - self.scale.dark - light.light
+        steepness = np.maximum(np.hypot(*seen), _LEAST_ZENITH)
+        growth = 1 / (1 + steepness**2)
+        along, across = seen / steepness, np.stack([-seen[1], seen[0]]) / steepness
+        by_slope = light.by_angle * (
+            angles.by_zenith * along * growth + angles.by_azimuth * across * np.sqrt(growth)
+        )
+        tilt_row = light.by_globals[GLOBALS.index("tilt")]
+        phase_row = light.by_globals[GLOBALS.index("phase")]
+        tilt_row *= poses.tilt
+        tilt_row += np.sum(by_slope * moves.by_tilt, axis=0)
+        phase_row += np.sum(by_slope * moves.by_phase, axis=0)
+        rest = np.concatenate([
+            light.by_globals,
+            [
+                tilt_row * double[0] - phase_row * double[1],
+                tilt_row * double[1] + phase_row * double[0],
+                light.by_angle * bend,
+                np.sum(by_slope * moves.by_pivot, axis=0),
+                -np.sum(by_slope * slopes[:, np.newaxis], axis=0),
+            ],
+        ])  # fmt: skip
+        chosen = self.usable
+        parts = self.left, by_slope, light.by_gain, rest
+        self.rough = _second_differences(slopes, inner)
+        return Sums.of(*(part[..., chosen] for part in parts))
+
+    @property
+    def heights(self) -> Doubles:
+        """Heights of inner pixels, (n,) mm; without a press, with the mean of those that registered them."""
+        inner = slice(MARGIN, self.size - MARGIN)
+        height = self.z.reshape(self.size, self.size)[inner, inner].ravel()
+        if np.isfinite(self.middle).any():
+            return height
+        return height + np.mean((self.relief - height)[self.usable])
+
+    @property
+    def misplaced(self) -> float:
+        """RMS error of the heights with which frames were registered, mm."""
+        return float(np.sqrt(np.mean((self.relief - self.heights)[self.usable] ** 2)))
+
+    def _moves(self, poses: Poses, by_column: Doubles, by_row: Doubles) -> _Moves:
+        """Return how the slopes that a pixel shows change if frames were registered with a wrong movement.
+
+        A frame is sampled where the assumed movement p' = sin(tilt) (z - q) (cos(phase), sin(phase)) puts the
+        point of a pixel, with the pivot's height q: the point that is seen is off by the difference.
+        """
+        if poses.arm is None:
+            zeros = np.zeros((2, *self.counts.shape))
+            return _Moves(zeros, zeros, zeros)
+        arm = poses.arm + self.relief
+        cosine, sine = np.cos(poses.phase), np.sin(poses.phase)
+        x, y = by_column[:, np.newaxis] / self.pixel_size[0], by_row[:, np.newaxis] / -self.pixel_size[1]
+        outwards, onwards = cosine * x + sine * y, cosine * y - sine * x  # per mm
+        lean = math.sin(poses.tilt)
+        by_tilt = -poses.tilt * math.cos(poses.tilt) * arm * outwards
+        return _Moves(by_tilt, -lean * arm * onwards, lean * outwards)
+
+    def exclude_outliers(self) -> None:
+        """Exclude pixels that do not follow the model."""
+        misfit = np.sqrt(np.mean(self.left**2, axis=0))
+        self.usable &= misfit < _OUTLIER_RATIO * float(np.median(misfit[self.usable]))
+
+    def eliminate(self, sums: Sums, noise: float) -> Eliminated:
+        """Return the information on the nuisances that remains after the heights are eliminated.
+
+        ``noise`` is the variance of a sample. A slope may differ from that of the heights by a normal
+        deviate; to eliminate it changes all sums by the same projection.
+        """
+        rough = np.maximum((_ROUGH * self.rough[self.usable]) ** 2, 1e-16)
+        inner = np.linalg.inv(sums.matrices + (noise / rough)[:, np.newaxis, np.newaxis] * np.eye(2))
+        by_cross, by_push = inner @ sums.cross, np.einsum("iab,ib->ia", inner, sums.push)
+        own = sums.own - np.einsum("iak,ial->kl", sums.cross, by_cross)
+        pull = sums.pull - np.einsum("iak,ia->k", sums.cross, by_push)
+        matrices = sums.matrices - sums.matrices @ inner @ sums.matrices
+        cross = sums.cross - sums.matrices @ by_cross
+        push = sums.push - np.einsum("iab,ib->ia", sums.matrices, by_push)
+
+        slopes = self._slopes()
+        slopes = slopes[np.concatenate([self.usable, self.usable])]
+        slopes_x, slopes_y = slopes[: len(matrices)], slopes[len(matrices) :]
+        along_x = slopes_x.multiply(matrices[:, 0, 0, np.newaxis]) + slopes_y.multiply(
+            matrices[:, 0, 1, np.newaxis]
+        )
+        along_y = slopes_x.multiply(matrices[:, 1, 0, np.newaxis]) + slopes_y.multiply(
+            matrices[:, 1, 1, np.newaxis]
+        )
+        height, weight = self.evidence or (self.middle, self._press_weight())
+        matrix = (slopes_x.T @ along_x + slopes_y.T @ along_y) / noise + _diagonal(weight)
+        smooth = _smoothness(self.size) * (_SMOOTH * float(np.mean(matrix.diagonal())))
+        solver = _Solver(matrix + smooth)
+        coupled = (slopes_x.T @ cross[:, 0] + slopes_y.T @ cross[:, 1]) / noise
+        right = (slopes_x.T @ push[:, 0] + slopes_y.T @ push[:, 1]) / noise - smooth @ self.z
+        right += weight * np.where(weight > 0, height - self.z, 0.0)
+        reduced = solver.forward(np.column_stack([coupled, right]))
+        products = reduced[:, :-1].T @ reduced
+        own, pull = own / noise - products[:, :-1], pull / noise - products[:, -1]
+        return Eliminated(own, pull, functools.partial(_step, solver, reduced))
+
+
+def _step(solver: _Solver, reduced: Doubles, nuisances: Doubles) -> Doubles:
+    """Return the step of heights for a step of the nuisances."""
+    return solver.backward(reduced[:, -1:] - reduced[:, :-1] @ nuisances[:, np.newaxis])[:, 0]
+
+
+def _second_differences(slopes: Doubles, inner: int) -> Doubles:
+    """Return the size of second differences of slopes along both axes, (n,)."""
+    maps = slopes.reshape(2, inner, inner)
+    total = np.zeros((inner, inner))
+    for axis in (1, 2):
+        middle = [slice(None)] * 2
+        middle[axis - 1] = slice(1, -1)
+        total[tuple(middle)] += np.sum(np.diff(maps, 2, axis=axis) ** 2, axis=0)
+    return np.sqrt(total).ravel()
+
+
+@functools.cache
+def _derivatives(size: int) -> tuple[Any, Any]:
+    """Return matrices from S x S heights to differences along columns and rows at inner pixels."""
+    from scipy.sparse import csr_matrix, diags, kron
+
+    inner = size - 2 * MARGIN
+    first = diags(list(_STENCIL), list(range(2 * MARGIN + 1)), shape=(inner, size))
+    keep = csr_matrix((np.ones(inner), (np.arange(inner), np.arange(inner) + MARGIN)), (inner, size))
+    return kron(keep, first).tocsr(), kron(first, keep).tocsr()
+
+
+@functools.cache
+def _smoothness(size: int) -> Any:
+    """Return the matrix of the sum of squares of second differences of S x S heights."""
+    from scipy.sparse import diags, identity, kron
+
+    second = diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(size - 2, size))
+    square, eye = second.T @ second, identity(size)
+    return (kron(square, eye) + kron(eye, square) + 1e-3 * identity(size * size)).tocsc()
+
+
+def _diagonal(values: Doubles) -> Any:
+    from scipy.sparse import diags
+
+    return diags(values).tocsc()
+
+
+class _Solver:
+    """Cholesky factor L of the banded, symmetric system of a window."""
+
+    def __init__(self, matrix: Any) -> None:
+        from scipy.linalg import cholesky_banded
+
+        entries = matrix.tocoo()
+        below = entries.row >= entries.col
+        row, column = entries.row[below], entries.col[below]
+        bands = np.zeros((int(np.max(row - column)) + 1, matrix.shape[0]))
+        bands[row - column, column] = entries.data[below]
+        self._factor = cholesky_banded(bands, overwrite_ab=True, lower=True, check_finite=False)
+
+    def forward(self, right: Doubles) -> Doubles:
+        """Return L^-1 times right sides, (S * S, k)."""
+        return self._solved(right, "N")
+
+    def backward(self, right: Doubles) -> Doubles:
+        """Return L^-T times right sides, (S * S, k)."""
+        return self._solved(right, "T")
+
+    def _solved(self, right: Doubles, transposed: str) -> Doubles:
+        from scipy.linalg.lapack import dtbtrs
+
+        return np.asarray(dtbtrs(self._factor, right, uplo="L", trans=transposed)[0])
