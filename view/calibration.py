@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.undistort import distorted
 from mirrorskin.io import Calibration, InputError
 from mirrorskin.io.base.types import Floats
-from mirrorskin.io.model.calibration import BITS, Lens, Precession, References
+from mirrorskin.io.model.calibration import BITS, Lens, LinearResponse, Precession, References
 from mirrorskin.view.drawing.canvas import (
     check_drawing,
     draw_classes,
@@ -111,6 +111,24 @@ def draw_lens(lens: Lens) -> Figure:
         color="white",
         width=0.004,
     )
+    return figure
+
+
+def draw_linear_response(response: LinearResponse) -> Figure:
+    """Draw gain and offset of the pixels, and the brightness of a usual one by the zenith."""
+    figure = new_sheet(17, 5.2)
+    axes = figure.subplots(1, 3)
+    draw_pixels(axes[0], response.gain, "zenith gain", "counts/rad", SEQUENTIAL)
+    draw_pixels(axes[1], response.offset, "zenith offset", "counts", SEQUENTIAL)
+    zenith = np.linspace(0, math.pi / 4, _FINE)
+    gain, offset = (float(np.nanmedian(values)) for values in (response.gain, response.offset))
+    sigma = np.hypot(response.sigma["gain"] * zenith, response.sigma["offset"])
+    light = offset + gain * zenith
+    axes[2].plot(np.degrees(zenith), light, lw=2)
+    axes[2].fill_between(np.degrees(zenith), light - sigma, light + sigma, alpha=0.3)
+    title = f"median of the pixels, {response.touches} touches\ngamma {response.gamma:.3f}"
+    axes[2].set(xlabel="zenith (deg)", ylabel="brightness (counts)", title=title)
+    axes[2].grid(alpha=0.3)
     return figure
 
 
@@ -298,6 +316,7 @@ def calibration_figures(calibration: Calibration, folder: Path) -> list[Path]:
         "precession": draw_precession,
         "gel": draw_gel,
         "stiffness": draw_stiffness,
+        "response": draw_linear_response,
     }
     check_drawing()
     try:

@@ -7,6 +7,7 @@ from .lens import LensFit, calibrate_lens
 from .references import LevelReport, Measured, measure_references
 from .tilt import PrecessionFit, fit_precession
 from .tilt_tracks import BallTrack, PlateTrack, track_ball, track_plate
+from .touches import Estimate, Stated, TouchFit, from_touches
 from .wall import fit_zenith
 from .wall_response import threshold_zenith
 
@@ -19,6 +20,7 @@ __all__ = [
     "Dots",
     "ErrorMap",
     "ErrorSummary",
+    "Estimate",
     "GelFit",
     "KnownPress",
     "LensFit",
@@ -27,7 +29,9 @@ __all__ = [
     "Measured",
     "PlateTrack",
     "PrecessionFit",
+    "Stated",
     "StiffnessFit",
+    "TouchFit",
     "WallBrightness",
     "ball_onset",
     "calibrate_lens",
@@ -37,6 +41,7 @@ __all__ = [
     "fit_precession",
     "fit_stiffness",
     "fit_zenith",
+    "from_touches",
     "known_press",
     "mean_of_still",
     "measure_references",

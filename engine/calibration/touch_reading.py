@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.base.provenance import naming
 from mirrorskin.engine.base.resample import fill_with_nearest
-from mirrorskin.engine.base.running import Run
 from mirrorskin.engine.base.sources import EditedSource
 from mirrorskin.engine.calibration.sources import pixel_size_of, read_turn
 from mirrorskin.engine.calibration.touch_window import MARGIN, TURNS, Poses, Window
@@ -29,7 +28,6 @@ from mirrorskin.engine.diagnosis.turn_nuisances import (
     shows_model,
 )
 from mirrorskin.engine.fusion.fusion import press_evidence
-from mirrorskin.engine.rotation.rotation import Rotation
 from mirrorskin.io import Block, Header, InputError, Source
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
@@ -69,7 +67,6 @@ class Touch:
     frame_covariance: Doubles  # (2 T, 2 T)
     frame_values: Doubles  # (2 T,): gains and offsets of the frames
     least_noise: float  # counts
-    has_press: bool
     time: float  # seconds since 1970; NaN if unknown
     tilt_seen: float  # radians: half-angle that the amplitude of the brightness shows
     misfits: Doubles  # of first slopes to surfaces; see `Window.start`
@@ -89,9 +86,9 @@ class Touch:
         return bool(misfit < _MAX_MISFIT * max(noise, self.least_noise**2))
 
 
-def model_of(turn: Source) -> SensorModel:
-    """Return what a recording, with a calibration applied, states of the sensor."""
-    header, shape = turn.header, turn.shape[1:]
+def model_of(turn: Source, header: Header) -> SensorModel:
+    """Return what the header of a recording states of the sensor."""
+    shape = turn.shape[1:]
     if header.zenith_gain is None:
         raise InputError(
             f"{turn.name} has no zenith gain: touches improve an approximate one. Give it, such as"
@@ -113,25 +110,22 @@ def model_of(turn: Source) -> SensorModel:
 
 @dataclass(frozen=True, slots=True)
 class TouchReader:
-    """A press, if there is one, and a turn at the same place, which can be read with other movements."""
+    """A press and a turn at the same place, which can be read with other movements."""
 
     turn: Source
-    middle: Doubles  # (H, W): heights of the press, mm; NaN without
+    middle: Doubles  # (H, W): heights of the press, mm; NaN where unknown
     half: Doubles  # (H, W): half-widths of their intervals, mm
     relief: Doubles  # (H, W): heights that register frames, mm
     device: str | Device | None
 
     @classmethod
-    def of(cls, press: Source | None, turn: Source, device: str | Device | None = None) -> TouchReader:
+    def of(cls, press: Source, turn: Source, device: str | Device | None = None) -> TouchReader:
         """Read a press."""
         shape = turn.shape[1:]
         if min(shape) < _LEAST_SIDE:
             raise InputError(
                 f"{turn.name} has {shape[1]} x {shape[0]} pixels: at least {_LEAST_SIDE} a side are needed"
             )
-        nothing = np.full(shape, np.nan)
-        if press is None:
-            return cls(turn, nothing, nothing, _relief_of(turn, device), device)
         if press.motion != "vertical":
             raise InputError(f"{press.name} has {press.motion} motion: give a press and a turn of each touch")
         if press.shape[1:] != shape:
@@ -224,22 +218,10 @@ class TouchReader:
             frame_covariance=_frame_covariance(header, phase, counts),
             frame_values=np.zeros(2 * len(phase)),
             least_noise=_LEAST_NOISE * count_of(counts),
-            has_press=bool(np.isfinite(self.half).any()),
             time=_time_of(header),
             tilt_seen=tilt_seen,
             misfits=misfits,
         )
-
-
-def _relief_of(turn: Source, device: str | Device | None) -> Doubles:
-    """Return heights of a turn alone, mm, around half the press: first those that register it roughly."""
-    shape, header = turn.shape[1:], turn.header
-    relief = np.full(shape, 0.0 if header.press is None else -header.press / 2)
-    if header.press is None or header.pivot is None or not turn.rewindable:
-        return relief
-    plan = Rotation(heights=relief, device=device).plan(turn)
-    height = np.asarray(Run(replace(plan, checked=False), turn).complete().height, np.float64)
-    return relief + fill_with_nearest(height) if np.isfinite(height).any() else relief
 
 
 def _tilt_seen(wave: Doubles, tilt: float) -> float:

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,6 +41,7 @@ MARGIN = 3
 
 _ROUGH = 0.1  # share of the second difference of slopes by which a slope may differ from that of the heights
 _SMOOTH = 1e-6  # weight of second differences of heights, relative to that of slopes: where nothing is seen
+_SMOOTHING = 1.0  # pixels: of slopes, before their changes from pixel to pixel are computed
 _OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
 _LEAST_ZENITH = 1e-3  # radians
 
@@ -83,7 +85,7 @@ class Window:
     pixel_size: tuple[float, float]  # mm
     place: tuple[slice, slice]  # rows and columns of inner pixels in the picture
     usable: NDArray[np.bool_]  # (n,)
-    middle: Doubles  # (S * S,): middles of the intervals of a press, mm; NaN without
+    middle: Doubles  # (S * S,): middles of the intervals of a press, mm; NaN where unknown
     half: Doubles  # (S * S,): half-widths, mm
     relief: Doubles  # (n,): heights with which inner pixels were registered, mm
     z: Doubles  # (S * S,): heights, mm
@@ -150,8 +152,9 @@ class Window:
         named = dict(zip(SHARED, values.tolist(), strict=True))
         slopes = (self._slopes() @ self.z).reshape(2, -1) * (1 - named["pixel_size"])
         inner = self.size - 2 * MARGIN
-        maps = slopes.reshape(2, inner, inner)
-        by_column, by_row = (np.gradient(maps, axis=axis).reshape(2, -1) for axis in (2, 1))
+        # Noise of slopes would make the surface seem more bent than it is.
+        maps = [cv2.GaussianBlur(part, (0, 0), _SMOOTHING) for part in slopes.reshape(2, inner, inner)]
+        by_column, by_row = (np.gradient(np.stack(maps), axis=axis).reshape(2, -1) for axis in (2, 1))
         turned = poses.phase + named["phase"]
         double = np.cos(2 * turned), np.sin(2 * turned)
         larger = (1 + named["tilt"]) * (1 + named["oval_x"] * double[0] + named["oval_y"] * double[1])
@@ -203,12 +206,9 @@ class Window:
 
     @property
     def heights(self) -> Doubles:
-        """Heights of inner pixels, (n,) mm; without a press, with the mean of those that registered them."""
+        """Heights of inner pixels, (n,) mm."""
         inner = slice(MARGIN, self.size - MARGIN)
-        height = self.z.reshape(self.size, self.size)[inner, inner].ravel()
-        if np.isfinite(self.middle).any():
-            return height
-        return height + np.mean((self.relief - height)[self.usable])
+        return self.z.reshape(self.size, self.size)[inner, inner].ravel()
 
     @property
     def misplaced(self) -> float:

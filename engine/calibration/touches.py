@@ -1,6 +1,6 @@
 """Calibration of a sensor from touches of unknown objects.
 
-Each touch is a press and a turn at one place, or a turn alone. The surfaces are unknown and are
+Each touch is a press and a turn at one place. The surfaces are unknown and are
 eliminated; see `mirrorskin.engine.calibration.touch_window`. What remains is the information about the
 sensor, which is summed over touches, kept with the calibration, and forgotten with a time constant.
 """
@@ -38,7 +38,7 @@ _SETTLED = 0.1  # largest last step, in standard errors
 _ROUGHLY = 2  # steps before outliers are excluded; in an exact fit, heights then stay as they are
 _CONTRADICTION = 3.0  # standard deviations between a prior and the touches
 _NEGLIGIBLE = 1e-6  # standard deviation of a parameter that is not estimated
-_MOVED = 0.05  # pixels that points move by an error of the pivot, from which frames are registered again
+_MOVED = 0.02  # pixels that points move by an error of the pivot, from which frames are registered again
 _UNKNOWN = {
     "gamma": 0.2,
     "zenith_gain": 0.1,
@@ -47,7 +47,7 @@ _UNKNOWN = {
     "phase": 0.3,
     "uneven": 0.05,
     "oval": 0.03,
-    "footprint": 0.7,
+    "footprint": 2.0,
     "pivot_z": 10.0,
 }  # standard deviations of parameters about which nothing is stated; counts of 8 bits, radians, mm
 _LOOSER = 10.0  # of the standard deviation of a number that is estimated only if it is stated
@@ -115,20 +115,19 @@ class TouchFit:
     notes: tuple[str, ...]
 
 
-TouchSources = Source | tuple[Source | None, Source]
-
-
 def from_touches(
-    touches: Sequence[TouchSources],
+    touches: Sequence[tuple[Source, Source]],
     *,
     calibration: Calibration | None = None,
     stated: Mapping[str, Stated | tuple[float, float]] | None = None,
     forget: float | None = None,
+    zenith_gain: float | None = None,
+    zenith_offset: float | None = None,
     device: str | Device | None = None,
 ) -> TouchFit:
     """Estimate response and movement of a sensor from touches of unknown objects.
 
-    Each touch is a press and a turn of the same object at the same place, or a turn alone. The heights of the
+    Each touch is a press and a turn of the same object at the same place. The heights of the
     object at each pixel are unknown, and so are the gain and the offset of each frame; all are eliminated
     from one least-squares fit. The samples of a turn follow ::
 
@@ -139,8 +138,8 @@ def from_touches(
 
     Parameters
     ----------
-    touches : sequence of Source or (Source, Source)
-        Turns, or presses and turns. All turns have one half-angle, and an approximate zenith gain.
+    touches : sequence of (Source, Source)
+        Presses and turns. All turns have one half-angle, and an approximate zenith gain.
     calibration : Calibration, optional
         What is already calibrated. If it has a response of touches, these touches are added to it.
     stated : mapping of str to (float, float), optional
@@ -149,6 +148,8 @@ def from_touches(
         (mm). The pixel size is estimated only if it is given here: it is nearly degenerate with the gain.
     forget : float, optional
         Time constant, seconds, after which the information of a touch counts 1/e; by default it is kept.
+    zenith_gain, zenith_offset : float, optional
+        Approximate response to start with, counts/rad and counts; by default that of the recordings.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
 
@@ -165,27 +166,29 @@ def from_touches(
     Examples
     --------
     >>> from mirrorskin.twin import Axial, Twin, Vertical
-    >>> thing = {"object": "texture", "shape": (40, 40), "pixel_size": 0.1}
-    >>> press = Twin(movement=Vertical(0.05 * np.arange(1, 40)), **thing)
+    >>> thing = {"object": "sphere", "shape": (48, 48), "pixel_size": 0.1}
+    >>> press = Twin(movement=Vertical(0.03 * np.arange(1, 60)), **thing)
     >>> turn = Twin(movement=Axial(np.arange(12) * np.pi / 6, 0.05, 1.5), pattern="linear", **thing)
     >>> fit = from_touches([(press, turn)], stated={"tilt": (0.05, 0.001)})
     >>> abs(fit.precession.tilt - 0.05) < 0.002
     True
     """
     if not touches:
-        raise InputError("there are no touches: give presses and turns, or turns")
-    pairs = [touch if isinstance(touch, tuple) else (None, touch) for touch in touches]
+        raise InputError("there are no touches: give presses and turns")
     before = None if calibration is None else calibration.response
-    opened = [
-        (None if press is None else calibrated(press, calibration), _upright(turn, calibration))
-        for press, turn in pairs
-    ]
+    opened = [(calibrated(press, calibration), _upright(turn, calibration)) for press, turn in touches]
     for _, turn in opened:
         _check_same(turn, opened[0][1])
     precession = None if calibration is None else calibration.precession
+    header = opened[0][1].header
+    if zenith_gain is not None:
+        header = replace(header, zenith_gain=np.asarray(zenith_gain, np.float64))
+    if zenith_offset is not None:
+        header = replace(header, zenith_offset=np.asarray(zenith_offset, np.float64))
+    sensor = model_of(opened[0][1], header)
     readers = [TouchReader.of(press, turn, device) for press, turn in opened]
-    movement = _Movement.of(model_of(opened[0][1]), precession)
-    priors = _Priors.of(opened[0][1].header, movement, before is not None, stated or {})
+    movement = _Movement.of(sensor, precession)
+    priors = _Priors.of(header, movement, before is not None, stated or {})
     attempt = _Attempt.of(readers, movement, priors, before, forget).registered()
     if precession is None and not (attempt.following() and attempt.is_plausible):
         movement = _search(readers[0], movement)
@@ -265,10 +268,7 @@ class _Movement(NamedTuple):
 
 
 def _search(reader: TouchReader, movement: _Movement) -> _Movement:
-    """Return the movement with the sense of rotation and the phase zero with which slopes fit a surface best.
-
-    Without a press, a surface may be upside down: its slopes fit as well from the opposite phase.
-    """
+    """Return the movement whose sense and phase zero give slopes that fit a surface best."""
     best = math.inf, movement
     for sense in (1, -1):
         for ahead in np.linspace(-math.pi, math.pi, _SEARCHED, endpoint=False):
@@ -512,11 +512,6 @@ class _Attempt:
         fit, dropped = _fit_with_priors(used, start, priors, memory, exact=False)
         return cls(readers, movement, priors, before, forget, read, used, memory, fit, dropped, moved)
 
-    @property
-    def press(self) -> float:
-        """Travel of the press, mm."""
-        return self.readers[0].turn.header.press or 0.0
-
     def following(self) -> list[Touch]:
         """Return the touches whose samples follow the model."""
         return [touch for touch in self.used if touch.follows()]
@@ -722,8 +717,6 @@ def _result(attempt: _Attempt) -> TouchFit:
     kept = fit.values.copy()  # others are in the numbers of the calibration from now on
     kept[[number for number, name in enumerate(SHARED) if _is_absorbed(name)]] = 0.0
     scale = abs(float(np.nanmedian(sensor.gain)))
-    if not any(touch.has_press for touch in used):  # the heights of the surfaces are unknown
-        sigma["pivot_z"] = math.hypot(sigma["pivot_z"], attempt.press / math.sqrt(12))
     response = LinearResponse(
         gain=gain.astype(np.float32),
         offset=offset.astype(np.float32),

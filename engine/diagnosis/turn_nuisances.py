@@ -372,7 +372,8 @@ class _Fit:
 
     def __init__(
         self, counts: Doubles, phase: Doubles, tilt: float, gain: Doubles, base: Doubles, dark: Doubles,
-        wave: Doubles, places: tuple[Doubles, Doubles], rise: Doubles, full: float, priors: Doubles, gamma: float,
+        wave: Doubles, places: tuple[Doubles, Doubles], rise: Doubles, full: float, priors: Doubles,
+        gamma: float,
     ) -> None:  # fmt: skip
         self._counts, self._phase, self._tilt, self._full = counts, phase[:, np.newaxis], tilt, full
         self._gain, self._base, self._dark = gain, base, dark
@@ -484,11 +485,11 @@ class _Fit:
         sums = Sums.of(self._left, self._by_normal, self._by_gain, self._by_rest)
         matrices, cross, own = sums.matrices, sums.cross, sums.own
         matrices[:, [0, 1], [0, 1]] += 1e-12 * np.trace(matrices, axis1=1, axis2=2)[:, np.newaxis]
-        inverses = np.linalg.inv(matrices)
+        inverses: Doubles = np.asarray(np.linalg.inv(matrices), np.float64)
         through = inverses @ cross
         # Not by products of matrices: the threads that they start wait for those of OpenCL.
         own -= np.einsum("nk,nl->kl", cross.reshape(-1, len(own)), through.reshape(-1, len(own)))
-        pull: Doubles = sums.pull - np.einsum("iak,ia->k", through, sums.push)
+        pull = sums.pull - np.einsum("iak,ia->k", through, sums.push)
         self._equations = _Equations(inverses, through, own, noise, sums.push, pull)
         return self._equations
 

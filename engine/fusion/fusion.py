@@ -392,7 +392,7 @@ def _options_of(method: Method | Mapping[str, Any] | None) -> Mapping[str, Any]:
 def press_evidence(
     vertical: Source, options: Mapping[str, Any], progress: Progress | None = None
 ) -> tuple[Result, PressEvidence]:
-    """Return the maps of a press by options of `Press`, without filled holes, and what they are evidence of."""
+    """Return the maps of a press by options of `Press`, without filled holes, and its evidence."""
     taken = PressEvidence(blur=options.get("blur"))
     method = Press(**{**options, "fill": False, "blur": 0.0})
     return run_over(vertical, method, progress, [taken]), taken

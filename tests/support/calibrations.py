@@ -61,6 +61,22 @@ def a_response(shape=SHAPE):
     )
 
 
+def a_linear_response(shape=SHAPE):
+    """Return the response that touches determine."""
+    return io.LinearResponse(
+        gain=a_map(6, shape, 350.0),
+        offset=a_map(7, shape, -60.0),
+        gamma=1.02,
+        names=("gamma", "zenith_gain"),
+        values=np.array([0.02, 0.0]),
+        information=np.array([[4e4, 1e3], [1e3, 9e4]]),
+        pull=np.array([10.0, -20.0]),
+        touches=3,
+        time=1.7e9,
+        sigma={"gain": 1.2, "offset": 0.4, "gamma": 0.005},
+    )
+
+
 def a_lens(shape=SHAPE):
     """Return a lens with a little of everything."""
     return io.Lens(
@@ -82,6 +98,7 @@ def a_calibration(shape=SHAPE, dtype="uint8", name="left", only=None):
         "precession": a_precession(),
         "gel": io.Gel(threshold=0.2, compliance=0.05, axis=(0.1, 0.3), sigma={"threshold": 0.01}),
         "stiffness": io.Stiffness(0.12, (0.5, -1.0, 0.1), 1e-6 * np.eye(4), 0.01, 0.2, 0.011, 6),
+        "response": a_linear_response(shape),
     }
     process = {"references.program": "mirrorskin", "tilt.frames": 8, "zenith.weight": 0.5, "scale.dots": True}
     chosen = {part: value for part, value in parts.items() if only is None or part in only}

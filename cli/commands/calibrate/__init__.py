@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mirrorskin.cli.commands.calibrate import check, elastic, force, references, scale, show, tilt, zenith
+from mirrorskin.cli.commands.calibrate import (
+    check,
+    elastic,
+    force,
+    references,
+    scale,
+    self_,
+    show,
+    tilt,
+    zenith,
+)
 from mirrorskin.cli.groups import Group
 
 app = Group(
     help="Calibrate brightness, scale, tilt and elasticity of a sensor.\n\n"
     "The order is references, scale, zenith, tilt, elastic, force; each adds its part to the same calibration"
-    " file, and leaves out what the sensor does not need. Then 'check' measures the errors that remain.",
+    " file, and leaves out what the sensor does not need. 'self' needs no known object. Then 'check' measures"
+    " the errors that remain.",
     no_args_is_help=True,
 )
 
@@ -22,6 +33,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "tilt": tilt.command,
     "elastic": elastic.command,
     "force": force.command,
+    "self": self_.command,
     "check": check.command,
     "show": show.command,
 }

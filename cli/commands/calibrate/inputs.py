@@ -172,6 +172,7 @@ class Learned(NamedTuple):
     numbers: Mapping[str, Any]  # printed with --json
     line: str  # printed otherwise
     notes: Sequence[str] = ()  # printed to standard error
+    also: Part | None = None  # another part, with the same provenance
 
 
 def learn(
@@ -221,6 +222,8 @@ def save(
     from mirrorskin import io
     from mirrorskin.cli.output import print_json
 
+    if learned.also is not None:
+        io.update_calibration(output, learned.also, camera, process)
     calibration = io.update_calibration(output, learned.part, camera, process)
     if as_json:
         print_json({"output": str(output), **learned.numbers})

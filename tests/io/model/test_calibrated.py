@@ -41,20 +41,32 @@ def differing(header, reference=OWN):
     return {name for name in names if getattr(header, name) is not getattr(reference, name)}
 
 
+RESPONSE = {"zenith_gain", "zenith_offset", "gamma"}
+RESPONSE |= {f"{name}_sigma" for name in RESPONSE}
+
+
 @pytest.mark.parametrize(
     ("only", "changed"),
     [
         ([], set()),
         (["references"], {"dark", "bright"}),
         (["precession"], {"tilt", "pivot"}),
-        (None, {"dark", "bright", "pixel_size", "tilt", "pivot"}),
+        (["response"], RESPONSE),
+        (None, {"dark", "bright", "pixel_size", "tilt", "pivot", *RESPONSE}),
     ],
 )
 def test_each_part_replaces_its_values_and_the_rest_is_the_source_s(only, changed):
     with_calibration = calibrated(only)
     header, calibration = with_calibration.header, with_calibration.calibration
     assert differing(header) == changed
+    response = calibration.response
     stated = {
+        "zenith_gain": lambda: response.gain,
+        "zenith_offset": lambda: response.offset,
+        "gamma": lambda: response.gamma,
+        "zenith_gain_sigma": lambda: response.sigma["gain"] / float(np.median(response.gain)),
+        "zenith_offset_sigma": lambda: response.sigma["offset"],
+        "gamma_sigma": lambda: response.sigma["gamma"],
         "dark": lambda: calibration.references.dark,
         "bright": lambda: calibration.references.bright,
         "pixel_size": lambda: calibration.lens.pixel_size,
@@ -220,7 +232,7 @@ def test_a_recording_contains_a_copy_and_the_header_of_the_source(tmp_path):
         np.testing.assert_array_equal(recording.header.dark, OWN.dark)
         assert recording.header.tilt == OWN.tilt
     assert io.describe(path)["carried calibration"] == (
-        "references, scale, zenith, tilt, elastic, force of camera 'left', 7 x 5, uint8"
+        "references, scale, zenith, tilt, elastic, force, self of camera 'left', 7 x 5, uint8"
     )
     assert io.describe(path)["camera"] == "left"
     assert_same(io.open_calibration(path), calibration)

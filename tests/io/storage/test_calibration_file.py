@@ -11,7 +11,7 @@ from stacks import record, sphere
 
 from mirrorskin import io
 
-PARTS = ("references", "lens", "zenith", "precession", "gel", "stiffness")
+PARTS = ("references", "lens", "zenith", "precession", "gel", "stiffness", "response")
 CAMERA = io.CameraId("left", SHAPE, np.dtype("uint8"))
 
 
@@ -67,6 +67,7 @@ def test_it_has_the_layout_that_is_documented(saved):
         "tilt": "NXcollection",
         "elastic": "NXcollection",
         "force": "NXcollection",
+        "self": "NXdata",
         "process": "NXprocess",
     }
     assert (actual["references"]["signal"], actual["zenith"]["signal"]) == ("bright", "zenith_sigma")

@@ -1,0 +1,78 @@
+"""`mirrorskin calibrate self`: from touches of unknown objects to a response."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from commands import done, refused
+from stacks import record
+
+from mirrorskin import io
+from mirrorskin.twin import Axial, Camera, Twin, Vertical
+
+TILT = math.radians(3.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A press and a turn."""
+    folder = tmp_path_factory.mktemp("touch")
+    thing = {"object": "sphere", "shape": (48, 48), "pixel_size": 0.1}
+    press = Twin(movement=Vertical(0.03 * np.arange(1, 60)), camera=Camera(seed=1), **thing)
+    movement = Axial(np.arange(12) * np.pi / 6, tilt=TILT, press=1.5)
+    turn = Twin(movement=movement, pattern="linear", camera=Camera(seed=2), **thing)
+    record(press, folder / "press.h5")
+    record(turn, folder / "turn.h5")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def here(folder, tmp_path):
+    for path in folder.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+
+
+def test_response_and_movement_are_written():
+    done("calibrate self press.h5 turn.h5 -o cal.h5")
+    calibration = io.open_calibration("cal.h5")
+    assert calibration.response.touches == 1
+    assert abs(calibration.precession.tilt - TILT) < 4 * calibration.precession.sigma["tilt"]
+
+
+def test_touches_are_added():
+    for _ in range(2):
+        done("calibrate self press.h5 turn.h5 -o cal.h5")
+    assert io.open_calibration("cal.h5").response.touches == 2
+
+
+def test_numbers_have_standard_errors():
+    printed = json.loads(done("calibrate self press.h5 turn.h5 -o cal.h5 --json").stdout)
+    gain = printed["estimates"]["zenith_gain"]
+    assert 0 < gain["sigma"] < 0.05 * gain["value"]
+    assert len(printed["frame_gains"]["turn.h5"]) == 12
+
+
+def test_stated_number_that_touches_contradict_is_reported():
+    actual = done("calibrate self press.h5 turn.h5 -o cal.h5 --stated tilt=4deg+-0.05deg")
+    assert "the touches say" in actual.stderr
+
+
+def test_show_prints_the_response():
+    done("calibrate self press.h5 turn.h5 -o cal.h5")
+    assert "zenith gain" in done("calibrate show cal.h5").stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("press.h5", "has no turn"),
+        ("turn.h5", "follows no press"),
+        ("press.h5 press.h5", "another press"),
+        ("press.h5 turn.h5 --stated tilt=2deg", "NAME=VALUE+-SIGMA"),
+        ("press.h5 turn.h5 --stated weight=2+-1", "cannot be stated"),
+        ("press.h5 turn.h5 --forget 1d", "start time"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(arguments, message):
+    assert message in refused(f"calibrate self {arguments} -o cal.h5")

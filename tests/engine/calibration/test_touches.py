@@ -1,0 +1,270 @@
+"""Calibration from touches of unknown objects, against the twin."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from mirrorskin import engine, io
+from mirrorskin.engine.calibration import from_touches
+from mirrorskin.io.files.arrays import ArrayRecording
+from mirrorskin.twin import Axial, Camera, Cone, Twin, Vertical
+
+TILT = math.radians(2.5)
+FRAMES = 12
+PHASE = np.arange(FRAMES) * 2 * np.pi / FRAMES
+PRESS = 1.6
+PIVOT = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Random waves, of 0.35 mm and longer, on a blunt cone."""
+
+    seed: int = 0
+    name: str = "waves"
+    radius: float = 5.0
+
+    def _waves(self):
+        random = np.random.default_rng(self.seed)
+        number = 2 * np.pi / random.uniform(0.35, 1.05, 14)
+        azimuth, phase = random.uniform(0, 2 * np.pi, (2, 14))
+        size = 0.12 * np.sqrt(2 / 14) / number
+        return zip(number * np.cos(azimuth), number * np.sin(azimuth), phase, size, strict=True)
+
+    def height(self, x, y):
+        waves = sum(size * np.sin(kx * x + ky * y + phase) for kx, ky, phase, size in self._waves())
+        distance = np.hypot(x, y)
+        return np.where(distance < self.radius, waves - 0.35 - 0.5 * np.hypot(distance, 0.3), np.nan)
+
+    def slope(self, x, y):
+        fall = -0.5 / np.sqrt(x**2 + y**2 + 0.09)
+        slope_x, slope_y = fall * x, fall * y
+        for kx, ky, phase, size in self._waves():
+            slope = size * np.cos(kx * x + ky * y + phase)
+            slope_x, slope_y = slope_x + kx * slope, slope_y + ky * slope
+        inside = np.hypot(x, y) < self.radius
+        return np.where(inside, slope_x, np.nan), np.where(inside, slope_y, np.nan)
+
+
+def a_press(thing, seed=0, shape=(56, 56)):
+    """Return a press with steps of 30 um."""
+    travel = np.arange(0.03, PRESS, 0.03)
+    return Twin(
+        object=thing,
+        shape=shape,
+        pixel_size=0.03,
+        object_shift=(0.6, 0.3),
+        movement=Vertical(travel),
+        camera=Camera(seed=2 * seed + 1),
+    )
+
+
+def a_turn(thing, seed=0, shape=(56, 56), tilt=TILT, pivot=PIVOT):
+    """Return a turn."""
+    return Twin(
+        object=thing,
+        shape=shape,
+        pixel_size=0.03,
+        object_shift=(0.6, 0.3),
+        movement=Axial(PHASE, tilt=tilt, press=PRESS, pivot=pivot),
+        pattern="linear",
+        camera=Camera(seed=2 * seed + 2),
+    )
+
+
+def stating(turn, phase=None, gain=1.0, offset=0.0, **properties):
+    """Return a turn whose recording states other properties of the sensor than those that it has."""
+    header = turn.header
+    names = "pixel_size", "tilt", "press", "pivot", "dark", "bright", "camera"
+    stated = {name: getattr(header, name) for name in names}
+    stated |= {"zenith_gain": gain * header.zenith_gain, "zenith_offset": header.zenith_offset + offset}
+    frames = turn.read(np.empty(turn.shape, turn.dtype)).frames.copy()
+    turn.rewind()
+    return ArrayRecording(frames, {"phase": PHASE if phase is None else phase}, stated | properties)
+
+
+def touches_of(count, first=0, stated=None, **turn):
+    """Return presses and turns of waves."""
+    return [
+        (a_press(Waves(seed), seed), stating(a_turn(Waves(seed), seed, **turn), **stated or {}))
+        for seed in range(first, first + count)
+    ]
+
+
+def deviations(fit, tilt=TILT, phase_offset=0.0, pivot=PIVOT, first=0):
+    """Return the deviation of each estimate from the truth, in standard errors."""
+    header = a_turn(Waves(first), first).header
+    truth = {
+        "gamma": 1.0,
+        "zenith_gain": float(np.median(header.zenith_gain)),
+        "zenith_offset": float(np.median(header.zenith_offset)),
+        "tilt": tilt,
+        "phase_offset": phase_offset,
+        "pivot_z": pivot[2],
+    }
+    return {each.name: (each.value - truth.get(each.name, 0.0)) / each.sigma for each in fit.estimates}
+
+
+def named(fit):
+    """Return the estimates by name."""
+    return {each.name: each for each in fit.estimates}
+
+
+def test_wrong_gain_and_offset_are_corrected():
+    fit = from_touches(touches_of(2, stated={"gain": 1.05, "offset": 2.0}))
+    away = deviations(fit)
+    assert max(abs(away[name]) for name in ("gamma", "zenith_gain", "zenith_offset", "tilt")) < 3
+
+
+def test_gain_is_known_to_half_a_percent_from_two_touches():
+    gain = named(from_touches(touches_of(2)))["zenith_gain"]
+    assert gain.sigma / gain.value < 0.005
+
+
+@pytest.mark.slow
+def test_errors_are_as_large_as_their_standard_errors():
+    seeds = 50
+    fits = [
+        from_touches(touches_of(1, first=seed, stated={"gain": 1.02})) for seed in range(100, 100 + seeds)
+    ]
+    away = [deviations(fit) for fit in fits]
+    names = "gamma", "zenith_gain", "zenith_offset", "tilt", "phase_offset"
+    chi2 = {name: np.mean([each[name] ** 2 for each in away]) for name in names}
+    assert all(0.7 < value < 1.5 for value in chi2.values()), chi2
+
+
+def test_wrong_half_angle_of_a_data_sheet_is_reported():
+    pairs = touches_of(1, tilt=math.radians(3.0), stated={"tilt": TILT})
+    fit = from_touches(pairs, stated={"tilt": (TILT, math.radians(0.1))})
+    assert abs(math.degrees(fit.precession.tilt) - 3.0) < 0.1
+    assert any(note.startswith("tilt: the touches say") and "2.5 ± 0.1 deg is" in note for note in fit.notes)
+
+
+def test_right_half_angle_of_a_data_sheet_is_used():
+    fit = from_touches(touches_of(1), stated={"tilt": (TILT, math.radians(0.001))})
+    assert not any("is stated" in note for note in fit.notes)
+    assert fit.precession.sigma["tilt"] < math.radians(0.0011)
+
+
+def test_cone_does_not_determine_the_gain():
+    cone = Cone(math.radians(25.0), 5.0)
+    fit = from_touches([(a_press(cone), stating(a_turn(cone)))])
+    gain = named(fit)["zenith_gain"]
+    assert not gain.determined
+    assert gain.of_touches / gain.value > 0.01
+    assert any("zenith gain" in note and "something rough" in note for note in fit.notes)
+
+
+def test_sense_of_rotation_and_phase_zero_are_found():
+    fit = from_touches(touches_of(1, stated={"phase": 1.0 - PHASE}))
+    assert fit.precession.direction == -1
+    assert abs(fit.precession.phase_offset - 1.0) < 0.02
+
+
+def test_wrong_pivot_is_found():
+    fit = from_touches(touches_of(1, pivot=(0.0, 0.0, -3.0), stated={"pivot": (0.0, 0.0, -2.8)}))
+    assert abs(fit.precession.pivot[2] + 3.0) < 0.1
+
+
+def test_flicker_is_a_gain_of_each_frame():
+    press, turn = touches_of(1)[0]
+    flicker = 1 + 0.03 * np.sin(np.arange(FRAMES) ** 2)
+    frames = turn.read(np.empty(turn.shape, turn.dtype)).frames.astype(np.float64)
+    dark = turn.header.dark
+    lit = np.clip(np.rint(dark + flicker[:, None, None] * (frames - dark)), 0, 255).astype(np.uint8)
+    header = {name: getattr(turn.header, name) for name in ("pixel_size", "tilt", "press", "pivot", "dark")}
+    header |= {name: getattr(turn.header, name) for name in ("bright", "zenith_gain", "zenith_offset")}
+    fit = from_touches([(press, ArrayRecording(lit, {"phase": PHASE}, header, name="flickering"))])
+    np.testing.assert_allclose(fit.frame_gains["flickering"], flicker / flicker.mean(), atol=0.005)
+
+
+def test_pixel_size_is_nearly_degenerate_with_the_gain():
+    fit = from_touches(touches_of(1), stated={"pixel_size": (0.03, 0.001)})
+    assert any("pixel size and zenith gain are nearly degenerate" in note for note in fit.notes)
+
+
+def calibration_of(fit, before=None):
+    """Return the calibration of a fit."""
+    camera = io.CameraId("twin", (56, 56), np.dtype(np.uint8))
+    return replace(before or io.Calibration(camera), response=fit.response, precession=fit.precession)
+
+
+def test_touches_add_to_a_calibration():
+    first = from_touches(touches_of(1, stated={"gain": 1.03}))
+    both = from_touches(touches_of(1, first=1, stated={"gain": 1.03}), calibration=calibration_of(first))
+    assert both.response.touches == 2
+    assert both.response.sigma["gain"] < 0.9 * first.response.sigma["gain"]
+    assert abs(deviations(both)["zenith_gain"]) < 3
+
+
+def test_two_steps_are_as_good_as_one():
+    pairs = touches_of(2, stated={"gain": 1.03})
+    first = from_touches(pairs[:1])
+    second = from_touches(pairs[1:], calibration=calibration_of(first))
+    at_once = from_touches(pairs)
+    gains = [named(fit)["zenith_gain"] for fit in (second, at_once)]
+    assert abs(gains[0].value - gains[1].value) < gains[1].sigma
+    assert gains[0].sigma == pytest.approx(gains[1].sigma, rel=0.2)
+
+
+def timed(pairs, start_time):
+    """Return touches whose turns start at a time."""
+    changed = []
+    for press, turn in pairs:
+        turn.header = replace(turn.header, start_time=start_time)
+        changed.append((press, turn))
+    return changed
+
+
+def test_old_touches_are_forgotten():
+    stated = {"gain": 1.03}
+    first = from_touches(timed(touches_of(1, stated=stated), "2026-01-01T00:00:00"))
+    later = timed(touches_of(1, first=1, stated=stated), "2026-01-11T00:00:00")
+    kept = from_touches(later, calibration=calibration_of(first))
+    forgotten = from_touches(later, calibration=calibration_of(first), forget=86400.0)
+    alone = from_touches(touches_of(1, first=1, stated=stated))
+    assert kept.response.sigma["gain"] < 0.9 * forgotten.response.sigma["gain"]
+    assert forgotten.response.sigma["gain"] == pytest.approx(alone.response.sigma["gain"], rel=0.15)
+
+
+def test_forgetting_needs_start_times():
+    with pytest.raises(io.InputError, match="start time"):
+        from_touches(touches_of(1), forget=86400.0)
+
+
+@pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
+def test_reconstruct_uses_the_response():
+    fit = from_touches(touches_of(2, stated={"gain": 1.05, "offset": 2.0}))
+    turn = a_turn(Waves(7), 7)
+    errors = []
+    for calibration in (None, calibration_of(fit)):
+        result = engine.reconstruct(stating(turn, gain=1.05, offset=2.0), calibration)
+        error = result.zenith - turn.truth.zenith
+        errors.append(float(np.sqrt(np.nanmedian(error[result.contact > 0] ** 2))))
+    assert errors[1] < errors[0] / 2
+
+
+def test_response_survives_a_file(tmp_path):
+    fit = from_touches(touches_of(1))
+    io.save_calibration(calibration_of(fit), tmp_path / "cal.h5")
+    response = io.open_calibration(tmp_path / "cal.h5").response
+    np.testing.assert_array_equal(response.information, fit.response.information)
+    assert response.names == fit.response.names
+
+
+def test_no_touches_are_refused():
+    with pytest.raises(io.InputError, match="no touches"):
+        from_touches([])
+
+
+def test_unknown_number_is_refused():
+    with pytest.raises(io.InputError, match="weight cannot be stated"):
+        from_touches(touches_of(1), stated={"weight": (1.0, 0.1)})
+
+
+def test_two_presses_of_a_touch_are_refused():
+    press = a_press(Waves(0))
+    with pytest.raises(io.InputError, match="vertical motion"):
+        from_touches([(press, press)])
