@@ -189,8 +189,8 @@ def _calibration(calibration: Calibration) -> dict[str, str]:
     facts = {"camera": str(calibration.camera)}
     for name, kind in PARTS.items():
         part = calibration.parts().get(name)
-        if part is None and name == "stiffness":
-            continue  # shown only where it exists, which is rare
+        if part is None and name in ("stiffness", "response"):
+            continue  # shown only where they exist, which is rare
         if part is None:
             facts[kind.command] = "none"
         else:

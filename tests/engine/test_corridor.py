@@ -51,8 +51,8 @@ def test_library_run(recordings, levels):
     ("line", "functions", "files"),
     [
         ("reconstruct press.h5", 570, 75),
-        ("reconstruct turn.h5", 771, 97),
-        ("fuse press.h5 turn.h5", 949, 113),
+        ("reconstruct turn.h5", 781, 98),
+        ("fuse press.h5 turn.h5", 960, 114),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):

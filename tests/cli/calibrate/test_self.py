@@ -47,7 +47,7 @@ def test_touches_are_added():
 
 
 def test_numbers_have_standard_errors():
-    printed = json.loads(done("calibrate self press.h5 turn.h5 -o cal.h5 --json").stdout)
+    printed = json.loads(done("calibrate self press.h5 turn.h5 -o cal.h5 --json").out)
     gain = printed["estimates"]["zenith_gain"]
     assert 0 < gain["sigma"] < 0.05 * gain["value"]
     assert len(printed["frame_gains"]["turn.h5"]) == 12
@@ -55,12 +55,12 @@ def test_numbers_have_standard_errors():
 
 def test_stated_number_that_touches_contradict_is_reported():
     actual = done("calibrate self press.h5 turn.h5 -o cal.h5 --stated tilt=4deg+-0.05deg")
-    assert "the touches say" in actual.stderr
+    assert "the touches say" in actual.said
 
 
 def test_show_prints_the_response():
     done("calibrate self press.h5 turn.h5 -o cal.h5")
-    assert "zenith gain" in done("calibrate show cal.h5").stdout
+    assert "zenith gain" in done("calibrate show cal.h5").out
 
 
 @pytest.mark.parametrize(
@@ -71,8 +71,7 @@ def test_show_prints_the_response():
         ("press.h5 press.h5", "another press"),
         ("press.h5 turn.h5 --stated tilt=2deg", "NAME=VALUE+-SIGMA"),
         ("press.h5 turn.h5 --stated weight=2+-1", "cannot be stated"),
-        ("press.h5 turn.h5 --forget 1d", "start time"),
     ],
 )
 def test_what_cannot_be_used_is_refused(arguments, message):
-    assert message in refused(f"calibrate self {arguments} -o cal.h5")
+    refused(message, f"calibrate self {arguments} -o cal.h5")
