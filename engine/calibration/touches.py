@@ -15,8 +15,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mirrorskin.engine.base.reconstruction import calibrated
-from mirrorskin.engine.calibration.touch_reading import SensorModel, Touch, TouchReader, model_of
-from mirrorskin.engine.calibration.touch_window import FOOTPRINT, SHARED, TURNS
+from mirrorskin.engine.calibration.touch_window import (
+    FOOTPRINT,
+    SHARED,
+    TURNS,
+    SensorModel,
+    Touch,
+    TouchReader,
+    model_of,
+)
 from mirrorskin.engine.diagnosis.turn_light import GLOBALS, UNEVEN, uneven_terms
 from mirrorskin.engine.diagnosis.turn_nuisances import picture_axes
 from mirrorskin.engine.press.intervals import estimate_interval_scatter
