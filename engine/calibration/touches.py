@@ -196,17 +196,21 @@ def from_touches(
     readers = [TouchReader.of(press, turn, device) for press, turn in opened]
     movement = _Movement.of(sensor, precession)
     priors = _Priors.of(header, movement, before is not None, stated or {})
-    attempt = _Attempt.of(readers, movement, priors, before, forget).registered()
-    if precession is None and not (attempt.following() and attempt.is_plausible):
-        movement = _search(readers[0], movement)
-        attempt = _Attempt.of(readers, movement, priors.relative_to(movement), before, forget).registered()
-    used = attempt.following()
-    if not used or not attempt.is_plausible:
-        raise InputError(
-            "no touch can be used: the brightness does not follow the turn. Press deeper, on something with"
-            " relief, and check phases, tilt and pivot"
-        )
-    return _result(attempt.exact(used))
+    try:
+        attempt = _Attempt.of(readers, movement, priors, before, forget).registered()
+        if precession is None and not (attempt.following() and attempt.is_plausible):
+            movement = _search(readers[0], movement)
+            priors = priors.relative_to(movement)
+            attempt = _Attempt.of(readers, movement, priors, before, forget).registered()
+        used = attempt.following()
+        if used and attempt.is_plausible:
+            return _result(attempt.exact(used))
+    except np.linalg.LinAlgError:  # surfaces that are nowhere near those of the touches
+        pass
+    raise InputError(
+        "no touch can be used: the brightness does not follow the turn. Press deeper, on something with"
+        " relief, and check phases, tilt and pivot"
+    )
 
 
 def _upright(turn: Source, calibration: Calibration | None) -> Source:
