@@ -153,6 +153,13 @@ class Lab:
         header = replace(movement.header(), title=surface.name, pixel_size=self._pixel)
         return Frames(self._exposed(light, take), header, surface.name, travel=travel)
 
+    def lowered(self, surface: Surface, travel: Map, take: int) -> Frames:
+        """Return a vertical recording of an object that the sheet follows."""
+        movement = Vertical(travel)
+        light = self._light(surface, movement, ("vertical", travel.tolist()))
+        header = replace(movement.header(), title=surface.name, pixel_size=self._pixel)
+        return Frames(self._exposed(light, take), header, surface.name, travel=travel)
+
     @property
     def _pixel(self) -> tuple[float, float]:
         return self.pixel_size, self.pixel_size

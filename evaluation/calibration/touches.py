@@ -1,0 +1,148 @@
+"""Targets of a calibration from touches of unknown objects, next to that with five presses of a ball.
+
+``python evaluation/calibration/touches.py [--cache DIR] [--only ball,touches,prior]`` prints what was
+measured. The sensor is the twin with a wall, uneven lamps and perspective; the further touch is of an object
+that no calibration has seen. The least possible errors are those of ``fisher.py``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mirrorskin import engine, io
+from mirrorskin.evaluation.base.sources import Frames
+from mirrorskin.evaluation.base.tables import Table
+from mirrorskin.evaluation.calibration import scorer
+from mirrorskin.evaluation.calibration.scenes import BALL, Lab, held_out, nine_balls, press_for
+from mirrorskin.evaluation.calibration.scorer import Surface
+
+PHASE = tuple(float(phase) for phase in np.arange(12) * np.pi / 6)
+LAB = Lab(shape=(96, 96), pixel_size=0.1, phase=PHASE, distance=150.0)
+REACH, APART = 6.0, 3.0  # mm: of objects, and between the calibration's balls
+FURTHER = scorer.waves(0.18, 2.1, 0.8, REACH)
+BOUND = 1.2  # times the errors with a ball
+WRONG = math.radians(2.5), math.radians(0.1)  # a stated half-angle, and its standard deviation
+TRUE = math.radians(3.0)
+
+
+def mixed_objects() -> list[tuple[Surface, float]]:
+    """Return ten objects, and how far to press them: waves, facets and cones."""
+    things = [thing for thing, _ in held_out(REACH)]
+    things += [scorer.waves(0.15, 1.6, turned, REACH) for turned in (0.1, 0.7)]
+    things += [scorer.cone(math.radians(zenith), 4.0, (0.3, -0.2)) for zenith in (20, 28)]
+    return [(thing, press_for(thing)) for thing in things]
+
+
+def references_of(lab: Lab) -> io.References:
+    """Return the references of a sensor."""
+    levels = [lab.flat(light, 64, take) for light, take in ((0.0, 900), (1.0, 901))]
+    return engine.calibration.measure_references(levels[:1], levels[1:]).references
+
+
+def camera_of(lab: Lab) -> io.CameraId:
+    """Return the camera of a sensor."""
+    return io.CameraId("", lab.shape, np.dtype("uint8"))
+
+
+def as_designed(lab: Lab, taken: io.References) -> dict[str, Any]:
+    """Return the approximate response that is known without any calibration: that of the wall's centre."""
+    low, high = lab.rig.dark_zenith, lab.rig.light_zenith
+    gain = float(np.nanmedian(taken.bright - taken.dark)) / (high - low)
+    return {"zenith_gain": gain, "zenith_offset": float(np.nanmedian(taken.dark)) - low * gain}
+
+
+def by_balls(lab: Lab, taken: io.References) -> io.Calibration:
+    """Return the calibration with five presses of a ball."""
+    balls = nine_balls(lab, APART, 1)[::2]
+    response = engine.calibration.fit_zenith(balls, BALL / 2, references=taken)
+    pixel = lab.pixel_size, lab.pixel_size
+    light = engine.calibration.WallBrightness.of_pixels(response, taken.dark, taken.bright, lab.shape, pixel)
+    tracks = []
+    for ball in balls:
+        ball.rewind()
+        tracks.append(engine.calibration.track_ball(ball, BALL / 2, light))
+    movement = engine.calibration.fit_precession(tracks, depth_sigma=light.depth_sigma).precession
+    return io.Calibration(camera_of(lab), taken, zenith=response, precession=movement)
+
+
+def touch(lab: Lab, surface: Surface, press: float, take: int, taken: io.References) -> tuple[Frames, Frames]:
+    """Return a press of an object with uniform light, and a turn with the graded wall."""
+    travel = np.round(np.arange(0.0, press + 1e-9, 0.02), 3)
+    pressed = replace(lab, uniform=True).lowered(surface, travel, 1000 + take)
+    turned = lab.turned(surface, press, take)
+    levels = {"dark": taken.dark, "bright": taken.bright}
+    pressed.header = replace(pressed.header, **levels)
+    turned.header = replace(turned.header, **levels, **as_designed(lab, taken))
+    return pressed, turned
+
+
+def from_touches(lab: Lab, taken: io.References, objects: int, stated: Mapping[str, Any]) -> Any:
+    """Return the fit of a calibration to touches of mixed objects."""
+    touches = [
+        touch(lab, surface, press, 30 + number, taken)
+        for number, (surface, press) in enumerate(mixed_objects()[:objects])
+    ]
+    estimate = engine.calibration.from_touches
+    return estimate(touches, stated=stated)
+
+
+def height_error(lab: Lab, source: Frames, calibration: io.Calibration, **options: Any) -> float:
+    """Return the RMS error of the heights of a turn of the further object, without their mean, µm."""
+    source.rewind()
+    result = engine.reconstruct(source, calibration=calibration, **options)
+    x, y = scorer.pixel_grid(lab.shape, lab.pixel_size)
+    view = scorer.see(lab.rig, FURTHER, x, y, press_for(FURTHER))
+    bound = scorer.bounds(lab.rig, view, 3 * lab.pixel_size, lab.half)
+    error = np.where(np.isfinite(bound.zenith), result.height - view.z, np.nan)
+    return float(1e3 * np.nanstd(error))
+
+
+def rows(lab: Lab, parts: Sequence[str]) -> Iterator[tuple[str, str, str]]:
+    """Yield lines of the table: what, target, measured."""
+    taken = references_of(lab)
+    further = lab.turned(FURTHER, press_for(FURTHER), 20)
+    plain = io.Calibration(camera_of(lab), taken)
+    yield (
+        "heights as designed",
+        "",
+        f"{height_error(lab, further, plain, **as_designed(lab, taken)):.3g} µm",
+    )
+    with_ball = math.nan
+    if "ball" in parts or "touches" in parts:
+        with_ball = height_error(lab, further, by_balls(lab, taken))
+        yield "heights with five presses of a ball", "", f"{with_ball:.3g} µm"
+    stated = {"tilt": (lab.tilt, math.radians(0.2))}
+    if "touches" in parts:
+        fit = from_touches(lab, taken, 10, stated)
+        learned = replace(plain, response=fit.response, precession=fit.precession)
+        error = height_error(lab, further, learned)
+        yield "heights with ten touches", f"at most {BOUND} x", f"{error:.3g} µm, {error / with_ball:.2f} x"
+        for each in fit.estimates:
+            yield f"{each.name}, {each.unit}", "", f"{each.value:.5g} ± {each.sigma:.2g}"
+    if "prior" in parts:
+        notes = from_touches(replace(lab, tilt=TRUE), taken, 3, {"tilt": WRONG}).notes
+        told = next((note for note in notes if "tilt" in note or "half-angle" in note), "not reported")
+        yield "a half-angle of 3.0 degrees, stated as 2.5 ± 0.1", "reported", told
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description="Targets of a calibration from touches.")
+    parser.add_argument("--cache", type=Path, help="folder that keeps light")
+    parser.add_argument("--only", default="ball,touches,prior", help="parts, with commas between them")
+    options = parser.parse_args()
+    if options.cache is not None:
+        options.cache.mkdir(exist_ok=True)
+    lines = list(rows(replace(LAB, cache=options.cache), options.only.split(",")))
+    print(Table("Calibration from touches", ("what", "target", "measured"), lines))
+
+
+if __name__ == "__main__":
+    main()
