@@ -77,9 +77,8 @@ def touch(lab: Lab, surface: Surface, press: float, take: int, taken: io.Referen
     travel = np.round(np.arange(0.0, press + 1e-9, 0.02), 3)
     pressed = replace(lab, uniform=True).lowered(surface, travel, 1000 + take)
     turned = lab.turned(surface, press, take)
-    levels = {"dark": taken.dark, "bright": taken.bright}
-    pressed.header = replace(pressed.header, **levels)
-    turned.header = replace(turned.header, **levels, **as_designed(lab, taken))
+    pressed.header = replace(pressed.header, dark=taken.dark, bright=taken.bright)
+    turned.header = replace(turned.header, dark=taken.dark, bright=taken.bright, **as_designed(lab, taken))
     return pressed, turned
 
 
