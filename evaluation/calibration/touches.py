@@ -119,16 +119,31 @@ def rows(lab: Lab, parts: Sequence[str]) -> Iterator[tuple[str, str, str]]:
         yield "heights with five presses of a ball", "", f"{with_ball:.3g} µm"
     stated = {"tilt": (lab.tilt, math.radians(0.2))}
     if "touches" in parts:
-        fit = from_touches(lab, taken, 10, stated)
-        learned = replace(plain, response=fit.response, precession=fit.precession)
-        error = height_error(lab, further, learned)
-        yield "heights with ten touches", f"at most {BOUND} x", f"{error:.3g} µm, {error / with_ball:.2f} x"
-        for each in fit.estimates:
-            yield f"{each.name}, {each.unit}", "", f"{each.value:.5g} ± {each.sigma:.2g}"
+        yield from _rows_of_touches(lab, plain, further, with_ball, stated)
     if "prior" in parts:
-        notes = from_touches(replace(lab, tilt=TRUE), taken, 3, {"tilt": WRONG}).notes
+        try:
+            notes = from_touches(replace(lab, tilt=TRUE), taken, 3, {"tilt": WRONG}).notes
+        except io.InputError as error:
+            notes = (f"refused: {error}",)
         told = next((note for note in notes if "tilt" in note or "half-angle" in note), "not reported")
         yield "a half-angle of 3.0 degrees, stated as 2.5 ± 0.1", "reported", told
+
+
+def _rows_of_touches(
+    lab: Lab, plain: io.Calibration, further: Frames, with_ball: float, stated: Mapping[str, Any]
+) -> Iterator[tuple[str, str, str]]:
+    what, target = "heights with ten touches", f"at most {BOUND} x"
+    assert plain.references is not None
+    try:
+        fit = from_touches(lab, plain.references, 10, stated)
+    except io.InputError as error:
+        yield what, target, f"missed, refused: {error}"
+        return
+    learned = replace(plain, response=fit.response, precession=fit.precession)
+    error_of_touches = height_error(lab, further, learned)
+    yield what, target, f"{error_of_touches:.3g} µm, {error_of_touches / with_ball:.2f} x"
+    for each in fit.estimates:
+        yield f"{each.name}, {each.unit}", "", f"{each.value:.5g} ± {each.sigma:.2g}"
 
 
 def main() -> None:
