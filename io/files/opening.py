@@ -159,10 +159,10 @@ def open_recording(
             file = opening.enter_context(open_file(path, memory_limit))
         except InputError as error:
             raise _explained(path, error) from None
-        if dataset is not None and file.marked(MARK, f"/{dataset.strip('/')}/entry"):
+        ours = file.marked(MARK)
+        if ours and dataset is not None and file.marked(MARK, f"/{dataset.strip('/')}/entry"):
             file.enter(dataset.strip("/"))  # another recording in the same file, as the turn of a touch
             dataset = None
-        ours = file.marked(MARK)
         file.check_layout(MARK)
         names = [dataset or STACK] if ours else names_of_stack(file, dataset)
         if len(names) > 1:

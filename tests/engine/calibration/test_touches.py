@@ -158,6 +158,16 @@ def test_cone_does_not_determine_the_gain():
     assert any("zenith gain" in note and "something rough" in note for note in fit.notes)
 
 
+@pytest.mark.parametrize("thing", ["texture", "sphere", "coin", "cone"])
+def test_what_shows_little_has_large_standard_errors(thing):
+    field = {"object": thing, "shape": (96, 96), "pixel_size": 0.05}
+    press = Twin(movement=Vertical(np.arange(0.02, 0.8, 0.02)), camera=Camera(seed=1), **field)
+    movement = Axial(PHASE, tilt=TILT, press=0.6, pivot=PIVOT)
+    turn = Twin(movement=movement, pattern="linear", camera=Camera(seed=2), **field)
+    away = deviations(from_touches([(press, stating(turn))]))
+    assert max(map(abs, away.values())) < 3
+
+
 def test_sense_of_rotation_and_phase_zero_are_found():
     fit = from_touches(touches_of(1, stated={"phase": 1.0 - PHASE}))
     assert fit.precession.direction == -1

@@ -62,7 +62,7 @@ import numpy as np
 from mirrorskin import io
 from mirrorskin.hw.base.rig_file import TEMPLATE, load_rig
 from mirrorskin.hw.rig.plans import VerticalPlan
-from mirrorskin.hw.rig.scan import _header
+from mirrorskin.hw.rig.scan import make_header
 from mirrorskin.io.files.arrays import ArrayRecording
 from mirrorskin.io.files.recorder import Recorder
 from mirrorskin.io.formats.mcap import save_messages
@@ -71,7 +71,7 @@ assert changed
 assert "# humidity = 45.5 " in TEMPLATE
 rig = TEMPLATE.replace("# humidity", "humidity").replace('bright = "', '# bright = "')
 Path("rig.toml").write_text(rig)
-header = _header(load_rig("rig.toml"), VerticalPlan(0.0, 1.0, speed=1.0))
+header = make_header(load_rig("rig.toml"), VerticalPlan(0.0, 1.0, speed=1.0))
 known = {{"humidity": header.humidity, "title": header.title}}
 source = ArrayRecording(np.zeros((3, 4, 5), np.uint8), {{"travel": np.arange(3.0)}}, known)
 with Recorder(source, "press.h5") as recorder:
