@@ -15,7 +15,7 @@ from mirrorskin.engine.base.reconstruction import calibrated, method_for, recons
 from mirrorskin.engine.base.running import Progress, Run
 from mirrorskin.engine.calibration.ball import see_ball
 from mirrorskin.engine.calibration.sources import check_ball_radius
-from mirrorskin.engine.diagnosis.sensor_health import find_clear_change
+from mirrorskin.engine.diagnosis.sensor_health import find_clear_change, reference_of
 from mirrorskin.io import Calibration, InputError, Result, Source, WallResponse
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.threads import computes
@@ -421,4 +421,4 @@ def compare_brightness(
         return None
     finally:
         source.rewind()
-    return find_clear_change(result.fitted, source.motion)
+    return find_clear_change(result.fitted, reference_of(opened))

@@ -18,7 +18,12 @@ from mirrorskin.engine.diagnosis.amplitude_blur import BEND_NOISE, with_bend
 from mirrorskin.engine.diagnosis.curl import AzimuthBias, find_azimuth_bias
 from mirrorskin.engine.diagnosis.registration import Registered
 from mirrorskin.engine.diagnosis.residual_noise import CountNoise
-from mirrorskin.engine.diagnosis.sensor_health import change_of_swing, with_light_change
+from mirrorskin.engine.diagnosis.sensor_health import (
+    CALIBRATION,
+    change_of_swing,
+    reference_of,
+    with_light_change,
+)
 from mirrorskin.engine.diagnosis.swing import ModulationEffects, find_modulation_effects, swing_of_wall
 from mirrorskin.engine.diagnosis.turn_nuisances import TurnNuisances
 from mirrorskin.io import Result
@@ -96,8 +101,8 @@ class ResponseUncertainty(Step):
 
     Gains of pixels are added to the errors, and noted; the area that a pixel sees is used. Blur, and a
     response that is not linear, are warnings: see `mirrorskin.engine.diagnosis.swing`, and so is brightness
-    that has changed since the calibration: see `mirrorskin.engine.diagnosis.sensor_health`. Of a calibrated
-    response, only the latter is judged.
+    that has changed since the calibration, or that contradicts the stated gain: see
+    `mirrorskin.engine.diagnosis.sensor_health`. Of a calibrated response, only the latter is judged.
     """
 
     needs = ("normals", "normals_sigma", "zenith", "mean", "modulation", "contact")
@@ -121,7 +126,8 @@ class ResponseUncertainty(Step):
             swing = swing_of_wall(*maps, response, tilt, noise_of_mean)
             # The swing is a difference of light whose zeniths are two tilts apart.
             sigma = math.sqrt(2) * float(np.nanmedian(response.sigma)) / tilt
-            return with_light_change(result, change_of_swing(swing, header, tilt, sigma), "axial")
+            change = change_of_swing(swing, header, tilt, sigma)
+            return with_light_change(result, change, CALIBRATION)
         gain = cast("ArrayLike", operation.zenith_gain)
         modulation = find_modulation_effects(*maps, gain, tilt, noise_of_mean)
         if modulation.gain > 0:
@@ -133,7 +139,7 @@ class ResponseUncertainty(Step):
         result = with_findings(result, *_of_swing(modulation))
         doubtful = modulation.blur > 0 or modulation.response > 0
         change = None if doubtful else change_of_swing(modulation.swing, header, tilt)
-        return with_light_change(result, change, "axial")
+        return with_light_change(result, change, reference_of(context.source, gain))
 
 
 class NuisanceUncertainty(Step):

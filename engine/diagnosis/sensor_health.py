@@ -1,7 +1,8 @@
 """How much the brightness of a sensor has changed since its calibration, by an ordinary recording.
 
 The swing of a rotation's brightness, and the full light of a press, are compared with what the calibration
-states. Their ratios, at a grid of pixels, are a weighted sum ::
+states; of a rotation without one, with the stated zenith gain and tilt. Their ratios, at a grid of pixels,
+are a weighted sum ::
 
     ratio - 1 = change + towards_x x + towards_y y + to_rim (x^2 + y^2 - 2/3) + skew x y + nuisances,
 
@@ -16,11 +17,12 @@ from dataclasses import replace
 from typing import NamedTuple, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mirrorskin.engine.diagnosis.footprint import LEAST_BLUR, PIXEL
 from mirrorskin.engine.diagnosis.swing import Swing
 from mirrorskin.engine.diagnosis.turn_nuisances import shift_of
-from mirrorskin.io import Fitted, Header, Motion, Result
+from mirrorskin.io import Calibrated, Fitted, Header, Result, Source
 from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.numerics.least_squares import OUTLYING, gram, mad_sigma
@@ -56,6 +58,51 @@ class LightChange(NamedTuple):
 
     value: Parts
     sigma: Parts
+
+
+class Reference(NamedTuple):
+    """What the brightness is compared with, as a finding states it."""
+
+    fallen: str  # verb of less brightness
+    risen: str
+    compared: str  # what follows the amount
+    remedy: str
+    warning: bool  # whether a change makes the maps wrong
+
+
+CALIBRATION = Reference(
+    "has fallen by",
+    "has risen by",
+    "since the calibration, because of the lamp or the gel",
+    "calibrate the zenith again",
+    True,
+)
+_REFERENCES = CALIBRATION._replace(
+    compared="since the references, because of the lamp or the gel",
+    remedy="take references again",
+    warning=False,
+)
+_STATED = Reference(
+    "is lower by",
+    "is higher by",
+    "than the stated zenith gain and tilt predict",
+    "check both, or calibrate the zenith",
+    True,
+)
+
+
+def reference_of(source: Source, gain: ArrayLike | None = None) -> Reference:
+    """Return what the brightness of a source is compared with.
+
+    Of a rotation it is the calibrated response, or the stated zenith gain and tilt: those of the header, or
+    ``gain``, counts per radian, if another one was given. Of a press it is the references.
+    """
+    if source.motion == "vertical":
+        return _REFERENCES
+    calibration = source.calibration if isinstance(source, Calibrated) else None
+    calibrated = calibration is not None and (calibration.zenith or calibration.response) is not None
+    given = gain is not None and not np.array_equal(gain, np.asarray(source.header.zenith_gain))
+    return CALIBRATION if calibrated and not given else _STATED
 
 
 class Samples(NamedTuple):
@@ -122,23 +169,22 @@ def find_light_change(samples: Samples, common: float, uneven: float) -> LightCh
     )
 
 
-def with_light_change(result: Result, change: LightChange | None, motion: Motion) -> Result:
+def with_light_change(result: Result, change: LightChange | None, reference: Reference) -> Result:
     """Return a result that states a change of the brightness, with a finding if it is significant."""
     if change is None:
         return result
     fitted = replace(result.fitted, light_change=change.value, light_change_sigma=change.sigma)
-    finding = find_clear_change(fitted, motion)
+    finding = find_clear_change(fitted, reference)
     result = result.assign(fitted=fitted)
     return result if finding is None else with_findings(result, finding)
 
 
-def find_clear_change(fitted: Fitted, motion: Motion) -> Finding | None:
+def find_clear_change(fitted: Fitted, reference: Reference) -> Finding | None:
     """Return the finding about the stated change of the brightness; None if it is not significant.
 
     It is that of the mean, of the rim or of one side, whichever is the most significant. A rotation whose
     brightness has changed has wrong normals: a warning. Heights of a press only have the note.
     """
-    warning = motion == "axial"
     if fitted.light_change is None or fitted.light_change_sigma is None:
         return None
     value, sigma = np.array(fitted.light_change), np.array(fitted.light_change_sigma)
@@ -153,15 +199,10 @@ def find_clear_change(fitted: Fitted, motion: Motion) -> Finding | None:
         place, amount = f" towards the {side}", -abs(amount)
     elif part == 3:
         place = " from the centre to the rim"
-    verb, percent = ("fallen" if amount < 0 else "risen"), f"{100 * abs(amount):.2g} ± {100 * error:.1g} %"
-    reference, remedy = (
-        ("calibration", "calibrate the zenith again") if warning else ("references", "take references again")
-    )
-    text = (
-        f"brightness{place} has {verb} by {percent} since the {reference}, because of the lamp or the gel:"
-        f" {remedy}"
-    )
-    return Finding(KIND, text, warning)
+    verb = reference.fallen if amount < 0 else reference.risen
+    percent = f"{100 * abs(amount):.2g} ± {100 * error:.1g} %"
+    text = f"brightness{place} {verb} {percent} {reference.compared}: {reference.remedy}"
+    return Finding(KIND, text, reference.warning)
 
 
 def change_of_swing(

@@ -18,6 +18,7 @@ from mirrorskin.engine.diagnosis.sensor_health import (
     LightChange,
     Samples,
     find_light_change,
+    reference_of,
     with_light_change,
 )
 from mirrorskin.engine.diagnosis.turn_nuisances import picture_axes
@@ -120,7 +121,7 @@ class Nuisances(Step):
         if clear_lag or any(errors):
             found = with_findings(found, *_findings(errors, lag if clear_lag else 0.0))
         change = None if edges is None else edges.light_change(context)
-        return with_light_change(found, change, "vertical")
+        return with_light_change(found, change, reference_of(context.source))
 
     def _shares(self, context: Context) -> tuple[float, float]:
         """Return the uncertainty of the level at the threshold, before the frames, as a share of the rise.

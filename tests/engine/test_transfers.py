@@ -49,7 +49,7 @@ CALLS = {
     # Frames and phases of each of two turns, and the scale.
     "normals": (
         *(engine.estimate_normals, (TURNS, PHASE)),
-        {"tilt": 0.05, "zenith_gain": 300, "noise": 1.0},
+        {"tilt": 0.05, "zenith_gain": 200, "noise": 1.0},
         Moved(5, FRAMES, 7, 33, 1),
     ),
     "heights": (engine.integrate, (*SLOPES, 0.1), {"sigma": False}, Moved(2, 8, 1, 4, 1)),

@@ -57,22 +57,35 @@ def test_a_change_of_brightness_is_stated(height):
 
 def test_a_clear_change_is_a_warning():
     result = quietly(turn(TEXTURED[0], 0.9))
-    assert result.process["warnings"].startswith("brightness has fallen by ")
+    assert result.process["warnings"].startswith("brightness is lower by ")
 
 
 def test_a_characterised_sensor_shows_a_smaller_change():
     result = quietly(turn(TEXTURED[0], 0.96, **CHARACTERISED))
-    assert "since the calibration, because of the lamp or the gel" in result.process["warnings"]
+    assert "than the stated zenith gain and tilt predict: check both" in result.process["warnings"]
+
+
+def test_a_change_of_a_calibrated_sensor_is_one_since_the_calibration():
+    recording = turn(TEXTURED[0], 0.96, tilt_sigma=0.003)
+    shape = recording.shape[1:]
+    maps = (np.full(shape, counts, np.float32) for counts in (SETUP.slope, DARK))
+    sigma = {"gain": 0.003 * SETUP.slope, "offset": 0.1, "gamma": 0.005}
+    response = io.LinearResponse(
+        *maps, 1.0, ("gain",), np.zeros(1), np.eye(1), np.zeros(1), touches=1, time=np.nan, sigma=sigma
+    )
+    calibration = io.Calibration(io.CameraId("", shape, np.dtype("uint8")), response=response)
+    with pytest.warns(match="brightness has fallen by .* since the calibration, because of the lamp"):
+        engine.reconstruct(recording, calibration=calibration)
 
 
 def test_brightness_that_falls_at_the_rim_is_named():
     result = quietly(turn(TEXTURED[0], 1 - 0.06 * TO_RIM, uneven_light_sigma=0.005))
-    assert result.process["warnings"].startswith("brightness from the centre to the rim has fallen by ")
+    assert result.process["warnings"].startswith("brightness from the centre to the rim is lower by ")
 
 
 def test_brightness_that_falls_towards_one_side_is_named():
     result = quietly(turn(TEXTURED[0], 1 + 0.06 * X, uneven_light_sigma=0.005))
-    assert result.process["warnings"].startswith("brightness towards the left has fallen by 6")
+    assert result.process["warnings"].startswith("brightness towards the left is lower by 6")
 
 
 def test_what_is_uncertain_of_the_calibration_is_in_the_standard_deviation():
