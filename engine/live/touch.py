@@ -295,10 +295,10 @@ def fuse_touch(press: Source, turn: Source, device: Choice = None) -> Result:
     sigma = np.hypot(np.asarray(surface.height_sigma), np.float32(common))
     component, unknown = np.asarray(surface.component), np.asarray(surface.offset_unknown)
     sigma[(component >= 0) & (unknown[np.maximum(component, 0)] != 0)] = np.nan
-    process = {**surface.process, "common_height_sigma": common, "common_height_shift": shift}
-    return surface.assign(
-        height=np.asarray(surface.height) + np.float32(shift), height_sigma=sigma, process=process
-    )
+    process = {**surface.process, "common_height_shift": shift}
+    height = np.asarray(surface.height) + np.float32(shift)
+    surface = surface.assign(height=height, height_sigma=sigma, process=process)
+    return surface.with_fitted(common_height_sigma=common)
 
 
 def _height_errors(
@@ -659,7 +659,7 @@ def _moved(press: ArrayRecording | None, turn: ArrayRecording | None) -> float:
 
 def _contradict(outcome: Touched) -> bool:
     """Return whether most of the variance is the contradiction of heights and slopes."""
-    return 2 * float(outcome.result.process.get("disagreement", 0.0)) ** 2 > outcome.sigma**2
+    return 2 * (outcome.result.fitted.disagreement or 0.0) ** 2 > outcome.sigma**2
 
 
 def _limit(outcome: Touched) -> str:
@@ -669,7 +669,7 @@ def _limit(outcome: Touched) -> str:
     with_normal = np.isfinite(np.asarray(result.normals)[..., 0])
     if not np.isfinite(sigma[with_normal]).any() or not math.isfinite(outcome.sigma):
         return "pixels without a height: there is no contact, or no light"
-    common = float(result.process["common_height_sigma"])
+    common = result.fitted.common_height_sigma or 0.0
     if 2 * common**2 > outcome.sigma**2:
         return f"the common height ({1e3 * common:.2g} µm, from the press steps)"
     if _contradict(outcome):

@@ -48,8 +48,9 @@ class Fitted:
         valid=lambda factors: len(factors) % 50 == 0 and bool(np.isfinite(factors).all()),
     )
     light_change: tuple[float, float, float, float] | None = parameter(
-        "relative change of the brightness since the calibration: mean over the picture, increase from its"
-        " centre to the right and to the upper border, and from its centre to the rim",
+        "relative change of the brightness since the calibration, or from what the stated zenith gain and"
+        " tilt predict: mean over the picture, increase from its centre to the right and to the upper"
+        " border, and from its centre to the rim",
         default=None,
         valid=lambda change: bool(np.isfinite(change).all()),
     )
@@ -98,6 +99,18 @@ class Fitted:
     )
     height_common_sigma: float | None = parameter(
         "standard deviation of the error that heights of a press have in common because of gamma and drift",
+        "mm",
+        default=None,
+    )
+    common_height_sigma: float | None = parameter(
+        "standard deviation of the common height of a touch, from its press steps, which is part of"
+        " `height_sigma`",
+        "mm",
+        default=None,
+    )
+    disagreement: float | None = parameter(
+        "RMS by which heights and normals of a fused surface contradict each other, which is part of"
+        " `height_sigma`",
         "mm",
         default=None,
     )

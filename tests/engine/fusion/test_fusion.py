@@ -767,7 +767,7 @@ def test_what_a_press_and_a_rotation_disagree_about_is_part_of_the_standard_devi
         result = engine.fuse(pressed_waves(1), turned_waves(2, light=striped), register=False)
     assert chi_square(result) < 2
     error = (result.height - waves()[0])[result.contact > 0]
-    assert 0.7 * rms(error) < result.process["disagreement"] < 2 * rms(error)
+    assert 0.7 * rms(error) < result.fitted.disagreement < 2 * rms(error)
 
 
 def test_maps_that_contradict_each_other_are_reported():
