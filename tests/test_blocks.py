@@ -54,7 +54,7 @@ FILES = {  # commands that write what the blocks of a page take for granted
     "docs/method/press.md": [f"simulate vertical {SMALL} 12 -o press.h5"],
     "docs/recordings.md": [f"simulate vertical {SMALL} 12 -o coin.h5"],
 }
-RIGS = {"docs/capture.md", "docs/stages.md"}  # pages with an emulated rig, rig.toml
+RIGS = {"docs/capture.md", "docs/stages.md", "docs/touch.md"}  # pages with an emulated rig, rig.toml
 
 
 def pages():
