@@ -40,6 +40,7 @@ def test_a_calibration_is_printed_in_a_table(saved):
         "tilt",
         "elastic",
         "force",
+        "self",
     }
     (angle,) = (line for line in lines if "half-angle" in line)
     assert angle.split() == ["tilt", "half-angle", "2.2918", "0.0057", "deg"]
