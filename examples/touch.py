@@ -14,19 +14,17 @@ from mirrorskin.twin.emulator.rig import EmulatedRig
 from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 SIGMA = 3e-3  # mm
-CLOCK = (
-    SimulatedClock()
-)  # waiting takes no time; with your rig: hw.open_rig(hw.load_rig("rig.toml"), steps=True)
+CLOCK = SimulatedClock()  # waits take no time; your rig: hw.open_rig(hw.load_rig("rig.toml"), steps=True)
 SCENE = {"shape": (96, 128), "pixel_size": 0.03, "pattern": "linear"}
 
-steps = []  # share of the pixels after each surface
+surfaces = []
 
 
 def show(text, result):
     """Print what happens, and keep how good the surface is."""
     print(text)
     if result is not None:
-        steps.append(result.height_sigma)
+        surfaces.append(result)
 
 
 with EmulatedRig("cone", rate=20.0, clock=CLOCK, **SCENE) as emulated:
@@ -47,11 +45,11 @@ shown = left.imshow(surface.height, extent=extent)
 figure.colorbar(shown, label="height (mm)")
 shown = middle.imshow(1e3 * surface.height_sigma, extent=extent, vmin=0, vmax=6)
 figure.colorbar(shown, label="standard deviation (µm)")
-for number, sigma in enumerate([*steps, surface.height_sigma], 1):
-    values = np.sort(1e3 * sigma[np.isfinite(sigma)])
+for number, result in enumerate([*surfaces, surface], 1):
+    values = np.sort(1e3 * result.height_sigma[np.isfinite(result.normals[..., 0])])
     right.plot(values, np.linspace(0, 100, len(values)), label=f"surface {number}")
 right.axvline(1e3 * SIGMA, color="grey", linestyle=":")
-right.set(xlim=(0, 10), xlabel="standard deviation (µm)", ylabel="pixels (%)")
+right.set(xlim=(0, 10), xlabel="standard deviation (µm)", ylabel="pixels with normals (%)")
 right.legend()
 for axes in (left, middle):
     axes.set(xlabel="x (mm)", ylabel="y (mm)")
