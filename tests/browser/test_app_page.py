@@ -175,6 +175,7 @@ def test_a_file_that_is_dropped_on_the_page_opens(opened, press, tmp_path):
     done("reconstruct", press, "-o", tmp_path / "dropped.h5")
     opened.page.evaluate(DROP, list((tmp_path / "dropped.h5").read_bytes()))
     opened.page.get_by_text("dropped.h5; height at").wait_for()
+    opened.page.get_by_text("highest point", exact=True).wait_for()
     with opened.page.expect_download() as download:
         opened.page.get_by_text("Save measures.csv").click()
     download.value.save_as(tmp_path / "measures.csv")
