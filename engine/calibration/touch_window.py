@@ -40,6 +40,7 @@ from mirrorskin.engine.diagnosis.turn_light import (
 )
 from mirrorskin.engine.diagnosis.turn_nuisances import (
     count_of,
+    follow_model,
     frame_priors,
     offset_prior,
     picture_axes,
@@ -70,8 +71,6 @@ _SMOOTH = 1e-6  # weight of second differences of heights, relative to that of s
 _SMOOTHING = 1.0  # pixels: of slopes, before their changes from pixel to pixel are computed
 _OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
 _LEAST_ZENITH = 1e-3  # radians
-
-
 _SLOPE_WEIGHT = 1e3  # of a slope by the wave of a pixel
 TURNS = np.linspace(-math.pi, math.pi, 24, endpoint=False)
 """Angles by which azimuths are turned to find the phase of a stage, radians."""
@@ -378,7 +377,6 @@ _SIDE = 48  # pixels along a side of a window
 _LEAST_SIDE = 16
 _WINDOWS = 2  # of a touch, at most
 _LEAST_USABLE = 0.2  # share of the pixels of a window at which the model holds
-_MAX_MISFIT = 4.0  # variance of residuals, relative to that of two waves a pixel, of a touch that fits
 _LEAST_NOISE = 0.3  # counts of 8 bits: rounding
 _FLICKER = 4.0  # the light of frames may differ by this times the usual standard deviation, unless stated
 _FLOOR = 1e-12  # variance that keeps covariances of gains and offsets without their means regular
@@ -414,16 +412,9 @@ class Touch:
 
     def follows(self) -> bool:
         """Return whether samples differ from the fit hardly more than from any two waves of a pixel."""
-        count = len(self.phase)
-        waves = np.linalg.qr(np.concatenate([basis(self.phase), basis(2 * self.phase)[:, 1:]], axis=1))[0]
-        if count <= waves.shape[1] + 1:
-            return True
         counts = np.concatenate([window.counts[:, window.usable] for window in self.windows], axis=1)
-        fitted = np.concatenate([window.left[:, window.usable] for window in self.windows], axis=1)
-        left = counts - waves @ (waves.T @ counts)
-        noise = float(np.median(np.sum(left**2, axis=0))) / (count - waves.shape[1])
-        misfit = float(np.median(np.sum(fitted**2, axis=0))) / (count - 1)
-        return bool(misfit < _MAX_MISFIT * max(noise, self.least_noise**2))
+        left = np.concatenate([window.left[:, window.usable] for window in self.windows], axis=1)
+        return follow_model(counts, left, self.phase, 1, self.least_noise)
 
 
 def model_of(turn: Source, header: Header) -> SensorModel:

@@ -278,6 +278,21 @@ def shows_model(wave: Doubles, least: Doubles, tilt: float, full: float) -> NDAr
     return np.asarray(usable & (least > _LEAST_LIGHT * full))
 
 
+def follow_model(counts: Doubles, left: Doubles, phase: Doubles, unknowns: int, floor: float) -> bool:
+    """Return whether samples differ from a fit hardly more than from any two waves a pixel.
+
+    ``counts`` and ``left``, (T, n), are the samples and their residuals, ``unknowns`` is the number of those
+    that the fit has for each pixel, and ``floor`` the least noise of a sample, counts.
+    """
+    waves = np.linalg.qr(np.concatenate([basis(phase), basis(2 * phase)[:, 1:]], axis=1))[0]
+    if len(phase) <= waves.shape[1] + 1:
+        return True
+    scatter = counts - waves @ (waves.T @ counts)
+    noise = float(np.median(np.sum(scatter**2, axis=0))) / (len(phase) - waves.shape[1])
+    misfit = float(np.median(np.sum(left**2, axis=0))) / max(1, len(phase) - unknowns)
+    return bool(misfit < _MAX_MISFIT * max(noise, floor**2))
+
+
 def _found(
     fit_to: Callable[[NDArray[np.bool_]], _Fit],
     usable: NDArray[np.bool_],
@@ -295,7 +310,7 @@ def _found(
             break
         fit.improve()
         fit.widen()
-    if fit is not None and fit.pixels >= _MIN_PIXELS and fit.follows_model():
+    if fit is not None and fit.pixels >= _MIN_PIXELS and fit.follows_model:
         return fit.nuisances()
     if not faces.any():
         return None
@@ -399,6 +414,11 @@ class _Fit:
     def misfit(self) -> Doubles:
         """RMS residual of each pixel, counts."""
         return np.asarray(np.sqrt(np.mean(self._left**2, axis=0)))
+
+    @property
+    def follows_model(self) -> bool:
+        """Whether samples differ from the model hardly more than from any two waves a pixel."""
+        return follow_model(self._counts, self._left, self._phase[:, 0], 2, self.floor)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
         """Exclude the other pixels."""
@@ -523,17 +543,6 @@ class _Fit:
                 self._scales[part.start] = scale = min(max(1.0, size / determined), _WIDEST)
             self._priors[part, part] = scale * self._stated[part, part]
             self._precision[part, part] = prior / scale
-
-    def follows_model(self) -> bool:
-        """Return whether samples differ from the model hardly more than from any two waves a pixel."""
-        phase = self._phase[:, 0]
-        waves = np.linalg.qr(np.concatenate([basis(phase), basis(2 * phase)[:, 1:]], axis=1))[0]
-        if len(phase) <= waves.shape[1] + 1:
-            return True
-        left = self._counts - waves @ (waves.T @ self._counts)
-        noise = float(np.median(np.sum(left**2, axis=0))) / (len(phase) - waves.shape[1])
-        misfit = float(np.median(np.sum(self._left**2, axis=0))) / max(1, len(phase) - 2)
-        return bool(misfit < _MAX_MISFIT * max(noise, self.floor**2))
 
     def nuisances(self, informed: bool = True) -> TurnNuisances:
         """Return the estimates, and what remains; unless ``informed``, only the priors are used."""

@@ -156,25 +156,29 @@ class RigControl:
 
     def run(self, plan: Plan, record: Path | None = None) -> None:
         """Move as planned, reconstruct meanwhile, and record if a file is given."""
-        if record is not None:
-            try:
-                io.check_output(record, replaces="nothing")
-            except io.InputError as error:
-                self.problem = str(error)
-                return
-        self._give(lambda rig: self._run(rig, plan, record))
+        if self._can_write(record):
+            self._give(lambda rig: self._run(rig, plan, record))
 
     def touch(
         self, sigma: float, share: float, press: float, tilt: float, record: Path | None = None
     ) -> None:
         """Press and turn until a share of the pixels has a standard deviation, mm; record if asked to."""
+
+        def task(rig: Rig) -> None:
+            self._touch(_WatchedTouch(self, rig, press, tilt=tilt), sigma, share, record)
+
+        if self._can_write(record):
+            self._give(task)
+
+    def _can_write(self, record: Path | None) -> bool:
+        """Return whether a recording can be written, if one is asked for; otherwise tell the problem."""
         if record is not None:
             try:
                 io.check_output(record, replaces="nothing")
             except io.InputError as error:
                 self.problem = str(error)
-                return
-        self._give(lambda rig: self._touch(_WatchedTouch(self, rig, press, tilt=tilt), sigma, share, record))
+                return False
+        return True
 
     def _give(self, task: Callable[[Rig], None]) -> None:
         if self.state != "ready" or self._task is not None:
