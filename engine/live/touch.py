@@ -15,11 +15,10 @@ from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.fusion.fusion import fuse
 from mirrorskin.engine.live.recipe import PRESS_STEPS, TURN_FRAMES, Contact, Measured, Recipe, cheapest
 from mirrorskin.engine.press.press import Press
-from mirrorskin.io import ArrayRecording, Calibrated, Calibration, InputError, Result
+from mirrorskin.io import ArrayRecording, Calibrated, Calibration, InputError, Result, check
 from mirrorskin.io.base.arguments import check_number, checked, in_unit
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.types import Header, Source
-from mirrorskin.io.watch.watch import FrameChecker
 from mirrorskin.kernels.device import Choice
 
 CLEAR_CHANGE = 8.0
@@ -591,19 +590,15 @@ class _Touch:
 
 def _check(recording: ArrayRecording) -> Sequence[Finding]:
     """Return the warnings of the check of frames, also of few."""
-    watch = FrameChecker(recording, alone=True)
-    frames, count = np.empty(recording.shape, recording.dtype), 0
-    recording.rewind()
-    while count < len(frames) and (block := recording.read(frames[count:])) is not None:
-        watch.push(block)
-        frames[count : count + len(block.frames)] = block.frames
-        count += len(block.frames)
-    recording.rewind()
-    change = _change_of_light(frames, recording.phase)
-    found = watch.check().warnings
+    change = _change_of_light(_frames_of(recording), recording.phase)
+    found = check(recording).warnings
     if change > _LIGHT_MAX:
         found += (Finding("flicker", f"the light changes by {change:.1%} between frames: use a steady lamp"),)
     return found
+
+
+def _frames_of(recording: ArrayRecording) -> NDArray[Any]:
+    return np.stack([recording.frame(number) for number in range(recording.shape[0])])
 
 
 def _change_of_light(frames: NDArray[Any], phase: NDArray[np.float64] | None) -> float:
@@ -638,8 +633,7 @@ def _moved(press: ArrayRecording | None, turn: ArrayRecording | None) -> float:
     """
     assert press is not None
     assert turn is not None
-    frames = np.stack([turn.frame(number) for number in range(turn.shape[0])])
-    pictures = press.frame(press.shape[0] - 1), frames.mean(axis=0)
+    pictures = press.frame(press.shape[0] - 1), _frames_of(turn).mean(axis=0)
     deepest, mean = (
         cv2.GaussianBlur(np.asarray(picture, np.float32), (0, 0), _SMOOTHED) for picture in pictures
     )
