@@ -659,9 +659,12 @@ class Kernel:
         for place, (name, convert) in enumerate(self._signature):
             given = arguments[name]
             if convert is not None:
-                # The same number needs no conversion, except 0 or -0; an array may have changed.
+                # The same number needs no conversion, except 0 or -0; nor does the same tuple. An array may
+                # have changed.
                 last = self._given[place]
                 if type(given) in _NUMBERS and type(given) is type(last) and given == last and given:
+                    continue
+                if given is last and type(given) is tuple:
                     continue
                 self._given[place] = _UNSET
                 try:

@@ -1,4 +1,4 @@
-"""Windows of a key frame that are followed one by one, and what is known of each, on a device."""
+"""Windows of a key frame that are followed one by one, and their states, on a device."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class Windows:
         self._state.write(state)
 
     def know(self, *planes: Doubles) -> None:
-        """Replace what is known, (`KNOWN`, rows, columns)."""
+        """Replace the variances and displacements on the device, (`KNOWN`, rows, columns)."""
         self._maps["known"].write(np.concatenate(planes))
 
     def spread(self) -> None:

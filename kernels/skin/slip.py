@@ -30,7 +30,7 @@ which it started to slip; and the last of the fields of ``displacement_follow``.
 """
 STATES = LAST + AFFINE
 KNOWN = 9
-"""Planes of what is known: variance of a sample; covariance xx, yy and xy of a displacement by noise; the
+"""Planes of the given numbers: variance of a sample; covariance xx, yy and xy of a displacement by noise; the
 displacement until the key; and its covariance.
 """
 SCRATCH, SUMS = 13, 8
