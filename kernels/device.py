@@ -662,9 +662,10 @@ class Kernel:
                 # The same number needs no conversion, except 0 or -0; nor does the same tuple. An array may
                 # have changed.
                 last = self._given[place]
-                if type(given) in _NUMBERS and type(given) is type(last) and given == last and given:
-                    continue
-                if given is last and type(given) is tuple:
+                kind = type(given)
+                if (given is last and kind is tuple) or (
+                    kind in _NUMBERS and kind is type(last) and given == last and given
+                ):
                     continue
                 self._given[place] = _UNSET
                 try:

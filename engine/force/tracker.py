@@ -33,6 +33,7 @@ _ROUND_ERROR, _SMALL_ERROR = 0.0065, 0.04  # relative error of the load; see `_b
 _CUT_ERROR = 0.17  # the same, if the object ends in the contact
 _CENTRE_ERROR = 9.5  # error of the centre of pressure, blocks, over the relative error of the load
 _SHEAR_MODEL = 0.03  # relative error of the tangential force, over the share of blocks at the border
+_SHEAR_STALE = 0.1  # the same, over the share of the contact that has changed since its weights were computed
 _CENTRES = "pressure_centre_x", "pressure_centre_y"
 
 
@@ -344,5 +345,7 @@ def _tangential(
     force = area * np.einsum("klij,lij->k", state.shears[place], means, dtype=np.float64) * UP.ravel()
     errors = BlockErrors(sigma, blocks, window_size, boxes=True)
     variance = errors.variance(area * state.shear_weights[place].astype(np.float64), window).sum(axis=-1)
-    sigma = np.hypot(np.sqrt(variance), _SHEAR_MODEL * state.border_share() * np.hypot(*force))
+    changed = _changed(state.pressed.contact, state.sheared)
+    rough = math.hypot(_SHEAR_MODEL * state.border_share(), _SHEAR_STALE * changed)
+    sigma = np.hypot(np.sqrt(variance), rough * np.hypot(*force))
     return np.stack([force, sigma], axis=-1), covered
