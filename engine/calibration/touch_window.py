@@ -32,13 +32,14 @@ from mirrorskin.engine.diagnosis.residual_noise import valid
 from mirrorskin.engine.diagnosis.turn_light import (
     GLOBALS,
     UNEVEN,
-    AxisAngles,
     PixelScale,
+    SlopeAngles,
     Sums,
     light_of,
     uneven_terms,
 )
 from mirrorskin.engine.diagnosis.turn_nuisances import (
+    LEAST_LIGHT,
     count_of,
     follow_model,
     frame_priors,
@@ -51,6 +52,7 @@ from mirrorskin.engine.press.intervals import IntervalScatter, interval_evidence
 from mirrorskin.io import Block, Header, InputError, Source
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.rotation.registration import BORDER
 
 SHARED = (
     *GLOBALS,
@@ -70,8 +72,13 @@ _ROUGH = 0.1  # share of the second difference of slopes by which a slope may di
 _SMOOTH = 1e-6  # weight of second differences of heights, relative to that of slopes: where nothing is seen
 _SMOOTHING = 1.0  # pixels: of slopes, before their changes from pixel to pixel are computed
 _OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
-_LEAST_ZENITH = 1e-3  # radians
 _SLOPE_WEIGHT = 1e3  # of a slope by the wave of a pixel
+NOT_FOLLOWED = (
+    "the brightness does not follow the turn. Press deeper, on something with relief, and check phases, tilt"
+    " and pivot"
+)
+"""Why a touch is not used that does not fit the model."""
+
 TURNS = np.linspace(-math.pi, math.pi, 24, endpoint=False)
 """Angles by which azimuths are turned to find the phase of a stage, radians."""
 
@@ -115,9 +122,10 @@ class Window:
     relief: Doubles  # (n,): heights with which inner pixels were registered, mm
     z: Doubles  # (S * S,): heights, mm
     noise_gain: float  # factor of the noise by registration
+    smooth: Doubles  # (S - 6, S - 6): 1 at inner pixels whose slopes are differences across no edge, or 0
     evidence: tuple[Doubles, Doubles] | None = field(default=None)  # heights of the press, and their weights
-    left: Doubles = field(default_factory=lambda: np.empty(0))  # (T, n): residuals
-    rough: Doubles = field(default_factory=lambda: np.empty(0))  # (n,): second differences of slopes
+    left: Doubles = field(default_factory=lambda: np.empty(0))  # (T, m): residuals of usable pixels
+    rough: Doubles = field(default_factory=lambda: np.empty(0))  # (m,): second differences of slopes
 
     @property
     def size(self) -> int:
@@ -130,7 +138,7 @@ class Window:
         Returns the misfit of these slopes to a surface if all azimuths were mirrored or not, and turned by
         `TURNS`, (2, len(TURNS)).
         """
-        steepness, azimuth = np.tan(np.clip(wave[0], 0, 1.4)), np.arctan2(wave[2], wave[1])
+        steepness, azimuth = np.hypot(*_slopes_of(wave)), np.arctan2(wave[2], wave[1])
         parts = [
             -steepness * np.stack([np.cos(angle), np.sin(angle)])
             for mirrored in (azimuth, -azimuth)
@@ -138,7 +146,7 @@ class Window:
         ]
         stated = np.where(np.tile(self.usable, 2), np.reshape(parts, (4, -1)), 0.0).T
         weight = _SLOPE_WEIGHT * np.tile(self.usable, 2).astype(np.float64)
-        slopes, firm = self._slopes(), self._press_weight()
+        slopes, firm = _slopes(self.size, self.pixel_size), self._press_weight()
         matrix = slopes.T @ slopes.multiply(weight[:, np.newaxis]) + _diagonal(firm)
         solver = _Solver(matrix + _smoothness(self.size) * (_SMOOTH * float(np.max(matrix.diagonal()))))
         known = np.nan_to_num(self.middle) * firm
@@ -157,13 +165,6 @@ class Window:
     def _press_weight(self) -> Doubles:
         return np.nan_to_num(3 / self.half**2)
 
-    def _slopes(self) -> Any:
-        """Return the matrix from heights to slopes along x and y of inner pixels, (2 n, S * S)."""
-        from scipy.sparse import vstack
-
-        along_x, along_y = _derivatives(self.size)
-        return vstack([along_x / self.pixel_size[0], along_y / -self.pixel_size[1]]).tocsr()
-
     def use_intervals(self, spread: IntervalScatter) -> None:
         """Take heights of the press from their intervals, at the present heights."""
         known = np.isfinite(self.middle)
@@ -174,12 +175,12 @@ class Window:
 
     def look(self, poses: Poses, gains: Doubles, offsets: Doubles, values: Doubles) -> Sums:
         """Compute residuals, and return the normal equations of slopes of usable pixels and nuisances."""
-        named = dict(zip(SHARED, values.tolist(), strict=True))
-        slopes = (self._slopes() @ self.z).reshape(2, -1) * (1 - named["pixel_size"])
+        named, chosen = dict(zip(SHARED, values.tolist(), strict=True)), self.usable
         inner = self.size - 2 * MARGIN
-        # Noise of slopes would make the surface seem more bent than it is.
-        maps = [cv2.GaussianBlur(part, (0, 0), _SMOOTHING) for part in slopes.reshape(2, inner, inner)]
-        by_column, by_row = (np.gradient(np.stack(maps), axis=axis).reshape(2, -1) for axis in (2, 1))
+        maps = (_slopes(self.size, self.pixel_size) @ self.z).reshape(2, inner, inner)
+        maps *= 1 - named["pixel_size"]
+        slopes = maps.reshape(2, -1)[:, chosen]
+        by_column, by_row = self._changes(maps)
         turned = poses.phase + named["phase"]
         double = np.cos(2 * turned), np.sin(2 * turned)
         larger = (1 + named["tilt"]) * (1 + named["oval_x"] * double[0] + named["oval_y"] * double[1])
@@ -188,27 +189,16 @@ class Window:
         moves = self._moves(poses, by_column, by_row)
         seen = slopes[:, np.newaxis] + (larger - 1) * moves.by_tilt + ahead * moves.by_phase
         seen = seen + named["pivot_z"] * moves.by_pivot
-
-        def angles_of(slope: Doubles) -> AxisAngles:
-            steepness = np.maximum(np.hypot(*slope), _LEAST_ZENITH)
-            azimuth = np.arctan2(-slope[1], -slope[0])
-            return AxisAngles.of(np.arctan(steepness), azimuth, phase, np.sin(tilt), np.cos(tilt))
-
-        angles = angles_of(seen)
-        width, bend = math.sqrt(FOOTPRINT), -2 * angles_of(slopes).angle
-        for change in (by_column, -by_column, by_row, -by_row):
-            bend = bend + angles_of(slopes + width * change).angle / 2
+        angles = SlopeAngles.of(seen, phase, tilt, (by_column, by_row))
+        bend = FOOTPRINT * angles.bend
+        levels = self.scale
+        scale = PixelScale(levels.gain[chosen], levels.base[chosen], levels.dark[chosen], levels.full)
         light = light_of(
-            angles, (1 + named["footprint"]) * bend, self.scale, gains[:, np.newaxis], offsets[:, np.newaxis],
-            values[: len(GLOBALS) + UNEVEN], self.places,
+            angles, (1 + named["footprint"]) * bend, scale, gains[:, np.newaxis], offsets[:, np.newaxis],
+            values[: len(GLOBALS) + UNEVEN], self.places[:, chosen],
         )  # fmt: skip
-        self.left = self.counts - self.scale.dark - light.light
-        steepness = np.maximum(np.hypot(*seen), _LEAST_ZENITH)
-        growth = 1 / (1 + steepness**2)
-        along, across = seen / steepness, np.stack([-seen[1], seen[0]]) / steepness
-        by_slope = light.by_angle * (
-            angles.by_zenith * along * growth + angles.by_azimuth * across * np.sqrt(growth)
-        )
+        self.left = self.counts[:, chosen] - scale.dark - light.light
+        by_slope = light.by_angle * angles.by_slopes
         tilt_row = light.by_globals[GLOBALS.index("tilt")]
         phase_row = light.by_globals[GLOBALS.index("phase")]
         tilt_row *= poses.tilt
@@ -224,10 +214,19 @@ class Window:
                 -np.sum(by_slope * slopes[:, np.newaxis], axis=0),
             ],
         ])  # fmt: skip
-        chosen = self.usable
-        parts = self.left, by_slope, light.by_gain, rest
-        self.rough = _second_differences(slopes, inner)
-        return Sums.of(*(part[..., chosen] for part in parts))
+        self.rough = _second_differences(maps)[chosen]
+        return Sums.of(self.left, by_slope, light.by_gain, rest)
+
+    def _changes(self, maps: Doubles) -> tuple[Doubles, Doubles]:
+        """Return changes of slopes, (2, S - 6, S - 6), from column to column and row to row, (2, m).
+
+        Slopes are smoothed before, as their noise would make the surface seem more bent than it is, but not
+        across edges.
+        """
+        share = np.maximum(cv2.GaussianBlur(self.smooth, (0, 0), _SMOOTHING), 1e-9)
+        smoothed = [cv2.GaussianBlur(part * self.smooth, (0, 0), _SMOOTHING) / share for part in maps]
+        by_column, by_row = (np.gradient(np.stack(smoothed), axis=axis).reshape(2, -1) for axis in (2, 1))
+        return by_column[:, self.usable], by_row[:, self.usable]
 
     @property
     def heights(self) -> Doubles:
@@ -247,9 +246,9 @@ class Window:
         point of a pixel, with the pivot's height q: the point that is seen is off by the difference.
         """
         if poses.arm is None:
-            zeros = np.zeros((2, *self.counts.shape))
+            zeros = np.zeros((2, len(poses.phase), by_column.shape[1]))
             return _Moves(zeros, zeros, zeros)
-        arm = poses.arm + self.relief
+        arm = poses.arm + self.relief[self.usable]
         cosine, sine = np.cos(poses.phase), np.sin(poses.phase)
         x, y = by_column[:, np.newaxis] / self.pixel_size[0], by_row[:, np.newaxis] / -self.pixel_size[1]
         outwards, onwards = cosine * x + sine * y, cosine * y - sine * x  # per mm
@@ -260,7 +259,7 @@ class Window:
     def exclude_outliers(self) -> None:
         """Exclude pixels that do not follow the model."""
         misfit = np.sqrt(np.mean(self.left**2, axis=0))
-        self.usable &= misfit < _OUTLIER_RATIO * float(np.median(misfit[self.usable]))
+        self.usable[self.usable] = misfit < _OUTLIER_RATIO * float(np.median(misfit))
 
     def eliminate(self, sums: Sums, noise: float) -> Eliminated:
         """Return the information on the nuisances that remains after the heights are eliminated.
@@ -268,7 +267,7 @@ class Window:
         ``noise`` is the variance of a sample. A slope may differ from that of the heights by a normal
         deviate; to eliminate it changes all sums by the same projection.
         """
-        rough = np.maximum((_ROUGH * self.rough[self.usable]) ** 2, 1e-16)
+        rough = np.maximum((_ROUGH * self.rough) ** 2, 1e-16)
         inner = np.linalg.inv(sums.matrices + (noise / rough)[:, np.newaxis, np.newaxis] * np.eye(2))
         by_cross, by_push = inner @ sums.cross, np.einsum("iab,ib->ia", inner, sums.push)
         own = sums.own - np.einsum("iak,ial->kl", sums.cross, by_cross)
@@ -277,7 +276,7 @@ class Window:
         cross = sums.cross - sums.matrices @ by_cross
         push = sums.push - np.einsum("iab,ib->ia", sums.matrices, by_push)
 
-        slopes = self._slopes()
+        slopes = _slopes(self.size, self.pixel_size)
         slopes = slopes[np.concatenate([self.usable, self.usable])]
         slopes_x, slopes_y = slopes[: len(matrices)], slopes[len(matrices) :]
         along_x = slopes_x.multiply(matrices[:, 0, 0, np.newaxis]) + slopes_y.multiply(
@@ -304,15 +303,23 @@ def _step(solver: _Solver, reduced: Doubles, nuisances: Doubles) -> Doubles:
     return solver.backward(reduced[:, -1:] - reduced[:, :-1] @ nuisances[:, np.newaxis])[:, 0]
 
 
-def _second_differences(slopes: Doubles, inner: int) -> Doubles:
-    """Return the size of second differences of slopes along both axes, (n,)."""
-    maps = slopes.reshape(2, inner, inner)
-    total = np.zeros((inner, inner))
+def _second_differences(maps: Doubles) -> Doubles:
+    """Return the size of second differences of maps of slopes, (2, N, N), along both axes, (N * N,)."""
+    total = np.zeros(maps.shape[1:])
     for axis in (1, 2):
         middle = [slice(None)] * 2
         middle[axis - 1] = slice(1, -1)
         total[tuple(middle)] += np.sum(np.diff(maps, 2, axis=axis) ** 2, axis=0)
     return np.sqrt(total).ravel()
+
+
+@functools.lru_cache(maxsize=4)
+def _slopes(size: int, pixel_size: tuple[float, float]) -> Any:
+    """Return the matrix from S x S heights to slopes along x and y of inner pixels, (2 n, S * S)."""
+    from scipy.sparse import vstack
+
+    along_x, along_y = _derivatives(size)
+    return vstack([along_x / pixel_size[0], along_y / -pixel_size[1]]).tocsr()
 
 
 @functools.cache
@@ -376,10 +383,17 @@ _LEAST_FRAMES = 4
 _SIDE = 48  # pixels along a side of a window
 _LEAST_SIDE = 16
 _WINDOWS = 2  # of a touch, at most
-_LEAST_USABLE = 0.2  # share of the pixels of a window at which the model holds
+_LEAST_USABLE = 0.05  # share of the pixels of a window at which the model holds
 _LEAST_NOISE = 0.3  # counts of 8 bits: rounding
 _FLICKER = 4.0  # the light of frames may differ by this times the usual standard deviation, unless stated
 _FLOOR = 1e-12  # variance that keeps covariances of gains and offsets without their means regular
+_LEVEL = 1.5  # tilts: zenith below which the wave of a pixel tells it better than the mean
+_GENTLE = 3.0  # tilts: zenith up to which the amplitude of a wave may be any
+_NEAR_AXIS = 0.5  # tilts: least difference of a zenith from the tilt, where the normal passes the axis
+_VARIED = 0.2  # least scatter of the slopes of a touch, relative to the usual one
+_STEEPEST = math.radians(80)
+_EDGE = 4.0  # standard deviations between heights of neighbours, beyond their slope: an edge
+_STEEPER = 1.2  # factor of slopes: they are approximate
 _SWING = 0.4, 2.5  # range of the amplitude of the zenith, in tilts, from which the half-angle is guessed
 
 
@@ -408,12 +422,22 @@ class Touch:
     time: float  # seconds since 1970; NaN if unknown
     tilt_seen: float  # radians: half-angle that the amplitude of the brightness shows
     misfits: Doubles  # of first slopes to surfaces; see `Window.start`
+    varied: bool  # whether its slopes are not all alike
     noise: float = 1.0  # variance of a sample
+
+    @property
+    def reason(self) -> str:
+        """Why the touch is not used."""
+        if not self.windows:
+            return "it shows hardly any light in contact. Press deeper, on a larger object"
+        if not self.varied:
+            return "its slopes are all alike, as those of a plate or an edge. Touch something rough or round"
+        return NOT_FOLLOWED
 
     def follows(self) -> bool:
         """Return whether samples differ from the fit hardly more than from any two waves of a pixel."""
         counts = np.concatenate([window.counts[:, window.usable] for window in self.windows], axis=1)
-        left = np.concatenate([window.left[:, window.usable] for window in self.windows], axis=1)
+        left = np.concatenate([window.left for window in self.windows], axis=1)
         return follow_model(counts, left, self.phase, 1, self.least_noise)
 
 
@@ -497,6 +521,23 @@ class TouchReader:
         with naming(self.turn):
             return self._touch(frames, phase, noise_gain, sensor)
 
+    def _crosses_no_edge(self, steepness: Doubles, size: tuple[float, float]) -> NDArray[np.bool_]:
+        """Return the pixels at which differences of heights, by which slopes are computed, cross no edge.
+
+        From one pixel to the next, heights of the press change there by more than the steepness, (H, W),
+        explains.
+        """
+        clear = np.ones(self.middle.shape, np.bool_)
+        for axis, pixel in ((1, size[0]), (0, size[1])):
+            height, half, steep = (np.moveaxis(part, axis, 0) for part in (self.middle, self.half, steepness))
+            expected = _STEEPER * pixel * np.fmax(steep[1:], steep[:-1])
+            expected += _EDGE * np.hypot(half[1:], half[:-1]) / math.sqrt(3)
+            steps = np.pad(np.abs(np.diff(height, axis=0)) > expected, ((MARGIN, MARGIN), (0, 0)))
+            count = len(height)
+            for shift in range(2 * MARGIN):
+                np.moveaxis(clear, axis, 0)[...] &= ~steps[shift : shift + count]
+        return clear
+
     def _touch(self, frames: NDArray[Any], phase: Doubles, noise_gain: float, sensor: SensorModel) -> Touch:
         header, shape, size = self.turn.header, self.turn.shape[1:], pixel_size_of(self.turn)
         whole = valid(frames).all(axis=0)
@@ -508,16 +549,21 @@ class TouchReader:
         light = frames - sensor.dark
         full = float(np.max(light[:, whole])) if sensor.full is None else sensor.full
         with np.errstate(invalid="ignore", divide="ignore"):
-            wave = np.einsum(
-                "kt,tij->kij", np.linalg.pinv(basis(phase)), (frames - sensor.base) / sensor.gain
-            )
+            wave = _wave((frames - sensor.base) / sensor.gain, phase, sensor.tilt)
             tilt_seen = _tilt_seen(wave, sensor.tilt)
-            usable = whole & shows_model(wave, np.min(light, axis=0), tilt_seen, full)
+            least = np.min(light, axis=0)
+            gentle = np.isfinite(self.middle) & (least > LEAST_LIGHT * full) & (wave[0] < _GENTLE * tilt_seen)
+            shown = whole & (gentle | shows_model(wave, least, tilt_seen, full))
+        usable = shown & (np.abs(wave[0] / tilt_seen - 1) > _NEAR_AXIS)
+        if sensor.pivot is not None:
+            usable = _without_border(usable)
+        smooth = self._crosses_no_edge(np.where(whole, np.tan(np.minimum(wave[0], _STEEPEST)), np.nan), size)
+        usable &= smooth
         counts = frames[:, whole]
         arm = None
         if sensor.pivot is not None and header.press is not None:
             arm = header.press - sensor.pivot[2]
-        windows, misfits = list[Window](), np.zeros((2, len(TURNS)))
+        windows, misfits, slopes = list[Window](), np.zeros((2, len(TURNS))), list[Doubles]()
         x, y = np.meshgrid(*picture_axes(shape))
         for outer in _places(usable, wave):
             inner = [slice(part.start + MARGIN, part.stop - MARGIN) for part in outer]
@@ -533,13 +579,16 @@ class TouchReader:
                 pixel_size=size,
                 place=(inner[0], inner[1]),
                 usable=chosen,
-                middle=self.middle[outer].ravel(),
-                half=self.half[outer].ravel(),
+                middle=np.where(shown, self.middle, np.nan)[outer].ravel(),
+                half=np.where(shown, self.half, np.nan)[outer].ravel(),
                 relief=self.relief[*inner].ravel(),
                 z=np.zeros(self.middle[outer].size),
                 noise_gain=noise_gain,
+                smooth=smooth[*inner].astype(np.float64),
             )
-            misfits += window.start(np.nan_to_num(wave[:, *inner].reshape(3, -1)))
+            seen = np.nan_to_num(wave[:, *inner].reshape(3, -1))
+            misfits += window.start(seen)
+            slopes.append(_slopes_of(seen[:, chosen]))
             windows.append(window)
         return Touch(
             name=self.turn.name,
@@ -552,7 +601,46 @@ class TouchReader:
             time=_time_of(header),
             tilt_seen=tilt_seen,
             misfits=misfits,
+            varied=bool(slopes) and _vary(np.concatenate(slopes, axis=1)),
         )
+
+
+def _without_border(usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the pixels whose registered samples are interpolated from usable ones alone.
+
+    Where contact or the linear response ends, brightness has a bend, across which samples are wrong.
+    """
+    reach = np.ones((2 * BORDER + 1,) * 2, np.uint8)
+    return np.asarray(cv2.erode(usable.astype(np.uint8), reach) > 0)
+
+
+def _wave(angles: Doubles, phase: Doubles, tilt: float) -> Doubles:
+    """Return the zenith of each pixel, and the apparent half-angle times cosine and sine of the azimuth.
+
+    The cosines of angles to the axis, (T, H, W), are a wave of the phase: its mean is cos(zenith) cos(tilt),
+    and its amplitude sin(zenith) sin(tilt), which is the better known if the zenith is less than the tilt.
+    """
+    mean, cosine, sine = np.einsum("kt,tij->kij", np.linalg.pinv(basis(phase)), np.cos(angles))
+    zenith, size = np.arccos(np.clip(mean / math.cos(tilt), -1, 1)), np.hypot(cosine, sine)
+    swing = np.arcsin(np.clip(size / np.maximum(np.sin(zenith), 1e-9), 0, 1))
+    by_size = np.arcsin(np.clip(size / math.sin(tilt), 0, 1))
+    zenith = np.where(zenith < _LEVEL * tilt, by_size, zenith)
+    return np.stack([zenith, *(-swing * part / np.maximum(size, 1e-30) for part in (cosine, sine))])
+
+
+def _slopes_of(wave: Doubles) -> Doubles:
+    """Return the slopes, (2, m), of waves of zeniths, (3, m), with azimuths as they appear."""
+    size = np.tan(np.clip(wave[0], 0, _STEEPEST)) / np.maximum(np.hypot(wave[1], wave[2]), 1e-30)
+    return np.asarray(-size * wave[1:])
+
+
+def _vary(slopes: Doubles) -> bool:
+    """Return whether slopes, (2, m), differ from each other.
+
+    Those of a plate or of a ramp change like gains and offsets of the frames, whatever is wrong.
+    """
+    low, middle, high = np.percentile(slopes, (16, 50, 84), axis=1)
+    return bool(np.hypot(*(high - low)) / 2 > _VARIED * np.hypot(*middle))
 
 
 def _tilt_seen(wave: Doubles, tilt: float) -> float:

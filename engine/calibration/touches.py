@@ -17,11 +17,13 @@ import numpy as np
 from mirrorskin.engine.base.reconstruction import calibrated
 from mirrorskin.engine.calibration.touch_window import (
     FOOTPRINT,
+    NOT_FOLLOWED,
     SHARED,
     TURNS,
     SensorModel,
     Touch,
     TouchReader,
+    Window,
     model_of,
 )
 from mirrorskin.engine.diagnosis.turn_light import GLOBALS, UNEVEN, uneven_terms
@@ -44,7 +46,6 @@ _ITERATIONS = 10  # Gauss-Newton steps, at most
 _SETTLED = 0.1  # largest last step, in standard errors
 _ROUGHLY = 2  # steps before outliers are excluded; in an exact fit, heights then stay as they are
 _CONTRADICTION = 3.0  # standard deviations between a prior and the touches
-_WELL_SHOWN = 0.006  # relative standard error of gain and half-angle by a touch, up to which noise prevails
 _NEGLIGIBLE = 1e-6  # standard deviation of a parameter that is not estimated
 _MOVED = 0.02  # pixels that points move by an error of the pivot, from which frames are registered again
 _UNKNOWN = {
@@ -197,21 +198,21 @@ def from_touches(
     readers = [TouchReader.of(press, turn, device) for press, turn in opened]
     movement = _Movement.of(sensor, precession)
     priors = _Priors.of(header, movement, before is not None, stated or {})
+    reason = NOT_FOLLOWED
     try:
         attempt = _Attempt.of(readers, movement, priors, before, forget).registered()
-        if precession is None and not (attempt.following() and attempt.is_plausible):
+        if precession is None and attempt.may_be_of_another_movement:
             movement = _search(readers[0], movement)
             priors = priors.relative_to(movement)
             attempt = _Attempt.of(readers, movement, priors, before, forget).registered()
+        if not attempt.used:
+            reason = attempt.read[0].reason
         used = attempt.following()
         if used and attempt.is_plausible:
             return _result(attempt.exact(used))
     except np.linalg.LinAlgError:  # surfaces that are nowhere near those of the touches
         pass
-    raise InputError(
-        "no touch can be used: the brightness does not follow the turn. Press deeper, on something with"
-        " relief, and check phases, tilt and pivot"
-    )
+    raise InputError(f"no touch can be used: {reason}")
 
 
 def _upright(turn: Source, calibration: Calibration | None) -> Source:
@@ -515,7 +516,7 @@ class _Attempt:
                 movement = movement.changed({"tilt": seen - 1, "phase": 0.0, "pivot_z": 0.0})
                 priors = priors.relative_to(movement)
                 read = [movement.read(reader) for reader in readers]
-        used = [touch for touch in read if touch.windows]
+        used = [touch for touch in read if touch.varied]
         if start is None:
             start = priors.start(before, movement.before)
         if moved is None:
@@ -527,6 +528,12 @@ class _Attempt:
     def following(self) -> list[Touch]:
         """Return the touches whose samples follow the model."""
         return [touch for touch in self.used if touch.follows()]
+
+    @property
+    def may_be_of_another_movement(self) -> bool:
+        """Whether touches that show a surface do not fit it."""
+        fits = self.following() and self.is_plausible
+        return not fits and any(touch.varied or not touch.windows for touch in self.read)
 
     @property
     def is_plausible(self) -> bool:
@@ -641,7 +648,6 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: _Priors, memory: _Mem
             information, push, step = _eliminate(
                 touch, values, number == _ROUGHLY, exact and number < _ROUGHLY
             )
-            weight = weight * _trust(information, priors)
             matrix += weight * information
             vector += weight * (information @ values + push)
             steps.append(step)
@@ -653,20 +659,6 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: _Priors, memory: _Mem
         if number > _ROUGHLY and np.all(np.abs(step) < _SETTLED * np.sqrt(np.diag(covariance))):
             break
     return _Fitted(values, matrix, vector, (covariance + covariance.T) / 2)
-
-
-def _trust(information: Doubles, priors: _Priors) -> float:
-    """Return the weight of a touch: 1 if it alone shows the gain and the half-angle well.
-
-    An error of the model of a tenth of a count changes the parameters by their variance times its slope by
-    them: the less a touch shows, the more the error exceeds the noise.
-    """
-    at = [SHARED.index("zenith_gain"), SHARED.index("tilt")]
-    sigma = priors.sigma.copy()
-    sigma[at] *= _WITHOUT
-    covariance = np.linalg.inv(information + np.diag(sigma**-2.0))
-    alone = math.sqrt(float(np.max(np.diag(covariance)[at])))
-    return min(1.0, (_WELL_SHOWN / alone) ** 4)
 
 
 def _eliminate(
@@ -684,13 +676,9 @@ def _eliminate(
         for window in touch.windows:
             window.exclude_outliers()
         sums = look()
-    squares = sum(float(np.sum(window.left[:, window.usable] ** 2)) for window in touch.windows)
-    freedom = (
-        sum(int(np.count_nonzero(window.usable)) for window in touch.windows) * (frames - 1) - 2 * frames
-    )
     # Neighbours of registered frames share their noise, so that of a sample is larger than the residuals.
     usual = float(np.mean([window.noise_gain**2 for window in touch.windows]))
-    touch.noise = max(squares / max(freedom, 1) / usual, touch.least_noise**2)
+    touch.noise = max(_noise_of(touch.windows, frames) / usual, touch.least_noise**2)
     if uses_intervals:
         _use_intervals(touch)
     parts = [window.eliminate(each, touch.noise) for window, each in zip(touch.windows, sums, strict=True)]
@@ -709,6 +697,13 @@ def _eliminate(
             window.z = window.z + part.step(np.concatenate([change, of_parameters]))
 
     return own[of_sensor, of_sensor] - reduced[:, :-1], pull[of_sensor] - reduced[:, -1], step
+
+
+def _noise_of(windows: Sequence[Window], frames: int) -> float:
+    """Return the variance of residuals, by their median, as pixels of a wrong surface are no noise."""
+    squares = np.concatenate([np.sum(window.left**2, axis=0) for window in windows])
+    freedom = max(frames - 1 - 2 * frames / max(len(squares), 1), 1.0)
+    return float(np.median(squares)) / (freedom * (1 - 2 / (9 * freedom)) ** 3)  # Wilson and Hilferty
 
 
 def _use_intervals(touch: Touch) -> None:
@@ -775,8 +770,7 @@ def _result(attempt: _Attempt) -> TouchFit:
         )  # fmt: skip
     notes += [_contradiction(each, priors, fit) for each in attempt.dropped]
     notes += _undetermined(estimates)
-    unused = [touch.name for touch in attempt.read if touch not in used]
-    notes += [f"{name} is not used: its brightness does not follow the turn" for name in unused]
+    notes += [f"{touch.name} is not used: {touch.reason}" for touch in attempt.read if touch not in used]
     if priors.is_free(SHARED.index("pixel_size")):
         at = SHARED.index("pixel_size"), SHARED.index("zenith_gain")
         common = fit.covariance[at] / (errors[at[0]] * errors[at[1]])

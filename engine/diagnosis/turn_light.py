@@ -61,6 +61,49 @@ class AxisAngles(NamedTuple):
         return cls(angle, by_zenith, by_azimuth, by_tilt, -by_azimuth * sine)
 
 
+class SlopeAngles(NamedTuple):
+    """Angles between the normals of slopes and the body's axis, and their derivatives, radians, (T, n).
+
+    With the slopes s, L^2 = 1 + s^2, and the direction e of the lean by d, the angle a has ::
+
+        cos a = u = (cos d + sin d (s . e)) / L
+    """
+
+    angle: Doubles
+    by_slopes: Doubles  # (2, T, n)
+    by_tilt: Doubles
+    by_phase: Doubles
+    bend: Doubles  # half of the second derivatives along some changes of the slopes, summed
+
+    @classmethod
+    def of(
+        cls, slopes: Doubles, phase: Doubles, tilt: Doubles, changes: Sequence[Doubles] = ()
+    ) -> SlopeAngles:
+        """Return the angles for slopes, (2, T, n), at phases and tilts, (T, 1), and changes, (2, n)."""
+        lean, upright, cosine, sine = np.sin(tilt), np.cos(tilt), np.cos(phase), np.sin(phase)
+        outwards, onwards = cosine * slopes[0] + sine * slopes[1], cosine * slopes[1] - sine * slopes[0]
+        shortened = 1 / np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2)  # 1 / L
+        along = shortened * (upright + lean * outwards)
+        angle = np.arccos(np.clip(along, -1, 1))
+        steep = 1 / np.maximum(np.sin(angle), 1e-9)
+
+        def rise(change: Doubles) -> Doubles:
+            onto = slopes[0] * change[0] + slopes[1] * change[1]
+            moved = lean * (cosine * change[0] + sine * change[1]) - along * shortened * onto
+            return np.asarray(shortened * moved)
+
+        bend = np.zeros_like(angle)
+        for change in changes:
+            first = rise(change)
+            both = shortened**2 * (slopes[0] * change[0] + slopes[1] * change[1])
+            square = shortened**2 * (change[0] ** 2 + change[1] ** 2)
+            second = -2 * both * first - along * (square - both**2)
+            bend -= (second * steep + along * first**2 * steep**3) / 2
+        by_slopes = np.stack([-steep * rise(axis) for axis in np.eye(2)])
+        by_tilt = steep * shortened * (lean - upright * outwards)
+        return cls(angle, by_slopes, by_tilt, -steep * shortened * lean * onwards, bend)
+
+
 class PixelScale(NamedTuple):
     """How counts depend on the zenith at some pixels: each a number or (n,), counts."""
 
@@ -80,8 +123,8 @@ class Light(NamedTuple):
 
 
 def light_of(
-    angles: AxisAngles, bent: Doubles | float, scale: PixelScale, gains: Doubles, offsets: Doubles,
-    values: Doubles, places: Doubles, all_derivatives: bool = True,
+    angles: AxisAngles | SlopeAngles, bent: Doubles | float, scale: PixelScale, gains: Doubles,
+    offsets: Doubles, values: Doubles, places: Doubles, all_derivatives: bool = True,
 ) -> Light:  # fmt: skip
     """Return the light of normals at angles to the axis plus ``bent``, (T, n) radians.
 

@@ -40,7 +40,7 @@ _MIN_PIXELS, _MOST_PIXELS, _MIN_FRAMES, _MAX_FRAMES = 16, 192, 4, 128
 _STEEP, _UPRIGHT = 3.0, math.radians(80)  # range of zeniths that tell: minimum in tilts, and maximum
 _LEVEL = 1.5  # tilts: least zenith at which errors are evaluated
 _SWING = 0.75, 1.33  # range of the amplitude of the zenith of a usable pixel, in tilts
-_LEAST_LIGHT = 0.05  # share of full light of a usable sample: next to its dark end, a pattern is not linear
+LEAST_LIGHT = 0.05  # share of full light of a usable sample: next to its dark end, a pattern is not linear
 _OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
 _MAX_MISFIT = 4.0  # variance of residuals, relative to that of two waves a pixel, of a model that fits
 _LEAST_NOISE = 0.3  # counts of 8 bits: rounding
@@ -275,7 +275,7 @@ def shows_model(wave: Doubles, least: Doubles, tilt: float, full: float) -> NDAr
     """
     swing = np.hypot(wave[1], wave[2]) / tilt
     usable = (wave[0] > _STEEP * tilt) & (wave[0] < _UPRIGHT) & (swing > _SWING[0]) & (swing < _SWING[1])
-    return np.asarray(usable & (least > _LEAST_LIGHT * full))
+    return np.asarray(usable & (least > LEAST_LIGHT * full))
 
 
 def follow_model(counts: Doubles, left: Doubles, phase: Doubles, unknowns: int, floor: float) -> bool:

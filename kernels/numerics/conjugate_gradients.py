@@ -83,8 +83,7 @@ def conjugate_gradients(
     x = np.zeros_like(target) if start is None else start
     if moved is None:
         moved = np.zeros_like(target) if start is None else product(x)
-    direction: Array | None = None
-    last: Array | None = None
+    direction = last = np.zeros_like(target)
     gain: Array | float = np.inf
     tiny = np.finfo(target.dtype).tiny
 
@@ -104,14 +103,10 @@ def conjugate_gradients(
             break
         steepest = here.project(here.precondition(residual))
         before, gain = gain, inner(residual, steepest)
-        if last is None or direction is None:
-            direction = steepest
-        else:
-            memory = np.maximum(gain - inner(last, steepest), 0) / np.maximum(before, tiny)
-            direction = steepest + memory * direction
-            if callable(face):  # the direction before may be outside of this face
-                direction = here.project(direction)
-        last = residual
+        memory = np.maximum(gain - inner(last, steepest), 0) / np.maximum(before, tiny)
+        direction, last = steepest + memory * direction, residual
+        if callable(face):  # the direction before may be outside of this face
+            direction = here.project(direction)
         along = product(direction)
         stiff = along if here.curvature is None else along + here.curvature * direction
         length = inner(residual, direction) / np.maximum(inner(direction, stiff), tiny)

@@ -9,7 +9,7 @@ import pytest
 from mirrorskin import engine, io
 from mirrorskin.engine.calibration import from_touches
 from mirrorskin.io.files.arrays import ArrayRecording
-from mirrorskin.twin import Axial, Camera, Cone, Twin, Vertical
+from mirrorskin.twin import Axial, Camera, Cone, Plane, Step, Twin, Vertical
 
 TILT = math.radians(2.5)
 FRAMES = 12
@@ -158,14 +158,72 @@ def test_cone_does_not_determine_the_gain():
     assert any("zenith gain" in note and "something rough" in note for note in fit.notes)
 
 
-@pytest.mark.parametrize("thing", ["texture", "sphere", "coin", "cone"])
-def test_what_shows_little_has_large_standard_errors(thing):
+def a_touch(thing, press=0.6):
+    """Return a press and a turn of an object in a larger field."""
     field = {"object": thing, "shape": (96, 96), "pixel_size": 0.05}
-    press = Twin(movement=Vertical(np.arange(0.02, 0.8, 0.02)), camera=Camera(seed=1), **field)
-    movement = Axial(PHASE, tilt=TILT, press=0.6, pivot=PIVOT)
+    travel = np.arange(0.02, press + 0.2, 0.02)
+    movement = Axial(PHASE, tilt=TILT, press=press, pivot=PIVOT)
     turn = Twin(movement=movement, pattern="linear", camera=Camera(seed=2), **field)
-    away = deviations(from_touches([(press, stating(turn))]))
+    return Twin(movement=Vertical(travel), camera=Camera(seed=1), **field), stating(turn)
+
+
+@pytest.mark.parametrize("thing", ["texture", "sphere", "coin", "cone"])
+def test_smooth_objects_do_not_bias_the_estimates(thing):
+    away = deviations(from_touches([a_touch(thing)]))
     assert max(map(abs, away.values())) < 3
+
+
+@pytest.mark.parametrize(("thing", "press"), [(Plane(), 1.6), (Step(), 0.6)])
+def test_plate_and_edge_are_refused(thing, press):
+    with pytest.raises(io.InputError, match="slopes are all alike"):
+        from_touches([a_touch(thing, press)])
+
+
+def test_plate_next_to_other_touches_is_named():
+    fit = from_touches([a_touch("sphere"), a_touch(Plane(), 1.6)])
+    assert any("is not used: its slopes are all alike" in note for note in fit.notes)
+
+
+def a_staircase(seed):
+    """Return a touch of treads that are level and inclined in turn, under light that begins at zenith 0."""
+    gain, offset, shape, size = 265.0, 30.0, (48, 56), 0.1
+    x = np.broadcast_to((np.arange(shape[1]) - shape[1] / 2 + 0.5) * size, shape)
+    tread = np.floor(x / 0.8)
+    rise = math.tan(math.radians(5)) * (tread % 2)
+    height = 0.15 * tread + rise * (x - (tread + 0.5) * 0.8) - 0.8
+    phase = PHASE[:, np.newaxis, np.newaxis]
+    axis = -math.sin(TILT) * np.cos(phase), math.cos(TILT)
+    angle = np.arccos((axis[1] - rise * axis[0]) / np.sqrt(1 + rise**2))
+    travel = np.arange(0.0, 1.7, 0.02)
+    pressed = np.where(travel[:, np.newaxis, np.newaxis] > -height, 200.0, 16.0)
+    noise, stated = np.random.default_rng(seed), {"pixel_size": (size, size), "dark": np.zeros(shape)}
+    press, turn = (
+        np.clip(np.rint(light + noise.standard_normal(light.shape)), 0, 255).astype(np.uint8)
+        for light in (pressed, offset + gain * angle)
+    )
+    stated["bright"] = np.full(shape, 235.0)
+    sensor = {"tilt": TILT, "zenith_gain": gain, "zenith_offset": offset}
+    return ArrayRecording(press, {"travel": travel}, stated), ArrayRecording(
+        turn, {"phase": PHASE}, stated | sensor
+    )
+
+
+@pytest.fixture(scope="module")
+def staircase():
+    """The fit of a staircase."""
+    return from_touches([a_staircase(3)])
+
+
+def test_staircase_has_honest_standard_errors(staircase):
+    truth = {"gamma": 1.0, "zenith_gain": 265.0, "zenith_offset": 30.0, "tilt": TILT}
+    away = [(each.value - truth.get(each.name, 0.0)) / each.sigma for each in staircase.estimates]
+    assert max(map(abs, away)) < 3
+    assert named(staircase)["zenith_gain"].of_touches / 265.0 > 0.013  # the Cramer-Rao bound
+
+
+@pytest.mark.parametrize("name", ["zenith gain", "zenith offset", "tilt", "gamma"])
+def test_what_a_staircase_does_not_determine_is_named_with_a_remedy(staircase, name):
+    assert any(f"{name} (±" in note and "Remedy: " in note for note in staircase.notes)
 
 
 def test_sense_of_rotation_and_phase_zero_are_found():
