@@ -659,9 +659,13 @@ class Kernel:
         for place, (name, convert) in enumerate(self._signature):
             given = arguments[name]
             if convert is not None:
-                # The same number needs no conversion, except 0 or -0; an array may have changed.
+                # The same number needs no conversion, except 0 or -0; nor does the same tuple. An array may
+                # have changed.
                 last = self._given[place]
-                if type(given) in _NUMBERS and type(given) is type(last) and given == last and given:
+                kind = type(given)
+                if (given is last and kind is tuple) or (
+                    kind in _NUMBERS and kind is type(last) and given == last and given
+                ):
                     continue
                 self._given[place] = _UNSET
                 try:

@@ -103,11 +103,11 @@ class Blocks:
         factor = means.dtype.type((1 - 1 / self.binning**2) / 24)
         if not factor:
             return means
-        values = means.copy()
+        values, is_whole = means.copy(), bool(np.isfinite(means).all())
         for source, target in ((means, values), (means.swapaxes(-1, -2), values.swapaxes(-1, -2))):
             bend = source[..., 2:] + source[..., :-2]
             bend -= 2 * source[..., 1:-1]
-            if not np.isfinite(bend).all():
+            if not is_whole:
                 if extended:
                     for ahead, behind in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
                         one, other = bend[..., ahead], bend[..., behind]
@@ -160,7 +160,7 @@ class BlockErrors:
         )
 
     def variance(self, weights: Doubles, window: Window) -> Doubles:
-        """Return the variances of sums of means, weighted by (n, H, W) in a window.
+        """Return the variances of sums of means, weighted by (..., n, H, W) in a window.
 
         Of errors of n kinds, each has its own weights.
         """
@@ -169,8 +169,8 @@ class BlockErrors:
         shares = weights * (spread if spread.ndim == 2 else spread.transpose(2, 0, 1))
         if rows.size == columns.size == 1:
             return np.asarray(np.einsum("...ij,...ij->...", shares, shares) * (rows[0] * columns[0]))
-        alike = np.empty_like(shares)
-        for part, out in zip(shares, alike, strict=True):
+        alike, shape = np.empty_like(shares), (-1, *shares.shape[-2:])
+        for part, out in zip(shares.reshape(shape), alike.reshape(shape), strict=True):
             cv2.sepFilter2D(part, -1, columns, rows, dst=out, borderType=cv2.BORDER_CONSTANT)
         return np.asarray(np.maximum(np.einsum("...ij,...ij->...", shares, alike), 0))
 

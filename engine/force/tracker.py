@@ -26,13 +26,14 @@ Singles = NDArray[np.float32]
 _TOLERANCE = 0.25  # gap in contact, standard deviations of the mean of a block
 _LOOSE = 5e-4  # maximum gap in contact as a share of the maximum height; the load is corrected for it
 _CLEARLY = 6.0  # standard deviations
-_STALE = 0.05  # share of the contact that may change before gradients of the load are computed anew
+_STALE = 0.1  # share of the contact that may change before gradients of the load are computed anew
 _SAME_LOAD = 0.1  # relative change of the load after which its increase by noise is computed anew
 _SHEAR_ERROR = 1e-3  # of displacements in contact under tractions that move it by 1
 _ROUND_ERROR, _SMALL_ERROR = 0.0065, 0.04  # relative error of the load; see `_border_error`
 _CUT_ERROR = 0.17  # the same, if the object ends in the contact
 _CENTRE_ERROR = 9.5  # error of the centre of pressure, blocks, over the relative error of the load
 _SHEAR_MODEL = 0.03  # relative error of the tangential force, over the share of blocks at the border
+_SHEAR_STALE = 0.1  # the same, over the share of the contact that has changed since its weights were computed
 _CENTRES = "pressure_centre_x", "pressure_centre_y"
 
 
@@ -248,7 +249,7 @@ def _findings(contact: Mask, covered: float) -> list[Finding]:
     if covered < MIN_COVERAGE:
         text = f"no tangential force: {covered:.0%} of the contact has a displacement"
         findings.append(Finding("no displacement", text))
-    if contact[[0, -1]].any() or contact[:, [0, -1]].any():
+    if any(edge.any() for edge in (contact[0], contact[-1], contact[:, 0], contact[:, -1])):
         text = "the contact reaches the edge of the maps: forces lack what is outside"
         findings.append(Finding("contact at the edge", text))
     return findings
@@ -338,9 +339,13 @@ def _tangential(
         means = np.stack([fill_with_nearest(part) for part in means])
     means[:, ~contact] = 0
     means *= UP.astype(np.float32)
+    # The force that displaces a contact by 1 is proportional to its length, and thus to the root of its area.
+    grown = math.sqrt(np.count_nonzero(state.pressed.contact) / np.count_nonzero(contact))
+    area *= grown
     force = area * np.einsum("klij,lij->k", state.shears[place], means, dtype=np.float64) * UP.ravel()
     errors = BlockErrors(sigma, blocks, window_size, boxes=True)
-    weights = area * state.shear_weights[place].astype(np.float64)
-    variance = np.array([errors.variance(part, window).sum() for part in weights])
-    sigma = np.hypot(np.sqrt(variance), _SHEAR_MODEL * state.border_share() * np.hypot(*force))
+    variance = errors.variance(area * state.shear_weights[place].astype(np.float64), window).sum(axis=-1)
+    changed = _changed(state.pressed.contact, state.sheared)
+    rough = math.hypot(_SHEAR_MODEL * state.border_share(), _SHEAR_STALE * changed)
+    sigma = np.hypot(np.sqrt(variance), rough * np.hypot(*force))
     return np.stack([force, sigma], axis=-1), covered

@@ -22,6 +22,7 @@ from mirrorskin.engine.base.running import Progress, Run, run_over
 from mirrorskin.engine.base.steps import Context, Step, undistorted
 from mirrorskin.engine.base.tiling import MEMORY_LIMIT
 from mirrorskin.engine.diagnosis.footprint import PIXEL
+from mirrorskin.engine.fusion.common_height import PressSteps
 from mirrorskin.engine.fusion.solver import AbsoluteHeights, FusionSolver
 from mirrorskin.engine.integration.normals_to_height import (
     Slopes,
@@ -158,9 +159,11 @@ def fuse(
     If normals are those of a rotation whose frames were not registered, the differences between heights and
     surface are part of ``height_sigma``.
 
-    If the surface of a component rises by less than one step, all of its heights have nearly the same error,
-    which normals cannot reduce. The returned ``height_sigma`` contains only a part of it: add
-    step / sqrt(12) in quadrature.
+    All heights of a component have an error in common, which normals cannot reduce. The steps of a press
+    show it: at each, the pixels in contact must be the highest ones. A clear error is removed, and the
+    standard deviation of the common height is part of ``height_sigma``. If the surface of a component rises
+    by less than one step, ``height_sigma`` is at least that of a single height. The frames of heights from
+    other sources are unknown; ``height_sigma`` then contains only a part: add step / sqrt(12) in quadrature.
 
     Examples
     --------
@@ -257,7 +260,10 @@ def _fuse_maps(
     slopes = _slopes_of_maps(normal_maps, selected, moved)
     opened = device_of_maps(device, height_maps, normal_maps)
     footprint = max(height_maps.fitted.footprint or PIXEL, normal_maps.fitted.footprint or PIXEL)
-    solver = FusionSolver(absolute, size, robust, opened, footprint, doubtful=moved > 0)
+    steps = None
+    if travel is not None and intervals.middle is not values:  # heights were not changed since
+        steps = PressSteps.of(values, values, absolute.sigma, np.array(travel))
+    solver = FusionSolver(absolute, size, robust, opened, footprint, moved > 0, steps)
     solver.modes = normal_maps.fitted.common_errors or ()
     surface = solver.filled(solver.surface(slopes))
     x, y = pixel_axes(selected.shape, size)
@@ -335,7 +341,7 @@ def _fuse_sources(
     if not np.isfinite(pressed.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
     before = fill_with_nearest(pressed.height)
-    solver = FusionSolver(taken.heights, pixel_size, robust, opened[0], taken.footprint)
+    solver = FusionSolver(taken.heights, pixel_size, robust, opened[0], taken.footprint, steps=taken.steps)
     passes = _passes(axial, register)
     for number in range(passes):
         registered = turn.with_options(heights=before) if register else turn
@@ -415,6 +421,8 @@ class PressEvidence(Step):
         # Checks and steps, such as the correction for the elastomer, move heights and change their sigma.
         larger = result.height_sigma * (between / sigma)
         self.heights = AbsoluteHeights.of(result.height + (middle - height), larger)
+        corrected = np.asarray(result.height, np.float64)
+        self.steps = PressSteps.of(height, corrected, self.heights.sigma, context.positions("travel"))
         footprint = footprint_of(Edges.of(result, context), context.source.header, self.blur)
         self.footprint = footprint.variance if footprint.clear else PIXEL
         return result

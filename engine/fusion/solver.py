@@ -18,6 +18,7 @@ from mirrorskin.engine.fusion.agreement import (
     describe_disagreement,
     find_disagreement,
 )
+from mirrorskin.engine.fusion.common_height import CommonHeight, PressSteps
 from mirrorskin.engine.integration.arrays import integrate_arrays
 from mirrorskin.engine.integration.common_errors import find_common_errors
 from mirrorskin.engine.integration.normals_to_height import Slopes
@@ -92,7 +93,9 @@ class FusionSolver:
     replaces the first two. `surface` raises InputError without any height or slope, and NotConverged if the
     integration does not converge. If slopes are ``doubtful``, as those of frames that were not registered,
     their difference from the heights is part of ``height_sigma`` even if chance explains it. ``modes`` are
-    the errors that all slopes have in common; see `mirrorskin.engine.integration.common_errors`.
+    the errors that all slopes have in common; see `mirrorskin.engine.integration.common_errors`. ``steps``
+    are those of the press whose heights these are, if known: they determine the uncertainty of the common
+    height.
     """
 
     def __init__(
@@ -103,14 +106,16 @@ class FusionSolver:
         device: Device,
         footprint: float = PIXEL,
         doubtful: bool = False,
+        steps: PressSteps | None = None,
     ) -> None:
         self._press, self._pixel_size = press, check_pixel_size(pixel_size)
         self._robust, self._device, self.footprint = robust, device, footprint
-        self._doubtful = doubtful
+        self._doubtful, self._steps = doubtful, steps
         self.modes: Sequence[float] = ()
         self._near: Result | None = None
         self._zenith_bias, self._disagreement = ZenithBias(), Disagreement()
         self._correlation, self._scatter = 0.0, 1.0
+        self._common = CommonHeight()
 
     def surface(self, slopes: Slopes, *, sigma: bool = True) -> Result:
         """Return the surface of the heights and given slopes.
@@ -134,16 +139,24 @@ class FusionSolver:
             if not self._disagreement.chi2 < _IMPROVED * before[1].chi2:
                 (surface, self._disagreement, self._zenith_bias), self._near = before, near
                 break
-        if not contradict or surface.height_sigma is None:
-            return surface
-        larger = np.hypot(surface.height_sigma, np.float32(self._disagreement.rms))
-        return surface.assign(height_sigma=larger)
+        if contradict and surface.height_sigma is not None:
+            larger = np.hypot(surface.height_sigma, np.float32(self._disagreement.rms))
+            surface = surface.assign(height_sigma=larger)
+        if self._steps is not None:
+            surface, self._common = self._steps.place(surface)
+        return surface
 
     @property
     def process(self) -> dict[str, ProcessValue]:
-        """Facts about the last surface: contradictions, and the correlation of the errors of heights."""
+        """Facts about the last surface: contradictions, correlation of errors, and the common height."""
         process = describe_disagreement(self._disagreement, self._zenith_bias, self._scatter)
-        return {**process, "height_correlation": self._correlation}
+        process["height_correlation"] = self._correlation
+        if self._common.sigma is not None:
+            process |= {
+                "common_height_shift": self._common.shift,
+                "common_height_sigma": self._common.sigma,
+            }
+        return process
 
     def _fit(self, slopes: Slopes, sigma: bool) -> tuple[Result, Disagreement]:
         """Return the surface of heights and slopes, and their disagreement."""
@@ -291,8 +304,7 @@ def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> t
         return height, weight
     label, half = surface.component[joined], _UNIFORM * press.sigma[joined]
     middle, shape = press.height[joined], surface.height[joined].astype(np.float64)
-    # The offset of the solver is a mean, which outliers affect; the median is robust.
-    lift = _medians(middle - shape, label, size.size)
+    lift = _most_agreed(middle - shape, half, label, size.size)  # steps from a mean may end elsewhere
     half *= _share_used(middle - shape - lift[label], half, shape)
     for _ in range(_ITERATIONS):
         at = shape + lift[label]
@@ -314,18 +326,23 @@ def _use_intervals(surface: Result, press: AbsoluteHeights, slopes: Slopes) -> t
     return height, weight
 
 
-def _medians(values: Doubles, label: NDArray[np.integer], count: int) -> Doubles:
-    """Return the median of each label's values, 0 without any."""
-    members = np.bincount(label, minlength=count)
-    largest = int(np.argmax(members))
-    others = label != largest  # few, as a rule: they are sorted
-    ordered = np.append(values[others][np.lexsort((values[others], label[others]))], 0.0)
-    sizes = np.where(np.arange(count) == largest, 0, members)
-    first = np.cumsum(sizes) - sizes
-    middles = (ordered[first + (sizes - 1) // 2 * (sizes > 0)] + ordered[first + sizes // 2]) / 2
-    medians = np.where(sizes, middles, 0.0)
-    medians[largest] = np.median(values[~others])
-    return medians
+def _most_agreed(error: Doubles, half: Doubles, label: NDArray[np.integer], count: int) -> Doubles:
+    """Return, for each label, the offset at which most errors are within their intervals, 0 without any.
+
+    If it is not unique, it is the middle of the least and the greatest.
+    """
+    offset = np.concatenate([error - half, error + half])
+    enters = np.repeat([1, -1], error.size)
+    order = np.lexsort((-enters, offset, np.tile(label, 2)))
+    offset, label = offset[order], np.tile(label, 2)[order]
+    agreeing = np.cumsum(enters[order])  # 0 at the end of each label
+    most = np.zeros(count, np.int64)
+    np.maximum.at(most, label, agreeing)
+    first = np.flatnonzero(agreeing == most[label])  # they agree up to the next offset
+    ends = np.zeros((2, count))
+    ends[0, label[first[::-1]]] = offset[first[::-1]]  # the first of each label
+    ends[1, label[first]] = offset[first + 1]  # the last
+    return np.asarray(ends.mean(axis=0))
 
 
 def _share_used(error: Doubles, half: Doubles, height: Doubles) -> float:

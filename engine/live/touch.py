@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.fusion.fusion import fuse
 from mirrorskin.engine.live.recipe import PRESS_STEPS, TURN_FRAMES, Contact, Measured, Recipe, cheapest
-from mirrorskin.engine.press.press import Press
 from mirrorskin.io import ArrayRecording, Calibrated, Calibration, InputError, Result, check
 from mirrorskin.io.base.arguments import check_number, checked, in_unit
 from mirrorskin.io.base.findings import Finding
@@ -23,9 +22,6 @@ from mirrorskin.kernels.device import Choice
 
 CLEAR_CHANGE = 8.0
 """Change of a pixel's counts on contact, in standard deviations of the noise."""
-
-CLEAR_ERROR = 2.0
-"""Error of the common height, in standard deviations, from which on it is removed."""
 
 _MIN_PIXELS = 16  # pixels that must have changed
 _NOISE_MIN = 0.3  # counts: rounding alone, as the standard deviation of integers
@@ -270,77 +266,18 @@ def recordings_of(
 
 
 def fuse_touch(press: Source, turn: Source, device: Choice = None) -> Result:
-    """Return the surface of the press and the turn of a touch.
-
-    Each pixel of the press has levels of its own. The common height is checked: at each press step, the
-    pixels in contact must be the highest ones. The mean error of the steps is removed from the heights if it
-    is clear, more than two standard deviations. Their scatter over the steps, with the rise of the surface
-    within a pixel as one prior degree of freedom, divided by the square root of their number, is the
-    uncertainty of the common height, which is added to ``height_sigma``. Parts of the surface whose height is
-    unknown have none.
-    """
-    method: dict[str, Any] = {"method": "change-point"}
-    surface = fuse(press, turn, press=method, device=device)
-    travel: NDArray[np.float64] = np.asarray(press.travel)  # type: ignore[attr-defined]
-    onset = -np.asarray(Press(**method, fill=False, device=device).run(press).height, np.float64)
-    errors = _height_errors(surface, onset, travel)
-    rise = _rise_within_pixel(surface, max(press.header.pixel_size or (0.0,)))
-    if errors.size:
-        mean = float(errors.mean())
-        common = math.sqrt((rise**2 + float(np.sum((errors - mean) ** 2))) / errors.size**2)
-    else:  # it rises by less than a step
-        mean, common = 0.0, float(np.diff(np.unique(travel))[-1]) / math.sqrt(12)
-    shift = mean if abs(mean) > CLEAR_ERROR * common else 0.0
-    sigma = np.hypot(np.asarray(surface.height_sigma), np.float32(common))
-    component, unknown = np.asarray(surface.component), np.asarray(surface.offset_unknown)
-    sigma[(component >= 0) & (unknown[np.maximum(component, 0)] != 0)] = np.nan
-    process = {**surface.process, "common_height_shift": shift}
-    height = np.asarray(surface.height) + np.float32(shift)
-    surface = surface.assign(height=height, height_sigma=sigma, process=process)
-    return surface.with_fitted(common_height_sigma=common)
-
-
-def _height_errors(
-    surface: Result, onset: NDArray[np.float64], travel: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return, for each press step that shows it, by how much the surface is too low there, mm.
-
-    Of the pixels within half a step, those that are in contact must be the highest ones: the height at which
-    the fewest pixels contradict this is compared with the travel.
-    """
-    depth = -np.asarray(surface.height, np.float64)
-    usual = np.isfinite(depth) & np.isfinite(onset) & np.isfinite(np.asarray(surface.height_sigma))
-    depth, onset = depth[usual], onset[usual]
-    least = max(_MIN_PIXELS, _LEAST_SHARE * len(onset))
-    places = np.unique(travel)
-    errors = []
-    for before, place, after in zip(places, places[1:], places[2:], strict=False):
-        near = (depth > (before + place) / 2) & (depth < (place + after) / 2)
-        order = np.argsort(depth[near])
-        there, touched = depth[near][order], onset[near][order] < place
-        if min(np.count_nonzero(touched), np.count_nonzero(~touched)) < least:
-            continue
-        wrong = np.concatenate([[0], np.cumsum(~touched)]) + np.concatenate(
-            [np.cumsum(touched[::-1])[::-1], [0]]
-        )
-        fewest = np.flatnonzero(wrong == wrong.min())
-        edges = np.concatenate([there[:1], (there[1:] + there[:-1]) / 2, there[-1:]])
-        errors.append(float(np.mean(edges[fewest])) - place)
-    return np.array(errors)
-
-
-def _rise_within_pixel(surface: Result, pixel: float) -> float:
-    """Return the standard deviation of the surface within a typical pixel, mm."""
-    normals = np.asarray(surface.normals, np.float64)
-    normals = normals[np.isfinite(normals[..., 0])]
-    slope = np.hypot(normals[:, 0], normals[:, 1]) / np.maximum(normals[:, 2], 1e-3)
-    return pixel * float(np.median(slope)) / math.sqrt(12) if slope.size else math.inf
+    """Return the surface of the press and the turn of a touch; each pixel of the press has its own levels."""
+    return fuse(press, turn, press={"method": "change-point"}, device=device)
 
 
 def sigma_of_normals(surface: Result) -> NDArray[np.float64]:
-    """Return the standard deviations of the heights of all pixels with a normal, mm; inf without any."""
+    """Return the standard deviations of the heights of all pixels with a normal, mm.
+
+    It is infinite where the height is unknown, also of a whole component.
+    """
+    unknown = np.append(np.asarray(surface.offset_unknown), 0)[np.asarray(surface.component)] != 0
     with_normal = np.isfinite(np.asarray(surface.normals)[..., 0])
-    sigma = np.asarray(surface.height_sigma, np.float64)[with_normal]
+    sigma = np.where(unknown, np.inf, np.asarray(surface.height_sigma, np.float64))[with_normal]
     return np.where(np.isfinite(sigma), sigma, np.inf)
 
 

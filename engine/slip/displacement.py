@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mirrorskin.engine.base.device_arrays import AnyArray, device_of, on_host
 from mirrorskin.engine.base.frames import as_frames, check_frames
 from mirrorskin.engine.base.resample import fill_with_nearest
-from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, NodeField, Tracker, invert_symmetric
+from mirrorskin.engine.slip.tracking import GRADIENT_NOISE, Level, NodeField, Tracker, invert_symmetric
 from mirrorskin.io import InputError, Result, pixel_axes
 from mirrorskin.io.base.arguments import check_count, check_number, check_pixel_size, checked, in_unit
 from mirrorskin.io.base.findings import Finding, with_findings
@@ -21,6 +21,7 @@ from mirrorskin.io.watch.saturation import MAD
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.skin.slip import CORRELATED_SAMPLES, LAPLACIAN_NOISE
 
 MAPS = {
     "displacement": TABLE["displacement"],
@@ -36,9 +37,7 @@ XY = np.array([1, 1j])
 
 _RANK = np.array([1, 0, 2, 3], np.uint8)  # rank of a status: a pixel has the highest of its nodes
 _MOST_STEP = 64  # maximum distance of nodes, pixels
-_CORRELATED_SAMPLES = 4  # samples over which residuals are correlated
 _LEAST_VARIANCE = 1e-4  # of samples of a window, relative to the median
-_LAPLACIAN_NOISE = 4 * 20 / 24**2  # noise of the squared bias (two standard deviations) per variance
 _LEAST_WINDOWS = 20  # for an estimate of their scatter
 _MEDIAN_NOISE = 2.3  # standard deviation of the median of n squares, times sqrt(n), relative to their mean
 _SCATTERED = 2.5  # excess of the variance above which there is a finding
@@ -123,7 +122,7 @@ def find_displacement(
     check_noise(noise)
     tracker = Tracker(reference, window_size, window_step, device_of(device, reference, frames))
     fields = [tracker.follow(frame) for frame in frames]
-    texture = Texture.of(tracker, np.mean([field.variance for field in fields], axis=0), noise)
+    texture = Texture.of(tracker.finest, np.mean([field.variance for field in fields], axis=0), noise)
     texture.refuse_clear("the frames")
     sigma = np.sqrt(np.einsum("yxii->yxi", texture.covariance)) * size
     nodes = [_at_nodes(tracker, field, texture, window_size, sigma, size) for field in fields]
@@ -166,12 +165,11 @@ class Texture:
     noise: float
 
     @classmethod
-    def of(cls, tracker: Tracker, variance: Doubles, noise: float | None) -> Texture:
-        """Evaluate a tracker's reference, given the variance of a sample in the frames, (rows, columns).
+    def of(cls, level: Level, variance: Doubles, noise: float | None) -> Texture:
+        """Evaluate a reference, given the variance of a sample in the frames, (rows, columns).
 
         Both the reference and a frame have noise, so that the covariance is 2 variance / information.
         """
-        level = tracker.finest
         variances = variance[np.isfinite(variance)] if noise is None else np.array([noise**2])
         usual = float(np.median(variances)) if variances.size else np.nan
         variance = np.where(
@@ -230,7 +228,7 @@ def misfit(variance: Doubles, usual: Doubles, window: int) -> Doubles:
     brightness are correlated over some samples; the factor allows for that.
     """
     chance = 1 + 2 * math.sqrt(2) / window  # two standard deviations of a window's variance
-    return np.asarray(1 + _CORRELATED_SAMPLES * np.fmax(variance / usual - chance, 0))
+    return np.asarray(1 + CORRELATED_SAMPLES * np.fmax(variance / usual - chance, 0))
 
 
 def bending_variance(
@@ -255,7 +253,7 @@ def bending_variance(
     square = np.empty(variance.shape)
     np.square(bias.real, out=square[0])
     np.square(bias.imag, out=square[1])
-    square -= _LAPLACIAN_NOISE * variance
+    square -= LAPLACIAN_NOISE * variance
     return np.fmax(square, 0, out=square)
 
 

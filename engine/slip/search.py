@@ -227,7 +227,7 @@ class SlipOnset(Operation):
         assert self._tracker is not None
         tracker, fields = self._tracker, self._fields
         variance = np.mean([field.variance for field in fields], axis=0)
-        texture = Texture.of(tracker, variance, self.noise)
+        texture = Texture.of(tracker.finest, variance, self.noise)
         texture.refuse_clear("the frames")
         codes = node_status(fields[-1], texture)
         moved = self._in_mm(tracker, fields, texture)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -16,6 +17,7 @@ from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import C_TYPES, Device
 from mirrorskin.kernels.skin.displacement import AFFINE, MARGIN, PACKED, PARAMETERS
+from mirrorskin.kernels.skin.slip import MAX_CHANGE, MIN_CONTRAST
 
 ITERATIONS = 8
 """Largest number of iterations; 2 are needed with a good start."""
@@ -24,12 +26,10 @@ GRADIENT_NOISE = 1.3923
 
 _LEVELS = 4  # maximum number of resolutions
 _MIN_CONVERGED = 0.5  # minimum share of windows that are found
-_MIN_CONTRAST = 0.5  # minimum contrast of the same texture, relative to the reference
 _CONVERGED_FRACTION = 0.98  # share of the nodes that must converge; windows with little texture never do
-_LARGEST_CHANGE = 0.5  # pixels, in the last iteration of a window that is found
 _LAST_CHANGE = 0.03  # pixels: the linearisation error is then below 0.001 pixels
 _SEPARATE_ITERATIONS, _SETTLED = 4, 0.05  # of windows without neighbours: largest number, last change, pixels
-_LEAST_STEP = 0.1  # pixels by which the step of such a window must differ from the mean one to be used
+_FOLLOWED = "coefficients", "planes", "inverse", "summary", "field", "answer"
 _REACH = 16  # pixels by which the samples of such a window may be displaced from its start
 _FIELD_WEIGHT = 0.01  # weight of the previous field, relative to that of the median node
 _TILE, _NODES = 4096, 16  # pixels and nodes per work-item on a CPU
@@ -85,14 +85,14 @@ class Tracker:
     def __init__(
         self, reference: AnyArray, window: int, step: int, device: Device, separate: bool = False
     ) -> None:
-        self._make = partial(_Level, window=window, step=step, device=device, separate=separate)
-        self._separate, self._least = separate, 2 * window
+        self._make = partial(Level, window=window, step=step, device=device, separate=separate)
+        self._least = 2 * window
         self._reference = reference
-        self.finest: _Level = self._make(reference)
+        self.finest: Level = self._make(reference)
         self._fields = [self.finest.rest, self.finest.rest]
 
     @cached_property
-    def _levels(self) -> list[_Level]:
+    def _levels(self) -> list[Level]:
         """The reference at all resolutions, each half of the preceding one."""
         levels, counts = [self.finest], on_host(self._reference)
         for _ in range(1, _LEVELS):
@@ -102,47 +102,35 @@ class Tracker:
             levels.append(self._make(counts))
         return levels
 
-    def follow(self, frame: AnyArray, stride: float = 1.0, part: Part | None = None) -> NodeField:
-        """Return the displacement of a frame; ``stride`` is its step as a multiple of the previous step.
-
-        Windows without neighbours may be followed in a part of the nodes only; the others then keep the field
-        that the nearest of these have.
-        """
+    def follow(self, frame: AnyArray, stride: float = 1.0) -> NodeField:
+        """Return the displacement of a frame; ``stride`` is its step as a multiple of the previous step."""
         last, before = self._fields
-        step = last - before
-        if self._separate:  # its noise would be extrapolated, too
-            moves = step[:2]
-            mean = moves.mean(axis=(1, 2), keepdims=True)
-            step[:2] = np.where(np.abs(moves - mean) > _LEAST_STEP, moves, mean)
-            step[2:] = 0
-        begin = last + stride * step
-        part = part or self.finest.whole
-        best, field = self.finest.follow(frame, begin, part)
-        least = _MIN_CONVERGED * np.count_nonzero(self.finest.usable[part])
-        for correlated in (False, True):
-            if np.count_nonzero(best.converged) >= least:
-                break
-            frame = on_host(frame)
-            displacement, other = self._follow_down(
-                frame, self._correlated(frame) if correlated else begin, part
-            )
-            if np.count_nonzero(displacement.converged) > np.count_nonzero(best.converged):
-                best, field = displacement, other
+        begin = last + stride * (last - before)
+        best, field = self.finest.follow(frame, begin, self.finest.whole)
+        if np.count_nonzero(best.converged) < self.least_converged(self.finest.whole):
+            best, field = self.search(on_host(frame), best, begin, field, self.finest.whole)
         self._fields = [field, last]
         return best
 
-    @property
-    def moved(self) -> Doubles:
-        """Displacement of the nodes in the last frame, (2, rows, columns), pixels to the right and down."""
-        return self._fields[0][:2]
+    def least_converged(self, part: Part) -> int:
+        """Return the number of windows of a part below which `search` finds more."""
+        return math.ceil(_MIN_CONVERGED * np.count_nonzero(self.finest.usable[part]))
 
-    def spread(self, part: Part) -> None:
-        """Give nodes outside of a part, which were not followed, the fields of the nearest ones in it."""
-        rows, columns = (
-            np.clip(np.arange(size), inner.start, inner.stop - 1)
-            for size, inner in zip(self.finest.grid, part, strict=True)
-        )
-        self._fields = [field[:, rows[:, None], columns] for field in self._fields]
+    def search(
+        self, frame: NDArray[Any], best: NodeField, begin: Doubles, field: Doubles, part: Part
+    ) -> tuple[NodeField, Doubles]:
+        """Return the displacement of a part of a frame and its field, by coarser resolutions if better.
+
+        ``best`` and ``field`` were found from the start ``begin``.
+        """
+        for correlated in (False, True):
+            if np.count_nonzero(best.converged) >= self.least_converged(part):
+                break
+            start = self._correlated(frame) if correlated else begin
+            displacement, other = self._follow_down(frame, start, part)
+            if np.count_nonzero(displacement.converged) > np.count_nonzero(best.converged):
+                best, field = displacement, other
+        return best, field
 
     def to_pixels(self, values: Doubles, on_device: bool = False) -> AnyArray:
         """Return values of the nodes, (rows, columns) or ([T,] rows, columns, n), at all pixels.
@@ -214,7 +202,7 @@ class Tracker:
         return field
 
 
-class _Level:
+class Level:
     """The reference at one resolution, and its arrays on the device."""
 
     step: int
@@ -245,12 +233,12 @@ class _Level:
             "inverse": (self._items, PACKED, self._nodes),
             "summary": (4, *self.grid),
         }
-        self._maps = {
+        self.maps = {
             name: device.array(name, shape, np.float32, zeroed=False) for name, shape in shapes.items()
         }
         self._dtype = reference.dtype
         self._measure_reference(reference)
-        summary = self._maps["summary"].read().astype(np.float64)
+        summary = self.maps["summary"].read().astype(np.float64)
         variances, self.measured = summary[:3], summary[3]
         # Information about the displacement, with all other parameters free.
         self.information: NDArray[Any] = invert_symmetric(variances)
@@ -258,12 +246,12 @@ class _Level:
         trust = np.nan_to_num(1 / (variances[0] + variances[2]))
         trust = trust / (trust.max() or 1.0) + 1e-9
         self._hold = _FIELD_WEIGHT * float(np.median(trust))
-        self._maps["trust"] = device.from_host("trust", trust)
+        self.maps["trust"] = device.from_host("trust", trust)
 
     def _measure_reference(self, reference: AnyArray) -> None:
         """Compute the reference's planes, and the inverse normal matrix of each node."""
         frame = {"frame": self._fit_spline(reference)}
-        maps, (rows, columns) = self._maps, self.shape
+        maps, (rows, columns) = self.maps, self.shape
         sizes: dict[str, Any] = {"rows": rows, "columns": columns}
         sums = {name: maps[name] for name in ("sums", "counts")}
         self._launch("across", rows * math.ceil(columns / self._tile), **sizes, **frame, **sums)
@@ -334,7 +322,7 @@ class _Level:
 
         ``inside`` are the rows and columns of the samples to be interpolated, by default all.
         """
-        coefficients, (rows, columns) = self._maps["coefficients"], self.shape
+        coefficients, (rows, columns) = self.maps["coefficients"], self.shape
         placed = frame if isinstance(frame, Array) else self._frame
         if placed is not frame:
             placed.write(frame)
@@ -360,7 +348,7 @@ class _Level:
 
     def follow(self, frame: AnyArray, field: Doubles, part: Part) -> tuple[NodeField, Doubles]:
         """Return the displacement of a frame, starting from a field, and the final field."""
-        maps = self._maps
+        maps = self.maps
         maps["field"].write(field)
         if self._separate:
             return self._follow_separately(frame, field, part)
@@ -375,20 +363,41 @@ class _Level:
         moved = answer[:2]
         gain, squares, variances = answer[AFFINE:]
         with np.errstate(invalid="ignore"):
-            converged = (np.abs(moved - last).max(axis=0) < _LARGEST_CHANGE) & (gain > _MIN_CONTRAST)
+            converged = (np.abs(moved - last).max(axis=0) < MAX_CHANGE) & (gain > MIN_CONTRAST)
         return NodeField(moved, self._variance(gain, squares, variances), converged), field
 
     def _follow_separately(self, frame: AnyArray, field: Doubles, part: Part) -> tuple[NodeField, Doubles]:
         """Return the displacement of windows without neighbours, and their affine fields."""
-        maps, (rows, columns), moves = self._maps, part, field[1::-1, *part].reshape(2, -1)
-        begin, end = moves.min(axis=1).tolist(), moves.max(axis=1).tolist()
-        top, left = (
-            math.floor(self._first + nodes.start * self.step + move) - _REACH
-            for nodes, move in zip(part, begin, strict=True)
-        )
-        bottom, right = (
-            math.ceil(self._first + (nodes.stop - 1) * self.step + move) + self._window + _REACH
-            for nodes, move in zip(part, end, strict=True)
+        start = field[:2, *part].reshape(2, -1)
+        self.follow_windows(frame, start.min(axis=1).tolist(), start.max(axis=1).tolist(), part)
+        return self.answered(field, part)
+
+    def answered(self, field: Doubles, part: Part) -> tuple[NodeField, Doubles]:
+        """Return the displacement of windows without neighbours that were followed, and their affine fields.
+
+        ``field`` is the one from which they were followed.
+        """
+        answer = self.maps["answer"].read()[:, *part].astype(np.float64)
+        moved, (gain, variance, change) = answer[:AFFINE], answer[AFFINE:]
+        converged = (change < MAX_CHANGE) & (gain > MIN_CONTRAST)
+        field = field.copy()
+        np.copyto(field[:, *part], moved, where=converged)
+        return NodeField(moved[:2], variance, converged), field
+
+    def follow_windows(
+        self, frame: AnyArray, least: Sequence[float], most: Sequence[float], part: Part
+    ) -> None:
+        """Follow the windows of a part, from the field on the device, whose answers remain there.
+
+        ``least`` and ``most`` are the range of the field there, pixels to the right and down.
+        """
+        maps, (rows, columns) = self.maps, part
+        (top, bottom), (left, right) = (
+            (
+                math.floor(self._first + nodes.start * self.step + lowest) - _REACH,
+                math.ceil(self._first + (nodes.stop - 1) * self.step + highest) + self._window + _REACH,
+            )
+            for nodes, lowest, highest in zip(part, reversed(least), reversed(most), strict=True)
         )
         self._fit_spline(frame, (slice(top, bottom), slice(left, right)))
         self._launch(
@@ -401,17 +410,8 @@ class _Level:
             right=columns.stop,
             iterations=_SEPARATE_ITERATIONS,
             settled=_SETTLED,
-            **{
-                name: maps[name]
-                for name in ("coefficients", "planes", "inverse", "summary", "field", "answer")
-            },
+            **{name: maps[name] for name in _FOLLOWED},
         )
-        answer = maps["answer"].read()[:, *part].astype(np.float64)
-        moved, (gain, variance, change) = answer[:AFFINE], answer[AFFINE:]
-        converged = (change < _LARGEST_CHANGE) & (gain > _MIN_CONTRAST)
-        field = field.copy()
-        np.copyto(field[:, *part], moved, where=converged)
-        return NodeField(moved[:2], variance, converged), field
 
     def _variance(self, gain: Doubles, squares: Doubles, variances: Doubles) -> Doubles:
         """Return the variance of a sample from sums of squares and of the variances of differences."""
@@ -423,7 +423,7 @@ class _Level:
 
     def _solve(self) -> None:
         """Warp the frame back by the field, solve all windows, and compute the next field."""
-        maps, (rows, columns), sizes = self._maps, self.shape, self._sizes
+        maps, (rows, columns), sizes = self.maps, self.shape, self._sizes
         shared = {name: maps[name] for name in ("planes", "field", "difference")}
         items = rows * math.ceil(columns / self._tile)
         self._launch("warp", items, **sizes, **shared, coefficients=maps["coefficients"])
@@ -438,7 +438,7 @@ class _Level:
             **{name: maps[name] for name in ("trust", "answer", "field", "next_field")},
         )
 
-    def at_nodes(self, field: Doubles, level: _Level, scale: float) -> Doubles:
+    def at_nodes(self, field: Doubles, level: Level, scale: float) -> Doubles:
         """Return a field of another level at the nodes of this one, whose pixels are larger by a scale."""
         if level is self:
             return field

@@ -103,8 +103,8 @@ class Fitted:
         default=None,
     )
     common_height_sigma: float | None = parameter(
-        "standard deviation of the common height of a touch, from its press steps, which is part of"
-        " `height_sigma`",
+        "standard deviation of the common height of a fused surface, from the steps of the press, which is"
+        " part of `height_sigma`",
         "mm",
         default=None,
     )

@@ -83,7 +83,8 @@ def conjugate_gradients(
     x = np.zeros_like(target) if start is None else start
     if moved is None:
         moved = np.zeros_like(target) if start is None else product(x)
-    direction = last = np.zeros_like(target)
+    direction: Array | None = None
+    last: Array | None = None
     gain: Array | float = np.inf
     tiny = np.finfo(target.dtype).tiny
 
@@ -103,10 +104,14 @@ def conjugate_gradients(
             break
         steepest = here.project(here.precondition(residual))
         before, gain = gain, inner(residual, steepest)
-        memory = np.maximum(gain - inner(last, steepest), 0) / np.maximum(before, tiny)
-        direction, last = steepest + memory * direction, residual
-        if callable(face):  # the direction before may be outside of this face
-            direction = here.project(direction)
+        if last is None or direction is None:
+            direction = steepest
+        else:
+            memory = np.maximum(gain - inner(last, steepest), 0) / np.maximum(before, tiny)
+            direction = steepest + memory * direction
+            if callable(face):  # the direction before may be outside of this face
+                direction = here.project(direction)
+        last = residual
         along = product(direction)
         stiff = along if here.curvature is None else along + here.curvature * direction
         length = inner(residual, direction) / np.maximum(inner(direction, stiff), tiny)

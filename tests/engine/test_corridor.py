@@ -52,7 +52,7 @@ def test_library_run(recordings, levels):
     [
         ("reconstruct press.h5", 570, 75),
         ("reconstruct turn.h5", 781, 98),
-        ("fuse press.h5 turn.h5", 960, 114),
+        ("fuse press.h5 turn.h5", 963, 115),
     ],
 )
 def test_command(recordings, monkeypatch, line, functions, files):

@@ -15,7 +15,7 @@ from mirrorskin.kernels.device import C_TYPES
 from mirrorskin.kernels.integration.breaks import DOWN, RIGHT
 from mirrorskin.kernels.optical import focus, lambert
 from mirrorskin.kernels.rotation import correlation, registration
-from mirrorskin.kernels.skin import displacement, pose, pose_maps, turn_pose
+from mirrorskin.kernels.skin import displacement, pose, pose_maps, slip, turn_pose
 from mirrorskin.kernels.twin.skin import FLAKES
 
 DTYPES, WHOLE = {"dtype": ("uint8", "uint16", "float32")}, {"dtype": ("uint8", "uint16")}
@@ -301,6 +301,90 @@ def _(grid):
         "next_field": np.zeros((2, *grid)),
     }
     return values | arrays | {"shape": grid, "macros": displaced()}
+
+
+def same_state(actual, expected, values):
+    """Check the planes of a state of windows, of which some are numbers."""
+    for plane in range(slip.STATES):
+        kind = np.int32 if plane in (slip.FLAGS, slip.FITTED, slip.ONSET) else np.float32
+        np.testing.assert_allclose(actual[plane].view(kind), expected[plane].view(kind), 1e-4, 1e-6)
+
+
+def same_slip(actual, expected, values):
+    """Check what windows show, of which some are numbers and some are counts."""
+    numbers, windows = slip.NUMBERS, values["state"][0].size
+    counts, maps = [0, *range(5, 11)], slice(numbers, numbers + 7 * windows)
+    np.testing.assert_array_equal(actual[counts], expected[counts])
+    if actual[0] < values["least"]:
+        return
+    range_of_start, motion = slice(1, 5), slice(11, 19)
+    for part in (range_of_start, motion, maps):
+        np.testing.assert_allclose(actual[part].view(np.float32), expected[part].view(np.float32), 1e-4, 1e-6)
+    np.testing.assert_array_equal(actual[maps.stop :], expected[maps.stop :])
+
+
+def measured_before(actual, expected, values):
+    """Check the measured displacements in the scratch."""
+    np.testing.assert_allclose(actual[:7], expected[:7], 1e-4, 1e-7)
+
+
+@case(
+    "slip_windows",
+    {"moment": ("lost", "first", "second", "starts", "moves", "slips", "enters"), "apart": (1, 3)},
+    per=lambda device, values: device.layout.group,
+    checks={
+        "state": same_state,
+        "found": same_slip,
+        "scratch": measured_before,
+        "sums": lambda *_: None,
+        "field": near(1e-5, 1e-6),
+    },
+)
+def _(moment, apart):
+    grid, rng = (7, 11), np.random.default_rng(3)
+    row, column = np.indices(grid)
+    right, down = 0.3 + 0.02 * row, -0.2 - 0.02 * column
+    if moment == "slips":
+        right[3:5, 6] -= 0.15
+    answer = np.concatenate(
+        [[right, down], np.zeros((4, *grid)), np.ones((2, *grid)), np.full((1, *grid), 0.01)]
+    )
+    answer[:8] += rng.normal(0, 0.002, (8, *grid))
+    answer[7, 2, 7], answer[8, 4, 4], answer[8, 1, 2] = 30, 2, np.nan
+    field = np.concatenate([[right + 0.05, down], np.zeros((4, *grid))])
+    state = np.zeros((slip.STATES, *grid), np.int32)
+    numbers = state.view(np.float32)
+    numbers[slip.LAST : slip.LAST + 2] = right - 0.1, down + rng.normal(0, 0.1, grid)
+    numbers[slip.LEARNED] = np.nan if moment == "second" else 0.9
+    flags = state[slip.FLAGS]
+    flags[...] = slip.FOLLOWED
+    flags[2:-1, 2:-2] |= slip.TOUCHED
+    flags[2:-1, 2] |= slip.PARTIAL
+    flags[3, 5] &= ~slip.FOLLOWED
+    is_later = moment in ("moves", "slips", "enters", "lost")
+    state[slip.ONSET], state[slip.FITTED] = -1, 5
+    numbers[slip.FIXED : slip.FIXED + 2] = np.nan
+    if is_later:
+        flags[2:-1, 3:-2] |= slip.SETTLED
+        numbers[slip.FIXED : slip.FIXED + 2, 2:-1, 2:-2] = 0.002
+        numbers[slip.DRIFT], numbers[slip.TURNED] = 1e-9, 1e-9
+        if moment == "enters":
+            flags[2:-1, -3] &= ~slip.SETTLED
+            numbers[slip.FIXED : slip.FIXED + 2, 2:-1, -3] = np.nan
+    known = np.concatenate([np.ones((1, *grid)), np.full((2, *grid), 4e-8), np.full((1, *grid), 5e-9)])
+    known = np.concatenate([known, rng.normal(0, 0.01, (2, *grid)), np.full((3, *grid), 1e-9)])
+    since = {"first": 0, "second": 1}.get(moment, 9)
+    works = {"first": slip.MEASURE | slip.FIND_SLIP, "second": slip.LEARN}
+    work = works.get(moment, slip.LEARN | slip.MEASURE | slip.FIND_SLIP)
+    values = named("top bottom left right", 1, grid[0], 1, grid[1] - 1)
+    values |= {"rows": grid[0], "columns": grid[1], "work": work, "least": 1000 if moment == "lost" else 0}
+    values |= {"frame": 9, "since_key": since, "started": int(is_later), "apart": apart}
+    values |= {"bend_scale": 0.04, "chance": 1.2, "grid": (-0.5, 0.4, 0.1, 0.12), "size": (0.02, 0.024)}
+    found = np.zeros(slip.NUMBERS + slip.MAPS * row.size, np.int32)
+    scratch, sums = np.zeros((slip.SCRATCH, *grid)), np.zeros((128, slip.SUMS))
+    return values | named(
+        "answer known field state scratch sums found", answer, known, field, state, scratch, sums, found
+    )
 
 
 def measured(dtype):

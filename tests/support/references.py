@@ -95,6 +95,8 @@ def agree(
     macros, frames = values.get("macros", {}), values.get("frames", values.get("frame"))
     if isinstance(frames, np.ndarray):
         macros = {"FRAME": C_TYPES[frames.dtype.name], "BITS": 8 * frames.itemsize} | macros
+    if f"__kernel GROUP_SIZE void {name}(" in SOURCES[KERNELS[name]]:
+        macros = {"GROUP": device.layout.group} | macros
     kernel = device.kernel(KERNELS[name], name, **macros)
     pixels, tile = rows * columns, device.layout.tile
     sizes = {"rows": rows, "columns": columns, "pixels": pixels}

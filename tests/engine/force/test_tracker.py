@@ -114,6 +114,20 @@ def test_an_answer_depends_on_earlier_results_by_less_than_its_sigma():
         assert abs(warm.pressure_centre_x - cold.pressure_centre_x) < 0.2 * cold.pressure_centre_x_sigma
 
 
+@pytest.mark.parametrize("step", [0.002, 0.004, -0.004])
+def test_tangential_force_of_a_changing_contact_depends_little_on_earlier_results(step):
+    random, tracker, errors = np.random.default_rng(1), ForceTracker(modulus=MODULUS), []
+    for number in range(10):
+        moved = np.broadcast_to([0.05, -0.02], (*SHAPE, 2))
+        height, depth = paraboloid(4.0) + random.normal(0, 0.002, SHAPE), 0.4 + step * number
+        pressed = result(height, 0.002, displacement=moved, displacement_sigma=np.full((*SHAPE, 2), 1e-4))
+        warm, cold = tracker.push(pressed, depth), ForceTracker(modulus=MODULUS).push(pressed, depth)
+        errors.append((warm.force_x / cold.force_x - 1, (warm.force_x - cold.force_x) / warm.force_x_sigma))
+    relative, sigmas = np.transpose(errors)
+    assert np.sqrt(np.mean(relative**2)) < 0.008
+    assert np.sqrt(np.mean(sigmas**2)) < 0.7
+
+
 def test_contact_is_lost_and_found_again():
     tracker, moved = ForceTracker(modulus=MODULUS), np.full((*SHAPE, 2), 0.01, np.float32)
     pressed = result(paraboloid(), 0.001, displacement=moved)
