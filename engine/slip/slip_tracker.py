@@ -283,7 +283,6 @@ class SlipTracker(ThreadSafe):
     def _change_contact(self, windows: Windows, contact: Mask) -> None:
         """Let windows enter and leave the contact, and choose those that are followed."""
         before = windows.part
-        windows.spread()
         state = windows.read()
         numbers = state.view(np.float32)
         self._sums = cv2.integral(contact.view(np.uint8))

@@ -115,24 +115,9 @@ class Windows:
         """Replace the variances and displacements on the device, (`KNOWN`, rows, columns)."""
         self._maps["known"].write(np.concatenate(planes))
 
-    def spread(self) -> None:
-        """Give windows outside of the part, which were not followed, the fields of the nearest ones in it."""
-        if self.part == self.level.whole:
-            return
-        rows, columns = (
-            np.clip(np.arange(size), inner.start, inner.stop - 1)
-            for size, inner in zip(self.level.grid, self.part, strict=True)
-        )
-        state, field = self.read(), self.level.maps["field"]
-        state[LAST:] = state[LAST:, rows[:, None], columns]
-        self.write(state)
-        field.write(field.read()[:, rows[:, None], columns])
-
     def choose(self, part: Part) -> None:
         """Follow the windows of a part, from now on."""
-        start = self.level.maps["field"].read()[:2, *part].reshape(2, -1)
-        self.part, self._start = part, (start.min(axis=1).tolist(), start.max(axis=1).tolist())
-        self._enough = self._tracker.least_converged(part)
+        self.part, self._enough = part, self._tracker.least_converged(part)
 
     def follow(self, frame: NDArray[Any]) -> None:
         """Follow the windows of the part to a frame."""
@@ -169,8 +154,10 @@ class Windows:
 
         They are x + i y, (rows, columns) mm, NaN where a window is not found; and (2, rows, columns).
         """
-        self.spread()
-        self.level.maps["field"].write(self.read().view(np.float32)[LAST:])
+        last = self.read().view(np.float32)[LAST:]
+        self.level.maps["field"].write(last)
+        start = last[:2].reshape(2, -1)
+        self._start = start.min(axis=1).tolist(), start.max(axis=1).tolist()
         self.choose(self.level.whole)
         self.follow(frame)
         self.evaluate(MEASURE, since_key)

@@ -137,31 +137,34 @@ __kernel GROUP_SIZE void slip_windows(
         }
         // The next start: the mean step is added, as a window's own one has noise, unless it differs much.
         total[0] = total[1] = 0;
-        for (int node = item; node < nodes; node += ITEMS) {
-            const int i = node / columns, j = node % columns;
-            const int is_new = i >= top && i < bottom && j >= left && j < right && CONVERGED;
+        EACH_WINDOW
             for (int k = 0; k < AFFINE; ++k) {
-                const float value = is_new ? ANSWER(k) : field[k * nodes + node], step = value - STATE(LAST + k);
+                const float value = CONVERGED ? ANSWER(k) : field[k * nodes + node], step = value - STATE(LAST + k);
                 field[k * nodes + node] = k < 2 ? step : value;
                 SET_STATE(LAST + k, value);
                 if (k < 2) total[k] += step;
             }
-        }
         combine(total, 2, 0, item, sums);
-        const float mean[2] = {total[0] / nodes, total[1] / nodes};
-        for (int node = item; node < nodes; node += ITEMS)
-            for (int k = 0; k < 2; ++k) {
-                const float step = field[k * nodes + node], differs = step - mean[k];
-                field[k * nodes + node] = STATE(LAST + k) + (differs > MIN_STEP || differs < -MIN_STEP ? step : mean[k]);
-            }
-        BARRIER;
+        const float mean[2] = {total[0] / windows, total[1] / windows};
         for (int k = 0; k < 4; ++k) total[k] = INFINITY;
         EACH_WINDOW
             for (int k = 0; k < 2; ++k) {
-                total[k] = LESSER(total[k], field[k * nodes + node]);
-                total[2 + k] = LESSER(total[2 + k], -field[k * nodes + node]);
+                const float step = field[k * nodes + node], differs = step - mean[k];
+                const float start = STATE(LAST + k) + (differs > MIN_STEP || differs < -MIN_STEP ? step : mean[k]);
+                field[k * nodes + node] = start;
+                total[k] = LESSER(total[k], start);
+                total[2 + k] = LESSER(total[2 + k], -start);
             }
         combine(total, 4, 1, item, sums);
+        // Windows outside of the part start like the nearest ones in it.
+        for (int node = item; node < nodes; node += ITEMS) {
+            const int i = LIMITED(node / columns, top, bottom - 1), j = LIMITED(node % columns, left, right - 1);
+            if (i * columns + j == node) continue;
+            for (int k = 0; k < AFFINE; ++k) {
+                field[k * nodes + node] = field[k * nodes + i * columns + j];
+                state[(LAST + k) * nodes + node] = state[(LAST + k) * nodes + i * columns + j];
+            }
+        }
         if (item == 0)
             for (int k = 0; k < 4; ++k) found[1 + k] = as_int(k < 2 ? total[k] : -total[k]);
     }

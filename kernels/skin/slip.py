@@ -160,15 +160,23 @@ def _learn(learned: Array, variance: Doubles, since_key: int) -> None:
 def _next_start(
     part: tuple[slice, slice], moved: Doubles, converged: Array, field: Array, last: Array
 ) -> list[float]:
-    """Write the fields of this frame and the start of the next one; return its range."""
-    inner, now = (slice(None), *part), field.astype(np.float64)
-    now[inner] = np.where(converged, moved, now[inner])
-    step = now[:2] - last[:2]
+    """Write the fields of this frame and the start of the next one, and return its range.
+
+    Windows outside of the part get those of the nearest ones in it.
+    """
+    inner = (slice(None), *part)
+    now = np.where(converged, moved, field[inner])
+    step = now[:2] - last[inner][:2]
     mean = step.mean(axis=(1, 2), keepdims=True)
-    field[...], last[...] = now, now
-    field[:2] += np.where(np.abs(step - mean) > MIN_STEP, step, mean)
-    start = field[inner][:2].reshape(2, -1)
-    return [*start.min(axis=1), *start.max(axis=1)]
+    start = now.copy()
+    start[:2] += np.where(np.abs(step - mean) > MIN_STEP, step, mean)
+    rows, columns = (
+        np.clip(np.arange(size), inside.start, inside.stop - 1) - inside.start
+        for size, inside in zip(field.shape[1:], part, strict=True)
+    )
+    last[...], field[...] = (values[:, rows[:, None], columns] for values in (now, start))
+    ends = start[:2].reshape(2, -1)
+    return [*ends.min(axis=1), *ends.max(axis=1)]
 
 
 def _bent(values: Doubles, apart: int) -> Doubles:
