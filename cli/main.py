@@ -241,10 +241,12 @@ def _ended_by_signals(is_program: bool) -> Iterator[None]:
         kind, arguments = type(lost.exc_value), lost.exc_value.args
 
         def again(number: int, frame: object) -> None:
+            signal.setitimer(signal.ITIMER_REAL, 0)
             raise kind(*arguments)
 
+        # Alarms go on until one is taken: the first may come just before the program begins to wait.
         install(signal.SIGALRM, again)
-        signal.setitimer(signal.ITIMER_REAL, _SOON)
+        signal.setitimer(signal.ITIMER_REAL, _SOON, _SOON)
 
     with _restored_handlers(is_program) as install:
         for name in ("SIGTERM", "SIGHUP"):

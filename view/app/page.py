@@ -344,9 +344,15 @@ def _in_thread(worker: Executor, document: Any, closed: Event) -> Run:
                 return
             document.add_next_tick_callback(lambda: then(result))
 
-        worker.submit(compute).add_done_callback(Future.result)  # an error is logged
+        worker.submit(compute).add_done_callback(_show_error)
 
     return run
+
+
+def _show_error(ended: Future[None]) -> None:
+    """Log what failed; work that the end of a page took back did not fail."""
+    if not ended.cancelled():
+        ended.result()
 
 
 def _name_of(source: Shown, number: int) -> str:
