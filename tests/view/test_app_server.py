@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from bokeh.document import Document
 from stacks import record
 from tornado.httpclient import HTTPRequest
 from tornado.ioloop import IOLoop
@@ -312,6 +313,39 @@ def test_pages_are_served_while_one_computes(blocked, tmp_path):
 
     with serving(page) as address:
         assert asyncio.run(look(address)) == (200, False)
+
+
+def test_only_the_thread_of_the_server_adds_to_a_page(tmp_path, monkeypatch):
+    # Panel exchanges lists of what is to be sent, and would lose what another thread adds meanwhile.
+    twin = Twin(object="sphere", shape=(20, 20), pixel_size=0.5, movement=Vertical(0.1 * np.arange(4)))
+    record(twin, tmp_path / "press.h5")
+    computed, servers, adding = threading.Event(), set(), set()
+    add = Document.add_next_tick_callback
+
+    def added(document, callback):
+        adding.add(threading.get_ident())
+        return add(document, callback)
+
+    monkeypatch.setattr(Document, "add_next_tick_callback", added)
+
+    class Watched(App):
+        def _keep(self, number, result):
+            super()._keep(number, result)
+            if result is not None:
+                computed.set()
+
+    def page():
+        servers.add(threading.get_ident())
+        return Watched(tmp_path / "press.h5").view
+
+    async def look(address):
+        socket = await _open_socket(address, await asyncio.to_thread(_token, address))
+        assert await asyncio.to_thread(computed.wait, PATIENCE)
+        await _close_socket(socket)
+
+    with serving(page) as address:
+        asyncio.run(look(address))
+    assert adding == servers
 
 
 @pytest.fixture

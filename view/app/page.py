@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from html import escape
 from importlib import resources
@@ -335,14 +337,21 @@ def _is_served() -> bool:
 
 
 def _in_thread(worker: Executor, document: Any, closed: Event) -> Run:
-    """Return a way to compute in a thread, so that the server answers meanwhile, and to show the result."""
+    """Return a way to compute in a thread, so that the server answers meanwhile, and to show the result.
+
+    Only the server's thread touches the document: Panel may lose what another thread adds to it.
+    """
+    loop, context = asyncio.get_running_loop(), document.session_context
 
     def run(work: Callable[[], T], then: Callable[[T], object], /) -> None:
+        def show(result: T) -> None:
+            if not closed.is_set() and not context.destroyed:
+                document.add_next_tick_callback(lambda: then(result))
+
         def compute() -> None:
             result = work()
-            if closed.is_set():
-                return
-            document.add_next_tick_callback(lambda: then(result))
+            with suppress(RuntimeError):  # the server has ended
+                loop.call_soon_threadsafe(show, result)
 
         worker.submit(compute).add_done_callback(_show_error)
 

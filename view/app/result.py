@@ -144,9 +144,9 @@ class ResultPane:
         self.restart = widgets.Button(label="Measure the whole map", width=190)
         self.unmask = widgets.Button(label="Forget the dust", width=140, visible=False)
         self.uncut = widgets.Button(label="Remove the last section", width=190, visible=False)
-        self.copy = widgets.Button(label="Copy measures", width=140)
+        self.copy = widgets.Button(label="Copy measures", width=140, disabled=True)
         self.table = widgets.FileDownload(
-            callback=self._csv, filename="measures.csv", label="Save measures.csv", width=180,
+            callback=self._csv, filename="measures.csv", label="Save measures.csv", width=180, disabled=True,
         )  # fmt: skip
         self._text = ColumnDataSource(data={"text": [""]})
         self.copy.js_on_click(args={"source": self._text}, code=_COPY)
@@ -405,6 +405,7 @@ class ResultPane:
             show(found)
             return
         self.measures.styles = dict(_STALE)
+        self.copy.disabled = self.table.disabled = True
         session.run_aside(measure, show)
 
     def _csv(self) -> StringIO:
