@@ -15,6 +15,7 @@ from mirrorskin.io.base.url import path_of
 from mirrorskin.io.files.opening import open_recording
 from mirrorskin.io.files.recorder import Compression, Recorder
 from mirrorskin.io.files.recording import Recording
+from mirrorskin.io.formats.registry import is_of_others
 from mirrorskin.io.model.calibration import Calibration
 from mirrorskin.io.storage.atomic import MAKE_ROOM, check_output, new_hdf5
 from mirrorskin.io.storage.layout import MARK
@@ -76,6 +77,14 @@ def save_touch(
         new.check()
 
 
+def has_turn(path: str | Path) -> bool:
+    """Return whether a file of ours contains the turn of a touch beside its press."""
+    if is_of_others(Path(path)):
+        return False
+    with open_file(path_of(path)) as file:
+        return file.marked(MARK) and file.marked(MARK, f"/{TURN}/entry")
+
+
 @contextmanager
 def open_touch(path: str | Path, memory_limit: int | None = None) -> Iterator[tuple[Recording, Recording]]:
     """Open the press and the turn of a touch; InputError for a file with only one movement.
@@ -91,9 +100,7 @@ def open_touch(path: str | Path, memory_limit: int | None = None) -> Iterator[tu
     >>> with open_touch("ball-frames.h5") as (press, turn):  # doctest: +SKIP
     ...     surface = engine.live.fuse_touch(press, turn)
     """
-    with open_file(path_of(path), memory_limit) as file:
-        has_turn = file.marked(MARK) and file.marked(MARK, f"/{TURN}/entry")
-    if not has_turn:
+    if not has_turn(path):
         raise InputError(f"{path} is not the recording of a touch: name a press and a rotation")
     with (
         open_recording(path, memory_limit=memory_limit) as press,

@@ -73,14 +73,27 @@ def check_call(
 
 @contextmanager
 def open_all(
-    paths: Sequence[Path], options: StackOptions, calibration: Calibration | None, output: Path
+    paths: Sequence[Path],
+    options: StackOptions,
+    calibration: Calibration | None,
+    output: Path,
+    with_turns: bool = False,
 ) -> Iterator[tuple[list[Source], CameraId]]:
-    """Open recordings with the pixel size of the calibration's scale, and return them and their camera."""
+    """Open recordings with the pixel size of the calibration's scale, and return them and their camera.
+
+    With ``with_turns``, the recording of a touch is two: its press, and then its turn.
+    """
     from mirrorskin import io
+    from mirrorskin.io.files.touch_file import TURN, has_turn
 
     options = _scaled(options, calibration)
     with ExitStack() as opening:
-        sources = [opening.enter_context(io.open_recording(path, **options)) for path in paths]
+        sources = []
+        for path in paths:
+            sources.append(opening.enter_context(io.open_recording(path, **options)))
+            if with_turns and has_turn(path):
+                turn = io.open_recording(path, **(options | {"dataset": TURN}))
+                sources.append(opening.enter_context(turn))
         yield [*sources], _one_camera(sources, calibration, output)
 
 
@@ -183,12 +196,14 @@ def learn(
     as_json: bool,
     capture: Capture | None = None,
     plates: Sequence[Path] = (),
+    with_turns: bool = False,
     **options: str | None,
 ) -> None:
     """Fit a part to recordings, add it to a calibration, and report it.
 
     Presses are named or captured with a rig, which ``options`` need; plates are always named. ``fit`` gets
     all recordings, open, and the paths of the presses, which come first. ``stack`` describes the recordings.
+    ``with_turns``: the recording of a touch is a press, and then a turn.
     """
     capture = capture or Capture()
     needs_rig = options | {"settle": capture.settle, "overwrite": capture.overwrite}
@@ -209,7 +224,7 @@ def learn(
             with open_all(plates, opening, calibration, output):
                 pass  # refused before anything moves
         paths = take(capture.rig, output, places, capture.settle, capture.overwrite)
-    with open_all([*paths, *plates], opening, calibration, output) as (sources, camera):
+    with open_all([*paths, *plates], opening, calibration, output, with_turns) as (sources, camera):
         learned = fit(sources, calibration, paths)
         process = process_of(sources[0], **learned.facts)
     save(output, camera, learned, process, as_json)

@@ -27,7 +27,7 @@ def command(
         list[Path],
         Argument(
             metavar="REC.h5...",
-            help="Touches of anything: a press, then a turn at the same place, and so on.",
+            help="Recordings of 'mirrorskin touch'; or presses, each before the turn at the same place.",
         ),
     ],
     stated: Annotated[
@@ -69,7 +69,7 @@ def command(
         )
         return _learned(found, paths)
 
-    inputs.learn(output, recordings, fit, stack, as_json)
+    inputs.learn(output, recordings, fit, stack, as_json, with_turns=True)
 
 
 def _touches(sources: Sequence[Source]) -> list[tuple[Source, Source]]:

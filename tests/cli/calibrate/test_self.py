@@ -9,6 +9,7 @@ from commands import done, refused
 from stacks import record
 
 from mirrorskin import io
+from mirrorskin.io.files.touch_file import save_touch
 from mirrorskin.twin import Axial, Camera, Twin, Vertical
 
 TILT = math.radians(3.0)
@@ -38,6 +39,15 @@ def test_response_and_movement_are_written():
     calibration = io.open_calibration("cal.h5")
     assert calibration.response.touches == 1
     assert abs(calibration.precession.tilt - TILT) < 4 * calibration.precession.sigma["tilt"]
+
+
+def test_recording_of_a_touch_is_a_press_and_its_turn():
+    with io.open_recording("press.h5") as press, io.open_recording("turn.h5") as turn:
+        save_touch("touch.h5", press, turn)
+    done("calibrate self press.h5 turn.h5 -o two.h5")
+    done("calibrate self touch.h5 -o one.h5")
+    of_two, of_one = (io.open_calibration(name).response for name in ("two.h5", "one.h5"))
+    np.testing.assert_array_equal(of_one.gain, of_two.gain)
 
 
 def test_touches_are_added():
