@@ -28,7 +28,6 @@ from mirrorskin.kernels.skin.slip import (
     SUMS,
 )
 
-Mask = NDArray[np.bool_]
 Singles = NDArray[np.float32]
 Integers = NDArray[np.int32]
 
@@ -75,7 +74,7 @@ class Windows:
     ) -> None:
         self._tracker = Tracker(key, window, step, device, separate=True)
         self.level: Level = self._tracker.finest
-        self._device, self._size = device, size
+        self._device = device
         grid, group = self.level.grid, device.layout.group
         self.part: Part = self.level.whole
         apart = max(1, round(window / step))
