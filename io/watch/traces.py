@@ -40,6 +40,8 @@ _BLOCK = 8  # pixels of a block of JPEG and of video codecs
 _BLOCKY = (1.02, 5.0), (1.08, 8.0)  # ratio and z-score of steps at borders, in both directions or in one
 _NO_STEP, _OF_FRAMES = 0.02, 0.4  # steps of frames over other differences; steps of changes over these
 _PATTERNS, _REPEATED = 2, 0.45  # that a scene repeats, and their share in its steps
+_CONTACT = 0.1  # change of a pixel on contact, at least, share of the span
+_ROWS_MIN = 64  # rows with steps at all places of a block
 _THIN = 4  # an axis shorter than both others by this factor may be in the wrong place
 
 
@@ -128,13 +130,14 @@ class FrameSamples:
             self._parts = [np.concatenate(self._parts)]
         return self._parts[0]
 
-    def compression(self) -> bool:
+    def compression(self, motion: Motion) -> bool:
         """Return whether the changes of neighbouring pixels show blocks of a compression with a loss.
 
         A codec treats blocks of 8 x 8 pixels, or of a multiple, each for itself, so that their noise changes
         in steps from block to block. Third differences of the change between two frames, across the border
         of two pixels, are larger at every eighth border then. A pattern of this period on the object has
-        steps in each frame, which are larger than their changes, or changes that repeat.
+        steps in each frame, which are larger than their changes, or changes that repeat. Pixels of a press
+        that change by contact between two frames show the object, and are not compared.
         """
         pairs = [(patch[:-1], patch[1:]) for patch in self._patches if len(patch) > 1]
         single = [patch[0] for patch in self._patches if len(patch) == 1]
@@ -149,7 +152,11 @@ class FrameSamples:
         change -= first
         if not np.isfinite(change).all():
             return False
-        blocky = [_blocky(change, first), _blocky(change.swapaxes(1, 2), first.swapaxes(1, 2))]
+        limit = np.inf
+        if motion == "vertical":
+            limit = _CONTACT * float(max(before.max(), after.max()) - min(before.min(), after.min()))
+        across = change.swapaxes(1, 2), first.swapaxes(1, 2)
+        blocky = [_blocky(change, first, limit), _blocky(*across, limit)]
         (both, clear), (one, clearer) = _BLOCKY
         return all(ratio > both and score > clear for ratio, score in blocky) or (
             any(ratio > one and score > clearer for ratio, score in blocky)
@@ -157,22 +164,31 @@ class FrameSamples:
         )
 
 
-def _blocky(change: Samples, frames: Samples) -> tuple[float, float]:
+def _blocky(change: Samples, frames: Samples, limit: float) -> tuple[float, float]:
     """Return the ratio of steps across the borders of blocks to others, and its excess in standard errors.
 
-    Borders are those between columns of a change between frames, (n, H, W). The ratio is 0 if nothing
-    changes; it is 1, and the excess 0, if the scene explains it.
+    Borders are those between columns of a change between frames, (n, H, W). Pixels whose change exceeds a
+    limit are left out. The ratio is 0 if nothing changes; it is 1, and the excess 0, if the scene explains
+    it, or if too few pixels are left.
     """
     middle = change[..., 1:-2] - change[..., 2:-1]
     signed = change[..., 3:] - change[..., :-3] + 3 * middle
     whole = signed.shape[-1] // _BLOCK * _BLOCK
     signed = signed[..., :whole].reshape(-1, whole // _BLOCK, _BLOCK)
     steps = np.sqrt(np.abs(signed))
-    mean = float(steps.mean())
+    large = np.abs(change) > limit
+    left = ~(large[..., 3:] | large[..., 2:-1] | large[..., 1:-2] | large[..., :-3])
+    left = left[..., :whole].reshape(steps.shape)
+    steps[~left] = 0.0
+    mean = float(steps.sum()) / max(1, int(left.sum()))
     if mean == 0:
         return 0.0, 0.0
     np.minimum(steps, 2 * mean, out=steps)  # a few large changes, as at the edge of contact, do not decide
-    series = steps.mean(axis=1)
+    number = left.sum(axis=1)
+    rows = number.min(axis=1) > 0
+    if np.count_nonzero(rows) < min(_ROWS_MIN, len(rows)):
+        return 1.0, 0.0
+    series = steps.sum(axis=1)[rows] / number[rows]
     places = series.mean(axis=0)
     border = int(np.argmax(places))
     others = [(border + apart) % _BLOCK for apart in (2, 4, 6)]  # as large in pictures that were enlarged

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from mirrorskin import io
+from mirrorskin.twin import Camera, Twin, Vertical
 
 SHAPE, PIXEL, STEP = (60, 80), 0.1, 0.05
 TRAVEL = STEP * np.arange(30)
@@ -482,6 +483,14 @@ def test_frames_that_were_not_compressed_have_no_such_finding(light, name, posit
     binned = frames.reshape(len(frames), 30, 2, 40, 2).mean(axis=(2, 4)).astype(np.uint8)
     for each in (frames, noisy(light() * SQUARES, noise), twice, binned, frames // 8 * 8):
         assert "lossy compression" not in kinds(found(each, **{name: positions}))
+
+
+@pytest.mark.parametrize(("shape", "pixel", "frames"), [((96, 128), 0.05, 3), ((120, 160), 0.04, 5)])
+def test_a_periodic_texture_in_few_frames_is_no_compression(shape, pixel, frames):
+    travel = np.linspace(0.0, 0.6, frames)
+    scene = {"object": "texture", "shape": shape, "pixel_size": pixel, "pattern": "linear"}
+    press = Twin(movement=Vertical(travel), camera=Camera(seed=1), references="ball", **scene)
+    assert "lossy compression" not in kinds(io.check(press))
 
 
 def test_few_pixels_contain_no_information():
