@@ -69,7 +69,7 @@ class PressSteps:
 
             sum (w_i^2 / 12) / m^2  and  (mean (w_i^2 / 12) + sum (e_i - mean e)^2) / m^2
 
-        times (m + 2) / m, the variance of Student's t with m + 2 degrees of freedom: few steps show little.
+        times 1 + 1 / m, because few steps show their scatter inaccurately.
         A component without such a step is known at most as well as a single height of the press.
         """
         height = np.asarray(surface.height)
@@ -93,7 +93,7 @@ class PressSteps:
             mean = float(errors.mean())
             scatter = float(variances.mean() + np.sum((errors - mean) ** 2))
             variance = max(float(variances.sum()), scatter) / errors.size**2
-            added[component] = math.sqrt(variance * (errors.size + 2) / errors.size)
+            added[component] = math.sqrt(variance * (1 + 1 / errors.size))
             if abs(mean) > _CLEAR * added[component]:
                 shifts[component] = mean
             if component == np.argmax(sizes):

@@ -13,6 +13,9 @@ TURN_FRAMES = 4, 24
 
 _CERTAIN = 1.81  # integral of phi^2 / (Phi (1 - Phi)): information of one boundary, in 1 / blur
 _HIGHEST = 8.0  # greatest eigenvalue of the Laplacian of a grid of unit spacing
+# Of the boundaries, in the variance of the common height. Where the object is aligned with the pixels, each
+# boundary counts once: 1. Where it crosses them, errors along a boundary average out: more.
+_COMMON_POWER = 1.5
 _AT_BORDER = 2.0  # variance at a straight border, relative to the inside: the mirror image of the errors
 
 VarianceOf = Callable[[int, int], float]
@@ -103,7 +106,7 @@ class Contact:
 
     def variance(self, press_steps: int, turn_frames: int) -> float:
         """Return the variance of a height, mm², from a number of press steps and turn frames."""
-        return self.variance_of_turn(press_steps, turn_frames) + self.rise**2 / _boundaries(press_steps)
+        return self.variance_of_turn(press_steps, turn_frames) + self.rise**2 * _common(press_steps)
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ class Measured:
     def after(self, press_steps: int, turn_frames: int) -> float:
         """Return the variance that is expected of more frames."""
         of_turn = min(self.of_turn, self.variance)
-        rest = (self.variance - of_turn) * _boundaries(self.press_steps) / _boundaries(press_steps)
+        rest = (self.variance - of_turn) * _common(press_steps) / _common(self.press_steps)
         return of_turn * self.turn_frames / turn_frames + rest
 
 
@@ -156,3 +159,8 @@ def cheapest(variance: VarianceOf, sigma: float, least: tuple[int, int] = (0, 0)
 def _boundaries(press_steps: int) -> int:
     """Return the number of boundaries between the terraces of a press: its last frame shows none."""
     return max(1, press_steps - 1)
+
+
+def _common(press_steps: int) -> float:
+    """Return the variance of the common height, relative to that of one boundary."""
+    return float(_boundaries(press_steps) ** -_COMMON_POWER)

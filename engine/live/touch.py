@@ -162,7 +162,7 @@ def touch(
 
     With n turn frames and b boundaries between press steps the expected variance of a height is ::
 
-        a^2 s_r s_t ln(1 + 8 / (w a^2 s_r s_t)) / (4 pi) + beta^2 / b
+        a^2 s_r s_t ln(1 + 8 / (w a^2 s_r s_t)) / (4 pi) + beta^2 / b^1.5
 
     where a is the pixel size, s_r = c / (g sqrt(n)) and s_t = tan(theta) c sqrt(2 / n) / (g d) are the
     standard deviations of slopes along and across the inclination theta, for the noise c, the zenith gain g

@@ -239,4 +239,4 @@ def test_no_recipe_suffices_for_an_impossible_request():
 def test_the_variance_of_the_turn_falls_with_its_frames_alone():
     measured = Measured(4, 4, variance=4.0, of_turn=1.0)
     assert measured.after(4, 8) == pytest.approx(3.5)
-    assert measured.after(7, 4) == pytest.approx(2.5)
+    assert measured.after(7, 4) == pytest.approx(1 + 3 / 2**1.5)
