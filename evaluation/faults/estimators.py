@@ -462,6 +462,8 @@ def applies(estimator: str, fault: Fault) -> bool:
     """Return whether a fault can occur; projectors and lamps do not move while a frame is exposed."""
     if fault.stated:
         return estimator.startswith(("threshold", "change-point"))
+    if estimator == "touch":  # at rest a frame that is lost is replaced by the next one
+        return not (fault.dropped or fault.shutter)
     if estimator == "displacement":  # it answers for each frame alone
         return not (fault.jitter or fault.dropped or fault.duplicated or fault.shutter)
     return not (fault.shutter and estimator in ("fringes", "photometric stereo"))

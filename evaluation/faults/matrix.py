@@ -23,6 +23,7 @@ from mirrorskin.evaluation.faults.camera import FAULTS, Fault, Floats
 from mirrorskin.evaluation.faults.estimators import ARRAYS, RECORDINGS, Answers, Surface, applies
 from mirrorskin.evaluation.faults.judge import Answer, Cell, inside, judge, rms
 from mirrorskin.evaluation.faults.slopes import SLOPE_FAULTS, integrated
+from mirrorskin.evaluation.faults.touches import of_touch
 
 SHAPE = 48, 64  # pixels
 _STORED = Path(__file__).with_suffix(".json")
@@ -78,6 +79,7 @@ def _on_waves(answers: Mapping[str, Answers]) -> dict[str, Estimator]:
 _RIM = "threshold, steps of 20 µm"
 ESTIMATORS: Mapping[str, Estimator] = {
     **_on_waves(RECORDINGS),
+    "touch": functools.partial(of_touch(_waves), WAVES),
     "integrate": _of_slopes(),
     "integrate with weights": _of_slopes(weights=True),
     "integrate robustly": _of_slopes(robust=True),
@@ -88,7 +90,8 @@ FUNCTIONS: Mapping[str, Estimator] = _on_waves(ARRAYS)
 
 PRESS = [name for name in ESTIMATORS if name.startswith(("threshold", "change-point"))]
 SLOPES = [name for name in ESTIMATORS if name.startswith("integrate")]
-OTHERS = [name for name in ESTIMATORS if name not in PRESS + SLOPES]
+TOUCHES = ["touch"]
+OTHERS = [name for name in ESTIMATORS if name not in PRESS + SLOPES + TOUCHES]
 
 
 # --- Cells ---------------------------------------------------------------------------------------------
@@ -191,6 +194,7 @@ def with_tables(page: str) -> str:
         (PRESS, FAULTS),
         (OTHERS, FAULTS),
         (SLOPES, SLOPE_FAULTS),
+        (TOUCHES, faults_of("touch")),
     )
     for number, (names, faults) in enumerate(parts):
         rows = [
