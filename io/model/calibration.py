@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.io.base.types import Floats, ProcessValue
+from mirrorskin.io.base.types import Floats, InputError, ProcessValue
 from mirrorskin.io.model.parameters import Part, Row, median, parameter, part
 
 HOT, DEAD, SATURATED = 1, 2, 4
@@ -422,6 +422,11 @@ class Calibration:
         commands: references, scale, zenith, tilt, elastic, force, self.
     name : str
         The file that it was read from, for messages.
+
+    Raises
+    ------
+    InputError
+        It has two responses of a turn: that of a graded wall, and that of touches.
     """
 
     camera: CameraId
@@ -434,6 +439,13 @@ class Calibration:
     response: LinearResponse | None = None
     process: Mapping[str, ProcessValue] = field(default_factory=dict)
     name: str = ""
+
+    def __post_init__(self) -> None:
+        if self.response is not None and self.zenith is not None and self.zenith.pattern == "graded":
+            raise InputError(
+                f"{self.name or 'a calibration'} cannot contain both zenith (balls) and self (touches), two"
+                " responses of a turn: write one of them to another file with -o"
+            )
 
     def parts(self) -> dict[str, Part]:
         """Return the existing parts, by the names of the attributes."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -90,7 +90,7 @@ def a_lens(shape=SHAPE):
 
 
 def a_calibration(shape=SHAPE, dtype="uint8", name="left", only=None):
-    """Return a calibration of all parts, or of some."""
+    """Return a calibration of all parts, or of some; next to that of touches, the wall is uniform."""
     parts = {
         "references": some_references(shape),
         "lens": a_lens(shape),
@@ -102,6 +102,8 @@ def a_calibration(shape=SHAPE, dtype="uint8", name="left", only=None):
     }
     process = {"references.program": "mirrorskin", "tilt.frames": 8, "zenith.weight": 0.5, "scale.dots": True}
     chosen = {part: value for part, value in parts.items() if only is None or part in only}
+    if {"zenith", "response"} <= chosen.keys():
+        chosen["zenith"] = replace(chosen["zenith"], pattern="uniform")
     return io.Calibration(io.CameraId(name, shape, np.dtype(dtype)), **chosen, process=process)
 
 

@@ -237,9 +237,9 @@ def save(
     from mirrorskin import io
     from mirrorskin.cli.output import print_json
 
-    if learned.also is not None:
-        io.update_calibration(output, learned.also, camera, process)
     calibration = io.update_calibration(output, learned.part, camera, process)
+    if learned.also is not None:
+        calibration = io.update_calibration(output, learned.also, camera, process)
     if as_json:
         print_json({"output": str(output), **learned.numbers})
     else:

@@ -135,6 +135,16 @@ def test_a_part_of_another_camera_is_refused(saved, changes, message):
     assert saved.read_bytes() == before
 
 
+@pytest.mark.parametrize(("first", "second"), [("zenith", "response"), ("response", "zenith")])
+def test_two_responses_of_a_turn_are_refused(path, first, second):
+    calibration = a_calibration(only=[first])
+    io.save_calibration(calibration, path)
+    part = getattr(a_calibration(only=[second]), second)
+    with pytest.raises(io.InputError, match=r"cannot contain both zenith .* and self"):
+        io.update_calibration(path, part, calibration.camera)
+    assert_same(getattr(io.open_calibration(path), first), getattr(calibration, first))
+
+
 def test_a_part_that_does_not_fit_leaves_the_file_as_it_was(saved):
     before = saved.read_bytes()
     with pytest.raises(ValueError, match=r"references/dark is of shape \(3, 3\)"):
