@@ -72,6 +72,7 @@ _ROUGH = 0.1  # share of the second difference of slopes by which a slope may di
 _SMOOTH = 1e-6  # weight of second differences of heights, relative to that of slopes: where nothing is seen
 _SMOOTHING = 1.0  # pixels: of slopes, before their changes from pixel to pixel are computed
 _OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
+_PIECE = 96  # rows of products
 _SLOPE_WEIGHT = 1e3  # of a slope by the wave of a pixel
 NOT_FOLLOWED = (
     "the brightness does not follow the turn. Press deeper, on something with relief, and check phases, tilt"
@@ -147,8 +148,8 @@ class Window:
         stated = np.where(np.tile(self.usable, 2), np.reshape(parts, (4, -1)), 0.0).T
         weight = _SLOPE_WEIGHT * np.tile(self.usable, 2).astype(np.float64)
         slopes, firm = _slopes(self.size, self.pixel_size), self._press_weight()
-        matrix = slopes.T @ slopes.multiply(weight[:, np.newaxis]) + _diagonal(firm)
-        solver = _Solver(matrix + _smoothness(self.size) * (_SMOOTH * float(np.max(matrix.diagonal()))))
+        same = _SLOPE_WEIGHT * self.usable
+        solver = _Solver(self.pixel_size, np.stack([same, np.zeros_like(same), same]), firm)
         known = np.nan_to_num(self.middle) * firm
         right = np.column_stack([slopes.T @ (weight[:, np.newaxis] * stated), known])
         *by_slopes, by_press = solver.backward(solver.forward(right)).T
@@ -270,7 +271,7 @@ class Window:
         rough = np.maximum((_ROUGH * self.rough) ** 2, 1e-16)
         inner = np.linalg.inv(sums.matrices + (noise / rough)[:, np.newaxis, np.newaxis] * np.eye(2))
         by_cross, by_push = inner @ sums.cross, np.einsum("iab,ib->ia", inner, sums.push)
-        own = sums.own - np.einsum("iak,ial->kl", sums.cross, by_cross)
+        own = sums.own - _products(_flat(sums.cross), _flat(by_cross))
         pull = sums.pull - np.einsum("iak,ia->k", sums.cross, by_push)
         matrices = sums.matrices - sums.matrices @ inner @ sums.matrices
         cross = sums.cross - sums.matrices @ by_cross
@@ -279,21 +280,17 @@ class Window:
         slopes = _slopes(self.size, self.pixel_size)
         slopes = slopes[np.concatenate([self.usable, self.usable])]
         slopes_x, slopes_y = slopes[: len(matrices)], slopes[len(matrices) :]
-        along_x = slopes_x.multiply(matrices[:, 0, 0, np.newaxis]) + slopes_y.multiply(
-            matrices[:, 0, 1, np.newaxis]
-        )
-        along_y = slopes_x.multiply(matrices[:, 1, 0, np.newaxis]) + slopes_y.multiply(
-            matrices[:, 1, 1, np.newaxis]
-        )
         height, weight = self.evidence or (self.middle, self._press_weight())
-        matrix = (slopes_x.T @ along_x + slopes_y.T @ along_y) / noise + _diagonal(weight)
-        smooth = _smoothness(self.size) * (_SMOOTH * float(np.mean(matrix.diagonal())))
-        solver = _Solver(matrix + smooth)
+        spread = np.zeros((3, len(self.usable)))
+        spread[:, self.usable] = matrices[:, (0, 0, 1), (0, 1, 1)].T / noise
+        solver = _Solver(self.pixel_size, spread, weight)
         coupled = (slopes_x.T @ cross[:, 0] + slopes_y.T @ cross[:, 1]) / noise
-        right = (slopes_x.T @ push[:, 0] + slopes_y.T @ push[:, 1]) / noise - smooth @ self.z
+        right = (slopes_x.T @ push[:, 0] + slopes_y.T @ push[:, 1]) / noise - solver.smoothing * (
+            _smoothness(self.size) @ self.z
+        )
         right += weight * np.where(weight > 0, height - self.z, 0.0)
         reduced = solver.forward(np.column_stack([coupled, right]))
-        products = reduced[:, :-1].T @ reduced
+        products = _products(reduced[:, :-1], reduced)
         own, pull = own / noise - products[:, :-1], pull / noise - products[:, -1]
         return Eliminated(own, pull, functools.partial(_step, solver, reduced))
 
@@ -343,37 +340,106 @@ def _smoothness(size: int) -> Any:
     return (kron(square, eye) + kron(eye, square) + 1e-3 * identity(size * size)).tocsc()
 
 
-def _diagonal(values: Doubles) -> Any:
-    from scipy.sparse import diags
+def _flat(cross: Doubles) -> Doubles:
+    return cross.reshape(-1, cross.shape[2])
 
-    return diags(values).tocsc()
+
+def _products(first: Doubles, second: Doubles) -> Doubles:
+    """Return the products of columns, in pieces that are too small for linear algebra to start threads."""
+    pieces = range(0, len(first), _PIECE)
+    return np.asarray(sum(first[at : at + _PIECE].T @ second[at : at + _PIECE] for at in pieces))
+
+
+class _Band(NamedTuple):
+    """Where the entries of the system of S x S heights are, and how they follow from weights of slopes."""
+
+    places: NDArray[np.intp]  # (m,): in the blocks of `_Solver`
+    of_slopes: Any  # (m, 3 n): from the weights of squares along x, of products, and of squares along y
+    smooth: Doubles  # (m,): entries of second differences
+    diagonal: NDArray[np.intp]  # (S * S,): which entries are on the diagonal
+
+
+@functools.lru_cache(maxsize=4)
+def _band(size: int, pixel_size: tuple[float, float]) -> _Band:
+    from scipy.sparse import coo_matrix
+
+    slopes = _slopes(size, pixel_size)
+    count = slopes.shape[0] // 2
+    (at_x, at_y), (by_x, by_y) = (part.reshape(2, count, -1) for part in (slopes.indices, slopes.data))
+    parts = []
+    for kind, at, by, other_at, other_by in (
+        (0, at_x, by_x, at_x, by_x),
+        (1, at_x, by_x, at_y, by_y),
+        (1, at_y, by_y, at_x, by_x),
+        (2, at_y, by_y, at_y, by_y),
+    ):
+        products = by[:, :, np.newaxis] * other_by[:, np.newaxis]
+        weight = np.broadcast_to(np.arange(count)[:, np.newaxis, np.newaxis] + kind * count, products.shape)
+        row = np.broadcast_to(at[:, :, np.newaxis], products.shape)
+        column = np.broadcast_to(other_at[:, np.newaxis], products.shape)
+        parts.append([values.ravel() for values in (row, column, products, weight)])
+    smooth = _smoothness(size).tocoo()
+    parts.append([smooth.row, smooth.col, smooth.data, np.full(smooth.nnz, 3 * count)])
+    row, column, values, weight = (np.concatenate(each) for each in zip(*parts, strict=True))
+    kept = (row >= column) & (values != 0)
+    row, column, values, weight = (each[kept] for each in (row, column, values, weight))
+    above = row // size - column // size
+    places = ((column // size * (2 * MARGIN + 1) + above) * size + row % size) * size + column % size
+    places, entry = np.unique(places, return_inverse=True)
+    entries = coo_matrix((values, (entry, weight)), (len(places), 3 * count + 1)).tocsc()
+    on_diagonal = row == column
+    diagonal = np.zeros(size * size, np.intp)
+    diagonal[row[on_diagonal]] = entry[on_diagonal]
+    return _Band(places, entries[:, :-1].tocsr(), entries[:, -1].toarray()[:, 0], diagonal)
 
 
 class _Solver:
-    """Cholesky factor L of the banded, symmetric system of a window."""
+    """Cholesky factor L of the banded, symmetric system of a window of S x S heights.
 
-    def __init__(self, matrix: Any) -> None:
-        from scipy.linalg import cholesky_banded
+    It consists of blocks of S x S, one for each row of the window, that are too small for linear algebra to
+    start threads, which would wait for those of other users and of OpenCL.
+    """
 
-        entries = matrix.tocoo()
-        below = entries.row >= entries.col
-        row, column = entries.row[below], entries.col[below]
-        bands = np.zeros((int(np.max(row - column)) + 1, matrix.shape[0]))
-        bands[row - column, column] = entries.data[below]
-        self._factor = cholesky_banded(bands, overwrite_ab=True, lower=True, check_finite=False)
+    _REACH = 2 * MARGIN  # rows of the window that a row depends on
+
+    def __init__(self, pixel_size: tuple[float, float], of_slopes: Doubles, of_heights: Doubles) -> None:
+        """Decompose the system with weights of slopes, (3, n), see `_Band`, and of heights, (S * S,)."""
+        size = self._size = math.isqrt(len(of_heights))
+        band = _band(size, pixel_size)
+        entries = band.of_slopes @ of_slopes.ravel()
+        entries[band.diagonal] += of_heights
+        self.smoothing = _SMOOTH * float(np.mean(entries[band.diagonal]))
+        blocks = np.zeros((size + self._REACH, 1 + self._REACH, size, size))
+        blocks.ravel()[band.places] = entries + self.smoothing * band.smooth
+        self._inverse = np.empty((size, size, size))  # of blocks of L on the diagonal
+        self._below = np.empty((size, self._REACH, size, size))
+        for number in range(size):
+            self._inverse[number] = np.linalg.inv(np.linalg.cholesky(blocks[number, 0]))
+            below = np.matmul(blocks[number, 1:], self._inverse[number].T, out=self._below[number])
+            for further in range(self._REACH):
+                blocks[number + 1 + further, : self._REACH - further] -= below[further:] @ below[further].T
 
     def forward(self, right: Doubles) -> Doubles:
         """Return L^-1 times right sides, (S * S, k)."""
-        return self._solved(right, "N")
+        rows = self._rows(right)
+        for number, inverse in enumerate(self._inverse):
+            rows[number] = inverse @ rows[number]
+            rows[number + 1 : number + 1 + self._REACH] -= self._below[number] @ rows[number]
+        return rows[: self._size].reshape(right.shape)
 
     def backward(self, right: Doubles) -> Doubles:
         """Return L^-T times right sides, (S * S, k)."""
-        return self._solved(right, "T")
+        rows = self._rows(right)
+        for number in reversed(range(self._size)):
+            further = rows[number + 1 : number + 1 + self._REACH]
+            rows[number] -= np.sum(self._below[number].transpose(0, 2, 1) @ further, axis=0)
+            rows[number] = self._inverse[number].T @ rows[number]
+        return rows[: self._size].reshape(right.shape)
 
-    def _solved(self, right: Doubles, transposed: str) -> Doubles:
-        from scipy.linalg.lapack import dtbtrs
-
-        return np.asarray(dtbtrs(self._factor, right, uplo="L", trans=transposed)[0])
+    def _rows(self, right: Doubles) -> Doubles:
+        rows = np.zeros((self._size + self._REACH, self._size, right.shape[1]))
+        rows[: self._size] = right.reshape(self._size, self._size, -1)
+        return rows
 
 
 # --- reading ------------------------------------------------------------------------------------------------
@@ -383,6 +449,7 @@ _LEAST_FRAMES = 4
 _SIDE = 48  # pixels along a side of a window
 _LEAST_SIDE = 16
 _WINDOWS = 2  # of a touch, at most
+_AROUND = 2 * MARGIN + BORDER  # pixels next to the inner ones of a window on which they depend
 _LEAST_USABLE = 0.05  # share of the pixels of a window at which the model holds
 _LEAST_NOISE = 0.3  # counts of 8 bits: rounding
 _FLICKER = 4.0  # the light of frames may differ by this times the usual standard deviation, unless stated
@@ -423,6 +490,7 @@ class Touch:
     tilt_seen: float  # radians: half-angle that the amplitude of the brightness shows
     misfits: Doubles  # of first slopes to surfaces; see `Window.start`
     varied: bool  # whether its slopes are not all alike
+    is_warm: bool  # whether its surfaces are those of an earlier fit
     noise: float = 1.0  # variance of a sample
 
     @property
@@ -472,6 +540,7 @@ class TouchReader:
     half: Doubles  # (H, W): half-widths of their intervals, mm
     relief: Doubles  # (H, W): heights that register frames, mm
     device: str | Device | None
+    earlier: Touch | None = None  # the same touch, read with almost the same movement
 
     @classmethod
     def of(cls, press: Source, turn: Source, device: str | Device | None = None) -> TouchReader:
@@ -493,13 +562,13 @@ class TouchReader:
         return cls(turn, evidence.heights.height, half, fill_with_nearest(relief), device)
 
     def with_heights(self, touch: Touch) -> TouchReader:
-        """Return the reader with the heights of a touch's surfaces to register frames."""
+        """Return the reader with the surfaces of a touch, to register frames and to start with."""
         relief = self.relief.copy()
         for window in touch.windows:
             part = relief[window.place]
             usable = window.usable.reshape(part.shape)
             part[usable] = window.heights[window.usable]
-        return replace(self, relief=relief)
+        return replace(self, relief=relief, earlier=touch)
 
     def read(self, sensor: SensorModel, sense: int, ahead: float) -> Touch:
         """Read the turn, with its phases times ``sense``, 1 or -1, plus ``ahead``, radians."""
@@ -521,88 +590,153 @@ class TouchReader:
         with naming(self.turn):
             return self._touch(frames, phase, noise_gain, sensor)
 
-    def _crosses_no_edge(self, steepness: Doubles, size: tuple[float, float]) -> NDArray[np.bool_]:
-        """Return the pixels at which differences of heights, by which slopes are computed, cross no edge.
-
-        From one pixel to the next, heights of the press change there by more than the steepness, (H, W),
-        explains.
-        """
-        clear = np.ones(self.middle.shape, np.bool_)
-        for axis, pixel in ((1, size[0]), (0, size[1])):
-            height, half, steep = (np.moveaxis(part, axis, 0) for part in (self.middle, self.half, steepness))
-            expected = _STEEPER * pixel * np.fmax(steep[1:], steep[:-1])
-            expected += _EDGE * np.hypot(half[1:], half[:-1]) / math.sqrt(3)
-            steps = np.pad(np.abs(np.diff(height, axis=0)) > expected, ((MARGIN, MARGIN), (0, 0)))
-            count = len(height)
-            for shift in range(2 * MARGIN):
-                np.moveaxis(clear, axis, 0)[...] &= ~steps[shift : shift + count]
-        return clear
-
     def _touch(self, frames: NDArray[Any], phase: Doubles, noise_gain: float, sensor: SensorModel) -> Touch:
-        header, shape, size = self.turn.header, self.turn.shape[1:], pixel_size_of(self.turn)
-        whole = valid(frames).all(axis=0)
-        frames = frames.astype(np.float64)
+        header, shape = self.turn.header, self.turn.shape[1:]
+        whole: NDArray[np.bool_] = np.asarray(valid(frames).all(axis=0))
         for level in (sensor.gain, sensor.base, sensor.dark):
             whole &= np.isfinite(level)
         if not whole.any():
             raise InputError("no pixel has valid samples in all frames: shorten the exposure")
-        light = frames - sensor.dark
-        full = float(np.max(light[:, whole])) if sensor.full is None else sensor.full
-        with np.errstate(invalid="ignore", divide="ignore"):
-            wave = _wave((frames - sensor.base) / sensor.gain, phase, sensor.tilt)
-            tilt_seen = _tilt_seen(wave, sensor.tilt)
-            least = np.min(light, axis=0)
-            gentle = np.isfinite(self.middle) & (least > LEAST_LIGHT * full) & (wave[0] < _GENTLE * tilt_seen)
-            shown = whole & (gentle | shows_model(wave, least, tilt_seen, full))
-        usable = shown & (np.abs(wave[0] / tilt_seen - 1) > _NEAR_AXIS)
-        if sensor.pivot is not None:
-            usable = _without_border(usable)
-        smooth = self._crosses_no_edge(np.where(whole, np.tan(np.minimum(wave[0], _STEEPEST)), np.nan), size)
-        usable &= smooth
         counts = frames[:, whole]
-        arm = None
-        if sensor.pivot is not None and header.press is not None:
-            arm = header.press - sensor.pivot[2]
+        extremes = np.array([np.min(counts), np.max(counts)], np.float64)
+        if sensor.full is None:
+            sensor = sensor._replace(full=float(np.max(counts - sensor.dark[whole])))
+        if self.earlier is None:
+            part = slice(0, shape[0]), slice(0, shape[1])
+            view = self._view(frames, phase, whole, sensor, part)
+            views = [(place, view) for place in _places(view.usable, view.wave)]
+        else:
+            views = []
+            for window in self.earlier.windows:
+                rows, columns = (
+                    slice(max(0, each.start - _AROUND), each.stop + _AROUND) for each in window.place
+                )
+                place = tuple(slice(each.start - MARGIN, each.stop + MARGIN) for each in window.place)
+                views.append(
+                    ((place[0], place[1]), self._view(frames, phase, whole, sensor, (rows, columns)))
+                )
         windows, misfits, slopes = list[Window](), np.zeros((2, len(TURNS))), list[Doubles]()
-        x, y = np.meshgrid(*picture_axes(shape))
-        for outer in _places(usable, wave):
-            inner = [slice(part.start + MARGIN, part.stop - MARGIN) for part in outer]
-            chosen = usable[*inner].ravel()
-            gain, base, dark = (
-                np.where(chosen, values[*inner].ravel(), 1.0)
-                for values in (sensor.gain, sensor.base, sensor.dark)
-            )
-            window = Window(
-                counts=np.where(chosen, frames[:, *inner].reshape(len(frames), -1), 0.0),
-                scale=PixelScale(gain, base, dark, full),
-                places=np.stack(uneven_terms(x[*inner].ravel(), y[*inner].ravel())),
-                pixel_size=size,
-                place=(inner[0], inner[1]),
-                usable=chosen,
-                middle=np.where(shown, self.middle, np.nan)[outer].ravel(),
-                half=np.where(shown, self.half, np.nan)[outer].ravel(),
-                relief=self.relief[*inner].ravel(),
-                z=np.zeros(self.middle[outer].size),
-                noise_gain=noise_gain,
-                smooth=smooth[*inner].astype(np.float64),
-            )
-            seen = np.nan_to_num(wave[:, *inner].reshape(3, -1))
-            misfits += window.start(seen)
-            slopes.append(_slopes_of(seen[:, chosen]))
+        for number, (place, view) in enumerate(views):
+            window, wave = self._window(frames, sensor, noise_gain, place, view)
+            if self.earlier is None:
+                misfits += window.start(wave)
+            else:
+                window.z = self.earlier.windows[number].z
+                window.usable &= self.earlier.windows[number].usable
+            if not window.usable.any():
+                continue
             windows.append(window)
+            slopes.append(_slopes_of(wave[:, window.usable]))
         return Touch(
             name=self.turn.name,
             windows=windows,
-            poses=Poses(phase[:, np.newaxis], sensor.tilt, arm),
+            poses=Poses(phase[:, np.newaxis], sensor.tilt, self._arm(sensor)),
             phase=phase,
-            frame_covariance=_frame_covariance(header, phase, counts),
-            frame_values=np.zeros(2 * len(phase)),
-            least_noise=_LEAST_NOISE * count_of(counts),
+            frame_covariance=_frame_covariance(header, phase, extremes),
+            frame_values=np.zeros(2 * len(phase)) if self.earlier is None else self.earlier.frame_values,
+            least_noise=_LEAST_NOISE * count_of(extremes),
             time=_time_of(header),
-            tilt_seen=tilt_seen,
+            tilt_seen=float(np.median([view.tilt_seen for _, view in views])) if views else sensor.tilt,
             misfits=misfits,
+            is_warm=self.earlier is not None,
             varied=bool(slopes) and _vary(np.concatenate(slopes, axis=1)),
         )
+
+    def _arm(self, sensor: SensorModel) -> float | None:
+        press = self.turn.header.press
+        return None if sensor.pivot is None or press is None else press - sensor.pivot[2]
+
+    def _view(
+        self, frames: NDArray[Any], phase: Doubles, whole: NDArray[np.bool_], sensor: SensorModel,
+        part: tuple[slice, slice],
+    ) -> _View:  # fmt: skip
+        """Return what frames show in a part of the picture."""
+        assert sensor.full is not None
+        counts, middle = frames[:, *part].astype(np.float64), self.middle[part]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            wave = _wave((counts - sensor.base[part]) / sensor.gain[part], phase, sensor.tilt)
+            tilt_seen, least = _tilt_seen(wave, sensor.tilt), np.min(counts, axis=0) - sensor.dark[part]
+            gentle = (
+                np.isfinite(middle) & (least > LEAST_LIGHT * sensor.full) & (wave[0] < _GENTLE * tilt_seen)
+            )
+            shown = whole[part] & (gentle | shows_model(wave, least, tilt_seen, sensor.full))
+        usable = shown & (np.abs(wave[0] / tilt_seen - 1) > _NEAR_AXIS)
+        if sensor.pivot is not None:
+            usable = _without_border(usable)
+        steepness = np.where(whole[part], np.tan(np.minimum(wave[0], _STEEPEST)), np.nan)
+        smooth = _crosses_no_edge(middle, self.half[part], steepness, pixel_size_of(self.turn))
+        return _View(part, wave, shown, usable & smooth, smooth, tilt_seen)
+
+    def _window(
+        self, frames: NDArray[Any], sensor: SensorModel, noise_gain: float, place: tuple[slice, slice],
+        view: _View,
+    ) -> tuple[Window, Doubles]:  # fmt: skip
+        """Return the window at a place, and the waves of its inner pixels, (3, n)."""
+        assert sensor.full is not None
+        rows, columns = (slice(part.start + MARGIN, part.stop - MARGIN) for part in place)
+        inner, seen = (rows, columns), view.of((rows, columns))
+        usable, shown = view.usable[seen].ravel(), view.shown[view.of(place)]
+        gain, base, dark = (
+            np.where(usable, values[inner].ravel(), 1.0) for values in (sensor.gain, sensor.base, sensor.dark)
+        )
+        x, y = (
+            axis[part] for axis, part in zip(picture_axes(frames.shape[1:]), (columns, rows), strict=True)
+        )
+        window = Window(
+            counts=np.where(usable, frames[:, rows, columns].reshape(len(frames), -1), 0.0).astype(
+                np.float64
+            ),
+            scale=PixelScale(gain, base, dark, sensor.full),
+            places=np.stack(uneven_terms(*(axis.ravel() for axis in np.meshgrid(x, y)))),
+            pixel_size=pixel_size_of(self.turn),
+            place=inner,
+            usable=usable,
+            middle=np.where(shown, self.middle[place], np.nan).ravel(),
+            half=np.where(shown, self.half[place], np.nan).ravel(),
+            relief=self.relief[inner].ravel(),
+            z=np.zeros(shown.size),
+            noise_gain=noise_gain,
+            smooth=view.smooth[seen].astype(np.float64),
+        )
+        return window, np.nan_to_num(view.wave[:, *seen].reshape(3, -1))
+
+
+class _View(NamedTuple):
+    """What frames show in a part of a picture."""
+
+    part: tuple[slice, slice]
+    wave: Doubles  # (3, H, W): see `_wave`
+    shown: NDArray[np.bool_]  # (H, W): whether the model holds
+    usable: NDArray[np.bool_]  # (H, W): whether samples can be used
+    smooth: NDArray[np.bool_]  # (H, W): whether slopes cross no edge
+    tilt_seen: float
+
+    def of(self, place: tuple[slice, slice]) -> tuple[slice, slice]:
+        """Return the rows and columns of a place of the picture in the part."""
+        rows, columns = (
+            slice(each.start - part.start, each.stop - part.start)
+            for each, part in zip(place, self.part, strict=True)
+        )
+        return rows, columns
+
+
+def _crosses_no_edge(
+    middle: Doubles, half: Doubles, steepness: Doubles, size: tuple[float, float]
+) -> NDArray[np.bool_]:
+    """Return the pixels, (H, W), at which the differences of heights that slopes are cross no edge.
+
+    From one pixel to the next, heights of the press, the ``middle`` of intervals, change there by more than
+    the steepness explains.
+    """
+    clear = np.ones(middle.shape, np.bool_)
+    for axis, pixel in ((1, size[0]), (0, size[1])):
+        height, width, steep = (np.moveaxis(part, axis, 0) for part in (middle, half, steepness))
+        expected = _STEEPER * pixel * np.fmax(steep[1:], steep[:-1])
+        expected += _EDGE * np.hypot(width[1:], width[:-1]) / math.sqrt(3)
+        steps = np.pad(np.abs(np.diff(height, axis=0)) > expected, ((MARGIN, MARGIN), (0, 0)))
+        for shift in range(2 * MARGIN):
+            np.moveaxis(clear, axis, 0)[...] &= ~steps[shift : shift + len(height)]
+    return clear
 
 
 def _without_border(usable: NDArray[np.bool_]) -> NDArray[np.bool_]:

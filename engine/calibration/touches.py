@@ -44,6 +44,7 @@ from mirrorskin.kernels.device import Device
 
 _ITERATIONS = 10  # Gauss-Newton steps, at most
 _SETTLED = 0.1  # largest last step, in standard errors
+_NEARLY_SETTLED = 0.5  # the same, of a fit that is repeated
 _ROUGHLY = 2  # steps before outliers are excluded; in an exact fit, heights then stay as they are
 _CONTRADICTION = 3.0  # standard deviations between a prior and the touches
 _NEGLIGIBLE = 1e-6  # standard deviation of a parameter that is not estimated
@@ -641,13 +642,12 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: _Priors, memory: _Mem
     near the true ones, takes heights of presses from their intervals.
     """
     values, precision = start.copy(), np.diag(priors.sigma**-2.0)
+    roughly = 0 if not exact and all(touch.is_warm for touch in touches) else _ROUGHLY
     for number in range(_ITERATIONS):
         matrix, vector = memory.matrix.copy(), memory.vector.copy()
         steps = []
         for touch, weight in zip(touches, memory.weights, strict=False):
-            information, push, step = _eliminate(
-                touch, values, number == _ROUGHLY, exact and number < _ROUGHLY
-            )
+            information, push, step = _eliminate(touch, values, number == roughly, exact and number < roughly)
             matrix += weight * information
             vector += weight * (information @ values + push)
             steps.append(step)
@@ -656,7 +656,8 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: _Priors, memory: _Mem
         for of_touch in steps:
             of_touch(step)
         values = values + step
-        if number > _ROUGHLY and np.all(np.abs(step) < _SETTLED * np.sqrt(np.diag(covariance))):
+        settled = _SETTLED if exact else _NEARLY_SETTLED
+        if number >= roughly and np.all(np.abs(step) < settled * np.sqrt(np.diag(covariance))):
             break
     return _Fitted(values, matrix, vector, (covariance + covariance.T) / 2)
 
