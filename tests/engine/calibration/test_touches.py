@@ -298,6 +298,31 @@ def test_old_touches_are_forgotten():
     assert forgotten.response.sigma["gain"] == pytest.approx(alone.response.sigma["gain"], rel=0.15)
 
 
+@pytest.mark.slow
+def test_gain_that_falls_is_followed():
+    lights = [touches_of(1, first=seed)[0] for seed in range(4)]
+    calibration, errors = None, []
+    for hour in range(24):
+        press, turn = lights[hour % 4]
+        gain = 1 - 0.0005 * hour
+        frames = turn.read(np.empty(turn.shape, turn.dtype)).frames.astype(np.float64)
+        turn.rewind()
+        noise = np.random.default_rng(hour).uniform(-0.5, 0.5, frames.shape)
+        dark = np.median(turn.header.dark)
+        dimmed = np.clip(np.rint(dark + gain * (frames - dark) + noise), 0, 255).astype(np.uint8)
+        header = replace(turn.header, start_time=f"2026-01-{1 + hour // 24:02}T{hour % 24:02}:00:00")
+        stated = {
+            name: getattr(header, name) for name in ("tilt", "press", "pivot", "zenith_gain", "zenith_offset")
+        }
+        stated |= {name: getattr(header, name) for name in ("pixel_size", "dark", "bright", "start_time")}
+        recording = ArrayRecording(dimmed, {"phase": PHASE}, stated)
+        fit = from_touches([(press, recording)], calibration=calibration, forget=5 * 3600.0)
+        calibration = calibration_of(fit, calibration)
+        errors.append(np.median(fit.response.gain) / (gain * np.median(header.zenith_gain)) - 1)
+        press.rewind()
+    assert np.sqrt(np.mean(np.square(errors[8:]))) < 0.005
+
+
 def test_forgetting_needs_start_times():
     with pytest.raises(io.InputError, match="start time"):
         from_touches(touches_of(1), forget=86400.0)

@@ -1,0 +1,166 @@
+"""How calibration from touches follows a lamp that ages.
+
+``python evaluation/calibration/ageing.py [--recordings 100] [--freeze]`` prints the error of the gain for
+some time constants of forgetting, and writes the table into docs/method/touches.md. The gain of the sensor
+falls by 5 % over all recordings, one of a textured object every hour. Each is added to the calibration from
+all earlier ones, and the result is compared with the gain in this recording.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin import io
+from mirrorskin.engine.calibration import from_touches
+from mirrorskin.evaluation.base.sources import Frames
+from mirrorskin.evaluation.base.tables import Table, replace_part
+from mirrorskin.twin import Axial, Camera, Twin, Vertical
+
+Map = NDArray[np.float64]
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "method" / "touches.md"
+SHAPE, PIXEL, PRESS = (56, 56), 0.03, 1.6
+TILT, PHASE = math.radians(2.5), np.arange(12) * np.pi / 6
+NOISE = 1.5  # counts
+OBJECTS = 8  # that are touched in turn
+FALL = 0.05  # of the gain, over all recordings
+HOURS = 3.0, 5.0, 10.0, math.inf  # time constants; recordings are an hour apart
+START = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+@dataclass(frozen=True, slots=True)
+class Textured:
+    """Random waves, of 0.35 mm and longer, on a blunt cone."""
+
+    seed: int
+    name: str = "textured cone"
+    radius: float = 5.0
+
+    def _waves(self) -> Iterator[tuple[float, float, float, float]]:
+        random = np.random.default_rng(self.seed)
+        number = 2 * np.pi / random.uniform(0.35, 1.05, 14)
+        azimuth, phase = random.uniform(0, 2 * np.pi, (2, 14))
+        size = 0.12 * np.sqrt(2 / 14) / number
+        return zip(number * np.cos(azimuth), number * np.sin(azimuth), phase, size, strict=True)
+
+    def height(self, x: Map, y: Map, /) -> Map:
+        """Return its heights, mm."""
+        height = -0.35 - 0.5 * np.hypot(np.hypot(x, y), 0.3)
+        for across, along, phase, size in self._waves():
+            height = height + size * np.sin(across * x + along * y + phase)
+        return np.where(np.hypot(x, y) < self.radius, height, np.nan)
+
+    def slope(self, x: Map, y: Map, /) -> tuple[Map, Map]:
+        """Return its slopes."""
+        fall = -0.5 / np.sqrt(x**2 + y**2 + 0.09)
+        slope_x, slope_y = fall * x, fall * y
+        for across, along, phase, size in self._waves():
+            wave = size * np.cos(across * x + along * y + phase)
+            slope_x, slope_y = slope_x + across * wave, slope_y + along * wave
+        inside = np.hypot(x, y) < self.radius
+        return np.where(inside, slope_x, np.nan), np.where(inside, slope_y, np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """A touch without noise: frames and headers of press and turn."""
+
+    frames: tuple[Map, Map]
+    headers: tuple[io.Header, io.Header]
+    travel: Map
+
+    @classmethod
+    def of(cls, seed: int) -> Light:
+        """Render a touch."""
+        travel = np.arange(0.03, PRESS, 0.03)
+        field: dict[str, Any] = {"object": Textured(seed), "shape": SHAPE, "pixel_size": PIXEL}
+        field |= {
+            "object_shift": (0.6, 0.3),
+            "camera": Camera(dtype=np.dtype(np.float32), noise=0.0, bits=None),
+        }
+        movement = Axial(PHASE, tilt=TILT, press=PRESS, pivot=(0.0, 0.0, 1.0))
+        twins = Twin(movement=Vertical(travel), **field), Twin(movement=movement, pattern="linear", **field)
+        press, turn = (_all_frames(twin) for twin in twins)
+        return cls((press, turn), (twins[0].header, twins[1].header), travel)
+
+    def taken(self, number: int, gain: float) -> tuple[Frames, Frames]:
+        """Return a recording of it in the light of a lamp that has aged, with noise."""
+        noise = np.random.default_rng(1000 + number)
+        dark = np.median(np.asarray(self.headers[1].dark))
+        press, turn = (
+            np.clip(
+                np.rint(dark + share * (light - dark) + NOISE * noise.standard_normal(light.shape)), 0, 255
+            )
+            for light, share in zip(self.frames, (1.0, gain), strict=True)
+        )
+        time = (START + timedelta(hours=number)).isoformat()
+        headers = [replace(header, start_time=time) for header in self.headers]
+        return (
+            Frames(press.astype(np.uint8), headers[0], f"press {number}", travel=self.travel),
+            Frames(turn.astype(np.uint8), headers[1], f"turn {number}", phase=PHASE),
+        )
+
+
+def _all_frames(twin: Twin) -> Map:
+    block = twin.read(np.empty(twin.shape, np.float32))
+    assert block is not None
+    return block.frames.astype(np.float64)
+
+
+def errors_of(lights: Sequence[Light], recordings: int, hours: float) -> Map:
+    """Return the error of the gain after each recording, %, if touches are forgotten with a time constant."""
+    before = io.Calibration(io.CameraId("", SHAPE, np.dtype(np.uint8)))
+    errors = []
+    for number in range(recordings):
+        gain = 1 - FALL * number / max(recordings - 1, 1)
+        light = lights[number % len(lights)]
+        fit = from_touches(
+            [light.taken(number, gain)],
+            calibration=before,
+            forget=3600 * hours if math.isfinite(hours) else None,
+        )
+        before = replace(before, response=fit.response, precession=fit.precession)
+        true = gain * float(np.median(np.asarray(light.headers[1].zenith_gain)))
+        errors.append(100 * (float(np.median(fit.response.gain)) / true - 1))
+    return np.array(errors)
+
+
+def table(recordings: int) -> Table:
+    """Return the errors by time constant."""
+    lights = [Light.of(seed) for seed in range(OBJECTS)]
+    rows = []
+    for hours in HOURS:
+        errors = errors_of(lights, recordings, hours)
+        settled = errors[recordings // 5 :]
+        numbers = (np.sqrt(np.mean(settled**2)), np.mean(settled), np.max(np.abs(settled)))
+        rows.append(
+            ("never" if math.isinf(hours) else f"{hours:g}", *(f"{number:.2f}" for number in numbers))
+        )
+    head = ("time constant, recordings", "RMS error of the gain, %", "mean, %", "largest, %")
+    return Table(f"A gain that falls by {100 * FALL:g} % over {recordings} recordings", head, rows)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description="How calibration from touches follows a lamp that ages.")
+    parser.add_argument("--recordings", type=int, default=100, help="number of recordings")
+    parser.add_argument("--freeze", action="store_true", help="write the table into the page")
+    options = parser.parse_args()
+    found = table(options.recordings)
+    print(found)
+    if options.freeze:
+        page = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(replace_part(page, "ageing", found.as_markdown("---:")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
