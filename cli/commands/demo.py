@@ -68,10 +68,13 @@ TURN = (
     f"axial {_CAMERA} --size 240x240 --pixel-size 0.05mm --pattern linear --references exact"
     " --frames 8 --press 1.5mm --tilt 2.5deg"
 )
+_TOUCH_TITLE = "Touch: ball, 10 mm in diameter, until 95 % of the pixels have a standard deviation of 1 µm"
+_TOUCH: dict[str, Any] = {"shape": (96, 128), "pixel_size": 0.03, "pattern": "linear", "rate": 20.0}
+_TOUCH_SIGMA, _TOUCH_DEEPEST, _TOUCH_START = 0.001, 0.6, -1.0  # mm
 _TURN, _FUSED_PRESS = "fig10a", "fig5"
 # The method of the normals, and whether the frames are registered with the true heights.
 _METHODS = {"paper": ("paper", False), "exact": ("exact", False), "exact, registered": ("exact", True)}
-_STEPS = len(PRESSES) + 2
+_STEPS = len(PRESSES) + 3
 
 _HEIGHTS = ["figure", "method", "answered", "RMS", "mean", "99 %", "filled", "RMS of filled"]
 _HEIGHTS_LEGEND = """\
@@ -117,11 +120,13 @@ def command(
         for number, (name, press) in enumerate(PRESSES.items(), 1):
             _announce(f"{number} of {_STEPS}: {press.title}")
             scores[name] = _press(name, press, output, device, overwrite, draw)
-        _announce(f"{_STEPS - 1} of {_STEPS}: {_TURN_TITLE}")
+        _announce(f"{_STEPS - 2} of {_STEPS}: {_TURN_TITLE}")
         truth, results = _turn(output, device, overwrite, draw)
         scores[_TURN] = _judge(results, truth)
-        _announce(f"{_STEPS} of {_STEPS}: {_FUSED_TITLE}")
+        _announce(f"{_STEPS - 1} of {_STEPS}: {_FUSED_TITLE}")
         scores |= _surfaces(results, truth, output, device, overwrite, draw)
+        _announce(f"{_STEPS} of {_STEPS}: {_TOUCH_TITLE}")
+        scores["touch"] = _touch(output, device, overwrite, draw)
     if as_json:
         print_json(scores)
         return
@@ -237,6 +242,48 @@ def _fuse(folder: Path, device: str | None, overwrite: bool) -> io.Result:
         result = engine.fuse(vertical, axial, device=device, progress=show)
     io.save_result(result, folder / "fused-result.h5", overwrite=overwrite)
     return result
+
+
+def _touch(folder: Path, device: str | None, overwrite: bool, draw: Draw) -> Scores:
+    """Touch a ball on the emulated rig, on simulated time, and draw its surface and that of the press."""
+    import numpy as np
+
+    from mirrorskin import engine, io, view
+    from mirrorskin.hw.rig.rig import Rig
+    from mirrorskin.hw.rig.touch import RigTouch
+    from mirrorskin.twin import Axial
+    from mirrorskin.twin.emulator.rig import EmulatedRig
+    from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
+
+    clock = SimulatedClock()
+    with EmulatedRig("sphere", clock=clock, **_TOUCH) as emulated:
+        settings = emulated.settings
+        with (
+            Rig(emulated.open_stage(settings.stage), emulated.camera, settings, clock) as rig,
+            RigTouch(rig, _TOUCH_DEEPEST, _TOUCH_START) as sensor,
+        ):
+            outcome = engine.live.touch(sensor, _TOUCH_SIGMA, device=device)
+        header, phase = outcome.turn.header, outcome.turn.phase
+        assert header.tilt is not None
+        assert header.press is not None
+        assert phase is not None
+        truth = emulated.twin(Axial(phase, header.tilt, header.press)).truth
+    _announce(f"  {outcome}")
+    io.save_touch(folder / "touch.h5", outcome.press, outcome.turn, overwrite=overwrite)
+    io.save_result(outcome.result, folder / "touch-result.h5", overwrite=overwrite)
+    with io.open_recording(folder / "touch.h5") as press:
+        pressed = engine.reconstruct(press, method="change-point", fill=False, device=device)
+    result = outcome.result
+    # What a touch counts: beyond the normals only the press has heights, and some parts have no offset.
+    unknown = np.append(result.offset_unknown, 0)[result.component] != 0
+    counted = (np.isfinite(result.normals[..., 0]) & ~unknown) | (result.filled > 0)
+    touched = result.assign(
+        height=np.where(counted, result.height, np.float32(np.nan)),
+        offset_unknown=np.zeros_like(result.offset_unknown),
+    )
+    results = {"press": pressed, "touch": touched}
+    draw(view.surface_figure, results, truth, _TOUCH_TITLE, folder / "touch.png")
+    return _judge(results, truth)
 
 
 def _record(line: str, path: Path, device: str | None, overwrite: bool) -> io.Truth:

@@ -15,7 +15,7 @@ from mirrorskin import io, view
 from mirrorskin.cli.commands import demo
 from mirrorskin.view.drawing import canvas
 
-FIGURES = "fig5", "fig6", "fig10a", "fig10b", "fused"
+FIGURES = "fig5", "fig6", "fig10a", "fig10b", "fused", "touch"
 PRESSED = "sub-frame", "eq. 4"
 TURNED = "paper", "exact", "exact, registered"
 HEIGHTS = [
@@ -25,6 +25,8 @@ HEIGHTS = [
     ["fig10b", "rotation"],
     ["fused", "press"],
     ["fused", "press and rotation"],
+    ["touch", "press"],
+    ["touch", "touch"],
 ]
 
 
@@ -46,7 +48,7 @@ def shown(tmp_path_factory):
         ended = run("demo -o", folder)
     assert ended.code == 0, ended.said
     steps = ended.said.splitlines()
-    assert [step.split(":")[0] for step in steps if step[0] != " "] == [f"{n} of 4" for n in range(1, 5)]
+    assert [step.split(":")[0] for step in steps if step[0] != " "] == [f"{n} of 5" for n in range(1, 6)]
     assert [step for step in steps if "simulating" in step] == [
         f"  simulating the sensor: {name}.h5" for name in ("fig5", "fig6", "fig10a")
     ]
@@ -58,7 +60,9 @@ def shown(tmp_path_factory):
 def test_recordings_results_and_figures_are_kept(shown):
     _, folder = shown
     files = {f"{name}{end}" for name in ("fig5", "fig6") for end in (".h5", "-result.h5")}
-    files |= {"fig10a.h5", "fused-result.h5"} | {f"{name}.png" for name in FIGURES}
+    files |= {"fig10a.h5", "fused-result.h5", "touch.h5", "touch-result.h5"} | {
+        f"{name}.png" for name in FIGURES
+    }
     files |= {f"fig10a-{method.replace(', ', '-')}-result.h5" for method in TURNED}
     assert {path.name for path in folder.iterdir()} == files
     for name in FIGURES:
