@@ -105,7 +105,7 @@ def conjugate_gradients(
         steepest = here.project(here.precondition(residual))
         before, gain = gain, inner(residual, steepest)
         if last is None or direction is None:
-            direction = steepest
+            direction = steepest.astype(target.dtype, copy=False)
         else:
             memory = np.maximum(gain - inner(last, steepest), 0) / np.maximum(before, tiny)
             direction = steepest + memory * direction
