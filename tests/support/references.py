@@ -95,8 +95,10 @@ def agree(
     macros, frames = values.get("macros", {}), values.get("frames", values.get("frame"))
     if isinstance(frames, np.ndarray):
         macros = {"FRAME": C_TYPES[frames.dtype.name], "BITS": 8 * frames.itemsize} | macros
+    group = 1  # items that share a sum
     if f"__kernel GROUP_SIZE void {name}(" in SOURCES[KERNELS[name]]:
-        macros = {"GROUP": device.layout.group} | macros
+        group = device.layout.group
+        macros = {"GROUP": group} | macros
     kernel = device.kernel(KERNELS[name], name, **macros)
     pixels, tile = rows * columns, device.layout.tile
     sizes = {"rows": rows, "columns": columns, "pixels": pixels}
@@ -118,7 +120,7 @@ def agree(
 
     arrays = {}
     for key in kernel.arguments:
-        values_in = values[key] if key in values else _untouched(expected[key], items)
+        values_in = values[key] if key in values else _untouched(expected[key], -(-items // group))
         if key == "frames" and max(values.get("each", 0), values.get("stride", 0)) > pixels:
             # The reference sees the pixels of rows.
             values_in = expected[key] = np.pad(values_in, ((0, 0), (0, 3)), constant_values=77)
