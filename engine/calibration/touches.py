@@ -47,6 +47,7 @@ _SETTLED = 0.1  # largest last step, in standard errors
 _NEARLY_SETTLED = 0.5  # the same, of a fit that is repeated
 _ROUGHLY = 2  # steps before outliers are excluded; in an exact fit, heights then stay as they are
 _CONTRADICTION = 3.0  # standard deviations between a prior and the touches
+_WELL_SHOWN = 0.008  # relative standard error of gain and half-angle by a touch, up to which noise prevails
 _NEGLIGIBLE = 1e-6  # standard deviation of a parameter that is not estimated
 _MOVED = 0.02  # pixels that points move by an error of the pivot, from which frames are registered again
 _UNKNOWN = {
@@ -648,6 +649,7 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: _Priors, memory: _Mem
         steps = []
         for touch, weight in zip(touches, memory.weights, strict=False):
             information, push, step = _eliminate(touch, values, number == roughly, exact and number < roughly)
+            weight = weight * _trust(information, priors)
             matrix += weight * information
             vector += weight * (information @ values + push)
             steps.append(step)
@@ -660,6 +662,20 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: _Priors, memory: _Mem
         if number >= roughly and np.all(np.abs(step) < settled * np.sqrt(np.diag(covariance))):
             break
     return _Fitted(values, matrix, vector, (covariance + covariance.T) / 2)
+
+
+def _trust(information: Doubles, priors: _Priors) -> float:
+    """Return the weight of a touch: 1 if it alone shows the gain and the half-angle well.
+
+    An error of the model of a tenth of a count changes the parameters by their variance times its slope by
+    them: the less a touch shows, the more the error exceeds the noise.
+    """
+    at = [SHARED.index("zenith_gain"), SHARED.index("tilt")]
+    sigma = priors.sigma.copy()
+    sigma[at] *= _WITHOUT
+    covariance = np.linalg.inv(information + np.diag(sigma**-2.0))
+    alone = math.sqrt(float(np.max(np.diag(covariance)[at])))
+    return min(1.0, (_WELL_SHOWN / alone) ** 4)
 
 
 def _eliminate(

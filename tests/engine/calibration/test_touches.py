@@ -123,6 +123,18 @@ def test_gain_is_known_to_half_a_percent_from_two_touches():
     assert gain.sigma / gain.value < 0.005
 
 
+def test_periodic_texture_pressed_in_few_steps_is_honest():
+    thing = {"object": "texture", "shape": (120, 160), "pixel_size": 0.04}
+    press = Twin(movement=Vertical(np.linspace(-0.3, 1.0, 17)), camera=Camera(seed=2), **thing)
+    movement = Axial(np.arange(8) * np.pi / 4, tilt=TILT, press=1.0)
+    turn = Twin(movement=movement, pattern="linear", camera=Camera(seed=102), **thing)
+    found, header = named(from_touches([(press, turn)])), turn.header
+    truth = {"gamma": 1.0, "tilt": TILT}
+    truth |= {name: float(np.median(getattr(header, name))) for name in ("zenith_gain", "zenith_offset")}
+    away = {name: (found[name].value - value) / found[name].sigma for name, value in truth.items()}
+    assert max(map(abs, away.values())) < 3, away
+
+
 @pytest.mark.slow
 def test_errors_are_as_large_as_their_standard_errors():
     seeds = 50
