@@ -249,6 +249,7 @@ def _touch(folder: Path, device: str | None, overwrite: bool, draw: Draw) -> Sco
     import numpy as np
 
     from mirrorskin import engine, io, view
+    from mirrorskin.engine.fusion.solver import is_relative
     from mirrorskin.hw.rig.rig import Rig
     from mirrorskin.hw.rig.touch import RigTouch
     from mirrorskin.twin import Axial
@@ -275,8 +276,7 @@ def _touch(folder: Path, device: str | None, overwrite: bool, draw: Draw) -> Sco
         pressed = engine.reconstruct(press, method="change-point", fill=False, device=device)
     result = outcome.result
     # What a touch counts: beyond the normals only the press has heights, and some parts have no offset.
-    unknown = np.append(result.offset_unknown, 0)[result.component] != 0
-    counted = (np.isfinite(result.normals[..., 0]) & ~unknown) | (result.filled > 0)
+    counted = (np.isfinite(result.normals[..., 0]) & ~is_relative(result)) | (result.filled > 0)
     touched = result.assign(
         height=np.where(counted, result.height, np.float32(np.nan)),
         offset_unknown=np.zeros_like(result.offset_unknown),

@@ -414,13 +414,13 @@ def _add_error_of_averaging(surface: Result, footprint: float) -> Result:
 
 def _fill(surface: Result, pixel_size: ArrayLike) -> Result:
     """Fill holes from the absolute heights around them; relative heights do not change."""
-    absolute = (surface.component >= 0) & ~_relative(surface)
+    absolute = (surface.component >= 0) & ~is_relative(surface)
     height, filled = fill_holes(np.where(absolute, surface.height, np.nan), surface.height_sigma, pixel_size)
     filled = np.where(surface.component < 0, filled, 0).astype(np.uint8)
     return surface.assign(height=np.where(filled, height, surface.height), filled=filled)
 
 
-def _relative(surface: Result) -> Mask:
+def is_relative(surface: Result) -> Mask:
     """Return the pixels with a relative height, of components without a known one."""
     return np.asarray(np.append(surface.offset_unknown, 0)[surface.component] != 0)
 
@@ -428,7 +428,7 @@ def _relative(surface: Result) -> Mask:
 def _join(surface: Result) -> Result:
     """Merge adjacent components with absolute heights, although no slope connects them."""
     answered = (surface.component >= 0) | (surface.filled > 0)
-    relative = _relative(surface)
+    relative = is_relative(surface)
     count, labels = cv2.connectedComponents((answered & ~relative).view(np.uint8), connectivity=4)
     names = np.where(relative, count + surface.component, labels - 1)
     _, first, rank = np.unique(names[answered], return_index=True, return_inverse=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.base.errors import NotConverged
 from mirrorskin.engine.fusion.fusion import fuse
+from mirrorskin.engine.fusion.solver import is_relative
 from mirrorskin.engine.live.recipe import PRESS_STEPS, TURN_FRAMES, Contact, Measured, Recipe, cheapest
 from mirrorskin.io import ArrayRecording, Calibrated, Calibration, InputError, Result, check
 from mirrorskin.io.base.arguments import check_number, checked, in_unit
@@ -24,8 +25,8 @@ CLEAR_CHANGE = 8.0
 """Change of a pixel's counts on contact, in standard deviations of the noise."""
 
 _MIN_PIXELS = 16  # pixels that must have changed
+_LEAST_SHARE = 0.01  # of the pixels, which are lit in three frames, to compare their light
 _NOISE_MIN = 0.3  # counts: rounding alone, as the standard deviation of integers
-_LEAST_SHARE = 0.01  # of the pixels, on either side of a press step that shows the common height
 _LEAST_GROWTH = 0.005  # share of the picture: contact that grows by less has ended
 _LIGHT_MAX = 0.08  # share of the light by which it may change between frames
 _MOVED_MAX, _SMOOTHED = 0.5, 2.0  # pixels: largest shift between press and turn, and Gaussian blur for it
@@ -275,9 +276,8 @@ def sigma_of_normals(surface: Result) -> NDArray[np.float64]:
 
     It is infinite where the height is unknown, also of a whole component.
     """
-    unknown = np.append(np.asarray(surface.offset_unknown), 0)[np.asarray(surface.component)] != 0
     with_normal = np.isfinite(np.asarray(surface.normals)[..., 0])
-    sigma = np.where(unknown, np.inf, np.asarray(surface.height_sigma, np.float64))[with_normal]
+    sigma = np.where(is_relative(surface), np.inf, np.asarray(surface.height_sigma, np.float64))[with_normal]
     return np.where(np.isfinite(sigma), sigma, np.inf)
 
 

@@ -236,14 +236,6 @@ __kernel void pose_equations(
     add_block(item % blocks, rows, columns, other_rows, other_columns, 1, first, second, &pose, sums + item * SUMS);
 }
 
-#if GROUP > 1
-#define ITEMS GROUP
-#define BARRIER barrier(CLK_GLOBAL_MEM_FENCE)
-#else
-#define ITEMS 1
-#define BARRIER
-#endif
-
 #define STRIDE 4
 #define MAX_COARSE 8
 #define MAX_FINE 4

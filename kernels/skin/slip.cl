@@ -6,14 +6,6 @@
 
 #include "common.clh"
 
-#if GROUP > 1
-#define ITEMS GROUP
-#define BARRIER barrier(CLK_GLOBAL_MEM_FENCE)
-#else
-#define ITEMS 1
-#define BARRIER
-#endif
-
 #define INLINE static inline __attribute__((always_inline))
 
 #define LEARN 1
