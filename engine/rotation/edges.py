@@ -27,6 +27,7 @@ LIMITS = Limits(
 )
 """Limits of edges, for the kernels and their reference."""
 
+_CHUNK = 64  # pixels of a row that a work-item processes on a CPU; see edges.cl
 _SHORTER = 4  # approximate ratio of the run times of the longest kernel and the others
 
 
@@ -137,7 +138,8 @@ class EdgeDrawing:
         yield from self._draw(NEAR, parts, "cells", "lines", "more")
         yield from self._draw(FINE, parts, "cells", "more", "lines")
         joined: dict[str, Any] = {"cells": maps["cells"], "edges": maps["lines"], "joined": maps["joined"]}
-        yield from self._run("edges_join", fewer, cells, **joined)
+        chunks = rows * -(-columns // min(self._device.layout.tile, _CHUNK))
+        yield from self._run("edges_join", fewer, chunks, **joined)
         yield from self._draw(COARSE, parts, "joined", "lines", "more")
         drawn: dict[str, Any] = {"clean": maps["clean"], "edges": maps["more"], "drawn": maps["lines"]}
         yield from self._run("edges_bound", fewer, self._tiles, **drawn)
@@ -168,7 +170,7 @@ class EdgeDrawing:
         yield from self._run(
             "edges_jumps",
             parts,
-            rows * -(-columns // min(self._device.layout.tile, 64)),
+            rows * -(-columns // min(self._device.layout.tile, _CHUNK)),
             macros,
             cells=maps[cells],
             pairs=_pairs_on(self._device, chosen),

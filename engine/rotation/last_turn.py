@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _UPDATES_BETWEEN_PLACINGS = 8  # updates between estimates of the object's height in the body
 _MIN_FRAMES = 3  # minimum number of frames of a fit
 _WARMING = 10  # number of updates that run all kernels
-_PARTS = 24  # number of parts of the longest kernel of the edges
+_PARTS = 12  # number of parts of the longest kernel of the edges
 _INTERVAL = 0.25  # least seconds between the starts of drawings of edges
 _OVERDUE = 0.1  # seconds without a part after which one is run without idle time
 _FIRST_COST = 0.005  # seconds: assumed duration of the first part

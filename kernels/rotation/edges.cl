@@ -74,23 +74,53 @@ __kernel void edges_cells(
     }
 }
 
+// Sums over columns of three rows, and then over three of these.
+#define JOIN_ROW(map) (map[q - stride] + map[q] + map[q + stride])
+#define JOIN_THREE(sums) (sums[i] + sums[i + 1] + sums[i + 2])
 __kernel void edges_join(const int rows, const int columns, MAP cells, __global const uchar *restrict edges, OUT joined)
 {
-    EACH_CELL {
-        const int rim = y == 0 || y == high - 1 || x == 0 || x == stride - 1;
-        float sum[4] = {0, 0, 0, 0}, count = 0;
-        int drawn = 0;
-        for (int k = 0; k < 9 && !rim; ++k) {
-            const int down = y + k / 3 - 1, right = x + k % 3 - 1, q = down * stride + right;
-            const int row = down - MARGIN, column = right - MARGIN;
-            for (int i = 0; i < 4; ++i) sum[i] += cells[i * plane + q];
-            count += cells[4 * plane + q];
-            if (row >= 0 && row < rows && column >= 0 && column < columns) drawn |= edges[row * columns + column];
-        }
-        for (int i = 0; i < 4; ++i) joined[i * plane + y * stride + x] = sum[i] / GREATER(count, 1);
-        joined[4 * plane + y * stride + x] = count / 9;
-        joined[5 * plane + y * stride + x] = !rim && !drawn;
+    const int stride = columns + 2 * MARGIN, high = rows + 2 * MARGIN, plane = high * stride;
+    const int runs = (stride + CHUNK - 1) / CHUNK, y = (int)get_global_id(0) / runs;
+    const int from = (int)get_global_id(0) % runs * CHUNK, width = LESSER(CHUNK, stride - from);
+    if (y >= high) return;
+    const int start = y * stride + from, row = y - MARGIN;
+    __global const float *valid = cells + 4 * plane;
+    float count[CHUNK + 2], sum[CHUNK + 2], free[CHUNK + 2];
+    const int first = from == 0, last = from + width == stride ? width + 1 : width + 2;  // within the row
+    for (int i = 0; i < width + 2; ++i) count[i] = sum[i] = 0, free[i] = 1;
+    if (y == 0 || y == high - 1) {
+        for (int k = 0; k < 6; ++k)
+            for (int i = 0; i < width; ++i) joined[k * plane + start + i] = 0;
+        return;
     }
+    for (int i = first; i < last; ++i) {
+        const int q = start + i - 1;
+        count[i] = JOIN_ROW(valid);
+    }
+    for (int down = GREATER(row - 1, 0); down <= LESSER(row + 1, rows - 1); ++down) {
+        const int begin = GREATER(MARGIN + 1 - from, 0), end = LESSER(columns + MARGIN + 1 - from, width + 2);
+        __global const uchar *line = edges + down * columns + from - MARGIN - 1;
+        for (int i = begin; i < end; ++i) free[i] = line[i] ? 0 : free[i];
+    }
+    for (int k = 0; k < 4; ++k) {
+        __global const float *cell = cells + k * plane;
+        for (int i = first; i < last; ++i) {
+            const int q = start + i - 1;
+            sum[i] = JOIN_ROW(cell);
+        }
+        for (int i = 0; i < width; ++i) {
+            const float all = JOIN_THREE(count);
+            joined[k * plane + start + i] = JOIN_THREE(sum) / GREATER(all, 1);
+        }
+    }
+    for (int i = 0; i < width; ++i) {
+        joined[4 * plane + start + i] = JOIN_THREE(count) / 9;
+        joined[5 * plane + start + i] = free[i] * free[i + 1] * free[i + 2];
+    }
+    if (from == 0)
+        for (int k = 0; k < 6; ++k) joined[k * plane + start] = 0;
+    if (from + width == stride)
+        for (int k = 0; k < 6; ++k) joined[k * plane + start + width - 1] = 0;
 }
 
 #ifdef SPACING
