@@ -214,18 +214,29 @@ class Components:
         return len(self.offset_unknown)
 
 
+def _extent(used: NDArray[np.bool_]) -> slice:
+    """Return the part of an axis from the first to the last used place; one place if none is used."""
+    places = np.flatnonzero(used)
+    return slice(places[0], places[-1] + 1) if len(places) else slice(0, 1)
+
+
 def find_components(flags: Flags, by_links: bool) -> Components:
     """Label connected pixels. ``by_links``: neighbours with an answer may have no link."""
     import cv2
 
-    grid = (flags & (SLOPE | KNOWN) != 0).view(np.uint8)
+    answered = flags & (SLOPE | KNOWN) != 0
+    used = tuple(_extent(answered.any(axis=axis)) for axis in (1, 0))
+    labels = np.full(flags.shape, -1, np.int32)
+    grid, part = answered[used].view(np.uint8), flags[used]
     if by_links:  # links between the pixels
-        grid = np.zeros((2 * flags.shape[0] - 1, 2 * flags.shape[1] - 1), np.uint8)
-        grid[::2, ::2] = flags & (SLOPE | KNOWN)
-        grid[::2, 1::2], grid[1::2, ::2] = flags[:, :-1] & RIGHT, flags[:-1] & DOWN
+        links = np.zeros((2 * grid.shape[0] - 1, 2 * grid.shape[1] - 1), np.uint8)
+        links[::2, ::2] = grid
+        links[::2, 1::2], links[1::2, ::2] = part[:, :-1] & RIGHT, part[:-1] & DOWN
+        grid = links
     count, numbers = cv2.connectedComponents(grid, connectivity=4)
     step = 2 if by_links else 1
-    labels, count = np.subtract(numbers[::step, ::step], 1, dtype=np.int32), count - 1
+    np.subtract(numbers[::step, ::step], 1, out=labels[used])
+    count -= 1
     unknown = np.ones(count, bool)
     unknown[labels[flags & KNOWN != 0]] = False
     for array in (labels, unknown):  # shared by the surfaces of several frames

@@ -161,7 +161,7 @@ class Multigrid:
         if self._products is None:
             self._products, self._lengths = h.array("parts", 4 * count), h.array("lengths", 2)
         step: dict[str, Any] = {"z": cycle.x, "p": solver.p}
-        h.over_parts("curve", self._products, **h.graph, b=cycle.b, **step, count=count)
+        h.over_parts("curve", self._products, **h.graph, inverse=h.inverse, b=cycle.b, **step, count=count)
         products: dict[str, Any] = {"products": cycle.parts.shape[0], "product": cycle.parts}
         lengths: dict[str, Any] = {"lengths": self._lengths}
         h.alone("best", h.levels[-1], **products, count=count, parts=self._products, **lengths)
@@ -288,7 +288,7 @@ class ConjugateGradients:
 
     def find_residual(self) -> None:
         """Compute the residual, which is the right side of a cycle."""
-        arrays = {"b": self.source, "x": self.x, "residual": self.cycle.b}
+        arrays = {"inverse": self._h.inverse, "b": self.source, "x": self.x, "residual": self.cycle.b}
         self._h.over("residual", self._h.levels[0], **self._h.graph, **arrays, lanes=self.lanes)
 
     def energy(self) -> Doubles:

@@ -94,18 +94,29 @@ __kernel GROUP_SIZE void components_sum(
 #else
         // Adjacent pixels of one component are summed first: sums in memory are slow and lose digits.
         int component = -1;
-        float part = 0.0f, shares = 0.0f;
-        for (int column = 0; column <= columns; ++column) {
+        float part[WIDE] = {0}, shares[WIDE] = {0};
+        for (int column = 0; column <= columns;) {
+            int same = column + WIDE <= columns;
+            for (int lane = 0; lane < WIDE && same; ++lane) same &= labels[first + column + lane] == component;
+            if (same) {
+                for (int lane = 0; lane < WIDE && component >= 0; ++lane)
+                    ADD(part[lane], shares[lane], first + column + lane, column + lane)
+                column += WIDE;
+                continue;
+            }
             const int label = column < columns ? labels[first + column] : -1;
             if (label != component) {
-                if (component >= 0) {
-                    sum[component] += part;
-                    total[component] += shares;
+                for (int lane = 0; lane < WIDE; ++lane) {
+                    if (component >= 0) {
+                        sum[component] += part[lane];
+                        total[component] += shares[lane];
+                    }
+                    part[lane] = shares[lane] = 0.0f;
                 }
                 component = label;
-                part = shares = 0.0f;
             }
-            if (label >= 0) ADD(part, shares, first + column, column)
+            if (label >= 0) ADD(part[0], shares[0], first + column, column)
+            ++column;
         }
 #endif
     }

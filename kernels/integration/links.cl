@@ -238,6 +238,21 @@ __kernel void links_join(GRAPH, KEPT_MAPS OUT source, const long start, const in
     }
     for (int row = top; row < bottom; ++row) {
         const int first = row * columns + begin;
+#if CHUNK > 1  // no link starts or ends where no pixel counts
+        int some = 0;
+        for (int i = 0; i < width; ++i) some |= flags[first + i];
+        if (!some) {
+            const long at = start + (long)row * stride + begin;
+            for (int i = 0; i < width; ++i) source[at + i] = above[i] = 0.0f;
+#if KEEP
+            for (int i = 0; i < width; ++i) right[at + i] = down[at + i] = 0.0f;
+#if HEIGHTS
+            for (int i = 0; i < width; ++i) anchor[at + i] = 0.0f;
+#endif
+#endif
+            continue;
+        }
+#endif
         NEIGHBOURS(row)
         from_left[0] = begin > 0 ? X_RISE(first - 1, GREATER(first - 2, 0), begin > 1 ? RIGHT : 0) : 0.0f;
         from_left[1] = X_RISE(first, GREATER(first - 1, 0), begin > 0 ? RIGHT : 0);

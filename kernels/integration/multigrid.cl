@@ -120,6 +120,21 @@ typedef int ints;
      WITH_CORNERS(READ, p, s))
 #define INVERSE(value) ((value) > 0 ? 1 / (value) : 0)
 
+// Whether none of the nodes i has a link or an anchor, by their inverse diagonals, which are not negative. On a GPU
+// and for several right sides, a test would cost more than it saves.
+#if WIDTH == 8
+INLINE int are_alone(__global const float *inverse)
+{
+    const int8 bits = as_int8(AT(inverse));
+    const int4 four = bits.lo | bits.hi;
+    const int2 two = four.lo | four.hi;
+    return (two.x | two.y) == 0;
+}
+#define ALONE are_alone(inverse + i)
+#else
+#define ALONE 0
+#endif
+
 // --- Levels -----------------------------------------------------------------------------------------------------
 //
 // A coarse node represents an aggregate of fine ones, usually a block of two by two. If strong links do not connect all
@@ -540,7 +555,13 @@ GATHERED(gathered, __global)
     EACH_LINE(more) if (top + y < 0 || top + y >= rows) EACH_OF_LINE(more) PUT_NEAR(scratch + p) = 0;      \
     EACH_LINE(more) if (top + y >= 0 && top + y < rows) EACH_OF_LINE(more)
 #define FILLED barrier(CLK_LOCAL_MEM_FENCE);
-#define STEP_NEAR(omega, from, to) SIDES PUT_NEAR(to + p) = STEP_BY(omega, NEAR, from + p, ACROSS);
+#define STEP_NEAR(omega, from, to)                                                                         \
+    if (ALONE) {                                                                                           \
+        PUT_NEAR(to + p) = (1 - (omega)) * NEAR(from + p);                                                 \
+    } else {                                                                                               \
+        SIDES                                                                                              \
+        PUT_NEAR(to + p) = STEP_BY(omega, NEAR, from + p, ACROSS);                                         \
+    }
 #define EACH_COARSE_OF_TILE                                                                                \
     for (int y = line, coarse_of_tile = coarse_base + coarse_stride * (top / 2 + 1) + first_column / 2;    \
          y < ROWS / 2 && top / 2 + y < coarse_rows; y += lines)                                            \
@@ -601,8 +622,11 @@ __kernel void multigrid_descend(
     }
     FILLED
     FILL(0, other) {
-        SIDES
-        const values rest = AT(b + i) + FLOW(NEAR, one + p, ACROSS);
+        values rest = AT(b + i);
+        if (!ALONE) {
+            SIDES
+            rest += FLOW(NEAR, one + p, ACROSS);
+        }
         PUT_NEAR(other + p) = rest;
         if (keep) PUT(residual + i) = rest;
     }
@@ -644,8 +668,11 @@ __kernel void multigrid_ascend(
     FILLED
     values sum = 0;
     FILL(0, other) {
-        SIDES
-        const values height = STEP_BY(LARGE_FIRST, NEAR, one + p, ACROSS);
+        values height = (1 - LARGE_FIRST) * NEAR(one + p);
+        if (!ALONE) {
+            SIDES
+            height = STEP_BY(LARGE_FIRST, NEAR, one + p, ACROSS);
+        }
         STREAM(x_new + i, height);
         sum += height * AT(b + i);
     }
@@ -784,10 +811,14 @@ __kernel GROUP_SIZE void multigrid_tail(
 #endif
 
 // The residual, b - A x.
-__kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, VALUES b, VALUES x, OUT_VALUES residual)
+__kernel void multigrid_residual(LEVEL_ARGS, GRAPH_ARGS, MAP inverse, VALUES b, VALUES x, OUT_VALUES residual)
 {
     ITEMS_NODES
     EACH_NODE {
+        if (ALONE) {
+            PUT(residual + i) = AT(b + i);
+            continue;
+        }
         SIDES
         PUT(residual + i) = AT(b + i) + FLOW(AT, x + i, stride);
     }
@@ -917,7 +948,8 @@ __kernel void multigrid_admit_graph(
 // Heights of nodes that have slopes but had no link: means of those that nodes in a square around imply, with the mean of
 // both slopes, weighted by the inverse of their squared distances. `right` and `down` are still the last graph's.
 #define SIDE 3
-#define HAD_LINK(i) (right[i] > 0 || right[(i) - 1] > 0 || down[i] > 0 || down[(i) - stride] > 0)
+#define HAD_LINK(i) ((right[i] > 0) | (right[(i) - 1] > 0) | (down[i] > 0) | (down[(i) - stride] > 0))
+#define ENTERS(i, p) ((map[p] == map[p]) & !HAD_LINK(i))
 __kernel void multigrid_enter(
     LEVEL_ARGS, const int columns, const float step_x, const float step_y, MAP right, MAP down, MAP map, MAP dz_dy,
     __global float *level)
@@ -925,7 +957,15 @@ __kernel void multigrid_enter(
     PICTURE_ITEMS
     for (int c = from; c < upto; ++c) {
         const int i = base + (row + 1) * stride + c, p = row * columns + c;
-        if (map[p] != map[p] || HAD_LINK(i)) continue;
+#if WIDTH > 1  // few enter
+        int some = c + WIDTH > upto;
+        for (int k = 0; k < WIDTH && c + WIDTH <= upto; ++k) some |= ENTERS(i + k, p + k);
+        if (!some) {
+            c += WIDTH - 1;
+            continue;
+        }
+#endif
+        if (!ENTERS(i, p)) continue;
         float sum = 0, weights = 0;
         for (int y = -LESSER(SIDE, row); y <= LESSER(SIDE, rows - 1 - row); ++y)
             for (int x = -LESSER(SIDE, c); x <= LESSER(SIDE, columns - 1 - c); ++x) {
@@ -956,17 +996,19 @@ __kernel void multigrid_finish(
 // p and b p.
 #define STEP(i) AT(p + (i))
 #define CORRECTION(i) AT(z + (i))
-__kernel SUM_GROUP void multigrid_curve(LEVEL_ARGS, GRAPH_ARGS, MAP b, MAP z, MAP p, const int count, OUT parts)
+__kernel SUM_GROUP void multigrid_curve(
+    LEVEL_ARGS, GRAPH_ARGS, MAP inverse, MAP b, MAP z, MAP p, const int count, OUT parts)
 {
     PART_NODES
     reals zz = 0, zp = 0, pp = 0, bp = 0;
     EACH_OF_PART {
+        bp += AT(b + i) * STEP(i);
+        if (ALONE) continue;
         SIDES
         const reals along = -FLOW(STEP, i, stride);
         zz -= CORRECTION(i) * FLOW(CORRECTION, i, stride);
         zp += CORRECTION(i) * along;
         pp += STEP(i) * along;
-        bp += AT(b + i) * STEP(i);
     }
     WRITE_SUM(0, zz)
     WRITE_SUM(count, zp)

@@ -57,16 +57,17 @@ __kernel void slopes_find(
 {
     const int first = (int)get_global_id(0) * TILE;
     for (int p = first; p < LESSER(first + TILE, pixels); p += WIDTH) {
-        READ_VECTORS
-        const F s = READ(sigma, p);
-        const I valid = (FLAGS(contact, p) != 0) & (z > 0.0f) & (s > 0.0f) & (s < INFINITY);
-        if (!any_of(valid)) {
+        const I touches = FLAGS(contact, p) != 0;
+        if (!any_of(touches)) {
             WRITE(dz_dx, p, (F)NAN);
             WRITE(dz_dy, p, (F)NAN);
             WRITE(squares_x, p, (F)0.0f);
             WRITE(squares_y, p, (F)0.0f);
             continue;
         }
+        READ_VECTORS
+        const F s = READ(sigma, p);
+        const I valid = touches & (z > 0.0f) & (s > 0.0f) & (s < INFINITY);
         x = valid ? x : (F)0.0f;
         y = valid ? y : (F)0.0f;
         const F flat = x * x + y * y, slant = 1.0f / GREATER(z, (F)STEEPEST);
@@ -101,7 +102,7 @@ __kernel void slopes_find(
 // Inverse variances of slopes along x and y, within bounds; 0 without a normal.
 __kernel void slopes_weigh(
     const int rows, const int columns, const float flat_limit, const float lowest, const float highest, MAP sigma,
-    MAP dz_dx,     MAP squares_x, MAP squares_y, OUT weight_x, OUT weight_y)
+    MAP dz_dx, MAP squares_x, MAP squares_y, OUT weight_x, OUT weight_y)
 {
     const int across_all = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
     const int top = item / across_all * ROWS, bottom = LESSER(rows, top + ROWS);
@@ -112,6 +113,16 @@ __kernel void slopes_weigh(
     float x[CHUNK + 2 * AROUND + WIDTH], y[CHUNK + 2 * AROUND + WIDTH];
     for (int i = 0; i < from; ++i) x[i] = y[i] = 0.0f;
     for (int row = top; row < bottom; ++row) {
+        const int start = row * columns + begin;
+        I some = 0;
+        for (int i = 0; i < width; i += WIDTH) {
+            const F slope = READ(dz_dx, start + i);
+            some |= slope == slope;
+        }
+        if (!any_of(some)) {
+            for (int i = 0; i < width; ++i) weight_x[start + i] = weight_y[start + i] = 0.0f;
+            continue;
+        }
         ROW(0, -2) ROW(1, -1) ROW(2, 0) ROW(3, 1) ROW(4, 2)
         for (int i = from; i < to; i += WIDTH) {
             PUT(x, i, DOWN_FIVE(squares_x));
@@ -119,7 +130,7 @@ __kernel void slopes_weigh(
         }
         for (int i = to; i < width + 2 * AROUND + WIDTH; ++i) x[i] = y[i] = 0.0f;
         for (int i = 0; i < width; i += WIDTH) {
-            const int p = row * columns + begin + i;
+            const int p = start + i;
             const F slope = READ(dz_dx, p);
             const I valid = slope == slope;
             F in_x = 0.0f, in_y = 0.0f;

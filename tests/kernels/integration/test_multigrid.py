@@ -140,7 +140,7 @@ def test_the_coarsest_level_is_inverted(cases, kind, anchored):
 def test_a_residual_is_that_of_the_reference(cases, graph, number):
     case = cases(*graph)
     (b, b_given), (x, x_given), residual = case.random(number), case.random(number), case.h.array("found")
-    arrays = {"b": b_given, "x": x_given, "residual": residual}
+    arrays = {"inverse": case.h.inverse, "b": b_given, "x": x_given, "residual": residual}
     case.h.over("residual", case.h.levels[number], **case.h.graph, **arrays)
     close(case.get(residual, number), twin.residual(case.levels[number], b, x))
 
@@ -216,7 +216,7 @@ def test_the_best_step_in_a_plane(cases, graph, same):
         p_given.write(z_given.read())
     z_image, p_image = (-twin.residual(level, zero, field) for field in (z, p))
     expected = [(field * other).sum() for field, other in ((z, z_image), (z, p_image), (p, p_image), (b, p))]
-    products = case.sums("curve", 4, **case.h.graph, b=b_given, z=z_given, p=p_given)
+    products = case.sums("curve", 4, **case.h.graph, inverse=case.h.inverse, b=b_given, z=z_given, p=p_given)
     np.testing.assert_allclose(products, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
     halves = np.array([0.25, 0.75]) * (b * z).sum()
     parts = np.repeat(expected, 2) * np.tile([0.5, 0.5], 4)
