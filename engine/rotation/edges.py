@@ -130,16 +130,16 @@ class EdgeDrawing:
         """Enqueue the kernels, the longest ones in ``parts`` parts, and yield after each."""
         maps, fewer = self._maps, -(-parts // _SHORTER)
         rows, columns = (size + 2 * MARGIN for size in self._shape)
-        cells = rows * -(-columns // self._device.layout.tile)
+        chunk = min(self._device.layout.tile, _CHUNK)
+        cells, pixels = rows * -(-columns // chunk), self._shape[0] * -(-self._shape[1] // chunk)
         contact: dict[str, Any] = {name: maps[name] for name in ("contact", "clean")}
         normals: dict[str, Any] = {name: maps[name] for name in ("vectors", "sigma", "cells")}
-        yield from self._run("edges_clean", fewer, self._tiles, **contact)
+        yield from self._run("edges_clean", fewer, pixels, **contact)
         yield from self._run("edges_cells", fewer, cells, **contact, **normals)
         yield from self._draw(NEAR, parts, "cells", "lines", "more")
         yield from self._draw(FINE, parts, "cells", "more", "lines")
         joined: dict[str, Any] = {"cells": maps["cells"], "edges": maps["lines"], "joined": maps["joined"]}
-        chunks = rows * -(-columns // min(self._device.layout.tile, _CHUNK))
-        yield from self._run("edges_join", fewer, chunks, **joined)
+        yield from self._run("edges_join", fewer, cells, **joined)
         yield from self._draw(COARSE, parts, "joined", "lines", "more")
         drawn: dict[str, Any] = {"clean": maps["clean"], "edges": maps["more"], "drawn": maps["lines"]}
         yield from self._run("edges_bound", fewer, self._tiles, **drawn)

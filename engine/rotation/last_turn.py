@@ -28,6 +28,7 @@ _MIN_FRAMES = 3  # minimum number of frames of a fit
 _WARMING = 10  # number of updates that run all kernels
 _PARTS = 12  # number of parts of the longest kernel of the edges
 _INTERVAL = 0.25  # least seconds between the starts of drawings of edges
+_PAUSE = 10.0  # the same, in durations of a drawing: on a slow device edges take a tenth of the time
 _OVERDUE = 0.1  # seconds without a part after which one is run without idle time
 _FIRST_COST = 0.005  # seconds: assumed duration of the first part
 _LAG = {"height_lag": Map("number of updates since the frames of the heights", dtype="int64", axes="none")}
@@ -175,7 +176,7 @@ class LastTurn(Normals):
 
 
 class IdleEdges:
-    """Edges that are drawn in idle time, up to four times a second: each costs as much as ten updates.
+    """Edges that are drawn in idle time, up to four times a second and for a tenth of the time.
 
     ``lines``, (H, W), is None until the first drawing is complete.
     """
@@ -186,15 +187,17 @@ class IdleEdges:
         self.lines: NDArray[np.uint8] | None = None
         self._steps: Iterator[None] | None = None
         self._cost, self._last, self._start = _FIRST_COST, -math.inf, -math.inf
+        self._spent = 0.0  # seconds that the drawing took so far
 
     def work(self, window: NormalWindow, seconds: float) -> None:
         """Continue to draw a window's last estimate for some seconds; overdue parts are drawn in any case."""
         started = now = time.perf_counter()
-        while (self._steps is not None or now - self._start > _INTERVAL) and (
+        while (self._steps is not None or now - self._start > max(_INTERVAL, _PAUSE * self._spent)) and (
             started + seconds - now > self._cost or now - self._last > _OVERDUE
         ):
             self._part(window)
             self._last = time.perf_counter()
+            self._spent += self._last - now
             self._cost = max(self._last - now, _DECAY * self._cost)
             now = self._last
 
@@ -209,7 +212,7 @@ class IdleEdges:
         """Start a drawing, continue it by one part, or fetch its lines."""
         if self._steps is None:
             self._drawing.take(*window.maps.read("vectors", "sigma", "contact"))
-            self._steps, self._start = self._drawing.steps(_PARTS), time.perf_counter()
+            self._steps, self._start, self._spent = self._drawing.steps(_PARTS), time.perf_counter(), 0.0
         elif next(self._steps, self) is self:
             self.lines, self._steps = self._drawing.lines(), None
         self._device.finish()

@@ -25,52 +25,58 @@
     const int begin = (int)get_global_id(0) * TILE, all = rows * columns;                        \
     for (int p = begin; p < LESSER(begin + TILE, all); ++p)
 
+#define FINITE(value) ((value) - (value) == 0.0f)
+
+// Runs of CHUNK pixels of a row, one per item.
+#define RUN(columns)                                                                               \
+    const int runs = ((columns) + CHUNK - 1) / CHUNK, line = (int)get_global_id(0) / runs;         \
+    const int from = (int)get_global_id(0) % runs * CHUNK, width = LESSER(CHUNK, (columns) - from);
+
 __kernel void edges_clean(
     const int rows, const int columns, __global const uchar *restrict contact, __global uchar *restrict clean)
 {
-    EACH_PIXEL {
-        const int row = p / columns, column = p % columns;
-        int near = 0, neighbours = 0;
-        for (int y = GREATER(row - 1, 0); y <= LESSER(row + 1, rows - 1); ++y) {
-            for (int x = GREATER(column - 1, 0); x <= LESSER(column + 1, columns - 1); ++x) {
-                const int other = y != row || x != column;
-                near += other && contact[y * columns + x];
-                neighbours += other;
-            }
-        }
-        clean[p] = contact[p] ? near > 1 || neighbours < 2 : 4 * near >= 3 * neighbours && neighbours > 0;
+    RUN(columns)
+    if (line >= rows) return;
+    const int first = from == 0, last = from + width == columns ? width + 1 : width + 2;  // within the row
+    const int top = GREATER(line - 1, 0), bottom = LESSER(line + 1, rows - 1);
+    int touched[CHUNK + 2];
+    for (int i = 0; i < width + 2; ++i) touched[i] = 0;
+    for (int y = top; y <= bottom; ++y) {
+        __global const uchar *here = contact + y * columns + from - 1;
+        for (int i = first; i < last; ++i) touched[i] += here[i] != 0;
+    }
+    __global const uchar *middle = contact + line * columns + from;
+    for (int i = 0; i < width; ++i) {
+        const int own = middle[i] != 0, near = touched[i] + touched[i + 1] + touched[i + 2] - own, x = from + i;
+        const int neighbours = (bottom - top + 1) * (1 + (x > 0) + (x + 1 < columns)) - 1;
+        const int stays = (near > 1) | (neighbours < 2), fills = (4 * near >= 3 * neighbours) & (neighbours > 0);
+        clean[line * columns + x] = own ? stays : fills;
     }
 }
 
-// Runs of TILE cells of a row, one per item; rows include the margin.
-#define EACH_CELL                                                                                  \
-    const int stride = columns + 2 * MARGIN, high = rows + 2 * MARGIN, plane = high * stride;      \
-    const int runs = (stride + TILE - 1) / TILE, y = (int)get_global_id(0) / runs;                 \
-    const int begin = ((int)get_global_id(0) - y * runs) * TILE;                                   \
-    if (y >= high) return;                                                                         \
-    for (int x = begin; x < LESSER(begin + TILE, stride); ++x)
-
+// Cells include the margin.
 __kernel void edges_cells(
     const int rows, const int columns, MAP vectors, MAP sigma, __global const uchar *restrict contact,
     __global const uchar *restrict clean, OUT cells)
 {
-    EACH_CELL {
-        const int row = y - MARGIN, column = x - MARGIN, q = y * stride + x;
-        const int inside = row >= 0 && row < rows && column >= 0 && column < columns;
-        const int p = inside ? row * columns + column : -1;
-        float part[4] = {0, 0, 0, 0};
-        int valid = 0;
-        if (p >= 0 && clean[p] && contact[p]) {
-            part[3] = sigma[p] * sigma[p];
-            valid = sigma[p] >= 0 && sigma[p] < INFINITY;
-            for (int i = 0; i < 3; ++i) {
-                part[i] = vectors[3 * p + i];
-                valid &= isfinite(part[i]) != 0;
-            }
-        }
-        for (int i = 0; i < 4; ++i) cells[i * plane + q] = valid ? part[i] : 0;
-        cells[4 * plane + q] = valid;
-        cells[5 * plane + q] = 1;
+    const int stride = columns + 2 * MARGIN, high = rows + 2 * MARGIN, plane = high * stride;
+    RUN(stride)
+    if (line >= high) return;
+    const int row = line - MARGIN, target = line * stride + from;
+    const int inside = row >= 0 && row < rows;
+    const int begin = inside ? GREATER(MARGIN - from, 0) : width;
+    const int end = inside ? LESSER(columns + MARGIN - from, width) : width;
+    for (int k = 0; k < 6; ++k)
+        for (int i = 0; i < width; ++i) cells[k * plane + target + i] = k == 5;
+    for (int i = begin; i < end; ++i) {
+        const int p = row * columns + from + i - MARGIN;
+        const float x = vectors[3 * p], y = vectors[3 * p + 1], z = vectors[3 * p + 2], s = sigma[p];
+        const int valid = (clean[p] != 0) & (contact[p] != 0) & (s >= 0) & (s < INFINITY) & FINITE(x) & FINITE(y) & FINITE(z);
+        cells[target + i] = valid ? x : 0;
+        cells[plane + target + i] = valid ? y : 0;
+        cells[2 * plane + target + i] = valid ? z : 0;
+        cells[3 * plane + target + i] = valid ? s * s : 0;
+        cells[4 * plane + target + i] = valid;
     }
 }
 
@@ -80,15 +86,14 @@ __kernel void edges_cells(
 __kernel void edges_join(const int rows, const int columns, MAP cells, __global const uchar *restrict edges, OUT joined)
 {
     const int stride = columns + 2 * MARGIN, high = rows + 2 * MARGIN, plane = high * stride;
-    const int runs = (stride + CHUNK - 1) / CHUNK, y = (int)get_global_id(0) / runs;
-    const int from = (int)get_global_id(0) % runs * CHUNK, width = LESSER(CHUNK, stride - from);
-    if (y >= high) return;
-    const int start = y * stride + from, row = y - MARGIN;
+    RUN(stride)
+    if (line >= high) return;
+    const int start = line * stride + from, row = line - MARGIN;
     __global const float *valid = cells + 4 * plane;
     float count[CHUNK + 2], sum[CHUNK + 2], free[CHUNK + 2];
     const int first = from == 0, last = from + width == stride ? width + 1 : width + 2;  // within the row
     for (int i = 0; i < width + 2; ++i) count[i] = sum[i] = 0, free[i] = 1;
-    if (y == 0 || y == high - 1) {
+    if (line == 0 || line == high - 1) {
         for (int k = 0; k < 6; ++k)
             for (int i = 0; i < width; ++i) joined[k * plane + start + i] = 0;
         return;
@@ -99,8 +104,8 @@ __kernel void edges_join(const int rows, const int columns, MAP cells, __global 
     }
     for (int down = GREATER(row - 1, 0); down <= LESSER(row + 1, rows - 1); ++down) {
         const int begin = GREATER(MARGIN + 1 - from, 0), end = LESSER(columns + MARGIN + 1 - from, width + 2);
-        __global const uchar *line = edges + down * columns + from - MARGIN - 1;
-        for (int i = begin; i < end; ++i) free[i] = line[i] ? 0 : free[i];
+        __global const uchar *drawn = edges + down * columns + from - MARGIN - 1;
+        for (int i = begin; i < end; ++i) free[i] = drawn[i] ? 0 : free[i];
     }
     for (int k = 0; k < 4; ++k) {
         __global const float *cell = cells + k * plane;
@@ -124,7 +129,6 @@ __kernel void edges_join(const int rows, const int columns, MAP cells, __global 
 }
 
 #ifdef SPACING
-// Runs of CHUNK pixels of a row, one per item.
 __kernel void edges_jumps(
     const int rows, const int columns, MAP cells, MAP pairs, const float jump, const float bend,
     const float significance, const float quiet, const float floor_, const float lowest,
