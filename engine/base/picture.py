@@ -249,9 +249,8 @@ class Picture:
         tile = self._tile if self._tile and device.layout.tile > 1 else device.layout.tile
         macros = {**self._macros, "TILE": tile, "LANES": vector_lanes(device)}
         kernel = device.kernel(source or self._source, name, **macros)
-        available: dict[str, Any] = {
-            name: band.maps[name] for name in self._kinds if name in kernel.arguments
-        }
+        wanted = frozenset(kernel.arguments)
+        available: dict[str, Any] = {name: band.maps[name] for name in self._kinds if name in wanted}
         moved = sum(array.nbytes for array in available.values()) if whole else 0
         available |= self._constants[device]
         available |= {"pixels": band.pixels, "rows": band.rows.stop - band.rows.start}
@@ -260,8 +259,10 @@ class Picture:
         if scanned is not None:
             available |= scanned
             moved += scanned["count"] * band.pixels * self._itemsize
-        needed = {name: value for name, value in available.items() if name in kernel.arguments} | arguments
-        needed = {name: _on(band, name, value) for name, value in needed.items()}
+        needed = {name: available[name] for name in wanted.intersection(available)} | arguments
+        for name, value in needed.items():
+            if isinstance(value, np.ndarray | PerPixel):
+                needed[name] = _on(band, name, value)
         kernel(-(-band.pixels // tile), moved=moved, **needed)
 
 
@@ -269,12 +270,12 @@ def _named(part: Part) -> tuple[str, int]:
     return (part, 0) if isinstance(part, str) else part
 
 
-def _on(band: Band, name: str, value: Any) -> Any:
-    """Return an argument for the pixels of a launch, on the device if it is an array."""
+def _on(band: Band, name: str, value: NDArray[Any] | PerPixel) -> Any:
+    """Return an array on the device, for the pixels of a launch."""
     if isinstance(value, PerPixel):
         rows = value.values[band.rows] if value.values.ndim else value.values.reshape(1)
         return band.device.share(name, np.ascontiguousarray(rows))
-    return _copied(band.device, name, value) if isinstance(value, np.ndarray) else value
+    return _copied(band.device, name, value)
 
 
 def _copied(device: Device, name: str, values: NDArray[Any]) -> Array:

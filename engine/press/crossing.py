@@ -218,7 +218,7 @@ class Crossing:
         count = len(self.travel)
         if count > (length := self._travel_table.shape[1]):  # frames may come one by one
             self._travel_table = np.pad(self._travel_table, ((0, 0), (0, 2 * count - length)))
-        steps = np.diff(more, prepend=last if first else more[:1])
+        steps = more - np.concatenate([last if first else more[:1], more[:-1]])
         self._travel_table[:, first:count] = more, steps, more - self.travel[0]
         self._noise.look(frames)
         noise = self._noise.value or 0.0  # not needed for a single frame, which is assumed to be dark

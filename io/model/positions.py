@@ -107,6 +107,8 @@ def stroke_starts(travel: NDArray[np.float64], direction: int = 0) -> NDArray[np
     [3, 4]
     """
     steps = np.sign(np.diff(travel))
+    if direction and not (steps == -direction).any():
+        return np.empty(0, np.intp)
     moving = np.flatnonzero(steps)
     turned = np.diff(steps[moving], prepend=direction or (steps[moving[0]] if len(moving) else 0)) != 0
     return np.asarray(moving[turned] + 1, np.intp)
