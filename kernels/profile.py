@@ -89,9 +89,12 @@ class Profile:
         pending = self._pending[:count]
         del self._pending[:count]  # a failed one is not waited for again
         for kind, name, event, nbytes in pending:
-            with waiting:
-                event.wait()
-            start, end = (cast(int, event.get_profiling_info(number)) for number in _TIMES)
+            try:
+                start, end = (cast(int, event.get_profiling_info(number)) for number in _TIMES)
+            except cl.Error:  # it is not over
+                with waiting:
+                    event.wait()
+                start, end = (cast(int, event.get_profiling_info(number)) for number in _TIMES)
             self._add(kind, name, (end - start) * 1e-9, nbytes)
 
     def _add(self, kind: Kind, name: str, seconds: float, nbytes: int) -> None:
