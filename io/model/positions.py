@@ -106,7 +106,7 @@ def stroke_starts(travel: NDArray[np.float64], direction: int = 0) -> NDArray[np
     >>> stroke_starts(np.array([0.0, 1.0, 1.0, 0.5, 2.0])).tolist()
     [3, 4]
     """
-    steps = np.sign(np.diff(travel))
+    steps = np.sign(travel[1:] - travel[:-1])
     if direction and not (steps == -direction).any():
         return np.empty(0, np.intp)
     moving = np.flatnonzero(steps)
@@ -165,8 +165,8 @@ def check_finite(
         raise InputError(f"{name} has shape {array.shape} for {count} frames: {needed} needed")
     start, stop = within or (0, count)
     checked = array[start:stop].astype(np.float64)
-    defined = (np.abs(checked) <= _VALUE_MAX).all(axis=tuple(range(1, array.ndim)))
-    if not np.all(defined):
+    if not (np.abs(checked) <= _VALUE_MAX).all():
+        defined = (np.abs(checked) <= _VALUE_MAX).all(axis=tuple(range(1, array.ndim)))
         frame = start + int(np.argmin(defined))
         needed = f"every frame needs a finite number, at most {_VALUE_MAX:g}"
         raise InputError(f"{name} is {array[frame]} at frame {frame}: {needed}")

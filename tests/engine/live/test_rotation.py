@@ -2,6 +2,7 @@
 
 import math
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from mirrorskin.engine import Correlate, Rotation, Run, estimate_normals, find_e
 from mirrorskin.engine.integration.normals_to_height import find_slopes
 from mirrorskin.engine.integration.warm_start import WarmStartIntegrator
 from mirrorskin.engine.live import LiveRun, Loop
-from mirrorskin.engine.rotation.last_turn import choose_window
+from mirrorskin.engine.rotation.last_turn import IdleEdges, choose_window
 from mirrorskin.evaluation.scenes import rotations
 from mirrorskin.evaluation.scenes.inputs import SCALES, TILT
 from mirrorskin.io import Header, InputError, open_result, save_result
@@ -126,6 +127,25 @@ def test_the_result_is_whole_and_stores_its_provenance(tmp_path):
     np.testing.assert_allclose(result.height, integrate(normals, pixel_size=PIXEL).height, atol=1e-6)
     assert (result.process["window_frames"], result.process["live"]) == (WINDOW, True)
     assert result.process["tilt"] == pytest.approx(TILT)
+
+
+def test_edges_take_at_most_a_tenth_of_the_time(monkeypatch):
+    seconds, spent, draw = 0.0, 0.0, IdleEdges._part
+
+    def draw_slowly(self, window):
+        nonlocal seconds, spent
+        draw(self, window)
+        seconds, spent = seconds + 0.02, spent + 0.02
+
+    clock = SimpleNamespace(perf_counter=lambda: seconds)
+    monkeypatch.setattr("mirrorskin.engine.rotation.last_turn.time", clock)
+    monkeypatch.setattr(IdleEdges, "_part", draw_slowly)
+    frames, live = make()
+    feed(live, frames, [SHAPE[0]])
+    while seconds < 100:
+        live.idle_work(0.01)
+        seconds += 0.05
+    assert 0.05 < spent / seconds < 0.11
 
 
 def test_edges_are_drawn_in_the_time_that_is_left(device):
