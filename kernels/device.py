@@ -51,6 +51,7 @@ _opening = threading.Lock()
 _numbers = itertools.count()  # of buffers that were arguments of kernels
 _UNSET = object()  # no value of an argument
 _NUMBERS = frozenset((int, float))
+_OPERANDS = Array, BorrowedBuffer  # sooner than the union of them
 _opened: WeakSet[Device] = WeakSet()
 _left_out: set[cl.Device] = set()  # devices that failed and were replaced by others
 _KINDS = ("gpu", "cpu", "other")  # in the order of preference
@@ -673,7 +674,7 @@ class Kernel:
                 except (TypeError, OverflowError) as error:
                     raise TypeError(f"{self.name}: {name} cannot be {given!r}: {error}") from None
                 key = value.tobytes()  # 0 and -0 are equal
-            elif isinstance(given, Operand):
+            elif isinstance(given, _OPERANDS):
                 arrays.append(given)
                 value = given.buffer
                 key = value.__dict__.get("number")

@@ -87,6 +87,9 @@ def operand_of(
     if map_shape != shape:
         raise InputError(f"{name} has shape {map_shape}, but the height needs {shape}: give maps of one size")
     if isinstance(stored, Array) and stored.dtype == dtype and stored.device.context == device.context:
+        if stored.device is not device and stored.latest is not None:  # kernels of another queue
+            stored.device.flush()
+            stored.arrived = stored.latest
         return stored
     values = np.asarray(result[name])
     flags = values != 0 if dtype == np.uint8 else values

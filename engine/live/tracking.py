@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -16,7 +17,13 @@ from mirrorskin.engine.live.status import Event, Update
 from mirrorskin.io import InputError, Motion, Result, Source
 
 Tracker = Any
-"""An object with ``push(maps)``, or of the parts of an update that it ``takes``, or a function of it."""
+"""An object with ``push(maps)``, or of the parts of an update that it ``takes``, or a function of it.
+
+If it also has ``submit``, which takes the same, starts the work on a device, and returns a function that
+waits for the answer, then other trackers work at the same time.
+"""
+
+_REFUSALS = InputError, NotConverged  # of a frame, after which a tracker goes on
 
 
 class Frames(Operation):
@@ -80,23 +87,36 @@ class Trackers:
     def track(self, update: Update, press: float | None) -> None:
         """Write the answers into an update, and the reasons of those that are missing.
 
-        ``press`` is the travel of motions that are not vertical.
+        The work of all trackers that can submit it is started before the first answer is waited for, so that
+        devices and the host work at the same time. Answers are taken one after the other. ``press`` is the
+        travel of motions that are not vertical.
         """
         tracked, lost = cast("dict[str, Any]", update.tracked), cast("dict[str, str]", update.lost)
         travel = update.position if update.motion == "vertical" else press
         if update.maps and travel is not None and math.isfinite(travel) and update.maps.fitted.travel is None:
             update = replace(update, maps=update.maps.with_fitted(travel=float(travel)))
+        answers: dict[str, Callable[[], Any]] = {}
         for name, tracker in tuple(self._trackers.items()):
             try:
-                taken = getattr(tracker, "takes", ("maps",))
-                if not hasattr(tracker, "push"):
-                    tracked[name] = tracker(update)
-                elif "maps" in taken and not update.maps:
-                    tracked[name], lost[name] = None, "the frames do not determine maps yet"
-                else:
-                    tracked[name] = tracker.push(*(getattr(update, part) for part in taken))
-            except (InputError, NotConverged) as error:
+                answers[name] = _submit(tracker, update)
+            except _REFUSALS as error:
                 tracked[name], lost[name] = None, str(error)
+        for name, answer in answers.items():
+            try:
+                tracked[name] = answer()
+            except _REFUSALS as error:
+                tracked[name], lost[name] = None, str(error)
+
+
+def _submit(tracker: Tracker, update: Update) -> Callable[[], Any]:
+    """Start the work of a tracker, if it can, and return a function that waits for the answer."""
+    if not hasattr(tracker, "push"):
+        return partial(tracker, update)
+    taken = getattr(tracker, "takes", ("maps",))
+    if "maps" in taken and not update.maps:
+        raise InputError("the frames do not determine maps yet")
+    parts = [getattr(update, part) for part in taken]
+    return tracker.submit(*parts) if hasattr(tracker, "submit") else partial(tracker.push, *parts)
 
 
 def _check(name: str, tracker: Tracker, motion: Motion) -> None:

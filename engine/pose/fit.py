@@ -22,16 +22,17 @@ from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.skin.pose import (
     BLOCK,
+    COVARIANCE_AT,
     FEWEST,
     FOUND,
+    INDEPENDENT,
     LEAST,
     MAX_STEP,
     NO_LIMIT,
     PARTS,
+    PIXELS_AT,
     POSE,
-    SCATTER_AT,
     SHIFT_AT,
-    SUMS_AT,
     TURN_AT,
 )
 
@@ -45,7 +46,6 @@ _LIKELY = 0.5, 0.02  # noise assumed by `Equations.free` during steps, near the 
 _MAX_CHI2 = 3.0  # chi square above which a motion is far from the solution
 _COARSEST = 24  # pixels along the shorter side of the coarsest maps
 MAX_STEPS, _LAST_STEP = 40, 1e-2  # maximum number of steps; step, in standard deviations, that ends them
-_BLOCKS = 100  # weight, in blocks, of the covariance of independent errors
 _POOR = 2.0  # typical chi square above which other starts are tried
 _ANGLES, _SHIFTS, _TRIED = 24, 13, 6  # starts of the grid: rotations, shifts per axis, and number refined
 _REACH = 0.8  # maximum shift relative to the map's extent
@@ -117,7 +117,7 @@ class Equations:
         alike = inverse if unbiased is independent else np.linalg.inv(independent)
         scatter = products * (count / max(count - 6, 1))
         size = np.vdot(alike, scatter) / len(independent)
-        share = count / (count + _BLOCKS)
+        share = count / (count + INDEPENDENT)
         middle = share * scatter + ((1 - share) * size) * independent
         covariance = inverse @ middle @ inverse.T
         return np.asarray(covariance if directions is None else directions @ covariance @ directions.T)
@@ -154,26 +154,29 @@ class BlockEquations(Equations):
         return float(np.median(chi[used] / expected[used])) if used.any() else math.inf
 
 
-class Followed(Equations):
-    """A motion that `PairFit.follow` found, and the equations there.
+class Followed:
+    """A motion that `PairFit.submit` searched for.
 
     Attributes
     ----------
     motion : Motion
     bend : float
         Error that a coarse step leaves over the square of the step, both in sigmas.
+    pixels, chi_square : float
+        As of `Equations`.
     """
 
-    def __init__(self, found: NDArray[np.floating], size: float) -> None:
+    def __init__(self, found: NDArray[np.floating]) -> None:
         values = found.astype(np.float64)
-        super().__init__(values[SUMS_AT:SCATTER_AT], size)
-        self._blocks, self.bend = int(found[0]), float(found[1])
-        self.motion: Motion = Motion(values[TURN_AT:SHIFT_AT].reshape(3, 3), values[SHIFT_AT:SUMS_AT]).rigid()
-        self._products = values[SCATTER_AT:]
+        self.bend, self.pixels = float(found[1]), float(found[PIXELS_AT])
+        self.chi_square = float(found[PIXELS_AT + 1])
+        turn, shift = values[TURN_AT:SHIFT_AT].reshape(3, 3), values[SHIFT_AT:PIXELS_AT]
+        self.motion: Motion = Motion(turn, shift).rigid()
+        self._covariance = values[COVARIANCE_AT:][_UPPER]
 
-    def scatter(self) -> tuple[NDArray[Any], int]:
-        """Return the sum over blocks of the products of their J'Wr, (6, 6), and the number of blocks."""
-        return _symmetric(self._products, self._size), self._blocks
+    def covariance(self, free: Doubles) -> Doubles:
+        """Return the covariance of the motion, except in the directions in which it was not followed."""
+        return self._covariance
 
 
 def _split(sums: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -213,28 +216,29 @@ class PairFit:
     second: PoseMap
     device: Device
 
-    def __init__(self, first: PoseMap, second: PoseMap, device: Device) -> None:
+    def __init__(
+        self, first: PoseMap, second: PoseMap, device: Device, workspace: Workspace | None = None
+    ) -> None:
         self.first, self.second, self.device = first, second, device
-        self._array = Workspace(device).array
+        self._workspace = workspace or Workspace(device)
+        self._array = self._workspace.array
 
     def after(self, first: PoseMap) -> PairFit:
         """Return the fit of another first map to the same second one, which uses the same memory."""
-        fit = PairFit(first, self.second, self.device)
-        fit._array = self._array
-        return fit
+        return PairFit(first, self.second, self.device, self._workspace)
 
     def equations(self, motion: Motion, unbiased: bool = False) -> BlockEquations:
         """Return the sums at a motion."""
         return BlockEquations(self._sums([motion], unbiased)[0], self.second.extent.size)
 
-    def follow(self, expected: Motion, key: Array, bend: float) -> Followed | None:
-        """Return the motion near an expected one; None if there is none, or the maps hardly match there.
+    def submit(self, expected: Motion, key: Array, bend: float) -> None:
+        """Start the search for the motion near an expected one.
 
         ``key`` is that of `constants`, and ``bend`` the last one of `Followed`.
         """
-        device, (rows, columns) = self.device, self.first.shape
-        group, turn, (x, y, z) = device.layout.group, expected.turn.tolist(), expected.shift.tolist()
-        device.kernel("pose", "pose_follow", BESIDE=0, GROUP=group)(
+        (rows, columns), turn, (x, y, z) = self.first.shape, expected.turn.tolist(), expected.shift.tolist()
+        group = self.device.layout.group
+        self.device.kernel("pose", "pose_follow", BESIDE=0, GROUP=group)(
             group,
             rows=rows,
             columns=columns,
@@ -251,11 +255,14 @@ class PairFit:
             found=self._array("found", FOUND),
             moved=32 * rows * columns,
         )
+
+    def answer(self) -> Followed | None:
+        """Wait for the motion; return None if there is none, or the maps hardly match there."""
         found = self._array("found", FOUND).read()
-        return Followed(found, self.second.extent.size) if found[0] else None
+        return Followed(found) if found[0] else None
 
     def constants(self, typical: float, directions: Doubles) -> Array:
-        """Return what `follow` needs of two maps, on the device.
+        """Return what `submit` needs of two maps, on the device.
 
         They are the typical chi square and the directions in which the motion is followed.
         """

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from mirrorskin.engine.base.device_arrays import device_of_maps
 from mirrorskin.engine.base.inputs import Maps, as_result
-from mirrorskin.engine.pose.fit import Equations, PairFit
+from mirrorskin.engine.pose.fit import Equations, Followed, PairFit
 from mirrorskin.engine.pose.maps import PoseMap
 from mirrorskin.engine.pose.motion import Motion
 from mirrorskin.io.base.arguments import as_array, checked, in_unit
@@ -192,7 +192,7 @@ def pose_of(fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose
     return _pose(motion, covariance, (change @ free).T, now.chi_square, int(now.pixels), ())
 
 
-def pose_after(before: Pose, fit: PairFit, motion: Motion, now: Equations, free: Doubles) -> Pose:
+def pose_after(before: Pose, fit: PairFit, motion: Motion, now: Equations | Followed, free: Doubles) -> Pose:
     """Return a pose followed by the inverse of a fitted motion, of independent errors."""
     back = motion.inverse()
     change = back.adjoint()

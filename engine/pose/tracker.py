@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +17,7 @@ from mirrorskin.engine.pose.motion import STILL, Motion
 from mirrorskin.engine.pose.pose import IDENTITY, Pose, pose_after
 from mirrorskin.io import InputError, Result
 from mirrorskin.io.base.findings import findings_of
-from mirrorskin.io.base.threads import ThreadSafe
+from mirrorskin.io.base.threads import ThreadSafe, locked
 from mirrorskin.io.model.result import shape_of
 from mirrorskin.kernels.array import Array
 from mirrorskin.kernels.array_types import Doubles
@@ -78,7 +80,7 @@ class PoseTracker(ThreadSafe):
 
     def __init__(self, pixel_size: ArrayLike | None = None, *, device: str | Device | None = None) -> None:
         self.keys: int = 0
-        self._pixel_size, self._device = pixel_size, open_device(device)
+        self._pixel_size, self._device = pixel_size, open_device(device).with_new_queue()
         self._key: _Key | None = None
         self._earlier: list[_Key] = []
         self._workspace = Workspace(self._device)  # of results that are not keys
@@ -108,28 +110,42 @@ class PoseTracker(ThreadSafe):
             Maps that `estimate_pose` refuses, or too few pixels shared with earlier results. The result is
             ignored.
         """
+        return self.submit(maps)()
+
+    def submit(self, maps: Maps) -> Callable[[], Pose]:
+        """Start the work on the next result, and return a function that waits for the pose of `push`.
+
+        Call it before the next result is pushed or submitted. Arguments and errors are those of `push`.
+        """
         result = as_result(maps, "result")
         self._notes = tuple(
             finding.text for finding in findings_of(f"result {self._results}", result.process)
         )
-        pose = self._find(result)
+        key, started = self._key, None
+        if key is not None and key.fit is not None:
+            map_ = self._map(result, key.size)
+            started = map_, key.submit(map_, self._last.then(self._back))
+        return partial(self._answer, result, started)
+
+    @locked
+    def _answer(self, result: Result, started: tuple[PoseMap, PairFit] | None) -> Pose:
+        """Return the pose of a result, whose comparison with the key may have been started."""
+        pose = self._find(result, started)
         self._results += 1
         return self._noted(pose)
 
-    def _find(self, result: Result) -> Pose:
+    def _find(self, result: Result, started: tuple[PoseMap, PairFit] | None) -> Pose:
         """Return the motion from the first result; its notes are those of the keys."""
         key = self._key
         if key is None:
             self._take_key(result, IDENTITY)
             return IDENTITY
-        expected = self._last.then(self._back)
-        if key.fit is None:
-            return self._first_after_key(key, result, expected)
-        maps = {key.size: self._map(result, key.size)}
-        found = key.follow(maps[key.size], expected)
-        if found is None:
+        if started is None:
+            return self._first_after_key(key, result, self._last.then(self._back))
+        map_, fit = started
+        maps, now = {key.size: map_}, key.answer(fit)
+        if now is None:
             return self._search(key, result)
-        fit, now = found
         pose = self._moved_to(now.motion, key.pose_of(fit, now.motion, now))
         share = key.share(now)
         if key.has_left(share) or share < _MIN_COMMON:
@@ -176,10 +192,10 @@ class PoseTracker(ThreadSafe):
         for key in self._earlier:
             if key.size not in maps:
                 maps[key.size] = self._map(result, key.size)
-            found = key.follow(maps[key.size], first_to_map.inverse().then(key.pose.motion))
-            if found is None or (share := key.share(found[1])) < _MIN_COMMON + _LEAVING:
+            fit = key.submit(maps[key.size], first_to_map.inverse().then(key.pose.motion))
+            now = key.answer(fit)
+            if now is None or (share := key.share(now)) < _MIN_COMMON + _LEAVING:
                 continue
-            fit, now = found
             other = key.pose_of(fit, now.motion, now)
             if key.spread(other) < best:
                 pose, best, key.peak = other, key.spread(other), share
@@ -266,7 +282,7 @@ class _Key:
         self.fit, self.free = fit, free
         self.pixels, self.typical = now.pixels, max(now.chi_square, now.typical, 1.0)
 
-    def share(self, now: Equations) -> float:
+    def share(self, now: Followed) -> float:
         """Return the share of the pixels that another result shares."""
         return now.pixels / self.pixels
 
@@ -283,19 +299,22 @@ class _Key:
         variances = np.diag(pose.covariance)
         return float(variances[3:].sum() + self.map.extent.size**2 * variances[:3].sum())
 
-    def follow(self, map_: PoseMap, motion: Motion) -> tuple[PairFit, Followed] | None:
-        """Return the motion from a map to this key near an expected motion, or None."""
-        if self.fit is None:
-            return None
+    def submit(self, map_: PoseMap, motion: Motion) -> PairFit:
+        """Start the search for the motion from a map to this key near an expected motion."""
+        assert self.fit is not None
         fit, layout = self.fit.after(map_), (map_.grid, map_.flat_limit)
         if self.constants is None or layout != self.layout:
             self.layout, self.constants = layout, fit.constants(self.typical, complement(self.free))
-        found = fit.follow(motion, self.constants, self.bend)
-        if found is None:
-            return None
-        self.bend = found.bend
-        return fit, found
+        fit.submit(motion, self.constants, self.bend)
+        return fit
 
-    def pose_of(self, fit: PairFit, motion: Motion, now: Equations) -> Pose:
+    def answer(self, fit: PairFit) -> Followed | None:
+        """Wait for the search, and return the motion, or None."""
+        found = fit.answer()
+        if found is not None:
+            self.bend = found.bend
+        return found
+
+    def pose_of(self, fit: PairFit, motion: Motion, now: Equations | Followed) -> Pose:
         """Return the motion from the first result to the one from which a motion to this key was found."""
         return pose_after(self.pose, fit, motion, now, self.free)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import cv2
@@ -22,7 +24,7 @@ from mirrorskin.engine.slip.tracking import Level
 from mirrorskin.engine.slip.windows import Found, Motion, Windows
 from mirrorskin.io import InputError, Map, Result, pixel_axes
 from mirrorskin.io.base.arguments import check_count, check_number, check_pixel_size, checked
-from mirrorskin.io.base.threads import ThreadSafe
+from mirrorskin.io.base.threads import ThreadSafe, locked
 from mirrorskin.io.base.types import ProcessValue
 from mirrorskin.io.model.maps import SlipStatus, status_of
 from mirrorskin.kernels.array_types import Doubles
@@ -159,7 +161,7 @@ class SlipTracker(ThreadSafe):
         else:
             self._size = pixel_size_of(self._contact, "contact", pixel_size)
         self._window, self._chosen_step, self._noise = window_size, window_step, noise
-        self._device = open_device(device)
+        self._device = open_device(device).with_new_queue()
         self._frames = 0
         self._windows: Windows | None = None
 
@@ -208,6 +210,13 @@ class SlipTracker(ThreadSafe):
         mirrorskin.io.InputError
             A frame of another type or shape, a contact of another shape, or a sheet without texture.
         """
+        return self.submit(frame, contact)()
+
+    def submit(self, frame: AnyArray, contact: Maps | None = None) -> Callable[[], Result]:
+        """Start the work on the next frame, and return a function that waits for the result of `push`.
+
+        Call it before the next frame is pushed or submitted. Arguments and errors are those of `push`.
+        """
         frame = on_host(as_frames("frame", frame))
         windows, work = self._windows, MEASURE | FIND_SLIP
         if windows is None:
@@ -226,11 +235,18 @@ class SlipTracker(ThreadSafe):
             windows.follow(frame)
             self._since_key += 1
             if self._since_key & (self._since_key - 1) == 0 or self._since_key % MEMORY == 0:
-                windows.evaluate(LEARN, self._since_key)
+                windows.submit(LEARN, self._since_key)
+                windows.answer()
                 self._learn(windows)
             else:
                 work |= LEARN
-        found = windows.evaluate(work, self._since_key, self._frames, self._started)
+        windows.submit(work, self._since_key, self._frames, self._started)
+        return partial(self._answer, windows, frame)
+
+    @locked
+    def _answer(self, windows: Windows, frame: NDArray[Any]) -> Result:
+        """Wait for the work on a frame, and return its result."""
+        found = windows.answer()
         assert found is not None
         result = self._result(found)
         self._frames += 1

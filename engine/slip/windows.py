@@ -97,6 +97,7 @@ class Windows:
         self._found: Array = device.array("found", (NUMBERS + MAPS * math.prod(grid),), np.int32)
         self._start: tuple[list[float], list[float]] = [0.0, 0.0], [0.0, 0.0]
         self._least, self._enough = 0, self._tracker.least_converged(self.part)
+        self._work: dict[str, int] = {}  # that was submitted
         self.level.maps["field"].write(self.level.rest)
         state = self.read()
         state.view(np.float32)[[LEARNED, FIXED, FIXED + 1]], state[ONSET] = np.nan, -1
@@ -123,12 +124,19 @@ class Windows:
         self._frame, self._least = frame, self._enough
         self.level.follow_windows(frame, *self._start, self.part)
 
-    def evaluate(self, work: int, since_key: int, frame: int = 0, started: bool = False) -> Found | None:
-        """Do some of the work of a frame; return what it shows if that includes the search for slip."""
-        found = self._run(work, since_key, frame, started)
+    def submit(self, work: int, since_key: int, frame: int = 0, started: bool = False) -> None:
+        """Start some of the work of a frame on the device."""
+        self._work = {"work": work, "since_key": since_key, "frame": frame, "started": started}
+        self._launch()
+
+    def answer(self) -> Found | None:
+        """Wait for the work; return what the frame shows if it includes the search for slip."""
+        work = self._work["work"]
+        found = self._found.read(slice(None if work & FIND_SLIP else NUMBERS))
         if found[0] < self._least:
             self._search()
-            found = self._run(work, since_key, frame, started)
+            self._launch()
+            return self.answer()
         numbers = found[:NUMBERS].view(np.float32).tolist()
         if work & LEARN:
             self._start = numbers[1:3], numbers[3:5]
@@ -159,12 +167,13 @@ class Windows:
         self._start = start.min(axis=1).tolist(), start.max(axis=1).tolist()
         self.choose(self.level.whole)
         self.follow(frame)
-        self.evaluate(MEASURE, since_key)
+        self.submit(MEASURE, since_key)
+        self.answer()
         x, y, *_, bent_x, bent_y = self._maps["scratch"].read()[:7].astype(np.float64)
         return x + 1j * y, np.stack([bent_x, bent_y])
 
-    def _run(self, work: int, since_key: int, frame: int, started: bool) -> Integers:
-        """Return the numbers of the kernel, and the maps if slip is searched."""
+    def _launch(self) -> None:
+        """Start the submitted work."""
         rows, columns = self.part
         maps = self.level.maps
         self._device.kernel("slip", "slip_windows", GROUP=self._device.layout.group)(
@@ -174,11 +183,8 @@ class Windows:
             bottom=rows.stop,
             left=columns.start,
             right=columns.stop,
-            work=work,
             least=self._least,
-            frame=frame,
-            since_key=since_key,
-            started=started,
+            **self._work,
             answer=maps["answer"],
             field=maps["field"],
             state=self._state,
@@ -188,7 +194,6 @@ class Windows:
             sums=self._maps["sums"],
             moved=self._state.nbytes,
         )
-        return self._found.read() if work & FIND_SLIP else self._found.read(slice(NUMBERS))
 
     def _search(self) -> None:
         """Find windows by coarser resolutions, as too few converged."""

@@ -27,6 +27,15 @@ _ending = _waited = False
 _ended = set[threading.Thread]()  # threads in which SystemExit was raised
 
 
+class _Inside(threading.local):
+    """Whether a thread is in a computation that is counted; those in it are not, which takes less time."""
+
+    is_counted = False
+
+
+_inside = _Inside()
+
+
 @contextmanager
 def computation() -> Iterator[None]:
     """Delay the end of the interpreter while a daemon thread is in the context.
@@ -37,11 +46,18 @@ def computation() -> Iterator[None]:
     if not threading.current_thread().daemon:
         yield
         return
+    if _inside.is_counted and not _ending:
+        yield
+        if _ending:
+            _count(0)
+        return
     _register()
     _count(1)
+    outside, _inside.is_counted = _inside.is_counted, True
     try:
         yield
     finally:
+        _inside.is_counted = outside
         _count(-1)
 
 
@@ -62,9 +78,9 @@ def _count(change: int) -> None:
     with _changed:
         if change < 0 or not _ending:
             _computations += change
-            _changed.notify_all()
         if not _ending:
             return
+        _changed.notify_all()
         if not _waited:
             _ended.add(threading.current_thread())
     if _waited:  # nobody waits while this thread deletes what it computed, so the interpreter ends first
@@ -141,16 +157,18 @@ class ThreadSafe:
 def _guarded(member: Any) -> Any:
     """Return a method or property that runs under the object's lock; anything else unchanged."""
     if isinstance(member, FunctionType):
-        return _locked(member)
+        return locked(member)
     if isinstance(member, property) and member.fget is not None:
-        return property(_locked(member.fget), doc=member.__doc__)
+        return property(locked(member.fget), doc=member.__doc__)
     return member
 
 
-def _locked(function: Callable[..., Any]) -> Callable[..., Any]:
+def locked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate a private method of a `ThreadSafe` class that is called from outside."""
+
     @functools.wraps(function)
-    def locked(self: ThreadSafe, /, *args: Any, **kwargs: Any) -> Any:
+    def call(self: ThreadSafe, /, *args: Any, **kwargs: Any) -> Any:
         with computation(), self._thread_lock:
             return function(self, *args, **kwargs)
 
-    return locked
+    return call

@@ -249,6 +249,7 @@ __kernel void pose_equations(
 #define NO_LIMIT 1e30f
 #define LEAST 1e-6f
 #define MAX_STEP 0.35f
+#define INDEPENDENT 100.0f
 
 #define SCALE(i) ((i) < 3 ? per_size : 1.0f)
 #define AT(i, k) UPPER(LESSER(i, k), GREATER(i, k))
@@ -274,6 +275,30 @@ INLINE void solve(float matrix[6][6], float *right)
     UNROLL for (int i = 5; i >= 0; --i) {
         UNROLL for (int k = i + 1; k < 6; ++k) right[i] -= matrix[k][i] * right[k];
         right[i] *= matrix[i][i];
+    }
+}
+
+// The inverse of a matrix in the directions of a projection. In the others it gets a diagonal for the inversion.
+INLINE void invert(const float full[6][6], const float *projection, float inverse[6][6])
+{
+    float part[6][6], trace = 0;
+    for (int i = 0; i < 6; ++i) trace += full[i][i];
+    for (int i = 0; i < 6; ++i)
+        for (int k = 0; k < 6; ++k) {
+            part[i][k] = 0;
+            for (int j = 0; j < 6; ++j) part[i][k] += projection[6 * i + j] * full[j][k];
+        }
+    for (int row = 0; row < 6; ++row) {
+        float matrix[6][6], right[6];
+        for (int i = 0; i < 6; ++i) {
+            right[i] = projection[6 * i + row];
+            for (int k = 0; k < 6; ++k) {
+                matrix[i][k] = trace / 6 * ((i == k) - projection[6 * i + k]);
+                for (int j = 0; j < 6; ++j) matrix[i][k] += part[i][j] * projection[6 * j + k];
+            }
+        }
+        solve(matrix, right);
+        for (int i = 0; i < 6; ++i) inverse[row][i] = right[i];
     }
 }
 
@@ -416,20 +441,44 @@ __kernel GROUP_SIZE void pose_follow(
             if (UPPER(i, k) % ITEMS != item) continue;
             float scatter = 0;
             for (int block = 0; block < blocks; ++block) scatter += sums[block * SUMS + 21 + i] * sums[block * SUMS + 21 + k];
-            found[14 + SUMS + UPPER(i, k)] = scatter;
+            found[16 + UPPER(i, k)] = scatter;
         }
+    BARRIER;
     if (item > 0) return;
     for (int i = 0; i < 6; ++i) {
         float added = 0;
         for (int k = 0; k < 6; ++k) added += total[AT(i, k)] * step[k];
         total[27] += (2 * total[21 + i] + added) * step[i];
-        total[21 + i] += added;
     }
     int used = 0;
     for (int block = 0; block < blocks; ++block) used += sums[block * SUMS + 29] + sums[block * SUMS + 30] > 0;
+    float full[6][6], inverse[6][6], scatter[6][6], part[6][6], size = 0, rank = 0;
+    for (int i = 0; i < 6; ++i) {
+        rank += fixed.projection[7 * i];
+        for (int k = 0; k < 6; ++k) {
+            const float scale = SCALE(i) * SCALE(k);
+            full[i][k] = total[AT(i, k)] * scale;
+            scatter[i][k] = found[16 + AT(i, k)] * scale * used / GREATER(used - 6.0f, 1.0f);
+        }
+    }
+    invert(full, fixed.projection, inverse);
+    for (int i = 0; i < 6; ++i)
+        for (int k = 0; k < 6; ++k) {
+            part[i][k] = 0;
+            for (int j = 0; j < 6; ++j) part[i][k] += inverse[i][j] * scatter[j][k];
+            if (i == k) size += part[i][i] / rank;
+        }
+    const float share = used / (used + INDEPENDENT);
+    for (int i = 0; i < 6; ++i)
+        for (int k = i; k < 6; ++k) {
+            float covariance = 0;
+            for (int j = 0; j < 6; ++j) covariance += part[i][j] * inverse[j][k];
+            found[16 + UPPER(i, k)] = share * covariance + (1 - share) * size * inverse[i][k];
+        }
     found[0] = used;
     found[1] = bend;
     for (int i = 0; i < 9; ++i) found[2 + i] = pose.turn[i];
     for (int i = 0; i < 3; ++i) found[11 + i] = pose.shift[i];
-    for (int i = 0; i < SUMS; ++i) found[14 + i] = total[i];
+    found[14] = GREATER(total[29], total[30]);
+    found[15] = CHI_SQUARE;
 }

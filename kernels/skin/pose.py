@@ -36,10 +36,12 @@ NO_LIMIT = 1e30
 """Limit of a pixel's chi square above which none is left out."""
 FEWEST = 20
 """Smallest number of pixels that two maps must share."""
-TURN_AT, SHIFT_AT, SUMS_AT, SCATTER_AT = 2, 11, 14, 14 + PARTS[-2]
+TURN_AT, SHIFT_AT, PIXELS_AT, COVARIANCE_AT = 2, 11, 14, 16
 """Offsets in the answer of `pose_follow`."""
-FOUND = SCATTER_AT + PARTS[1]
+FOUND = COVARIANCE_AT + PARTS[1]
 """Numbers in that answer."""
+INDEPENDENT = 100
+"""Weight, in blocks, of the covariance of independent errors."""
 LEAST = 1e-6
 """Share of the mean information that is added to all directions of a step, for rounding errors."""
 MAX_STEP = 0.35
@@ -112,9 +114,11 @@ def pose_follow(
         Records.
     found : (FOUND,)
         Number of blocks with shared pixels, 0 if no motion is found; error over the square of a step as
-        ``expected_bend``; rotation matrix; translation; sums over all pixels, as of `pose_equations` without
-        J'WK; and the upper triangle of the sum over blocks of the products of their J'Wr. The sums are those
-        after the last step, for residuals that are linear in it.
+        ``expected_bend``; rotation matrix; translation; number of pixels; chi square per degree of freedom;
+        and the upper triangle of the covariance in the directions of the projection, of rotations in units of
+        1 / size. It is N S N or n N: N is the inverse of J'WJ, S the sum over blocks of the products of their
+        J'Wr, and n their size relative to J'WJ. The mean of both is weighted by the number of blocks and
+        `INDEPENDENT`. Chi square and S are those after the last step, for residuals that are linear in it.
     """
     found[0] = 0
     size, typical, projection = key[13], key[14], key[15:].reshape(6, 6)
@@ -151,11 +155,24 @@ def pose_follow(
     if fine < 0:
         return
     sums[:, 21:27] += _matrix(sums) @ (step * scale)
-    after = sums.sum(axis=0)
-    after[27] += (total[21:27] + after[21:27]) @ (step * scale)
-    products = sums[:, 21:27].T @ sums[:, 21:27]
-    used = np.count_nonzero(sums[:, 29] + sums[:, 30])
-    found[:] = [used, bend, *motion, *after, *products[np.triu_indices(6)]]
+    right = sums[:, 21:27].sum(axis=0)
+    chi_square = (total[27] + (total[21:27] + right) @ (step * scale)) / max(total[28], 1e-9)
+    used = int(np.count_nonzero(sums[:, 29] + sums[:, 30]))
+    covariance = _covariance(_matrix(total), sums[:, 21:27], used, projection, scale)
+    found[:] = [used, bend, *motion, total[29:31].max(), chi_square, *covariance[np.triu_indices(6)]]
+
+
+def _covariance(normal: Doubles, scores: Doubles, used: int, projection: Doubles, scale: Doubles) -> Doubles:
+    """Return the covariance of a motion, (6, 6), in units of the object's size, in some directions."""
+    sizes, directions = np.linalg.eigh(projection)
+    directions = directions[:, sizes > 0.5]
+    independent = directions.T @ (normal * np.outer(scale, scale)) @ directions
+    scores = scores * scale @ directions
+    scatter = scores.T @ scores * (used / max(used - 6, 1))
+    inverse, share = np.linalg.inv(independent), used / (used + INDEPENDENT)
+    size = np.trace(inverse @ scatter) / len(inverse)
+    within = share * inverse @ scatter @ inverse + (1 - share) * size * inverse
+    return np.asarray(directions @ within @ directions.T, np.float64)
 
 
 def _matrix(sums: Array) -> Doubles:

@@ -23,7 +23,7 @@ offline."""
 def command(
     of: Annotated[
         str,
-        Option(metavar="NAME[,NAME]", help="What runs; pose+slip: both, one after the other for each frame."),
+        Option(metavar="NAME[,NAME]", help="What runs; pose+slip: both, for each frame."),
     ] = "press,turn,pose,slip,force",
     size: Annotated[str, Option(metavar="WxH[,WxH]", help="Columns and rows of a frame.")] = (
         "160x120,320x240,640x480"

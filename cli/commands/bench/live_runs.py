@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
@@ -16,6 +17,7 @@ from mirrorskin.engine import Press, Rotation, Run
 from mirrorskin.engine.base.running import plan_of
 from mirrorskin.engine.force import ForceTracker
 from mirrorskin.engine.live import LiveRun, Loop, Status, Update
+from mirrorskin.engine.live.tracking import Tracker, Trackers
 from mirrorskin.engine.pose import PoseTracker
 from mirrorskin.engine.slip import SlipTracker
 from mirrorskin.io import InputError
@@ -27,8 +29,6 @@ _LOOPED = NAMES[:2]
 _ROUNDS = 10  # of a tracker's inputs on simulated time
 _ROUNDING = 1e-5  # of float32, over the largest number of a map
 _MODULUS, _TRAVEL = 0.1, 0.3  # MPa and mm, of the forces
-
-Push = Callable[[Any], object]
 
 
 class Ran(NamedTuple):
@@ -94,13 +94,19 @@ class Looped:
 
 
 class Tracked:
-    """Trackers that take the same inputs again and again, one after the other for each frame."""
+    """Trackers of a live loop that take the same maps and frames again and again."""
 
     def __init__(self, names: Sequence[str], shape: scenes.Shape, device: Device) -> None:
-        made = {"pose": scenes.moving_domes, "slip": scenes.sliding_texture, "force": scenes.loaded_domes}
         self._names, self._shape, self._device = names, shape, device
-        self._inputs: list[Any] = list(zip(*(made[name](shape) for name in names), strict=True))
-        self.count: int = _ROUNDS * len(self._inputs)
+        maps = (scenes.moving_domes if "pose" in names else scenes.loaded_domes)(shape)
+        if "force" in names:
+            maps = [result.with_fitted(travel=_TRAVEL) for result in maps]
+        frames = scenes.sliding_texture(shape)
+        self._updates = [
+            Update(0, math.nan, "vertical", math.nan, frame, result)
+            for frame, result in zip(frames, maps, strict=True)
+        ]
+        self.count: int = _ROUNDS * len(self._updates)
 
     def run(self, pace: Pace) -> Ran:
         """Push inputs when they are due; only the newest one if several are."""
@@ -123,25 +129,28 @@ class Tracked:
 
     def _warm(self) -> Callable[[int], Any]:
         """Return new trackers that have taken each input once, as a function of the number of an input."""
-        pushes = [_tracker(name, self._shape, self._device) for name in self._names]
+        trackers = Trackers(
+            {name: _tracker(name, self._shape, self._device) for name in self._names}, "vertical"
+        )
 
-        def push(number: int) -> Any:
-            inputs = self._inputs[number % len(self._inputs)]
-            return [push(value) for push, value in zip(pushes, inputs, strict=True)]
+        def push(number: int) -> dict[str, Any]:
+            update = replace(self._updates[number % len(self._updates)], tracked={}, lost={})
+            trackers.track(update, None)
+            for name, reason in update.lost.items():
+                raise InputError(f"{name}: {reason}")
+            return dict(update.tracked)
 
-        for number in range(len(self._inputs)):
+        for number in range(len(self._updates)):
             push(number)
         return push
 
 
-def _tracker(name: str, shape: scenes.Shape, device: Device) -> Push:
+def _tracker(name: str, shape: scenes.Shape, device: Device) -> Tracker:
     if name == "pose":
-        return PoseTracker(device=device).push
+        return PoseTracker(device=device)
     if name == "slip":
-        contact = scenes.round_contact(shape)
-        return SlipTracker(contact, scenes.FIELD / shape[1], device=device).push
-    force = ForceTracker(modulus=_MODULUS)
-    return lambda maps: force.push(maps, _TRAVEL)
+        return SlipTracker(scenes.round_contact(shape), scenes.FIELD / shape[1], device=device)
+    return ForceTracker(modulus=_MODULUS)
 
 
 def check_name(name: str) -> str:
@@ -162,7 +171,7 @@ def measure_live(
     Parameters
     ----------
     name : str
-        One of `NAMES`, or trackers joined by +, which take turns for each frame.
+        One of `NAMES`, or trackers joined by +, which run together.
     shape : (int, int)
         Rows and columns of a frame.
     rate, seconds : float

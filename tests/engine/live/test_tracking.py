@@ -5,11 +5,14 @@ import math
 
 import cv2
 import numpy as np
+import pyopencl as cl
 import pytest
 from live_frames import paced, turn_header
 
 from mirrorskin import engine, io
+from mirrorskin.cli.commands.bench.scenes import FIELD, moving_domes, round_contact, sliding_texture
 from mirrorskin.engine.live import SHOWN, Frames, Limit, LiveRun, Loop, Stream
+from mirrorskin.kernels.device import open_device
 from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 
 COUNT, RATE = 40, 100.0
@@ -109,6 +112,114 @@ def test_a_function_gets_the_answers_of_the_trackers_before_it():
         pushed.push(NUMBERS[3])
         pushed.result()
         assert pushed.latest().tracked == {"number": 3, "double": 6}
+
+
+class Deferred:
+    """A tracker that notes when it starts and when its answer is taken."""
+
+    takes = ("picture",)
+
+    def __init__(self, name, notes, refused=None):
+        self.name, self.notes, self.refused = name, notes, refused
+
+    def push(self, frame):
+        return self.submit(frame)()
+
+    def submit(self, frame):
+        self.notes.append(f"{self.name} starts")
+        self._refuse("starts")
+
+        def answer():
+            self.notes.append(f"{self.name} answers")
+            self._refuse("answers")
+            return self.name
+
+        return answer
+
+    def _refuse(self, when):
+        if when == self.refused:
+            raise io.InputError(f"{self.name} refused")
+
+
+def test_all_trackers_start_before_the_first_answer_is_waited_for():
+    notes = []
+    function = {"last": lambda update: notes.append(f"last after {[*update.tracked]}")}
+    with stream({"a": Deferred("a", notes), "b": Deferred("b", notes), **function}) as pushed:
+        pushed.push(NUMBERS[:2])
+    once = ["a starts", "b starts", "a answers", "b answers", "last after ['a', 'b']"]
+    assert notes == 2 * once
+
+
+@pytest.mark.parametrize("when", ["starts", "answers"])
+def test_the_refusal_of_one_tracker_leaves_the_answers_of_the_others(when):
+    notes = []
+    with stream({"a": Deferred("a", notes, when), "b": Deferred("b", notes)}) as pushed:
+        pushed.push(NUMBERS[0])
+        pushed.result()
+        update = pushed.latest()
+    assert (update.tracked, update.lost) == ({"a": None, "b": "b"}, {"a": "a refused"})
+
+
+def test_an_error_in_the_answer_of_a_tracker_ends_the_stream():
+    notes = []
+    failing = Deferred("a", notes)
+    failing.submit = lambda frame: lambda: 1 / 0
+    pushed = stream({"a": failing, "b": Deferred("b", notes)})
+    pushed.push(NUMBERS[:2])
+    with pytest.raises(ZeroDivisionError):
+        pushed.close()
+    assert notes == ["b starts"]
+
+
+def test_pose_and_slip_together_answer_as_each_alone():
+    maps, frames = moving_domes((60, 80))[:4], sliding_texture((60, 80))[:4]
+    contact = round_contact((60, 80))
+
+    class Domes(engine.Operation):
+        motions = ("vertical",)
+        updates_per_second = math.inf
+
+        def push(self, frames, *, travel):
+            self.number = int(travel[-1])
+
+        def result(self):
+            return {}
+
+        def preview(self, seconds):
+            return maps[self.number]
+
+    def trackers():
+        return {
+            "pose": engine.pose.PoseTracker(),
+            "slip": engine.slip.SlipTracker(contact, FIELD / 80),
+        }
+
+    updates = []
+    with stream(
+        trackers(), Domes(), (60, 80), on_update=lambda update, status: updates.append(update)
+    ) as pushed:
+        for number, frame in enumerate(frames):
+            pushed.push(frame, travel=number)
+    pose, slip = trackers().values()
+    for update, result, frame in zip(updates, maps, frames, strict=True):
+        np.testing.assert_array_equal(update.tracked["pose"].translation, pose.push(result).translation)
+        np.testing.assert_array_equal(update.tracked["slip"].displacement, slip.push(frame).displacement)
+
+
+def test_trackers_do_not_wait_for_earlier_work_of_the_device():
+    device, gate = open_device(), cl.UserEvent(open_device().context)
+    blocked = cl.enqueue_marker(device.queue, wait_for=[gate])
+    try:
+        pose = engine.pose.PoseTracker(device=device)
+        for result in moving_domes((60, 80))[:3]:
+            pose.push(result)
+        slip = engine.slip.SlipTracker(round_contact((60, 80)), FIELD / 80, device=device)
+        for frame in sliding_texture((60, 80))[:3]:
+            slip.push(frame)
+        assert blocked.command_execution_status != cl.command_execution_status.COMPLETE
+    finally:
+        gate.set_status(cl.command_execution_status.COMPLETE)
+        device.finish()
 
 
 def test_trackers_can_be_replaced_while_the_stream_runs():

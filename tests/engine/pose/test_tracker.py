@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from moved_surfaces import Form, Map, bumpy, error_of, sampled
 
 from mirrorskin import engine, io
+from mirrorskin.kernels.device import open_device
 
 
 def test_a_stream_is_followed_over_keys_with_true_errors() -> None:
@@ -25,6 +27,23 @@ def test_a_result_that_shares_nothing_is_refused() -> None:
     tracker.push(sampled(bumpy, rng=rng))
     with pytest.raises(io.InputError, match="share too few pixels"):
         tracker.push(sampled(bumpy, shift=(50, 0, 0), rng=rng))
+
+
+def test_a_pose_waits_for_maps_that_another_queue_has_not_written_yet() -> None:
+    rng, device = np.random.default_rng(1), open_device()
+    results = [sampled(bumpy, shift=(0.02 * number, 0, 0), rng=rng) for number in range(3)]
+    tracker, other = engine.pose.PoseTracker(), engine.pose.PoseTracker()
+    for result in results[:2]:
+        tracker.push(result)
+        other.push(result)
+    gate = cl.UserEvent(device.context)
+    sources = {name: device.from_host(name, results[2][name]) for name in results[2]}
+    for source in sources.values():
+        source.arrived = gate
+    late = {name: source.copy_region(0, source.shape) for name, source in sources.items()}
+    answer = tracker.submit(io.Result(late, x=results[2].x, y=results[2].y))
+    gate.set_status(cl.command_execution_status.COMPLETE)
+    np.testing.assert_array_equal(answer().translation, other.push(results[2]).translation)
 
 
 def circle(steps: int, radius: float) -> list[np.ndarray]:
