@@ -227,7 +227,7 @@ def _records(
     pixels, (_, _, step_x, step_y) = rows * columns, grid
     height, normals = map_of("height", np.float32), map_of("normals", np.float32, 3)
     sigma = map_of("height_sigma", np.float32)
-    if size > 1:
+    if size > 1 and normals is None:
         means = array("mean", *shape), None if sigma is None else array("mean_sigma", *shape)
         _run(
             device, "pose_means", rows, columns, size,
@@ -252,8 +252,8 @@ def _records(
             device, "pose_gradient", rows, columns,
             step_x=step_x, step_y=step_y, values=height, gradient=gradient, moved=12 * pixels,
         )  # fmt: skip
-    unknown = result.offset_unknown
-    apart = result.component is not None and unknown is not None and np.any(unknown)
+    unknown: Any = None if result.component is None else result.offset_unknown
+    apart = unknown is not None and np.any(unknown)
     maps: dict[str, Any] = {
         "spiky": int(spiky and normals is not None),
         "height": height,

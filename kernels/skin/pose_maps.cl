@@ -110,26 +110,40 @@ INLINE int is_near_border(
     return is_left_out;
 }
 
-INLINE float height_at(MAP height, const int rows, const int columns, const int row, const int column)
+#define SHARE (1.0f / (SIZE * SIZE))
+
+// A height; NaN outside of the map. Unless they are means already, it is the mean of SIZE x SIZE heights.
+INLINE float height_at(
+    MAP height, const int are_means, const int wide, const int rows, const int columns, const int row, const int column)
 {
-    return row >= 0 && column >= 0 && row < rows && column < columns ? height[row * columns + column] : NAN;
+    if (row < 0 || column < 0 || row >= rows || column >= columns) return NAN;
+    if (are_means) return height[row * columns + column];
+    float mean = 0;
+    for (int x = 0; x < SIZE; ++x) {
+        float sum = 0;
+        for (int y = 0; y < SIZE; ++y) sum += height[(SIZE * row + y) * wide + SIZE * column + x];
+        mean += sum;
+    }
+    return SHARE * mean;
 }
 
 // Whether a height is far from its neighbours along all known lines, and from their cubic.
 INLINE int is_spike(
-    MAP height, const int rows, const int columns, const int row, const int column, const float here, const float limit)
+    MAP height, const int are_means, const int wide, const int rows, const int columns, const int row,
+    const int column, const float here, const float limit)
 {
+#define HEIGHT_AT(down, right) height_at(height, are_means, wide, rows, columns, row + (down), column + (right))
     const int down[4] = {0, 1, 1, 1}, right[4] = {1, 0, 1, -1};
     const int is_at_border = row == 0 || column == 0 || row == rows - 1 || column == columns - 1;
     int lines = 0;
     for (int i = 0; i < 4; ++i) {
         const int y = down[i], x = right[i];
-        const float near = height_at(height, rows, columns, row - y, column - x) + height_at(height, rows, columns, row + y, column + x);
+        const float near = HEIGHT_AT(-y, -x) + HEIGHT_AT(y, x);
         const float bend = fabs(here - 0.5f * near);
         if (bend != bend) continue;
         if (!(bend > limit)) return 0;
-        const float wide = height_at(height, rows, columns, row - 2 * y, column - 2 * x) + height_at(height, rows, columns, row + 2 * y, column + 2 * x);
-        if (fabs(here - (4 * near - wide) / 6) < 0.5f * bend) return 0;
+        const float far = HEIGHT_AT(-2 * y, -2 * x) + HEIGHT_AT(2 * y, 2 * x);
+        if (fabs(here - (4 * near - far) / 6) < 0.5f * bend) return 0;
         ++lines;
     }
     return lines > !is_at_border;
@@ -157,8 +171,6 @@ INLINE void add_lines(MAP values, const int wide, const int count, const int par
         }
     }
 }
-
-#define SHARE (1.0f / (SIZE * SIZE))
 
 // The sums of the SIZE numbers of a line for each pixel of a group.
 INLINE F sums_of_line(const float *line, const int parts)
@@ -193,10 +205,15 @@ INLINE void put_some(OUT values, const int count, const F numbers)
 
 // Whether no height of a group is a spike, by the neighbours in the same row.
 INLINE int is_smooth(
-    MAP height, const int p, const int column, const int columns, const int count, const F here, const F limit)
+    MAP height, const int are_means, const int wide, const int rows, const int columns, const int row,
+    const int column, const int count, const F here, const F limit)
 {
     if (count < LANES || column == 0 || column + LANES >= columns) return 0;
-    const F bend = here - 0.5f * (LOAD(height + p - 1) + LOAD(height + p + 1));
+    float near[LANES + 2];
+    near[0] = height_at(height, are_means, wide, rows, columns, row, column - 1);
+    *(Lanes *)(near + 1) = here;
+    near[LANES + 1] = height_at(height, are_means, wide, rows, columns, row, column + LANES);
+    const F bend = here - 0.5f * (*(const Lanes *)near + *(const Lanes *)(near + 2));
     return !any_of(!((bend <= limit) & (-bend <= limit)));
 }
 
@@ -206,9 +223,9 @@ __kernel void pose_spikes(const int rows, const int columns, MAP height, MAP hei
     EACH_GROUP {
         const F here = some_of(height + p, count), limit = SPIKE * some_of(height_sigma + p, count);
         put_some(clean + p, count, here);
-        if (is_smooth(height, p, column, columns, count, here, limit)) continue;
+        if (is_smooth(height, 1, columns, rows, columns, row, column, count, here, limit)) continue;
         for (int i = 0; i < count; ++i)
-            if (is_spike(height, rows, columns, row, column + i, height[p + i], SPIKE * height_sigma[p + i]))
+            if (is_spike(height, 1, columns, rows, columns, row, column + i, height[p + i], SPIKE * height_sigma[p + i]))
                 clean[p + i] = NAN;
     }
 }
@@ -235,9 +252,16 @@ __kernel void pose_records(
     BYTES filled, BYTES contact, BYTES edges, OUT records, OUT slopes)
 {
     EACH_GROUP {
-        const int first = SIZE * (row * wide + column);
-        const F z = some_of(height + p, count), none = NAN;
-        F x, y, upright, square = NOT_COMPARED, variance = FAR;
+        const int first = SIZE * (row * wide + column), are_means = SIZE == 1 || gradient;
+        const F none = NAN;
+        F z, sigma, x, y, upright, square = NOT_COMPARED, variance = FAR;
+        if (are_means) {
+            z = some_of(height + p, count);
+        } else {
+            float line[LANES * SIZE];
+            add_lines(height + first, wide, count, 1, 0, line);
+            z = SHARE * sums_of_line(line, 1);
+        }
         if (normals) {
             float line[3 * LANES * SIZE];
             add_lines(normals + 3 * first, wide, count, 3, 0, line);
@@ -264,15 +288,28 @@ __kernel void pose_records(
         int flags[LANES], far[LANES], is_each_smooth = 1;
         for (int i = 0; i < LANES; ++i) flags[i] = far[i] = 0;
         if (height_sigma) {
-            const F sigma = some_of(height_sigma + p, count), own = sigma * sigma;
+            if (are_means) {
+                sigma = some_of(height_sigma + p, count);
+            } else {
+                float line[LANES * SIZE];
+                add_lines(height_sigma + first, wide, count, 1, 1, line);
+                sigma = SHARE * roots(sums_of_line(line, 1));
+            }
+            const F own = sigma * sigma;
             variance = sigma > 0.0f ? GREATER(own, (F)SHARPEST) : variance;
-            is_each_smooth = !spiky || is_smooth(height, p, column, columns, count, z, SPIKE * sigma);
+            is_each_smooth = !spiky
+                || is_smooth(height, are_means, wide, rows, columns, row, column, count, z, SPIKE * sigma);
+        }
+        float heights[LANES], limits[LANES];
+        if (!is_each_smooth) {
+            *(Lanes *)heights = z;
+            *(Lanes *)limits = SPIKE * sigma;
         }
         if (component || filled || edges || contact || !is_each_smooth)
             for (int lane = 0; lane < count; ++lane) {
                 if (!is_each_smooth)
                     flags[lane] = is_spike(
-                        height, rows, columns, row, column + lane, height[p + lane], SPIKE * height_sigma[p + lane]);
+                        height, are_means, wide, rows, columns, row, column + lane, heights[lane], limits[lane]);
                 const int left = SIZE * (column + lane);
                 for (int i = 0, q; i < SIZE * SIZE; ++i) {
                     q = (SIZE * row + i / SIZE) * wide + left + i % SIZE;

@@ -71,10 +71,9 @@ def pose_means(
     height: Array, height_sigma: Array | None, mean: Array, mean_sigma: Array | None, size: int = 1
 ) -> None:
     """Write the means of size x size heights, and their standard deviations; NaN if one is unknown."""
-    mean[...] = _blocks(height, size).mean(axis=0)
-    if height_sigma is not None and mean_sigma is not None:
-        sigmas = _blocks(np.where(height_sigma > 0, height_sigma, np.nan), size)
-        mean_sigma[...] = np.sqrt(np.sum(sigmas**2, axis=0)) / size**2
+    mean[...], sigma = _means(height, height_sigma, size)
+    if mean_sigma is not None:
+        mean_sigma[...] = sigma
 
 
 def pose_records(
@@ -100,14 +99,15 @@ def pose_records(
     A pixel is not used if it is filled, steep, or at most two pixels away from an edge or a pixel without
     contact; or, if ``spiky``, a spike as of `pose_spikes`.
 
-    A pixel of the records is a block of ``size`` x ``size`` pixels of the maps, except of heights, their
-    standard deviations and the gradient, which are means already. Its normal is the mean of theirs.
+    A pixel of the records is a block of ``size`` x ``size`` pixels of the maps. Its normal is the mean of
+    theirs, its height as of `pose_means`. With a gradient, it and the heights are means already.
     """
     if normals is None:
         assert gradient is not None
         normals = np.dstack([-gradient, np.ones(height.shape)])
         normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
     else:
+        height, height_sigma = _means(height, height_sigma, size)
         normals = _blocks(normals, size).mean(axis=0)
     square, variance = np.full(height.shape, NOT_COMPARED), np.full(height.shape, FAR)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -181,6 +181,15 @@ def _blocks(values: Array, size: int) -> Array:
             for row, column in np.ndindex(size, size)
         ]
     )
+
+
+def _means(height: Array, height_sigma: Array | None, size: int) -> tuple[Array, Array | None]:
+    """Return the means of size x size heights, and their standard deviations; NaN if one is unknown."""
+    mean = np.asarray(_blocks(height, size).mean(axis=0))
+    if height_sigma is None:
+        return mean, None
+    sigmas = _blocks(np.where(height_sigma > 0, height_sigma, np.nan), size)
+    return mean, np.asarray(np.sqrt(np.sum(sigmas**2, axis=0)) / size**2)
 
 
 def _near(border: NDArray[np.bool_]) -> NDArray[np.bool_]:
