@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -22,12 +23,27 @@ class Motion:
     @classmethod
     def of(cls, vector: Doubles, shift: Doubles) -> Motion:
         """Return the motion with a rotation vector, (3,), and a translation."""
-        return cls(np.asarray(cv2.Rodrigues(np.asarray(vector, np.float64))[0]), shift)
+        x, y, z = np.asarray(vector, np.float64).tolist()  # without a call that lets other threads run
+        angle = math.sqrt(x * x + y * y + z * z)
+        along = math.sin(angle) / angle if angle else 1.0
+        across = 2 * (math.sin(angle / 2) / angle) ** 2 if angle else 0.5
+        turn = [
+            [1 - across * (y * y + z * z), across * x * y - along * z, across * x * z + along * y],
+            [across * x * y + along * z, 1 - across * (x * x + z * z), across * y * z - along * x],
+            [across * x * z - along * y, across * y * z + along * x, 1 - across * (x * x + y * y)],
+        ]
+        return cls(np.array(turn), shift)
 
     @property
     def vector(self) -> Doubles:
         """The rotation vector, (3,)."""
-        return np.asarray(cv2.Rodrigues(self.turn)[0].ravel())
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self.turn.tolist()
+        x, y, z, cosine = (zy - yz) / 2, (xz - zx) / 2, (yx - xy) / 2, (xx + yy + zz - 1) / 2
+        sine = math.sqrt(x * x + y * y + z * z)
+        if cosine < 0:  # near half a turn, the difference from the transpose does not determine the axis
+            return np.asarray(cv2.Rodrigues(self.turn)[0].ravel())
+        scale = math.atan2(sine, cosine) / sine if sine else 1.0
+        return np.array([scale * x, scale * y, scale * z])
 
     def apply(self, points: Doubles) -> Doubles:
         """Move points, (..., 3)."""

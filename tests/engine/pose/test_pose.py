@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 from moved_surfaces import RADIUS, ball, bumpy, error_at, error_of, plane, rod, sampled
+from scipy.spatial.transform import Rotation
 from turned_objects import Moved, turned
 
 from mirrorskin import engine, io
@@ -224,3 +225,11 @@ def test_what_cannot_be_compared_is_refused(name: str) -> None:
     first, second, message = refusals()[name]
     with pytest.raises(io.InputError, match=message):
         engine.pose.estimate_pose(first, second)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.5, 1.6, 3.1])
+def test_a_rotation_is_kept_to_rounding_errors(angle: float) -> None:
+    vector = angle * np.array([0.6, -0.64, 0.48])
+    pose = engine.pose.Pose(vector, np.zeros(3), np.eye(6), 1.0, 1, np.zeros((0, 6)))
+    np.testing.assert_allclose(pose.motion.turn, Rotation.from_rotvec(vector).as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(pose.inverse().rotation, -vector, rtol=1e-13, atol=1e-25)
