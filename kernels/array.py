@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property, wraps
@@ -362,8 +363,9 @@ class Array:
             return self._host[rows].copy()
         out = _empty(shape, self.dtype)
         if out.nbytes:
-            with self.device.profile.waiting_for(self.name):
-                cl.enqueue_copy(queue, out, self.buffer, src_offset=start, wait_for=after, is_blocking=True)
+            began = time.perf_counter()
+            cl.enqueue_copy(queue, out, self.buffer, src_offset=start, wait_for=after, is_blocking=True)
+            self.device.profile.add("wait", self.name, time.perf_counter() - began)
         return out
 
     def _part(self, rows: int | slice) -> tuple[int, tuple[int, ...]]:
@@ -519,6 +521,9 @@ Operand = Array | BorrowedBuffer
 
 def _wait_before_end(command: cl.Event, memory_in_use: NDArray[Any]) -> None:
     """Wait for the last command that uses some memory, before the memory is released."""
+    with suppress(cl.Error):
+        if command.command_execution_status == cl.command_execution_status.COMPLETE:
+            return
     try:
         with waiting, suppress(cl.Error):
             command.wait()

@@ -18,6 +18,7 @@ from mirrorskin.engine.live.run import LiveRun
 from mirrorskin.engine.live.status import PUSHED, RAISED, SHOWN, UPDATED, WAITED, Monitor, Status, Update
 from mirrorskin.engine.live.tracking import Events, Limit, Tracker, Trackers
 from mirrorskin.io import Block, InputError, LiveSource
+from mirrorskin.io.base.threads import computes
 from mirrorskin.io.storage.layout import POSITIONS
 
 LATENCY = 0.1
@@ -181,6 +182,7 @@ class Loop:
             part = part_of(block, slice(number, number + 1))
             yield part if number == 0 else replace(part, dropped=0)  # lost frames are counted once
 
+    @computes
     def _take(self, block: Block, newest: bool) -> None:
         """Push the frames of a block, except for those that are too old, and mark them.
 
@@ -213,6 +215,7 @@ class Loop:
             self._taken, self._pending = times[last], True
             self._monitor.time(PUSHED, self._source.now() - now)
 
+    @computes
     def _update(self) -> None:
         if not self._pending or self._newest is None:
             return
@@ -227,7 +230,7 @@ class Loop:
         self._monitor.updated()
         self._monitor.time(UPDATED, finished - started)
         self._arrived.append(self._taken)
-        if update.first is not None or update.tracked:
+        if update.tracked or update.first is not None:
             self._monitor.time(SHOWN, finished - self._taken)
         if update.height is not None:
             lag = min(update.height_lag, len(self._arrived) - 1)

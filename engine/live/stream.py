@@ -386,7 +386,8 @@ class _Pushed(Closing):
             return None
         frames, times, places = zip(*taken, strict=True)
         part = out[: len(taken)]
-        np.stack(frames, out=part)
+        for copied, frame in zip(part, frames, strict=True):
+            np.copyto(copied, frame)
         self._free += frames
         first, self._count = self._count, self._count + len(taken)
         positions: dict[str, Any] = {name: np.array([place[name] for place in places]) for name in places[0]}

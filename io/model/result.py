@@ -285,7 +285,12 @@ class Result(MapContainer, Mapping[str, Any]):
         >>> turn.fitted.tilt, turn.process
         (0.05, {'tilt': 0.05})
         """
-        return self.assign(fitted=replace(self.fitted, **values), process={**self.process, **values})
+        changed = object.__new__(Result)
+        for name in Result.__slots__:
+            object.__setattr__(changed, name, getattr(self, name))
+        object.__setattr__(changed, "fitted", replace(self.fitted, **values))
+        object.__setattr__(changed, "process", {**self.process, **values})
+        return changed
 
     def with_process(self, process: Mapping[str, ProcessValue]) -> Result:
         """Return a copy with another process; what `Fitted` declares of it is in ``fitted``, if unknown."""
