@@ -207,7 +207,7 @@ def fuse(
         if not sources:
             return _fuse_maps(first, second, pixel_size, mask, robust, device)
         options: dict[str, Any] = {"memory_limit": memory_limit, "device": device, "progress": progress}
-        return _fuse_sources(first, second, **for_recordings, register=register, robust=robust, **options)
+        return fuse_sources(first, second, **for_recordings, register=register, robust=robust, **options)
 
 
 def _is_source(value: Any) -> bool:
@@ -318,26 +318,30 @@ def _check_shapes(heights: Result, normals: Result, mask: ArrayLike | None) -> M
     return np.ones((rows, columns), bool) if mask is None else np.asarray(mask) != 0
 
 
-def _fuse_sources(
+def fuse_sources(
     vertical: Source,
     axial: Source,
     *,
-    press: Press | Mapping[str, Any] | None,
-    rotation: Rotation | Mapping[str, Any] | None,
-    register: bool,
-    robust: bool,
-    memory_limit: int,
-    device: Choice,
-    progress: Progress | None,
+    press: Press | Mapping[str, Any] | None = None,
+    rotation: Rotation | Mapping[str, Any] | None = None,
+    register: bool = True,
+    robust: bool = False,
+    memory_limit: int = MEMORY_LIMIT,
+    device: Choice = None,
+    progress: Progress | None = None,
+    evidence: tuple[Result, PressEvidence] | None = None,
 ) -> Result:
-    """Reconstruct a press and a rotation, and return the surface of both."""
+    """Reconstruct a press and a rotation, and return the surface of both; see `fuse`.
+
+    ``evidence`` is that of `press_evidence` of the press, if it was computed before.
+    """
     vertical, axial = calibrated(vertical), calibrated(axial)
     pixel_size = _check_sources(vertical, axial)
     opened = open_devices(device)
     common: dict[str, Any] = {"memory_limit": memory_limit, "device": opened}
     turn = Rotation(**{**_options_of(rotation), **common})
     _check_rotation(axial, turn)
-    pressed, taken = press_evidence(vertical, {**_options_of(press), **common}, progress)
+    pressed, taken = evidence or press_evidence(vertical, {**_options_of(press), **common}, progress)
     if not np.isfinite(pressed.height).any():
         raise InputError(f"{vertical.name}: no pixel turned light, so no height is known to fuse")
     before = fill_with_nearest(pressed.height)
@@ -352,7 +356,8 @@ def _fuse_sources(
         # The first of several surfaces is rarely the last one, so its sigma is not needed.
         surface = solver.surface(slopes, sigma=number > 0 or passes == 1)
         assert turned.fitted.tilt is not None
-        moved = _moved(before, surface.height, turned.fitted.tilt, pixel_size)
+        change = np.where(slopes.defined, surface.height - before, np.nan)
+        moved = _moved(change, turned.fitted.tilt, pixel_size)
         if moved <= _MAX_MOVEMENT:
             break
         before = fill_with_nearest(surface.height)
@@ -481,11 +486,9 @@ def _check_rotation(axial: Source, rotation: Rotation) -> None:
         raise InputError(f"{axial.name}: frames are registered with the heights of the press: give no others")
 
 
-def _moved(
-    before: NDArray[np.float32], after: NDArray[np.float32], tilt: float, pixel_size: tuple[float, float]
-) -> float:
+def _moved(change: NDArray[np.floating], tilt: float, pixel_size: tuple[float, float]) -> float:
     """Return the 99th percentile of the shift of points, pixels, by a change of their heights."""
-    change = np.abs(before - after)[np.isfinite(after)]
+    change = np.abs(change[np.isfinite(change)])
     return float(np.percentile(change, 99) * np.sin(tilt) / min(pixel_size)) if change.size else 0.0
 
 

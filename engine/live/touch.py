@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -12,14 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mirrorskin.engine.base.errors import NotConverged
-from mirrorskin.engine.fusion.fusion import fuse
+from mirrorskin.engine.base.reconstruction import calibrated
+from mirrorskin.engine.fusion.fusion import PressEvidence, fuse_sources, press_evidence
 from mirrorskin.engine.fusion.solver import is_relative
 from mirrorskin.engine.live.recipe import PRESS_STEPS, TURN_FRAMES, Contact, Measured, Recipe, cheapest
 from mirrorskin.io import ArrayRecording, Calibrated, Calibration, InputError, Result, check
 from mirrorskin.io.base.arguments import check_number, checked, in_unit
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.types import Header, Source
-from mirrorskin.kernels.device import Choice
+from mirrorskin.kernels.device import Choice, open_devices
 
 CLEAR_CHANGE = 8.0
 """Change of a pixel's counts on contact, in standard deviations of the noise."""
@@ -37,7 +40,7 @@ _GAIN_MIN = 0.97  # more frames that leave more than this share of the standard 
 _USELESS = 2  # extensions in a row that were of no use, after which a touch ends
 _MARGIN = 0.9  # of the requested standard deviation, which additional frames aim at
 _RETAKEN = ("flicker", "outliers", "repeated frames", "phase jump", "cut off", "no response")
-_SATURATED = "cut off"
+_PRESS = {"method": "change-point"}
 
 
 @dataclass(frozen=True)
@@ -268,7 +271,7 @@ def recordings_of(
 
 def fuse_touch(press: Source, turn: Source, device: Choice = None) -> Result:
     """Return the surface of the press and the turn of a touch; each pixel of the press has its own levels."""
-    return fuse(press, turn, press={"method": "change-point"}, device=device)
+    return fuse_sources(press, turn, press=_PRESS, device=device)
 
 
 def sigma_of_normals(surface: Result) -> NDArray[np.float64]:
@@ -301,10 +304,18 @@ class _Touch:
         self._began = sensor.now()
         self._searched = self._retaken = 0
         self._error: NotConverged | None = None
+        self._worker = ThreadPoolExecutor(1, "mirrorskin-touch")
+        self._pressed: tuple[list[Taken], Future[tuple[Result, PressEvidence]]] | None = None
         self._doubts: dict[str, str] = {}  # findings that were left, by kind
 
     def run(self) -> Touched:
         """Find contact, press and turn, and add what helps until the surface is good enough."""
+        try:
+            return self._run()
+        finally:
+            self._worker.shutdown(wait=False, cancel_futures=True)
+
+    def _run(self) -> Touched:
         contact = self._find_contact()
         planned = self._plan(contact)
         self._tell(f"expected: {planned}", None)
@@ -407,6 +418,7 @@ class _Touch:
                 break
             share = here
         self._check(first)
+        self._evidence()
 
     def _turn(self, count: int) -> None:
         """Lean at the deepest place, and take evenly spaced frames of a turn."""
@@ -417,6 +429,20 @@ class _Touch:
         for number in range(count):
             self._take(Pose(press, tilt, (math.tau * number / count + shift) % math.tau))
         self._check(first)
+
+    def _evidence(self) -> Future[tuple[Result, PressEvidence]]:
+        """Return the evidence of the press so far, which is computed while the body leans and turns."""
+        upright = [taken for taken in self._taken if not taken.pose.tilt]
+        if self._pressed is not None:
+            earlier, evidence = self._pressed
+            if len(earlier) == len(upright) and all(map(operator.is_, earlier, upright)):
+                return evidence
+        press, _ = recordings_of(self._sensor, upright)
+        assert press is not None
+        options = {**_PRESS, "device": open_devices(self._device)}
+        source = calibrated(_calibrated(press, self._calibration))
+        self._pressed = upright, self._worker.submit(press_evidence, source, options)
+        return self._pressed[1]
 
     @property
     def _deepest(self) -> float:
@@ -475,9 +501,10 @@ class _Touch:
         press, turn = recordings_of(self._sensor, self._taken)
         assert press is not None
         assert turn is not None
-        calibration = self._calibration
+        sources = (_calibrated(source, self._calibration) for source in (press, turn))
         try:
-            result = fuse_touch(_calibrated(press, calibration), _calibrated(turn, calibration), self._device)
+            evidence = self._evidence().result()
+            result = fuse_sources(*sources, press=_PRESS, device=self._device, evidence=evidence)
         except NotConverged as error:  # more frames may help
             self._error = error
             return best, math.inf

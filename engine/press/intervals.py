@@ -252,7 +252,7 @@ def _lowest(function: Callable[[float], float], low: float, high: float) -> floa
 
 _TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of the column and row offsets
 _REACH = 3.0  # half the size of the window, in its widths
-_MIN_EIGENVALUE = 1e-9  # least eigenvalue of a scaled normal matrix that is inverted
+_MIN_PIVOT = 1e-9  # least pivot of a scaled normal matrix that is inverted
 
 
 class Paraboloids(NamedTuple):
@@ -283,20 +283,17 @@ def fit_paraboloids(height: Doubles, weight: Doubles, places: NDArray[np.bool_],
     window = _Window(places, width, reach)
     powers = [(i, j) for i, j in product(range(5), repeat=2) if i + j <= 4]
     moments = window.sums(weight, powers)
-    right = np.stack(list(window.sums(weight * relative, list(_TERMS)).values()), axis=-1)
-    matrix = np.stack(
-        [np.stack([moments[a + c, b + d] for c, d in _TERMS], axis=-1) for a, b in _TERMS], axis=-2
-    )
+    right = np.stack(list(window.sums(weight * relative, list(_TERMS)).values()))
+    matrix = np.stack([[moments[a + c, b + d] for c, d in _TERMS] for a, b in _TERMS])
     square = window.sums(weight * relative**2, [(0, 0)])[0, 0]
     pixels = window.sums(valid.astype(np.float64), [(0, 0)])[0, 0]
-    inverse, sound = _invert(matrix)
-    terms = np.einsum("nij,nj->ni", inverse, right)
-    residual = np.maximum(square - np.sum(terms * right, axis=-1), 0)
+    terms, variance, sound = _solve(matrix, right)
+    residual = np.maximum(square - np.sum(terms * right, axis=0), 0)
     enough = sound & (pixels > 2 * len(_TERMS))
     return Paraboloids(
-        height=terms[:, 0] + datum,
-        along=terms[:, 1:3].T,
-        variance=np.stack([inverse[:, 1, 1], inverse[:, 2, 2]]),
+        height=terms[0] + datum,
+        along=terms[1:3],
+        variance=variance[1:3],
         misfit=np.where(enough, residual / np.maximum(pixels - len(_TERMS), 1), np.nan),
         pixels=pixels,
     )
@@ -326,10 +323,27 @@ class _Window:
         return np.asarray(cv2.sepFilter2D(values, cv2.CV_64F, along, down, borderType=border), np.float64)
 
 
-def _invert(matrix: Doubles) -> tuple[Doubles, NDArray[np.bool_]]:
-    """Return the inverses of matrices, and which are regular; the others are replaced by the identity."""
-    size = np.sqrt(np.maximum(np.einsum("nii->ni", matrix), np.finfo(float).tiny))
-    scaled = matrix / (size[:, :, np.newaxis] * size[:, np.newaxis, :])
-    sound = np.linalg.eigvalsh(scaled)[:, 0] > _MIN_EIGENVALUE
-    scaled[~sound] = np.eye(matrix.shape[-1])
-    return np.linalg.inv(scaled) / (size[:, :, np.newaxis] * size[:, np.newaxis, :]), sound
+def _solve(matrix: Doubles, right: Doubles) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
+    """Return the solutions of n systems, (K, n), the diagonals of the inverses, and which are regular.
+
+    The matrices, (K, K, n), are symmetric. Cholesky's factor of each, scaled to a diagonal of 1, is inverted.
+    """
+    count = len(matrix)
+    diagonal = matrix[range(count), range(count)]
+    size = np.sqrt(np.maximum(diagonal, np.finfo(float).tiny))
+    factor, inverse = np.zeros(matrix.shape), np.zeros(matrix.shape)
+    sound: NDArray[np.bool_] = np.min(diagonal, axis=0) > 0
+    for row in range(count):
+        for column in range(row):
+            known = np.sum(factor[row, :column] * factor[column, :column], axis=0)
+            factor[row, column] = matrix[row, column] / (size[row] * size[column]) - known
+            factor[row, column] /= factor[column, column]
+        pivot = 1 - np.sum(factor[row, :row] ** 2, axis=0)
+        sound &= pivot > _MIN_PIVOT
+        root = factor[row, row] = np.sqrt(np.where(sound, pivot, 1.0))
+        inverse[row, row] = 1 / root
+        for column in range(row):
+            known = np.sum(factor[row, column:row] * inverse[column:row, column], axis=0)
+            inverse[row, column] = -known / root
+    scaled = np.einsum("abn,bn->an", inverse, right / size)
+    return np.einsum("abn,an->bn", inverse, scaled) / size, np.sum(inverse**2, axis=0) / size**2, sound
