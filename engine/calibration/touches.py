@@ -48,6 +48,7 @@ _NEARLY_SETTLED = 0.5  # the same, of a fit that is repeated
 _ROUGHLY = 2  # steps before outliers are excluded; in an exact fit, heights then stay as they are
 _CONTRADICTION = 3.0  # standard deviations between a prior and the touches
 _WELL_SHOWN = 0.008  # relative standard error of gain and half-angle by a touch, up to which noise prevails
+_CLEAR = 4.0  # standard deviations of the contradiction of touches by chance, from which on it is a note
 _NEGLIGIBLE = 1e-6  # standard deviation of a parameter that is not estimated
 _MOVED = 0.02  # pixels that points move by an error of the pivot, from which frames are registered again
 _UNKNOWN = {
@@ -602,6 +603,13 @@ class _Fitted(NamedTuple):
     matrix: Doubles  # information of all touches
     vector: Doubles  # matrix times the parameters that the touches alone would have
     covariance: Doubles
+    contradiction: float  # of touches with each other, over what noise explains
+    degrees: float  # of freedom of the contradiction
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the touches contradict each other by more than chance."""
+        return self.contradiction > 1 + _CLEAR * math.sqrt(2 / max(self.degrees, 1e-9))
 
 
 def _fit_with_priors(
@@ -645,14 +653,16 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: _Priors, memory: _Mem
     values, precision = start.copy(), np.diag(priors.sigma**-2.0)
     roughly = 0 if not exact and all(touch.is_warm for touch in touches) else _ROUGHLY
     for number in range(_ITERATIONS):
-        matrix, vector = memory.matrix.copy(), memory.vector.copy()
-        steps = []
+        informations, pushes, steps = [], [], []
         for touch, weight in zip(touches, memory.weights, strict=False):
             information, push, step = _eliminate(touch, values, number == roughly, exact and number < roughly)
             weight = weight * _trust(information, priors)
-            matrix += weight * information
-            vector += weight * (information @ values + push)
+            informations.append(weight * information)
+            pushes.append(weight * push)
             steps.append(step)
+        pulls = [each @ values + push for each, push in zip(informations, pushes, strict=True)]
+        matrix = memory.matrix + np.sum(informations, axis=0)
+        vector = memory.vector + np.sum(pulls, axis=0)
         covariance = np.linalg.inv(matrix + precision)
         step = covariance @ (vector + precision @ priors.mean) - values
         for of_touch in steps:
@@ -661,7 +671,34 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: _Priors, memory: _Mem
         settled = _SETTLED if exact else _NEARLY_SETTLED
         if number >= roughly and np.all(np.abs(step) < settled * np.sqrt(np.diag(covariance))):
             break
-    return _Fitted(values, matrix, vector, (covariance + covariance.T) / 2)
+    pushes = [push - each @ step for push, each in zip(pushes, informations, strict=True)]
+    contradiction, degrees = _contradiction_of(informations, pushes, covariance, precision)
+    if exact and contradiction > 1:
+        matrix, vector = (
+            earlier + (each - earlier) / contradiction
+            for earlier, each in ((memory.matrix, matrix), (memory.vector, vector))
+        )
+        covariance = np.linalg.inv(matrix + precision)
+        values = covariance @ (vector + precision @ priors.mean)
+    return _Fitted(values, matrix, vector, (covariance + covariance.T) / 2, contradiction, degrees)
+
+
+def _contradiction_of(
+    informations: Sequence[Doubles], pushes: Sequence[Doubles], covariance: Doubles, precision: Doubles
+) -> tuple[float, float]:
+    """Return by how much touches contradict each other, over what noise explains, and degrees of freedom.
+
+    A touch with the information I pushes the parameters of the fit, whose covariance is C, by g. By noise
+    alone the covariance of g is I - I C I. With the priors' precision P the contradiction is ::
+
+        sum of g^T (I + P)^-1 g  /  sum of trace((I + P)^-1 (I - I C I))
+    """
+    squares = degrees = 0.0
+    for information, push in zip(informations, pushes, strict=True):
+        alone = np.linalg.inv(information + precision)
+        squares += float(push @ alone @ push)
+        degrees += float(np.trace(alone @ (information - information @ covariance @ information)))
+    return (squares / degrees, degrees) if len(pushes) > 1 and degrees > 0 else (1.0, 0.0)
 
 
 def _trust(information: Doubles, priors: _Priors) -> float:
@@ -786,6 +823,12 @@ def _result(attempt: _Attempt) -> TouchFit:
                      error * size, unit, determined)
         )  # fmt: skip
     notes += [_contradiction(each, priors, fit) for each in attempt.dropped]
+    if fit.contradicts:
+        notes.append(
+            f"the touches contradict each other by {math.sqrt(fit.contradiction):.2g} times their errors,"
+            " which the standard errors include: was a frame lost, did an object slip, is the travel exact,"
+            " and is the lens in focus?"
+        )
     notes += _undetermined(estimates)
     notes += [f"{touch.name} is not used: {touch.reason}" for touch in attempt.read if touch not in used]
     if priors.is_free(SHARED.index("pixel_size")):

@@ -14,6 +14,7 @@ from mirrorskin.engine.base.sources import DerivedSource
 from mirrorskin.io import Block, Header, InputError, Source, pixel_axes
 from mirrorskin.io.base.types import block_memory
 from mirrorskin.io.model.positions import check_phase
+from mirrorskin.io.watch.traces import FrameSamples
 from mirrorskin.kernels.device import C_TYPES, Device, open_device
 from mirrorskin.kernels.rotation.registration import BORDER
 
@@ -107,6 +108,7 @@ class Registered(DerivedSource):
         self._registered = self.device.array("registered", (rows, columns), np.float32)
         length = _BLOCK // (rows * columns * source.dtype.itemsize)
         self._room = np.empty((min(max(1, length), self.shape[0]), rows, columns), source.dtype)
+        self._original = FrameSamples(self.shape)
 
     @property
     def noise_gain(self) -> NDArray[np.float32]:
@@ -119,9 +121,17 @@ class Registered(DerivedSource):
         gain: NDArray[np.float32] = np.sqrt(squares / np.where(count > 0, count, np.float32(np.nan)))
         return gain
 
+    def shows_compression(self) -> bool:
+        """Return whether the frames so far, before they were interpolated, show a compression with a loss.
+
+        Interpolation changes the noise, by the fraction of a pixel that each point moves.
+        """
+        return self._original.compression(self.motion)
+
     def rewind(self) -> None:
         """Go back to the first frame, and forget the noise."""
         self._source.rewind()
+        self._original = FrameSamples(self.shape)
         self._noise.fill()
 
     def read(self, out: NDArray[Any] | None = None, /) -> Block | None:
@@ -131,6 +141,7 @@ class Registered(DerivedSource):
         if block is None:
             return None
         count = len(block.frames)
+        self._original.push(block.frames)
         phases = check_phase(block.phase, count, f"{self.name}: the phase of frames from {block.index} on")
         for frame, phase, registered in zip(block.frames, phases, out, strict=False):
             self._shift.write(self._geometry.shift(float(phase)))

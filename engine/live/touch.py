@@ -38,8 +38,9 @@ _SAME_CONTACT = 0.75  # least ratio of the areas of contact in press and turn
 _RETAKES = 2  # of what the check complains about
 _GAIN_MIN = 0.97  # more frames that leave more than this share of the standard deviation were of no use
 _USELESS = 2  # extensions in a row that were of no use, after which a touch ends
-_MARGIN = 0.9  # of the requested standard deviation, which additional frames aim at
-_RETAKEN = ("flicker", "outliers", "repeated frames", "phase jump", "cut off", "no response")
+_MARGIN = 0.85  # of the requested standard deviation, which the first recipe aims at; others aim at all of it
+_RETAKEN = ("flicker", "outliers", "repeated frames", "phase jump", "no response")
+_SATURATED = "cut off"  # again in all frames until the exposure is shorter
 _PRESS = {"method": "change-point"}
 
 
@@ -390,7 +391,7 @@ class _Touch:
     def _plan(self, contact: Contact) -> Recipe:
         """Return the cheapest recipe; if none suffices in time, what is possible in it."""
         room = (self._within - self._seconds) / self._each
-        recipe = cheapest(contact.variance, self._sigma)
+        recipe = cheapest(contact.variance, _MARGIN * self._sigma)
         if recipe is None or recipe.frames > room:
             most = min(room, (PRESS_STEPS[1] + TURN_FRAMES[1]) / 2)
             turn = TURN_FRAMES[0]
@@ -457,9 +458,10 @@ class _Touch:
             recording = recordings_of(sensor, self._taken)[int(leaning)]
             if recording is None:
                 return
-            found = {finding.kind: finding.text for finding in _check(recording) if finding.kind in _RETAKEN}
+            texts = {finding.kind: finding.text for finding in _check(recording)}
+            found = {kind: text for kind, text in texts.items() if kind in _RETAKEN}
             if not found or attempt == _RETAKES:
-                self._doubts |= found
+                self._doubts |= {kind: texts[kind] for kind in (*found, _SATURATED) if kind in texts}
                 return
             if attempt:  # an earlier frame may be wrong
                 first = self._searched
@@ -528,7 +530,7 @@ class _Touch:
         variance = sigma**2 if known else math.inf
         measured = Measured(press, turn, variance, contact.variance_of_turn(press, turn))
         recipes = [Recipe(*counts, math.sqrt(measured.after(*counts))) for counts in more]
-        enough = [recipe for recipe in recipes if recipe.sigma <= _MARGIN * self._sigma]
+        enough = [recipe for recipe in recipes if recipe.sigma <= self._sigma]
         usual = (2 * press, turn) if len(finer) == 2 else (press, min(2 * turn, TURN_FRAMES[1]))
         other = next(recipe for recipe in recipes if (recipe.press_steps, recipe.turn_frames) == usual)
         recipe = self._timed(min(enough, key=lambda r: (r.frames, r.sigma), default=other), press + turn)

@@ -103,8 +103,9 @@ def rms(values: Floats) -> float:
 
 
 def inside(values: Floats) -> Floats:
-    """Return what is not near the border, which has no light from outside of the picture."""
-    return np.asarray(values, np.float64)[3:-3, 3:-3]
+    """Return what is not near the border of a picture, which has no light from outside of it."""
+    values = np.asarray(values, np.float64)
+    return values[3:-3, 3:-3] if values.ndim == 2 else values
 
 
 Watched = tuple[Result, str, str]

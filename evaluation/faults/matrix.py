@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from mirrorskin.evaluation.base.tables import Table, replace_part
+from mirrorskin.evaluation.faults.calibrations import CALIBRATION_FAULTS, of_calibration
 from mirrorskin.evaluation.faults.camera import FAULTS, Fault, Floats
 from mirrorskin.evaluation.faults.estimators import ARRAYS, RECORDINGS, Answers, Surface, applies
 from mirrorskin.evaluation.faults.judge import Answer, Cell, inside, judge, rms
@@ -80,6 +81,7 @@ _RIM = "threshold, steps of 20 µm"
 ESTIMATORS: Mapping[str, Estimator] = {
     **_on_waves(RECORDINGS),
     "touch": functools.partial(of_touch(_waves), WAVES),
+    "calibration from touches": of_calibration,
     "integrate": _of_slopes(),
     "integrate with weights": _of_slopes(weights=True),
     "integrate robustly": _of_slopes(robust=True),
@@ -91,7 +93,8 @@ FUNCTIONS: Mapping[str, Estimator] = _on_waves(ARRAYS)
 PRESS = [name for name in ESTIMATORS if name.startswith(("threshold", "change-point"))]
 SLOPES = [name for name in ESTIMATORS if name.startswith("integrate")]
 TOUCHES = ["touch"]
-OTHERS = [name for name in ESTIMATORS if name not in PRESS + SLOPES + TOUCHES]
+CALIBRATIONS = ["calibration from touches"]
+OTHERS = [name for name in ESTIMATORS if name not in PRESS + SLOPES + TOUCHES + CALIBRATIONS]
 
 
 # --- Cells ---------------------------------------------------------------------------------------------
@@ -101,6 +104,8 @@ def faults_of(estimator: str) -> tuple[Any, ...]:
     """Return the faults of the frames, or of the slopes, that an estimator gets."""
     if estimator in SLOPES:
         return SLOPE_FAULTS
+    if estimator in CALIBRATIONS:
+        return CALIBRATION_FAULTS
     return tuple(fault for fault in FAULTS if applies(estimator, fault))
 
 
@@ -195,6 +200,7 @@ def with_tables(page: str) -> str:
         (OTHERS, FAULTS),
         (SLOPES, SLOPE_FAULTS),
         (TOUCHES, faults_of("touch")),
+        (CALIBRATIONS, CALIBRATION_FAULTS),
     )
     for number, (names, faults) in enumerate(parts):
         rows = [

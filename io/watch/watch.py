@@ -143,9 +143,8 @@ class FrameChecker:
         dropped = getattr(source, "dropped", None)
         lost = self._lost if dropped is None else int(np.sum(dropped))
         known = getattr(source, "findings", ())
-        undeclared = self.samples.compression(source.motion) and not any(
-            finding.kind == LOSSY and finding.warning for finding in known
-        )
+        shown = getattr(source, "shows_compression", lambda: self.samples.compression(source.motion))
+        undeclared = shown() and not any(finding.kind == LOSSY and finding.warning for finding in known)
         lengths = tuple(_geometry(source, series, field_limits, travel_limits))
         return (
             *known,

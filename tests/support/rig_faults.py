@@ -73,12 +73,7 @@ FAULTS: dict[str, tuple[Callable[[EmulatedRig], Any], str]] = {
 """What happens to a rig in the middle of a press, and words of what is said of it."""
 
 
-FIRMWARE_ONLY = {
-    "paused for 2 s",
-    "door by another program",
-    "G92 by another program",
-    "G10 by another program",
-}
+FIRMWARE_ONLY = {"paused for 2 s"}
 """What the emulator does not know."""
 
 AFTERWARDS = {"move by another program"}

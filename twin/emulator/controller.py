@@ -5,8 +5,9 @@ wait in a planner of 15, and a line is answered when its move is in the planner;
 at once. Machine coordinates are 0 at the homing switches and negative elsewhere.
 
 It supports what the driver uses: moves (``gcode.py``), the outputs coolant and spindle, ``$$``, ``$I``,
-``$X``, ``$H``, hold, resume and reset. Soft limits are checked for a whole arc before it starts; homing moves
-one axis at a time and slows down before the switch; reading any line takes a millisecond.
+``$X``, ``$H``, hold, resume and reset; and what another program may send: the door, and work offsets. Soft
+limits are checked for a whole arc before it starts; homing moves one axis at a time and slows down before the
+switch; reading any line takes a millisecond.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ RX_BUFFER = 128  # size of the receive buffer, bytes
 LINE_TIME = 1e-3  # time to read a line, seconds
 HARD_LIMIT, SOFT_LIMIT, ABORTED, HOMING_ABORTED, NO_SWITCH = 1, 2, 3, 6, 9
 
-_RESET, _QUERY, _HOLD, _RESUME = 0x18, ord("?"), ord("!"), ord("~")
+_RESET, _QUERY, _HOLD, _RESUME, _DOOR = 0x18, ord("?"), ord("!"), ord("~"), 0x84
 _SWITCHES: Mapping[str, tuple[str, bool]] = {
     "M8": ("coolant", True),
     "M9": ("coolant", False),
@@ -80,7 +81,7 @@ class Controller:
         self._received.clear()
         self._program.reset(self._own_place())
         self._homing = self._needs_reset = self._limit_reached = self._executing = False
-        self._report_due = self._hold_pending = False
+        self._report_due = self._hold_pending = self._door_opened = False
         self._reports = 0
         self._steps = self._loop()
         self._wait: _Wait = -math.inf
@@ -96,6 +97,8 @@ class Controller:
         for name, holds in (
             ("Home", self._homing),
             ("Alarm", self._locked),
+            ("Door:0", self._door_opened and self.planner.held(self._now)),
+            ("Door:2", self._door_opened),
             ("Hold:0", self.planner.held(self._now)),
             ("Hold:1", self.planner.holding),
             ("Run", self.planner.busy),
@@ -129,7 +132,7 @@ class Controller:
         if self._powered_off:
             return
         for byte in data:
-            if byte in (_RESET, _QUERY, _HOLD, _RESUME):
+            if byte in (_RESET, _QUERY, _HOLD, _RESUME, _DOOR):
                 self._on_realtime(byte)
             elif byte < 0x80 and len(self._received) < RX_BUFFER:
                 self._received.append(byte)
@@ -178,11 +181,13 @@ class Controller:
             self._report_due = True
         elif self._needs_reset:
             return
-        elif byte == _HOLD and self._homing:
+        elif byte in (_HOLD, _DOOR) and self._homing:
             self._hold_pending = True
-        elif byte == _HOLD and not self._locked:
+        elif byte in (_HOLD, _DOOR) and not self._locked:
             self.planner.hold(self._now)
+            self._door_opened |= byte == _DOOR
         elif byte == _RESUME and self.planner.held(self._now) and not self._limit_reached:
+            self._door_opened = False
             self.planner.resume(self._now)
 
     def _react(self) -> None:
@@ -219,7 +224,7 @@ class Controller:
         place = ",".join(f"{round(value, 3) + 0.0:.3f}" for value in self._own_place())
         fields = [self.state, f"MPos:{place}", f"FS:{self.planner.speed(self._now) * 60:.0f},0"]
         if self._reports % _WCO_EVERY == 0:
-            fields.append("WCO:" + ",".join(["0.000"] * self._axes))
+            fields.append("WCO:" + ",".join(f"{offset:.3f}" for offset in self._program.offset))
         self._reports += 1
         self._say(f"<{'|'.join(fields)}>")
 
@@ -261,12 +266,23 @@ class Controller:
                 if line in _SWITCHES:
                     yield lambda: not self.planner.busy
                     self._switch(*_SWITCHES[line])
+                elif line.startswith(("G92", "G10")):
+                    yield from self._set_offset(line)
                 elif (drive := self._program.run(line)) is not None:
                     yield from self._drive(*drive)
         except GrblError as error:
             self._say(str(error))
         else:
             self._say("ok")
+
+    def _set_offset(self, line: str) -> _Steps:
+        """Change the work offset, by ``G92`` before moves end, by ``G10`` afterwards; then it is reported."""
+        waits = line.startswith("G10")
+        yield lambda: not (waits and self.planner.busy)
+        if not self._program.set_offset(line):
+            raise GrblError(20)
+        yield lambda: not self.planner.busy
+        self._reports = 0
 
     def _switch(self, line: str, on: bool) -> None:
         if on != len(self.switched[line]) % 2:

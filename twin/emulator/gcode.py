@@ -36,10 +36,14 @@ class GrblError(Exception):
 
 
 class Interpreter:
-    """The modal state and the position of the program; work and machine coordinates are the same."""
+    """The modal state and the position of the program, in machine coordinates.
+
+    ``offset`` is that of the work coordinates, in which lines are, unless they begin with ``G53``.
+    """
 
     def __init__(self, axes: str, place: Place) -> None:
         self.axes = axes
+        self.offset: Place = (0.0,) * len(axes)
         self.reset(place)
 
     def reset(self, place: Place) -> None:
@@ -60,6 +64,18 @@ class Interpreter:
         if drive is not None:
             self.place = drive[0].end
         return drive
+
+    def set_offset(self, line: str) -> bool:
+        """Execute ``G92`` or ``G10 L2 P1`` with places; return whether the line is one of these."""
+        given = re.fullmatch(rf"(G92|G10L2P1)((?:[{self.axes}][+-]?[\d.]+)+)", line)
+        if given is None:
+            return False
+        values = {word[0]: float(word[1:]) for word in re.findall(r"[A-Z][^A-Z]+", given[2])}
+        self.offset = tuple(
+            before if letter not in values else at - values[letter] if given[1] == "G92" else values[letter]
+            for letter, at, before in zip(self.axes, self.place, self.offset, strict=True)
+        )
+        return True
 
     def _words(self, line: str) -> tuple[dict[str, str], dict[str, float]]:
         """Return the commands by group, and the other numbers by letter."""
@@ -95,8 +111,10 @@ class Interpreter:
             raise GrblError(22)
         relative = modes["distance"] == "G91" and not machine
         end = tuple(
-            values.get(letter, 0.0) + at if relative else values.get(letter, at)
-            for letter, at in zip(self.axes, self.place, strict=True)
+            at + values.get(letter, 0.0)
+            if relative or letter not in values
+            else values[letter] + (0.0 if machine else offset)
+            for letter, at, offset in zip(self.axes, self.place, self.offset, strict=True)
         )
         if motion in ("G2", "G3"):
             plane = _PLANES[modes["plane"]]
