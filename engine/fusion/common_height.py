@@ -43,22 +43,31 @@ class PressSteps:
         Standard deviations of the heights, mm.
     travel : (T,) array, float64
         Travel of the frames, mm, increasing.
+    travel_sigma : float
+        Standard deviation of the travel, mm; 0 unless it is stated.
     """
 
     onset: Doubles
     correction: Doubles
     sigma: Doubles
     travel: Doubles
+    travel_sigma: float
 
     @classmethod
-    def of(cls, height: Doubles, corrected: Doubles, sigma: Doubles, travel: Doubles) -> PressSteps | None:
+    def of(
+        cls,
+        height: Doubles,
+        corrected: Doubles,
+        sigma: Doubles,
+        travel: Doubles,
+        travel_sigma: float | None = None,
+    ) -> PressSteps | None:
         """Return the steps of heights before and after corrections; None unless the travel is monotonic."""
         direction = np.diff(travel)
         if not ((direction > 0).all() or (direction < 0).all()):
             return None
-        return cls(
-            np.where(np.isfinite(corrected), -height, np.nan), corrected - height, sigma, np.sort(travel)
-        )
+        onset = np.where(np.isfinite(corrected), -height, np.nan)
+        return cls(onset, corrected - height, sigma, np.sort(travel), travel_sigma or 0.0)
 
     def place(self, surface: Result) -> tuple[Result, CommonHeight]:
         """Remove a clear error of the common height, and add its uncertainty to ``height_sigma``.
@@ -112,7 +121,7 @@ class PressSteps:
         """Return, for each step that shows it, by how much sorted depths are too large there, mm.
 
         Of the pixels within half a step, those in contact must be the highest ones. The variances, mm^2, are
-        those of a boundary anywhere in the range that the fewest pixels contradict.
+        those of a boundary anywhere in the range that the fewest pixels contradict, and of the travel.
         """
         places = self.travel
         share = min(_MIN_SHARE, _MIN_EVEN_SHARE / max(1, places.size - 1))
@@ -132,5 +141,5 @@ class PressSteps:
             best = np.flatnonzero(wrong == wrong.min())
             least, greatest = edges[best[0]], edges[best[-1] + 1]
             errors.append((least + greatest) / 2 - place)
-            variances.append((greatest - least) ** 2 / 12)
+            variances.append((greatest - least) ** 2 / 12 + self.travel_sigma**2)
         return np.array(errors), np.array(variances)

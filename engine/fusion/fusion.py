@@ -427,7 +427,8 @@ class PressEvidence(Step):
         larger = result.height_sigma * (between / sigma)
         self.heights = AbsoluteHeights.of(result.height + (middle - height), larger)
         corrected = np.asarray(result.height, np.float64)
-        self.steps = PressSteps.of(height, corrected, self.heights.sigma, context.positions("travel"))
+        travel, travel_sigma = context.positions("travel"), getattr(context.operation, "travel_sigma", None)
+        self.steps = PressSteps.of(height, corrected, self.heights.sigma, travel, travel_sigma)
         footprint = footprint_of(Edges.of(result, context), context.source.header, self.blur)
         self.footprint = footprint.variance if footprint.clear else PIXEL
         return result

@@ -38,7 +38,7 @@ _SAME_CONTACT = 0.75  # least ratio of the areas of contact in press and turn
 _RETAKES = 2  # of what the check complains about
 _GAIN_MIN = 0.97  # more frames that leave more than this share of the standard deviation were of no use
 _USELESS = 2  # extensions in a row that were of no use, after which a touch ends
-_MARGIN = 0.85  # of the requested standard deviation, which the first recipe aims at; others aim at all of it
+_MARGIN = 0.85  # of the requested standard deviation, which a recipe of few steps aims at
 _RETAKEN = ("flicker", "outliers", "repeated frames", "phase jump", "no response")
 _SATURATED = "cut off"  # again in all frames until the exposure is shorter
 _PRESS = {"method": "change-point"}
@@ -391,7 +391,9 @@ class _Touch:
     def _plan(self, contact: Contact) -> Recipe:
         """Return the cheapest recipe; if none suffices in time, what is possible in it."""
         room = (self._within - self._seconds) / self._each
-        recipe = cheapest(contact.variance, _MARGIN * self._sigma)
+        recipe = cheapest(contact.variance, self._sigma)
+        if recipe is not None and recipe.press_steps < _MANY:  # of which all are taken first
+            recipe = cheapest(contact.variance, _MARGIN * self._sigma) or recipe
         if recipe is None or recipe.frames > room:
             most = min(room, (PRESS_STEPS[1] + TURN_FRAMES[1]) / 2)
             turn = TURN_FRAMES[0]

@@ -34,7 +34,7 @@ def test_errors_are_within_the_request(touched, name, request_):
     assert errors.errors[touch.REQUESTS.index(request_)] <= 1.1 * request_
 
 
-@pytest.mark.parametrize(("name", "request_"), [case for case in CASES if case != ("texture", 3.0)])
+@pytest.mark.parametrize(("name", "request_"), CASES)
 def test_few_more_frames_are_taken_than_by_the_best_recipe(touched, name, request_):
     outcome, _ = touched[name, request_]
     fewest = touch.fewest(json.loads(touch.STORED.read_text())[name], request_)

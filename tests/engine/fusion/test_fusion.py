@@ -619,7 +619,7 @@ def test_other_regions_of_one_size_are_refused(tmp_path):
 
 
 @cache
-def of_few_steps(name, steps):
+def of_few_steps(name, steps, travel_sigma=None):
     """Return the surface of an object pressed by 0.6 mm in some steps, and its true heights."""
     scene = {"object": name, "shape": (96, 128), "pixel_size": 0.03, "pattern": "linear"}
     scene |= {"references": "ball", "camera": Camera(seed=0)}
@@ -628,7 +628,8 @@ def of_few_steps(name, steps):
     assert pressed.read(frames) is not None
     travel, header = {"travel": pressed.travel}, {"pixel_size": pressed.header.pixel_size}
     turned = Twin(movement=Axial(EIGHTHS, TILT, press=0.6), **scene)
-    surface = engine.fuse(ArrayRecording(frames, travel, header), turned, press={"method": "change-point"})
+    press = {"method": "change-point", "travel_sigma": travel_sigma}
+    surface = engine.fuse(ArrayRecording(frames, travel, header), turned, press=press)
     return surface, turned.truth.height
 
 
@@ -647,6 +648,11 @@ def test_the_common_height_is_within_its_standard_deviation(name, steps):
     surface, truth = of_few_steps(name, steps)
     error = (surface.height - truth)[np.isfinite(surface.normals[..., 0])]
     assert abs(np.nanmedian(error)) < 3 * surface.fitted.common_height_sigma + 0.0005
+
+
+def test_the_common_height_is_as_uncertain_as_a_stated_travel():
+    surface, _ = of_few_steps("sphere", 4, travel_sigma=0.01)
+    assert surface.fitted.common_height_sigma > 0.01 / np.sqrt(3)  # of three boundaries
 
 
 def test_a_surface_on_one_terrace_is_known_as_a_single_height():
