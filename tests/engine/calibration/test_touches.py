@@ -112,6 +112,21 @@ def named(fit):
     return {each.name: each for each in fit.estimates}
 
 
+def test_touches_that_contradict_each_other_have_larger_errors_and_a_note():
+    sound = touches_of(2)
+    press, turn = touches_of(1, first=1)[0]
+    frames = turn.read(np.empty(turn.shape, turn.dtype)).frames.copy()
+    frames[6:] = np.roll(frames, -1, axis=0)[6:]  # the seventh was lost
+    header = {name: getattr(turn.header, name) for name in ("pixel_size", "tilt", "press", "pivot")}
+    header |= {
+        name: getattr(turn.header, name) for name in ("dark", "bright", "zenith_gain", "zenith_offset")
+    }
+    lost = ArrayRecording(frames, {"phase": PHASE}, header)
+    fit = from_touches([sound[0], (press, lost)])
+    assert "contradict each other" in " ".join(fit.notes)
+    assert named(fit)["phase_offset"].sigma > 2 * named(from_touches(sound))["phase_offset"].sigma
+
+
 def test_wrong_gain_and_offset_are_corrected():
     fit = from_touches(touches_of(2, stated={"gain": 1.05, "offset": 2.0}))
     away = deviations(fit)

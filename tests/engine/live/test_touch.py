@@ -184,6 +184,12 @@ def test_a_bump_between_press_and_turn_is_taken_again():
     assert outcome.reached
 
 
+def test_frames_that_are_interpolated_do_not_look_compressed():
+    with sensor_of("texture", shape=(96, 128), pixel_size=0.03) as (_, _, sensor), sensor:
+        outcome = engine.live.touch(sensor, 0.01)
+    assert not any("compressed" in str(value) for value in outcome.result.process.values())
+
+
 def test_a_frame_of_an_earlier_place_is_taken_again():
     with sensor_of() as (_, _, sensor):
         take, frames = sensor.take, []
