@@ -1,0 +1,150 @@
+"""Calibration of a sensor from touches of unknown objects.
+
+Each touch is a press and a turn at one place. The surfaces are unknown and are
+eliminated; see `mirrorskin.engine.calibration.touches.window`. What remains is the information about the
+sensor, which is summed over touches, kept with the calibration, and forgotten with a time constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mirrorskin.engine.base.reconstruction import calibrated
+from mirrorskin.engine.calibration.touches.fit import Attempt
+from mirrorskin.engine.calibration.touches.priors import (
+    Movement,
+    Priors,
+    Stated,
+    search,
+)
+from mirrorskin.engine.calibration.touches.reading import (
+    NOT_FOLLOWED,
+    TouchReader,
+    model_of,
+)
+from mirrorskin.engine.calibration.touches.result import TouchFit, result_of
+from mirrorskin.io import (
+    Calibrated,
+    Calibration,
+    InputError,
+    Source,
+)
+from mirrorskin.kernels.device import Device
+
+
+def from_touches(
+    touches: Sequence[tuple[Source, Source]],
+    *,
+    calibration: Calibration | None = None,
+    stated: Mapping[str, Stated | tuple[float, float]] | None = None,
+    forget: float | None = None,
+    zenith_gain: float | None = None,
+    zenith_offset: float | None = None,
+    device: str | Device | None = None,
+) -> TouchFit:
+    """Estimate response and movement of a sensor from touches of unknown objects.
+
+    Each touch is a press and a turn of the same object at the same place. The heights of the
+    object at each pixel are unknown, and so are the gain and the offset of each frame; all are eliminated
+    from one least-squares fit. The samples of a turn follow ::
+
+        y = dark + (1 + g_t) (1 + u) R (l / R)^gamma + o_t,    l = offset + gain angle(n, t) - dark
+
+    with gains g and offsets o of the frames, uneven light u, and the angle between the normal n, by the
+    slopes of the heights, and the body's axis. The press ties heights to travel, so slopes are absolute.
+
+    Parameters
+    ----------
+    touches : sequence of (Source, Source)
+        Presses and turns. All turns have one half-angle, and an approximate zenith gain.
+    calibration : Calibration, optional
+        What is already calibrated. If it has a response of touches, these touches are added to it.
+    stated : mapping of str to (float, float), optional
+        Numbers with standard deviations, such as of a data sheet: ``gamma``, ``zenith_gain`` (counts/rad),
+        ``zenith_offset`` (counts), ``tilt`` (rad), ``phase_offset`` (rad), ``pivot_z`` (mm), ``pixel_size``
+        (mm). The pixel size is estimated only if it is given here: it is nearly degenerate with the gain.
+    forget : float, optional
+        Time constant, seconds, after which the information of a touch counts 1/e; by default it is kept.
+    zenith_gain, zenith_offset : float, optional
+        Approximate response to start with, counts/rad and counts; by default that of the recordings.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
+
+    Returns
+    -------
+    TouchFit
+
+    Raises
+    ------
+    mirrorskin.io.InputError
+        No touch can be used; a recording has no zenith gain, tilt, pixel size or phases; a stated number is
+        unknown; ``forget`` is given, but a recording has no start time.
+
+    Examples
+    --------
+    >>> from mirrorskin.twin import Axial, Twin, Vertical
+    >>> thing = {"object": "sphere", "shape": (48, 48), "pixel_size": 0.1}
+    >>> press = Twin(movement=Vertical(0.03 * np.arange(1, 60)), **thing)
+    >>> turn = Twin(movement=Axial(np.arange(12) * np.pi / 6, 0.05, 1.5), pattern="linear", **thing)
+    >>> fit = from_touches([(press, turn)], stated={"tilt": (0.05, 0.001)})
+    >>> abs(fit.precession.tilt - 0.05) < 0.002
+    True
+    """
+    if not touches:
+        raise InputError("there are no touches: give presses and turns")
+    before = None if calibration is None else calibration.response
+    opened = [(calibrated(press, calibration), _upright(turn, calibration)) for press, turn in touches]
+    for _, turn in opened:
+        _check_same(turn, opened[0][1])
+    precession = None if calibration is None else calibration.precession
+    header = opened[0][1].header
+    if zenith_gain is not None:
+        header = replace(header, zenith_gain=np.asarray(zenith_gain, np.float64))
+    if zenith_offset is not None:
+        header = replace(header, zenith_offset=np.asarray(zenith_offset, np.float64))
+    sensor = model_of(opened[0][1], header)
+    readers = [TouchReader.of(press, turn, device) for press, turn in opened]
+    movement = Movement.of(sensor, precession)
+    priors = Priors.of(header, movement, before is not None, stated or {})
+    reason = NOT_FOLLOWED
+    try:
+        attempt = Attempt.of(readers, movement, priors, before, forget).registered()
+        if precession is None and attempt.may_be_of_another_movement:
+            movement = search(readers[0], movement)
+            priors = priors.relative_to(movement)
+            attempt = Attempt.of(readers, movement, priors, before, forget).registered()
+        if not attempt.used:
+            reason = attempt.read[0].reason
+        used = attempt.following()
+        if used and attempt.is_plausible:
+            return result_of(attempt.exact(used))
+    except np.linalg.LinAlgError:  # surfaces that are nowhere near those of the touches
+        pass
+    raise InputError(f"no touch can be used: {reason}")
+
+
+def _upright(turn: Source, calibration: Calibration | None) -> Source:
+    """Return a turn with its calibration, but with phases on a circle: the ellipse is fitted."""
+    source = calibrated(turn, calibration)
+    if source.motion != "axial":
+        raise InputError(f"{source.name} has {source.motion} motion: give presses and turns, in pairs")
+    if isinstance(source, Calibrated) and source.whole.precession is not None:
+        circle = replace(source.whole.precession, ellipticity=0.0)
+        return Calibrated(source.source, replace(source.whole, precession=circle))
+    return source
+
+
+def _check_same(turn: Source, first: Source) -> None:
+    """Raise InputError unless two turns are of one sensor and one movement."""
+    if turn.shape[1:] != first.shape[1:] or turn.dtype != first.dtype:
+        raise InputError(f"{turn.name} and {first.name} are of different cameras or regions")
+    for name in ("tilt", "pixel_size", "zenith_gain", "zenith_offset"):
+        one, other = (getattr(source.header, name) for source in (turn, first))
+        if (one is None) != (other is None) or (one is not None and not np.allclose(one, other)):
+            raise InputError(
+                f"{turn.name} and {first.name} state different values of {name.replace('_', ' ')}: give one"
+                " for all"
+            )

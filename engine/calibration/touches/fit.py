@@ -1,0 +1,404 @@
+"""The fit of touches of unknown objects: what they tell of a sensor, with what earlier ones told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mirrorskin.engine.calibration.touches.priors import (
+    Movement,
+    Priors,
+)
+from mirrorskin.engine.calibration.touches.reading import (
+    Touch,
+    TouchReader,
+)
+from mirrorskin.engine.calibration.touches.window import (
+    SHARED,
+    Window,
+)
+from mirrorskin.engine.diagnosis.turn_light import (
+    GLOBALS,
+    UNEVEN,
+)
+from mirrorskin.engine.press.intervals import estimate_interval_scatter
+from mirrorskin.io import (
+    InputError,
+    LinearResponse,
+)
+from mirrorskin.kernels.array_types import Doubles
+
+_WORSE = 1.02  # ratio of misfits from which on a step was too long
+_ITERATIONS = 16  # Gauss-Newton steps, at most
+_SETTLED = 0.1  # largest last step, in standard errors
+_NEARLY_SETTLED = 0.5  # the same, of a fit that is repeated
+_ROUGHLY = 2  # steps before outliers are excluded; in an exact fit, heights then stay as they are
+_CONTRADICTION = 3.0  # standard deviations between a prior and the touches
+_ROUGH = 2  # pixels between knots of splines up to which a surface shows the pivot
+_WELL_SHOWN = 0.02  # relative standard error of the gain by a touch, up to which noise prevails
+_CLEAR = 4.0  # standard deviations of the contradiction of touches by chance, from which on it is a note
+_SINGULAR = 1e-9  # relative eigenvalue of a parameter that is not estimated
+_MOVED = 0.02  # pixels that points move by an error of the pivot, from which frames are registered again
+_WITHOUT = 1e4  # factor of the standard deviation of a prior that is left out
+_REGISTRATIONS = 5  # largest number of registrations with an estimated movement
+_OTHER_TILT = (
+    0.05  # relative difference of the amplitude of the brightness from which the tilt starts with it
+)
+_IMPLAUSIBLE = 5.0  # standard deviations of what is usual: a fit that is so far off is of another movement
+
+
+class _Memory(NamedTuple):
+    """Information of earlier touches, and the weight of each of the new ones."""
+
+    matrix: Doubles
+    vector: Doubles  # matrix times the parameters that earlier touches alone would have
+    weights: tuple[float, ...]
+    time: float
+
+    @classmethod
+    def of(cls, before: LinearResponse | None, touches: Sequence[Touch], forget: float | None) -> _Memory:
+        times = [touch.time for touch in touches] + ([] if before is None else [before.time])
+        last = max((time for time in times if math.isfinite(time)), default=math.nan)
+        weights = [1.0] * len(times)
+        if forget is not None:
+            if not forget > 0:
+                raise InputError(f"forget {forget} s: give a time above 0")
+            if not np.isfinite(times).all():
+                raise InputError(
+                    "old touches can only be forgotten if recordings have a start time: leave forget out"
+                )
+            weights = [math.exp((time - last) / forget) for time in times]
+        matrix, vector = np.zeros((len(SHARED),) * 2), np.zeros(len(SHARED))
+        if before is not None:
+            at = np.array([SHARED.index(name) for name in before.names if name in SHARED])
+            of = np.array([number for number, name in enumerate(before.names) if name in SHARED])
+            matrix[np.ix_(at, at)] = weights[-1] * before.information[np.ix_(of, of)]
+            vector[at] = weights[-1] * before.pull[of]
+            vector += matrix[:, at] @ before.values[of]
+        return cls(matrix, vector, tuple(weights[: len(touches)]), last)
+
+    def moved(self, by: Doubles) -> _Memory:
+        """Return the information about parameters that are smaller by some values."""
+        return self._replace(vector=self.vector - self.matrix @ by)
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """A fit of all touches with frames that are registered with an assumed movement."""
+
+    readers: Sequence[TouchReader]
+    movement: Movement
+    priors: Priors
+    before: LinearResponse | None
+    forget: float | None
+    read: list[Touch]
+    used: list[Touch]
+    memory: _Memory
+    fit: Fitted
+    dropped: list[Dropped]
+    moved: Doubles  # changes of the parameters that are in the movement
+
+    @classmethod
+    def of(
+        cls,
+        readers: Sequence[TouchReader],
+        movement: Movement,
+        priors: Priors,
+        before: LinearResponse | None,
+        forget: float | None,
+        start: Doubles | None = None,
+        moved: Doubles | None = None,
+    ) -> Attempt:
+        """Read all touches, and fit the sensor to them."""
+        read = [movement.read(reader) for reader in readers]
+        if start is None:
+            seen = float(np.median([touch.tilt_seen for touch in read])) / movement.sensor.tilt
+            if abs(seen - 1) > _OTHER_TILT:
+                movement = movement.changed({"tilt": seen - 1, "phase": 0.0, "pivot_z": 0.0})
+                priors = priors.relative_to(movement)
+                read = [movement.read(reader) for reader in readers]
+        used = [touch for touch in read if touch.varied]
+        if start is None:
+            start = priors.start(before, movement.before)
+        if moved is None:
+            moved = np.zeros(len(SHARED))
+        memory = _Memory.of(before, used, forget).moved(moved)
+        fit, dropped = _fit_with_priors(used, start, priors, memory, exact=False)
+        return cls(readers, movement, priors, before, forget, read, used, memory, fit, dropped, moved)
+
+    def following(self) -> list[Touch]:
+        """Return the touches whose samples follow the model."""
+        return [touch for touch in self.used if touch.follows()]
+
+    @property
+    def may_be_of_another_movement(self) -> bool:
+        """Whether touches that show a surface do not fit it."""
+        fits = self.following() and self.is_plausible
+        return not fits and any(touch.varied or not touch.windows for touch in self.read)
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether the parameters are those of a sensor, and not of another movement."""
+        priors = self.priors
+        away = (self.fit.values - priors.mean) * priors.scale / np.maximum(priors.loose, 1e-12)
+        names = ("gamma", "zenith_gain", "zenith_offset", "tilt", *SHARED[len(GLOBALS) :][:UNEVEN])
+        return float(np.sum(away[[SHARED.index(name) for name in names]] ** 2)) < _IMPLAUSIBLE**2
+
+    def exact(self, used: list[Touch]) -> Attempt:
+        """Return the exact fit of some of the touches."""
+        memory = _Memory.of(self.before, used, self.forget).moved(self.moved)
+        fit, dropped = _fit_with_priors(used, self.fit.values, self.priors, memory, exact=True)
+        return replace(self, used=used, memory=memory, fit=fit, dropped=dropped)
+
+    def registered(self) -> Attempt:
+        """Return the fit of frames that are registered with the estimated movement."""
+        attempt = self
+        for _ in range(_REGISTRATIONS):
+            if attempt._misplaced < _MOVED or not all(reader.turn.rewindable for reader in self.readers):
+                break
+            attempt = attempt._again()
+        return attempt
+
+    @property
+    def _misplaced(self) -> float:
+        """Pixels by which points are registered wrongly, about."""
+        sensor, values = self.movement.sensor, self.values
+        if sensor.pivot is None or not self.used:
+            return 0.0
+        poses, size = self.used[0].poses, self.used[0].windows[0].pixel_size
+        arm = abs(poses.arm or 0.0)
+        heights = max(window.misplaced for touch in self.used for window in touch.windows)
+        errors = arm * values["tilt"], arm * values["phase"], values["pivot_z"], heights
+        return sensor.tilt * max(abs(error) for error in errors) / min(size)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The parameters by name."""
+        return dict(zip(SHARED, self.fit.values.tolist(), strict=True))
+
+    def _again(self) -> Attempt:
+        movement = self.movement.changed(self.values)
+        start, moved = self.fit.values.copy(), self.moved.copy()
+        at = [SHARED.index(name) for name in ("tilt", "phase", "pivot_z")]
+        moved[at] += start[at]
+        start[at] = 0.0
+        pairs = zip(self.readers, self.read, strict=True)
+        readers = [reader.with_heights(touch) for reader, touch in pairs]
+        priors = self.priors.relative_to(movement)
+        return Attempt.of(readers, movement, priors, self.before, self.forget, start, moved)
+
+
+class Dropped(NamedTuple):
+    """A stated number that the touches contradict."""
+
+    at: int
+    number: float
+    error: float
+
+
+class Fitted(NamedTuple):
+    """Parameters of a sensor, and the information about them."""
+
+    values: Doubles
+    matrix: Doubles  # information of all touches
+    vector: Doubles  # matrix times the parameters that the touches alone would have
+    covariance: Doubles
+    contradiction: float  # of touches with each other, over what noise explains
+    degrees: float  # of freedom of the contradiction
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the touches contradict each other by more than chance."""
+        return self.contradiction > 1 + _CLEAR * math.sqrt(2 / max(self.degrees, 1e-9))
+
+
+def _fit_with_priors(
+    touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memory, exact: bool
+) -> tuple[Fitted, list[Dropped]]:
+    """Return the fit without the stated numbers that the touches contradict, and these."""
+    dropped: list[Dropped] = []
+    fit = _fit(touches, start, priors, memory, exact)
+    while True:
+        contradictions = []
+        for number in np.flatnonzero(priors.stated):
+            value, error = without_prior(fit, priors, int(number))
+            away = abs(value - priors.mean[number]) / math.hypot(error, priors.sigma[number])
+            contradictions.append((away, int(number)))
+        worst = max(contradictions, default=(0.0, 0))
+        if worst[0] < _CONTRADICTION:
+            break
+        dropped.append(Dropped(worst[1], float(priors.number[worst[1]]), float(priors.error[worst[1]])))
+        priors = priors.without(worst[1])
+        fit = _fit(touches, fit.values, priors, memory, exact)
+    return fit, dropped
+
+
+def without_prior(fit: Fitted, priors: Priors, number: int) -> tuple[float, float]:
+    """Return a parameter and its standard error by touches and the priors of the other parameters."""
+    sigma = priors.sigma.copy()
+    sigma[number] *= _WITHOUT
+    precision = np.diag(sigma**-2.0)
+    covariance = np.linalg.inv(fit.matrix + precision)
+    return float(covariance[number] @ (fit.vector + precision @ priors.mean)), float(
+        np.sqrt(covariance[number, number])
+    )
+
+
+def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memory, exact: bool) -> Fitted:
+    """Return the Gauss-Newton fit of surfaces, frames and parameters.
+
+    Splines are chosen, and pixels that do not follow the model are excluded, on the way. An ``exact`` fit,
+    which starts with surfaces near the true ones, takes heights of presses from their intervals.
+    """
+    values, precision = start.copy(), np.diag(priors.sigma**-2.0)
+    is_cold = not exact and not all(touch.is_warm for touch in touches)
+    roughly = _ROUGHLY if exact or is_cold else 0
+    last, before = math.inf, values
+    for number in range(_ITERATIONS):
+        early = number < roughly
+        informations, pushes, steps = [], [], []
+        for touch, weight in zip(touches, memory.weights, strict=False):
+            information, push, step = _eliminate(
+                touch, values, number == roughly, exact and early, is_cold and early
+            )
+            weight = weight * _trust(information, priors)
+            informations.append(weight * information)
+            pushes.append(weight * push)
+            steps.append(step)
+        pulls = [each @ values + push for each, push in zip(informations, pushes, strict=True)]
+        matrix = memory.matrix + np.sum(informations, axis=0)
+        vector = memory.vector + np.sum(pulls, axis=0)
+        covariance = np.linalg.inv(matrix + precision)
+        change = covariance @ (vector + precision @ priors.mean) - values
+        misfit = float(np.sum([np.sum(window.left**2) for touch in touches for window in touch.windows]))
+        if number > roughly and misfit > _WORSE * last:
+            for touch in touches:
+                touch.turn_back()
+            values = (values + before) / 2
+            continue
+        last, before = misfit, values
+        for touch, of_touch in zip(touches, steps, strict=True):
+            touch.keep()
+            of_touch(change)
+        values = values + change
+        settled = _SETTLED if exact else _NEARLY_SETTLED
+        if number >= roughly and np.all(np.abs(change) < settled * np.sqrt(np.diag(covariance))):
+            break
+    pushes = [push - each @ change for push, each in zip(pushes, informations, strict=True)]
+    contradiction, degrees = _contradiction_of(informations, pushes, covariance, precision)
+    if exact and contradiction > 1:
+        matrix, vector = (
+            earlier + (each - earlier) / contradiction
+            for earlier, each in ((memory.matrix, matrix), (memory.vector, vector))
+        )
+        covariance = np.linalg.inv(matrix + precision)
+        values = covariance @ (vector + precision @ priors.mean)
+    return Fitted(values, matrix, vector, (covariance + covariance.T) / 2, contradiction, degrees)
+
+
+def _contradiction_of(
+    informations: Sequence[Doubles], pushes: Sequence[Doubles], covariance: Doubles, precision: Doubles
+) -> tuple[float, float]:
+    """Return by how much touches contradict each other, over what noise explains, and degrees of freedom.
+
+    A touch with the information I pushes the parameters of the fit, whose covariance is C, by g. By noise
+    alone the covariance of g is I - I C I. With the priors' precision P the contradiction is ::
+
+        sum of g^T (I + P)^-1 g  /  sum of trace((I + P)^-1 (I - I C I))
+    """
+    squares = degrees = 0.0
+    for information, push in zip(informations, pushes, strict=True):
+        alone = np.linalg.inv(information + precision)
+        squares += float(push @ alone @ push)
+        degrees += float(np.trace(alone @ (information - information @ covariance @ information)))
+    return (squares / degrees, degrees) if len(pushes) > 1 and degrees > 0 else (1.0, 0.0)
+
+
+def _trust(information: Doubles, priors: Priors) -> float:
+    """Return the weight of a touch: 1 if it alone shows the gain well.
+
+    An error of the model of a tenth of a count changes the parameters by their variance times its slope by
+    them: the less a touch shows, the more the error exceeds the noise.
+    """
+    at = SHARED.index("zenith_gain")
+    sigma = priors.sigma.copy()
+    sigma[at] *= _WITHOUT
+    alone = math.sqrt(float(np.linalg.inv(information + np.diag(sigma**-2.0))[at, at]))
+    return min(1.0, (_WELL_SHOWN / alone) ** 4)
+
+
+def _eliminate(
+    touch: Touch, values: Doubles, excludes: bool, uses_intervals: bool, chooses: bool
+) -> tuple[Doubles, Doubles, Any]:
+    """Return a touch's information about the sensor, its push, and what a step of the sensor does to it."""
+    frames = len(touch.phase)
+
+    def look() -> list[Any]:
+        gains, offsets = np.split(touch.frame_values, 2)
+        return [window.look(touch.poses, gains, offsets, values) for window in touch.windows]
+
+    sums = look()
+    if excludes:
+        for window in touch.windows:
+            window.exclude_outliers()
+        sums = look()
+    # Neighbours of registered frames share their noise, so that of a sample is larger than the residuals.
+    usual = float(np.mean([window.noise_gain**2 for window in touch.windows]))
+    touch.noise = max(_noise_of(touch.windows, frames) / usual, touch.least_noise**2)
+    if uses_intervals:
+        _use_intervals(touch)
+    parts = [
+        window.eliminate(each, touch.noise, chooses) for window, each in zip(touch.windows, sums, strict=True)
+    ]
+    own = np.sum([part.own for part in parts], axis=0)
+    pull = np.sum([part.pull for part in parts], axis=0)
+    of_frames, of_sensor = slice(0, 2 * frames), slice(2 * frames, None)
+    stiff = np.linalg.inv(touch.frame_covariance)
+    right = np.column_stack([own[of_frames, of_sensor], pull[of_frames] - stiff @ touch.frame_values])
+    solved = np.linalg.solve(own[of_frames, of_frames] + stiff, right)
+    reduced = own[of_sensor, of_frames] @ solved
+
+    def step(of_parameters: Doubles) -> None:
+        change = solved[:, -1] - solved[:, :-1] @ of_parameters
+        touch.frame_values = touch.frame_values + change
+        for window, part in zip(touch.windows, parts, strict=True):
+            window.z = part.heights(np.concatenate([change, of_parameters]))
+
+    information, push = own[of_sensor, of_sensor] - reduced[:, :-1], pull[of_sensor] - reduced[:, -1]
+    if max(window.spacing for window in touch.windows) > _ROUGH:
+        _forget_pivot(information, push)
+    return information, push, step
+
+
+def _forget_pivot(information: Doubles, push: Doubles) -> None:
+    """Leave of the information about the pivot only how the other parameters depend on it."""
+    at = SHARED.index("pivot_z")
+    rest = np.delete(np.arange(len(push)), at)
+    by_rest = np.linalg.lstsq(information[np.ix_(rest, rest)], information[rest, at], rcond=_SINGULAR)[0]
+    information[at, at] = by_rest @ information[rest, at]
+    push[at] = by_rest @ push[rest]
+
+
+def _noise_of(windows: Sequence[Window], frames: int) -> float:
+    """Return the variance of residuals, by their median, as pixels of a wrong surface are no noise."""
+    squares = np.concatenate([np.sum(window.left**2, axis=0) for window in windows])
+    freedom = max(frames - 1 - 2 * frames / max(len(squares), 1), 1.0)
+    return float(np.median(squares)) / (freedom * (1 - 2 / (9 * freedom)) ** 3)  # Wilson and Hilferty
+
+
+def _use_intervals(touch: Touch) -> None:
+    """Take the heights of a press from their intervals around the present surfaces."""
+    known = [np.isfinite(window.middle) for window in touch.windows]
+    if not any(part.any() for part in known):
+        return
+    pairs = list(zip(touch.windows, known, strict=True))
+    error = np.concatenate([window.middle[part] - window.z[part] for window, part in pairs])
+    half = np.concatenate([window.half[part] for window, part in pairs])
+    spread = estimate_interval_scatter(error, half)
+    for window, part in pairs:
+        if part.any():
+            window.use_intervals(spread)

@@ -1,0 +1,265 @@
+"""Priors of the numbers of a sensor, and the movement that touches are read with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from mirrorskin.engine.calibration.touches.reading import (
+    SensorModel,
+    Touch,
+    TouchReader,
+)
+from mirrorskin.engine.calibration.touches.window import (
+    FOOTPRINT,
+    SHARED,
+    TURNS,
+)
+from mirrorskin.engine.diagnosis.turn_light import (
+    GLOBALS,
+)
+from mirrorskin.io import (
+    Header,
+    InputError,
+    LinearResponse,
+    Precession,
+)
+from mirrorskin.kernels.array_types import Doubles
+
+NEGLIGIBLE = 1e-6  # standard deviation of a parameter that is not estimated
+UNKNOWN = {
+    "gamma": 0.2,
+    "zenith_gain": 0.1,
+    "zenith_offset": 10.0,
+    "tilt": 0.15,
+    "phase": 0.3,
+    "uneven": 0.05,
+    "oval": 0.03,
+    "footprint": 2.0,
+    "pivot_z": 10.0,
+}  # standard deviations of parameters about which nothing is stated; counts of 8 bits, radians, mm
+_LOOSER = 10.0  # of the standard deviation of a number that is estimated only if it is stated
+_KNOWN_PIVOT = 1.0  # mm: standard deviation of a recorded pivot
+_SEARCHED = 8  # phases that are tried if frames do not follow the movement
+_OTHER_PHASE = 0.2  # radians: difference of phases from which one was searched for
+TITLES = {"phase": "phase_offset"}
+UNITS = {
+    "zenith_gain": "counts/rad",
+    "zenith_offset": "counts",
+    "tilt": "rad",
+    "phase": "rad",
+    "pivot_z": "mm",
+    "pixel_size": "mm",
+}
+
+
+class Stated(NamedTuple):
+    """A number that is stated of the sensor, such as in a data sheet, and its standard deviation."""
+
+    value: float
+    sigma: float
+
+
+class Movement(NamedTuple):
+    """The sensor and its movement as they are assumed in a fit: phases of files times sense plus ahead."""
+
+    sensor: SensorModel
+    before: Precession | None  # applied to the phases already
+    sense: int
+    ahead: float
+
+    @classmethod
+    def of(cls, sensor: SensorModel, precession: Precession | None) -> Movement:
+        """Return the movement that a recording and a calibration state."""
+        return cls(sensor, precession, 1, 0.0)
+
+    @property
+    def direction(self) -> int:
+        """Sense of rotation."""
+        return self.sense * (1 if self.before is None else self.before.direction)
+
+    @property
+    def phase_offset(self) -> float:
+        """Azimuth of the lean at phase zero, radians."""
+        offset = 0.0 if self.before is None else self.before.phase_offset
+        return self.sense * offset + self.ahead
+
+    def read(self, reader: TouchReader) -> Touch:
+        """Read a touch with this movement."""
+        return reader.read(self.sensor, self.sense, self.ahead)
+
+    def changed(self, values: Mapping[str, float]) -> Movement:
+        """Return the movement with estimated tilt, phase and pivot."""
+        sensor = self.sensor
+        pivot = sensor.pivot
+        if pivot is not None:
+            pivot = (pivot[0], pivot[1], pivot[2] + values["pivot_z"])
+        sensor = sensor._replace(tilt=sensor.tilt * (1 + values["tilt"]), pivot=pivot)
+        return self._replace(sensor=sensor, ahead=math.remainder(self.ahead + values["phase"], math.tau))
+
+
+def search(reader: TouchReader, movement: Movement) -> Movement:
+    """Return the movement whose sense and phase zero give slopes that fit a surface best."""
+    best = math.inf, movement
+    for sense in (1, -1):
+        for ahead in np.linspace(-math.pi, math.pi, _SEARCHED, endpoint=False):
+            tried = movement._replace(sense=sense, ahead=float(ahead))
+            touch = tried.read(reader)
+            pixels = sum(int(np.count_nonzero(window.usable)) for window in touch.windows)
+            turn = int(np.argmin(touch.misfits[0]))
+            if pixels:
+                found = tried._replace(ahead=math.remainder(float(ahead + TURNS[turn]), math.tau))
+                best = min(best, (float(touch.misfits[0, turn]) / pixels**2, found), key=lambda each: each[0])
+    return best[1]
+
+
+@dataclass(frozen=True, slots=True)
+class Priors:
+    """Priors of the numbers of a sensor, and how they follow from the parameters of a fit."""
+
+    number: Doubles
+    error: Doubles
+    loose: Doubles  # error of a number about which nothing is stated
+    stated: tuple[bool, ...]
+    reference: Doubles  # number at a parameter of 0
+    scale: Doubles  # change of the number by the parameter
+
+    @classmethod
+    def of(
+        cls,
+        header: Header,
+        movement: Movement,
+        of_touches: bool,
+        given: Mapping[str, Stated | tuple[float, float]],
+    ) -> Priors:
+        """Return the priors from a recording with its calibration, and from numbers that are given."""
+        sensor = movement.sensor
+        count = max(1.0, float(np.nanmedian(np.abs(sensor.gain))) / 1000)  # a count of 8 bits
+        size = min(header.pixel_size or (1.0,))
+        gain, base = float(np.nanmedian(sensor.gain)), float(np.nanmedian(sensor.base))
+        numbers = {
+            "gamma": (1.0, 1.0),
+            "zenith_gain": (gain, gain),
+            "zenith_offset": (base, 1.0),
+            "footprint": (FOOTPRINT, FOOTPRINT),
+            "pixel_size": (size, -size),
+        }
+        reference, scale = np.zeros(len(SHARED)), np.ones(len(SHARED))
+        error = np.full(len(SHARED), NEGLIGIBLE)
+        for at, name in enumerate(SHARED):
+            reference[at], scale[at] = numbers.get(name, (0.0, 1.0))
+            error[at] = UNKNOWN.get(name, UNKNOWN.get(name.partition("_")[0], NEGLIGIBLE))
+        scale[SHARED.index("tilt")] = sensor.tilt
+        error[SHARED.index("lag")] = header.prior("lag_sigma")
+        error[SHARED.index("zenith_offset")] *= count
+        if header.pivot is not None:
+            error[SHARED.index("pivot_z")] = _KNOWN_PIVOT
+        if sensor.pivot is None:
+            error[SHARED.index("pivot_z")] = NEGLIGIBLE
+        error *= np.abs(scale)
+        number = reference.copy()
+        number[SHARED.index("gamma")] = header.prior("gamma")
+        free = (False,) * len(SHARED)
+        priors = cls(number, error.copy(), error, free, reference, scale).relative_to(movement)
+        for name in ("tilt", "phase", "pivot_z"):
+            priors.number[SHARED.index(name)] = priors.reference[SHARED.index(name)]
+        stated: dict[str, Stated] = {}
+        if not of_touches:  # what touches have found is no prior of more touches, but their memory
+            stated |= _stated_by(header, movement.before, priors)
+        can_be_stated = ("gamma", "zenith_gain", "zenith_offset", "tilt", "phase", "pivot_z", "pixel_size")
+        for name, value in given.items():
+            title = next((title for title, shown in TITLES.items() if shown == name), name)
+            if title not in can_be_stated:
+                names = ", ".join(TITLES.get(each, each) for each in can_be_stated)
+                raise InputError(f"{name} cannot be stated: give one of {names}")
+            stated[title] = Stated(*value)
+        return priors.stating(stated)
+
+    @property
+    def mean(self) -> Doubles:
+        """Means of the parameters."""
+        return np.asarray((self.number - self.reference) / self.scale)
+
+    @property
+    def sigma(self) -> Doubles:
+        """Standard deviations of the parameters."""
+        return np.asarray(np.maximum(np.abs(self.error / self.scale), NEGLIGIBLE / 10))
+
+    def number_of(self, name: str, value: float) -> float:
+        """Return the number of the sensor for the value of a parameter."""
+        at = SHARED.index(name)
+        return float(self.reference[at] + self.scale[at] * value)
+
+    def is_free(self, at: int) -> bool:
+        """Return whether a parameter is estimated."""
+        return bool(self.loose[at] > 2 * NEGLIGIBLE * abs(self.scale[at]))
+
+    def relative_to(self, movement: Movement) -> Priors:
+        """Return the same priors for parameters that are relative to a movement."""
+        reference, scale, number = self.reference.copy(), self.scale.copy(), self.number.copy()
+        reference[SHARED.index("tilt")] = scale[SHARED.index("tilt")] = movement.sensor.tilt
+        at = SHARED.index("phase")
+        reference[at] = movement.phase_offset
+        if abs(math.remainder(reference[at] - number[at], math.tau)) > _OTHER_PHASE and not self.stated[at]:
+            number[at] = reference[at]  # it was searched for
+        number[at] = reference[at] + math.remainder(number[at] - reference[at], math.tau)
+        if movement.sensor.pivot is not None:
+            reference[SHARED.index("pivot_z")] = movement.sensor.pivot[2]
+        return replace(self, reference=reference, scale=scale, number=number)
+
+    def stating(self, numbers: Mapping[str, Stated]) -> Priors:
+        """Return the priors with numbers of the sensor that are stated."""
+        number, error, loose = self.number.copy(), self.error.copy(), self.loose.copy()
+        is_stated = list(self.stated)
+        for name, (value, sigma) in numbers.items():
+            if not (math.isfinite(value) and 0 < sigma < math.inf):
+                raise InputError(f"{name} {value} ± {sigma}: give a number and a standard deviation above 0")
+            at = SHARED.index(name)
+            if not self.is_free(at):
+                loose[at] = _LOOSER * sigma
+            number[at], error[at], is_stated[at] = value, sigma, True
+        return replace(self, number=number, error=error, loose=loose, stated=tuple(is_stated))
+
+    def start(self, before: LinearResponse | None, precession: Precession | None) -> Doubles:
+        """Return parameters to start with."""
+        start = np.zeros(len(SHARED))
+        start[SHARED.index("gamma")] = self.mean[SHARED.index("gamma")]
+        if before is not None:
+            named = dict(zip(before.names, before.values.tolist(), strict=True))
+            start = np.array([named.get(name, value) for name, value in zip(SHARED, start, strict=True)])
+        elif precession is not None:
+            turned = 2 * precession.major_axis
+            for name, part in (("oval_x", math.cos(turned)), ("oval_y", math.sin(turned))):
+                start[SHARED.index(name)] = precession.ellipticity * part
+        return start
+
+    def without(self, at: int) -> Priors:
+        """Return the priors without what is stated of a parameter."""
+        error, is_stated = self.error.copy(), list(self.stated)
+        error[at], is_stated[at] = self.loose[at], False
+        return replace(self, error=error, stated=tuple(is_stated))
+
+
+def _stated_by(header: Header, precession: Precession | None, priors: Priors) -> dict[str, Stated]:
+    """Return the numbers that a recording and a calibration state with standard deviations."""
+    stated = {}
+    for name in GLOBALS:
+        sigma = getattr(header, f"{name}_sigma")
+        if sigma and name != "lag":
+            size = abs(priors.scale[SHARED.index(name)])
+            stated[name] = Stated(float(priors.number[SHARED.index(name)]), sigma * size)
+    if precession is not None:
+        numbers = {
+            "tilt": precession.tilt,
+            "phase": precession.phase_offset,
+            "pivot_z": precession.pivot[2],
+        }
+        for name, value in numbers.items():
+            sigma = precession.sigma.get(TITLES.get(name, name), 0.0)
+            if sigma > 0 and math.isfinite(sigma) and math.isfinite(value):
+                stated[name] = Stated(value, sigma)
+    return stated

@@ -1,0 +1,378 @@
+"""Windows of touches, whose surfaces are eliminated.
+
+The unknowns of a window are the heights z of its pixels, which are splines. A normal is that of the slopes of
+z, by differences that are exact for polynomials of sixth degree; the slopes may differ from it by what these
+differences leave out where the surface is rough. Frames of the turn determine the slopes, and the press ties z to absolute
+heights. The light that a pixel sees is the mean over its footprint: to second order, angles to the axis
+are those of the mean normal, and a term that grows with the variance of the footprint and the square of
+the curvature of the surface.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mirrorskin.engine.calibration.touches.heights import (
+    MARGIN,
+    SPACINGS,
+    HeightSolver,
+    HeightSystem,
+    slope_matrix,
+)
+from mirrorskin.engine.diagnosis.footprint import LEAST_BLUR, PIXEL
+from mirrorskin.engine.diagnosis.turn_light import (
+    GLOBALS,
+    UNEVEN,
+    PixelScale,
+    SlopeAngles,
+    Sums,
+    light_of,
+)
+from mirrorskin.engine.press.intervals import IntervalScatter, interval_evidence
+from mirrorskin.kernels.array_types import Doubles
+
+SHARED = (
+    *GLOBALS,
+    *(f"uneven_{term}" for term in ("x", "y", "xx", "xy", "yy")),
+    *("oval_x", "oval_y", "footprint", "pivot_z", "pixel_size"),
+)
+"""Names of the sensor's parameters in the order of a fit."""
+
+FOOTPRINT = PIXEL + LEAST_BLUR**2
+"""Assumed variance of a pixel's footprint, square pixels; the parameter is the relative error of it."""
+
+_ROUGH = 0.1  # share of the second difference of slopes by which a slope may differ from that of the heights
+_SMOOTHING = 1.0  # pixels: of slopes, before their changes from pixel to pixel are computed
+_OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
+_NEAR = 9  # pixels around which splines must follow the surface
+_LEAST_NEAR = 0.1  # share of these pixels that counts, at least
+_MOST = 0.75  # least share of pixels that splines follow
+_LOCALLY = 6.0  # standard deviations of chi-square there, by which finer splines are better
+_CLEAR = 1.0  # the same, over all pixels
+_ORDERS = np.arange(1, 5)  # of waves of an interval that show pixels at the same place in it
+_BLUR = 1 / 3  # least blur of an interval's ends, in distances between places of pixels in it
+_PIECE = 96  # rows of products
+_SLOPE_WEIGHT = 1e3  # of a slope by the wave of a pixel
+_STEEPEST = math.radians(80)
+
+TURNS = np.linspace(-math.pi, math.pi, 24, endpoint=False)
+"""Angles by which azimuths are turned to find the phase of a stage, radians."""
+
+
+class Poses(NamedTuple):
+    """Movement of the body in a turn of T frames, as it was assumed to register them."""
+
+    phase: Doubles  # (T, 1), radians
+    tilt: float  # half-angle, radians
+    arm: float | None  # mm from the pivot up to the sheet's rest plane; None: frames are not registered
+
+
+class _Moves(NamedTuple):
+    """Changes of the slopes that pixels show in frames, (2, T, n)."""
+
+    by_tilt: Doubles  # relative
+    by_phase: Doubles
+    by_pivot: Doubles  # per mm of its height
+
+
+class Eliminated(NamedTuple):
+    """Information of a window on the nuisances: gains and offsets of the frames, and `SHARED`."""
+
+    own: Doubles  # (K, K)
+    pull: Doubles  # (K,)
+    heights: Callable[[Doubles], Doubles]  # (S * S,) mm, for a step of the nuisances
+
+
+@dataclass(slots=True, eq=False)
+class Window:
+    """A square window of a touch: samples of its inner pixels, and the heights of its S x S pixels."""
+
+    counts: Doubles  # (T, n), of inner pixels
+    scale: PixelScale  # of inner pixels
+    places: Doubles  # (5, n): terms of uneven light
+    pixel_size: tuple[float, float]  # mm
+    place: tuple[slice, slice]  # rows and columns of inner pixels in the picture
+    usable: NDArray[np.bool_]  # (n,)
+    middle: Doubles  # (S * S,): middles of the intervals of a press, mm; NaN where unknown
+    half: Doubles  # (S * S,): half-widths, mm
+    relief: Doubles  # (n,): heights with which inner pixels were registered, mm
+    z: Doubles  # (S * S,): heights, mm
+    noise_gain: float  # factor of the noise by registration
+    smooth: Doubles  # (S - 6, S - 6): 1 at inner pixels whose slopes are differences across no edge, or 0
+    spacing: int = 1  # pixels between knots of the splines that its heights are
+    evidence: tuple[Doubles, Doubles] | None = field(default=None)  # heights of the press, and their weights
+    left: Doubles = field(default_factory=lambda: np.empty(0))  # (T, m): residuals of usable pixels
+    rough: Doubles = field(default_factory=lambda: np.empty(0))  # (m,): second differences of slopes
+
+    @property
+    def size(self) -> int:
+        """Pixels along a side."""
+        return math.isqrt(len(self.z))
+
+    def start(self, wave: Doubles) -> Doubles:
+        """Compute first heights from zeniths and azimuths of the frames' waves, (3, n), and the press.
+
+        Returns the misfit of these slopes to a surface if all azimuths were mirrored or not, and turned by
+        `TURNS`, (2, len(TURNS)).
+        """
+        steepness, azimuth = np.hypot(*slopes_of_waves(wave)), np.arctan2(wave[2], wave[1])
+        parts = [
+            -steepness * np.stack([np.cos(angle), np.sin(angle)])
+            for mirrored in (azimuth, -azimuth)
+            for angle in (mirrored, mirrored + math.pi / 2)
+        ]
+        stated = np.where(np.tile(self.usable, 2), np.reshape(parts, (4, -1)), 0.0).T
+        weight = _SLOPE_WEIGHT * np.tile(self.usable, 2).astype(np.float64)
+        slopes, firm = slope_matrix(self.size, self.pixel_size), self._press_weight()
+        same = _SLOPE_WEIGHT * self.usable
+        system = HeightSystem(self.pixel_size, np.stack([same, np.zeros_like(same), same]), firm)
+        solver = system.solver(1)
+        known = np.nan_to_num(self.middle) * firm
+        right = np.column_stack([slopes.T @ (weight[:, np.newaxis] * stated), known])
+        *by_slopes, by_press = solver.backward(solver.forward(right)).T
+        misfits = np.empty((2, len(TURNS)))
+        for kind, turn in np.ndindex(misfits.shape):
+            share = math.cos(TURNS[turn]), math.sin(TURNS[turn])
+            z = by_press + share[0] * by_slopes[2 * kind] + share[1] * by_slopes[2 * kind + 1]
+            slope = share[0] * stated[:, 2 * kind] + share[1] * stated[:, 2 * kind + 1]
+            misfits[kind, turn] = np.sum(weight * (slopes @ z - slope) ** 2)
+            misfits[kind, turn] += np.nansum(firm * (self.middle - z) ** 2)
+        self.z = by_press + by_slopes[0]
+        return misfits
+
+    def _copies(self) -> float:
+        """Return how many pixels, on average, are at the same place between two steps of the press."""
+        place = (self.z - self.middle) / (2 * self.half)
+        wave = np.exp(2j * np.pi * _ORDERS[:, np.newaxis] * place[np.isfinite(place)])
+        return max(1.0, float(np.mean(np.abs(wave.sum(axis=1)) ** 2) / max(wave.shape[1], 1)))
+
+    def _press_weight(self) -> Doubles:
+        return np.nan_to_num(3 / self.half**2)
+
+    def use_intervals(self, spread: IntervalScatter) -> None:
+        """Take heights of the press from their intervals, at the present heights.
+
+        Pixels at the same place between two steps count once, and the ends of intervals are not known better
+        than by the distance between such places.
+        """
+        known, copies = np.isfinite(self.middle), self._copies()
+        z, middle, half = self.z[known], self.middle[known], self.half[known]
+        distance = max(float(np.ptp(z)), 2 * float(np.median(half))) * copies / len(z)
+        found = interval_evidence(z, middle, half, spread._replace(blur=max(spread.blur, _BLUR * distance)))
+        height, weight = self.z.copy(), np.zeros(len(self.z))
+        height[known], weight[known] = found.height, found.weight / copies
+        self.evidence = height, weight
+
+    def look(self, poses: Poses, gains: Doubles, offsets: Doubles, values: Doubles) -> Sums:
+        """Compute residuals, and return the normal equations of slopes of usable pixels and nuisances."""
+        named, chosen = dict(zip(SHARED, values.tolist(), strict=True)), self.usable
+        inner = self.size - 2 * MARGIN
+        maps = (slope_matrix(self.size, self.pixel_size) @ self.z).reshape(2, inner, inner)
+        maps *= 1 - named["pixel_size"]
+        slopes = maps.reshape(2, -1)[:, chosen]
+        by_column, by_row = self._changes(1 - named["pixel_size"])
+        turned = poses.phase + named["phase"]
+        double = np.cos(2 * turned), np.sin(2 * turned)
+        larger = (1 + named["tilt"]) * (1 + named["oval_x"] * double[0] + named["oval_y"] * double[1])
+        ahead = named["phase"] + named["oval_y"] * double[0] - named["oval_x"] * double[1]
+        tilt, phase = poses.tilt * larger, poses.phase + ahead
+        moves = self._moves(poses, slopes, by_column, by_row)
+        seen = slopes[:, np.newaxis] + (larger - 1) * moves.by_tilt + ahead * moves.by_phase
+        above = (self.relief - self.heights)[chosen]
+        seen = seen + (named["pivot_z"] + above) * moves.by_pivot
+        angles = SlopeAngles.of(seen, phase, tilt, (by_column, by_row))
+        bend = FOOTPRINT * angles.bend
+        levels = self.scale
+        scale = PixelScale(levels.gain[chosen], levels.base[chosen], levels.dark[chosen], levels.full)
+        light = light_of(
+            angles, (1 + named["footprint"]) * bend, scale, gains[:, np.newaxis], offsets[:, np.newaxis],
+            values[: len(GLOBALS) + UNEVEN], self.places[:, chosen],
+        )  # fmt: skip
+        self.left = self.counts[:, chosen] - scale.dark - light.light
+        by_slope = light.by_angle * angles.by_slopes
+        tilt_row = light.by_globals[GLOBALS.index("tilt")]
+        phase_row = light.by_globals[GLOBALS.index("phase")]
+        tilt_row *= poses.tilt
+        tilt_row += np.sum(by_slope * moves.by_tilt, axis=0)
+        phase_row += np.sum(by_slope * moves.by_phase, axis=0)
+        rest = np.concatenate([
+            light.by_globals,
+            [
+                tilt_row * double[0] - phase_row * double[1],
+                tilt_row * double[1] + phase_row * double[0],
+                light.by_angle * bend,
+                np.sum(by_slope * moves.by_pivot, axis=0),
+                -np.sum(by_slope * slopes[:, np.newaxis], axis=0),
+            ],
+        ])  # fmt: skip
+        self.rough = _second_differences(maps)[chosen]
+        return Sums.of(self.left, by_slope, light.by_gain, rest)
+
+    def _changes(self, scale: float) -> tuple[Doubles, Doubles]:
+        """Return changes of slopes, times a factor, from column to column and row to row, (2, m)."""
+        along, across, both = self._bends(self.z)
+        x, y = scale / self.pixel_size[0], -scale / self.pixel_size[1]
+        return np.stack([x * along, y * both]), np.stack([x * both, y * across])
+
+    def _bends(self, z: Doubles) -> Doubles:
+        """Return second differences of heights at usable pixels, along rows, columns and both, (3, m).
+
+        They are smoothed, as noise would make the surface seem more bent than it is, but not across edges.
+        """
+        z = z.reshape(self.size, self.size)
+        bends = np.zeros((3, *z.shape))
+        bends[0, :, 1:-1], bends[1, 1:-1] = np.diff(z, 2, axis=1), np.diff(z, 2, axis=0)
+        bends[2] = np.gradient(np.gradient(z, axis=0), axis=1)
+        clear = np.pad(self.smooth, MARGIN, "edge")
+        share = np.maximum(cv2.GaussianBlur(clear, (0, 0), _SMOOTHING), 1e-9)
+        inner = slice(MARGIN, -MARGIN)
+        return np.stack([
+            (cv2.GaussianBlur(bend * clear, (0, 0), _SMOOTHING) / share)[inner, inner].ravel()[self.usable]
+            for bend in bends
+        ])  # fmt: skip
+
+    @property
+    def heights(self) -> Doubles:
+        """Heights of inner pixels, (n,) mm."""
+        inner = slice(MARGIN, self.size - MARGIN)
+        return self.z.reshape(self.size, self.size)[inner, inner].ravel()
+
+    @property
+    def misplaced(self) -> float:
+        """RMS error of the heights with which frames were registered, mm."""
+        return float(np.sqrt(np.mean((self.relief - self.heights)[self.usable] ** 2)))
+
+    def _moves(self, poses: Poses, slopes: Doubles, by_column: Doubles, by_row: Doubles) -> _Moves:
+        """Return how the slopes that a pixel shows change if frames were registered with a wrong movement.
+
+        A frame is sampled where the assumed movement p' = sin(tilt) (z - q) (cos(phase), sin(phase)) puts the
+        point of a pixel, with the pivot's height q: the point that is seen is off by the difference.
+        """
+        if poses.arm is None:
+            zeros = np.zeros((2, len(poses.phase), by_column.shape[1]))
+            return _Moves(zeros, zeros, zeros)
+        arm = poses.arm + self.relief[self.usable]
+        cosine, sine = np.cos(poses.phase), np.sin(poses.phase)
+        x, y = by_column[:, np.newaxis] / self.pixel_size[0], by_row[:, np.newaxis] / -self.pixel_size[1]
+        lean = math.sin(poses.tilt)
+        rise = 1 + lean * (cosine * slopes[0] + sine * slopes[1])
+        outwards, onwards = (cosine * x + sine * y) / rise, (cosine * y - sine * x) / rise  # per mm
+        by_tilt = -poses.tilt * math.cos(poses.tilt) * arm * outwards
+        return _Moves(by_tilt, -lean * arm * onwards, lean * outwards)
+
+    def exclude_outliers(self) -> None:
+        """Exclude pixels that do not follow the model."""
+        misfit = np.sqrt(np.mean(self.left**2, axis=0))
+        self.usable[self.usable] = misfit < _OUTLIER_RATIO * float(np.median(misfit))
+
+    def eliminate(self, sums: Sums, noise: float, chooses: bool) -> Eliminated:
+        """Return the information on the nuisances that remains after the heights are eliminated.
+
+        ``noise`` is the variance of a sample. A slope may differ from that of the heights by a normal
+        deviate; to eliminate it changes all sums by the same projection.
+        """
+        rough = np.maximum((_ROUGH * self.rough) ** 2, 1e-16)
+        inner = np.linalg.inv(sums.matrices + (noise / rough)[:, np.newaxis, np.newaxis] * np.eye(2))
+        by_cross, by_push = inner @ sums.cross, np.einsum("iab,ib->ia", inner, sums.push)
+        own = sums.own - _products(_flat(sums.cross), _flat(by_cross))
+        pull = sums.pull - np.einsum("iak,ia->k", sums.cross, by_push)
+        matrices = sums.matrices - sums.matrices @ inner @ sums.matrices
+        cross = sums.cross - sums.matrices @ by_cross
+        push = sums.push - np.einsum("iab,ib->ia", sums.matrices, by_push)
+
+        slopes = slope_matrix(self.size, self.pixel_size)
+        slopes = slopes[np.concatenate([self.usable, self.usable])]
+        slopes_x, slopes_y = slopes[: len(matrices)], slopes[len(matrices) :]
+        height, weight = self.evidence or (self.middle, self._press_weight() / self._copies())
+        spread = np.zeros((3, len(self.usable)))
+        spread[:, self.usable] = matrices[:, (0, 0, 1), (0, 1, 1)].T / noise
+        system = HeightSystem(self.pixel_size, spread, weight)
+        seen = push + np.einsum("iab,ib->ia", matrices, np.stack([slopes_x @ self.z, slopes_y @ self.z], 1))
+        coupled = (slopes_x.T @ cross[:, 0] + slopes_y.T @ cross[:, 1]) / noise
+        right = (slopes_x.T @ seen[:, 0] + slopes_y.T @ seen[:, 1]) / noise
+        right += weight * np.where(weight > 0, height, 0.0)
+        apart = np.zeros(len(self.usable), np.bool_)
+        if chooses:
+            self.spacing, apart = self._choose(system, right, spread)
+        solver = system.solver(self.spacing)
+        reduced = solver.forward(np.column_stack([coupled, right]))
+        products = _products(reduced[:, :-1], reduced)
+        own, pull = own / noise - products[:, :-1], pull / noise - products[:, -1] + coupled.T @ self.z
+        self.usable &= ~apart  # from the next look on
+        return Eliminated(own, pull, functools.partial(_heights, solver, reduced))
+
+    def _choose(
+        self, system: HeightSystem, right: Doubles, of_slopes: Doubles
+    ) -> tuple[int, NDArray[np.bool_]]:
+        """Return the largest spacing of knots whose splines follow the surface as well as finer ones.
+
+        In addition, returns the few pixels at which they do not, (n,). ``of_slopes``, (3, n), are the weights of
+        slopes in the system.
+        """
+        chosen, most, finest = 1, 0, np.empty(0)
+        inner, count = self.size - 2 * MARGIN, max(1, int(np.count_nonzero(self.usable)))
+        near = np.maximum(self._mean_nearby(self.usable.astype(np.float64)), _LEAST_NEAR)
+        left = np.zeros(len(self.usable), np.bool_)
+        for spacing in SPACINGS:
+            solver = system.solver(spacing)
+            reduced = solver.forward(right[:, np.newaxis])
+            z = solver.backward(reduced)[:, 0]
+            if most:
+                expected = (most - len(reduced)) / inner**2  # chi-square of a pixel, by noise
+                x, y = (slope_matrix(self.size, self.pixel_size) @ (z - finest)).reshape(2, -1)
+                square = of_slopes[0] * x * x + 2 * of_slopes[1] * x * y + of_slopes[2] * y * y
+                nearby, rest = self._mean_nearby(square) / near, self.usable & ~left
+                usual = float(np.median(nearby[rest])) if rest.any() else math.inf
+                apart = nearby > usual + _LOCALLY * math.sqrt(2 * usual) / _NEAR
+                followed = rest & ~apart
+                if np.count_nonzero(followed) < _MOST * count:
+                    break
+                if np.mean(square[followed]) > expected + _CLEAR * math.sqrt(2 * expected / count):
+                    break
+                left |= apart & self.usable
+            chosen, most, finest = spacing, len(reduced), z
+        return chosen, left
+
+    def _mean_nearby(self, values: Doubles) -> Doubles:
+        """Return the mean of values of inner pixels, (n,), over the square around each."""
+        inner = self.size - 2 * MARGIN
+        return np.asarray(cv2.blur(values.reshape(inner, inner), (_NEAR, _NEAR)), np.float64).ravel()
+
+
+def _heights(solver: HeightSolver, reduced: Doubles, nuisances: Doubles) -> Doubles:
+    """Return the heights for a step of the nuisances."""
+    return solver.backward(reduced[:, -1:] - reduced[:, :-1] @ nuisances[:, np.newaxis])[:, 0]
+
+
+def _second_differences(maps: Doubles) -> Doubles:
+    """Return the size of second differences of maps of slopes, (2, N, N), along both axes, (N * N,)."""
+    total = np.zeros(maps.shape[1:])
+    for axis in (1, 2):
+        middle = [slice(None)] * 2
+        middle[axis - 1] = slice(1, -1)
+        total[tuple(middle)] += np.sum(np.diff(maps, 2, axis=axis) ** 2, axis=0)
+    return np.sqrt(total).ravel()
+
+
+def _flat(cross: Doubles) -> Doubles:
+    return cross.reshape(-1, cross.shape[2])
+
+
+def _products(first: Doubles, second: Doubles) -> Doubles:
+    """Return the products of columns, in pieces that are too small for linear algebra to start threads."""
+    pieces = range(0, len(first), _PIECE)
+    return np.asarray(sum(first[at : at + _PIECE].T @ second[at : at + _PIECE] for at in pieces))
+
+
+def slopes_of_waves(wave: Doubles) -> Doubles:
+    """Return the slopes, (2, m), of waves of zeniths, (3, m), with azimuths as they appear."""
+    size = np.tan(np.clip(wave[0], 0, _STEEPEST)) / np.maximum(np.hypot(wave[1], wave[2]), 1e-30)
+    return np.asarray(-size * wave[1:])
