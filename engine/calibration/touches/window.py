@@ -1,11 +1,11 @@
 """Windows of touches, whose surfaces are eliminated.
 
-The unknowns of a window are the heights z of its pixels, which are splines. A normal is that of the slopes of
-z, by differences that are exact for polynomials of sixth degree; the slopes may differ from it by what these
-differences leave out where the surface is rough. Frames of the turn determine the slopes, and the press ties z to absolute
-heights. The light that a pixel sees is the mean over its footprint: to second order, angles to the axis
-are those of the mean normal, and a term that grows with the variance of the footprint and the square of
-the curvature of the surface.
+The unknowns of a window are the heights z of its pixels, which are splines. A normal is that of the slopes
+of z, by differences that are exact for polynomials of sixth degree; the slopes may differ from it by what
+these differences leave out where the surface is rough. Frames of the turn determine the slopes, and the
+press ties z to absolute heights. The light that a pixel sees is the mean over its footprint: to second
+order, angles to the axis are those of the mean normal, and a term that grows with the variance of the
+footprint and the square of the curvature of the surface.
 """
 
 from __future__ import annotations
@@ -314,8 +314,8 @@ class Window:
     ) -> tuple[int, NDArray[np.bool_]]:
         """Return the largest spacing of knots whose splines follow the surface as well as finer ones.
 
-        In addition, returns the few pixels at which they do not, (n,). ``of_slopes``, (3, n), are the weights of
-        slopes in the system.
+        In addition, returns the few pixels at which they do not, (n,). ``of_slopes``, (3, n), are the weights
+        of slopes in the system.
         """
         chosen, most, finest = 1, 0, np.empty(0)
         inner, count = self.size - 2 * MARGIN, max(1, int(np.count_nonzero(self.usable)))
