@@ -139,7 +139,10 @@ class HeightSystem:
         blocks = self._blocks.copy()
         blocks[:, 0] += np.swapaxes(np.tril(blocks[:, 0], -1), 1, 2)
         blocks = np.matmul(splines.T, np.matmul(blocks, splines))  # of columns
-        return HeightSolver(splines, _of_rows(splines, blocks, -(-_REACH // spacing) + _DEGREE))
+        blocks = _of_rows(splines, blocks, -(-_REACH // spacing) + _DEGREE)
+        diagonal = np.einsum("nii->ni", blocks[:, 0])
+        diagonal += _LEAST * np.mean(diagonal)  # splines that hardly any pixel shows
+        return HeightSolver(splines, blocks)
 
 
 def _of_rows(splines: Doubles, blocks: Doubles, reach: int) -> Doubles:
