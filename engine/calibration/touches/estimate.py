@@ -115,7 +115,8 @@ def from_touches(
         if precession is None and attempt.may_be_of_another_movement:
             movement = search(readers[0], movement)
             priors = priors.relative_to(movement)
-            attempt = Attempt.of(readers, movement, priors, before, forget).registered()
+            other = Attempt.of(readers, movement, priors, before, forget).registered()
+            attempt = min(other, attempt, key=lambda each: each.noise)
         if not attempt.used:
             reason = attempt.read[0].reason
         used = attempt.following()

@@ -38,10 +38,10 @@ _SETTLED = 0.1  # largest last step, in standard errors
 _NEARLY_SETTLED = 0.5  # the same, of a fit that is repeated
 _ROUGHLY = 2  # steps before outliers are excluded; in an exact fit, heights then stay as they are
 _CONTRADICTION = 3.0  # standard deviations between a prior and the touches
-_ROUGH = 2  # pixels between knots of splines up to which a surface shows the pivot
+_LEAST_RELIEF = 30.0  # chi-square of a pixel by relief from which on a touch shows the pivot
 _WELL_SHOWN = 0.02  # relative standard error of the gain by a touch, up to which noise prevails
 _CLEAR = 4.0  # standard deviations of the contradiction of touches by chance, from which on it is a note
-_SINGULAR = 1e-9  # relative eigenvalue of a parameter that is not estimated
+_SINGULAR = 1e-12  # relative eigenvalue of a direction about which a touch tells nothing
 _MOVED = 0.02  # pixels that points move by an error of the pivot, from which frames are registered again
 _WITHOUT = 1e4  # factor of the standard deviation of a prior that is left out
 _REGISTRATIONS = 5  # largest number of registrations with an estimated movement
@@ -135,9 +135,14 @@ class Attempt:
         return [touch for touch in self.used if touch.follows()]
 
     @property
+    def noise(self) -> float:
+        """Usual variance of samples, relative to the least."""
+        return float(np.median([touch.noise / touch.least_noise**2 for touch in self.used] or [math.inf]))
+
+    @property
     def may_be_of_another_movement(self) -> bool:
         """Whether touches that show a surface do not fit it."""
-        fits = self.following() and self.is_plausible
+        fits = self.following() and self.is_plausible and self.fit.is_settled
         return not fits and any(touch.varied or not touch.windows for touch in self.read)
 
     @property
@@ -209,6 +214,7 @@ class Fitted(NamedTuple):
     covariance: Doubles
     contradiction: float  # of touches with each other, over what noise explains
     degrees: float  # of freedom of the contradiction
+    is_settled: bool  # whether the last step was small
 
     @property
     def contradicts(self) -> bool:
@@ -257,7 +263,7 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memo
     values, precision = start.copy(), np.diag(priors.sigma**-2.0)
     is_cold = not exact and not all(touch.is_warm for touch in touches)
     roughly = _ROUGHLY if exact or is_cold else 0
-    last, before = math.inf, values
+    last, before, is_settled = math.inf, values, False
     for number in range(_ITERATIONS):
         early = number < roughly
         informations, pushes, steps = [], [], []
@@ -265,6 +271,8 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memo
             information, push, step = _eliminate(
                 touch, values, number == roughly, exact and early, is_cold and early
             )
+            if max(window.relief_shown for window in touch.windows) < _LEAST_RELIEF:
+                _forget_pivot(information, push, priors)
             weight = weight * _trust(information, priors)
             informations.append(weight * information)
             pushes.append(weight * push)
@@ -286,7 +294,8 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memo
             of_touch(change)
         values = values + change
         settled = _SETTLED if exact else _NEARLY_SETTLED
-        if number >= roughly and np.all(np.abs(change) < settled * np.sqrt(np.diag(covariance))):
+        is_settled = bool(np.all(np.abs(change) < settled * np.sqrt(np.diag(covariance))))
+        if number >= roughly and is_settled:
             break
     pushes = [push - each @ change for push, each in zip(pushes, informations, strict=True)]
     contradiction, degrees = _contradiction_of(informations, pushes, covariance, precision)
@@ -297,7 +306,7 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memo
         )
         covariance = np.linalg.inv(matrix + precision)
         values = covariance @ (vector + precision @ priors.mean)
-    return Fitted(values, matrix, vector, (covariance + covariance.T) / 2, contradiction, degrees)
+    return Fitted(values, matrix, vector, (covariance + covariance.T) / 2, contradiction, degrees, is_settled)
 
 
 def _contradiction_of(
@@ -369,15 +378,13 @@ def _eliminate(
             window.z = part.heights(np.concatenate([change, of_parameters]))
 
     information, push = own[of_sensor, of_sensor] - reduced[:, :-1], pull[of_sensor] - reduced[:, -1]
-    if max(window.spacing for window in touch.windows) > _ROUGH:
-        _forget_pivot(information, push)
     return information, push, step
 
 
-def _forget_pivot(information: Doubles, push: Doubles) -> None:
-    """Leave of the information about the pivot only how the other parameters depend on it."""
+def _forget_pivot(information: Doubles, push: Doubles, priors: Priors) -> None:
+    """Leave of what a touch tells of the pivot only how the other estimated parameters depend on it."""
     at = SHARED.index("pivot_z")
-    rest = np.delete(np.arange(len(push)), at)
+    rest = np.array([number for number in range(len(push)) if number != at and priors.is_free(number)])
     by_rest = np.linalg.lstsq(information[np.ix_(rest, rest)], information[rest, at], rcond=_SINGULAR)[0]
     information[at, at] = by_rest @ information[rest, at]
     push[at] = by_rest @ push[rest]

@@ -249,6 +249,7 @@ class TouchReader:
             else:
                 window.z = self.earlier.windows[number].z
                 window.spacing = self.earlier.windows[number].spacing
+                window.relief_shown = self.earlier.windows[number].relief_shown
                 window.usable &= self.earlier.windows[number].usable
             if not window.usable.any():
                 continue

@@ -108,6 +108,7 @@ class Window:
     noise_gain: float  # factor of the noise by registration
     smooth: Doubles  # (S - 6, S - 6): 1 at inner pixels whose slopes are differences across no edge, or 0
     spacing: int = 1  # pixels between knots of the splines that its heights are
+    relief_shown: float = math.inf  # chi-square of a pixel by the relief that the coarsest splines lack
     evidence: tuple[Doubles, Doubles] | None = field(default=None)  # heights of the press, and their weights
     left: Doubles = field(default_factory=lambda: np.empty(0))  # (T, m): residuals of usable pixels
     rough: Doubles = field(default_factory=lambda: np.empty(0))  # (m,): second differences of slopes
@@ -327,8 +328,7 @@ class Window:
             z = solver.backward(reduced)[:, 0]
             if most:
                 expected = (most - len(reduced)) / inner**2  # chi-square of a pixel, by noise
-                x, y = (slope_matrix(self.size, self.pixel_size) @ (z - finest)).reshape(2, -1)
-                square = of_slopes[0] * x * x + 2 * of_slopes[1] * x * y + of_slopes[2] * y * y
+                square = self._chi_square(z - finest, of_slopes)
                 nearby, rest = self._mean_nearby(square) / near, self.usable & ~left
                 usual = float(np.median(nearby[rest])) if rest.any() else math.inf
                 apart = nearby > usual + _LOCALLY * math.sqrt(2 * usual) / _NEAR
@@ -339,7 +339,15 @@ class Window:
                     break
                 left |= apart & self.usable
             chosen, most, finest = spacing, len(reduced), z
+        coarsest = system.solver(SPACINGS[-1])
+        smooth = coarsest.backward(coarsest.forward(right[:, np.newaxis]))[:, 0]
+        self.relief_shown = float(np.sum(self._chi_square(finest - smooth, of_slopes))) / count
         return chosen, left
+
+    def _chi_square(self, z: Doubles, of_slopes: Doubles) -> Doubles:
+        """Return the squares of slopes of a difference of heights, times their weights, (n,)."""
+        x, y = (slope_matrix(self.size, self.pixel_size) @ z).reshape(2, -1)
+        return np.asarray(of_slopes[0] * x * x + 2 * of_slopes[1] * x * y + of_slopes[2] * y * y)
 
     def _mean_nearby(self, values: Doubles) -> Doubles:
         """Return the mean of values of inner pixels, (n,), over the square around each."""

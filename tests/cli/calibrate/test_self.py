@@ -64,7 +64,7 @@ def test_numbers_have_standard_errors():
 
 
 def test_stated_number_that_touches_contradict_is_reported():
-    actual = done("calibrate self press.h5 turn.h5 -o cal.h5 --stated tilt=4deg+-0.05deg")
+    actual = done("calibrate self press.h5 turn.h5 -o cal.h5 --stated zenith_offset=-20+-1")
     assert "the touches say" in actual.said
 
 
