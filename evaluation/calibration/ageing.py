@@ -89,7 +89,7 @@ class Light:
         }
         movement = Axial(PHASE, tilt=TILT, press=PRESS, pivot=(0.0, 0.0, 1.0))
         twins = Twin(movement=Vertical(travel), **field), Twin(movement=movement, pattern="linear", **field)
-        press, turn = (_all_frames(twin) for twin in twins)
+        press, turn = (all_frames(twin).astype(np.float64) for twin in twins)
         return cls((press, turn), (twins[0].header, twins[1].header), travel)
 
     def taken(self, number: int, gain: float) -> tuple[Frames, Frames]:
@@ -110,10 +110,11 @@ class Light:
         )
 
 
-def _all_frames(twin: Twin) -> Map:
-    block = twin.read(np.empty(twin.shape, np.float32))
+def all_frames(twin: Twin) -> NDArray[Any]:
+    """Return all frames of a twin in memory."""
+    block = twin.read(np.empty(twin.shape, twin.dtype))
     assert block is not None
-    return block.frames.astype(np.float64)
+    return block.frames
 
 
 def errors_of(lights: Sequence[Light], recordings: int, hours: float) -> Map:

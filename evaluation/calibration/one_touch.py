@@ -20,7 +20,7 @@ import numpy as np
 from mirrorskin.engine.calibration import from_touches
 from mirrorskin.evaluation.base.sources import Frames
 from mirrorskin.evaluation.base.tables import Table, replace_part
-from mirrorskin.evaluation.calibration.ageing import Textured
+from mirrorskin.evaluation.calibration.ageing import Textured, all_frames
 from mirrorskin.io import InputError
 from mirrorskin.twin import Axial, Camera, Twin, Vertical
 
@@ -54,14 +54,8 @@ def touch(name: str, seed: int) -> tuple[Frames, Frames, dict[str, float]]:
         tilt=TILT * (1 + 0.04 * random.normal()),
         pivot=(0.0, 0.0, PIVOT + 0.15 * random.normal()),
     )
-    turned = Frames(_frames(turn), header, f"{name} {seed}", phase=phase)
-    return Frames(_frames(press), press.header, f"{name} {seed}", travel=travel), turned, true
-
-
-def _frames(twin: Twin) -> Any:
-    block = twin.read(np.empty(twin.shape, twin.dtype))
-    assert block is not None
-    return block.frames.copy()
+    turned = Frames(all_frames(turn), header, f"{name} {seed}", phase=phase)
+    return Frames(all_frames(press), press.header, f"{name} {seed}", travel=travel), turned, true
 
 
 def rows(seeds: int) -> Iterator[tuple[str, ...]]:
@@ -72,6 +66,8 @@ def rows(seeds: int) -> Iterator[tuple[str, ...]]:
         refused = 0
         for seed in range(seeds):
             press, turn, true = touch(name, seed)
+            scale = {"zenith_gain": 100 / true["zenith_gain"], "tilt": 100 / TILT}
+            scale["phase_offset"] = math.degrees(1)
             try:
                 fit = from_touches([(press, turn)])
             except InputError:
@@ -79,9 +75,7 @@ def rows(seeds: int) -> Iterator[tuple[str, ...]]:
                 continue
             for each in fit.estimates:
                 if each.name in PARAMETERS:
-                    scale = {"zenith_gain": 100 / true["zenith_gain"], "tilt": 100 / TILT}.get(each.name, 1.0)
-                    scale = math.degrees(1) if each.name == "phase_offset" else scale
-                    sigma[each.name].append(each.sigma * scale)
+                    sigma[each.name].append(each.sigma * scale.get(each.name, 1.0))
                     away[each.name].append((each.value - true[each.name]) / each.sigma)
         cells = [
             f"{np.median(sigma[each]):.2g}; {np.sqrt(np.mean(np.square(away[each]))):.1f}" for each in sigma

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 
 _UNKNOWN = Fitted()
+_OF_SAME_MAPS = frozenset(FIELDS) - {"declarations"}  # fields that can change without a look at the maps
 _CENTRED = 0.01  # largest mean of a piece, over the range of its heights, that counts as 0
 _FEW_GAPS = 16  # maximum number of gaps between codes that are searched one by one
 
@@ -268,6 +269,11 @@ class Result(MapContainer, Mapping[str, Any]):
             findings = {name: maps.process[name] for name in ("warnings", "notes") if name in maps.process}
             changes["process"] = merged(self.process, findings)
         values = {**(maps or {}), **changes}
+        if values.keys() <= _OF_SAME_MAPS:
+            changed = object.__new__(Result)
+            for name in Result.__slots__:
+                object.__setattr__(changed, name, values.get(name, getattr(self, name)))
+            return changed
         fields = {name: values.pop(name, getattr(self, name)) for name in FIELDS}
         fields["declarations"] = {**self.declarations, **(fields["declarations"] or {})}
         replaced = {self._own_name(name): value for name, value in values.items()}
@@ -285,12 +291,7 @@ class Result(MapContainer, Mapping[str, Any]):
         >>> turn.fitted.tilt, turn.process
         (0.05, {'tilt': 0.05})
         """
-        changed = object.__new__(Result)
-        for name in Result.__slots__:
-            object.__setattr__(changed, name, getattr(self, name))
-        object.__setattr__(changed, "fitted", replace(self.fitted, **values))
-        object.__setattr__(changed, "process", {**self.process, **values})
-        return changed
+        return self.assign(fitted=replace(self.fitted, **values), process={**self.process, **values})
 
     def with_process(self, process: Mapping[str, ProcessValue]) -> Result:
         """Return a copy with another process; what `Fitted` declares of it is in ``fitted``, if unknown."""

@@ -92,7 +92,7 @@ def _band(size: int, pixel_size: tuple[float, float]) -> _Band:
     kept = (row >= column) & (values != 0)
     row, column, values, weight = (each[kept] for each in (row, column, values, weight))
     above = row // size - column // size
-    places = ((column // size * (2 * MARGIN + 1) + above) * size + row % size) * size + column % size
+    places = ((column // size * (1 + _REACH) + above) * size + row % size) * size + column % size
     places, entry = np.unique(places, return_inverse=True)
     entries = coo_matrix((values, (entry, weight)), (len(places), 3 * count + 1)).tocsc()
     on_diagonal = row == column
@@ -128,21 +128,27 @@ class HeightSystem:
         entries = band.of_slopes @ of_slopes.ravel()
         usual = float(np.mean(entries[band.diagonal]))
         entries[band.diagonal] += of_heights + _LEAST * usual
+        self._solvers = dict[int, HeightSolver]()
         self._blocks = np.zeros((size, 1 + _REACH, size, size))
         self._blocks.ravel()[band.places] = entries + _SMOOTH * usual * band.smooth
 
     def solver(self, spacing: int) -> HeightSolver:
-        """Return the solver for heights that are splines."""
-        splines = _splines(self._size, spacing)
-        if spacing == 1:
-            return HeightSolver(splines, self._blocks)
+        """Return the solver for heights that are splines, which is decomposed once."""
+        if spacing not in self._solvers:
+            splines = _splines(self._size, spacing)
+            blocks = self._blocks if spacing == 1 else self._projected(splines, spacing)
+            self._solvers[spacing] = HeightSolver(splines, blocks)
+        return self._solvers[spacing]
+
+    def _projected(self, splines: Doubles, spacing: int) -> Doubles:
+        """Return the blocks of the system of splines."""
         blocks = self._blocks.copy()
         blocks[:, 0] += np.swapaxes(np.tril(blocks[:, 0], -1), 1, 2)
         blocks = np.matmul(splines.T, np.matmul(blocks, splines))  # of columns
         blocks = _of_rows(splines, blocks, -(-_REACH // spacing) + _DEGREE)
         diagonal = np.einsum("nii->ni", blocks[:, 0])
         diagonal += _LEAST * np.mean(diagonal)  # splines that hardly any pixel shows
-        return HeightSolver(splines, blocks)
+        return blocks
 
 
 def _of_rows(splines: Doubles, blocks: Doubles, reach: int) -> Doubles:

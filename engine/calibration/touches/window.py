@@ -219,16 +219,16 @@ class Window:
 
     def _changes(self, scale: float) -> tuple[Doubles, Doubles]:
         """Return changes of slopes, times a factor, from column to column and row to row, (2, m)."""
-        along, across, both = self._bends(self.z)
+        along, across, both = self._bends()
         x, y = scale / self.pixel_size[0], -scale / self.pixel_size[1]
         return np.stack([x * along, y * both]), np.stack([x * both, y * across])
 
-    def _bends(self, z: Doubles) -> Doubles:
+    def _bends(self) -> Doubles:
         """Return second differences of heights at usable pixels, along rows, columns and both, (3, m).
 
         They are smoothed, as noise would make the surface seem more bent than it is, but not across edges.
         """
-        z = z.reshape(self.size, self.size)
+        z = self.z.reshape(self.size, self.size)
         bends = np.zeros((3, *z.shape))
         bends[0, :, 1:-1], bends[1, 1:-1] = np.diff(z, 2, axis=1), np.diff(z, 2, axis=0)
         bends[2] = np.gradient(np.gradient(z, axis=0), axis=1)
