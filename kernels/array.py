@@ -29,6 +29,12 @@ if TYPE_CHECKING:
 SLACK = 64
 """Readable bytes after an array, which a kernel may load with its last word."""
 
+POCL = "Portable Computing Language"
+"""A platform whose processors work in the host's memory, which need not be mapped: waiting is enough.
+
+A map or a copy is a command, which waits for those of other queues; a wait for a kernel does not.
+"""
+
 ZERO = 0
 """Fill values that are valid for all types."""
 
@@ -104,6 +110,7 @@ class Array:
         self.last_use: cl.Event | None = None
         self.device = device
         self.is_shared: bool = device.info.shares_memory
+        self._is_in_place = self.is_shared and device.info.kind == "cpu" and device.info.platform == POCL
         self._lock = threading.RLock()
         self._mapped: Mapping | None = None
         self._parked: NDArray[Any] | None = None  # values while there is no memory on the device
@@ -308,16 +315,24 @@ class Array:
 
     def _let_host_write(self, whole: bool) -> None:
         """Map shared memory for writing by the host: all of it, or a part outside the device's writes."""
-        if not whole:
+        if not whole or self._needs_no_map:
             self._map()
         elif self._mapped is None and self._buffer is not None:
             if self.last_use is not None:
                 self.device.profile.wait(self.name, self.last_use)
             self._buffer = None  # a new buffer contains the host's writes without a command on the queue
 
+    @property
+    def _needs_no_map(self) -> bool:
+        return self._is_in_place and not self._is_exported
+
     def _map(self) -> None:
         """Make the device's writes to shared memory visible to the host."""
         if self._mapped is None and self._buffer is not None:
+            if self._needs_no_map:
+                if self.latest is not None:
+                    self.device.profile.wait(self.name, self.latest)
+                return
             with self.device.profile.waiting_for(self.name):
                 self._mapped = Mapping(self.device.queue, self._buffer, self.shape, self.dtype)
 
@@ -364,7 +379,12 @@ class Array:
         out = _empty(shape, self.dtype)
         if out.nbytes:
             began = time.perf_counter()
-            cl.enqueue_copy(queue, out, self.buffer, src_offset=start, wait_for=after, is_blocking=True)
+            if self._needs_no_map:
+                for event in after:
+                    event.wait()
+                np.copyto(out, self._host[rows])
+            else:
+                cl.enqueue_copy(queue, out, self.buffer, src_offset=start, wait_for=after, is_blocking=True)
             self.device.profile.add("wait", self.name, time.perf_counter() - began)
         return out
 

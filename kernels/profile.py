@@ -98,8 +98,11 @@ class Profile:
             self._add(kind, name, (end - start) * 1e-9, nbytes)
 
     def _add(self, kind: Kind, name: str, seconds: float, nbytes: int) -> None:
-        record = self._records.setdefault((kind, name), Record(kind, name))
+        record = self._records.get((kind, name))
+        if record is None:
+            record = self._records[kind, name] = Record(kind, name)
         record.runs += 1
         record.seconds += seconds
-        record.fastest = min(record.fastest, seconds)
+        if seconds < record.fastest:
+            record.fastest = seconds
         record.bytes += nbytes

@@ -60,7 +60,9 @@ _GLANCE = (
 )
 _LIVE = (
     "Frames come from memory at a pace, by `mirrorskin bench live`. used, updates: frames, and maps or "
-    "results of a tracker, a second. 50 %, 95 %, 99 %: latency from when a frame was due to its maps. "
+    "results of a tracker, a second. Frames that come too early wait, at most 64 of them (of a press or "
+    "turn, 256) and for 0.1 s; the others are lost. "
+    "50 %, 95 %, 99 %: latency from when a frame was due to its maps. "
     "processor: ms of all threads a frame, on simulated time; there the result must be that of the same "
     "frames offline."
 )

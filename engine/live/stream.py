@@ -31,7 +31,9 @@ from mirrorskin.io.base.types import Closing, Floats
 from mirrorskin.io.model.positions import check_finite
 from mirrorskin.io.storage.layout import LIVE, POSITIONS, as_series
 
-_WAITING = 64  # frames at most that wait to be processed
+WAITING = 64
+"""Largest number of frames that wait to be processed."""
+
 _ENDLESS = 1 << 40  # frames that a stream may have
 
 
@@ -330,9 +332,9 @@ class _Pushed(Closing):
             when = self._in_order(at, places)
             for number, frame in enumerate(array):
                 if self._keeps_all:
-                    self._changed.wait_for(lambda: len(self._waiting) < _WAITING or self._stopped)
+                    self._changed.wait_for(lambda: len(self._waiting) < WAITING or self._stopped)
                 self._check()
-                if len(self._waiting) == _WAITING:
+                if len(self._waiting) == WAITING:
                     self._free.append(self._waiting.popleft()[0])
                     self._lost += 1
                 here = {name: value[number] for name, value in places.items()}

@@ -17,6 +17,8 @@ from mirrorskin.engine import Press, Rotation, Run
 from mirrorskin.engine.base.running import plan_of
 from mirrorskin.engine.force import ForceTracker
 from mirrorskin.engine.live import LiveRun, Loop, Status, Update
+from mirrorskin.engine.live.loop import LATENCY
+from mirrorskin.engine.live.stream import WAITING
 from mirrorskin.engine.live.tracking import Tracker, Trackers
 from mirrorskin.engine.pose import PoseTracker
 from mirrorskin.engine.slip import SlipTracker
@@ -109,17 +111,19 @@ class Tracked:
         self.count: int = _ROUNDS * len(self._updates)
 
     def run(self, pace: Pace) -> Ran:
-        """Push inputs when they are due; only the newest one if several are."""
+        """Push inputs when they are due, in order; those are lost that a `Stream` would not use either."""
         push = self._warm()
         latency: list[float] = []
         result: Any = None
         number = lost = 0
         used = time.process_time()
         while number < pace.count:
-            newest = pace.wait(number) - 1
-            result = push(newest)
-            latency.append(pace.now() - newest / pace.rate)
-            number, lost = newest + 1, lost + newest - number
+            due = pace.wait(number)
+            first = max(number, due - WAITING, math.ceil((pace.now() - LATENCY) * pace.rate))
+            first = min(first, due - 1)
+            result = push(first)
+            latency.append(pace.now() - first / pace.rate)
+            number, lost = first + 1, lost + first - number
         return Ran(pace.now(), time.process_time() - used, lost, latency, result)
 
     def offline(self) -> Any:
