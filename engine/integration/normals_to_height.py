@@ -280,20 +280,26 @@ def _stack(maps: list[NDArray[Any] | None], per_turn: bool) -> NDArray[Any] | No
 class SlopeKernels:
     """Slopes and weights from normals on the device; as `find_slopes` for one turn of a known tilt.
 
-    ``typical`` is the median weight, which determines the limits of weights; it is computed if it is NaN.
+    They are those of a part of a picture of a number of columns. If it is narrower, its width is a multiple
+    of 8. ``typical`` is the median weight, which determines the limits of weights; it is computed if it is
+    NaN.
     """
 
-    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
-        self._device, self._shape = device, shape
+    def __init__(
+        self, device: Device, part: tuple[slice, slice], columns: int, typical: float = math.nan
+    ) -> None:
+        rows, across = part
+        self._device, self._shape = device, (rows.stop - rows.start, across.stop - across.start)
+        self._place = {"start": rows.start * columns + across.start, "stride": columns}
         names = "squares_x", "squares_y"
-        self._squares: dict[str, Any] = {name: device.array(name, shape, np.float32) for name in names}
-        self.typical: float = math.nan
+        self._squares: dict[str, Any] = {name: device.array(name, self._shape, np.float32) for name in names}
+        self.typical: float = typical
 
     def find(self, tilt: float, normals: Mapping[str, Array], to: Mapping[str, Array]) -> None:
         """Enqueue the kernels; the first time, wait for `typical`.
 
-        The input ``vectors``, ``sigma`` and ``contact`` may have padding; the output is ``dz_dx``, ``dz_dy``,
-        ``weight_x`` and ``weight_y``, (H, W).
+        The input ``vectors``, ``sigma`` and ``contact`` are maps of the picture, which may have padding; the
+        output is ``dz_dx``, ``dz_dy``, ``weight_x`` and ``weight_y`` of the part.
         """
         rows, columns = self._shape
         pixels, tile = rows * columns, self._device.layout.tile
@@ -302,6 +308,8 @@ class SlopeKernels:
         find(
             -(-pixels // tile),
             pixels=pixels,
+            columns=columns,
+            **self._place,
             flat_limit=floor,
             vectors=normals["vectors"],
             sigma=normals["sigma"],
@@ -328,6 +336,7 @@ class SlopeKernels:
             -(-rows // strip) * -(-columns // min(tile, _CHUNK)),
             rows=rows,
             columns=columns,
+            **self._place,
             flat_limit=floor,
             lowest=bounds[0],
             highest=bounds[1],

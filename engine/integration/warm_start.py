@@ -21,6 +21,7 @@ MAPS = {"dz_dx": "dz_dx", "dz_dy": "dz_dy", "weight_x": "map_x", "weight_y": "ma
 
 _FIRST_RESIDUAL, _FIRST_CYCLES = 1e-3, 30  # tolerance and limit of the first solution
 _MORE_STEPS = 6  # largest number of further steps for a frame
+_DEEP = 4  # frames of which one rebuilds all levels of the graph, which change by little
 # Relative error above which further steps follow, and then the next frame is solved from scratch.
 _LARGEST_GAP = 0.1
 
@@ -62,8 +63,8 @@ class WarmStartIntegrator(ThreadSafe):
         if self._multigrid is not None and self._steps:
             self._multigrid.enter(self.maps["dz_dx"], self.maps["dz_dy"], self._pixel_size)
             self._graph.put_links(*self._multigrid.in_place())
-            # All levels: a cycle is of no use where coarse ones join what is not joined any more.
-            self._relief = self._multigrid.follow(None, deep=True)
+            self._is_deep = self._steps % _DEEP == 1
+            self._relief = self._multigrid.follow(None, deep=self._is_deep)
         self._device.flush()
         self._height = None
 
@@ -92,7 +93,9 @@ class WarmStartIntegrator(ThreadSafe):
             self.gap = self._multigrid.gap()
             if self.gap < _LARGEST_GAP:
                 return relief
-            relief = self._multigrid.follow(None, deep=False)
+            # All levels: a cycle is of no use where coarse ones join what is not joined any more.
+            relief = self._multigrid.follow(None, deep=not self._is_deep)
+            self._is_deep = True
         if not self._multigrid.gap() < _LARGEST_GAP:
             self._steps = -1  # the next frame begins anew
         return relief

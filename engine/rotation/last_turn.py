@@ -27,7 +27,7 @@ _UPDATES_BETWEEN_PLACINGS = 8  # updates between estimates of the object's heigh
 _MIN_FRAMES = 3  # minimum number of frames of a fit
 _WARMING = 10  # number of updates that run all kernels
 _PARTS = 12  # number of parts of the longest kernel of the edges
-_INTERVAL = 0.25  # least seconds between the starts of drawings of edges
+_INTERVAL = 0.5  # least seconds between the starts of drawings of edges
 _PAUSE = 10.0  # the same, in durations of a drawing: on a slow device edges take a tenth of the time
 _OVERDUE = 0.1  # seconds without a part after which one is run without idle time
 _FIRST_COST = 0.005  # seconds: assumed duration of the first part
@@ -108,7 +108,7 @@ class LastTurn(Normals):
         normals, sigma, contact = window.maps.read("vectors", "sigma", "contact")
         self._has_estimate = True
         if heights is not None:
-            heights.follow(window)
+            heights.follow(window, contact)
             heights.wait(seconds - (time.perf_counter() - started))
         height = None if heights is None else heights.height
         self._updates += 1
@@ -176,7 +176,7 @@ class LastTurn(Normals):
 
 
 class IdleEdges:
-    """Edges that are drawn in idle time, up to four times a second and for a tenth of the time.
+    """Edges that are drawn in idle time, up to twice a second and for a tenth of the time.
 
     ``lines``, (H, W), is None until the first drawing is complete.
     """

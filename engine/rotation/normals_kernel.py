@@ -32,6 +32,7 @@ MAPS = "vectors", "sigma", "contact", "mean", "cosines", "sines", "residual"
 SLOPE_MAPS = "slopes", "slope_errors", "zeniths"
 """Names of the additional maps of a body that rocks."""
 
+_AGAIN = 2  # see normals.clh
 _MIN_CLEAR_PIXELS = 500  # minimum number of clear pixels for an estimate of the noise
 _MOST_NOISE = 1e12  # counts
 
@@ -170,11 +171,13 @@ class NormalKernel:
         *,
         start: int = 0,
         bare: bool = False,
+        again: bool = False,
     ) -> None:
         """Fit the frames of one turn, or those of the picture's map ``frames``, a ring buffer.
 
         The maps become the mean of ``turns`` turns, including this one. ``start`` is the number of the oldest
-        frame of a ring buffer. ``bare`` omits mean, cosine, sine and residual.
+        frame of a ring buffer. ``bare`` omits mean, cosine, sine and residual. ``again``: the maps have the
+        normals of an earlier estimate.
         """
         count, noise, scale = len(fit.weights), model.noise, self._scale
         tilt = fit.tilt if isinstance(fit, PoseFit) else model.tilt
@@ -198,7 +201,7 @@ class NormalKernel:
             "start": start,
             "turns": turns,
             "per_pixel": int(scale.per_pixel),
-            "bare": int(bare),
+            "bare": _AGAIN if bare and again else int(bare),
             "cos_tilt": math.cos(tilt),
             "sin_tilt": math.sin(tilt),
             "noise_base": noise.base,

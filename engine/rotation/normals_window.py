@@ -38,6 +38,7 @@ class NormalWindow:
         self.length, self.count, self._kernel, self._model = length, 0, kernel, kernel.model
         self.maps = kernel.picture(operation, 1, **WindowSums.maps_of(operation, length))
         self._sums = WindowSums(self.maps, operation.dtype, length)
+        self._is_estimated = False
 
     @property
     def is_full(self) -> bool:
@@ -66,7 +67,9 @@ class NormalWindow:
         ``bare`` omits mean, cosine, sine and residual. InputError: the window is not full, or its phases do
         not determine a normal.
         """
-        self._kernel.run(self.maps, None, self._fit(), self.model, 1, start=self._sums.oldest, bare=bare)
+        kinds = {"bare": bare, "again": self._is_estimated}
+        self._kernel.run(self.maps, None, self._fit(), self.model, 1, start=self._sums.oldest, **kinds)
+        self._is_estimated = True
 
     def place(self, heights: NDArray[np.floating]) -> None:
         """Set the height of the object for a response, (H, W), mm above the rest plane."""

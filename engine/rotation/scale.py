@@ -74,8 +74,10 @@ def make_scale(
             (levels.get(name, np.asarray(end)) - zero) * per_count
             for name, end in (("dark", -np.inf), ("bright", np.inf))
         ]
-    planes = zero, per_count, np.fmin(*ends), np.fmax(*ends)
-    return Scale(np.stack(np.broadcast_arrays(*planes)).astype(np.float64))
+    planes = np.stack(np.broadcast_arrays(zero, per_count, np.fmin(*ends), np.fmax(*ends)))
+    first = planes.reshape(4, -1)[:, 0]
+    is_uniform = np.array_equal(planes, np.broadcast_to(first, planes.T.shape).T)
+    return Scale((first if is_uniform else planes).astype(np.float64))  # a kernel need not read uniform maps
 
 
 def check_gain(gain: ArrayLike) -> None:

@@ -3,7 +3,9 @@
 // TILE     pixels of one work-item: 1 on a GPU, many on a CPU
 // WIDTH    pixels in a vector: 8 on a CPU, 1 on a GPU
 //
-// Maps have the size of the picture, but whole vectors of them may be read and written.
+// Vectors, sigma and contact are those of a picture with rows of `stride` pixels; all other maps, those of a part of
+// it that starts at pixel `start`. If the part is narrower than the picture, its width is a multiple of WIDTH. Whole
+// vectors of maps may be read and written.
 
 #include "common.clh"
 
@@ -25,7 +27,7 @@ typedef uchar8 __attribute__((aligned(1))) Bytes;
 #define PUT(line, i, values) (*(Loose *)((line) + (i)) = (values))
 #define FLAGS(map, p) convert_int8(*(__global const Bytes *)((map) + (p)))
 #define READ_VECTORS                                                                                   \
-    const F a = READ(vectors, 3 * p), b = READ(vectors, 3 * p + 8), c = READ(vectors, 3 * p + 16);      \
+    const F a = READ(vectors, 3 * q), b = READ(vectors, 3 * q + 8), c = READ(vectors, 3 * q + 16);      \
     F x = (F)(a.s0, a.s3, a.s6, b.s1, b.s4, b.s7, c.s2, c.s5);                                         \
     F y = (F)(a.s1, a.s4, a.s7, b.s2, b.s5, c.s0, c.s3, c.s6);                                         \
     F z = (F)(a.s2, a.s5, b.s0, b.s3, b.s6, c.s1, c.s4, c.s7);
@@ -35,7 +37,7 @@ typedef uchar8 __attribute__((aligned(1))) Bytes;
 #define GET(line, i) ((line)[i])
 #define PUT(line, i, values) ((line)[i] = (values))
 #define FLAGS(map, p) ((int)(map)[p])
-#define READ_VECTORS F x = vectors[3 * p], y = vectors[3 * p + 1], z = vectors[3 * p + 2];
+#define READ_VECTORS F x = vectors[3 * q], y = vectors[3 * q + 1], z = vectors[3 * q + 2];
 #endif
 
 // Exponential function from 0 to 1/2, accurate to 1e-7.
@@ -52,12 +54,15 @@ typedef uchar8 __attribute__((aligned(1))) Bytes;
 // Slopes, and the squares of the normal's components along x and y. Without a normal slopes are NaN, and the
 // squares 0.
 __kernel void slopes_find(
-    const int pixels, const float flat_limit, MAP vectors, MAP sigma, __global const uchar *restrict contact, OUT dz_dx,
-    OUT dz_dy, OUT squares_x, OUT squares_y)
+    const int pixels, const int columns, const int start, const int stride, const float flat_limit, MAP vectors,
+    MAP sigma, __global const uchar *restrict contact, OUT dz_dx, OUT dz_dy, OUT squares_x, OUT squares_y)
 {
     const int first = (int)get_global_id(0) * TILE;
+    int row = first / columns;
     for (int p = first; p < LESSER(first + TILE, pixels); p += WIDTH) {
-        const I touches = FLAGS(contact, p) != 0;
+        row += p >= (row + 1) * columns;
+        const int q = start + p + row * (stride - columns);
+        const I touches = FLAGS(contact, q) != 0;
         if (!any_of(touches)) {
             WRITE(dz_dx, p, (F)NAN);
             WRITE(dz_dy, p, (F)NAN);
@@ -66,7 +71,7 @@ __kernel void slopes_find(
             continue;
         }
         READ_VECTORS
-        const F s = READ(sigma, p);
+        const F s = READ(sigma, q);
         const I valid = touches & (z > 0.0f) & (s > 0.0f) & (s < INFINITY);
         x = valid ? x : (F)0.0f;
         y = valid ? y : (F)0.0f;
@@ -101,8 +106,8 @@ __kernel void slopes_find(
 
 // Inverse variances of slopes along x and y, within bounds; 0 without a normal.
 __kernel void slopes_weigh(
-    const int rows, const int columns, const float flat_limit, const float lowest, const float highest, MAP sigma,
-    MAP dz_dx, MAP squares_x, MAP squares_y, OUT weight_x, OUT weight_y)
+    const int rows, const int columns, const int start, const int stride, const float flat_limit, const float lowest,
+    const float highest, MAP sigma, MAP dz_dx, MAP squares_x, MAP squares_y, OUT weight_x, OUT weight_y)
 {
     const int across_all = (columns + CHUNK - 1) / CHUNK, item = get_global_id(0);
     const int top = item / across_all * ROWS, bottom = LESSER(rows, top + ROWS);
@@ -113,14 +118,14 @@ __kernel void slopes_weigh(
     float x[CHUNK + 2 * AROUND + WIDTH], y[CHUNK + 2 * AROUND + WIDTH];
     for (int i = 0; i < from; ++i) x[i] = y[i] = 0.0f;
     for (int row = top; row < bottom; ++row) {
-        const int start = row * columns + begin;
+        const int line = row * columns + begin, in_picture = start + row * stride + begin;
         I some = 0;
         for (int i = 0; i < width; i += WIDTH) {
-            const F slope = READ(dz_dx, start + i);
+            const F slope = READ(dz_dx, line + i);
             some |= slope == slope;
         }
         if (!any_of(some)) {
-            for (int i = 0; i < width; ++i) weight_x[start + i] = weight_y[start + i] = 0.0f;
+            for (int i = 0; i < width; ++i) weight_x[line + i] = weight_y[line + i] = 0.0f;
             continue;
         }
         ROW(0, -2) ROW(1, -1) ROW(2, 0) ROW(3, 1) ROW(4, 2)
@@ -130,12 +135,12 @@ __kernel void slopes_weigh(
         }
         for (int i = to; i < width + 2 * AROUND + WIDTH; ++i) x[i] = y[i] = 0.0f;
         for (int i = 0; i < width; i += WIDTH) {
-            const int p = start + i;
+            const int p = line + i;
             const F slope = READ(dz_dx, p);
             const I valid = slope == slope;
             F in_x = 0.0f, in_y = 0.0f;
             if (any_of(valid)) {
-                const F sum_x = FIVE(x), sum_y = FIVE(y), s = READ(sigma, p);
+                const F sum_x = FIVE(x), sum_y = FIVE(y), s = READ(sigma, in_picture + i);
                 const F variance = valid ? s * s : (F)1.0f, flat = READ(squares_x, p) + READ(squares_y, p);
                 const F upright = 1.0f - flat, steep = 1.0f / GREATER(upright, (F)(STEEPEST * STEEPEST));
                 UNSURE(flat, variance)

@@ -138,6 +138,12 @@ __kernel void normals_exact(ARGUMENTS)
         }
         if (bare && !some) {
             const F none = 0.0f;
+            I had = bare == AGAIN ? 0 : -1;
+            for (int p = from; bare == AGAIN && p < LESSER(from + PART * LANES, end); p += LANES) {
+                const F error = READ(maps.sigma, p);
+                had |= error == error;
+            }
+            if (!any_of(had)) continue;
             for (int p = from; p < LESSER(from + PART * LANES, end); p += LANES)
                 keep_answer(maps, p, turns, (I)0, none, none, none, none, (I)0);
             continue;
