@@ -123,4 +123,5 @@ def part_around(contact: NDArray[np.uint8]) -> Part | None:
 
 
 def _area(part: Part) -> int:
-    return (part[0].stop - part[0].start) * (part[1].stop - part[1].start)
+    rows, columns = part
+    return int((rows.stop - rows.start) * (columns.stop - columns.start))

@@ -77,6 +77,25 @@ def test_heights_follow_those_that_fit_best(device):
         assert np.sqrt(np.mean(off**2)) < 0.01 * np.ptp(best[np.isfinite(best)])
 
 
+def test_heights_follow_a_contact_that_moves_to_another_part_of_the_picture():
+    count, (rows, columns) = 5 * WINDOW, (150, 203)
+    phase, small = phases(count), turn_frames((count, 40, 52))
+    frames = np.full((count, rows, columns), round(OFFSET), np.uint8)  # without contact
+    for turns, top, left in [(slice(3 * WINDOW), 70, 10), (slice(3 * WINDOW, None), 5, 140)]:
+        frames[turns, top : top + 40, left : left + 52] = small[turns]
+    live = LiveRun(paced(frames, turn_header(), phase), Rotation(window_frames=WINDOW, noise=NOISE, blur=0.0))
+    for number in range(count):
+        live.push(frames[[number]], phase=phase[[number]])
+        update = live.maps()
+        if number + 1 in (3 * WINDOW, count):  # a smaller part is in use for long; contact left it
+            last = slice(number + 1 - WINDOW, number + 1)
+            best = best_heights(estimate_normals(frames[last], phase[last], **OFFLINE))
+            np.testing.assert_array_equal(np.isnan(update["height"]), np.isnan(best))
+            inside = np.isfinite(best)
+            off = (update["height"] - best)[inside]
+            assert np.sqrt(np.mean(off**2)) < 0.01 * np.ptp(best[inside])
+
+
 def test_heights_that_take_long_hold_up_no_normals(monkeypatch):
     frames, live = make()
     live.push(frames[:WINDOW], phase=PHASE[:WINDOW])

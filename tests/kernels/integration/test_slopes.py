@@ -26,10 +26,12 @@ def normals(shape):
     return vectors.astype(np.float32), sigma.astype(np.float32), contact.astype(np.uint8)
 
 
-def on_device(device, vectors, sigma, contact):
-    maps = SlopeKernels(device, (slice(0, contact.shape[0]), slice(0, contact.shape[1])), contact.shape[1])
+def on_device(device, vectors, sigma, contact, part=None):
+    rows, columns = part = part or (slice(0, contact.shape[0]), slice(0, contact.shape[1]))
+    maps = SlopeKernels(device, part, contact.shape[1])
     options = {"vectors": (vectors, np.float32), "sigma": (sigma, np.float32), "contact": (contact, np.uint8)}
-    to = {name: device.from_host(name, np.zeros(contact.shape)) for name in MAPS}
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    to = {name: device.from_host(name, np.zeros(shape)) for name in MAPS}
     maps.find(TILT, {name: device.from_host(name, *array) for name, array in options.items()}, to)
     return maps, {name: to[name].read() for name in MAPS}
 
@@ -53,3 +55,15 @@ def test_the_typical_weight_is_determined_once_and_bounds_the_others(device):
     weights = find_slopes(*maps_of_normals, TILT).weights
     assert maps.typical == pytest.approx(float(np.median(weights[weights > 0])), rel=0.05)
     assert typical["weight_x"].max() <= 1e3 * maps.typical * 1.0001
+
+
+def test_slopes_of_a_part_are_those_of_the_picture(device):
+    vectors, sigma, contact = normals((40, 61))
+    part = slice(11, 31), slice(5, 37)
+    outside = np.ones(contact.shape, bool)
+    outside[part] = False
+    contact[outside] = 0
+    _, whole = on_device(device, vectors, sigma, contact)
+    _, cut = on_device(device, vectors, sigma, contact, part)
+    for name in MAPS:
+        np.testing.assert_array_equal(cut[name], whole[name][part], err_msg=name)
