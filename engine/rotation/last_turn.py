@@ -105,10 +105,12 @@ class LastTurn(Normals):
             return Result()
         window.estimate()
         started = time.perf_counter()
-        normals, sigma, contact = window.maps.read("vectors", "sigma", "contact")
+        (contact,) = window.maps.read("contact")
         self._has_estimate = True
         if heights is not None:
             heights.follow(window, contact)
+        normals, sigma = window.maps.read("vectors", "sigma")  # heights are computed meanwhile
+        if heights is not None:
             heights.wait(seconds - (time.perf_counter() - started))
         height = None if heights is None else heights.height
         self._updates += 1
