@@ -469,13 +469,16 @@ def fetch(parts: Sequence[tuple[Array, int | slice]], keep: Sequence[bool] = ())
 
 def _put(target: NDArray[Any], values: NDArray[Any], first: int) -> None:
     """Write values to the elements from index ``first`` on."""
+    if values.shape == target.shape:
+        np.copyto(target, values, casting="unsafe")
+        return
     target.reshape(-1)[first : first + values.size].reshape(values.shape)[...] = values
 
 
 def _empty(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return previously used memory on the host, if available."""
     nbytes = math.prod(shape) * dtype.itemsize
-    if nbytes < memory.PAGE:
+    if nbytes < memory.MIN_CACHED:
         return np.empty(shape, dtype)
     return memory.take(nbytes, zeroed=False)[:nbytes].view(dtype).reshape(shape)
 

@@ -14,7 +14,8 @@ KEPT = 2**29
 PAGE = 4096
 """Size of the smallest pages, bytes."""
 
-_MIN_CACHED = 2**16  # bytes, below which memory is not cached
+MIN_CACHED = 2**16
+"""Number of bytes below which memory is not cached."""
 
 _lock = threading.Lock()
 _kept: list[NDArray[np.uint8]] = []  # least recently used first
@@ -40,7 +41,7 @@ def take(nbytes: int, zeroed: bool) -> NDArray[np.uint8]:
 
     It contains zeros, or is not initialised. MemoryError if there is none.
     """
-    if nbytes < _MIN_CACHED:
+    if nbytes < MIN_CACHED:
         small = np.zeros(nbytes + PAGE, np.uint8)
         start = -small.ctypes.data % PAGE
         return small[start : start + nbytes]
