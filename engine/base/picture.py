@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from mirrorskin.engine.base.operation import Operation
     from mirrorskin.kernels.array import Array
 
+_FIRST_ROWS = 64  # frames for which `Appended` has room at first
 _MOST_CACHED = 2**26  # bytes of frames whose memory is cached for the next run
 
 Part: TypeAlias = "str | tuple[str, int]"
@@ -53,6 +54,40 @@ class PerPixel:
     """An argument of a kernel with a value for each pixel, (H, W), or with one number."""
 
     values: NDArray[Any]
+
+
+class Appended:
+    """An argument of a kernel with numbers for each frame so far, (n, width), float32.
+
+    A launch copies only those to the device that were appended since the last one.
+    """
+
+    def __init__(self, width: int) -> None:
+        self._values, self._count = np.zeros((_FIRST_ROWS, width), np.float32), 0
+        self._copies: dict[Device, tuple[Array, int]] = {}  # and the number of rows that were copied
+
+    def append(self, rows: ArrayLike) -> None:
+        """Append the numbers of the next frames, (n, width)."""
+        rows = np.asarray(rows)
+        first, self._count = self._count, self._count + len(rows)
+        if self._count > len(self._values):  # frames may come one by one
+            self._values = np.pad(self._values, ((0, 2 * self._count - len(self._values)), (0, 0)))
+        self._values[first : self._count] = rows
+
+    def clear(self) -> None:
+        """Remove all numbers."""
+        self._count = 0
+        self._copies = {device: (array, 0) for device, (array, _) in self._copies.items()}
+
+    def on(self, name: str, device: Device) -> Array:
+        """Return the numbers on a device."""
+        array, copied = self._copies.get(device, (None, 0))
+        if array is None or array.shape != self._values.shape:
+            array, copied = device.array(name, self._values.shape, np.float32), 0
+        if copied < self._count:
+            array.write(self._values[copied : self._count], copied)
+        self._copies[device] = array, self._count
+        return array
 
 
 class Picture:
@@ -263,6 +298,8 @@ class Picture:
         for name, value in needed.items():
             if isinstance(value, np.ndarray | PerPixel):
                 needed[name] = _on(band, name, value)
+            elif isinstance(value, Appended):
+                needed[name] = value.on(name, band.device)
         kernel(-(-band.pixels // tile), moved=moved, **needed)
 
 

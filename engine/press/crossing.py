@@ -13,7 +13,7 @@ from mirrorskin.engine.base.device_arrays import AnyArray
 from mirrorskin.engine.base.frames import Noise, estimate_noise_of_all, reference_maps
 from mirrorskin.engine.base.operation import Operation
 from mirrorskin.engine.base.options import option
-from mirrorskin.engine.base.picture import PerPixel, Picture
+from mirrorskin.engine.base.picture import Appended, PerPixel, Picture
 from mirrorskin.engine.base.tiling import Planes
 from mirrorskin.engine.diagnosis.position_uncertainty import with_travel_error
 from mirrorskin.io import Fitted, Map, Result
@@ -175,8 +175,9 @@ class Crossing:
         self._release, self._subframe = event == "release", operation.subframe
         self._hold = min(operation.hold, _MAX_HOLD)
         self._noise = Noise(operation.noise, dtype.kind == "u")
-        self.travel: NDArray[np.float64] = np.empty(0)  # of the frames so far, (T,), mm
-        self._travel_table = np.zeros((3, 64), np.float32)  # travel; the step to it; since the first frame
+        self._travel: list[NDArray[np.float64]] = []  # of the frames of each push, mm
+        self._count = 0
+        self._travel_table = Appended(3)  # travel; the step to it; since the first frame
         # Of a release, the dark plateau is unknown: no reference specifies it.
         self._dark_from_frames = self._release or operation.dark is None
         self._marked_noise: float | None = None
@@ -212,14 +213,13 @@ class Crossing:
 
     def push(self, frames: AnyArray, travel: ArrayLike) -> None:
         """Process the next frames, (n, H, W), and the travel of each; InputError if it reverses."""
-        first, last = len(self.travel), self.travel[-1:]
+        first, last = self._count, self._travel[-1][-1:] if self._travel else np.empty(0)
         more = check_travel(travel, len(frames), "travel", after=last, falls=self._release)
-        self.travel = np.concatenate([self.travel, more])
-        count = len(self.travel)
-        if count > (length := self._travel_table.shape[1]):  # frames may come one by one
-            self._travel_table = np.pad(self._travel_table, ((0, 0), (0, 2 * count - length)))
-        steps = more - np.concatenate([last if first else more[:1], more[:-1]])
-        self._travel_table[:, first:count] = more, steps, more - self.travel[0]
+        if len(more):
+            self._travel.append(more)
+            self._count += len(more)
+            steps = more - np.concatenate([last if first else more[:1], more[:-1]])
+            self._travel_table.append(np.stack([more, steps, more - self._travel[0][0]], axis=1))
         self._noise.look(frames)
         noise = self._noise.value or 0.0  # not needed for a single frame, which is assumed to be dark
         arguments: dict[str, Any] = {}
@@ -241,7 +241,7 @@ class Crossing:
         dark = light if self._dark_from_frames else _PLATEAU_Z_SCORE * noise
         arguments |= {"noise": noise, "dark_tolerance": dark, "light_tolerance": light, "hold": self._hold}
         arguments["threshold"] = self._threshold  # as a share of the way from the plateau before the event
-        arguments |= {"travel": self._travel_table, "row_length": self._travel_table.shape[1]}
+        arguments["travel"] = self._travel_table
         arguments |= {} if self._subframe else {"samples": None}
         self._maps.scan("onset_scan", frames, first=first, **arguments)
         self._marked_noise = self._noise.value
@@ -260,9 +260,15 @@ class Crossing:
         parts = ("answers", 0), ("answers", 1), "status", "times"
         return EventMaps(*self._maps.take(*parts, on_host=on_host))
 
+    @property
+    def travel(self) -> NDArray[np.float64]:
+        """Travel of the frames so far, (T,), mm."""
+        return np.concatenate([np.empty(0), *self._travel])
+
     def reset(self, noise: float | None = None) -> None:
         """Prepare for another press with the same references and, if given, the same noise, counts."""
-        self.travel = np.empty(0)
+        self._travel, self._count = [], 0
+        self._travel_table.clear()
         self._noise.reset(noise)
         if self._dark_from_frames:  # the marks depend on the first frame
             self._marked_noise = None

@@ -18,7 +18,7 @@
 // answers      height; sigma: as if no frame followed
 // status       0 invalid input, 1 onset, 2 never light, 3 light at start (RELEASE: 2 dark at start, 3 light to the
 //              end)
-// travel       has planes of `row_length` frames: travel; the step to it; travel since the first frame
+// travel       has three numbers of each frame: travel; the step to it; travel since the first frame
 
 #pragma OPENCL FP_CONTRACT OFF
 #include "common.clh"
@@ -254,7 +254,7 @@ __attribute__((always_inline)) float2 answer(
 __kernel void onset_scan(
     __global const FRAME *restrict frames, const int count, const int pixels, const int stride, const int first,
     const int hold, const float threshold, LEVELS, __global Count *restrict frames_left,
-    __global int *restrict times, MAP travel, const int row_length,
+    __global int *restrict times, MAP travel,
     const float noise, const float dark_tolerance, const float light_tolerance, __global FRAME *restrict samples,
     OUT answers, __global uchar *restrict status)
 {
@@ -352,7 +352,7 @@ __kernel void onset_scan(
             if (!SUBFRAME) {
                 for (int p = low; p < high; ++p) {
                     const int begin = times[p], frame = begin < 1 ? 1 : begin;
-                    const float height = -travel[frame], step = travel[row_length + frame], size = step < 0 ? -step : step;
+                    const float height = -travel[3 * frame], step = travel[3 * frame + 1], size = step < 0 ? -step : step;
                     answers[p] = begin > 0 ? height : NAN;
                     answers[stride + p] = begin > 0 ? size * 0.577350269f : NAN;  // over sqrt(3)
                     status[p] = begin > 0 ? 1 : begin == 0 ? 3 - RELEASE : remain[p] > 0 ? NEVER : 0;
@@ -422,7 +422,7 @@ __kernel void onset_scan(
                 for (int p = low, i = 0; p < high; ++p, ++i) {
                     const int begin = times[p], kept = waits[i], from = kept ? begin - 1 : 0, dark = kept ? darks[p] : 0;
                     waited[i] = kept ? begin - dark : 1;
-                    unclear_travel[i] = travel[2 * row_length + from] - travel[2 * row_length + dark];
+                    unclear_travel[i] = travel[3 * from + 2] - travel[3 * dark + 2];
                     const float to_level = LEVEL(p) - PLATEAU(p);
                     const float light = later[i], first_rise = first_rises[p];
                     const int rises = first_rise >= light - to_level * 0.125f;
@@ -436,7 +436,7 @@ __kernel void onset_scan(
             for (int p = low, i = 0; p < high; ++p, ++i) {
                 const int begin = times[p];
                 const float2 crossing = answer(dim[i], bright[i], later[i], waited[i], unclear_travel[i],
-                                               travel[frame[i] - 1], travel[row_length + frame[i]], LEVEL(p),
+                                               travel[3 * (frame[i] - 1)], travel[3 * frame[i] + 1], LEVEL(p),
                                                PLATEAU(p), threshold, noise, dark_tolerance,
                                                light_tolerance, jumped[i]);
                 const float height = answers[p], spread = rough_inverse_root(crossing.y);

@@ -8,7 +8,7 @@ import pytest
 from bare import bare, bare_run
 
 from mirrorskin import engine, io
-from mirrorskin.engine.base.picture import PerFrame, Picture
+from mirrorskin.engine.base.picture import Appended, PerFrame, Picture
 from mirrorskin.engine.base.tiling import Planes
 from mirrorskin.engine.optical.focus import Focus
 from mirrorskin.engine.optical.photometric import PhotometricStereo
@@ -95,3 +95,19 @@ def test_memory_is_free_with_the_last_reference(device, name):
     del run
     gc.enable()
     assert band() is None
+
+
+def test_numbers_of_earlier_frames_are_copied_to_the_device_once(card):
+    numbers = Appended(2)
+    card.profile.clear()
+    for frame in range(100):
+        numbers.append([[frame, -frame]])
+        placed = numbers.on("numbers", card)
+    np.testing.assert_array_equal(placed.read()[:100], np.outer(np.arange(100), [1, -1]))
+    uploads = [
+        record for record in card.profile.records() if (record.kind, record.name) == ("upload", "numbers")
+    ]
+    assert sum(record.bytes for record in uploads) <= 2 * 100 * 2 * 4
+    numbers.clear()
+    numbers.append([[5, 6], [7, 8]])
+    np.testing.assert_array_equal(numbers.on("numbers", card).read()[:2], [[5, 6], [7, 8]])
