@@ -155,24 +155,25 @@ def light_of(
 
 
 class Sums(NamedTuple):
-    """Normal equations of samples: of each pixel's normal, of the nuisances, and of both.
+    """Normal equations of samples: of each pixel's own parameters, of the nuisances, and of both.
 
-    The nuisances are the gains of T frames, their offsets, and the others.
+    The p parameters of a pixel are those of its normal, and maybe more. The nuisances are the gains of T
+    frames, their offsets, and the others.
     """
 
-    matrices: Doubles  # (n, 2, 2)
-    cross: Doubles  # (n, 2, K)
+    matrices: Doubles  # (n, p, p)
+    cross: Doubles  # (n, p, K)
     own: Doubles  # (K, K)
-    push: Doubles  # (n, 2): by the residuals
+    push: Doubles  # (n, p): by the residuals
     pull: Doubles  # (K,)
 
     @classmethod
     def of(cls, left: Doubles, normal: Doubles, gain: Doubles, rest: Doubles) -> Sums:
-        """Return the sums of residuals, (T, n), and derivatives: (2, T, n), (T, n) and (k, T, n)."""
+        """Return the sums of residuals, (T, n), and derivatives: (p, T, n), (T, n) and (k, T, n)."""
         frames, count = left.shape
         size = 2 * frames + len(rest)
         matrices = np.einsum("ati,bti->iab", normal, normal)
-        cross = np.empty((count, 2, size))
+        cross = np.empty((count, len(normal), size))
         cross[:, :, :frames] = np.moveaxis(normal * gain, 2, 0)
         cross[:, :, frames : 2 * frames] = np.moveaxis(normal, 2, 0)
         cross[:, :, 2 * frames :] = np.einsum("ati,kti->iak", normal, rest)

@@ -267,14 +267,17 @@ def find_nuisances(
         return None
 
 
-def shows_model(wave: Doubles, least: Doubles, tilt: float, full: float) -> NDArray[np.bool_]:
+def shows_model(
+    wave: Doubles, least: Doubles, tilt: float, full: float, gentlest: float = _STEEP
+) -> NDArray[np.bool_]:
     """Return the pixels at which the model holds, (...).
 
     ``wave`` is the wave of the zenith with the phase, (3, ...) radians: mean, cosine and sine. ``least`` is
-    the light of the darkest frame, (...), and ``full`` full light, counts above the dark level.
+    the light of the darkest frame, (...), and ``full`` full light, counts above the dark level. The least
+    zenith is ``gentlest`` tilts.
     """
     swing = np.hypot(wave[1], wave[2]) / tilt
-    usable = (wave[0] > _STEEP * tilt) & (wave[0] < _UPRIGHT) & (swing > _SWING[0]) & (swing < _SWING[1])
+    usable = (wave[0] > gentlest * tilt) & (wave[0] < _UPRIGHT) & (swing > _SWING[0]) & (swing < _SWING[1])
     return np.asarray(usable & (least > LEAST_LIGHT * full))
 
 

@@ -1,14 +1,16 @@
 """Errors of a calibration from a single touch, over objects of the twin.
 
-``python evaluation/calibration/one_touch.py [--seeds 12] [--freeze]`` prints, for each object, the usual
-standard error of parameters and the RMS deviation in standard errors, and writes the table into
-docs/method/touches.md. Each seed has its own number of frames and press steps, place, and noise. The
-recording states gain, offset, half-angle and pivot with errors of 3 %, 3 counts, 4 % and 0.15 mm.
+``python evaluation/calibration/one_touch.py [--seeds 12] [--freeze]`` prints, for each object, with a press
+and by the turn alone, the usual standard error of parameters and the RMS deviation in standard errors, and
+writes the table into docs/method/touches.md. Each seed has its own number of frames and press steps, place,
+and noise. The recording states gain, offset, half-angle and pivot with errors of 3 %, 3 counts, 4 % and
+0.15 mm.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -59,8 +61,8 @@ def touch(name: str, seed: int) -> tuple[Frames, Frames, dict[str, float]]:
 
 
 def rows(seeds: int) -> Iterator[tuple[str, ...]]:
-    """Yield a row for each object."""
-    for name in OBJECTS:
+    """Yield rows for each object."""
+    for name, is_alone in itertools.product(OBJECTS, (False, True)):
         sigma: dict[str, list[float]] = {each: [] for each in PARAMETERS}
         away: dict[str, list[float]] = {each: [] for each in PARAMETERS}
         refused = 0
@@ -69,7 +71,7 @@ def rows(seeds: int) -> Iterator[tuple[str, ...]]:
             scale = {"zenith_gain": 100 / true["zenith_gain"], "tilt": 100 / TILT}
             scale["phase_offset"] = math.degrees(1)
             try:
-                fit = from_touches([(press, turn)])
+                fit = from_touches([(None if is_alone else press, turn)])
             except InputError:
                 refused += 1
                 continue
@@ -80,7 +82,7 @@ def rows(seeds: int) -> Iterator[tuple[str, ...]]:
         cells = [
             f"{np.median(sigma[each]):.2g}; {np.sqrt(np.mean(np.square(away[each]))):.1f}" for each in sigma
         ]
-        yield name, *cells, str(refused)
+        yield f"{name}, turn alone" if is_alone else name, *cells, str(refused)
 
 
 def main() -> None:

@@ -65,6 +65,8 @@ class CalibrationFault:
         Whether dust on the lens takes half of the light of some points.
     stated : float, optional
         The half-angle that is stated with a standard deviation of 2 %, over the true one.
+    has_presses : bool
+        Whether each turn has a press.
     """
 
     name: str
@@ -73,6 +75,7 @@ class CalibrationFault:
     slips: bool = False
     dust: bool = False
     stated: float | None = None
+    has_presses: bool = True
 
 
 CALIBRATION_FAULTS = (
@@ -82,6 +85,8 @@ CALIBRATION_FAULTS = (
         if not (fault.stated or fault.shutter or fault.codec == "mpeg")
     ),
     CalibrationFault("half-angle stated 20 % too small", stated=0.8),
+    CalibrationFault("turns alone", has_presses=False),
+    CalibrationFault("turns alone, half-angle stated 20 % too small", stated=0.8, has_presses=False),
     CalibrationFault("slip of a pixel in the turn", slips=True),
     CalibrationFault("a plate only", thing="plate"),
     CalibrationFault("an edge only", thing="edge"),
@@ -176,7 +181,11 @@ def of_calibration(fault: CalibrationFault, seed: int) -> Answer:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", MirrorskinWarning)
             try:
-                fit = from_touches(touches, stated=stated, **start)
+                fit = from_touches(
+                    [(press if fault.has_presses else None, turn) for press, turn in touches],
+                    stated=stated,
+                    **start,
+                )
             except InputError as refused:
                 told.append(str(refused))
                 continue

@@ -27,7 +27,8 @@ def command(
         list[Path],
         Argument(
             metavar="REC.h5...",
-            help="Recordings of 'mirrorskin touch'; or presses, each before the turn at the same place.",
+            help="Recordings of 'mirrorskin touch'; presses, each before the turn at the same place; or turns"
+            " alone, which determine less.",
         ),
     ],
     stated: Annotated[
@@ -72,11 +73,11 @@ def command(
     inputs.learn(output, recordings, fit, stack, as_json, with_turns=True)
 
 
-def _touches(sources: Sequence[Source]) -> list[tuple[Source, Source]]:
-    """Return presses with the turn that follows each."""
+def _touches(sources: Sequence[Source]) -> list[tuple[Source | None, Source]]:
+    """Return turns with the press before each, or None."""
     from mirrorskin.io import InputError
 
-    touches: list[tuple[Source, Source]] = []
+    touches: list[tuple[Source | None, Source]] = []
     press: Source | None = None
     for source in sources:
         if source.motion == "vertical":
@@ -84,8 +85,6 @@ def _touches(sources: Sequence[Source]) -> list[tuple[Source, Source]]:
                 raise InputError(f"{press.name} is followed by another press: give the turn of each press")
             press = source
             continue
-        if press is None:
-            raise InputError(f"{source.name} follows no press: give the press at the same place before it")
         touches.append((press, source))
         press = None
     if press is not None:

@@ -1,6 +1,6 @@
 """Calibration of a sensor from touches of unknown objects.
 
-Each touch is a press and a turn at one place. The surfaces are unknown and are
+Each touch is a press and a turn at one place, or a turn alone. The surfaces are unknown and are
 eliminated; see `mirrorskin.engine.calibration.touches.window`. What remains is the information about the
 sensor, which is summed over touches, kept with the calibration, and forgotten with a time constant.
 """
@@ -24,6 +24,7 @@ from mirrorskin.engine.calibration.touches.reading import (
     NOT_FOLLOWED,
     TouchReader,
     model_of,
+    with_levels,
 )
 from mirrorskin.engine.calibration.touches.result import TouchFit, result_of
 from mirrorskin.io import (
@@ -36,7 +37,7 @@ from mirrorskin.kernels.device import Device
 
 
 def from_touches(
-    touches: Sequence[tuple[Source, Source]],
+    touches: Sequence[tuple[Source | None, Source]],
     *,
     calibration: Calibration | None = None,
     stated: Mapping[str, Stated | tuple[float, float]] | None = None,
@@ -47,19 +48,23 @@ def from_touches(
 ) -> TouchFit:
     """Estimate response and movement of a sensor from touches of unknown objects.
 
-    Each touch is a press and a turn of the same object at the same place. The heights of the
-    object at each pixel are unknown, and so are the gain and the offset of each frame; all are eliminated
+    Each touch is a press and a turn of the same object at the same place, or a turn alone. The heights of
+    the object at each pixel are unknown, and so are the gain and the offset of each frame; all are eliminated
     from one least-squares fit. The samples of a turn follow ::
 
         y = dark + (1 + g_t) (1 + u) R (l / R)^gamma + o_t,    l = offset + gain angle(n, t) - dark
 
     with gains g and offsets o of the frames, uneven light u, and the angle between the normal n, by the
     slopes of the heights, and the body's axis. The press ties heights to travel, so slopes are absolute.
+    A turn alone determines response and movement because slopes of a surface are integrable: three times
+    less well on rough objects, and hardly on smooth ones. Its heights have an unknown constant, which moves
+    points in the picture in the same way as the pivot's height, so it determines neither that nor the pixel
+    size.
 
     Parameters
     ----------
-    touches : sequence of (Source, Source)
-        Presses and turns. All turns have one half-angle, and an approximate zenith gain.
+    touches : sequence of (Source or None, Source)
+        Presses, or None, and turns. All turns have one half-angle, and an approximate zenith gain.
     calibration : Calibration, optional
         What is already calibrated. If it has a response of touches, these touches are added to it.
     stated : mapping of str to (float, float), optional
@@ -94,9 +99,12 @@ def from_touches(
     True
     """
     if not touches:
-        raise InputError("there are no touches: give presses and turns")
+        raise InputError("there are no touches: give turns, with or without presses")
     before = None if calibration is None else calibration.response
-    opened = [(calibrated(press, calibration), _upright(turn, calibration)) for press, turn in touches]
+    opened = [
+        (None if press is None else calibrated(press, calibration), _upright(turn, calibration))
+        for press, turn in touches
+    ]
     for _, turn in opened:
         _check_same(turn, opened[0][1])
     precession = None if calibration is None else calibration.precession
@@ -105,6 +113,7 @@ def from_touches(
         header = replace(header, zenith_gain=np.asarray(zenith_gain, np.float64))
     if zenith_offset is not None:
         header = replace(header, zenith_offset=np.asarray(zenith_offset, np.float64))
+    header = with_levels(header, [turn for _, turn in opened])
     sensor = model_of(opened[0][1], header)
     readers = [TouchReader.of(press, turn, device) for press, turn in opened]
     movement = Movement.of(sensor, precession)
@@ -113,7 +122,7 @@ def from_touches(
     try:
         attempt = Attempt.of(readers, movement, priors, before, forget).registered()
         if precession is None and attempt.may_be_of_another_movement:
-            movement = search(readers[0], movement)
+            movement = search(max(readers, key=lambda reader: reader.has_press), movement)
             priors = priors.relative_to(movement)
             other = Attempt.of(readers, movement, priors, before, forget).registered()
             attempt = min(other, attempt, key=lambda each: each.noise)
@@ -131,7 +140,7 @@ def _upright(turn: Source, calibration: Calibration | None) -> Source:
     """Return a turn with its calibration, but with phases on a circle: the ellipse is fitted."""
     source = calibrated(turn, calibration)
     if source.motion != "axial":
-        raise InputError(f"{source.name} has {source.motion} motion: give presses and turns, in pairs")
+        raise InputError(f"{source.name} has {source.motion} motion: give turns, each after its press")
     if isinstance(source, Calibrated) and source.whole.precession is not None:
         circle = replace(source.whole.precession, ellipticity=0.0)
         return Calibrated(source.source, replace(source.whole, precession=circle))

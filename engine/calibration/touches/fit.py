@@ -32,19 +32,22 @@ from mirrorskin.io import (
 )
 from mirrorskin.kernels.array_types import Doubles
 
+_BETTER = 0.9  # ratio of misfits up to which errors, which follow from the misfit, still shrink
 _WORSE = 1.02  # ratio of misfits from which on a step was too long
 _ITERATIONS = 16  # Gauss-Newton steps, at most
 _SETTLED = 0.1  # largest last step, in standard errors
 _NEARLY_SETTLED = 0.5  # the same, of a fit that is repeated
-_ROUGHLY = 2  # steps before outliers are excluded; in an exact fit, heights then stay as they are
+_ROUGHLY = 2  # steps, and registrations, before pixels are chosen; in an exact fit, heights then stay
 _CONTRADICTION = 3.0  # standard deviations between a prior and the touches
 _LEAST_RELIEF = 30.0  # chi-square of a pixel by relief from which on a touch shows the pivot
 _WELL_SHOWN = 0.02  # relative standard error of the gain by a touch, up to which noise prevails
 _CLEAR = 4.0  # standard deviations of the contradiction of touches by chance, from which on it is a note
 _SINGULAR = 1e-12  # relative eigenvalue of a direction about which a touch tells nothing
 _MOVED = 0.02  # pixels that points move by an error of the pivot, from which frames are registered again
+_REGISTERED = 0.3  # standard errors of a movement with which turns without a press are registered
 _WITHOUT = 1e4  # factor of the standard deviation of a prior that is left out
 _REGISTRATIONS = 5  # largest number of registrations with an estimated movement
+_REGISTRATIONS_OF_TURNS = 12  # the same, of turns without a press once their pixels are chosen again
 _OTHER_TILT = (
     0.05  # relative difference of the amplitude of the brightness from which the tilt starts with it
 )
@@ -160,13 +163,39 @@ class Attempt:
         return replace(self, used=used, memory=memory, fit=fit, dropped=dropped)
 
     def registered(self) -> Attempt:
-        """Return the fit of frames that are registered with the estimated movement."""
+        """Return the fit of frames that are registered with the estimated movement.
+
+        Pixels and splines of turns without a press are then chosen again: the first ones were chosen where a
+        wrong movement put the points.
+        """
+        if all(reader.has_press for reader in self.readers):
+            return self._until_registered(_REGISTRATIONS)
+        attempt = self._until_registered(_ROUGHLY)
+        if not attempt.used:
+            return attempt
+        return attempt._again(chooses=True)._until_registered(_REGISTRATIONS_OF_TURNS)
+
+    def _until_registered(self, limit: int) -> Attempt:
         attempt = self
-        for _ in range(_REGISTRATIONS):
-            if attempt._misplaced < _MOVED or not all(reader.turn.rewindable for reader in self.readers):
+        for _ in range(limit):
+            if attempt._is_registered or not all(reader.turn.rewindable for reader in self.readers):
                 break
             attempt = attempt._again()
         return attempt
+
+    @property
+    def _is_registered(self) -> bool:
+        """Whether points are hardly registered wrongly, and no estimate depends on it.
+
+        Heights of a turn without a press follow from how its frames are registered.
+        """
+        if self._misplaced >= _MOVED:
+            return False
+        if all(reader.has_press for reader in self.readers):
+            return True
+        at = [SHARED.index(name) for name in ("tilt", "phase")]
+        sigma = np.sqrt(np.diag(self.fit.covariance))
+        return bool(np.all(np.abs(self.fit.values[at]) < _REGISTERED * sigma[at]))
 
     @property
     def _misplaced(self) -> float:
@@ -185,14 +214,14 @@ class Attempt:
         """The parameters by name."""
         return dict(zip(SHARED, self.fit.values.tolist(), strict=True))
 
-    def _again(self) -> Attempt:
+    def _again(self, chooses: bool = False) -> Attempt:
         movement = self.movement.changed(self.values)
         start, moved = self.fit.values.copy(), self.moved.copy()
         at = [SHARED.index(name) for name in ("tilt", "phase", "pivot_z")]
         moved[at] += start[at]
         start[at] = 0.0
         pairs = zip(self.readers, self.read, strict=True)
-        readers = [reader.with_heights(touch) for reader, touch in pairs]
+        readers = [reader.with_heights(touch, chooses and not reader.has_press) for reader, touch in pairs]
         priors = self.priors.relative_to(movement)
         return Attempt.of(readers, movement, priors, self.before, self.forget, start, moved)
 
@@ -288,13 +317,14 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memo
                 touch.turn_back()
             values = (values + before) / 2
             continue
+        is_level = misfit > _BETTER * last if number > roughly else not is_cold
         last, before = misfit, values
         for touch, of_touch in zip(touches, steps, strict=True):
             touch.keep()
             of_touch(change)
         values = values + change
         settled = _SETTLED if exact else _NEARLY_SETTLED
-        is_settled = bool(np.all(np.abs(change) < settled * np.sqrt(np.diag(covariance))))
+        is_settled = is_level and bool(np.all(np.abs(change) < settled * np.sqrt(np.diag(covariance))))
         if number >= roughly and is_settled:
             break
     pushes = [push - each @ change for push, each in zip(pushes, informations, strict=True)]

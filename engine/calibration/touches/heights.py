@@ -19,6 +19,9 @@ _STENCIL = np.array([-1, 9, -45, 0, 45, -9, 1]) / 60.0  # first derivative at th
 MARGIN = 3
 """Pixels at the edge of a window whose slopes are not used."""
 
+PRODUCTS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
+"""Pairs of what a pixel has: the slopes along x and y, and the height."""
+
 SPACINGS = (1, 2, 4, 8, 16, 48)
 """Pixels between knots of splines; heights of pixels are independent of each other with 1."""
 
@@ -35,6 +38,24 @@ def slope_matrix(size: int, pixel_size: tuple[float, float]) -> Any:
 
     along_x, along_y = _derivatives(size)
     return vstack([along_x / pixel_size[0], along_y / -pixel_size[1]]).tocsr()
+
+
+@functools.lru_cache(maxsize=4)
+def local_matrix(size: int, pixel_size: tuple[float, float]) -> Any:
+    """Return the matrix from S x S heights to slopes along x and y and heights of inner pixels."""
+    from scipy.sparse import vstack
+
+    return vstack([slope_matrix(size, pixel_size), _inner(size)]).tocsr()
+
+
+@functools.cache
+def _inner(size: int) -> Any:
+    """Return the matrix from S x S heights to those of inner pixels, (n, S * S)."""
+    from scipy.sparse import csr_matrix, kron
+
+    inner = size - 2 * MARGIN
+    keep = csr_matrix((np.ones(inner), (np.arange(inner), np.arange(inner) + MARGIN)), (inner, size))
+    return kron(keep, keep).tocsr()
 
 
 @functools.cache
@@ -59,10 +80,10 @@ def _smoothness(size: int) -> Any:
 
 
 class _Band(NamedTuple):
-    """Where the entries of the system of S x S heights are, and how they follow from weights of slopes."""
+    """Where the entries of the system of S x S heights are, and how they follow from weights of pixels."""
 
     places: NDArray[np.intp]  # (m,): in the blocks of `HeightSystem`
-    of_slopes: Any  # (m, 3 n): from the weights of squares along x, of products, and of squares along y
+    of_pixels: Any  # (m, 6 n): from the weights of `PRODUCTS` of slopes and heights of inner pixels
     smooth: Doubles  # (m,): entries of second differences
     diagonal: NDArray[np.intp]  # (S * S,): which entries are on the diagonal
 
@@ -71,30 +92,29 @@ class _Band(NamedTuple):
 def _band(size: int, pixel_size: tuple[float, float]) -> _Band:
     from scipy.sparse import coo_matrix
 
-    slopes = slope_matrix(size, pixel_size)
-    count = slopes.shape[0] // 2
-    (at_x, at_y), (by_x, by_y) = (part.reshape(2, count, -1) for part in (slopes.indices, slopes.data))
+    slopes, inner = slope_matrix(size, pixel_size), _inner(size)
+    count = inner.shape[0]
+    places_of = [*slopes.indices.reshape(2, count, -1), inner.indices.reshape(count, 1)]
+    factors = [*slopes.data.reshape(2, count, -1), inner.data.reshape(count, 1)]
     parts = []
-    for kind, at, by, other_at, other_by in (
-        (0, at_x, by_x, at_x, by_x),
-        (1, at_x, by_x, at_y, by_y),
-        (1, at_y, by_y, at_x, by_x),
-        (2, at_y, by_y, at_y, by_y),
-    ):
-        products = by[:, :, np.newaxis] * other_by[:, np.newaxis]
-        weight = np.broadcast_to(np.arange(count)[:, np.newaxis, np.newaxis] + kind * count, products.shape)
-        row = np.broadcast_to(at[:, :, np.newaxis], products.shape)
-        column = np.broadcast_to(other_at[:, np.newaxis], products.shape)
-        parts.append([values.ravel() for values in (row, column, products, weight)])
+    for kind, pair in enumerate(PRODUCTS):
+        for first, second in {pair, pair[::-1]}:
+            products = factors[first][:, :, np.newaxis] * factors[second][:, np.newaxis]
+            weight = np.broadcast_to(
+                np.arange(count)[:, np.newaxis, np.newaxis] + kind * count, products.shape
+            )
+            row = np.broadcast_to(places_of[first][:, :, np.newaxis], products.shape)
+            column = np.broadcast_to(places_of[second][:, np.newaxis], products.shape)
+            parts.append([values.ravel() for values in (row, column, products, weight)])
     smooth = _smoothness(size).tocoo()
-    parts.append([smooth.row, smooth.col, smooth.data, np.full(smooth.nnz, 3 * count)])
+    parts.append([smooth.row, smooth.col, smooth.data, np.full(smooth.nnz, len(PRODUCTS) * count)])
     row, column, values, weight = (np.concatenate(each) for each in zip(*parts, strict=True))
     kept = (row >= column) & (values != 0)
     row, column, values, weight = (each[kept] for each in (row, column, values, weight))
     above = row // size - column // size
     places = ((column // size * (1 + _REACH) + above) * size + row % size) * size + column % size
     places, entry = np.unique(places, return_inverse=True)
-    entries = coo_matrix((values, (entry, weight)), (len(places), 3 * count + 1)).tocsc()
+    entries = coo_matrix((values, (entry, weight)), (len(places), len(PRODUCTS) * count + 1)).tocsc()
     on_diagonal = row == column
     diagonal = np.zeros(size * size, np.intp)
     diagonal[row[on_diagonal]] = entry[on_diagonal]
@@ -115,17 +135,17 @@ def _splines(size: int, spacing: int) -> Doubles:
 
 
 class HeightSystem:
-    """Symmetric system of the S x S heights of a window, with weights of slopes and of heights.
+    """Symmetric system of the S x S heights of a window, with weights of inner pixels and of heights.
 
     It consists of blocks of S x S, one for each row of the window and each of the rows that depend on it, of
     which only those below the diagonal are kept.
     """
 
-    def __init__(self, pixel_size: tuple[float, float], of_slopes: Doubles, of_heights: Doubles) -> None:
-        """Take the weights of slopes, (3, n), see `_Band`, and of heights, (S * S,)."""
+    def __init__(self, pixel_size: tuple[float, float], of_pixels: Doubles, of_heights: Doubles) -> None:
+        """Take the weights of inner pixels by `PRODUCTS`, (6, n), and of heights, (S * S,)."""
         size = self._size = math.isqrt(len(of_heights))
         band = _band(size, pixel_size)
-        entries = band.of_slopes @ of_slopes.ravel()
+        entries = band.of_pixels @ of_pixels.ravel()
         usual = float(np.mean(entries[band.diagonal]))
         entries[band.diagonal] += of_heights + _LEAST * usual
         self._solvers = dict[int, HeightSolver]()

@@ -103,17 +103,23 @@ class Movement(NamedTuple):
 
 
 def search(reader: TouchReader, movement: Movement) -> Movement:
-    """Return the movement whose sense and phase zero give slopes that fit a surface best."""
+    """Return the movement whose sense and phase zero give slopes that fit a surface best.
+
+    Without a press a surface that is upside down fits as well, with half a turn of the phase: phases of files
+    are then right within a quarter of a turn.
+    """
+    circle = math.tau if reader.has_press else math.pi
     best = math.inf, movement
     for sense in (1, -1):
         for ahead in np.linspace(-math.pi, math.pi, _SEARCHED, endpoint=False):
             tried = movement._replace(sense=sense, ahead=float(ahead))
             touch = tried.read(reader)
-            pixels = sum(int(np.count_nonzero(window.usable)) for window in touch.windows)
             turn = int(np.argmin(touch.misfits[0]))
-            if pixels:
-                found = tried._replace(ahead=math.remainder(float(ahead + TURNS[turn]), math.tau))
-                best = min(best, (float(touch.misfits[0, turn]) / pixels**2, found), key=lambda each: each[0])
+            if touch.pixels:
+                found = tried._replace(ahead=math.remainder(float(ahead + TURNS[turn]), circle))
+                best = min(
+                    best, (float(touch.misfits[0, turn]) / touch.pixels**2, found), key=lambda each: each[0]
+                )
     return best[1]
 
 

@@ -1,9 +1,9 @@
-"""Reading of touches: a press and a turn at one place."""
+"""Reading of touches: a turn, and a press at the same place if there is one."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.base.provenance import naming
 from mirrorskin.engine.base.resample import fill_with_nearest
+from mirrorskin.engine.base.running import Run, plan_of
 from mirrorskin.engine.base.sources import EditedSource
 from mirrorskin.engine.calibration.sources import pixel_size_of, read_turn
 from mirrorskin.engine.calibration.touches.heights import (
@@ -42,6 +43,7 @@ from mirrorskin.engine.diagnosis.turn_nuisances import (
     shows_model,
 )
 from mirrorskin.engine.fusion.fusion import press_evidence
+from mirrorskin.engine.rotation.rotation import Rotation
 from mirrorskin.io import (
     Block,
     Header,
@@ -65,13 +67,17 @@ _LEAST_SIDE = 16
 _WINDOWS = 2  # of a touch, at most
 _AROUND = 2 * MARGIN + BORDER  # pixels next to the inner ones of a window on which they depend
 _LEAST_USABLE = 0.05  # share of the pixels of a window at which the model holds
+_ENDS = 0.1, 99.9  # percentiles of samples that replace references
 _LEAST_NOISE = 0.3  # counts of 8 bits: rounding
 _FLICKER = 4.0  # the light of frames may differ by this times the usual standard deviation, unless stated
 _FLOOR = 1e-12  # variance that keeps covariances of gains and offsets without their means regular
+_LEVELS = 5  # depths at which a surface without a press may be, from 0 to that of the body
 _LEVEL = 1.5  # tilts: zenith below which the wave of a pixel tells it better than the mean
 _GENTLE = 3.0  # tilts: zenith up to which the amplitude of a wave may be any
 _NEAR_AXIS = 0.5  # tilts: least difference of a zenith from the tilt, where the normal passes the axis
 _VARIED = 0.2  # least scatter of the slopes of a touch, relative to the usual one
+_ODD_TILT = 0.15  # relative standard deviation of an assumed half-angle
+_LEAST_PRESS = 0.1  # mm: from rest to the body's depth, between which a touched object is
 _STEEPEST = math.radians(80)
 _EDGE = 4.0  # standard deviations between heights of neighbours, beyond their slope: an edge
 _STEEPER = 1.2  # factor of slopes: they are approximate
@@ -84,7 +90,7 @@ class SensorModel(NamedTuple):
     gain: Doubles  # (H, W): counts per radian of zenith
     base: Doubles  # (H, W): counts at zenith 0
     dark: Doubles  # (H, W)
-    full: float | None  # full light, counts; None: the brightest sample
+    full: float  # full light, counts
     tilt: float
     pivot: tuple[float, float, float] | None  # None: frames are not registered
 
@@ -104,6 +110,7 @@ class Touch:
     tilt_seen: float  # radians: half-angle that the amplitude of the brightness shows
     misfits: Doubles  # of first slopes to surfaces; see `Window.start`
     varied: bool  # whether its slopes are not all alike
+    relief: Doubles  # (H, W): heights with which frames were registered, mm
     is_warm: bool  # whether its surfaces are those of an earlier fit
     noise: float = 1.0  # variance of a sample
 
@@ -118,6 +125,11 @@ class Touch:
         self.frame_values = (self.frame_values + self._kept[0]) / 2
         for window, z in zip(self.windows, self._kept[1:], strict=True):
             window.z = (window.z + z) / 2
+
+    @property
+    def pixels(self) -> int:
+        """Number of usable pixels."""
+        return sum(int(np.count_nonzero(window.usable)) for window in self.windows)
 
     @property
     def reason(self) -> str:
@@ -135,8 +147,30 @@ class Touch:
         return follow_model(counts, left, self.phase, 1, self.least_noise)
 
 
+def with_levels(header: Header, turns: Sequence[Source]) -> Header:
+    """Return a header with the darkest and the brightest samples of all turns where it has no references.
+
+    A wrong level only rescales the offset and the gain of a linear response, but pixels at its dark end are
+    not linear, and are recognised by it.
+    """
+    if header.dark is not None and header.bright is not None:
+        return header
+    ends = []
+    for turn in turns:
+        if not turn.rewindable:
+            raise InputError(
+                f"{turn.name} has no dark and bright references, and cannot be read twice: record it first"
+            )
+        frames, _ = read_turn(turn, _FRAMES)
+        samples = frames[valid(frames)]
+        ends.append(np.percentile(samples, _ENDS) if samples.size else np.zeros(2))
+    low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
+    dark = np.asarray(low) if header.dark is None else header.dark
+    return replace(header, dark=dark, bright=np.asarray(high) if header.bright is None else header.bright)
+
+
 def model_of(turn: Source, header: Header) -> SensorModel:
-    """Return what the header of a recording states of the sensor."""
+    """Return what the header of a recording, with levels, states of the sensor."""
     shape = turn.shape[1:]
     if header.zenith_gain is None:
         raise InputError(
@@ -145,37 +179,43 @@ def model_of(turn: Source, header: Header) -> SensorModel:
         )
     if header.tilt is None:
         raise InputError(f"{turn.name} has no tilt: give an approximate one, as in --tilt 2.5deg")
-    gain, base, dark = (
+    gain, base, dark, bright = (
         np.broadcast_to(np.asarray(0.0 if values is None else values, np.float64), shape)
-        for values in (header.zenith_gain, header.zenith_offset, header.dark)
+        for values in (header.zenith_gain, header.zenith_offset, header.dark, header.bright)
     )
-    full = None
-    if header.bright is not None:
-        span = header.bright - np.asarray(0.0 if header.dark is None else header.dark, np.float64)
-        full = float(np.nanmedian(span))
+    full = max(float(np.nanmedian(bright - dark)), 1e-9)
     pivot = header.pivot if header.pivot is not None else (0.0, 0.0, 0.0)
     return SensorModel(gain, base, dark, full, header.tilt, None if header.press is None else pivot)
 
 
 @dataclass(frozen=True, slots=True)
 class TouchReader:
-    """A press and a turn at the same place, which can be read with other movements."""
+    """A turn, and a press at the same place or none, which can be read with other movements."""
 
     turn: Source
+    has_press: bool
     middle: Doubles  # (H, W): heights of the press, mm; NaN where unknown
-    half: Doubles  # (H, W): half-widths of their intervals, mm
+    half: Doubles  # (H, W): half-widths of their intervals, mm; NaN in the same way
     relief: Doubles  # (H, W): heights that register frames, mm
     device: str | Device | None
     earlier: Touch | None = None  # the same touch, read with almost the same movement
+    chooses: bool = False  # whether pixels and splines are chosen although there is an earlier touch
 
     @classmethod
-    def of(cls, press: Source, turn: Source, device: str | Device | None = None) -> TouchReader:
-        """Read a press."""
+    def of(cls, press: Source | None, turn: Source, device: str | Device | None = None) -> TouchReader:
+        """Read a press, if there is one."""
         shape = turn.shape[1:]
         if min(shape) < _LEAST_SIDE:
             raise InputError(
                 f"{turn.name} has {shape[1]} x {shape[0]} pixels: at least {_LEAST_SIDE} a side are needed"
             )
+        if press is None:
+            if not turn.rewindable:
+                raise InputError(
+                    f"{turn.name} cannot be read twice, as a turn without a press is: record it first"
+                )
+            unknown = np.full(shape, np.nan)
+            return cls(turn, False, unknown, unknown, np.zeros(shape), device)
         if press.motion != "vertical":
             raise InputError(f"{press.name} has {press.motion} motion: give a press and a turn of each touch")
         if press.shape[1:] != shape:
@@ -185,16 +225,16 @@ class TouchReader:
         if not np.isfinite(relief).any():
             raise InputError(f"no pixel of {press.name} turned light: press deeper, or leave it out")
         half = math.sqrt(3) * evidence.heights.sigma
-        return cls(turn, evidence.heights.height, half, fill_with_nearest(relief), device)
+        return cls(turn, True, evidence.heights.height, half, fill_with_nearest(relief), device)
 
-    def with_heights(self, touch: Touch) -> TouchReader:
+    def with_heights(self, touch: Touch, chooses: bool = False) -> TouchReader:
         """Return the reader with the surfaces of a touch, to register frames and to start with."""
-        relief = self.relief.copy()
+        relief = touch.relief.copy()
         for window in touch.windows:
             part = relief[window.place]
             usable = window.usable.reshape(part.shape)
             part[usable] = window.heights[window.usable]
-        return replace(self, relief=relief, earlier=touch)
+        return replace(self, relief=relief, earlier=touch, chooses=chooses)
 
     def read(self, sensor: SensorModel, sense: int, ahead: float) -> Touch:
         """Read the turn, with its phases times ``sense``, 1 or -1, plus ``ahead``, radians."""
@@ -205,6 +245,31 @@ class TouchReader:
         source: Source = self.turn
         if sense < 0 or ahead:
             source = EditedSource(source, turned)
+        if self.has_press or self.earlier is not None:
+            return self._read(source, sensor)
+        relief = self._surface(source, sensor)
+        press = self.turn.header.press or 0.0
+        levels = np.zeros(1) if sensor.pivot is None else np.linspace(0, -press, _LEVELS)
+        touches = (replace(self, relief=relief + level)._read(source, sensor) for level in levels)
+
+        def score(touch: Touch) -> float:
+            odd = math.log(touch.tilt_seen / sensor.tilt) / _ODD_TILT
+            return touch.pixels * math.exp(-(odd**2) / 2)
+
+        return max(touches, key=score)
+
+    def _surface(self, source: Source, sensor: SensorModel) -> Doubles:
+        """Return heights by the normals of a turn, (H, W), mm, with the highest at 0."""
+        method = Rotation(
+            zenith_gain=sensor.gain, zenith_offset=sensor.base, tilt=sensor.tilt, device=self.device
+        )
+        plan = plan_of(method, source)
+        height = np.asarray(Run(plan, source).complete().height, np.float64)
+        if not np.isfinite(height).any():
+            return np.zeros(height.shape)
+        return fill_with_nearest(height - np.nanmax(height))
+
+    def _read(self, source: Source, sensor: SensorModel) -> Touch:
         registered = None
         if sensor.pivot is not None:
             header = replace(source.header, pivot=sensor.pivot, tilt=sensor.tilt)
@@ -225,8 +290,6 @@ class TouchReader:
             raise InputError("no pixel has valid samples in all frames: shorten the exposure")
         counts = frames[:, whole]
         extremes = np.array([np.min(counts), np.max(counts)], np.float64)
-        if sensor.full is None:
-            sensor = sensor._replace(full=float(np.max(counts - sensor.dark[whole])))
         if self.earlier is None:
             part = slice(0, shape[0]), slice(0, shape[1])
             view = self._view(frames, phase, whole, sensor, part)
@@ -248,6 +311,7 @@ class TouchReader:
                 misfits += window.start(wave)
             else:
                 window.z = self.earlier.windows[number].z
+            if self.earlier is not None and not self.chooses:
                 window.spacing = self.earlier.windows[number].spacing
                 window.relief_shown = self.earlier.windows[number].relief_shown
                 window.usable &= self.earlier.windows[number].usable
@@ -266,7 +330,8 @@ class TouchReader:
             time=_time_of(header),
             tilt_seen=float(np.median([view.tilt_seen for _, view in views])) if views else sensor.tilt,
             misfits=misfits,
-            is_warm=self.earlier is not None,
+            is_warm=self.earlier is not None and not self.chooses,
+            relief=self.relief,
             varied=bool(slopes) and _vary(np.concatenate(slopes, axis=1)),
         )
 
@@ -279,7 +344,6 @@ class TouchReader:
         part: tuple[slice, slice],
     ) -> _View:  # fmt: skip
         """Return what frames show in a part of the picture."""
-        assert sensor.full is not None
         counts, middle = frames[:, *part].astype(np.float64), self.middle[part]
         with np.errstate(invalid="ignore", divide="ignore"):
             wave = _wave((counts - sensor.base[part]) / sensor.gain[part], phase, sensor.tilt)
@@ -287,7 +351,8 @@ class TouchReader:
             gentle = (
                 np.isfinite(middle) & (least > LEAST_LIGHT * sensor.full) & (wave[0] < _GENTLE * tilt_seen)
             )
-            shown = whole[part] & (gentle | shows_model(wave, least, tilt_seen, sensor.full))
+            gentlest = _GENTLE if self.has_press else _LEVEL  # skin without contact does not swing
+            shown = whole[part] & (gentle | shows_model(wave, least, tilt_seen, sensor.full, gentlest))
         usable = shown & (np.abs(wave[0] / tilt_seen - 1) > _NEAR_AXIS)
         if sensor.pivot is not None:
             usable = _without_border(usable)
@@ -300,7 +365,6 @@ class TouchReader:
         view: _View,
     ) -> tuple[Window, Doubles]:  # fmt: skip
         """Return the window at a place, and the waves of its inner pixels, (3, n)."""
-        assert sensor.full is not None
         rows, columns = (slice(part.start + MARGIN, part.stop - MARGIN) for part in place)
         inner, seen = (rows, columns), view.of((rows, columns))
         usable, shown = view.usable[seen].ravel(), view.shown[view.of(place)]
@@ -310,6 +374,7 @@ class TouchReader:
         x, y = (
             axis[part] for axis, part in zip(picture_axes(frames.shape[1:]), (columns, rows), strict=True)
         )
+        press = max(self.turn.header.press or 0.0, _LEAST_PRESS)
         window = Window(
             counts=np.where(usable, frames[:, rows, columns].reshape(len(frames), -1), 0.0).astype(
                 np.float64
@@ -322,8 +387,9 @@ class TouchReader:
             middle=np.where(shown, self.middle[place], np.nan).ravel(),
             half=np.where(shown, self.half[place], np.nan).ravel(),
             relief=self.relief[inner].ravel(),
-            z=np.zeros(shown.size),
+            z=self.relief[place].ravel(),
             noise_gain=noise_gain,
+            depth=(-press / 2, press / 2),
             smooth=view.smooth[seen].astype(np.float64),
         )
         return window, np.nan_to_num(view.wave[:, *seen].reshape(3, -1))

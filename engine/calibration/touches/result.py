@@ -45,6 +45,8 @@ _REMEDIES = {
     "pivot_z": "press and turn on something with relief",
     "pixel_size": "calibrate the scale",
 }
+_OF_PRESSES = ("zenith_gain", "tilt", "pivot_z")
+_ADD_PRESSES = "add a press of the same touch before each turn"
 _NEEDED = {"oval": 0.01, "pivot_z": 1.0, "pixel_size": 0.003}  # standard errors of a determined parameter
 
 
@@ -134,9 +136,10 @@ def result_of(attempt: Attempt) -> TouchFit:
             " which the standard errors include: was a frame lost, did an object slip, is the travel exact,"
             " and is the lens in focus?"
         )
-    notes += _undetermined(estimates)
+    pressed = any(window.is_pressed for touch in used for window in touch.windows)
+    notes += _undetermined(estimates, pressed)
     notes += [f"{touch.name} is not used: {touch.reason}" for touch in attempt.read if touch not in used]
-    if priors.is_free(SHARED.index("pixel_size")):
+    if pressed and priors.is_free(SHARED.index("pixel_size")):
         at = SHARED.index("pixel_size"), SHARED.index("zenith_gain")
         common = fit.covariance[at] / (errors[at[0]] * errors[at[1]])
         notes.append(
@@ -179,13 +182,15 @@ def _contradiction(dropped: Dropped, priors: Priors, fit: Fitted) -> str:
     return f"{title}: the touches say {by_touches}, but {by_statement} is stated, which was not used"
 
 
-def _undetermined(estimates: Sequence[Estimate]) -> list[str]:
+def _undetermined(estimates: Sequence[Estimate], pressed: bool) -> list[str]:
     """Return sentences about parameters that the touches do not determine, those of one remedy together."""
     groups: dict[str, list[str]] = {}
     for estimate in estimates:
         if not estimate.determined:
             name = "phase" if estimate.name == "phase_offset" else estimate.name
             remedy = _REMEDIES.get(name, _REMEDIES.get(name.partition("_")[0], ""))
+            if not pressed and name in _OF_PRESSES:
+                remedy = _ADD_PRESSES
             groups.setdefault(remedy, []).append(_with_error(estimate))
     return [f"not determined: {', '.join(names)}. Remedy: {remedy}" for remedy, names in groups.items()]
 

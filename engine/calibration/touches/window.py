@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.touches.heights import (
     MARGIN,
+    PRODUCTS,
     SPACINGS,
     HeightSolver,
     HeightSystem,
+    local_matrix,
     slope_matrix,
 )
 from mirrorskin.engine.diagnosis.footprint import LEAST_BLUR, PIXEL
@@ -107,6 +109,7 @@ class Window:
     z: Doubles  # (S * S,): heights, mm
     noise_gain: float  # factor of the noise by registration
     smooth: Doubles  # (S - 6, S - 6): 1 at inner pixels whose slopes are differences across no edge, or 0
+    depth: tuple[float, float]  # prior of the mean height without a press, and its standard deviation, mm
     spacing: int = 1  # pixels between knots of the splines that its heights are
     relief_shown: float = math.inf  # chi-square of a pixel by the relief that the coarsest splines lack
     evidence: tuple[Doubles, Doubles] | None = field(default=None)  # heights of the press, and their weights
@@ -134,8 +137,9 @@ class Window:
         weight = _SLOPE_WEIGHT * np.tile(self.usable, 2).astype(np.float64)
         slopes, firm = slope_matrix(self.size, self.pixel_size), self._press_weight()
         same = _SLOPE_WEIGHT * self.usable
-        system = HeightSystem(self.pixel_size, np.stack([same, np.zeros_like(same), same]), firm)
-        solver = system.solver(1)
+        of_slopes = np.zeros((len(PRODUCTS), len(same)))
+        of_slopes[[PRODUCTS.index((axis, axis)) for axis in (0, 1)]] = same
+        solver = HeightSystem(self.pixel_size, of_slopes, firm).solver(1)
         known = np.nan_to_num(self.middle) * firm
         right = np.column_stack([slopes.T @ (weight[:, np.newaxis] * stated), known])
         *by_slopes, by_press = solver.backward(solver.forward(right)).T
@@ -146,8 +150,18 @@ class Window:
             slope = share[0] * stated[:, 2 * kind] + share[1] * stated[:, 2 * kind + 1]
             misfits[kind, turn] = np.sum(weight * (slopes @ z - slope) ** 2)
             misfits[kind, turn] += np.nansum(firm * (self.middle - z) ** 2)
-        self.z = by_press + by_slopes[0]
+        if self.is_pressed:
+            self.z = by_press + by_slopes[0]
+        else:  # near the heights that are given: between parts of a surface that are apart, slopes tell none
+            near = np.full(len(self.z), _SLOPE_WEIGHT)
+            solver = HeightSystem(self.pixel_size, of_slopes, near).solver(1)
+            self.z = solver.backward(solver.forward(right[:, :1] + (near * self.z)[:, np.newaxis]))[:, 0]
         return misfits
+
+    @property
+    def is_pressed(self) -> bool:
+        """Whether a press shows heights; otherwise they have an unknown constant."""
+        return bool(np.isfinite(self.middle).any())
 
     def _copies(self) -> float:
         """Return how many pixels, on average, are at the same place between two steps of the press."""
@@ -173,7 +187,10 @@ class Window:
         self.evidence = height, weight
 
     def look(self, poses: Poses, gains: Doubles, offsets: Doubles, values: Doubles) -> Sums:
-        """Compute residuals, and return the normal equations of slopes of usable pixels and nuisances."""
+        """Compute residuals, and return the normal equations of usable pixels and nuisances.
+
+        A pixel has two slopes, and a height, which determines where the body's movement puts its point.
+        """
         named, chosen = dict(zip(SHARED, values.tolist(), strict=True)), self.usable
         inner = self.size - 2 * MARGIN
         maps = (slope_matrix(self.size, self.pixel_size) @ self.z).reshape(2, inner, inner)
@@ -204,18 +221,19 @@ class Window:
         tilt_row *= poses.tilt
         tilt_row += np.sum(by_slope * moves.by_tilt, axis=0)
         phase_row += np.sum(by_slope * moves.by_phase, axis=0)
+        by_pivot = np.sum(by_slope * moves.by_pivot, axis=0)
         rest = np.concatenate([
             light.by_globals,
             [
                 tilt_row * double[0] - phase_row * double[1],
                 tilt_row * double[1] + phase_row * double[0],
                 light.by_angle * bend,
-                np.sum(by_slope * moves.by_pivot, axis=0),
+                by_pivot,
                 -np.sum(by_slope * slopes[:, np.newaxis], axis=0),
             ],
         ])  # fmt: skip
         self.rough = _second_differences(maps)[chosen]
-        return Sums.of(self.left, by_slope, light.by_gain, rest)
+        return Sums.of(self.left, np.concatenate([by_slope, [-by_pivot]]), light.by_gain, rest)
 
     def _changes(self, scale: float) -> tuple[Doubles, Doubles]:
         """Return changes of slopes, times a factor, from column to column and row to row, (2, m)."""
@@ -281,24 +299,24 @@ class Window:
         deviate; to eliminate it changes all sums by the same projection.
         """
         rough = np.maximum((_ROUGH * self.rough) ** 2, 1e-16)
-        inner = np.linalg.inv(sums.matrices + (noise / rough)[:, np.newaxis, np.newaxis] * np.eye(2))
-        by_cross, by_push = inner @ sums.cross, np.einsum("iab,ib->ia", inner, sums.push)
-        own = sums.own - _products(_flat(sums.cross), _flat(by_cross))
-        pull = sums.pull - np.einsum("iak,ia->k", sums.cross, by_push)
-        matrices = sums.matrices - sums.matrices @ inner @ sums.matrices
-        cross = sums.cross - sums.matrices @ by_cross
-        push = sums.push - np.einsum("iab,ib->ia", sums.matrices, by_push)
+        of_slopes, by_slopes = sums.matrices[:, :2, :2], sums.matrices[:, :, :2]
+        inner = np.linalg.inv(of_slopes + (noise / rough)[:, np.newaxis, np.newaxis] * np.eye(2))
+        by_cross, by_push = inner @ sums.cross[:, :2], np.einsum("iab,ib->ia", inner, sums.push[:, :2])
+        own = sums.own - _products(_flat(sums.cross[:, :2]), _flat(by_cross))
+        pull = sums.pull - np.einsum("iak,ia->k", sums.cross[:, :2], by_push)
+        matrices = sums.matrices - by_slopes @ inner @ np.swapaxes(by_slopes, 1, 2)
+        cross = sums.cross - by_slopes @ by_cross
+        push = sums.push - np.einsum("iab,ib->ia", by_slopes, by_push)
 
-        slopes = slope_matrix(self.size, self.pixel_size)
-        slopes = slopes[np.concatenate([self.usable, self.usable])]
-        slopes_x, slopes_y = slopes[: len(matrices)], slopes[len(matrices) :]
+        local = local_matrix(self.size, self.pixel_size)[np.tile(self.usable, 3)]
         height, weight = self.evidence or (self.middle, self._press_weight() / self._copies())
-        spread = np.zeros((3, len(self.usable)))
-        spread[:, self.usable] = matrices[:, (0, 0, 1), (0, 1, 1)].T / noise
+        spread = np.zeros((len(PRODUCTS), len(self.usable)))
+        spread[:, self.usable] = np.stack([matrices[:, first, second] for first, second in PRODUCTS]) / noise
         system = HeightSystem(self.pixel_size, spread, weight)
-        seen = push + np.einsum("iab,ib->ia", matrices, np.stack([slopes_x @ self.z, slopes_y @ self.z], 1))
-        coupled = (slopes_x.T @ cross[:, 0] + slopes_y.T @ cross[:, 1]) / noise
-        right = (slopes_x.T @ seen[:, 0] + slopes_y.T @ seen[:, 1]) / noise
+        level = 0.0 if self.is_pressed else float(np.mean(self.z))
+        seen = push + np.einsum("iab,bi->ia", matrices, (local @ (self.z - level)).reshape(3, -1))
+        coupled = local.T @ np.swapaxes(cross, 0, 1).reshape(local.shape[0], -1) / noise
+        right = local.T @ seen.T.ravel() / noise
         right += weight * np.where(weight > 0, height, 0.0)
         apart = np.zeros(len(self.usable), np.bool_)
         if chooses:
@@ -306,17 +324,23 @@ class Window:
         solver = system.solver(self.spacing)
         reduced = solver.forward(np.column_stack([coupled, right]))
         products = _products(reduced[:, :-1], reduced)
-        own, pull = own / noise - products[:, :-1], pull / noise - products[:, -1] + coupled.T @ self.z
-        self.usable &= ~apart  # from the next look on
-        return Eliminated(own, pull, functools.partial(_heights, solver, reduced))
+        own, pull = own / noise - products[:, :-1], pull / noise - products[:, -1]
+        pull = pull + coupled.T @ (self.z - level)
+        chosen = self.usable
+        self.usable = chosen & ~apart  # from the next look on
+        heights = functools.partial(_heights, solver, reduced, level)
+        if self.is_pressed:
+            return Eliminated(own, pull, lambda nuisances: heights(nuisances))
+        away = float(np.mean(self.heights[chosen])) - self.depth[0]
+        return _without_level(own, pull, heights, self.depth[1], away)
 
     def _choose(
         self, system: HeightSystem, right: Doubles, of_slopes: Doubles
     ) -> tuple[int, NDArray[np.bool_]]:
         """Return the largest spacing of knots whose splines follow the surface as well as finer ones.
 
-        In addition, returns the few pixels at which they do not, (n,). ``of_slopes``, (3, n), are the weights
-        of slopes in the system.
+        In addition, returns the few pixels at which they do not, (n,). ``of_slopes``, (3, n) or more, are the
+        weights of slopes in the system.
         """
         chosen, most, finest = 1, 0, np.empty(0)
         inner, count = self.size - 2 * MARGIN, max(1, int(np.count_nonzero(self.usable)))
@@ -347,7 +371,8 @@ class Window:
     def _chi_square(self, z: Doubles, of_slopes: Doubles) -> Doubles:
         """Return the squares of slopes of a difference of heights, times their weights, (n,)."""
         x, y = (slope_matrix(self.size, self.pixel_size) @ z).reshape(2, -1)
-        return np.asarray(of_slopes[0] * x * x + 2 * of_slopes[1] * x * y + of_slopes[2] * y * y)
+        squares = zip((x * x, 2 * x * y, y * y), of_slopes, strict=False)
+        return np.asarray(sum(square * weight for square, weight in squares))
 
     def _mean_nearby(self, values: Doubles) -> Doubles:
         """Return the mean of values of inner pixels, (n,), over the square around each."""
@@ -355,9 +380,32 @@ class Window:
         return np.asarray(cv2.blur(values.reshape(inner, inner), (_NEAR, _NEAR)), np.float64).ravel()
 
 
-def _heights(solver: HeightSolver, reduced: Doubles, nuisances: Doubles) -> Doubles:
+def _heights(solver: HeightSolver, reduced: Doubles, level: float, nuisances: Doubles) -> Doubles:
     """Return the heights for a step of the nuisances."""
-    return solver.backward(reduced[:, -1:] - reduced[:, :-1] @ nuisances[:, np.newaxis])[:, 0]
+    return level + solver.backward(reduced[:, -1:] - reduced[:, :-1] @ nuisances[:, np.newaxis])[:, 0]
+
+
+def _without_level(
+    own: Doubles, pull: Doubles, heights: Callable[[Doubles], Doubles], sigma: float, away: float
+) -> Eliminated:
+    """Return the information that remains after a constant of all heights is eliminated.
+
+    It has a standard deviation by its prior, from which it is ``away``, mm. Heights only matter where the
+    body's movement puts their points: a constant does what a lower pivot does, of which nothing remains.
+    """
+    at = SHARED.index("pivot_z") - len(SHARED)
+    by_level, weight = -own[:, at], own[at, at] + sigma**-2
+    push = -pull[at] - away * sigma**-2
+    own, pull = own - np.outer(by_level, by_level) / weight, pull - by_level * push / weight
+    own[at] = own[:, at] = pull[at] = 0.0
+
+    def moved(step: Doubles) -> Doubles:
+        level = float(push - by_level @ step) / weight
+        step = step.copy()
+        step[at] -= level
+        return heights(step) + level
+
+    return Eliminated(own, pull, moved)
 
 
 def _second_differences(maps: Doubles) -> Doubles:

@@ -50,6 +50,19 @@ def test_recording_of_a_touch_is_a_press_and_its_turn():
     np.testing.assert_array_equal(of_one.gain, of_two.gain)
 
 
+def test_turn_without_a_press_is_used_as_far_as_it_goes():
+    actual = done("calibrate self turn.h5 -o cal.h5")
+    assert io.open_calibration("cal.h5").response.touches == 1
+    assert "zenith gain (±" in actual.said
+    assert "add a press of the same touch before each turn" in actual.said
+
+
+def test_turn_without_a_press_is_added_to_touches():
+    done("calibrate self press.h5 turn.h5 turn.h5 -o cal.h5")
+    done("calibrate self turn.h5 -o cal.h5")
+    assert io.open_calibration("cal.h5").response.touches == 3
+
+
 def test_touches_are_added():
     for _ in range(2):
         done("calibrate self press.h5 turn.h5 -o cal.h5")
@@ -77,7 +90,6 @@ def test_show_prints_the_response():
     ("arguments", "message"),
     [
         ("press.h5", "has no turn"),
-        ("turn.h5", "follows no press"),
         ("press.h5 press.h5", "another press"),
         ("press.h5 turn.h5 --stated tilt=2deg", "NAME=VALUE+-SIGMA"),
         ("press.h5 turn.h5 --stated weight=2+-1", "cannot be stated"),

@@ -138,6 +138,93 @@ def test_gain_is_known_to_half_a_percent_from_two_touches():
     assert gain.sigma / gain.value < 0.005
 
 
+WRONG = {"gain": 1.03, "offset": 3.0, "tilt": 0.96 * TILT, "pivot": (0.0, 0.0, 1.15)}
+
+
+def turns_of(count, first=0, stated=None):
+    """Return turns of waves, without presses."""
+    return [
+        (None, stating(a_turn(Waves(seed), seed), **stated or {})) for seed in range(first, first + count)
+    ]
+
+
+@pytest.fixture(scope="module")
+def turns_alone():
+    """The fit of two turns without presses, whose recordings state wrong numbers."""
+    return from_touches(turns_of(2, stated=WRONG))
+
+
+def test_turns_alone_correct_wrong_numbers(turns_alone):
+    away = deviations(turns_alone)
+    assert max(abs(away[name]) for name in ("gamma", "zenith_gain", "zenith_offset", "tilt")) < 3, away
+
+
+def test_turns_alone_of_something_rough_determine_the_gain_to_two_percent(turns_alone):
+    gain = named(turns_alone)["zenith_gain"]
+    assert gain.of_touches / gain.value < 0.02
+
+
+def test_turns_alone_determine_no_pivot_and_the_remedy_is_a_press(turns_alone):
+    assert any("pivot z (±" in note and "add a press" in note for note in turns_alone.notes)
+    assert named(turns_alone)["pivot_z"].sigma > 0.9
+
+
+def test_turns_alone_add_to_a_press_and_a_turn():
+    pair = touches_of(1, stated=WRONG)
+    first = from_touches(pair)
+    both = from_touches(touches_of(1, stated=WRONG) + turns_of(1, first=1, stated=WRONG))
+    added = from_touches(turns_of(1, first=1, stated=WRONG), calibration=calibration_of(first))
+    gains = [named(fit)["zenith_gain"] for fit in (both, added)]
+    assert max(gain.sigma for gain in gains) < 0.97 * named(first)["zenith_gain"].sigma
+    assert abs(gains[0].value - gains[1].value) < gains[0].sigma
+
+
+def test_smooth_object_without_a_press_is_named_with_its_errors():
+    fit = from_touches([(None, a_touch("sphere")[1])])
+    assert any("zenith gain (±" in note and "add a press" in note for note in fit.notes)
+    assert named(fit)["zenith_gain"].of_touches / named(fit)["zenith_gain"].value > 0.05
+
+
+def test_sense_of_rotation_is_found_without_a_press():
+    fit = from_touches(turns_of(1, stated={"phase": 1.0 - PHASE}))
+    assert fit.precession.direction == -1
+    assert abs(fit.precession.phase_offset - 1.0) < 0.02
+
+
+def test_wrong_half_angle_of_a_data_sheet_is_reported_by_turns_alone():
+    tilt = math.radians(3.0)
+    turns = [(None, stating(a_turn(Waves(seed), seed, tilt=tilt), tilt=TILT)) for seed in range(2)]
+    fit = from_touches(turns, stated={"tilt": (TILT, math.radians(0.05))})
+    assert any(note.startswith("tilt: the touches say") for note in fit.notes)
+
+
+@pytest.mark.slow
+def test_errors_of_turns_alone_are_not_larger_than_their_standard_errors():
+    away = []
+    for seed in range(200, 216):
+        random = np.random.default_rng(seed)
+        stated = {"gain": 1 + 0.03 * random.normal(), "offset": 3 * random.normal()}
+        stated |= {
+            "tilt": TILT * (1 + 0.04 * random.normal()),
+            "pivot": (0.0, 0.0, 1 + 0.15 * random.normal()),
+        }
+        away.append(deviations(from_touches(turns_of(1, first=seed, stated=stated))))
+    names = "gamma", "zenith_gain", "zenith_offset", "tilt", "phase_offset"
+    chi2 = {name: np.mean([each[name] ** 2 for each in away]) for name in names}
+    assert all(value < 1.7 for value in chi2.values()), chi2  # 2 standard deviations of chi-square
+
+
+@pytest.mark.parametrize("has_press", [True, False])
+def test_references_are_not_needed(has_press):
+    """Gain and offset of the response contain what the dark level and full light would say."""
+    stated = {"gain": 1.03, "offset": 3.0, "dark": None, "bright": None}
+    press, turn = touches_of(1, stated=stated)[0]
+    press.header = replace(press.header, dark=None, bright=None)
+    fit = from_touches([(press if has_press else None, turn)])
+    away = deviations(fit)
+    assert max(abs(away[name]) for name in ("gamma", "zenith_gain", "zenith_offset", "tilt")) < 3, away
+
+
 def test_periodic_texture_pressed_in_few_steps_is_honest():
     thing = {"object": "texture", "shape": (120, 160), "pixel_size": 0.04}
     press = Twin(movement=Vertical(np.linspace(-0.3, 1.0, 17)), camera=Camera(seed=2), **thing)
