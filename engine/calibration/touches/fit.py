@@ -165,15 +165,16 @@ class Attempt:
     def registered(self) -> Attempt:
         """Return the fit of frames that are registered with the estimated movement.
 
-        Pixels and splines of turns without a press are then chosen again: the first ones were chosen where a
-        wrong movement put the points.
+        Pixels and splines of turns without a press are then chosen again, if samples follow them better: the
+        first ones were chosen where a wrong movement put the points.
         """
         if all(reader.has_press for reader in self.readers):
             return self._until_registered(_REGISTRATIONS)
         attempt = self._until_registered(_ROUGHLY)
         if not attempt.used:
             return attempt
-        return attempt._again(chooses=True)._until_registered(_REGISTRATIONS_OF_TURNS)
+        better = min(attempt._again(chooses=True), attempt, key=lambda each: each.noise)
+        return better._until_registered(_REGISTRATIONS_OF_TURNS)
 
     def _until_registered(self, limit: int) -> Attempt:
         attempt = self

@@ -330,7 +330,7 @@ class Window:
         self.usable = chosen & ~apart  # from the next look on
         heights = functools.partial(_heights, solver, reduced, level)
         if self.is_pressed:
-            return Eliminated(own, pull, lambda nuisances: heights(nuisances))
+            return Eliminated(own, pull, heights)
         away = float(np.mean(self.heights[chosen])) - self.depth[0]
         return _without_level(own, pull, heights, self.depth[1], away)
 
@@ -390,8 +390,9 @@ def _without_level(
 ) -> Eliminated:
     """Return the information that remains after a constant of all heights is eliminated.
 
-    It has a standard deviation by its prior, from which it is ``away``, mm. Heights only matter where the
-    body's movement puts their points: a constant does what a lower pivot does, of which nothing remains.
+    It has a standard deviation by its prior, from which it is ``away``, mm; it stays within this deviation.
+    Heights only matter where the body's movement puts their points: a constant does what a lower pivot does,
+    of which nothing remains.
     """
     at = SHARED.index("pivot_z") - len(SHARED)
     by_level, weight = -own[:, at], own[at, at] + sigma**-2
@@ -400,10 +401,10 @@ def _without_level(
     own[at] = own[:, at] = pull[at] = 0.0
 
     def moved(step: Doubles) -> Doubles:
-        level = float(push - by_level @ step) / weight
+        level = float(np.clip(away + (push - by_level @ step) / weight, -sigma, sigma)) - away
         step = step.copy()
         step[at] -= level
-        return heights(step) + level
+        return np.asarray(heights(step) + level)
 
     return Eliminated(own, pull, moved)
 
