@@ -57,9 +57,9 @@ def from_touches(
     with gains g and offsets o of the frames, uneven light u, and the angle between the normal n, by the
     slopes of the heights, and the body's axis. The press ties heights to travel, so slopes are absolute.
     A turn alone determines response and movement because slopes of a surface are integrable: three to seven
-    times less well on rough objects, and hardly on smooth ones. Its heights have an unknown constant, which moves
-    points in the picture in the same way as the pivot's height, so it determines neither that nor the pixel
-    size.
+    times less well on rough objects, and hardly on smooth ones. Its heights have an unknown constant, which
+    moves points in the picture in the same way as the pivot's height, so it determines neither that nor the
+    pixel size.
 
     Parameters
     ----------
