@@ -20,7 +20,6 @@ from mirrorskin.kernels.array_types import Doubles
 Singles = NDArray[np.float32]
 Window = tuple[slice, slice]
 
-_SQUARES = 2**14  # pixels that are squared at a time
 _NEGLIGIBLE, _JITTER = 1e-8, 1e-6  # covariances relative to the variance: left out; added to it
 
 
@@ -66,56 +65,47 @@ class Blocks:
         (x, y) = axes
         return float(x[-1] - x[0]) / 2, float(y[0] - y[-1]) / 2
 
-    def pixels(self, window: Window) -> Window:
-        """Return the pixels of the blocks in a window."""
-        rows, columns = (slice(part.start * self.binning, part.stop * self.binning) for part in window)
-        return rows, columns
+    @property
+    def bend(self) -> float:
+        """How much lower a mean is than the value at a block's centre, over the second difference of means.
 
-    def means(self, values: NDArray[Any]) -> Singles:
-        """Return the means of blocks, (H, W) or (H, W, n), NaN where most of a block is undefined."""
-        step = self.binning
-        rows, columns = values.shape[0] // step, values.shape[1] // step
-        values = values[: rows * step, : columns * step]
-        if step == 1:
-            return np.array(values, np.float32)
-        if min(values.strides) <= 0 or values.dtype not in (np.float32, np.float64):
-            values = np.ascontiguousarray(values, np.float64)
-        means = cv2.resize(values, (columns, rows), interpolation=cv2.INTER_AREA).astype(
-            np.float32, copy=False
-        )
-        gaps = ~np.isfinite(means)
-        if gaps.any():
-            gaps = np.any(gaps.reshape(rows, columns, -1), axis=-1)
-            parts = values.reshape(rows, step, columns, step, *values.shape[2:]).swapaxes(1, 2)[gaps]
-            finite = np.isfinite(parts)
-            count = np.count_nonzero(finite, axis=(1, 2))
-            total = np.where(finite, parts, 0).sum(axis=(1, 2))
-            means[gaps] = np.where(2 * count >= step**2, total / np.maximum(count, 1), np.nan)
-        return means
-
-    def at_centres(self, means: NDArray[Any], extended: bool = False) -> NDArray[Any]:
-        """Return values at the centres of blocks, (..., H, W), from means, which are lower on a dome.
-
-        The difference is 1/24 of the second differences of the means, less the same of pixels. The operator
-        is symmetric inside a map, so it also converts weights of values to weights of means. Next to missing
-        values the second difference is taken for 0, or ``extended``, for that of the next block inside.
+        It is 1/24, less the same of pixels.
         """
-        factor = means.dtype.type((1 - 1 / self.binning**2) / 24)
-        if not factor:
-            return means
-        values, is_whole = means.copy(), bool(np.isfinite(means).all())
+        return (1 - 1 / self.binning**2) / 24
+
+    def at_centres(self, means: Singles) -> Singles:
+        """Return weights of means, (..., H, W), from those of values at centres, 0 outside the map.
+
+        The operator from means to values at centres is symmetric.
+        """
+        values = means.copy()
         for source, target in ((means, values), (means.swapaxes(-1, -2), values.swapaxes(-1, -2))):
-            bend = source[..., 2:] + source[..., :-2]
-            bend -= 2 * source[..., 1:-1]
-            if not is_whole:
-                if extended:
-                    for ahead, behind in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
-                        one, other = bend[..., ahead], bend[..., behind]
-                        np.copyto(one, other, where=np.isnan(one))
-                bend[~np.isfinite(bend)] = 0
-            bend *= factor
-            target[..., 1:-1] -= bend
+            second = source[..., 2:] - 2 * source[..., 1:-1] + source[..., :-2]
+            target[..., 1:-1] -= np.float32(self.bend) * second
         return values
+
+    def weights_of_means(self, weights: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[Any]:
+        """Return weights of means, (..., H, W), from those of values at centres, 0 where nothing is known.
+
+        The values are those of `at_centres`, but next to an unknown block, the second difference is that of
+        the next block inside.
+        """
+        weights, factor = weights.copy(), weights.dtype.type(self.bend)
+        for values, mask in ((weights.copy(), known), (weights.swapaxes(-1, -2).copy(), known.T)):
+            inside = np.zeros_like(mask)
+            inside[:, 1:-1] = mask[:, 1:-1] & mask[:, 2:] & mask[:, :-2]
+            ahead, behind = np.zeros_like(mask), np.zeros_like(mask)  # blocks that take the next one's
+            ahead[:, :-1] = mask[:, :-1] & ~inside[:, :-1] & inside[:, 1:]
+            behind[:, 1:] = mask[:, 1:] & ~inside[:, 1:] & inside[:, :-1] & ~ahead[:, 1:]
+            bend = np.where(inside, values, 0)
+            bend[..., 1:] += np.where(ahead, values, 0)[..., :-1]
+            bend[..., :-1] += np.where(behind, values, 0)[..., 1:]
+            bend *= factor
+            target = weights if mask is known else weights.swapaxes(-1, -2)
+            target += 2 * bend
+            target[..., 1:] -= bend[..., :-1]
+            target[..., :-1] -= bend[..., 1:]
+        return weights
 
     def alike(self, length: float, boxes: bool = False) -> tuple[Doubles, Doubles]:
         """Return the covariances of means along a column and along a row, by distance in blocks, from 0.
@@ -123,13 +113,18 @@ class Blocks:
         Pixels have the variance 1. Their errors are correlated over a Gaussian ``length``, mm, or are those
         of overlapping ``boxes``, whose length is in pixels. Covariances that are negligible are left out.
         """
-        (rows, columns), (width, height) = self.space.shape, self.pixel_size
-        along_rows, along_columns = (length, length) if boxes else (length / height, length / width)
-        step = self.binning
-        return _alike(rows, step, along_rows, boxes), _alike(columns, step, along_columns, boxes)
+        return _both_alike(self, length, boxes)
 
 
 @lru_cache(maxsize=16)
+def _both_alike(blocks: Blocks, length: float, boxes: bool) -> tuple[Doubles, Doubles]:
+    """Return the covariances of `Blocks.alike`."""
+    (rows, columns), (width, height) = blocks.space.shape, blocks.pixel_size
+    along_rows, along_columns = (length, length) if boxes else (length / height, length / width)
+    step = blocks.binning
+    return _alike(rows, step, along_rows, boxes), _alike(columns, step, along_columns, boxes)
+
+
 def _alike(count: int, binning: int, length: float, boxes: bool) -> Doubles:
     """Return the covariance of means along an axis, by distance, for a variance of 1; see `Blocks.alike`."""
     inside = np.arange(binning)
@@ -143,70 +138,53 @@ def _alike(count: int, binning: int, length: float, boxes: bool) -> Doubles:
 
 
 class BlockErrors:
-    """Errors of means, given standard deviations of pixels, (H, W) or (H, W, n); see `Blocks.alike`."""
+    """Errors of means in a window, given their variances without correlation, (H, W) or (n, H, W) of n kinds.
 
-    def __init__(
-        self, sigma: NDArray[Any] | None, blocks: Blocks, length: float, boxes: bool = False
-    ) -> None:
-        self._sigma, self._blocks, self._alike = sigma, blocks, blocks.alike(length, boxes)
-        self._found: tuple[Window, Doubles] | None = None
+    Errors of pixels are correlated as in `Blocks.alike`. Where a variance is undefined, it is that of the
+    nearest block, or 0 if there is none.
+    """
 
-    def usual(self, window: Window) -> float:
-        """Return the usual standard deviation of a mean in a window."""
-        rows, columns = self._alike
-        spread = self._spread(window).ravel()
-        return float(np.partition(spread, spread.size // 2)[spread.size // 2]) * math.sqrt(
-            rows[0] * columns[0]
-        )
+    def __init__(self, variance: NDArray[Any], blocks: Blocks, length: float, boxes: bool = False) -> None:
+        if not np.isfinite(variance).all():
+            layers = variance.reshape(-1, *variance.shape[-2:])
+            filled = [
+                fill_with_nearest(layer) if np.isfinite(layer).any() else np.zeros_like(layer)
+                for layer in layers
+            ]
+            variance = np.stack(filled).reshape(variance.shape)
+        self._spread, self._alike = np.sqrt(variance), blocks.alike(length, boxes)
 
-    def variance(self, weights: Doubles, window: Window) -> Doubles:
-        """Return the variances of sums of means, weighted by (..., n, H, W) in a window.
+    def usual(self) -> float:
+        """Return the usual standard deviation of a mean."""
+        (rows, columns), spread = self._alike, self._spread.ravel()
+        middle = float(np.partition(spread, spread.size // 2)[spread.size // 2])
+        return middle * math.sqrt(rows[0] * columns[0])
 
-        Of errors of n kinds, each has its own weights.
+    def covariance(self, weights: NDArray[Any]) -> Doubles:
+        """Return the covariance, (n, n), of n sums of means.
+
+        Weights are (n, H, W), or (n, k, H, W) for means of k kinds, whose errors are independent.
         """
-        rows, columns = (np.concatenate([part[:0:-1], part]) for part in self._alike)
-        spread = self._spread(window)
-        shares = weights * (spread if spread.ndim == 2 else spread.transpose(2, 0, 1))
+        rows, columns = self._alike
+        shares = weights * self._spread
+        alike, shape = shares, (len(shares), -1)
         if rows.size == columns.size == 1:
-            return np.asarray(np.einsum("...ij,...ij->...", shares, shares) * (rows[0] * columns[0]))
-        alike, shape = np.empty_like(shares), (-1, *shares.shape[-2:])
-        for part, out in zip(shares.reshape(shape), alike.reshape(shape), strict=True):
-            cv2.sepFilter2D(part, -1, columns, rows, dst=out, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(np.maximum(np.einsum("...ij,...ij->...", shares, alike), 0))
+            alike = shares * float(rows[0] * columns[0])
+        else:
+            across, down = (np.concatenate([part[:0:-1], part]) for part in (columns, rows))
+            layers = shares.astype(np.float64).reshape(-1, *shares.shape[-2:])
+            alike = np.stack(
+                [cv2.sepFilter2D(layer, -1, across, down, borderType=cv2.BORDER_CONSTANT) for layer in layers]
+            )
+        return np.asarray(np.einsum("ni,mi->nm", shares.reshape(shape), alike.reshape(shape)), np.float64)
 
-    def drawn(self, window: Window) -> Singles:
-        """Return random errors of means, (H, W), 0 outside a window."""
-        errors = np.zeros(self._blocks.space.shape, np.float32)
+    def drawn(self) -> Singles:
+        """Return random errors of means."""
         roots = []
-        for part, inner in zip(self._alike, window, strict=True):
-            size = inner.stop - inner.start
+        for part, size in zip(self._alike, self._spread.shape, strict=True):
             column = np.pad(part[:size], (0, max(size - part.size, 0)))
             column[0] *= 1 + _JITTER
             roots.append(cholesky(toeplitz(column), lower=True))
-        spread = self._spread(window)
         rows, columns = roots
-        errors[window] = spread * (rows @ np.random.default_rng(0).normal(size=spread.shape) @ columns.T)
-        return errors
-
-    def _spread(self, window: Window) -> Doubles:
-        """Return the RMS standard deviation of a block's pixels, in a window; where unknown, the nearest."""
-        if self._sigma is None:
-            return np.zeros([part.stop - part.start for part in window])
-        if self._found is None or self._found[0] != window:
-            square = self._squares(self._sigma[self._blocks.pixels(window)])
-            if not np.isfinite(square).all():
-                layers = square.reshape(*square.shape[:2], -1)
-                for n in range(layers.shape[2]):
-                    layer = layers[..., n]
-                    layer[...] = fill_with_nearest(layer) if np.isfinite(layer).any() else 0
-            self._found = window, np.sqrt(square, dtype=np.float64)
-        return self._found[1]
-
-    def _squares(self, sigma: NDArray[Any]) -> Singles:
-        """Return the means of squares, of some rows at a time: there is no new array of a frame's size."""
-        step = self._blocks.binning
-        row = sigma[:step].size
-        size = step * max(1, _SQUARES // max(row, 1))
-        strips = (sigma[start : start + size] for start in range(0, len(sigma), size))
-        parts = [self._blocks.means(strip * strip) for strip in strips]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        random = np.random.default_rng(0).normal(size=self._spread.shape)
+        return np.asarray(self._spread * (rows @ random @ columns.T), np.float32)

@@ -32,7 +32,8 @@ _SOFTNESS = 3 / (4 * math.pi)  # 1 / (pi E*) at E = 1, with E* = E / (1 - nu^2) 
 _MAX_CONTACT_CHANGES = 40  # maximum number of changes of the contact
 _MAX_STEPS = 300  # maximum number of conjugate-gradient steps
 _ROUGHLY = 0.1  # gap in a contact that may change, as a share of its initial gap
-_GRADIENT_ERROR = 1e-3  # maximum gap of a flat punch that is pressed in by 1
+GRADIENT_ERROR = 1e-3
+"""Maximum gap of a flat punch that is pressed in by 1."""
 _NO_SLOPE = 1e-9  # slope below which its direction is undefined
 _FIRM = 0.05  # share of the maximum pressure below which the contact of a cell is neglected in derivatives
 _ROUGH_TOLERANCE, _ROUGH_STEPS = 2e-2, 60  # relative residual, and maximum number of steps, for derivatives
@@ -120,17 +121,14 @@ class HalfSpace:
         wave *= _inverse_spectrum(self.shape, self.pixel_size, wave.dtype)
         return inverse_transform(wave, self.shape)
 
+    @property
+    def own_displacement(self) -> float:
+        """Displacement of a pixel, as if it were square, by unit strain on it, mm."""
+        return _OWN * math.sqrt(self.pixel_area)
+
     def influence(self) -> Doubles:
         """Return the displacement of the pixels below and to the right by unit strain on one, (H, W), mm."""
-        return influences(_cut_off, self._whole, self.pixel_size)[0][: self.shape[0], : self.shape[1]]
-
-
-class Sheet(NamedTuple):
-    """The solution in a part of the grid, from which that for a similar surface is found."""
-
-    window: Window
-    strain: Reals  # also that of pixels that are pulled a little
-    moved: Reals  # displacement against the stage, mm
+        return influences(point_spectrum, self._whole, self.pixel_size)[0][: self.shape[0], : self.shape[1]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,20 +139,13 @@ class Pressed:
     contact: Mask
     load: float  # force over Young's modulus, mm^2
     gap: Reals  # gap in contact that the search left, mm; 0 elsewhere
-    sheet: Sheet | None = None
 
     def more(self, gradient: Reals) -> float:
         """Return what a sum of pressures lacks because of the gap, given its derivatives by heights."""
         return -float(np.sum(gradient * self.gap))
 
 
-def press(
-    space: HalfSpace,
-    surface: Reals,
-    compliance: float = 0.0,
-    start: Pressed | None = None,
-    tolerance: float = 0.0,
-) -> Pressed:
+def press(space: HalfSpace, surface: Reals, compliance: float = 0.0, start: Pressed | None = None) -> Pressed:
     """Press a rigid surface into the half-space without friction.
 
     In contact, the half-space takes the surface's height; elsewhere the pressure is 0. The contact is found
@@ -165,71 +156,59 @@ def press(
 
     ``surface``, (H, W), is mm above the rest plane for a stiff stage, NaN where there is none; its type is
     that of the computation. The stage deflects by ``compliance``, 1/mm, for each mm^2 of load. ``start`` is a
-    similar press, as an initial guess. Gaps in contact, and overlaps elsewhere, are at most ``tolerance``,
-    mm, if that is more than `TOLERANCE`; then, from a similar press, a pixel remains in contact if a pull
-    that displaces it by less would be needed. NotConverged if the contact does not converge.
+    similar press, as an initial guess. NotConverged if the contact does not converge.
     """
     surface = np.where(np.isfinite(surface), surface, surface.dtype.type(-np.inf))
     reach, nothing = surface > 0, np.zeros(space.shape, surface.dtype)
     if not reach.any():
         return Pressed(nothing, reach, 0.0, nothing)
-    follows = tolerance > 0  # otherwise contact and pressure must not depend on the initial guess
-    tolerance = max(tolerance, TOLERANCE * float(surface.max()))
+    tolerance = TOLERANCE * float(surface.max())
     if start is None and min(space.shape) >= 2 * _COARSEST:
         start = _coarse_press(space, surface, compliance)
-    contact, strain, sheet = reach, nothing, None
+    contact, strain = reach, nothing
     if start is not None and (reach & start.contact).any():
-        contact, strain, sheet = reach & start.contact, start.strain, start.sheet if follows else None
+        contact, strain = reach & start.contact, start.strain
     while True:
-        if follows and sheet is not None and _is_inside(contact, sheet.window):
-            window, part = sheet.window, space.part(sheet.strain.shape)
-        else:
-            sheet, (window, part) = None, window_of(space, contact, MARGIN)
-        inner, touching, remaining = _press_within(
-            part, surface[window], compliance, tolerance, strain[window], contact[window], sheet
+        window, part = window_of(space, contact, MARGIN)
+        pressure, touching, remaining = _press_within(
+            part, surface[window], compliance, tolerance, strain[window], contact[window]
         )
-        sheet = Sheet(window, *inner)
         strain, contact, left = nothing.copy(), np.zeros_like(reach), nothing.copy()
-        pressure = np.maximum(sheet.strain, 0)
         strain[window], contact[window], left[window] = pressure, touching, remaining
-        load = float(pressure.sum(dtype=np.float64)) * space.pixel_area
-        outside = reach.copy()
-        outside[window] = False
-        if outside.any():
-            window, part = window_of(space, reach)
-            gap = _opening(part, compliance)(strain[window]) - surface[window]
-            outside[window] &= gap < -tolerance
+        outside = overlap_outside(space, surface, compliance, tolerance, strain, window)
         if not outside.any():
-            return Pressed(strain, contact, load, left, sheet)
+            load = float(pressure.sum(dtype=np.float64)) * space.pixel_area
+            return Pressed(strain, contact, load, left)
         contact |= outside
 
 
-def _press_within(
-    space: HalfSpace,
-    surface: Reals,
-    compliance: float,
-    tolerance: float,
-    strain: Reals,
-    contact: Mask,
-    similar: Sheet | None,
-) -> tuple[tuple[Reals, Reals], Mask, Reals]:
-    """Return strain and displacement of the sheet, the contact, and the gap in it, from initial ones.
+def overlap_outside(
+    space: HalfSpace, surface: Reals, compliance: float, tolerance: float, strain: Reals, window: Window
+) -> Mask:
+    """Return where a surface overlaps with the sheet outside of a window, (H, W)."""
+    outside = surface > 0
+    outside[window] = False
+    if outside.any():
+        reached, part = window_of(space, surface > 0)
+        gap = _opening(part, compliance)(strain[reached]) - surface[reached]
+        outside[reached] &= gap < -tolerance
+    return outside
 
-    The first solution is rough, unless that of a ``similar`` surface is available.
-    """
-    moved, pull, share = None, 0.0, _ROUGHLY
-    if similar is not None:
-        strain, moved, share = similar.strain, similar.moved, 0.0
-        pull = tolerance / (_OWN * math.sqrt(space.pixel_area))
+
+def _press_within(
+    space: HalfSpace, surface: Reals, compliance: float, tolerance: float, strain: Reals, contact: Mask
+) -> tuple[Reals, Mask, Reals]:
+    """Return the strain, the contact, and the gap in it, from initial ones; the first solution is rough."""
+    moved: Reals | None = None
     for _ in range(_MAX_CONTACT_CHANGES):
         if moved is not None and strain[~contact].any():
             moved = None
         strain = np.where(contact, strain, strain.dtype.type(0))
-        strain, moved, error = _solve(space, surface, compliance, tolerance, contact, strain, share, moved)
+        strain, moved, error = _solve(space, surface, compliance, tolerance, contact, strain, moved)
         gap = moved - surface
-        changed = np.where(contact, strain > -pull, gap < -tolerance)
+        changed = np.where(contact, strain > 0, gap < -tolerance)
         if error <= tolerance and np.array_equal(changed, contact):
-            return (strain, moved), contact, np.where(contact, gap, gap.dtype.type(0))
+            return strain, contact, np.where(contact, gap, gap.dtype.type(0))
         contact = changed
     raise NotConverged(f"the contact did not converge in {_MAX_CONTACT_CHANGES} rounds")
 
@@ -253,32 +232,21 @@ def load_gradient(space: HalfSpace, contact: Mask, compliance: float = 0.0) -> D
     They equal the pixel area times the strain under a flat punch of the contact's shape, indented by 1: the
     operator is symmetric, and the pressure at the border of a contact is 0, so its motion adds nothing.
     """
+    gradient = np.zeros(space.shape)
     if not contact.any():
-        return np.zeros(space.shape)
-    gradient: Doubles = punches(space, contact, np.ones((1, *space.shape)), compliance)[0] * space.pixel_area
-    return gradient
-
-
-def punches(
-    space: HalfSpace, contact: Mask, forms: Reals, compliance: float = 0.0, start: Reals | None = None
-) -> Reals:
-    """Return the strains under punches of the contact's shape and given forms, (n, H, W), mm, about 1."""
+        return gradient
     window, part = window_of(space, contact)
-    inner, touching = (slice(None), *window), contact[window]
-    strains = np.zeros_like(forms)
     solution = conjugate_gradients(
         _opening(part, compliance),
-        forms[inner],
-        Face.of(touching, part.pressed),
-        converged=lambda residual: float(np.abs(residual).max()) <= _GRADIENT_ERROR,
+        np.ones(part.shape),
+        Face.of(contact[window], part.pressed),
+        converged=lambda residual: float(np.abs(residual).max()) <= GRADIENT_ERROR,
         steps=_MAX_STEPS,
-        start=None if start is None else np.where(touching, start[inner], start.dtype.type(0)),
-        axes=(1, 2),
     )
     if not solution.converged:
         raise NotConverged(f"the pressure of a punch was not found in {_MAX_STEPS} steps")
-    strains[inner] = solution.x
-    return strains
+    gradient[window] = solution.x * space.pixel_area
+    return gradient
 
 
 def _solve(
@@ -288,18 +256,17 @@ def _solve(
     tolerance: float,
     contact: Mask,
     strain: Reals,
-    share: float,
     moved: Reals | None,
 ) -> tuple[Reals, Reals, float]:
     """Return the strain for which the sheet follows the surface in contact, the sheet, and the largest gap.
 
-    The largest gap is at most a tolerance, or a share of that of the initial strain, if it is larger.
+    The largest gap is at most a tolerance, or a tenth of that of the initial strain, if it is larger.
     """
     errors: list[float] = []
 
     def converged(residual: Reals) -> bool:
         errors.append(float(np.abs(residual).max()))
-        return errors[-1] <= max(tolerance, share * errors[0])
+        return errors[-1] <= max(tolerance, _ROUGHLY * errors[0])
 
     solution = conjugate_gradients(
         _opening(space, compliance),
@@ -355,7 +322,9 @@ def reach_of(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> float:
 
 
 @lru_cache(maxsize=128)
-def _cut_off(shape: tuple[int, int], pixel_size: tuple[float, float], reach: float) -> tuple[Doubles, ...]:
+def point_spectrum(
+    shape: tuple[int, int], pixel_size: tuple[float, float], reach: float
+) -> tuple[Doubles, ...]:
     """Return the one spectrum of a point's displacement, cut off at a reach, at a grid's wavenumbers; mm."""
     q_y = 2 * math.pi * fft.fftfreq(shape[0], pixel_size[1])
     q_x = 2 * math.pi * fft.rfftfreq(shape[1], pixel_size[0])
@@ -371,14 +340,14 @@ def _spectrum(
     shape: tuple[int, int], whole: tuple[int, int], pixel_size: tuple[float, float], dtype: np.dtype[Any]
 ) -> Reals:
     """Return the transform of a whole grid's weights on a part, padded: real, because they are even."""
-    weights = influences(_cut_off, whole, pixel_size)[0]
+    weights = influences(point_spectrum, whole, pixel_size)[0]
     return spectrum_of(weights[: shape[0], : shape[1]]).astype(dtype)
 
 
 @lru_cache(maxsize=128)
 def _inverse_spectrum(shape: tuple[int, int], pixel_size: tuple[float, float], dtype: np.dtype[Any]) -> Reals:
     """Return the inverse of the spectrum of a point's displacement on a periodic grid, 1/mm."""
-    spectrum = 1 / _cut_off(shape, pixel_size, reach_of(shape, pixel_size))[0]
+    spectrum = 1 / point_spectrum(shape, pixel_size, reach_of(shape, pixel_size))[0]
     return packed(spectrum, shape[1]).astype(dtype)
 
 
@@ -525,15 +494,6 @@ def window_of(space: HalfSpace, contact: Mask, margin: float = 0.0) -> tuple[tup
         window.append(slice(start, start + length))
     shape = window[0].stop - window[0].start, window[1].stop - window[1].start
     return (window[0], window[1]), space.part(shape)
-
-
-def _is_inside(contact: Mask, window: Window) -> bool:
-    """Return whether a contact is within a window, and not at an edge that is inside the grid."""
-    inner = tuple(
-        slice(part.start + (part.start > 0), part.stop - (part.stop < size))
-        for part, size in zip(window, contact.shape, strict=True)
-    )
-    return bool(np.count_nonzero(contact[inner]) == np.count_nonzero(contact))
 
 
 def _square(maps: Singles) -> Singles:

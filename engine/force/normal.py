@@ -114,11 +114,13 @@ def find_force(
     common = math.hypot(travel_sigma, (own and fitted.height_common_sigma) or 0.0) * float(gradient.sum())
     independent = excess = 0.0
     if pressed.load > 0:
-        spread, length = np.broadcast_to(errors, space.shape), noise_length(result) if own else 0.0
-        uncertain = BlockErrors(spread, Blocks(space.shape, size, 1), length)
         window, _ = window_of(space, pressed.contact, MARGIN)
-        independent = math.sqrt(uncertain.variance(gradient[window][np.newaxis], window)[0])
-        excess = excess_load(space, lowered, uncertain.drawn(window), compliance, pressed, gradient)
+        variance = np.broadcast_to(errors, space.shape)[window].astype(np.float64) ** 2
+        uncertain = BlockErrors(variance, Blocks(space.shape, size, 1), noise_length(result) if own else 0.0)
+        independent = math.sqrt(float(uncertain.covariance(gradient[window][np.newaxis])[0, 0]))
+        drawn = np.zeros(space.shape, np.float32)
+        drawn[window] = uncertain.drawn()
+        excess = excess_load(space, lowered, drawn, compliance, pressed, gradient)
     load = pressed.load + pressed.more(gradient) - excess
     terms = young * common, young * independent, young_sigma * load, young * UNCERTAIN * excess
     pressure = (young * pressed.strain * (load / pressed.load if pressed.load else 1)).astype(np.float32)

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin.engine.base.inputs import Maps, as_result, pixel_size_of
 from mirrorskin.engine.base.resample import fill_with_nearest
 from mirrorskin.engine.force.blocks import BlockErrors, Blocks, Window
-from mirrorskin.engine.force.halfspace import Mask, Pressed, press, punches
+from mirrorskin.engine.force.following import ContactFollower
+from mirrorskin.engine.force.following import Maps as BlockMaps
+from mirrorskin.engine.force.halfspace import Mask, Pressed, press
 from mirrorskin.engine.force.normal import UNCERTAIN, check_bounds, excess_load, modulus_of, surface_of
-from mirrorskin.engine.force.tangential import MIN_COVERAGE, UP, ContactShear, last_displacement
+from mirrorskin.engine.force.tangential import MIN_COVERAGE, UP, last_displacement
 from mirrorskin.engine.metrology.patch import noise_length
 from mirrorskin.io import Fitted, InputError, Result
 from mirrorskin.io.base.arguments import check_count, check_number, checked, in_unit
 from mirrorskin.io.base.findings import Finding, carried, in_process
 from mirrorskin.io.base.threads import ThreadSafe
 from mirrorskin.kernels.array_types import Doubles
+from mirrorskin.kernels.device import Device, open_device
 
 Singles = NDArray[np.float32]
 
@@ -28,13 +33,14 @@ _LOOSE = 5e-4  # maximum gap in contact as a share of the maximum height; the lo
 _CLEARLY = 6.0  # standard deviations
 _STALE = 0.1  # share of the contact that may change before gradients of the load are computed anew
 _SAME_LOAD = 0.1  # relative change of the load after which its increase by noise is computed anew
-_SHEAR_ERROR = 1e-3  # of displacements in contact under tractions that move it by 1
+_UNITS = np.eye(2, dtype=np.float32)[:, :, np.newaxis, np.newaxis]  # displacements along x and along rows
 _ROUND_ERROR, _SMALL_ERROR = 0.0065, 0.04  # relative error of the load; see `_border_error`
 _CUT_ERROR = 0.17  # the same, if the object ends in the contact
 _CENTRE_ERROR = 9.5  # error of the centre of pressure, blocks, over the relative error of the load
 _SHEAR_MODEL = 0.03  # relative error of the tangential force, over the share of blocks at the border
 _SHEAR_STALE = 0.1  # the same, over the share of the contact that has changed since its weights were computed
 _CENTRES = "pressure_centre_x", "pressure_centre_y"
+_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
 class ForceTracker(ThreadSafe):
@@ -61,6 +67,8 @@ class ForceTracker(ThreadSafe):
         Compliance of the stage times the modulus, 1/mm, as in `find_force`.
     window_size : int
         Side of the windows in which displacements were estimated, pixels; errors are correlated within it.
+    device : str or Device, optional
+        See ``mirrorskin.kernels.device.open_device``.
 
     Examples
     --------
@@ -96,6 +104,7 @@ class ForceTracker(ThreadSafe):
         travel_sigma: float = 0.0,
         compliance: float = 0.0,
         window_size: int = 1,
+        device: str | Device | None = None,
     ) -> None:
         self._pixel_size, self._modulus, self._modulus_sigma = pixel_size, modulus, modulus_sigma
         self._binning, self._window_size = binning, window_size
@@ -103,7 +112,18 @@ class ForceTracker(ThreadSafe):
         check_bounds(travel_sigma=travel_sigma, modulus_sigma=modulus_sigma, compliance=compliance)
         if binning < 1 or window_size < 1:
             raise InputError(f"binning {binning} and window_size {window_size}: give pixels, 1 or more")
+        self._device = open_device(device).with_new_queue()
+        self._follower: ContactFollower | None = None
         self._state: _State | None = None
+
+    def precompile(self, shape: tuple[int, int], dtype: object = None) -> None:
+        """Compile what maps of a shape need, with another tracker, so that the first ones are not delayed."""
+        trial = ForceTracker(1.0, 1.0, binning=self._binning, device=self._device)
+        row, column = (np.linspace(-1, 1, size, dtype=np.float32) for size in shape)
+        dome = -(row[:, np.newaxis] ** 2 + column**2)
+        with suppress(InputError):  # of maps that are too small
+            for _ in range(2):
+                trial.push(dome, 0.5)
 
     def push(self, maps: Maps, travel: float | None = None) -> Result:
         """Return the forces of the next result.
@@ -144,34 +164,29 @@ class ForceTracker(ThreadSafe):
         blocks = Blocks((surface.shape[0], surface.shape[1]), size, self._binning)
         state, self._state = self._state, None  # after an error, the next result starts anew
         if state is None or state.blocks != blocks:
-            state = _State(blocks, self._compliance)
-        heights = blocks.at_centres(blocks.means(surface)) + np.float32(travel)
-        errors = BlockErrors(result.height_sigma, blocks, noise_length(result))
-        state.press(heights, errors)
-        axes, pressed = blocks.axes(result), state.pressed
-        numbers = dict.fromkeys(("force", *_CENTRES), (0.0, 0.0)) | dict.fromkeys(
-            _CENTRES, (math.nan, math.nan)
-        )
-        along, covered = np.zeros((2, 2)), 1.0
-        if pressed.load > 0:
+            if self._follower is None or self._follower.blocks != blocks:
+                self._follower = ContactFollower(blocks, self._compliance, self._device)
+            state = _State(self._follower)
+        state.press(_maps(surface, result.height_sigma, moved), travel)
+        axes = blocks.axes(result)
+        found: dict[str, Any] = {"contact": state.contact.view(np.uint8), "pressure": state.pressure}
+        numbers = {"force": (0.0, 0.0), _CENTRES[0]: (math.nan, math.nan), _CENTRES[1]: (math.nan, math.nan)}
+        along, covered = [(0.0, 0.0), (0.0, 0.0)], 1.0
+        if state.load > 0:
             common = math.hypot(self._travel_sigma, result.fitted.height_common_sigma or 0.0)
-            (load, load_sigma), *centres = _normal(state, errors, axes, common)
-            numbers |= {"force": (young * load, young * load_sigma)} | dict(
-                zip(_CENTRES, centres, strict=True)
-            )
+            load, *centres = _normal(state, noise_length(result), axes, common)
+            numbers = {"force": load, **dict(zip(_CENTRES, centres, strict=True))}
+            found["pressure"] *= np.float32(young * load[0] / state.load)
             if moved is not None:
-                along, covered = _tangential(state, *moved, self._window_size)
+                along, covered = state.forces(self._window_size)
             self._state = state
         if moved is not None and covered >= MIN_COVERAGE:
-            numbers |= zip(("force_x", "force_y"), young * along, strict=True)
-        found: dict[str, Any] = {"contact": pressed.contact.astype(np.uint8), "pressure": pressed.strain}
+            numbers |= zip(("force_x", "force_y"), along, strict=True)
         for name, (value, sigma) in numbers.items():
-            by_modulus = 0.0 if name in _CENTRES else young_sigma / young * value
-            found |= {name: float(value), f"{name}_sigma": math.hypot(sigma, by_modulus)}
-        if pressed.load > 0:
-            found["pressure"] = pressed.strain * np.float32(found["force"] / pressed.load)
-        findings = _findings(pressed.contact, covered)
-        if not pressed.load > 0 and _touches(surface + np.float32(travel), result.height_sigma):
+            scale, by_modulus = (1.0, 0.0) if name in _CENTRES else (young, young_sigma * value)
+            found |= {name: scale * value, f"{name}_sigma": math.hypot(scale * sigma, by_modulus)}
+        findings = _findings(state.contact, covered)
+        if not state.load > 0 and _touches(surface + np.float32(travel), result.height_sigma):
             text = f"what touches is smaller than {self._binning} pixels: use a smaller binning"
             findings.append(Finding("small contact", text))
         process = in_process(findings, carried({}, result=result.process))
@@ -181,61 +196,178 @@ class ForceTracker(ThreadSafe):
         )
 
 
+def _maps(
+    height: NDArray[Any], sigma: NDArray[Any] | None, moved: tuple[NDArray[Any], NDArray[Any]] | None
+) -> BlockMaps:
+    """Return maps as a device takes them."""
+    displacement, spread = (None, None) if moved is None else moved
+    if spread is not None and not any(spread.strides):
+        spread = np.full(height.shape, spread.flat[0]) if spread.flat[0] else None
+    elif spread is not None and not spread.strides[-1]:
+        spread = spread[..., 0]
+    sigma, displacement, spread = (
+        None if part is None else np.ascontiguousarray(part, np.float32)
+        for part in (sigma, displacement, spread)
+    )
+    return BlockMaps(np.ascontiguousarray(height, np.float32), sigma, displacement, spread)
+
+
 class _State:
-    """The solution of the last result, as an initial guess of the next one."""
+    """The solution of the last result, as an initial guess of the next one.
 
-    def __init__(self, blocks: Blocks, compliance: float) -> None:
-        self.blocks, self._compliance = blocks, compliance
-        self.pressed: Pressed
-        self.window: Window
-        self.object: Mask  # blocks with a height
-        self.inside: Mask  # blocks in the window that touch, with their four neighbours
-        self._usual = 0.0  # standard deviation of a mean
-        # Strains that move the contact by the forms of the blocks, and tractions that move it by 1 along x
-        # and along rows; and the weights of means that these are.
-        self.punches: Singles | None = None
-        self.shears: Singles | None = None
+    Maps are those of the blocks, or, if it is stated, of the follower's window.
+    """
+
+    def __init__(self, follower: ContactFollower) -> None:
+        follower.reset()
+        self.follower, self.blocks = follower, follower.blocks
+        self.contact: Mask
+        self.pressure: Singles  # over Young's modulus
+        self.load = 0.0  # mm^2
+        self.cut_share = 0.0  # share of the blocks at the contact's border that are next to missing heights
+        self.excess = 0.0  # increase of the load by noise, as a share of it
+        # In the window: weights of means that correspond to the strains under punches of the forms of the
+        # blocks, (3, H, W), and their sums; weights of displacements, (2, 2, H, W), for forces along x and y.
         self.punch_weights: Singles
+        self.punch_sums: Doubles
         self.shear_weights: Singles
-        self._punched = self.sheared = np.zeros(0, bool)  # the contacts of these
-        self._start: Pressed | None = None
-        self._load, self.excess = 0.0, 0.0  # a load, and its increase by noise, as a share of it
+        self._punched = self._sheared = np.zeros(follower.blocks.space.shape, bool)  # the contacts of these
+        self._punches = np.zeros((3, 1, *self._punched.shape), np.float32)
+        self._shears = np.zeros((2, 2, *self._punched.shape), np.float32)
+        self._window: Window | None = None  # of the weights
+        self._usual = 0.0  # standard deviation of a mean
+        self._excess_load = 0.0  # the load at which the excess was computed
 
-    def press(self, heights: Singles, errors: BlockErrors) -> None:
+    def press(self, maps: BlockMaps, travel: float) -> None:
         """Find the contact, and its gradients if it has changed."""
-        space, start = self.blocks.space, self._start
-        self.object = np.isfinite(heights)
-        tolerance = _LOOSE * float(np.max(heights, where=self.object, initial=0))
-        if start is not None:
-            tolerance = max(tolerance, _TOLERANCE * self._usual)
-        self._start = self.pressed = pressed = press(space, heights, self._compliance, start, tolerance)
-        if not pressed.load > 0:
+        follower, space = self.follower, self.blocks.space
+        if not follower.follow(maps, travel, _LOOSE, _TOLERANCE * self._usual):
+            pressed = press(space, follower.surface, follower.compliance, self._pressed())
+            self.contact, self.pressure, self.load = pressed.contact, pressed.strain, pressed.load
+            if not pressed.load > 0:
+                return
+            follower.restart(pressed)
+        self._weigh(maps.displacement is not None)
+        window, sums = follower.window, follower.sums
+        self.contact, self.pressure = follower.contact, np.zeros(space.shape, np.float32)
+        np.maximum(follower.strain, 0, out=self.pressure[window])
+        self.load = sums.pressure * space.pixel_area
+        self.cut_share = 0.0
+        if sums.lost:
+            touching, known = self.contact[window], np.isfinite(follower.surface[window])
+            self.cut_share = np.count_nonzero(touching & ~_inside(known)) / max(sums.border, 1)
+
+    def _weigh(self, with_shears: bool) -> None:
+        """Find the gradients anew if the contact has changed, and let the follower sum with them."""
+        follower, sums, window = self.follower, self.follower.sums, self.follower.window
+        has_moved, changed, changed_later = window != self._window, sums.changed, sums.changed_later
+        if has_moved:  # the sums were those of other weights
+            changed = float(np.count_nonzero(follower.contact ^ self._punched))
+            changed_later = float(np.count_nonzero(follower.contact ^ self._sheared))
+        is_stale, is_sheared = changed > _STALE * sums.contact, changed_later > _STALE * sums.contact
+        if is_stale:
+            self._find(self._punches, self.blocks.forms[:, np.newaxis])
+            self._punched = follower.contact
+        if with_shears and is_sheared:
+            self._find(self._shears, _UNITS)
+            self._sheared = follower.contact
+        if not (is_stale or has_moved or (with_shears and is_sheared)):
             return
-        contact = pressed.contact
-        assert pressed.sheet is not None
-        self.window = pressed.sheet.window
-        self._usual, self.inside = errors.usual(self.window), _inside(contact[self.window])
-        if self.punches is None or _changed(contact, self._punched) > _STALE:
-            self.punches = punches(space, contact, self.blocks.forms, self._compliance, self.punches)
-            self.punch_weights, self._punched = self.blocks.at_centres(self.punches), contact
-        if abs(pressed.load - self._load) > _SAME_LOAD * self._load:
-            drawn, gradient = errors.drawn(self.window), self.punches[0] * space.pixel_area
-            excess = excess_load(space, heights, drawn, self._compliance, pressed, gradient)
-            self._load, self.excess = pressed.load, excess / pressed.load
+        punches, sheared = self._punches[(slice(None), 0, *window)], self._sheared[window]
+        self.punch_weights = self.blocks.at_centres(punches)
+        self.punch_sums = self.punch_weights.sum(axis=(1, 2), dtype=np.float64)
+        signs = (UP * UP[:, np.newaxis]).astype(np.float32)
+        self.shear_weights = signs * self.blocks.weights_of_means(self._shears[(..., *window)], sheared)
+        shears = self.shear_weights.reshape(4, *sheared.shape)
+        contacts = self._punched[window][np.newaxis], sheared[np.newaxis]
+        follower.weigh(np.concatenate([punches, self.punch_weights, shears, *contacts]))
+        self._window = window
 
-    def border_share(self) -> float:
-        """Return the share of blocks in contact that are at its border."""
-        return 1 - np.count_nonzero(self.inside) / np.count_nonzero(self.pressed.contact)
+    def _find(self, strains: Singles, forms: Singles) -> None:
+        """Find the strains that move the contact by given forms, from those of an earlier contact."""
+        place = (..., *self.follower.window)
+        found = self.follower.load(np.broadcast_to(forms, strains.shape)[place], strains[place])
+        strains[:] = 0
+        strains[place] = found
 
-    def shear(self) -> None:
-        """Find the tractions that move the contact by 1 along x, and along rows, if it has changed."""
-        contact, place = self.pressed.contact, (..., *self.window)
-        if self.shears is None or _changed(contact, self.sheared) > _STALE:
-            system = ContactShear(contact[self.window], self.blocks.space.pixel_size, contact.shape)
-            weights = system.weights(_SHEAR_ERROR, None if self.shears is None else self.shears[place])
-            self.shears, self.sheared = np.zeros((2, 2, *contact.shape), np.float32), contact
-            self.shears[place] = weights
-            self.shear_weights = self.blocks.at_centres(self.shears)
+    def covariance(self, length: float) -> Doubles:
+        """Return the covariance, (3, 3), of the sums of heights weighted by the strains under punches.
+
+        ``length`` is that of the correlation of errors of heights, mm.
+        """
+        follower, sums = self.follower, self.follower.sums
+        alike = self.blocks.alike(length)
+        self._usual = math.sqrt(alike[0][0] * alike[1][0]) * sums.contact / sums.inverse_sigma
+        if not math.isfinite(self._usual):
+            self._usual = 0.0
+        independent = _independent(alike, sums.covariance)
+        errors = None
+        if independent is None:
+            errors = BlockErrors(follower.variance, self.blocks, length)
+            matrix = errors.covariance(self.punch_weights)
+        else:
+            xx, xy, xz, yy, yz, zz = independent
+            matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if abs(self.load - self._excess_load) > _SAME_LOAD * self._excess_load:
+            self._correct(errors or BlockErrors(follower.variance, self.blocks, length))
+        return matrix
+
+    def _correct(self, errors: BlockErrors) -> None:
+        """Find the increase of the load by errors of heights."""
+        follower, space = self.follower, self.blocks.space
+        drawn = np.zeros(space.shape, np.float32)
+        drawn[follower.window] = errors.drawn()
+        pressed, gradient = self._pressed(), self._punches[0, 0] * space.pixel_area
+        assert pressed is not None
+        excess = excess_load(space, follower.surface, drawn, follower.compliance, pressed, gradient)
+        self._excess_load, self.excess = self.load, excess / self.load
+
+    def _pressed(self) -> Pressed | None:
+        """Return the last press."""
+        if not self.load > 0:
+            return None
+        gap = np.zeros(self.contact.shape, np.float32)
+        gap[self.follower.window] = self.follower.gap
+        return Pressed(self.pressure, self.contact, self.load, gap)
+
+    def forces(self, window_size: int) -> tuple[list[tuple[float, float]], float]:
+        """Return the forces along x and y over Young's modulus, mm^2, with their standard deviations.
+
+        The second number is the share of the contact that has a displacement.
+        """
+        follower, sums, area, covered = self.follower, self.follower.sums, self.blocks.space.pixel_area, 1.0
+        sheared, moved = self._sheared[follower.window], sums.displacements
+        if not all(map(math.isfinite, moved)):
+            means = follower.moved
+            gaps = ~np.isfinite(means).all(axis=0)
+            covered = 1 - np.count_nonzero(gaps & sheared) / sums.later
+            if covered < MIN_COVERAGE:
+                return [(0.0, 0.0)] * 2, covered
+            filled = [fill_with_nearest(np.where(gaps | ~sheared, np.nan, part)) for part in means]
+            moved = np.einsum("klij,lij->k", self.shear_weights, np.stack(filled)).tolist()
+        # The force that displaces a contact by 1 is proportional to its length, thus to the root of its area.
+        area *= math.sqrt(sums.contact / sums.later)
+        along, up = (area * value for value in moved)
+        variances = _independent(self.blocks.alike(window_size, boxes=True), sums.displacement_variances)
+        if variances is None:
+            errors = BlockErrors(follower.moved_variance, self.blocks, window_size, boxes=True)
+            variances = np.diag(errors.covariance(self.shear_weights)).tolist()
+        rough = math.hypot(along, up) * math.hypot(
+            _SHEAR_MODEL * sums.border / sums.contact, _SHEAR_STALE * sums.changed_later / sums.contact
+        )
+        return [
+            (force, math.hypot(area * math.sqrt(max(variance, 0.0)), rough))
+            for force, variance in zip((along, up), variances, strict=True)
+        ], covered
+
+
+def _independent(alike: tuple[Doubles, Doubles], variances: list[float]) -> list[float] | None:
+    """Return variances of sums of means, if the errors of these are independent and all of them defined."""
+    rows, columns = alike
+    if rows.size > 1 or columns.size > 1 or not all(map(math.isfinite, variances)):
+        return None
+    factor = float(rows[0] * columns[0])
+    return [factor * variance for variance in variances]
 
 
 def _touches(surface: NDArray[Any], sigma: NDArray[Any] | None) -> bool:
@@ -249,23 +381,17 @@ def _findings(contact: Mask, covered: float) -> list[Finding]:
     if covered < MIN_COVERAGE:
         text = f"no tangential force: {covered:.0%} of the contact has a displacement"
         findings.append(Finding("no displacement", text))
-    if any(edge.any() for edge in (contact[0], contact[-1], contact[:, 0], contact[:, -1])):
+    x, y, width, height = cv2.boundingRect(contact.view(np.uint8))
+    if width and (min(x, y) == 0 or y + height == contact.shape[0] or x + width == contact.shape[1]):
         text = "the contact reaches the edge of the maps: forces lack what is outside"
         findings.append(Finding("contact at the edge", text))
     return findings
 
 
-def _changed(contact: Mask, before: Mask) -> float:
-    """Return by how many pixels a contact differs from another, as a share of it."""
-    return np.count_nonzero(contact ^ before) / np.count_nonzero(contact)
-
-
 def _inside(mask: Mask) -> Mask:
     """Return where a mask and its four neighbours are set; those outside the map are not."""
-    inside = np.zeros_like(mask)
-    near = mask[2:, 1:-1] & mask[:-2, 1:-1] & mask[1:-1, 2:] & mask[1:-1, :-2]
-    np.logical_and(mask[1:-1, 1:-1], near, out=inside[1:-1, 1:-1])
-    return inside
+    inside = cv2.erode(mask.astype(np.uint8), _CROSS, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return inside.view(np.bool_)
 
 
 def _border_error(state: _State) -> float:
@@ -274,78 +400,44 @@ def _border_error(state: _State) -> float:
     It depends on the share of blocks at the border, and on how many of these are next to missing heights. It
     was measured on balls, cones, ellipsoids, pairs of balls, cylinders and punches, without noise.
     """
-    contact, known = (mask[state.window] for mask in (state.pressed.contact, state.object))
-    share, cut = state.border_share(), 0.0
-    if not known.all():
-        cut = np.count_nonzero(contact & ~_inside(known)) / np.count_nonzero(contact & ~state.inside)
-    return (_ROUND_ERROR + _CUT_ERROR * cut) * share**2 + _SMALL_ERROR * share**6
+    share = state.follower.sums.border / state.follower.sums.contact
+    return (_ROUND_ERROR + _CUT_ERROR * state.cut_share) * share**2 + _SMALL_ERROR * share**6
 
 
 def _normal(
-    state: _State, errors: BlockErrors, axes: tuple[Doubles, Doubles], common: float
+    state: _State, correlation: float, axes: tuple[Doubles, Doubles], common: float
 ) -> list[tuple[float, float]]:
     """Return the load, mm^2, and the centre of pressure along x and y, mm, with their standard deviations.
 
     By Betti's reciprocity, the load changes with the heights by the strain under a flat punch, and moments of
-    the pressure by that under a tilted one.
+    the pressure by that under a tilted one. ``correlation`` is the length of errors of heights, mm.
     """
-    assert state.punches is not None
-    blocks, pressed, window = state.blocks, state.pressed, state.window
-    strain, left = pressed.strain[window].astype(np.float64), pressed.gap[window]
-    area, place = blocks.space.pixel_area, (slice(None), *window)
-    lacking = area * np.einsum("nij,ij->n", state.punches[place], left, dtype=np.float64)
-    total = pressed.load - lacking[0]
-    load, centre, size, mixed = total * (1 - state.excess), [], [], np.eye(3)
-    for axis, scale, part in zip(axes, blocks.scales(axes), (1, 2), strict=True):
-        lever = axis - axis.mean()
-        profile, inside = area * strain.sum(axis=part - 1), lever[window[2 - part]]
-        middle = (float(profile @ inside) - scale * lacking[part]) / total
-        centre.append(middle + float(axis.mean()))
-        size.append(math.sqrt(max(float(profile @ inside**2) / total - middle**2, 0.0)))
-        mixed[part, part], mixed[part, 0] = scale / total, -middle / total
-    weights = np.einsum("kn,nij->kij", area * mixed, state.punch_weights[place])
-    spread = np.hypot(np.sqrt(errors.variance(weights, window)), common * weights.sum(axis=(1, 2)))
-    rough = _border_error(state)
-    others = [load * math.hypot(rough, UNCERTAIN * state.excess)]
-    for step, length in zip(blocks.space.pixel_size, size, strict=True):
-        others.append(rough * math.hypot(_CENTRE_ERROR * step, length))
+    blocks, window, sums = state.blocks, state.follower.window, state.follower.sums
+    covariance, area = state.covariance(correlation), blocks.space.pixel_area
+    lacking = [area * part for part in sums.lacking]
+    total = state.load - lacking[0]
+    load, rough = total * (1 - state.excess), _border_error(state)
+    values, others = [load], [load * math.hypot(rough, UNCERTAIN * state.excess)]
+    mixed = np.eye(3)
+    scales, steps = blocks.scales(axes), blocks.space.pixel_size
+    places = zip(
+        axes, scales, steps, window[::-1], state.follower.shape[::-1],
+        (sums.x, sums.y), (sums.xx, sums.yy), strict=True,
+    )  # fmt: skip
+    for part, (axis, scale, step, inside, length, first, second) in enumerate(places, 1):
+        middle, block = float(axis[0] + axis[-1]) / 2, float(axis[-1] - axis[0]) / (axis.size - 1)
+        away = float(axis[inside.start]) + block * (length - 1) / 2 - middle
+        moment = area * (block * first + away * sums.pressure)
+        square = area * (block * (block * second + 2 * away * first) + away**2 * sums.pressure)
+        centre = (moment - scale * lacking[part]) / total
+        values.append(centre + middle)
+        radius = math.sqrt(max(square / total - centre**2, 0.0))
+        others.append(rough * math.hypot(_CENTRE_ERROR * step, radius))
+        mixed[part, part], mixed[part, 0] = scale / total, -centre / total
+    mixed *= area
+    variances = np.einsum("ki,kj,ij->k", mixed, mixed, covariance).tolist()
+    by_common = (common * (mixed @ state.punch_sums)).tolist()
     return [
-        (value, math.hypot(own, other))
-        for value, own, other in zip((load, *centre), spread, others, strict=True)
+        (value, math.hypot(math.sqrt(max(variance, 0.0)), shared, other))
+        for value, variance, shared, other in zip(values, variances, by_common, others, strict=True)
     ]
-
-
-def _tangential(
-    state: _State, moved: NDArray[Any], sigma: NDArray[Any], window_size: int
-) -> tuple[Doubles, float]:
-    """Return the forces along x and y over Young's modulus with their standard deviations, (2, 2), mm^2.
-
-    The second number is the share of the contact that has a displacement.
-    """
-    blocks, window = state.blocks, state.window
-    state.shear()
-    assert state.shears is not None
-    place, area = (..., *window), blocks.space.pixel_area
-    contact, fine = state.sheared[window], blocks.pixels(window)
-    means = blocks.means(moved[fine]).transpose(2, 0, 1)
-    gaps = contact & ~np.isfinite(means).all(axis=0)
-    missing = np.count_nonzero(gaps)
-    covered = 1 - missing / np.count_nonzero(contact)
-    if covered < MIN_COVERAGE:
-        return np.zeros((2, 2)), covered
-    means = np.where(contact, means, np.float32(np.nan))
-    means = blocks.at_centres(means, extended=True)
-    if missing:
-        means = np.stack([fill_with_nearest(part) for part in means])
-    means[:, ~contact] = 0
-    means *= UP.astype(np.float32)
-    # The force that displaces a contact by 1 is proportional to its length, and thus to the root of its area.
-    grown = math.sqrt(np.count_nonzero(state.pressed.contact) / np.count_nonzero(contact))
-    area *= grown
-    force = area * np.einsum("klij,lij->k", state.shears[place], means, dtype=np.float64) * UP.ravel()
-    errors = BlockErrors(sigma, blocks, window_size, boxes=True)
-    variance = errors.variance(area * state.shear_weights[place].astype(np.float64), window).sum(axis=-1)
-    changed = _changed(state.pressed.contact, state.sheared)
-    rough = math.hypot(_SHEAR_MODEL * state.border_share(), _SHEAR_STALE * changed)
-    sigma = np.hypot(np.sqrt(variance), rough * np.hypot(*force))
-    return np.stack([force, sigma], axis=-1), covered

@@ -1151,6 +1151,7 @@ def test_a_kernel_computes_its_reference(device, name, function, chosen, options
 ELSEWHERE = {
     "changepoint": "support/changes.py",
     "components": "kernels/integration/test_components.py",
+    "contact": "engine/force/test_following.py",
     "edges": "kernels/rotation/test_edges.py",
     "links": "kernels/integration/test_links.py",
     "multigrid": "kernels/integration/test_multigrid.py",

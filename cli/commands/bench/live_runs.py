@@ -154,7 +154,7 @@ def _tracker(name: str, shape: scenes.Shape, device: Device) -> Tracker:
         return PoseTracker(device=device)
     if name == "slip":
         return SlipTracker(scenes.round_contact(shape), scenes.FIELD / shape[1], device=device)
-    return ForceTracker(modulus=_MODULUS)
+    return ForceTracker(modulus=_MODULUS, device=device)
 
 
 def check_name(name: str) -> str:

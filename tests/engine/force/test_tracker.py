@@ -272,3 +272,11 @@ def test_an_object_may_end_within_the_maps(missing):
 def test_impossible_input_is_one_line(options, maps, message):
     with pytest.raises(io.InputError, match=message):
         ForceTracker(**{"modulus": MODULUS} | options).push(maps, 0.1)
+
+
+def test_a_tracker_that_was_compiled_before_gives_the_same_forces():
+    pressed, tracker = result(paraboloid(), 0.001), ForceTracker(modulus=MODULUS)
+    tracker.precompile(SHAPE)
+    found = [each.push(pressed, 0.4).force for each in (tracker, ForceTracker(modulus=MODULUS))]
+    assert found[0] == found[1] > 0
+    tracker.precompile((4, 4))  # too small for a block
