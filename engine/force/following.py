@@ -171,31 +171,31 @@ class ContactFollower:
         self._find()
 
     def load(self, forms: Singles, start: Singles) -> Singles:
-        """Return the strains that move the contact by given forms, about 1 mm, (n, parts, H, W).
+        """Return the strains that move the contact by given forms, about 1 mm, (n, parts, rows, columns).
 
-        Pressures have one part; tractions have two, along x and along rows. Maps are those of the window.
+        Pressures have one part; tractions have two, along x and along rows. Maps are those of all blocks.
         """
-        maps = {"contact": self.contact[self.window], "forms": forms, "strains": start}
+        count, parts = start.shape[:2]
+        rows, columns = _box(self.contact)
+        columns = _rounded_slice(columns, self.contact.shape[1])
+        shape, place = (rows.stop - rows.start, _rounded(columns.stop - columns.start)), (..., rows, columns)
+        inside = ..., slice(columns.stop - columns.start)
         arrays = {}
-        for name, values in maps.items():
-            arrays[name] = self._array(name, (*values.shape[:-2], *self.shape))
-            arrays[name].write(self._padded(values))
-        count, parts = forms.shape[:2]
-        work = self._array("work of loads", (count, parts, WORK, *self.shape))
+        for name, values in (("contact", self.contact), ("forms", forms), ("strains", start)):
+            leading = () if values is self.contact else (count, parts)
+            padded = np.zeros((*leading, *shape), np.float32)
+            padded[inside] = values[place]
+            arrays[name] = self._array(name, padded.shape)
+            arrays[name].write(padded)
+        arrays["work"] = self._array("work of loads", (count, parts, WORK, *shape))
         self._launch(
-            "contact_load",
-            parts,
-            count,
-            parts=parts,
-            count=count,
-            tolerance=GRADIENT_ERROR,
-            work=work,
-            **arrays,
+            "contact_load", shape, parts, count, parts=parts, count=count, tolerance=GRADIENT_ERROR, **arrays
         )
-        strains = arrays["strains"].read()[self._inside]
-        if not np.isfinite(strains[..., 0, 0]).all():
+        strains = np.zeros_like(start)
+        strains[place] = arrays["strains"].read()[inside]
+        if not np.isfinite(strains).all():
             raise NotConverged("the load that moves the contact was not found")
-        return np.asarray(strains)
+        return strains
 
     def _find(self) -> bool:
         """Find the contact near the last one in the window, and return whether there is one."""
@@ -205,6 +205,7 @@ class ContactFollower:
         strip = max(2 * map_columns + LANES, NUMBERS * group)
         self._launch(
             "contact_follow",
+            self.shape,
             1,
             1,
             map_rows=map_rows,
@@ -242,8 +243,7 @@ class ContactFollower:
             window.append(part)
         # Columns are rounded up where the grid permits, because few tables are then computed.
         rows, columns = window
-        stop = min(columns.start + _rounded(columns.stop - columns.start), contact.shape[1])
-        columns = slice(max(stop - _rounded(columns.stop - columns.start), 0), stop)
+        columns = _rounded_slice(columns, contact.shape[1])
         has_moved = (rows, columns) != self.window
         self.window = rows, columns
         return has_moved
@@ -281,8 +281,10 @@ class ContactFollower:
         padded[self._inside] = values
         return padded
 
-    def _launch(self, name: str, parts: int, groups: int, /, **arguments: Any) -> None:
-        rows, columns = self.shape
+    def _launch(
+        self, name: str, shape: tuple[int, int], parts: int, groups: int, /, **arguments: Any
+    ) -> None:
+        rows, columns = shape
         group, tables = self._device.layout.group, self._tables.get((columns, parts))
         if tables is None:
             values = wave_tables(self._space, columns, parts)
@@ -309,6 +311,13 @@ class ContactFollower:
 
 def _rounded(columns: int) -> int:
     return -(-columns // LANES) * LANES
+
+
+def _rounded_slice(columns: slice, size: int) -> slice:
+    """Return columns whose number is rounded up, as far as the grid permits."""
+    length = _rounded(columns.stop - columns.start)
+    stop = min(columns.start + length, size)
+    return slice(max(stop - length, 0), stop)
 
 
 def _box(mask: Mask) -> tuple[slice, slice]:

@@ -266,10 +266,10 @@ class _State:
             changed_later = float(np.count_nonzero(follower.contact ^ self._sheared))
         is_stale, is_sheared = changed > _STALE * sums.contact, changed_later > _STALE * sums.contact
         if is_stale:
-            self._find(self._punches, self.blocks.forms[:, np.newaxis])
+            self._punches = follower.load(self.blocks.forms[:, np.newaxis], self._punches)
             self._punched = follower.contact
         if with_shears and is_sheared:
-            self._find(self._shears, _UNITS)
+            self._shears = follower.load(np.broadcast_to(_UNITS, self._shears.shape), self._shears)
             self._sheared = follower.contact
         if not (is_stale or has_moved or (with_shears and is_sheared)):
             return
@@ -282,13 +282,6 @@ class _State:
         contacts = self._punched[window][np.newaxis], sheared[np.newaxis]
         follower.weigh(np.concatenate([punches, self.punch_weights, shears, *contacts]))
         self._window = window
-
-    def _find(self, strains: Singles, forms: Singles) -> None:
-        """Find the strains that move the contact by given forms, from those of an earlier contact."""
-        place = (..., *self.follower.window)
-        found = self.follower.load(np.broadcast_to(forms, strains.shape)[place], strains[place])
-        strains[:] = 0
-        strains[place] = found
 
     def covariance(self, length: float) -> Doubles:
         """Return the covariance, (3, 3), of the sums of heights weighted by the strains under punches.
