@@ -232,21 +232,32 @@ def load_gradient(space: HalfSpace, contact: Mask, compliance: float = 0.0) -> D
     They equal the pixel area times the strain under a flat punch of the contact's shape, indented by 1: the
     operator is symmetric, and the pressure at the border of a contact is 0, so its motion adds nothing.
     """
-    gradient = np.zeros(space.shape)
     if not contact.any():
-        return gradient
+        return np.zeros(space.shape)
+    gradient: Doubles = punches(space, contact, np.ones((1, *space.shape)), compliance)[0] * space.pixel_area
+    return gradient
+
+
+def punches(
+    space: HalfSpace, contact: Mask, forms: Reals, compliance: float = 0.0, start: Reals | None = None
+) -> Reals:
+    """Return the strains under punches of the contact's shape and given forms, (n, H, W), mm, about 1."""
     window, part = window_of(space, contact)
+    inner, touching = (slice(None), *window), contact[window]
+    strains = np.zeros_like(forms)
     solution = conjugate_gradients(
         _opening(part, compliance),
-        np.ones(part.shape),
-        Face.of(contact[window], part.pressed),
+        forms[inner],
+        Face.of(touching, part.pressed),
         converged=lambda residual: float(np.abs(residual).max()) <= GRADIENT_ERROR,
         steps=_MAX_STEPS,
+        start=None if start is None else np.where(touching, start[inner], start.dtype.type(0)),
+        axes=(1, 2),
     )
     if not solution.converged:
         raise NotConverged(f"the pressure of a punch was not found in {_MAX_STEPS} steps")
-    gradient[window] = solution.x * space.pixel_area
-    return gradient
+    strains[inner] = solution.x
+    return strains
 
 
 def _solve(

@@ -217,18 +217,20 @@ def _touches(contact: ArrayLike | None, pressure: ArrayLike | None, shape: tuple
 class ContactShear:
     """The linear map from tractions over Young's modulus to displacements of a contact, along x and rows.
 
-    Maps are (..., 2, H, W), float32.
+    Maps are (..., 2, H, W), float32. A part of a larger grid, ``whole``, has that grid's weights.
     """
 
-    def __init__(self, contact: Mask, pixel_size: tuple[float, float]) -> None:
-        self._contact, self._size = contact, pixel_size
-        self._padded = padded_shape(contact.shape)
-        self._spectra = _spectra(contact.shape, pixel_size)
+    def __init__(
+        self, contact: Mask, pixel_size: tuple[float, float], whole: tuple[int, ...] | None = None
+    ) -> None:
+        self._contact, self._size, shape = contact, pixel_size, contact.shape
+        self._padded = padded_shape(shape)
+        self._spectra = _spectra(shape, whole or shape, pixel_size)
 
-    def weights(self) -> Singles:
+    def weights(self, error: float = _TOLERANCE, start: Singles | None = None) -> Singles:
         """Return the tractions that displace the contact by 1 along x, and along rows, (2, 2, H, W)."""
         units = np.eye(2, dtype=np.float32)[:, :, np.newaxis, np.newaxis] * self._contact
-        return self._solve(units, _TOLERANCE)
+        return self._solve(units, error, start=start)
 
     def _solve(
         self, target: Singles, tolerance: float, damping: float = 0.0, start: Singles | None = None
@@ -298,9 +300,9 @@ def _filtered(values: Singles, spectra: Singles, shape: tuple[int, int]) -> Sing
 
 
 @lru_cache(maxsize=32)
-def _spectra(shape: tuple[int, ...], pixel_size: tuple[float, float]) -> Singles:
-    """Return the transforms of the weights on a padded grid."""
-    weights = influences(tensor_spectra, shape, pixel_size)
+def _spectra(shape: tuple[int, ...], whole: tuple[int, ...], pixel_size: tuple[float, float]) -> Singles:
+    """Return the transforms of a whole grid's weights on a part, padded."""
+    weights = [part[: shape[0], : shape[1]] for part in influences(tensor_spectra, whole, pixel_size)]
     spectra = [spectrum_of(part, sign) for part, sign in zip(weights, (1.0, 1.0, -1.0), strict=True)]
     return np.stack(spectra).astype(np.float32)
 

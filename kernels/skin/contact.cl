@@ -23,6 +23,7 @@
 #define INLINE static inline __attribute__((always_inline))
 
 #define NOTHING -1e30f
+#define WIDE 64
 #define MOST_CHANGES 40
 #define MOST_STEPS 300
 #define TINY 1.17549435e-38f
@@ -496,11 +497,15 @@ __kernel GROUP_SIZE void contact_follow(
     bool is_moved = is_same && all_freed == 0, is_found = false;
     for (int round = 0; round < MOST_CHANGES && !is_found; ++round) {
         const Box box = box_of(&window, contact);
+        // In a wide window, the displacement outside of the contact is computed once for all steps.
+        const bool is_wide = ITEMS > 1 || columns > WIDE;
+        const Box to = is_wide ? box : whole(&window);
 #if ITEMS == 1
         if (!is_moved)
 #endif
-            displace(&window, box, whole(&window), strain, window.moved);
-        const bool is_solved = solve(&window, box, whole(&window), tolerance, surface, contact, strain);
+            displace(&window, box, to, strain, window.moved);
+        const bool is_solved = solve(&window, box, to, tolerance, surface, contact, strain);
+        if (is_wide) displace(&window, box, whole(&window), strain, window.moved);
         F changes = 0.0f, removed = 0.0f;
         const Box everywhere = whole(&window);
         FOR_BOX(p, i, &window, everywhere) {
