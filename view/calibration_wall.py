@@ -169,7 +169,7 @@ def _draw_correlation(axes: Axes, response: WallResponse) -> None:
     picture = axes.imshow(correlation, cmap=DIVERGING, vmin=-1, vmax=1, interpolation="nearest")
     explain_colours(axes, picture, "correlation")
     residual = math.degrees(response.error)
-    axes.set_title(f"errors of the {len(sigma)} parameters\nleft on the balls: {residual:.3f}° RMS")
+    axes.set_title(f"errors of the {len(sigma)} parameters\nleft of the zenith: {residual:.3f}° RMS")
     names = [response.parameters[number] for number in free] if len(free) <= _NAMED else []
     size = 7 if len(names) > 12 else 9
     axes.set_xticks(range(len(names)), names, rotation=90, fontsize=size)

@@ -25,11 +25,14 @@ Numbers = NDArray[np.intp]
 BODY_RADIUS, BODY_HEIGHT = 17.5, 40.0
 """Radius and height of the paper's body, mm."""
 
+BODY_ERROR = 0.1
+"""Relative standard deviation of the body's nominal radius and height."""
+
 FEWEST = 5
 """Minimum number of presses."""
 
 _SAMPLES = 60_000  # number of samples of all presses
-_LIKELY = {
+LIKELY = {
     **dict.fromkeys(("axis_x", "axis_y"), (0.0, 1.0)),
     "sight_0": (0.004, 0.004),  # a camera at 100 to 200 mm; 0 for a telecentric one
     "sight_2": (0.0, 3e-7),
@@ -37,7 +40,7 @@ _LIKELY = {
     **dict.fromkeys(("lamp_x", "lamp_y"), (0.0, 0.2)),
     **dict.fromkeys((f"shade_{number}" for number in range(5)), (0.0, 0.02)),
 }
-"""wall_fit.Prior means and standard deviations of a sensor's parameters."""
+"""Prior means and standard deviations of a sensor's parameters."""
 
 _FIRST_SAMPLES, _LAST_SAMPLES = 4_000, 30_000  # number of samples of the first fits, and of the last
 _TOLERANCES = {
@@ -116,7 +119,7 @@ def _prior(
     presses: Sequence[wall_fit.BallPress], pivot: wall_fit.Pivot, pattern: str, body: tuple[float, float]
 ) -> wall_fit.Prior:
     radius, rim = body
-    sensor = dict(_LIKELY, radius=(radius, 0.1 * radius), rim=(rim, 0.1 * rim))
+    sensor = dict(LIKELY, radius=(radius, BODY_ERROR * radius), rim=(rim, BODY_ERROR * rim))
     for axis, place, sigma in zip("xyz", pivot.place, pivot.sigma, strict=True):
         sensor[f"pivot_{axis}"] = place, sigma
     sensor["phase_offset"] = (0.0, pivot.phase_sigma)

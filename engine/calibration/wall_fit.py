@@ -190,7 +190,9 @@ def _clipped_counts(frames: NDArray[Any]) -> NDArray[Any]:
 # --- the fit ------------------------------------------------------------------------------------------------
 
 _LOSS = least_squares.cauchy(3.0)  # standard deviations
-_ROUGH = 0.05  # prior standard deviation of third differences of the coefficients, share of full light
+ROUGH = 0.05
+"""Prior standard deviation of third differences of the curve's coefficients, share of full light."""
+
 _SCATTER = (1e-3, 0.3)  # radians: bounds of the scatter
 _CHUNK = 8192  # samples whose derivatives are computed at a time
 
@@ -209,7 +211,7 @@ class Prior:
         values = rows @ self.mean[free]
         if self.sigma[STEPS].all():
             rough = np.zeros((CURVE_COEFFICIENTS - 3, len(self.mean)))
-            rough[:, STEPS] = curve_roughness() @ curve_from_steps(self.rising) / _ROUGH
+            rough[:, STEPS] = curve_roughness() @ curve_from_steps(self.rising) / ROUGH
             rows = np.concatenate([rows, rough[:, free]])
             values = np.concatenate([values, np.zeros(len(rough))])
         return least_squares.Prior(rows, values)

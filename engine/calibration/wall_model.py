@@ -25,6 +25,7 @@ CURVE_COEFFICIENTS = _PIECES + _CUBIC
 """Number of coefficients of the curve, a cubic spline with evenly spaced knots on 0 to 1, and 0 outside."""
 
 _KNOTS = np.pad(np.linspace(0, 1, _PIECES + 1), _CUBIC, "edge")
+_WIDTHS = (_KNOTS[_CUBIC + 1 :] - _KNOTS[: -_CUBIC - 1]) / (_CUBIC + 1)  # integrals of the basis functions
 
 
 def curve_values(coefficients: ArrayLike, fraction: ArrayLike) -> Doubles:
@@ -47,6 +48,16 @@ def curve_means(low: ArrayLike, high: ArrayLike) -> Doubles:
     return np.asarray(grown / (high - low)[:, np.newaxis])
 
 
+def curve_mean(coefficients: Doubles, low: Doubles, high: Doubles) -> Doubles:
+    """Return the curve's means over intervals, (n,): ``curve_means(low, high) @ coefficients``."""
+    from scipy.interpolate import BSpline
+
+    sums = np.append(0.0, np.cumsum(_WIDTHS * coefficients))
+    integral = BSpline(np.pad(_KNOTS, 1, "edge"), sums, _CUBIC + 1)
+    grown = integral(np.clip(high, 0, 1)) - integral(np.clip(low, 0, 1))
+    return np.asarray(grown / (high - low))
+
+
 def curve_from_steps(rising: bool) -> Doubles:
     """Return the square matrix from steps to coefficients.
 
@@ -55,6 +66,11 @@ def curve_from_steps(rising: bool) -> Doubles:
     """
     matrix = np.tril(np.ones((CURVE_COEFFICIENTS, CURVE_COEFFICIENTS)))
     return matrix if rising else matrix[::-1]
+
+
+def even_curve() -> Doubles:
+    """Return the coefficients of the curve whose light is the share u (Greville's abscissae)."""
+    return np.convolve(_KNOTS[1:-1], np.full(_CUBIC, 1 / _CUBIC), "valid")
 
 
 def curve_roughness() -> Doubles:
@@ -70,10 +86,8 @@ def _antiderivatives(fraction: Doubles) -> Doubles:
     """
     from scipy.interpolate import BSpline
 
-    order = _CUBIC + 1
-    widths = (_KNOTS[order:] - _KNOTS[:-order]) / order
-    sums = np.vstack([np.zeros(CURVE_COEFFICIENTS), np.tril(np.tile(widths, (CURVE_COEFFICIENTS, 1)))])
-    basis = BSpline.design_matrix(fraction, np.pad(_KNOTS, 1, "edge"), order)
+    sums = np.vstack([np.zeros(CURVE_COEFFICIENTS), np.tril(np.tile(_WIDTHS, (CURVE_COEFFICIENTS, 1)))])
+    basis = BSpline.design_matrix(fraction, np.pad(_KNOTS, 1, "edge"), _CUBIC + 1)
     return np.asarray(basis @ sums)
 
 
@@ -87,8 +101,15 @@ SENSOR = (
 STEPS = slice(len(SENSOR), len(SENSOR) + CURVE_COEFFICIENTS)
 """The curve's steps among the parameters; the balls' centres, x, y and z each, follow."""
 
-_GEOMETRIC = len(SENSOR) - 7  # number of parameters that change the path of rays; others change their light
-_OF_THE_WALL = ("radius", "rim", "scatter")  # parameters without influence on where rays are reflected
+GEOMETRIC = len(SENSOR) - 7
+"""Number of parameters of the sensor that change the path of rays; the others change their light."""
+
+OF_THE_WALL = ("radius", "rim", "scatter")
+"""Parameters without influence on where rays are reflected."""
+
+SCATTER_MARGIN = 1.05
+"""Factor of the scatter in a response: edges are not sharp, and off the centre it is wider."""
+
 MAX_RAY_ELEVATION = np.radians(89.0)
 """Maximum elevation of a ray that is followed to the wall."""
 _CLOSEST = 1e-6  # mm^2: minimum difference to the wall; see `follow`
@@ -187,7 +208,7 @@ def reach_wall(met: SheetPoints, named: Mapping[str, float]) -> WallHit:
     return WallHit(low, high, ray)
 
 
-def _shade_terms(met: SheetPoints, radius: float) -> Doubles:
+def shading(met: SheetPoints, radius: float) -> Doubles:
     """Return the basis functions of the shading at positions on the rest plane, (5, N)."""
     back = met.z / met.sight[2]
     return shade_terms((met.x - back * met.sight[0]) / radius, (met.y - back * met.sight[1]) / radius)
@@ -202,8 +223,8 @@ def split(parameters: Doubles) -> tuple[dict[str, float], Doubles, Doubles]:
 def light_of(met: SheetPoints, named: Mapping[str, float], coefficients: Doubles) -> Doubles:
     """Return the light of mirrors, (N,): shares of each pixel's full light."""
     wall = reach_wall(met, named)
-    level = np.einsum("nk,k->n", curve_means(wall.low, wall.high), coefficients)
-    return np.asarray(_factor(met, wall, named) * level)
+    level = curve_mean(coefficients, wall.low, wall.high)
+    return np.asarray(lamps_and_shade(met, wall, named) * level)
 
 
 def predict(samples: LightSamples, parameters: Doubles, rising: bool) -> Doubles:
@@ -221,7 +242,7 @@ def linearise(samples: LightSamples, parameters: Doubles, rising: bool) -> tuple
     met = meet_balls(samples, named, centres)
     wall = reach_wall(met, named)
     basis, coefficients = curve_means(wall.low, wall.high), curve_from_steps(rising) @ steps
-    level, factor = np.einsum("nk,k->n", basis, coefficients), _factor(met, wall, named)
+    level, factor = np.einsum("nk,k->n", basis, coefficients), lamps_and_shade(met, wall, named)
     per_width = factor / (wall.high - wall.low)
     by_high = per_width * (curve_values(coefficients, wall.high) - level)
     by_low = per_width * (level - curve_values(coefficients, wall.low))
@@ -229,17 +250,17 @@ def linearise(samples: LightSamples, parameters: Doubles, rising: bool) -> tuple
     def change(step: float, changed: Mapping[str, float], points: SheetPoints) -> Doubles:
         other = reach_wall(points, changed)
         by_ends = by_high * (other.high - wall.high) + by_low * (other.low - wall.low)
-        return np.asarray((by_ends + level * (_factor(points, other, changed) - factor)) / step)
+        return np.asarray((by_ends + level * (lamps_and_shade(points, other, changed) - factor)) / step)
 
     slopes = np.zeros((len(level), len(parameters)))
-    for number, name in enumerate(SENSOR[:_GEOMETRIC]):
+    for number, name in enumerate(SENSOR[:GEOMETRIC]):
         step = _SMALL * SCALES[name]
         changed = {**named, name: named[name] + step}
-        points = met if name in _OF_THE_WALL else meet_balls(samples, changed, centres)
+        points = met if name in OF_THE_WALL else meet_balls(samples, changed, centres)
         slopes[:, number] = change(step, changed, points)
     lamp = lamp_light(wall.ray, (named["lamp_x"], named["lamp_y"]))
-    slopes[:, _GEOMETRIC : _GEOMETRIC + 2] = (factor * level / lamp * wall.ray.at).T
-    slopes[:, _GEOMETRIC + 2 : STEPS.start] = (lamp * level * _shade_terms(met, named["radius"])).T
+    slopes[:, GEOMETRIC : GEOMETRIC + 2] = (factor * level / lamp * wall.ray.at).T
+    slopes[:, GEOMETRIC + 2 : STEPS.start] = (lamp * level * shading(met, named["radius"])).T
     slopes[:, STEPS] = factor[:, np.newaxis] * np.einsum("nk,ks->ns", basis, curve_from_steps(rising))
     centre = STEPS.stop + 3 * samples.press[samples.pose]
     for axis, shift in enumerate(_SMALL * np.eye(3)):
@@ -248,8 +269,8 @@ def linearise(samples: LightSamples, parameters: Doubles, rising: bool) -> tuple
     return factor * level, slopes
 
 
-def _factor(met: SheetPoints, wall: WallHit, named: Mapping[str, float]) -> Doubles:
+def lamps_and_shade(met: SheetPoints, wall: WallHit, named: Mapping[str, float]) -> Doubles:
     """Return the factor of lamps and shading."""
     lamp = lamp_light(wall.ray, (named["lamp_x"], named["lamp_y"]))
     shade = np.array([named[f"shade_{number}"] for number in range(5)])
-    return np.asarray(lamp * (1 + shade @ _shade_terms(met, named["radius"])))
+    return np.asarray(lamp * (1 + shade @ shading(met, named["radius"])))

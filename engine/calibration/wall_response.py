@@ -29,14 +29,16 @@ from mirrorskin.kernels.rotation.response import (
 _ZENITHS = 16  # number of zeniths at which the first light is searched for
 _HALVINGS = 16  # number of bisections of the interval of the first light
 
-_SCATTER_MARGIN = 1.05  # factor of the scatter: edges are not sharp, and off the centre it is wider
 _EXACT = 1e-4  # share of full light: maximum error of the polynomial
 _TERMS = 12  # maximum number of terms of the polynomial
 _PLACES = 400  # number of points of the curve to which the polynomial is fitted
+_SMOOTH = 1e-3  # weight of the roughness of a curve, relative to its light
 _HALF = 0.5  # share of full light: threshold of a uniform wall
 _GRADED = 0.2  # minimum variation of a graded wall, as a share of its maximum light
 _MIN_CURVE_SLOPE = 0.02  # minimum slope of the curve, relative to the slope in its middle
-_FEW = 2e-3  # share of the samples outside the reach, at either end
+FEW = 2e-3
+"""Share of the samples outside the reach, at either end."""
+
 
 _SIDE = 5  # number of positions along a side at which errors are computed
 _TURN = 8  # number of azimuths at each position
@@ -119,26 +121,38 @@ def _normals(zenith: Doubles, azimuth: Doubles) -> Doubles:
 def make_response(
     fit: WallFit, samples: model.LightSamples, noise: Doubles, pattern: str, source: Source
 ) -> WallResponse:
-    """Return a fit to samples with some noise as a response for the pixels of a source.
-
-    Its scatter is 5 % larger than the fitted one, so that its range is on the safe side.
-    """
-    named, steps, centres = model.split(fit.parameters)
+    """Return a fit to samples with some noise as a response for the pixels of a source."""
+    named, _, centres = model.split(fit.parameters)
     residual, largest = error_left(samples, fit, noise)
+    shares = (0.0, 1.0)
+    if pattern == "graded":
+        wall = model.reach_wall(model.meet_balls(samples, named, centres), named)
+        low, high = np.quantile((wall.low + wall.high) / 2, [FEW, 1 - FEW])
+        shares = float(low), float(high)
+    response = response_of(fit, shares, pattern, source)
+    zenith_sigma = np.hypot(response.zenith_sigma, np.float32(residual))
+    return replace(response, zenith_sigma=zenith_sigma, error=largest)
+
+
+def response_of(fit: WallFit, shares: tuple[float, float], pattern: str, source: Source) -> WallResponse:
+    """Return a fit to samples between two shares of the wall's height as a response for a source's pixels.
+
+    Its scatter is 5 % larger than the fitted one, so that its range is on the safe side. Its error is the
+    median standard error of the zenith.
+    """
+    named, steps, _ = model.split(fit.parameters)
     coefficients = model.curve_from_steps(fit.rising) @ steps
     if pattern == "uniform":
         powers, reach = coefficients[:1], _reach(named)
     else:
-        wall = model.reach_wall(model.meet_balls(samples, named, centres), named)
-        low, high = np.quantile((wall.low + wall.high) / 2, [_FEW, 1 - _FEW])
-        powers, reach = _polynomial(named, coefficients, _reach(named, (float(low), float(high))))
+        powers, reach = _polynomial(named, coefficients, _reach(named, shares))
     response = WallResponse(
         radius=named["radius"],
         rim=named["rim"],
         axis=(named["axis_x"], named["axis_y"]),
         sight=(named["sight_0"], named["sight_2"]),
         lamps=(named["lamp_x"], named["lamp_y"]),
-        scatter=_SCATTER_MARGIN * named["scatter"],
+        scatter=model.SCATTER_MARGIN * named["scatter"],
         curve=powers,
         reach=reach,
         shade=np.array([named[f"shade_{number}"] for number in range(5)]),
@@ -147,16 +161,16 @@ def make_response(
         azimuth_sigma=np.full(source.shape[1:], np.nan, np.float32),
         parameters=(*model.SENSOR, *(f"step_{number}" for number in range(model.CURVE_COEFFICIENTS))),
         covariance=fit.covariance[: model.STEPS.stop, : model.STEPS.stop],
-        error=largest,
+        error=math.nan,
     )
     zenith_sigma, azimuth_sigma = _error_maps(response, fit, source)
-    zenith_sigma = np.hypot(zenith_sigma, np.float32(residual))
-    return replace(response, zenith_sigma=zenith_sigma, azimuth_sigma=azimuth_sigma)
+    error = float(np.nanmedian(zenith_sigma))
+    return replace(response, zenith_sigma=zenith_sigma, azimuth_sigma=azimuth_sigma, error=error)
 
 
 def _reach(named: Mapping[str, float], shares: tuple[float, float] = (0.0, 1.0)) -> tuple[float, float]:
     """Return the range of q in which the whole scattered ray meets the wall, and there are samples."""
-    whole, spread = math.atan2(named["rim"], named["radius"]), _SCATTER_MARGIN * named["scatter"]
+    whole, spread = math.atan2(named["rim"], named["radius"]), model.SCATTER_MARGIN * named["scatter"]
     low = max(spread, (1 - shares[1]) * whole)
     high = min(whole - spread, (1 - shares[0]) * whole)
     return math.tan(low / 2), math.tan(high / 2)
@@ -167,10 +181,7 @@ def _polynomial(
 ) -> tuple[Doubles, tuple[float, float]]:
     """Return the blurred curve at the centre as a polynomial in q with few terms, and its valid range."""
     q = np.linspace(*ends, _PLACES)
-    whole = math.atan2(named["rim"], named["radius"])
-    elevation, spread = 2 * np.arctan(q), named["scatter"]
-    low, high = 1 - (elevation + spread) / whole, 1 - (elevation - spread) / whole
-    light = model.curve_means(low, high) @ coefficients
+    light = _blurred(named, q) @ coefficients
     for terms in range(2, _TERMS + 1):
         fit = np.polynomial.Polynomial.fit(q, light, terms - 1)
         if np.max(np.abs(fit(q) - light)) <= _EXACT:
@@ -185,6 +196,27 @@ def _polynomial(
     first = flat[flat < middle].max(initial=-1) + 1
     last = flat[flat > middle].min(initial=_PLACES) - 1
     return np.asarray(fit.convert().coef), (float(q[first]), float(q[last]))
+
+
+def _blurred(named: Mapping[str, float], q: Doubles) -> Doubles:
+    """Return the matrix from coefficients to the light of the centre at q, blurred by the scatter."""
+    whole = math.atan2(named["rim"], named["radius"])
+    elevation, spread = 2 * np.arctan(q), named["scatter"]
+    return model.curve_means(1 - (elevation + spread) / whole, 1 - (elevation - spread) / whole)
+
+
+def steps_of(response: WallResponse) -> Doubles:
+    """Return the steps of the smoothest rising curve whose light is that of a response, by least squares."""
+    named = {
+        "radius": response.radius,
+        "rim": response.rim,
+        "scatter": response.scatter / model.SCATTER_MARGIN,
+    }
+    q = np.linspace(*response.reach, _PLACES)
+    matrix = _blurred(named, q) @ model.curve_from_steps(rising=True)
+    rough = _SMOOTH * model.curve_roughness() @ model.curve_from_steps(rising=True)
+    light = np.append(np.polynomial.polynomial.polyval(q, response.curve), np.zeros(len(rough)))
+    return np.asarray(np.linalg.lstsq(np.concatenate([matrix, rough]), light, rcond=None)[0])
 
 
 def _error_maps(

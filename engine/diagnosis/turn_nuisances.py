@@ -42,7 +42,9 @@ _LEVEL = 1.5  # tilts: least zenith at which errors are evaluated
 _SWING = 0.75, 1.33  # range of the amplitude of the zenith of a usable pixel, in tilts
 LEAST_LIGHT = 0.05  # share of full light of a usable sample: next to its dark end, a pattern is not linear
 _OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
-_MAX_MISFIT = 4.0  # variance of residuals, relative to that of two waves a pixel, of a model that fits
+MAX_MISFIT = 4.0
+"""Variance of residuals, relative to that of two waves a pixel, of a model that fits."""
+
 _LEAST_NOISE = 0.3  # counts of 8 bits: rounding
 _ITERATIONS = 3
 _SWINGS = 0.03, 0.03, 0.03, *(0.01,) * UNEVEN  # of the swing by zenith and place: a pixel has an area
@@ -281,19 +283,19 @@ def shows_model(
     return np.asarray(usable & (least > LEAST_LIGHT * full))
 
 
-def follow_model(counts: Doubles, left: Doubles, phase: Doubles, unknowns: int, floor: float) -> bool:
-    """Return whether samples differ from a fit hardly more than from any two waves a pixel.
+def misfit_of(counts: Doubles, left: Doubles, phase: Doubles, unknowns: int, floor: float) -> float:
+    """Return the variance of residuals of a fit, relative to that of any two waves a pixel.
 
     ``counts`` and ``left``, (T, n), are the samples and their residuals, ``unknowns`` is the number of those
-    that the fit has for each pixel, and ``floor`` the least noise of a sample, counts.
+    that the fit has for each pixel, and ``floor`` the least noise of a sample, counts. 0 for too few frames.
     """
     waves = np.linalg.qr(np.concatenate([basis(phase), basis(2 * phase)[:, 1:]], axis=1))[0]
     if len(phase) <= waves.shape[1] + 1:
-        return True
+        return 0.0
     scatter = counts - waves @ (waves.T @ counts)
     noise = float(np.median(np.sum(scatter**2, axis=0))) / (len(phase) - waves.shape[1])
     misfit = float(np.median(np.sum(left**2, axis=0))) / max(1, len(phase) - unknowns)
-    return bool(misfit < _MAX_MISFIT * max(noise, floor**2))
+    return float(misfit / max(noise, floor**2))
 
 
 def _found(
@@ -421,7 +423,7 @@ class _Fit:
     @property
     def follows_model(self) -> bool:
         """Whether samples differ from the model hardly more than from any two waves a pixel."""
-        return follow_model(self._counts, self._left, self._phase[:, 0], 2, self.floor)
+        return misfit_of(self._counts, self._left, self._phase[:, 0], 2, self.floor) < MAX_MISFIT
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
         """Exclude the other pixels."""

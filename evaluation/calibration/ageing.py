@@ -129,6 +129,7 @@ def errors_of(lights: Sequence[Light], recordings: int, hours: float) -> Map:
             calibration=before,
             forget=3600 * hours if math.isfinite(hours) else None,
         )
+        assert isinstance(fit.response, io.LinearResponse)
         before = replace(before, response=fit.response, precession=fit.precession)
         true = gain * float(np.median(np.asarray(light.headers[1].zenith_gain)))
         errors.append(100 * (float(np.median(fit.response.gain)) / true - 1))

@@ -78,7 +78,7 @@ def touch(lab: Lab, surface: Surface, press: float, take: int, taken: io.Referen
     pressed = replace(lab, uniform=True).lowered(surface, travel, 1000 + take)
     turned = lab.turned(surface, press, take)
     pressed.header = replace(pressed.header, dark=taken.dark, bright=taken.bright)
-    turned.header = replace(turned.header, dark=taken.dark, bright=taken.bright, **as_designed(lab, taken))
+    turned.header = replace(turned.header, dark=taken.dark, bright=taken.bright)
     return pressed, turned
 
 
@@ -88,8 +88,7 @@ def from_touches(lab: Lab, taken: io.References, objects: int, stated: Mapping[s
         touch(lab, surface, press, 30 + number, taken)
         for number, (surface, press) in enumerate(mixed_objects()[:objects])
     ]
-    estimate = engine.calibration.from_touches
-    return estimate(touches, stated=stated)
+    return engine.calibration.from_touches(touches, stated=stated, body=(lab.body.radius, lab.body.height))
 
 
 def height_error(lab: Lab, source: Frames, calibration: io.Calibration, **options: Any) -> float:
@@ -139,7 +138,7 @@ def _rows_of_touches(
     except io.InputError as error:
         yield what, target, f"missed, refused: {error}"
         return
-    learned = replace(plain, response=fit.response, precession=fit.precession)
+    learned = replace(plain, zenith=fit.response, precession=fit.precession)
     error_of_touches = height_error(lab, further, learned)
     yield what, target, f"{error_of_touches:.3g} µm, {error_of_touches / with_ball:.2f} x"
     for each in fit.estimates:

@@ -187,9 +187,30 @@ class WallResponse(Part):
     parameters: tuple[str, ...] = parameter("names of the fitted parameters", shape=("p",))
     covariance: Floats = parameter("covariance of the fitted parameters, in their units", shape=("p", "p"))
     error: float = parameter(
-        "residual of the zenith on the balls plus one standard error, RMS",
+        "residual of the zenith on the balls plus one standard error, RMS; of touches: the median standard"
+        " error",
         "rad",
-        title="left on the balls at most",
+        title="left of the zenith at most",
+    )
+    names: tuple[str, ...] | None = parameter(
+        "of touches: names of their parameters", shape=("k",), default=None
+    )
+    values: Floats | None = parameter(
+        "of touches: their parameters, those of the movement relative to the precession",
+        shape=("k",),
+        default=None,
+    )
+    information: Floats | None = parameter(
+        "of touches: information about the parameters, without priors", shape=("k", "k"), default=None
+    )
+    pull: Floats | None = parameter(
+        "of touches: information times the deviation of the parameters that touches alone would have",
+        shape=("k",),
+        default=None,
+    )
+    touches: int | None = parameter("number of touches used", default=None)
+    time: float | None = parameter(
+        "time of the last touch since 1970; NaN if unknown", "s", title="", default=None
     )
 
     def standard_errors(self) -> Mapping[str, float]:

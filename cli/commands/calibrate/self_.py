@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from mirrorskin.io import Calibration, Source
 
 _RESPONSE = declared("fuse").only("zenith_gain", "zenith_offset")
-_LENGTHS, _ANGLES = ("pivot_z", "pixel_size"), ("tilt", "phase_offset")
+_LENGTHS = "pivot_z", "pixel_size", "radius", "rim", "axis_x", "axis_y"
+_ANGLES = "tilt", "phase_offset", "scatter"
+_SHOWN = "zenith_gain", "zenith_offset", "gamma", "radius", "rim", "tilt"
 
 
 def command(
@@ -36,12 +38,23 @@ def command(
         Option(
             metavar="NAME=VALUE+-SIGMA",
             help="What a data sheet says: tilt=2.5deg+-0.2deg, phase_offset, gamma, zenith_gain,"
-            " zenith_offset, pivot_z or pixel_size; may be repeated.",
+            " zenith_offset, pivot_z or pixel_size; under a wall radius, rim, axis_x, axis_y, scatter, ...;"
+            " may be repeated.",
         ),
     ] = None,
     forget: Annotated[
         str | None,
         Option(metavar="TIME", help="Time after which a touch counts 1/e: 30d.", show_default="never"),
+    ] = None,
+    body_radius: Annotated[
+        str | None,
+        Option(
+            metavar="LENGTH",
+            help="Nominal radius of the body, within 10 %, if a lit wall surrounds the skin: 17.5mm.",
+        ),
+    ] = None,
+    body_height: Annotated[
+        str | None, Option(metavar="LENGTH", help="Nominal height of that wall, within 10 %: 40mm.")
     ] = None,
     device: options.Device = None,
     as_json: options.Json = False,
@@ -58,6 +71,7 @@ def command(
     response = {name: stack.pop(name, None) for name in ("zenith_gain", "zenith_offset")}
     numbers = _stated(stated or [])
     seconds = None if forget is None else duration(forget, "--forget")
+    body = _body(body_radius, body_height)
 
     def fit(sources: list[Source], calibration: Calibration | None, paths: list[Path]) -> inputs.Learned:
         found = from_touches(
@@ -66,11 +80,24 @@ def command(
             stated=numbers,
             forget=seconds,
             **response,
+            body=body,
             device=device,
         )
         return _learned(found, paths)
 
     inputs.learn(output, recordings, fit, stack, as_json, with_turns=True)
+
+
+def _body(radius: str | None, height: str | None) -> tuple[float, float] | None:
+    """Return radius and height of a wall, mm; None without."""
+    from mirrorskin.cli.quantity import length
+    from mirrorskin.io import InputError
+
+    if radius is None and height is None:
+        return None
+    if radius is None or height is None:
+        raise InputError("--body-radius and --body-height belong together: give both")
+    return length(radius, "--body-radius"), length(height, "--body-height")
 
 
 def _touches(sources: Sequence[Source]) -> list[tuple[Source | None, Source]]:
@@ -120,7 +147,7 @@ def _stated(texts: Sequence[str]) -> dict[str, Stated]:
 
 def _learned(found: TouchFit, paths: list[Path]) -> inputs.Learned:
     named = {estimate.name: estimate for estimate in found.estimates}
-    shown = [named[name] for name in ("zenith_gain", "zenith_offset", "gamma", "tilt") if name in named]
+    shown = [named[name] for name in _SHOWN if name in named]
     numbers = {
         name: {"value": each.value, "sigma": each.sigma, "of_touches": each.of_touches, "unit": each.unit}
         | {"determined": each.determined}

@@ -7,13 +7,14 @@ sensor, which is summed over touches, kept with the calibration, and forgotten w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from mirrorskin.engine.base.reconstruction import calibrated
-from mirrorskin.engine.calibration.touches.fit import Attempt
+from mirrorskin.engine.calibration.touches.fit import Attempt, Earlier
 from mirrorskin.engine.calibration.touches.priors import (
     Movement,
     Priors,
@@ -22,14 +23,17 @@ from mirrorskin.engine.calibration.touches.priors import (
 )
 from mirrorskin.engine.calibration.touches.reading import (
     NOT_FOLLOWED,
+    SensorModel,
     TouchReader,
     model_of,
     with_levels,
 )
 from mirrorskin.engine.calibration.touches.result import TouchFit, result_of
+from mirrorskin.engine.calibration.touches.wall_result import earlier_of
 from mirrorskin.io import (
     Calibrated,
     Calibration,
+    Header,
     InputError,
     Source,
 )
@@ -44,6 +48,7 @@ def from_touches(
     forget: float | None = None,
     zenith_gain: float | None = None,
     zenith_offset: float | None = None,
+    body: tuple[float, float] | None = None,
     device: str | Device | None = None,
 ) -> TouchFit:
     """Estimate response and movement of a sensor from touches of unknown objects.
@@ -60,6 +65,7 @@ def from_touches(
     times less well on rough objects, and hardly on smooth ones. Its heights have an unknown constant, which
     moves points in the picture in the same way as the pivot's height, so it determines neither that nor the
     pixel size.
+    Under a lit wall, the light is that of `mirrorskin.engine.calibration.fit_zenith`.
 
     Parameters
     ----------
@@ -75,6 +81,10 @@ def from_touches(
         Time constant, seconds, after which the information of a touch counts 1/e; by default it is kept.
     zenith_gain, zenith_offset : float, optional
         Approximate response to start with, counts/rad and counts; by default that of the recordings.
+    body : (float, float), optional
+        Nominal radius of the body and height of its lit wall, mm, within 10 %: the response is that of the
+        wall, whose print gets brighter from the rim down. Turns have references, and need no zenith gain. A
+        calibration with a wall needs no body: these touches are added to what it was made with.
     device : str or Device, optional
         See ``mirrorskin.kernels.device.open_device``.
 
@@ -85,8 +95,9 @@ def from_touches(
     Raises
     ------
     mirrorskin.io.InputError
-        No touch can be used; a recording has no zenith gain, tilt, pixel size or phases; a stated number is
-        unknown; ``forget`` is given, but a recording has no start time.
+        No touch can be used; a recording has no zenith gain (or references), tilt, pixel size or phases; a
+        stated number is unknown; ``forget`` is given, but a recording has no start time; the calibration has
+        a response of touches without a wall, and ``body`` is given.
 
     Examples
     --------
@@ -100,21 +111,17 @@ def from_touches(
     """
     if not touches:
         raise InputError("there are no touches: give turns, with or without presses")
-    before = None if calibration is None else calibration.response
+    before, body = _start(calibration, body)
     opened = [
         (None if press is None else calibrated(press, calibration), _upright(turn, calibration))
         for press, turn in touches
     ]
-    for _, turn in opened:
+    for press, turn in opened:
         _check_same(turn, opened[0][1])
+        if press is None and body is not None:
+            raise InputError(f"{turn.name} follows no press: under a wall, give the press of each turn")
+    sensor, header = _sensor(opened, calibration, body, zenith_gain, zenith_offset)
     precession = None if calibration is None else calibration.precession
-    header = opened[0][1].header
-    if zenith_gain is not None:
-        header = replace(header, zenith_gain=np.asarray(zenith_gain, np.float64))
-    if zenith_offset is not None:
-        header = replace(header, zenith_offset=np.asarray(zenith_offset, np.float64))
-    header = with_levels(header, [turn for _, turn in opened])
-    sensor = model_of(opened[0][1], header)
     readers = [TouchReader.of(press, turn, device) for press, turn in opened]
     movement = Movement.of(sensor, precession)
     priors = Priors.of(header, movement, before is not None, stated or {})
@@ -134,6 +141,51 @@ def from_touches(
     except np.linalg.LinAlgError:  # surfaces that are nowhere near those of the touches
         pass
     raise InputError(f"no touch can be used: {reason}")
+
+
+def _sensor(
+    touches: Sequence[tuple[Source | None, Source]],
+    calibration: Calibration | None,
+    body: tuple[float, float] | None,
+    zenith_gain: float | None,
+    zenith_offset: float | None,
+) -> tuple[SensorModel, Header]:
+    """Return the sensor to start with, and the header that states it."""
+    turns = [turn for _, turn in touches]
+    header = turns[0].header
+    if zenith_gain is not None:
+        header = replace(header, zenith_gain=np.asarray(zenith_gain, np.float64))
+    if zenith_offset is not None:
+        header = replace(header, zenith_offset=np.asarray(zenith_offset, np.float64))
+    if body is None:
+        header = with_levels(header, turns)
+    sensor = model_of(turns[0], header, body)
+    if sensor.wall is not None and calibration is not None and calibration.zenith is not None:
+        known = calibration.zenith
+        sensor = sensor._replace(wall=sensor.wall._replace(axis=known.axis, sight=known.sight))
+    return sensor, header
+
+
+def _start(
+    calibration: Calibration | None, body: tuple[float, float] | None
+) -> tuple[Earlier | None, tuple[float, float] | None]:
+    """Return what is known of the response, and radius and height of a wall."""
+    if body is not None and not (min(body) > 0 and max(body) < math.inf):
+        raise InputError(f"a body of {body[0]} mm radius and {body[1]} mm height: both must be above 0")
+    if calibration is None:
+        return None, body
+    wall, linear = calibration.zenith, calibration.response
+    if linear is not None and body is not None:
+        raise InputError(
+            f"{calibration.name or 'the calibration'} has a response of touches without a wall: leave the"
+            " body out, or name another file"
+        )
+    if wall is not None and wall.pattern == "graded":
+        return earlier_of(wall), body or (wall.radius, wall.rim)
+    if linear is None:
+        return None, body
+    told = linear.information, linear.pull, linear.touches, linear.time
+    return Earlier(linear.names, linear.values, *told), body
 
 
 def _upright(turn: Source, calibration: Calibration | None) -> Source:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.touches.priors import (
     Movement,
@@ -17,18 +18,13 @@ from mirrorskin.engine.calibration.touches.reading import (
     Touch,
     TouchReader,
 )
-from mirrorskin.engine.calibration.touches.window import (
-    SHARED,
-    Window,
-)
-from mirrorskin.engine.diagnosis.turn_light import (
-    GLOBALS,
-    UNEVEN,
-)
+from mirrorskin.engine.calibration.touches.wall_light import STEPS
+from mirrorskin.engine.calibration.touches.window import MOVEMENT, Window
 from mirrorskin.engine.press.intervals import estimate_interval_scatter
 from mirrorskin.io import (
     InputError,
     LinearResponse,
+    WallResponse,
 )
 from mirrorskin.kernels.array_types import Doubles
 
@@ -38,6 +34,9 @@ _ITERATIONS = 16  # Gauss-Newton steps, at most
 _SETTLED = 0.1  # largest last step, in standard errors
 _NEARLY_SETTLED = 0.5  # the same, of a fit that is repeated
 _ROUGHLY = 2  # steps, and registrations, before pixels are chosen; in an exact fit, heights then stay
+_ROUGHLY_UNDER_WALL = 3  # the same under a wall, where the sensor stays as it is in a first fit
+_FOLLOWED = 1.6  # variance of residuals of a touch under a wall that is used, times that of other touches
+_EXCLUDING = 3  # steps in which outliers are excluded under a wall; otherwise in one
 _CONTRADICTION = 3.0  # standard deviations between a prior and the touches
 _LEAST_RELIEF = 30.0  # chi-square of a pixel by relief from which on a touch shows the pivot
 _WELL_SHOWN = 0.02  # relative standard error of the gain by a touch, up to which noise prevails
@@ -45,13 +44,26 @@ _CLEAR = 4.0  # standard deviations of the contradiction of touches by chance, f
 _SINGULAR = 1e-12  # relative eigenvalue of a direction about which a touch tells nothing
 _MOVED = 0.02  # pixels that points move by an error of the pivot, from which frames are registered again
 _REGISTERED = 0.3  # standard errors of a movement with which turns without a press are registered
-_WITHOUT = 1e4  # factor of the standard deviation of a prior that is left out
 _REGISTRATIONS = 5  # largest number of registrations with an estimated movement
 _REGISTRATIONS_OF_TURNS = 12  # the same, of turns without a press once their pixels are chosen again
 _OTHER_TILT = (
     0.05  # relative difference of the amplitude of the brightness from which the tilt starts with it
 )
 _IMPLAUSIBLE = 5.0  # standard deviations of what is usual: a fit that is so far off is of another movement
+
+
+Response = LinearResponse | WallResponse
+
+
+class Earlier(NamedTuple):
+    """What earlier touches, or presses of a ball, have told of a sensor."""
+
+    names: tuple[str, ...]  # of the parameters
+    values: Doubles
+    information: Doubles
+    pull: Doubles  # information times the deviation of the parameters that touches alone would have
+    touches: int
+    time: float  # of the last, seconds since 1970; NaN if unknown
 
 
 class _Memory(NamedTuple):
@@ -63,7 +75,13 @@ class _Memory(NamedTuple):
     time: float
 
     @classmethod
-    def of(cls, before: LinearResponse | None, touches: Sequence[Touch], forget: float | None) -> _Memory:
+    def of(
+        cls,
+        before: Earlier | None,
+        touches: Sequence[Touch],
+        forget: float | None,
+        names: Sequence[str],
+    ) -> _Memory:
         times = [touch.time for touch in touches] + ([] if before is None else [before.time])
         last = max((time for time in times if math.isfinite(time)), default=math.nan)
         weights = [1.0] * len(times)
@@ -75,10 +93,10 @@ class _Memory(NamedTuple):
                     "old touches can only be forgotten if recordings have a start time: leave forget out"
                 )
             weights = [math.exp((time - last) / forget) for time in times]
-        matrix, vector = np.zeros((len(SHARED),) * 2), np.zeros(len(SHARED))
+        matrix, vector = np.zeros((len(names),) * 2), np.zeros(len(names))
         if before is not None:
-            at = np.array([SHARED.index(name) for name in before.names if name in SHARED])
-            of = np.array([number for number, name in enumerate(before.names) if name in SHARED])
+            at = np.array([names.index(name) for name in before.names if name in names])
+            of = np.array([number for number, name in enumerate(before.names) if name in names])
             matrix[np.ix_(at, at)] = weights[-1] * before.information[np.ix_(of, of)]
             vector[at] = weights[-1] * before.pull[of]
             vector += matrix[:, at] @ before.values[of]
@@ -96,7 +114,7 @@ class Attempt:
     readers: Sequence[TouchReader]
     movement: Movement
     priors: Priors
-    before: LinearResponse | None
+    before: Earlier | None
     forget: float | None
     read: list[Touch]
     used: list[Touch]
@@ -111,7 +129,7 @@ class Attempt:
         readers: Sequence[TouchReader],
         movement: Movement,
         priors: Priors,
-        before: LinearResponse | None,
+        before: Earlier | None,
         forget: float | None,
         start: Doubles | None = None,
         moved: Doubles | None = None,
@@ -126,16 +144,20 @@ class Attempt:
                 read = [movement.read(reader) for reader in readers]
         used = [touch for touch in read if touch.varied]
         if start is None:
-            start = priors.start(before, movement.before)
+            named = None if before is None else dict(zip(before.names, before.values.tolist(), strict=True))
+            start = priors.start(named, movement.before)
         if moved is None:
-            moved = np.zeros(len(SHARED))
-        memory = _Memory.of(before, used, forget).moved(moved)
+            moved = np.zeros(len(priors.names))
+        memory = _Memory.of(before, used, forget, priors.names).moved(moved)
         fit, dropped = _fit_with_priors(used, start, priors, memory, exact=False)
         return cls(readers, movement, priors, before, forget, read, used, memory, fit, dropped, moved)
 
     def following(self) -> list[Touch]:
         """Return the touches whose samples follow the model."""
-        return [touch for touch in self.used if touch.follows()]
+        used = [touch for touch in self.used if touch.follows()]
+        if self.movement.sensor.wall is None or not used:
+            return used
+        return [touch for touch, follows in zip(used, _follow(used), strict=True) if follows]
 
     @property
     def noise(self) -> float:
@@ -153,12 +175,13 @@ class Attempt:
         """Whether the parameters are those of a sensor, and not of another movement."""
         priors = self.priors
         away = (self.fit.values - priors.mean) * priors.scale / np.maximum(priors.loose, 1e-12)
-        names = ("gamma", "zenith_gain", "zenith_offset", "tilt", *SHARED[len(GLOBALS) :][:UNEVEN])
-        return float(np.sum(away[[SHARED.index(name) for name in names]] ** 2)) < _IMPLAUSIBLE**2
+        others = {"phase", "lag", *MOVEMENT, *STEPS} - {"tilt"}
+        judged = [number for number, name in enumerate(priors.names) if name not in others]
+        return float(np.sum(away[judged] ** 2)) < _IMPLAUSIBLE**2
 
     def exact(self, used: list[Touch]) -> Attempt:
         """Return the exact fit of some of the touches."""
-        memory = _Memory.of(self.before, used, self.forget).moved(self.moved)
+        memory = _Memory.of(self.before, used, self.forget, self.priors.names).moved(self.moved)
         fit, dropped = _fit_with_priors(used, self.fit.values, self.priors, memory, exact=True)
         return replace(self, used=used, memory=memory, fit=fit, dropped=dropped)
 
@@ -194,7 +217,7 @@ class Attempt:
             return False
         if all(reader.has_press for reader in self.readers):
             return True
-        at = [SHARED.index(name) for name in ("tilt", "phase")]
+        at = [self.priors.at(name) for name in ("tilt", "phase")]
         sigma = np.sqrt(np.diag(self.fit.covariance))
         return bool(np.all(np.abs(self.fit.values[at]) < _REGISTERED * sigma[at]))
 
@@ -208,23 +231,53 @@ class Attempt:
         arm = abs(poses.arm or 0.0)
         heights = max(window.misplaced for touch in self.used for window in touch.windows)
         errors = arm * values["tilt"], arm * values["phase"], values["pivot_z"], heights
-        return sensor.tilt * max(abs(error) for error in errors) / min(size)
+        along = 0.0
+        if sensor.wall is not None:
+            half = math.hypot(
+                *(side * pixel / 2 for side, pixel in zip(sensor.gain.shape, size, strict=True))
+            )
+            along = abs(values["sight_0"] - sensor.wall.sight[0]) * half * abs(self._press)
+        return (sensor.tilt * max(abs(error) for error in errors) + along) / min(size)
+
+    @property
+    def _press(self) -> float:
+        """Largest press of the turns, mm."""
+        return max(reader.turn.header.press or 0.0 for reader in self.readers)
 
     @property
     def values(self) -> dict[str, float]:
         """The parameters by name."""
-        return dict(zip(SHARED, self.fit.values.tolist(), strict=True))
+        return dict(zip(self.priors.names, self.fit.values.tolist(), strict=True))
+
+    @property
+    def remembered(self) -> dict[str, Any]:
+        """What a response keeps of the touches, so that others can be added."""
+        fit, values = self.fit, self.fit.values.copy()
+        # Others are in the numbers of the calibration from now on.
+        values[[number for number, name in enumerate(self.priors.names) if _is_absorbed(name)]] = 0.0
+        return {
+            "names": self.priors.names,
+            "values": values,
+            "information": (fit.matrix + fit.matrix.T) / 2,
+            "pull": fit.vector - fit.matrix @ fit.values,
+            "touches": len(self.used) + (0 if self.before is None else self.before.touches),
+            "time": self.memory.time,
+        }
 
     def _again(self, chooses: bool = False) -> Attempt:
         movement = self.movement.changed(self.values)
         start, moved = self.fit.values.copy(), self.moved.copy()
-        at = [SHARED.index(name) for name in ("tilt", "phase", "pivot_z")]
+        at = [self.priors.at(name) for name in ("tilt", "phase", "pivot_z")]
         moved[at] += start[at]
         start[at] = 0.0
         pairs = zip(self.readers, self.read, strict=True)
         readers = [reader.with_heights(touch, chooses and not reader.has_press) for reader, touch in pairs]
         priors = self.priors.relative_to(movement)
         return Attempt.of(readers, movement, priors, self.before, self.forget, start, moved)
+
+
+def _is_absorbed(name: str) -> bool:
+    return name.startswith(("zenith", "uneven")) or name in ("tilt", "phase", "pivot_z", "pixel_size")
 
 
 class Dropped(NamedTuple):
@@ -275,9 +328,7 @@ def _fit_with_priors(
 
 def without_prior(fit: Fitted, priors: Priors, number: int) -> tuple[float, float]:
     """Return a parameter and its standard error by touches and the priors of the other parameters."""
-    sigma = priors.sigma.copy()
-    sigma[number] *= _WITHOUT
-    precision = np.diag(sigma**-2.0)
+    precision = priors.precision(without=number)
     covariance = np.linalg.inv(fit.matrix + precision)
     return float(covariance[number] @ (fit.vector + precision @ priors.mean)), float(
         np.sqrt(covariance[number, number])
@@ -288,30 +339,37 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memo
     """Return the Gauss-Newton fit of surfaces, frames and parameters.
 
     Splines are chosen, and pixels that do not follow the model are excluded, on the way. An ``exact`` fit,
-    which starts with surfaces near the true ones, takes heights of presses from their intervals.
+    which starts with surfaces near the true ones, takes heights of presses from their intervals. Surfaces
+    under a wall start far from the true ones, as if there were none: they are fitted before the sensor.
     """
-    values, precision = start.copy(), np.diag(priors.sigma**-2.0)
+    values, precision = start.copy(), priors.precision()
     is_cold = not exact and not all(touch.is_warm for touch in touches)
-    roughly = _ROUGHLY if exact or is_cold else 0
-    last, before, is_settled = math.inf, values, False
+    under_wall = "zenith_gain" not in priors.names
+    roughly = 0 if not (exact or is_cold) else _ROUGHLY_UNDER_WALL if under_wall else _ROUGHLY
+    excluding = range(roughly, roughly + (_EXCLUDING if under_wall else 1))
+    last, before, is_settled, following = math.inf, values, False, np.ones(len(touches), np.bool_)
     for number in range(_ITERATIONS):
         early = number < roughly
         informations, pushes, steps = [], [], []
-        for touch, weight in zip(touches, memory.weights, strict=False):
+        for touch, weight, follows in zip(touches, memory.weights, following, strict=False):
             information, push, step = _eliminate(
-                touch, values, number == roughly, exact and early, is_cold and early
+                touch, values, number in excluding, exact and early, is_cold and early
             )
             if max(window.relief_shown for window in touch.windows) < _LEAST_RELIEF:
                 _forget_pivot(information, push, priors)
-            weight = weight * _trust(information, priors)
+            weight = weight * (follows if under_wall else _trust(information, priors))
             informations.append(weight * information)
             pushes.append(weight * push)
             steps.append(step)
+        follow = _follow(touches)
+        following = following & follow if number > excluding[-1] else follow
         pulls = [each @ values + push for each, push in zip(informations, pushes, strict=True)]
         matrix = memory.matrix + np.sum(informations, axis=0)
         vector = memory.vector + np.sum(pulls, axis=0)
         covariance = np.linalg.inv(matrix + precision)
         change = covariance @ (vector + precision @ priors.mean) - values
+        if under_wall and is_cold and early:
+            change = np.zeros(len(values))
         misfit = float(np.sum([np.sum(window.left**2) for touch in touches for window in touch.windows]))
         if number > roughly and misfit > _WORSE * last:
             for touch in touches:
@@ -358,16 +416,20 @@ def _contradiction_of(
     return (squares / degrees, degrees) if len(pushes) > 1 and degrees > 0 else (1.0, 0.0)
 
 
+def _follow(touches: Sequence[Touch]) -> NDArray[np.bool_]:
+    """Return which touches follow the model hardly less than the others."""
+    misfits = np.array([touch.misfit for touch in touches])
+    return np.asarray(misfits <= _FOLLOWED * max(1.0, float(np.median(misfits))))
+
+
 def _trust(information: Doubles, priors: Priors) -> float:
     """Return the weight of a touch: 1 if it alone shows the gain well.
 
     An error of the model of a tenth of a count changes the parameters by their variance times its slope by
     them: the less a touch shows, the more the error exceeds the noise.
     """
-    at = SHARED.index("zenith_gain")
-    sigma = priors.sigma.copy()
-    sigma[at] *= _WITHOUT
-    alone = math.sqrt(float(np.linalg.inv(information + np.diag(sigma**-2.0))[at, at]))
+    at = priors.at("zenith_gain")
+    alone = math.sqrt(float(np.linalg.inv(information + priors.precision(without=at))[at, at]))
     return min(1.0, (_WELL_SHOWN / alone) ** 4)
 
 
@@ -414,7 +476,7 @@ def _eliminate(
 
 def _forget_pivot(information: Doubles, push: Doubles, priors: Priors) -> None:
     """Leave of what a touch tells of the pivot only how the other estimated parameters depend on it."""
-    at = SHARED.index("pivot_z")
+    at = priors.at("pivot_z")
     rest = np.array([number for number in range(len(push)) if number != at and priors.is_free(number)])
     by_rest = np.linalg.lstsq(information[np.ix_(rest, rest)], information[rest, at], rcond=_SINGULAR)[0]
     information[at, at] = by_rest @ information[rest, at]

@@ -9,23 +9,21 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mirrorskin.engine.calibration.touches.light import FOOTPRINT
 from mirrorskin.engine.calibration.touches.reading import (
     SensorModel,
     Touch,
     TouchReader,
 )
-from mirrorskin.engine.calibration.touches.window import (
-    FOOTPRINT,
-    SHARED,
-    TURNS,
-)
+from mirrorskin.engine.calibration.touches.wall_light import STEPS, WallLight, even_steps, roughness
+from mirrorskin.engine.calibration.touches.window import TURNS
+from mirrorskin.engine.calibration.wall import BODY_ERROR, LIKELY
 from mirrorskin.engine.diagnosis.turn_light import (
     GLOBALS,
 )
 from mirrorskin.io import (
     Header,
     InputError,
-    LinearResponse,
     Precession,
 )
 from mirrorskin.kernels.array_types import Doubles
@@ -42,8 +40,11 @@ UNKNOWN = {
     "footprint": 2.0,
     "pivot_z": 10.0,
 }  # standard deviations of parameters about which nothing is stated; counts of 8 bits, radians, mm
+_SCATTER = math.radians(0.5)  # of a usual sheet: touches near the rim, which show it, are left out
+_STEP = 1.0  # share of full light: standard deviation of a step of the printed curve
 _LOOSER = 10.0  # of the standard deviation of a number that is estimated only if it is stated
 _KNOWN_PIVOT = 1.0  # mm: standard deviation of a recorded pivot
+_WITHOUT = 1e4  # factor of the standard deviation of a parameter of which nothing is known
 _SEARCHED = 8  # phases that are tried if frames do not follow the movement
 _OTHER_PHASE = 0.2  # radians: difference of phases from which one was searched for
 TITLES = {"phase": "phase_offset"}
@@ -54,7 +55,12 @@ UNITS = {
     "phase": "rad",
     "pivot_z": "mm",
     "pixel_size": "mm",
+    **dict.fromkeys(("radius", "rim", "axis_x", "axis_y"), "mm"),
+    "scatter": "rad",
+    "sight_0": "1/mm",
+    "sight_2": "1/mm^3",
 }
+_NOT_STATED = ("lag", "footprint", "oval_x", "oval_y", *STEPS)
 
 
 class Stated(NamedTuple):
@@ -93,12 +99,16 @@ class Movement(NamedTuple):
         return reader.read(self.sensor, self.sense, self.ahead)
 
     def changed(self, values: Mapping[str, float]) -> Movement:
-        """Return the movement with estimated tilt, phase and pivot."""
+        """Return the movement with estimated tilt, phase and pivot, and lines of sight."""
         sensor = self.sensor
         pivot = sensor.pivot
         if pivot is not None:
             pivot = (pivot[0], pivot[1], pivot[2] + values["pivot_z"])
-        sensor = sensor._replace(tilt=sensor.tilt * (1 + values["tilt"]), pivot=pivot)
+        wall = sensor.wall
+        if wall is not None:
+            axis, sight = (values["axis_x"], values["axis_y"]), (values["sight_0"], values["sight_2"])
+            wall = wall._replace(axis=axis, sight=sight)
+        sensor = sensor._replace(tilt=sensor.tilt * (1 + values["tilt"]), pivot=pivot, wall=wall)
         return self._replace(sensor=sensor, ahead=math.remainder(self.ahead + values["phase"], math.tau))
 
 
@@ -127,6 +137,7 @@ def search(reader: TouchReader, movement: Movement) -> Movement:
 class Priors:
     """Priors of the numbers of a sensor, and how they follow from the parameters of a fit."""
 
+    names: tuple[str, ...]  # of the parameters
     number: Doubles
     error: Doubles
     loose: Doubles  # error of a number about which nothing is stated
@@ -144,46 +155,50 @@ class Priors:
     ) -> Priors:
         """Return the priors from a recording with its calibration, and from numbers that are given."""
         sensor = movement.sensor
-        count = max(1.0, float(np.nanmedian(np.abs(sensor.gain))) / 1000)  # a count of 8 bits
+        names = sensor.names
         size = min(header.pixel_size or (1.0,))
-        gain, base = float(np.nanmedian(sensor.gain)), float(np.nanmedian(sensor.base))
-        numbers = {
-            "gamma": (1.0, 1.0),
-            "zenith_gain": (gain, gain),
-            "zenith_offset": (base, 1.0),
-            "footprint": (FOOTPRINT, FOOTPRINT),
-            "pixel_size": (size, -size),
-        }
-        reference, scale = np.zeros(len(SHARED)), np.ones(len(SHARED))
-        error = np.full(len(SHARED), NEGLIGIBLE)
-        for at, name in enumerate(SHARED):
+        numbers = {"footprint": (FOOTPRINT, FOOTPRINT), "pixel_size": (size, -size)}
+        likely: dict[str, tuple[float, float]] = {}
+        if sensor.wall is not None:
+            likely = _of_wall(sensor.wall.body)
+        else:
+            gain, base = float(np.nanmedian(sensor.gain)), float(np.nanmedian(sensor.base))
+            numbers |= {"gamma": (1.0, 1.0), "zenith_gain": (gain, gain), "zenith_offset": (base, 1.0)}
+        reference, scale, number = np.zeros(len(names)), np.ones(len(names)), np.zeros(len(names))
+        error = np.full(len(names), NEGLIGIBLE)
+        for at, name in enumerate(names):
             reference[at], scale[at] = numbers.get(name, (0.0, 1.0))
             error[at] = UNKNOWN.get(name, UNKNOWN.get(name.partition("_")[0], NEGLIGIBLE))
-        scale[SHARED.index("tilt")] = sensor.tilt
-        error[SHARED.index("lag")] = header.prior("lag_sigma")
-        error[SHARED.index("zenith_offset")] *= count
+            number[at], error[at] = likely.get(name, (reference[at], error[at]))
+        scale[names.index("tilt")] = sensor.tilt
+        error[names.index("lag")] = header.prior("lag_sigma")
+        if "gamma" in names:
+            number[names.index("gamma")] = header.prior("gamma")
+            error[names.index("zenith_offset")] *= max(1.0, abs(gain) / 1000)  # a count of 8 bits
         if header.pivot is not None:
-            error[SHARED.index("pivot_z")] = _KNOWN_PIVOT
+            error[names.index("pivot_z")] = _KNOWN_PIVOT
         if sensor.pivot is None:
-            error[SHARED.index("pivot_z")] = NEGLIGIBLE
+            error[names.index("pivot_z")] = NEGLIGIBLE
         error *= np.abs(scale)
-        number = reference.copy()
-        number[SHARED.index("gamma")] = header.prior("gamma")
-        free = (False,) * len(SHARED)
-        priors = cls(number, error.copy(), error, free, reference, scale).relative_to(movement)
+        free = (False,) * len(names)
+        priors = cls(names, number, error.copy(), error, free, reference, scale).relative_to(movement)
         for name in ("tilt", "phase", "pivot_z"):
-            priors.number[SHARED.index(name)] = priors.reference[SHARED.index(name)]
+            priors.number[priors.at(name)] = priors.reference[priors.at(name)]
         stated: dict[str, Stated] = {}
         if not of_touches:  # what touches have found is no prior of more touches, but their memory
             stated |= _stated_by(header, movement.before, priors)
-        can_be_stated = ("gamma", "zenith_gain", "zenith_offset", "tilt", "phase", "pivot_z", "pixel_size")
+        can_be_stated = [name for name in names if name not in _NOT_STATED and not name.startswith("uneven")]
         for name, value in given.items():
             title = next((title for title, shown in TITLES.items() if shown == name), name)
             if title not in can_be_stated:
-                names = ", ".join(TITLES.get(each, each) for each in can_be_stated)
-                raise InputError(f"{name} cannot be stated: give one of {names}")
+                offered = ", ".join(TITLES.get(each, each) for each in can_be_stated)
+                raise InputError(f"{name} cannot be stated: give one of {offered}")
             stated[title] = Stated(*value)
         return priors.stating(stated)
+
+    def at(self, name: str) -> int:
+        """Return the number of a parameter."""
+        return self.names.index(name)
 
     @property
     def mean(self) -> Doubles:
@@ -195,9 +210,24 @@ class Priors:
         """Standard deviations of the parameters."""
         return np.asarray(np.maximum(np.abs(self.error / self.scale), NEGLIGIBLE / 10))
 
+    def precision(self, without: int | None = None) -> Doubles:
+        """Return the inverse of the parameters' covariance, if nothing is known of one of them or not.
+
+        A printed curve differs smoothly from a straight line.
+        """
+        sigma = self.sigma
+        if without is not None:
+            sigma[without] *= _WITHOUT
+        precision = np.diag(sigma**-2.0)
+        if STEPS[0] in self.names:
+            first = self.at(STEPS[0])
+            steps = slice(first, first + len(STEPS))
+            precision[steps, steps] += roughness()
+        return precision
+
     def number_of(self, name: str, value: float) -> float:
         """Return the number of the sensor for the value of a parameter."""
-        at = SHARED.index(name)
+        at = self.at(name)
         return float(self.reference[at] + self.scale[at] * value)
 
     def is_free(self, at: int) -> bool:
@@ -207,14 +237,14 @@ class Priors:
     def relative_to(self, movement: Movement) -> Priors:
         """Return the same priors for parameters that are relative to a movement."""
         reference, scale, number = self.reference.copy(), self.scale.copy(), self.number.copy()
-        reference[SHARED.index("tilt")] = scale[SHARED.index("tilt")] = movement.sensor.tilt
-        at = SHARED.index("phase")
+        reference[self.at("tilt")] = scale[self.at("tilt")] = movement.sensor.tilt
+        at = self.at("phase")
         reference[at] = movement.phase_offset
         if abs(math.remainder(reference[at] - number[at], math.tau)) > _OTHER_PHASE and not self.stated[at]:
             number[at] = reference[at]  # it was searched for
         number[at] = reference[at] + math.remainder(number[at] - reference[at], math.tau)
         if movement.sensor.pivot is not None:
-            reference[SHARED.index("pivot_z")] = movement.sensor.pivot[2]
+            reference[self.at("pivot_z")] = movement.sensor.pivot[2]
         return replace(self, reference=reference, scale=scale, number=number)
 
     def stating(self, numbers: Mapping[str, Stated]) -> Priors:
@@ -224,23 +254,22 @@ class Priors:
         for name, (value, sigma) in numbers.items():
             if not (math.isfinite(value) and 0 < sigma < math.inf):
                 raise InputError(f"{name} {value} ± {sigma}: give a number and a standard deviation above 0")
-            at = SHARED.index(name)
+            at = self.at(name)
             if not self.is_free(at):
                 loose[at] = _LOOSER * sigma
             number[at], error[at], is_stated[at] = value, sigma, True
         return replace(self, number=number, error=error, loose=loose, stated=tuple(is_stated))
 
-    def start(self, before: LinearResponse | None, precession: Precession | None) -> Doubles:
-        """Return parameters to start with."""
-        start = np.zeros(len(SHARED))
-        start[SHARED.index("gamma")] = self.mean[SHARED.index("gamma")]
+    def start(self, before: Mapping[str, float] | None, precession: Precession | None) -> Doubles:
+        """Return parameters to start with, from those of earlier touches or those of a precession."""
+        known = ("gamma", *WallLight.names)
+        start = np.where([name in known for name in self.names], self.mean, 0.0)
         if before is not None:
-            named = dict(zip(before.names, before.values.tolist(), strict=True))
-            start = np.array([named.get(name, value) for name, value in zip(SHARED, start, strict=True)])
+            start = np.array([before.get(name, value) for name, value in zip(self.names, start, strict=True)])
         elif precession is not None:
             turned = 2 * precession.major_axis
             for name, part in (("oval_x", math.cos(turned)), ("oval_y", math.sin(turned))):
-                start[SHARED.index(name)] = precession.ellipticity * part
+                start[self.at(name)] = precession.ellipticity * part
         return start
 
     def without(self, at: int) -> Priors:
@@ -253,11 +282,11 @@ class Priors:
 def _stated_by(header: Header, precession: Precession | None, priors: Priors) -> dict[str, Stated]:
     """Return the numbers that a recording and a calibration state with standard deviations."""
     stated = {}
-    for name in GLOBALS:
+    for name in set(GLOBALS) & set(priors.names):
         sigma = getattr(header, f"{name}_sigma")
         if sigma and name != "lag":
-            size = abs(priors.scale[SHARED.index(name)])
-            stated[name] = Stated(float(priors.number[SHARED.index(name)]), sigma * size)
+            size = abs(priors.scale[priors.at(name)])
+            stated[name] = Stated(float(priors.number[priors.at(name)]), sigma * size)
     if precession is not None:
         numbers = {
             "tilt": precession.tilt,
@@ -269,3 +298,13 @@ def _stated_by(header: Header, precession: Precession | None, priors: Priors) ->
             if sigma > 0 and math.isfinite(sigma) and math.isfinite(value):
                 stated[name] = Stated(value, sigma)
     return stated
+
+
+def _of_wall(body: tuple[float, float]) -> dict[str, tuple[float, float]]:
+    """Return likely numbers of a wall, and their standard deviations."""
+    likely = (
+        LIKELY
+        | {"scatter": (LIKELY["scatter"][0], _SCATTER)}
+        | {name: (size, BODY_ERROR * size) for name, size in zip(("radius", "rim"), body, strict=True)}
+    )
+    return likely | {name: (step, _STEP) for name, step in zip(STEPS, even_steps(), strict=True)}

@@ -20,24 +20,27 @@ from mirrorskin.engine.calibration.sources import pixel_size_of, read_turn
 from mirrorskin.engine.calibration.touches.heights import (
     MARGIN,
 )
+from mirrorskin.engine.calibration.touches.light import LinearLight
+from mirrorskin.engine.calibration.touches.wall_light import WallLight
 from mirrorskin.engine.calibration.touches.window import (
+    MOVEMENT,
     TURNS,
     Poses,
     Window,
     slopes_of_waves,
 )
+from mirrorskin.engine.calibration.wall import LIKELY
+from mirrorskin.engine.calibration.wall_fit import levels_of
 from mirrorskin.engine.correlation.design_matrix import basis
-from mirrorskin.engine.diagnosis.registration import Registered
+from mirrorskin.engine.diagnosis.registration import Registered, Sight
 from mirrorskin.engine.diagnosis.residual_noise import valid
-from mirrorskin.engine.diagnosis.turn_light import (
-    PixelScale,
-    uneven_terms,
-)
+from mirrorskin.engine.diagnosis.turn_light import uneven_terms
 from mirrorskin.engine.diagnosis.turn_nuisances import (
     LEAST_LIGHT,
+    MAX_MISFIT,
     count_of,
-    follow_model,
     frame_priors,
+    misfit_of,
     offset_prior,
     picture_axes,
     shows_model,
@@ -49,10 +52,12 @@ from mirrorskin.io import (
     Header,
     InputError,
     Source,
+    pixel_axes,
 )
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.rotation.registration import BORDER
+from mirrorskin.kernels.rotation.response import sight_slopes
 
 NOT_FOLLOWED = (
     "the brightness does not follow the turn. Press deeper, on something with relief, and check phases, tilt"
@@ -65,6 +70,7 @@ _LEAST_FRAMES = 4
 _SIDE = 48  # pixels along a side of a window
 _LEAST_SIDE = 16
 _WINDOWS = 2  # of a touch, at most
+_ALL_OVER = 6  # windows of a touch, at most, of a response that differs from place to place
 _AROUND = 2 * MARGIN + BORDER  # pixels next to the inner ones of a window on which they depend
 _LEAST_USABLE = 0.05  # share of the pixels of a window at which the model holds
 _ENDS = 0.1, 99.9  # percentiles of samples that replace references
@@ -72,6 +78,7 @@ _LEAST_NOISE = 0.3  # counts of 8 bits: rounding
 _FLICKER = 4.0  # the light of frames may differ by this times the usual standard deviation, unless stated
 _FLOOR = 1e-12  # variance that keeps covariances of gains and offsets without their means regular
 _LEVELS = 5  # depths at which a surface without a press may be, from 0 to that of the body
+_RIM, _REST_PLANE = 0.06, 0.92  # shares of full light between which scattered rays meet the whole wall
 _LEVEL = 1.5  # tilts: zenith below which the wave of a pixel tells it better than the mean
 _GENTLE = 3.0  # tilts: zenith up to which the amplitude of a wave may be any
 _NEAR_AXIS = 0.5  # tilts: least difference of a zenith from the tilt, where the normal passes the axis
@@ -84,8 +91,17 @@ _STEEPER = 1.2  # factor of slopes: they are approximate
 _SWING = 0.4, 2.5  # range of the amplitude of the zenith, in tilts, from which the half-angle is guessed
 
 
+class Wall(NamedTuple):
+    """A lit wall whose print gets brighter from the rim down, and the lines of sight that are assumed."""
+
+    body: tuple[float, float]  # nominal radius of the body and height of the wall, mm
+    span: Doubles  # (H, W): counts from dark to full light
+    axis: tuple[float, float]  # of the body, mm
+    sight: tuple[float, float]  # see `mirrorskin.io.WallResponse`
+
+
 class SensorModel(NamedTuple):
-    """What is assumed of the sensor before a fit: the parameters of touches are relative to it."""
+    """What is assumed of the sensor before a fit: the parameters of its movement are relative to it."""
 
     gain: Doubles  # (H, W): counts per radian of zenith
     base: Doubles  # (H, W): counts at zenith 0
@@ -93,6 +109,12 @@ class SensorModel(NamedTuple):
     full: float  # full light, counts
     tilt: float
     pivot: tuple[float, float, float] | None  # None: frames are not registered
+    wall: Wall | None = None  # None: the response is linear in the zenith
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters in the order of a fit."""
+        return (*(LinearLight if self.wall is None else WallLight).names, *MOVEMENT)
 
 
 @dataclass(slots=True, eq=False)
@@ -140,11 +162,16 @@ class Touch:
             return "its slopes are all alike, as those of a plate or an edge. Touch something rough or round"
         return NOT_FOLLOWED
 
-    def follows(self) -> bool:
-        """Return whether samples differ from the fit hardly more than from any two waves of a pixel."""
+    @property
+    def misfit(self) -> float:
+        """Variance of the residuals, relative to that of any two waves of a pixel."""
         counts = np.concatenate([window.counts[:, window.usable] for window in self.windows], axis=1)
         left = np.concatenate([window.left for window in self.windows], axis=1)
-        return follow_model(counts, left, self.phase, 1, self.least_noise)
+        return misfit_of(counts, left, self.phase, 1, self.least_noise)
+
+    def follows(self) -> bool:
+        """Return whether samples differ from the fit hardly more than from any two waves of a pixel."""
+        return self.misfit < MAX_MISFIT
 
 
 def with_levels(header: Header, turns: Sequence[Source]) -> Header:
@@ -169,8 +196,10 @@ def with_levels(header: Header, turns: Sequence[Source]) -> Header:
     return replace(header, dark=dark, bright=np.asarray(high) if header.bright is None else header.bright)
 
 
-def model_of(turn: Source, header: Header) -> SensorModel:
-    """Return what the header of a recording, with levels, states of the sensor."""
+def model_of(turn: Source, header: Header, body: tuple[float, float] | None = None) -> SensorModel:
+    """Return what the header of a recording, with levels, states of the sensor, under a wall or without."""
+    if body is not None:
+        return _model_under_wall(turn, header, body)
     shape = turn.shape[1:]
     if header.zenith_gain is None:
         raise InputError(
@@ -186,6 +215,21 @@ def model_of(turn: Source, header: Header) -> SensorModel:
     full = max(float(np.nanmedian(bright - dark)), 1e-9)
     pivot = header.pivot if header.pivot is not None else (0.0, 0.0, 0.0)
     return SensorModel(gain, base, dark, full, header.tilt, None if header.press is None else pivot)
+
+
+def _model_under_wall(turn: Source, header: Header, body: tuple[float, float]) -> SensorModel:
+    """Return the sensor whose wall is printed evenly, seen from the axis."""
+    for name, remedy in (("tilt", "--tilt 2.5deg"), ("press", "--press 1.2mm")):
+        if getattr(header, name) is None:
+            raise InputError(f"{turn.name} has no {name}: give an approximate one, as in {remedy}")
+    dark, bright = levels_of(turn, None)
+    first = math.atan2(*body) / 2  # zenith at which the axis shows the rim
+    gain = (bright - dark) / (math.pi / 4 - first)
+    assert header.tilt is not None
+    wall = Wall(body, bright - dark, (0.0, 0.0), (LIKELY["sight_0"][0], LIKELY["sight_2"][0]))
+    pivot = header.pivot or (0.0, 0.0, 0.0)
+    full = float(np.nanmedian(wall.span))
+    return SensorModel(gain, dark - first * gain, dark, full, header.tilt, pivot, wall)
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,21 +315,53 @@ class TouchReader:
 
     def _read(self, source: Source, sensor: SensorModel) -> Touch:
         registered = None
+        reader = self if sensor.wall is None else self._seen_along(sensor.wall)
         if sensor.pivot is not None:
-            header = replace(source.header, pivot=sensor.pivot, tilt=sensor.tilt)
-            source = registered = Registered(source, self.relief, device=self.device, header=header)
+            header, sight = replace(source.header, pivot=sensor.pivot, tilt=sensor.tilt), None
+            if sensor.wall is not None:
+                header = replace(header, zenith_gain=sensor.gain, zenith_offset=sensor.base)
+                sight = Sight(sensor.wall.sight[0], sensor.wall.axis)
+            source = registered = Registered(
+                source, reader.relief, device=self.device, header=header, sight=sight
+            )
         frames, phase = read_turn(source, _FRAMES)
         if len(phase) < _LEAST_FRAMES:
             raise InputError(f"{source.name} has {len(phase)} frames: at least {_LEAST_FRAMES} are needed")
         noise_gain = 1.0 if registered is None else float(np.nanmedian(registered.noise_gain))
         with naming(self.turn):
-            return self._touch(frames, phase, noise_gain, sensor)
+            return reader._touch(frames, phase, noise_gain, sensor)
+
+    def _seen_along(self, wall: Wall) -> TouchReader:
+        """Return the reader with the press as the pixels of a turn see it, along inclined lines of sight.
+
+        A press is seen in the rest plane, and a turn above it.
+        """
+        axes = pixel_axes(self.middle.shape, pixel_size_of(self.turn))
+        x, y = np.meshgrid(*axes)
+        size_x, size_y = pixel_size_of(self.turn)
+        above = self.relief + (self.turn.header.press or 0.0)
+        away = np.stack([x - wall.axis[0], y - wall.axis[1]])
+        moved_x, moved_y = above * sight_slopes(away, wall.sight)
+        columns, rows = np.meshgrid(*(np.arange(len(axis), dtype=np.float64) for axis in axes))
+        column = (columns + moved_x / size_x).astype(np.float32)
+        row = (rows - moved_y / size_y).astype(np.float32)
+
+        def seen(values: Doubles) -> Doubles:
+            remapped = cv2.remap(
+                values, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan
+            )
+            return np.asarray(remapped, np.float64)
+
+        relief = self.relief if self.earlier is not None else fill_with_nearest(seen(self.relief))
+        return replace(self, middle=seen(self.middle), half=seen(self.half), relief=relief)
 
     def _touch(self, frames: NDArray[Any], phase: Doubles, noise_gain: float, sensor: SensorModel) -> Touch:
         header, shape = self.turn.header, self.turn.shape[1:]
         whole: NDArray[np.bool_] = np.asarray(valid(frames).all(axis=0))
         for level in (sensor.gain, sensor.base, sensor.dark):
             whole &= np.isfinite(level)
+        if sensor.wall is not None:
+            whole &= sensor.wall.span > 0
         if not whole.any():
             raise InputError("no pixel has valid samples in all frames: shorten the exposure")
         counts = frames[:, whole]
@@ -293,7 +369,7 @@ class TouchReader:
         if self.earlier is None:
             part = slice(0, shape[0]), slice(0, shape[1])
             view = self._view(frames, phase, whole, sensor, part)
-            views = [(place, view) for place in _places(view.usable, view.wave)]
+            views = [(place, view) for place in _places(view, sensor.wall is not None)]
         else:
             views = []
             for window in self.earlier.windows:
@@ -347,17 +423,24 @@ class TouchReader:
         counts, middle = frames[:, *part].astype(np.float64), self.middle[part]
         with np.errstate(invalid="ignore", divide="ignore"):
             wave = _wave((counts - sensor.base[part]) / sensor.gain[part], phase, sensor.tilt)
-            tilt_seen, least = _tilt_seen(wave, sensor.tilt), np.min(counts, axis=0) - sensor.dark[part]
-            gentle = (
-                np.isfinite(middle) & (least > LEAST_LIGHT * sensor.full) & (wave[0] < _GENTLE * tilt_seen)
-            )
-            gentlest = _GENTLE if self.has_press else _LEVEL  # skin without contact does not swing
-            shown = whole[part] & (gentle | shows_model(wave, least, tilt_seen, sensor.full, gentlest))
-        usable = shown & (np.abs(wave[0] / tilt_seen - 1) > _NEAR_AXIS)
+            if sensor.wall is None:
+                tilt_seen, least = _tilt_seen(wave, sensor.tilt), np.min(counts, axis=0) - sensor.dark[part]
+                gentle = np.isfinite(middle) & (least > LEAST_LIGHT * sensor.full)
+                gentlest = _GENTLE if self.has_press else _LEVEL  # skin without contact does not swing
+                gentle &= wave[0] < _GENTLE * tilt_seen
+                shown = whole[part] & (gentle | shows_model(wave, least, tilt_seen, sensor.full, gentlest))
+                usable = shown & (np.abs(wave[0] / tilt_seen - 1) > _NEAR_AXIS)
+            else:
+                tilt_seen = sensor.tilt
+                first = math.atan2(*sensor.wall.body) / 2
+                low, high = ((wave[0] + side * tilt_seen - first) / (math.pi / 4 - first) for side in (-1, 1))
+                usable = shown = whole[part] & np.isfinite(middle) & (low > _RIM) & (high < _REST_PLANE)
         if sensor.pivot is not None:
             usable = _without_border(usable)
         steepness = np.where(whole[part], np.tan(np.minimum(wave[0], _STEEPEST)), np.nan)
         smooth = _crosses_no_edge(middle, self.half[part], steepness, pixel_size_of(self.turn))
+        if sensor.wall is not None:
+            smooth &= ~_ridges(middle, self.half[part])
         return _View(part, wave, shown, usable & smooth, smooth, tilt_seen)
 
     def _window(
@@ -368,19 +451,13 @@ class TouchReader:
         rows, columns = (slice(part.start + MARGIN, part.stop - MARGIN) for part in place)
         inner, seen = (rows, columns), view.of((rows, columns))
         usable, shown = view.usable[seen].ravel(), view.shown[view.of(place)]
-        gain, base, dark = (
-            np.where(usable, values[inner].ravel(), 1.0) for values in (sensor.gain, sensor.base, sensor.dark)
-        )
-        x, y = (
-            axis[part] for axis, part in zip(picture_axes(frames.shape[1:]), (columns, rows), strict=True)
-        )
+        response = self._response(sensor, inner, usable)
         press = max(self.turn.header.press or 0.0, _LEAST_PRESS)
         window = Window(
             counts=np.where(usable, frames[:, rows, columns].reshape(len(frames), -1), 0.0).astype(
                 np.float64
             ),
-            scale=PixelScale(gain, base, dark, sensor.full),
-            places=np.stack(uneven_terms(*(axis.ravel() for axis in np.meshgrid(x, y)))),
+            response=response,
             pixel_size=pixel_size_of(self.turn),
             place=inner,
             usable=usable,
@@ -393,6 +470,25 @@ class TouchReader:
             smooth=view.smooth[seen].astype(np.float64),
         )
         return window, np.nan_to_num(view.wave[:, *seen].reshape(3, -1))
+
+    def _response(
+        self, sensor: SensorModel, place: tuple[slice, slice], usable: NDArray[np.bool_]
+    ) -> LinearLight | WallLight:
+        """Return the response of the pixels of a place."""
+
+        def of(values: Doubles) -> Doubles:
+            return np.where(usable, values[place].ravel(), 1.0)
+
+        def spread(x: Doubles, y: Doubles) -> list[Doubles]:
+            return [axis.ravel() for axis in np.meshgrid(x[place[1]], y[place[0]])]
+
+        if sensor.wall is None:
+            places = np.stack(uneven_terms(*spread(*picture_axes(self.middle.shape))))
+            return LinearLight(of(sensor.gain), of(sensor.base), of(sensor.dark), sensor.full, places)
+        assert sensor.pivot is not None
+        assert self.turn.header.press is not None
+        places = np.stack(spread(*pixel_axes(self.middle.shape, pixel_size_of(self.turn))))
+        return WallLight(of(sensor.dark), of(sensor.wall.span), places, self.turn.header.press, sensor.pivot)
 
 
 class _View(NamedTuple):
@@ -431,6 +527,19 @@ def _crosses_no_edge(
         for shift in range(2 * MARGIN):
             np.moveaxis(clear, axis, 0)[...] &= ~steps[shift : shift + len(height)]
     return clear
+
+
+def _ridges(middle: Doubles, half: Doubles) -> NDArray[np.bool_]:
+    """Return the pixels, (H, W), at which slopes are not those of one side of a ridge.
+
+    There, the change of heights from one pixel to the next differs from that to the next but one.
+    """
+    ridges = np.zeros(middle.shape, np.uint8)
+    for axis in (0, 1):
+        height, width = np.moveaxis(middle, axis, 0), np.moveaxis(half, axis, 0)
+        bent = np.abs(np.diff(height, 2, axis=0)) > _EDGE * math.sqrt(2) * width[1:-1]
+        np.moveaxis(ridges, axis, 0)[1:-1] |= bent
+    return np.asarray(cv2.dilate(ridges, np.ones((2 * MARGIN + 3,) * 2, np.uint8)) > 0)
 
 
 def _without_border(usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -493,8 +602,9 @@ def _time_of(header: Header) -> float:
     return (start if start.tzinfo else start.replace(tzinfo=UTC)).timestamp()
 
 
-def _places(usable: NDArray[np.bool_], wave: Doubles) -> Iterator[tuple[slice, slice]]:
-    """Yield the windows in which slopes vary most, without overlap."""
+def _places(view: _View, all_over: bool) -> Iterator[tuple[slice, slice]]:
+    """Yield the windows in which slopes vary most, without overlap; of tiles if they are to be all over."""
+    usable, wave = view.usable, view.wave
     side = min(_SIDE, *usable.shape)
     azimuth = np.arctan2(wave[2], wave[1])
     flat = [np.where(usable, wave[0] * turned, 0.0) for turned in (np.cos(azimuth), np.sin(azimuth))]
@@ -508,7 +618,14 @@ def _places(usable: NDArray[np.bool_], wave: Doubles) -> Iterator[tuple[slice, s
     count = sums(usable.astype(np.float64))
     spread = sum(sums(part**2) - sums(part) ** 2 / np.maximum(count, 1) for part in flat)
     score = np.where(count > _LEAST_USABLE * side**2, spread, -1.0)
-    for _ in range(_WINDOWS):
+    if all_over:
+        starts = (
+            np.linspace(0, length - side, length // side).round().astype(np.intp) for length in usable.shape
+        )
+        tiles = np.zeros(score.shape, np.bool_)
+        tiles[np.ix_(*starts)] = True
+        score[~tiles] = -1.0
+    for _ in range(_ALL_OVER if all_over else _WINDOWS):
         row, column = (int(number) for number in np.unravel_index(int(np.argmax(score)), score.shape))
         if score[row, column] < 0:
             return

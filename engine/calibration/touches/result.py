@@ -9,21 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mirrorskin.engine.calibration.touches.fit import Attempt, Dropped, Fitted, without_prior
+from mirrorskin.engine.calibration.touches.fit import Attempt, Dropped, Fitted, Response, without_prior
+from mirrorskin.engine.calibration.touches.light import UNEVEN_TERMS
 from mirrorskin.engine.calibration.touches.priors import (
     TITLES,
     UNITS,
     UNKNOWN,
     Priors,
 )
-from mirrorskin.engine.calibration.touches.window import (
-    SHARED,
-)
-from mirrorskin.engine.diagnosis.turn_light import (
-    GLOBALS,
-    UNEVEN,
-    uneven_terms,
-)
+from mirrorskin.engine.calibration.touches.wall_light import STEPS, WallLight
+from mirrorskin.engine.calibration.touches.wall_result import wall_response
+from mirrorskin.engine.diagnosis.turn_light import uneven_terms
 from mirrorskin.engine.diagnosis.turn_nuisances import (
     picture_axes,
 )
@@ -47,6 +43,11 @@ _REMEDIES = {
 }
 _OF_PRESSES = ("zenith_gain", "tilt", "pivot_z")
 _ADD_PRESSES = "add a press of the same touch before each turn"
+_REMEDIES |= dict.fromkeys(
+    (name for name in WallLight.names if name not in STEPS),
+    "touch at places all over the field, on slopes from flat to steep",
+)
+_LEARNED = 0.5  # standard error of a number of a wall that is determined, times the usual deviation
 _NEEDED = {"oval": 0.01, "pivot_z": 1.0, "pixel_size": 0.003}  # standard errors of a determined parameter
 
 
@@ -67,7 +68,7 @@ class TouchFit:
 
     Attributes
     ----------
-    response : LinearResponse
+    response : LinearResponse or WallResponse
     precession : Precession
     estimates : tuple of Estimate
         All parameters, in the units of files.
@@ -77,7 +78,7 @@ class TouchFit:
         Sentences: what is not determined, and stated numbers that the touches contradict.
     """
 
-    response: LinearResponse
+    response: Response
     precession: Precession
     estimates: tuple[Estimate, ...]
     frame_gains: Mapping[str, Doubles]
@@ -87,38 +88,12 @@ class TouchFit:
 def result_of(attempt: Attempt) -> TouchFit:
     """Return the parts of a calibration, and notes."""
     fit, priors, sensor, used = attempt.fit, attempt.priors, attempt.movement.sensor, attempt.used
-    before = attempt.before
-    values, errors = dict(zip(SHARED, fit.values.tolist(), strict=True)), np.sqrt(np.diag(fit.covariance))
-    sigma = dict(zip(SHARED, errors.tolist(), strict=True))
-    x, y = np.meshgrid(*picture_axes((sensor.gain.shape[0], sensor.gain.shape[1])))
-    uneven = sum(
-        factor * term
-        for factor, term in zip(fit.values[len(GLOBALS) :][:UNEVEN], uneven_terms(x, y), strict=True)
-    )
-    gain = sensor.gain * (1 + values["zenith_gain"]) * (1 + uneven)
-    offset = sensor.dark + (1 + uneven) * (sensor.base + values["zenith_offset"] - sensor.dark)
-    kept = fit.values.copy()  # others are in the numbers of the calibration from now on
-    kept[[number for number, name in enumerate(SHARED) if _is_absorbed(name)]] = 0.0
-    scale = abs(float(np.nanmedian(sensor.gain)))
-    response = LinearResponse(
-        gain=gain.astype(np.float32),
-        offset=offset.astype(np.float32),
-        gamma=1 + values["gamma"],
-        sigma={
-            "gain": sigma["zenith_gain"] * scale,
-            "offset": sigma["zenith_offset"],
-            "gamma": sigma["gamma"],
-        },
-        names=SHARED,
-        values=kept,
-        information=(fit.matrix + fit.matrix.T) / 2,
-        pull=fit.vector - fit.matrix @ fit.values,
-        touches=len(used) + (0 if before is None else before.touches),
-        time=attempt.memory.time,
-    )
+    values, errors = attempt.values, np.sqrt(np.diag(fit.covariance))
+    sigma = dict(zip(priors.names, errors.tolist(), strict=True))
+    response = _linear_response(attempt, sigma) if sensor.wall is None else wall_response(attempt)
     estimates, notes = [], []
-    for number, name in enumerate(SHARED):
-        if not priors.is_free(number) or name in ("lag", "footprint"):
+    for number, name in enumerate(priors.names):
+        if not priors.is_free(number) or name in ("lag", "footprint", *STEPS):
             continue
         _, error = without_prior(fit, priors, number)
         needed = _needed(name, priors)
@@ -139,8 +114,8 @@ def result_of(attempt: Attempt) -> TouchFit:
     pressed = any(window.is_pressed for touch in used for window in touch.windows)
     notes += _undetermined(estimates, pressed)
     notes += [f"{touch.name} is not used: {touch.reason}" for touch in attempt.read if touch not in used]
-    if pressed and priors.is_free(SHARED.index("pixel_size")):
-        at = SHARED.index("pixel_size"), SHARED.index("zenith_gain")
+    if pressed and priors.is_free(priors.at("pixel_size")) and "zenith_gain" in priors.names:
+        at = priors.at("pixel_size"), priors.at("zenith_gain")
         common = fit.covariance[at] / (errors[at[0]] * errors[at[1]])
         notes.append(
             "pixel size and zenith gain are nearly degenerate: their errors have a correlation of"
@@ -151,25 +126,44 @@ def result_of(attempt: Attempt) -> TouchFit:
     return TouchFit(response, precession, tuple(estimates), gains, tuple(notes))
 
 
-def _is_absorbed(name: str) -> bool:
-    return name.startswith(("zenith", "uneven")) or name in ("tilt", "phase", "pivot_z", "pixel_size")
+def _linear_response(attempt: Attempt, sigma: Mapping[str, float]) -> LinearResponse:
+    """Return the response that is linear in the zenith."""
+    sensor, values = attempt.movement.sensor, attempt.values
+    x, y = np.meshgrid(*picture_axes((sensor.gain.shape[0], sensor.gain.shape[1])))
+    uneven = sum(values[name] * term for name, term in zip(UNEVEN_TERMS, uneven_terms(x, y), strict=True))
+    gain = sensor.gain * (1 + values["zenith_gain"]) * (1 + uneven)
+    offset = sensor.dark + (1 + uneven) * (sensor.base + values["zenith_offset"] - sensor.dark)
+    scale = abs(float(np.nanmedian(sensor.gain)))
+    return LinearResponse(
+        gain=gain.astype(np.float32),
+        offset=offset.astype(np.float32),
+        gamma=1 + values["gamma"],
+        sigma={
+            "gain": sigma["zenith_gain"] * scale,
+            "offset": sigma["zenith_offset"],
+            "gamma": sigma["gamma"],
+        },
+        **attempt.remembered,
+    )
 
 
 def _needed(name: str, priors: Priors) -> float:
     """Return the standard error of a parameter that counts as determined: that of a usual sensor."""
     kind = name.partition("_")[0]
+    if name in WallLight.names and name != "lag":
+        return _LEARNED * float(priors.loose[priors.at(name)])
     if name in _NEEDED or kind in _NEEDED:
         return _NEEDED.get(name, _NEEDED.get(kind, 0.0))
     usual = PROPERTIES["uneven_light_sigma" if kind == "uneven" else f"{name}_sigma"].default
     assert usual is not None
     return float(usual) * (
-        priors.loose[SHARED.index(name)] / UNKNOWN["zenith_offset"] if name == "zenith_offset" else 1.0
+        priors.loose[priors.at(name)] / UNKNOWN["zenith_offset"] if name == "zenith_offset" else 1.0
     )
 
 
 def _contradiction(dropped: Dropped, priors: Priors, fit: Fitted) -> str:
     """Return the sentence about a stated number that the touches contradict."""
-    name = SHARED[dropped.at]
+    name = priors.names[dropped.at]
     title, unit, factor = TITLES.get(name, name).replace("_", " "), UNITS.get(name, ""), 1.0
     if unit == "rad":
         unit, factor = "deg", math.degrees(1)
@@ -213,7 +207,7 @@ def _precession(attempt: Attempt, values: Mapping[str, float], sigma: Mapping[st
     size = float(np.hypot(*oval))
     along = oval / size if size > 0 else np.array([1.0, 0.0])
     across = np.array([-along[1], along[0]])
-    at = [SHARED.index("oval_x"), SHARED.index("oval_y")]
+    at = [priors.at("oval_x"), priors.at("oval_y")]
     covariance = fit.covariance[np.ix_(at, at)]
     axis = math.sqrt(across @ covariance @ across) / (2 * size) if size > 0 else math.inf
     x, y, z = (math.nan,) * 3 if sensor.pivot is None else sensor.pivot

@@ -29,31 +29,19 @@ from mirrorskin.engine.calibration.touches.heights import (
     local_matrix,
     slope_matrix,
 )
-from mirrorskin.engine.diagnosis.footprint import LEAST_BLUR, PIXEL
-from mirrorskin.engine.diagnosis.turn_light import (
-    GLOBALS,
-    UNEVEN,
-    PixelScale,
-    SlopeAngles,
-    Sums,
-    light_of,
-)
+from mirrorskin.engine.calibration.touches.light import LinearLight, Seen
+from mirrorskin.engine.calibration.touches.wall_light import WallLight
+from mirrorskin.engine.diagnosis.turn_light import Sums
 from mirrorskin.engine.press.intervals import IntervalScatter, interval_evidence
 from mirrorskin.kernels.array_types import Doubles
 
-SHARED = (
-    *GLOBALS,
-    *(f"uneven_{term}" for term in ("x", "y", "xx", "xy", "yy")),
-    *("oval_x", "oval_y", "footprint", "pivot_z", "pixel_size"),
-)
-"""Names of the sensor's parameters in the order of a fit."""
-
-FOOTPRINT = PIXEL + LEAST_BLUR**2
-"""Assumed variance of a pixel's footprint, square pixels; the parameter is the relative error of it."""
+MOVEMENT = ("tilt", "phase", "oval_x", "oval_y", "footprint", "pivot_z", "pixel_size")
+"""Names of the parameters of the movement and of pixels; in a fit, those of the response come before."""
 
 _ROUGH = 0.1  # share of the second difference of slopes by which a slope may differ from that of the heights
 _SMOOTHING = 1.0  # pixels: of slopes, before their changes from pixel to pixel are computed
 _OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
+_UNDER_WALL = 2.0  # the same of pixels under a wall, where a few of them tell much of one parameter or other
 _NEAR = 9  # pixels around which splines must follow the surface
 _LEAST_NEAR = 0.1  # share of these pixels that counts, at least
 _MOST = 0.75  # least share of pixels that splines follow
@@ -86,7 +74,7 @@ class _Moves(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """Information of a window on the nuisances: gains and offsets of the frames, and `SHARED`."""
+    """Information of a window on the nuisances: gains and offsets of the frames, and the parameters."""
 
     own: Doubles  # (K, K)
     pull: Doubles  # (K,)
@@ -98,8 +86,7 @@ class Window:
     """A square window of a touch: samples of its inner pixels, and the heights of its S x S pixels."""
 
     counts: Doubles  # (T, n), of inner pixels
-    scale: PixelScale  # of inner pixels
-    places: Doubles  # (5, n): terms of uneven light
+    response: LinearLight | WallLight  # of inner pixels
     pixel_size: tuple[float, float]  # mm
     place: tuple[slice, slice]  # rows and columns of inner pixels in the picture
     usable: NDArray[np.bool_]  # (n,)
@@ -186,54 +173,59 @@ class Window:
         height[known], weight[known] = found.height, found.weight / copies
         self.evidence = height, weight
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters in the order of a fit."""
+        return (*self.response.names, *MOVEMENT)
+
     def look(self, poses: Poses, gains: Doubles, offsets: Doubles, values: Doubles) -> Sums:
         """Compute residuals, and return the normal equations of usable pixels and nuisances.
 
         A pixel has two slopes, and a height, which determines where the body's movement puts its point.
         """
-        named, chosen = dict(zip(SHARED, values.tolist(), strict=True)), self.usable
+        named, chosen = dict(zip(self.names, values.tolist(), strict=True)), self.usable
         inner = self.size - 2 * MARGIN
         maps = (slope_matrix(self.size, self.pixel_size) @ self.z).reshape(2, inner, inner)
         maps *= 1 - named["pixel_size"]
         slopes = maps.reshape(2, -1)[:, chosen]
-        by_column, by_row = self._changes(1 - named["pixel_size"])
+        changes = self._changes(1 - named["pixel_size"])
         turned = poses.phase + named["phase"]
         double = np.cos(2 * turned), np.sin(2 * turned)
         larger = (1 + named["tilt"]) * (1 + named["oval_x"] * double[0] + named["oval_y"] * double[1])
         ahead = named["phase"] + named["oval_y"] * double[0] - named["oval_x"] * double[1]
-        tilt, phase = poses.tilt * larger, poses.phase + ahead
-        moves = self._moves(poses, slopes, by_column, by_row)
-        seen = slopes[:, np.newaxis] + (larger - 1) * moves.by_tilt + ahead * moves.by_phase
+        moves = self._moves(poses, slopes, *changes)
         above = (self.relief - self.heights)[chosen]
-        seen = seen + (named["pivot_z"] + above) * moves.by_pivot
-        angles = SlopeAngles.of(seen, phase, tilt, (by_column, by_row))
-        bend = FOOTPRINT * angles.bend
-        levels = self.scale
-        scale = PixelScale(levels.gain[chosen], levels.base[chosen], levels.dark[chosen], levels.full)
-        light = light_of(
-            angles, (1 + named["footprint"]) * bend, scale, gains[:, np.newaxis], offsets[:, np.newaxis],
-            values[: len(GLOBALS) + UNEVEN], self.places[:, chosen],
-        )  # fmt: skip
-        self.left = self.counts[:, chosen] - scale.dark - light.light
-        by_slope = light.by_angle * angles.by_slopes
-        tilt_row = light.by_globals[GLOBALS.index("tilt")]
-        phase_row = light.by_globals[GLOBALS.index("phase")]
-        tilt_row *= poses.tilt
-        tilt_row += np.sum(by_slope * moves.by_tilt, axis=0)
-        phase_row += np.sum(by_slope * moves.by_phase, axis=0)
-        by_pivot = np.sum(by_slope * moves.by_pivot, axis=0)
-        rest = np.concatenate([
-            light.by_globals,
-            [
-                tilt_row * double[0] - phase_row * double[1],
-                tilt_row * double[1] + phase_row * double[0],
-                light.by_angle * bend,
-                by_pivot,
-                -np.sum(by_slope * slopes[:, np.newaxis], axis=0),
-            ],
-        ])  # fmt: skip
+        seen = Seen(
+            slopes=slopes[:, np.newaxis]
+            + (larger - 1) * moves.by_tilt
+            + ahead * moves.by_phase
+            + (named["pivot_z"] + above) * moves.by_pivot,
+            phase=poses.phase + ahead,
+            tilt=poses.tilt * larger,
+            changes=changes,
+            heights=self.heights[chosen],
+            pivot_z=named["pivot_z"],
+            gains=gains[:, np.newaxis],
+            offsets=offsets[:, np.newaxis],
+        )
+        light = self.response.of(seen, chosen, named)
+        self.left = self.counts[:, chosen] - light.counts
+        tilt_row = poses.tilt * light.by_tilt + np.sum(light.by_slopes * moves.by_tilt, axis=0)
+        phase_row = light.by_phase + np.sum(light.by_slopes * moves.by_phase, axis=0)
+        by_pivot = np.sum(light.by_slopes * moves.by_pivot, axis=0)
+        of_movement = [
+            tilt_row,
+            phase_row,
+            tilt_row * double[0] - phase_row * double[1],
+            tilt_row * double[1] + phase_row * double[0],
+            light.by_footprint,
+            by_pivot,
+            -np.sum(light.by_slopes * slopes[:, np.newaxis], axis=0),
+        ]
         self.rough = _second_differences(maps)[chosen]
-        return Sums.of(self.left, np.concatenate([by_slope, [-by_pivot]]), light.by_gain, rest)
+        rest = np.concatenate([light.by_response, of_movement])
+        by_unknowns = np.concatenate([light.by_slopes, [-by_pivot]])
+        return Sums.of(self.left, by_unknowns, light.by_gains, rest)
 
     def _changes(self, scale: float) -> tuple[Doubles, Doubles]:
         """Return changes of slopes, times a factor, from column to column and row to row, (2, m)."""
@@ -290,7 +282,8 @@ class Window:
     def exclude_outliers(self) -> None:
         """Exclude pixels that do not follow the model."""
         misfit = np.sqrt(np.mean(self.left**2, axis=0))
-        self.usable[self.usable] = misfit < _OUTLIER_RATIO * float(np.median(misfit))
+        ratio = _OUTLIER_RATIO if isinstance(self.response, LinearLight) else _UNDER_WALL
+        self.usable[self.usable] = misfit < ratio * float(np.median(misfit))
 
     def eliminate(self, sums: Sums, noise: float, chooses: bool) -> Eliminated:
         """Return the information on the nuisances that remains after the heights are eliminated.
@@ -394,7 +387,7 @@ def _without_level(
     Heights only matter where the body's movement puts their points: a constant does what a lower pivot does,
     of which nothing remains.
     """
-    at = SHARED.index("pivot_z") - len(SHARED)
+    at = MOVEMENT.index("pivot_z") - len(MOVEMENT)
     by_level, weight = -own[:, at], own[at, at] + sigma**-2
     push = -pull[at] - away * sigma**-2
     own, pull = own - np.outer(by_level, by_level) / weight, pull - by_level * push / weight

@@ -9,6 +9,8 @@ from commands import done, refused
 from stacks import record
 
 from mirrorskin import io
+from mirrorskin.evaluation.calibration.scenes import press_for
+from mirrorskin.evaluation.calibration.touches import FURTHER, LAB, camera_of, references_of, touch
 from mirrorskin.io.files.touch_file import save_touch
 from mirrorskin.twin import Axial, Camera, Twin, Vertical
 
@@ -93,7 +95,19 @@ def test_show_prints_the_response():
         ("press.h5 press.h5", "another press"),
         ("press.h5 turn.h5 --stated tilt=2deg", "NAME=VALUE+-SIGMA"),
         ("press.h5 turn.h5 --stated weight=2+-1", "cannot be stated"),
+        ("press.h5 turn.h5 --body-radius 17.5mm", "give both"),
     ],
 )
 def test_what_cannot_be_used_is_refused(arguments, message):
     refused(message, f"calibrate self {arguments} -o cal.h5")
+
+
+def test_wall_is_found_without_a_ball():
+    taken = references_of(LAB)
+    press, turn = touch(LAB, FURTHER, press_for(FURTHER), 1, taken)
+    record(press, "press.h5")
+    record(turn, "turn.h5")
+    io.update_calibration("cal.h5", taken, camera_of(LAB))
+    said = done("calibrate self press.h5 turn.h5 -o cal.h5 --body-radius 17.5mm --body-height 40mm").out
+    assert "radius 17." in said
+    assert io.open_calibration("cal.h5").zenith.touches == 1

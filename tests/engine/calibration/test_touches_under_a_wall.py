@@ -1,0 +1,138 @@
+"""Calibration of a lit wall from touches of unknown objects."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mirrorskin import io
+from mirrorskin.engine.calibration import from_touches
+from mirrorskin.evaluation.base.sources import Frames
+from mirrorskin.evaluation.calibration import scorer
+from mirrorskin.evaluation.calibration.scenes import press_for
+from mirrorskin.evaluation.calibration.touches import (
+    FURTHER,
+    LAB,
+    REACH,
+    by_balls,
+    camera_of,
+    height_error,
+    references_of,
+    touch,
+)
+
+BODY = LAB.body.radius, LAB.body.height
+TRUTH = {"pivot_z": LAB.pivot[2], "radius": BODY[0], "rim": BODY[1], "tilt": LAB.tilt, "phase_offset": 0.0}
+
+
+@pytest.fixture(scope="module")
+def taken():
+    """References of the sensor."""
+    return references_of(LAB)
+
+
+@pytest.fixture(scope="module")
+def touches(taken):
+    """Touches of waves."""
+    things = [scorer.waves(0.22, 2.4, 0.35, REACH), scorer.waves(0.18, 3.1, 1.1, REACH)]
+    return [touch(LAB, thing, press_for(thing), 30 + number, taken) for number, thing in enumerate(things)]
+
+
+def rewound(touches):
+    """Return touches from the start."""
+    for press, turn in touches:
+        press.rewind()
+        turn.rewind()
+    return touches
+
+
+def stating(turn, **properties):
+    """Return a turn whose recording states other properties."""
+    return Frames(turn.frames, replace(turn.header, **properties), turn.name, **turn.series)
+
+
+@pytest.fixture(scope="module")
+def fit(touches):
+    """What two touches tell."""
+    return from_touches(rewound(touches), body=(16.9, 41.0))
+
+
+def calibration_of(fit, taken):
+    """Return the calibration with what touches tell."""
+    return io.Calibration(camera_of(LAB), taken, zenith=fit.response, precession=fit.precession)
+
+
+@pytest.mark.parametrize("name", TRUTH)
+def test_errors_are_as_large_as_their_standard_errors(fit, name):
+    estimate = next(each for each in fit.estimates if each.name == name)
+    assert abs(estimate.value - TRUTH[name]) < 4 * estimate.sigma
+
+
+def test_radius_is_better_known_than_before(fit):
+    estimate = next(each for each in fit.estimates if each.name == "radius")
+    assert estimate.sigma < 0.04 * BODY[0]
+
+
+def test_heights_are_those_of_a_calibrated_sensor(fit, taken):
+    further = LAB.turned(FURTHER, press_for(FURTHER), 20)
+    assert height_error(LAB, further, calibration_of(fit, taken)) < 12.0  # µm; 84 without a calibration
+
+
+@pytest.mark.slow
+def test_wrong_half_angle_and_pivot_in_the_recording_are_corrected(touches):
+    wrong = []
+    for press, turn in rewound(touches):
+        x, y, z = turn.header.pivot
+        wrong.append((press, stating(turn, tilt=1.04 * LAB.tilt, pivot=(x, y, z + 0.1))))
+    estimates = {each.name: each for each in from_touches(wrong, body=BODY).estimates}
+    assert abs(estimates["tilt"].value - LAB.tilt) < 4 * estimates["tilt"].sigma < 0.1 * LAB.tilt
+
+
+def test_touches_are_added_to_a_calibration(fit, taken, touches):
+    more = from_touches(rewound(touches)[:1], calibration=calibration_of(fit, taken))
+    assert more.response.touches == 3
+
+
+@pytest.mark.slow
+def test_touches_are_added_to_a_calibration_with_balls(taken, touches):
+    balls = by_balls(LAB, taken)
+    more = from_touches(rewound(touches)[:1], calibration=balls)
+    errors, before = more.response.standard_errors(), balls.zenith.standard_errors()
+    assert errors["radius"] <= 1.1 * before["radius"]
+    assert abs(more.response.radius - BODY[0]) < 0.5
+
+
+def test_response_survives_a_file(fit, taken, tmp_path):
+    io.save_calibration(calibration_of(fit, taken), tmp_path / "cal.h5")
+    found = io.open_calibration(tmp_path / "cal.h5").zenith
+    np.testing.assert_array_equal(found.information, fit.response.information)
+
+
+def test_body_must_have_a_size(touches):
+    with pytest.raises(io.InputError, match="must be above 0"):
+        from_touches(touches, body=(0.0, 40.0))
+
+
+def test_wall_needs_references(touches):
+    press, turn = rewound(touches)[0]
+    with pytest.raises(io.InputError, match="there are no dark and bright references"):
+        from_touches([(press, stating(turn, dark=None, bright=None))], body=BODY)
+
+
+def test_wall_needs_a_press_before_each_turn(touches):
+    _, turn = rewound(touches)[0]
+    with pytest.raises(io.InputError, match="follows no press"):
+        from_touches([(None, turn)], body=BODY)
+
+
+def test_wall_needs_the_depth(touches):
+    press, turn = rewound(touches)[0]
+    with pytest.raises(io.InputError, match="has no press"):
+        from_touches([(press, stating(turn, press=None))], body=BODY)
+
+
+@pytest.mark.slow
+def test_stated_half_angle_that_touches_contradict_is_reported(touches):
+    fit = from_touches(rewound(touches), body=BODY, stated={"tilt": (1.3 * LAB.tilt, math.radians(0.02))})
+    assert any(note.startswith("tilt: the touches say") for note in fit.notes)
