@@ -419,7 +419,8 @@ def _contradiction_of(
 def _follow(touches: Sequence[Touch]) -> NDArray[np.bool_]:
     """Return which touches follow the model hardly less than the others."""
     misfits = np.array([touch.misfit for touch in touches])
-    return np.asarray(misfits <= _FOLLOWED * max(1.0, float(np.median(misfits))))
+    usual = float(np.median(misfits)) if touches else 1.0
+    return np.asarray(misfits <= _FOLLOWED * max(1.0, usual))
 
 
 def _trust(information: Doubles, priors: Priors) -> float:
