@@ -285,7 +285,7 @@ class Array:
         """Return a `pyopencl.array.Array` in the same memory, on the device's queue."""
         from pyopencl.array import Array as OpenCLArray
 
-        buffer, self._is_exported = self.buffer, True
+        buffer, self._is_exported, self._is_in_place = self.buffer, True, False
         after = [] if self.latest is None else [self.latest]
         return OpenCLArray(self.device.queue, self.shape, self.dtype, data=buffer, events=after)
 
@@ -315,21 +315,17 @@ class Array:
 
     def _let_host_write(self, whole: bool) -> None:
         """Map shared memory for writing by the host: all of it, or a part outside the device's writes."""
-        if not whole or self._needs_no_map:
+        if not whole or self._is_in_place:
             self._map()
         elif self._mapped is None and self._buffer is not None:
             if self.last_use is not None:
                 self.device.profile.wait(self.name, self.last_use)
             self._buffer = None  # a new buffer contains the host's writes without a command on the queue
 
-    @property
-    def _needs_no_map(self) -> bool:
-        return self._is_in_place and not self._is_exported
-
     def _map(self) -> None:
         """Make the device's writes to shared memory visible to the host."""
         if self._mapped is None and self._buffer is not None:
-            if self._needs_no_map:
+            if self._is_in_place:
                 if self.latest is not None:
                     self.device.profile.wait(self.name, self.latest)
                 return
@@ -379,7 +375,7 @@ class Array:
         out = _empty(shape, self.dtype)
         if out.nbytes:
             began = time.perf_counter()
-            if self._needs_no_map:
+            if self._is_in_place:
                 for event in after:
                     event.wait()
                 np.copyto(out, self._host[rows])

@@ -1,6 +1,6 @@
 """Targets of a calibration from touches of unknown objects, next to that with five presses of a ball.
 
-``python evaluation/calibration/touches.py [--cache DIR] [--only ball,touches,prior]`` prints what was
+``python evaluation/calibration/touches.py [--cache DIR] [--only ball,touches,sensors,prior]`` prints what was
 measured. The sensor is the twin with a wall, uneven lamps and perspective; the further touch is of an object
 that no calibration has seen. The least possible errors are those of ``fisher.py``.
 """
@@ -28,6 +28,7 @@ LAB = Lab(shape=(96, 96), pixel_size=0.1, phase=PHASE, distance=150.0)
 REACH, APART = 6.0, 3.0  # mm: of objects, and between the calibration's balls
 FURTHER = scorer.waves(0.18, 2.1, 0.8, REACH)
 BOUND = 1.2  # times the errors with a ball
+SENSORS, THINGS = 6, 3  # with which errors are compared with standard errors, and touches of each
 WRONG = math.radians(2.5), math.radians(0.1)  # a stated half-angle, and its standard deviation
 TRUE = math.radians(3.0)
 
@@ -119,6 +120,8 @@ def rows(lab: Lab, parts: Sequence[str]) -> Iterator[tuple[str, str, str]]:
     stated = {"tilt": (lab.tilt, math.radians(0.2))}
     if "touches" in parts:
         yield from _rows_of_touches(lab, plain, further, with_ball, stated)
+    if "sensors" in parts:
+        yield from _rows_of_sensors(lab)
     if "prior" in parts:
         try:
             notes = from_touches(replace(lab, tilt=TRUE), taken, 3, {"tilt": WRONG}).notes
@@ -145,11 +148,43 @@ def _rows_of_touches(
         yield f"{each.name}, {each.unit}", "", f"{each.value:.5g} ± {each.sigma:.2g}"
 
 
+def _rows_of_sensors(lab: Lab) -> Iterator[tuple[str, str, str]]:
+    """Yield how errors compare with standard errors, and errors of heights, over sensors with other noise."""
+    truth = {"radius": lab.body.radius, "rim": lab.body.height, "tilt": lab.tilt, "pivot_z": lab.pivot[2]}
+    truth |= dict.fromkeys(("axis_x", "axis_y", "phase_offset", "oval_x", "oval_y"), 0.0)
+    deviations, errors = [], []
+    for seed in range(SENSORS):
+        sensor, random = replace(lab, seed=100 + seed), np.random.default_rng(seed)
+        taken = references_of(sensor)
+        things = [
+            scorer.waves(random.uniform(0.12, 0.24), random.uniform(1.9, 3.2), random.uniform(0, 1.5), REACH)
+            for _ in range(THINGS - 1)
+        ]
+        steepness, aside = math.radians(random.uniform(20, 30)), random.uniform(-0.5, 0.5)
+        things.append(scorer.cone(steepness, 4.0, (aside, 0.2)))
+        touches = [
+            touch(sensor, thing, press_for(thing), 30 + number, taken) for number, thing in enumerate(things)
+        ]
+        fit = engine.calibration.from_touches(touches, body=(lab.body.radius, lab.body.height))
+        found = {each.name: each for each in fit.estimates}
+        deviations.append([(found[name].value - value) / found[name].sigma for name, value in truth.items()])
+        assert isinstance(fit.response, io.WallResponse)
+        learned = io.Calibration(camera_of(sensor), taken, zenith=fit.response, precession=fit.precession)
+        further = sensor.turned(FURTHER, press_for(FURTHER), 20)
+        errors.append(height_error(sensor, further, learned))
+    what = f"heights with {THINGS} touches, {SENSORS} sensors"
+    yield what, "", f"{min(errors):.2g} to {max(errors):.2g} µm"
+    for name, each in zip(truth, np.sqrt(np.mean(np.square(deviations), axis=0)), strict=True):
+        yield f"RMS deviation of {name}, standard errors", "", f"{each:.2g}"
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description="Targets of a calibration from touches.")
     parser.add_argument("--cache", type=Path, help="folder that keeps light")
-    parser.add_argument("--only", default="ball,touches,prior", help="parts, with commas between them")
+    parser.add_argument(
+        "--only", default="ball,touches,sensors,prior", help="parts, with commas between them"
+    )
     options = parser.parse_args()
     if options.cache is not None:
         options.cache.mkdir(exist_ok=True)

@@ -29,7 +29,7 @@ from mirrorskin.engine.calibration.touches.reading import (
     with_levels,
 )
 from mirrorskin.engine.calibration.touches.result import TouchFit, result_of
-from mirrorskin.engine.calibration.touches.wall_result import earlier_of
+from mirrorskin.engine.calibration.touches.wall_result import earlier_of, scatter_of
 from mirrorskin.io import (
     Calibrated,
     Calibration,
@@ -162,14 +162,15 @@ def _sensor(
     sensor = model_of(turns[0], header, body)
     if sensor.wall is not None and calibration is not None and calibration.zenith is not None:
         known = calibration.zenith
-        sensor = sensor._replace(wall=sensor.wall._replace(axis=known.axis, sight=known.sight))
+        wall = sensor.wall._replace(axis=known.axis, sight=known.sight, scatter=scatter_of(known))
+        sensor = sensor._replace(wall=wall)
     return sensor, header
 
 
 def _start(
     calibration: Calibration | None, body: tuple[float, float] | None
 ) -> tuple[Earlier | None, tuple[float, float] | None]:
-    """Return what is known of the response, and radius and height of a wall."""
+    """Return what earlier touches have told, and radius and height of a wall."""
     if body is not None and not (min(body) > 0 and max(body) < math.inf):
         raise InputError(f"a body of {body[0]} mm radius and {body[1]} mm height: both must be above 0")
     if calibration is None:

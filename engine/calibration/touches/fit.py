@@ -350,19 +350,19 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memo
     last, before, is_settled, following = math.inf, values, False, np.ones(len(touches), np.bool_)
     for number in range(_ITERATIONS):
         early = number < roughly
-        informations, pushes, steps = [], [], []
-        for touch, weight, follows in zip(touches, memory.weights, following, strict=False):
-            information, push, step = _eliminate(
-                touch, values, number in excluding, exact and early, is_cold and early
-            )
+        excludes, uses_intervals, chooses = number in excluding, exact and early, is_cold and early
+        found = [_eliminate(touch, values, excludes, uses_intervals, chooses) for touch in touches]
+        follow = _follow(touches)
+        following = following & follow if number > excluding[-1] else follow
+        informations, pushes = [], []
+        for touch, weight, follows, (information, push, _) in zip(
+            touches, memory.weights, following, found, strict=False
+        ):
             if max(window.relief_shown for window in touch.windows) < _LEAST_RELIEF:
                 _forget_pivot(information, push, priors)
             weight = weight * (follows if under_wall else _trust(information, priors))
             informations.append(weight * information)
             pushes.append(weight * push)
-            steps.append(step)
-        follow = _follow(touches)
-        following = following & follow if number > excluding[-1] else follow
         pulls = [each @ values + push for each, push in zip(informations, pushes, strict=True)]
         matrix = memory.matrix + np.sum(informations, axis=0)
         vector = memory.vector + np.sum(pulls, axis=0)
@@ -378,7 +378,7 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memo
             continue
         is_level = misfit > _BETTER * last if number > roughly else not is_cold
         last, before = misfit, values
-        for touch, of_touch in zip(touches, steps, strict=True):
+        for touch, (_, _, of_touch) in zip(touches, found, strict=True):
             touch.keep()
             of_touch(change)
         values = values + change

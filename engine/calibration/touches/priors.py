@@ -14,6 +14,7 @@ from mirrorskin.engine.calibration.touches.reading import (
     SensorModel,
     Touch,
     TouchReader,
+    Wall,
 )
 from mirrorskin.engine.calibration.touches.wall_light import STEPS, WallLight, even_steps, roughness
 from mirrorskin.engine.calibration.touches.window import TURNS
@@ -40,7 +41,6 @@ UNKNOWN = {
     "footprint": 2.0,
     "pivot_z": 10.0,
 }  # standard deviations of parameters about which nothing is stated; counts of 8 bits, radians, mm
-_SCATTER = math.radians(0.5)  # of a usual sheet: touches near the rim, which show it, are left out
 _STEP = 1.0  # share of full light: standard deviation of a step of the printed curve
 _LOOSER = 10.0  # of the standard deviation of a number that is estimated only if it is stated
 _KNOWN_PIVOT = 1.0  # mm: standard deviation of a recorded pivot
@@ -160,7 +160,7 @@ class Priors:
         numbers = {"footprint": (FOOTPRINT, FOOTPRINT), "pixel_size": (size, -size)}
         likely: dict[str, tuple[float, float]] = {}
         if sensor.wall is not None:
-            likely = _of_wall(sensor.wall.body)
+            likely = _of_wall(sensor.wall)
         else:
             gain, base = float(np.nanmedian(sensor.gain)), float(np.nanmedian(sensor.base))
             numbers |= {"gamma": (1.0, 1.0), "zenith_gain": (gain, gain), "zenith_offset": (base, 1.0)}
@@ -300,11 +300,9 @@ def _stated_by(header: Header, precession: Precession | None, priors: Priors) ->
     return stated
 
 
-def _of_wall(body: tuple[float, float]) -> dict[str, tuple[float, float]]:
+def _of_wall(wall: Wall) -> dict[str, tuple[float, float]]:
     """Return likely numbers of a wall, and their standard deviations."""
-    likely = (
-        LIKELY
-        | {"scatter": (LIKELY["scatter"][0], _SCATTER)}
-        | {name: (size, BODY_ERROR * size) for name, size in zip(("radius", "rim"), body, strict=True)}
-    )
+    likely = LIKELY | {"scatter": (wall.scatter, NEGLIGIBLE)}
+    for name, size in zip(("radius", "rim"), wall.body, strict=True):
+        likely[name] = size, BODY_ERROR * size
     return likely | {name: (step, _STEP) for name, step in zip(STEPS, even_steps(), strict=True)}

@@ -78,6 +78,7 @@ _LEAST_NOISE = 0.3  # counts of 8 bits: rounding
 _FLICKER = 4.0  # the light of frames may differ by this times the usual standard deviation, unless stated
 _FLOOR = 1e-12  # variance that keeps covariances of gains and offsets without their means regular
 _LEVELS = 5  # depths at which a surface without a press may be, from 0 to that of the body
+_SMOOTH = 0.2  # least share of the pixels of a window that show the wall, and are next to no ridge or border
 _RIM, _REST_PLANE = 0.06, 0.92  # shares of full light between which scattered rays meet the whole wall
 _LEVEL = 1.5  # tilts: zenith below which the wave of a pixel tells it better than the mean
 _GENTLE = 3.0  # tilts: zenith up to which the amplitude of a wave may be any
@@ -98,6 +99,7 @@ class Wall(NamedTuple):
     span: Doubles  # (H, W): counts from dark to full light
     axis: tuple[float, float]  # of the body, mm
     sight: tuple[float, float]  # see `mirrorskin.io.WallResponse`
+    scatter: float  # half-angle of the sheet's scatter, radians
 
 
 class SensorModel(NamedTuple):
@@ -226,7 +228,8 @@ def _model_under_wall(turn: Source, header: Header, body: tuple[float, float]) -
     first = math.atan2(*body) / 2  # zenith at which the axis shows the rim
     gain = (bright - dark) / (math.pi / 4 - first)
     assert header.tilt is not None
-    wall = Wall(body, bright - dark, (0.0, 0.0), (LIKELY["sight_0"][0], LIKELY["sight_2"][0]))
+    sight = LIKELY["sight_0"][0], LIKELY["sight_2"][0]
+    wall = Wall(body, bright - dark, (0.0, 0.0), sight, LIKELY["scatter"][0])
     pivot = header.pivot or (0.0, 0.0, 0.0)
     full = float(np.nanmedian(wall.span))
     return SensorModel(gain, dark - first * gain, dark, full, header.tilt, pivot, wall)
@@ -391,7 +394,9 @@ class TouchReader:
                 window.spacing = self.earlier.windows[number].spacing
                 window.relief_shown = self.earlier.windows[number].relief_shown
                 window.usable &= self.earlier.windows[number].usable
-            if not window.usable.any():
+            shown = np.count_nonzero(view.shown[view.of(window.place)])
+            least = 0.0 if sensor.wall is None else _SMOOTH * shown  # what is left among ridges misleads
+            if np.count_nonzero(window.usable) <= least:
                 continue
             windows.append(window)
             slopes.append(slopes_of_waves(wave[:, window.usable]))

@@ -69,7 +69,7 @@ def earlier_of(wall: WallResponse) -> Earlier:
     numbers = {
         "radius": wall.radius,
         "rim": wall.rim,
-        "scatter": wall.scatter / model.SCATTER_MARGIN,
+        "scatter": scatter_of(wall),
         **{f"axis_{axis}": value for axis, value in zip("xy", wall.axis, strict=True)},
         **{f"sight_{power}": value for power, value in zip("02", wall.sight, strict=True)},
         **{f"lamp_{axis}": value for axis, value in zip("xy", wall.lamps, strict=True)},
@@ -78,3 +78,8 @@ def earlier_of(wall: WallResponse) -> Earlier:
     }
     values = np.array([numbers[name] for name in _OF_WALL], np.float64)
     return Earlier(_OF_WALL, values, (known + known.T) / 2, np.zeros(len(_OF_WALL)), 0, math.nan)
+
+
+def scatter_of(wall: WallResponse) -> float:
+    """Return the scatter that was fitted, radians."""
+    return wall.scatter / model.SCATTER_MARGIN
