@@ -57,14 +57,19 @@ class PerPixel:
 
 
 class Appended:
-    """An argument of a kernel with numbers for each frame so far, (n, width), float32.
+    """Numbers for each frame so far, (n, width), float32 if they are an argument of a kernel.
 
     A launch copies only those to the device that were appended since the last one.
     """
 
-    def __init__(self, width: int) -> None:
-        self._values, self._count = np.zeros((_FIRST_ROWS, width), np.float32), 0
+    def __init__(self, width: int, dtype: DTypeLike = np.float32) -> None:
+        self._values, self._count = np.zeros((_FIRST_ROWS, width), dtype), 0
         self._copies: dict[Device, tuple[Array, int]] = {}  # and the number of rows that were copied
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """The numbers, which later ones do not change."""
+        return self._values[: self._count]
 
     def append(self, rows: ArrayLike) -> None:
         """Append the numbers of the next frames, (n, width)."""
@@ -76,7 +81,7 @@ class Appended:
 
     def clear(self) -> None:
         """Remove all numbers."""
-        self._count = 0
+        self._values, self._count = np.zeros_like(self._values), 0
         self._copies = {device: (array, 0) for device, (array, _) in self._copies.items()}
 
     def on(self, name: str, device: Device) -> Array:

@@ -147,8 +147,7 @@ def check_zenith(
     check_ball_radius(ball)
     if pattern not in PATTERNS:
         raise InputError(f"pattern {pattern!r} is unknown: take {' or '.join(PATTERNS)}")
-    if not (min(body) > 0 and max(body) < math.inf):
-        raise InputError(f"a body of {body[0]} mm radius and {body[1]} mm height: both must be above 0")
+    check_body(body)
     first = presses[0]
     for source in presses[1:]:
         pixels = source.shape[1:], source.header.pixel_size
@@ -157,6 +156,12 @@ def check_zenith(
     for source in presses:
         wall_fit.levels_of(source, references)
         pixel_size_of(source)
+
+
+def check_body(body: tuple[float, float]) -> None:
+    """Raise InputError unless radius and height of a body, mm, are above 0."""
+    if not (min(body) > 0 and max(body) < math.inf):
+        raise InputError(f"a body of {body[0]} mm radius and {body[1]} mm height: both must be above 0")
 
 
 # --- the area in which the sheet takes the ball's shape -----------------------------------------------------

@@ -98,6 +98,9 @@ SENSOR = (
 )
 """Names of the sensor's parameters in the order of a fit; the curve's steps and the balls' centres follow."""
 
+STEP_NAMES = tuple(f"step_{number}" for number in range(CURVE_COEFFICIENTS))
+"""Names of the curve's steps; see `curve_from_steps`."""
+
 STEPS = slice(len(SENSOR), len(SENSOR) + CURVE_COEFFICIENTS)
 """The curve's steps among the parameters; the balls' centres, x, y and z each, follow."""
 

@@ -159,7 +159,7 @@ def response_of(fit: WallFit, shares: tuple[float, float], pattern: str, source:
         pattern=pattern,
         zenith_sigma=np.full(source.shape[1:], np.nan, np.float32),
         azimuth_sigma=np.full(source.shape[1:], np.nan, np.float32),
-        parameters=(*model.SENSOR, *(f"step_{number}" for number in range(model.CURVE_COEFFICIENTS))),
+        parameters=(*model.SENSOR, *model.STEP_NAMES),
         covariance=fit.covariance[: model.STEPS.stop, : model.STEPS.stop],
         error=math.nan,
     )

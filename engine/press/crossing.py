@@ -38,7 +38,6 @@ _DARK_Z_SCORE = 6.0  # standard deviations below the threshold: a sample whose p
 _ROUNDING = 1e-12  # tolerance of a threshold such as 0.55, which has no exact binary value
 _TILE = 4096  # pixels of a work-item on a CPU; 0.8 times the run time of 1024 for long rows
 _MAX_NOISE_RATIO = 1.6  # ratio of two estimates of the noise that chance, or shot noise, hardly explains
-_FIRST_TRAVELS = 64  # frames for which there is room at first
 _MAX_HOLD = 2**30  # frames: limit of `hold`, so that sums of frame numbers do not overflow
 
 
@@ -176,7 +175,8 @@ class Crossing:
         self._release, self._subframe = event == "release", operation.subframe
         self._hold = min(operation.hold, _MAX_HOLD)
         self._noise = Noise(operation.noise, dtype.kind == "u")
-        self._travel, self._count = np.empty(_FIRST_TRAVELS), 0  # of the frames so far, mm; more than needed
+        self._travels = Appended(1, np.float64)
+        self.travel: NDArray[np.float64] = np.empty(0)  # of the frames so far, (T,), mm
         self._travel_table = Appended(3)  # travel; the step to it; since the first frame
         # Of a release, the dark plateau is unknown: no reference specifies it.
         self._dark_from_frames = self._release or operation.dark is None
@@ -213,15 +213,13 @@ class Crossing:
 
     def push(self, frames: AnyArray, travel: ArrayLike) -> None:
         """Process the next frames, (n, H, W), and the travel of each; InputError if it reverses."""
-        first, last = self._count, self.travel[-1:]
+        first, last = len(self.travel), self.travel[-1:]
         more = check_travel(travel, len(frames), "travel", after=last, falls=self._release)
         if len(more):
-            self._count += len(more)
-            if self._count > len(self._travel):  # frames may come one by one
-                self._travel = np.pad(self._travel, (0, 2 * self._count - len(self._travel)))
-            self._travel[first : self._count] = more
+            self._travels.append(more[:, np.newaxis])
+            self.travel = self._travels.values[:, 0]
             steps = more - np.concatenate([last if first else more[:1], more[:-1]])
-            self._travel_table.append(np.stack([more, steps, more - self._travel[0]], axis=1))
+            self._travel_table.append(np.stack([more, steps, more - self.travel[0]], axis=1))
         self._noise.look(frames)
         noise = self._noise.value or 0.0  # not needed for a single frame, which is assumed to be dark
         arguments: dict[str, Any] = {}
@@ -262,14 +260,10 @@ class Crossing:
         parts = ("answers", 0), ("answers", 1), "status", "times"
         return EventMaps(*self._maps.take(*parts, on_host=on_host))
 
-    @property
-    def travel(self) -> NDArray[np.float64]:
-        """Travel of the frames so far, (T,), mm."""
-        return self._travel[: self._count]
-
     def reset(self, noise: float | None = None) -> None:
         """Prepare for another press with the same references and, if given, the same noise, counts."""
-        self._travel, self._count = np.empty(_FIRST_TRAVELS), 0  # what was returned stays as it was
+        self.travel = np.empty(0)
+        self._travels.clear()
         self._travel_table.clear()
         self._noise.reset(noise)
         if self._dark_from_frames:  # the marks depend on the first frame

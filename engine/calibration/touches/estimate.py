@@ -7,7 +7,6 @@ sensor, which is summed over touches, kept with the calibration, and forgotten w
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -30,6 +29,7 @@ from mirrorskin.engine.calibration.touches.reading import (
 )
 from mirrorskin.engine.calibration.touches.result import TouchFit, result_of
 from mirrorskin.engine.calibration.touches.wall_result import earlier_of, scatter_of
+from mirrorskin.engine.calibration.wall import check_body
 from mirrorskin.io import (
     Calibrated,
     Calibration,
@@ -171,8 +171,8 @@ def _start(
     calibration: Calibration | None, body: tuple[float, float] | None
 ) -> tuple[Earlier | None, tuple[float, float] | None]:
     """Return what earlier touches have told, and radius and height of a wall."""
-    if body is not None and not (min(body) > 0 and max(body) < math.inf):
-        raise InputError(f"a body of {body[0]} mm radius and {body[1]} mm height: both must be above 0")
+    if body is not None:
+        check_body(body)
     if calibration is None:
         return None, body
     wall, linear = calibration.zenith, calibration.response

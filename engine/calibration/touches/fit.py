@@ -18,8 +18,8 @@ from mirrorskin.engine.calibration.touches.reading import (
     Touch,
     TouchReader,
 )
-from mirrorskin.engine.calibration.touches.wall_light import STEPS
 from mirrorskin.engine.calibration.touches.window import MOVEMENT, Window
+from mirrorskin.engine.calibration.wall_model import STEP_NAMES
 from mirrorskin.engine.press.intervals import estimate_interval_scatter
 from mirrorskin.io import (
     InputError,
@@ -175,7 +175,7 @@ class Attempt:
         """Whether the parameters are those of a sensor, and not of another movement."""
         priors = self.priors
         away = (self.fit.values - priors.mean) * priors.scale / np.maximum(priors.loose, 1e-12)
-        others = {"phase", "lag", *MOVEMENT, *STEPS} - {"tilt"}
+        others = {"phase", "lag", *MOVEMENT, *STEP_NAMES} - {"tilt"}
         judged = [number for number, name in enumerate(priors.names) if name not in others]
         return float(np.sum(away[judged] ** 2)) < _IMPLAUSIBLE**2
 
@@ -352,7 +352,7 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memo
         early = number < roughly
         excludes, uses_intervals, chooses = number in excluding, exact and early, is_cold and early
         found = [_eliminate(touch, values, excludes, uses_intervals, chooses) for touch in touches]
-        follow = _follow(touches)
+        follow = _follow(touches) if under_wall else following
         following = following & follow if number > excluding[-1] else follow
         informations, pushes = [], []
         for touch, weight, follows, (information, push, _) in zip(

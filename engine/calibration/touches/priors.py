@@ -16,9 +16,10 @@ from mirrorskin.engine.calibration.touches.reading import (
     TouchReader,
     Wall,
 )
-from mirrorskin.engine.calibration.touches.wall_light import STEPS, WallLight, even_steps, roughness
+from mirrorskin.engine.calibration.touches.wall_light import WallLight, even_steps, roughness
 from mirrorskin.engine.calibration.touches.window import TURNS
 from mirrorskin.engine.calibration.wall import BODY_ERROR, LIKELY
+from mirrorskin.engine.calibration.wall_model import STEP_NAMES
 from mirrorskin.engine.diagnosis.turn_light import (
     GLOBALS,
 )
@@ -60,7 +61,7 @@ UNITS = {
     "sight_0": "1/mm",
     "sight_2": "1/mm^3",
 }
-_NOT_STATED = ("lag", "footprint", "oval_x", "oval_y", *STEPS)
+_NOT_STATED = ("lag", "footprint", "oval_x", "oval_y", *STEP_NAMES)
 
 
 class Stated(NamedTuple):
@@ -219,9 +220,9 @@ class Priors:
         if without is not None:
             sigma[without] *= _WITHOUT
         precision = np.diag(sigma**-2.0)
-        if STEPS[0] in self.names:
-            first = self.at(STEPS[0])
-            steps = slice(first, first + len(STEPS))
+        if STEP_NAMES[0] in self.names:
+            first = self.at(STEP_NAMES[0])
+            steps = slice(first, first + len(STEP_NAMES))
             precision[steps, steps] += roughness()
         return precision
 
@@ -305,4 +306,4 @@ def _of_wall(wall: Wall) -> dict[str, tuple[float, float]]:
     likely = LIKELY | {"scatter": (wall.scatter, NEGLIGIBLE)}
     for name, size in zip(("radius", "rim"), wall.body, strict=True):
         likely[name] = size, BODY_ERROR * size
-    return likely | {name: (step, _STEP) for name, step in zip(STEPS, even_steps(), strict=True)}
+    return likely | {name: (step, _STEP) for name, step in zip(STEP_NAMES, even_steps(), strict=True)}

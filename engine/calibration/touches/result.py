@@ -17,8 +17,9 @@ from mirrorskin.engine.calibration.touches.priors import (
     UNKNOWN,
     Priors,
 )
-from mirrorskin.engine.calibration.touches.wall_light import STEPS, WallLight
+from mirrorskin.engine.calibration.touches.wall_light import WallLight
 from mirrorskin.engine.calibration.touches.wall_result import wall_response
+from mirrorskin.engine.calibration.wall_model import STEP_NAMES
 from mirrorskin.engine.diagnosis.turn_light import uneven_terms
 from mirrorskin.engine.diagnosis.turn_nuisances import (
     picture_axes,
@@ -44,7 +45,7 @@ _REMEDIES = {
 _OF_PRESSES = ("zenith_gain", "tilt", "pivot_z")
 _ADD_PRESSES = "add a press of the same touch before each turn"
 _REMEDIES |= dict.fromkeys(
-    (name for name in WallLight.names if name not in STEPS),
+    (name for name in WallLight.names if name not in STEP_NAMES),
     "touch at places all over the field, on slopes from flat to steep",
 )
 _LEARNED = 0.5  # standard error of a number of a wall that is determined, times the usual deviation
@@ -93,7 +94,7 @@ def result_of(attempt: Attempt) -> TouchFit:
     response = _linear_response(attempt, sigma) if sensor.wall is None else wall_response(attempt)
     estimates, notes = [], []
     for number, name in enumerate(priors.names):
-        if not priors.is_free(number) or name in ("lag", "footprint", *STEPS):
+        if not priors.is_free(number) or name in ("lag", "footprint", *STEP_NAMES):
             continue
         _, error = without_prior(fit, priors, number)
         needed = _needed(name, priors)

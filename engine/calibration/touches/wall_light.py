@@ -26,9 +26,6 @@ from mirrorskin.kernels.rotation.response import lamp_light, sight_of, sight_slo
 
 _OF_MOVEMENT = ("pivot_x", "pivot_y", "pivot_z", "phase_offset")
 _OF_PATH = tuple(name for name in model.SENSOR[: model.GEOMETRIC] if name not in _OF_MOVEMENT)
-STEPS = tuple(f"step_{number}" for number in range(model.CURVE_COEFFICIENTS))
-"""Names of the steps of the printed curve; see `wall_model.curve_from_steps`."""
-
 _SHADE = model.SENSOR[model.GEOMETRIC + 2 :]
 _CURVE = model.curve_from_steps(rising=True)
 _ANGLE = 1e-5  # radians: step of numerical derivatives
@@ -46,7 +43,7 @@ class WallLight:
     press: float  # mm that surfaces are pressed in
     pivot: tuple[float, float, float]  # as it was assumed, mm
 
-    names: ClassVar[tuple[str, ...]] = ("lag", *_OF_PATH, "lamp_x", "lamp_y", *_SHADE, *STEPS)
+    names: ClassVar[tuple[str, ...]] = ("lag", *_OF_PATH, "lamp_x", "lamp_y", *_SHADE, *model.STEP_NAMES)
 
     def of(self, seen: Seen, chosen: NDArray[np.bool_], named: Mapping[str, float]) -> Lit:
         """Return the light of chosen pixels."""
@@ -54,7 +51,7 @@ class WallLight:
         share = (1 + seen.gains) * self.span[chosen]
         surface = _Surface(seen, self.place[:, chosen], self.press, self.pivot)
         met = surface.met(named)
-        curve = _CURVE @ np.array([named[name] for name in STEPS])
+        curve = _CURVE @ np.array([named[name] for name in model.STEP_NAMES])
         wall = model.reach_wall(met, named)
         basis = model.curve_means(wall.low, wall.high)
         level, factor = np.einsum("nk,k->n", basis, curve), model.lamps_and_shade(met, wall, named)

@@ -10,14 +10,14 @@ import numpy as np
 
 from mirrorskin.engine.calibration import wall_model as model
 from mirrorskin.engine.calibration.touches.fit import Attempt, Earlier
-from mirrorskin.engine.calibration.touches.wall_light import STEPS, WallLight
+from mirrorskin.engine.calibration.touches.wall_light import WallLight
 from mirrorskin.engine.calibration.wall_fit import WallFit
 from mirrorskin.engine.calibration.wall_response import FEW, response_of, steps_of
 from mirrorskin.io import WallResponse
 from mirrorskin.kernels.array_types import Doubles
 
 _OF_WALL = tuple(name for name in WallLight.names if name != "lag")
-_NAMES = (*model.SENSOR, *STEPS)
+_NAMES = (*model.SENSOR, *model.STEP_NAMES)
 _SHARES = np.linspace(0, 1, 1001)
 
 
@@ -74,7 +74,7 @@ def earlier_of(wall: WallResponse) -> Earlier:
         **{f"sight_{power}": value for power, value in zip("02", wall.sight, strict=True)},
         **{f"lamp_{axis}": value for axis, value in zip("xy", wall.lamps, strict=True)},
         **{f"shade_{number}": value for number, value in enumerate(wall.shade)},
-        **dict(zip(STEPS, steps_of(wall), strict=True)),
+        **dict(zip(model.STEP_NAMES, steps_of(wall), strict=True)),
     }
     values = np.array([numbers[name] for name in _OF_WALL], np.float64)
     return Earlier(_OF_WALL, values, (known + known.T) / 2, np.zeros(len(_OF_WALL)), 0, math.nan)
