@@ -84,7 +84,7 @@ def command(
         drops = Path(
             stack.enter_context(TemporaryDirectory(prefix="mirrorskin-", ignore_cleanup_errors=True))
         )
-        page = pages(files or (), openings, control, Path.cwd(), drops)
+        page = stack.enter_context(pages(files or (), openings, control, Path.cwd(), drops))
         server = AppServer(page, port or 0, drops=drops, **lifetime)
         click.echo(server.address)
         try:

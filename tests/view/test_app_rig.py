@@ -409,15 +409,15 @@ def test_closing_the_last_page_stops_the_rig(ready, monkeypatch):
     monkeypatch.setattr(
         type(pn.state), "on_session_destroyed", lambda state, callback: closed.append(callback)
     )
-    page = pages([], [], ready.control)
-    page()
-    page()
-    ready.control.jog("travel", 3.0)
-    ready.until(ready.rig.machine.moving)
-    closed[0](None)
-    assert ready.rig.machine.moving()
-    closed[1](None)
-    ready.until(lambda: not ready.rig.machine.moving())
+    with pages([], [], ready.control) as page:
+        page()
+        page()
+        ready.control.jog("travel", 3.0)
+        ready.until(ready.rig.machine.moving)
+        closed[0](None)
+        assert ready.rig.machine.moving()
+        closed[1](None)
+        ready.until(lambda: not ready.rig.machine.moving())
     assert ended(ready)
 
 

@@ -21,10 +21,12 @@ from tornado.httpclient import HTTPRequest
 from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 
+from mirrorskin import io
 from mirrorskin.engine.base.reconstruction import load_operation
 from mirrorskin.io import InputError
 from mirrorskin.twin import Twin, Vertical
 from mirrorskin.view.app import App, Opening
+from mirrorskin.view.app.page import pages
 from mirrorskin.view.app.server import AppServer, StopServer, open_browser
 
 PATIENCE = 60.0  # seconds
@@ -186,6 +188,27 @@ def test_a_web_socket_without_the_token_is_refused(served):
 def test_a_port_that_is_in_use_is_refused_in_one_line(served):
     with pytest.raises(InputError, match=f"port {served.port} cannot be used .*choose another with --port"):
         AppServer(_page, served.port)
+
+
+def test_a_file_being_opened_when_the_server_ends_is_given_up(tmp_path, monkeypatch, caplog):
+    twin = Twin(object="sphere", shape=(40, 40), pixel_size=0.26, movement=Vertical([0.1, 0.2, 0.3]))
+    record(twin, tmp_path / "press.h5")
+    begun, go_on, opened = threading.Event(), threading.Event(), io.open_recording
+
+    def wait(*arguments, **keywords):
+        begun.set()
+        assert go_on.wait(PATIENCE)
+        return opened(*arguments, **keywords)
+
+    monkeypatch.setattr(io, "open_recording", wait)
+    with pages([tmp_path / "press.h5"], [Opening()]) as page, serving(page) as address:
+        assert status(address.geturl()) == 200
+        assert begun.wait(PATIENCE)
+    go_on.set()
+    for thread in threading.enumerate():
+        if thread.name.startswith("mirrorskin-page"):
+            thread.join(PATIENCE)
+    assert not [entry for entry in caplog.records if entry.levelno >= logging.WARNING]
 
 
 def test_the_token_is_no_argument_of_the_browser(tmp_path, monkeypatch):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from html import escape
 from importlib import resources
@@ -305,10 +305,10 @@ class App:
         return self.view._repr_mimebundle_(include, exclude)
 
     def close(self) -> None:
-        """Close the files."""
+        """Close the files, and give up what is computed."""
+        self._closed.set()
         if self.session is not None:
             self.session.close()
-        self._closed.set()
         for worker in (self._worker, self._measurer):
             if worker is not None:
                 worker.shutdown(wait=False, cancel_futures=True)
@@ -353,15 +353,20 @@ def _in_thread(worker: Executor, document: Any, closed: Event) -> Run:
             with suppress(RuntimeError):  # the server has ended
                 loop.call_soon_threadsafe(show, result)
 
-        worker.submit(compute).add_done_callback(_show_error)
+        def show_error(ended: Future[None]) -> None:
+            """Log what failed, unless the page is closed: the work may lack what has been closed with it."""
+            if not closed.is_set():
+                ended.result()
+
+        try:
+            ended = worker.submit(compute)
+        except RuntimeError:
+            if not closed.is_set():
+                raise
+        else:
+            ended.add_done_callback(show_error)
 
     return run
-
-
-def _show_error(ended: Future[None]) -> None:
-    """Log what failed; work that the end of a page took back did not fail."""
-    if not ended.cancelled():
-        ended.result()
 
 
 def _name_of(source: Shown, number: int) -> str:
@@ -370,16 +375,18 @@ def _name_of(source: Shown, number: int) -> str:
     return source.name if isinstance(source, io.Recording) else f"result {number + 1}"
 
 
+@contextmanager
 def pages(
     sources: Sequence[Path],
     openings: Sequence[Opening],
     rig: RigControl | None = None,
     folder: Path | None = None,
     drops: Path | None = None,
-) -> Callable[[], Any]:
-    """Return a function that makes a page; when the last page is closed, the rig is stopped.
+) -> Iterator[Callable[[], Any]]:
+    """Yield a function that makes a page; at the end, all pages are closed.
 
-    The page opens files of a folder, and of one where the server puts what is dropped on the page.
+    A page opens files of a folder, and of one where the server puts what is dropped on the page. When the
+    last one is closed, the rig is stopped.
     """
     opened: list[App] = []
     # Pages show them; threads cannot change filters for themselves.
@@ -398,4 +405,8 @@ def pages(
         pn.state.on_session_destroyed(close)
         return app.page()
 
-    return page
+    try:
+        yield page
+    finally:
+        for app in opened:
+            app.close()
