@@ -493,7 +493,7 @@ class BorrowedBuffer:
 
     arrived = None
 
-    def __init__(self, device: Device, name: str, values: NDArray[Any]) -> None:
+    def __init__(self, device: Device, name: str, values: NDArray[Any], address: int) -> None:
         self.device, self.name, self.host = device, name, values
         self.shape, self.nbytes = values.shape, values.nbytes
         self.last_use: cl.Event | None = None
@@ -501,7 +501,7 @@ class BorrowedBuffer:
         # Kernels only read it, but Intel's runtime copies read-only memory that is not aligned to 128 bytes.
         access = cl.mem_flags.READ_WRITE if values.flags.writeable else cl.mem_flags.READ_ONLY
         flags = access | cl.mem_flags.USE_HOST_PTR
-        loaded = (ctypes.c_char * (values.nbytes + SLACK)).from_address(values.ctypes.data)
+        loaded = (ctypes.c_char * (values.nbytes + SLACK)).from_address(address)
         try:
             self.buffer: cl.Buffer = cl.Buffer(device.context, flags, hostbuf=loaded)
         except cl.Error as error:
@@ -518,7 +518,7 @@ class BorrowedBuffer:
             self.device.profile.wait(self.name, self.last_use)
 
 
-def can_be_borrowed(values: NDArray[Any]) -> bool:
+def can_be_borrowed(values: NDArray[Any], address: int) -> bool:
     """Return whether kernels can read values in place: C order, aligned, and followed by readable memory.
 
     Kernels load their last word as a whole. The values may be followed by other elements of their base array,
@@ -529,7 +529,7 @@ def can_be_borrowed(values: NDArray[Any]) -> bool:
     whole = values
     while isinstance(whole.base, np.ndarray) and whole.base.flags.c_contiguous:
         whole = whole.base
-    end = values.ctypes.data + values.nbytes
+    end = address + values.nbytes
     last = end if whole is values else whole.ctypes.data + whole.nbytes
     return bool(-(-last // memory.PAGE) * memory.PAGE - end >= SLACK)
 

@@ -51,6 +51,7 @@ _opening = threading.Lock()
 _numbers = itertools.count()  # of buffers that were arguments of kernels
 _UNSET = object()  # no value of an argument
 _NUMBERS = frozenset((int, float))
+_FIXED = frozenset((int, float, bool, tuple))  # the same object is the same number
 _OPERANDS = Array, BorrowedBuffer  # sooner than the union of them
 _opened: WeakSet[Device] = WeakSet()
 _left_out: set[cl.Device] = set()  # devices that failed and were replaced by others
@@ -336,10 +337,11 @@ class Device:
         values : ndarray
             Must not be written to while it is borrowed.
         """
-        if not can_be_borrowed(values):
+        address = values.ctypes.data
+        if not can_be_borrowed(values, address):
             return None
         try:
-            return BorrowedBuffer(self, name, values)
+            return BorrowedBuffer(self, name, values, address)
         except DeviceError as error:
             _log.info("%s cannot use %s in place (%s): it is copied", self.info.title, name, error)
             return None
@@ -657,23 +659,23 @@ class Kernel:
         Setting all of them takes longer than a launch.
         """
         arrays: list[Operand] = []
+        last, current = self._given, self._set
         for place, (name, convert) in enumerate(self._signature):
             given = arguments[name]
             if convert is not None:
-                # The same number needs no conversion, except 0 or -0; nor does the same tuple. An array may
-                # have changed.
-                last = self._given[place]
-                kind = type(given)
-                if (given is last and kind is tuple) or (
-                    kind in _NUMBERS and kind is type(last) and given == last and given
+                # An equal number needs no conversion either, except 0 or -0. An array may have changed.
+                before, kind = last[place], type(given)
+                if given is before or (
+                    kind in _NUMBERS and kind is type(before) and given == before and given
                 ):
                     continue
-                self._given[place] = _UNSET
+                last[place] = _UNSET
                 try:
                     value = convert(given)
                 except (TypeError, OverflowError) as error:
                     raise TypeError(f"{self.name}: {name} cannot be {given!r}: {error}") from None
                 key = value.tobytes()  # 0 and -0 are equal
+                fixed = given if kind in _FIXED else _UNSET
             elif isinstance(given, _OPERANDS):
                 arrays.append(given)
                 value = given.buffer
@@ -684,12 +686,12 @@ class Kernel:
                 value = key = None
             else:
                 raise TypeError(f"{self.name}: {name} must be an array of the device, not {given!r}")
-            if key != self._set[place]:
-                self._set[place] = _UNSET
+            if key != current[place]:
+                current[place] = _UNSET
                 (self._kernel.set_arg if convert is None else self._set_number)(place, value)
-                self._set[place] = key
+                current[place] = key
             if convert is not None:
-                self._given[place] = given
+                last[place] = fixed
         return arrays
 
 

@@ -83,7 +83,8 @@ def operand_of(
     if name is None:
         return None
     stored = result.on_device(name)
-    map_shape = np.shape(result[name]) if stored is None else tuple(stored.shape)
+    values = result[name] if stored is None else stored
+    map_shape = tuple(getattr(values, "shape", ()))
     if map_shape != shape:
         raise InputError(f"{name} has shape {map_shape}, but the height needs {shape}: give maps of one size")
     if isinstance(stored, Array) and stored.dtype == dtype and stored.device.context == device.context:
@@ -91,7 +92,7 @@ def operand_of(
             stored.device.flush()
             stored.arrived = stored.latest
         return stored
-    values = np.asarray(result[name])
+    values = np.asarray(values if stored is None else result[name])
     flags = values != 0 if dtype == np.uint8 else values
     return device.share(name, np.ascontiguousarray(flags, dtype))
 

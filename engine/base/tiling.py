@@ -255,7 +255,7 @@ class Band:
         if borrowed is None:
             copied = self.staging_buffer[: len(frames)]
             copied[...] = frames[: len(copied)]
-            borrowed = BorrowedBuffer(self.device, "frames", copied)
+            borrowed = BorrowedBuffer(self.device, "frames", copied, copied.ctypes.data)
         # Releasing the previous buffer waits for its kernels, so at most one piece is being processed.
         self._borrowed = borrowed
         return Staged(borrowed, slice(start, start + borrowed.shape[0]))

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +63,39 @@ def _references(objects: Sequence[object], number: int) -> int:
 _ALONE = _references([object()], 0)  # without any other reference
 
 
+class _Begun(NamedTuple):
+    """An update without answers of trackers, when it was begun, and when its newest frame was exposed."""
+
+    update: Update
+    started: float
+    taken: float
+
+
+class _Following:
+    """The next update, which may be begun before the one before it is handed out; an error waits for that."""
+
+    def __init__(self, updates: Iterator[_Begun]) -> None:
+        self._updates = updates
+        self._begun: _Begun | None = None
+        self._error: Exception | None = None
+        self._is_begun = False
+
+    def begin(self) -> Update | None:
+        """Begin it, and return it; None if no frame waits."""
+        self._is_begun = True
+        try:
+            self._begun = next(self._updates, None)
+        except Exception as error:
+            self._error = error
+        return None if self._begun is None else self._begun.update
+
+    def take(self) -> _Begun | None:
+        """Return it, or raise the error of its frame; None if no frame waits."""
+        if self._error is not None:
+            raise self._error
+        return self._begun if self._is_begun else next(self._updates, None)
+
+
 class Loop:
     """Push the frames of a live source into a run; the status is available after an exception, too.
 
@@ -73,8 +106,9 @@ class Loop:
     is counted as pushed, skipped or dropped.
 
     *Trackers* give an answer for each update. With trackers, frames that waited together are pushed one by
-    one, so that each used frame has an update. What a tracker refuses, such as a frame without contact, is
-    stated in ``Update.lost``, and the loop continues.
+    one, so that each used frame has an update. If the next one waits when the first tracker that works on a
+    device has answered, its maps are computed, and trackers that have answered start their work for it. What
+    a tracker refuses, such as a frame without contact, is stated in ``Update.lost``, and the loop continues.
 
     Parameters
     ----------
@@ -138,7 +172,7 @@ class Loop:
         self._monitor, self._pictures = Monitor(), _Pictures()
         self._taken = self._updated = -math.inf  # time of the newest frame that was pushed, of an update
         self._newest: tuple[float, float, NDArray[Any]] | None = None  # its exposure, position and picture
-        self._pending = False
+        self._pending = self._ends = False
         self._times: deque[float] = deque(maxlen=_INTERVALS)
         self._arrived: deque[float] = deque(maxlen=_INTERVALS)  # times of the newest frames of updates
 
@@ -155,23 +189,28 @@ class Loop:
 
     def run(self) -> Status:
         """Push until the source ends, or ``stop`` returns True."""
-        while (block := self._source.read(self._run.staging_buffer)) is not None:
-            used = self._monitor.used
-            for part in self._parts(block):
-                newest = part.index + len(part.frames) == block.index + len(block.frames)
-                self._take(part, newest and self._monitor.used == used)
-                if self._stop is not None and self._stop():
-                    return self._finish()
-                if self._source.now() - self._updated >= self._period:
-                    self._update()
-            self._run.idle_work(self._idle())
-        return self._finish()
-
-    def _finish(self) -> Status:
-        """Update once more, if frames were pushed since."""
-        if self._pending:
-            self._update()
+        while not self._ends and (block := self._source.read(self._run.staging_buffer)) is not None:
+            updates = self._updates_of(block)
+            begun = next(updates, None)
+            while begun is not None:
+                begun = self._complete(begun, updates)
+            if not self._ends:
+                self._run.idle_work(self._idle())
+        if (begun := self._begin()) is not None:  # frames were pushed since the last update
+            self._complete(begun, iter(()))
         return self.status
+
+    def _updates_of(self, block: Block) -> Iterator[_Begun]:
+        """Push the frames of a block, and yield the updates that are due, until ``stop`` returns True."""
+        used = self._monitor.used
+        for part in self._parts(block):
+            newest = part.index + len(part.frames) == block.index + len(block.frames)
+            self._take(part, newest and self._monitor.used == used)
+            self._ends = self._stop is not None and self._stop()
+            if self._ends:
+                return
+            if self._source.now() - self._updated >= self._period and (begun := self._begin()) is not None:
+                yield begun
 
     def _parts(self, block: Block) -> Iterator[Block]:
         """Yield what is pushed together: all frames of a block, or one by one for trackers."""
@@ -216,31 +255,39 @@ class Loop:
             self._monitor.time(PUSHED, self._source.now() - now)
 
     @computes
-    def _update(self) -> None:
+    def _begin(self) -> _Begun | None:
+        """Return the update with the maps of the frames so far, if there are new ones."""
         if not self._pending or self._newest is None:
-            return
+            return None
         started = self._source.now()
         (at, position, picture), frames = self._newest, self._monitor.used
         maps, motion = self._run.maps(max(_PATIENCE, self._idle())), self._source.motion
         update = Update(frames, at, motion, position, self._pictures.copy(picture), maps, tracked={}, lost={})
-        if self._trackers is not None:
-            self._trackers.track(update, self._source.header.press)
-        finished = self._source.now()
         self._updated, self._pending = started, False
+        return _Begun(update, started, self._taken)
+
+    @computes
+    def _complete(self, begun: _Begun, updates: Iterator[_Begun]) -> _Begun | None:
+        """Let trackers answer, hand out an update, and return the next one of those that wait."""
+        (update, started, taken), following = begun, _Following(updates)
+        if self._trackers is not None:
+            self._trackers.track(update, self._source.header.press, following.begin)
+        finished = self._source.now()
         self._monitor.updated()
         self._monitor.time(UPDATED, finished - started)
-        self._arrived.append(self._taken)
+        self._arrived.append(taken)
         if update.tracked or update.first is not None:
-            self._monitor.time(SHOWN, finished - self._taken)
+            self._monitor.time(SHOWN, finished - taken)
         if update.height is not None:
             lag = min(update.height_lag, len(self._arrived) - 1)
             self._monitor.time(RAISED, finished - self._arrived[-1 - lag])
         status = self._monitor.status()
         events = self._events.of(update)
-        p99 = status.latency[SHOWN].p99 + self._taken - at  # from the exposure
-        update = replace(update, latency=finished - at, latency_p99=p99, events=events)
+        p99 = status.latency[SHOWN].p99 + taken - update.time  # from the exposure
+        update = replace(update, latency=finished - update.time, latency_p99=p99, events=events)
         if self._on_update is not None:
             self._on_update(update, status)
+        return following.take()
 
     def _idle(self) -> float:
         """Return the seconds until the next frame is expected, less a margin."""

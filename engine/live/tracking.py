@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, NoReturn, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,7 @@ class Trackers:
 
     def __init__(self, trackers: Mapping[str, Tracker], motion: Motion) -> None:
         self._trackers = trackers
+        self._started: dict[str, _Started] = {}  # for the next update
         for name, tracker in trackers.items():
             _check(name, tracker, motion)
 
@@ -84,28 +85,62 @@ class Trackers:
             if hasattr(tracker, "precompile"):
                 tracker.precompile(shape, dtype)
 
-    def track(self, update: Update, press: float | None) -> None:
+    def track(self, update: Update, press: float | None, following: Callable[[], Update | None]) -> None:
         """Write the answers into an update, and the reasons of those that are missing.
 
         The work of all trackers that can submit it is started before the first answer is waited for, so that
-        devices and the host work at the same time. Answers are taken one after the other. ``press`` is the
-        travel of motions that are not vertical.
+        devices and the host work at the same time. Answers are taken one after the other. As soon as one that
+        was submitted is there, ``following`` is called once: it returns the next update if a frame waits, and
+        each tracker that has answered starts its work for that. ``press`` is the travel of motions that are
+        not vertical.
         """
         tracked, lost = cast("dict[str, Any]", update.tracked), cast("dict[str, str]", update.lost)
-        travel = update.position if update.motion == "vertical" else press
-        if update.maps and travel is not None and math.isfinite(travel) and update.maps.fitted.travel is None:
-            update = replace(update, maps=update.maps.with_fitted(travel=float(travel)))
-        answers: dict[str, Callable[[], Any]] = {}
+        before, self._started = self._started, {}
+        update = _with_travel(update, press)
+        started: dict[str, _Started] = {}
         for name, tracker in tuple(self._trackers.items()):
+            is_started = name in before and before[name].tracker is tracker
+            started[name] = before[name] if is_started else _Started.of(tracker, update)
+        asked, upcoming = False, None
+        for name, work in started.items():
             try:
-                answers[name] = _submit(tracker, update)
+                tracked[name] = work.answer()
             except _REFUSALS as error:
                 tracked[name], lost[name] = None, str(error)
-        for name, answer in answers.items():
-            try:
-                tracked[name] = answer()
-            except _REFUSALS as error:
-                tracked[name], lost[name] = None, str(error)
+            if not hasattr(work.tracker, "submit"):
+                continue
+            if not asked:
+                asked, upcoming = True, following()
+                upcoming = None if upcoming is None else _with_travel(upcoming, press)
+            if upcoming is not None:
+                self._started[name] = _Started.of(work.tracker, upcoming)
+
+
+class _Started(NamedTuple):
+    """A tracker whose work has been started, if it can be, and a function that waits for the answer."""
+
+    tracker: Tracker
+    answer: Callable[[], Any]
+
+    @classmethod
+    def of(cls, tracker: Tracker, update: Update) -> _Started:
+        """Start the work of a tracker on an update; the answer raises what the tracker refuses."""
+        try:
+            return cls(tracker, _submit(tracker, update))
+        except _REFUSALS as error:
+            return cls(tracker, partial(_refuse, error))
+
+
+def _refuse(error: Exception) -> NoReturn:
+    raise error
+
+
+def _with_travel(update: Update, press: float | None) -> Update:
+    """Return an update whose maps have the travel of the body."""
+    travel = update.position if update.motion == "vertical" else press
+    if update.maps and travel is not None and math.isfinite(travel) and update.maps.fitted.travel is None:
+        return replace(update, maps=update.maps.with_fitted(travel=float(travel)))
+    return update
 
 
 def _submit(tracker: Tracker, update: Update) -> Callable[[], Any]:

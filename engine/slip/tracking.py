@@ -305,7 +305,7 @@ class Level:
         )
         return pixels
 
-    @property
+    @cached_property
     def _sizes(self) -> dict[str, int]:
         """Sizes of the picture, of the nodes, and of the halo, as arguments of kernels."""
         (rows, columns), (node_rows, node_columns) = self.shape, self.grid

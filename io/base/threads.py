@@ -11,7 +11,7 @@ import functools
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import FunctionType
 from typing import Any, ParamSpec, Self, TypeVar
 
@@ -36,21 +36,33 @@ class _Inside(threading.local):
 _inside = _Inside()
 
 
-@contextmanager
-def computation() -> Iterator[None]:
-    """Delay the end of the interpreter while a daemon thread is in the context.
+class _Nested:
+    """A computation within one that is counted, whose thread ends here if the program ends."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None and _ending:
+            _count(0)
+
+
+_NESTED, _NOT_COUNTED = _Nested(), nullcontext()
+
+
+def computation() -> AbstractContextManager[None]:
+    """Return a context that delays the end of the interpreter while a daemon thread is in it.
 
     At the end, `SystemExit` is raised in daemon threads that enter or leave a context, such as between two
     blocks of frames.
     """
     if not threading.current_thread().daemon:
-        yield
-        return
-    if _inside.is_counted and not _ending:
-        yield
-        if _ending:
-            _count(0)
-        return
+        return _NOT_COUNTED
+    return _NESTED if _inside.is_counted and not _ending else _counted()
+
+
+@contextmanager
+def _counted() -> Iterator[None]:
     _register()
     _count(1)
     outside, _inside.is_counted = _inside.is_counted, True

@@ -38,6 +38,7 @@
 typedef float8 __attribute__((aligned(4))) Loose;  // unaligned
 typedef F __attribute__((aligned(4))) Lanes;
 typedef I __attribute__((aligned(4))) Flags;
+typedef float4 __attribute__((aligned(4))) Four;
 #define LOAD(values) (*(__global const Lanes *)(values))
 
 #define EACH_PIXEL                                      \
@@ -172,15 +173,52 @@ INLINE void add_lines(MAP values, const int wide, const int count, const int par
     }
 }
 
+#define EVEN(a, b) (F)((a).even, (b).even)
+#define ODD(a, b) (F)((a).odd, (b).odd)
+
 // The sums of the SIZE numbers of a line for each pixel of a group.
-INLINE F sums_of_line(const float *line, const int parts)
+INLINE F sums_of_line(const float *line)
 {
+#if LANES == 8 && (SIZE == 2 || SIZE == 4)
+    F v[4];
+    UNROLL for (int i = 0; i < SIZE; ++i) v[i] = *(const Lanes *)(line + LANES * i);
+    const F even = EVEN(v[0], v[1]), odd = ODD(v[0], v[1]);
+#if SIZE == 2
+    return even + odd;
+#else
+    const F more_even = EVEN(v[2], v[3]), more_odd = ODD(v[2], v[3]);
+    return EVEN(even, more_even) + EVEN(odd, more_odd) + ODD(even, more_even) + ODD(odd, more_odd);
+#endif
+#else
     float sums[LANES];
     UNROLL for (int lane = 0; lane < LANES; ++lane) {
         sums[lane] = 0;
-        UNROLL for (int i = 0; i < SIZE; ++i) sums[lane] += line[parts * (SIZE * lane + i)];
+        UNROLL for (int i = 0; i < SIZE; ++i) sums[lane] += line[SIZE * lane + i];
     }
     return *(const Lanes *)sums;
+#endif
+}
+
+// The sums of the SIZE vectors of a line for each pixel of a group. One more number of the line is read.
+INLINE void vectors_of_line(const float *line, F *x, F *y, F *z)
+{
+    float4 sums[LANES];
+    UNROLL for (int lane = 0; lane < LANES; ++lane) {
+        sums[lane] = 0;
+        UNROLL for (int i = 0; i < SIZE; ++i) sums[lane] += *(const Four *)(line + 3 * (SIZE * lane + i));
+    }
+#if LANES > 1
+    const float8 a = (float8)(sums[0], sums[1]), b = (float8)(sums[2], sums[3]);
+    const float8 c = (float8)(sums[4], sums[5]), d = (float8)(sums[6], sums[7]);
+    const F xz = EVEN(a, b), more_xz = EVEN(c, d), yw = ODD(a, b), more_yw = ODD(c, d);
+    *x = EVEN(xz, more_xz);
+    *y = EVEN(yw, more_yw);
+    *z = ODD(xz, more_xz);
+#else
+    *x = sums[0].x;
+    *y = sums[0].y;
+    *z = sums[0].z;
+#endif
 }
 
 // A group's values of which only some are in memory; NAN for the others.
@@ -238,10 +276,10 @@ __kernel void pose_means(
         const int q = SIZE * (row * wide + column);
         float line[LANES * SIZE];
         add_lines(height + q, wide, count, 1, 0, line);
-        put_some(mean + p, count, SHARE * sums_of_line(line, 1));
+        put_some(mean + p, count, SHARE * sums_of_line(line));
         if (height_sigma) {
             add_lines(height_sigma + q, wide, count, 1, 1, line);
-            put_some(mean_sigma + p, count, SHARE * roots(sums_of_line(line, 1)));
+            put_some(mean_sigma + p, count, SHARE * roots(sums_of_line(line)));
         }
     }
 }
@@ -260,14 +298,15 @@ __kernel void pose_records(
         } else {
             float line[LANES * SIZE];
             add_lines(height + first, wide, count, 1, 0, line);
-            z = SHARE * sums_of_line(line, 1);
+            z = SHARE * sums_of_line(line);
         }
         if (normals) {
-            float line[3 * LANES * SIZE];
+            float line[3 * LANES * SIZE + 1];
             add_lines(normals + 3 * first, wide, count, 3, 0, line);
-            x = SHARE * sums_of_line(line, 3);
-            y = SHARE * sums_of_line(line + 1, 3);
-            upright = SHARE * sums_of_line(line + 2, 3);
+            vectors_of_line(line, &x, &y, &upright);
+            x *= SHARE;
+            y *= SHARE;
+            upright *= SHARE;
         } else {
             float along[LANES], up[LANES];
             for (int i = 0; i < LANES; ++i) {
@@ -282,7 +321,7 @@ __kernel void pose_records(
         if (normals_sigma) {
             float line[LANES * SIZE];
             add_lines(normals_sigma + first, wide, count, 1, 1, line);
-            square = SHARE * SHARE * sums_of_line(line, 1);
+            square = SHARE * SHARE * sums_of_line(line);
             square = square < SHARPEST ? (F)SHARPEST : square;
         }
         int flags[LANES], far[LANES], is_each_smooth = 1;
@@ -293,7 +332,7 @@ __kernel void pose_records(
             } else {
                 float line[LANES * SIZE];
                 add_lines(height_sigma + first, wide, count, 1, 1, line);
-                sigma = SHARE * roots(sums_of_line(line, 1));
+                sigma = SHARE * roots(sums_of_line(line));
             }
             const F own = sigma * sigma;
             variance = sigma > 0.0f ? GREATER(own, (F)SHARPEST) : variance;

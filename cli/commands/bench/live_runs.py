@@ -111,17 +111,26 @@ class Tracked:
         self.count: int = _ROUNDS * len(self._updates)
 
     def run(self, pace: Pace) -> Ran:
-        """Push inputs when they are due, in order; those are lost that a `Stream` would not use either."""
+        """Push inputs when they are due, in order; those are lost that a `Stream` would not use either.
+
+        As in a `Loop`, trackers start their work for an input that waits before the one before is complete.
+        """
         push = self._warm()
         latency: list[float] = []
         result: Any = None
         number = lost = 0
+        started: int | None = None
+
+        def oldest(number: int, due: int) -> int:
+            return max(number, due - WAITING, math.ceil((pace.now() - LATENCY) * pace.rate))
+
         used = time.process_time()
         while number < pace.count:
             due = pace.wait(number)
-            first = max(number, due - WAITING, math.ceil((pace.now() - LATENCY) * pace.rate))
-            first = min(first, due - 1)
-            result = push(first)
+            first = min(oldest(number, due), due - 1) if started is None else started
+            following = oldest(first + 1, due)
+            started = following if following < due else None
+            result = push(first, started)
             latency.append(pace.now() - first / pace.rate)
             number, lost = first + 1, lost + first - number
         return Ran(pace.now(), time.process_time() - used, lost, latency, result)
@@ -131,15 +140,21 @@ class Tracked:
         push = self._warm()
         return [push(number) for number in range(self.count)][-1]
 
-    def _warm(self) -> Callable[[int], Any]:
-        """Return new trackers that have taken each input once, as a function of the number of an input."""
+    def _warm(self) -> Callable[..., Any]:
+        """Return new trackers that have taken each input once, as a function of the numbers of inputs.
+
+        They are those of an input, and of the next one if that waits already.
+        """
         trackers = Trackers(
             {name: _tracker(name, self._shape, self._device) for name in self._names}, "vertical"
         )
 
-        def push(number: int) -> dict[str, Any]:
-            update = replace(self._updates[number % len(self._updates)], tracked={}, lost={})
-            trackers.track(update, None)
+        def update_of(number: int) -> Update:
+            return replace(self._updates[number % len(self._updates)], tracked={}, lost={})
+
+        def push(number: int, following: int | None = None) -> dict[str, Any]:
+            update = update_of(number)
+            trackers.track(update, None, lambda: None if following is None else update_of(following))
             for name, reason in update.lost.items():
                 raise InputError(f"{name}: {reason}")
             return dict(update.tracked)

@@ -111,10 +111,10 @@ def test_a_block_may_be_written_anew_after_it_was_pushed(device):
 
 
 def test_a_device_that_refuses_lent_memory_gets_copies(device, monkeypatch):
-    def refuse(device, name, values):
+    def refuse(device, name, values, address):
         if not values.flags.writeable:
             raise DeviceError("it cannot hold frames: read only")
-        return borrow(device, name, values)
+        return borrow(device, name, values, address)
 
     borrow = device_layer.BorrowedBuffer
     monkeypatch.setattr(device_layer, "BorrowedBuffer", refuse)

@@ -145,9 +145,49 @@ def test_all_trackers_start_before_the_first_answer_is_waited_for():
     notes = []
     function = {"last": lambda update: notes.append(f"last after {[*update.tracked]}")}
     with stream({"a": Deferred("a", notes), "b": Deferred("b", notes), **function}) as pushed:
+        pushed.push(NUMBERS[0])
+    assert notes == ["a starts", "b starts", "a answers", "b answers", "last after ['a', 'b']"]
+
+
+def test_a_tracker_that_has_answered_starts_with_a_frame_that_waits():
+    notes = []
+    function = {"last": lambda update: notes.append(f"last of {update.frames}")}
+    with stream({"a": Deferred("a", notes), "b": Deferred("b", notes), **function}) as pushed:
         pushed.push(NUMBERS[:2])
-    once = ["a starts", "b starts", "a answers", "b answers", "last after ['a', 'b']"]
-    assert notes == 2 * once
+    first = ["a starts", "b starts", "a answers", "a starts", "b answers", "b starts", "last of 1"]
+    assert notes == [*first, "a answers", "b answers", "last of 2"]
+
+
+def test_a_tracker_that_is_replaced_does_not_answer_for_a_frame_that_waits():
+    notes, answers = [], []
+    trackers = {"a": Deferred("a", notes)}
+
+    def replace(update, status):
+        answers.append(update.tracked["a"])
+        trackers["a"] = Deferred("b", notes)
+
+    with stream(trackers, on_update=replace) as pushed:
+        pushed.push(NUMBERS[:2])
+    assert answers == ["a", "b"]
+
+
+def test_a_frame_that_is_refused_loses_no_answer_for_the_one_before():
+    class Refusing(Frames):
+        def push(self, frames):
+            if frames[-1].any():
+                raise io.InputError("refused")
+            super().push(frames)
+
+    answers = []
+    pushed = stream(
+        {"a": Deferred("a", []), "b": Deferred("b", [])},
+        Refusing(),
+        on_update=lambda update, status: answers.append(update.tracked),
+    )
+    pushed.push(NUMBERS[:2])
+    with pytest.raises(io.InputError, match="refused"):
+        pushed.close()
+    assert answers == [{"a": "a", "b": "b"}]
 
 
 @pytest.mark.parametrize("when", ["starts", "answers"])
