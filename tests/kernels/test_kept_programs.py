@@ -7,9 +7,11 @@ import shutil
 import subprocess
 import sys
 
+import platformdirs
 import pytest
 
 from mirrorskin.kernels import bitcode
+from mirrorskin.kernels import device as device_layer
 from mirrorskin.kernels.device import list_devices
 
 CHANGED = """
@@ -44,6 +46,10 @@ def start(tmp_path):
         pytest.skip("another OpenCL than PoCL 3.0")
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     environment.pop("POCL_CACHE_DIR", None)
+    device_layer.open_device("Portable Computing Language")  # that PoCL can run a kernel is known from now on
+    (tmp_path / "mirrorskin").mkdir()
+    for record in platformdirs.user_cache_path("mirrorskin").glob("pocl-*"):
+        shutil.copy(record, tmp_path / "mirrorskin")
 
     def begin(change, **variables):
         command, environ = [sys.executable, "-c", CHANGE, change], {**environment, **variables}
@@ -104,6 +110,7 @@ def test_a_record_that_is_damaged_or_refused_by_pocl_is_made_again(change, tmp_p
 
 
 def test_a_folder_that_cannot_be_written_costs_only_time(change, tmp_path):
+    shutil.rmtree(tmp_path / "mirrorskin")
     (tmp_path / "mirrorskin").write_text("a file where the folder should be")
     assert change("2*values[item]") == [[0, 2, 4], 1]
 

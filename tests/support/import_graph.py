@@ -45,12 +45,14 @@ def _defining(module: str, name: str) -> str:
     return module
 
 
-def _executed(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield the nodes below a node, without those that only type checkers read."""
-    for child in ast.iter_child_nodes(node):
-        if not (isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING"):
-            yield child
-            yield from _executed(child)
+def _executed(module: ast.AST) -> Iterator[ast.AST]:
+    """Yield the nodes of a module, without those that only type checkers read."""
+    nodes = [module]
+    while nodes:
+        node = nodes.pop()
+        if not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
+            yield node
+            nodes.extend(ast.iter_child_nodes(node))
 
 
 def _imported(file: Path) -> Iterator[str]:

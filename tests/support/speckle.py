@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
 WAVES = 300
 
@@ -18,21 +19,51 @@ class Speckle:
         self._x, self._y = size * np.cos(angle), size * np.sin(angle)
         self._phase = generator.uniform(0, 2 * np.pi, WAVES)
         self._amplitude = contrast * np.sqrt(2 / WAVES)
+        self._splines = {}
 
     def __call__(self, column, row):
-        total = np.zeros(np.broadcast(column, row).shape)
-        for x, y, phase in zip(self._x, self._y, self._phase, strict=True):
-            total += np.cos(x * column + y * row + phase)
-        return 120 + self._amplitude * total
+        """Counts at any places, between samples at quarters of a pixel: within 1e-5, less than float32 keeps."""
+        corner, end = (_beyond(edge(column), edge(row), side) for edge, side in ((np.min, -1), (np.max, 1)))
+        if (corner, end) not in self._splines:
+            columns, rows = (np.arange(4 * first, 4 * last) / 4 for first, last in zip(corner, end, strict=True))
+            self._splines[corner, end] = ndimage.spline_filter(self._on_grid(columns, rows), 5, mode="mirror")
+        places = 4 * (row - corner[1]), 4 * (column - corner[0])
+        return ndimage.map_coordinates(
+            self._splines[corner, end], places, order=5, prefilter=False, mode="mirror"
+        )
+
+    def _on_grid(self, columns, rows):
+        """Counts at columns and rows: cos(a + b) is a sum of products."""
+        along, across = np.outer(self._x, columns), np.outer(rows, self._y) + self._phase
+        cosines = np.concatenate([np.cos(across), -np.sin(across)], axis=1)
+        return 120 + self._amplitude * (cosines @ np.concatenate([np.cos(along), np.sin(along)]))
 
     def frame(self, shape, right, down, noise=0.0, seed=0):
         """A frame whose points have gone so many pixels, numbers or functions of where they were."""
         row, column = np.mgrid[: shape[0], : shape[1]].astype(float)
-        x, y = column, row
-        for _ in range(40 if callable(right) else 1):  # where the point was that is seen here
-            x, y = (
-                column - (right(x, y) if callable(right) else right),
-                row - (down(x, y) if callable(down) else down),
-            )
+        if callable(right) or callable(down):
+            counts = self(*_origins(column, row, *map(_as_function, (right, down))))
+        else:
+            counts = self._on_grid(column[0] - right, row[:, 0] - down)
         noise = np.random.default_rng(seed).normal(0, noise, shape) if noise else 0
-        return (self(x, y) + noise).astype(np.float32)
+        return (counts + noise).astype(np.float32)
+
+
+def _as_function(move):
+    return move if callable(move) else lambda x, y: move
+
+
+def _origins(column, row, right, down):
+    """Return where the points were that are seen at columns and rows now."""
+    x, y = column, row
+    for _ in range(40):
+        before = x, y
+        x, y = column - right(x, y), row - down(x, y)
+        if max(np.max(np.abs(x - before[0])), np.max(np.abs(y - before[1]))) < 1e-9:
+            break
+    return x, y
+
+
+def _beyond(column, row, side):
+    """Return whole pixels before or after a place, alike for places near each other."""
+    return tuple(32 * int(np.floor(place / 32)) + (-8 if side < 0 else 40) for place in (column, row))

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -30,25 +31,32 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def fitted(folder, tmp_path_factory):
+    """What a press and a turn tell: the printed numbers, and the calibration."""
+    path = tmp_path_factory.mktemp("fitted") / "cal.h5"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        return json.loads(done("calibrate self press.h5 turn.h5 --json -o", path).out), path
+
+
 @pytest.fixture(autouse=True)
 def here(folder, tmp_path):
     for path in folder.iterdir():
         (tmp_path / path.name).symlink_to(path)
 
 
-def test_response_and_movement_are_written():
-    done("calibrate self press.h5 turn.h5 -o cal.h5")
-    calibration = io.open_calibration("cal.h5")
+def test_response_and_movement_are_written(fitted):
+    calibration = io.open_calibration(fitted[1])
     assert calibration.response.touches == 1
     assert abs(calibration.precession.tilt - TILT) < 4 * calibration.precession.sigma["tilt"]
 
 
-def test_recording_of_a_touch_is_a_press_and_its_turn():
+def test_recording_of_a_touch_is_a_press_and_its_turn(fitted):
     with io.open_recording("press.h5") as press, io.open_recording("turn.h5") as turn:
         save_touch("touch.h5", press, turn)
-    done("calibrate self press.h5 turn.h5 -o two.h5")
     done("calibrate self touch.h5 -o one.h5")
-    of_two, of_one = (io.open_calibration(name).response for name in ("two.h5", "one.h5"))
+    of_two, of_one = (io.open_calibration(path).response for path in (fitted[1], "one.h5"))
     np.testing.assert_array_equal(of_one.gain, of_two.gain)
 
 
@@ -59,20 +67,20 @@ def test_turn_without_a_press_is_used_as_far_as_it_goes():
     assert "add a press of the same touch before each turn" in actual.said
 
 
-def test_turn_without_a_press_is_added_to_touches():
+def test_turn_without_a_press_is_added_to_touches(fitted):
+    shutil.copy(fitted[1], "cal.h5")
     done("calibrate self press.h5 turn.h5 turn.h5 -o cal.h5")
-    done("calibrate self turn.h5 -o cal.h5")
     assert io.open_calibration("cal.h5").response.touches == 3
 
 
-def test_touches_are_added():
-    for _ in range(2):
-        done("calibrate self press.h5 turn.h5 -o cal.h5")
+def test_touches_are_added(fitted):
+    shutil.copy(fitted[1], "cal.h5")
+    done("calibrate self press.h5 turn.h5 -o cal.h5")
     assert io.open_calibration("cal.h5").response.touches == 2
 
 
-def test_numbers_have_standard_errors():
-    printed = json.loads(done("calibrate self press.h5 turn.h5 -o cal.h5 --json").out)
+def test_numbers_have_standard_errors(fitted):
+    printed, _ = fitted
     gain = printed["estimates"]["zenith_gain"]
     assert 0 < gain["sigma"] < 0.1 * gain["value"]
     assert len(printed["frame_gains"]["turn.h5"]) == 12
@@ -83,9 +91,8 @@ def test_stated_number_that_touches_contradict_is_reported():
     assert "the touches say" in actual.said
 
 
-def test_show_prints_the_response():
-    done("calibrate self press.h5 turn.h5 -o cal.h5")
-    assert "zenith gain" in done("calibrate show cal.h5").out
+def test_show_prints_the_response(fitted):
+    assert "zenith gain" in done("calibrate show", fitted[1]).out
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Calibration from touches of unknown objects, against the twin."""
 
+import functools
 import math
 from dataclasses import dataclass, replace
 
@@ -93,6 +94,12 @@ def touches_of(count, first=0, stated=None, **turn):
     ]
 
 
+@functools.cache
+def fit_of(count, first=0, **stated):
+    """Return the fit of presses and turns of waves, which several tests look at."""
+    return from_touches(touches_of(count, first, stated))
+
+
 def deviations(fit, tilt=TILT, phase_offset=0.0, pivot=PIVOT, first=0):
     """Return the deviation of each estimate from the truth, in standard errors."""
     header = a_turn(Waves(first), first).header
@@ -113,8 +120,7 @@ def named(fit):
 
 
 def test_touches_that_contradict_each_other_have_larger_errors_and_a_note():
-    sound = touches_of(2)
-    press, turn = touches_of(1, first=1)[0]
+    sound, (press, turn) = touches_of(2)
     frames = turn.read(np.empty(turn.shape, turn.dtype)).frames.copy()
     frames[6:] = np.roll(frames, -1, axis=0)[6:]  # the seventh was lost
     header = {name: getattr(turn.header, name) for name in ("pixel_size", "tilt", "press", "pivot")}
@@ -122,19 +128,19 @@ def test_touches_that_contradict_each_other_have_larger_errors_and_a_note():
         name: getattr(turn.header, name) for name in ("dark", "bright", "zenith_gain", "zenith_offset")
     }
     lost = ArrayRecording(frames, {"phase": PHASE}, header)
-    fit = from_touches([sound[0], (press, lost)])
+    fit = from_touches([sound, (press, lost)])
     assert "contradict each other" in " ".join(fit.notes)
-    assert named(fit)["phase_offset"].sigma > 2 * named(from_touches(sound))["phase_offset"].sigma
+    assert named(fit)["phase_offset"].sigma > 2 * named(fit_of(2))["phase_offset"].sigma
 
 
 def test_wrong_gain_and_offset_are_corrected():
-    fit = from_touches(touches_of(2, stated={"gain": 1.05, "offset": 2.0}))
+    fit = fit_of(2, gain=1.05, offset=2.0)
     away = deviations(fit)
     assert max(abs(away[name]) for name in ("gamma", "zenith_gain", "zenith_offset", "tilt")) < 3
 
 
 def test_gain_is_known_to_half_a_percent_from_two_touches():
-    gain = named(from_touches(touches_of(2)))["zenith_gain"]
+    gain = named(fit_of(2))["zenith_gain"]
     assert gain.sigma / gain.value < 0.005
 
 
@@ -374,20 +380,23 @@ def calibration_of(fit, before=None):
     return replace(before or io.Calibration(camera), response=fit.response, precession=fit.precession)
 
 
+@functools.cache
+def added():
+    """Return the fit of a touch, and that of another which is added to its calibration."""
+    first = fit_of(1, gain=1.03)
+    later = touches_of(1, first=1, stated={"gain": 1.03})
+    return first, from_touches(later, calibration=calibration_of(first))
+
+
 def test_touches_add_to_a_calibration():
-    first = from_touches(touches_of(1, stated={"gain": 1.03}))
-    both = from_touches(touches_of(1, first=1, stated={"gain": 1.03}), calibration=calibration_of(first))
+    first, both = added()
     assert both.response.touches == 2
     assert both.response.sigma["gain"] < 0.9 * first.response.sigma["gain"]
     assert abs(deviations(both)["zenith_gain"]) < 3
 
 
 def test_two_steps_are_as_good_as_one():
-    pairs = touches_of(2, stated={"gain": 1.03})
-    first = from_touches(pairs[:1])
-    second = from_touches(pairs[1:], calibration=calibration_of(first))
-    at_once = from_touches(pairs)
-    gains = [named(fit)["zenith_gain"] for fit in (second, at_once)]
+    gains = [named(fit)["zenith_gain"] for fit in (added()[1], fit_of(2, gain=1.03))]
     assert abs(gains[0].value - gains[1].value) < gains[1].sigma
     assert gains[0].sigma == pytest.approx(gains[1].sigma, rel=0.2)
 
@@ -405,9 +414,9 @@ def test_old_touches_are_forgotten():
     stated = {"gain": 1.03}
     first = from_touches(timed(touches_of(1, stated=stated), "2026-01-01T00:00:00"))
     later = timed(touches_of(1, first=1, stated=stated), "2026-01-11T00:00:00")
-    kept = from_touches(later, calibration=calibration_of(first))
+    kept = added()[1]  # of the same touches
     forgotten = from_touches(later, calibration=calibration_of(first), forget=86400.0)
-    alone = from_touches(touches_of(1, first=1, stated=stated))
+    alone = fit_of(1, first=1, gain=1.03)
     assert kept.response.sigma["gain"] < 0.9 * forgotten.response.sigma["gain"]
     assert forgotten.response.sigma["gain"] == pytest.approx(alone.response.sigma["gain"], rel=0.15)
 
@@ -444,7 +453,7 @@ def test_forgetting_needs_start_times():
 
 @pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")
 def test_reconstruct_uses_the_response():
-    fit = from_touches(touches_of(2, stated={"gain": 1.05, "offset": 2.0}))
+    fit = fit_of(2, gain=1.05, offset=2.0)
     turn = a_turn(Waves(7), 7)
     errors = []
     for calibration in (None, calibration_of(fit)):
@@ -455,7 +464,7 @@ def test_reconstruct_uses_the_response():
 
 
 def test_response_survives_a_file(tmp_path):
-    fit = from_touches(touches_of(1))
+    fit = fit_of(2)
     io.save_calibration(calibration_of(fit), tmp_path / "cal.h5")
     response = io.open_calibration(tmp_path / "cal.h5").response
     np.testing.assert_array_equal(response.information, fit.response.information)
