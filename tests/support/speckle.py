@@ -22,11 +22,11 @@ class Speckle:
         self._splines = {}
 
     def __call__(self, column, row):
-        """Counts at any places, between samples at quarters of a pixel: within 1e-5, less than float32 keeps."""
+        """Counts at any places, by a spline of samples at quarters of a pixel: within 1e-5."""
         corner, end = (_beyond(edge(column), edge(row), side) for edge, side in ((np.min, -1), (np.max, 1)))
         if (corner, end) not in self._splines:
-            columns, rows = (np.arange(4 * first, 4 * last) / 4 for first, last in zip(corner, end, strict=True))
-            self._splines[corner, end] = ndimage.spline_filter(self._on_grid(columns, rows), 5, mode="mirror")
+            grid = [np.arange(4 * first, 4 * last) / 4 for first, last in zip(corner, end, strict=True)]
+            self._splines[corner, end] = ndimage.spline_filter(self._on_grid(*grid), 5, mode="mirror")
         places = 4 * (row - corner[1]), 4 * (column - corner[0])
         return ndimage.map_coordinates(
             self._splines[corner, end], places, order=5, prefilter=False, mode="mirror"

@@ -42,7 +42,8 @@ def reconstruct(surface, fault=CLEAN, seed=1, **options):
     x, y = points(SHAPE, PIXEL)
     along, up = (np.abs(surface(x + a, y + b) - surface(x - a, y - b)) for a, b in ((1e-4, 0), (0, 1e-4)))
     width = (along + up) / 2e-4 * PIXEL / 4 + 1e-9
-    frames = record(lambda travel: np.clip((travel + surface(x, y)) / width + 0.5, 0, 1), TRAVEL, fault, seed)
+    height = surface(x, y)
+    frames = record(lambda travel: np.clip((travel + height) / width + 0.5, 0, 1), TRAVEL, fault, seed)
     levels = {"dark": DARK, "bright": DARK + SPAN}
     return engine.reconstruct(frames, travel=TRAVEL, pixel_size=PIXEL, fill=False, **levels, **options)
 

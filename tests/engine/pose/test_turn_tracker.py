@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,21 @@ def phase_of(number: int) -> float:
     return 2 * np.pi * number / TURN
 
 
+@cache
+def normals_of(
+    vector: tuple[float, ...], shift: tuple[float, ...], form: Any, shape: tuple[int, int]
+) -> np.ndarray:
+    """Return the normals of a moved object, in float64: heights are those above their mean at rest."""
+
+    def lowered(x: Map, y: Map) -> tuple[Map, Map, Map]:
+        height, *slopes = form(x, y)
+        return height - MIDDLE, *slopes
+
+    rng, pixel = np.random.default_rng(), PIXEL * SHAPE[0] / shape[0]
+    exact = sampled(lowered, vector, shift, rng=rng, shape=shape, pixel=pixel, normals_sigma=0)
+    return exact.normals.astype(np.float64)
+
+
 def frame(
     number: int,
     path: Path = spun,
@@ -44,19 +60,13 @@ def frame(
     light: float = 1.0,
     noise: float = 1.5,
 ) -> np.ndarray:
-    """Return a frame of a moved object: heights are those above their mean at rest, as of a key."""
+    """Return a frame of a moved object."""
     rng = np.random.default_rng((seed, number))
-
-    def lowered(x: Map, y: Map) -> tuple[Map, Map, Map]:
-        height, *slopes = form(x, y)
-        return height - MIDDLE, *slopes
-
-    vector, shift = path(number)
-    pixel = PIXEL * SHAPE[0] / shape[0]
-    normals = sampled(lowered, vector, shift, rng=rng, shape=shape, pixel=pixel, normals_sigma=0).normals
     alpha = phase_of(number)
     axis = [-np.sin(TILT) * np.cos(alpha), -np.sin(TILT) * np.sin(alpha), np.cos(TILT)]
-    zenith = np.arccos(np.clip(normals.astype(np.float64) @ axis, -1, 1))
+    vector, shift = path(number)
+    normals = normals_of(tuple(vector), tuple(shift), form, shape)
+    zenith = np.arccos(np.clip(normals @ axis, -1, 1))
     counts = light * (OFFSET + GAIN * zenith) + rng.normal(0, noise, shape)
     return np.clip(np.rint(counts), 0, 255).astype(np.uint8)
 

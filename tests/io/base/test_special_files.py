@@ -1,5 +1,6 @@
 """FIFOs, sockets, devices and folders instead of files: refused in one line before they are opened."""
 
+import json
 import os
 import socket
 import subprocess
@@ -48,41 +49,42 @@ COMMANDS = {
 """Files of each kind, and a command that reads one."""
 
 PROGRAM = """
-import json, sys
+import json, os, sys
 import numpy as np
 from commands import run
-np.save("sound.npy", np.zeros((4, 8, 8), np.uint8))
-run("simulate", "vertical", "--size", "8x8", "--frames", "4", "-o", "sound.h5")
-for words in json.loads(sys.argv[1]):
-    ended = run(*words)
-    print(json.dumps([words, ended.code, ended.said]), flush=True)
+for folder, lines in json.loads(sys.argv[1]):
+    os.chdir(folder)
+    np.save("sound.npy", np.zeros((4, 8, 8), np.uint8))
+    run("simulate", "vertical", "--size", "8x8", "--frames", "4", "-o", "sound.h5")
+    for words in lines:
+        ended = run(*words)
+        print(json.dumps([words, ended.code, ended.said]), flush=True)
 """
 
 
-def commands_for(make):
-    """Return the commands, each of a file that was made so."""
+def commands_for(make, folder):
+    """Return the commands, each of a file that was made so in a folder."""
     lines = []
     for name, words in COMMANDS.items():
-        make(Path(name))
+        make(folder / name)
         arguments = [name if word == "{}" else word for word in words]
         lines.append(arguments if "{}" in words else [*arguments, name])
     return lines
 
 
-def outcomes(lines):
+def outcomes(lines_by_folder):
     """Run commands in a process that is ended when one of them waits; return code and message of each."""
-    import json
-
     support = Path(__file__).parents[2] / "support"
     ended = subprocess.run(
-        [sys.executable, "-c", PROGRAM, json.dumps(lines)],
+        [sys.executable, "-c", PROGRAM, json.dumps(lines_by_folder)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(support), os.environ.get("PYTHONPATH", "")])},
         capture_output=True,
         text=True,
         timeout=LIMIT,
     )
     actual = [json.loads(line) for line in ended.stdout.splitlines()]
-    assert len(actual) == len(lines), f"{lines[len(actual)]} did not end: {ended.stderr}"
+    expected = [line for _, lines in lines_by_folder for line in lines]
+    assert len(actual) == len(expected), f"{expected[len(actual)]} did not end: {ended.stderr}"
     return actual
 
 
@@ -91,30 +93,40 @@ def make_socket(path):
         item.bind(str(path))
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (os.mkfifo, "regular file"),
-        (make_socket, "regular file"),
-        (lambda path: path.symlink_to("/dev/zero"), "regular file"),
-        (lambda path: path.mkdir(), ""),
-    ],
-    ids=["fifo", "socket", "device", "folder"],
-)
-def test_what_is_not_a_file_is_refused_by_every_reader(tmp_path, monkeypatch, make, words):
-    monkeypatch.chdir(tmp_path)
-    for line, code, message in outcomes(commands_for(make)):
+SPECIAL = {
+    "fifo": (os.mkfifo, "regular file"),
+    "socket": (make_socket, "regular file"),
+    "device": (lambda path: path.symlink_to("/dev/zero"), "regular file"),
+    "folder": (lambda path: path.mkdir(), ""),
+}
+"""How to make what is not a file, and words of the message."""
+
+
+@pytest.fixture(scope="module")
+def refusals(tmp_path_factory):
+    """Command, code and message for each kind, of all kinds in one process, whose start takes longest."""
+    lines_by_folder = []
+    for kind, (make, _) in SPECIAL.items():
+        folder = tmp_path_factory.mktemp(kind)
+        lines_by_folder.append((str(folder), commands_for(make, folder)))
+    actual = outcomes(lines_by_folder)
+    count = len(COMMANDS)
+    return {kind: actual[at * count : (at + 1) * count] for at, kind in enumerate(SPECIAL)}
+
+
+@pytest.mark.parametrize("kind", SPECIAL)
+def test_what_is_not_a_file_is_refused_by_every_reader(refusals, kind):
+    for line, code, message in refusals[kind]:
         assert code == 2, (line, message)
         assert message.startswith("mirrorskin: "), line
         assert message.count("\n") == 1, (line, message)
-        assert words in message, (line, message)
+        assert SPECIAL[kind][1] in message, (line, message)
 
 
-def test_a_fifo_in_a_folder_of_pictures_is_left_out(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("frames").mkdir()
-    os.mkfifo("frames/frame1.png")
-    ((_, code, message),) = outcomes([["import", "frames", *STEPS]])
+def test_a_fifo_in_a_folder_of_pictures_is_left_out(tmp_path):
+    (tmp_path / "frames").mkdir()
+    os.mkfifo(tmp_path / "frames" / "frame1.png")
+    ((_, code, message),) = outcomes([(str(tmp_path), [["import", "frames", *STEPS]])])
     assert (code, "without numbered pictures" in message) == (2, True)
 
 
