@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -34,10 +35,16 @@ def last_name(node: ast.expr) -> str:
     return name.lstrip("_")
 
 
+@cache
+def nodes_of(tree: ast.Module) -> list[ast.AST]:
+    """Return all nodes of a module."""
+    return [*ast.walk(tree)]
+
+
 def classes_of(trees: list[ast.Module]) -> set[str]:
     """Return the names of all classes that are derived from operations or steps."""
     names = set(BASES)
-    defined = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    defined = [node for tree in trees for node in nodes_of(tree) if isinstance(node, ast.ClassDef)]
     while more := {node.name for node in defined if names & {*map(last_name, node.bases)}} - names:
         names |= more
     return {name.lstrip("_") for name in names}
@@ -49,7 +56,7 @@ class Calls(ast.NodeVisitor):
     def __init__(self, tree: ast.Module, classes: set[str]) -> None:
         self.lines: list[int] = []
         self._classes, self._inside = classes, False  # of a class of operations or steps
-        self._names = NAMES | {name for node in ast.walk(tree) for name in self._assigned(node)}
+        self._names = NAMES | {name for node in nodes_of(tree) for name in self._assigned(node)}
         self.visit(tree)
 
     def _makes(self, node: ast.expr | None) -> bool:

@@ -6,10 +6,14 @@ import golden
 import pytest
 from cases import CASES
 
-FROZEN = golden.load()
 pytestmark = pytest.mark.skipif(
     not golden.ANSWERS.exists(), reason="the source distribution contains no frozen answers"
 )
+
+
+@pytest.fixture(scope="module")
+def frozen():
+    return golden.load()
 
 
 @pytest.fixture(scope="module")
@@ -18,12 +22,12 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_answers_are_as_they_were(name, folder, monkeypatch):
+def test_answers_are_as_they_were(name, frozen, folder, monkeypatch):
     monkeypatch.chdir(folder)
-    assert name in FROZEN, "never frozen: python tests/golden/compare.py --freeze"
-    wrong = golden.differences(name, golden.answers(name), FROZEN[name])
+    assert name in frozen, "never frozen: python tests/golden/compare.py --freeze"
+    wrong = golden.differences(name, golden.answers(name), frozen[name])
     assert not wrong
 
 
-def test_every_frozen_answer_has_a_case():
-    assert set(FROZEN) == set(CASES)
+def test_every_frozen_answer_has_a_case(frozen):
+    assert set(frozen) == set(CASES)

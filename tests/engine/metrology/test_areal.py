@@ -4,7 +4,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-import surfalize
 from height_maps import places
 from scipy import ndimage
 
@@ -43,6 +42,8 @@ CASES = [(kind, name) for kind in SURFACES for name in AREAL if name not in ("St
 @cache
 def of_surface(kind):
     """Return the parameters of a surface, and what surfalize makes its own from."""
+    import surfalize  # half a second, of which other workers need nothing
+
     surface = surfalize.Surface(1e3 * SURFACES[kind], 1e3 * SIZE[0], 1e3 * SIZE[1])
     return values(SURFACES[kind]), surface, surface.get_abbott_firestone_curve()
 
