@@ -67,13 +67,18 @@ def command(
     """Learn the response to zenith and the movement from touches of unknown objects; add them to others."""
     from mirrorskin.cli.quantity import duration
     from mirrorskin.engine.calibration.touches import from_touches
+    from mirrorskin.io import InputError
 
     response = {name: stack.pop(name, None) for name in ("zenith_gain", "zenith_offset")}
     numbers = _stated(stated or [])
     seconds = None if forget is None else duration(forget, "--forget")
     body = _body(body_radius, body_height)
 
+    of_press = "travel_step" in stack
+
     def fit(sources: list[Source], calibration: Calibration | None, paths: list[Path]) -> inputs.Learned:
+        if of_press and all(source.motion != "vertical" for source in sources):
+            raise InputError("--travel-step applies to presses, and there are turns only: remove it")
         found = from_touches(
             _touches(sources),
             calibration=calibration,

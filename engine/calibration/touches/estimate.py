@@ -80,7 +80,8 @@ def from_touches(
     forget : float, optional
         Time constant, seconds, after which the information of a touch counts 1/e; by default it is kept.
     zenith_gain, zenith_offset : float, optional
-        Approximate response to start with, counts/rad and counts; by default that of the recordings.
+        Approximate response to start with, counts/rad and counts; by default that of the recordings. Not
+        under a wall, and not if touches are added to others.
     body : (float, float), optional
         Nominal radius of the body and height of its lit wall, mm, within 10 %: the response is that of the
         wall, whose print gets brighter from the rim down. Turns have references, and need no zenith gain. A
@@ -96,8 +97,9 @@ def from_touches(
     ------
     mirrorskin.io.InputError
         No touch can be used; a recording has no zenith gain (or references), tilt, pixel size or phases; a
-        stated number is unknown; ``forget`` is given, but a recording has no start time; the calibration has
-        a response of touches without a wall, and ``body`` is given.
+        stated number is unknown, or these touches do not depend on it; ``forget`` is given, but a recording
+        has no start time; ``body``, ``zenith_gain`` or ``zenith_offset`` contradicts the calibration, or each
+        other.
 
     Examples
     --------
@@ -112,6 +114,8 @@ def from_touches(
     if not touches:
         raise InputError("there are no touches: give turns, with or without presses")
     before, body = _start(calibration, body)
+    response = {"zenith_gain": zenith_gain, "zenith_offset": zenith_offset}
+    _check_response([name for name, value in response.items() if value is not None], before, body)
     opened = [
         (None if press is None else calibrated(press, calibration), _upright(turn, calibration))
         for press, turn in touches
@@ -124,7 +128,8 @@ def from_touches(
     precession = None if calibration is None else calibration.precession
     readers = [TouchReader.of(press, turn, device) for press, turn in opened]
     movement = Movement.of(sensor, precession)
-    priors = Priors.of(header, movement, before is not None, stated or {})
+    has_press = any(reader.has_press for reader in readers)
+    priors = Priors.of(header, movement, before is not None, stated or {}, has_press)
     reason = NOT_FOLLOWED
     try:
         attempt = Attempt.of(readers, movement, priors, before, forget).registered()
@@ -187,6 +192,18 @@ def _start(
         return None, body
     told = linear.information, linear.pull, linear.touches, linear.time
     return Earlier(linear.names, linear.values, *told), body
+
+
+def _check_response(given: Sequence[str], before: Earlier | None, body: tuple[float, float] | None) -> None:
+    """Raise InputError if an approximate response is given that would not be used."""
+    if not given or (before is None and body is None):
+        return
+    names = " and ".join(name.replace("_", " ") for name in given)
+    options = " and ".join(f"--{name.replace('_', '-')}" for name in given)
+    reason = "touches are added to the response of the calibration"
+    if body is not None:
+        reason = "the response of a lit wall follows from its geometry and the references"
+    raise InputError(f"{names} cannot be given: {reason}. Remove {options}")
 
 
 def _upright(turn: Source, calibration: Calibration | None) -> Source:

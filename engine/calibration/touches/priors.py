@@ -153,6 +153,7 @@ class Priors:
         movement: Movement,
         of_touches: bool,
         given: Mapping[str, Stated | tuple[float, float]],
+        has_press: bool,
     ) -> Priors:
         """Return the priors from a recording with its calibration, and from numbers that are given."""
         sensor = movement.sensor
@@ -188,13 +189,7 @@ class Priors:
         stated: dict[str, Stated] = {}
         if not of_touches:  # what touches have found is no prior of more touches, but their memory
             stated |= _stated_by(header, movement.before, priors)
-        can_be_stated = [name for name in names if name not in _NOT_STATED and not name.startswith("uneven")]
-        for name, value in given.items():
-            title = next((title for title, shown in TITLES.items() if shown == name), name)
-            if title not in can_be_stated:
-                offered = ", ".join(TITLES.get(each, each) for each in can_be_stated)
-                raise InputError(f"{name} cannot be stated: give one of {offered}")
-            stated[title] = Stated(*value)
+        stated |= _given(given, sensor, has_press)
         return priors.stating(stated)
 
     def at(self, name: str) -> int:
@@ -278,6 +273,33 @@ class Priors:
         error, is_stated = self.error.copy(), list(self.stated)
         error[at], is_stated[at] = self.loose[at], False
         return replace(self, error=error, stated=tuple(is_stated))
+
+
+def _given(
+    numbers: Mapping[str, Stated | tuple[float, float]], sensor: SensorModel, has_press: bool
+) -> dict[str, Stated]:
+    """Return given numbers by the names of parameters; InputError for one that touches do not depend on."""
+    stated = {}
+    offered = {
+        TITLES.get(name, name): name
+        for name in sensor.names
+        if name not in _NOT_STATED and not name.startswith("uneven")
+    }
+    for name, value in numbers.items():
+        if name not in offered:
+            raise InputError(f"{name} cannot be stated: give one of {', '.join(offered)}")
+        if name == "pivot_z" and sensor.pivot is None:
+            raise InputError(
+                "pivot_z cannot be stated: without the depth of the press, turns do not depend on it. Record"
+                " the depth, as in --press 1.2mm, or leave it out"
+            )
+        if name == "pixel_size" and not has_press:
+            raise InputError(
+                "pixel_size cannot be stated: turns alone do not depend on it. Add a press before each turn,"
+                " or leave it out"
+            )
+        stated[offered[name]] = Stated(*value)
+    return stated
 
 
 def _stated_by(header: Header, precession: Precession | None, priors: Priors) -> dict[str, Stated]:

@@ -65,6 +65,7 @@ NOT_FOLLOWED = (
 )
 """Why a touch is not used that does not fit the model."""
 
+_RECORD = "state an approximate one when it is captured or imported, as in"
 _FRAMES = 32  # frames of a turn that are used, at most, evenly spaced
 _LEAST_FRAMES = 4
 _SIDE = 48  # pixels along a side of a window
@@ -206,10 +207,10 @@ def model_of(turn: Source, header: Header, body: tuple[float, float] | None = No
     if header.zenith_gain is None:
         raise InputError(
             f"{turn.name} has no zenith gain: touches improve an approximate one. Give it, such as"
-            " --zenith-gain 360 --zenith-offset -60"
+            " --zenith-gain 6.3/deg --zenith-offset -60"
         )
     if header.tilt is None:
-        raise InputError(f"{turn.name} has no tilt: give an approximate one, as in --tilt 2.5deg")
+        raise InputError(f"{turn.name} has no tilt: {_RECORD} --tilt 2.5deg")
     gain, base, dark, bright = (
         np.broadcast_to(np.asarray(0.0 if values is None else values, np.float64), shape)
         for values in (header.zenith_gain, header.zenith_offset, header.dark, header.bright)
@@ -223,7 +224,7 @@ def _model_under_wall(turn: Source, header: Header, body: tuple[float, float]) -
     """Return the sensor whose wall is printed evenly, seen from the axis."""
     for name, remedy in (("tilt", "--tilt 2.5deg"), ("press", "--press 1.2mm")):
         if getattr(header, name) is None:
-            raise InputError(f"{turn.name} has no {name}: give an approximate one, as in {remedy}")
+            raise InputError(f"{turn.name} has no {name}: {_RECORD} {remedy}")
     dark, bright = levels_of(turn, None)
     first = math.atan2(*body) / 2  # zenith at which the axis shows the rim
     gain = (bright - dark) / (math.pi / 4 - first)

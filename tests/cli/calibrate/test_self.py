@@ -79,6 +79,14 @@ def test_touches_are_added(fitted):
     assert io.open_calibration("cal.h5").response.touches == 2
 
 
+def test_touches_that_are_added_have_the_response_of_the_file(fitted):
+    shutil.copy(fitted[1], "cal.h5")
+    refused(
+        "added to the response of the calibration. Remove --zenith-gain and --zenith-offset",
+        "calibrate self press.h5 turn.h5 -o cal.h5 --zenith-gain 6.3/deg --zenith-offset -60",
+    )
+
+
 def test_numbers_have_standard_errors(fitted):
     printed, _ = fitted
     gain = printed["estimates"]["zenith_gain"]
@@ -103,6 +111,12 @@ def test_show_prints_the_response(fitted):
         ("press.h5 turn.h5 --stated tilt=2deg", "NAME=VALUE+-SIGMA"),
         ("press.h5 turn.h5 --stated weight=2+-1", "cannot be stated"),
         ("press.h5 turn.h5 --body-radius 17.5mm", "give both"),
+        ("turn.h5 --travel-step 0.1mm", "applies to presses"),
+        ("turn.h5 --stated pixel_size=0.1mm+-0.001mm", "turns alone do not depend on it"),
+        (
+            "press.h5 turn.h5 --body-radius 17.5mm --body-height 40mm --zenith-gain 6.3/deg",
+            "follows from its geometry and the references. Remove --zenith-gain",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_refused(arguments, message):

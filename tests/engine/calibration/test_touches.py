@@ -204,6 +204,11 @@ def test_wrong_half_angle_of_a_data_sheet_is_reported_by_turns_alone():
     assert any(note.startswith("tilt: the touches say") for note in fit.notes)
 
 
+def test_pivot_cannot_be_stated_without_the_depth_of_the_press():
+    with pytest.raises(io.InputError, match="pivot_z cannot be stated: without the depth"):
+        from_touches(touches_of(1, stated={"press": None}), stated={"pivot_z": (1.0, 0.1)})
+
+
 @pytest.mark.slow
 def test_errors_of_turns_alone_are_not_larger_than_their_standard_errors():
     away = []

@@ -114,6 +114,16 @@ def test_body_must_have_a_size(touches):
         from_touches(touches, body=(0.0, 40.0))
 
 
+def test_wall_has_no_zenith_offset_of_its_own(touches):
+    with pytest.raises(io.InputError, match="zenith offset cannot be given"):
+        from_touches(rewound(touches), body=BODY, zenith_offset=-60.0)
+
+
+def test_added_touches_of_a_wall_have_no_zenith_gain(fit, taken, touches):
+    with pytest.raises(io.InputError, match="zenith gain cannot be given"):
+        from_touches(rewound(touches), calibration=calibration_of(fit, taken), zenith_gain=360.0)
+
+
 def test_wall_needs_references(touches):
     press, turn = rewound(touches)[0]
     with pytest.raises(io.InputError, match="there are no dark and bright references"):
