@@ -48,6 +48,7 @@ _REMEDIES |= dict.fromkeys(
     (name for name in WallLight.names if name not in STEP_NAMES),
     "touch at places all over the field, on slopes from flat to steep",
 )
+_REMEDIES["scatter"] = "calibrate zenith with a ball, as touches leave out the samples that show it"
 _LEARNED = 0.5  # standard error of a number of a wall that is determined, times the usual deviation
 _NEEDED = {"oval": 0.01, "pivot_z": 1.0, "pixel_size": 0.003}  # standard errors of a determined parameter
 

@@ -142,6 +142,15 @@ def test_wall_needs_the_depth(touches):
         from_touches([(press, stating(turn, press=None))], body=BODY)
 
 
+def test_stated_scatter_is_used_and_only_a_ball_would_show_it(touches):
+    stated = math.radians(2.0), math.radians(0.5)
+    fit = from_touches(rewound(touches)[:1], body=BODY, stated={"scatter": stated})
+    scatter = next(each for each in fit.estimates if each.name == "scatter")
+    assert abs(scatter.value - stated[0]) < 0.5 * stated[1]
+    assert abs(scatter.sigma / stated[1] - 1) < 0.05
+    assert any("scatter (±" in note and "with a ball" in note for note in fit.notes)
+
+
 @pytest.mark.slow
 def test_stated_half_angle_that_touches_contradict_is_reported(touches):
     fit = from_touches(rewound(touches), body=BODY, stated={"tilt": (1.3 * LAB.tilt, math.radians(0.02))})
