@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from mirrorskin.engine.base.reconstruction import calibrated
-from mirrorskin.engine.calibration.touches.fit import Attempt, Earlier
+from mirrorskin.engine.calibration.touches.fit import Attempt
+from mirrorskin.engine.calibration.touches.memory import Earlier
 from mirrorskin.engine.calibration.touches.priors import (
     Movement,
     Priors,
@@ -22,12 +23,10 @@ from mirrorskin.engine.calibration.touches.priors import (
 )
 from mirrorskin.engine.calibration.touches.reading import (
     NOT_FOLLOWED,
-    SensorModel,
     TouchReader,
-    model_of,
-    with_levels,
 )
 from mirrorskin.engine.calibration.touches.result import TouchFit, result_of
+from mirrorskin.engine.calibration.touches.sensor import SensorModel, model_of, with_levels
 from mirrorskin.engine.calibration.touches.wall_result import earlier_of, scatter_of
 from mirrorskin.engine.calibration.wall import check_body
 from mirrorskin.io import (

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.engine.calibration.touches.memory import Earlier, Memory
 from mirrorskin.engine.calibration.touches.priors import (
     Movement,
     Priors,
@@ -22,7 +23,6 @@ from mirrorskin.engine.calibration.touches.window import MOVEMENT, Window
 from mirrorskin.engine.calibration.wall_model import STEP_NAMES
 from mirrorskin.engine.press.intervals import estimate_interval_scatter
 from mirrorskin.io import (
-    InputError,
     LinearResponse,
     WallResponse,
 )
@@ -55,58 +55,6 @@ _IMPLAUSIBLE = 5.0  # standard deviations of what is usual: a fit that is so far
 Response = LinearResponse | WallResponse
 
 
-class Earlier(NamedTuple):
-    """What earlier touches, or presses of a ball, have told of a sensor."""
-
-    names: tuple[str, ...]  # of the parameters
-    values: Doubles
-    information: Doubles
-    pull: Doubles  # information times the deviation of the parameters that touches alone would have
-    touches: int
-    time: float  # of the last, seconds since 1970; NaN if unknown
-
-
-class _Memory(NamedTuple):
-    """Information of earlier touches, and the weight of each of the new ones."""
-
-    matrix: Doubles
-    vector: Doubles  # matrix times the parameters that earlier touches alone would have
-    weights: tuple[float, ...]
-    time: float
-
-    @classmethod
-    def of(
-        cls,
-        before: Earlier | None,
-        touches: Sequence[Touch],
-        forget: float | None,
-        names: Sequence[str],
-    ) -> _Memory:
-        times = [touch.time for touch in touches] + ([] if before is None else [before.time])
-        last = max((time for time in times if math.isfinite(time)), default=math.nan)
-        weights = [1.0] * len(times)
-        if forget is not None:
-            if not forget > 0:
-                raise InputError(f"forget {forget} s: give a time above 0")
-            if not np.isfinite(times).all():
-                raise InputError(
-                    "old touches can only be forgotten if recordings have a start time: leave forget out"
-                )
-            weights = [math.exp((time - last) / forget) for time in times]
-        matrix, vector = np.zeros((len(names),) * 2), np.zeros(len(names))
-        if before is not None:
-            at = np.array([names.index(name) for name in before.names if name in names])
-            of = np.array([number for number, name in enumerate(before.names) if name in names])
-            matrix[np.ix_(at, at)] = weights[-1] * before.information[np.ix_(of, of)]
-            vector[at] = weights[-1] * before.pull[of]
-            vector += matrix[:, at] @ before.values[of]
-        return cls(matrix, vector, tuple(weights[: len(touches)]), last)
-
-    def moved(self, by: Doubles) -> _Memory:
-        """Return the information about parameters that are smaller by some values."""
-        return self._replace(vector=self.vector - self.matrix @ by)
-
-
 @dataclass(frozen=True, slots=True)
 class Attempt:
     """A fit of all touches with frames that are registered with an assumed movement."""
@@ -118,7 +66,7 @@ class Attempt:
     forget: float | None
     read: list[Touch]
     used: list[Touch]
-    memory: _Memory
+    memory: Memory
     fit: Fitted
     dropped: list[Dropped]
     moved: Doubles  # changes of the parameters that are in the movement
@@ -148,7 +96,7 @@ class Attempt:
             start = priors.start(named, movement.before)
         if moved is None:
             moved = np.zeros(len(priors.names))
-        memory = _Memory.of(before, used, forget, priors.names).moved(moved)
+        memory = Memory.of(before, used, forget, priors.names).moved(moved)
         fit, dropped = _fit_with_priors(used, start, priors, memory, exact=False)
         return cls(readers, movement, priors, before, forget, read, used, memory, fit, dropped, moved)
 
@@ -181,7 +129,7 @@ class Attempt:
 
     def exact(self, used: list[Touch]) -> Attempt:
         """Return the exact fit of some of the touches."""
-        memory = _Memory.of(self.before, used, self.forget, self.priors.names).moved(self.moved)
+        memory = Memory.of(self.before, used, self.forget, self.priors.names).moved(self.moved)
         fit, dropped = _fit_with_priors(used, self.fit.values, self.priors, memory, exact=True)
         return replace(self, used=used, memory=memory, fit=fit, dropped=dropped)
 
@@ -306,7 +254,7 @@ class Fitted(NamedTuple):
 
 
 def _fit_with_priors(
-    touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memory, exact: bool
+    touches: Sequence[Touch], start: Doubles, priors: Priors, memory: Memory, exact: bool
 ) -> tuple[Fitted, list[Dropped]]:
     """Return the fit without the stated numbers that the touches contradict, and these."""
     dropped: list[Dropped] = []
@@ -335,7 +283,7 @@ def without_prior(fit: Fitted, priors: Priors, number: int) -> tuple[float, floa
     )
 
 
-def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: _Memory, exact: bool) -> Fitted:
+def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: Memory, exact: bool) -> Fitted:
     """Return the Gauss-Newton fit of surfaces, frames and parameters.
 
     Splines are chosen, and pixels that do not follow the model are excluded, on the way. An ``exact`` fit,

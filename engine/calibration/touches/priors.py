@@ -11,11 +11,10 @@ import numpy as np
 
 from mirrorskin.engine.calibration.touches.light import FOOTPRINT
 from mirrorskin.engine.calibration.touches.reading import (
-    SensorModel,
     Touch,
     TouchReader,
-    Wall,
 )
+from mirrorskin.engine.calibration.touches.sensor import SensorModel, Wall
 from mirrorskin.engine.calibration.touches.wall_light import WallLight, even_steps, roughness
 from mirrorskin.engine.calibration.touches.window import TURNS
 from mirrorskin.engine.calibration.wall import BODY_ERROR, LIKELY

@@ -9,7 +9,8 @@ from typing import cast
 import numpy as np
 
 from mirrorskin.engine.calibration import wall_model as model
-from mirrorskin.engine.calibration.touches.fit import Attempt, Earlier
+from mirrorskin.engine.calibration.touches.fit import Attempt
+from mirrorskin.engine.calibration.touches.memory import Earlier
 from mirrorskin.engine.calibration.touches.wall_light import WallLight
 from mirrorskin.engine.calibration.wall_fit import WallFit
 from mirrorskin.engine.calibration.wall_response import FEW, response_of, steps_of
