@@ -21,12 +21,10 @@ from mirrorskin.engine.calibration.touches.priors import (
     Stated,
     search,
 )
-from mirrorskin.engine.calibration.touches.reading import (
-    NOT_FOLLOWED,
-    TouchReader,
-)
+from mirrorskin.engine.calibration.touches.reading import TouchReader
 from mirrorskin.engine.calibration.touches.result import TouchFit, result_of
 from mirrorskin.engine.calibration.touches.sensor import SensorModel, model_of, with_levels
+from mirrorskin.engine.calibration.touches.view import NOT_FOLLOWED
 from mirrorskin.engine.calibration.touches.wall_result import earlier_of, scatter_of
 from mirrorskin.engine.calibration.wall import check_body
 from mirrorskin.io import (
@@ -138,7 +136,8 @@ def from_touches(
             other = Attempt.of(readers, movement, priors, before, forget).registered()
             attempt = min(other, attempt, key=lambda each: each.noise)
         if not attempt.used:
-            reason = attempt.read[0].reason
+            reasons = dict.fromkeys(touch.reason for touch in attempt.read)
+            reason = "; ".join(reasons)
         used = attempt.following()
         if used and attempt.is_plausible:
             return result_of(attempt.exact(used))

@@ -22,7 +22,7 @@ from mirrorskin.engine.calibration.touches.heights import (
 )
 from mirrorskin.engine.calibration.touches.light import LinearLight
 from mirrorskin.engine.calibration.touches.sensor import FRAMES, SensorModel, Wall
-from mirrorskin.engine.calibration.touches.view import Place, View, varied_places, vary
+from mirrorskin.engine.calibration.touches.view import NOT_FOLLOWED, Place, View, lacking, varied_places, vary
 from mirrorskin.engine.calibration.touches.wall_light import WallLight
 from mirrorskin.engine.calibration.touches.window import (
     TURNS,
@@ -55,12 +55,10 @@ from mirrorskin.kernels.device import Device
 from mirrorskin.kernels.rotation.registration import BORDER
 from mirrorskin.kernels.rotation.response import sight_slopes
 
-NOT_FOLLOWED = (
-    "the brightness does not follow the turn. Press deeper, on something with relief, and check phases, tilt"
-    " and pivot"
+_ODD = (
+    "its samples differ from the model by more than those of the other touches, as next to ridges. Touch"
+    " something whose slopes change gradually"
 )
-"""Why a touch is not used that does not fit the model."""
-
 _LEAST_FRAMES = 4
 _LEAST_SIDE = 16
 _AROUND = 2 * MARGIN + BORDER  # pixels next to the inner ones of a window on which they depend
@@ -89,6 +87,7 @@ class Touch:
     misfits: Doubles  # of first slopes to surfaces; see `Window.start`
     varied: bool  # whether its slopes are not all alike
     relief: Doubles  # (H, W): heights with which frames were registered, mm
+    lacking: str  # why it has no window, if it has none
     is_warm: bool  # whether its surfaces are those of an earlier fit
     noise: float = 1.0  # variance of a sample
 
@@ -113,10 +112,10 @@ class Touch:
     def reason(self) -> str:
         """Why the touch is not used."""
         if not self.windows:
-            return "it shows hardly any light in contact. Press deeper, on a larger object"
+            return self.lacking
         if not self.varied:
             return "its slopes are all alike, as those of a plate or an edge. Touch something rough or round"
-        return NOT_FOLLOWED
+        return _ODD if self.follows() else NOT_FOLLOWED
 
     @property
     def misfit(self) -> float:
@@ -269,7 +268,7 @@ class TouchReader:
         def look(part: Place) -> View:
             return View.of(frames, phase, whole, sensor, press, pixel_size, part)
 
-        views = self._views(look, sensor.wall is not None)
+        views, looked = self._views(look, sensor.wall is not None)
         windows, misfits, slopes = list[Window](), np.zeros((2, len(TURNS))), list[Doubles]()
         for number, (place, view) in enumerate(views):
             window, wave = self._window(frames, sensor, noise_gain, place, view)
@@ -300,15 +299,19 @@ class TouchReader:
             misfits=misfits,
             is_warm=self.earlier is not None and not self.chooses,
             relief=self.relief,
+            lacking=lacking(looked, whole, sensor),
             varied=bool(slopes) and vary(np.concatenate(slopes, axis=1)),
         )
 
-    def _views(self, look: Callable[[Place], View], all_over: bool) -> list[tuple[Place, View]]:
-        """Return the windows, and what frames show in them."""
-        if self.earlier is None:
+    def _views(
+        self, look: Callable[[Place], View], all_over: bool
+    ) -> tuple[list[tuple[Place, View]], list[View]]:
+        """Return the windows with what frames show there, and all that was looked at."""
+        if self.earlier is None or not self.earlier.windows:
             height, width = self.turn.shape[1:]
             view = look((slice(0, height), slice(0, width)))
-            return [(place, view) for place in varied_places(view, all_over)]
+            places = [] if self.earlier is not None else varied_places(view, all_over)
+            return [(place, view) for place in places], [view]
         views = []
         for window in self.earlier.windows:
             rows, columns = window.place
@@ -320,7 +323,7 @@ class TouchReader:
                 for margin in (MARGIN, _AROUND)
             )
             views.append((place, look(part)))
-        return views
+        return views, [view for _, view in views]
 
     def _arm(self, sensor: SensorModel) -> float | None:
         press = self.turn.header.press

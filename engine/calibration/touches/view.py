@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -31,6 +31,30 @@ _EDGE = 4.0  # standard deviations between heights of neighbours, beyond their s
 _STEEPER = 1.2  # factor of slopes: they are approximate
 _SWING = 0.4, 2.5  # range of the amplitude of the zenith, in tilts, from which the half-angle is guessed
 
+NOT_FOLLOWED = (
+    "the brightness does not follow the turn. Press deeper, on something with relief, and check phases, tilt"
+    " and pivot, and the travel of the press"
+)
+"""Why a touch is not used that does not fit the model."""
+
+_CLIPPED = "hardly any pixel has valid samples in all frames. Shorten the exposure"
+_DARK = "it shows hardly any light in contact. Press deeper, on a larger object"
+_EDGES = "nearly all of its pixels are next to edges or ridges. Touch something whose slopes change gradually"
+_REASONS = (
+    _CLIPPED,
+    _DARK,
+    NOT_FOLLOWED,
+    "its contact is narrow, or its slopes are those of the half-angle. Press deeper, on something steeper",
+    _EDGES,
+)
+_REASONS_UNDER_WALL = (
+    _CLIPPED,
+    _DARK,
+    "nearly all of its slopes are steeper than the wall shows. Touch something that is less steep",
+    "its light is in patches of a few pixels. Touch something larger, whose slopes change gradually",
+    _EDGES,
+)  # why few pixels remain that have samples, are lit, shown, inside and usable; see `View`
+
 Place = tuple[slice, slice]
 """Rows and columns of a part of a picture."""
 
@@ -40,8 +64,10 @@ class View(NamedTuple):
 
     part: Place
     wave: Doubles  # (3, H, W): see `_wave`
+    lit: NDArray[np.bool_]  # (H, W): whether there is light in all frames
     shown: NDArray[np.bool_]  # (H, W): whether the model holds
-    usable: NDArray[np.bool_]  # (H, W): whether samples can be used
+    inside: NDArray[np.bool_]  # (H, W): the same, next to no border, and not near the half-angle
+    usable: NDArray[np.bool_]  # (H, W): whether samples can be used: those that are also smooth
     smooth: NDArray[np.bool_]  # (H, W): whether slopes cross no edge
     tilt_seen: float
 
@@ -59,24 +85,26 @@ class View(NamedTuple):
             wave = _wave((counts - sensor.base[part]) / sensor.gain[part], phase, sensor.tilt)
             if sensor.wall is None:
                 tilt_seen, least = _tilt_seen(wave, sensor.tilt), np.min(counts, axis=0) - sensor.dark[part]
-                gentle = np.isfinite(middle) & (least > LEAST_LIGHT * sensor.full)
+                lit = whole[part] & (least > LEAST_LIGHT * sensor.full)
+                gentle = np.isfinite(middle) & lit
                 has_press = np.isfinite(press[0]).any()
                 gentlest = _GENTLE if has_press else _LEVEL  # skin without contact does not swing
                 gentle &= wave[0] < _GENTLE * tilt_seen
                 shown = whole[part] & (gentle | shows_model(wave, least, tilt_seen, sensor.full, gentlest))
-                usable = shown & (np.abs(wave[0] / tilt_seen - 1) > _NEAR_AXIS)
+                inside = shown & (np.abs(wave[0] / tilt_seen - 1) > _NEAR_AXIS)
             else:
                 tilt_seen = sensor.tilt
                 first = math.atan2(*sensor.wall.body) / 2
                 low, high = ((wave[0] + side * tilt_seen - first) / (math.pi / 4 - first) for side in (-1, 1))
-                usable = shown = whole[part] & np.isfinite(middle) & (low > _RIM) & (high < _REST_PLANE)
+                lit = whole[part] & np.isfinite(middle) & (low > _RIM)
+                inside = shown = lit & (high < _REST_PLANE)
         if sensor.pivot is not None:
-            usable = _without_border(usable)
+            inside = _without_border(inside)
         steepness = np.where(whole[part], np.tan(np.minimum(wave[0], _STEEPEST)), np.nan)
         smooth = _crosses_no_edge(middle, half, steepness, pixel_size)
         if sensor.wall is not None:
             smooth &= ~_ridges(middle, half)
-        return cls(part, wave, shown, usable & smooth, smooth, tilt_seen)
+        return cls(part, wave, lit, shown, inside, inside & smooth, smooth, tilt_seen)
 
     def seen(self, place: Place) -> Place:
         """Return the rows and columns of a place of the picture in the part."""
@@ -85,6 +113,20 @@ class View(NamedTuple):
             for each, part in zip(place, self.part, strict=True)
         )
         return rows, columns
+
+
+def lacking(views: Sequence[View], whole: NDArray[np.bool_], sensor: SensorModel) -> str:
+    """Return why there are hardly any usable pixels: the first step that leaves few, or the strictest one.
+
+    ``whole`` are the pixels of the picture, (H, W), with samples in all frames.
+    """
+    steps = [(whole[view.part], view.lit, view.shown, view.inside, view.usable) for view in views]
+    counts = np.sum([[np.count_nonzero(pixels) for pixels in step] for step in steps], axis=0)
+    reasons = _REASONS if sensor.wall is None else _REASONS_UNDER_WALL
+    few = counts <= _LEAST_USABLE * min(_SIDE, *whole.shape) ** 2
+    if few.any():
+        return reasons[int(np.argmax(few))]
+    return reasons[2 + int(np.argmin(counts[2:] / counts[1:-1]))]
 
 
 def _crosses_no_edge(

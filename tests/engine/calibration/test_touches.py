@@ -309,6 +309,30 @@ def test_plate_next_to_other_touches_is_named():
     assert any("is not used: its slopes are all alike" in note for note in fit.notes)
 
 
+def shown(turn, share=1.0, frames=slice(None)):
+    """Return a turn with a share of its light above the dark level, and the samples of some frames only."""
+    dark = np.median(np.asarray(turn.header.dark))
+    samples = turn.read(np.empty(turn.shape, turn.dtype)).frames.astype(np.float64)
+    samples = np.rint(dark + share * (samples - dark)).astype(turn.dtype)
+    repeated = np.repeat(samples[frames], FRAMES // len(samples[frames]), axis=0)
+    names = "pixel_size", "tilt", "press", "pivot", "dark", "bright", "zenith_gain", "zenith_offset"
+    stated = {name: getattr(turn.header, name) for name in names}
+    return ArrayRecording(repeated, {"phase": PHASE}, stated, name="this turn")
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"share": 0.01}, "it shows hardly any light in contact"),
+        ({"frames": slice(1)}, "the brightness does not follow the turn"),
+    ],
+)
+def test_turn_that_is_not_used_is_named_with_the_reason(change, reason):
+    press, turn = a_touch("sphere")
+    fit = from_touches([a_touch("sphere"), (press, shown(turn, **change))])
+    assert any(note.startswith(f"this turn is not used: {reason}") for note in fit.notes), fit.notes
+
+
 def a_staircase(seed):
     """Return a touch of treads that are level and inclined in turn, under light that begins at zenith 0."""
     gain, offset, shape, size = 265.0, 30.0, (48, 56), 0.1

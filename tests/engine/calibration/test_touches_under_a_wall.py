@@ -109,6 +109,19 @@ def test_response_survives_a_file(fit, taken, tmp_path):
     np.testing.assert_array_equal(found.information, fit.response.information)
 
 
+@pytest.mark.parametrize(
+    ("thing", "reason"),
+    [
+        (scorer.facets(math.radians(29), 1.3, 2.1, 0.8, REACH), "next to edges or ridges"),
+        (scorer.facets(math.radians(9), 3.0, 2.1, 0.5, REACH), "hardly any light in contact"),
+    ],
+)
+def test_touch_that_is_not_used_is_named_with_the_reason(touches, taken, thing, reason):
+    others = rewound(touches)[:1]
+    fit = from_touches([*others, touch(LAB, thing, press_for(thing), 40, taken)], body=BODY)
+    assert any(note.startswith(f"{thing.name} is not used: ") and reason in note for note in fit.notes)
+
+
 def test_body_must_have_a_size(touches):
     with pytest.raises(io.InputError, match="must be above 0"):
         from_touches(touches, body=(0.0, 40.0))
