@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -51,6 +52,10 @@ def command(
         )
         return
     _print(str(calibration), rows)
+    notes = (str(text).split("; ") for name, text in parts.process.items() if name.endswith(".notes"))
+    for note in dict.fromkeys(itertools.chain.from_iterable(notes)):
+        if note:
+            click.echo(f"note: {note}")
     if output is not None:
         click.echo(f"{output}: {', '.join(path.name for path in pictures) or 'nothing to draw'}")
 

@@ -106,6 +106,7 @@ def result_of(attempt: Attempt) -> TouchFit:
             Estimate(TITLES.get(name, name), priors.number_of(name, values[name]), sigma[name] * size,
                      error * size, unit, determined)
         )  # fmt: skip
+    notes += _missing_references(attempt)
     notes += [_contradiction(each, priors, fit) for each in attempt.dropped]
     if fit.contradicts:
         notes.append(
@@ -126,6 +127,19 @@ def result_of(attempt: Attempt) -> TouchFit:
     gains = {touch.name: 1 + np.split(touch.frame_values, 2)[0] for touch in used}
     precession = _precession(attempt, values, sigma)
     return TouchFit(response, precession, tuple(estimates), gains, tuple(notes))
+
+
+def _missing_references(attempt: Attempt) -> list[str]:
+    """Return the sentence about references that samples stand in for, if any are missing."""
+    header, ends = attempt.readers[0].turn.header, {"dark": "darkest", "bright": "brightest"}
+    missing = [name for name in ends if getattr(header, name) is None]
+    if not missing:
+        return []
+    samples = " and ".join(ends[name] for name in missing)
+    return [
+        f"no {' and '.join(missing)} references: the {samples} 0.1 % of the samples stand in for them, and"
+        " gain and offset contain their errors. Remedy: calibrate references"
+    ]
 
 
 def _linear_response(attempt: Attempt, sigma: Mapping[str, float]) -> LinearResponse:

@@ -103,6 +103,13 @@ def test_show_prints_the_response(fitted):
     assert "zenith gain" in done("calibrate show", fitted[1]).out
 
 
+def test_show_repeats_each_note_once():
+    said = done("calibrate self turn.h5 -o cal.h5").said
+    shown = done("calibrate show cal.h5").out
+    notes = [line for line in said.splitlines() if line.startswith("note: ")]
+    assert [line for line in shown.splitlines() if line.startswith("note: ")] == notes
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

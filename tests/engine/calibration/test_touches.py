@@ -234,6 +234,7 @@ def test_references_are_not_needed(has_press):
     fit = from_touches([(press if has_press else None, turn)])
     away = deviations(fit)
     assert max(abs(away[name]) for name in ("gamma", "zenith_gain", "zenith_offset", "tilt")) < 3, away
+    assert any(note.startswith("no dark and bright references: the darkest and bright") for note in fit.notes)
 
 
 def test_periodic_texture_pressed_in_few_steps_is_honest():
