@@ -49,12 +49,16 @@ class Lit(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearLight:
-    """The light of n pixels by `mirrorskin.engine.diagnosis.turn_light`."""
+    """The light of n pixels by `mirrorskin.engine.diagnosis.turn_light`.
+
+    An error of the zenith offset is light, so that of a pixel is in proportion to its gain.
+    """
 
     gain: Doubles  # (n,)
     base: Doubles  # (n,)
     dark: Doubles  # (n,)
     full: float
+    usual: float  # gain of the usual pixel
     places: Doubles  # (5, n): terms of uneven light
 
     names: ClassVar[tuple[str, ...]] = (
@@ -66,8 +70,9 @@ class LinearLight:
         """Return the light of chosen pixels."""
         angles = SlopeAngles.of(seen.slopes, seen.phase, seen.tilt, seen.changes)
         bend = FOOTPRINT * angles.bend
-        dark = self.dark[chosen]
-        scale = PixelScale(self.gain[chosen], self.base[chosen], dark, self.full)
+        dark, share = self.dark[chosen], self.gain[chosen] / self.usual
+        base = self.base[chosen] + named["zenith_offset"] * (share - 1)
+        scale = PixelScale(self.gain[chosen], base, dark, self.full)
         values = np.array([named[name] for name in (*GLOBALS, *UNEVEN_TERMS)])
         light = light_of(
             angles, (1 + named["footprint"]) * bend, scale, seen.gains, seen.offsets, values,
@@ -75,6 +80,7 @@ class LinearLight:
         )  # fmt: skip
         of_movement = [GLOBALS.index(name) for name in _OF_MOVEMENT]
         by_tilt, by_phase = light.by_globals[of_movement]
+        light.by_globals[GLOBALS.index("zenith_offset")] *= share
         return Lit(
             light.light + dark,
             light.by_angle * angles.by_slopes,

@@ -214,10 +214,14 @@ class TouchReader:
         registered = None
         reader = self if sensor.wall is None else self._seen_along(sensor.wall)
         if sensor.pivot is not None:
-            header, sight = replace(source.header, pivot=sensor.pivot, tilt=sensor.tilt), None
-            if sensor.wall is not None:
-                header = replace(header, zenith_gain=sensor.gain, zenith_offset=sensor.base)
-                sight = Sight(sensor.wall.sight[0], sensor.wall.axis)
+            header = replace(
+                source.header,
+                pivot=sensor.pivot,
+                tilt=sensor.tilt,
+                zenith_gain=sensor.gain,
+                zenith_offset=sensor.base,
+            )
+            sight = None if sensor.wall is None else Sight(sensor.wall.sight[0], sensor.wall.axis)
             source = registered = Registered(
                 source, reader.relief, device=self.device, header=header, sight=sight
             )
@@ -370,7 +374,8 @@ class TouchReader:
 
         if sensor.wall is None:
             places = np.stack(uneven_terms(*spread(*picture_axes(self.middle.shape))))
-            return LinearLight(of(sensor.gain), of(sensor.base), of(sensor.dark), sensor.full, places)
+            usual = float(np.nanmedian(sensor.gain))
+            return LinearLight(of(sensor.gain), of(sensor.base), of(sensor.dark), sensor.full, usual, places)
         assert sensor.pivot is not None
         assert self.turn.header.press is not None
         places = np.stack(spread(*pixel_axes(self.middle.shape, pixel_size_of(self.turn))))

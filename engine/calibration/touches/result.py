@@ -148,14 +148,15 @@ def _linear_response(attempt: Attempt, sigma: Mapping[str, float]) -> LinearResp
     x, y = np.meshgrid(*picture_axes((sensor.gain.shape[0], sensor.gain.shape[1])))
     uneven = sum(values[name] * term for name, term in zip(UNEVEN_TERMS, uneven_terms(x, y), strict=True))
     gain = sensor.gain * (1 + values["zenith_gain"]) * (1 + uneven)
-    offset = sensor.dark + (1 + uneven) * (sensor.base + values["zenith_offset"] - sensor.dark)
-    scale = abs(float(np.nanmedian(sensor.gain)))
+    usual = float(np.nanmedian(sensor.gain))
+    more = values["zenith_offset"] * sensor.gain / usual
+    offset = sensor.dark + (1 + uneven) * (sensor.base + more - sensor.dark)
     return LinearResponse(
         gain=gain.astype(np.float32),
         offset=offset.astype(np.float32),
         gamma=1 + values["gamma"],
         sigma={
-            "gain": sigma["zenith_gain"] * scale,
+            "gain": sigma["zenith_gain"] * abs(usual),
             "offset": sigma["zenith_offset"],
             "gamma": sigma["gamma"],
         },

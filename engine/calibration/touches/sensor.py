@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -92,8 +92,23 @@ def model_of(turn: Source, header: Header, body: tuple[float, float] | None = No
         for values in (header.zenith_gain, header.zenith_offset, header.dark, header.bright)
     )
     full = max(float(np.nanmedian(bright - dark)), 1e-9)
+    stated = header.zenith_gain, header.zenith_offset
+    if all(values is None or np.size(values) == 1 for values in stated):
+        gain, base = _of_pixels(float(gain.flat[0]), float(base.flat[0]), dark, bright, turn.dtype)
     pivot = header.pivot if header.pivot is not None else (0.0, 0.0, 0.0)
     return SensorModel(gain, base, dark, full, header.tilt, None if header.press is None else pivot)
+
+
+def _of_pixels(
+    gain: float, base: float, dark: Doubles, bright: Doubles, dtype: np.dtype[Any]
+) -> tuple[Doubles, Doubles]:
+    """Return gain and offset of each pixel, (H, W), by its references; NaN if the bright one is clipped."""
+    clear = bright < (np.iinfo(dtype).max if dtype.kind == "u" else math.inf)
+    if not clear.any():
+        return np.full(dark.shape, gain), np.full(dark.shape, base)
+    span = np.where(clear, bright - dark, np.nan)
+    share = span / np.nanmedian(span)
+    return gain * share, dark + (base - np.nanmedian(dark)) * share
 
 
 def _model_under_wall(turn: Source, header: Header, body: tuple[float, float]) -> SensorModel:

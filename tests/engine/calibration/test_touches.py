@@ -225,6 +225,22 @@ def test_errors_of_turns_alone_are_not_larger_than_their_standard_errors():
     assert all(value < 1.7 for value in chi2.values()), chi2  # 2 standard deviations of chi-square
 
 
+def test_one_gain_is_shared_out_among_pixels_as_references_say():
+    camera = Camera(seed=3, gain_deviation=0.05)
+    movement = Axial(PHASE, tilt=TILT, press=PRESS, pivot=PIVOT)
+    field = {"object": Waves(0), "shape": (56, 56), "pixel_size": 0.03, "object_shift": (0.6, 0.3)}
+    turn = Twin(movement=movement, pattern="linear", camera=camera, **field)
+    true = turn.header
+    one = {name: np.median(getattr(true, name)) for name in ("zenith_gain", "zenith_offset")}
+    fit = from_touches(
+        [(a_press(Waves(0)), stating(turn, **one | {"zenith_offset": one["zenith_offset"] + 3}))]
+    )
+    error = fit.response.gain / true.zenith_gain
+    assert np.nanstd(error) < 0.005  # 0.05 without references
+    away = fit.response.offset - true.zenith_offset
+    assert np.nanstd(away) < 0.6  # counts; 4 without
+
+
 @pytest.mark.parametrize("has_press", [True, False])
 def test_references_are_not_needed(has_press):
     """Gain and offset of the response contain what the dark level and full light would say."""
