@@ -46,6 +46,8 @@ _LEAN = math.radians(2.5)  # tilt of a typical rotation; errors of the normals h
 _FRAMES = 8  # number of frames of that rotation
 _DERIVATIVE_STEP = 1e-4  # radians: step of numerical derivatives by angles
 _SMALL = 1e-3  # step of numerical derivatives by a parameter, relative to its scale
+_SCALES = np.append([model.SCALES[name] for name in model.SENSOR], np.ones(model.CURVE_COEFFICIENTS))
+_SWING_ZENITHS = 0.25, 0.5, 0.75  # shares of the reach at which errors of the swing are computed
 _CLIP_Z_SCORE = 3.0  # times the noise at which residuals are clipped
 _RINGS, _OCTANTS = 6, 8  # cells of a press, in which residuals are averaged
 
@@ -131,7 +133,10 @@ def make_response(
         shares = float(low), float(high)
     response = response_of(fit, shares, pattern, source)
     zenith_sigma = np.hypot(response.zenith_sigma, np.float32(residual))
-    return replace(response, zenith_sigma=zenith_sigma, error=largest)
+    swing_sigma = response.swing_sigma
+    if swing_sigma is not None:  # the swing is a difference of light whose zeniths are two tilts apart
+        swing_sigma = math.hypot(swing_sigma, math.sqrt(2) * residual / _LEAN)
+    return replace(response, zenith_sigma=zenith_sigma, swing_sigma=swing_sigma, error=largest)
 
 
 def response_of(fit: WallFit, shares: tuple[float, float], pattern: str, source: Source) -> WallResponse:
@@ -164,8 +169,9 @@ def response_of(fit: WallFit, shares: tuple[float, float], pattern: str, source:
         error=math.nan,
     )
     zenith_sigma, azimuth_sigma = _error_maps(response, fit, source)
-    error = float(np.nanmedian(zenith_sigma))
-    return replace(response, zenith_sigma=zenith_sigma, azimuth_sigma=azimuth_sigma, error=error)
+    swing_sigma = _swing_error(response, fit, source) if pattern == "graded" else None
+    response = replace(response, zenith_sigma=zenith_sigma, azimuth_sigma=azimuth_sigma)
+    return replace(response, swing_sigma=swing_sigma, error=float(np.nanmedian(zenith_sigma)))
 
 
 def _reach(named: Mapping[str, float], shares: tuple[float, float] = (0.0, 1.0)) -> tuple[float, float]:
@@ -230,16 +236,13 @@ def _error_maps(
     """
     from scipy.ndimage import map_coordinates
 
-    pixel_size, shape = pixel_size_of(source), source.shape[1:]
-    axes = (np.linspace(axis[0], axis[-1], _SIDE) for axis in pixel_axes(shape, pixel_size))
-    places = np.repeat(np.stack([axis.ravel() for axis in np.meshgrid(*axes)]), _TURN, axis=1)
-    azimuth = np.tile(np.arange(_TURN) * 2 * np.pi / _TURN, _SIDE * _SIDE)
+    shape = source.shape[1:]
+    places, azimuth = _mirrors(source)
     if response.pattern == "uniform":
         zenith = threshold_zenith(response, places[0], places[1], azimuth, _HALF * response.curve[0])
     else:
         middle = math.pi / 4 - math.atan(sum(response.reach) / 2)
-        outside = np.hypot(places[0] - response.axis[0], places[1] - response.axis[1]) >= response.radius
-        zenith = np.where(outside, np.nan, middle)
+        zenith = np.where(_on_body(response, places), middle, np.nan)
     valid = np.isfinite(zenith)
     slopes = np.full((2, len(zenith), model.STEPS.stop), np.nan)
     slopes[:, valid] = _normal_slopes(fit, places[:, valid], azimuth[valid], zenith[valid])
@@ -256,6 +259,63 @@ def _error_maps(
     if response.pattern == "uniform":
         azimuth_sigma[:] = np.nan
     return zenith_sigma, azimuth_sigma
+
+
+def _mirrors(source: Source) -> tuple[Doubles, Doubles]:
+    """Return places on the rest plane, (2, n), mm, and azimuths at which errors are computed, (n,)."""
+    axes = (
+        np.linspace(axis[0], axis[-1], _SIDE) for axis in pixel_axes(source.shape[1:], pixel_size_of(source))
+    )
+    places = np.repeat(np.stack([axis.ravel() for axis in np.meshgrid(*axes)]), _TURN, axis=1)
+    return places, np.tile(np.arange(_TURN) * 2 * np.pi / _TURN, _SIDE * _SIDE)
+
+
+def _on_body(response: WallResponse, places: Doubles) -> NDArray[np.bool_]:
+    """Return whether places are within the wall."""
+    away = np.hypot(places[0] - response.axis[0], places[1] - response.axis[1])
+    return np.asarray(away < response.radius)
+
+
+def _swing_error(response: WallResponse, fit: WallFit, source: Source) -> float:
+    """Return the relative standard error of the swing of the brightness over a turn, at a given mean.
+
+    The mean m and the amplitude a of the light of a mirror change with its zenith and with the parameters p
+    of the fit; at a given mean, the amplitude changes by ::
+
+        d ln a = (a_p - a_z m_p / m_z) dp / a
+
+    It is averaged over the picture and azimuths; RMS over zeniths.
+    """
+    places, azimuth = _mirrors(source)
+    inside = _on_body(response, places)
+    places, azimuth = places[:, inside], azimuth[inside]
+    parameters, covariance = (
+        fit.parameters[: model.STEPS.stop],
+        fit.covariance[: model.STEPS.stop, : model.STEPS.stop],
+    )
+    first = np.exp(2j * np.pi * np.arange(_FRAMES) / _FRAMES) * 2 / _FRAMES
+    low, high = (math.pi / 4 - math.atan(q) for q in reversed(response.reach))
+    variances = []
+    for share in _SWING_ZENITHS:
+        zenith = np.full(len(azimuth), low + share * (high - low))
+
+        def wave(values: Doubles, by: float = 0.0, at: Doubles = zenith) -> Doubles:
+            light = _light_of_turn(values, fit.rising, places, at + by, azimuth)
+            return np.stack([np.mean(light, axis=1), np.abs(light @ first)])
+
+        steeper = (wave(parameters, _DERIVATIVE_STEP) - wave(parameters, -_DERIVATIVE_STEP)) / (
+            2 * _DERIVATIVE_STEP
+        )
+        by_parameter = np.empty(len(parameters))
+        for number, step in enumerate(_SMALL * _SCALES):
+            change = np.zeros(len(parameters))
+            change[number] = step
+            mean, amplitude = (wave(parameters + change) - wave(parameters - change)) / (2 * step)
+            by_parameter[number] = np.nanmean(
+                (amplitude - steeper[1] * mean / steeper[0]) / wave(parameters)[1]
+            )
+        variances.append(by_parameter @ covariance @ by_parameter)
+    return math.sqrt(float(np.mean(variances)))
 
 
 def error_left(samples: model.LightSamples, fit: WallFit, noise: Doubles) -> tuple[float, float]:
@@ -308,8 +368,7 @@ def _normal_slopes(fit: WallFit, places: Doubles, azimuth: Doubles, zenith: Doub
         axis=-1,
     ) / (2 * _DERIVATIVE_STEP)
     by_parameter = np.zeros((*design.shape[:2], len(parameters)))
-    scales = np.append([model.SCALES[name] for name in model.SENSOR], np.ones(model.CURVE_COEFFICIENTS))
-    for number, step in enumerate(_SMALL * scales):
+    for number, step in enumerate(_SMALL * _SCALES):
         changed = np.repeat(parameters[np.newaxis], 2, axis=0)
         changed[:, number] += step, -step
         change = light(changed[0], zenith, azimuth) - light(changed[1], zenith, azimuth)

@@ -26,7 +26,7 @@ from mirrorskin.engine.diagnosis.sensor_health import (
 )
 from mirrorskin.engine.diagnosis.swing import ModulationEffects, find_modulation_effects, swing_of_wall
 from mirrorskin.engine.diagnosis.turn_nuisances import TurnNuisances
-from mirrorskin.io import Result
+from mirrorskin.io import Calibrated, Result, Source
 from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.io.watch.mirrored import MIRRORED
 from mirrorskin.kernels.numerics.least_squares import CLEAR_Z_SCORE, mad_sigma
@@ -124,9 +124,11 @@ class ResponseUncertainty(Step):
         header, response = context.source.header, operation.response
         if response is not None:
             swing = swing_of_wall(*maps, response, tilt, noise_of_mean)
-            # The swing is a difference of light whose zeniths are two tilts apart.
-            sigma = math.sqrt(2) * float(np.nanmedian(response.sigma)) / tilt
-            change = change_of_swing(swing, header, tilt, sigma)
+            sigma = response.swing_sigma
+            if sigma is None:  # the swing is a difference of light whose zeniths are two tilts apart
+                sigma = math.sqrt(2) * float(np.nanmedian(response.sigma)) / tilt
+            tilt_sigma = _calibrated_tilt_sigma(context.source, tilt)
+            change = change_of_swing(swing, header, tilt, sigma, tilt_sigma)
             return with_light_change(result, change, CALIBRATION)
         gain = cast("ArrayLike", operation.zenith_gain)
         modulation = find_modulation_effects(*maps, gain, tilt, noise_of_mean)
@@ -140,6 +142,15 @@ class ResponseUncertainty(Step):
         doubtful = modulation.blur > 0 or modulation.response > 0
         change = None if doubtful else change_of_swing(modulation.swing, header, tilt)
         return with_light_change(result, change, reference_of(context.source, gain))
+
+
+def _calibrated_tilt_sigma(source: Source, tilt: float) -> float | None:
+    """Return the relative standard error of a tilt if it is that of the calibration."""
+    precession = source.calibration.precession if isinstance(source, Calibrated) else None
+    if precession is None or not math.isclose(tilt, precession.tilt):
+        return None
+    sigma = precession.sigma.get("tilt", math.nan) / tilt
+    return sigma if math.isfinite(sigma) else None
 
 
 class NuisanceUncertainty(Step):

@@ -206,11 +206,17 @@ def find_clear_change(fitted: Fitted, reference: Reference) -> Finding | None:
 
 
 def change_of_swing(
-    swing: Swing | None, header: Header, tilt: float, gain_sigma: float | None = None
+    swing: Swing | None,
+    header: Header,
+    tilt: float,
+    gain_sigma: float | None = None,
+    tilt_sigma: float | None = None,
 ) -> LightChange | None:
     """Return the change of the brightness by the swing of a rotation.
 
-    ``gain_sigma`` is the relative standard deviation of a calibrated response; by default that of the gain.
+    ``gain_sigma`` is the relative standard deviation of the swing by a calibrated response, which contains
+    that of its curvature; by default it is that of gain and gamma. ``tilt_sigma`` is that of a calibrated
+    tilt.
     """
     if swing is None:
         return None
@@ -233,6 +239,8 @@ def change_of_swing(
         np.array([-footprint / 2, *[0.0] * 6]),
         np.array([_AREA / 2, _PER_ZENITH * gamma, *[shift] * 5]),
     )
-    gain_sigma = header.prior("zenith_gain_sigma") if gain_sigma is None else gain_sigma
-    stated = gain_sigma, header.prior("tilt_sigma"), _GAMMA * gamma
-    return find_light_change(samples, math.hypot(*stated), header.prior("uneven_light_sigma"))
+    if gain_sigma is None:
+        gain_sigma = math.hypot(header.prior("zenith_gain_sigma"), _GAMMA * gamma)
+    tilt_sigma = header.prior("tilt_sigma") if tilt_sigma is None else tilt_sigma
+    common = math.hypot(gain_sigma, tilt_sigma)
+    return find_light_change(samples, common, header.prior("uneven_light_sigma"))

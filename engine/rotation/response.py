@@ -36,6 +36,7 @@ class Response:
     wall: Wall
     sigma: NDArray[np.float32]  # (H, W): standard error of normals due to the calibration, radians; or NaN
     axis: tuple[float, float]  # position of the wall's axis, mm from the picture's centre
+    swing_sigma: float | None  # relative standard error of the swing; None if unknown
     per_pixel = True  # as of `Scale`
 
     @property
@@ -160,6 +161,7 @@ def make_response(
         _wall_of(wall, (0.0, 0.0, 0.0) if pivot is None else pivot, follows),
         np.hypot(wall.zenith_sigma, wall.azimuth_sigma),
         wall.axis,
+        wall.swing_sigma,
     )
 
 

@@ -192,6 +192,12 @@ class WallResponse(Part):
         "rad",
         title="left of the zenith at most",
     )
+    swing_sigma: float | None = parameter(
+        "relative standard error of the swing of the brightness over a turn, at given mean brightness",
+        title="error of the swing",
+        shown_unit="%",
+        default=None,
+    )
     names: tuple[str, ...] | None = parameter(
         "of touches: names of their parameters", shape=("k",), default=None
     )

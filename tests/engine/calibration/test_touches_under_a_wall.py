@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mirrorskin import io
+from mirrorskin import engine, io
 from mirrorskin.engine.calibration import from_touches
+from mirrorskin.engine.calibration.check import compare_brightness
 from mirrorskin.evaluation.base.sources import Frames
 from mirrorskin.evaluation.calibration import scorer
 from mirrorskin.evaluation.calibration.scenes import press_for
@@ -87,6 +88,38 @@ def test_wrong_half_angle_and_pivot_in_the_recording_are_corrected(touches):
         wrong.append((press, stating(turn, tilt=1.04 * LAB.tilt, pivot=(x, y, z + 0.1))))
     estimates = {each.name: each for each in from_touches(wrong, body=BODY).estimates}
     assert abs(estimates["tilt"].value - LAB.tilt) < 4 * estimates["tilt"].sigma < 0.1 * LAB.tilt
+
+
+def lit(turn, taken, share, seed):
+    """Return a turn in the light of a lamp that has aged, with the same noise."""
+    noise = LAB.noise * np.random.default_rng(seed).standard_normal(turn.frames.shape)
+    dark = np.nan_to_num(taken.dark)  # unknown of defects
+    samples = dark + share * (turn.frames - dark) + math.sqrt(1 - share**2) * noise
+    return Frames(np.clip(np.rint(samples), 0, 255).astype(np.uint8), turn.header, turn.name, **turn.series)
+
+
+@pytest.fixture(scope="module")
+def later():
+    """A turn on another object after the calibration."""
+    return LAB.turned(FURTHER, press_for(FURTHER), 70)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lamp_that_has_faded_is_reported(fit, taken, later, seed):
+    found = compare_brightness(lit(later, taken, 0.95, seed), calibration_of(fit, taken))
+    assert "brightness has fallen by" in found.text
+    assert found.warning
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_is_reported_of_the_same_lamp(fit, taken, seed):
+    later = LAB.turned(FURTHER, press_for(FURTHER), 80 + seed)
+    assert compare_brightness(later, calibration_of(fit, taken)) is None
+
+
+def test_each_result_reports_a_lamp_that_has_faded(fit, taken, later):
+    with pytest.warns(io.MirrorskinWarning, match="brightness has fallen by"):
+        engine.reconstruct(lit(later, taken, 0.95, 5), calibration=calibration_of(fit, taken))
 
 
 def test_touches_are_added_to_a_calibration(fit, taken, touches):
