@@ -24,6 +24,7 @@ FRAMES = 32
 
 _RECORD = "state an approximate one when it is captured or imported, as in"
 _ENDS = 0.1, 99.9  # percentiles of samples that replace references
+_LEAST_LIT = 0.1  # least light of a pixel, of the usual one: others are dead or covered
 
 
 class Wall(NamedTuple):
@@ -102,13 +103,23 @@ def model_of(turn: Source, header: Header, body: tuple[float, float] | None = No
 def _of_pixels(
     gain: float, base: float, dark: Doubles, bright: Doubles, dtype: np.dtype[Any]
 ) -> tuple[Doubles, Doubles]:
-    """Return gain and offset of each pixel, (H, W), by its references; NaN if the bright one is clipped."""
+    """Return gain and offset of each pixel, (H, W), by its references.
+
+    They are NaN where the bright one is clipped, and where it shows hardly any light, as at a dead pixel.
+    """
     clear = bright < (np.iinfo(dtype).max if dtype.kind == "u" else math.inf)
-    if not clear.any():
+    span = _lit(np.where(clear, bright - dark, np.nan))
+    if np.isnan(span).all():
         return np.full(dark.shape, gain), np.full(dark.shape, base)
-    span = np.where(clear, bright - dark, np.nan)
     share = span / np.nanmedian(span)
     return gain * share, dark + (base - np.nanmedian(dark)) * share
+
+
+def _lit(span: Doubles) -> Doubles:
+    """Return the counts from dark to full light of each pixel, (H, W), NaN where they are few."""
+    known = span[np.isfinite(span)]
+    usual = float(np.median(known)) if known.size else 0.0
+    return np.where((span > _LEAST_LIT * usual) & (span > 0), span, np.nan)
 
 
 def _model_under_wall(turn: Source, header: Header, body: tuple[float, float]) -> SensorModel:
@@ -118,10 +129,11 @@ def _model_under_wall(turn: Source, header: Header, body: tuple[float, float]) -
             raise InputError(f"{turn.name} has no {name}: {_RECORD} {remedy}")
     dark, bright = levels_of(turn, None)
     first = math.atan2(*body) / 2  # zenith at which the axis shows the rim
-    gain = (bright - dark) / (math.pi / 4 - first)
+    span = _lit(bright - dark)
+    gain = span / (math.pi / 4 - first)
     assert header.tilt is not None
     sight = LIKELY["sight_0"][0], LIKELY["sight_2"][0]
-    wall = Wall(body, bright - dark, (0.0, 0.0), sight, LIKELY["scatter"][0])
+    wall = Wall(body, span, (0.0, 0.0), sight, LIKELY["scatter"][0])
     pivot = header.pivot or (0.0, 0.0, 0.0)
     full = float(np.nanmedian(wall.span))
     return SensorModel(gain, dark - first * gain, dark, full, header.tilt, pivot, wall)

@@ -241,6 +241,26 @@ def test_one_gain_is_shared_out_among_pixels_as_references_say():
     assert np.nanstd(away) < 0.6  # counts; 4 without
 
 
+def test_pixels_whose_references_show_no_light_are_left_out():
+    turn = Twin(
+        movement=Axial(PHASE, tilt=TILT, press=PRESS, pivot=PIVOT),
+        pattern="linear",
+        object=Waves(0),
+        shape=(56, 56),
+        pixel_size=0.03,
+        object_shift=(0.6, 0.3),
+    )
+    one = {name: np.median(getattr(turn.header, name)) for name in ("zenith_gain", "zenith_offset")}
+    bright = np.broadcast_to(turn.header.bright, (56, 56)).copy()
+    dark = np.broadcast_to(turn.header.dark, (56, 56))
+    bright[20, 20], bright[30:33, 10] = dark[20, 20], dark[30:33, 10] - 2
+    fit = from_touches([(a_press(Waves(0)), stating(turn, **one | {"bright": bright, "dark": dark}))])
+    error = fit.response.gain / turn.header.zenith_gain
+    assert np.isnan(error[20, 20])
+    assert np.isnan(error[30:33, 10]).all()
+    assert np.nanmax(np.abs(error - 1)) < 0.03
+
+
 @pytest.mark.parametrize("has_press", [True, False])
 def test_references_are_not_needed(has_press):
     """Gain and offset of the response contain what the dark level and full light would say."""
