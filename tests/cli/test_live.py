@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -301,10 +300,11 @@ class Slow:
 
     def __init__(self, error=None):
         self.shown, self.closed, self.error = [], False, error
+        self.was_let_go = True
         self.go = threading.Event()
 
     def show(self, update, status):
-        self.go.wait(60)
+        self.was_let_go &= self.go.wait(60)
         if self.error:
             raise self.error
         self.shown.append(update)
@@ -316,12 +316,11 @@ class Slow:
 def test_a_slow_viewer_misses_updates_but_not_the_last_and_delays_nothing():
     viewer = Slow()
     newest = Newest(viewer)
-    begun = time.monotonic()
     for number in range(1000):
         newest.show(number, Status())
-    assert time.monotonic() - begun < 50
     viewer.go.set()
     newest.close()
+    assert viewer.was_let_go  # nothing waited for it in vain
     assert viewer.closed
     assert viewer.shown[-1] == 999
     assert len(viewer.shown) < 1000

@@ -48,7 +48,7 @@ def assert_as_alone(*calls):
     start = threading.Barrier(THREADS)
 
     def run(number):
-        start.wait(20)
+        start.wait(60)
         places = [(number + turn) % len(calls) for turn in range(RUNS)]
         return [(place, content(calls[place]())) for place in places]
 

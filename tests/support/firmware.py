@@ -29,7 +29,7 @@ _INVERTED = {5: 1, 6: 1}  # GRBL's switches are all low, which means pressed unl
 _STEPS = 250.0  # a mm, as GRBL has them unless told otherwise
 _PER_AXIS = range(100, 136)
 _TICK = 0.002  # seconds between looks at what it said, and between its lines of steps
-_START = 10.0
+_START = 60.0
 _STILL = 0.05  # seconds without a step, after which it rests
 _REPORT = re.compile(rb"<([^|>]*)\|MPos:([-\d.,]+)[^>]*>")
 

@@ -35,7 +35,7 @@ FULL = 2_950_000
 ON_THE_WAY = 0.3
 """Seconds more that a camera may be silent where it does not matter when frames came: 3 times ``stall``."""
 
-_START = 30.0
+_START = 60.0
 _LATEST = 3.0  # seconds after the first move that a mishap comes
 
 

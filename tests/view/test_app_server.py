@@ -293,7 +293,7 @@ class Blocked(engine.Operation):
 
     def push(self, frames):
         started.set()
-        assert go.wait(20)
+        assert go.wait(60)
         self.brightest = frames.max(axis=0)
 
     def result(self):

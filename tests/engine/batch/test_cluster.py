@@ -4,6 +4,7 @@ import logging
 import os
 import socket
 import sys
+import threading
 import time
 from contextlib import closing
 from importlib.metadata import PackageNotFoundError
@@ -162,10 +163,14 @@ def test_a_job_may_cost_three_workers_and_no_more(losses, state, recordings, tmp
         if job.source == recordings[0] and len(lost) < losses:
             here = distributed.get_worker()
             lost.append(here.address)
-            running.scheduler.loop.add_callback(
-                running.scheduler.remove_worker, here.address, stimulus_id="test", close=False
-            )
-            time.sleep(1)
+            removed = threading.Event()
+
+            async def remove():
+                await running.scheduler.remove_worker(here.address, stimulus_id="test", close=False)
+                removed.set()
+
+            running.scheduler.loop.add_callback(remove)
+            assert removed.wait(60)
         return Outcome(job, "done", "", 0.0)
 
     monkeypatch.setattr(worker, "run_job", lose)

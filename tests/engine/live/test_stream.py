@@ -318,7 +318,7 @@ def test_a_forgotten_stream_ends_its_thread(frames, latency):
     pushed.push(frames, travel=TRAVEL)
     del pushed
     gc.collect()
-    thread.join(20)
+    thread.join(60)
     assert not thread.is_alive()
 
 

@@ -13,7 +13,7 @@ from mirrorskin.hw.cameras.ring import MEMORY, Ring, usual_slots
 from mirrorskin.io import Block
 
 SHAPE = (5, 7)
-SOON = 20.0  # seconds, that nothing here takes
+SOON = 60.0  # seconds, that nothing here takes
 
 
 def put(ring: Ring, number: int, lost: int = 0) -> None:

@@ -25,7 +25,7 @@ from mirrorskin.twin.emulator.simulated_clock import SimulatedClock
 SHAPE = (480, 640)
 SMALL = (24, 32)
 BYTE = np.dtype(np.uint8)
-SOON = 20.0  # seconds, that nothing here takes
+SOON = 60.0  # seconds, that nothing here takes
 
 
 def settings(source, shape=SHAPE, dtype=BYTE, **more) -> CameraSettings:

@@ -71,7 +71,7 @@ def test_a_module_of_mirrorskin_adds_nothing(folder):
 WAITING = """
 import sys
 
-sys.modules["threads_of_a_test"].wait(20)
+sys.modules["threads_of_a_test"].wait(60)
 import {helper}
 
 class Named:

@@ -99,7 +99,7 @@ def test_every_motion_keeps_its_positions_and_its_plot(tmp_path, motion):
 def test_lent_frames_are_given_back_once_they_are_written(tmp_path):
     with io.StreamRecorder(Feed(10), tmp_path / "a.h5", period=60) as recorder:
         references = [weakref.ref(recorder.read().frames) for _ in range(2)]
-        until = time.monotonic() + 30
+        until = time.monotonic() + 60
         while any(frames() is not None for frames in references):
             assert time.monotonic() < until
             time.sleep(0.001)
@@ -306,7 +306,7 @@ def test_the_source_is_left_before_the_disk_is_waited_for(tmp_path, monkeypatch)
     source, append = Feed(3), streaming.GrowingRecording.append
 
     def waits(self, block):
-        until_left.wait(30)
+        until_left.wait(60)
         append(self, block)
 
     until_left = threading.Event()
@@ -321,7 +321,7 @@ def test_a_disk_that_is_too_slow_ends_it_and_nothing_waits(tmp_path, monkeypatch
     append, released = streaming.GrowingRecording.append, threading.Event()
 
     def slow(self, block):
-        assert released.wait(30)
+        assert released.wait(60)
         append(self, block)
 
     class Released(Feed):

@@ -12,7 +12,7 @@ import serial
 
 from mirrorskin.twin.emulator.port import GrblMachine, GrblPort
 
-SOON = 30.0  # seconds: a limit for a busy machine
+SOON = 60.0  # seconds: a limit for a busy machine
 
 
 @pytest.fixture
@@ -54,9 +54,12 @@ def test_a_host_that_comes_again_finds_it_as_it_was(port: GrblPort) -> None:
         with serial.Serial(port.url, timeout=SOON) as line:
             line.write(b"G91G0X1\n")
             line.read_until(b"ok\r\n")
-            time.sleep(0.15)
-            line.write(b"?")
-            assert place in line.read_until(b">\r\n")
+            until, report = time.monotonic() + SOON, b""
+            while b"<Idle" not in report:
+                assert time.monotonic() < until
+                line.write(b"?")
+                report = line.read_until(b">\r\n")
+            assert place in report
 
 
 @pytest.mark.parametrize("fault", ["silence", "garble", "alarm"])

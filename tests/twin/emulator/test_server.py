@@ -19,7 +19,7 @@ from mirrorskin.hw.cameras.camera_thread import ThreadedCamera
 from mirrorskin.io import InputError
 from mirrorskin.twin.emulator.server import FrameServer
 
-PATIENCE = 20.0  # seconds, for a busy machine
+PATIENCE = 60.0  # seconds, for a busy machine
 
 
 class Tape(ThreadedCamera):

@@ -25,7 +25,7 @@ def test_a_wait_ends_with_its_event_or_with_its_time(any_clock):
     assert not event.wait(0.02)
     assert any_clock.now() - began > 0.019
     any_clock.thread(event.set, "sets").start()
-    assert event.wait(30.0)
+    assert event.wait(60.0)
     assert event.is_set()
 
 
@@ -42,7 +42,7 @@ def test_a_condition_hands_over_a_value_and_its_lock_is_taken_twice(any_clock):
         any_clock.sleep(0.01)
         assert values == [], "the lock is held"
         while not values:
-            assert condition.wait(30.0)
+            assert condition.wait(60.0)
         assert not condition.wait(0.01)
         assert condition.wait_for(lambda: sum(values), 30.0) == 5
         assert not condition.wait_for(lambda: len(values) > 1, 0.01)
@@ -52,7 +52,7 @@ def test_a_thread_can_be_waited_for_and_has_a_name(any_clock):
     names, go_on = [], any_clock.event()
 
     def work():
-        go_on.wait(30.0)
+        go_on.wait(60.0)
         names.append(threading.current_thread().name)
 
     thread = any_clock.thread(work, "worker")
@@ -61,7 +61,7 @@ def test_a_thread_can_be_waited_for_and_has_a_name(any_clock):
     thread.join(0.01)
     assert thread.is_alive()
     go_on.set()
-    thread.join(30.0)
+    thread.join(60.0)
     assert not thread.is_alive()
     assert names == ["worker"]
 
