@@ -191,13 +191,15 @@ class TouchReader:
         relief = self._surface(source, sensor)
         press = self.turn.header.press or 0.0
         levels = np.zeros(1) if sensor.pivot is None else np.linspace(0, -press, _LEVELS)
-        touches = (replace(self, relief=relief + level)._read(source, sensor) for level in levels)
+        readers = [replace(self, relief=relief + level) for level in levels]
 
-        def score(touch: Touch) -> float:
+        def score(reader: TouchReader) -> float:
+            touch = reader._read(source, sensor, starts=False)
             odd = math.log(touch.tilt_seen / sensor.tilt) / _ODD_TILT
             return touch.pixels * math.exp(-(odd**2) / 2)
 
-        return max(touches, key=score)
+        best = readers[0] if len(readers) == 1 else max(readers, key=score)
+        return best._read(source, sensor)
 
     def _surface(self, source: Source, sensor: SensorModel) -> Doubles:
         """Return heights by the normals of a turn, (H, W), mm, with the highest at 0."""
@@ -210,7 +212,8 @@ class TouchReader:
             return np.zeros(height.shape)
         return fill_with_nearest(height - np.nanmax(height))
 
-    def _read(self, source: Source, sensor: SensorModel) -> Touch:
+    def _read(self, source: Source, sensor: SensorModel, starts: bool = True) -> Touch:
+        """Read the turn; unless it ``starts``, windows are left without first heights, which take longest."""
         registered = None
         reader = self if sensor.wall is None else self._seen_along(sensor.wall)
         if sensor.pivot is not None:
@@ -230,7 +233,7 @@ class TouchReader:
             raise InputError(f"{source.name} has {len(phase)} frames: at least {_LEAST_FRAMES} are needed")
         noise_gain = 1.0 if registered is None else float(np.nanmedian(registered.noise_gain))
         with naming(self.turn):
-            return reader._touch(frames, phase, noise_gain, sensor)
+            return reader._touch(frames, phase, noise_gain, sensor, starts)
 
     def _seen_along(self, wall: Wall) -> TouchReader:
         """Return the reader with the press as the pixels of a turn see it, along inclined lines of sight.
@@ -256,7 +259,9 @@ class TouchReader:
         relief = self.relief if self.earlier is not None else fill_with_nearest(seen(self.relief))
         return replace(self, middle=seen(self.middle), half=seen(self.half), relief=relief)
 
-    def _touch(self, frames: NDArray[Any], phase: Doubles, noise_gain: float, sensor: SensorModel) -> Touch:
+    def _touch(
+        self, frames: NDArray[Any], phase: Doubles, noise_gain: float, sensor: SensorModel, starts: bool
+    ) -> Touch:
         header = self.turn.header
         whole: NDArray[np.bool_] = np.asarray(valid(frames).all(axis=0))
         for level in (sensor.gain, sensor.base, sensor.dark):
@@ -276,10 +281,10 @@ class TouchReader:
         windows, misfits, slopes = list[Window](), np.zeros((2, len(TURNS))), list[Doubles]()
         for number, (place, view) in enumerate(views):
             window, wave = self._window(frames, sensor, noise_gain, place, view)
-            if self.earlier is None:
-                misfits += window.start(wave)
-            else:
+            if self.earlier is not None:
                 window.z = self.earlier.windows[number].z
+            elif starts:
+                misfits += window.start(wave)
             if self.earlier is not None and not self.chooses:
                 window.spacing = self.earlier.windows[number].spacing
                 window.relief_shown = self.earlier.windows[number].relief_shown

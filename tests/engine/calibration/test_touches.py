@@ -17,6 +17,7 @@ FRAMES = 12
 PHASE = np.arange(FRAMES) * 2 * np.pi / FRAMES
 PRESS = 1.6
 PIVOT = (0.0, 0.0, 1.0)
+SMALL = 40, 40  # pixels, for movements that are searched
 
 
 @dataclass(frozen=True)
@@ -192,7 +193,7 @@ def test_smooth_object_without_a_press_is_named_with_its_errors():
 
 
 def test_sense_of_rotation_is_found_without_a_press():
-    fit = from_touches(turns_of(1, stated={"phase": 1.0 - PHASE}))
+    fit = from_touches([(None, stating(a_turn(Waves(), shape=SMALL), phase=1.0 - PHASE))])
     assert fit.precession.direction == -1
     assert abs(fit.precession.phase_offset - 1.0) < 0.02
 
@@ -413,7 +414,8 @@ def test_what_a_staircase_does_not_determine_is_named_with_a_remedy(staircase, n
 
 
 def test_sense_of_rotation_and_phase_zero_are_found():
-    fit = from_touches(touches_of(1, stated={"phase": 1.0 - PHASE}))
+    turn = stating(a_turn(Waves(), shape=SMALL), phase=1.0 - PHASE)
+    fit = from_touches([(a_press(Waves(), shape=SMALL), turn)])
     assert fit.precession.direction == -1
     assert abs(fit.precession.phase_offset - 1.0) < 0.02
 
