@@ -25,6 +25,7 @@ from mirrorskin.evaluation.faults.estimators import ARRAYS, RECORDINGS, Answers,
 from mirrorskin.evaluation.faults.judge import Answer, Cell, inside, judge, rms
 from mirrorskin.evaluation.faults.slopes import SLOPE_FAULTS, integrated
 from mirrorskin.evaluation.faults.touches import of_touch
+from mirrorskin.evaluation.faults.walls import WALL_FAULTS, of_wall
 
 SHAPE = 48, 64  # pixels
 _STORED = Path(__file__).with_suffix(".json")
@@ -82,6 +83,7 @@ ESTIMATORS: Mapping[str, Estimator] = {
     **_on_waves(RECORDINGS),
     "touch": functools.partial(of_touch(_waves), WAVES),
     "calibration from touches": of_calibration,
+    "calibration of a wall from touches": of_wall,
     "integrate": _of_slopes(),
     "integrate with weights": _of_slopes(weights=True),
     "integrate robustly": _of_slopes(robust=True),
@@ -94,7 +96,8 @@ PRESS = [name for name in ESTIMATORS if name.startswith(("threshold", "change-po
 SLOPES = [name for name in ESTIMATORS if name.startswith("integrate")]
 TOUCHES = ["touch"]
 CALIBRATIONS = ["calibration from touches"]
-OTHERS = [name for name in ESTIMATORS if name not in PRESS + SLOPES + TOUCHES + CALIBRATIONS]
+WALLS = ["calibration of a wall from touches"]
+OTHERS = [name for name in ESTIMATORS if name not in PRESS + SLOPES + TOUCHES + CALIBRATIONS + WALLS]
 
 
 # --- Cells ---------------------------------------------------------------------------------------------
@@ -106,6 +109,8 @@ def faults_of(estimator: str) -> tuple[Any, ...]:
         return SLOPE_FAULTS
     if estimator in CALIBRATIONS:
         return CALIBRATION_FAULTS
+    if estimator in WALLS:
+        return WALL_FAULTS
     return tuple(fault for fault in FAULTS if applies(estimator, fault))
 
 
@@ -201,6 +206,7 @@ def with_tables(page: str) -> str:
         (SLOPES, SLOPE_FAULTS),
         (TOUCHES, faults_of("touch")),
         (CALIBRATIONS, CALIBRATION_FAULTS),
+        (WALLS, WALL_FAULTS),
     )
     for number, (names, faults) in enumerate(parts):
         rows = [
