@@ -87,7 +87,7 @@ class Touch:
     misfits: Doubles  # of first slopes to surfaces; see `Window.start`
     varied: bool  # whether its slopes are not all alike
     relief: Doubles  # (H, W): heights with which frames were registered, mm
-    lacking: str  # why it has no window, if it has none
+    lacking: str  # why it has no window with slopes that vary, if it has none
     is_warm: bool  # whether its surfaces are those of an earlier fit
     noise: float = 1.0  # variance of a sample
 
@@ -111,10 +111,8 @@ class Touch:
     @property
     def reason(self) -> str:
         """Why the touch is not used."""
-        if not self.windows:
+        if not self.windows or not self.varied:
             return self.lacking
-        if not self.varied:
-            return "its slopes are all alike, as those of a plate or an edge. Touch something rough or round"
         return _ODD if self.follows() else NOT_FOLLOWED
 
     @property

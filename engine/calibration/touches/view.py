@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.touches.heights import MARGIN
 from mirrorskin.engine.calibration.touches.sensor import SensorModel
+from mirrorskin.engine.calibration.touches.window import slopes_of_waves
 from mirrorskin.engine.correlation.design_matrix import basis
 from mirrorskin.engine.diagnosis.turn_nuisances import LEAST_LIGHT, shows_model
 from mirrorskin.kernels.array_types import Doubles
@@ -40,6 +41,7 @@ NOT_FOLLOWED = (
 _CLIPPED = "hardly any pixel has valid samples in all frames. Shorten the exposure"
 _DARK = "it shows hardly any light in contact. Press deeper, on a larger object"
 _EDGES = "nearly all of its pixels are next to edges or ridges. Touch something whose slopes change gradually"
+_ALIKE = "its slopes are all alike, as those of a plate or an edge. Touch something rough or round"
 _REASONS = (
     _CLIPPED,
     _DARK,
@@ -116,7 +118,10 @@ class View(NamedTuple):
 
 
 def lacking(views: Sequence[View], whole: NDArray[np.bool_], sensor: SensorModel) -> str:
-    """Return why there are hardly any usable pixels: the first step that leaves few, or the strictest one.
+    """Return why slopes of usable pixels do not vary.
+
+    Either no slopes vary, or there are hardly any usable pixels: because of the first step that leaves few,
+    or the strictest one.
 
     ``whole`` are the pixels of the picture, (H, W), with samples in all frames.
     """
@@ -126,7 +131,8 @@ def lacking(views: Sequence[View], whole: NDArray[np.bool_], sensor: SensorModel
     few = counts <= _LEAST_USABLE * min(_SIDE, *whole.shape) ** 2
     if few.any():
         return reasons[int(np.argmax(few))]
-    return reasons[2 + int(np.argmin(counts[2:] / counts[1:-1]))]
+    slopes = np.concatenate([slopes_of_waves(view.wave[:, view.shown]) for view in views], axis=1)
+    return reasons[2 + int(np.argmin(counts[2:] / counts[1:-1]))] if vary(slopes) else _ALIKE
 
 
 def _crosses_no_edge(

@@ -9,6 +9,7 @@ import pytest
 
 from mirrorskin import engine, io
 from mirrorskin.engine.calibration import from_touches
+from mirrorskin.evaluation.calibration import one_touch
 from mirrorskin.io.files.arrays import ArrayRecording
 from mirrorskin.twin import Axial, Camera, Cone, Plane, Step, Twin, Vertical
 
@@ -345,6 +346,15 @@ def test_plate_and_edge_are_refused(thing, press):
 def test_plate_next_to_other_touches_is_named():
     fit = from_touches([a_touch("sphere"), a_touch(Plane(), 1.6)])
     assert any("is not used: its slopes are all alike" in note for note in fit.notes)
+
+
+def test_texture_of_which_little_is_used_is_not_said_to_have_one_slope():
+    """Half-angle and pivot are far off, so few pixels, of one side of its grooves, remain."""
+    _, turn, true = one_touch.touch("texture", 0)
+    tilt, pivot = 1.134 * one_touch.TILT, (0.0, 0.0, one_touch.PIVOT + 0.59)
+    turn.header = replace(turn.header, tilt=tilt, pivot=pivot, zenith_gain=0.98 * true["zenith_gain"])
+    with pytest.raises(io.InputError, match="no touch can be used: its contact is narrow"):
+        from_touches([(None, turn)])
 
 
 def shown(turn, share=1.0, frames=slice(None)):
