@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -289,10 +289,8 @@ def _swing_error(response: WallResponse, fit: WallFit, source: Source) -> float:
     places, azimuth = _mirrors(source)
     inside = _on_body(response, places)
     places, azimuth = places[:, inside], azimuth[inside]
-    parameters, covariance = (
-        fit.parameters[: model.STEPS.stop],
-        fit.covariance[: model.STEPS.stop, : model.STEPS.stop],
-    )
+    parameters = fit.parameters[: model.STEPS.stop]
+    covariance = fit.covariance[: model.STEPS.stop, : model.STEPS.stop]
     first = np.exp(2j * np.pi * np.arange(_FRAMES) / _FRAMES) * 2 / _FRAMES
     low, high = (math.pi / 4 - math.atan(q) for q in reversed(response.reach))
     variances = []
@@ -303,17 +301,11 @@ def _swing_error(response: WallResponse, fit: WallFit, source: Source) -> float:
             light = _light_of_turn(values, fit.rising, places, at + by, azimuth)
             return np.stack([np.mean(light, axis=1), np.abs(light @ first)])
 
-        steeper = (wave(parameters, _DERIVATIVE_STEP) - wave(parameters, -_DERIVATIVE_STEP)) / (
-            2 * _DERIVATIVE_STEP
-        )
-        by_parameter = np.empty(len(parameters))
-        for number, step in enumerate(_SMALL * _SCALES):
-            change = np.zeros(len(parameters))
-            change[number] = step
-            mean, amplitude = (wave(parameters + change) - wave(parameters - change)) / (2 * step)
-            by_parameter[number] = np.nanmean(
-                (amplitude - steeper[1] * mean / steeper[0]) / wave(parameters)[1]
-            )
+        steeper = wave(parameters, _DERIVATIVE_STEP) - wave(parameters, -_DERIVATIVE_STEP)
+        mean_slope, slope = steeper / (2 * _DERIVATIVE_STEP)
+        mean, amplitude = _by_parameters(wave, parameters)
+        changes = amplitude - (slope / mean_slope)[:, np.newaxis] * mean
+        by_parameter = np.nanmean(changes / wave(parameters)[1][:, np.newaxis], axis=0)
         variances.append(by_parameter @ covariance @ by_parameter)
     return math.sqrt(float(np.mean(variances)))
 
@@ -367,13 +359,19 @@ def _normal_slopes(fit: WallFit, places: Doubles, azimuth: Doubles, zenith: Doub
         ],
         axis=-1,
     ) / (2 * _DERIVATIVE_STEP)
-    by_parameter = np.zeros((*design.shape[:2], len(parameters)))
-    for number, step in enumerate(_SMALL * _SCALES):
-        changed = np.repeat(parameters[np.newaxis], 2, axis=0)
-        changed[:, number] += step, -step
-        change = light(changed[0], zenith, azimuth) - light(changed[1], zenith, azimuth)
-        by_parameter[..., number] = change / (2 * step)
+    by_parameter = _by_parameters(lambda values: light(values, zenith, azimuth), parameters)
     return np.asarray(np.moveaxis(-np.linalg.pinv(design, rcond=1e-6) @ by_parameter, 1, 0), np.float64)
+
+
+def _by_parameters(of: Callable[[Doubles], Doubles], parameters: Doubles) -> Doubles:
+    """Return the derivatives of a function by the parameters, along a last axis."""
+    derivatives = []
+    for number, step in enumerate(_SMALL * _SCALES):
+        more, less = parameters.copy(), parameters.copy()
+        more[number] += step
+        less[number] -= step
+        derivatives.append((of(more) - of(less)) / (2 * step))
+    return np.stack(derivatives, axis=-1)
 
 
 def _light_of_turn(

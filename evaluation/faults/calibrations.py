@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -173,32 +173,51 @@ def _truth(camera: Fault, light: float) -> Mapping[str, float]:
 
 def of_calibration(fault: CalibrationFault, seed: int) -> Answer:
     """Return the errors of the parameters of a few calibrations, in what counts as determined."""
-    errors, sigmas, told = [], [], []
     start = zenith_scale(replace(fault.camera, exposure=1.0))
-    for number in range(_FITS):
-        touches = [_touch(fault, 100 * seed + _TOUCHES * number + k) for k in range(_TOUCHES)]
-        stated = {} if fault.stated is None else {"tilt": (fault.stated * TILT, 0.02 * TILT)}
+    stated = {} if fault.stated is None else {"tilt": (fault.stated * TILT, 0.02 * TILT)}
+
+    def seeds(number: int) -> range:
+        first = 100 * seed + _TOUCHES * number
+        return range(first, first + _TOUCHES)
+
+    def fit(number: int) -> TouchFit:
+        touches = [_touch(fault, each) for each in seeds(number)]
+        pairs = [(press if fault.has_presses else None, turn) for press, turn in touches]
+        return from_touches(pairs, stated=stated, **start)
+
+    def compared(number: int, found: TouchFit) -> tuple[Floats, Floats]:
+        light = np.mean([_mean_light(fault, each) for each in seeds(number)])
+        return _compared(found, _truth(fault.camera, float(light)), fault.camera.scale)
+
+    return answer_of_fits(_FITS, fit, compared)
+
+
+def answer_of_fits(
+    count: int,
+    fit: Callable[[int], TouchFit],
+    compared: Callable[[int, TouchFit], tuple[Floats, Floats]],
+) -> Answer:
+    """Return errors and standard errors of all calibrations that are not refused, and what all of them say.
+
+    ``fit`` makes one by its number, and ``compared`` compares it with the truth.
+    """
+    parts, told = list[tuple[Floats, Floats]](), list[str]()
+    for number in range(count):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", MirrorskinWarning)
             try:
-                fit = from_touches(
-                    [(press if fault.has_presses else None, turn) for press, turn in touches],
-                    stated=stated,
-                    **start,
-                )
+                found = fit(number)
             except InputError as refused:
                 told.append(str(refused))
                 continue
             finally:
                 told += [str(warning.message) for warning in caught]
-        light = np.mean([_mean_light(fault, 100 * seed + _TOUCHES * number + k) for k in range(_TOUCHES)])
-        error, sigma = _compared(fit, _truth(fault.camera, float(light)), fault.camera.scale)
-        errors.append(error)
-        sigmas.append(sigma)
-        told += [note for note in fit.notes if not note.startswith("not determined")]
-    if not errors:
+        parts.append(compared(number, found))
+        told += [note for note in found.notes if not note.startswith("not determined")]
+    if not parts:
         return Answer(np.array([math.nan]), np.array([math.nan]), "; ".join(told))
-    return Answer(np.concatenate(errors), np.concatenate(sigmas), "; ".join(told))
+    errors, sigmas = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return Answer(errors, sigmas, "; ".join(told))
 
 
 def _compared(fit: TouchFit, truth: Mapping[str, float], count: float) -> tuple[Floats, Floats]:

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mirrorskin import io
-from mirrorskin.engine.calibration.touches import from_touches
+from mirrorskin.engine.calibration.touches import TouchFit, from_touches
 from mirrorskin.evaluation.base.sources import Frames
 from mirrorskin.evaluation.calibration import scorer
 from mirrorskin.evaluation.calibration.scenes import press_for
 from mirrorskin.evaluation.calibration.touches import LAB, REACH, references_of, touch
+from mirrorskin.evaluation.faults.calibrations import answer_of_fits
 from mirrorskin.evaluation.faults.camera import Floats
 from mirrorskin.evaluation.faults.judge import Answer
 
@@ -106,23 +107,19 @@ def _faulty(turn: Frames, fault: WallFault, seed: int) -> Frames:
 
 def of_wall(fault: WallFault, seed: int) -> Answer:
     """Return the errors of the parameters of a few calibrations, in what hardly matters."""
-    errors, sigmas, told = list[Floats](), list[Floats](), list[str]()
     stated = {} if fault.stated is None else {"tilt": (fault.stated * LAB.tilt, 0.02 * LAB.tilt)}
-    for number in range(_FITS):
+
+    def fit(number: int) -> TouchFit:
         first, (press, turn) = (_touch(10 * seed + 2 * number + k) for k in range(2))
         touches = [first, (press, _faulty(turn, fault, seed))]
         for source in (source for pair in touches for source in pair):
             source.rewind()
-        try:
-            fit = from_touches(touches, body=(fault.radius * _BODY[0], _BODY[1]), stated=stated)
-        except io.InputError as refused:
-            told.append(str(refused))
-            continue
-        found = {each.name: each for each in fit.estimates}
-        unit = np.array([_NEEDED[name] for name in _TRUE])
-        errors.append(np.array([found[name].value - true for name, true in _TRUE.items()]) / unit)
-        sigmas.append(np.array([found[name].sigma for name in _TRUE]) / unit)
-        told += [note for note in fit.notes if not note.startswith("not determined")]
-    if not errors:
-        return Answer(np.array([math.nan]), np.array([math.nan]), "; ".join(told))
-    return Answer(np.concatenate(errors), np.concatenate(sigmas), "; ".join(told))
+        return from_touches(touches, body=(fault.radius * _BODY[0], _BODY[1]), stated=stated)
+
+    def compared(_: int, found: TouchFit) -> tuple[Floats, Floats]:
+        named = {estimate.name: estimate for estimate in found.estimates}
+        parts = [(named[name].value - true, named[name].sigma) for name, true in _TRUE.items()]
+        error, sigma = np.array(parts).T / np.array([_NEEDED[name] for name in _TRUE])
+        return error, sigma
+
+    return answer_of_fits(_FITS, fit, compared)

@@ -264,8 +264,6 @@ class TouchReader:
         whole: NDArray[np.bool_] = np.asarray(valid(frames).all(axis=0))
         for level in (sensor.gain, sensor.base, sensor.dark):
             whole &= np.isfinite(level)
-        if sensor.wall is not None:
-            whole &= sensor.wall.span > 0
         if not whole.any():
             raise InputError("no pixel has valid samples in all frames: shorten the exposure")
         counts = frames[:, whole]
