@@ -286,7 +286,9 @@ class Twin(Closing):
         time = np.arange(first, self._next) / self._camera.frame_rate
         return self.movement.mark(Block(frames, index=first, time=time))
 
-    def look(self, pose_at: Callable[[float], Pose], number: int, out: NDArray[Any]) -> None:
+    def look(
+        self, pose_at: Callable[[float], Pose], number: int, out: NDArray[Any], strength: float = 1.0
+    ) -> None:
         """Render one frame at any position of the body, as for a camera next to a stage.
 
         The counts equal those of `read` for the same frame number and positions. In elastic contact, friction
@@ -301,8 +303,11 @@ class Twin(Closing):
             Frame number, which determines the noise.
         out : ndarray, (H, W), the source's dtype
             Output.
+        strength : float
+            Light times exposure, relative to those of the camera's levels.
         """
-        self._sensor.expose(self._anywhere.light(pose_at), number, out)
+        light = self._anywhere.light(pose_at)
+        self._sensor.expose(light if strength == 1 else light * np.float32(strength), number, out)
 
     @property
     def grip(self) -> Grip:

@@ -68,7 +68,7 @@ def serve(
     times = {name: values[name] for name in ("rate", "delay", "jitter", "seed")}
     rig = EmulatedRig(values["object"], **sensor_options(values), **times, home=True, device=device)
     with rig, rig.serve() as server:
-        path = rig.write(output, server.url)
+        path = rig.write(output, server.controlled_url)
         columns, rows = values["size"]
         what = f"{values['object']} under {columns} x {rows} pixels at {values['rate']:g} frames a second"
         click.echo(f"{path}: {what}; stage at {rig.port.url}, camera at {server.url}")

@@ -6,6 +6,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -22,6 +23,7 @@ from mirrorskin.io import ArrayRecording, Calibrated, Calibration, InputError, R
 from mirrorskin.io.base.arguments import check_number, checked, in_unit
 from mirrorskin.io.base.findings import Finding
 from mirrorskin.io.base.types import Header, Source
+from mirrorskin.io.watch.saturation import REACHED, scale_ends, scale_top
 from mirrorskin.kernels.device import Choice, open_devices
 
 CLEAR_CHANGE = 8.0
@@ -41,6 +43,8 @@ _USELESS = 2  # extensions in a row that were of no use, after which a touch end
 _MARGIN = 0.85  # of the requested standard deviation, which a recipe of few steps aims at
 _RETAKEN = ("flicker", "outliers", "repeated frames", "phase jump", "no response")
 _SATURATED = "cut off"  # again in all frames until the exposure is shorter
+_EXPOSURE_RATIO = 0.5, 0.9  # by which an exposure is multiplied at a time
+_EXPOSURES_MAX = 8
 _PRESS = {"method": "change-point"}
 
 
@@ -94,6 +98,9 @@ class TouchSensor(Protocol):
 
     def lift(self) -> None:
         """Set the body upright, and lift it."""
+
+    def expose(self, ratio: float, /) -> None:
+        """Multiply the exposure by a ratio below 1; the header follows. InputError if it is fixed."""
 
     def now(self) -> float:
         """Return the time, seconds."""
@@ -163,7 +170,8 @@ def touch(
     The body is lowered until pixels change, and further in the steps of the recipe that is expected to
     suffice; it leans and turns at the deepest place. The fused surface decides: its standard deviations are
     measured from the frames. If they are too large, the frames that are expected to help most are added. What
-    the check of the frames complains about is taken again.
+    the check of the frames complains about is taken again; if light is cut off, everything is, with a shorter
+    exposure.
 
     With n turn frames and b boundaries between press steps the expected variance of a height is ::
 
@@ -285,6 +293,10 @@ def sigma_of_normals(surface: Result) -> NDArray[np.float64]:
     return np.where(np.isfinite(sigma), sigma, np.inf)
 
 
+class _ExposureChanged(Exception):  # noqa: N818
+    """All frames must be taken again."""
+
+
 class _Touch:
     """State of a touch."""
 
@@ -308,11 +320,16 @@ class _Touch:
         self._worker = ThreadPoolExecutor(1, "mirrorskin-touch")
         self._pressed: tuple[list[Taken], Future[tuple[Result, PressEvidence]]] | None = None
         self._doubts: dict[str, str] = {}  # findings that were left, by kind
+        self._exposed_at = self._began  # when the exposure was changed
+        self._exposures = 0  # changes of the exposure
+        self._fixed = ""  # why it is not changed any more
 
     def run(self) -> Touched:
         """Find contact, press and turn, and add what helps until the surface is good enough."""
         try:
-            return self._run()
+            while True:
+                with suppress(_ExposureChanged):
+                    return self._run()
         finally:
             self._worker.shutdown(wait=False, cancel_futures=True)
 
@@ -353,6 +370,32 @@ class _Touch:
         self._taken.append(Taken(pose, frame))
         return frame
 
+    def _shorten(self, share: float) -> None:
+        """Shorten the exposure by the share of the pixels in contact that are cut off, and begin again.
+
+        If that is not possible, remember why.
+        """
+        least, most = _EXPOSURE_RATIO
+        ratio = min(max(least, 1 - share), most)
+        try:
+            if self._exposures == _EXPOSURES_MAX:
+                raise InputError(f"it was shortened {_EXPOSURES_MAX} times")
+            if self._seconds + self._each * len(self._taken) > self._within:
+                raise InputError("there is no time to take all frames again")
+            self._sensor.expose(ratio)
+        except InputError as error:
+            self._fixed = str(error)
+            return
+        again = f"{len(self._taken)} frames are taken again with {ratio:.2f} of the exposure"
+        self._tell(f"{share:.0%} of the pixels in contact are cut off: {again}", None)
+        self._exposures += 1
+        self._exposed_at = self._sensor.now()
+        self._retaken += len(self._taken)
+        self._taken.clear()
+        self._doubts.clear()
+        self._pressed = None
+        raise _ExposureChanged
+
     @property
     def _seconds(self) -> float:
         return self._sensor.now() - self._began
@@ -361,11 +404,11 @@ class _Touch:
         """Lower the body until pixels change; return what is expected of the touch."""
         sensor = self._sensor
         places = np.arange(sensor.start, sensor.deepest, sensor.search)
-        frames = [np.asarray(self._take(Pose(float(place))), np.float32) for place in places[:2]]
+        frames = [self._search(place) for place in places[:2]]
         noise = max(_NOISE_MIN, float(np.std(frames[1] - frames[0])) / math.sqrt(2))
         before = (frames[0] + frames[1]) / 2
         for place in places[2:]:
-            frame = np.asarray(self._take(Pose(float(place))), np.float32)
+            frame = self._search(place)
             changed = np.abs(frame - before) > CLEAR_CHANGE * noise
             if np.count_nonzero(changed) >= _MIN_PIXELS:
                 break
@@ -388,6 +431,14 @@ class _Touch:
         pixel, tilt = max(header.pixel_size or (0.0,)), header.tilt or 0.0
         return Contact(pixel, noise, abs(gain), tilt, zenith, sensor.deepest - self._first)
 
+    def _search(self, travel: float) -> NDArray[np.float32]:
+        """Return a frame of the search for contact; what is cut off in it shows no contact."""
+        frame = self._take(Pose(float(travel)))
+        top = scale_top(float(frame.max()), frame.dtype.kind == "u")
+        if top is not None and np.mean(frame >= top) > REACHED and not self._fixed:
+            self._shorten(1.0)
+        return np.asarray(frame, np.float32)
+
     def _plan(self, contact: Contact) -> Recipe:
         """Return the cheapest recipe; if none suffices in time, what is possible in it."""
         room = (self._within - self._seconds) / self._each
@@ -404,7 +455,7 @@ class _Touch:
     @property
     def _each(self) -> float:
         """Seconds per frame so far."""
-        return self._seconds / (len(self._taken) + 1)
+        return (self._sensor.now() - self._exposed_at) / (len(self._taken) + 1)
 
     def _timed(self, recipe: Recipe, taken: int) -> Recipe:
         return replace(recipe, seconds=self._each * (recipe.frames - taken))
@@ -461,6 +512,10 @@ class _Touch:
             if recording is None:
                 return
             texts = {finding.kind: finding.text for finding in _check(recording)}
+            if _SATURATED in texts:
+                if not self._fixed:
+                    self._shorten(_cut_off(_frames_of(recording), self._before + self._clear))
+                texts[_SATURATED] += f" ({self._fixed})"
             found = {kind: text for kind, text in texts.items() if kind in _RETAKEN}
             if not found or attempt == _RETAKES:
                 self._doubts |= {kind: texts[kind] for kind in (*found, _SATURATED) if kind in texts}
@@ -563,6 +618,14 @@ def _check(recording: ArrayRecording) -> Sequence[Finding]:
     if change > _LIGHT_MAX:
         found += (Finding("flicker", f"the light changes by {change:.1%} between frames: use a steady lamp"),)
     return found
+
+
+def _cut_off(frames: NDArray[Any], light: NDArray[Any]) -> float:
+    """Return which share of the pixels with more light, (H, W), reach the end of the scale."""
+    stored = frames.reshape(len(frames), -1)
+    highest = stored.max(axis=0).astype(np.float32)
+    ends = scale_ends(stored, stored.astype(np.float32))
+    return float(np.mean((highest >= ends)[highest > light.ravel()]))
 
 
 def _frames_of(recording: ArrayRecording) -> NDArray[Any]:

@@ -80,6 +80,11 @@ class FaultySensor:
     def lift(self) -> None:
         """Do nothing: the body needs no way."""
 
+    def expose(self, ratio: float, /) -> None:
+        """Multiply the exposure."""
+        self._fault = replace(self._fault, exposure=ratio * self._fault.exposure)
+        self.header = replace(self.header, **zenith_scale(self._fault))
+
     def now(self) -> float:
         """Return a second for each frame."""
         return float(len(self._taken))

@@ -42,7 +42,8 @@ class Camera(Protocol):
     """A running camera: frames arrive continuously and are buffered until they are taken.
 
     It runs from construction until ``close``. All methods are thread-safe, but only one thread may take
-    frames.
+    frames. A camera may also have ``set_exposure(seconds) -> float``, which changes the exposure while it
+    runs, and returns the one that it has then; InputError if that is not possible.
     """
 
     @property

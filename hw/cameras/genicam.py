@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import deque
 from collections.abc import Iterator
@@ -87,19 +88,20 @@ class GenicamCamera(ReopenedCamera):
         self._opened()
         why = f"{self.name} delivers no picture"
         try:
-            self._read(stream)
+            self._read(device, stream)
             self._was_lost(why)  # stopping a lost camera takes seconds
         finally:
             with suppress(self._failure):
                 device.stop_acquisition()
         return why
 
-    def _read(self, stream: Any) -> None:
+    def _read(self, device: Any, stream: Any) -> None:
         """Put frames into the ring buffer until none arrives for 2 s."""
         times, last, silent_since = DeviceClock(), None, self.clock.now()
         dtype = self.dtype.newbyteorder("<")
         patience = READ_TIMEOUT if self._settings.trigger is None else math.inf
         while not self._stop.is_set() and self.clock.now() - silent_since < patience:
+            self._change_exposure(functools.partial(self._expose, device))
             buffer = stream.timeout_pop_buffer(round(1e6 * _LOOK))
             if buffer is None:
                 continue
@@ -160,10 +162,7 @@ class GenicamCamera(ReopenedCamera):
             )
         device.set_pixel_format_from_string(chosen[0])
         if asked.exposure is not None:
-            if device.is_exposure_auto_available():
-                device.set_exposure_time_auto(off)
-            device.set_exposure_time(1e6 * asked.exposure)
-            self._compare("exposure", asked.exposure, device.get_exposure_time() / 1e6, " s")
+            self._compare("exposure", asked.exposure, self._expose(device, asked.exposure), " s")
         if asked.gain is not None:
             if device.is_gain_auto_available():
                 device.set_gain_auto(off)
@@ -174,6 +173,14 @@ class GenicamCamera(ReopenedCamera):
             self._compare("rate", asked.rate, device.get_frame_rate(), " Hz")
         if asked.trigger is not None:  # last, because setting a rate switches it off
             device.set_trigger(asked.trigger_input or _INPUT)
+
+    def _expose(self, device: Any, seconds: float) -> float:
+        """Set the exposure, and return the one that the camera has then, seconds."""
+        with self._refused_in_one_line():
+            if device.is_exposure_auto_available():
+                device.set_exposure_time_auto(self._aravis.Auto.OFF)
+            device.set_exposure_time(1e6 * seconds)
+            return float(device.get_exposure_time()) / 1e6
 
     def _compare(self, what: str, asked: float, got: float, unit: str = "") -> None:
         if not np.isclose(asked, got, rtol=0.01):

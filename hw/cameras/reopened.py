@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
 
 from mirrorskin.hw.base.camera import Frames
 from mirrorskin.hw.base.clock import SYSTEM, Clock
@@ -52,6 +57,7 @@ class ReopenedCamera(ThreadedCamera):
         self._pause = _PAUSES[0]
         self._refusal: InputError | None = None
         self._ready, self._stop = clock.event(), clock.event()
+        self._change: _ExposureChange | None = None  # that the thread is asked for
         # A driver may hang, and must not keep the program from ending.
         self._thread = clock.thread(self._drain, self.name, daemon=True)
 
@@ -98,6 +104,31 @@ class ReopenedCamera(ThreadedCamera):
                 raise
             away = self.clock.now() - lost
             raise HardwareError(f"{self.name} was lost {away:.1f} s ago and has not come back yet") from error
+
+    def set_exposure(self, seconds: float, /) -> float:
+        """Change the exposure of the running camera, and return the one that it has then, seconds.
+
+        Frames that were exposed before may still arrive. A camera that was lost and comes back has the new
+        exposure. InputError if the camera refuses it; HardwareError if it does not answer within 3 s.
+        """
+        change = _ExposureChange(seconds, self.clock.event())
+        self._change = change
+        if not change.over.wait(_CLOSING):
+            raise HardwareError(f"{self.name} does not take another exposure: check its cable")
+        if isinstance(change.outcome, InputError):
+            raise change.outcome
+        self._settings = msgspec.structs.replace(self._settings, exposure=seconds)
+        return change.outcome
+
+    def _change_exposure(self, set_exposure: Callable[[float], float]) -> None:
+        """Set an exposure that was asked for, if any; called by the thread between frames."""
+        change, self._change = self._change, None
+        if change is not None:
+            try:
+                change.outcome = set_exposure(change.seconds)
+            except InputError as error:
+                change.outcome = error
+            change.over.set()
 
     def close(self) -> None:
         """Close the camera; a driver that does not answer within 3 s is abandoned."""
@@ -166,6 +197,15 @@ class ReopenedCamera(ThreadedCamera):
         self._reconnects += 1
         _log.warning("%s is back after %.2f s; about %d frames are missing", self.name, away, missing)
         return missing
+
+
+@dataclass
+class _ExposureChange:
+    """A change of the exposure, and what came of it."""
+
+    seconds: float
+    over: Any  # an event of the clock
+    outcome: float | InputError = math.nan
 
 
 def warn_of_other(name: str, what: str, asked: float | str, got: float | str, unit: str = "") -> None:

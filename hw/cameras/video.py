@@ -6,9 +6,11 @@ import logging
 import math
 import os
 import re
+import socket
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import parse_qs, urlsplit
 
 import cv2
 import numpy as np
@@ -47,6 +49,10 @@ _LONGEST_BACKLOG = 0.5  # seconds
 _WAITED = 0.9  # share of OpenCV's timeout after which a failure counts as a timeout
 _USUAL_RATE = 25.0  # default frame rate
 _DEVICES = Path("/dev")
+_ANSWER_SIZE_MAX = 64  # bytes
+EXPOSURE_PORT = "exposure_port"
+"""In the URL of an emulated camera: the port that takes an exposure, seconds, and answers with that set."""
+
 _CONVERSIONS = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
 
 
@@ -98,6 +104,15 @@ class VideoCamera(ReopenedCamera):
         super().__init__(self._source.name, settings, slots, clock)
         self._start()
 
+    def set_exposure(self, seconds: float, /) -> float:
+        """Change the exposure of a local camera, or of an emulated one; see ``ReopenedCamera``."""
+        if self._source.kind == "device":
+            return super().set_exposure(seconds)
+        exposure = expose_at_sender(self._source, seconds)
+        if exposure is None:
+            raise InputError(f"{self.name}: the exposure can only be set at the sender")
+        return exposure
+
     def _drain(self) -> None:
         with quiet_opencv():
             super()._drain()
@@ -108,6 +123,7 @@ class VideoCamera(ReopenedCamera):
         pace = _Pace(self.clock, capture.period) if self._source.kind == "file" else None
         try:
             while not self._stop.is_set():
+                self._change_exposure(capture.set_exposure)
                 began = self.clock.now()
                 time = capture.grab()
                 if time is None:
@@ -223,6 +239,12 @@ class Capture:
             self._picture = picture
             to_grey(picture, out, self._source.name)
 
+    def set_exposure(self, seconds: float) -> float:
+        """Set the exposure of a local camera, and return the one that it has then, seconds."""
+        self._video.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL)
+        self._video.set(cv2.CAP_PROP_EXPOSURE, seconds / _EXPOSURE_UNIT)
+        return float(self._video.get(cv2.CAP_PROP_EXPOSURE)) * _EXPOSURE_UNIT
+
     @property
     def position(self) -> float:
         """Position of the grabbed picture in a file, seconds, as the file states."""
@@ -279,6 +301,8 @@ def _configure(video: Any, source: VideoSource, settings: CameraSettings) -> boo
         raw = _letters(video.get(cv2.CAP_PROP_FOURCC)).strip() in _RAW
     else:
         asked = [name for name in ("fourcc", "exposure", "gain") if getattr(settings, name) is not None]
+        if settings.exposure is not None and expose_at_sender(source, settings.exposure) is not None:
+            asked.remove("exposure")
         if asked:
             _log.warning("%s: %s can only be set at the sender", source.name, " and ".join(asked))
         raw = _is_grey(video, source)
@@ -286,6 +310,21 @@ def _configure(video: Any, source: VideoSource, settings: CameraSettings) -> boo
     if raw:
         video.set(cv2.CAP_PROP_CONVERT_RGB, 0)
     return raw
+
+
+def expose_at_sender(source: VideoSource, seconds: float) -> float | None:
+    """Set the exposure of an emulated camera, whose URL names a port for it; None for other senders."""
+    address = urlsplit(source.target if source.kind == "stream" else "")
+    ports = parse_qs(address.query).get(EXPOSURE_PORT, [])
+    if address.scheme != "tcp" or not ports:
+        return None
+    try:
+        with socket.create_connection((address.hostname or "", int(ports[0])), READ_TIMEOUT) as line:
+            line.sendall(f"{seconds!r}\n".encode())
+            with line.makefile("rb") as answer:
+                return float(answer.readline(_ANSWER_SIZE_MAX))
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError(f"{source.name}: the exposure could not be set: {error}") from None
 
 
 def _as_jpeg(video: Any) -> bool:

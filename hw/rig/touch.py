@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self
@@ -10,6 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mirrorskin.hw.base.errors import HardwareError
 from mirrorskin.hw.base.rig_file import RigSettings
 from mirrorskin.hw.base.stage import Position
 from mirrorskin.hw.rig.plans import AxialPlan, check_plan
@@ -24,6 +26,7 @@ SEARCH = 0.2
 """Distance between frames until there is contact, mm, by default."""
 
 
+_OLD_FRAMES = 4  # that a camera may deliver with the exposure before
 _CATCHING_UP = (
     0.5  # share of a period: frames in quicker succession were held up, and may show an earlier place
 )
@@ -33,7 +36,7 @@ class RigTouch:
     """A rig for `mirrorskin.engine.live.touch`; its limits are checked before anything moves.
 
     Entering it lifts the body and takes the dark reference. Leaving it without an error lifts the body again;
-    leaving it during a move or by an error stops the stage.
+    leaving it during a move or by an error stops the stage. The exposure is then again that of the rig file.
 
     Parameters
     ----------
@@ -77,7 +80,8 @@ class RigTouch:
         self.start = limits.travel[0] if start is None else start
         limits.check(Position(self.start), rig.stage.name)
         self.deepest, self.search = plan.press, search
-        self.header = make_header(rig.settings, plan)
+        self.header = self._stated = make_header(rig.settings, plan)  # and that of the rig file
+        self._exposure: float | None = None  # seconds, if it was changed
 
     def take(self, travel: float, tilt: float = 0.0, phase: float = 0.0, /) -> NDArray[Any]:
         """Move to a travel, mm, and a lean, radians, rest there, and return a frame of its own, (H, W)."""
@@ -94,6 +98,40 @@ class RigTouch:
                 return np.array(taken.pixels[-1])
             last = time
 
+    def expose(self, ratio: float, /) -> None:
+        """Lift the body, and multiply the exposure of the camera by a ratio below 1; the header follows.
+
+        A dark reference that is not from the rig file is taken again. InputError if the camera keeps its
+        exposure.
+        """
+        camera, stated = self._rig.camera, self._rig.settings.camera.exposure
+        set_exposure = getattr(camera, "set_exposure", None)
+        if set_exposure is None:
+            raise InputError(f"{camera.name} cannot change its exposure while it is open")
+        if stated is None:
+            raise InputError(
+                f"{self.name}: state camera.exposure in the rig file, so that it can be shortened"
+            )
+        if self._exposure is None:
+            self._exposure = self._first = set_exposure(stated)  # as rounded by the camera
+        shorter = set_exposure(ratio * self._exposure)
+        if not 0 < shorter < self._exposure:
+            set_exposure(self._exposure)
+            raise InputError(f"{camera.name} does not take an exposure below {self._exposure:.3g} s")
+        self._exposure = shorter
+        self.lift()
+        self._rig.clock.sleep(_OLD_FRAMES * self._rig.period)
+        total = shorter / self._first
+        header = replace(self._stated, exposure_ratio=total * (self._stated.exposure_ratio or 1.0))
+        self.header = self._with_dark(header).exposed(total)
+
+    def _with_dark(self, header: Header) -> Header:
+        """Return a header with the dark reference of the rig file, or one that is taken now."""
+        if header.dark is not None:
+            return header
+        late = max(0.2, self._rig.settings.camera.delay or 0.0) + self._rig.period
+        return replace(header, dark=take_dark(self._rig, self.now() + late))
+
     def lift(self) -> None:
         """Set the body upright, and lift it to the end of its travel."""
         stage = self._rig.stage
@@ -106,18 +144,21 @@ class RigTouch:
 
     def __enter__(self) -> Self:
         self.lift()
-        if self.header.dark is None:
-            late = max(0.2, self._rig.settings.camera.delay or 0.0) + self._rig.period
-            self.header = replace(self.header, dark=take_dark(self._rig, self.now() + late))
+        self.header = self._with_dark(self.header)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
     ) -> None:
-        if kind is None and not self._rig.moving:
-            self.lift()
-        else:
-            self._rig.stage.stop()
+        try:
+            if kind is None and not self._rig.moving:
+                self.lift()
+            else:
+                self._rig.stage.stop()
+        finally:
+            if self._exposure is not None:
+                with suppress(HardwareError, InputError):  # of a camera that is lost
+                    self._rig.camera.set_exposure(self._first)  # type: ignore[attr-defined]
 
 
 def touch_plan(

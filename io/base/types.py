@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import inspect
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Literal, Protocol, Self, get_args
 from weakref import WeakValueDictionary
@@ -22,6 +22,10 @@ FRAME_DTYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
 
 Floats = NDArray[np.float64]
 ProcessValue = str | int | float | bool
+
+
+LEVELS = "bright", "zenith_gain", "zenith_offset"
+"""Counts of a header that depend on the exposure."""
 
 
 class InputError(ValueError):
@@ -171,6 +175,16 @@ class Header:
         example="15e-6",
         in_steps=False,
     )
+    exposure_ratio: float | None = stated(
+        of="camera",
+        unit="",
+        text="exposure of the frames, relative to that for which a calibration holds; 1 if it is not stated",
+        use="bright level and response of a calibration are multiplied by it, about the dark level",
+        short="exposure, relative to that of the calibration",
+        kind="number",
+        within=(0.001, 1000.0),
+        example="0.5",
+    )
     gamma: float | None = stated(
         of="camera",
         unit="",
@@ -211,6 +225,34 @@ class Header:
     phase_sigma: float | None = _prior(
         "stage", 0.0052, "the phase that all frames have in common", "rad", example="0.001"
     )
+
+    def exposed(self, ratio: float, names: Collection[str] = LEVELS) -> Header:
+        """Return the header of the same light after another exposure: counts change about the dark level.
+
+        Parameters
+        ----------
+        ratio : float
+            Of the exposures.
+        names : collection of str
+            Which of ``bright``, ``zenith_gain`` and ``zenith_offset`` change.
+
+        Examples
+        --------
+        >>> header = Header("axial", dark=np.full((1, 1), 10.0), zenith_offset=np.asarray(30.0))
+        >>> float(header.exposed(0.5).zenith_offset)
+        20.0
+        """
+        if ratio == 1:
+            return self
+        changed: dict[str, Any] = {}
+        for name in set(LEVELS) & set(names):
+            counts = getattr(self, name)
+            if counts is not None:
+                level: Any = 0.0
+                if name != "zenith_gain" and self.dark is not None:
+                    level = np.nanmean(self.dark, dtype=np.float64) if np.ndim(counts) == 0 else self.dark
+                changed[name] = np.asarray(level + ratio * (counts - level), np.asarray(counts).dtype)
+        return replace(self, **changed)
 
     def prior(self, name: str) -> float:
         """Return a stated number, or the default of a camera and a stage that nobody characterised.

@@ -187,7 +187,7 @@ class Calibrated:
             properties |= _brightness(calibration.response)
         if self.motion == "axial" and calibration.precession is not None:
             properties |= self._movement(stored, calibration.precession)
-        header = replace(stored, **properties)
+        header = replace(stored, **properties).exposed(stored.exposure_ratio or 1.0, properties)
         self._check_sizes(header.pixel_size)
         return header
 

@@ -19,6 +19,7 @@ from commands import refused
 
 from mirrorskin.hw import load_rig
 from mirrorskin.hw.base.rig_file import RigSettings
+from mirrorskin.hw.cameras.video import VideoCamera
 
 PATIENCE = 60.0  # seconds, for a busy machine
 SMALL = ("--size", "42x31", "--pixel-size", "0.3mm")
@@ -65,6 +66,8 @@ def test_a_rig_is_served_until_it_is_stopped(name: str, code: int, tmp_path: Pat
         assert Path(settings.stage.port).exists()
         with connected(settings) as line:
             assert line.recv(9, socket.MSG_WAITALL) == b"YUV4MPEG2"
+        with VideoCamera(settings.camera) as camera:
+            assert camera.set_exposure(0.01) == 0.01
         child.send_signal(getattr(signal, name))
         assert child.wait(PATIENCE) == code
         assert child.stdout is not None
@@ -76,7 +79,7 @@ def test_a_rig_is_served_until_it_is_stopped(name: str, code: int, tmp_path: Pat
 
 def connected(settings: RigSettings) -> socket.socket:
     """Connect to a rig's camera."""
-    match = re.fullmatch(r"tcp://(.+):(\d+)", str(settings.camera.source))
+    match = re.fullmatch(r"tcp://(.+):(\d+)\?exposure_port=\d+", str(settings.camera.source))
     assert match is not None
     return socket.create_connection((match[1], int(match[2])), PATIENCE)
 

@@ -55,7 +55,8 @@ class TwinCamera(ThreadedCamera):
     `where` returns the body's `Position` at a past time of the `clock`; the twin's movement only bounds the
     positions. `delay` and `jitter` are seconds. The body rotates about `pivot`, mm from the centre of the
     undeformed sheet. ``lateness`` returns an additional delay of a frame number in seconds; inf loses the
-    frame.
+    frame. ``light`` is relative to that at which full light has the camera's bright level in an exposure of a
+    whole period.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class TwinCamera(ThreadedCamera):
         seed: int = 0,
         pivot: tuple[float, float, float] = (0.0, 0.0, 0.0),
         trigger: Callable[[], list[float]] | None = None,
+        light: float = 1.0,
         clock: Clock = SYSTEM,
     ) -> None:
         rate = twin.frame_rate
@@ -80,6 +82,8 @@ class TwinCamera(ThreadedCamera):
         self._twin, self._where, self._pivot = twin, where, pivot
         self._trigger = trigger
         self._rate, self._delay, self._jitter = rate, delay, jitter
+        self._light, self._period = light, 1 / rate
+        self.exposure = self._period
         self._random = np.random.default_rng(seed)
         self._in_transit: deque[_Frame] = deque()
         self._change = clock.condition()
@@ -91,6 +95,13 @@ class TwinCamera(ThreadedCamera):
         ]
         for thread in self._threads:
             thread.start()
+
+    def set_exposure(self, seconds: float, /) -> float:
+        """Expose later frames for a time, at most a period, and return it, seconds."""
+        if not 0 < seconds < math.inf:
+            raise InputError(f"{self.name}: an exposure of {seconds} s is not possible: give one above 0")
+        self.exposure = min(seconds, self._period)
+        return self.exposure
 
     def stall(self) -> None:
         """Deliver no more frames, without an error."""
@@ -157,7 +168,7 @@ class TwinCamera(ThreadedCamera):
         def pose(late: float) -> Pose:
             return pose_at(self._where(middle + late), self._pivot)
 
-        self._twin.look(pose, number, pixels)
+        self._twin.look(pose, number, pixels, self._light * (self.exposure / self._period))
         return pixels
 
     def _deliver(self) -> None:

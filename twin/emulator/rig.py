@@ -102,6 +102,9 @@ class EmulatedRig:
         Whether the machine has switches and must be homed before it moves.
     machine : GrblMachine, optional
         Another controller with the settings ``MACHINE``, whose axes start at 0; it may lack axes.
+    light : float
+        Strength of the light: where it is above 1, full light is beyond the end of the camera's scale, unless
+        the exposure is shortened. The rig file states exposure, levels and response for it.
     clock : Clock
         With a `SimulatedClock` waiting takes no time; the controller is then behind a line in memory.
     **scene
@@ -130,13 +133,14 @@ class EmulatedRig:
         trigger: Line | None = None,
         home: bool = False,
         machine: GrblMachine | None = None,
+        light: float = 1.0,
         clock: Clock = SYSTEM,
         **scene: Any,
     ) -> None:
         self._levels = replace(camera or Camera(), frame_rate=rate, seed=seed)
         of_twin: dict[str, Any] = {"shape": (240, 320), "pixel_size": 0.05, **scene}
         self._make = functools.partial(Twin, object=object, camera=self._levels, **of_twin)
-        self._pivot, self._home, self._trigger = pivot, home, trigger
+        self._pivot, self._home, self._trigger, self._light = pivot, home, trigger, light
         self._seen = self._make(movement=_Anywhere(pivot))
         self._axes = _axes(home, _AXES if machine is None else machine.axes)
         start = {axis.letter: axis.zero for axis in self._axes.values()}
@@ -152,6 +156,7 @@ class EmulatedRig:
             jitter=jitter,
             seed=seed,
             pivot=pivot,
+            light=light,
             clock=clock,
         )
         if trigger is not None:
@@ -193,10 +198,15 @@ class EmulatedRig:
         """Restart the emulated camera, and return it; see ``rig.open_camera``."""
         self.camera.close()
         self.camera = self._make_camera()
+        if settings.exposure is not None:
+            self.camera.set_exposure(settings.exposure)
         return self.camera
 
     def twin(self, movement: Movement) -> Twin:
-        """Return the same scene as a twin that is rendered directly, with the references of `references`."""
+        """Return the same scene as a twin that is rendered directly, with the references of `references`.
+
+        Its light is that of a ``light`` of 1.
+        """
         return self._make(movement=movement, references="ball")
 
     def references(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -274,7 +284,9 @@ class EmulatedRig:
         self.check_folder(folder)
         path, picture = folder / _FILE, folder / _REFERENCE
         settings, change = self.settings, msgspec.structs.replace
-        camera = change(settings.camera, source=source, bright=picture.name, stall=max(_STALL, _SERVED))
+        measured = settings.camera.bright is not None
+        bright = picture.name if measured else None
+        camera = change(settings.camera, source=source, bright=bright, stall=max(_STALL, _SERVED))
         stage = change(settings.stage, silence=max(_SILENCE, _SERVED))
         file = RigFile(name=settings.name, stage=stage, camera=camera)
         text = "\n".join(_toml(msgspec.to_builtins(file)))
@@ -282,29 +294,32 @@ class EmulatedRig:
         with translate_os_errors(f"{folder} cannot be written to", "choose another folder with -o"):
             folder.mkdir(parents=True, exist_ok=True)
             self._leaving.callback(_remove, folder, emulator)
-            array = BytesIO()
-            np.save(array, self.references()[1])
-            # it belongs to an emulated rig, as was checked
-            write_new(picture, [array.getvalue()], replaces="anything")
+            if measured:
+                array = BytesIO()
+                np.save(array, self.references()[1])
+                # it belongs to an emulated rig, as was checked
+                write_new(picture, [array.getvalue()], replaces="anything")
             write_new(path, [f"{emulator.heading}{text}\n".encode()], replaces="anything")
         return path
 
     def _camera_settings(self) -> CameraSettings:
-        header = self._seen.header
+        header, levels = self._seen.header.exposed(self._light), self._levels
         gain, offset = (
             None if counts is None else float(np.mean(counts))
             for counts in (header.zenith_gain, header.zenith_offset)
         )
+        bright = levels.dark + self._light * (levels.bright - levels.dark)
         rows, columns = self._seen.shape[1:]
         return CameraSettings(
             source=self._seen.name,
             size=(columns, rows),
             dtype=cast(Literal["uint8", "uint16", "float32"], self._seen.dtype.name),
             rate=self._seen.frame_rate,
+            exposure=1 / self._seen.frame_rate,
             stall=_STALL,
             trigger=self._trigger,
             pixel_size=header.pixel_size,
-            bright=self._levels.bright,
+            bright=bright if bright <= levels.top else None,
             zenith_gain=None if gain is None else gain * math.radians(1.0),
             zenith_offset=offset,
             name=header.camera,

@@ -13,11 +13,14 @@ import numpy as np
 
 from mirrorskin.hw.base.camera import Camera
 from mirrorskin.hw.base.errors import HardwareError
+from mirrorskin.hw.cameras.video import EXPOSURE_PORT
 from mirrorskin.io.base.types import Closing, InputError
 
 _COLOURS = {np.dtype(np.uint8): "mono", np.dtype(np.uint16): "mono16"}
 _QUEUE = 4  # frames that wait for a slow viewer
 _LOOK = 0.1  # interval at which threads check whether to end, seconds
+_ASKING = 1.0  # seconds to send a request
+_REQUEST_SIZE_MAX = 64  # bytes
 _FRACTION = 1001  # greatest denominator of the rate in the header
 
 
@@ -29,7 +32,8 @@ class FrameServer(Closing):
     programs on this computer can connect.
 
     The server takes the camera's frames, but does not close the camera. ``url`` is the address to open; port
-    0 selects a free port.
+    0 selects a free port. ``controlled_url`` is the same stream with the port at which `VideoCamera` changes
+    the exposure of a camera that can: it takes a line with seconds, and answers with those set.
     """
 
     def __init__(self, camera: Camera, rate: float, port: int = 0) -> None:
@@ -49,9 +53,12 @@ class FrameServer(Closing):
             self._door = socket.create_server(("127.0.0.1", port))
         except (OSError, OverflowError) as error:
             raise InputError(f"port {port} cannot be opened: {error}; choose another one, or 0") from None
-        self._door.settimeout(_LOOK)
+        self._control = socket.create_server(("127.0.0.1", 0))
         self.url: str = f"tcp://127.0.0.1:{self._door.getsockname()[1]}"
-        self._threads = [threading.Thread(target=work) for work in (self._admit, self._take)]
+        self.controlled_url: str = f"{self.url}?{EXPOSURE_PORT}={self._control.getsockname()[1]}"
+        for door in (self._door, self._control):
+            door.settimeout(_LOOK)
+        self._threads = [threading.Thread(target=work) for work in (self._admit, self._take, self._obey)]
         for thread in self._threads:
             thread.start()
 
@@ -62,6 +69,7 @@ class FrameServer(Closing):
         for thread in self._threads:  # threads of viewers are added by the first thread
             thread.join()
         self._door.close()
+        self._control.close()
 
     def _admit(self) -> None:
         while not self._ended:
@@ -79,6 +87,17 @@ class FrameServer(Closing):
             self._threads.append(threading.Thread(target=self._serve, args=(line,)))
             self._threads[-1].start()
         self._dismiss()
+
+    def _obey(self) -> None:
+        """Set the exposures that are asked for, one at a time."""
+        set_exposure = getattr(self._camera, "set_exposure", None)
+        while set_exposure is not None and not self._ended:
+            with suppress(OSError, ValueError, InputError):  # no request, or not one that can be obeyed
+                line, _ = self._control.accept()
+                line.settimeout(_ASKING)
+                with line, line.makefile("rb") as request:
+                    exposure = set_exposure(float(request.readline(_REQUEST_SIZE_MAX)))
+                    line.sendall(f"{exposure!r}\n".encode())
 
     def _take(self) -> None:
         """Pass each frame of the camera to all viewers."""

@@ -1,8 +1,10 @@
 """Touches on the emulated rig, on simulated time."""
 
+import dataclasses
 import math
 from contextlib import contextmanager
 
+import msgspec
 import numpy as np
 import pytest
 from rig_faults import FAULTS, FIRMWARE_ONLY
@@ -165,6 +167,100 @@ def test_flicker_is_taken_again():
             outcome = engine.live.touch(sensor, 0.004)
     assert outcome.retaken > 0
     assert outcome.reached
+
+
+@pytest.fixture(scope="module")
+def too_bright(tmp_path_factory):
+    """A touch of a cone under a light that is twice too strong: the rig, the outcome, its recording."""
+    with sensor_of("cone", light=2.0) as (emulated, _, sensor):
+        with sensor:
+            outcome = engine.live.touch(sensor, 0.004)
+        path = tmp_path_factory.mktemp("too bright") / "frames.h5"
+        io.save_touch(path, outcome.press, outcome.turn)
+        yield emulated, outcome, path
+
+
+def test_light_that_is_too_strong_is_taken_again_with_a_shorter_exposure(too_bright):
+    _, outcome, path = too_bright
+    assert outcome.retaken > 0
+    with io.open_recording(path, dataset="turn") as turn:
+        assert turn.header.exposure_ratio == pytest.approx(0.5)
+        assert "cut off" not in {finding.kind for finding in io.check(turn).findings}
+
+
+def test_a_touch_with_a_shorter_exposure_has_the_requested_errors(too_bright):
+    emulated, outcome, _ = too_bright
+    assert outcome.reached
+    assert np.sqrt(np.mean(errors(emulated, outcome, 0.004) ** 2)) < 1.1 * 0.004
+
+
+def test_the_response_of_a_shorter_exposure_is_in_the_recording(too_bright):
+    emulated, _, path = too_bright
+    stated = emulated.settings.camera
+    with io.open_recording(path, dataset="turn") as turn:
+        ratio, dark = turn.header.exposure_ratio, float(turn.header.dark.mean())
+        assert float(turn.header.zenith_gain) == pytest.approx(ratio * stated.counts_per_radian)
+        assert float(turn.header.zenith_offset) == pytest.approx(dark + ratio * (stated.zenith_offset - dark))
+
+
+def test_the_recording_of_a_shorter_exposure_repeats_the_result_bit_by_bit(too_bright):
+    _, outcome, path = too_bright
+    with io.open_recording(path) as press, io.open_recording(path, dataset="turn") as turn:
+        again = engine.live.fuse_touch(press, turn)
+    for name, values in outcome.result.items():
+        np.testing.assert_array_equal(again[name], values, err_msg=name)
+
+
+def test_the_exposure_is_that_of_the_rig_file_afterwards(too_bright):
+    emulated, *_ = too_bright
+    assert emulated.camera.exposure == emulated.settings.camera.exposure
+
+
+def test_the_exposure_is_kept_if_no_light_is_cut_off(reached):
+    assert reached[1].turn.header.exposure_ratio is None
+
+
+def test_stray_light_at_the_end_of_the_scale_is_found_before_contact():
+    with sensor_of("cone") as (emulated, _, sensor):
+        take = sensor.take
+
+        def lit(*pose):
+            counts = take(*pose) + 400.0 * emulated.camera.exposure / emulated.settings.camera.exposure
+            return np.clip(counts, 0, 255).astype(np.uint8)
+
+        def stop(text, _):
+            raise InterruptedError(text)
+
+        sensor.take = lit
+        with sensor, pytest.raises(InterruptedError, match=r"again with 0\.50 of the exposure"):
+            engine.live.touch(sensor, 0.004, on_update=stop)
+
+
+@pytest.mark.parametrize(
+    ("without", "words"),
+    [("method", "cannot change its exposure"), ("exposure", "state camera.exposure in the rig file")],
+)
+def test_a_camera_that_keeps_its_exposure_leaves_light_cut_off_and_the_reason_says_so(
+    without, words, monkeypatch
+):
+    with sensor_of("cone", light=2.0) as (emulated, rig, sensor):
+        if without == "method":
+            monkeypatch.delattr(type(emulated.camera), "set_exposure")
+        else:
+            camera = msgspec.structs.replace(rig.settings.camera, exposure=None)
+            rig.settings = dataclasses.replace(rig.settings, camera=camera)
+        with sensor:
+            outcome = engine.live.touch(sensor, 0.02)
+    assert outcome.retaken == 0
+    assert "shorten the exposure" in outcome.reason
+    assert words in outcome.reason
+
+
+def test_frames_are_not_taken_again_with_a_shorter_exposure_if_there_is_no_time():
+    with sensor_of("cone", light=2.0) as (_, _, sensor), sensor:
+        outcome = engine.live.touch(sensor, 0.004, within=7.5)
+    assert "no time to take all frames again" in outcome.reason
+    assert outcome.seconds < 7.5
 
 
 @pytest.mark.filterwarnings("ignore::mirrorskin.io.MirrorskinWarning")

@@ -115,6 +115,7 @@ stall = 0.2
 trigger = "spindle"
 trigger_input = "Line2"
 line_time = 2e-5
+exposure_ratio = 0.5
 gamma = 1.05
 gamma_sigma = 0.01
 frame_gain_sigma = 0.002

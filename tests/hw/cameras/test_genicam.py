@@ -147,6 +147,15 @@ def test_one_that_is_triggered_gives_a_frame_each_time_and_is_not_lost_meanwhile
         devices.clear()
 
 
+def test_the_exposure_can_be_changed_while_it_runs(fake) -> None:
+    with closing(open_camera(settings(fake, exposure=0.004, rate=100.0))) as camera:
+        before = camera.take(1, SOON).pixels.max()
+        assert camera.set_exposure(0.001) == pytest.approx(0.001, rel=0.01)
+        camera.flush()
+        camera.take(3, SOON)
+        assert camera.take(1, SOON).pixels.max() < before
+
+
 def test_an_input_that_it_has_not_is_refused(fake) -> None:
     with pytest.raises(
         InputError, match=r"cannot be set as the rig file says: \[TriggerSource\] 'Line7' not"

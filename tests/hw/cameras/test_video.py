@@ -236,6 +236,36 @@ def test_a_camera_is_given_what_is_asked_for(driver, open_camera, caplog) -> Non
     assert not caplog.records
 
 
+def test_the_exposure_can_be_changed_while_it_runs(driver, open_camera) -> None:
+    driver.give(noise(1)[0])
+    opened = open_camera(exposure=0.004)
+    later = driver.clock.thread(lambda: driver.give(*noise(2)), "gives pictures")
+    later.start()
+    assert opened.set_exposure(0.00213) == pytest.approx(0.00213)
+    assert driver.values[cv2.CAP_PROP_EXPOSURE] == pytest.approx(21.3)
+    later.join()
+
+
+def test_a_camera_that_comes_back_has_the_changed_exposure(driver, open_camera, caplog) -> None:
+    driver.give(*noise(2))
+    opened = open_camera(exposure=0.004)
+    later = driver.clock.thread(lambda: driver.give(*noise(2)), "gives pictures")
+    later.start()
+    opened.set_exposure(0.002)
+    later.join()
+    driver.values.clear()
+    driver.give(None)
+    wait_until(driver.clock, lambda: cv2.CAP_PROP_EXPOSURE in driver.values)
+    assert driver.values[cv2.CAP_PROP_EXPOSURE] == pytest.approx(20.0)
+
+
+def test_the_exposure_of_a_film_cannot_be_changed(open_camera, tmp_path) -> None:
+    write_y4m(tmp_path / "film.y4m", noise(2), 50)
+    opened = open_camera(tmp_path / "film.y4m")
+    with pytest.raises(InputError, match=r"film\.y4m: the exposure can only be set at the sender$"):
+        opened.set_exposure(0.002)
+
+
 def test_what_a_camera_does_not_take_is_reported(driver, open_camera, caplog) -> None:
     driver.refuses = {cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FPS}
     driver.values[cv2.CAP_PROP_FPS] = 30.0

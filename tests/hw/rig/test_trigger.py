@@ -89,7 +89,8 @@ def test_a_missing_frame_ends_a_capture_in_one_line_and_the_line_is_off(emulated
     ended = run("capture", "vertical", "--rig", file, "-o", tmp_path / "press.h5", *STEPS)
     assert ended.code == 1
     assert (
-        "delivered no frame within 2 s of its trigger: check the controller's output 'coolant'" in ended.said
+        "delivered no frame within 2.02 s of its trigger: check the controller's output 'coolant'"
+        in ended.said
     )
     assert len(rig.machine.switched("coolant")) == 2
 

@@ -78,6 +78,17 @@ def test_each_part_replaces_its_values_and_the_rest_is_the_source_s(only, change
     assert (with_calibration.whole, with_calibration.calibration) == (calibration, calibration)
 
 
+@pytest.mark.parametrize("name", ["bright", "zenith_gain", "zenith_offset"])
+def test_levels_follow_the_exposure_about_the_dark_level(name):
+    whole, half = (calibrated(source=a_source(exposure_ratio=ratio)).header for ratio in (1.0, 0.5))
+    dark = 0.0 if name == "zenith_gain" else whole.dark
+    np.testing.assert_allclose(getattr(half, name), dark + (getattr(whole, name) - dark) / 2, rtol=1e-5)
+
+
+def test_levels_of_the_recording_are_those_of_its_exposure():
+    assert differing(calibrated([], a_source(exposure_ratio=0.5)).header) == {"exposure_ratio"}
+
+
 @pytest.mark.parametrize(
     ("actual", "of_source", "message"),
     [

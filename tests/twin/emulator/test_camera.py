@@ -118,6 +118,23 @@ def times_of(taken: list[Frames]) -> tuple[NDArray[np.int64], NDArray[np.float64
     return np.concatenate([f.number for f in taken]), np.concatenate([f.time for f in taken])
 
 
+def test_counts_above_the_dark_level_are_proportional_to_the_exposure(running) -> None:
+    def light(exposure: float, strength: float = 1.0) -> float:
+        camera = running(still, 50.0, light=strength)
+        camera.set_exposure(exposure)
+        camera.flush()
+        return float(np.mean([frames.pixels.mean() for frames in take(camera, 8)[1:]]) - Camera().dark)
+
+    whole = light(0.02)
+    assert [light(0.01), light(0.005, 2.0)] == pytest.approx([whole / 2, whole / 2], abs=0.2)
+
+
+@pytest.mark.parametrize("exposure", [0.0, -1.0, math.inf, math.nan])
+def test_an_impossible_exposure_is_refused(running, exposure: float) -> None:
+    with pytest.raises(InputError, match="give one above 0"):
+        running(still).set_exposure(exposure)
+
+
 def test_a_frame_shows_the_body_where_it_was_when_it_was_exposed(running, clock) -> None:
     began = clock.now()
 

@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any
 
 import cv2
@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mirrorskin.hw.base.rig_file import CameraSettings
 from mirrorskin.hw.cameras.camera_thread import ThreadedCamera
+from mirrorskin.hw.cameras.video import VideoCamera
 from mirrorskin.io import InputError
 from mirrorskin.twin.emulator.server import FrameServer
 
@@ -109,6 +111,38 @@ def test_opencv_reads_every_frame_bit_by_bit(shape: tuple[int, int], dtype: Any)
     for number, pixels in zip(numbers, frames, strict=True):
         assert pixels.dtype == dtype
         np.testing.assert_array_equal(pixels, picture(number, shape, dtype))
+
+
+class Exposed(Tape):
+    """A tape whose exposure can be set, up to 10 ms."""
+
+    def set_exposure(self, seconds: float) -> float:
+        return min(seconds, 0.01)
+
+
+@pytest.mark.parametrize(("seconds", "expected"), [(0.004, 0.004), (0.5, 0.01)])
+def test_the_exposure_can_be_set_through_the_stream(seconds: float, expected: float) -> None:
+    with closing(Exposed((60, 80), np.uint8, 0.005)) as tape, FrameServer(tape, 200.0) as server:
+        camera = CameraSettings(source=server.controlled_url, size=(80, 60))
+        with VideoCamera(camera) as opened:
+            assert opened.set_exposure(seconds) == expected
+
+
+def test_the_exposure_of_another_stream_cannot_be_set() -> None:
+    with (
+        streaming() as (_, server),
+        VideoCamera(CameraSettings(source=server.url, size=(80, 60))) as opened,
+        pytest.raises(InputError, match="can only be set at the sender"),
+    ):
+        opened.set_exposure(0.004)
+
+
+def test_an_impossible_request_is_not_answered() -> None:
+    with closing(Exposed((60, 80), np.uint8, 0.005)) as tape, FrameServer(tape, 200.0) as server:
+        port = int(server.controlled_url.rpartition("=")[2])
+        with socket.create_connection(("127.0.0.1", port), PATIENCE) as line:
+            line.sendall(b"a second\n")
+            assert line.recv(1) == b""
 
 
 def test_viewers_may_come_one_after_another_and_together() -> None:
