@@ -27,6 +27,15 @@ def command(
     within: Annotated[
         str | None, Option(metavar="TIME", help="End after this time: 20s.", show_default="no limit")
     ] = None,
+    region: Annotated[
+        str | None,
+        Option(
+            metavar="X,Y,WxH",
+            help="Only W x H pixels, from column X and row Y on, must have it; the press is as deep as their"
+            " contact needs.",
+            show_default="all of it",
+        ),
+    ] = None,
     record: Annotated[
         Path | None,
         Option(
@@ -70,6 +79,9 @@ def command(
     deepest = None if press is None else quantity.length(press, "--press")
     first = None if start is None else quantity.length(start, "--from")
     lean = quantity.angle(tilt, "--tilt")
+    part_of = None if region is None else quantity.region(region, "--region")
+    if part_of is not None:
+        part_of.check(settings.camera.shape, "--region")
     touch_plan(settings, deepest, first, lean)
     io.check_result_output(output, rig_file, calibration, frames_file, overwrite=overwrite)
     kept = (rig_file, calibration, output)
@@ -91,6 +103,7 @@ def command(
                     requested,
                     share=part,
                     within=limit,
+                    region=part_of,
                     calibration=calibrated,
                     device=device,
                     taken=taken,

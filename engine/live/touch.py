@@ -22,6 +22,7 @@ from mirrorskin.engine.live.recipe import PRESS_STEPS, TURN_FRAMES, Contact, Mea
 from mirrorskin.io import ArrayRecording, Calibrated, Calibration, InputError, Result, check
 from mirrorskin.io.base.arguments import check_number, checked, in_unit
 from mirrorskin.io.base.findings import Finding
+from mirrorskin.io.base.selection import Region
 from mirrorskin.io.base.types import Header, Source
 from mirrorskin.io.watch.saturation import REACHED, scale_ends, scale_top
 from mirrorskin.kernels.device import Choice, open_devices
@@ -32,7 +33,9 @@ CLEAR_CHANGE = 8.0
 _MIN_PIXELS = 16  # pixels that must have changed
 _LEAST_SHARE = 0.01  # of the pixels, which are lit in three frames, to compare their light
 _NOISE_MIN = 0.3  # counts: rounding alone, as the standard deviation of integers
-_LEAST_GROWTH = 0.005  # share of the picture: contact that grows by less has ended
+_NOT_JOINED = 0.005  # share of a region in contact that may be missing
+_LEVEL_MAX = 0.1  # share of a region that may be level, and thus dark, if contact encircles it
+_HALVINGS = 2  # of the distance between frames of the search, for the depth of a region
 _LIGHT_MAX = 0.08  # share of the light by which it may change between frames
 _MOVED_MAX, _SMOOTHED = 0.5, 2.0  # pixels: largest shift between press and turn, and Gaussian blur for it
 _MANY = 8  # press steps of a recipe, from which on half of them are taken first
@@ -119,7 +122,7 @@ class Touched:
     reached : bool
         Whether the requested share of the pixels has the requested standard deviation.
     share : float
-        Share of the pixels with normals that has it.
+        Share of the pixels with normals, in the region, that has it.
     sigma : float
         Standard deviation that the requested share of the pixels has, mm; infinite if some have none.
     reason : str
@@ -160,6 +163,7 @@ def touch(
     *,
     share: float = 0.95,
     within: float = math.inf,
+    region: Region | None = None,
     calibration: Calibration | None = None,
     device: Choice = None,
     taken: list[Taken] | None = None,
@@ -188,9 +192,13 @@ def touch(
     sigma : float
         Requested standard deviation of heights, mm, above 0.
     share : float
-        Share of the pixels with normals that must have it, above 0 to 1.
+        Share of the pixels with normals, in the region, that must have it, above 0 to 1.
     within : float
         Seconds from the first frame; the best surface so far is returned then.
+    region : Region, optional
+        Part of the picture that must have it; by default all of it. The press is as deep as contact of the
+        region needs, also when the body leans, which frames of the search find out. Frames and surface are
+        those of the whole picture.
     calibration : Calibration, optional
         Applied to the frames of both movements.
     device : str, Device or sequence of them, optional
@@ -224,9 +232,13 @@ def touch(
         raise InputError(f"share {share:g} is not possible: give one above 0, at most 1")
     if not within > 0:
         raise InputError(f"within {within:g} s is not possible: give a time above 0")
+    if region is not None:
+        region.check(sensor.shape, sensor.name)
     check_sensor(sensor, calibration)
     tell = on_update or (lambda text, result: None)
-    work = _Touch(sensor, sigma, share, within, calibration, device, [] if taken is None else taken, tell)
+    work = _Touch(
+        sensor, sigma, share, within, region, calibration, device, [] if taken is None else taken, tell
+    )
     return work.run()
 
 
@@ -283,14 +295,24 @@ def fuse_touch(press: Source, turn: Source, device: Choice = None) -> Result:
     return fuse_sources(press, turn, press=_PRESS, device=device)
 
 
-def sigma_of_normals(surface: Result) -> NDArray[np.float64]:
-    """Return the standard deviations of the heights of all pixels with a normal, mm.
+def sigma_of_normals(surface: Result, region: Region | None = None) -> NDArray[np.float64]:
+    """Return the standard deviations of the heights of all pixels with a normal, mm, or of those in a region.
 
     It is infinite where the height is unknown, also of a whole component.
     """
-    with_normal = np.isfinite(np.asarray(surface.normals)[..., 0])
-    sigma = np.where(is_relative(surface), np.inf, np.asarray(surface.height_sigma, np.float64))[with_normal]
+    sigma = np.where(is_relative(surface), np.inf, np.asarray(surface.height_sigma, np.float64))
+    sigma = sigma[_with_normal(surface, region)]
     return np.where(np.isfinite(sigma), sigma, np.inf)
+
+
+def _with_normal(surface: Result, region: Region | None) -> NDArray[np.bool_]:
+    """Return which pixels have a normal, (H, W), and are in a region, if one is given."""
+    with_normal: NDArray[np.bool_] = np.isfinite(np.asarray(surface.normals)[..., 0])
+    if region is not None:
+        inside = np.zeros(with_normal.shape, bool)
+        inside[region.slices] = True
+        with_normal &= inside
+    return with_normal
 
 
 class _ExposureChanged(Exception):  # noqa: N818
@@ -306,6 +328,7 @@ class _Touch:
         sigma: float,
         share: float,
         within: float,
+        region: Region | None,
         calibration: Calibration | None,
         device: Choice,
         taken: list[Taken],
@@ -313,7 +336,7 @@ class _Touch:
     ) -> None:
         self._sensor, self._sigma, self._share, self._within = sensor, sigma, share, within
         self._device, self._tell, self._taken = device, tell, taken
-        self._calibration = calibration
+        self._calibration, self._region = calibration, region
         self._began = sensor.now()
         self._searched = self._retaken = 0
         self._error: NotConverged | None = None
@@ -340,7 +363,7 @@ class _Touch:
         steps = planned.press_steps
         if steps >= _MANY:  # half may suffice, and halving its steps costs no frame
             steps = (steps + 1) // 2
-        self._press(np.linspace(self._first, self._sensor.deepest, steps + 1)[1:])
+        self._press(np.linspace(self._first, self._bottom, steps + 1)[1:])
         self._turn(planned.turn_frames)
         self._take_again_if_moved()
         best, sigma = self._measure(planned, None)
@@ -356,7 +379,7 @@ class _Touch:
             best, sigma = self._measure(planned, best)
             useless = useless + 1 if sigma > _GAIN_MIN * before else 0
             if best is not None and useless == _USELESS and not best.reached:
-                reason = f"more frames no longer help, limited by {_limit(best)}"
+                reason = f"more frames no longer help, limited by {_limit(best, self._region)}"
                 break
         self._sensor.lift()
         if best is None:
@@ -419,17 +442,47 @@ class _Touch:
                 " the object and the light, or allow a deeper press"
             )
         self._before, self._clear = before, CLEAR_CHANGE * noise
-        self._taken.pop()  # it is between press steps, which must be even
-        self._first = self._taken[-1].pose.travel
-        self._searched = len(self._taken)
+        self._searched = len(self._taken) - 1
+        self._first = self._taken[self._searched - 1].pose.travel
         header = check_sensor(sensor, self._calibration)
+        self._bottom = self._depth_of_region(float(place), frame, header)
+        del self._taken[self._searched :]  # they are between press steps, which must be even
         gain, offset = (
             0.0 if counts is None else float(np.mean(counts))
             for counts in (header.zenith_gain, header.zenith_offset)
         )
         zenith = float(np.median(np.clip((frame[changed] - offset) / gain, 0.05, 1.2)))
         pixel, tilt = max(header.pixel_size or (0.0,)), header.tilt or 0.0
-        return Contact(pixel, noise, abs(gain), tilt, zenith, sensor.deepest - self._first)
+        return Contact(pixel, noise, abs(gain), tilt, zenith, self._bottom - self._first)
+
+    def _depth_of_region(self, place: float, frame: NDArray[np.float32], header: Header) -> float:
+        """Return the least travel with contact of a region, also when the body leans, from a first contact.
+
+        It is the deepest place without a region, or if contact ends before.
+        """
+        sensor, region = self._sensor, self._region
+        if region is None:
+            return sensor.deepest
+        below, step = self._first, sensor.search
+        while not self._joined(frame, region):
+            if place == sensor.deepest:
+                return place
+            below, place = place, min(place + step, sensor.deepest)
+            frame = self._search(place)
+        for _ in range(_HALVINGS):
+            middle = (below + place) / 2
+            if self._joined(self._search(middle), region):
+                place = middle
+            else:
+                below = middle
+        lean = (header.tilt or 0.0) * _reach(region, sensor.shape, header)
+        return min(place + lean, sensor.deepest)
+
+    def _joined(self, frame: NDArray[np.float32], region: Region) -> bool:
+        """Return whether a region is in contact; a level spot that the wall does not reach is encircled."""
+        changed = np.abs(frame - self._before) > self._clear
+        parts = [float(np.mean(contact[region.slices])) for contact in (changed, _filled(changed))]
+        return parts[0] >= 1 - _LEVEL_MAX and parts[1] >= 1 - _NOT_JOINED
 
     def _search(self, travel: float) -> NDArray[np.float32]:
         """Return a frame of the search for contact; what is cut off in it shows no contact."""
@@ -461,16 +514,11 @@ class _Touch:
         return replace(recipe, seconds=self._each * (recipe.frames - taken))
 
     def _press(self, travels: Sequence[float] | NDArray[np.float64]) -> None:
-        """Take frames at some travels, and again if the check complains; end if contact stops growing."""
-        share, first = 0.0, len(self._taken)
+        """Take frames at some travels, and again if the check complains."""
+        first = len(self._taken)
         for travel in sorted(travels):
-            if any(abs(travel - taken.pose.travel) < 1e-6 for taken in self._taken):
-                continue
-            frame = self._take(Pose(float(travel)))
-            here = float(np.mean(np.abs(frame - self._before) > self._clear))
-            if travel > self._deepest and 0 < here < share + _LEAST_GROWTH:
-                break
-            share = here
+            if all(abs(travel - taken.pose.travel) >= 1e-6 for taken in self._taken):
+                self._take(Pose(float(travel)))
         self._check(first)
         self._evidence()
 
@@ -567,7 +615,7 @@ class _Touch:
         except NotConverged as error:  # more frames may help
             self._error = error
             return best, math.inf
-        sigma = sigma_of_normals(result)
+        sigma = sigma_of_normals(result, self._region)
         share = float(np.mean(sigma <= self._sigma)) if sigma.size else 0.0
         reaching = float(np.quantile(sigma, self._share, method="higher")) if sigma.size else math.inf
         reached = share >= self._share
@@ -578,7 +626,7 @@ class _Touch:
     def _following(self, contact: Contact, sigma: float, best: Touched | None) -> tuple[Recipe | None, str]:
         """Return the next recipe, or None and the reason; press steps are halved, so that they stay even."""
         press, turn = self._counts
-        limited = "" if best is None else f", limited by {_limit(best)}"
+        limited = "" if best is None else f", limited by {_limit(best, self._region)}"
         finer = [press, 2 * press] if 2 * press <= PRESS_STEPS[1] else [press]
         more = [(steps, count) for steps in finer for count in range(turn, TURN_FRAMES[1] + 1)][1:]
         known = math.isfinite(sigma)
@@ -682,17 +730,36 @@ def _moved(press: ArrayRecording | None, turn: ArrayRecording | None) -> float:
     return float(np.hypot(*shift[:2]))
 
 
+def _filled(contact: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return pixels in contact, and those that they encircle within the picture, (H, W)."""
+    outside = np.pad(~contact, 1, constant_values=True).astype(np.uint8)
+    cv2.floodFill(outside, None, (0, 0), 0)
+    return contact | (outside[1:-1, 1:-1] > 0)
+
+
+def _reach(region: Region, shape: tuple[int, int], header: Header) -> float:
+    """Return the largest distance of a region from the pivot, mm along the sheet."""
+    pixel_size = header.pixel_size or (0.0, 0.0)
+    centre, sides = region.centre(shape, pixel_size), region.shape[::-1]
+    away = (
+        abs(place - pivot) + count * size / 2
+        for place, pivot, count, size in zip(
+            centre, (header.pivot or (0.0, 0.0))[:2], sides, pixel_size, strict=True
+        )
+    )
+    return math.hypot(*away)
+
+
 def _contradict(outcome: Touched) -> bool:
     """Return whether most of the variance is the contradiction of heights and slopes."""
     return 2 * (outcome.result.fitted.disagreement or 0.0) ** 2 > outcome.sigma**2
 
 
-def _limit(outcome: Touched) -> str:
+def _limit(outcome: Touched, region: Region | None) -> str:
     """Return what limits the standard deviation of an outcome."""
     result = outcome.result
     sigma = np.asarray(result.height_sigma, np.float64)
-    with_normal = np.isfinite(np.asarray(result.normals)[..., 0])
-    if not np.isfinite(sigma[with_normal]).any() or not math.isfinite(outcome.sigma):
+    if not np.isfinite(sigma[_with_normal(result, region)]).any() or not math.isfinite(outcome.sigma):
         return "pixels without a height: there is no contact, or no light"
     common = result.fitted.common_height_sigma or 0.0
     if 2 * common**2 > outcome.sigma**2:

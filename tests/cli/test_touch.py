@@ -39,6 +39,15 @@ def test_fuse_of_its_recording_repeats_the_surface(touched):
         np.testing.assert_array_equal(again[name], values, err_msg=name)
 
 
+def test_a_region_needs_a_press_of_less_depth(touched, tmp_path):
+    folder, _, file = touched
+    done(LINE.format(rig=file, folder=tmp_path), "--region", "39,21,4x6")
+    with io.open_recording(tmp_path / "ball-frames.h5") as press:
+        with io.open_recording(folder / "ball-frames.h5") as whole:
+            assert press.travel.max() < whole.travel.max()
+        assert press.shape[1:] == (48, 64)
+
+
 def test_the_recording_is_that_of_the_press(touched):
     folder, *_ = touched
     with io.open_recording(folder / "ball-frames.h5") as press:
@@ -54,6 +63,8 @@ def test_the_recording_is_that_of_the_press(touched):
         ("--sigma 2um --from 2.9mm", "no place to search"),
         ("--sigma 2um --share 200%", "share 2 is not possible"),
         ("--sigma 2um --tilt 30deg", "exceeds the maximum"),
+        ("--sigma 2um --region 0,0,65x48", "a region of columns 0 to 65"),
+        ("--sigma 2um --region 0,0", "the first column and row"),
     ],
 )
 def test_what_cannot_be_done_is_refused(touched, line, words):

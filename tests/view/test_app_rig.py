@@ -1,5 +1,6 @@
 """The application's rig, on simulated time: it displays, moves, runs, and always stops."""
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -122,6 +123,7 @@ def test_a_touch_shows_its_surface_and_is_recorded(lit, tmp_path):
     pane = RigPane(lit.control, lambda *shown: None)
     pane.motion.value = "touch"
     pane.touch["sigma"].value = 20.0
+    pane.touch["region"].value = "52,20,10x8"
     pane.file.value = str(tmp_path / "frames.h5")
     pane._start()
     while lit.control.state != "moving":
@@ -133,6 +135,19 @@ def test_a_touch_shows_its_surface_and_is_recorded(lit, tmp_path):
     assert np.isfinite(lit.control.result.height).any()
     with io.open_recording(tmp_path / "frames.h5", dataset="turn") as turn:
         assert turn.motion == "axial"
+
+
+@pytest.mark.parametrize(
+    ("region", "words"), [("16,12", "Region .*: give the first column"), ("0,0,99x24", "a region of columns")]
+)
+def test_an_impossible_region_of_a_touch_is_refused(lit, region, words):
+    pane = RigPane(lit.control, lambda *shown: None)
+    pane.motion.value = "touch"
+    pane.touch["region"].value = region
+    pane._start()
+    while lit.control.state == "moving" or not lit.control.problem:
+        lit.clock.sleep(0.02)
+    assert re.search(words, lit.control.problem)
 
 
 def test_stop_ends_a_touch(lit):

@@ -15,6 +15,7 @@ from bokeh.models import ColumnDataSource, CustomJS, Range1d
 from bokeh.plotting import figure
 
 from mirrorskin.io import InputError
+from mirrorskin.io.base.selection import Region
 from mirrorskin.io.base.types import axes_with_unit
 from mirrorskin.view.app.look import heading, hint, plain_axes, problem, table, text
 from mirrorskin.view.app.picture import Picture, show_frame, show_map
@@ -190,6 +191,9 @@ class RigPane:
             "share": field("Of the pixels (%)", 95.0, 1.0),
             "press": field("To travel (mm)", at),
             "tilt": field("Tilt (deg)", 2.5),
+            "region": pn.widgets.TextInput(
+                label="Region (may be empty)", placeholder="100,50,64x48", width=_NARROW
+            ),
         }
         # Fields and the plan by motion, where the stage has the axes.
         self._motions: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {
@@ -248,7 +252,7 @@ class RigPane:
     def _start(self) -> None:
         fields, plan_of = self._motions[self.motion.value]
         try:
-            values = {name: _in_radians(field) for name, field in fields.items()}
+            values = {name: _value_of(field) for name, field in fields.items()}
             plan = plan_of(**values)
         except InputError as error:
             self.control.problem = str(error)
@@ -258,7 +262,7 @@ class RigPane:
         record = Path(name) if name else None
         if self.motion.value == _TOUCH:
             request = 1e-3 * values["sigma"], values["share"] / 100, values["press"], values["tilt"]
-            self._ask(lambda: self.control.touch(*request, record))
+            self._ask(lambda: self.control.touch(*request, record, values["region"]))
         else:
             self._ask(lambda: self.control.run(plan, record))
 
@@ -350,8 +354,13 @@ class RigPane:
         _set(self.run, table(facts))
 
 
-def _in_radians(field: Any) -> float:
-    """Return the value of a field, angles in radians."""
+def _value_of(field: Any) -> Any:
+    """Return the value of a field, angles in radians, and a region for a text; None if that is empty."""
+    if isinstance(field.value, str):
+        region = Region.read("".join(field.value.split()))
+        if region is None and field.value.strip():
+            raise InputError(f"{field.label}: give the first column and row, and how many: 100,50,64x48")
+        return region
     if field.value is None:
         raise InputError(f"{field.label}: a number is needed")
     return math.radians(field.value) if "(deg" in field.label else float(field.value)

@@ -30,6 +30,7 @@ from mirrorskin.hw.rig.rig import Rig
 from mirrorskin.hw.rig.scan import PlannedScan
 from mirrorskin.hw.rig.sweep import make_scan
 from mirrorskin.hw.rig.touch import RigTouch
+from mirrorskin.io.base.selection import Region
 from mirrorskin.io.watch.saturation import scale_top
 
 State = Literal["disconnected", "connecting", "ready", "moving"]
@@ -160,12 +161,18 @@ class RigControl:
             self._give(lambda rig: self._run(rig, plan, record))
 
     def touch(
-        self, sigma: float, share: float, press: float, tilt: float, record: Path | None = None
+        self,
+        sigma: float,
+        share: float,
+        press: float,
+        tilt: float,
+        record: Path | None = None,
+        region: Region | None = None,
     ) -> None:
         """Press and turn until a share of the pixels has a standard deviation, mm; record if asked to."""
 
         def task(rig: Rig) -> None:
-            self._touch(_WatchedTouch(self, rig, press, tilt=tilt), sigma, share, record)
+            self._touch(_WatchedTouch(self, rig, press, tilt=tilt), sigma, share, record, region)
 
         if self._can_write(record):
             self._give(task)
@@ -270,7 +277,9 @@ class RigControl:
         self.recorded = None if recorder is None else recorder.path
         self.result = run.result()
 
-    def _touch(self, sensor: RigTouch, sigma: float, share: float, record: Path | None) -> None:
+    def _touch(
+        self, sensor: RigTouch, sigma: float, share: float, record: Path | None, region: Region | None
+    ) -> None:
         self.result = self.recorded = None
         self.seen = replace(self.seen, update=None, status=None, surface=None, note="")
         taken: list[Taken] = []
@@ -280,7 +289,7 @@ class RigControl:
 
         try:
             with sensor:
-                outcome = touch(sensor, sigma, share=share, taken=taken, on_update=on_update)
+                outcome = touch(sensor, sigma, share=share, region=region, taken=taken, on_update=on_update)
         finally:
             press, turn = recordings_of(sensor, taken)
             if record is not None and press is not None:

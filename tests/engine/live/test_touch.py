@@ -109,6 +109,54 @@ def test_a_touch_ends_in_time():
     assert "no time" in outcome.reason
 
 
+REGION = io.Region((24, 40), (30, 50))
+"""The middle of the picture."""
+
+
+@pytest.fixture(scope="module")
+def of_region():
+    """A touch of the middle of a cone, and its rig."""
+    with sensor_of("cone") as (emulated, _, sensor):
+        with sensor:
+            outcome = engine.live.touch(sensor, 0.004, region=REGION)
+        yield emulated, outcome
+
+
+def test_the_press_is_as_deep_as_the_region_needs(of_region):
+    emulated, outcome = of_region
+    deepest = outcome.press.travel.max()
+    truth = emulated.twin(Axial(np.zeros(1), 0.01, DEPTH)).truth
+    needed = -truth.height[REGION.slices].min()
+    lean = outcome.turn.header.tilt * math.hypot(8, 10) * SCENE["pixel_size"]
+    assert needed < deepest < needed + lean + 0.05 + 0.01
+    assert deepest < DEPTH - 0.2
+
+
+def test_the_share_is_that_of_the_region(of_region):
+    _, outcome = of_region
+    result = outcome.result
+    unknown = np.append(result.offset_unknown, 0)[result.component] != 0
+    sigma = np.where(unknown, np.inf, result.height_sigma)[REGION.slices]
+    sigma = sigma[np.isfinite(result.normals[..., 0])[REGION.slices]]
+    assert outcome.reached
+    assert np.mean(sigma <= 0.004) == pytest.approx(outcome.share)
+
+
+def test_the_surface_of_a_region_is_that_of_the_whole_picture(of_region):
+    _, outcome = of_region
+    assert outcome.result.height.shape == SCENE["shape"]
+    outside = np.ones(SCENE["shape"], bool)
+    outside[REGION.slices] = False
+    assert np.isfinite(outcome.result.height[outside]).any()
+
+
+def test_a_region_without_contact_is_not_reached():
+    with sensor_of("coin", shape=(96, 128)) as (_, _, sensor), sensor:
+        outcome = engine.live.touch(sensor, 0.004, region=io.Region((0, 8), (0, 8)))
+    assert not outcome.reached
+    assert "there is no contact" in outcome.reason
+
+
 def test_no_contact_is_an_error_and_the_body_is_lifted():
     with sensor_of() as (_, rig, _):
         sensor = RigTouch(rig, -0.5, -3.0)
@@ -311,6 +359,7 @@ def test_a_frame_of_an_earlier_place_is_taken_again():
         ({"sigma": 0.0}, "sigma 0 mm is not possible"),
         ({"sigma": 0.01, "share": 95.0}, "share 95 is not possible"),
         ({"sigma": 0.01, "within": 0.0}, "within 0 s is not possible"),
+        ({"sigma": 0.01, "region": io.Region((0, 65), (0, 80))}, "a region of rows 0 to 65"),
     ],
 )
 def test_impossible_requests_are_refused_before_anything_moves(options, words):
