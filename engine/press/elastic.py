@@ -207,6 +207,23 @@ class PressFit(NamedTuple):
         """Interpolate a map of cells to pixels; 0 outside the cells."""
         return _on_pixels(self.scene, self.height.shape, values)
 
+    @property
+    def pixels_of_a_spline(self) -> float:
+        """Number of pixels over the number of coefficients of the surface."""
+        return max(1.0, self.height[self.scene.cells.box].size / len(self.factors))
+
+    def by_compliance(self) -> Doubles:
+        """Return the derivative of the heights by the gel's compliance, (H, W), mm per 1/mm.
+
+        A stage that gives way more lowers the body less at each onset, so all heights are larger.
+        """
+        slope = self.slopes.by_travel * self.slopes.load / _SLOPE_ERROR**2
+        moved = _solve(self.form, np.einsum("ki,k->i", self.slopes.jacobian, slope))
+        change = np.zeros(self.height.shape)
+        cells = self.scene.cells
+        change[cells.box] = self.scene.splines.at(moved, *cells.places(self.height.shape))
+        return change
+
     def load_errors(self, pressed: Pressed) -> tuple[float, Doubles]:
         """Return the load's standard error from the fit, and its changes with the gel's parameters, mm^2.
 

@@ -245,7 +245,8 @@ class LinearResponse(Part):
         "parameters of the touches, relative to the other numbers of the calibration", shape=("p",)
     )
     information: Floats = parameter(
-        "information of all touches about the parameters, without priors", shape=("p", "p")
+        "information of all touches about the parameters, and of what the calibration stated before",
+        shape=("p", "p"),
     )
     pull: Floats = parameter(
         "information times the deviation of the parameters that touches alone would have", shape=("p",)

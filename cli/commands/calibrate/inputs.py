@@ -185,7 +185,7 @@ class Learned(NamedTuple):
     numbers: Mapping[str, Any]  # printed with --json
     line: str  # printed otherwise
     notes: Sequence[str] = ()  # printed to standard error
-    also: Part | None = None  # another part, with the same provenance
+    also: Sequence[Part] = ()  # other parts, with the same provenance
 
 
 def learn(
@@ -238,8 +238,8 @@ def save(
     from mirrorskin.cli.output import print_json
 
     calibration = io.update_calibration(output, learned.part, camera, process)
-    if learned.also is not None:
-        calibration = io.update_calibration(output, learned.also, camera, process)
+    for part in learned.also:
+        calibration = io.update_calibration(output, part, camera, process)
     if as_json:
         print_json({"output": str(output), **learned.numbers})
     else:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _RESPONSE = declared("fuse").only("zenith_gain", "zenith_offset")
 _LENGTHS = "pivot_z", "pixel_size", "radius", "rim", "axis_x", "axis_y"
 _ANGLES = "tilt", "phase_offset", "scatter"
-_SHOWN = "zenith_gain", "zenith_offset", "gamma", "radius", "rim", "tilt"
+_SHOWN = "zenith_gain", "zenith_offset", "gamma", "radius", "rim", "tilt", "compliance"
 
 
 def command(
@@ -38,8 +38,8 @@ def command(
         Option(
             metavar="NAME=VALUE+-SIGMA",
             help="What a data sheet says: tilt=2.5deg+-0.2deg, phase_offset, gamma, zenith_gain,"
-            " zenith_offset, pivot_z or pixel_size; under a wall radius, rim, axis_x, axis_y, scatter, ...;"
-            " may be repeated.",
+            " zenith_offset, pivot_z, pixel_size or compliance; under a wall radius, rim, axis_x, axis_y,"
+            " scatter, ...; may be repeated.",
         ),
     ] = None,
     forget: Annotated[
@@ -168,7 +168,7 @@ def _learned(found: TouchFit, paths: list[Path]) -> inputs.Learned:
         },
         ", ".join(map(_text, shown)),
         [f"note: {note}" for note in found.notes],
-        found.precession,
+        [found.precession] if found.gel is None else [found.precession, found.gel],
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from mirrorskin.engine.base.reconstruction import calibrated
 from mirrorskin.engine.calibration.touches.fit import Attempt
 from mirrorskin.engine.calibration.touches.memory import Earlier
+from mirrorskin.engine.calibration.touches.pressed import gel_of
 from mirrorskin.engine.calibration.touches.priors import (
     Movement,
     Priors,
@@ -22,7 +23,7 @@ from mirrorskin.engine.calibration.touches.priors import (
     search,
 )
 from mirrorskin.engine.calibration.touches.reading import TouchReader
-from mirrorskin.engine.calibration.touches.result import TouchFit, result_of
+from mirrorskin.engine.calibration.touches.result import Estimate, TouchFit, result_of
 from mirrorskin.engine.calibration.touches.sensor import SensorModel, model_of, with_levels
 from mirrorskin.engine.calibration.touches.view import NOT_FOLLOWED
 from mirrorskin.engine.calibration.touches.wall_result import earlier_of, scatter_of
@@ -30,6 +31,7 @@ from mirrorskin.engine.calibration.wall import check_body
 from mirrorskin.io import (
     Calibrated,
     Calibration,
+    Gel,
     Header,
     InputError,
     Source,
@@ -62,6 +64,8 @@ def from_touches(
     times less well on rough objects, and hardly on smooth ones. Its heights have an unknown constant, which
     moves points in the picture in the same way as the pivot's height, so it determines neither that nor the
     pixel size.
+    If the calibration has a gel, the presses are corrected for it. An error of its compliance is common to
+    all of them: it is estimated, from the standard error that the gel has.
     Under a lit wall, the light is that of `mirrorskin.engine.calibration.fit_zenith`.
 
     Parameters
@@ -73,7 +77,8 @@ def from_touches(
     stated : mapping of str to (float, float), optional
         Numbers with standard deviations, such as of a data sheet: ``gamma``, ``zenith_gain`` (counts/rad),
         ``zenith_offset`` (counts), ``tilt`` (rad), ``phase_offset`` (rad), ``pivot_z`` (mm), ``pixel_size``
-        (mm). The pixel size is estimated only if it is given here: it is nearly degenerate with the gain.
+        (mm), ``compliance`` (1/mm) of a calibrated gel. The pixel size is estimated only if it is given here:
+        it is nearly degenerate with the gain.
     forget : float, optional
         Time constant, seconds, after which the information of a touch counts 1/e; by default it is kept.
     zenith_gain, zenith_offset : float, optional
@@ -126,7 +131,8 @@ def from_touches(
     readers = [TouchReader.of(press, turn, device) for press, turn in opened]
     movement = Movement.of(sensor, precession)
     has_press = any(reader.has_press for reader in readers)
-    priors = Priors.of(header, movement, before is not None, stated or {}, has_press)
+    gel = next((gel for gel in map(gel_of, [press for press, _ in opened]) if gel is not None), None)
+    priors = Priors.of(header, movement, before is not None, stated or {}, has_press, gel)
     reason = NOT_FOLLOWED
     try:
         attempt = Attempt.of(readers, movement, priors, before, forget).registered()
@@ -140,7 +146,8 @@ def from_touches(
             reason = "; ".join(reasons)
         used = attempt.following()
         if used and attempt.is_plausible:
-            return result_of(attempt.exact(used))
+            found = result_of(attempt.exact(used))
+            return replace(found, gel=_gel_with(found.estimates, calibration))
     except np.linalg.LinAlgError:  # surfaces that are nowhere near those of the touches
         pass
     raise InputError(f"no touch can be used: {reason}")
@@ -168,6 +175,18 @@ def _sensor(
         wall = sensor.wall._replace(axis=known.axis, sight=known.sight, scatter=scatter_of(known))
         sensor = sensor._replace(wall=wall)
     return sensor, header
+
+
+def _gel_with(estimates: Sequence[Estimate], calibration: Calibration | None) -> Gel | None:
+    """Return the gel with its estimated compliance; None where no other one is needed.
+
+    A modulus is learned with a gel: it keeps that gel.
+    """
+    found = next((estimate for estimate in estimates if estimate.name == "compliance"), None)
+    if found is None or calibration is None or calibration.gel is None or calibration.stiffness is not None:
+        return None
+    sigma = {**calibration.gel.sigma, "compliance": found.sigma}
+    return replace(calibration.gel, compliance=max(0.0, found.value), sigma=sigma)
 
 
 def _start(

@@ -199,15 +199,19 @@ class Attempt:
 
     @property
     def remembered(self) -> dict[str, Any]:
-        """What a response keeps of the touches, so that others can be added."""
-        fit, values = self.fit, self.fit.values.copy()
+        """What a response keeps of the touches, and of what was stated, so that others can be added."""
+        fit, values, priors = self.fit, self.fit.values.copy(), self.priors
+        dropped = [each.at for each in self.dropped]
+        kept = np.array(priors.kept) & ~np.isin(np.arange(len(values)), dropped)
+        matrix = fit.matrix + np.diag(kept / priors.sigma**2)
+        vector = fit.vector + kept / priors.sigma**2 * priors.mean
         # Others are in the numbers of the calibration from now on.
         values[[number for number, name in enumerate(self.priors.names) if _is_absorbed(name)]] = 0.0
         return {
             "names": self.priors.names,
             "values": values,
-            "information": (fit.matrix + fit.matrix.T) / 2,
-            "pull": fit.vector - fit.matrix @ fit.values,
+            "information": (matrix + matrix.T) / 2,
+            "pull": vector - matrix @ fit.values,
             "touches": len(self.used) + (0 if self.before is None else self.before.touches),
             "time": self.memory.time,
         }
@@ -445,7 +449,7 @@ def _use_intervals(touch: Touch) -> None:
     if not any(part.any() for part in known):
         return
     pairs = list(zip(touch.windows, known, strict=True))
-    error = np.concatenate([window.middle[part] - window.z[part] for window, part in pairs])
+    error = np.concatenate([window.of_press[part] - window.z[part] for window, part in pairs])
     half = np.concatenate([window.half[part] for window, part in pairs])
     spread = estimate_interval_scatter(error, half)
     for window, part in pairs:

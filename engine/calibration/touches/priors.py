@@ -23,6 +23,7 @@ from mirrorskin.engine.diagnosis.turn_light import (
     GLOBALS,
 )
 from mirrorskin.io import (
+    Gel,
     Header,
     InputError,
     Precession,
@@ -40,7 +41,8 @@ UNKNOWN = {
     "oval": 0.03,
     "footprint": 2.0,
     "pivot_z": 10.0,
-}  # standard deviations of parameters about which nothing is stated; counts of 8 bits, radians, mm
+    "compliance": 0.1,
+}  # standard deviations of parameters about which nothing is stated; counts of 8 bits, radians, mm, 1/mm
 _STEP = 1.0  # share of full light: standard deviation of a step of the printed curve
 _LOOSER = 10.0  # of the standard deviation of a number that is estimated only if it is stated
 _KNOWN_PIVOT = 1.0  # mm: standard deviation of a recorded pivot
@@ -55,6 +57,7 @@ UNITS = {
     "phase": "rad",
     "pivot_z": "mm",
     "pixel_size": "mm",
+    "compliance": "1/mm",
     **dict.fromkeys(("radius", "rim", "axis_x", "axis_y"), "mm"),
     "scatter": "rad",
     "sight_0": "1/mm",
@@ -142,6 +145,7 @@ class Priors:
     error: Doubles
     loose: Doubles  # error of a number about which nothing is stated
     stated: tuple[bool, ...]
+    kept: tuple[bool, ...]  # whether what is stated stays with what touches tell, when others are added
     reference: Doubles  # number at a parameter of 0
     scale: Doubles  # change of the number by the parameter
 
@@ -153,6 +157,7 @@ class Priors:
         of_touches: bool,
         given: Mapping[str, Stated | tuple[float, float]],
         has_press: bool,
+        gel: Gel | None,
     ) -> Priors:
         """Return the priors from a recording with its calibration, and from numbers that are given."""
         sensor = movement.sensor
@@ -176,20 +181,25 @@ class Priors:
         if "gamma" in names:
             number[names.index("gamma")] = header.prior("gamma")
             error[names.index("zenith_offset")] *= max(1.0, abs(gain) / 1000)  # a count of 8 bits
+        if gel is None:
+            error[names.index("compliance")] = NEGLIGIBLE
+        else:
+            number[names.index("compliance")] = gel.compliance
         if header.pivot is not None:
             error[names.index("pivot_z")] = _KNOWN_PIVOT
         if sensor.pivot is None:
             error[names.index("pivot_z")] = NEGLIGIBLE
         error *= np.abs(scale)
         free = (False,) * len(names)
-        priors = cls(names, number, error.copy(), error, free, reference, scale).relative_to(movement)
+        priors = cls(names, number, error.copy(), error, free, free, reference, scale).relative_to(movement)
         for name in ("tilt", "phase", "pivot_z"):
             priors.number[priors.at(name)] = priors.reference[priors.at(name)]
         stated: dict[str, Stated] = {}
         if not of_touches:  # what touches have found is no prior of more touches, but their memory
-            stated |= _stated_by(header, movement.before, priors)
-        stated |= _given(given, sensor, has_press)
-        return priors.stating(stated)
+            stated |= _stated_by(header, movement.before, gel, priors)
+        more = _given(given, sensor, has_press, gel)
+        kept = tuple(name in stated and name not in more for name in names)
+        return replace(priors.stating(stated | more), kept=kept)
 
     def at(self, name: str) -> int:
         """Return the number of a parameter."""
@@ -257,7 +267,7 @@ class Priors:
 
     def start(self, before: Mapping[str, float] | None, precession: Precession | None) -> Doubles:
         """Return parameters to start with, from those of earlier touches or those of a precession."""
-        known = ("gamma", *WallLight.names)
+        known = ("gamma", "compliance", *WallLight.names)
         start = np.where([name in known for name in self.names], self.mean, 0.0)
         if before is not None:
             start = np.array([before.get(name, value) for name, value in zip(self.names, start, strict=True)])
@@ -275,7 +285,10 @@ class Priors:
 
 
 def _given(
-    numbers: Mapping[str, Stated | tuple[float, float]], sensor: SensorModel, has_press: bool
+    numbers: Mapping[str, Stated | tuple[float, float]],
+    sensor: SensorModel,
+    has_press: bool,
+    gel: Gel | None,
 ) -> dict[str, Stated]:
     """Return given numbers by the names of parameters; InputError for one that touches do not depend on."""
     stated = {}
@@ -297,11 +310,18 @@ def _given(
                 "pixel_size cannot be stated: turns alone do not depend on it. Add a press before each turn,"
                 " or leave it out"
             )
+        if name == "compliance" and gel is None:
+            raise InputError(
+                "compliance cannot be stated: without a calibrated gel, the press is not corrected for it."
+                " Calibrate elastic first, or leave it out"
+            )
         stated[offered[name]] = Stated(*value)
     return stated
 
 
-def _stated_by(header: Header, precession: Precession | None, priors: Priors) -> dict[str, Stated]:
+def _stated_by(
+    header: Header, precession: Precession | None, gel: Gel | None, priors: Priors
+) -> dict[str, Stated]:
     """Return the numbers that a recording and a calibration state with standard deviations."""
     stated = {}
     for name in set(GLOBALS) & set(priors.names):
@@ -319,6 +339,8 @@ def _stated_by(header: Header, precession: Precession | None, priors: Priors) ->
             sigma = precession.sigma.get(TITLES.get(name, name), 0.0)
             if sigma > 0 and math.isfinite(sigma) and math.isfinite(value):
                 stated[name] = Stated(value, sigma)
+    if gel is not None and gel.sigma.get("compliance", 0.0) > 0:
+        stated["compliance"] = Stated(gel.compliance, gel.sigma["compliance"])
     return stated
 
 

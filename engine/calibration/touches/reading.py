@@ -21,6 +21,7 @@ from mirrorskin.engine.calibration.touches.heights import (
     MARGIN,
 )
 from mirrorskin.engine.calibration.touches.light import LinearLight
+from mirrorskin.engine.calibration.touches.pressed import Pressed, read_press
 from mirrorskin.engine.calibration.touches.sensor import FRAMES, SensorModel, Wall
 from mirrorskin.engine.calibration.touches.view import NOT_FOLLOWED, Place, View, lacking, varied_places, vary
 from mirrorskin.engine.calibration.touches.wall_light import WallLight
@@ -41,7 +42,6 @@ from mirrorskin.engine.diagnosis.turn_nuisances import (
     offset_prior,
     picture_axes,
 )
-from mirrorskin.engine.fusion.fusion import press_evidence
 from mirrorskin.engine.rotation.rotation import Rotation
 from mirrorskin.io import (
     Block,
@@ -133,8 +133,7 @@ class TouchReader:
 
     turn: Source
     has_press: bool
-    middle: Doubles  # (H, W): heights of the press, mm; NaN where unknown
-    half: Doubles  # (H, W): half-widths of their intervals, mm; NaN in the same way
+    pressed: Pressed
     relief: Doubles  # (H, W): heights that register frames, mm
     device: str | Device | None
     earlier: Touch | None = None  # the same touch, read with almost the same movement
@@ -153,18 +152,13 @@ class TouchReader:
                 raise InputError(
                     f"{turn.name} cannot be read twice, as a turn without a press is: record it first"
                 )
-            unknown = np.full(shape, np.nan)
-            return cls(turn, False, unknown, unknown, np.zeros(shape), device)
+            return cls(turn, False, Pressed.unknown(shape), np.zeros(shape), device)
         if press.motion != "vertical":
             raise InputError(f"{press.name} has {press.motion} motion: give a press and a turn of each touch")
         if press.shape[1:] != shape:
             raise InputError(f"{press.name} and {turn.name} have pictures of different sizes")
-        pressed, evidence = press_evidence(press, {"device": device})
-        relief = np.asarray(pressed.height, np.float64)
-        if not np.isfinite(relief).any():
-            raise InputError(f"no pixel of {press.name} turned light: press deeper, or leave it out")
-        half = math.sqrt(3) * evidence.heights.sigma
-        return cls(turn, True, evidence.heights.height, half, fill_with_nearest(relief), device)
+        pressed = read_press(press, device)
+        return cls(turn, True, pressed, fill_with_nearest(pressed.height), device)
 
     def with_heights(self, touch: Touch, chooses: bool = False) -> TouchReader:
         """Return the reader with the surfaces of a touch, to register frames and to start with."""
@@ -238,7 +232,7 @@ class TouchReader:
 
         A press is seen in the rest plane, and a turn above it.
         """
-        axes = pixel_axes(self.middle.shape, pixel_size_of(self.turn))
+        axes = pixel_axes(self.relief.shape, pixel_size_of(self.turn))
         x, y = np.meshgrid(*axes)
         size_x, size_y = pixel_size_of(self.turn)
         above = self.relief + (self.turn.header.press or 0.0)
@@ -255,7 +249,7 @@ class TouchReader:
             return np.asarray(remapped, np.float64)
 
         relief = self.relief if self.earlier is not None else fill_with_nearest(seen(self.relief))
-        return replace(self, middle=seen(self.middle), half=seen(self.half), relief=relief)
+        return replace(self, pressed=self.pressed.seen(seen), relief=relief)
 
     def _touch(
         self, frames: NDArray[Any], phase: Doubles, noise_gain: float, sensor: SensorModel, starts: bool
@@ -268,7 +262,7 @@ class TouchReader:
             raise InputError("no pixel has valid samples in all frames: shorten the exposure")
         counts = frames[:, whole]
         extremes = np.array([np.min(counts), np.max(counts)], np.float64)
-        press, pixel_size = (self.middle, self.half), pixel_size_of(self.turn)
+        press, pixel_size = (self.pressed.middle, self.pressed.half), pixel_size_of(self.turn)
 
         def look(part: Place) -> View:
             return View.of(frames, phase, whole, sensor, press, pixel_size, part)
@@ -352,8 +346,11 @@ class TouchReader:
             pixel_size=pixel_size_of(self.turn),
             place=inner,
             usable=usable,
-            middle=np.where(shown, self.middle[place], np.nan).ravel(),
-            half=np.where(shown, self.half[place], np.nan).ravel(),
+            middle=np.where(shown, self.pressed.middle[place], np.nan).ravel(),
+            half=np.where(shown, self.pressed.half[place], np.nan).ravel(),
+            error=np.where(shown, np.nan_to_num(self.pressed.error[place]), 0.0).ravel(),
+            compliance=self.pressed.compliance,
+            by_compliance=np.where(shown, np.nan_to_num(self.pressed.by_compliance[place]), 0.0).ravel(),
             relief=self.relief[inner].ravel(),
             z=self.relief[place].ravel(),
             noise_gain=noise_gain,
@@ -374,12 +371,12 @@ class TouchReader:
             return [axis.ravel() for axis in np.meshgrid(x[place[1]], y[place[0]])]
 
         if sensor.wall is None:
-            places = np.stack(uneven_terms(*spread(*picture_axes(self.middle.shape))))
+            places = np.stack(uneven_terms(*spread(*picture_axes(self.relief.shape))))
             usual = float(np.nanmedian(sensor.gain))
             return LinearLight(of(sensor.gain), of(sensor.base), of(sensor.dark), sensor.full, usual, places)
         assert sensor.pivot is not None
         assert self.turn.header.press is not None
-        places = np.stack(spread(*pixel_axes(self.middle.shape, pixel_size_of(self.turn))))
+        places = np.stack(spread(*pixel_axes(self.relief.shape, pixel_size_of(self.turn))))
         return WallLight(of(sensor.dark), of(sensor.wall.span), places, self.turn.header.press, sensor.pivot)
 
 

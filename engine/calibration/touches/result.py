@@ -25,6 +25,7 @@ from mirrorskin.engine.diagnosis.turn_nuisances import (
     picture_axes,
 )
 from mirrorskin.io import (
+    Gel,
     LinearResponse,
     Precession,
 )
@@ -41,6 +42,7 @@ _REMEDIES = {
     "oval": "press and turn on something rough, in more frames",
     "pivot_z": "press and turn on something with relief",
     "pixel_size": "calibrate the scale",
+    "compliance": "calibrate elastic",
 }
 _OF_PRESSES = ("zenith_gain", "tilt", "pivot_z")
 _ADD_PRESSES = "add a press of the same touch before each turn"
@@ -50,7 +52,14 @@ _REMEDIES |= dict.fromkeys(
 )
 _REMEDIES["scatter"] = "calibrate zenith with a ball, as touches leave out the samples that show it"
 _LEARNED = 0.5  # standard error of a number of a wall that is determined, times the usual deviation
-_NEEDED = {"oval": 0.01, "pivot_z": 1.0, "pixel_size": 0.003}  # standard errors of a determined parameter
+_NEEDED = {
+    "oval": 0.01,
+    "pivot_z": 1.0,
+    "pixel_size": 0.003,
+    "compliance": 0.01,
+}  # standard errors of a determined parameter
+
+_DEGENERATE = 0.7  # correlation of the errors of two parameters that can hardly be told apart
 
 
 class Estimate(NamedTuple):
@@ -72,6 +81,9 @@ class TouchFit:
     ----------
     response : LinearResponse or WallResponse
     precession : Precession
+    gel : Gel or None
+        That of the calibration with the compliance that the presses show, if it is estimated. A gel that a
+        modulus was learned with stays.
     estimates : tuple of Estimate
         All parameters, in the units of files.
     frame_gains : mapping of str to ndarray
@@ -85,6 +97,7 @@ class TouchFit:
     estimates: tuple[Estimate, ...]
     frame_gains: Mapping[str, Doubles]
     notes: tuple[str, ...]
+    gel: Gel | None = None
 
 
 def result_of(attempt: Attempt) -> TouchFit:
@@ -117,13 +130,15 @@ def result_of(attempt: Attempt) -> TouchFit:
     pressed = any(window.is_pressed for touch in used for window in touch.windows)
     notes += _undetermined(estimates, pressed)
     notes += [f"{touch.name} is not used: {touch.reason}" for touch in attempt.read if touch not in used]
-    if pressed and priors.is_free(priors.at("pixel_size")) and "zenith_gain" in priors.names:
-        at = priors.at("pixel_size"), priors.at("zenith_gain")
-        common = fit.covariance[at] / (errors[at[0]] * errors[at[1]])
-        notes.append(
-            "pixel size and zenith gain are nearly degenerate: their errors have a correlation of"
-            f" {common:.2f}"
-        )
+    for name in ("pixel_size", "compliance"):
+        if pressed and priors.is_free(priors.at(name)) and "zenith_gain" in priors.names:
+            at = priors.at(name), priors.at("zenith_gain")
+            common = fit.covariance[at] / (errors[at[0]] * errors[at[1]])
+            if abs(common) > _DEGENERATE:
+                notes.append(
+                    f"{name.replace('_', ' ')} and zenith gain are nearly degenerate: their errors have a"
+                    f" correlation of {common:.2f}"
+                )
     gains = {touch.name: 1 + np.split(touch.frame_values, 2)[0] for touch in used}
     precession = _precession(attempt, values, sigma)
     return TouchFit(response, precession, tuple(estimates), gains, tuple(notes))

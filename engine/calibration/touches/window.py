@@ -35,8 +35,8 @@ from mirrorskin.engine.diagnosis.turn_light import Sums
 from mirrorskin.engine.press.intervals import IntervalScatter, interval_evidence
 from mirrorskin.kernels.array_types import Doubles
 
-MOVEMENT = ("tilt", "phase", "oval_x", "oval_y", "footprint", "pivot_z", "pixel_size")
-"""Names of the parameters of the movement and of pixels; in a fit, those of the response come before."""
+MOVEMENT = ("tilt", "phase", "oval_x", "oval_y", "footprint", "pivot_z", "pixel_size", "compliance")
+"""Names of the parameters of movement, pixels and gel; in a fit, those of the response come before."""
 
 _ROUGH = 0.1  # share of the second difference of slopes by which a slope may differ from that of the heights
 _SMOOTHING = 1.0  # pixels: of slopes, before their changes from pixel to pixel are computed
@@ -92,6 +92,9 @@ class Window:
     usable: NDArray[np.bool_]  # (n,)
     middle: Doubles  # (S * S,): middles of the intervals of a press, mm; NaN where unknown
     half: Doubles  # (S * S,): half-widths, mm
+    error: Doubles  # (S * S,): standard deviations of what heights are corrected by for the gel, mm
+    compliance: float  # of the gel, with which the press is corrected, 1/mm
+    by_compliance: Doubles  # (S * S,): derivatives of heights of the press, mm per 1/mm; 0 where unknown
     relief: Doubles  # (n,): heights with which inner pixels were registered, mm
     z: Doubles  # (S * S,): heights, mm
     noise_gain: float  # factor of the noise by registration
@@ -100,6 +103,7 @@ class Window:
     spacing: int = 1  # pixels between knots of the splines that its heights are
     relief_shown: float = math.inf  # chi-square of a pixel by the relief that the coarsest splines lack
     evidence: tuple[Doubles, Doubles] | None = field(default=None)  # heights of the press, and their weights
+    risen: Doubles | float = 0.0  # (S * S,): how much higher the press shows heights by the compliance, mm
     left: Doubles = field(default_factory=lambda: np.empty(0))  # (T, m): residuals of usable pixels
     rough: Doubles = field(default_factory=lambda: np.empty(0))  # (m,): second differences of slopes
 
@@ -150,14 +154,19 @@ class Window:
         """Whether a press shows heights; otherwise they have an unknown constant."""
         return bool(np.isfinite(self.middle).any())
 
+    @property
+    def of_press(self) -> Doubles:
+        """Middles of the intervals of the press by the present compliance, (S * S,) mm; NaN if unknown."""
+        return np.asarray(self.middle + self.risen)
+
     def _copies(self) -> float:
         """Return how many pixels, on average, are at the same place between two steps of the press."""
-        place = (self.z - self.middle) / (2 * self.half)
+        place = (self.z - self.of_press) / (2 * self.half)
         wave = np.exp(2j * np.pi * _ORDERS[:, np.newaxis] * place[np.isfinite(place)])
         return max(1.0, float(np.mean(np.abs(wave.sum(axis=1)) ** 2) / max(wave.shape[1], 1)))
 
     def _press_weight(self) -> Doubles:
-        return np.nan_to_num(3 / self.half**2)
+        return np.nan_to_num(1 / (self.half**2 / 3 + self.error**2))
 
     def use_intervals(self, spread: IntervalScatter) -> None:
         """Take heights of the press from their intervals, at the present heights.
@@ -166,12 +175,13 @@ class Window:
         than by the distance between such places.
         """
         known, copies = np.isfinite(self.middle), self._copies()
-        z, middle, half = self.z[known], self.middle[known], self.half[known]
+        z, middle, half = self.z[known], self.of_press[known], self.half[known]
         distance = max(float(np.ptp(z)), 2 * float(np.median(half))) * copies / len(z)
-        found = interval_evidence(z, middle, half, spread._replace(blur=max(spread.blur, _BLUR * distance)))
+        blur = math.hypot(max(spread.blur, _BLUR * distance), float(np.median(self.error[known])))
+        found = interval_evidence(z, middle, half, spread._replace(blur=blur))
         height, weight = self.z.copy(), np.zeros(len(self.z))
         height[known], weight[known] = found.height, found.weight / copies
-        self.evidence = height, weight
+        self.evidence = height - self.risen, weight
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -184,6 +194,7 @@ class Window:
         A pixel has two slopes, and a height, which determines where the body's movement puts its point.
         """
         named, chosen = dict(zip(self.names, values.tolist(), strict=True)), self.usable
+        self.risen = (named["compliance"] - self.compliance) * self.by_compliance
         inner = self.size - 2 * MARGIN
         maps = (slope_matrix(self.size, self.pixel_size) @ self.z).reshape(2, inner, inner)
         maps *= 1 - named["pixel_size"]
@@ -221,6 +232,7 @@ class Window:
             light.by_footprint,
             by_pivot,
             -np.sum(light.by_slopes * slopes[:, np.newaxis], axis=0),
+            np.zeros(self.left.shape),  # the compliance changes heights of the press, but no light
         ]
         self.rough = _second_differences(maps)[chosen]
         rest = np.concatenate([light.by_response, of_movement])
@@ -303,6 +315,7 @@ class Window:
 
         local = local_matrix(self.size, self.pixel_size)[np.tile(self.usable, 3)]
         height, weight = self.evidence or (self.middle, self._press_weight() / self._copies())
+        height = np.where(weight > 0, height + self.risen, 0.0)
         spread = np.zeros((len(PRODUCTS), len(self.usable)))
         spread[:, self.usable] = np.stack([matrices[:, first, second] for first, second in PRODUCTS]) / noise
         system = HeightSystem(self.pixel_size, spread, weight)
@@ -310,14 +323,19 @@ class Window:
         seen = push + np.einsum("iab,bi->ia", matrices, (local @ (self.z - level)).reshape(3, -1))
         coupled = local.T @ np.swapaxes(cross, 0, 1).reshape(local.shape[0], -1) / noise
         right = local.T @ seen.T.ravel() / noise
-        right += weight * np.where(weight > 0, height, 0.0)
+        right += weight * height
         apart = np.zeros(len(self.usable), np.bool_)
         if chooses:
             self.spacing, apart = self._choose(system, right, spread)
         solver = system.solver(self.spacing)
+        own, pull = own / noise, pull / noise
+        by_compliance, at = weight * self.by_compliance, MOVEMENT.index("compliance") - len(MOVEMENT)
+        coupled[:, at] -= by_compliance
+        own[at, at] += by_compliance @ self.by_compliance
+        pull[at] -= by_compliance @ (height - self.z)
         reduced = solver.forward(np.column_stack([coupled, right]))
         products = _products(reduced[:, :-1], reduced)
-        own, pull = own / noise - products[:, :-1], pull / noise - products[:, -1]
+        own, pull = own - products[:, :-1], pull - products[:, -1]
         pull = pull + coupled.T @ (self.z - level)
         chosen = self.usable
         self.usable = chosen & ~apart  # from the next look on

@@ -10,6 +10,7 @@ from commands import done, refused
 from stacks import record
 
 from mirrorskin import io
+from mirrorskin.evaluation.calibration import elastic_touches
 from mirrorskin.evaluation.calibration.scenes import press_for
 from mirrorskin.evaluation.calibration.touches import FURTHER, LAB, camera_of, references_of, touch
 from mirrorskin.io.files.touch_file import save_touch
@@ -97,6 +98,17 @@ def test_numbers_have_standard_errors(fitted):
 def test_stated_number_that_touches_contradict_is_reported():
     actual = done("calibrate self press.h5 turn.h5 -o cal.h5 --stated zenith_offset=-20+-1")
     assert "the touches say" in actual.said
+
+
+def test_compliance_of_a_calibrated_gel_is_written():
+    for recording, name in zip(elastic_touches.touch("cone", 0), ("cone.h5", "turned.h5"), strict=True):
+        record(recording, name)
+    camera = io.CameraId("", elastic_touches.SHAPE, np.dtype("uint8"))
+    io.update_calibration("gel.h5", elastic_touches.calibration(0.03).gel, camera, {})
+    printed = json.loads(done("calibrate self cone.h5 turned.h5 --json -o gel.h5").out)
+    gel = io.open_calibration("gel.h5").gel
+    assert gel.compliance == printed["estimates"]["compliance"]["value"]
+    assert gel.sigma["compliance"] < elastic_touches.ERROR
 
 
 def test_show_prints_the_response(fitted):

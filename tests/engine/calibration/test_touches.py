@@ -479,6 +479,16 @@ def test_two_steps_are_as_good_as_one():
     assert gains[0].sigma == pytest.approx(gains[1].sigma, rel=0.2)
 
 
+def test_what_a_calibration_states_of_the_movement_counts_when_touches_are_added():
+    usual = calibration_of(fit_of(1, gain=1.03))
+    known = replace(usual.precession, tilt=TILT, sigma={"tilt": 1e-4 * TILT})
+    pairs = touches_of(1, stated={"gain": 1.03})
+    first = from_touches(pairs, calibration=replace(usual, response=None, precession=known))
+    later = touches_of(1, first=1, stated={"gain": 1.03})
+    both = from_touches(later, calibration=calibration_of(first))
+    assert named(both)["tilt"].sigma < 1.01e-4 * TILT
+
+
 def timed(pairs, start_time):
     """Return touches whose turns start at a time."""
     changed = []
