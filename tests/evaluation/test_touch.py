@@ -37,5 +37,5 @@ def test_errors_are_within_the_request(touched, name, request_):
 @pytest.mark.parametrize(("name", "request_"), CASES)
 def test_few_more_frames_are_taken_than_by_the_best_recipe(touched, name, request_):
     outcome, _ = touched[name, request_]
-    fewest = touch.fewest(json.loads(touch.STORED.read_text())[name], request_)
+    fewest = json.loads(touch.STORED.read_text())["fewest"][name][touch.REQUESTS.index(request_)]
     assert outcome.press_steps + outcome.turn_frames <= 1.3 * fewest
