@@ -126,8 +126,8 @@ def fewest(name: str, sigma: Sequence[Sequence[float | None]], request: float) -
         for count, value in zip(TURNS, row, strict=True)
         if value is not None and value <= request
     ]
-    for frames, *counts in sorted(candidates):
-        outcomes = (try_recipe(name, *counts, seed) for seed in SEEDS)
+    for frames, steps, count in sorted(candidates):
+        outcomes = (try_recipe(name, steps, count, seed) for seed in SEEDS)
         if all(each.sigma <= request and each.errors[number] <= ERROR_MAX * request for each in outcomes):
             return frames
     return None
