@@ -13,6 +13,10 @@ with x and y from -1 to 1 over the picture. The axis leans by (1 + e cos 2(p - m
 p = phase_t + phase, in the first order of the ellipticity. Normals are those of the heights, by central
 differences. The heights of all pixels are unknown: they are parameters, which are marginalised.
 
+A ``real`` sensor has more unknown parameters: instead of c, the exponent of the light l, full (l /
+full)^(1 + gamma), uneven light of second order, a share of the frame before that a frame still shows (lag),
+and gains and offsets of the frames without their means.
+
 The information of a touch is J^T J / noise^2 over brightness, heights and parameters; the block of the
 heights is sparse, and its Schur complement is the information of the parameters. That of several touches is
 the sum. The camera is a usual one of 8 bits: see `Sensor`.
@@ -45,6 +49,8 @@ FRAMES = 12  # of a turn
 PRESS_SIGMA = 0.006  # mm
 UNKNOWN_HEIGHT = 30.0  # mm: standard deviation of the height of a pixel without a press
 FRAME_GAIN_SIGMA = 0.005  # as a share: the light of a frame, if it is unknown
+FULL = 255.0  # counts of full light
+_NO_MEAN = 1e-3  # standard deviation of the mean of gains and offsets of frames, in theirs
 _STEP = 1e-6  # by which a parameter or a slope changes, to differentiate the brightness
 
 
@@ -69,8 +75,14 @@ class Sensor:
     def vector(self) -> Map:
         """Return the parameters, relative where `NAMES` says so."""
         values = (self.gain, self.offset, self.curvature, *self.uneven)
-        return np.array([*values, self.half_angle, self.phase, *self.ellipse])
+        of_real = np.zeros(len(REAL))
+        return np.array([*values, self.half_angle, self.phase, *self.ellipse, *of_real])
 
+
+REAL = {"gamma": 0.2, "lag": 0.01, "uneven xx": 0.05, "uneven xy": 0.05, "uneven yy": 0.05}
+"""Parameters that only a real sensor has, 0 here, and standard deviations of their priors."""
+
+OF_FRAMES = 0.02, 0.25  # standard deviations of gains, as a share, and offsets, counts, of a real sensor
 
 NAMES = (
     "gain",
@@ -82,12 +94,13 @@ NAMES = (
     "phase",
     "ellipticity x",
     "ellipticity y",
+    *REAL,
 )
 
 
 def render(parameters: Map, p: Map, q: Map, x: Map, y: Map, phases: Map) -> Map:
     """Return the brightness, (T, H, W), of slopes p = dz/dx and q = dz/dy at x and y, from -1 to 1."""
-    gain, offset, curvature, u_x, u_y, half, shift, e_x, e_y = parameters
+    gain, offset, curvature, u_x, u_y, half, shift, e_x, e_y, gamma, lag, *second = parameters
     turned = (phases + shift)[:, np.newaxis, np.newaxis]
     lean = half * (1 + e_x * np.cos(2 * turned) + e_y * np.sin(2 * turned))
     axis = -np.sin(lean) * np.cos(turned), -np.sin(lean) * np.sin(turned), np.cos(lean)
@@ -97,7 +110,11 @@ def render(parameters: Map, p: Map, q: Map, x: Map, y: Map, phases: Map) -> Map:
         sum((normal[i] * axis[j] - normal[j] * axis[i]) ** 2 for i, j in ((0, 1), (1, 2), (2, 0)))
     )
     angle = np.arctan2(across, sum(n * a for n, a in zip(normal, axis, strict=True)))
-    return np.asarray(offset + gain * (1 + u_x * x + u_y * y) * (angle + curvature * angle**2))
+    uneven = 1 + u_x * x + u_y * y + second[0] * x * x + second[1] * x * y + second[2] * y * y
+    light = offset + gain * uneven * (angle + curvature * angle**2)
+    if gamma:
+        light = FULL * np.maximum(light / FULL, 1e-9) ** (1 + gamma)
+    return np.asarray(light + lag * (np.concatenate([light[:1], light[:-1]]) - light))
 
 
 def differences(shape: tuple[int, int], pixel: float) -> tuple[sparse.csr_array, sparse.csr_array]:
@@ -151,6 +168,7 @@ def bound(
     unknown_frame_gains: bool = False,
     priors: Mapping[str, float] | None = None,
     seen: NDArray[np.bool_] | None = None,
+    real: bool = False,
 ) -> Bound:
     """Return the information of one touch of an object.
 
@@ -171,6 +189,8 @@ def bound(
         Standard deviations of parameters, in their units, by name; 0 for a parameter that is known.
     seen : ndarray, (H, W), bool, optional
         Pixels whose brightness is used; by default all.
+    real : bool
+        Whether the parameters of a real sensor are unknown, too.
     """
     sensor = sensor or Sensor()
     rows, columns = height.shape
@@ -191,9 +211,9 @@ def bound(
     by_q = slope(lambda step: brightness(still, dq=step))
     unit = np.eye(len(NAMES))
     lines = [slope(lambda step, row=row: brightness(step * row)) for row in unit]  # type: ignore[misc]
-    if unknown_frame_gains:
-        light = brightness(still)
-        lines += [np.where(np.arange(frames)[:, np.newaxis] == t, light, 0.0) for t in range(frames)]
+    light = brightness(still)
+    for size in (light, (light != 0).astype(np.float64))[: 2 if real else unknown_frame_gains]:
+        lines += [np.where(np.arange(frames)[:, np.newaxis] == t, size, 0.0) for t in range(frames)]
     by_parameter = np.stack(lines)
     own = np.einsum("kti,lti->kl", by_parameter, by_parameter) / sensor.noise**2
     heights = sparse.eye_array(height.size) / (press_sigma or UNKNOWN_HEIGHT) ** 2
@@ -203,9 +223,17 @@ def bound(
         heights = heights + jacobian.T @ jacobian / sensor.noise**2
         cross += jacobian.T @ by_parameter[:, t].T / sensor.noise**2
     information = own - cross.T @ splu(sparse.csc_array(heights)).solve(cross)
+    sigmas = {name: sigma if real else 0.0 for name, sigma in REAL.items()} | dict(priors or {})
+    if real:
+        sigmas["curvature"] = 0.0
     prior = np.zeros(len(lines))
     prior[len(NAMES) :] = FRAME_GAIN_SIGMA**-2
-    for name, sigma in (priors or {}).items():
+    if real:
+        prior[len(NAMES) :] = np.repeat(OF_FRAMES, frames) ** -2.0
+        for start, sigma in zip((len(NAMES), len(NAMES) + frames), OF_FRAMES, strict=True):
+            part = slice(start, start + frames)
+            information[part, part] += (frames * _NO_MEAN * sigma) ** -2.0
+    for name, sigma in sigmas.items():
         prior[NAMES.index(name)] = max(sigma, 1e-9) ** -2
     return Bound((information + information.T) / 2, prior)
 
@@ -213,7 +241,8 @@ def bound(
 # --- objects ------------------------------------------------------------------------------------------------
 
 
-def _axes(shape: tuple[int, int] = SHAPE, pixel: float = PIXEL) -> tuple[Map, Map]:
+def axes(shape: tuple[int, int] = SHAPE, pixel: float = PIXEL) -> tuple[Map, Map]:
+    """Return x and y of pixels, (H, W), mm."""
     rows, columns = shape
     across = (np.arange(columns) - (columns - 1) / 2) * pixel
     down = ((rows - 1) / 2 - np.arange(rows)) * pixel
@@ -221,48 +250,52 @@ def _axes(shape: tuple[int, int] = SHAPE, pixel: float = PIXEL) -> tuple[Map, Ma
     return x, y
 
 
-def rough(slope: float = 0.2, length: float = 0.35) -> Map:
+def rough(x: Map, y: Map, slope: float = 0.2, length: float = 0.35) -> Map:
     """Return a rough surface of a Gaussian correlation length, mm, and an RMS slope along each axis."""
     white = np.random.default_rng(1).standard_normal(SHAPE)
     f_y, f_x = (np.fft.fftfreq(count, PIXEL) for count in SHAPE)
     spectrum = np.exp(-((np.pi * length) ** 2) * (f_x**2 + f_y[:, np.newaxis] ** 2) / 2)
-    height = np.fft.ifft2(np.fft.fft2(white) * spectrum).real
-    return np.asarray(height * slope / np.sqrt(np.mean(np.gradient(height, PIXEL)[0] ** 2)))
+    waves = np.fft.fft2(white) * spectrum
+    height = np.fft.ifft2(waves).real
+    waves *= slope / np.sqrt(np.mean(np.gradient(height, PIXEL)[0] ** 2)) / height.size
+    corner = axes()[0][0, 0], axes()[1][0, 0]
+    turned_x, turned_y = (
+        np.exp(2j * np.pi * np.multiply.outer(f, along.ravel()))
+        for f, along in ((f_x, x - corner[0]), (f_y, corner[1] - y))
+    )
+    return np.asarray(np.sum(turned_y * (waves @ turned_x), axis=0).real.reshape(x.shape))
 
 
-def woven() -> Map:
+def woven(x: Map, y: Map) -> Map:
     """Return a weave: crossed waves."""
-    x, y = _axes()
     return np.asarray(0.06 * (np.sin(2 * np.pi * x / 1.1) + np.sin(2 * np.pi * y / 0.9 + 0.4)))
 
 
-def dimpled() -> Map:
+def dimpled(x: Map, y: Map) -> Map:
     """Return a plate of round bumps in a hexagonal grid."""
-    x, y = _axes()
-    step = 1.3
-    row = np.round(y / (step * 0.866))
-    dx = (x + step / 2 * (row % 2)) / step
-    r2 = ((dx - np.round(dx)) * step) ** 2 + (y - row * step * 0.866) ** 2
-    return np.asarray(0.2 * np.exp(-r2 / (2 * 0.33**2)))
+    step, height = 1.3, np.zeros(x.shape)
+    for near_row, near_column in np.ndindex(3, 3):
+        row = np.round(y / (step * 0.866)) + near_row - 1
+        dx = (x + step / 2 * (row % 2)) / step
+        r2 = ((dx - np.round(dx) - near_column + 1) * step) ** 2 + (y - row * step * 0.866) ** 2
+        height += 0.2 * np.exp(-r2 / (2 * 0.33**2))
+    return height
 
 
-def knurled() -> Map:
-    """Return a knurl: pyramids with rounded edges."""
-    x, y = _axes()
+def knurled(x: Map, y: Map) -> Map:
+    """Return a knurl: pyramids with edges that are rounded over two pixels."""
     u, v = (x + y) / math.sqrt(2), (x - y) / math.sqrt(2)
-    ridges = [np.sqrt(0.02 + np.sin(np.pi * each / 1.2) ** 2) for each in (u, v)]
+    ridges = [np.sqrt(0.2 + np.sin(np.pi * each / 1.2) ** 2) for each in (u, v)]
     return np.asarray(0.12 * (ridges[0] + ridges[1]))
 
 
-def cone() -> Map:
+def cone(x: Map, y: Map) -> Map:
     """Return a cone with a slope of 25 degrees and a tip of 0.25 mm."""
-    x, y = _axes()
     return np.asarray(-math.tan(math.radians(25)) * np.sqrt(x**2 + y**2 + 0.25**2))
 
 
-def staircase() -> Map:
+def staircase(x: Map, y: Map) -> Map:
     """Return a staircase: treads that are level, and inclined by 5 degrees, in turn."""
-    x, _ = _axes()
     tread, along = _treads(x)
     return np.asarray(0.15 * tread + math.tan(math.radians(5)) * (tread % 2) * along)
 
@@ -275,12 +308,12 @@ def _treads(x: Map) -> tuple[Map, Map]:
 
 def _without_risers() -> NDArray[np.bool_]:
     """Return the pixels of the staircase whose differences stay on one tread."""
-    tread = _treads(_axes()[0])[0]
+    tread = _treads(axes()[0])[0]
     padded = np.pad(tread, ((0, 0), (1, 1)), mode="edge")
     return np.asarray((padded[:, :-2] == tread) & (padded[:, 2:] == tread))
 
 
-OBJECTS: Mapping[str, Callable[[], Map]] = {
+OBJECTS: Mapping[str, Callable[[Map, Map], Map]] = {
     "rough": rough,
     "woven": woven,
     "dimpled": dimpled,
@@ -297,12 +330,14 @@ COLUMNS: Mapping[str, tuple[str, float]] = {
     "phase": ("phase, degrees", math.degrees(1)),
     "ellipticity x": ("ellipticity, %", 100.0),
     "uneven x": ("uneven light, %", 100.0),
+    "gamma": ("gamma, %", 100.0),
 }
 """Heading of a column, and the factor of its unit."""
 
 CASES: Mapping[str, Mapping[str, object]] = {
     "press and turn": {},
     "press and turn, unknown light of each frame": {"unknown_frame_gains": True},
+    "press and turn of a real sensor": {"real": True},
     "turn alone": {"press_sigma": None},
 }
 
@@ -313,10 +348,11 @@ def measure() -> dict[str, dict[str, dict[str, float | None]]]:
     for case, options in CASES.items():
         for name, make in OBJECTS.items():
             seen = _without_risers() if name == "staircase" else None
-            sigmas = bound(make(), seen=seen, **options).sigmas()  # type: ignore[arg-type]
+            sigmas = bound(make(*axes()), seen=seen, **options).sigmas()  # type: ignore[arg-type]
             row = {
                 head: (value if math.isfinite(value := factor * sigmas[key]) else None)
                 for key, (head, factor) in COLUMNS.items()
+                if key != ("curvature" if "real" in options else "gamma")
             }
             table.setdefault(case, {})[name] = row
     return table

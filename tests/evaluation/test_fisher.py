@@ -55,7 +55,7 @@ def test_a_turned_plane_does_not_tell_gain_from_half_angle() -> None:
 
 
 def test_the_bound_falls_with_the_square_root_of_the_touches() -> None:
-    touch = fisher.bound(fisher.woven())
+    touch = fisher.bound(fisher.woven(*fisher.axes()))
     four = fisher.Bound(4 * touch.information, touch.prior).sigmas()
     assert four["gain"] == pytest.approx(touch.sigmas()["gain"] / 2)
 

@@ -257,6 +257,15 @@ class Fitted(NamedTuple):
         return self.contradiction > 1 + _CLEAR * math.sqrt(2 / max(self.degrees, 1e-9))
 
 
+class _Stage(NamedTuple):
+    """What a step of a fit does."""
+
+    excludes: bool  # pixels that do not follow the model
+    uses_intervals: bool  # of presses, around the present surfaces
+    chooses: bool  # splines
+    is_near: bool  # whether surfaces are near the true ones
+
+
 def _fit_with_priors(
     touches: Sequence[Touch], start: Doubles, priors: Priors, memory: Memory, exact: bool
 ) -> tuple[Fitted, list[Dropped]]:
@@ -302,8 +311,8 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: Memor
     last, before, is_settled, following = math.inf, values, False, np.ones(len(touches), np.bool_)
     for number in range(_ITERATIONS):
         early = number < roughly
-        excludes, uses_intervals, chooses = number in excluding, exact and early, is_cold and early
-        found = [_eliminate(touch, values, excludes, uses_intervals, chooses) for touch in touches]
+        stage = _Stage(number in excluding, exact and early, early and (is_cold or exact), exact)
+        found = [_eliminate(touch, values, stage) for touch in touches]
         follow = _follow(touches) if under_wall else following
         following = following & follow if number > excluding[-1] else follow
         informations, pushes = [], []
@@ -386,26 +395,25 @@ def _trust(information: Doubles, priors: Priors) -> float:
     return min(1.0, (_WELL_SHOWN / alone) ** 4)
 
 
-def _eliminate(
-    touch: Touch, values: Doubles, excludes: bool, uses_intervals: bool, chooses: bool
-) -> tuple[Doubles, Doubles, Any]:
+def _eliminate(touch: Touch, values: Doubles, stage: _Stage) -> tuple[Doubles, Doubles, Any]:
     """Return a touch's information about the sensor, its push, and what a step of the sensor does to it."""
-    frames = len(touch.phase)
+    frames, is_sharp = len(touch.phase), stage.is_near and touch.is_sharp
 
     def look() -> list[Any]:
         gains, offsets = np.split(touch.frame_values, 2)
-        return [window.look(touch.poses, gains, offsets, values) for window in touch.windows]
+        return [window.look(touch.poses, gains, offsets, values, is_sharp) for window in touch.windows]
 
     sums = look()
-    if excludes:
+    if stage.excludes:
         for window in touch.windows:
             window.exclude_outliers()
         sums = look()
     # Neighbours of registered frames share their noise, so that of a sample is larger than the residuals.
     usual = float(np.mean([window.noise_gain**2 for window in touch.windows]))
     touch.noise = max(_noise_of(touch.windows, frames) / usual, touch.least_noise**2)
-    if uses_intervals:
+    if stage.uses_intervals:
         _use_intervals(touch)
+    chooses = stage.chooses and (is_sharp or not stage.is_near)
     parts = [
         window.eliminate(each, touch.noise, chooses) for window, each in zip(touch.windows, sums, strict=True)
     ]

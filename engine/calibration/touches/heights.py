@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mirrorskin.kernels.array_types import Doubles
 
 _STENCIL = np.array([-1, 9, -45, 0, 45, -9, 1]) / 60.0  # first derivative at the middle
+_SHORTER = np.array([0, 1, -8, 0, 8, -1, 0]) / 12.0  # the same, exact for polynomials of fourth degree
 MARGIN = 3
 """Pixels at the edge of a window whose slopes are not used."""
 
@@ -34,10 +35,13 @@ _LEAST = 1e-9  # weight of heights, in the same way
 @functools.lru_cache(maxsize=4)
 def slope_matrix(size: int, pixel_size: tuple[float, float]) -> Any:
     """Return the matrix from S x S heights to slopes along x and y of inner pixels, (2 n, S * S)."""
-    from scipy.sparse import vstack
+    return _slopes(size, pixel_size, tuple(_STENCIL))
 
-    along_x, along_y = _derivatives(size)
-    return vstack([along_x / pixel_size[0], along_y / -pixel_size[1]]).tocsr()
+
+@functools.lru_cache(maxsize=4)
+def shortening_matrix(size: int, pixel_size: tuple[float, float]) -> Any:
+    """Return the matrix from S x S heights to what slopes over five pixels differ from those over seven."""
+    return _slopes(size, pixel_size, tuple(_SHORTER - _STENCIL))
 
 
 @functools.lru_cache(maxsize=4)
@@ -58,15 +62,15 @@ def _inner(size: int) -> Any:
     return kron(keep, keep).tocsr()
 
 
-@functools.cache
-def _derivatives(size: int) -> tuple[Any, Any]:
-    """Return matrices from S x S heights to differences along columns and rows at inner pixels."""
-    from scipy.sparse import csr_matrix, diags, kron
+def _slopes(size: int, pixel_size: tuple[float, float], stencil: tuple[float, ...]) -> Any:
+    """Return the matrix from S x S heights to slopes by a stencil."""
+    from scipy.sparse import csr_matrix, diags, kron, vstack
 
     inner = size - 2 * MARGIN
-    first = diags(list(_STENCIL), list(range(2 * MARGIN + 1)), shape=(inner, size))
+    first = diags(list(stencil), list(range(2 * MARGIN + 1)), shape=(inner, size))
     keep = csr_matrix((np.ones(inner), (np.arange(inner), np.arange(inner) + MARGIN)), (inner, size))
-    return kron(keep, first).tocsr(), kron(first, keep).tocsr()
+    along_x, along_y = kron(keep, first), kron(first, keep)
+    return vstack([along_x / pixel_size[0], along_y / -pixel_size[1]]).tocsr()
 
 
 @functools.cache

@@ -109,6 +109,14 @@ class Touch:
         return sum(int(np.count_nonzero(window.usable)) for window in self.windows)
 
     @property
+    def is_sharp(self) -> bool:
+        """Whether heights are those of a press, and samples are not interpolated.
+
+        Interpolation is as wrong as slopes may be where a surface is rough, and makes that seem smoother.
+        """
+        return self.poses.arm is None and all(window.is_pressed for window in self.windows)
+
+    @property
     def reason(self) -> str:
         """Why the touch is not used."""
         if not self.windows or not self.varied:

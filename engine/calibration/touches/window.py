@@ -27,6 +27,7 @@ from mirrorskin.engine.calibration.touches.heights import (
     HeightSolver,
     HeightSystem,
     local_matrix,
+    shortening_matrix,
     slope_matrix,
 )
 from mirrorskin.engine.calibration.touches.light import LinearLight, Seen
@@ -38,7 +39,8 @@ from mirrorskin.kernels.array_types import Doubles
 MOVEMENT = ("tilt", "phase", "oval_x", "oval_y", "footprint", "pivot_z", "pixel_size", "compliance")
 """Names of the parameters of movement, pixels and gel; in a fit, those of the response come before."""
 
-_ROUGH = 0.1  # share of the second difference of slopes by which a slope may differ from that of the heights
+_ROUGH = 0.1  # share of the second difference of slopes by which they may be wrong, in a first fit
+_ROUGH_AT_END = 1.0  # the same of the difference between slopes over five and seven pixels, if it is sharp
 _SMOOTHING = 1.0  # pixels: of slopes, before their changes from pixel to pixel are computed
 _OUTLIER_RATIO = 3.0  # pixels with a larger misfit are excluded; times the usual misfit
 _UNDER_WALL = 2.0  # the same of pixels under a wall, where a few of them tell much of one parameter or other
@@ -105,7 +107,7 @@ class Window:
     evidence: tuple[Doubles, Doubles] | None = field(default=None)  # heights of the press, and their weights
     risen: Doubles | float = 0.0  # (S * S,): how much higher the press shows heights by the compliance, mm
     left: Doubles = field(default_factory=lambda: np.empty(0))  # (T, m): residuals of usable pixels
-    rough: Doubles = field(default_factory=lambda: np.empty(0))  # (m,): second differences of slopes
+    rough: Doubles = field(default_factory=lambda: np.empty(0))  # (m,): possible errors of slopes
 
     @property
     def size(self) -> int:
@@ -188,10 +190,12 @@ class Window:
         """Names of the parameters in the order of a fit."""
         return (*self.response.names, *MOVEMENT)
 
-    def look(self, poses: Poses, gains: Doubles, offsets: Doubles, values: Doubles) -> Sums:
+    def look(self, poses: Poses, gains: Doubles, offsets: Doubles, values: Doubles, is_sharp: bool) -> Sums:
         """Compute residuals, and return the normal equations of usable pixels and nuisances.
 
         A pixel has two slopes, and a height, which determines where the body's movement puts its point.
+        Where the surface is rough, slopes may be wrong: by less if it ``is_sharp``, near the true one and
+        shown by samples that are not interpolated.
         """
         named, chosen = dict(zip(self.names, values.tolist(), strict=True)), self.usable
         self.risen = (named["compliance"] - self.compliance) * self.by_compliance
@@ -234,7 +238,11 @@ class Window:
             -np.sum(light.by_slopes * slopes[:, np.newaxis], axis=0),
             np.zeros(self.left.shape),  # the compliance changes heights of the press, but no light
         ]
-        self.rough = _second_differences(maps)[chosen]
+        if is_sharp:
+            shorter = shortening_matrix(self.size, self.pixel_size) @ self.z
+            self.rough = _ROUGH_AT_END * np.hypot(*shorter.reshape(2, -1))[chosen]
+        else:
+            self.rough = _ROUGH * _second_differences(maps)[chosen]
         rest = np.concatenate([light.by_response, of_movement])
         by_unknowns = np.concatenate([light.by_slopes, [-by_pivot]])
         return Sums.of(self.left, by_unknowns, light.by_gains, rest)
@@ -303,7 +311,7 @@ class Window:
         ``noise`` is the variance of a sample. A slope may differ from that of the heights by a normal
         deviate; to eliminate it changes all sums by the same projection.
         """
-        rough = np.maximum((_ROUGH * self.rough) ** 2, 1e-16)
+        rough = np.maximum(self.rough**2, 1e-16)
         of_slopes, by_slopes = sums.matrices[:, :2, :2], sums.matrices[:, :, :2]
         inner = np.linalg.inv(of_slopes + (noise / rough)[:, np.newaxis, np.newaxis] * np.eye(2))
         by_cross, by_push = inner @ sums.cross[:, :2], np.einsum("iab,ib->ia", inner, sums.push[:, :2])
