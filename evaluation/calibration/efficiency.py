@@ -81,7 +81,10 @@ def touch(name: str, seed: int) -> tuple[Frames, Frames, Map]:
     )
     size = (fisher.PIXEL, fisher.PIXEL)
     pressed = Header(
-        motion="vertical", pixel_size=size, dark=np.full(z.shape, DARK), bright=np.full(z.shape, BRIGHT)
+        motion="vertical",
+        pixel_size=size,
+        dark=np.full(z.shape, DARK, np.float32),
+        bright=np.full(z.shape, BRIGHT, np.float32),
     )
     turned = Header(
         motion="axial",
@@ -89,8 +92,8 @@ def touch(name: str, seed: int) -> tuple[Frames, Frames, Map]:
         zenith_gain=np.asarray(sensor.gain * (1 + 0.03 * random.normal())),
         zenith_offset=np.asarray(sensor.offset + 3 * random.normal()),
         tilt=sensor.half_angle * (1 + 0.04 * random.normal()),
-        dark=np.zeros(z.shape),
-        bright=np.full(z.shape, fisher.FULL - 1),
+        dark=np.zeros(z.shape, np.float32),
+        bright=np.full(z.shape, fisher.FULL - 1, np.float32),
     )
     title = f"{name} {seed}"
     return Frames(press, pressed, title, travel=travel), Frames(turn, turned, title, phase=phase), z
