@@ -19,6 +19,7 @@ _CLEAR = 2.0  # error of the common height, in standard deviations, from which o
 _MIN_PIXELS = 16  # on either side of a step that shows an error
 _MIN_SHARE = 0.01  # of a component's pixels on either side; less with many steps,
 _MIN_EVEN_SHARE = 0.125  # of the pixels of an average step
+_NARROWED = 1.0  # standard deviations of heights by which their noise narrows the range of a boundary
 _MAX_CONTRADICTING = 0.25  # pixels that contradict a step, as a share of those on the smaller side
 
 
@@ -73,7 +74,8 @@ class PressSteps:
         """Remove a clear error of the common height, and add its uncertainty to ``height_sigma``.
 
         At each step, the heights that the fewest pixels contradict are compared with the travel: they are a
-        range of width w_i, because the boundary is between two pixels, and their middle has the error e_i.
+        range, because the boundary is between two pixels, and its middle has the error e_i. Noise of the
+        heights narrows that range, so its width w_i is that observed plus their standard deviation.
         The mean error over the m steps that show one has the variance, the larger of ::
 
             sum (w_i^2 / 12) / m^2  and  (mean (w_i^2 / 12) + sum (e_i - mean e)^2) / m^2
@@ -86,6 +88,7 @@ class PressSteps:
         label = surface.component[usable]
         depth = (self.correction - height)[usable]
         onset, sigma = self.onset[usable], self.sigma[usable]
+        noise = np.zeros(depth.size) if surface.height_sigma is None else surface.height_sigma[usable]
         count = len(surface.offset_unknown)
         shifts, added, least = np.zeros(count), np.zeros(count), np.zeros(count)
         sizes = np.bincount(label, minlength=count)
@@ -95,7 +98,7 @@ class PressSteps:
             part = order[end - sizes[component] : end]
             if part.size == 1:
                 continue
-            errors, variances = self._errors(depth[part], onset[part])
+            errors, variances = self._errors(depth[part], onset[part], float(np.nanmedian(noise[part])))
             if not errors.size:
                 least[component] = np.median(sigma[part])
                 continue
@@ -117,11 +120,12 @@ class PressSteps:
             placed = placed.assign(height_sigma=total.astype(np.float32))
         return placed, found
 
-    def _errors(self, depth: Doubles, onset: Doubles) -> tuple[Doubles, Doubles]:
+    def _errors(self, depth: Doubles, onset: Doubles, noise: float) -> tuple[Doubles, Doubles]:
         """Return, for each step that shows it, by how much sorted depths are too large there, mm.
 
         Of the pixels within half a step, those in contact must be the highest ones. The variances, mm^2, are
-        those of a boundary anywhere in the range that the fewest pixels contradict, and of the travel.
+        those of a boundary anywhere in the range that the fewest pixels contradict, of the noise of heights,
+        and of the travel.
         """
         places = self.travel
         share = min(_MIN_SHARE, _MIN_EVEN_SHARE / max(1, places.size - 1))
@@ -141,5 +145,6 @@ class PressSteps:
             best = np.flatnonzero(wrong == wrong.min())
             least, greatest = edges[best[0]], edges[best[-1] + 1]
             errors.append((least + greatest) / 2 - place)
-            variances.append((greatest - least) ** 2 / 12 + self.travel_sigma**2)
+            width = greatest - least + _NARROWED * noise
+            variances.append(width**2 / 12 + self.travel_sigma**2)
         return np.array(errors), np.array(variances)
