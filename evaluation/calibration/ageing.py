@@ -1,9 +1,15 @@
-"""How calibration from touches follows a lamp that ages.
+"""How calibration from touches follows a lamp that ages, and when results report it.
 
-``python evaluation/calibration/ageing.py [--recordings 100] [--freeze]`` prints the error of the gain for
-some time constants of forgetting, and writes the table into docs/method/touches.md. The gain of the sensor
-falls by 5 % over all recordings, one of a textured object every hour. Each is added to the calibration from
-all earlier ones, and the result is compared with the gain in this recording.
+``python evaluation/calibration/ageing.py [--only gain,trends] [--freeze]`` prints two tables, and writes them
+into docs/method/touches.md and docs/method/sensor-health.md.
+
+gain
+    The gain of the sensor falls by 5 % over 100 recordings, one of a textured object every hour. Each is
+    added to the calibration from all earlier ones, and the result is compared with the gain in this
+    recording, for some time constants of forgetting.
+trends
+    Series of 20 recordings, whose gain falls as fast or not at all: how many of them have a trend of the
+    brightness, as ``mirrorskin measure`` of the results reports it.
 """
 
 from __future__ import annotations
@@ -14,27 +20,33 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin import io
+from mirrorskin import engine, io
 from mirrorskin.engine.calibration import from_touches
+from mirrorskin.engine.metrology.tables import find_trend
 from mirrorskin.evaluation.base.sources import Frames
 from mirrorskin.evaluation.base.tables import Table, replace_part
+from mirrorskin.evaluation.calibration import scorer, touches
+from mirrorskin.evaluation.calibration.scenes import Lab, in_other_light, press_for
 from mirrorskin.twin import Axial, Camera, Twin, Vertical
 
 Map = NDArray[np.float64]
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "method" / "touches.md"
+PAGES = Path(__file__).resolve().parents[2] / "docs" / "method"
 SHAPE, PIXEL, PRESS = (56, 56), 0.03, 1.6
 TILT, PHASE = math.radians(2.5), np.arange(12) * np.pi / 6
 NOISE = 1.5  # counts
 OBJECTS = 8  # that are touched in turn
 FALL = 0.05  # of the gain, over all recordings
-HOURS = 3.0, 5.0, 10.0, math.inf  # time constants; recordings are an hour apart
+HOURS = 1.0, 2.0, 3.0, 10.0, math.inf  # time constants; recordings are an hour apart
 START = datetime(2026, 1, 1, tzinfo=UTC)
+RECORDINGS = 100
+SERIES, RESULTS, THINGS = 20, 20, 4  # series of results, and objects of each, for trends
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,17 +163,98 @@ def table(recordings: int) -> Table:
     return Table(f"A gain that falls by {100 * FALL:g} % over {recordings} recordings", head, rows)
 
 
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """Turns of textured cones by a sensor without a wall, registered with the heights of a press."""
+
+    name: str = "press and turn, textured cones"
+
+    def changes(self, seed: int, gains: Sequence[float]) -> Map:
+        """Return the change of the brightness that each result states, %."""
+        lights = [Light.of(THINGS * (seed + 1000) + number) for number in range(THINGS)]
+        stated = []
+        for number, gain in enumerate(gains):
+            press, turn = lights[number % THINGS].taken(2 * len(gains) * seed + number, gain)
+            stated.append(_change_of(engine.reconstruct(turn, heights=engine.reconstruct(press))))
+        return np.array(stated)
+
+
+@dataclass(frozen=True, slots=True)
+class UnderWall:
+    """Turns of waves by the sensor with a wall of `touches`, calibrated with five presses of a ball."""
+
+    lab: Lab
+    calibration: io.Calibration
+    name: str = "turn under a lit wall, waves"
+
+    def changes(self, seed: int, gains: Sequence[float]) -> Map:
+        """Return the change of the brightness that each result states, %."""
+        shapes = np.random.default_rng([seed, 77]).uniform((0.16, 2.2, 0.0), (0.24, 3.2, 1.5), (THINGS, 3))
+        things = [scorer.waves(*shape, touches.REACH) for shape in shapes.tolist()]
+        assert self.calibration.references is not None
+        dark = np.nan_to_num(self.calibration.references.dark)
+        stated = []
+        for number, gain in enumerate(gains):
+            take = 2 * len(gains) * seed + number
+            turn = self.lab.turned(thing := things[number % THINGS], press_for(thing), 2000 + take)
+            changed = in_other_light(turn, gain, dark, self.lab.noise, take)
+            stated.append(_change_of(engine.reconstruct(changed, calibration=self.calibration)))
+        return np.array(stated)
+
+
+def _change_of(result: io.Result) -> float:
+    """Return the mean change that a result states, %; NaN if it states none."""
+    return math.nan if result.fitted.light_change is None else 100 * result.fitted.light_change[0]
+
+
+def first_reported(changes: Map) -> int | None:
+    """Return the number of results from which on a trend is reported; None if none is."""
+    numbers = range(1, len(changes) + 1)
+    return next((number for number in numbers if find_trend(changes[:number], "%") is not None), None)
+
+
+def trends(folder: Path) -> Table:
+    """Return how many series have a trend; rendered light is kept in a folder."""
+    lab = replace(touches.LAB, cache=folder)
+    calibration = touches.by_balls(lab, touches.references_of(lab))
+    rows = []
+    for sensor in (Registered(), UnderWall(lab, calibration)):
+        loss = FALL / RECORDINGS
+        falling = [sensor.changes(seed, [1 - loss * number for number in range(RESULTS)]) for seed in range(SERIES)]
+        steady = [sensor.changes(SERIES + seed, [1.0] * RESULTS) for seed in range(SERIES)]
+        in_blocks = [np.concatenate([changes[number::THINGS] for number in range(THINGS)]) for changes in steady]
+        for what, series in (
+            (f"falls by {100 * loss:g} % each, objects in turn", falling),
+            ("constant, objects in turn", steady),
+            ("constant, one object after the other", in_blocks),
+        ):
+            numbers = sorted(number for changes in series if (number := first_reported(changes)) is not None)
+            from_to = "" if not numbers else f"{numbers[0]} to {numbers[-1]}"
+            expected = loss * np.arange(RESULTS) if series is falling else 0.0
+            scatter = np.mean([np.nanstd(changes + 100 * expected) for changes in series])
+            rows.append((sensor.name, what, f"{len(numbers)} of {len(series)}", from_to, f"{scatter:.2f}"))
+    head = ("recordings", "gain", "series with a trend", "from the result", "scatter of the change, %")
+    return Table(f"Trends of the brightness in {RESULTS} results", head, rows)
+
+
 def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description="How calibration from touches follows a lamp that ages.")
-    parser.add_argument("--recordings", type=int, default=100, help="number of recordings")
-    parser.add_argument("--freeze", action="store_true", help="write the table into the page")
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description="How a lamp that ages is followed, and reported.")
+    parser.add_argument("--only", default="gain,trends", help="tables to compute")
+    parser.add_argument("--freeze", action="store_true", help="write the tables into the pages")
     options = parser.parse_args()
-    found = table(options.recordings)
-    print(found)
-    if options.freeze:
-        page = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replace_part(page, "ageing", found.as_markdown("---:")), encoding="utf-8")
+    with TemporaryDirectory() as folder:
+        tables = {
+            "gain": lambda: ("touches.md", "ageing", table(RECORDINGS)),
+            "trends": lambda: ("sensor-health.md", "trends", trends(Path(folder))),
+        }
+        for name in options.only.split(","):
+            page, part, found = tables[name]()
+            print(found)
+            if options.freeze:
+                path = PAGES / page
+                text = replace_part(path.read_text(encoding="utf-8"), part, found.as_markdown("---:"))
+                path.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mirrorskin import io
 from mirrorskin.evaluation.base.sources import Frames
@@ -217,6 +217,14 @@ class Lab:
         fraction = (np.arctan2(body.radius, height) / 2 - first) / (math.pi / 4 - first)
         column = np.rint(np.iinfo(np.uint16).max * np.clip(fraction, 0, 1) ** self.gamma)
         return np.repeat(column.astype(np.uint16)[:, np.newaxis], 4, axis=1)
+
+
+def in_other_light(source: Frames, light: float, dark: ArrayLike, noise: float, seed: int) -> Frames:
+    """Return a recording in light that has fallen to a share, above dark levels, with the same noise, counts."""
+    random = np.random.default_rng(seed).standard_normal(source.frames.shape)
+    counts = dark + light * (source.frames - np.asarray(dark)) + math.sqrt(1 - light**2) * noise * random
+    frames = np.clip(np.rint(counts), 0, 255).astype(source.dtype)
+    return Frames(frames, source.header, source.name, **source.series)
 
 
 def nine_balls(lab: Lab, apart: float, first_take: int) -> list[Frames]:

@@ -15,7 +15,7 @@ from mirrorskin import io
 from mirrorskin.engine.calibration.touches import TouchFit, from_touches
 from mirrorskin.evaluation.base.sources import Frames
 from mirrorskin.evaluation.calibration import scorer
-from mirrorskin.evaluation.calibration.scenes import press_for
+from mirrorskin.evaluation.calibration.scenes import in_other_light, press_for
 from mirrorskin.evaluation.calibration.touches import LAB, REACH, references_of, touch
 from mirrorskin.evaluation.faults.calibrations import answer_of_fits
 from mirrorskin.evaluation.faults.camera import Floats
@@ -93,16 +93,11 @@ def _touch(seed: int) -> tuple[Frames, Frames]:
 
 def _faulty(turn: Frames, fault: WallFault, seed: int) -> Frames:
     """Return the second turn."""
-    frames = turn.frames
     if fault.dropped:
-        middle = len(frames) // 2
+        frames, middle = turn.frames, len(turn.frames) // 2
         frames = np.concatenate([frames[:middle], frames[middle + 1 :], frames[:1]])
-    if fault.lamp != 1:
-        dark = np.nan_to_num(_references().dark)
-        noise = LAB.noise * np.random.default_rng(seed).standard_normal(frames.shape)
-        light = fault.lamp * (frames - dark) + math.sqrt(1 - fault.lamp**2) * noise
-        frames = np.clip(np.rint(dark + light), 0, 255).astype(frames.dtype)
-    return Frames(frames, turn.header, turn.name, **turn.series)
+        turn = Frames(frames, turn.header, turn.name, **turn.series)
+    return in_other_light(turn, fault.lamp, np.nan_to_num(_references().dark), LAB.noise, seed)
 
 
 def of_wall(fault: WallFault, seed: int) -> Answer:

@@ -44,7 +44,11 @@ def command(
     ] = None,
     forget: Annotated[
         str | None,
-        Option(metavar="TIME", help="Time after which a touch counts 1/e: 30d.", show_default="never"),
+        Option(
+            metavar="TIME",
+            help="Time after which a touch counts 1/e for the response, but not for the movement: 30d.",
+            show_default="never",
+        ),
     ] = None,
     body_radius: Annotated[
         str | None,

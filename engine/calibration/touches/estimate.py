@@ -80,7 +80,8 @@ def from_touches(
         (mm), ``compliance`` (1/mm) of a calibrated gel. The pixel size is estimated only if it is given here:
         it is nearly degenerate with the gain.
     forget : float, optional
-        Time constant, seconds, after which the information of a touch counts 1/e; by default it is kept.
+        Time constant, seconds, after which the information of a touch about the response counts 1/e; by
+        default it is kept. That about the movement, the pivot and the area of a pixel is kept in any case.
     zenith_gain, zenith_offset : float, optional
         Approximate response to start with, counts/rad and counts; by default that of the recordings. Not
         under a wall, and not if touches are added to others.

@@ -316,12 +316,13 @@ def _fit(touches: Sequence[Touch], start: Doubles, priors: Priors, memory: Memor
         follow = _follow(touches) if under_wall else following
         following = following & follow if number > excluding[-1] else follow
         informations, pushes = [], []
-        for touch, weight, follows, (information, push, _) in zip(
-            touches, memory.weights, following, found, strict=False
+        for place, (touch, follows, (information, push, _)) in enumerate(
+            zip(touches, following, found, strict=True)
         ):
             if max(window.relief_shown for window in touch.windows) < _LEAST_RELIEF:
                 _forget_pivot(information, push, priors)
-            weight = weight * (follows if under_wall else _trust(information, priors))
+            weight = follows if under_wall else _trust(information, priors)
+            information, push = memory.of_touch(place, information, push)
             informations.append(weight * information)
             pushes.append(weight * push)
         pulls = [each @ values + push for each, push in zip(informations, pushes, strict=True)]

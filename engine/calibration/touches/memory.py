@@ -1,4 +1,8 @@
-"""What earlier touches have told of a sensor, and how it fades."""
+"""What earlier touches have told of a sensor, and how it fades.
+
+What touches tell is the probability of the movement, times that of response and gel for a given movement.
+Light and gel age, and the movement does not: with time, only the latter becomes less certain.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from mirrorskin.engine.calibration.touches.reading import Touch
+from mirrorskin.engine.calibration.touches.window import MOVEMENT
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array_types import Doubles
+
+
+_OF_GEL = "compliance"
+_SINGULAR = 1e-12  # relative eigenvalue of a direction about which touches tell nothing
 
 
 class Earlier(NamedTuple):
@@ -25,12 +34,13 @@ class Earlier(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Information of earlier touches, and the weight of each of the new ones."""
+    """Information of earlier touches, and how much of that of each new one is not forgotten."""
 
     matrix: Doubles
     vector: Doubles  # matrix times the parameters that earlier touches alone would have
     weights: tuple[float, ...]
     time: float
+    names: tuple[str, ...]
 
     @classmethod
     def of(
@@ -56,11 +66,39 @@ class Memory(NamedTuple):
         if before is not None:
             at = np.array([names.index(name) for name in before.names if name in names])
             of = np.array([number for number, name in enumerate(before.names) if name in names])
-            matrix[np.ix_(at, at)] = weights[-1] * before.information[np.ix_(of, of)]
-            vector[at] = weights[-1] * before.pull[of]
+            matrix[np.ix_(at, at)] = before.information[np.ix_(of, of)]
+            vector[at] = before.pull[of]
             vector += matrix[:, at] @ before.values[of]
-        return cls(matrix, vector, tuple(weights[: len(touches)]), last)
+            matrix, vector = _faded(matrix, vector, weights[-1], names)
+        return cls(matrix, vector, tuple(weights[: len(touches)]), last, tuple(names))
+
+    def of_touch(self, number: int, information: Doubles, push: Doubles) -> tuple[Doubles, Doubles]:
+        """Return what is not forgotten of a new touch's information, and of its push."""
+        return _faded(information, push, self.weights[number], self.names)
 
     def moved(self, by: Doubles) -> Memory:
         """Return the information about parameters that are smaller by some values."""
         return self._replace(vector=self.vector - self.matrix @ by)
+
+
+def _faded(
+    matrix: Doubles, vector: Doubles, weight: float, names: Sequence[str]
+) -> tuple[Doubles, Doubles]:
+    """Return information, and this times parameters, with a weight below 1 for response and gel alone.
+
+    The information about the movement is what remains if these are unknown. That about them for a given
+    movement gets the weight, as if its variance had grown.
+    """
+    if weight == 1:
+        return matrix, vector
+    moves = np.isin(names, MOVEMENT) & ~np.isin(names, _OF_GEL)
+    movement, response = np.flatnonzero(moves), np.flatnonzero(~moves)
+    mixed = matrix[np.ix_(response, movement)]
+    right = np.column_stack([mixed, vector[response]])
+    solved = np.linalg.lstsq(matrix[np.ix_(response, response)], right, rcond=_SINGULAR)[0]
+    faded, pull = weight * matrix, weight * vector
+    faded[np.ix_(movement, movement)] += (1 - weight) * (
+        matrix[np.ix_(movement, movement)] - mixed.T @ solved[:, :-1]
+    )
+    pull[movement] += (1 - weight) * (vector[movement] - mixed.T @ solved[:, -1])
+    return (faded + faded.T) / 2, pull
