@@ -141,7 +141,9 @@ def find_trend(values: Doubles, unit: str) -> Trend | None:
     slope = float(away @ y / (away @ away))
     line = np.mean(y) + slope * (number - np.mean(x))
     left = y - line[known]
-    sigma = float(np.sqrt(left @ left / (len(x) - 2) / (away @ away)))
+    square = float(left @ left)
+    alike = max(0.0, float(left[1:] @ left[:-1])) / square if square else 0.0
+    sigma = math.sqrt(square / (len(x) - 2) / float(away @ away) * (1 + alike) / (1 - alike))
     return Trend(Quantity(slope, sigma, unit), len(x), line) if abs(slope) > _CLEAR_TREND * sigma else None
 
 
@@ -208,7 +210,8 @@ class Table:
         """Return the trend of a quantity over the results in their order; None if none is clear.
 
         It is a straight line by least squares. The scatter of the values determines whether it is clear:
-        errors that all results have in common, such as those of the calibration, do not change it.
+        errors that all results have in common, such as those of the calibration, do not change it. Where
+        neighbours scatter alike, as of the same object several times in a row, they count for less.
 
         Examples
         --------
