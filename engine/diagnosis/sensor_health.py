@@ -4,9 +4,10 @@ The swing of a rotation's brightness, and the full light of a press, are compare
 states; of a rotation without one, with the stated zenith gain and tilt. Their ratios, at a grid of pixels,
 are a weighted sum ::
 
-    ratio - 1 = change + towards_x x + towards_y y + to_rim (x^2 + y^2 - 2/3) + skew x y + nuisances,
+    ratio - 1 = change + towards_x x + towards_y y + to_rim (x^2 + y^2) + skew x y + nuisances,
 
-with x and y from -1 to 1 over the picture. The nuisances have priors; what is uncertain of the calibration
+with x and y from -1 to 1 over the picture, and each of the four terms without its mean over the pixels.
+The nuisances have priors; what is uncertain of the calibration
 itself is added to the standard deviations. See the documentation, "Health of a sensor".
 """
 
@@ -52,8 +53,8 @@ Parts = tuple[float, float, float, float]
 class LightChange(NamedTuple):
     """Relative change of the brightness, and its standard deviation.
 
-    The four values are the mean over the picture; the increase from the centre to the right border, and to
-    the upper one; and the increase from the centre to the rim.
+    The four values are the mean over the pixels that show it; the increase from the centre of the picture to
+    the right border, and to the upper one; and the increase from the centre to the rim.
     """
 
     value: Parts
@@ -133,11 +134,14 @@ def find_light_change(samples: Samples, common: float, uneven: float) -> LightCh
     usable = np.isfinite(ratio) & np.isfinite(sigma) & (sigma > 0) & np.isfinite(nuisances).all(axis=1)
     if np.count_nonzero(usable) < _LEAST_PIXELS:
         return None
-    terms = np.stack([np.ones_like(x), x, y, x * x + y * y - 2 / 3, x * y], axis=1)
+    terms = np.stack([np.ones_like(x), x, y, x * x + y * y, x * y], axis=1)
     columns = np.concatenate([terms * response[:, np.newaxis], nuisances], axis=1)[usable]
     values = ratio[usable] - 1 - nuisances[usable] @ expected
     weights = 1 / sigma[usable]
     columns, values = columns * weights[:, np.newaxis], values * weights
+    # The change is that of the pixels that show it: outside of the contact, it is not known.
+    at = columns[:, 0] @ columns[:, 1 : terms.shape[1]] / (columns[:, 0] @ columns[:, 0])
+    columns[:, 1 : terms.shape[1]] -= np.multiply.outer(columns[:, 0], at)
     priors = np.concatenate([np.full(terms.shape[1], _WIDE), np.maximum(prior, _LEAST_PRIOR)])
     precision = np.diag(priors**-2.0)
     kept = np.full(len(values), True)

@@ -49,8 +49,8 @@ class Fitted:
     )
     light_change: tuple[float, float, float, float] | None = parameter(
         "relative change of the brightness since the calibration, or from what the stated zenith gain and"
-        " tilt predict: mean over the picture, increase from its centre to the right and to the upper"
-        " border, and from its centre to the rim",
+        " tilt predict: mean over the pixels that show it, increase from the centre of the picture to the"
+        " right and to the upper border, and from the centre to the rim",
         default=None,
         valid=lambda change: bool(np.isfinite(change).all()),
     )
