@@ -25,7 +25,7 @@ from mirrorskin.engine.diagnosis.sensor_health import (
     with_light_change,
 )
 from mirrorskin.engine.diagnosis.swing import ModulationEffects, find_modulation_effects, swing_of_wall
-from mirrorskin.engine.diagnosis.turn_nuisances import TurnNuisances
+from mirrorskin.engine.diagnosis.turn_nuisances import TurnNuisances, shift_of
 from mirrorskin.io import Calibrated, Result, Source
 from mirrorskin.io.base.findings import Finding, with_findings
 from mirrorskin.io.watch.mirrored import MIRRORED
@@ -40,6 +40,7 @@ _GRID = 64  # points along a side that show this extent
 _MIN_POINTS, _MIN_CORRELATION = 100, 0.1  # points, and their correlation, that decide
 _MAX_CORRELATION = 0.05  # of neighbours: greatest one of a mirrored surface
 _REACH = 5  # pixels: size of the neighbourhood whose loss of contact affects a registered sample
+_STILL = 0.2  # pixels by which points may move, where the swing of brightness is still that of their normals
 
 
 class RegistrationUncertainty(Step):
@@ -102,7 +103,8 @@ class ResponseUncertainty(Step):
     Gains of pixels are added to the errors, and noted; the area that a pixel sees is used. Blur, and a
     response that is not linear, are warnings: see `mirrorskin.engine.diagnosis.swing`, and so is brightness
     that has changed since the calibration, or that contradicts the stated gain: see
-    `mirrorskin.engine.diagnosis.sensor_health`. Of a calibrated response, only the latter is judged.
+    `mirrorskin.engine.diagnosis.sensor_health`. Of a calibrated response, only the latter is judged, and only
+    if points of the surface stay at their pixels: frames of a stream are not registered.
     """
 
     needs = ("normals", "normals_sigma", "zenith", "mean", "modulation", "contact")
@@ -123,6 +125,8 @@ class ResponseUncertainty(Step):
         noise_of_mean = CountNoise(base / frames, slope / frames, QUANTUM**2 / frames)
         header, response = context.source.header, operation.response
         if response is not None:
+            if not isinstance(context.stream, Registered) and shift_of(header, tilt) > _STILL:
+                return result
             swing = swing_of_wall(*maps, response, tilt, noise_of_mean)
             sigma = response.swing_sigma
             if sigma is None:  # the swing is a difference of light whose zeniths are two tilts apart

@@ -24,7 +24,7 @@ from mirrorskin.io.formats.tables import save_table
 from mirrorskin.kernels.array_types import Doubles
 
 _COVERAGE = 2  # standard uncertainties of the guard band (ISO 14253-1)
-_LEAST_TREND, _CLEAR_TREND = 10, 4.5  # results, and standard deviations of a slope, from which it is a trend
+_LEAST_TREND, _CLEAR_TREND = 12, 4.5  # results, and standard deviations of a slope, from which it is a trend
 _BOUND = re.compile(rf"\s*(?:({NUMBER})\s*([^\s0-9:][^\s:]*)?)?\s*")
 _PLAIN = {"²": "2", "³": "3", "°": "deg", "^": ""}
 

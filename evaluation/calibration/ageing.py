@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -190,7 +190,9 @@ class UnderWall:
     def changes(self, seed: int, gains: Sequence[float]) -> Map:
         """Return the change of the brightness that each result states, %."""
         shapes = np.random.default_rng([seed, 77]).uniform((0.16, 2.2, 0.0), (0.24, 3.2, 1.5), (THINGS, 3))
-        things = [scorer.waves(*shape, touches.REACH) for shape in shapes.tolist()]
+        things = [
+            scorer.waves(depth, pitch, turned, touches.REACH) for depth, pitch, turned in shapes.tolist()
+        ]
         assert self.calibration.references is not None
         dark = np.nan_to_num(self.calibration.references.dark)
         stated = []
@@ -220,9 +222,10 @@ def trends(folder: Path) -> Table:
     rows = []
     for sensor in (Registered(), UnderWall(lab, calibration)):
         loss = FALL / RECORDINGS
-        falling = [sensor.changes(seed, [1 - loss * number for number in range(RESULTS)]) for seed in range(SERIES)]
+        fallen = [1 - loss * number for number in range(RESULTS)]
+        falling = [sensor.changes(seed, fallen) for seed in range(SERIES)]
         steady = [sensor.changes(SERIES + seed, [1.0] * RESULTS) for seed in range(SERIES)]
-        in_blocks = [np.concatenate([changes[number::THINGS] for number in range(THINGS)]) for changes in steady]
+        in_blocks = [np.concatenate([each[number::THINGS] for number in range(THINGS)]) for each in steady]
         for what, series in (
             (f"falls by {100 * loss:g} % each, objects in turn", falling),
             ("constant, objects in turn", steady),
@@ -244,7 +247,7 @@ def main() -> None:
     parser.add_argument("--freeze", action="store_true", help="write the tables into the pages")
     options = parser.parse_args()
     with TemporaryDirectory() as folder:
-        tables = {
+        tables: dict[str, Callable[[], tuple[str, str, Table]]] = {
             "gain": lambda: ("touches.md", "ageing", table(RECORDINGS)),
             "trends": lambda: ("sensor-health.md", "trends", trends(Path(folder))),
         }

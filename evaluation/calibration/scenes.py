@@ -220,7 +220,7 @@ class Lab:
 
 
 def in_other_light(source: Frames, light: float, dark: ArrayLike, noise: float, seed: int) -> Frames:
-    """Return a recording in light that has fallen to a share, above dark levels, with the same noise, counts."""
+    """Return a recording in a share of the light above dark levels, with the same noise, counts."""
     random = np.random.default_rng(seed).standard_normal(source.frames.shape)
     counts = dark + light * (source.frames - np.asarray(dark)) + math.sqrt(1 - light**2) * noise * random
     frames = np.clip(np.rint(counts), 0, 255).astype(source.dtype)

@@ -17,7 +17,6 @@ from mirrorskin.engine.calibration.touches.window import MOVEMENT
 from mirrorskin.io import InputError
 from mirrorskin.kernels.array_types import Doubles
 
-
 _OF_GEL = "compliance"
 _SINGULAR = 1e-12  # relative eigenvalue of a direction about which touches tell nothing
 
@@ -81,9 +80,7 @@ class Memory(NamedTuple):
         return self._replace(vector=self.vector - self.matrix @ by)
 
 
-def _faded(
-    matrix: Doubles, vector: Doubles, weight: float, names: Sequence[str]
-) -> tuple[Doubles, Doubles]:
+def _faded(matrix: Doubles, vector: Doubles, weight: float, names: Sequence[str]) -> tuple[Doubles, Doubles]:
     """Return information, and this times parameters, with a weight below 1 for response and gel alone.
 
     The information about the movement is what remains if these are unknown. That about them for a given

@@ -17,7 +17,7 @@ from mirrorskin.io.files.arrays import ArrayRecording
 COUNT, DARK, PIXEL = 12, 20.0, fisher.PIXEL
 PHASE = np.arange(COUNT) * 2 * np.pi / COUNT
 SETUP = rotations.Setup(noise=1.0, offset=DARK, dtype="float32", phase=tuple(PHASE))
-TEXTURED = [fisher.OBJECTS[name]() for name in ("rough", "woven", "dimpled", "knurled")]
+TEXTURED = [fisher.OBJECTS[name](*fisher.axes()) for name in ("rough", "woven", "dimpled", "knurled")]
 CHARACTERISED = {"zenith_gain_sigma": 0.003, "tilt_sigma": 0.003, "gamma_sigma": 0.005}
 X, Y = np.meshgrid(np.linspace(-1, 1, fisher.SHAPE[1]), np.linspace(1, -1, fisher.SHAPE[0]))
 TO_RIM = (X**2 + Y**2 - 2 / 3) * 3 / 4
@@ -119,7 +119,7 @@ def test_ageing_by_five_percent_in_a_hundred_recordings_is_a_trend_by_the_twenti
 def test_ageing_is_tracked():
     numbers = np.arange(100)
     tracked = changes(aged(numbers, 0.0005))
-    assert np.abs(tracked + 0.0005 * numbers).max() < 0.005
+    assert np.abs(tracked + 0.0005 * numbers).max() < 0.006
 
 
 @pytest.mark.slow
