@@ -17,9 +17,7 @@ MET = {
 }
 """Objects whose requests are met."""
 CASES = [(name, request) for request, names in MET.items() for name in names]
-FEW = [
-    case for case in CASES if case != ("step", 10.0)
-]  # halved steps: 1.33 times
+FEW = [case for case in CASES if case != ("step", 10.0)]  # halved steps: 1.33 times
 
 
 @pytest.fixture(scope="module")

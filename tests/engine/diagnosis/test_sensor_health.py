@@ -4,9 +4,11 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
+from live_frames import paced
 
 from mirrorskin import engine, io
 from mirrorskin.engine.calibration import fit_zenith, measure_references
+from mirrorskin.engine.live import LiveRun
 from mirrorskin.engine.metrology import table
 from mirrorskin.evaluation.base.sources import Frames
 from mirrorskin.evaluation.calibration import fisher, scorer
@@ -189,3 +191,15 @@ def test_a_wall_whose_light_has_changed_states_it(walled, light):
     with told:
         result = engine.reconstruct(changed, calibration=calibration)
     assert result.fitted.light_change[0] == pytest.approx(light - 1, abs=0.01)
+
+
+@pytest.mark.slow
+def test_a_live_turn_under_a_wall_states_no_change_by_points_that_move(walled):
+    lab, calibration = walled
+    turned = lab.turned(WAVES, press_for(WAVES), 30)
+    live = io.Calibrated(paced(turned.frames, turned.header, turned.series["phase"]), calibration)
+    run = LiveRun(live, engine.Rotation(window_frames=len(turned.frames)))
+    run.push(turned.frames, phase=turned.series["phase"])
+    result = run.result()
+    assert np.isfinite(result.zenith).any()
+    assert result.fitted.light_change is None
