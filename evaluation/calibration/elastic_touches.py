@@ -22,6 +22,7 @@ from mirrorskin import io
 from mirrorskin.engine.calibration import from_touches
 from mirrorskin.evaluation.base.sources import Frames
 from mirrorskin.evaluation.base.tables import Table, replace_part
+from mirrorskin.evaluation.calibration import one_touch
 from mirrorskin.evaluation.calibration.ageing import all_frames
 from mirrorskin.twin import Axial, Camera, Twin, Vertical
 
@@ -31,9 +32,7 @@ TILT, PIVOT = math.radians(2.5), 0.5
 COMPLIANCE, ERROR = 0.05, 0.02  # 1/mm: of the gel, and standard error of its calibration
 FRAMES = 16
 THINGS: tuple[tuple[Literal["sphere", "cone"], ...], ...] = ("sphere",), ("cone",), ("sphere", "cone")
-PARAMETERS = {"compliance": "compliance, 1/mm", "zenith_gain": "gain, %", "zenith_offset": "offset, counts",
-              "gamma": "curvature", "tilt": "half-angle, %", "phase_offset": "phase, deg",
-              "pivot_z": "pivot, mm"}  # fmt: skip
+PARAMETERS = {"compliance": "compliance, 1/mm", **one_touch.PARAMETERS}
 
 
 def touch(name: Literal["sphere", "cone"], seed: int) -> tuple[Frames, Frames]:
@@ -78,23 +77,14 @@ def calibration(compliance: float, error: float = ERROR) -> io.Calibration:
 def rows(seeds: int) -> Iterator[tuple[str, ...]]:
     """Yield rows for each set of objects."""
     for names in THINGS:
-        sigma: dict[str, list[float]] = {each: [] for each in PARAMETERS}
-        away: dict[str, list[float]] = {each: [] for each in PARAMETERS}
+        found = []
         for seed in range(seeds):
             pairs, true = touches(names, seed)
             known = COMPLIANCE + ERROR * np.random.default_rng(seed).normal()
             stated = {"tilt": (pairs[0][1].header.tilt, 0.01 * TILT)}
             fit = from_touches(pairs, calibration=calibration(max(0.0, known)), stated=stated)
-            scale = {"zenith_gain": 100 / true["zenith_gain"], "tilt": 100 / TILT}
-            scale["phase_offset"] = math.degrees(1)
-            for each in fit.estimates:
-                if each.name in PARAMETERS:
-                    sigma[each.name].append(each.sigma * scale.get(each.name, 1.0))
-                    away[each.name].append((each.value - true[each.name]) / each.sigma)
-        cells = [
-            f"{np.median(sigma[each]):.2g}; {np.sqrt(np.mean(np.square(away[each]))):.1f}" for each in sigma
-        ]
-        yield " and ".join(names), *cells
+            found.append((fit, true))
+        yield " and ".join(names), *one_touch.summary(found, PARAMETERS)
 
 
 def main() -> None:

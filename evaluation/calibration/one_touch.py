@@ -12,14 +12,15 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mirrorskin.engine.calibration import from_touches
+from mirrorskin.engine.calibration import TouchFit, from_touches
 from mirrorskin.evaluation.base.sources import Frames
 from mirrorskin.evaluation.base.tables import Table, replace_part
 from mirrorskin.evaluation.calibration.ageing import Textured, all_frames
@@ -60,29 +61,35 @@ def touch(name: str, seed: int) -> tuple[Frames, Frames, dict[str, float]]:
     return Frames(all_frames(press), press.header, f"{name} {seed}", travel=travel), turned, true
 
 
+def summary(found: Sequence[tuple[TouchFit, Mapping[str, float]]], names: Iterable[str]) -> list[str]:
+    """Return the usual standard error of parameters, and the RMS deviation in standard errors, of some fits.
+
+    Each comes with the true parameters. Gain and half-angle are in percent, and the phase in degrees.
+    """
+    cells = []
+    for name in names:
+        sigma, away = [], []
+        for fit, true in found:
+            scale = {"phase_offset": math.degrees(1)}
+            scale |= {each: 100 / true[each] for each in ("zenith_gain", "tilt")}
+            for each in fit.estimates:
+                if each.name == name:
+                    sigma.append(each.sigma * scale.get(name, 1.0))
+                    away.append((each.value - true[name]) / each.sigma)
+        cells.append(f"{np.median(sigma):.2g}; {np.sqrt(np.mean(np.square(away))):.1f}")
+    return cells
+
+
 def rows(seeds: int) -> Iterator[tuple[str, ...]]:
     """Yield rows for each object."""
     for name, is_alone in itertools.product(OBJECTS, (False, True)):
-        sigma: dict[str, list[float]] = {each: [] for each in PARAMETERS}
-        away: dict[str, list[float]] = {each: [] for each in PARAMETERS}
-        refused = 0
+        found = []
         for seed in range(seeds):
             press, turn, true = touch(name, seed)
-            scale = {"zenith_gain": 100 / true["zenith_gain"], "tilt": 100 / TILT}
-            scale["phase_offset"] = math.degrees(1)
-            try:
-                fit = from_touches([(None if is_alone else press, turn)])
-            except InputError:
-                refused += 1
-                continue
-            for each in fit.estimates:
-                if each.name in PARAMETERS:
-                    sigma[each.name].append(each.sigma * scale.get(each.name, 1.0))
-                    away[each.name].append((each.value - true[each.name]) / each.sigma)
-        cells = [
-            f"{np.median(sigma[each]):.2g}; {np.sqrt(np.mean(np.square(away[each]))):.1f}" for each in sigma
-        ]
-        yield f"{name}, turn alone" if is_alone else name, *cells, str(refused)
+            with suppress(InputError):
+                found.append((from_touches([(None if is_alone else press, turn)]), true))
+        title = f"{name}, turn alone" if is_alone else name
+        yield title, *summary(found, PARAMETERS), str(seeds - len(found))
 
 
 def main() -> None:
