@@ -36,7 +36,8 @@ def save_touch(
 ) -> None:
     """Write the frames of a touch to one file.
 
-    It is the recording of the press. The group ``turn`` contains that of the turn, in the same layout.
+    It is the recording of the press. The group ``turn`` contains that of the turn, in the same layout. Both
+    sources are closed, as by `Recorder`.
 
     Parameters
     ----------
