@@ -52,6 +52,7 @@ from mirrorskin.io import (
 )
 from mirrorskin.kernels.array_types import Doubles
 from mirrorskin.kernels.device import Device
+from mirrorskin.kernels.numerics.least_squares import mad_sigma
 from mirrorskin.kernels.rotation.registration import BORDER
 from mirrorskin.kernels.rotation.response import sight_slopes
 
@@ -67,6 +68,7 @@ _FLICKER = 4.0  # the light of frames may differ by this times the usual standar
 _FLOOR = 1e-12  # variance that keeps covariances of gains and offsets without their means regular
 _LEVELS = 5  # depths at which a surface without a press may be, from 0 to that of the body
 _SMOOTH = 0.2  # least share of the pixels of a window that show the wall, and are next to no ridge or border
+_UNEVEN = 0.01  # relative standard deviation of gains from one pixel to the next
 _ODD_TILT = 0.15  # relative standard deviation of an assumed half-angle
 _LEAST_PRESS = 0.1  # mm: from rest to the body's depth, between which a touched object is
 
@@ -88,6 +90,7 @@ class Touch:
     varied: bool  # whether its slopes are not all alike
     relief: Doubles  # (H, W): heights with which frames were registered, mm
     lacking: str  # why it has no window with slopes that vary, if it has none
+    is_even: bool  # whether gains hardly differ from one pixel to the next
     is_warm: bool  # whether its surfaces are those of an earlier fit
     noise: float = 1.0  # variance of a sample
 
@@ -110,11 +113,12 @@ class Touch:
 
     @property
     def is_sharp(self) -> bool:
-        """Whether heights are those of a press, and samples are not interpolated.
+        """Whether heights are those of a press, pixels are alike, and samples are not interpolated.
 
         Interpolation is as wrong as slopes may be where a surface is rough, and makes that seem smoother.
         """
-        return self.poses.arm is None and all(window.is_pressed for window in self.windows)
+        still = self.poses.arm is None and self.is_even
+        return still and all(window.is_pressed for window in self.windows)
 
     @property
     def reason(self) -> str:
@@ -304,6 +308,7 @@ class TouchReader:
             time=_time_of(header),
             tilt_seen=float(np.median([view.tilt_seen for _, view in views])) if views else sensor.tilt,
             misfits=misfits,
+            is_even=_scatter_of(sensor.gain) < _UNEVEN,
             is_warm=self.earlier is not None and not self.chooses,
             relief=self.relief,
             lacking=lacking(looked, whole, sensor),
@@ -398,6 +403,12 @@ def _frame_covariance(header: Header, phase: Doubles, counts: Doubles) -> Double
     for part, block in ((slice(None, len(phase)), gains), (slice(len(phase), None), offsets)):
         covariance[part, part] = without_mean @ block @ without_mean
     return np.asarray(covariance + _FLOOR * np.eye(len(covariance)))
+
+
+def _scatter_of(gain: Doubles) -> float:
+    """Return by how much gains scatter from one pixel to the next, relative to their median."""
+    steps = np.diff(gain, axis=1) / math.sqrt(2)
+    return mad_sigma(steps[np.isfinite(steps)]) / abs(float(np.nanmedian(gain)))
 
 
 def _time_of(header: Header) -> float:
