@@ -428,6 +428,7 @@ class PressEvidence(Step):
         self.heights = AbsoluteHeights.of(result.height + (middle - height), larger)
         corrected = np.asarray(result.height, np.float64)
         travel, travel_sigma = context.positions("travel"), getattr(context.operation, "travel_sigma", None)
+        self.deepest = float(np.max(travel))
         self.steps = PressSteps.of(height, corrected, self.heights.sigma, travel, travel_sigma)
         footprint = footprint_of(Edges.of(result, context), context.source.header, self.blur)
         self.footprint = footprint.variance if footprint.clear else PIXEL

@@ -69,15 +69,13 @@ def read_press(press: Source, device: str | Device | None) -> Pressed:
     from mirrorskin.engine.press.elastic import LEARNED_AT, correct_press  # a tenth of a second to load
 
     firm = replace(gel, sigma={**gel.sigma, "compliance": 0.0})
-    assert evidence.steps is not None
-    deepest = float(np.max(evidence.steps.travel))
-    corrected, summary, fit = correct_press(result, press, deepest, LEARNED_AT, firm)
+    corrected, summary, fit = correct_press(result, press, evidence.deepest, LEARNED_AT, firm)
     if fit is None:
         reason = summary.partition(": ")[2]
         raise InputError(f"{press.name} cannot be corrected for the gel: {reason}. Leave it out")
     moved = np.asarray(corrected.height, np.float64) - height
     contact = fit.on_pixels(fit.slopes.contact.astype(np.float64)) > _INSIDE
-    more = np.asarray(corrected.height_sigma, np.float64) ** 2 - sigma**2
+    more = np.maximum(np.asarray(corrected.height_sigma, np.float64) ** 2 - sigma**2, 0.0)
     if np.isfinite(more[contact]).any():
         more = np.maximum(more, np.nanmean(more[contact])) * fit.pixels_of_a_spline
     middle, half = (np.where(contact, each, np.nan) for each in (middle + moved, half))
