@@ -215,10 +215,10 @@ class Table:
 
         Examples
         --------
-        >>> values = 0.0, 1.1, 1.9, 3.0, 4.2, 4.9, 6.0, 7.1, 8.0, 9.0
+        >>> values = 0.0, 1.1, 1.9, 3.0, 4.2, 4.9, 6.0, 7.1, 8.0, 9.0, 10.1, 10.9
         >>> lot = [Row("", Measures({"Sq": Quantity(value, 0.1, "um")}, [])) for value in values]
         >>> print(Table(lot).trend("Sq"))
-        rises by 1.000 ± 0.011 um from result to result, 9 um in all 10
+        rises by 0.9979 ± 0.0082 um from result to result, 11 um in all 12
         """
         return find_trend(self.values(name)[0], self.unit(name))
 
