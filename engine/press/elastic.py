@@ -177,8 +177,7 @@ def fit_press(
     here, everywhere = (int(np.sum(part)) for part in (scene.cells.inside(fit.contact), fit.contact))
     if everywhere - here > _MAX_OUTSIDE * everywhere:
         raise NotConverged("much of the contact is outside the picture")
-    change = np.zeros(heights.shape)
-    change[scene.cells.box] = scene.splines.at(factors - smooth, *scene.cells.places(heights.shape))
+    change = _splines_on_pixels(scene, heights.shape, factors - smooth)
     variance = _on_pixels(scene, heights.shape, _variances(scene, fit, form))
     contact = _on_pixels(scene, heights.shape, fit.contact.astype(np.float64)) >= 0.5
     variance = variance + (_SHARE_LEFT * change) ** 2 + gel.error**2
@@ -219,10 +218,7 @@ class PressFit(NamedTuple):
         """
         slope = self.slopes.by_travel * self.slopes.load / _SLOPE_ERROR**2
         moved = _solve(self.form, np.einsum("ki,k->i", self.slopes.jacobian, slope))
-        change = np.zeros(self.height.shape)
-        cells = self.scene.cells
-        change[cells.box] = self.scene.splines.at(moved, *cells.places(self.height.shape))
-        return change
+        return _splines_on_pixels(self.scene, self.height.shape, moved)
 
     def load_errors(self, pressed: Pressed) -> tuple[float, Doubles]:
         """Return the load's standard error from the fit, and its changes with the gel's parameters, mm^2.
@@ -288,6 +284,13 @@ def _scene_of(
     sampled = np.isfinite(means) & ((row + 2 * column) % math.ceil(len(onsets) / _SAMPLED) == 0)
     x, y = left + columns, top - rows
     return _Scene(cells, means, sampled, dark, surface, x, y, space, splines, travel, gel)
+
+
+def _splines_on_pixels(scene: _Scene, shape: tuple[int, ...], factors: Doubles) -> Doubles:
+    """Return the surface of splines at pixels, (H, W) mm; 0 outside the cells."""
+    pixels = np.zeros(shape)
+    pixels[scene.cells.box] = scene.splines.at(factors, *scene.cells.places(shape))
+    return pixels
 
 
 def _on_pixels(scene: _Scene, shape: tuple[int, ...], values: Doubles) -> Doubles:

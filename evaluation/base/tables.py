@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from mirrorskin.cli.commands.bench.records import Target
 
@@ -24,6 +25,11 @@ class Table:
         """Return the table alone, with the alignment of its columns."""
         lines = [self.head, (alignment,) * len(self.head), *self.rows]
         return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+    def write_into(self, page: Path, name: str) -> None:
+        """Write the table between the marks of a name in a page; see `replace_part`."""
+        text = page.read_text(encoding="utf-8")
+        page.write_text(replace_part(text, name, self.as_markdown("---:")), encoding="utf-8")
 
     def column(self, name: str) -> list[float]:
         """Return a column's numbers; NaN where there is none."""

@@ -30,7 +30,7 @@ from mirrorskin import engine, io
 from mirrorskin.engine.calibration import from_touches
 from mirrorskin.engine.metrology.tables import find_trend
 from mirrorskin.evaluation.base.sources import Frames
-from mirrorskin.evaluation.base.tables import Table, replace_part
+from mirrorskin.evaluation.base.tables import Table
 from mirrorskin.evaluation.calibration import scorer, touches
 from mirrorskin.evaluation.calibration.scenes import Lab, in_other_light, press_for
 from mirrorskin.twin import Axial, Camera, Twin, Vertical
@@ -255,9 +255,7 @@ def main() -> None:
             page, part, found = tables[name]()
             print(found)
             if options.freeze:
-                path = PAGES / page
-                text = replace_part(path.read_text(encoding="utf-8"), part, found.as_markdown("---:"))
-                path.write_text(text, encoding="utf-8")
+                found.write_into(PAGES / page, part)
 
 
 if __name__ == "__main__":

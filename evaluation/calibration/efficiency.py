@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration import from_touches
 from mirrorskin.evaluation.base.sources import Frames
-from mirrorskin.evaluation.base.tables import Table, replace_part
+from mirrorskin.evaluation.base.tables import Table
 from mirrorskin.evaluation.calibration import fisher
 from mirrorskin.io import Header
 
@@ -133,8 +133,7 @@ def main() -> None:
     table = Table("Standard errors over the bound", heads, list(rows(given.seeds)))
     print(table)
     if given.freeze:
-        page = replace_part(PAGE.read_text("utf-8"), "efficiency", table.as_markdown("---:"))
-        PAGE.write_text(page, "utf-8")
+        table.write_into(PAGE, "efficiency")
 
 
 if __name__ == "__main__":

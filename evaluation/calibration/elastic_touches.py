@@ -21,7 +21,7 @@ import numpy as np
 from mirrorskin import io
 from mirrorskin.engine.calibration import from_touches
 from mirrorskin.evaluation.base.sources import Frames
-from mirrorskin.evaluation.base.tables import Table, replace_part
+from mirrorskin.evaluation.base.tables import Table
 from mirrorskin.evaluation.calibration import one_touch
 from mirrorskin.evaluation.calibration.ageing import all_frames
 from mirrorskin.twin import Axial, Camera, Twin, Vertical
@@ -96,8 +96,7 @@ def main() -> None:
     table = Table("Touches of an elastic body", ("object", *PARAMETERS.values()), list(rows(given.seeds)))
     print(table)
     if given.freeze:
-        part = replace_part(PAGE.read_text("utf-8"), "elastic touches", table.as_markdown("---:"))
-        PAGE.write_text(part, "utf-8")
+        table.write_into(PAGE, "elastic touches")
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import numpy as np
 
 from mirrorskin.engine.calibration import TouchFit, from_touches
 from mirrorskin.evaluation.base.sources import Frames
-from mirrorskin.evaluation.base.tables import Table, replace_part
+from mirrorskin.evaluation.base.tables import Table
 from mirrorskin.evaluation.calibration.ageing import Textured, all_frames
 from mirrorskin.io import InputError
 from mirrorskin.twin import Axial, Camera, Twin, Vertical
@@ -101,9 +101,7 @@ def main() -> None:
     table = Table("One touch", ("object", *PARAMETERS.values(), "refused"), list(rows(given.seeds)))
     print(table)
     if given.freeze:
-        PAGE.write_text(
-            replace_part(PAGE.read_text("utf-8"), "one touch", table.as_markdown("---:")), "utf-8"
-        )
+        table.write_into(PAGE, "one touch")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mirrorskin.engine.calibration.touches.memory import Earlier, Memory
+from mirrorskin.engine.calibration.touches.memory import Earlier, Memory, told_by
 from mirrorskin.engine.calibration.touches.priors import (
     Movement,
     Priors,
@@ -41,7 +41,6 @@ _CONTRADICTION = 3.0  # standard deviations between a prior and the touches
 _LEAST_RELIEF = 30.0  # chi-square of a pixel by relief from which on a touch shows the pivot
 _WELL_SHOWN = 0.02  # relative standard error of the gain by a touch, up to which noise prevails
 _CLEAR = 4.0  # standard deviations of the contradiction of touches by chance, from which on it is a note
-_SINGULAR = 1e-12  # relative eigenvalue of a direction about which a touch tells nothing
 _MOVED = 0.02  # pixels that points move by an error of the pivot, from which frames are registered again
 _REGISTERED = 0.3  # standard errors of a movement with which turns without a press are registered
 _REGISTRATIONS = 5  # largest number of registrations with an estimated movement
@@ -440,9 +439,8 @@ def _forget_pivot(information: Doubles, push: Doubles, priors: Priors) -> None:
     """Leave of what a touch tells of the pivot only how the other estimated parameters depend on it."""
     at = priors.at("pivot_z")
     rest = np.array([number for number in range(len(push)) if number != at and priors.is_free(number)])
-    by_rest = np.linalg.lstsq(information[np.ix_(rest, rest)], information[rest, at], rcond=_SINGULAR)[0]
-    information[at, at] = by_rest @ information[rest, at]
-    push[at] = by_rest @ push[rest]
+    pivot = np.array([at])
+    information[np.ix_(pivot, pivot)], push[pivot] = told_by(information, push, pivot, rest)
 
 
 def _noise_of(windows: Sequence[Window], frames: int) -> float:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mirrorskin.engine.calibration.touches.reading import Touch
 from mirrorskin.engine.calibration.touches.window import MOVEMENT
@@ -88,14 +89,22 @@ def _faded(matrix: Doubles, vector: Doubles, weight: float, names: Sequence[str]
     """
     if weight == 1:
         return matrix, vector
-    moves = np.isin(names, MOVEMENT) & ~np.isin(names, _OF_GEL)
-    movement, response = np.flatnonzero(moves), np.flatnonzero(~moves)
-    mixed = matrix[np.ix_(response, movement)]
-    right = np.column_stack([mixed, vector[response]])
-    solved = np.linalg.lstsq(matrix[np.ix_(response, response)], right, rcond=_SINGULAR)[0]
+    moves = np.array([name in MOVEMENT and name != _OF_GEL for name in names])
+    movement, rest = np.flatnonzero(moves), np.flatnonzero(~moves)
+    by_rest, pull_by_rest = told_by(matrix, vector, movement, rest)
     faded, pull = weight * matrix, weight * vector
-    faded[np.ix_(movement, movement)] += (1 - weight) * (
-        matrix[np.ix_(movement, movement)] - mixed.T @ solved[:, :-1]
-    )
-    pull[movement] += (1 - weight) * (vector[movement] - mixed.T @ solved[:, -1])
+    faded[np.ix_(movement, movement)] += (1 - weight) * (matrix[np.ix_(movement, movement)] - by_rest)
+    pull[movement] += (1 - weight) * (vector[movement] - pull_by_rest)
     return (faded + faded.T) / 2, pull
+
+
+def told_by(
+    matrix: Doubles, vector: Doubles, of: NDArray[np.intp], by: NDArray[np.intp]
+) -> tuple[Doubles, Doubles]:
+    """Return the part of the information on some parameters, and of its vector, that is lost without others.
+
+    What remains is known even if those others, on which it depends, are unknown.
+    """
+    mixed = matrix[np.ix_(by, of)]
+    share = np.linalg.lstsq(matrix[np.ix_(by, by)], mixed, rcond=_SINGULAR)[0].T
+    return share @ mixed, share @ vector[by]

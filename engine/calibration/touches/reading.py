@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
@@ -90,7 +90,7 @@ class Touch:
     varied: bool  # whether its slopes are not all alike
     relief: Doubles  # (H, W): heights with which frames were registered, mm
     lacking: str  # why it has no window with slopes that vary, if it has none
-    is_even: bool  # whether gains hardly differ from one pixel to the next
+    is_sharp: bool  # whether heights are those of a press, and samples neither interpolated nor uneven
     is_warm: bool  # whether its surfaces are those of an earlier fit
     noise: float = 1.0  # variance of a sample
 
@@ -110,15 +110,6 @@ class Touch:
     def pixels(self) -> int:
         """Number of usable pixels."""
         return sum(int(np.count_nonzero(window.usable)) for window in self.windows)
-
-    @property
-    def is_sharp(self) -> bool:
-        """Whether heights are those of a press, pixels are alike, and samples are not interpolated.
-
-        Interpolation is as wrong as slopes may be where a surface is rough, and makes that seem smoother.
-        """
-        still = self.poses.arm is None and self.is_even
-        return still and all(window.is_pressed for window in self.windows)
 
     @property
     def reason(self) -> str:
@@ -297,10 +288,11 @@ class TouchReader:
                 continue
             windows.append(window)
             slopes.append(slopes_of_waves(wave[:, window.usable]))
+        arm = self._arm(sensor)
         return Touch(
             name=self.turn.name,
             windows=windows,
-            poses=Poses(phase[:, np.newaxis], sensor.tilt, self._arm(sensor)),
+            poses=Poses(phase[:, np.newaxis], sensor.tilt, arm),
             phase=phase,
             frame_covariance=_frame_covariance(header, phase, extremes),
             frame_values=np.zeros(2 * len(phase)) if self.earlier is None else self.earlier.frame_values,
@@ -308,7 +300,7 @@ class TouchReader:
             time=_time_of(header),
             tilt_seen=float(np.median([view.tilt_seen for _, view in views])) if views else sensor.tilt,
             misfits=misfits,
-            is_even=_scatter_of(sensor.gain) < _UNEVEN,
+            is_sharp=_is_sharp(windows, arm, sensor.gain),
             is_warm=self.earlier is not None and not self.chooses,
             relief=self.relief,
             lacking=lacking(looked, whole, sensor),
@@ -405,10 +397,16 @@ def _frame_covariance(header: Header, phase: Doubles, counts: Doubles) -> Double
     return np.asarray(covariance + _FLOOR * np.eye(len(covariance)))
 
 
-def _scatter_of(gain: Doubles) -> float:
-    """Return by how much gains scatter from one pixel to the next, relative to their median."""
+def _is_sharp(windows: Sequence[Window], arm: float | None, gain: Doubles) -> bool:
+    """Return whether heights are those of a press, samples not interpolated, and pixels alike.
+
+    Interpolation is as wrong as slopes may be where a surface is rough, and makes that seem smoother. So do
+    gains that scatter from one pixel to the next.
+    """
+    if arm is not None or not all(window.is_pressed for window in windows):
+        return False
     steps = np.diff(gain, axis=1) / math.sqrt(2)
-    return mad_sigma(steps[np.isfinite(steps)]) / abs(float(np.nanmedian(gain)))
+    return mad_sigma(steps[np.isfinite(steps)]) < _UNEVEN * abs(float(np.nanmedian(gain)))
 
 
 def _time_of(header: Header) -> float:
